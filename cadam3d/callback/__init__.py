@@ -1,0 +1,1 @@
+"""Who watches the loop: may look, may write files, may never change training."""

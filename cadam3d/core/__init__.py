@@ -1,0 +1,1 @@
+"""Floor 0: the data everybody shares. Torch only; knows nobody."""

@@ -1,0 +1,147 @@
+"""Cameras: OpenCV axes (+x right, +y down, +z forward) in a world with +z up and the object's front at +x."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """``v`` pinhole views that share one image size. Pixel centres lie at +0.5."""
+
+    world_to_camera: Float[Tensor, "v 4 4"]  # rigid; OpenCV axes
+    intrinsics: Float[Tensor, "v 3 3"]  # pixels
+    height: int
+    width: int
+    azimuth_deg: Float[Tensor, "v"]  # in [-180, 180]; 0 = front (+x), 90 = the +y side
+    elevation_deg: Float[Tensor, "v"]  # in [-90, 90]; positive = from above
+
+    def __len__(self) -> int:
+        return self.world_to_camera.shape[0]
+
+    @property
+    def positions(self) -> Float[Tensor, "v 3"]:
+        """Camera centres in world units."""
+        rotation, translation = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3]
+        return -(rotation.transpose(1, 2) @ translation[..., None])[..., 0]
+
+    def index(self, views: Int[Tensor, "views"] | slice) -> "Cameras":
+        """The chosen views, in the given order."""
+        return Cameras(
+            world_to_camera=self.world_to_camera[views],
+            intrinsics=self.intrinsics[views],
+            height=self.height,
+            width=self.width,
+            azimuth_deg=self.azimuth_deg[views],
+            elevation_deg=self.elevation_deg[views],
+        )
+
+    def to(self, target: torch.device | torch.dtype | str) -> "Cameras":
+        """The same cameras on another device or in another dtype."""
+        return Cameras(
+            world_to_camera=self.world_to_camera.to(target),
+            intrinsics=self.intrinsics.to(target),
+            height=self.height,
+            width=self.width,
+            azimuth_deg=self.azimuth_deg.to(target),
+            elevation_deg=self.elevation_deg.to(target),
+        )
+
+    def resize(self, height: int, width: int) -> "Cameras":
+        """The same views at another image size (intrinsics scaled per axis)."""
+        scale = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
+        return Cameras(
+            world_to_camera=self.world_to_camera,
+            intrinsics=self.intrinsics * scale[None, :, None],
+            height=height,
+            width=width,
+            azimuth_deg=self.azimuth_deg,
+            elevation_deg=self.elevation_deg,
+        )
+
+    def rays(self) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "v h w 3"]]:
+        """World-space ray origins and unit directions through every pixel centre."""
+        kwargs = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
+        y, x = torch.meshgrid(
+            torch.arange(self.height, **kwargs) + 0.5, torch.arange(self.width, **kwargs) + 0.5, indexing="ij"
+        )
+        pixels = torch.stack([x, y, torch.ones_like(x)], dim=-1)
+        to_world = self.world_to_camera[:, :3, :3].transpose(1, 2) @ torch.linalg.inv(self.intrinsics)
+        directions = torch.einsum("vij,hwj->vhwi", to_world, pixels)
+        return self.positions, torch.nn.functional.normalize(directions, dim=-1)
+
+
+def look_at(
+    position: Float[Tensor, "v 3"], target: Float[Tensor, "v 3"], up: Float[Tensor, "v 3"]
+) -> Float[Tensor, "v 4 4"]:
+    """World-to-camera matrices of cameras at ``position`` that look at ``target``, image top towards ``up``.
+
+    Looking along ``up`` itself is allowed: then another axis stands in for it (world +x for +z).
+    """
+    forward = torch.nn.functional.normalize(target - position, dim=-1)
+    right = torch.linalg.cross(forward, up, dim=-1)
+    is_parallel = right.norm(dim=-1, keepdim=True) < 1e-6 * up.norm(dim=-1, keepdim=True)
+    spare = up.roll(1, -1)  # (0, 0, 1) -> (1, 0, 0); never parallel to an axis-like `up`
+    right = torch.where(is_parallel, torch.linalg.cross(forward, spare, dim=-1), right)
+    right = torch.nn.functional.normalize(right, dim=-1)
+    down = torch.linalg.cross(forward, right, dim=-1)
+    rotation = torch.stack([right, down, forward], dim=1)
+    matrix = torch.eye(4, dtype=position.dtype, device=position.device).repeat(position.shape[0], 1, 1)
+    matrix[:, :3, :3] = rotation
+    matrix[:, :3, 3] = -(rotation @ position[..., None])[..., 0]
+    return matrix
+
+
+def pinhole(fov_y_deg: Float[Tensor, "v"], height: int, width: int) -> Float[Tensor, "v 3 3"]:
+    """Intrinsics with square pixels, a centred principal point and the given vertical field of view."""
+    focal = 0.5 * height / torch.tan(torch.deg2rad(fov_y_deg) / 2)
+    matrix = torch.zeros(fov_y_deg.shape[0], 3, 3, dtype=fov_y_deg.dtype, device=fov_y_deg.device)
+    matrix[:, 0, 0] = matrix[:, 1, 1] = focal
+    matrix[:, 0, 2], matrix[:, 1, 2], matrix[:, 2, 2] = width / 2, height / 2, 1.0
+    return matrix
+
+
+def orbit(
+    azimuth_deg: Float[Tensor, "v"],
+    elevation_deg: Float[Tensor, "v"],
+    distance: Float[Tensor, "v"],
+    fov_y_deg: Float[Tensor, "v"],
+    height: int,
+    width: int,
+) -> Cameras:
+    """Cameras on spheres around the origin, looking at it, upright (+z up in the image).
+
+    ``distance`` is in world units, angles in degrees; azimuth 0 sees the front (camera on +x).
+    """
+    azimuth, elevation = torch.deg2rad(azimuth_deg), torch.deg2rad(elevation_deg)
+    direction = torch.stack(
+        [elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()], dim=-1
+    )
+    position = distance[:, None] * direction
+    # The direction of growing elevation: +z as the image sees it, and well defined at the poles too.
+    up = torch.stack(
+        [-elevation.sin() * azimuth.cos(), -elevation.sin() * azimuth.sin(), elevation.cos()], dim=-1
+    )
+    return Cameras(
+        world_to_camera=look_at(position, torch.zeros_like(position), up),
+        intrinsics=pinhole(fov_y_deg, height, width),
+        height=height,
+        width=width,
+        azimuth_deg=(azimuth_deg + 180) % 360 - 180,
+        elevation_deg=elevation_deg,
+    )
+
+
+def turntable(views: int, *, elevation_deg: float, distance: float, fov_y_deg: float, size: int) -> Cameras:
+    """``views`` square cameras evenly spaced over one full turn, starting at the front."""
+    azimuth = torch.arange(views, dtype=torch.float32) * (360.0 / views)
+    full = torch.ones_like(azimuth)
+    return orbit(azimuth, full * elevation_deg, full * distance, full * fov_y_deg, size, size)
+
+
+def fitting_distance(fov_y_deg: float, radius: float = 1.0) -> float:
+    """Distance at which a ball of ``radius`` just touches the image border."""
+    return radius / math.sin(math.radians(fov_y_deg) / 2)

@@ -1,0 +1,65 @@
+"""Errors a user can cause, said so that the next line typed is the right one."""
+
+import math
+from collections.abc import Sequence
+
+from torch import Tensor
+
+
+class UserError(Exception):
+    """A mistake the user can mend: shown as one message, without a traceback, with exit code 1."""
+
+
+def fail(key: str, *, wanted: str, got: object, example: str) -> UserError:
+    """Build the error for one configuration key; the caller raises it.
+
+    ``example`` is a whole argument to paste, such as ``"densifier.tau_Q=0.9"``.
+    """
+    return UserError(f"{key}: wanted {wanted}, got {got!r}. Try: {example}")
+
+
+def require(claim: bool, key: str, *, wanted: str, got: object, example: str) -> None:
+    """Raise :class:`UserError` unless ``claim`` holds."""
+    if not claim:
+        raise fail(key, wanted=wanted, got=got, example=example)
+
+
+def require_range(
+    key: str,
+    value: float | None,
+    *,
+    low: float = -math.inf,
+    high: float = math.inf,
+    below: float = math.inf,
+    above: float = -math.inf,
+    example: object,
+) -> None:
+    """Raise unless ``value`` is a number in ``[low, high]``, ``< below`` and ``> above`` (NaN never is).
+
+    Example: ``require_range("densifier.tau_Q", tau_Q, low=0, below=1, example=0.9)``.
+    """
+    bounds = [
+        f"{sign} {bound:g}"
+        for sign, bound in ((">=", low), (">", above), ("<=", high), ("<", below))
+        if math.isfinite(bound)
+    ]
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    is_inside = is_number and low <= value <= high and above < value < below
+    unbounded = is_number and not bounds and math.isfinite(value)
+    if not (is_inside or unbounded):
+        wanted = "a number " + " and ".join(bounds) if bounds else "a finite number"
+        raise fail(key, wanted=wanted, got=value, example=f"{key}={example}")
+
+
+def require_choice(key: str, value: object, choices: Sequence[object]) -> None:
+    """Raise unless ``value`` is one of ``choices``; the message lists them."""
+    if value not in choices:
+        listed = "|".join(str(choice) for choice in choices)
+        raise fail(key, wanted=f"one of {listed}", got=value, example=f"{key}={choices[0]}")
+
+
+def require_finite(name: str, tensor: Tensor) -> None:
+    """Raise if ``tensor`` holds a NaN or an infinity; the message counts them."""
+    bad = int((~tensor.isfinite()).sum())
+    if bad:
+        raise UserError(f"{name}: {bad} of {tensor.numel()} numbers are not finite")

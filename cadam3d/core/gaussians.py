@@ -1,0 +1,79 @@
+"""Gaussians: five raw tensors and their activations. What the optimizer moves, nothing more."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
+from torch import Tensor
+
+FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh")
+
+
+@dataclass
+class Gaussians:
+    """``n`` anisotropic 3D Gaussians in their raw, unconstrained form (3DGS, Kerbl et al. 2023, sec. 4).
+
+    World units; the object fits in the unit ball, +z is up, its front faces +x (azimuth 0).
+    """
+
+    means: Float[Tensor, "n 3"]  # world units
+    log_scales: Float[Tensor, "n 3"]  # natural log of standard deviations in world units
+    quats: Float[Tensor, "n 4"]  # wxyz, any length
+    opacity_logits: Float[Tensor, "n"]
+    sh: Float[Tensor, "n k 3"]  # k = (degree + 1)**2; coefficient 0 is the view-independent one
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+    @property
+    def scales(self) -> Float[Tensor, "n 3"]:
+        """Standard deviations along the three own axes, in world units, > 0."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Float[Tensor, "n"]:
+        """Opacities in (0, 1)."""
+        return self.opacity_logits.sigmoid()
+
+    @property
+    def rotations(self) -> Float[Tensor, "n 3 3"]:
+        """Rotation matrices from own axes to world axes."""
+        return quaternion_to_rotation_matrix(self.quats)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors live."""
+        return self.means.device
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The five tensors by field name, in the fixed order of ``FIELDS``; no copies."""
+        return {name: getattr(self, name) for name in FIELDS}
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> "Gaussians":
+        """New Gaussians whose every tensor is ``change(tensor)``."""
+        return Gaussians(**{name: change(tensor) for name, tensor in self.tensors().items()})
+
+    def index(self, rows: Int[Tensor, "rows"] | Bool[Tensor, "n"] | slice) -> "Gaussians":
+        """The chosen rows, in the given order."""
+        return self.map(lambda tensor: tensor[rows])
+
+    def detach(self) -> "Gaussians":
+        """The same numbers, cut from the autograd graph."""
+        return self.map(lambda tensor: tensor.detach())
+
+    def to(self, target: torch.device | torch.dtype | str) -> "Gaussians":
+        """The same Gaussians on another device or in another dtype."""
+        return self.map(lambda tensor: tensor.to(target))
+
+
+def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
+    """All rows of ``parts``, one after the other; they must share their SH degree."""
+    columns = {name: [getattr(part, name) for part in parts] for name in FIELDS}
+    return Gaussians(**{name: torch.cat(tensors) for name, tensors in columns.items()})

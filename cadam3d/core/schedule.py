@@ -1,0 +1,97 @@
+"""Schedules are values: pure, printable, callable on a step.
+
+``Linear(start=1e-3, end=1e-5, steps=600)(300)`` is a number; nothing is mutated while training runs.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from cadam3d.core.checks import require, require_range
+
+
+class Schedule(ABC):
+    """A number that depends on the optimization step (0 is the first step)."""
+
+    @abstractmethod
+    def __call__(self, step: int) -> float:
+        """The value at ``step``."""
+
+
+@dataclass(frozen=True)
+class Constant(Schedule):
+    """The same value at every step."""
+
+    value: float
+
+    def __call__(self, step: int) -> float:
+        """The value, whatever the step."""
+        return self.value
+
+
+@dataclass(frozen=True)
+class Linear(Schedule):
+    """From ``start`` at step ``begin`` in a straight line to ``end`` ``steps`` later, then ``end``."""
+
+    start: float
+    end: float
+    steps: int
+    begin: int = 0
+
+    def __post_init__(self) -> None:
+        require_range("schedule.steps", self.steps, low=1, example=600)
+
+    def __call__(self, step: int) -> float:
+        """The value at ``step``."""
+        return self.start + (self.end - self.start) * _progress(step, self.begin, self.steps)
+
+
+@dataclass(frozen=True)
+class LogLinear(Schedule):
+    """As :class:`Linear`, in the logarithm: equal factors over equal times. 3DGS decays its rates so."""
+
+    start: float
+    end: float
+    steps: int
+    begin: int = 0
+
+    def __post_init__(self) -> None:
+        require_range("schedule.steps", self.steps, low=1, example=600)
+        require_range("schedule.start", self.start, above=0, example=1e-3)
+        require_range("schedule.end", self.end, above=0, example=1e-5)
+
+    def __call__(self, step: int) -> float:
+        """The value at ``step``."""
+        progress = _progress(step, self.begin, self.steps)
+        return math.exp(math.log(self.start) * (1 - progress) + math.log(self.end) * progress)
+
+
+@dataclass(frozen=True)
+class Steps(Schedule):
+    """``values[i]`` from ``milestones[i - 1]`` on; ``values[0]`` before the first milestone."""
+
+    values: Sequence[float]
+    milestones: Sequence[int]
+
+    def __post_init__(self) -> None:
+        require(
+            len(self.values) == len(self.milestones) + 1 and list(self.milestones) == sorted(self.milestones),
+            "schedule.values",
+            wanted="one value more than milestones, milestones ascending",
+            got=(list(self.values), list(self.milestones)),
+            example="{values: [0.98, 0.5], milestones: [500]}",
+        )
+
+    def __call__(self, step: int) -> float:
+        """The value at ``step``."""
+        return self.values[sum(step >= milestone for milestone in self.milestones)]
+
+
+def as_schedule(value: float | Schedule) -> Schedule:
+    """A plain number is a constant schedule."""
+    return value if isinstance(value, Schedule) else Constant(float(value))
+
+
+def _progress(step: int, begin: int, steps: int) -> float:
+    return min(max((step - begin) / steps, 0.0), 1.0)

@@ -1,0 +1,1 @@
+"""How the opinion of a prior becomes a gradient."""

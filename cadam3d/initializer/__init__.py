@@ -1,0 +1,1 @@
+"""What we start from: initial Gaussians."""

@@ -1,0 +1,1 @@
+"""Floor 0: one file per format on disk."""

@@ -1,0 +1,1 @@
+"""What knows images: diffusion and flow models behind one interface."""

@@ -1,0 +1,31 @@
+"""Rasterizer: Gaussians and cameras in, images and their gradients out."""
+
+from abc import ABC, abstractmethod
+
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.core.cameras import Cameras
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.render import RenderOutput
+
+# Constants of the image formation model, shared by every backend (gsplat-compatible).
+BLUR = 0.3  # pixels^2 added to the diagonal of each projected covariance
+ALPHA_MIN = 1 / 255  # a fainter contribution to a pixel is skipped
+ALPHA_MAX = 0.99  # a stronger one is capped, with zero gradient to what is capped
+TRANSMITTANCE_MIN = 1e-4  # a pixel stops before the splat that would bring it to this or below
+NEAR = 0.01  # world units; nearer centres are culled
+FRUSTUM_MARGIN = 0.15  # the Jacobian is evaluated at most this share of the image size outside the border
+
+
+class Rasterizer(ABC):
+    """How we see. A component is its hyper-parameters; it holds no tensors."""
+
+    @abstractmethod
+    def render(self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]) -> RenderOutput:
+        """Render every view, differentiably in all five tensors of ``gaussians`` and in ``means2d``.
+
+        ``background`` is one RGB colour per view, in [0, 1]. Whenever gradients are on, ``means2d`` retains its
+        own gradient, so ``output.means2d.grad`` is filled by ``backward()``. Gaussians that are behind a camera,
+        off screen, too faint or not finite are culled: radius 0, no contribution, zero gradient, never a NaN.
+        """
