@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -28,6 +29,9 @@ class TrainState:
     """All that changes while training; a checkpoint is exactly this."""
 
     step: int  # steps done
+    seconds: float  # wall-clock time spent on them
+    num_initial: int  # Gaussians at step 0
+    skipped: int  # steps without an update, because a gradient was not finite
     optimizer: GaussianOptimizer  # owns the Gaussians
     densifier: RowState
     generators: dict[str, torch.Generator]  # one per source of randomness, on the CPU
@@ -37,20 +41,33 @@ class TrainState:
         """The Gaussians as they stand."""
         return self.optimizer.gaussians
 
+    def to_payload(self) -> dict[str, Any]:
+        """Plain tensors, numbers and dicts: what a checkpoint file holds."""
+        return {
+            "step": self.step,
+            "seconds": self.seconds,
+            "num_initial": self.num_initial,
+            "skipped": self.skipped,
+            "gaussians": self.gaussians.detach().tensors(),
+            "optimizer": self.optimizer.state_dict(),
+            "densifier": self.densifier.to_dict(),
+            "generators": {name: generator.get_state() for name, generator in self.generators.items()},
+        }
+
 
 @dataclass(frozen=True)
 class StepReport:
     """What one training step did."""
 
     step: int  # 1 after the first step
-    loss: float
+    loss: float  # surrogate value: half the squared norm of the guidance gradient, plus regularizers
     log: dict[str, float]  # of the guidance and the regularizers
     num_gaussians: int
 
 
 @dataclass(frozen=True)
 class RefineReport:
-    """What one refinement did, in counts of Gaussians, and what the densifier saw."""
+    """What one refinement or opacity reset did, in counts of Gaussians, and what the densifier saw before it."""
 
     step: int
     before: int
@@ -59,7 +76,7 @@ class RefineReport:
     cloned: int
     split: int
     pruned: int
-    reset: int  # opacities lowered at this step
+    reset: int  # opacities lowered
     statistics: dict[str, float]  # of the densifier
 
 
@@ -67,7 +84,7 @@ class RefineReport:
 class RunContext:
     """What a callback may look at."""
 
+    folder: Path  # of the run; exists
     prompt: str
     total_steps: int
-    config: dict[str, Any]
-    render: RenderFn
+    render: RenderFn  # the Gaussians as they stand, without gradient

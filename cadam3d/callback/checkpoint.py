@@ -1,0 +1,35 @@
+"""Checkpoints: written atomically every so many steps and at the end, so that no kill loses more than that."""
+
+from dataclasses import dataclass
+
+from cadam3d.callback.base import Callback
+from cadam3d.core.checks import require_range
+from cadam3d.io.checkpoint import prune_checkpoints, save_checkpoint
+from cadam3d.state import Outcome, RunContext, StepReport, TrainState
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint(Callback):
+    """Saves the whole :class:`TrainState` into ``checkpoints/`` of the run folder."""
+
+    every: int  # steps between checkpoints
+    keep: int  # newest files to keep
+
+    def __post_init__(self) -> None:
+        require_range("callback.checkpoint.every", self.every, low=1, example=100)
+        require_range("callback.checkpoint.keep", self.keep, low=1, example=2)
+
+    def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
+        """Save at every multiple of ``every``."""
+        if state.step % self.every == 0:
+            self._save(context, state)
+
+    def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
+        """Save where the run ended, unless that step is saved already."""
+        if state.step % self.every != 0:
+            self._save(context, state)
+
+    def _save(self, context: RunContext, state: TrainState) -> None:
+        folder = context.folder / "checkpoints"
+        save_checkpoint(folder / f"step_{state.step:07d}.pt", state.to_payload())
+        prune_checkpoints(folder, keep=self.keep)

@@ -1,0 +1,241 @@
+"""The loop: sample views, render, ask the prior, step, and at times refine. It sees interfaces only."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+
+from cadam3d.background import Background
+from cadam3d.callback.base import Callback
+from cadam3d.camera.base import CameraSampler
+from cadam3d.core.checks import UserError, require, require_range
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.render import RenderFn, RenderOutput
+from cadam3d.densifier.base import Densifier, GradientSignal
+from cadam3d.densifier.refine import Refine
+from cadam3d.guidance.base import Guidance
+from cadam3d.initializer.base import Initializer
+from cadam3d.optimizer import AdamSettings
+from cadam3d.prior.base import DiffusionPrior, PromptEmbedding
+from cadam3d.rasterizer.base import Rasterizer
+from cadam3d.regularizer import Regularizer
+from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState
+
+# Sources of randomness, each with its own generator: two densifiers with one seed see the same views and noise.
+GENERATORS = ("initializer", "camera", "background", "guidance", "refine")
+
+
+def never() -> bool:
+    """The stop signal of a run that nobody interrupts."""
+    return False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trainer:
+    """Everything about a run that does not change while it runs."""
+
+    steps: int
+    views: int  # per step
+    camera: CameraSampler
+    background: Background
+    rasterizer: Rasterizer
+    prior: DiffusionPrior
+    guidance: Guidance
+    densifier: Densifier
+    refine: Refine
+    optimizer: AdamSettings
+    regularizers: Mapping[str, Regularizer]
+    callbacks: Sequence[Callback]
+
+    def __post_init__(self) -> None:
+        require_range("steps", self.steps, low=1, example=600)
+        require_range("views", self.views, low=1, example=2)
+
+    def start(self, prompt: str, initializer: Initializer, seed: int, device: torch.device) -> TrainState:
+        """The state before the first step; every later draw descends from ``seed``."""
+        children = np.random.SeedSequence(seed).spawn(len(GENERATORS))
+        generators = {
+            name: torch.Generator().manual_seed(int(child.generate_state(1, np.uint64)[0] >> 1))
+            for name, child in zip(GENERATORS, children, strict=True)
+        }
+        gaussians = initializer.build(prompt, generators["initializer"], device)
+        return TrainState(
+            step=0,
+            seconds=0.0,
+            num_initial=len(gaussians),
+            skipped=0,
+            optimizer=self.optimizer.start(gaussians),
+            densifier=self.densifier.init_state(len(gaussians), device),
+            generators=generators,
+        )
+
+    def restore(self, payload: Mapping[str, Any], device: torch.device) -> TrainState:
+        """The state that ``TrainState.to_payload`` described, on ``device``.
+
+        Raises ``UserError`` if the checkpoint belongs to another kind of densifier.
+        """
+        gaussians = Gaussians(**payload["gaussians"]).to(device)
+        optimizer = self.optimizer.start(gaussians)
+        optimizer.load_state_dict(payload["optimizer"])
+        blank = self.densifier.init_state(len(gaussians), device)
+        expected = {field.name for field in fields(blank)}
+        require(
+            expected == set(payload["densifier"]),
+            "densifier",
+            wanted=f"the one of the checkpoint (state: {sorted(payload['densifier'])})",
+            got=sorted(expected),
+            example="resume without densifier=...",
+        )
+        generators = {name: torch.Generator() for name in GENERATORS}
+        for name, generator in generators.items():
+            generator.set_state(payload["generators"][name])
+        return TrainState(
+            step=payload["step"],
+            seconds=payload["seconds"],
+            num_initial=payload["num_initial"],
+            skipped=payload["skipped"],
+            optimizer=optimizer,
+            densifier=type(blank)(**{k: v.to(device) for k, v in payload["densifier"].items()}),
+            generators=generators,
+        )
+
+    def renderer(self, state: TrainState) -> RenderFn:
+        """Renders the Gaussians as they stand, without gradient."""
+        return render_fn(self.rasterizer, lambda: state.gaussians)
+
+    def train(
+        self,
+        state: TrainState,
+        embedding: PromptEmbedding,
+        context: RunContext,
+        stop: Callable[[], bool] = never,
+    ) -> Outcome:
+        """Advance ``state`` (in place) to ``steps`` or to another outcome; ``stop()`` is asked after every step."""
+        for callback in self.callbacks:
+            callback.on_start(context, state)
+        outcome = self._loop(state, embedding, context, stop)
+        for callback in self.callbacks:
+            callback.on_end(context, state, outcome)
+        return outcome
+
+    def _loop(
+        self, state: TrainState, embedding: PromptEmbedding, context: RunContext, stop: Callable[[], bool]
+    ) -> Outcome:
+        while state.step < self.steps:
+            started = time.perf_counter()
+            try:
+                report, signal = self._step(state, embedding)
+                refined, outcome = self._refine(state, signal)
+            except (torch.OutOfMemoryError, MemoryError):
+                return Outcome.OUT_OF_MEMORY
+            except RuntimeError as error:
+                if "can't allocate memory" in str(error):  # what torch's CPU allocator says
+                    return Outcome.OUT_OF_MEMORY
+                raise
+            state.step += 1
+            state.seconds += time.perf_counter() - started
+            for callback in self.callbacks:
+                if refined is not None:
+                    callback.on_refine(context, state, refined)
+                callback.on_step(context, state, report)
+            if outcome is not None:
+                return outcome
+            if stop() and state.step < self.steps:
+                return Outcome.INTERRUPTED
+        return Outcome.FINISHED
+
+    def _step(self, state: TrainState, embedding: PromptEmbedding) -> tuple[StepReport, GradientSignal | None]:
+        """Render, judge, differentiate, observe and step. No signal if a gradient was not finite."""
+        gaussians, draw = state.gaussians, state.generators
+        cameras = self.camera.sample(state.step, self.views, draw["camera"]).to(gaussians.device)
+        background = self.background.sample(self.views, draw["background"]).to(gaussians.device)
+        output = self.rasterizer.render(gaussians, cameras, background)
+        condition = embedding.at(cameras, background)
+        judged = self.guidance(output.rgb, condition, self.prior, state.step, draw["guidance"])
+        penalties = {name: fn(gaussians, output, state.step) for name, fn in self.regularizers.items()}
+        loss = judged.loss + sum(penalties.values())
+        loss.backward()
+
+        report = StepReport(
+            step=state.step + 1,
+            loss=float(loss.detach()),
+            log={**judged.log, **{name: float(value.detach()) for name, value in penalties.items()}},
+            num_gaussians=len(gaussians),
+        )
+        if not state.optimizer.finite_gradients():
+            state.skipped += 1
+            state.optimizer.zero_grad()
+            return report, None
+        signal = _signal(gaussians, output)
+        state.densifier = self.densifier.observe(state.densifier, signal)
+        state.optimizer.step(state.step)
+        return report, signal
+
+    def _refine(
+        self, state: TrainState, signal: GradientSignal | None
+    ) -> tuple[RefineReport | None, Outcome | None]:
+        """Grow, prune and reset where the schedule says so: a pure plan, then one edit for every owner of rows."""
+        step = state.step + 1
+        refines, resets = self.refine.refines_at(step), self.refine.resets_at(step)
+        if signal is None or not (refines or resets):
+            return None, None
+        statistics = self.densifier.statistics(state.densifier)
+        before = len(state.gaussians)
+        selected = cloned = split = pruned = reset = 0
+        if refines:
+            is_selected = self.densifier.select(state.densifier)
+            plan = self.refine.plan(state.gaussians, is_selected, step, state.generators["refine"])
+            if self.refine.exceeds(plan):
+                report = RefineReport(step, before, before, plan.selected, 0, 0, 0, 0, statistics)
+                return report, Outcome.MAX_GAUSSIANS
+            selected, cloned, split, pruned = plan.selected, plan.cloned, plan.split, plan.pruned
+            state.optimizer.apply(plan.edit)
+            state.densifier = state.densifier.carry(plan.edit)
+        if resets:
+            unreliable = self.densifier.unreliable(state.densifier)
+            reset = state.optimizer.reset_opacity(unreliable, self.refine.reset_value)
+        after = len(state.gaussians)
+        report = RefineReport(step, before, after, selected, cloned, split, pruned, reset, statistics)
+        return report, (Outcome.VANISHED if after == 0 else None)
+
+
+def render_fn(rasterizer: Rasterizer, gaussians: Callable[[], Gaussians]) -> RenderFn:
+    """A :data:`RenderFn` of whatever Gaussians ``gaussians()`` returns when it is called."""
+
+    def render(cameras, background) -> RenderOutput:
+        now = gaussians().detach()
+        with torch.no_grad():
+            return rasterizer.render(now, cameras.to(now.device), background.to(now.device))
+
+    return render
+
+
+def resolve_device(name: str) -> torch.device:
+    """``auto`` is CUDA where there is one, else the CPU; other names are torch's.
+
+    Raises ``UserError`` for a name that torch does not know, or a device that this machine does not have.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise UserError(f"device={name}: not usable here ({reason}). Try: device=cpu") from error
+    return device
+
+
+def _signal(gaussians: Gaussians, output: RenderOutput) -> GradientSignal:
+    means = gaussians.means.grad
+    means2d = output.means2d.grad
+    return GradientSignal(
+        means=torch.zeros_like(gaussians.means) if means is None else means.detach().clone(),
+        means2d=torch.zeros_like(output.means2d) if means2d is None else means2d.detach(),
+        visible=output.visible.detach(),
+        height=output.rgb.shape[1],
+        width=output.rgb.shape[2],
+    )
