@@ -1,16 +1,20 @@
 """NoisePath: noisy = a(t) * clean + b(t) * noise, for diffusion and flow models alike.
 
-``t`` runs from 0 (clean) to 1 (noise) on every path. One prediction has three equivalent forms, clean, noise and
-velocity (paper eq. 5); a path turns any of them into the other two. Noising, a DDIM step and DDIM inversion are one
-call: ``mix(prediction.clean, prediction.noise, t)``.
+``t`` runs from 0 (clean) to 1 (noise) on every path. One prediction has three equivalent forms, clean, noise
+and velocity (paper eq. 5); a path turns any of them into the other two. Noising, a DDIM step and DDIM
+inversion are one call: ``mix(prediction.clean, prediction.noise, t)``.
 """
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import lru_cache
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from cadam3d.core.checks import require_range
 
 
 @dataclass(frozen=True)
@@ -40,22 +44,28 @@ class NoisePath(ABC):
         """The velocity form of a pair: what a velocity-predicting network of this path is trained on."""
 
     @abstractmethod
-    def from_clean(
-        self, noisy: Float[Tensor, "v c h w"], clean: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
-    ) -> Prediction:
-        """Complete a guess of the clean image."""
-
-    @abstractmethod
-    def from_noise(
-        self, noisy: Float[Tensor, "v c h w"], noise: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
-    ) -> Prediction:
-        """Complete a guess of the noise."""
-
-    @abstractmethod
     def from_velocity(
         self, noisy: Float[Tensor, "v c h w"], velocity: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
     ) -> Prediction:
-        """Complete a guess of the velocity."""
+        """Complete a guess of the velocity; exact at both ends of the path."""
+
+    @abstractmethod
+    def timestep(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        """What a network of this path is told about ``t``: the number it was trained on, not rounded."""
+
+    def from_clean(
+        self, noisy: Float[Tensor, "v c h w"], clean: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
+    ) -> Prediction:
+        """Complete a guess of the clean image. Where b is 0 the noise is out of sight and 0 stands in."""
+        noise = (noisy - per_view(self.a(t)) * clean) * per_view(_reciprocal_or_zero(self.b(t)))
+        return Prediction(clean=clean, noise=noise, velocity=self.velocity(clean, noise, t))
+
+    def from_noise(
+        self, noisy: Float[Tensor, "v c h w"], noise: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
+    ) -> Prediction:
+        """Complete a guess of the noise. Where a is 0 the image is out of sight and 0 stands in."""
+        clean = (noisy - per_view(self.b(t)) * noise) * per_view(_reciprocal_or_zero(self.a(t)))
+        return Prediction(clean=clean, noise=noise, velocity=self.velocity(clean, noise, t))
 
     def gamma(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
         """Noise-to-signal ratio b / a (paper sec. 3.2); infinite where a is 0."""
@@ -71,3 +81,104 @@ class NoisePath(ABC):
 def per_view(values: Float[Tensor, "v"]) -> Float[Tensor, "v 1 1 1"]:
     """Reshape one number per view so that it multiplies images."""
     return torch.reshape(values, (-1, 1, 1, 1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DDPM(NoisePath):
+    """The variance-preserving path of Stable Diffusion: a**2 + b**2 = 1, velocity = a * noise - b * clean.
+
+    Betas are linear in their square root ("scaled linear", Rombach et al. 2022). Step k = 1 ... ``train_steps``
+    of the published table lies at t = k / ``train_steps`` with a**2 = prod(1 - beta_i, i <= k); t = 0 is exactly
+    clean, and in between log(a**2) is linear. At t = 1 some signal remains (a = 0.068), as the models were
+    trained. The defaults are constants of those models, not settings.
+    """
+
+    train_steps: int = 1000
+    beta_start: float = 0.00085
+    beta_end: float = 0.012
+
+    def __post_init__(self) -> None:
+        require_range("prior.path.train_steps", self.train_steps, low=1, example=1000)
+        require_range("prior.path.beta_start", self.beta_start, above=0, below=1, example=0.00085)
+        require_range("prior.path.beta_end", self.beta_end, low=self.beta_start, below=1, example=0.012)
+
+    def a(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        """sqrt(alpha_bar), 1 at t = 0."""
+        return torch.exp(0.5 * self._log_alpha_bar(t))
+
+    def b(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        """sqrt(1 - alpha_bar), 0 at t = 0."""
+        return torch.expm1(self._log_alpha_bar(t)).abs().sqrt()  # expm1 keeps its digits where b is small
+
+    def velocity(
+        self, clean: Float[Tensor, "v c h w"], noise: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
+    ) -> Float[Tensor, "v c h w"]:
+        """a * noise - b * clean (v-prediction; Salimans and Ho 2022)."""
+        return per_view(self.a(t)) * noise - per_view(self.b(t)) * clean
+
+    def from_velocity(
+        self, noisy: Float[Tensor, "v c h w"], velocity: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
+    ) -> Prediction:
+        """clean = a * noisy - b * velocity; noise = b * noisy + a * velocity."""
+        a, b = per_view(self.a(t)), per_view(self.b(t))
+        return Prediction(clean=a * noisy - b * velocity, noise=b * noisy + a * velocity, velocity=velocity)
+
+    def timestep(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        """The row of the table, from 0: k - 1 at t = k / ``train_steps``; 0 for anything cleaner than k = 1."""
+        return (t * self.train_steps - 1).clamp_min(0)
+
+    def _log_alpha_bar(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        table = torch.as_tensor(_log_alpha_bars(self.train_steps, self.beta_start, self.beta_end)).to(t)
+        position = t.clamp(0, 1) * self.train_steps
+        below = position.floor().clamp_max(self.train_steps - 1).long()
+        return torch.lerp(table[below], table[below + 1], position - below)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RectifiedFlow(NoisePath):
+    """The straight path: noisy = (1 - sigma) * clean + sigma * noise, velocity = noise - clean.
+
+    ``shift`` bends t towards noise, sigma = shift * t / (1 + (shift - 1) * t) (Esser et al. 2024, sec. 5.3.2):
+    1 leaves t alone, Stable Diffusion 3 uses 3.
+    """
+
+    shift: float = 1.0
+
+    def __post_init__(self) -> None:
+        require_range("prior.path.shift", self.shift, above=0, example=1.0)
+
+    def a(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        """1 - sigma."""
+        return (1 - t) / (self.shift * t + (1 - t))  # not 1 - b: exactly 0 at t = 1, all digits near it
+
+    def b(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        """Sigma."""
+        return self.shift * t / (self.shift * t + (1 - t))
+
+    def velocity(
+        self, clean: Float[Tensor, "v c h w"], noise: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
+    ) -> Float[Tensor, "v c h w"]:
+        """Noise - clean, at every ``t``."""
+        return noise - clean
+
+    def from_velocity(
+        self, noisy: Float[Tensor, "v c h w"], velocity: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
+    ) -> Prediction:
+        """clean = noisy - sigma * velocity; noise = noisy + (1 - sigma) * velocity."""
+        a, b = per_view(self.a(t)), per_view(self.b(t))
+        return Prediction(clean=noisy - b * velocity, noise=noisy + a * velocity, velocity=velocity)
+
+    def timestep(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        """1000 * sigma, in [0, 1000]."""
+        return 1000 * self.b(t)
+
+
+@lru_cache(maxsize=8)
+def _log_alpha_bars(train_steps: int, beta_start: float, beta_end: float) -> np.ndarray:
+    """log(alpha_bar) at k = 0 ... train_steps; NumPy, so that no torch mode leaks into the cache."""
+    betas = np.linspace(beta_start**0.5, beta_end**0.5, train_steps) ** 2
+    return np.concatenate([[0.0], np.cumsum(np.log1p(-betas))])
+
+
+def _reciprocal_or_zero(values: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+    return torch.where(values > 0, 1 / values, 0)
