@@ -87,10 +87,10 @@ def per_view(values: Float[Tensor, "v"]) -> Float[Tensor, "v 1 1 1"]:
 class DDPM(NoisePath):
     """The variance-preserving path of Stable Diffusion: a**2 + b**2 = 1, velocity = a * noise - b * clean.
 
-    Betas are linear in their square root ("scaled linear", Rombach et al. 2022). Step k = 1 ... ``train_steps``
-    of the published table lies at t = k / ``train_steps`` with a**2 = prod(1 - beta_i, i <= k); t = 0 is exactly
-    clean, and in between log(a**2) is linear. At t = 1 some signal remains (a = 0.068), as the models were
-    trained. The defaults are constants of those models, not settings.
+    Betas are linear in their square root ("scaled linear", Rombach et al. 2022). Step k >= 1 of the published
+    table lies at t = k / ``train_steps`` with a**2 = prod(1 - beta_i, i <= k); t = 0 is exactly clean, and in
+    between log(a**2) is linear. At t = 1 some signal remains (a = 0.068), as the models were trained. The
+    defaults are constants of those models, not settings.
     """
 
     train_steps: int = 1000
@@ -124,7 +124,7 @@ class DDPM(NoisePath):
         return Prediction(clean=a * noisy - b * velocity, noise=b * noisy + a * velocity, velocity=velocity)
 
     def timestep(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """The row of the table, from 0: k - 1 at t = k / ``train_steps``; 0 for anything cleaner than k = 1."""
+        """The row of the table, from 0: k - 1 at t = k / ``train_steps``; 0 for anything cleaner."""
         return (t * self.train_steps - 1).clamp_min(0)
 
     def _log_alpha_bar(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
@@ -138,8 +138,8 @@ class DDPM(NoisePath):
 class RectifiedFlow(NoisePath):
     """The straight path: noisy = (1 - sigma) * clean + sigma * noise, velocity = noise - clean.
 
-    ``shift`` bends t towards noise, sigma = shift * t / (1 + (shift - 1) * t) (Esser et al. 2024, sec. 5.3.2):
-    1 leaves t alone, Stable Diffusion 3 uses 3.
+    ``shift`` bends t towards noise: sigma = shift * t / (1 + (shift - 1) * t), as Stable Diffusion 3 does
+    with shift 3 (Esser et al. 2024, sec. 5.3.2); 1 leaves t alone.
     """
 
     shift: float = 1.0
