@@ -30,10 +30,7 @@ class PromptEmbedding(ABC):
 class DiffusionPrior(ABC):
     """A denoiser of images. ``t`` in [0, 1]: 0 is clean, 1 is noise, for diffusion and flow models alike."""
 
-    @property
-    @abstractmethod
-    def path(self) -> NoisePath:
-        """How this model mixes images with noise."""
+    path: NoisePath  # how this model mixes images with noise; an annotation, so that it can be a dataclass field
 
     @abstractmethod
     def embed(self, prompt: str, negative: str) -> PromptEmbedding:
