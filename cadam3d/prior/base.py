@@ -24,13 +24,13 @@ class PromptEmbedding(ABC):
 
     @abstractmethod
     def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> Condition:
-        """The condition of these views: view-dependent wording, and the backdrop that the render stands before."""
+        """The condition of these views: view-dependent wording, and the backdrop behind the render."""
 
 
 class DiffusionPrior(ABC):
     """A denoiser of images. ``t`` in [0, 1]: 0 is clean, 1 is noise, for diffusion and flow models alike."""
 
-    path: NoisePath  # how this model mixes images with noise; an annotation, so that it can be a dataclass field
+    path: NoisePath  # how this model mixes images with noise; not a property, so that it can be a field
 
     @abstractmethod
     def embed(self, prompt: str, negative: str) -> PromptEmbedding:
@@ -44,7 +44,7 @@ class DiffusionPrior(ABC):
     def predict(
         self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: Condition, scale: float
     ) -> Prediction:
-        """One guess, without gradient, under classifier-free guidance: negative + scale * (positive - negative).
+        """One guess, without gradient, under guidance: negative + scale * (positive - negative).
 
         ``scale`` 1 is the prompt alone, 0 the negative prompt alone (the empty one unless the user gave one).
         """
