@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
+from cadam3d.core.errors import UserError
 
-class UserError(Exception):
-    """A mistake the user can mend: shown as one message, without a traceback, with exit code 1."""
+__all__ = ["UserError", "fail", "require", "require_choice", "require_finite", "require_range"]
 
 
 def fail(key: str, *, wanted: str, got: object, example: str) -> UserError:

@@ -1,0 +1,119 @@
+"""Advice: what Hydra complains about, said as one message that ends with what to type."""
+
+import difflib
+import re
+from collections.abc import Iterator, Sequence
+
+from hydra.errors import CompactHydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from cadam3d.core.errors import UserError
+from cadam3d.settings import compose, config_dir, quote
+
+SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
+PASTE_PROMPT = 'prompt="a red and yellow checkered torus"'
+
+
+def did_you_mean(word: str, known: Sequence[str]) -> list[str]:
+    """The known words that ``word`` may have been meant to be, the likeliest first; at most three."""
+    by_lower = {name.lower(): name for name in known}
+    matches = difflib.get_close_matches(word.lower(), list(by_lower), n=3, cutoff=0.6)
+    return [by_lower[match] for match in matches]
+
+
+def explain(error: Exception, config_name: str, overrides: Sequence[str]) -> UserError | None:
+    """The message for an exception of Hydra or OmegaConf while composing; None for any other exception."""
+    if isinstance(error, MissingConfigException):
+        return _unknown_option(error, config_name, overrides)
+    if isinstance(error, OverrideParseException):
+        return _unreadable(error.override, str(error).splitlines()[0])
+    if isinstance(error, (CompactHydraException, OmegaConfBaseException)):
+        text = str(error).strip() or str(error.__cause__ or "")
+        if key := re.search(r"Could not override '([^']+)'", text):
+            return _unknown_key(key.group(1), config_name, overrides)
+        if sweep := re.search(
+            r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)", text, re.M
+        ):
+            return _several_values(sweep.group(1))
+        cause = error.__cause__
+        detail = f" ({str(cause).splitlines()[0]})" if isinstance(cause, OmegaConfBaseException) else ""
+        return UserError(f"{' '.join(text.split())}{detail}")
+    return None
+
+
+def missing_values(cfg: DictConfig) -> list[str]:
+    """The dotted keys that still say ``???``, apart from Hydra's own."""
+    raw = OmegaConf.to_container(cfg, resolve=False)
+    return [key for key, value in _flatten(raw) if value == "???" and not key.startswith("hydra.")]
+
+
+def ask_for(keys: Sequence[str], config_name: str) -> UserError:
+    """The message for values that the user must give."""
+    first = keys[0]
+    example = PASTE_PROMPT if first == "prompt" else f"{first}=..."
+    grid = " grid=thresholds" if config_name == "sweep" else ""
+    return UserError(f"{', '.join(keys)}: no value given. Try: cadam3d {config_name} {example}{grid}")
+
+
+def _unknown_option(error: MissingConfigException, config_name: str, overrides: Sequence[str]) -> UserError:
+    """A group exists but not the chosen option of it, or the command itself has no YAML."""
+    path = error.missing_cfg_file or ""
+    group, _, option = path.rpartition("/")
+    if not group or not error.options:
+        return UserError(f"{path}: no such configuration in {config_dir()}. Try: cadam3d doctor")
+    options = sorted(error.options)
+    best = (did_you_mean(option, options) or options)[0]
+    return UserError(f"{group}: wanted one of {'|'.join(options)}, got {option!r}. Try: {group}={best}")
+
+
+def _unknown_key(key: str, config_name: str, overrides: Sequence[str]) -> UserError:
+    """A key that the configuration does not have: look for it in another spelling or another place."""
+    value = next((line.split("=", 1)[1] for line in overrides if line.startswith(f"{key}=")), "...")
+    known = _known_keys(key, config_name, overrides)
+    last = key.rpartition(".")[2].lower()
+    same_name = [name for name in known if name.rpartition(".")[2].lower() == last]
+    suggestions = same_name or did_you_mean(key, known)
+    if not suggestions:
+        return UserError(
+            f"{key}: no such setting. Try: cadam3d {config_name} --cfg job (it lists all of them)"
+        )
+    meant = " or ".join(suggestions[:3])
+    return UserError(f"{key}: no such setting. Did you mean {meant}? Try: {suggestions[0]}={value}")
+
+
+def _known_keys(wrong: str, config_name: str, overrides: Sequence[str]) -> list[str]:
+    """Every key of the configuration, with the groups that the user chose if those compose."""
+    choices = [line for line in overrides if re.match(r"[a-z]\w*=[\[\]\w,]+$", line) and "." not in line]
+    choices = [line for line in choices if not line.startswith(f"{wrong}=")]
+    for attempt in (choices, []):
+        try:
+            cfg = compose(attempt, config_name)
+        except (CompactHydraException, OmegaConfBaseException):
+            continue
+        keys = [key for key, _ in _flatten(OmegaConf.to_container(cfg, resolve=False), with_nodes=True)]
+        return [key for key in keys if not key.rpartition(".")[2].startswith("_")]
+    return []
+
+
+def _unreadable(override: str, reason: str) -> UserError:
+    key, _, value = override.partition("=")
+    return UserError(f'{key}: cannot read the value ({reason}). Try: "{key}={quote(value)}"')
+
+
+def _several_values(override: str) -> UserError:
+    key, _, value = override.partition("=")
+    return UserError(
+        f"{key}: several values make a sweep. Try: cadam3d sweep {override} ... (a list is {key}=[{value}])"
+    )
+
+
+def _flatten(node: object, prefix: str = "", *, with_nodes: bool = False) -> Iterator[tuple[str, object]]:
+    """Dotted keys and values of nested dicts; ``with_nodes`` yields the inner dicts as well."""
+    if not isinstance(node, dict):
+        yield prefix, node
+        return
+    if with_nodes and prefix:
+        yield prefix, node
+    for key, value in node.items():
+        yield from _flatten(value, f"{prefix}.{key}" if prefix else str(key), with_nodes=with_nodes)

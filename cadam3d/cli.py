@@ -1,0 +1,134 @@
+"""The command line: the first word is the command, the rest of the line is Hydra's.
+
+Nothing heavy is imported before it is needed: help and the completion of the command word must be instant.
+"""
+
+import contextlib
+import os
+import shlex
+import sys
+from collections.abc import Sequence
+
+from cadam3d import __version__
+from cadam3d.core.errors import UserError
+
+COMMANDS = {  # what each does, and a line to paste
+    "train": ("optimise an asset for a prompt", 'cadam3d train prompt="a red torus"'),
+    "sweep": ("train many times, one table of results", 'cadam3d sweep prompt="a red torus" grid=densifiers'),
+    "render": ("make pictures or a turntable of an asset", "cadam3d render run=outputs/latest"),
+    "export": ("write an asset in another form", "cadam3d export run=outputs/latest"),
+    "eval": ("measure a finished run or sweep", "cadam3d eval run=outputs/latest"),
+    "view": ("show the report of a run or a picture of an asset", "cadam3d view run=outputs/latest"),
+    "doctor": ("check this machine, with a hint for each failure", "cadam3d doctor"),
+}
+HELP_FLAGS = ("--help", "-h", "help")
+COMPLETION_FLAGS = ("--shell-completion", "-sc")
+
+
+def main() -> None:
+    """Run the command line of this process and exit: 0 done, 1 a mistake or a failure, 130 interrupted."""
+    wants_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    try:
+        code = dispatch(sys.argv[1:])
+        sys.stdout.flush()
+    except UserError as error:
+        if wants_traceback:
+            raise
+        print(f"cadam3d: {error}", file=sys.stderr)
+        code = 1
+    except KeyboardInterrupt:
+        print("\ncadam3d: interrupted", file=sys.stderr)
+        code = 130
+    except BrokenPipeError:  # the reader of our pipe had enough: `cadam3d train --cfg job | head -3`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    sys.exit(code)
+
+
+def dispatch(words: Sequence[str]) -> int:
+    """Do what ``words`` ask for and return the exit code."""
+    if not words or words[0] in HELP_FLAGS:
+        print(help_text())
+        return 0
+    if words[0] == "--version":
+        print(f"cadam3d {__version__}")
+        return 0
+    if words[0] in COMPLETION_FLAGS:
+        return complete(words)
+    if words[0] not in COMMANDS:
+        raise unknown_command(words)
+    from cadam3d.launch import launch
+
+    return launch(words[0], words[1:])
+
+
+def help_text() -> str:
+    """The commands with one line each, and where to read on."""
+    lines = [
+        f"cadam3d {__version__}: a sentence in, 3D Gaussians out",
+        "",
+        "Usage: cadam3d COMMAND [key=value ...]",
+        "",
+        *(f"  {name:<8}{summary:<51}{example}" for name, (summary, example) in COMMANDS.items()),
+        "",
+        "Settings of a command:  cadam3d COMMAND --help",
+        'Tab completion (bash):  eval "$(cadam3d -sc install=bash)"',
+    ]
+    return "\n".join(lines)
+
+
+def unknown_command(words: Sequence[str]) -> UserError:
+    """The message for a first word that is no command; a sentence or an override gets the line it wanted."""
+    from cadam3d.advice import did_you_mean
+
+    first = words[0]
+    listed = "|".join(COMMANDS)
+    if "=" in first:
+        line = shlex.join(["cadam3d", "train", *words])
+    elif " " in first:
+        line = f"cadam3d train {shlex.quote('prompt=' + first)}"
+    elif near := did_you_mean(first, list(COMMANDS)):
+        line = shlex.join(["cadam3d", near[0], *words[1:]])
+        return UserError(f"{first!r} is no command. Did you mean {near[0]}? Try: {line}")
+    else:
+        line = "cadam3d --help"
+    return UserError(f"{first!r} is no command: wanted one of {listed}. Try: {line}")
+
+
+def complete(words: Sequence[str]) -> int:
+    """Serve tab completion: the command word ourselves, what follows it through Hydra.
+
+    The shell asks with ``-sc query=SHELL`` and the line so far in ``COMP_LINE``; ``-sc install=SHELL`` prints
+    the script that makes it ask.
+    """
+    action, _, shell = words[1].partition("=") if len(words) > 1 else ("", "", "")
+    if not shell:
+        raise UserError('-sc: wanted install=bash|zsh|fish. Try: eval "$(cadam3d -sc install=bash)"')
+    if action == "query":
+        line = os.environ.get("COMP_LINE", "")
+        typed = _words(line)[1:]
+        is_new_word = line.endswith(" ")
+        if not typed or (len(typed) == 1 and not is_new_word):
+            start = typed[0] if typed else ""
+            separator = "\n" if shell == "fish" else " "
+            print(separator.join(name for name in COMMANDS if name.startswith(start)))
+            return 0
+        if typed[0] not in COMMANDS:
+            return 0
+        # Hydra splits the line at blanks and reads every word: keep sentences and half-typed quotes from it.
+        *done, last = [*typed[1:], ""] if is_new_word else typed[1:]
+        plain = [word for word in done if " " not in word and not word.startswith(("prompt=", "negative_"))]
+        os.environ["COMP_LINE"] = " ".join(["cadam3d", *plain, last])
+    from cadam3d.launch import run_hydra
+
+    command = typed[0] if action == "query" else "train"
+    with contextlib.suppress(UserError):  # a line that is wrong so far has no completions
+        run_hydra(command, list(words))
+    return 0
+
+
+def _words(line: str) -> list[str]:
+    try:
+        return shlex.split(line)
+    except ValueError:  # a quote is still open
+        return line.split()

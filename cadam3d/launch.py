@@ -1,0 +1,291 @@
+"""Launch: prepare a line for Hydra, refuse what cannot work before any work starts, and hand over."""
+
+import os
+import re
+import shlex
+import sys
+import tempfile
+from argparse import Namespace
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NoReturn
+
+import hydra
+import yaml
+from hydra._internal.utils import get_args_parser
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+
+from cadam3d.advice import ask_for, explain, missing_values
+from cadam3d.core.errors import UserError
+from cadam3d.settings import VERSION_BASE, compose, config_dir, quote, register_resolvers
+
+TRAINING = ("train", "sweep")  # the commands that own a run folder
+OVERRIDES = ".hydra/overrides.yaml"  # in a run folder: what its line said
+TEXT_KEYS = ("prompt", "negative_prompt")  # always text, so quoted for the user
+PATH_KEYS = ("run", "ply", "output", "resume", "hydra.run.dir", "hydra.sweep.dir")  # quoted if need be
+PLAIN_PATH = re.compile(r"[\w./~+-]*", re.ASCII)
+QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
+SWEEP_CALL = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)", re.DOTALL)
+PIECE = re.compile(r"(?:[^,]|,(?=\s|$))*", re.DOTALL)  # up to a comma that no blank follows
+FLAGS_WITH_VALUE = (
+    *("--cfg", "-c", "--package", "-p", "--info", "-i", "--experimental-rerun"),
+    *("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
+)
+
+
+class Task:
+    """What Hydra calls for each job: ``run`` of the command. A mistake of the user waits here, unprinted."""
+
+    def __init__(self, module: str) -> None:
+        self.module = module
+        self.mistake: UserError | None = None
+        self.has_started = False
+
+    def __call__(self, cfg: DictConfig) -> Any:
+        """Run the command on its composed configuration."""
+        self.has_started = True
+        try:
+            return import_module(f"cadam3d.commands.{self.module}").run(cfg)
+        except UserError as error:
+            self.mistake = error
+            return None
+
+
+def launch(command: str, words: Sequence[str]) -> int:
+    """Run ``cadam3d <command> <words>`` and return its exit code; the user's mistakes raise ``UserError``."""
+    overrides, flags = split(words)
+    _refuse_bare_words(command, overrides)
+    options = _read_flags(flags)
+    is_sweep = command == "sweep" or options.multirun or "hydra.mode=MULTIRUN" in overrides
+    overrides = [quoted(line, is_sweep=is_sweep) for line in overrides]
+    if command in TRAINING:
+        overrides = resumed(overrides, is_sweep=is_sweep)
+    elif is_sweep:
+        raise UserError(f"{command}: only training can be swept. Try: cadam3d {command} once for each asset")
+    if options.help or options.hydra_help or options.info or options.shell_completion:
+        return run_hydra(command, [*overrides, *flags])
+    first = _first_job(command, overrides, options) if is_sweep else overrides
+    if options.cfg:
+        shown = [flag for flag in flags if flag not in ("-m", "--multirun")]
+        return run_hydra(command, [*first, *shown])
+    return _run(command, overrides, first, flags, options, is_sweep=is_sweep)
+
+
+def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Tell overrides from flags, wherever the flags stand in the line."""
+    overrides, flags = [], []
+    takes_value = False
+    for word in words:
+        if takes_value or word.startswith("-"):
+            flags.append(word)
+            takes_value = not takes_value and word in FLAGS_WITH_VALUE
+        else:
+            overrides.append(word)
+    return overrides, flags
+
+
+def quoted(line: str, *, is_sweep: bool) -> str:
+    """One override with its prompt or path quoted, so that commas, brackets, ``=`` or emoji are just text.
+
+    In a sweep a comma before a blank belongs to the sentence and any other comma separates two prompts, so
+    ``prompt="a corgi, front view,a cat"`` is two. What is quoted already, or ``choice(...)``, stays as it is.
+    """
+    key, equals, value = line.partition("=")
+    name = key.lstrip("+")
+    if not equals or QUOTED.fullmatch(value):
+        return line
+    if name in PATH_KEYS and not PLAIN_PATH.fullmatch(value) and "${" not in value:
+        return f"{key}={quote(value)}"
+    if name in TEXT_KEYS and not (is_sweep and SWEEP_CALL.fullmatch(value)):
+        pieces = _prompts(value) if is_sweep else [value]
+        return f"{key}=" + ",".join(part if QUOTED.fullmatch(part) else quote(part) for part in pieces)
+    return line
+
+
+def resumed(overrides: Sequence[str], *, is_sweep: bool) -> list[str]:
+    """With ``resume=RUN`` in the line: what RUN was started with, changed by what the line says anew."""
+    given = {_key(line): line for line in overrides}
+    if "resume" not in given or (text := _text(given["resume"])) in ("null", ""):
+        return list(overrides)
+    if is_sweep:
+        raise UserError(f"resume: continues one run, not a sweep. Try: cadam3d train resume={text}")
+    path = Path(text).expanduser().resolve()
+    holders = [place for place in (path, *path.parents) if (place / OVERRIDES).is_file()]
+    folder = holders[0] if path.exists() and holders else None
+    if folder is None or (path.is_dir() and path != folder):
+        raise UserError(
+            f"resume: wanted the folder of a run (it holds {OVERRIDES}), got {text!r}. "
+            "Try: cadam3d train resume=outputs/latest"
+        )
+    if "hydra.run.dir" in given and Path(_text(given["hydra.run.dir"])).resolve() != folder:
+        raise UserError(f"hydra.run.dir: a resumed run stays in its folder. Try: cadam3d train resume={text}")
+    before = yaml.safe_load((folder / OVERRIDES).read_text(encoding="utf-8")) or []
+    merged = {_key(line): line for line in before if _key(line) != "grid"}
+    for key, line in given.items():
+        old = merged.get(key, "")
+        merged[key] = old[: len(old) - len(old.lstrip("+"))] + line if line[0] not in "+~" else line
+    merged["resume"] = f"resume={quote(str(path))}"
+    merged["hydra.run.dir"] = f"hydra.run.dir={quote(str(folder))}"
+    return list(merged.values())
+
+
+def run_hydra(command: str, arguments: Sequence[str], task: Task | None = None) -> int:
+    """Let Hydra read ``arguments`` with the YAML of ``command``; its complaints come out as ``UserError``."""
+    task = task or Task(command)
+    register_resolvers()
+    arguments_before, switch_before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    sys.argv = [sys.argv[0], *arguments]
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions reach us instead of Hydra's printer
+    try:
+        hydra.main(version_base=VERSION_BASE, config_path=str(config_dir()), config_name=command)(task)()
+    except Exception as error:
+        advice = None if task.has_started else explain(error, command, split(arguments)[0])
+        if advice is None:
+            raise
+        raise advice from error
+    finally:
+        sys.argv = arguments_before
+        os.environ["HYDRA_FULL_ERROR"] = switch_before or "0"
+    if task.mistake is not None:
+        raise task.mistake
+    return 0
+
+
+def _run(
+    command: str,
+    overrides: list[str],
+    first: list[str],
+    flags: list[str],
+    options: Namespace,
+    *,
+    is_sweep: bool,
+) -> int:
+    """Check what can be checked without working, fix the output folder, and start."""
+    cfg = _compose(command, first, options)
+    if missing := missing_values(cfg):
+        raise ask_for(missing, command)
+    if command not in TRAINING:
+        return run_hydra(command, [*overrides, *flags])
+    key = "hydra.sweep.dir" if is_sweep else "hydra.run.dir"
+    is_chosen = any(_key(line) == key for line in overrides)
+    folder = _claim(Path(OmegaConf.select(cfg, key)), key, is_chosen=is_chosen)
+    arguments = [line for line in overrides if _key(line) != key] + [f"{key}={quote(str(folder))}"]
+    if not is_sweep:
+        return run_hydra(command, [*arguments, *flags])
+    from cadam3d.commands import sweep
+
+    flags = flags if options.multirun else [*flags, "--multirun"]
+    try:
+        run_hydra(command, [*arguments, *flags], Task("sweep"))
+    finally:
+        code = sweep.finish(folder)
+    return code
+
+
+def _first_job(command: str, overrides: Sequence[str], options: Namespace) -> list[str]:
+    """The overrides of the first job of a sweep. With nothing to sweep over, ``cadam3d sweep`` is refused."""
+    cfg = _compose(command, [line for line in overrides if _key(line) == "grid"], options)
+    grid = OmegaConf.select(cfg, "hydra.sweeper.params") or {}
+    lines = {key: f"{key}={value}" for key, value in grid.items()} | {_key(line): line for line in overrides}
+    try:
+        parsed = OverridesParser.create().parse_overrides(list(lines.values()))
+    except Exception as error:
+        raise explain(error, command, overrides) or error from error
+    if command == "sweep" and not any(override.is_sweep_override() for override in parsed):
+        raise UserError(
+            "sweep: nothing to sweep over. Try: cadam3d sweep grid=thresholds ... or densifier=baseline,cadam"
+        )
+    first = []
+    for line, override in zip(lines.values(), parsed, strict=True):
+        if override.is_sweep_override() and override.is_discrete_sweep():
+            value = next(iter(override.sweep_string_iterator()))
+            first.append(f"{override.get_key_element()}={value}")
+        else:
+            first.append(line)
+    return first
+
+
+def _compose(command: str, overrides: Sequence[str], options: Namespace) -> DictConfig:
+    try:
+        return compose(
+            overrides,
+            options.config_name or command,
+            folder=Path(options.config_path) if options.config_path else None,
+            search_path=os.path.abspath(options.config_dir) if options.config_dir else None,  # noqa: PTH100
+            with_hydra=True,
+        )
+    except Exception as error:
+        advice = explain(error, command, overrides)
+        if advice is None:
+            raise
+        raise advice from error
+
+
+def _claim(folder: Path, key: str, *, is_chosen: bool) -> Path:
+    """Make the folder and prove that it can be written; a name of our own that is taken gets a number."""
+    folder = folder.expanduser()
+    number = 1
+    wanted = folder
+    while not is_chosen and folder.exists():
+        number += 1
+        folder = wanted.with_name(f"{wanted.name}-{number}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise UserError(
+            f"{key}: cannot write to {folder} ({error.strerror}). Try: {key}=/tmp/cadam3d"
+        ) from error
+    return folder
+
+
+def _read_flags(flags: Sequence[str]) -> Namespace:
+    parser = get_args_parser()
+    parser.error = _refuse_flags  # type: ignore[method-assign]
+    options = parser.parse_args(list(flags))
+    modes = [options.run, options.multirun and not options.cfg, bool(options.cfg), options.info is not None]
+    if sum(map(bool, modes)) > 1:
+        raise UserError(f"{' '.join(flags)}: these flags exclude one another. Try: one of them")
+    return options
+
+
+def _refuse_bare_words(command: str, overrides: Sequence[str]) -> None:
+    """A word without ``=`` is what the shell makes of a prompt that was not quoted: give it back whole."""
+    bare = [line for line in overrides if "=" not in line and not line.startswith("~")]
+    if bare:
+        before = [line for line in overrides[: overrides.index(bare[0])] if _key(line) in TEXT_KEYS]
+        key, _, start = before[-1].partition("=") if before else ("prompt", "", "")
+        whole = " ".join([start, *bare]).strip()
+        example = f"cadam3d {command} {key}={shlex.quote(whole)}" if command in TRAINING else f"run={bare[0]}"
+        raise UserError(f"{bare[0]!r}: wanted key=value. Try: {example}")
+
+
+def _refuse_flags(message: str) -> NoReturn:
+    raise UserError(f"{message}. Try: cadam3d --help")
+
+
+def _prompts(value: str) -> list[str]:
+    """The prompts of a sweep, as they stand between separating commas."""
+    pieces, rest = [], value
+    while True:
+        match = QUOTED.match(rest)
+        if match is None or rest[match.end() : match.end() + 1] not in ("", ","):
+            match = PIECE.match(rest)
+        assert match is not None, "PIECE matches the empty string too"
+        pieces.append(match.group().strip())
+        if match.end() == len(rest):
+            return pieces
+        rest = rest[match.end() + 1 :]
+
+
+def _key(line: str) -> str:
+    return line.partition("=")[0].lstrip("+~")
+
+
+def _text(line: str) -> str:
+    """The value of an override as plain text."""
+    value = OverridesParser.create().parse_override(line).value()
+    return OmegaConf.create({"value": value}).value if isinstance(value, str) else str(value or "null")

@@ -1,0 +1,117 @@
+"""Settings: where the numbers live, how a command line changes them, and how they become objects."""
+
+import re
+import unicodedata
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml  # comes with OmegaConf
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from cadam3d.core.errors import UserError
+
+VERSION_BASE = "1.3"  # Hydra's behaviour is pinned to this version, whatever is installed
+WRONG_CALL = r"unexpected keyword|missing \d+ required"  # how Python words a call with the wrong arguments
+SLUG_LENGTH = 60  # characters; even of three bytes each they fit a file name
+
+
+def config_dir() -> Path:
+    """The folder of YAML files: inside the installed package, or ``configs/`` of a checkout."""
+    package = Path(__file__).parent
+    packaged = package / "configs"
+    return packaged if packaged.is_dir() else package.parent / "configs"
+
+
+def compose(
+    overrides: Sequence[str] = (),
+    config_name: str = "train",
+    *,
+    folder: Path | None = None,
+    search_path: str | None = None,
+    with_hydra: bool = False,
+) -> DictConfig:
+    """The configuration that ``cadam3d <config_name> <overrides>`` would run with.
+
+    ``folder`` replaces :func:`config_dir`, ``search_path`` is one more folder of YAML files, ``with_hydra``
+    keeps Hydra's own node. Raises Hydra's exceptions; ``cadam3d.advice`` puts them into words.
+    """
+    register_resolvers()
+    extra = [] if search_path is None else [f"hydra.searchpath=[{quote('file://' + str(search_path))}]"]
+    with initialize_config_dir(str((folder or config_dir()).resolve()), version_base=VERSION_BASE):
+        return hydra_compose(config_name, [*extra, *overrides], return_hydra_config=with_hydra)
+
+
+def component(node: DictConfig | ListConfig | None) -> Any:
+    """Build the object that ``node._target_`` names; nested nodes too; lists and dicts become plain Python.
+
+    Raises ``UserError`` for what the configuration got wrong: values out of range, keys that the class does
+    not have, keys that it misses, a target that cannot be imported. A bug in a constructor stays what it is.
+    """
+    try:
+        return instantiate(node, _convert_="all")
+    except InstantiationException as error:
+        raise _construction_error(error) from error
+    except OmegaConfBaseException as error:
+        raise UserError(f"{error.full_key or 'configuration'}: {str(error.msg).splitlines()[0]}") from error
+
+
+def load(path: Path) -> DictConfig:
+    """The resolved ``config.yaml`` of a run: what looks like an interpolation there is somebody's text."""
+    return DictConfig(_escaped(yaml.safe_load(path.read_text(encoding="utf-8"))))
+
+
+def register_resolvers() -> None:
+    """Make ``${slug:...}`` known to OmegaConf; calling it again does nothing new."""
+    OmegaConf.register_new_resolver("slug", slug, replace=True)
+
+
+def slug(*parts: object) -> str:
+    """A piece of a file name that says ``parts``: ``slug("A red car!")`` is ``"A-red-car"``."""
+    text = unicodedata.normalize("NFKC", " ".join(str(part) for part in parts))
+    text = re.sub(r"(?:[^\w.=]|(?<!\w)=)+", "-", text).strip("-.")
+    return text[:SLUG_LENGTH].rstrip("-.") or "untitled"
+
+
+def escape(text: str) -> str:
+    """Text that OmegaConf reads back as ``text``, even if it holds ``${``."""
+    return re.sub(r"(\\*)\$\{", lambda match: match.group(1) * 2 + r"\${", text)
+
+
+def quote(text: str) -> str:
+    r"""``text`` as a quoted value of Hydra's override grammar: it stays text, whatever it holds.
+
+    Inside the quotes a backslash is special before a quote only, so only those are doubled.
+    """
+    escaped = re.sub(r"(\\*)'", lambda match: match.group(1) * 2 + r"\'", escape(text))
+    trailing = len(escaped) - len(escaped.rstrip("\\"))
+    return "'" + escaped + "\\" * trailing + "'"
+
+
+def _construction_error(error: InstantiationException) -> BaseException:
+    """What really went wrong: a mistake in the configuration as ``UserError``, a bug as itself."""
+    cause = error.__cause__
+    key = re.search(r"full_key: (\S+)", str(error))
+    where = key.group(1) if key else "configuration"
+    if isinstance(cause, TypeError) and (call := re.search(WRONG_CALL, str(cause))):
+        names = ", ".join(re.findall(r"'(\w+)'", str(cause)))
+        if call.group() == "unexpected keyword":
+            return UserError(f"{where}: there is no key {names}. Try: without it; --cfg job lists the keys")
+        return UserError(f"{where}: no value for {names}. Try: give one; --cfg job lists the keys")
+    if cause is None or isinstance(cause, ImportError):
+        reason = str(cause or error).splitlines()[-1]
+        return UserError(f"{where}._target_: cannot be loaded ({reason}). Try: cadam3d doctor")
+    return cause
+
+
+def _escaped(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _escaped(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_escaped(item) for item in value]
+    return escape(value) if isinstance(value, str) else value
