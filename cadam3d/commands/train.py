@@ -1,0 +1,195 @@
+"""``cadam3d train``: a prompt in, a run folder with an asset out."""
+
+import signal
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from cadam3d import __version__
+from cadam3d.core.checks import UserError
+from cadam3d.exporter.base import Exporter
+from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
+from cadam3d.io.jsonl import read_jsonl, write_json
+from cadam3d.io.report import write_report
+from cadam3d.settings import component
+from cadam3d.state import Outcome, RunContext, TrainState
+from cadam3d.trainer import Trainer, resolve_device
+
+COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "camera", "refine", "optimizer")
+
+
+class StopOnSignal:
+    """The first SIGINT or SIGTERM asks the loop to stop and save; the second one stops at once."""
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> "StopOnSignal":
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def __call__(self) -> bool:
+        return self.received is not None
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        if self.received is not None:
+            raise KeyboardInterrupt
+        self.received = number
+        print("\nStopping after this step and saving; once more to stop at once.", file=sys.stderr)
+
+
+def run(cfg: DictConfig) -> float | None:
+    """Train, export, measure and report; returns the PSNR in dB where the prior knows the truth."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    device = resolve_device(cfg.device)
+    # Same seed, same bytes: on the CPU every operation we use has a deterministic form.
+    torch.use_deterministic_algorithms(device.type == "cpu")
+    trainer = build_trainer(cfg, device)
+    exporters: dict[str, Exporter] = {name: component(node) for name, node in cfg.exporter.items()}
+    metrics = {name: component(node) for name, node in cfg.metric.items()}
+
+    embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
+    state = _start_or_resume(cfg, trainer, device, folder)
+    if notice := trainer.prior.notice():
+        print(f"Note: {notice}", file=sys.stderr)
+    config_text = OmegaConf.to_yaml(cfg, resolve=True)
+    (folder / "config.yaml").write_text(config_text, encoding="utf-8")
+    if HydraConfig.get().mode != RunMode.MULTIRUN:
+        _point_latest_at(folder)
+
+    render = trainer.renderer(state)
+    context = RunContext(folder=folder, prompt=cfg.prompt, total_steps=trainer.steps, render=render)
+    with StopOnSignal() as stop:
+        outcome = trainer.train(state, embedding, context, stop)
+        summary = summarize(cfg, state, outcome)
+        write_json(folder / "summary.json", summary)  # first of all: pictures may fail, the numbers stay
+        gaussians = state.gaussians.detach()
+        warnings = _export(exporters, gaussians, render, folder)
+        truth = trainer.prior.truth(cfg.prompt)
+        for metric in metrics.values():
+            summary |= metric.measure(gaussians, render, truth)
+        summary |= {"warnings": warnings}
+        write_json(folder / "summary.json", summary)
+        lines = read_jsonl(folder / "metrics.jsonl")
+        report = write_report(folder, summary=summary, metrics=lines, config_text=config_text)
+    _say(folder, summary, report)
+    if outcome is Outcome.INTERRUPTED and stop.received is not None:
+        sys.exit(128 + stop.received)
+    return summary.get("psnr")
+
+
+def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
+    """Wire the components that ``cfg`` names; the prior moves to ``device``."""
+    return Trainer(
+        steps=cfg.steps,
+        views=cfg.views,
+        camera=component(cfg.camera),
+        background=component(cfg.background),
+        rasterizer=component(cfg.rasterizer),
+        prior=component(cfg.prior).to(device),
+        guidance=component(cfg.guidance),
+        densifier=component(cfg.densifier),
+        refine=component(cfg.refine),
+        optimizer=component(cfg.optimizer),
+        regularizers={name: component(node) for name, node in cfg.regularizer.items()},
+        callbacks=[component(node) for node in cfg.callback.values()],
+    )
+
+
+def summarize(cfg: DictConfig, state: TrainState, outcome: Outcome) -> dict[str, Any]:
+    """The facts of a run, for ``summary.json`` and ``sweep.csv``."""
+    choices: Mapping[str, str] = HydraConfig.get().runtime.choices
+    return {
+        "prompt": cfg.prompt,
+        "negative_prompt": cfg.negative_prompt,
+        "seed": cfg.seed,
+        "steps": state.step,
+        "steps_asked": cfg.steps,
+        "outcome": str(outcome),
+        "num_gaussians_initial": state.num_initial,
+        "num_gaussians": len(state.gaussians),
+        "seconds": round(state.seconds, 2),
+        "skipped_steps": state.skipped,
+        **{name: choices.get(name) for name in COMPONENTS},
+        "device": str(state.gaussians.device),
+        "cadam3d": __version__,
+        "torch": torch.__version__,
+        "finished_at": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+    }
+
+
+def _start_or_resume(cfg: DictConfig, trainer: Trainer, device: torch.device, folder: Path) -> TrainState:
+    start = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, device)
+    if cfg.resume is None:
+        return start
+    path = Path(cfg.resume)
+    path = path if path.is_file() else latest_checkpoint(folder / "checkpoints")
+    if path is None:
+        print(f"No checkpoint in {folder / 'checkpoints'} yet: starting at step 0.", file=sys.stderr)
+        return start
+    state = trainer.restore(load_checkpoint(path), device)
+    if state.step >= trainer.steps:
+        print(f"{path.name} has all {state.step} steps; writing the outputs again.", file=sys.stderr)
+    return state
+
+
+def _export(exporters: Mapping[str, Exporter], gaussians, render, folder: Path) -> list[str]:
+    """Write every export; one that fails is reported and does not take the others with it."""
+    warnings = []
+    for name, exporter in exporters.items():
+        try:
+            exporter.export(gaussians, render, folder)
+        except UserError as error:
+            warnings.append(f"exporter.{name}: {error}")
+            print(f"Warning: exporter.{name}: {error}", file=sys.stderr)
+    return warnings
+
+
+def _point_latest_at(folder: Path) -> None:
+    """Make ``outputs/latest`` a link to ``folder``; a file system without links only loses the shortcut."""
+    link = Path("outputs") / "latest"
+    try:
+        link.parent.mkdir(parents=True, exist_ok=True)
+        fresh = link.with_name(f".latest-{folder.name}")
+        fresh.unlink(missing_ok=True)
+        fresh.symlink_to(_relative_if_inside(folder, link.parent))
+        fresh.replace(link)
+    except OSError as error:
+        print(f"Note: outputs/latest not updated ({error.strerror}).", file=sys.stderr)
+
+
+def _relative_if_inside(folder: Path, base: Path) -> Path:
+    folder, base = folder.resolve(), base.resolve()
+    return folder.relative_to(base) if folder.is_relative_to(base) else folder
+
+
+def _say(folder: Path, summary: Mapping[str, Any], report: Path) -> None:
+    try:
+        shown = folder.resolve().relative_to(Path.cwd())
+    except ValueError:
+        shown = folder
+    quality = f", PSNR {summary['psnr']:.2f} dB" if summary.get("psnr") is not None else ""
+    print(
+        f"{summary['outcome']} after {summary['steps']} steps, {summary['seconds']:.0f} s: "
+        f"{summary['num_gaussians']} Gaussians{quality}"
+    )
+    for label, name in (("asset", "asset.ply"), ("video", "turntable.mp4"), ("pictures", "preview.png")):
+        if (folder / name).exists():
+            print(f"  {label:<9}{shown / name}")
+    print(f"  {'report':<9}{shown / report.name}")
+    if summary["outcome"] == Outcome.INTERRUPTED:
+        print(f"  go on with: cadam3d train resume={shown}")

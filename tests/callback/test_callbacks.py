@@ -1,0 +1,95 @@
+"""What callbacks leave behind in the run folder."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from cadam3d.callback.checkpoint import Checkpoint
+from cadam3d.callback.metrics import Metrics
+from cadam3d.callback.progress import Progress
+from cadam3d.commands.train import build_trainer
+from cadam3d.core.checks import UserError
+from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
+from cadam3d.io.jsonl import append_jsonl, read_jsonl
+from cadam3d.settings import component, compose
+from cadam3d.state import Outcome, RunContext
+
+CPU = torch.device("cpu")
+
+
+def train(tmp_path, callbacks, steps: int = 7):
+    cfg = compose(
+        [
+            "prompt=a red cube",
+            "prior=tiny",
+            "rasterizer=reference",
+            f"steps={steps}",
+            "camera.size=12",
+            "initializer.count=20",
+            "refine.start=0",
+            "refine.end=100",
+            "refine.interval=3",
+            "callback=[]",
+        ]
+    )
+    trainer = replace(build_trainer(cfg, CPU), callbacks=callbacks)
+    state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
+    context = RunContext(tmp_path, cfg.prompt, trainer.steps, trainer.renderer(state))
+    assert trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context) is Outcome.FINISHED
+    return state
+
+
+def test_checkpoints_appear_at_multiples_and_at_the_end_and_old_ones_go(tmp_path):
+    state = train(tmp_path, [Checkpoint(every=2, keep=2)])
+    folder = tmp_path / "checkpoints"
+    assert sorted(path.name for path in folder.iterdir()) == ["step_0000006.pt", "step_0000007.pt"]
+    newest = load_checkpoint(latest_checkpoint(folder))
+    assert newest["step"] == state.step == 7
+    assert torch.equal(newest["gaussians"]["means"], state.gaussians.means)
+
+
+def test_a_checkpoint_at_the_last_step_is_not_written_twice(tmp_path, monkeypatch):
+    written = []
+    monkeypatch.setattr("cadam3d.callback.checkpoint.save_checkpoint", lambda path, _: written.append(path.name))
+    train(tmp_path, [Checkpoint(every=2, keep=9)], steps=4)
+    assert written == ["step_0000002.pt", "step_0000004.pt"]
+
+
+def test_metrics_hold_one_line_per_logged_step_and_per_refinement(tmp_path):
+    train(tmp_path, [Metrics(every=3)])
+    lines = read_jsonl(tmp_path / "metrics.jsonl")
+    assert [(line["kind"], line["step"]) for line in lines] == [
+        ("step", 1),
+        ("refine", 3),
+        ("step", 3),
+        ("refine", 6),
+        ("step", 6),
+        ("step", 7),
+    ]
+    refinement = lines[1]
+    assert {"before", "after", "selected", "cloned", "split", "pruned", "reset", "statistics"} <= refinement.keys()
+    assert {"loss", "num_gaussians", "seconds"} <= lines[0].keys()
+
+
+def test_lines_of_steps_that_will_be_done_again_are_dropped(tmp_path):
+    for step in (1, 2, 3):
+        append_jsonl(tmp_path / "metrics.jsonl", {"kind": "step", "step": step, "old": True})
+    train(tmp_path, [Metrics(every=1)], steps=2)
+    lines = read_jsonl(tmp_path / "metrics.jsonl")
+    assert not any(line.get("old") for line in lines)
+    assert [line["step"] for line in lines] == [1, 2]
+
+
+def test_the_bar_counts_every_step_and_shows_the_gaussians(tmp_path, capsys):
+    train(tmp_path, [Progress(refresh_seconds=0.0)], steps=3)
+    shown = capsys.readouterr().err
+    assert "3/3" in shown
+    assert "N=20" in shown
+    assert "loss=" in shown
+
+
+@pytest.mark.parametrize(("make", "key"), [(lambda: Checkpoint(every=0, keep=1), "every"), (lambda: Metrics(every=0), "every")])
+def test_zero_intervals_are_refused(make, key):
+    with pytest.raises(UserError, match=key):
+        make()

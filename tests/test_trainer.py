@@ -1,0 +1,228 @@
+"""Laws of the training loop: same seed same bytes, resume is no event, outcomes are recorded."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from cadam3d.callback.base import Callback
+from cadam3d.commands.train import build_trainer
+from cadam3d.core.checks import UserError
+from cadam3d.settings import component, compose
+from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState
+from cadam3d.trainer import Trainer, resolve_device
+
+CPU = torch.device("cpu")
+SMALL = [
+    "prompt=a red cube",
+    "prior=tiny",
+    "rasterizer=reference",
+    "steps=8",
+    "camera.size=16",
+    "initializer.count=30",
+    "refine.start=0",
+    "refine.end=100",
+    "refine.interval=2",
+    "refine.reset_interval=4",
+    "refine.reset_from=4",
+    "refine.reset_until=100",
+    "callback=[]",
+]
+
+
+@dataclass
+class Witness(Callback):
+    """Remembers what it was shown."""
+
+    steps: list[StepReport] = field(default_factory=list)
+    refinements: list[RefineReport] = field(default_factory=list)
+    ends: list[Outcome] = field(default_factory=list)
+
+    def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
+        assert report.step == state.step
+        self.steps.append(report)
+
+    def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
+        self.refinements.append(report)
+
+    def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
+        self.ends.append(outcome)
+
+
+def make(overrides: Sequence[str] = ()) -> tuple[Trainer, TrainState]:
+    cfg = compose([*SMALL, *overrides])
+    trainer = build_trainer(cfg, CPU)
+    return trainer, trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
+
+
+def go(trainer: Trainer, state: TrainState, tmp_path: Path, **kwargs) -> Outcome:
+    embedding = trainer.prior.embed("a red cube", "")
+    context = RunContext(tmp_path, "a red cube", trainer.steps, trainer.renderer(state))
+    return trainer.train(state, embedding, context, **kwargs)
+
+
+def same(left: dict, right: dict) -> bool:
+    """Bitwise equality of two payloads, wall-clock time aside."""
+    assert left.keys() == right.keys()
+    for key, value in left.items():
+        other = right[key]
+        if isinstance(value, dict):
+            if not same(value, other):
+                return False
+        elif isinstance(value, torch.Tensor):
+            if not torch.equal(value, other):
+                return False
+        elif key != "seconds" and value != other:
+            return False
+    return True
+
+
+@pytest.mark.parametrize("densifier", ["cadam", "baseline", "none"])
+def test_same_seed_same_bytes(tmp_path, densifier):
+    payloads = []
+    for _ in range(2):
+        trainer, state = make([f"densifier={densifier}"])
+        go(trainer, state, tmp_path)
+        payloads.append(state.to_payload())
+    assert same(*payloads)
+
+
+def test_another_seed_gives_another_result(tmp_path):
+    results = []
+    for seed in (0, 1):
+        trainer, state = make([f"seed={seed}"])
+        go(trainer, state, tmp_path)
+        results.append(state.to_payload())
+    assert not torch.equal(results[0]["generators"]["camera"], results[1]["generators"]["camera"])
+    assert not torch.equal(results[0]["gaussians"]["means"][:10], results[1]["gaussians"]["means"][:10])
+
+
+@pytest.mark.parametrize("densifier", ["cadam", "baseline"])
+@pytest.mark.parametrize("cut", [1, 4, 5])
+def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, densifier, cut):
+    trainer, whole = make([f"densifier={densifier}"])
+    go(trainer, whole, tmp_path)
+
+    first_half, state = make([f"densifier={densifier}", f"steps={cut}"])
+    # The schedule of the whole run, stopped early: what a kill leaves behind.
+    first_half = replace(trainer, steps=cut)
+    go(first_half, state, tmp_path)
+    torch.save(state.to_payload(), tmp_path / "half.pt")
+    resumed = trainer.restore(torch.load(tmp_path / "half.pt", weights_only=True), CPU)
+    assert go(trainer, resumed, tmp_path) is Outcome.FINISHED
+    assert same(whole.to_payload(), resumed.to_payload())
+
+
+def test_densifiers_with_one_seed_see_the_same_views_and_noise(tmp_path):
+    ends = {}
+    for densifier in ("cadam", "none"):
+        trainer, state = make([f"densifier={densifier}"])
+        go(trainer, state, tmp_path)
+        ends[densifier] = state.to_payload()["generators"]
+    for source in ("camera", "background", "guidance"):
+        assert torch.equal(ends["cadam"][source], ends["none"][source])
+
+
+def test_rows_of_all_three_owners_agree_after_every_refinement(tmp_path):
+    class Auditor(Callback):
+        def on_refine(self, context, state, report):
+            assert report.after == len(state.gaussians)
+            assert report.after == report.before + report.cloned + report.split - report.pruned
+            assert state.densifier.to_dict()["m"].shape[0] == report.after
+            assert state.optimizer.state_dict()["exp_avg"]["means"].shape[0] == report.after
+
+    trainer, state = make()
+    witness = Witness()
+    go(replace(trainer, callbacks=[Auditor(), witness]), state, tmp_path)
+    assert [report.step for report in witness.refinements] == [2, 4, 6, 8]
+    assert any(report.cloned + report.split for report in witness.refinements)
+
+
+def test_callbacks_see_every_step_once_and_the_end(tmp_path):
+    trainer, state = make()
+    witness = Witness()
+    go(replace(trainer, callbacks=[witness]), state, tmp_path)
+    assert [report.step for report in witness.steps] == list(range(1, 9))
+    assert witness.ends == [Outcome.FINISHED]
+
+
+def test_a_stop_signal_ends_the_run_after_the_step_at_hand(tmp_path):
+    trainer, state = make()
+    asked = iter([False, False, True])
+    assert go(trainer, state, tmp_path, stop=lambda: next(asked)) is Outcome.INTERRUPTED
+    assert state.step == 3
+
+
+def test_growth_beyond_max_gaussians_is_an_outcome_and_is_not_applied(tmp_path):
+    trainer, state = make(["refine.max_gaussians=30"])
+    witness = Witness()
+    outcome = go(replace(trainer, callbacks=[witness]), state, tmp_path)
+    assert outcome is Outcome.MAX_GAUSSIANS
+    assert witness.ends == [outcome]
+    assert len(state.gaussians) == 30
+    assert witness.refinements[-1].selected > 0
+
+
+def test_losing_every_gaussian_is_an_outcome(tmp_path):
+    trainer, state = make(["refine.min_opacity=0.999999", "refine.reset_interval=null"])
+    assert go(trainer, state, tmp_path) is Outcome.VANISHED
+    assert len(state.gaussians) == 0
+    image = trainer.renderer(state)(component(compose(SMALL).camera).sample(0, 1, torch.Generator()), torch.ones(1, 3))
+    assert torch.equal(image.rgb, torch.ones_like(image.rgb))
+
+
+@pytest.mark.parametrize(
+    "error", [torch.OutOfMemoryError("no"), RuntimeError("DefaultCPUAllocator: can't allocate memory: 9 bytes")]
+)
+def test_running_out_of_memory_is_an_outcome(tmp_path, error, monkeypatch):
+    trainer, state = make()
+
+    def exhausted(*_args):
+        raise error
+
+    monkeypatch.setattr(type(trainer.rasterizer), "render", exhausted)
+    assert go(trainer, state, tmp_path) is Outcome.OUT_OF_MEMORY
+    assert state.step == 0
+
+
+def test_another_runtime_error_is_not_swallowed(tmp_path, monkeypatch):
+    trainer, state = make()
+
+    def broken(*_args):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(type(trainer.rasterizer), "render", broken)
+    with pytest.raises(RuntimeError, match="a bug"):
+        go(trainer, state, tmp_path)
+
+
+def test_a_step_with_a_non_finite_gradient_changes_nothing_but_is_counted(tmp_path):
+    trainer, state = make(["steps=1"])
+
+    class Poison(type(trainer.guidance)):
+        def __call__(self, rgb, *args):
+            output = super().__call__(rgb, *args)
+            return replace(output, loss=output.loss + float("nan") * rgb.sum())
+
+    before = state.to_payload()
+    poisoned = Poison(**vars(trainer.guidance))
+    go(replace(trainer, guidance=poisoned), state, tmp_path)
+    after = state.to_payload()
+    assert after["skipped"] == 1
+    for owner in ("gaussians", "optimizer", "densifier"):
+        assert same({owner: before[owner]}, {owner: after[owner]})
+
+
+def test_a_checkpoint_of_another_densifier_is_refused():
+    trainer, state = make(["densifier=baseline"])
+    other, _ = make(["densifier=cadam"])
+    with pytest.raises(UserError, match="densifier"):
+        other.restore(state.to_payload(), CPU)
+
+
+def test_an_unknown_or_absent_device_says_what_to_type():
+    with pytest.raises(UserError, match="device=cpu"):
+        resolve_device("toaster")
+    assert resolve_device("cpu") == CPU
