@@ -1,16 +1,18 @@
 """RowEdit: the only way rows change. RowState: per-row tensors that follow one.
 
-Three owners of rows (Gaussians, optimizer moments, densifier state) follow the same edit, so they cannot disagree.
+Three owners of rows (Gaussians, optimizer moments, densifier state) follow one edit: they cannot disagree.
 """
 
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import TypeVar
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
 from cadam3d.core.gaussians import Gaussians, concatenate
+
+State = TypeVar("State", bound="RowState")  # not Self: run-time type checkers refuse it on plain methods
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class RowState:
     Newborns start at zero, which for CAdam is the paper's rule (m = v = 0, age = 0; sec. 4.2).
     """
 
-    def carry(self, edit: RowEdit) -> Self:
+    def carry(self: State, edit: RowEdit) -> State:
         """The state after ``edit``."""
         return type(self)(**{field.name: edit.carry(getattr(self, field.name)) for field in fields(self)})
 
