@@ -1,0 +1,169 @@
+"""Adam over the five raw tensors, following row edits: survivors keep their moments, newborns have zeros."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from cadam3d.core.checks import UserError, require_range
+from cadam3d.core.edit import RowEdit
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.schedule import Schedule, as_schedule
+
+# What Adam sees: the five tensors, with the view-dependent colours apart because they learn more slowly.
+PARTS = ("means", "sh_dc", "sh_rest", "opacity", "scale", "quat")
+MOMENTS = ("exp_avg", "exp_avg_sq")  # as torch names them
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdamSettings:
+    """Learning rates (a number, or a schedule of the step) and constants of Adam (Kingma and Ba 2015)."""
+
+    means_lr: float | Schedule  # world units per step
+    sh_dc_lr: float | Schedule  # of the view-independent colour coefficient
+    sh_rest_lr: float | Schedule  # of all other coefficients; unused at SH degree 0
+    opacity_lr: float | Schedule  # logits per step
+    scale_lr: float | Schedule  # natural logs per step
+    quat_lr: float | Schedule
+    beta1: float
+    beta2: float
+    eps: float  # far below any gradient: world gradients can be tiny
+
+    def __post_init__(self) -> None:
+        for part in PARTS:
+            rate = getattr(self, f"{part}_lr")
+            if not isinstance(rate, Schedule):
+                require_range(f"optimizer.{part}_lr", rate, low=0, example=0.005)
+        require_range("optimizer.beta1", self.beta1, low=0, below=1, example=0.9)
+        require_range("optimizer.beta2", self.beta2, low=0, below=1, example=0.999)
+        require_range("optimizer.eps", self.eps, above=0, example=1e-15)
+
+    def start(self, gaussians: Gaussians) -> "GaussianOptimizer":
+        """An optimizer that owns a copy of ``gaussians``, with zero moments."""
+        return GaussianOptimizer(self, gaussians)
+
+    def learning_rates(self, step: int) -> dict[str, float]:
+        """The rate of each part at ``step`` (0 is the first)."""
+        return {part: as_schedule(getattr(self, f"{part}_lr"))(step) for part in PARTS}
+
+
+class GaussianOptimizer:
+    """Mutable: owns the leaf tensors, moves them, and replaces them when rows change."""
+
+    def __init__(self, settings: AdamSettings, gaussians: Gaussians) -> None:
+        self.settings = settings
+        moments = {kind: _parts(gaussians.map(torch.zeros_like)) for kind in MOMENTS}
+        self._install(gaussians.map(lambda tensor: tensor.detach().clone()), {"steps": 0, **moments})
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The leaf tensors; ``backward()`` fills their ``grad``. Ask again after :meth:`apply`."""
+        return self._gaussians
+
+    def step(self, step: int) -> None:
+        """One Adam step at the learning rates of ``step`` (0 is the first), then forget the gradients.
+
+        A tensor without a gradient has the gradient zero: its moments decay like everybody's.
+        """
+        rates = self.settings.learning_rates(step)
+        gradients = self._gaussians.map(
+            lambda tensor: torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
+        )
+        for group, gradient in zip(self._adam.param_groups, _parts(gradients).values(), strict=True):
+            group["lr"] = rates[group["name"]]
+            group["params"][0].grad = gradient
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=True)
+        self.zero_grad()
+
+    def zero_grad(self) -> None:
+        """Forget the gradients, without a step."""
+        for tensor in self._gaussians.tensors().values():
+            tensor.grad = None
+
+    def finite_gradients(self) -> bool:
+        """Whether every gradient at hand is free of NaN and infinity. One wait for the device."""
+        gradients = [tensor.grad for tensor in self._gaussians.tensors().values() if tensor.grad is not None]
+        return not gradients or bool(torch.stack([grad.isfinite().all() for grad in gradients]).all())
+
+    def apply(self, edit: RowEdit) -> None:
+        """Replace the rows as ``edit`` says; pending gradients are dropped."""
+        moments = self.state_dict()
+        for kind in MOMENTS:
+            moments[kind] = {name: edit.carry(rows) for name, rows in moments[kind].items()}
+        self._install(edit.apply(self._gaussians), moments)
+
+    @torch.no_grad()
+    def reset_opacity(self, rows: Bool[Tensor, "n"], value: float) -> int:
+        """Lower the opacity of ``rows`` to at most ``value`` (paper sec. 4.4); nobody's is ever raised.
+
+        The opacity moments of exactly these rows become zero, so that old momentum does not undo the reset;
+        all other moments stay. Returns how many opacities were lowered.
+        """
+        logits = self._gaussians.opacity_logits
+        ceiling = math.log(value / (1 - value))
+        lowered = rows & (logits > ceiling)
+        logits.masked_fill_(lowered, ceiling)
+        moments = self._moments("opacity")
+        for kind in MOMENTS:
+            moments[kind].masked_fill_(rows, 0.0)
+        return int(lowered.sum())
+
+    def state_dict(self) -> dict[str, Any]:
+        """Steps done and both moments by part: plain numbers and tensors. The Gaussians are saved apart."""
+        return {
+            "steps": int(self._moments("means")["step"]),
+            **{kind: {name: self._moments(name)[kind] for name in PARTS} for kind in MOMENTS},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take over what :meth:`state_dict` described, for the same Gaussians; goes on bit for bit.
+
+        Raises ``UserError`` if the moments are of other Gaussians.
+        """
+        parts = _parts(self._gaussians.detach())
+        moments: dict[str, Any] = {"steps": state["steps"]}
+        for kind in MOMENTS:
+            for name, part in parts.items():
+                if state[kind][name].shape != part.shape:
+                    raise UserError(
+                        f"checkpoint: {kind} of {name} has shape {tuple(state[kind][name].shape)}, but the "
+                        f"Gaussians have {tuple(part.shape)}. Resume from another checkpoint of this run"
+                    )
+            moments[kind] = {name: state[kind][name].to(part, copy=True) for name, part in parts.items()}
+        self._install(self._gaussians.detach(), moments)
+
+    def _moments(self, part: str) -> dict[str, Tensor]:
+        return self._adam.state[self._adam.param_groups[PARTS.index(part)]["params"][0]]
+
+    def _install(self, gaussians: Gaussians, moments: Mapping[str, Any]) -> None:
+        """Make ``gaussians`` the leaves and hand Adam views into them, so that one step moves both."""
+        self._gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
+        parts = _parts(self._gaussians.detach())
+        self._adam = torch.optim.Adam(
+            [{"params": [part], "name": name} for name, part in parts.items()],
+            betas=(self.settings.beta1, self.settings.beta2),
+            eps=self.settings.eps,
+        )
+        for name, part in parts.items():
+            self._adam.state[part] = {
+                "step": torch.tensor(float(moments["steps"])),
+                **{kind: moments[kind][name].contiguous() for kind in MOMENTS},
+            }
+
+
+def _parts(gaussians: Gaussians) -> dict[str, Tensor]:
+    """The tensors as Adam groups them, in the order of ``PARTS``; views, no copies."""
+    tensors = (
+        gaussians.means,
+        gaussians.sh[:, :1],
+        gaussians.sh[:, 1:],
+        gaussians.opacity_logits,
+        gaussians.log_scales,
+        gaussians.quats,
+    )
+    return dict(zip(PARTS, tensors, strict=True))

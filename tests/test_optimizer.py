@@ -1,0 +1,260 @@
+"""Laws of GaussianOptimizer: it is Adam, it follows row edits, and it goes on bit for bit."""
+
+import math
+
+import pytest
+import torch
+
+from cadam3d.core.checks import UserError
+from cadam3d.core.edit import RowEdit
+from cadam3d.core.gaussians import FIELDS, Gaussians
+from cadam3d.core.schedule import Linear
+from cadam3d.optimizer import MOMENTS, PARTS, AdamSettings, GaussianOptimizer, _parts
+
+RATES = {
+    "means_lr": 0.01,
+    "sh_dc_lr": 0.02,
+    "sh_rest_lr": 0.001,
+    "opacity_lr": 0.05,
+    "scale_lr": 0.005,
+    "quat_lr": 0.003,
+}
+
+
+def settings(**changes) -> AdamSettings:
+    return AdamSettings(**{**RATES, "beta1": 0.9, "beta2": 0.999, "eps": 1e-15, **changes})
+
+
+def gaussians(n: int, seed: int = 0, k: int = 4) -> Gaussians:
+    draw = torch.Generator().manual_seed(seed)
+    shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "opacity_logits": (n,), "sh": (n, k, 3)}
+    return Gaussians(**{name: torch.randn(shapes[name], generator=draw) for name in FIELDS})
+
+
+def push(optimizer: GaussianOptimizer, seed: int) -> None:
+    """Random gradients for every tensor, as a backward pass would leave them."""
+    noise = gaussians(len(optimizer.gaussians), seed=seed, k=optimizer.gaussians.sh.shape[1])
+    for name, tensor in optimizer.gaussians.tensors().items():
+        tensor.grad = getattr(noise, name)
+
+
+def train(optimizer: GaussianOptimizer, steps: range) -> None:
+    for step in steps:
+        push(optimizer, seed=100 + step)
+        optimizer.step(step)
+
+
+def edit_of(n: int, keep: list[int], parents: list[int]) -> RowEdit:
+    return RowEdit(
+        keep=torch.tensor(keep), children=gaussians(len(parents), seed=9), parents=torch.tensor(parents)
+    )
+
+
+def as_named(moments: dict) -> dict[str, torch.Tensor]:
+    return {f"{kind}/{name}": moments[kind][name].clone() for kind in MOMENTS for name in PARTS}
+
+
+def test_it_is_torch_adam_on_every_tensor():
+    start = gaussians(7)
+    ours = settings().start(start)
+    parts = _parts(start.map(torch.clone))
+    groups = [{"params": [part], "lr": RATES[f"{name}_lr"]} for name, part in parts.items()]
+    theirs = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)
+    for step in range(20):
+        push(ours, seed=step)
+        for part, gradient in zip(parts.values(), _parts(gaussians(7, seed=step)).values(), strict=True):
+            part.grad = gradient
+        ours.step(step)
+        theirs.step()
+    for name, part in _parts(ours.gaussians.detach()).items():
+        torch.testing.assert_close(part, parts[name], rtol=0, atol=1e-6)
+
+
+def test_the_given_gaussians_are_left_alone():
+    start = gaussians(5)
+    copies = {name: tensor.clone() for name, tensor in start.tensors().items()}
+    train(settings().start(start), range(3))
+    for name, copy in copies.items():
+        assert torch.equal(getattr(start, name), copy)
+
+
+def test_leaves_collect_gradients_through_a_render_like_graph():
+    optimizer = settings().start(gaussians(4))
+    leaves = optimizer.gaussians
+    assert all(tensor.is_leaf and tensor.requires_grad for tensor in leaves.tensors().values())
+    (leaves.means.sum() + leaves.scales.sum() + leaves.sh.square().sum()).backward()
+    torch.testing.assert_close(leaves.means.grad, torch.ones(4, 3))
+    before = leaves.means.detach().clone()
+    optimizer.step(0)
+    assert optimizer.gaussians.means is leaves.means
+    torch.testing.assert_close(before - leaves.means.detach(), torch.full((4, 3), 0.01))
+
+
+def test_a_step_forgets_the_gradients():
+    optimizer = settings().start(gaussians(4))
+    push(optimizer, seed=0)
+    optimizer.step(0)
+    assert all(tensor.grad is None for tensor in optimizer.gaussians.tensors().values())
+
+
+def test_zero_grad_forgets_without_moving():
+    optimizer = settings().start(gaussians(4))
+    before = optimizer.gaussians.means.detach().clone()
+    push(optimizer, seed=0)
+    optimizer.zero_grad()
+    assert optimizer.gaussians.means.grad is None
+    assert torch.equal(optimizer.gaussians.means, before)
+
+
+def test_a_missing_gradient_is_the_gradient_zero():
+    with_none, with_zero = settings().start(gaussians(4)), settings().start(gaussians(4))
+    train(with_none, range(3))
+    train(with_zero, range(3))
+    with_zero.gaussians.means.grad = torch.zeros(4, 3)
+    with_none.step(3)
+    with_zero.step(3)
+    assert torch.equal(with_none.gaussians.means, with_zero.gaussians.means)
+    assert torch.equal(with_none.state_dict()["exp_avg"]["means"], with_zero.state_dict()["exp_avg"]["means"])
+
+
+def test_rates_follow_their_schedule():
+    optimizer = settings(means_lr=Linear(start=1.0, end=0.0, steps=10)).start(gaussians(3))
+    moved = []
+    for step in (0, 5, 10):
+        optimizer.gaussians.means.grad = torch.ones(3, 3)
+        before = optimizer.gaussians.means.detach().clone()
+        optimizer.step(step)
+        moved.append(float((before - optimizer.gaussians.means.detach()).mean()))
+    assert moved == pytest.approx([1.0, 0.5, 0.0], abs=1e-5)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", FIELDS)
+def test_one_bad_gradient_is_noticed(name, bad):
+    optimizer = settings().start(gaussians(4))
+    push(optimizer, seed=0)
+    assert optimizer.finite_gradients()
+    getattr(optimizer.gaussians, name).grad.view(-1)[-1] = bad
+    assert not optimizer.finite_gradients()
+
+
+def test_no_gradients_are_finite_gradients():
+    assert settings().start(gaussians(4)).finite_gradients()
+
+
+def test_survivors_keep_values_and_moments_and_newborns_start_at_zero():
+    optimizer = settings().start(gaussians(6))
+    train(optimizer, range(5))
+    values, moments = optimizer.gaussians.detach(), as_named(optimizer.state_dict())
+    edit = edit_of(6, keep=[0, 2, 5], parents=[2, 4])
+    optimizer.apply(edit)
+    assert len(optimizer.gaussians) == 5
+    for name, tensor in optimizer.gaussians.tensors().items():
+        assert torch.equal(tensor[:3], getattr(values, name)[[0, 2, 5]])
+        assert torch.equal(tensor[3:], getattr(edit.children, name))
+    for name, rows in as_named(optimizer.state_dict()).items():
+        assert torch.equal(rows[:3], moments[name][[0, 2, 5]]), name
+        assert not rows[3:].any(), name
+
+
+def test_an_edit_that_changes_nothing_changes_no_later_step():
+    plain, edited = settings().start(gaussians(6)), settings().start(gaussians(6))
+    train(plain, range(8))
+    train(edited, range(4))
+    edited.apply(RowEdit(keep=torch.arange(6), children=gaussians(0), parents=torch.arange(0)))
+    train(edited, range(4, 8))
+    for name in FIELDS:
+        assert torch.equal(getattr(plain.gaussians, name), getattr(edited.gaussians, name))
+
+
+def test_an_edit_leaves_fresh_leaves_that_train():
+    optimizer = settings().start(gaussians(6))
+    train(optimizer, range(2))
+    optimizer.apply(edit_of(6, keep=[1], parents=[1, 1]))
+    before = optimizer.gaussians.sh.detach().clone()
+    train(optimizer, range(2, 4))
+    assert (optimizer.gaussians.sh != before).all()
+
+
+def test_everybody_may_vanish():
+    optimizer = settings().start(gaussians(3))
+    train(optimizer, range(2))
+    optimizer.apply(RowEdit(keep=torch.arange(0), children=gaussians(0), parents=torch.arange(0)))
+    optimizer.step(2)
+    assert len(optimizer.gaussians) == 0
+
+
+def test_a_reset_never_raises_an_opacity():
+    optimizer = settings().start(gaussians(50))
+    optimizer.gaussians.opacity_logits.data.uniform_(-8, 3, generator=torch.Generator().manual_seed(0))
+    before = optimizer.gaussians.opacities.detach().clone()
+    lowered = optimizer.reset_opacity(torch.ones(50, dtype=torch.bool), 0.01)
+    after = optimizer.gaussians.opacities.detach()
+    torch.testing.assert_close(after, before.clamp_max(0.01), rtol=1e-5, atol=0)
+    assert lowered == int((before > 0.01).sum())
+    assert 0 < lowered < 50
+
+
+def test_a_reset_touches_exactly_the_marked_rows_and_only_the_opacity():
+    optimizer = settings().start(gaussians(10))
+    train(optimizer, range(5))
+    values = optimizer.gaussians.detach().map(torch.clone)
+    moments = as_named(optimizer.state_dict())
+    rows = torch.tensor([True, False] * 5)
+    optimizer.reset_opacity(rows, 0.01)
+    assert torch.equal(optimizer.gaussians.opacity_logits[~rows], values.opacity_logits[~rows])
+    for name in set(FIELDS) - {"opacity_logits"}:
+        assert torch.equal(getattr(optimizer.gaussians, name), getattr(values, name))
+    for name, now in as_named(optimizer.state_dict()).items():
+        expected = moments[name]
+        if name.endswith("/opacity"):
+            assert not now[rows].any()
+            expected = expected.masked_fill(rows, 0.0)
+        assert torch.equal(now, expected), name
+
+
+def test_a_reset_moves_what_is_rendered_next():
+    optimizer = settings().start(gaussians(10))
+    leaf = optimizer.gaussians.opacity_logits
+    optimizer.reset_opacity(torch.ones(10, dtype=torch.bool), 0.01)
+    train(optimizer, range(1))
+    assert optimizer.gaussians.opacity_logits is leaf
+    assert float(leaf.detach().sigmoid().max()) < 0.02
+
+
+def test_resuming_from_disk_is_bit_exact(tmp_path):
+    whole = settings().start(gaussians(6))
+    train(whole, range(10))
+    half = settings().start(gaussians(6))
+    train(half, range(4))
+    payload = {"gaussians": half.gaussians.detach().tensors(), "optimizer": half.state_dict()}
+    torch.save(payload, tmp_path / "half.pt")
+    payload = torch.load(tmp_path / "half.pt", weights_only=True)
+    resumed = settings().start(Gaussians(**payload["gaussians"]))
+    resumed.load_state_dict(payload["optimizer"])
+    train(resumed, range(4, 10))
+    for name in FIELDS:
+        assert torch.equal(getattr(whole.gaussians, name), getattr(resumed.gaussians, name))
+    for name, moment in as_named(whole.state_dict()).items():
+        assert torch.equal(moment, as_named(resumed.state_dict())[name])
+
+
+def test_resuming_takes_a_copy_of_the_moments():
+    first = settings().start(gaussians(4))
+    train(first, range(2))
+    second = settings().start(first.gaussians)
+    second.load_state_dict(first.state_dict())
+    before = as_named(first.state_dict())
+    train(second, range(2, 4))
+    assert all(torch.equal(moment, before[name]) for name, moment in as_named(first.state_dict()).items())
+
+
+def test_moments_of_other_gaussians_are_refused():
+    with pytest.raises(UserError, match=r"exp_avg of means has shape \(5, 3\).*\(4, 3\)"):
+        settings().start(gaussians(4)).load_state_dict(settings().start(gaussians(5)).state_dict())
+
+
+@pytest.mark.parametrize("key", [*RATES, "beta1", "beta2", "eps"])
+def test_an_impossible_number_is_refused_by_name(key):
+    with pytest.raises(UserError, match=rf"optimizer\.{key}"):
+        settings(**{key: -1.0})
