@@ -1,0 +1,96 @@
+"""3DGS adaptive density control: grow where the view-space gradient is large on average (paper eq. 1)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from cadam3d.core.checks import require_choice, require_range
+from cadam3d.core.edit import RowEdit, RowState
+from cadam3d.densifier.base import Densifier, GradientSignal
+
+VIEWS = ("sum_norm", "sum_vector", "last")
+
+
+@dataclass
+class BaselineState(RowState):
+    """Gradient norms since the last refinement."""
+
+    norm_sum: Float[Tensor, "n"]  # of view-space gradients; loss per NDC unit
+    sightings: Int[Tensor, "n"]  # how many norms were added
+
+    def carry(self, edit: RowEdit) -> "BaselineState":
+        """All zero after every refinement, survivors included: 3DGS averages over one interval at a time."""
+        rows = edit.rows_after
+        return BaselineState(norm_sum=self.norm_sum.new_zeros(rows), sightings=self.sightings.new_zeros(rows))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Baseline(Densifier[BaselineState]):
+    """Select whoever's mean gradient norm reaches a fixed threshold; a reset lowers everybody's opacity.
+
+    The mean runs over the steps since the last refinement that saw the Gaussian. Gradients are taken in
+    normalised device coordinates (image half-widths), as 3DGS and gsplat do, so the threshold does not depend
+    on the image size. It does depend on the scale of the loss and of its noise (paper sec. 4.1: the dilemma).
+    """
+
+    tau_pos: float  # loss per NDC unit
+    views: str  # how the views of one batch are combined, see `_norms`
+    grad_multiplier: float  # applied to gradients first, for recipes that threshold scaled losses
+
+    def __post_init__(self) -> None:
+        require_range("densifier.tau_pos", self.tau_pos, above=0, example=2e-4)
+        require_choice("densifier.views", self.views, VIEWS)
+        require_range("densifier.grad_multiplier", self.grad_multiplier, above=0, example=1.0)
+
+    def init_state(self, n: int, device: torch.device) -> BaselineState:
+        """Nothing accumulated."""
+        return BaselineState(
+            norm_sum=torch.zeros(n, device=device), sightings=torch.zeros(n, dtype=torch.int32, device=device)
+        )
+
+    def observe(self, state: BaselineState, signal: GradientSignal) -> BaselineState:
+        """Add the norms of one batch. A gradient that is not finite counts as not seen."""
+        half_size = signal.means2d.new_tensor([signal.width / 2, signal.height / 2])  # pixels per NDC unit
+        gradients = signal.means2d * (half_size * self.grad_multiplier)
+        seen = signal.visible & gradients.isfinite().all(dim=-1)
+        norms, sightings = self._norms(gradients.masked_fill(~seen[..., None], 0.0), seen)
+        return BaselineState(norm_sum=state.norm_sum + norms, sightings=state.sightings + sightings)
+
+    def select(self, state: BaselineState) -> Bool[Tensor, "n"]:
+        """Mark the Gaussians to grow: A_i >= tau_pos (paper eq. 1; ``>=`` as in 3DGS)."""
+        return self._mean_norms(state) >= self.tau_pos
+
+    def unreliable(self, state: BaselineState) -> Bool[Tensor, "n"]:
+        """Everybody: the global opacity reset of 3DGS."""
+        return torch.ones_like(state.sightings, dtype=torch.bool)
+
+    def statistics(self, state: BaselineState) -> dict[str, float]:
+        """Quantiles of the mean gradient norm, and the share of Gaussians that reach the threshold."""
+        norms = self._mean_norms(state)
+        if len(norms) == 0:
+            return {}
+        ordered, last = norms.sort().values, len(norms) - 1
+        return {
+            "tau_pos": self.tau_pos,
+            **{f"gradient_p{p}": float(ordered[round(last * p / 100)]) for p in (10, 50, 90)},
+            "share_above_tau_pos": float((norms >= self.tau_pos).float().mean()),
+        }
+
+    def _norms(
+        self, gradients: Float[Tensor, "v n 2"], seen: Bool[Tensor, "v n"]
+    ) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
+        """What a batch adds to the sum and to the count; the released codes disagree about it.
+
+        ``sum_norm``: every view by itself (gsplat, gsgen). ``sum_vector``: the norm of the sum, one count per
+        batch (GaussianDreamer). ``last``: only the last view (LucidDreamer, FlowDreamer, GCS-BEG).
+        """
+        if self.views == "sum_norm":
+            return gradients.norm(dim=-1).sum(dim=0), seen.sum(dim=0, dtype=torch.int32)
+        if self.views == "sum_vector":
+            return gradients.sum(dim=0).norm(dim=-1), seen.any(dim=0).to(torch.int32)
+        return gradients[-1].norm(dim=-1), seen[-1].to(torch.int32)
+
+    def _mean_norms(self, state: BaselineState) -> Float[Tensor, "n"]:
+        return state.norm_sum / state.sightings.clamp_min(1)
