@@ -30,4 +30,4 @@ class Guidance(ABC):
         step: int,
         generator: torch.Generator,
     ) -> GuidanceOutput:
-        """Judge the render ``rgb`` (in [0, 1], with gradient); every draw comes from the (CPU) ``generator``."""
+        """Judge the render ``rgb`` (in [0, 1], with gradient); all draws come from the CPU ``generator``."""

@@ -1,0 +1,41 @@
+"""VFDS: would the prior's flow have led back to where we came from?"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.guidance.distill import Comparison, Distillation, standard_normal
+from cadam3d.prior.base import Condition, DiffusionPrior
+
+
+@dataclass(frozen=True, kw_only=True)
+class VFDS(Distillation):
+    """Vector field distillation sampling (FlowDreamer; paper sec. 3.2).
+
+    With x_t = a x0 + b eps, eps ~ N(0, I),
+
+        G = weight * w(t) * (v_hat(x_t, t, prompt) - v),    v = velocity of the path at (x0, eps),
+
+    which on a rectified flow is v = eps - x0, as published. On a DDPM path v = a eps - b x0. On both,
+
+        v_hat - v = (x0 - x0_hat) / b,
+
+    so that at equal b and an equal clean guess the two paths give the same G, and G is SDS's divided by a.
+    """
+
+    def compare(
+        self,
+        clean: Float[Tensor, "v c h w"],
+        t: Float[Tensor, "v"],
+        condition: Condition,
+        prior: DiffusionPrior,
+        step: int,
+        generator: torch.Generator,
+    ) -> Comparison:
+        """Predicted velocity minus the velocity of the pair. One guided prediction per view."""
+        noise = standard_normal(clean, generator)
+        guess = prior.predict(prior.path.mix(clean, noise, t), t, condition, self.scale)
+        velocity = prior.path.velocity(clean, noise, t)
+        return Comparison(difference=guess.velocity - velocity, clean=guess.clean)

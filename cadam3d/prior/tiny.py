@@ -1,0 +1,228 @@
+"""prior=tiny: a small random network with everything a real prior has, except knowledge."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812  (the name everybody knows)
+
+from cadam3d.core.cameras import Cameras
+from cadam3d.core.checks import require, require_choice
+from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
+from cadam3d.prior.path import NoisePath, Prediction
+
+START, PADDING = 256, 257  # tokens 0 to 255 are the bytes of the prompt
+MAX_TOKENS = 96  # longer prompts are cut
+GROUPS = 8  # of every normalization
+FREQUENCIES = 32  # of the time embedding
+
+
+@dataclass(frozen=True)
+class TinyCondition(Condition):
+    """Two prompts as tokens, and where the views stand."""
+
+    positive: Int[Tensor, "tokens"]
+    negative: Int[Tensor, "tokens"]
+    directions: Float[Tensor, "v 4"]  # cosine and sine of azimuth and of elevation
+
+    def unprompted(self) -> "TinyCondition":
+        """The same views under two empty prompts."""
+        empty = tokenize("").to(self.positive.device)
+        return TinyCondition(positive=empty, negative=empty, directions=self.directions)
+
+
+@dataclass(frozen=True)
+class TinyEmbedding(PromptEmbedding):
+    """Two prompts as tokens; the network embeds them itself."""
+
+    positive: Int[Tensor, "tokens"]
+    negative: Int[Tensor, "tokens"]
+
+    def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> TinyCondition:
+        """The condition of these views; the backdrop plays no part."""
+        angles = torch.deg2rad(torch.stack([cameras.azimuth_deg, cameras.elevation_deg], dim=-1))
+        directions = torch.cat([angles.cos(), angles.sin()], dim=-1)
+        return TinyCondition(positive=self.positive, negative=self.negative, directions=directions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tiny(DiffusionPrior):
+    """A random UNet, conditioned on text and view: for tests and dry runs of everything around it.
+
+    Its weights depend on ``seed`` and ``width`` alone; making them leaves the global random state untouched.
+    Images of any size from 8 x 8 pixels up, odd ones too, become three channels in [-1, 1], averaged down.
+    """
+
+    predicts: str  # noise | velocity
+    path: NoisePath
+    width: int  # channels at full size
+    downscale: int  # pixels per latent, per side
+    seed: int
+
+    def __post_init__(self) -> None:
+        require_choice("prior.predicts", self.predicts, ("noise", "velocity"))
+        require_choice("prior.width", self.width, range(16, 49, GROUPS))
+        require_choice("prior.downscale", self.downscale, range(1, 9))
+        require(
+            isinstance(self.seed, int) and self.seed >= 0,
+            "prior.seed",
+            wanted="a whole number >= 0",
+            got=self.seed,
+            example="prior.seed=0",
+        )
+
+    @cached_property
+    def network(self) -> "TinyUNet":
+        """The network, frozen; made when first asked for."""
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(self.seed)  # torch.manual_seed would reseed every GPU as well
+            network = TinyUNet(self.width)
+        return network.requires_grad_(False).eval()
+
+    def embed(self, prompt: str, negative: str) -> TinyEmbedding:
+        """Any text will do, cut after 95 bytes."""
+        return TinyEmbedding(positive=tokenize(prompt), negative=tokenize(negative))
+
+    def encode(self, rgb: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v c lh lw"]:
+        """Images in [0, 1] to three channels in [-1, 1]; sizes shrink by ``downscale``, rounded up."""
+        pixels = rgb.permute(0, 3, 1, 2)
+        return 2 * F.avg_pool2d(pixels, self.downscale, ceil_mode=True) - 1
+
+    @torch.no_grad()
+    def predict(
+        self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: TinyCondition, scale: float
+    ) -> Prediction:
+        """One guess, without gradient: negative + scale * (positive - negative), both halves in one batch."""
+        prompts = [condition.positive] if scale == 1 else [condition.negative, condition.positive]
+        copies = len(prompts)
+        output = self.network(
+            noisy.float().repeat(copies, 1, 1, 1),
+            self.path.timestep(t).float().repeat(copies),
+            torch.stack(prompts).to(noisy.device).repeat_interleave(noisy.shape[0], dim=0),
+            condition.directions.to(noisy.device, torch.float32).repeat(copies, 1),
+        )
+        halves = output.to(noisy.dtype).chunk(copies)
+        guess = torch.lerp(halves[0], halves[-1], scale)
+        complete = self.path.from_noise if self.predicts == "noise" else self.path.from_velocity
+        return complete(noisy, guess, t)
+
+    def notice(self) -> str:
+        """What a user of this prior must know."""
+        return (
+            "prior=tiny is a random network for tests and dry runs: it makes no meaningful object. "
+            "For one, use prior=shapes."
+        )
+
+    def to(self, device: torch.device) -> "Tiny":
+        """Move the network to ``device``, in place; returns the prior."""
+        self.network.to(device)
+        return self
+
+
+class TinyUNet(nn.Module):
+    """Three scales, two skips, one cross-attention to the prompt at the coarsest; under 2M parameters."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        wide = 2 * width
+        self.token = nn.Embedding(PADDING + 1, wide)
+        self.position = nn.Embedding(MAX_TOKENS, wide)
+        self.time = nn.Linear(2 * FREQUENCIES, wide)
+        self.view = nn.Linear(4, wide)
+        self.mixture = nn.Sequential(nn.SiLU(), nn.Linear(wide, wide), nn.SiLU())
+
+        self.enter = nn.Conv2d(3, width, 3, padding=1)
+        self.fine_down = ResidualBlock(width, width, wide)
+        self.shrink1 = nn.Conv2d(width, wide, 3, stride=2, padding=1)
+        self.middle_down = ResidualBlock(wide, wide, wide)
+        self.shrink2 = nn.Conv2d(wide, wide, 3, stride=2, padding=1)
+        self.coarse1 = ResidualBlock(wide, wide, wide)
+        self.attention = PromptAttention(wide)
+        self.coarse2 = ResidualBlock(wide, wide, wide)
+        self.middle_up = ResidualBlock(2 * wide, wide, wide)
+        self.fine_up = ResidualBlock(wide + width, width, wide)
+        self.leave = nn.Sequential(nn.GroupNorm(GROUPS, width), nn.SiLU(), nn.Conv2d(width, 3, 3, padding=1))
+
+    def forward(
+        self,
+        noisy: Float[Tensor, "b 3 h w"],
+        timestep: Float[Tensor, "b"],
+        tokens: Int[Tensor, "b tokens"],
+        directions: Float[Tensor, "b 4"],
+    ) -> Float[Tensor, "b 3 h w"]:
+        """The prediction; what it means is the prior's affair."""
+        is_padding = tokens == PADDING
+        text = self.token(tokens) + self.position.weight
+        share = (~is_padding).float() / (~is_padding).sum(dim=1, keepdim=True)
+        pooled = torch.einsum("bt,btc->bc", share, text)
+        context = self.mixture(self.time(sinusoids(timestep)) + self.view(directions) + pooled)
+
+        fine = self.fine_down(self.enter(noisy), context)
+        middle = self.middle_down(self.shrink1(fine), context)
+        coarse = self.coarse1(self.shrink2(middle), context)
+        coarse = self.coarse2(self.attention(coarse, text, is_padding), context)
+        middle = self.middle_up(_join(coarse, middle), context)
+        fine = self.fine_up(_join(middle, fine), context)
+        return self.leave(fine)
+
+
+class ResidualBlock(nn.Module):
+    """Two convolutions; the context scales and shifts between them (FiLM)."""
+
+    def __init__(self, channels_in: int, channels: int, context: int) -> None:
+        super().__init__()
+        self.before = nn.Sequential(
+            nn.GroupNorm(GROUPS, channels_in), nn.SiLU(), nn.Conv2d(channels_in, channels, 3, padding=1)
+        )
+        self.film = nn.Linear(context, 2 * channels)
+        self.norm = nn.GroupNorm(GROUPS, channels)
+        self.after = nn.Sequential(nn.SiLU(), nn.Conv2d(channels, channels, 3, padding=1))
+        self.skip = nn.Conv2d(channels_in, channels, 1)
+
+    def forward(self, x: Float[Tensor, "b i h w"], context: Float[Tensor, "b k"]) -> Float[Tensor, "b o h w"]:
+        """The block's output, on top of what came in."""
+        factor, offset = self.film(context)[..., None, None].chunk(2, dim=1)
+        changed = self.after(self.norm(self.before(x)) * (1 + factor) + offset)
+        return self.skip(x) + changed
+
+
+class PromptAttention(nn.Module):
+    """Every pixel asks the prompt's tokens."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(GROUPS, channels)
+        self.query = nn.Linear(channels, channels)
+        self.key = nn.Linear(channels, channels)
+        self.value = nn.Linear(channels, channels)
+
+    def forward(
+        self, x: Float[Tensor, "b c h w"], text: Float[Tensor, "b t c"], is_padding: Tensor
+    ) -> Float[Tensor, "b c h w"]:
+        """The answers, on top of what came in; padding is not heard."""
+        pixels = self.norm(x).flatten(2).transpose(1, 2)
+        answers = F.scaled_dot_product_attention(
+            self.query(pixels), self.key(text), self.value(text), attn_mask=~is_padding[:, None, :]
+        )
+        return x + answers.transpose(1, 2).unflatten(2, x.shape[2:])
+
+
+def tokenize(text: str) -> Int[Tensor, "tokens"]:
+    """A start token and the UTF-8 bytes of ``text``, cut or padded to ``MAX_TOKENS``."""
+    tokens = [START, *text.encode("utf-8")][:MAX_TOKENS]
+    return torch.tensor(tokens + [PADDING] * (MAX_TOKENS - len(tokens)))
+
+
+def sinusoids(timestep: Float[Tensor, "b"]) -> Float[Tensor, "b k"]:
+    """Cosines and sines of ``timestep`` at geometrically spaced frequencies from 1 to 1e-4."""
+    exponents = torch.arange(FREQUENCIES, device=timestep.device) / (FREQUENCIES - 1)
+    phases = timestep[:, None] * torch.exp(-math.log(10_000) * exponents)
+    return torch.cat([phases.cos(), phases.sin()], dim=-1)
+
+
+def _join(coarse: Float[Tensor, "b i h w"], skip: Float[Tensor, "b o lh lw"]) -> Tensor:
+    """Enlarge ``coarse`` to the size of ``skip``, odd or even, and stack both."""
+    return torch.cat([F.interpolate(coarse, size=skip.shape[2:], mode="nearest"), skip], dim=1)
