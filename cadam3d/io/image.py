@@ -1,0 +1,78 @@
+"""Pictures: float images to PNG, colour maps for depth and alpha, contact sheets."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from cadam3d.io.atomic import replacing
+
+# Viridis (van der Walt and Smith, CC0) at ten equal distances: dark is low, and it stays readable in grey.
+VIRIDIS = (
+    (68, 1, 84), (72, 40, 120), (62, 74, 137), (49, 104, 142), (38, 130, 142),
+    (31, 158, 137), (53, 183, 121), (110, 206, 88), (181, 222, 43), (253, 231, 37),
+)  # fmt: skip
+LABEL_MARGIN = 4  # pixels
+
+
+def to_uint8(rgb: Float[Tensor, "*batch h w 3"]) -> UInt8[np.ndarray, "*batch h w 3"]:
+    """Images in [0, 1] to bytes, rounded to the nearest; outside values are clamped, NaN is black."""
+    return (rgb.detach().nan_to_num(nan=0.0).clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+
+
+def write_png(path: Path, rgb: Float[Tensor, "h w 3"]) -> None:
+    """Write one image in [0, 1] as 8-bit sRGB, atomically. Raises ``UserError`` if it cannot be written."""
+    with replacing(path) as temporary:
+        imageio.imwrite(temporary, to_uint8(rgb), extension=".png")
+
+
+def colorize(values: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch h w 3"]:
+    """Viridis colours of values in [0, 1]; outside values are clamped, NaN counts as 0."""
+    table = torch.tensor(VIRIDIS, dtype=values.dtype, device=values.device) / 255
+    position = values.nan_to_num(nan=0.0).clamp(0, 1) * (len(VIRIDIS) - 1)
+    low = position.floor().clamp_max(len(VIRIDIS) - 2)
+    return torch.lerp(table[low.long()], table[low.long() + 1], (position - low)[..., None])
+
+
+def closeness(
+    depth: Float[Tensor, "*batch h w"], alpha: Float[Tensor, "*batch h w"], distance: float
+) -> Float[Tensor, "*batch h w 3"]:
+    """Depth as colours: yellow is near, dark far, black where there is nothing.
+
+    The range is that of the unit ball, which objects fit in, seen from ``distance``: the same in every
+    view, so that colours can be compared between frames.
+    """
+    return colorize((distance + 1.0 - depth) / 2.0) * alpha[..., None]
+
+
+def contact_sheet(
+    images: Float[Tensor, "v h w 3"], columns: int, labels: Sequence[str] = ()
+) -> Float[Tensor, "sheet_h sheet_w 3"]:
+    """All images in rows of ``columns``, the last row filled with white; labels go into the corners."""
+    views, height, width, _ = images.shape
+    rows = math.ceil(views / columns)
+    cells = images.new_ones(rows * columns, height, width, 3)
+    cells[:views] = images
+    for cell, label in zip(cells, labels, strict=False):
+        _write_label(cell, label)
+    return (
+        cells.reshape(rows, columns, height, width, 3)
+        .transpose(1, 2)
+        .reshape(rows * height, columns * width, 3)
+    )
+
+
+def _write_label(cell: Float[Tensor, "h w 3"], label: str) -> None:
+    """Draw ``label`` into ``cell`` (in place), dark on light or light on dark as the corner asks."""
+    height, width, _ = cell.shape
+    mask = Image.new("L", (width, height))
+    ImageDraw.Draw(mask).text((LABEL_MARGIN, LABEL_MARGIN), label, fill=255, font=ImageFont.load_default())
+    coverage = torch.from_numpy(np.array(mask)).to(cell) / 255
+    ink = 0.15 if cell[: height // 8 + 1, : width // 4 + 1].mean() > 0.5 else 0.9
+    cell.lerp_(torch.full_like(cell, ink), coverage[..., None])

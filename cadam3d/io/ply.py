@@ -1,0 +1,244 @@
+"""PLY in the de-facto layout of 3D Gaussian Splatting: what every splat viewer opens.
+
+``binary_little_endian 1.0``, float32 properties ``x y z nx ny nz f_dc_0..2 f_rest_0..(3r-1) opacity
+scale_0..2 rot_0..3``: raw numbers (logit opacity, natural-log scales, quaternion wxyz of any length),
+``r = (degree + 1)^2 - 1`` rest coefficients per channel, stored channel-major (all of red, then green, then
+blue); normals are zeros.
+
+A comment line records the frame, so that our own files come back into our world frame by themselves.
+Reading back what was written gives the same bits, except SH bands 2 and 3 in a frame other than ``+z`` (see
+``frames.py``), which are rounded to float32 once on the way out and once on the way back.
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+
+from cadam3d import __version__
+from cadam3d.core.checks import UserError, require_choice
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.sh import MAX_DEGREE
+from cadam3d.io.atomic import replacing
+from cadam3d.io.frames import UPS, file_to_world, world_to_file
+
+FORMAT = "binary_little_endian 1.0"
+COLUMNS = {  # of each tensor that is stored as it is
+    "means": ["x", "y", "z"],
+    "opacity_logits": ["opacity"],
+    "log_scales": ["scale_0", "scale_1", "scale_2"],
+    "quats": ["rot_0", "rot_1", "rot_2", "rot_3"],
+}
+NORMALS = ["nx", "ny", "nz"]  # unread by anybody, but readers with a fixed record size count on them
+SH0 = ["f_dc_0", "f_dc_1", "f_dc_2"]
+REST_SIZES = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_DEGREE + 1)]
+MAX_HEADER_BYTES = 1 << 16
+NUMPY_TYPES = {
+    **dict.fromkeys(["char", "int8"], "<i1"),
+    **dict.fromkeys(["uchar", "uint8"], "<u1"),
+    **dict.fromkeys(["short", "int16"], "<i2"),
+    **dict.fromkeys(["ushort", "uint16"], "<u2"),
+    **dict.fromkeys(["int", "int32"], "<i4"),
+    **dict.fromkeys(["uint", "uint32"], "<u4"),
+    **dict.fromkeys(["float", "float32"], "<f4"),
+    **dict.fromkeys(["double", "float64"], "<f8"),
+}
+
+
+def write_ply(path: Path, gaussians: Gaussians, *, up: str, pad_sh: int) -> None:
+    """Write ``gaussians`` as float32, atomically, in the frame whose up axis is ``up`` (see ``frames.py``).
+
+    ``pad_sh`` is the least SH degree of the file (0 to 3): missing coefficients are zeros, which changes no
+    colour but satisfies importers that insist on degree 3. Raises ``UserError`` if the file cannot be
+    written.
+    """
+    require_choice("pad_sh", pad_sh, range(MAX_DEGREE + 1))
+    local = world_to_file(gaussians.detach().to("cpu").to(torch.float32), up)
+    arrays = {name: tensor.numpy() for name, tensor in local.tensors().items()}
+    rest_size = REST_SIZES[max(pad_sh, local.sh_degree)]
+    rest = np.zeros((len(local), 3, rest_size // 3), dtype=np.float32)
+    rest[:, :, : local.sh.shape[1] - 1] = arrays["sh"][:, 1:].transpose(0, 2, 1)
+
+    columns = [
+        arrays["means"],
+        np.zeros((len(local), len(NORMALS)), dtype=np.float32),
+        arrays["sh"][:, 0],
+        rest.reshape(len(local), rest_size),
+        arrays["opacity_logits"][:, None],
+        arrays["log_scales"],
+        arrays["quats"],
+    ]
+    body = np.concatenate(columns, axis=1).astype("<f4", copy=False)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(_header(len(local), rest_size, up).encode("ascii"))
+        file.write(body.tobytes())
+
+
+def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
+    """Read Gaussians into our world frame, on the CPU, as float32.
+
+    Properties are found by name, so their order, extra ones and missing normals do not matter. ``up`` is
+    the up axis of files that do not say it themselves (ours do). Raises ``UserError`` if ``path`` is not
+    such a file, naming what is wrong or missing.
+    """
+    require_choice("up", up, UPS)
+    try:
+        with path.open("rb") as file:
+            header = _parse_header(path, file)
+            rows = _read_rows(path, file, header)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise UserError(
+            f"{path}: cannot be read ({reason}). Try: ply=FILE with a file that exists"
+        ) from error
+
+    def columns(names: Sequence[str]) -> np.ndarray:
+        found = [rows[name].astype(np.float32, copy=False) for name in names]
+        return np.stack(found, axis=1) if found else np.zeros((len(rows), 0), dtype=np.float32)
+
+    rest = columns([f"f_rest_{i}" for i in range(header.rest_size)])
+    rest = rest.reshape(len(rows), 3, header.rest_size // 3)
+    sh = np.concatenate([columns(SH0)[:, None], rest.transpose(0, 2, 1)], axis=1)
+    local = Gaussians(
+        means=torch.from_numpy(columns(COLUMNS["means"])),
+        log_scales=torch.from_numpy(columns(COLUMNS["log_scales"])),
+        quats=torch.from_numpy(columns(COLUMNS["quats"])),
+        opacity_logits=torch.from_numpy(columns(COLUMNS["opacity_logits"])[:, 0].copy()),
+        sh=torch.from_numpy(np.ascontiguousarray(sh)),
+    )
+    return file_to_world(local, header.up or up)
+
+
+def ply_bytes(num_gaussians: int, sh_degree: int) -> int:
+    """Size of the file that :func:`write_ply` writes: header and ``4 (17 + rest)`` bytes per Gaussian."""
+    rest_size = REST_SIZES[sh_degree]
+    return len(_header(num_gaussians, rest_size, UPS[0])) + num_gaussians * 4 * len(_names(rest_size))
+
+
+def _names(rest_size: int) -> list[str]:
+    rest = [f"f_rest_{i}" for i in range(rest_size)]
+    last = [*COLUMNS["opacity_logits"], *COLUMNS["log_scales"], *COLUMNS["quats"]]
+    return [*COLUMNS["means"], *NORMALS, *SH0, *rest, *last]
+
+
+def _header(num_gaussians: int, rest_size: int, up: str) -> str:
+    lines = [
+        "ply",
+        f"format {FORMAT}",
+        f"comment cadam3d {__version__}",
+        f"comment cadam3d up={up}",
+        f"element vertex {num_gaussians}",
+        *(f"property float {name}" for name in _names(rest_size)),
+        "end_header",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What a file says about itself."""
+
+    skip_bytes: int  # of elements before the vertices
+    count: int
+    record: np.dtype  # one vertex
+    rest_size: int
+    up: str | None  # the frame, where cadam3d wrote it
+
+
+def _parse_header(path: Path, file: BinaryIO) -> _Header:
+    up, skip_bytes = None, 0
+    elements: list[tuple[str, int, list[tuple[str, str]]]] = []  # name, count, (property, numpy type)
+    for words in _header_lines(path, file):
+        match words:
+            case ["format", *version]:
+                _require_format(path, " ".join(version))
+            case ["comment", "cadam3d", claim] if claim.startswith("up="):
+                up = _frame(path, claim.removeprefix("up="))
+            case ["element", name, count] if count.isdecimal():
+                elements.append((name, int(count), []))
+            case ["property", kind, name] if elements and kind in NUMPY_TYPES:
+                elements[-1][2].append((name, NUMPY_TYPES[kind]))
+            case ["property", "list", *_] if elements and any(e[0] == "vertex" for e in elements[:-1]):
+                pass  # faces and such, after the vertices: never read
+            case ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                raise UserError(f"{path}: not a Gaussian ply: cannot read header line {' '.join(words)!r}")
+    for name, count, properties in elements:
+        if name == "vertex":
+            return _vertex_header(path, skip_bytes, count, properties, up)
+        skip_bytes += count * sum(np.dtype(kind).itemsize for _, kind in properties)
+    raise UserError(f"{path}: not a Gaussian ply: it has no vertices")
+
+
+def _require_format(path: Path, version: str) -> None:
+    convert = (
+        f"from plyfile import PlyData; ply = PlyData.read('{path}'); "
+        "ply.text = False; ply.byte_order = '<'; ply.write('binary.ply')"
+    )
+    if version != FORMAT:
+        raise UserError(
+            f"{path}: wanted format {FORMAT}, got {version}. "
+            f'Try: pip install plyfile && python -c "{convert}"'
+        )
+
+
+def _frame(path: Path, up: str) -> str:
+    if up not in UPS:
+        raise UserError(f"{path}: unknown frame up={up}; known are {', '.join(UPS)}")
+    return up
+
+
+def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:
+    """The words of each line between ``ply`` and ``end_header``."""
+    line = file.readline(MAX_HEADER_BYTES)
+    if line.strip() != b"ply":
+        raise UserError(f"{path}: not a ply file: it begins with {line[:16]!r}")
+    while file.tell() < MAX_HEADER_BYTES:
+        line = file.readline(MAX_HEADER_BYTES)
+        if not line.endswith(b"\n"):
+            break
+        words = line.decode("ascii", errors="replace").split()
+        if words == ["end_header"]:
+            return
+        if words:
+            yield words
+    raise UserError(f"{path}: truncated: the header has no end")
+
+
+def _vertex_header(
+    path: Path, skip_bytes: int, count: int, properties: list[tuple[str, str]], up: str | None
+) -> _Header:
+    names = [name for name, _ in properties]
+    wanted = [*COLUMNS["means"], *SH0, *_names(0)[-8:]]
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise UserError(
+            f"{path}: not a Gaussian ply: properties missing: {', '.join(missing)}"
+            + (" (a compressed ply: decompress it first)" if "packed_position" in names else "")
+        )
+    if len(set(names)) < len(names):
+        raise UserError(f"{path}: not a Gaussian ply: a property appears twice")
+    rest_size = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
+    if rest_size not in REST_SIZES or any(f"f_rest_{i}" not in names for i in range(rest_size)):
+        raise UserError(
+            f"{path}: not a Gaussian ply: wanted f_rest_0.. for SH degree 0 to {MAX_DEGREE} "
+            f"({', '.join(map(str, REST_SIZES))} of them), got {rest_size}"
+        )
+    return _Header(skip_bytes, count, np.dtype(properties), rest_size, up)
+
+
+def _read_rows(path: Path, file: BinaryIO, header: _Header) -> np.ndarray:
+    start = file.tell() + header.skip_bytes
+    available = max(file.seek(0, 2) - start, 0)
+    whole = available // header.record.itemsize
+    if whole < header.count:
+        raise UserError(
+            f"{path}: truncated: the header promises {header.count} Gaussians, the file holds {whole}"
+        )
+    file.seek(start)
+    return np.frombuffer(file.read(header.count * header.record.itemsize), dtype=header.record)

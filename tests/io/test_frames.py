@@ -1,0 +1,101 @@
+"""Laws of the frames: a change of frame turns the object, and changes nothing that can be seen."""
+
+import pytest
+import torch
+
+from cadam3d.core.checks import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.sh import sh_basis
+from cadam3d.io.frames import FRAMES, UPS, band_matrix, file_to_world, world_to_file
+
+
+def random_gaussians(n: int = 40, degree: int = 3, seed: int = 0, dtype=torch.float64) -> Gaussians:
+    draw = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=draw, dtype=dtype)
+
+    return Gaussians(normal(n, 3), normal(n, 3), normal(n, 4), normal(n), normal(n, (degree + 1) ** 2, 3))
+
+
+def covariances(gaussians: Gaussians) -> torch.Tensor:
+    half = gaussians.rotations * gaussians.scales[:, None, :]
+    return half @ half.transpose(1, 2)
+
+
+def axes(up: str) -> torch.Tensor:
+    return torch.tensor(FRAMES[up], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_frames_are_rotations_that_mirror_nothing(up):
+    torch.testing.assert_close(axes(up) @ axes(up).T, torch.eye(3, dtype=torch.float64))
+    assert torch.linalg.det(axes(up)).item() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("up", "file_up"), [("-y", (0, -1, 0)), ("+y", (0, 1, 0)), ("+z", (0, 0, 1))])
+def test_the_name_of_a_frame_is_where_our_up_goes(up, file_up):
+    assert (axes(up) @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)).tolist() == list(file_up)
+
+
+@pytest.mark.parametrize("up", ["-y", "+y"])
+def test_the_front_faces_the_first_camera_of_viewers(up):
+    assert (axes(up) @ torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)).tolist() == [0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_means_and_covariances_turn_with_the_frame(up):
+    world, turn = random_gaussians(), axes(up)
+    local = world_to_file(world, up)
+    torch.testing.assert_close(local.means, world.means @ turn.T)
+    torch.testing.assert_close(covariances(local), turn @ covariances(world) @ turn.T)
+
+
+@pytest.mark.parametrize("up", UPS)
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_colours_seen_along_turned_directions_stay(up, degree):
+    world = random_gaussians(degree=degree)
+    directions = torch.nn.functional.normalize(random_gaussians(seed=1).means, dim=1)
+    local = world_to_file(world, up)
+
+    def colours(gaussians, seen_along):
+        return torch.einsum("nk,gkc->gnc", sh_basis(seen_along, degree), gaussians.sh)
+
+    torch.testing.assert_close(colours(local, directions @ axes(up).T), colours(world, directions))
+
+
+@pytest.mark.parametrize("up", UPS)
+@pytest.mark.parametrize("degree", [0, 1])
+def test_there_and_back_is_bit_exact_up_to_degree_one(up, degree):
+    world = random_gaussians(degree=degree, dtype=torch.float32)
+    back = file_to_world(world_to_file(world, up), up)
+    for name, tensor in world.tensors().items():
+        assert torch.equal(back.tensors()[name], tensor), name
+
+
+@pytest.mark.parametrize("up", ["-y", "+y"])
+def test_there_and_back_rounds_higher_bands_by_little(up):
+    world = random_gaussians(n=2000, degree=3, dtype=torch.float32)
+    back = file_to_world(world_to_file(world, up), up)
+    for name in ("means", "log_scales", "quats", "opacity_logits"):
+        assert torch.equal(back.tensors()[name], world.tensors()[name]), name
+    torch.testing.assert_close(back.sh, world.sh, rtol=0, atol=1e-6)  # coefficients of size 1 to 4
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_band_matrices_are_orthogonal_for_any_rotation(degree):
+    rotation = random_gaussians(n=1).rotations[0]
+    matrix = band_matrix(degree, tuple(rotation.flatten().tolist()))
+    torch.testing.assert_close(matrix @ matrix.T, torch.eye(2 * degree + 1, dtype=torch.float64))
+
+
+def test_the_vector_rule_of_band_one_is_the_fitted_matrix():
+    world = random_gaussians(degree=1)
+    matrix = band_matrix(1, tuple(axes("-y").flatten().tolist()))
+    expected = torch.einsum("ij,njc->nic", matrix, world.sh[:, 1:])
+    torch.testing.assert_close(world_to_file(world, "-y").sh[:, 1:], expected)
+
+
+def test_an_unknown_frame_is_refused_with_the_choices():
+    with pytest.raises(UserError, match=r"-y\|\+y\|\+z"):
+        world_to_file(random_gaussians(), "up")

@@ -1,0 +1,123 @@
+"""Logs that survive a kill, and JSON that any reader accepts."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from cadam3d.core.checks import UserError
+from cadam3d.io import jsonl
+from cadam3d.io.jsonl import append_jsonl, read_json, read_jsonl, truncate_after, write_json
+
+
+def refuse_constant(name):
+    raise AssertionError(f"{name} is not JSON")
+
+
+def test_lines_come_back_in_order(tmp_path):
+    lines = [
+        {"step": step, "loss": 0.1 * step, "prompt": "ein Ü\nzwei", "nested": {"a": [1, None]}}
+        for step in range(5)
+    ]
+    for line in lines:
+        append_jsonl(tmp_path / "deep" / "metrics.jsonl", line)
+    assert read_jsonl(tmp_path / "deep" / "metrics.jsonl") == lines
+    assert len((tmp_path / "deep" / "metrics.jsonl").read_text().splitlines()) == 5
+
+
+def test_every_line_is_on_disk_before_the_next_one_is_written(tmp_path):
+    for count in range(1, 4):
+        append_jsonl(tmp_path / "m.jsonl", {"step": count})
+        assert len(read_jsonl(tmp_path / "m.jsonl")) == count
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_json_cannot_say_becomes_null(tmp_path, value):
+    append_jsonl(tmp_path / "m.jsonl", {"loss": value, "deep": {"list": [value, 1.0]}})
+    write_json(tmp_path / "s.json", {"loss": value})
+    assert read_jsonl(tmp_path / "m.jsonl") == [{"loss": None, "deep": {"list": [None, 1.0]}}]
+    json.loads((tmp_path / "s.json").read_text(), parse_constant=refuse_constant)
+
+
+@pytest.mark.parametrize("cut", range(1, 20))
+def test_a_cut_last_line_is_left_out_and_harms_no_later_line(tmp_path, cut):
+    path = tmp_path / "m.jsonl"
+    append_jsonl(path, {"step": 1})
+    append_jsonl(path, {"step": 2, "x": "abc"})
+    path.write_bytes(path.read_bytes()[:-cut])
+    complete = [{"step": 1}, {"step": 2, "x": "abc"}][: 1 + (cut == 1)]
+    assert read_jsonl(path) == complete
+    append_jsonl(path, {"step": 3})
+    assert read_jsonl(path) == [*complete, {"step": 3}]
+
+
+def test_a_missing_log_is_empty(tmp_path):
+    assert read_jsonl(tmp_path / "m.jsonl") == []
+
+
+def test_truncating_drops_later_steps_only(tmp_path):
+    path = tmp_path / "m.jsonl"
+    for line in [
+        {"note": "no step"},
+        {"step": 10},
+        {"step": 20, "kind": "refine"},
+        {"step": 20},
+        {"step": 30},
+    ]:
+        append_jsonl(path, line)
+    truncate_after(path, 20)
+    assert [line.get("step") for line in read_jsonl(path)] == [None, 10, 20, 20]
+
+
+def test_truncating_keeps_the_bytes_of_what_stays(tmp_path):
+    path = tmp_path / "m.jsonl"
+    for step in range(1, 6):
+        append_jsonl(path, {"step": step, "loss": 1 / 3 * step})
+    before = path.read_bytes()
+    truncate_after(path, 5)
+    assert path.read_bytes() == before
+
+
+def test_truncating_removes_a_cut_line(tmp_path):
+    (tmp_path / "m.jsonl").write_text('{"step": 1}\n{"st')
+    truncate_after(tmp_path / "m.jsonl", 9)
+    assert (tmp_path / "m.jsonl").read_text() == '{"step": 1}\n'
+
+
+def test_truncating_nothing_makes_no_file(tmp_path):
+    truncate_after(tmp_path / "m.jsonl", 5)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_json_files_come_back(tmp_path):
+    write_json(tmp_path / "s.json", {"prompt": "Ü", "path": Path("/a"), "counts": (1, 2)})
+    assert read_json(tmp_path / "s.json") == {"prompt": "Ü", "path": "/a", "counts": [1, 2]}
+
+
+def test_a_json_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
+    write_json(tmp_path / "s.json", {"step": 1})
+
+    def fails(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(jsonl, "to_json", fails)
+    with pytest.raises(UserError, match="No space left"):
+        write_json(tmp_path / "s.json", {"step": 2})
+    assert read_json(tmp_path / "s.json") == {"step": 1}
+
+
+@pytest.mark.parametrize("content", [None, "{cut", ""])
+def test_a_missing_or_broken_json_file_is_a_user_error(tmp_path, content):
+    if content is not None:
+        (tmp_path / "s.json").write_text(content)
+    with pytest.raises(UserError, match=r"s\.json"):
+        read_json(tmp_path / "s.json")
+
+
+def test_a_log_that_cannot_be_written_is_a_user_error(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(UserError, match="cannot be written"):
+        append_jsonl(tmp_path / "file" / "m.jsonl", {"step": 1})
+    with pytest.raises(UserError, match="cannot be written"):
+        write_json(tmp_path / "file" / "s.json", {})

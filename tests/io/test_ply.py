@@ -1,0 +1,321 @@
+"""The file that leaves the house: same bits back, everybody's layout, clear words for everything else."""
+
+import struct
+
+import numpy as np
+import pytest
+import torch
+
+from cadam3d.core.checks import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.io import ply
+from cadam3d.io.frames import UPS
+from cadam3d.io.ply import ply_bytes, read_ply, write_ply
+
+
+def random_gaussians(n: int = 50, degree: int = 3, seed: int = 0) -> Gaussians:
+    draw = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=draw)
+
+    return Gaussians(normal(n, 3), normal(n, 3), normal(n, 4), normal(n), normal(n, (degree + 1) ** 2, 3))
+
+
+def assert_same_bits(actual: Gaussians, expected: Gaussians) -> None:
+    for name, tensor in expected.tensors().items():
+        assert actual.tensors()[name].numpy().tobytes() == tensor.contiguous().numpy().tobytes(), name
+
+
+def property_names(path) -> list[str]:
+    header = path.read_bytes().split(b"end_header")[0].decode()
+    return [line.split()[-1] for line in header.splitlines() if line.startswith("property")]
+
+
+def hand_made(names, rows, kinds=None, version="binary_little_endian 1.0", before="", after="") -> bytes:
+    """A ply built without the code under test."""
+    kinds = kinds or ["float"] * len(names)
+    declared = "".join(f"property {kind} {name}\n" for kind, name in zip(kinds, names, strict=True))
+    header = f"ply\nformat {version}\n{before}element vertex {len(rows)}\n{declared}{after}end_header\n"
+    code = {"float": "f", "double": "d", "uchar": "B"}
+    layout = "<" + "".join(code[kind] for kind in kinds)
+    return header.encode() + b"".join(struct.pack(layout, *row) for row in rows)
+
+
+NAMES = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
+NAMES += ["rot_0", "rot_1", "rot_2", "rot_3"]
+
+
+# Laws
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_the_round_trip_in_our_frame_returns_the_same_bits(tmp_path, degree):
+    gaussians = random_gaussians(degree=degree)
+    write_ply(tmp_path / "a.ply", gaussians, up="+z", pad_sh=0)
+    assert_same_bits(read_ply(tmp_path / "a.ply"), gaussians)
+
+
+@pytest.mark.parametrize("up", UPS)
+@pytest.mark.parametrize("degree", [0, 1])
+def test_the_round_trip_in_every_frame_returns_the_same_bits_up_to_degree_one(tmp_path, up, degree):
+    gaussians = random_gaussians(degree=degree)
+    write_ply(tmp_path / "a.ply", gaussians, up=up, pad_sh=0)
+    assert_same_bits(read_ply(tmp_path / "a.ply"), gaussians)
+
+
+def test_extreme_numbers_survive(tmp_path):
+    gaussians = random_gaussians(n=6, degree=0)
+    gaussians.means[:, 0] = torch.tensor([0.0, -0.0, 1e-45, 3e38, float("inf"), float("-inf")])
+    write_ply(tmp_path / "a.ply", gaussians, up="-y", pad_sh=0)
+    assert_same_bits(read_ply(tmp_path / "a.ply"), gaussians)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_no_gaussians_are_a_valid_file(tmp_path, degree):
+    write_ply(tmp_path / "a.ply", random_gaussians(n=0, degree=degree), up="-y", pad_sh=0)
+    back = read_ply(tmp_path / "a.ply")
+    assert len(back) == 0
+    assert back.sh_degree == degree
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("n", [0, 7, 1234])
+def test_ply_bytes_is_the_size_of_the_file(tmp_path, degree, n):
+    for up in UPS:
+        write_ply(tmp_path / "a.ply", random_gaussians(n=n, degree=degree), up=up, pad_sh=0)
+        assert (tmp_path / "a.ply").stat().st_size == ply_bytes(n, degree)
+
+
+def test_the_same_gaussians_make_the_same_file(tmp_path):
+    for name in ("a.ply", "b.ply"):
+        write_ply(tmp_path / name, random_gaussians(), up="-y", pad_sh=0)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_padding_adds_zeros_and_changes_nothing_else(tmp_path):
+    gaussians = random_gaussians(degree=1)
+    write_ply(tmp_path / "a.ply", gaussians, up="-y", pad_sh=3)
+    back = read_ply(tmp_path / "a.ply")
+    assert len(property_names(tmp_path / "a.ply")) * 4 == 248
+    assert torch.equal(back.sh[:, :4], gaussians.sh)
+    assert back.sh[:, 4:].abs().max() == 0
+
+
+def test_padding_never_removes_coefficients(tmp_path):
+    write_ply(tmp_path / "a.ply", random_gaussians(degree=2), up="-y", pad_sh=1)
+    assert read_ply(tmp_path / "a.ply").sh_degree == 2
+
+
+# Layout
+
+
+def test_the_layout_is_the_one_of_3dgs(tmp_path):
+    write_ply(tmp_path / "a.ply", random_gaussians(degree=1), up="-y", pad_sh=0)
+    expected = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    expected += [f"f_rest_{i}" for i in range(9)] + NAMES[6:]
+    assert property_names(tmp_path / "a.ply") == expected
+
+
+def test_the_file_of_one_gaussian_is_what_a_hand_would_write(tmp_path):
+    gaussians = Gaussians(
+        means=torch.tensor([[1.0, 2.0, 3.0]]),
+        log_scales=torch.tensor([[-1.0, -2.0, -3.0]]),
+        quats=torch.tensor([[2.0, 0.25, 0.5, 0.75]]),
+        opacity_logits=torch.tensor([4.0]),
+        sh=torch.arange(12.0).reshape(1, 4, 3),  # coefficient k, channel c: 3 k + c
+    )
+    write_ply(tmp_path / "a.ply", gaussians, up="+z", pad_sh=0)
+    numbers = np.frombuffer((tmp_path / "a.ply").read_bytes().split(b"end_header\n")[1], dtype="<f4")
+    red, green, blue = [3, 6, 9], [4, 7, 10], [5, 8, 11]
+    expected = [1, 2, 3, 0, 0, 0, 0, 1, 2, *red, *green, *blue, 4, -1, -2, -3, 2, 0.25, 0.5, 0.75]
+    assert numbers.tolist() == expected
+
+
+def test_the_rest_is_read_channel_major_from_a_hand_made_file(tmp_path):
+    names = [*NAMES, *(f"f_rest_{i}" for i in range(9))]
+    (tmp_path / "a.ply").write_bytes(hand_made(names, [[0.0] * 14 + [float(i) for i in range(9)]]))
+    sh = read_ply(tmp_path / "a.ply", up="+z").sh
+    assert sh[0, 1:].tolist() == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
+
+
+def test_the_default_frame_puts_up_at_minus_y(tmp_path):
+    gaussians = random_gaussians(n=1, degree=0)
+    gaussians.means[0] = torch.tensor([0.1, 0.2, 0.9])  # front, left, up
+    write_ply(tmp_path / "a.ply", gaussians, up="-y", pad_sh=0)
+    numbers = np.frombuffer((tmp_path / "a.ply").read_bytes().split(b"end_header\n")[1], dtype="<f4")
+    assert numbers[:3].tolist() == pytest.approx([-0.2, -0.9, 0.1])
+
+
+def test_the_header_says_version_and_frame(tmp_path):
+    write_ply(tmp_path / "a.ply", random_gaussians(), up="+y", pad_sh=0)
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode()
+    assert f"comment cadam3d {ply.__version__}\n" in header
+    assert "comment cadam3d up=+y\n" in header
+
+
+def test_the_frame_of_the_header_wins_over_the_argument(tmp_path):
+    gaussians = random_gaussians(degree=0)
+    write_ply(tmp_path / "a.ply", gaussians, up="+y", pad_sh=0)
+    assert_same_bits(read_ply(tmp_path / "a.ply", up="+z"), gaussians)
+
+
+@pytest.mark.parametrize(("up", "world"), [("-y", (3, -1, -2)), ("+y", (3, 1, 2)), ("+z", (1, 2, 3))])
+def test_files_from_elsewhere_are_turned_by_the_argument(tmp_path, up, world):
+    (tmp_path / "a.ply").write_bytes(hand_made(NAMES, [[1.0, 2.0, 3.0] + [0.0] * 11]))
+    assert read_ply(tmp_path / "a.ply", up=up).means[0].tolist() == list(world)
+
+
+# Other people's files
+
+
+def test_order_extra_properties_and_other_types_do_not_matter(tmp_path):
+    names = ["red", *reversed(NAMES), "confidence"]
+    kinds = ["uchar", "double", *["float"] * 13, "double"]
+    rows = [[255, *reversed([float(10 * row + i) for i in range(14)]), 0.5] for row in range(3)]
+    (tmp_path / "a.ply").write_bytes(hand_made(names, rows, kinds))
+    back = read_ply(tmp_path / "a.ply", up="+z")
+    assert back.means.tolist() == [[0, 1, 2], [10, 11, 12], [20, 21, 22]]
+    assert back.quats[2].tolist() == [30, 31, 32, 33]
+    assert back.opacity_logits.tolist() == [6, 16, 26]
+
+
+def test_other_elements_before_and_after_are_skipped(tmp_path):
+    before = "comment made elsewhere\nobj_info x\nelement camera 2\nproperty uchar id\nproperty double t\n"
+    after = "element face 1\nproperty list uchar int vertex_indices\n"
+    content = hand_made(NAMES, [[float(i) for i in range(14)]], before=before, after=after)
+    header, body = content.split(b"end_header\n")
+    (tmp_path / "a.ply").write_bytes(header + b"end_header\n" + b"\0" * 18 + body + b"\3\0\0\0\0")
+    assert read_ply(tmp_path / "a.ply", up="+z").opacity_logits.tolist() == [6]
+
+
+@pytest.mark.parametrize("version", ["ascii 1.0", "binary_big_endian 1.0"])
+def test_other_encodings_are_refused_with_the_way_to_convert(tmp_path, version):
+    (tmp_path / "a.ply").write_bytes(hand_made(NAMES, [], version=version))
+    with pytest.raises(UserError, match=f"got {version}.*plyfile"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_the_conversion_that_the_message_suggests_works(tmp_path):
+    plyfile = pytest.importorskip("plyfile")
+    write_ply(tmp_path / "a.ply", random_gaussians(n=3, degree=0), up="-y", pad_sh=0)
+    data = plyfile.PlyData.read(str(tmp_path / "a.ply"))
+    data.byte_order = ">"
+    data.write(str(tmp_path / "big.ply"))
+    with pytest.raises(UserError) as error:
+        read_ply(tmp_path / "big.ply")
+    command = str(error.value).split('"')[1].replace("binary.ply", str(tmp_path / "binary.ply"))
+    exec(command)
+    assert_same_bits(read_ply(tmp_path / "binary.ply"), random_gaussians(n=3, degree=0))
+
+
+def test_a_file_without_gaussians_names_what_is_missing(tmp_path):
+    (tmp_path / "a.ply").write_bytes(hand_made(["x", "y", "z", "opacity"], []))
+    with pytest.raises(UserError, match=r"not a Gaussian ply: properties missing: f_dc_0.*scale_0.*rot_3"):
+        read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("rest", [1, 10, 72])
+def test_a_number_of_rest_coefficients_that_no_degree_has_is_refused(tmp_path, rest):
+    (tmp_path / "a.ply").write_bytes(hand_made([*NAMES, *(f"f_rest_{i}" for i in range(rest))], []))
+    with pytest.raises(UserError, match=f"got {rest}$"):
+        read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("lost", [1, 67, 68, 5 * 68])
+def test_a_truncated_body_is_refused_with_the_counts(tmp_path, lost):
+    write_ply(tmp_path / "a.ply", random_gaussians(n=5, degree=0), up="-y", pad_sh=0)
+    content = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(content[:-lost])
+    with pytest.raises(UserError, match=f"truncated: the header promises 5 .* holds {(5 * 68 - lost) // 68}"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_every_truncation_of_the_header_is_a_user_error(tmp_path):
+    write_ply(tmp_path / "a.ply", random_gaussians(n=1, degree=0), up="-y", pad_sh=0)
+    content = (tmp_path / "a.ply").read_bytes()
+    for length in range(content.index(b"end_header\n") + len(b"end_header\n")):
+        (tmp_path / "b.ply").write_bytes(content[:length])
+        with pytest.raises(UserError):
+            read_ply(tmp_path / "b.ply")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\x89PNG\r\n",
+        b"ply\n" + b"x" * 200_000,
+        b"ply\nformat binary_little_endian 1.0\nelement vertex -1\nend_header\n",
+        b"ply\nformat binary_little_endian 1.0\nproperty float x\nend_header\n",
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n",
+        b"ply\nformat binary_little_endian 1.0\nend_header\n",
+        b"ply\nformat binary_little_endian 1.0\ncomment cadam3d up=sideways\nend_header\n",
+        hand_made([*NAMES, "x"], []),
+        hand_made(NAMES, []).replace(b"vertex 0", b"vertex 999999999999"),
+    ],
+)
+def test_what_is_not_a_gaussian_ply_is_a_user_error(tmp_path, content):
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(UserError, match=r"a\.ply"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_a_missing_file_is_a_user_error(tmp_path):
+    with pytest.raises(UserError, match="No such file"):
+        read_ply(tmp_path / "a.ply")
+
+
+# Independent readers
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_plyfile_reads_the_same_numbers(tmp_path, degree):
+    plyfile = pytest.importorskip("plyfile")
+    gaussians = random_gaussians(degree=degree)
+    write_ply(tmp_path / "a.ply", gaussians, up="+z", pad_sh=0)
+    vertices = plyfile.PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+
+    def columns(prefix, size):
+        return np.stack([vertices[f"{prefix}{i}"] for i in range(size)], axis=1)
+
+    assert np.array_equal(np.stack([vertices["x"], vertices["y"], vertices["z"]], axis=1), gaussians.means)
+    assert np.array_equal(columns("scale_", 3), gaussians.log_scales)
+    assert np.array_equal(columns("rot_", 4), gaussians.quats)
+    assert np.array_equal(vertices["opacity"], gaussians.opacity_logits)
+    assert np.array_equal(columns("f_dc_", 3), gaussians.sh[:, 0])
+    for channel in range(3):
+        for k in range(1, gaussians.sh.shape[1]):
+            name = f"f_rest_{channel * (gaussians.sh.shape[1] - 1) + k - 1}"
+            assert np.array_equal(vertices[name], gaussians.sh[:, k, channel])
+
+
+def test_trimesh_opens_it_as_points(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    gaussians = random_gaussians()
+    write_ply(tmp_path / "a.ply", gaussians, up="+z", pad_sh=0)
+    assert np.allclose(trimesh.load(tmp_path / "a.ply").vertices, gaussians.means)
+
+
+# Writing
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
+    write_ply(tmp_path / "a.ply", random_gaussians(), up="-y", pad_sh=0)
+    before = (tmp_path / "a.ply").read_bytes()
+
+    def fails(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(ply, "_header", fails)
+    with pytest.raises(UserError, match="No space left"):
+        write_ply(tmp_path / "a.ply", random_gaussians(seed=1), up="-y", pad_sh=0)
+    assert (tmp_path / "a.ply").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_gradients_and_double_precision_are_written_as_float32(tmp_path):
+    gaussians = random_gaussians(degree=0)
+    tracked = gaussians.to(torch.float64).map(lambda tensor: tensor.requires_grad_())
+    write_ply(tmp_path / "a.ply", tracked, up="-y", pad_sh=0)
+    assert_same_bits(read_ply(tmp_path / "a.ply"), gaussians)
