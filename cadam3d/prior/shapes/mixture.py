@@ -1,0 +1,73 @@
+"""A Gaussian mixture over images and its denoiser in closed form.
+
+p(x) = sum_m w_m N(x; mu_m, diag(sigma^2)) and noisy = a x + b eps give, with s^2 = a^2 sigma^2 + b^2 per pixel,
+
+    r_m      = softmax_m(log w_m + log N(noisy; a mu_m, s^2))                    responsibility of mode m
+    E[x]     = sum_m r_m (mu_m + a sigma^2 / s^2 (noisy - a mu_m))               given noisy
+    E[eps]   = sum_m r_m  b / s^2 (noisy - a mu_m)                               given noisy
+
+(Bayes' rule for a linear Gaussian observation). Then noisy = a E[x] + b E[eps] holds exactly, and E[eps] = -b times the
+score of the noisy density (Tweedie's formula).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.prior.path import per_view
+
+# Where a pixel is certain (sigma = 0) and free of noise (b = 0), the posterior is 0 / 0. A variance that no image
+# shows stands in: the answer is then the limit b -> 0 of the model at hand, the nearest mode.
+VARIANCE_FLOOR = 1e-12
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """One distribution of images per view, in the space that the model denoises in."""
+
+    means: Float[Tensor, "v m c h w"]
+    log_weights: Float[Tensor, "m"]
+    variance: Float[Tensor, "v c h w"]  # per pixel, shared by the modes
+
+    def denoise(
+        self, noisy: Float[Tensor, "v c h w"], a: Float[Tensor, "v"], b: Float[Tensor, "v"]
+    ) -> tuple[Float[Tensor, "v c h w"], Float[Tensor, "v c h w"]]:
+        """Posterior means of the clean image and of the noise; finite for every a, b in [0, 1]."""
+        a, b = per_view(a), per_view(b)
+        total = (a * a * self.variance + b * b).clamp_min(VARIANCE_FLOOR)
+        mean = self._mean_of_modes(noisy, a, total)
+        away = (noisy - a * mean) / total
+        return mean + a * self.variance * away, b * away
+
+    def responsibilities(
+        self, noisy: Float[Tensor, "v c h w"], a: Float[Tensor, "v"], b: Float[Tensor, "v"]
+    ) -> Float[Tensor, "v m"]:
+        """Posterior probability of each mode (float64)."""
+        a, b = per_view(a), per_view(b)
+        return self._responsibilities(noisy, a, (a * a * self.variance + b * b).clamp_min(VARIANCE_FLOOR))
+
+    def log_density(
+        self, noisy: Float[Tensor, "v c h w"], a: Float[Tensor, "v"], b: Float[Tensor, "v"]
+    ) -> Float[Tensor, "v"]:
+        """Log-density of the noisy image (float64)."""
+        a, b = per_view(a), per_view(b)
+        total = (a * a * self.variance + b * b).clamp_min(VARIANCE_FLOOR).double()
+        norm = (2 * torch.pi * total).log().sum(dim=(1, 2, 3))
+        return self._log_joint(noisy, a, total).logsumexp(dim=1) - 0.5 * norm
+
+    def _log_joint(self, noisy: Tensor, a: Tensor, total: Tensor) -> Float[Tensor, "v m"]:
+        """Log of weight times density, without the normalizer that all modes share."""
+        away = noisy[:, None] - a[:, None] * self.means
+        distance = (away * away / total[:, None]).sum(dim=(2, 3, 4), dtype=torch.float64)
+        return self.log_weights.double() - 0.5 * distance
+
+    def _responsibilities(self, noisy: Tensor, a: Tensor, total: Tensor) -> Float[Tensor, "v m"]:
+        return self._log_joint(noisy, a, total).softmax(dim=1)
+
+    def _mean_of_modes(self, noisy: Tensor, a: Tensor, total: Tensor) -> Float[Tensor, "v c h w"]:
+        if self.means.shape[1] == 1:
+            return self.means[:, 0]
+        shares = self._responsibilities(noisy, a, total).to(noisy.dtype)
+        return torch.einsum("vm,vmchw->vchw", shares, self.means)

@@ -1,0 +1,249 @@
+"""ShapesPrior: an exact diffusion model of a procedural world. No weights, no training, and the truth is known."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.core.cameras import Cameras, fitting_distance, turntable
+from cadam3d.core.checks import UserError, require_range
+from cadam3d.core.render import TruthFn
+from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
+from cadam3d.prior.path import NoisePath, Prediction, per_view
+from cadam3d.prior.shapes.grammar import TRY
+from cadam3d.prior.shapes.mixture import Mixture
+from cadam3d.prior.shapes.objects import known_objects, known_primitives
+from cadam3d.prior.shapes.scene import Scene, build
+from cadam3d.prior.shapes.tracer import Layers, trace
+
+CENSUS_VIEWS = 4  # of every object, around its equator
+CENSUS_ELEVATION_DEG = 15.0
+CENSUS_FOV_DEG = 45.0
+ERROR_GRID = 8  # cells per side of the prediction error: smooth beside any image that is larger
+ERROR_FREQUENCY = (
+    3.0  # radians per standard deviation of the projected noise: error fields of two noises decorrelate
+)
+
+
+@dataclass(frozen=True)
+class Census:
+    """First and second moments of all images of the world, per pixel of a small picture (premultiplied RGB, alpha)."""
+
+    rgb: Float[Tensor, "3 s s"]
+    alpha: Float[Tensor, "s s"]
+    rgb_variance: Float[Tensor, "3 s s"]
+    alpha_variance: Float[Tensor, "s s"]
+    covariance: Float[Tensor, "3 s s"]  # of each colour with alpha
+
+    def mixture(self, cameras: Cameras, background: Float[Tensor, "v 3"], floor: float) -> Mixture:
+        """One Gaussian per pixel over the given backdrops, in model space; variances at least ``floor``."""
+        maps = torch.cat(
+            [self.rgb, self.alpha[None], self.rgb_variance, self.alpha_variance[None], self.covariance]
+        )
+        sized = torch.nn.functional.interpolate(
+            maps[None].to(background), (cameras.height, cameras.width), mode="bilinear", align_corners=False
+        )
+        rgb, alpha, rgb_variance, alpha_variance, covariance = sized.split([3, 1, 3, 1, 3], dim=1)
+        backdrop = background[:, :, None, None]
+        mean = rgb + (1 - alpha) * backdrop
+        variance = rgb_variance + backdrop**2 * alpha_variance - 2 * backdrop * covariance
+        return Mixture(
+            means=(2 * mean - 1)[:, None],
+            log_weights=background.new_zeros(1),
+            variance=(4 * variance).clamp_min(floor),
+        )
+
+
+@dataclass(frozen=True)
+class ShapesCondition(Condition):
+    """The distributions of images of these views."""
+
+    positive: Mixture
+    negative: Mixture
+    empty: Mixture
+
+    def unprompted(self) -> "ShapesCondition":
+        """The same views, knowing only that they show something of this world."""
+        return replace(self, positive=self.empty, negative=self.empty)
+
+
+@dataclass(frozen=True)
+class ShapesEmbedding(PromptEmbedding):
+    """The scenes of a prompt and of a negative prompt (None: unconditional)."""
+
+    prior: "ShapesPrior"
+    positive: Scene
+    negative: Scene | None
+    census: Census
+
+    def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> ShapesCondition:
+        """Render the modes for these views."""
+        empty = self.census.mixture(cameras, background, max(self.prior.spread, self.prior.edge_spread) ** 2)
+        negative = empty if self.negative is None else self.prior.mixture(self.negative, cameras, background)
+        return ShapesCondition(self.prior.mixture(self.positive, cameras, background), negative, empty)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapesPrior(DiffusionPrior):
+    """A Gaussian mixture over images of the prompt's scene, one mode per choice that the prompt leaves open."""
+
+    path: NoisePath
+    spread: float  # standard deviation of every pixel around its mode, model space ([-1, 1])
+    edge_spread: float  # added to it where a silhouette crosses the pixel
+    model_error: float  # rms of the smooth prediction error, model space at full noise; 0 = exact
+    samples_per_pixel: int  # rays per pixel and axis
+    census_size: int  # pixels per side of the pictures that the empty prompt is measured on
+    seed: int  # of the prediction error
+
+    def __post_init__(self) -> None:
+        require_range("prior.spread", self.spread, low=0, high=10, example=0.1)
+        require_range("prior.edge_spread", self.edge_spread, low=0, high=10, example=0.1)
+        require_range("prior.model_error", self.model_error, low=0, high=10, example=0.1)
+        require_range("prior.samples_per_pixel", self.samples_per_pixel, low=1, high=8, example=2)
+        require_range("prior.census_size", self.census_size, low=2, high=256, example=24)
+        require_range("prior.seed", self.seed, low=0, high=2**62, example=0)
+
+    def embed(self, prompt: str, negative: str) -> ShapesEmbedding:
+        """Parse both prompts; the empty negative prompt is the whole world.
+
+        Raises ``UserError`` for an empty prompt and for words that the grammar does not know.
+        """
+        if not prompt.strip():
+            raise UserError(f"prompt: wanted an object, got {prompt!r}. {TRY}")
+        positive = build(prompt)
+        return ShapesEmbedding(
+            prior=self,
+            positive=positive,
+            negative=build(negative) if negative.strip() else None,
+            census=take_census(self.census_size),
+        )
+
+    def encode(self, rgb: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v 3 h w"]:
+        """Images in [0, 1] to [-1, 1]; the model denoises pixels."""
+        return 2 * rgb.permute(0, 3, 1, 2) - 1
+
+    def mixture(self, scene: Scene, cameras: Cameras, background: Float[Tensor, "v 3"]) -> Mixture:
+        """The distribution of images of a scene."""
+        layers, scene = self._layers(scene, cameras)
+        edge = 4 * layers.alpha * (1 - layers.alpha)
+        sigma = (self.spread + self.edge_spread * edge)[:, None].expand(-1, 3, -1, -1)
+        return Mixture(
+            means=2 * layers.images(scene.albedo, background) - 1,
+            log_weights=scene.log_weights,
+            variance=sigma * sigma,
+        )
+
+    @torch.no_grad()
+    def predict(
+        self,
+        noisy: Float[Tensor, "v c h w"],
+        t: Float[Tensor, "v"],
+        condition: ShapesCondition,
+        scale: float,
+    ) -> Prediction:
+        """Posterior means under guidance, plus the configured error; a branch of weight zero is not computed.
+
+        All three forms come from the posterior means of clean image and noise, so none is divided by a small b.
+        """
+        clean, noise = torch.zeros_like(noisy), torch.zeros_like(noisy)
+        for branch, (share, mixture) in enumerate(
+            ((scale, condition.positive), (1 - scale, condition.negative))
+        ):
+            if share == 0:
+                continue
+            guess_clean, guess_noise = self._guess(noisy, t, mixture, branch)
+            clean, noise = clean + share * guess_clean, noise + share * guess_noise
+        return Prediction(clean=clean, noise=noise, velocity=self.path.velocity(clean, noise, t))
+
+    def truth(self, prompt: str) -> TruthFn:
+        """Images of every mode of ``prompt``: (cameras, background "v 3") -> "m v h w 3" in [0, 1]."""
+        scene = build(prompt)
+
+        def images(cameras: Cameras, background: Tensor) -> Tensor:
+            layers, sized = self._layers(scene, cameras)
+            return layers.images(sized.albedo, background).permute(1, 0, 3, 4, 2)
+
+        return images
+
+    def _layers(self, scene: Scene, cameras: Cameras) -> tuple[Layers, Scene]:
+        scene = scene.to(cameras.intrinsics.device, cameras.intrinsics.dtype)
+        return trace(scene, cameras, self.samples_per_pixel), scene
+
+    def _guess(self, noisy: Tensor, t: Tensor, mixture: Mixture, branch: int) -> tuple[Tensor, Tensor]:
+        a, b = self.path.a(t), self.path.b(t)
+        clean, noise = mixture.denoise(noisy, a, b)
+        if self.model_error == 0:
+            return clean, noise
+        # Split so that a * clean + b * noise stays put: nothing is wrong with a clean image, all with pure noise.
+        norm = per_view((a * a + b * b).sqrt())
+        error = self.model_error * error_field(noisy / norm, self.seed * 2 + branch)
+        return clean + per_view(b) / norm * error, noise - per_view(a) / norm * error
+
+
+def error_field(image: Float[Tensor, "v c h w"], seed: int) -> Float[Tensor, "v c h w"]:
+    """A smooth field of mean about zero and unit rms that is a fixed, continuous function of ``image``.
+
+    The image is multiplied with random signs, summed over each cell of a coarse grid (white noise of unit variance
+    gives unit variance), and the sine of that is upsampled bicubically: another noise, another field.
+    """
+    _, channels, height, width = image.shape
+    generator = torch.Generator().manual_seed(seed)
+    signs = torch.randint(0, 2, (channels, channels, height, width), generator=generator).to(image) * 2 - 1
+    phase = 2 * math.pi * torch.rand(channels, ERROR_GRID, ERROR_GRID, generator=generator).to(image)
+    rows, columns = _cells(height, image), _cells(width, image)
+    signed = torch.einsum("vchw,dchw->vdhw", image, signs) / math.sqrt(channels)
+    projected = torch.einsum("gh,vdhw,kw->vdgk", rows, signed, columns)
+    coarse = math.sqrt(2) * torch.sin(ERROR_FREQUENCY * projected + phase)
+    return torch.einsum("hg,vdgk,wk->vdhw", _bicubic(height, image), coarse, _bicubic(width, image))
+
+
+def _cells(size: int, like: Tensor) -> Float[Tensor, "g s"]:
+    """Sums over the cells of the error grid, scaled so that white noise keeps its variance."""
+    cell = torch.arange(size, device=like.device) * ERROR_GRID // size
+    member = (cell[None] == torch.arange(ERROR_GRID, device=like.device)[:, None]).to(like)
+    return member / member.sum(1, keepdim=True).sqrt().clamp_min(1)
+
+
+def _bicubic(size: int, like: Tensor) -> Float[Tensor, "s g"]:
+    """Interpolation from the error grid to ``size`` pixels, scaled so that independent cells keep unit variance."""
+    grid = torch.eye(ERROR_GRID, device=like.device, dtype=like.dtype)[None, None]
+    rows = torch.nn.functional.interpolate(grid, (size, ERROR_GRID), mode="bicubic", align_corners=False)[
+        0, 0
+    ]
+    return rows / rows.norm(dim=1, keepdim=True)
+
+
+def take_census(size: int) -> Census:
+    """Moments over every object of the world, a few views of each and every mode, all equally likely."""
+    cameras = turntable(
+        CENSUS_VIEWS,
+        elevation_deg=CENSUS_ELEVATION_DEG,
+        distance=fitting_distance(CENSUS_FOV_DEG),
+        fov_y_deg=CENSUS_FOV_DEG,
+        size=size,
+    )
+    black = torch.zeros(CENSUS_VIEWS, 3)
+    rgb_sum, rgb_square, cross = torch.zeros(3, 3, size, size, dtype=torch.float64)
+    alpha_sum, alpha_square = torch.zeros(2, size, size, dtype=torch.float64)
+    names = (*known_primitives(), *known_objects())
+    for name in names:
+        scene = build(name).to(torch.device("cpu"), torch.float32)
+        layers = trace(scene, cameras, samples=1)
+        images = layers.images(scene.albedo, black).double()
+        alpha = layers.alpha.double()
+        rgb_sum += images.mean(dim=(0, 1))
+        rgb_square += images.square().mean(dim=(0, 1))
+        cross += (images * alpha[:, None, None]).mean(dim=(0, 1))
+        alpha_sum += alpha.mean(0)
+        alpha_square += alpha.square().mean(0)
+    count = len(names)
+    rgb, alpha = rgb_sum / count, alpha_sum / count
+    return Census(
+        rgb=rgb,
+        alpha=alpha,
+        rgb_variance=rgb_square / count - rgb**2,
+        alpha_variance=alpha_square / count - alpha**2,
+        covariance=cross / count - rgb * alpha,
+    )

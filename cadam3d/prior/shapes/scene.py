@@ -1,0 +1,278 @@
+"""From a sentence to a scene: objects painted, put in their places and fitted into the unit ball."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cadam3d.prior.shapes.grammar import Phrase, Sentence, parse
+from cadam3d.prior.shapes.objects import (
+    ACCENT,
+    MAIN,
+    OPEN,
+    Coat,
+    Part,
+    Thing,
+    bounds,
+    moved,
+    stretched,
+    thing,
+)
+from cadam3d.prior.shapes.solids import KINDS, Kind, size_row
+from cadam3d.prior.shapes.vocabulary import COLOURS, OPEN_PALETTE, PATTERNS, PLAIN
+
+FIT_RADIUS = 0.85  # every scene fits in the ball of this radius around the origin
+CLEARANCE = 0.12  # between neighbours, in units of a natural radius of 1
+SINK = 0.01  # how deep things sit into what they stand on: no light shines through the contact
+OPEN_STRIDE = 3  # open objects differ: the k-th takes the palette shifted by 3 k
+SUPPORT_DIRECTIONS = 512
+PATTERN_NAMES = tuple(dict.fromkeys(PATTERNS.values()))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything the tracer needs, one row per part; parts of one kind are neighbours."""
+
+    kinds: tuple[tuple[Kind, int], ...]  # kind and number of parts, in row order
+    to_local: Float[Tensor, "p 3 3"]  # own = to_local @ (world - offsets)
+    offsets: Float[Tensor, "p 3"]
+    sizes: Float[Tensor, "p 4"]
+    low: Float[Tensor, "p 3"]  # tight box in own coordinates
+    high: Float[Tensor, "p 3"]
+    centres: Float[Tensor, "p 3"]  # bounding ball in the world
+    radii: Float[Tensor, "p"]
+    patterns: Int[Tensor, "p"]  # index into PATTERN_NAMES
+    paints: Int[Tensor, "p 2"]  # first and second column of ``albedo``
+    albedo: Float[Tensor, "m paints 3"]  # in [0, 1], per mode
+    log_weights: Float[Tensor, "m"]  # of the modes; they sum to one
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> "Scene":
+        """The same scene on ``device``, its numbers in ``dtype``."""
+        moved_tensors = {
+            name: value.to(device, dtype if value.is_floating_point() else value.dtype)
+            for name, value in vars(self).items()
+            if isinstance(value, Tensor)
+        }
+        return replace(self, **moved_tensors)
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """A painted object with what others need to stand on it or shelter under it."""
+
+    parts: tuple[Part, ...]
+    seat: float
+    shelter: tuple[float, float] | None
+
+    @property
+    def low(self) -> list[float]:
+        return bounds(self.parts)[0].tolist()
+
+    @property
+    def high(self) -> list[float]:
+        return bounds(self.parts)[1].tolist()
+
+    def at(self, x: float, y: float, z: float) -> "_Placed":
+        return replace(self, parts=moved(self.parts, x, y, z), seat=self.seat + z)
+
+    def scaled(self, factor: float) -> "_Placed":
+        shelter = self.shelter and (self.shelter[0] * factor, self.shelter[1] * factor)
+        return _Placed(stretched(self.parts, factor, factor, factor), self.seat * factor, shelter)
+
+
+def build(prompt: str) -> Scene:
+    """The scene of a prompt.
+
+    Raises ``UserError`` for words or sentences that the grammar does not know.
+    """
+    return compile_scene(assemble(parse(prompt)))
+
+
+def assemble(sentence: Sentence) -> tuple[Part, ...]:
+    """Paint, place and fit all objects of a sentence."""
+    groups = [_place(phrase, index) for index, phrase in enumerate(sentence.phrases)]
+    # From the right: "a cube on a ball on a table" is a cube on (a ball on a table).
+    right = groups.pop()
+    for relation in reversed(sentence.relations):
+        left = groups.pop()
+        if relation == "and of between":
+            between = groups.pop()
+            right = _row([left, between, right])
+        elif relation != "between":
+            right = _relate(left, relation, right)
+    return _fit(right.parts)
+
+
+def compile_scene(parts: tuple[Part, ...]) -> Scene:
+    """Parts to tensors, sorted by kind, in float64 on the CPU."""
+    parts = tuple(sorted(parts, key=lambda part: KINDS.index(part.solid.kind)))
+    kinds = [part.solid.kind for part in parts]
+    colours = list(dict.fromkeys(name for part in parts for name in (part.coat.first, part.coat.second)))
+    axes = torch.cat([torch.eye(3), -torch.eye(3)], dim=1).double()
+    own_reach = torch.stack([part.solid.kind.support(axes, part.solid.size) for part in parts])
+    world_reach = torch.stack([part.solid.support(axes) for part in parts])
+    centres = (world_reach[:, :3] - world_reach[:, 3:]) / 2
+    directions = sphere_directions(SUPPORT_DIRECTIONS).double().T
+    reach = torch.stack([part.solid.support(directions) for part in parts])
+    radii = (reach - centres @ directions).amax(1) * 1.01  # directions are finitely many: a margin
+    matrices = torch.stack([part.solid.matrix for part in parts])
+    return Scene(
+        kinds=tuple((kind, kinds.count(kind)) for kind in dict.fromkeys(kinds)),
+        to_local=torch.linalg.inv(matrices),
+        offsets=torch.stack([part.solid.offset for part in parts]),
+        sizes=torch.stack([size_row(part.solid.size) for part in parts]),
+        low=-own_reach[:, 3:],
+        high=own_reach[:, :3],
+        centres=centres,
+        radii=radii,
+        patterns=torch.tensor([PATTERN_NAMES.index(part.coat.pattern) for part in parts]),
+        paints=torch.tensor(
+            [[colours.index(part.coat.first), colours.index(part.coat.second)] for part in parts]
+        ),
+        albedo=_albedo(colours),
+        log_weights=_log_weights(colours),
+    )
+
+
+def sphere_directions(count: int) -> Float[Tensor, "count 3"]:
+    """Nearly uniform unit vectors (a Fibonacci lattice)."""
+    index = torch.arange(count, dtype=torch.float64) + 0.5
+    z = 1 - 2 * index / count
+    angle = math.pi * (1 + math.sqrt(5)) * index
+    across = (1 - z * z).sqrt()
+    return torch.stack([across * angle.cos(), across * angle.sin(), z], dim=1)
+
+
+# --- colours
+
+
+def _colour(name: str) -> Float[Tensor, "3"]:
+    shade, _, plain = name.rpartition(" ")
+    rgb = torch.tensor(COLOURS[plain], dtype=torch.float64)
+    if shade == "dark":
+        return 0.55 * rgb
+    return 0.5 * rgb + 0.5 if shade == "light" else rgb
+
+
+def _slots(colours: list[str]) -> list[str]:
+    return [name for name in colours if name.startswith(OPEN)]
+
+
+def _albedo(colours: list[str]) -> Float[Tensor, "m paints 3"]:
+    modes = len(OPEN_PALETTE) if _slots(colours) else 1
+
+    def row(mode: int) -> Tensor:
+        names = [
+            OPEN_PALETTE[(mode + OPEN_STRIDE * int(name[len(OPEN) :])) % modes]
+            if name.startswith(OPEN)
+            else name
+            for name in colours
+        ]
+        return torch.stack([_colour(name) for name in names])
+
+    return torch.stack([row(mode) for mode in range(modes)])
+
+
+def _log_weights(colours: list[str]) -> Float[Tensor, "m"]:
+    modes = len(OPEN_PALETTE) if _slots(colours) else 1
+    return torch.full((modes,), -math.log(modes), dtype=torch.float64)
+
+
+def _paint(item: Thing, phrase: Phrase, index: int) -> tuple[Part, ...]:
+    """Decide MAIN and ACCENT; a pattern goes to whatever is painted in plain MAIN."""
+    open_colour = f"{OPEN}{index}"
+    main = phrase.colours[0] if phrase.colours else (open_colour if item.main == OPEN else item.main)
+    accent = item.accent
+    pattern = phrase.pattern
+    if len(phrase.colours) == 2:
+        accent = phrase.colours[1]
+        pattern = pattern or ("striped" if item.main == OPEN else None)
+    # One colour and a pattern: the other colour is white, or black where white would not show.
+    other = (
+        phrase.colours[1]
+        if len(phrase.colours) == 2
+        else ("black" if main in ("white", "cream") else "white")
+    )
+
+    def coat(old: Coat) -> Coat:
+        if pattern is not None and old == Coat(MAIN, ACCENT, PLAIN):
+            return Coat(main, main if pattern == PLAIN else other, pattern)
+        names = {MAIN: main, ACCENT: accent}
+        first = names.get(old.first, old.first)
+        return Coat(first, first if old.pattern == PLAIN else names.get(old.second, old.second), old.pattern)
+
+    return tuple(replace(part, coat=coat(part.coat)) for part in item.parts)
+
+
+# --- places
+
+
+def _place(phrase: Phrase, index: int) -> _Placed:
+    item = thing(phrase.noun)
+    parts = stretched(_paint(item, phrase, index), *phrase.stretch)
+    low, high = bounds(parts)
+    radius = float((high - low).norm()) / 2
+    top = float(high[2]) if item.seat is None else item.seat * phrase.stretch[2]
+    one = _Placed(parts, top, item.shelter).scaled(item.natural * phrase.size / radius)
+    return _row([one] * phrase.count) if phrase.count > 1 else one
+
+
+def _join(parts: list[_Placed], seat: float, shelter: tuple[float, float] | None = None) -> _Placed:
+    return _Placed(tuple(part for placed in parts for part in placed.parts), seat, shelter)
+
+
+def _stand(placed: _Placed, x: float, y: float, z: float) -> _Placed:
+    """Centred over (x, y), its lowest point at height z."""
+    low, high = placed.low, placed.high
+    return placed.at(x - (low[0] + high[0]) / 2, y - (low[1] + high[1]) / 2, z - low[2])
+
+
+def _row(items: list[_Placed]) -> _Placed:
+    """Side by side on one floor, left to right as seen from the front (-y to +y)."""
+    placed, edge = [], 0.0
+    for item in items:
+        width = item.high[1] - item.low[1]
+        placed.append(_stand(item, 0.0, edge + width / 2, 0.0))
+        edge += width + CLEARANCE
+    return _join(placed, max(item.seat for item in placed))
+
+
+def _relate(left: _Placed, relation: str, right: _Placed) -> _Placed:
+    """Put ``left`` in its relation to ``right``."""
+    if relation == "next to":
+        return _row([left, right])
+    if relation == "under":
+        return _under(left, right)
+    base = _stand(right, 0.0, 0.0, 0.0)
+    if relation in ("on", "above"):
+        gap = -SINK if relation == "on" else CLEARANCE * 2
+        upper = _stand(left, 0.0, 0.0, base.seat + gap)
+        return _join([upper, base], upper.seat)
+    sign = 1.0 if relation == "in front of" else -1.0
+    depth = (left.high[0] - left.low[0] + base.high[0] - base.low[0]) / 2 + CLEARANCE
+    return _join([_stand(left, sign * depth, 0.0, 0.0), base], base.seat)
+
+
+def _under(left: _Placed, right: _Placed) -> _Placed:
+    """Between the legs of what has legs, shrunk to fit; otherwise below."""
+    if right.shelter is None:
+        lower = _stand(left, 0.0, 0.0, 0.0)
+        upper = _stand(right, 0.0, 0.0, lower.seat - SINK)
+        return _join([upper, lower], upper.seat)
+    radius, height = right.shelter
+    width, depth = left.high[1] - left.low[1], left.high[0] - left.low[0]
+    shrink = min(1.0, 0.95 * height / (left.high[2] - left.low[2]), 2 * radius / max(width, depth))
+    base = _stand(right, 0.0, 0.0, 0.0)
+    return _join([_stand(left.scaled(shrink), 0.0, 0.0, 0.0), base], base.seat)
+
+
+def _fit(parts: tuple[Part, ...]) -> tuple[Part, ...]:
+    """Centre the bounding box on the origin and scale so that the furthest point has radius FIT_RADIUS."""
+    low, high = bounds(parts)
+    centre = ((low + high) / 2).tolist()
+    centred = moved(parts, -centre[0], -centre[1], -centre[2])
+    directions = sphere_directions(SUPPORT_DIRECTIONS).T
+    reach = float(torch.stack([part.solid.support(directions) for part in centred]).max())
+    return stretched(centred, *[FIT_RADIUS / reach] * 3)

@@ -1,0 +1,358 @@
+"""Solids as signed distance functions: negative inside, positive outside, never further than the surface is.
+
+Each kind is written in its own coordinates and lives in the world through an affine map. A ray keeps its parameter
+under an affine map, so sphere tracing in own coordinates stays exact for stretched solids too: an ellipsoid is a
+stretched ball, and no approximate distance is needed. Every function here is 1-Lipschitz and has the right sign, which
+is all that sphere tracing asks (Hart 1996, theorem 1); most are the maximum of a few planes.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+SIZES_PER_SOLID = 4  # numbers that shape a solid; a kind uses as many as it needs
+STAR_POINTS = 5
+AXES = {"x": 0, "y": 1, "z": 2}
+
+SdfFn = Callable[[Tensor, Tensor], Tensor]  # points "3 n" and sizes "4 n", own coordinates -> distances "n"
+SupportFn = Callable[
+    [Tensor, tuple[float, ...]], Tensor
+]  # directions "3 k" and sizes -> max of p.d over the solid
+
+
+@dataclass(frozen=True, eq=False)
+class Kind:
+    """A family of solids."""
+
+    name: str
+    sdf: SdfFn
+    support: SupportFn
+    wrap: str  # how patterns lie on it: "ring" (two angles), "round" (azimuth, height) or "flat" (x, y, z)
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """One solid in the world: world = matrix @ own + offset."""
+
+    kind: Kind
+    size: tuple[float, ...]
+    matrix: Float[Tensor, "3 3"]
+    offset: Float[Tensor, "3"]
+
+    def at(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Solid":
+        """Moved by a vector."""
+        return replace(self, offset=self.offset + torch.tensor([x, y, z], dtype=torch.float64))
+
+    def turned(self, axis: str, degrees: float) -> "Solid":
+        """Turned about a world axis through the origin, right-handed."""
+        return self.mapped(rotation(axis, degrees))
+
+    def stretched(self, x: float = 1.0, y: float = 1.0, z: float = 1.0) -> "Solid":
+        """Stretched along the world axes, about the origin."""
+        return self.mapped(torch.diag(torch.tensor([x, y, z], dtype=torch.float64)))
+
+    def mapped(self, matrix: Float[Tensor, "3 3"]) -> "Solid":
+        """Under a linear map of the world."""
+        return replace(self, matrix=matrix @ self.matrix, offset=matrix @ self.offset)
+
+    def support(self, directions: Float[Tensor, "3 k"]) -> Float[Tensor, "k"]:
+        """How far the solid reaches along each direction: the maximum of p . d over its points."""
+        return self.kind.support(self.matrix.T @ directions, self.size) + self.offset @ directions
+
+    def distance(self, points: Float[Tensor, "3 n"]) -> Float[Tensor, "n"]:
+        """A signed lower bound of the world distance to the surface (exact sign)."""
+        local = torch.linalg.inv(self.matrix) @ (points - self.offset[:, None])
+        sizes = size_row(self.size)[:, None].expand(-1, local.shape[1])
+        return self.kind.sdf(local, sizes) * torch.linalg.svdvals(self.matrix)[-1]
+
+
+def size_row(size: tuple[float, ...]) -> Float[Tensor, "4"]:
+    """The sizes of a solid, padded to a common length."""
+    return torch.tensor((*size, *[0.0] * (SIZES_PER_SOLID - len(size))), dtype=torch.float64)
+
+
+def rotation(axis: str, degrees: float) -> Float[Tensor, "3 3"]:
+    """Right-handed rotation about a world axis."""
+    angle, first = math.radians(degrees), (AXES[axis] + 1) % 3
+    second = (first + 1) % 3
+    matrix = torch.eye(3, dtype=torch.float64)
+    matrix[first, first] = matrix[second, second] = math.cos(angle)
+    matrix[first, second], matrix[second, first] = -math.sin(angle), math.sin(angle)
+    return matrix
+
+
+# --- ball
+
+
+def _ball_sdf(p: Tensor, size: Tensor) -> Tensor:
+    return p.square().sum(0).sqrt() - size[0]
+
+
+def _ball_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
+    return size[0] * d.norm(dim=0)
+
+
+# --- box: half lengths
+
+
+def _box_sdf(p: Tensor, size: Tensor) -> Tensor:
+    return (p.abs() - size[:3]).amax(0)
+
+
+def _box_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
+    return torch.tensor(size, dtype=d.dtype) @ d.abs()
+
+
+# --- frustum about z: bottom radius, top radius, half height (cylinder, cone, disc)
+
+
+def _frustum_sdf(p: Tensor, size: Tensor) -> Tensor:
+    bottom, top, half = size[0], size[1], size[2]
+    slope = (bottom - top) / (2 * half)
+    radius = p[:2].square().sum(0).sqrt()
+    side = (radius - (bottom + top) / 2 + slope * p[2]) * torch.rsqrt(1 + slope * slope)
+    return torch.maximum(side, p[2].abs() - half)
+
+
+def _frustum_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
+    bottom, top, half = size
+    across = d[:2].norm(dim=0)
+    return torch.maximum(bottom * across - half * d[2], top * across + half * d[2])
+
+
+# --- tube about z: outer radius, inner radius, half height
+
+
+def _tube_sdf(p: Tensor, size: Tensor) -> Tensor:
+    outer, inner, half = size[0], size[1], size[2]
+    radius = p[:2].square().sum(0).sqrt()
+    wall = (radius - (outer + inner) / 2).abs() - (outer - inner) / 2
+    return torch.maximum(wall, p[2].abs() - half)
+
+
+def _tube_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
+    return size[0] * d[:2].norm(dim=0) + size[2] * d[2].abs()
+
+
+# --- torus about z: ring radius, pipe radius
+
+
+def _torus_sdf(p: Tensor, size: Tensor) -> Tensor:
+    away = p[:2].square().sum(0).sqrt() - size[0]
+    return (away * away + p[2] * p[2]).sqrt() - size[1]
+
+
+def _torus_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
+    return size[0] * d[:2].norm(dim=0) + size[1] * d.norm(dim=0)
+
+
+# --- arc: the part of a torus within an angle (radians) of +y, round ends: ring radius, pipe radius, angle
+
+
+def _arc_sdf(p: Tensor, size: Tensor) -> Tensor:
+    x = p[0].abs()
+    angle = torch.minimum(torch.atan2(x, p[1]), size[2])
+    dx, dy = x - size[0] * angle.sin(), p[1] - size[0] * angle.cos()
+    return (dx * dx + dy * dy + p[2] * p[2]).sqrt() - size[1]
+
+
+def _arc_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
+    x = d[0].abs()
+    angle = torch.atan2(x, d[1]).clamp(max=size[2])
+    return size[0] * (angle.sin() * x + angle.cos() * d[1]) + size[1] * d.norm(dim=0)
+
+
+# --- capsule about z: radius, half length of its axis
+
+
+def _capsule_sdf(p: Tensor, size: Tensor) -> Tensor:
+    beyond = (p[2].abs() - size[1]).clamp_min(0)
+    return (p[0] * p[0] + p[1] * p[1] + beyond * beyond).sqrt() - size[0]
+
+
+def _capsule_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
+    return size[0] * d.norm(dim=0) + size[1] * d[2].abs()
+
+
+# --- star: five points in the y-z plane, one up, thick along x: outer radius, inner radius, half thickness
+
+
+def _star_sdf(p: Tensor, size: Tensor) -> Tensor:
+    # Fold the plane into one half of one point: reflections keep distances, so the bound survives.
+    sector = math.pi / STAR_POINTS
+    angle = torch.atan2(p[1], p[2])
+    folded = (torch.remainder(angle + sector, 2 * sector) - sector).abs()
+    radius = (p[1] * p[1] + p[2] * p[2]).sqrt()
+    along, across = radius * folded.cos(), radius * folded.sin()
+    # The edge runs from the tip (outer, 0) to the notch (inner cos sector, inner sin sector).
+    edge_x, edge_y = size[1] * math.cos(sector) - size[0], size[1] * math.sin(sector)
+    side = (edge_y * (along - size[0]) - edge_x * across) * torch.rsqrt(edge_x * edge_x + edge_y * edge_y)
+    return torch.maximum(side, p[0].abs() - size[2])
+
+
+def _star_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
+    angles = 2 * math.pi / STAR_POINTS * torch.arange(STAR_POINTS, dtype=d.dtype)
+    tips = size[0] * torch.stack([angles.sin(), angles.cos()], dim=1)
+    return (tips @ d[1:]).amax(0) + size[2] * d[0].abs()
+
+
+# --- polytopes: the maximum of their planes; they are shaped by their matrix alone
+
+
+def _polytope(name: str, planes: list[list[float]], corners: list[list[float]]) -> Kind:
+    """``planes`` holds rows (nx, ny, nz, d) with n . p <= d inside; n need not be of unit length."""
+    rows = torch.tensor(planes, dtype=torch.float64)
+    rows = rows / rows[:, :3].norm(dim=1, keepdim=True)
+    points = torch.tensor(corners, dtype=torch.float64)
+
+    def sdf(p: Tensor, size: Tensor) -> Tensor:
+        faces = rows.to(p)
+        return (faces[:, :3] @ p - faces[:, 3:]).amax(0)
+
+    def support(d: Tensor, size: tuple[float, ...]) -> Tensor:
+        return (points.to(d) @ d).amax(0)
+
+    return Kind(name, sdf, support, "flat")
+
+
+_ROOT2 = math.sqrt(2)
+_ROOT3 = math.sqrt(3)
+BALL = Kind("ball", _ball_sdf, _ball_support, "round")
+BOX = Kind("box", _box_sdf, _box_support, "flat")
+FRUSTUM = Kind("frustum", _frustum_sdf, _frustum_support, "round")
+TUBE = Kind("tube", _tube_sdf, _tube_support, "round")
+TORUS = Kind("torus", _torus_sdf, _torus_support, "ring")
+ARC = Kind("arc", _arc_sdf, _arc_support, "ring")
+CAPSULE = Kind("capsule", _capsule_sdf, _capsule_support, "round")
+STAR = Kind("star", _star_sdf, _star_support, "flat")
+PYRAMID = _polytope(  # square base of side 2 at z = -1, apex at z = 1
+    "pyramid",
+    [[0, 0, -1, 1], [2, 0, 1, 1], [-2, 0, 1, 1], [0, 2, 1, 1], [0, -2, 1, 1]],
+    [[0, 0, 1], [1, 1, -1], [1, -1, -1], [-1, 1, -1], [-1, -1, -1]],
+)
+GABLE = _polytope(  # a roof: base of side 2 at z = -1, ridge along x at z = 1
+    "gable",
+    [[0, 0, -1, 1], [1, 0, 0, 1], [-1, 0, 0, 1], [0, 2, 1, 1], [0, -2, 1, 1]],
+    [[1, 0, 1], [-1, 0, 1], [1, 1, -1], [1, -1, -1], [-1, 1, -1], [-1, -1, -1]],
+)
+TETRAHEDRON = _polytope(  # regular, circumradius 1, one face below
+    "tetrahedron",
+    [
+        [0, 0, -1, 1 / 3],
+        [-2 * _ROOT2 / 3, 0, 1 / 3, 1 / 3],
+        [_ROOT2 / 3, -_ROOT2 / _ROOT3, 1 / 3, 1 / 3],
+        [_ROOT2 / 3, _ROOT2 / _ROOT3, 1 / 3, 1 / 3],
+    ],
+    [
+        [0, 0, 1],
+        [2 * _ROOT2 / 3, 0, -1 / 3],
+        [-_ROOT2 / 3, _ROOT2 / _ROOT3, -1 / 3],
+        [-_ROOT2 / 3, -_ROOT2 / _ROOT3, -1 / 3],
+    ],
+)
+OCTAHEDRON = _polytope(
+    "octahedron",
+    [[x, y, z, 1] for x in (1, -1) for y in (1, -1) for z in (1, -1)],
+    [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]],
+)
+KINDS = (
+    BALL,
+    BOX,
+    FRUSTUM,
+    TUBE,
+    TORUS,
+    ARC,
+    CAPSULE,
+    STAR,
+    PYRAMID,
+    GABLE,
+    TETRAHEDRON,
+    OCTAHEDRON,
+)
+
+
+# --- how objects are built: full lengths, centred on the origin
+
+
+def _solid(kind: Kind, *size: float, stretch: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Solid:
+    matrix = torch.diag(torch.tensor(stretch, dtype=torch.float64))
+    return Solid(kind=kind, size=size, matrix=matrix, offset=torch.zeros(3, dtype=torch.float64))
+
+
+def ball(radius: float) -> Solid:
+    """A ball."""
+    return _solid(BALL, radius)
+
+
+def ellipsoid(x: float, y: float, z: float) -> Solid:
+    """An ellipsoid with these half axes."""
+    return _solid(BALL, 1.0, stretch=(x, y, z))
+
+
+def box(x: float, y: float, z: float) -> Solid:
+    """A box with these side lengths."""
+    return _solid(BOX, x / 2, y / 2, z / 2)
+
+
+def cylinder(radius: float, height: float) -> Solid:
+    """A cylinder about z."""
+    return _solid(FRUSTUM, radius, radius, height / 2)
+
+
+def frustum(bottom: float, top: float, height: float) -> Solid:
+    """A cone about z cut off at the ``top`` radius."""
+    return _solid(FRUSTUM, bottom, top, height / 2)
+
+
+def cone(radius: float, height: float) -> Solid:
+    """A cone about z, apex up."""
+    return _solid(FRUSTUM, radius, 0.0, height / 2)
+
+
+def tube(outer: float, inner: float, height: float) -> Solid:
+    """A cylinder about z with a hole."""
+    return _solid(TUBE, outer, inner, height / 2)
+
+
+def torus(ring: float, pipe: float) -> Solid:
+    """A torus about z: radius of the ring, radius of the pipe."""
+    return _solid(TORUS, ring, pipe)
+
+
+def arc(ring: float, pipe: float, degrees: float) -> Solid:
+    """The part of a torus about z within ``degrees`` to either side of +y."""
+    return _solid(ARC, ring, pipe, math.radians(degrees))
+
+
+def capsule(radius: float, length: float) -> Solid:
+    """A cylinder about z with round ends; ``length`` from end to end."""
+    return _solid(CAPSULE, radius, length / 2 - radius)
+
+
+def star(outer: float, inner: float, thickness: float) -> Solid:
+    """A five-pointed star facing +x."""
+    return _solid(STAR, outer, inner, thickness / 2)
+
+
+def pyramid(x: float, y: float, z: float) -> Solid:
+    """A pyramid on a rectangular base."""
+    return _solid(PYRAMID, stretch=(x / 2, y / 2, z / 2))
+
+
+def gable(x: float, y: float, z: float) -> Solid:
+    """A gable roof with its ridge along x."""
+    return _solid(GABLE, stretch=(x / 2, y / 2, z / 2))
+
+
+def tetrahedron(radius: float) -> Solid:
+    """A regular tetrahedron in a ball of ``radius``, one face below."""
+    return _solid(TETRAHEDRON, stretch=(radius, radius, radius))
+
+
+def octahedron(x: float, y: float, z: float) -> Solid:
+    """An octahedron with these half diagonals."""
+    return _solid(OCTAHEDRON, stretch=(x, y, z))

@@ -1,0 +1,250 @@
+"""Sphere tracing: rays march by the distance to the surface until they touch it (Hart 1996).
+
+Every part is traced on its own, only by rays that meet its bounding box, in its own coordinates; the nearest hit wins.
+All parts of one kind march together, so the number of tensor operations does not grow with the number of parts.
+Light is baked into the world and does not depend on the view: an asset of SH degree 0 can match it exactly.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from cadam3d.core.cameras import Cameras
+from cadam3d.prior.shapes.scene import PATTERN_NAMES, Scene, sphere_directions
+from cadam3d.prior.shapes.solids import Kind
+
+MARCH_STEPS = 48
+COMPACT_EVERY = 4  # steps between throwing out rays that have arrived or left
+HIT_DISTANCE = 5e-4  # world units; a pixel of a usual view is thirty times wider
+GRAZE_DISTANCE = 4e-3  # a ray still this close after the last step has hit
+NEAR = 0.01  # world units; as the rasterizers
+NORMAL_STEP = 1e-3  # of the finite differences, in own coordinates
+LIGHT = (0.60, 0.42, 0.68)  # towards the light; the front faces +x
+AMBIENT, SKY, DIFFUSE, WRAP = 0.46, 0.18, 0.36, 0.5  # the first three add up to one: never over-exposed
+SPOTS = 26
+SPOT_COSINE = 0.965  # of the angular radius of a spot
+
+
+@dataclass(frozen=True)
+class Layers:
+    """A rendered scene before its colours are chosen: every mode is one product with its albedo."""
+
+    alpha: Float[Tensor, "v h w"]  # in [0, 1]
+    paints: Float[Tensor, "v h w paints"]  # light that each paint sends, premultiplied with its coverage
+
+    def images(
+        self, albedo: Float[Tensor, "m paints 3"], background: Float[Tensor, "v 3"]
+    ) -> Float[Tensor, "v m 3 h w"]:
+        """Every mode's image over the background, in [0, 1]."""
+        colour = torch.einsum("vhwp,mpc->vmchw", self.paints, albedo)
+        backdrop = torch.einsum("vhw,vc->vchw", 1 - self.alpha, background)
+        return colour + backdrop[:, None]
+
+
+@dataclass(frozen=True)
+class _Hits:
+    """The visible points, sorted by part."""
+
+    ray: Int[Tensor, "n"]
+    part: Int[Tensor, "n"]
+    local: Float[Tensor, "3 n"]  # own coordinates
+
+
+@torch.no_grad()
+def trace(scene: Scene, cameras: Cameras, samples: int) -> Layers:
+    """Render with ``samples`` x ``samples`` rays per pixel, in the cameras' device and dtype."""
+    fine = cameras.resize(cameras.height * samples, cameras.width * samples)
+    origins, directions = fine.rays()
+    views, height, width = directions.shape[:3]
+    flat = directions.reshape(-1, 3).T.contiguous()
+    view = torch.arange(views, device=flat.device).repeat_interleave(height * width)
+    is_near = _meets_ball(origins.T[:, view], flat)
+    kept = is_near.nonzero()[:, 0]
+    hits = _first_hits(scene, origins, flat[:, kept], view[kept])
+    light, paint = _shade(scene, hits)
+
+    row = torch.div(kept[hits.ray], width, rounding_mode="floor")
+    column = kept[hits.ray] - row * width
+    pixel = torch.div(row, samples, rounding_mode="floor") * cameras.width + torch.div(
+        column, samples, rounding_mode="floor"
+    )
+    count, share = views * cameras.height * cameras.width, 1.0 / samples**2
+    paints = scene.albedo.shape[1]
+    alpha = flat.new_zeros(count).index_add_(0, pixel, torch.full_like(light, share))
+    sent = flat.new_zeros(count * paints).index_add_(0, pixel * paints + paint, light * share)
+    shape = (views, cameras.height, cameras.width)
+    return Layers(alpha=alpha.reshape(shape).clamp_max(1.0), paints=sent.reshape(*shape, paints))
+
+
+def _meets_ball(origin: Tensor, direction: Tensor) -> Bool[Tensor, "n"]:
+    """Rays that meet the unit ball: nothing lies outside it."""
+    along = (origin * direction).sum(0)
+    return (origin.square().sum(0) - along.clamp_max(0).square()) <= 1.0
+
+
+def _first_hits(scene: Scene, origins: Tensor, direction: Tensor, view: Tensor) -> _Hits:
+    """For every ray that hits something: which part, and where."""
+    # Candidate pairs (part, ray): the ray meets the part's bounding ball. Row-major, so sorted by part.
+    towards = scene.centres @ direction - (origins.T[:, view] * direction).sum(0)
+    square = (scene.centres[:, None] - origins[None]).square().sum(-1)[:, view]
+    is_candidate = (square - towards.clamp_min(0).square()) <= scene.radii.square()[:, None]
+    part, ray = is_candidate.nonzero(as_tuple=True)
+
+    # The same rays in the parts' own coordinates; the ray parameter stays in world units.
+    start = torch.einsum("pij,vpj->ivp", scene.to_local, origins[:, None] - scene.offsets[None])
+    local_origin = start.flatten(1)[:, view[ray] * len(scene.radii) + part]
+    matrix = scene.to_local.flatten(1).T[:, part].reshape(3, 3, -1)
+    local_direction = (matrix * direction[:, ray]).sum(1)
+    begin, end = _box_interval(scene, part, local_origin, local_direction)
+    is_inside = begin < end
+    part, ray, begin, end = part[is_inside], ray[is_inside], begin[is_inside], end[is_inside]
+    local_origin, local_direction = local_origin[:, is_inside], local_direction[:, is_inside]
+
+    sizes = scene.sizes.T[:, part]
+    reached = torch.full_like(begin, torch.inf)
+    for kind, rows in _runs(scene, part):
+        reached[rows] = _march(
+            kind, local_origin[:, rows], local_direction[:, rows], sizes[:, rows], begin[rows], end[rows]
+        )
+
+    nearest = torch.full_like(direction[0], torch.inf).scatter_reduce_(0, ray, reached, "amin")
+    is_first = (reached <= nearest[ray]) & reached.isfinite()
+    # Two parts that touch the ray at the same point: the later one, so that no ray counts twice.
+    number = torch.arange(len(ray), device=ray.device)
+    winner = torch.full_like(view, -1).scatter_reduce_(0, ray[is_first], number[is_first], "amax")
+    chosen = winner[winner >= 0].sort().values
+    point = local_origin[:, chosen] + reached[chosen] * local_direction[:, chosen]
+    return _Hits(ray=ray[chosen], part=part[chosen], local=point)
+
+
+def _box_interval(scene: Scene, part: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Where each ray enters and leaves the box of its part, in front of the camera."""
+    tiny = torch.full_like(direction, 1e-12)
+    inverse = 1 / torch.where(direction.abs() < 1e-12, tiny, direction)
+    first = (scene.low.T[:, part] - origin) * inverse
+    second = (scene.high.T[:, part] - origin) * inverse
+    begin = torch.minimum(first, second).amax(0).clamp_min(NEAR)
+    # A little longer than the box: at a flat face the interval of a grazing ray is empty but for rounding.
+    return begin, torch.maximum(first, second).amin(0) + HIT_DISTANCE
+
+
+def _march(
+    kind: Kind, origin: Tensor, direction: Tensor, sizes: Tensor, begin: Tensor, end: Tensor
+) -> Tensor:
+    """Ray parameter of the first point on the surface; infinite for a miss."""
+    reached = torch.full_like(begin, torch.inf)
+    rows = torch.arange(len(begin), device=begin.device)
+    t, speed = begin, direction.square().sum(0).rsqrt()
+    for step in range(MARCH_STEPS):
+        advance = kind.sdf(origin + t * direction, sizes) * speed
+        t = t + advance
+        if step % COMPACT_EVERY != COMPACT_EVERY - 1:
+            continue
+        is_hit = advance < (HIT_DISTANCE if step < MARCH_STEPS - 1 else GRAZE_DISTANCE)
+        is_hit &= t <= end
+        reached[rows[is_hit]] = t[is_hit]
+        alive = ((~is_hit) & (t < end)).nonzero()[:, 0]
+        if len(alive) == 0:
+            break
+        rows, t, end, speed = rows[alive], t[alive], end[alive], speed[alive]
+        origin, direction, sizes = origin[:, alive], direction[:, alive], sizes[:, alive]
+    return reached
+
+
+def _runs(scene: Scene, part: Tensor) -> list[tuple[Kind, slice]]:
+    """Rows of each kind, given part numbers in ascending order."""
+    runs, first, begin = [], 0, 0
+    for kind, count in scene.kinds:
+        first += count
+        end = int(torch.searchsorted(part, first))
+        if end > begin:
+            runs.append((kind, slice(begin, end)))
+        begin = end
+    return runs
+
+
+# --- light and paint
+
+
+def _shade(scene: Scene, hits: _Hits) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
+    """Light in [0, 1] and paint of every visible point."""
+    sizes = scene.sizes.T[:, hits.part]
+    normal = torch.empty_like(hits.local)
+    for kind, rows in _runs(scene, hits.part):
+        normal[:, rows] = _gradient(kind, hits.local[:, rows], sizes[:, rows])
+    to_local = scene.to_local.flatten(1).T[:, hits.part].reshape(3, 3, -1)
+    normal = torch.nn.functional.normalize((to_local * normal[:, None]).sum(0), dim=0)
+    light = torch.nn.functional.normalize(normal.new_tensor(LIGHT), dim=0)
+    facing = ((light @ normal + WRAP) / (1 + WRAP)).clamp_min(0)
+    sent = AMBIENT + SKY * (0.5 + 0.5 * normal[2]) + DIFFUSE * facing
+
+    is_second = torch.zeros_like(hits.part, dtype=torch.bool)
+    pattern = scene.patterns[hits.part]
+    for kind, rows in _runs(scene, hits.part):
+        for index, name in enumerate(PATTERN_NAMES):
+            chosen = (pattern[rows] == index).nonzero()[:, 0] + rows.start
+            if index == 0 or len(chosen) == 0:
+                continue
+            part = hits.part[chosen]
+            box = ((scene.high + scene.low) / 2).T[:, part], ((scene.high - scene.low) / 2).T[:, part]
+            is_second[chosen] = _paint_second(kind, name, hits.local[:, chosen], sizes[:, chosen], box)
+    return sent, torch.where(is_second, scene.paints[hits.part, 1], scene.paints[hits.part, 0])
+
+
+def _gradient(kind: Kind, points: Tensor, sizes: Tensor) -> Tensor:
+    """Gradient of the distance, up to a factor, from four points of a tetrahedron around each point."""
+    corners = points.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    probes = points[:, None] + NORMAL_STEP * corners.T[:, :, None]
+    distance = kind.sdf(probes.flatten(1), sizes.repeat(1, 4)).reshape(4, -1)
+    return corners.T @ distance
+
+
+def _paint_second(
+    kind: Kind, pattern: str, p: Tensor, sizes: Tensor, box: tuple[Tensor, Tensor]
+) -> Bool[Tensor, "n"]:
+    """Whether a point wears the second colour of its pattern."""
+    centre, half = box
+    unit = (p - centre) / half  # in [-1, 1]
+    if kind.wrap == "ring":
+        turn, roll = torch.atan2(p[1], p[0]), torch.atan2(p[2], p[:2].square().sum(0).sqrt() - sizes[0])
+        return _ring_pattern(pattern, turn / torch.pi, roll / torch.pi)
+    if pattern == "spotted":
+        direction = torch.nn.functional.normalize(unit, dim=0)
+        return (sphere_directions(SPOTS).to(p) @ direction).amax(0) > SPOT_COSINE
+    if kind.wrap == "flat":
+        # A hair smaller, so that faces do not fall on the border between two cells.
+        inner = 0.999 * unit
+        if pattern == "striped":
+            return _is_odd((inner[2] + 1) * 3)
+        return _is_odd_sum((inner + 1) * 2)
+    across = unit[:2].square().sum(0).sqrt().clamp_max(1)
+    height = (
+        torch.asin(unit[2].clamp(-1, 1)) / (torch.pi / 2) if kind.name == "ball" else unit[2] + 1 - across
+    )
+    band = 3 * height + 100.0  # positive for every solid
+    if pattern == "striped":
+        return _is_odd(band)
+    azimuth = torch.atan2(p[1], p[0]) / torch.pi
+    return _is_odd_sum(torch.stack([band, 4 * azimuth + 4]))
+
+
+def _ring_pattern(pattern: str, turn: Tensor, roll: Tensor) -> Bool[Tensor, "n"]:
+    """Patterns on a torus; both angles in half turns, [-1, 1]."""
+    if pattern == "striped":
+        return _is_odd((turn + 1) * 8)
+    if pattern == "checkered":
+        return _is_odd_sum(torch.stack([(turn + 1) * 7, (roll + 1) * 4]))
+    # Spots: one per cell of a staggered grid, round because a cell is about as long as it is high.
+    along, around = (turn + 1) * 6, (roll + 1) * 2
+    around = around + 0.5 * torch.remainder(along.floor(), 2)
+    return (torch.remainder(along, 1) - 0.5).square() + (torch.remainder(around, 1) - 0.5).square() < 0.09
+
+
+def _is_odd(x: Tensor) -> Bool[Tensor, "n"]:
+    return torch.remainder(x.floor(), 2) == 1
+
+
+def _is_odd_sum(x: Tensor) -> Bool[Tensor, "n"]:
+    return torch.remainder(x.floor().sum(0), 2) == 1
