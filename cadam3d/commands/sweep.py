@@ -5,7 +5,6 @@ asked for; it is written again after every job, because a sweep may be stopped.
 """
 
 import csv
-import json
 import logging
 import math
 import sys
@@ -17,12 +16,16 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from cadam3d.core.errors import UserError
+from cadam3d.io.atomic import replacing
+from cadam3d.io.jsonl import read_json, write_json
 from cadam3d.state import Outcome
 
 COLUMNS = (
     *("job", "overrides", "seed", "outcome", "num_gaussians", "asset_bytes", "seconds", "psnr"),
     *("message", "folder"),
 )
+SUMMARY = "summary.json"  # of a job
+UNFINISHED = "unfinished"  # the outcome of a job that is running, or that was killed
 SHOWN = ("job", "outcome", "num_gaussians", "asset_bytes", "seconds", "psnr", "overrides")
 
 log = logging.getLogger(__name__)
@@ -53,25 +56,24 @@ def finish(folder: Path) -> int:
         return 1
     print(as_text(rows))
     print(f"\n{len(rows)} jobs: {folder / 'sweep.csv'}")
-    return 1 if all(row["outcome"] == Outcome.FAILED for row in rows) else 0
+    return 1 if all(row["outcome"] in (Outcome.FAILED, UNFINISHED) for row in rows) else 0
 
 
 def write(folder: Path) -> list[dict[str, Any]]:
     """Gather the rows of the sweep in ``folder`` and write them to its ``sweep.csv`` in one move."""
     rows = gather(folder)
     if rows:
-        fresh = folder / ".sweep.csv"
-        with fresh.open("w", newline="", encoding="utf-8") as file:
+        path = folder / "sweep.csv"
+        with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, COLUMNS)
             writer.writeheader()
             writer.writerows(rows)
-        fresh.replace(folder / "sweep.csv")
     return rows
 
 
 def gather(folder: Path) -> list[dict[str, Any]]:
-    """One row per job that has ended, in the order of the jobs."""
-    return [_row(job) for job in jobs(folder) if (job / "summary.json").is_file()]
+    """One row per job that was started, in the order of the jobs."""
+    return [_row(job) for job in jobs(folder)]
 
 
 def jobs(folder: Path) -> list[Path]:
@@ -89,7 +91,8 @@ def as_text(rows: list[dict[str, Any]]) -> str:
 
 
 def _row(job: Path) -> dict[str, Any]:
-    summary = json.loads((job / "summary.json").read_text(encoding="utf-8"))
+    path = job / SUMMARY
+    summary = read_json(path) if path.is_file() else {"outcome": UNFINISHED}
     overrides = yaml.safe_load((job / ".hydra/overrides.yaml").read_text(encoding="utf-8")) or []
     told = {"job": _number(job), "overrides": " ".join(overrides), "folder": job.name}
     return {name: summary.get(name) for name in COLUMNS} | told
@@ -98,10 +101,9 @@ def _row(job: Path) -> dict[str, Any]:
 def _note_failure(folder: Path, cfg: DictConfig, message: str) -> None:
     """Leave the failure in the job's ``summary.json``, beside whatever training had written there."""
     print(f"cadam3d: {folder.name} failed: {message}", file=sys.stderr)
-    path = folder / "summary.json"
-    before = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {"prompt": cfg.prompt}
-    summary = {"seed": cfg.seed, **before, "outcome": str(Outcome.FAILED), "message": message}
-    path.write_text(json.dumps(summary, indent=2, ensure_ascii=False), encoding="utf-8")
+    path = folder / SUMMARY
+    before = read_json(path) if path.is_file() else {"prompt": cfg.prompt}
+    write_json(path, {"seed": cfg.seed, **before, "outcome": str(Outcome.FAILED), "message": message})
 
 
 def _number(job: Path) -> int:

@@ -1,0 +1,95 @@
+"""Opening what a run left behind: the shared first half of ``render``, ``export``, ``eval`` and ``view``."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from cadam3d.core.checks import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.render import RenderFn
+from cadam3d.exporter.base import Exporter
+from cadam3d.io.ply import read_ply
+from cadam3d.settings import component, load
+from cadam3d.trainer import render_fn, resolve_device
+
+ASSET = "asset.ply"
+CONFIG = "config.yaml"
+
+
+@dataclass(frozen=True)
+class Asset:
+    """Gaussians from disk, on the device asked for, and where they lay."""
+
+    gaussians: Gaussians
+    ply: Path  # the file they came from
+    folder: Path  # of the run; for a bare file, a folder named after it
+
+
+def open_asset(cfg: DictConfig) -> Asset:
+    """The asset that ``run=`` or ``ply=`` names, exactly one of which must be given."""
+    if (cfg.run is None) == (cfg.ply is None):
+        got = "neither" if cfg.run is None else "both"
+        raise UserError(f"run, ply: wanted one of them, got {got}. Try: run=outputs/latest")
+    if cfg.run is not None:
+        return open_run(find_run(cfg.run), cfg.device)
+    ply = Path(cfg.ply).expanduser()
+    gaussians = read_ply(ply, up=cfg.ply_up).to(resolve_device(cfg.device))
+    return Asset(gaussians=gaussians, ply=ply, folder=ply.with_suffix(""))
+
+
+def open_run(folder: Path, device: str) -> Asset:
+    """The asset of the run in ``folder``."""
+    ply = folder / ASSET
+    if not ply.is_file():
+        raise UserError(f"{shown(folder)}: has no {ASSET} yet. Try: cadam3d train resume={shown(folder)}")
+    return Asset(gaussians=read_ply(ply).to(resolve_device(device)), ply=ply, folder=folder)
+
+
+def find_run(text: str) -> Path:
+    """The folder of the run called ``text``."""
+    folder = Path(text).expanduser().resolve()
+    if (folder / CONFIG).is_file():
+        return folder
+    if not folder.is_dir():
+        reason = "no such folder"
+    elif (folder / "multirun.yaml").is_file():
+        reason = f"a sweep, which holds many runs; one of them is {_any_job(folder)}"
+    else:
+        reason = f"it holds no {CONFIG}"
+    raise UserError(f"run: wanted the folder of a run, got {text!r} ({reason}). Try: run=outputs/latest")
+
+
+def run_config(folder: Path) -> DictConfig:
+    """What the run in ``folder`` was configured with."""
+    return load(folder / CONFIG)
+
+
+def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
+    """Renders ``gaussians`` with the rasterizer that the configuration names."""
+    return render_fn(component(rasterizer), lambda: gaussians)
+
+
+def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
+    """Let every exporter of ``cfg`` write ``asset`` into ``folder``; returns what they wrote."""
+    exporters: Sequence[Exporter] = [component(node) for node in (cfg.exporter or {}).values()]
+    if not exporters:
+        raise UserError("exporter: wanted at least one, got none. Try: exporter=[images,turntable]")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise UserError(f"output: cannot write to {folder} ({reason}). Try: output=/tmp/cadam3d") from error
+    render = renderer(cfg.rasterizer, asset.gaussians)
+    return [path for exporter in exporters for path in exporter.export(asset.gaussians, render, folder)]
+
+
+def shown(path: Path) -> Path:
+    """``path`` as a user in the current folder would write it."""
+    path = path.resolve()
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def _any_job(sweep: Path) -> str:
+    return next((job.parent.name for job in sorted(sweep.glob(f"*/{CONFIG}"))), "not finished")

@@ -1,0 +1,69 @@
+"""``cadam3d eval``: how good is a finished run, or every run of a sweep."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from cadam3d.commands.asset import find_run, open_run, renderer, run_config, shown
+from cadam3d.commands.sweep import jobs
+from cadam3d.core.checks import UserError
+from cadam3d.io.jsonl import write_json
+from cadam3d.settings import component
+
+RESULT = "eval.json"
+
+
+def run(cfg: DictConfig) -> None:
+    """Measure ``run=`` and write its ``eval.json``; for a sweep, every job, and one ``eval.json`` of all."""
+    if cfg.run is None:
+        raise UserError("run: wanted a finished run or a sweep. Try: cadam3d eval run=outputs/latest")
+    folder = Path(cfg.run).expanduser().resolve()
+    if (folder / "multirun.yaml").is_file():
+        _evaluate_sweep(cfg, folder)
+        return
+    result = evaluate(cfg, find_run(cfg.run))
+    for name, value in result.items():
+        print(f"{name:<20}{value:.4f}" if isinstance(value, float) else f"{name:<20}{value}")
+    print(f"\n{shown(folder / RESULT)}")
+
+
+def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
+    """Measure the run in ``folder`` with the metrics of ``cfg``, and write its ``eval.json``.
+
+    The rasterizer and the prior are those of the run; the prior's true images, where it knows them, are what
+    ``psnr`` and ``ssim`` compare with. Without them those two do not exist, and a note says so.
+    """
+    source = run_config(folder)
+    asset = open_run(folder, cfg.device)
+    device = asset.gaussians.device
+    prior = component(source.prior).to(device)
+    truth = prior.truth(source.prompt)
+    render = renderer(source.rasterizer, asset.gaussians)
+    result: dict[str, Any] = {"run": str(shown(folder)), "prompt": source.prompt}
+    for node in cfg.metric.values():
+        result |= component(node).measure(asset.gaussians, render, truth)
+    if truth is None:
+        result["note"] = "this prior knows no true images, so there is no psnr and no ssim"
+    write_json(folder / RESULT, result)
+    return result
+
+
+def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
+    results, failures = [], 0
+    for job in jobs(folder):
+        try:
+            results.append(evaluate(cfg, find_run(str(job))))
+        except UserError as error:
+            failures += 1
+            results.append({"run": str(shown(job)), "message": str(error)})
+            print(f"cadam3d: {job.name}: {error}", file=sys.stderr)
+            continue
+        psnr = results[-1].get("psnr")
+        quality = "no psnr" if psnr is None else f"{psnr:6.2f} dB"
+        print(f"{quality}  {results[-1].get('num_gaussians', '-'):>8} Gaussians  {job.name}")
+    if failures == len(results):
+        raise UserError(f"run={cfg.run}: no job of this sweep could be measured. Try: cadam3d sweep again")
+    write_json(folder / RESULT, results)
+    print(f"\n{len(results)} jobs: {shown(folder / RESULT)}")

@@ -1,0 +1,38 @@
+"""``cadam3d export``: an asset in the form that another program wants."""
+
+import tempfile
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from cadam3d.commands.asset import Asset, export_all, open_asset, shown
+from cadam3d.core.checks import UserError
+
+
+def run(cfg: DictConfig) -> None:
+    """Write ``output``: a file if it has a suffix, else a folder (by default ``export`` beside the asset)."""
+    asset = open_asset(cfg)
+    target = Path(cfg.output).expanduser() if cfg.output else asset.folder / "export"
+    paths = [_one_file(cfg, asset, target)] if target.suffix else export_all(cfg, asset, target)
+    for path in paths:
+        print(f"{shown(path)}  {path.stat().st_size / 1e6:.2f} MB, {len(asset.gaussians)} Gaussians")
+
+
+def _one_file(cfg: DictConfig, asset: Asset, target: Path) -> Path:
+    """Export into a folder beside ``target``, then move the one file to its name in a single step."""
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".export-") as folder:
+            paths = export_all(cfg, asset, Path(folder))
+            suffixes = {path.suffix for path in paths}
+            if len(paths) != 1 or suffixes != {target.suffix}:
+                raise UserError(
+                    f"output={target}: the exporters write {len(paths)} file(s) with suffix "
+                    f"{'|'.join(sorted(suffixes))}. Try: output={target.with_suffix('')}, a folder"
+                )
+            return paths[0].replace(target)
+    except OSError as error:
+        reason = error.strerror or error
+        raise UserError(
+            f"output: cannot write {target} ({reason}). Try: output=/tmp/{target.name}"
+        ) from error
