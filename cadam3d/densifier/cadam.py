@@ -81,8 +81,8 @@ class CAdam(Densifier[CAdamState]):
             gradients = _over_population_rms(gradients)
         rows = is_updated[:, None]
         return CAdamState(
-            m=torch.where(rows, torch.lerp(gradients, state.m, self.beta1), state.m),
-            v=torch.where(rows, torch.lerp(gradients.square(), state.v, self.beta2), state.v),
+            m=torch.where(rows, torch.lerp(state.m, gradients, 1 - self.beta1), state.m),
+            v=torch.where(rows, torch.lerp(state.v, gradients.square(), 1 - self.beta2), state.v),
             age=state.age + is_updated,
         )
 

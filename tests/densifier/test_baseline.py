@@ -1,0 +1,204 @@
+"""Laws of the baseline, 3DGS adaptive density control (paper eq. 1)."""
+
+import math
+
+import pytest
+import torch
+
+from cadam3d.core.checks import UserError
+from cadam3d.core.edit import RowEdit
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.densifier.base import GradientSignal
+from cadam3d.densifier.baseline import VIEWS, Baseline, BaselineState
+
+CPU = torch.device("cpu")
+
+
+def baseline(**changes) -> Baseline:
+    return Baseline(**{"tau_pos": 2e-4, "views": "sum_norm", "grad_multiplier": 1.0, **changes})
+
+
+def signal(means2d: torch.Tensor, visible: torch.Tensor | None = None, height=2, width=2) -> GradientSignal:
+    """At 2 x 2 pixels one pixel is one NDC unit."""
+    visible = torch.ones(means2d.shape[:2], dtype=torch.bool) if visible is None else visible
+    return GradientSignal(
+        means=torch.zeros(means2d.shape[1], 3), means2d=means2d, visible=visible, height=height, width=width
+    )
+
+
+def mean_norms(densifier: Baseline, *signals: GradientSignal) -> torch.Tensor:
+    state = densifier.init_state(signals[0].means.shape[0], CPU)
+    for one in signals:
+        state = densifier.observe(state, one)
+    return state.norm_sum / state.sightings.clamp_min(1)
+
+
+def gradients(views: int, n: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(views, n, 2, generator=torch.Generator().manual_seed(seed))
+
+
+def test_the_criterion_is_the_mean_norm_over_steps():
+    steps = [gradients(1, 5, seed) for seed in range(4)]
+    expected = torch.stack([step[0].norm(dim=-1) for step in steps]).mean(dim=0)
+    torch.testing.assert_close(mean_norms(baseline(), *map(signal, steps)), expected)
+
+
+def test_noise_that_cancels_still_counts_in_full():
+    there_and_back = [signal(torch.full((1, 1, 2), sign * 3e-4)) for sign in (1.0, -1.0)]
+    state = baseline().init_state(1, CPU)
+    for one in there_and_back:
+        state = baseline().observe(state, one)
+    assert baseline().select(state).all()  # the dilemma of paper sec. 4.1
+
+
+def test_steps_that_do_not_see_a_gaussian_do_not_dilute_its_mean():
+    seen, unseen = torch.tensor([[True]]), torch.tensor([[False]])
+    once = signal(torch.full((1, 1, 2), 1.0), seen)
+    never = signal(torch.full((1, 1, 2), 1.0), unseen)
+    torch.testing.assert_close(mean_norms(baseline(), once, never, never), mean_norms(baseline(), once))
+
+
+def test_a_gaussian_never_seen_is_never_selected():
+    hidden = signal(torch.ones(1, 2, 2), torch.tensor([[True, False]]))
+    state = baseline().observe(baseline().init_state(2, CPU), hidden)
+    assert baseline().select(state).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("views", VIEWS)
+def test_the_criterion_does_not_depend_on_the_image_size(views):
+    densifier, pixel = baseline(views=views), gradients(2, 6)
+    small = mean_norms(densifier, signal(pixel, height=50, width=40))
+    large = mean_norms(densifier, signal(pixel / 4, height=200, width=160))  # the same scene, finer pixels
+    torch.testing.assert_close(small, large)
+
+
+def test_each_axis_is_scaled_by_its_own_half_size():
+    norms = mean_norms(baseline(), signal(torch.tensor([[[1.0, 0.0], [0.0, 1.0]]]), height=10, width=60))
+    assert norms.tolist() == [30.0, 5.0]
+
+
+@pytest.mark.parametrize("views", ["sum_norm", "sum_vector"])
+def test_the_order_of_the_views_in_a_batch_is_irrelevant(views):
+    pixel, visible = gradients(4, 9), torch.rand(4, 9, generator=torch.Generator().manual_seed(1)) > 0.4
+    order = torch.tensor([2, 0, 3, 1])
+    straight = mean_norms(baseline(views=views), signal(pixel, visible))
+    shuffled = mean_norms(baseline(views=views), signal(pixel[order], visible[order]))
+    torch.testing.assert_close(straight, shuffled)
+
+
+def test_a_batch_of_views_is_as_good_as_the_same_views_one_by_one():
+    pixel, visible = gradients(4, 9), torch.rand(4, 9, generator=torch.Generator().manual_seed(1)) > 0.4
+    one_by_one = [signal(pixel[i : i + 1], visible[i : i + 1]) for i in range(4)]
+    torch.testing.assert_close(
+        mean_norms(baseline(), signal(pixel, visible)), mean_norms(baseline(), *one_by_one)
+    )
+
+
+def test_the_views_of_a_batch_combine_as_asked():
+    pixel = torch.tensor([[[3.0, 0.0]], [[0.0, 4.0]], [[-3.0, 0.0]]])
+    visible = torch.tensor([[True], [True], [True]])
+    expected = {"sum_norm": 10 / 3, "sum_vector": 4.0, "last": 3.0}
+    for views, norm in expected.items():
+        assert float(mean_norms(baseline(views=views), signal(pixel, visible))) == pytest.approx(norm)
+
+
+def test_only_the_last_view_decides_who_was_seen_under_last():
+    visible = torch.tensor([[True, False], [False, True]])
+    state = baseline(views="last").observe(
+        baseline().init_state(2, CPU), signal(torch.ones(2, 2, 2), visible)
+    )
+    assert state.sightings.tolist() == [0, 1]
+
+
+def test_reaching_the_threshold_is_enough():
+    norms = torch.tensor([[[0.5, 0.0], [0.25, 0.0], [0.1875, 0.0]]])
+    densifier = baseline(tau_pos=0.25)
+    state = densifier.observe(densifier.init_state(3, CPU), signal(norms))
+    assert densifier.select(state).tolist() == [True, True, False]
+
+
+def test_the_multiplier_undoes_a_loss_scale():
+    pixel = gradients(2, 6)
+    plain = mean_norms(baseline(), signal(pixel))
+    torch.testing.assert_close(mean_norms(baseline(grad_multiplier=8.0), signal(pixel / 8)), plain)
+
+
+def test_the_accumulators_are_cleared_by_every_refinement():
+    state = baseline().observe(baseline().init_state(4, CPU), signal(gradients(1, 4)))
+    child = Gaussians(
+        means=torch.zeros(1, 3),
+        log_scales=torch.zeros(1, 3),
+        quats=torch.ones(1, 4),
+        opacity_logits=torch.zeros(1),
+        sh=torch.zeros(1, 1, 3),
+    )
+    after = state.carry(RowEdit(keep=torch.tensor([0, 1, 3]), children=child, parents=torch.tensor([2])))
+    assert after.norm_sum.tolist() == [0.0] * 4
+    assert after.sightings.tolist() == [0] * 4
+
+
+def test_observe_leaves_the_old_state_and_the_signal_alone():
+    before = baseline().observe(baseline().init_state(4, CPU), signal(gradients(2, 4)))
+    copy = BaselineState(norm_sum=before.norm_sum.clone(), sightings=before.sightings.clone())
+    pixel = gradients(2, 4, seed=1)
+    evidence = signal(pixel.clone())
+    for views in VIEWS:
+        baseline(views=views).observe(before, evidence)
+    assert torch.equal(before.norm_sum, copy.norm_sum)
+    assert torch.equal(before.sightings, copy.sightings)
+    assert torch.equal(evidence.means2d, pixel)
+
+
+@pytest.mark.parametrize("views", VIEWS)
+def test_observe_never_waits_for_the_device(views):
+    meta = torch.device("meta")  # its tensors have no values, so reading one is an error
+    evidence = GradientSignal(
+        means=torch.empty(4, 3, device=meta),
+        means2d=torch.empty(2, 4, 2, device=meta),
+        visible=torch.empty(2, 4, dtype=torch.bool, device=meta),
+        height=8,
+        width=8,
+    )
+    densifier = baseline(views=views)
+    assert densifier.observe(densifier.init_state(4, meta), evidence).norm_sum.shape == (4,)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize("views", VIEWS)
+def test_a_gradient_that_is_not_finite_counts_as_not_seen(views, bad):
+    pixel, visible = gradients(2, 3), torch.ones(2, 3, dtype=torch.bool)
+    broken, hidden = pixel.clone(), visible.clone()
+    broken[1, 2, 0], hidden[1, 2] = bad, False
+    densifier = baseline(views=views)
+    torch.testing.assert_close(
+        mean_norms(densifier, signal(broken, visible)), mean_norms(densifier, signal(pixel, hidden))
+    )
+
+
+def test_everybody_is_reset():
+    state = baseline().init_state(3, CPU)
+    assert baseline().unreliable(state).tolist() == [True] * 3
+
+
+def test_statistics_say_what_the_densifier_saw():
+    pixel = torch.zeros(1, 11, 2)
+    pixel[0, :, 0] = torch.arange(11) * 1e-4
+    numbers = baseline(tau_pos=4.5e-4).statistics(
+        baseline().observe(baseline().init_state(11, CPU), signal(pixel))
+    )
+    assert numbers["gradient_p10"] == pytest.approx(1e-4)
+    assert numbers["gradient_p50"] == pytest.approx(5e-4)
+    assert numbers["gradient_p90"] == pytest.approx(9e-4)
+    assert numbers["share_above_tau_pos"] == pytest.approx(6 / 11)
+
+
+def test_an_empty_scene_is_no_problem():
+    state = baseline().observe(baseline().init_state(0, CPU), signal(torch.zeros(2, 0, 2)))
+    assert baseline().select(state).shape == (0,)
+    assert baseline().statistics(state) == {}
+
+
+@pytest.mark.parametrize(("key", "value"), [("tau_pos", 0.0), ("views", "first"), ("grad_multiplier", 0.0)])
+def test_an_impossible_value_is_refused_by_name(key, value):
+    with pytest.raises(UserError, match=rf"densifier\.{key}"):
+        baseline(**{key: value})

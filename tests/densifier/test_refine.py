@@ -1,0 +1,331 @@
+"""Laws of refinement: when it happens, how Gaussians clone, split and vanish, and that all owners agree."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from cadam3d.core.checks import UserError
+from cadam3d.core.gaussians import FIELDS, Gaussians
+from cadam3d.densifier.base import GradientSignal
+from cadam3d.densifier.baseline import Baseline
+from cadam3d.densifier.cadam import CAdam
+from cadam3d.densifier.none import NoGrowth
+from cadam3d.densifier.refine import Refine
+from cadam3d.optimizer import AdamSettings
+
+CPU = torch.device("cpu")
+LATE = 10_000  # a step at which nothing is scheduled
+
+
+def refine(**changes) -> Refine:
+    usual = {
+        "start": 100,
+        "end": 3000,
+        "interval": 100,
+        "tau_scale": 0.05,
+        "split_children": 2,
+        "split_shrink": 1.6,
+        "min_opacity": 0.005,
+        "max_scale": None,
+        "prune_from": 0,
+        "reset_interval": None,
+        "reset_from": 0,
+        "reset_until": 3000,
+        "reset_value": 0.01,
+        "prune_grace": 0,
+        "max_gaussians": None,
+    }
+    return Refine(**{**usual, **changes})
+
+
+def gaussians(n: int, seed: int = 0) -> Gaussians:
+    """Half of them smaller than tau_scale, half larger; all well visible."""
+    draw = torch.Generator().manual_seed(seed)
+    scales = torch.empty(n, 3).uniform_(0.01, 0.02, generator=draw)
+    scales[n // 2 :, 1] *= 10
+    return Gaussians(
+        means=torch.randn(n, 3, generator=draw),
+        log_scales=scales.log(),
+        quats=torch.randn(n, 4, generator=draw),
+        opacity_logits=torch.rand(n, generator=draw),
+        sh=torch.randn(n, 4, 3, generator=draw),
+    )
+
+
+def some(n: int, seed: int = 1) -> torch.Tensor:
+    return torch.rand(n, generator=torch.Generator().manual_seed(seed)) < 0.5
+
+
+def draw(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def with_opacity(scene: Gaussians, opacities: list[float]) -> Gaussians:
+    return replace(scene, opacity_logits=torch.tensor(opacities).logit())
+
+
+# When.
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "expected"),
+    [
+        (300, 900, range(400, 801, 100)),  # GaussianDreamer: 5 calls
+        (100, 3000, range(200, 2901, 100)),  # LucidDreamer: 28 calls
+        (100, 1500, range(200, 1401, 100)),  # FlowDreamer: 13 calls
+    ],
+)
+def test_refinements_happen_at_the_steps_of_the_published_recipes(start, end, expected):
+    schedule = refine(start=start, end=end)
+    assert [step for step in range(1, 4000) if schedule.refines_at(step)] == list(expected)
+
+
+@pytest.mark.parametrize(
+    ("first", "until", "expected"),
+    [
+        (300, 3000, range(300, 2701, 300)),  # LucidDreamer
+        (500, 1500, range(600, 1201, 300)),  # FlowDreamer, whose warm-up ends at 500
+    ],
+)
+def test_resets_happen_at_the_steps_of_the_published_recipes(first, until, expected):
+    schedule = refine(reset_interval=300, reset_from=first, reset_until=until)
+    assert [step for step in range(1, 4000) if schedule.resets_at(step)] == list(expected)
+
+
+def test_without_an_interval_there_is_no_reset():
+    assert not any(refine(reset_interval=None).resets_at(step) for step in range(1, 4000))
+
+
+# Growth.
+
+
+def test_clones_and_splits_partition_the_selection_by_scale():
+    scene, selected = gaussians(40), some(40)
+    plan = refine().plan(scene, selected, LATE, draw())
+    is_large = scene.scales.amax(dim=-1) > 0.05
+    stays = torch.zeros(40, dtype=torch.bool)
+    stays[plan.edit.keep] = True
+    assert torch.equal(stays, ~(selected & is_large))  # split parents go, clone parents stay
+    births = torch.bincount(plan.edit.parents, minlength=40)
+    assert torch.equal(births, selected * torch.where(is_large, 2, 1))
+    assert (plan.cloned, plan.split) == (int((selected & ~is_large).sum()), int((selected & is_large).sum()))
+    assert plan.cloned > 0
+    assert plan.split > 0
+
+
+@pytest.mark.parametrize("children", [2, 3, 5])
+def test_the_counts_add_up(children):
+    scene = gaussians(60)
+    scene.opacity_logits[::7] = -9.0
+    plan = refine(split_children=children).plan(scene, some(60), LATE, draw())
+    assert plan.selected == plan.cloned + plan.split == int(some(60).sum())
+    assert plan.edit.rows_after == 60 + plan.cloned + (children - 1) * plan.split - plan.pruned
+    assert plan.pruned > 0
+    assert len(plan.edit.apply(scene)) == plan.edit.rows_after
+
+
+def test_nobody_selected_means_nobody_changes():
+    scene = gaussians(10)
+    plan = refine().plan(scene, torch.zeros(10, dtype=torch.bool), LATE, draw())
+    after = plan.edit.apply(scene)
+    assert all(torch.equal(getattr(after, name), getattr(scene, name)) for name in FIELDS)
+
+
+def test_a_clone_is_its_parent_again():
+    scene = gaussians(6)
+    scene.log_scales[:] = -5.0
+    plan = refine().plan(scene, some(6), LATE, draw())
+    for name in FIELDS:
+        assert torch.equal(getattr(plan.edit.children, name), getattr(scene, name)[plan.edit.parents])
+
+
+def test_split_children_are_smaller_by_the_shrink_and_otherwise_like_their_parent():
+    scene = gaussians(12)
+    scene.log_scales[:] += 3.0
+    plan = refine().plan(scene, some(12), LATE, draw())
+    children, parents = plan.edit.children, scene.index(plan.edit.parents)
+    torch.testing.assert_close(children.scales * 1.6, parents.scales)
+    for name in ("quats", "opacity_logits", "sh"):
+        assert torch.equal(getattr(children, name), getattr(parents, name))
+    assert (children.means != parents.means).any(dim=-1).all()
+
+
+def test_split_children_lie_where_their_parent_has_its_density():
+    n = 4000
+    one = gaussians(2).index(torch.tensor([1]))
+    scene = one.map(lambda tensor: tensor.repeat(n, *[1] * (tensor.ndim - 1)))
+    scene.log_scales[:] = torch.tensor([0.2, 0.6, 1.0]).log()
+    plan = refine().plan(scene, torch.ones(n, dtype=torch.bool), LATE, draw())
+    offsets = plan.edit.children.means - one.means
+    axes = one.rotations[0]
+    expected = axes @ torch.diag(torch.tensor([0.04, 0.36, 1.0])) @ axes.T
+    torch.testing.assert_close(offsets.T @ offsets / len(offsets), expected, atol=0.04, rtol=0)
+    torch.testing.assert_close(offsets.mean(dim=0), torch.zeros(3), atol=0.04, rtol=0)
+
+
+def test_the_plan_is_decided_by_the_generator():
+    scene, everybody = gaussians(10), torch.ones(10, dtype=torch.bool)
+    first, again, other = (refine().plan(scene, everybody, LATE, draw(seed)) for seed in (0, 0, 1))
+    assert torch.equal(first.edit.children.means, again.edit.children.means)
+    assert not torch.equal(first.edit.children.means, other.edit.children.means)
+
+
+def test_planning_changes_nothing_and_leaves_no_graph():
+    scene = gaussians(10).map(lambda tensor: tensor.requires_grad_())
+    copies = {name: tensor.detach().clone() for name, tensor in scene.tensors().items()}
+    plan = refine().plan(scene, torch.ones(10, dtype=torch.bool), LATE, draw())
+    assert all(torch.equal(getattr(scene, name), copy) for name, copy in copies.items())
+    assert not any(tensor.requires_grad for tensor in plan.edit.children.tensors().values())
+
+
+# Pruning.
+
+
+def test_the_faint_are_pruned_whether_old_or_newborn():
+    scene = with_opacity(gaussians(4), [0.004, 0.006, 0.004, 0.006])  # two clones, two splits
+    plan = refine().plan(scene, torch.tensor([True, False, True, False]), LATE, draw())
+    assert plan.edit.keep.tolist() == [1, 3]
+    assert len(plan.edit.children) == 0
+    assert plan.pruned == 1 + 1 + 2  # a survivor, its clone, and both children of a split
+
+
+def test_the_large_are_pruned_only_after_prune_from():
+    scene = gaussians(4)
+    scene.log_scales[3, 0] = 0.0
+    schedule, nobody = refine(max_scale=0.5, prune_from=500), torch.zeros(4, dtype=torch.bool)
+    assert schedule.plan(scene, nobody, 500, draw()).pruned == 0
+    assert schedule.plan(scene, nobody, 501, draw()).edit.keep.tolist() == [0, 1, 2]
+
+
+def test_the_children_of_a_split_are_judged_by_their_own_scale():
+    scene = gaussians(1)
+    scene.log_scales[:] = torch.tensor(0.6).log()
+    plan = refine(max_scale=0.5).plan(scene, torch.ones(1, dtype=torch.bool), LATE, draw())
+    assert plan.pruned == 0
+    assert plan.edit.rows_after == 2
+
+
+@pytest.mark.parametrize("name", ["means", "log_scales", "opacity_logits"])
+def test_rows_with_nan_are_pruned(name):
+    scene = gaussians(4)
+    getattr(scene, name)[2] = torch.nan
+    plan = refine(max_scale=10.0).plan(scene, torch.zeros(4, dtype=torch.bool), LATE, draw())
+    assert plan.edit.keep.tolist() == [0, 1, 3]
+
+
+def test_opacity_does_not_prune_during_the_grace_after_a_reset():
+    scene, nobody = with_opacity(gaussians(2), [0.01, 0.9]), torch.zeros(2, dtype=torch.bool)
+    schedule = refine(reset_interval=300, reset_from=300, prune_grace=100, min_opacity=0.05)
+    pruned = {
+        step: schedule.plan(scene, nobody, step, draw()).pruned for step in (200, 300, 301, 400, 401, 700)
+    }
+    assert pruned == {200: 1, 300: 1, 301: 0, 400: 0, 401: 1, 700: 0}
+
+
+def test_everybody_may_vanish():
+    scene = with_opacity(gaussians(2), [1e-4, 1e-4])
+    plan = refine().plan(scene, torch.ones(2, dtype=torch.bool), LATE, draw())
+    assert plan.edit.rows_after == 0
+    assert len(plan.edit.apply(scene)) == 0
+
+
+def test_an_empty_scene_is_no_problem():
+    plan = refine().plan(gaussians(0), torch.zeros(0, dtype=torch.bool), LATE, draw())
+    assert (plan.edit.rows_after, plan.selected, plan.pruned) == (0, 0, 0)
+
+
+# The cap.
+
+
+def test_a_plan_exceeds_the_cap_by_its_count_after_the_edit():
+    scene, everybody = gaussians(10), torch.ones(10, dtype=torch.bool)
+    plan = refine().plan(scene, everybody, LATE, draw())
+    assert plan.edit.rows_after == 20
+    assert refine(max_gaussians=19).exceeds(plan)
+    assert not refine(max_gaussians=20).exceeds(plan)
+    assert not refine(max_gaussians=None).exceeds(plan)
+
+
+# The three owners of rows.
+
+
+@pytest.mark.parametrize(
+    "densifier",
+    [
+        NoGrowth(),
+        Baseline(tau_pos=0.1, views="sum_norm", grad_multiplier=1.0),
+        CAdam(
+            tau_Q=0.7,
+            tau_SNR=0.1,
+            beta1=0.9,
+            beta2=0.999,
+            eps=1e-15,
+            invisible="zero",
+            min_age=0,
+            quantile_over="all",
+            reset_min_age=0,
+            grad_norm="none",
+            nonfinite="skip_step",
+        ),
+    ],
+    ids=["none", "baseline", "cadam"],
+)
+def test_gaussians_moments_and_densifier_state_stay_in_step_through_many_edits(densifier):
+    rates = ("means_lr", "sh_dc_lr", "sh_rest_lr", "opacity_lr", "scale_lr", "quat_lr")
+    optimizer = AdamSettings(**dict.fromkeys(rates, 0.01), beta1=0.9, beta2=0.999, eps=1e-15).start(
+        gaussians(30)
+    )
+    state, noise = densifier.init_state(30, CPU), draw(5)
+    for step in range(1, 40):
+        n = len(optimizer.gaussians)
+        optimizer.gaussians.means.grad = torch.randn(n, 3, generator=noise)
+        signal = GradientSignal(
+            means=optimizer.gaussians.means.grad.clone(),
+            means2d=torch.randn(2, n, 2, generator=noise) * 0.02,
+            visible=torch.ones(2, n, dtype=torch.bool),
+            height=8,
+            width=8,
+        )
+        state = densifier.observe(state, signal)
+        optimizer.step(step)
+        if step % 10 == 0:
+            plan = refine().plan(optimizer.gaussians, densifier.select(state), LATE, noise)
+            optimizer.apply(plan.edit)
+            state = state.carry(plan.edit)
+        counts = {len(rows) for rows in state.to_dict().values()}
+        counts |= {len(rows) for rows in optimizer.state_dict()["exp_avg"].values()}
+        counts |= {len(tensor) for tensor in optimizer.gaussians.tensors().values()}
+        assert counts == {len(optimizer.gaussians)}
+    assert (len(optimizer.gaussians) > 30) == (not isinstance(densifier, NoGrowth))
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("start", -1),
+        ("interval", 0),
+        ("tau_scale", 0.0),
+        ("split_children", 1),
+        ("split_shrink", 0.5),
+        ("min_opacity", 1.0),
+        ("max_scale", 0.0),
+        ("reset_interval", 0),
+        ("reset_value", 1.0),
+        ("prune_grace", -1),
+        ("max_gaussians", 0),
+    ],
+)
+def test_an_impossible_value_is_refused_by_name(key, value):
+    with pytest.raises(UserError, match=rf"refine\.{key}"):
+        refine(**{key: value})
+
+
+def test_a_reset_that_would_delete_is_refused():
+    with pytest.raises(UserError, match=r"refine\.min_opacity.*refine\.prune_grace=100"):
+        refine(reset_interval=300, min_opacity=0.05)
+
+
+def test_a_grace_without_end_is_refused():
+    with pytest.raises(UserError, match=r"refine\.prune_grace.*refine\.reset_interval=300"):
+        refine(reset_interval=300, prune_grace=300)
