@@ -127,8 +127,8 @@ class Trainer:
         while state.step < self.steps:
             started = time.perf_counter()
             try:
-                report, signal = self._step(state, embedding)
-                refined, outcome = self._refine(state, signal)
+                report = self._step(state, embedding)
+                refined, outcome = self._refine(state)
             except (torch.OutOfMemoryError, MemoryError):
                 return Outcome.OUT_OF_MEMORY
             except RuntimeError as error:
@@ -147,8 +147,8 @@ class Trainer:
                 return Outcome.INTERRUPTED
         return Outcome.FINISHED
 
-    def _step(self, state: TrainState, embedding: PromptEmbedding) -> tuple[StepReport, GradientSignal | None]:
-        """Render, judge, differentiate, observe and step. No signal if a gradient was not finite."""
+    def _step(self, state: TrainState, embedding: PromptEmbedding) -> StepReport:
+        """Render, judge, differentiate, observe and step."""
         gaussians, draw = state.gaussians, state.generators
         cameras = self.camera.sample(state.step, self.views, draw["camera"]).to(gaussians.device)
         background = self.background.sample(self.views, draw["background"]).to(gaussians.device)
@@ -156,31 +156,27 @@ class Trainer:
         condition = embedding.at(cameras, background)
         judged = self.guidance(output.rgb, condition, self.prior, state.step, draw["guidance"])
         penalties = {name: fn(gaussians, output, state.step) for name, fn in self.regularizers.items()}
-        loss = judged.loss + sum(penalties.values())
+        loss = sum(penalties.values(), start=judged.loss)
         loss.backward()
 
-        report = StepReport(
+        state.densifier = self.densifier.observe(state.densifier, _signal(gaussians, output))
+        if state.optimizer.finite_gradients():
+            state.optimizer.step(state.step)
+        else:
+            state.skipped += 1
+            state.optimizer.zero_grad()
+        return StepReport(
             step=state.step + 1,
             loss=float(loss.detach()),
             log={**judged.log, **{name: float(value.detach()) for name, value in penalties.items()}},
             num_gaussians=len(gaussians),
         )
-        if not state.optimizer.finite_gradients():
-            state.skipped += 1
-            state.optimizer.zero_grad()
-            return report, None
-        signal = _signal(gaussians, output)
-        state.densifier = self.densifier.observe(state.densifier, signal)
-        state.optimizer.step(state.step)
-        return report, signal
 
-    def _refine(
-        self, state: TrainState, signal: GradientSignal | None
-    ) -> tuple[RefineReport | None, Outcome | None]:
+    def _refine(self, state: TrainState) -> tuple[RefineReport | None, Outcome | None]:
         """Grow, prune and reset where the schedule says so: a pure plan, then one edit for every owner of rows."""
         step = state.step + 1
         refines, resets = self.refine.refines_at(step), self.refine.resets_at(step)
-        if signal is None or not (refines or resets):
+        if not (refines or resets):
             return None, None
         statistics = self.densifier.statistics(state.densifier)
         before = len(state.gaussians)

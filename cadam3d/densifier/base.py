@@ -33,7 +33,10 @@ class Densifier(ABC, Generic[State]):
 
     @abstractmethod
     def observe(self, state: State, signal: GradientSignal) -> State:
-        """The state after one more step; ``state`` itself is left alone. Called at every step."""
+        """The state after one more step; ``state`` itself is left alone. Called at every step.
+
+        A gradient may hold NaN or infinities (the loop then skips the optimizer step); none may enter the state.
+        """
 
     @abstractmethod
     def select(self, state: State) -> Bool[Tensor, "n"]:
