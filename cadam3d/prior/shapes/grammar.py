@@ -1,11 +1,12 @@
-"""From a prompt to a sentence: noun phrases joined by relations.
+"""From a prompt to a sentence: noun phrases joined by relations, read from the left.
 
-sentence = phrase (relation phrase)*          relation = on | under | above | next to | in front of | behind | and
-         | phrase "between" phrase "and" phrase
+sentence = phrase | phrase relation sentence | phrase "between" phrase "and" sentence
+relation = "on" | "under" | "above" | "next to" | "in front of" | "behind" | "and", which means next to
 phrase   = (article | number | size | colour | "and" | pattern)* noun
 """
 
 import difflib
+import math
 import re
 from dataclasses import dataclass
 
@@ -43,10 +44,11 @@ class Phrase:
 
 @dataclass(frozen=True)
 class Sentence:
-    """``phrases[i + 1]`` is what ``relations[i]`` relates ``phrases[i]`` to; "between" takes two."""
+    """A phrase, and how it stands to what follows: "a cube on (a ball on a table)"."""
 
-    phrases: tuple[Phrase, ...]
-    relations: tuple[str, ...]
+    phrase: Phrase
+    relation: str | None = None
+    others: tuple["Sentence", ...] = ()  # two for "between", none without a relation, else one
 
 
 def known_words() -> dict[str, tuple[str, ...]]:
@@ -70,18 +72,7 @@ def parse(prompt: str) -> Sentence:
     """
     words = _join_compounds(re.findall(r"[a-z0-9]+", prompt.lower()))
     _reject_unknown(prompt, words)
-    words = [word for word in words if word not in FILLERS or word == "of"]
-    reader = _Reader(prompt, words)
-    phrases, relations = [reader.phrase()], []
-    while not reader.done():
-        relation = reader.relation()
-        relations.append(relation)
-        phrases.append(reader.phrase())
-        if relation == "between":
-            reader.expect("and")
-            phrases.append(reader.phrase())
-            relations.append("and of between")
-    return Sentence(tuple(phrases), tuple(relations))
+    return _Reader(prompt, [word for word in words if word not in FILLERS | ARTICLES]).sentence()
 
 
 def noun_of(word: str) -> str | None:
@@ -101,66 +92,77 @@ def is_plural(word: str) -> bool:
 
 
 class _Reader:
-    """A cursor over the words of one prompt."""
+    """A cursor over the words of one prompt, articles and fillers left out."""
 
     def __init__(self, prompt: str, words: list[str]) -> None:
         self.prompt, self.words, self.position = prompt, words, 0
 
-    def done(self) -> bool:
-        return all(word in ARTICLES or word == "of" for word in self.words[self.position :])
+    def sentence(self) -> Sentence:
+        phrase = self.phrase()
+        relation = self.relation()
+        if relation is None:
+            return Sentence(phrase)
+        if relation != "between":
+            return Sentence(phrase, relation, (self.sentence(),))
+        first = Sentence(self.phrase())
+        if not self.take("and"):
+            raise self.fail("'between' wants two objects joined by 'and'")
+        return Sentence(phrase, relation, (first, self.sentence()))
 
-    def fail(self, reason: str) -> UserError:
-        return UserError(f"prompt {self.prompt!r}: {reason}. {TRY}")
+    def phrase(self) -> Phrase:
+        start = self.position
+        while (word := self.peek()) is not None and noun_of(word) is None:
+            self.position += 1
+        if word is None:
+            raise self.fail("an object is missing" + (" at the end" if self.words else ""))
+        self.position += 1
+        described = self.words[start : self.position - 1]
+        return Phrase(
+            noun=noun_of(word) or word,
+            colours=self.colours(described),
+            pattern=next((PATTERNS[near] for near in described if near in PATTERNS), None),
+            size=math.prod(SIZES.get(near, 1.0) for near in described),
+            stretch=next((STRETCHES[near] for near in described if near in STRETCHES), (1.0, 1.0, 1.0)),
+            count=next((NUMBERS[near] for near in described if near in NUMBERS), 2 if is_plural(word) else 1),
+        )
+
+    def colours(self, described: list[str]) -> tuple[str, ...]:
+        """The colours among the words before a noun; refuses words that cannot stand there."""
+        adjectives = {*COLOURS, *COLOUR_ALIASES, *SHADES, *PATTERNS, *SIZES, *STRETCHES, *NUMBERS, "and"}
+        for word in described:
+            if word not in adjectives:
+                raise self.fail(f"an object is missing before {word!r}")
+        colours = []
+        for before, word in zip(["", *described], [*described, "end"], strict=True):
+            colour = COLOUR_ALIASES.get(word, word)
+            if colour in COLOURS:
+                colours.append(f"{before} {colour}" if before in SHADES else colour)
+            elif before in SHADES:
+                raise self.fail(f"{before!r} wants a colour after it")
+        if len(colours) > MAX_COLOURS:
+            raise self.fail(f"at most {MAX_COLOURS} colours for one object, got {', '.join(colours)}")
+        return tuple(colours)
+
+    def relation(self) -> str | None:
+        """Step over the relation at the cursor; None at the end."""
+        for words, name in RELATIONS:
+            if self.take(*words):
+                return name
+        if self.peek() is not None:
+            raise self.fail(f"wanted a relation such as 'on' or 'next to' before {self.peek()!r}")
+        return None
+
+    def take(self, *words: str) -> bool:
+        """Step over ``words`` if they come next."""
+        is_next = tuple(self.words[self.position : self.position + len(words)]) == words
+        self.position += len(words) * is_next
+        return is_next
 
     def peek(self) -> str | None:
         return self.words[self.position] if self.position < len(self.words) else None
 
-    def expect(self, word: str) -> None:
-        if self.peek() != word:
-            raise self.fail(f"wanted {word!r} after {self.words[self.position - 1]!r}")
-        self.position += 1
-
-    def relation(self) -> str:
-        for words, name in RELATIONS:
-            if tuple(self.words[self.position : self.position + len(words)]) == words:
-                self.position += len(words)
-                return name
-        if self.peek() == "and":
-            self.position += 1
-            return "next to"
-        raise self.fail(f"wanted a relation such as 'on' or 'next to' before {self.peek()!r}")
-
-    def phrase(self) -> Phrase:
-        colours: list[str] = []
-        pattern, size, stretch, count, shade = None, 1.0, (1.0, 1.0, 1.0), None, None
-        while (word := self.peek()) is not None:
-            self.position += 1
-            colour = COLOUR_ALIASES.get(word, word)
-            if (noun := noun_of(word)) is not None:
-                break
-            if colour in COLOURS:
-                colours.append(f"{shade} {colour}" if shade else colour)
-                shade = None
-            elif word in SHADES:
-                shade = word
-            elif word in PATTERNS:
-                pattern = PATTERNS[word]
-            elif word in SIZES:
-                size = SIZES[word]
-            elif word in STRETCHES:
-                stretch = STRETCHES[word]
-            elif word in NUMBERS:
-                count = NUMBERS[word]
-            elif not (word in ARTICLES or word == "of" or (word == "and" and colours)):
-                raise self.fail(f"wanted an object before {word!r}")
-        else:
-            raise self.fail("no object named" if not self.words else "an object is missing at the end")
-        if len(colours) > MAX_COLOURS:
-            raise self.fail(f"at most {MAX_COLOURS} colours for one object, got {', '.join(colours)}")
-        if shade:
-            raise self.fail(f"{shade!r} wants a colour after it")
-        count = count or (2 if is_plural(word) else 1)
-        return Phrase(noun, tuple(colours), pattern, size, stretch, count)
+    def fail(self, reason: str) -> UserError:
+        return UserError(f"prompt {self.prompt!r}: {reason}. {TRY}")
 
 
 def _join_compounds(words: list[str]) -> list[str]:
@@ -184,7 +186,7 @@ def _join_compounds(words: list[str]) -> list[str]:
 
 
 def _reject_unknown(prompt: str, words: list[str]) -> None:
-    vocabulary = {part for group in known_words().values() for words_ in group for part in words_.split()}
+    vocabulary = {part for group in known_words().values() for entry in group for part in entry.split()}
     vocabulary |= ARTICLES | FILLERS | {"and"}
     unknown = [word for word in dict.fromkeys(words) if word not in vocabulary and noun_of(word) is None]
     if not unknown:
@@ -195,5 +197,6 @@ def _reject_unknown(prompt: str, words: list[str]) -> None:
         named.append(f"{word!r}" + (f" (did you mean {' or '.join(near)}?)" if near else ""))
     listed = "\n".join(f"  {group}: {', '.join(known)}" for group, known in known_words().items())
     raise UserError(
-        f"prompt {prompt!r}: prior=shapes does not know {', '.join(named)}. It knows\n{listed}\n{FREE_TEXT} {TRY}"
+        f"prompt {prompt!r}: prior=shapes does not know {', '.join(named)}. It knows\n{listed}\n"
+        f"{FREE_TEXT} {TRY}"
     )

@@ -1,13 +1,13 @@
 """A Gaussian mixture over images and its denoiser in closed form.
 
-p(x) = sum_m w_m N(x; mu_m, diag(sigma^2)) and noisy = a x + b eps give, with s^2 = a^2 sigma^2 + b^2 per pixel,
+With p(x) = sum_m w_m N(x; mu_m, diag(sigma^2)), noisy = a x + b eps and s^2 = a^2 sigma^2 + b^2 per pixel,
 
     r_m      = softmax_m(log w_m + log N(noisy; a mu_m, s^2))                    responsibility of mode m
     E[x]     = sum_m r_m (mu_m + a sigma^2 / s^2 (noisy - a mu_m))               given noisy
     E[eps]   = sum_m r_m  b / s^2 (noisy - a mu_m)                               given noisy
 
-(Bayes' rule for a linear Gaussian observation). Then noisy = a E[x] + b E[eps] holds exactly, and E[eps] = -b times the
-score of the noisy density (Tweedie's formula).
+by Bayes' rule for a linear Gaussian observation. So noisy = a E[x] + b E[eps] holds exactly, and E[eps] is
+-b times the score of the noisy density (Tweedie's formula).
 """
 
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ from torch import Tensor
 
 from cadam3d.prior.path import per_view
 
-# Where a pixel is certain (sigma = 0) and free of noise (b = 0), the posterior is 0 / 0. A variance that no image
-# shows stands in: the answer is then the limit b -> 0 of the model at hand, the nearest mode.
+# Where a pixel is certain (sigma = 0) and free of noise (b = 0), the posterior is 0 / 0. A variance too small
+# to see stands in, which gives the limit b -> 0: the nearest mode.
 VARIANCE_FLOOR = 1e-12
 
 

@@ -1,6 +1,6 @@
 """The things of the world: primitives and composed objects, each a handful of painted solids.
 
-Own coordinates: +z up, standing anywhere, front at +x; seen from the front, +y is to the right. Units do not matter,
+Own coordinates: +z up, front at +x; seen from the front, +y is to the right. Position and unit do not matter,
 since ``natural`` says how large a thing is beside others.
 """
 
@@ -429,22 +429,21 @@ def _lamp() -> Thing:
 
 
 def _boat() -> Thing:
-    sail = pyramid(0.06, 1.10, 1.20)
     return Thing(
         (
             _p(box(1.10, 0.62, 0.34).at(-0.15, 0, 0.27), MAIN),
-            _p(gable(0.62, 0.68, 0.60).turned("x", 90).turned("y", 90).turned("x", 90)
-               .at(0.70, 0, 0.27).stretched(1.0, 1.0, 1.0), MAIN),
+            _p(pyramid(0.34, 0.62, 0.62).turned("y", 90).at(0.70, 0, 0.27), MAIN),
             _p(box(1.14, 0.66, 0.06).at(-0.15, 0, 0.46), ACCENT),
             _p(cylinder(0.045, 1.70).at(0.10, 0, 1.15), "brown"),
-            _p(sail.turned("z", 90).at(-0.05, 0, 1.25), ACCENT),
+            _p(pyramid(1.00, 0.05, 1.25).at(-0.10, 0, 1.28), ACCENT),
+            _p(pyramid(0.62, 0.04, 0.95).at(0.42, 0, 1.10), ACCENT),
             _p(box(0.36, 0.34, 0.20).at(-0.42, 0, 0.56), "brown"),
-            _p(box(0.26, 0.03, 0.14).at(-0.02, 0, 1.95), "red"),
+            _p(box(0.26, 0.03, 0.14).at(-0.03, 0, 1.93), "red"),
         ),
         "blue",
         "white",
         1.3,
-    )  # fmt: skip
+    )
 
 
 def _castle() -> Thing:
@@ -638,7 +637,7 @@ PRIMITIVES: dict[str, Solid] = {
     "sphere": ball(1.0),
     "cube": box(1.2, 1.2, 1.2),
     "box": box(1.0, 1.6, 0.8),
-    "torus": torus(0.68, 0.30).turned("y", 40),
+    "torus": torus(0.70, 0.28).turned("y", 50),
     "cylinder": cylinder(0.55, 1.4),
     "cone": cone(0.7, 1.5),
     "capsule": capsule(0.42, 1.8),

@@ -1,7 +1,8 @@
-"""ShapesPrior: an exact diffusion model of a procedural world. No weights, no training, and the truth is known."""
+"""ShapesPrior: an exact diffusion model of a procedural world. No weights, no training, a known truth."""
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
@@ -29,7 +30,7 @@ ERROR_FREQUENCY = (
 
 @dataclass(frozen=True)
 class Census:
-    """First and second moments of all images of the world, per pixel of a small picture (premultiplied RGB, alpha)."""
+    """Moments of premultiplied RGB and alpha over all images of the world, per pixel of a small picture."""
 
     rgb: Float[Tensor, "3 s s"]
     alpha: Float[Tensor, "s s"]
@@ -87,7 +88,7 @@ class ShapesEmbedding(PromptEmbedding):
 
 @dataclass(frozen=True, kw_only=True)
 class ShapesPrior(DiffusionPrior):
-    """A Gaussian mixture over images of the prompt's scene, one mode per choice that the prompt leaves open."""
+    """A Gaussian mixture over images of the scene, one mode per choice that the prompt leaves open."""
 
     path: NoisePath
     spread: float  # standard deviation of every pixel around its mode, model space ([-1, 1])
@@ -145,7 +146,7 @@ class ShapesPrior(DiffusionPrior):
     ) -> Prediction:
         """Posterior means under guidance, plus the configured error; a branch of weight zero is not computed.
 
-        All three forms come from the posterior means of clean image and noise, so none is divided by a small b.
+        The forms come from the posterior means of clean image and noise: none is divided by a small b.
         """
         clean, noise = torch.zeros_like(noisy), torch.zeros_like(noisy)
         for branch, (share, mixture) in enumerate(
@@ -176,7 +177,7 @@ class ShapesPrior(DiffusionPrior):
         clean, noise = mixture.denoise(noisy, a, b)
         if self.model_error == 0:
             return clean, noise
-        # Split so that a * clean + b * noise stays put: nothing is wrong with a clean image, all with pure noise.
+        # Split so that a * clean + b * noise stays put: no error on a clean image, all of it on pure noise.
         norm = per_view((a * a + b * b).sqrt())
         error = self.model_error * error_field(noisy / norm, self.seed * 2 + branch)
         return clean + per_view(b) / norm * error, noise - per_view(a) / norm * error
@@ -185,8 +186,8 @@ class ShapesPrior(DiffusionPrior):
 def error_field(image: Float[Tensor, "v c h w"], seed: int) -> Float[Tensor, "v c h w"]:
     """A smooth field of mean about zero and unit rms that is a fixed, continuous function of ``image``.
 
-    The image is multiplied with random signs, summed over each cell of a coarse grid (white noise of unit variance
-    gives unit variance), and the sine of that is upsampled bicubically: another noise, another field.
+    The image is multiplied with random signs, summed over each cell of a coarse grid (white noise keeps its
+    variance), and the sine of that is upsampled bicubically: another noise, another field.
     """
     _, channels, height, width = image.shape
     generator = torch.Generator().manual_seed(seed)
@@ -207,7 +208,7 @@ def _cells(size: int, like: Tensor) -> Float[Tensor, "g s"]:
 
 
 def _bicubic(size: int, like: Tensor) -> Float[Tensor, "s g"]:
-    """Interpolation from the error grid to ``size`` pixels, scaled so that independent cells keep unit variance."""
+    """Interpolation from the error grid to ``size`` pixels; independent cells of unit variance keep it."""
     grid = torch.eye(ERROR_GRID, device=like.device, dtype=like.dtype)[None, None]
     rows = torch.nn.functional.interpolate(grid, (size, ERROR_GRID), mode="bicubic", align_corners=False)[
         0, 0
@@ -215,6 +216,7 @@ def _bicubic(size: int, like: Tensor) -> Float[Tensor, "s g"]:
     return rows / rows.norm(dim=1, keepdim=True)
 
 
+@lru_cache(maxsize=4)
 def take_census(size: int) -> Census:
     """Moments over every object of the world, a few views of each and every mode, all equally likely."""
     cameras = turntable(

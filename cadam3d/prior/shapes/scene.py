@@ -92,17 +92,7 @@ def build(prompt: str) -> Scene:
 
 def assemble(sentence: Sentence) -> tuple[Part, ...]:
     """Paint, place and fit all objects of a sentence."""
-    groups = [_place(phrase, index) for index, phrase in enumerate(sentence.phrases)]
-    # From the right: "a cube on a ball on a table" is a cube on (a ball on a table).
-    right = groups.pop()
-    for relation in reversed(sentence.relations):
-        left = groups.pop()
-        if relation == "and of between":
-            between = groups.pop()
-            right = _row([left, between, right])
-        elif relation != "between":
-            right = _relate(left, relation, right)
-    return _fit(right.parts)
+    return _fit(_arrange(sentence, 0).parts)
 
 
 def compile_scene(parts: tuple[Part, ...]) -> Scene:
@@ -207,6 +197,17 @@ def _paint(item: Thing, phrase: Phrase, index: int) -> tuple[Part, ...]:
 
 
 # --- places
+
+
+def _arrange(sentence: Sentence, index: int) -> _Placed:
+    """All objects of a sentence; ``index`` counts phrases, so that open colours differ."""
+    first = _place(sentence.phrase, index)
+    others = [_arrange(other, index + 1 + number) for number, other in enumerate(sentence.others)]
+    if sentence.relation is None:
+        return first
+    if sentence.relation == "between":
+        return _row([others[0], first, others[1]])
+    return _relate(first, sentence.relation, others[0])
 
 
 def _place(phrase: Phrase, index: int) -> _Placed:

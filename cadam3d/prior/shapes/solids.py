@@ -1,9 +1,9 @@
 """Solids as signed distance functions: negative inside, positive outside, never further than the surface is.
 
-Each kind is written in its own coordinates and lives in the world through an affine map. A ray keeps its parameter
-under an affine map, so sphere tracing in own coordinates stays exact for stretched solids too: an ellipsoid is a
-stretched ball, and no approximate distance is needed. Every function here is 1-Lipschitz and has the right sign, which
-is all that sphere tracing asks (Hart 1996, theorem 1); most are the maximum of a few planes.
+Each kind is written in its own coordinates and lives in the world through an affine map. A ray keeps its
+parameter under an affine map, so sphere tracing in own coordinates stays exact for stretched solids too: an
+ellipsoid is a stretched ball, and no approximate distance is needed. Every function here is 1-Lipschitz and has
+the right sign, which is all that sphere tracing asks (Hart 1996, sec. 2); many are the maximum of a few planes.
 """
 
 import math

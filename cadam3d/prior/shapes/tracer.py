@@ -1,10 +1,11 @@
 """Sphere tracing: rays march by the distance to the surface until they touch it (Hart 1996).
 
-Every part is traced on its own, only by rays that meet its bounding box, in its own coordinates; the nearest hit wins.
-All parts of one kind march together, so the number of tensor operations does not grow with the number of parts.
-Light is baked into the world and does not depend on the view: an asset of SH degree 0 can match it exactly.
+Every part is traced on its own, only by rays that meet its bounding box, in its own coordinates; the nearest
+hit wins. All parts of one kind march together, so the number of tensor operations does not grow with the number
+of parts. Light is baked into the world and does not depend on the view: an asset of SH degree 0 can match it.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -19,6 +20,7 @@ MARCH_STEPS = 48
 COMPACT_EVERY = 4  # steps between throwing out rays that have arrived or left
 HIT_DISTANCE = 5e-4  # world units; a pixel of a usual view is thirty times wider
 GRAZE_DISTANCE = 4e-3  # a ray still this close after the last step has hit
+BALL_RADIUS = 0.9  # nothing lies outside it; scenes are fitted into 0.85
 NEAR = 0.01  # world units; as the rasterizers
 NORMAL_STEP = 1e-3  # of the finite differences, in own coordinates
 LIGHT = (0.60, 0.42, 0.68)  # towards the light; the front faces +x
@@ -52,79 +54,106 @@ class _Hits:
     local: Float[Tensor, "3 n"]  # own coordinates
 
 
+@dataclass(frozen=True)
+class _Rays:
+    """Rays of all views that meet the ball the scene lies in, sorted by view."""
+
+    origins: Float[Tensor, "v 3"]
+    directions: Float[Tensor, "3 r"]  # unit
+    views: Int[Tensor, "r"]
+    pixels: Int[Tensor, "r"]  # number of the pixel among all pixels of all views
+    per_view: tuple[int, ...]  # how many rays each view has
+
+
 @torch.no_grad()
 def trace(scene: Scene, cameras: Cameras, samples: int) -> Layers:
     """Render with ``samples`` x ``samples`` rays per pixel, in the cameras' device and dtype."""
-    fine = cameras.resize(cameras.height * samples, cameras.width * samples)
-    origins, directions = fine.rays()
-    views, height, width = directions.shape[:3]
-    flat = directions.reshape(-1, 3).T.contiguous()
-    view = torch.arange(views, device=flat.device).repeat_interleave(height * width)
-    is_near = _meets_ball(origins.T[:, view], flat)
-    kept = is_near.nonzero()[:, 0]
-    hits = _first_hits(scene, origins, flat[:, kept], view[kept])
+    rays = _cast(cameras, samples)
+    hits = _first_hits(scene, rays)
     light, paint = _shade(scene, hits)
-
-    row = torch.div(kept[hits.ray], width, rounding_mode="floor")
-    column = kept[hits.ray] - row * width
-    pixel = torch.div(row, samples, rounding_mode="floor") * cameras.width + torch.div(
-        column, samples, rounding_mode="floor"
-    )
-    count, share = views * cameras.height * cameras.width, 1.0 / samples**2
-    paints = scene.albedo.shape[1]
-    alpha = flat.new_zeros(count).index_add_(0, pixel, torch.full_like(light, share))
-    sent = flat.new_zeros(count * paints).index_add_(0, pixel * paints + paint, light * share)
-    shape = (views, cameras.height, cameras.width)
+    pixel, share = rays.pixels[hits.ray], 1.0 / samples**2
+    shape = (len(cameras), cameras.height, cameras.width)
+    count, paints = math.prod(shape), scene.albedo.shape[1]
+    alpha = light.new_zeros(count).index_add_(0, pixel, torch.full_like(light, share))
+    sent = light.new_zeros(count * paints).index_add_(0, pixel * paints + paint, light * share)
     return Layers(alpha=alpha.reshape(shape).clamp_max(1.0), paints=sent.reshape(*shape, paints))
 
 
-def _meets_ball(origin: Tensor, direction: Tensor) -> Bool[Tensor, "n"]:
-    """Rays that meet the unit ball: nothing lies outside it."""
-    along = (origin * direction).sum(0)
-    return (origin.square().sum(0) - along.clamp_max(0).square()) <= 1.0
+def _cast(cameras: Cameras, samples: int) -> _Rays:
+    """Rays through a regular grid of points in every pixel; those that miss the scene's ball are left out."""
+    fine = cameras.resize(cameras.height * samples, cameras.width * samples)
+    like = {"dtype": fine.intrinsics.dtype, "device": fine.intrinsics.device}
+    rows, columns = torch.arange(fine.height, **like), torch.arange(fine.width, **like)
+    y, x = torch.meshgrid(rows + 0.5, columns + 0.5, indexing="ij")
+    to_world = fine.world_to_camera[:, :3, :3].transpose(1, 2) @ torch.linalg.inv(fine.intrinsics)
+    direction = to_world @ torch.stack([x.flatten(), y.flatten(), torch.ones_like(x).flatten()])  # "v 3 r"
+    direction = direction * direction.square().sum(1, keepdim=True).rsqrt()
+
+    origins = fine.positions
+    along = (origins[:, None] @ direction)[:, 0]
+    apart = origins.square().sum(1, keepdim=True) - along.clamp_max(0).square()
+    view, sample = (apart <= BALL_RADIUS**2).nonzero(as_tuple=True)
+    row = torch.div(sample, fine.width * samples, rounding_mode="floor")
+    column = torch.div(sample % fine.width, samples, rounding_mode="floor")
+    return _Rays(
+        origins=origins,
+        directions=direction.transpose(0, 1).flatten(1).index_select(1, view * y.numel() + sample),
+        views=view,
+        pixels=(view * cameras.height + row) * cameras.width + column,
+        per_view=tuple(torch.bincount(view, minlength=len(cameras)).tolist()),
+    )
 
 
-def _first_hits(scene: Scene, origins: Tensor, direction: Tensor, view: Tensor) -> _Hits:
+def _candidates(scene: Scene, rays: _Rays) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
+    """Pairs (part, ray) where the ray meets the part's bounding ball, sorted by part."""
+    masks = []
+    for origin, direction in zip(rays.origins, rays.directions.split(rays.per_view, dim=1), strict=True):
+        towards = (scene.centres - origin) @ direction
+        apart = (scene.centres - origin).square().sum(1, keepdim=True) - towards.clamp_min(0).square()
+        masks.append(apart <= scene.radii[:, None].square())
+    part, ray = torch.cat(masks, dim=1).nonzero(as_tuple=True)
+    return part, ray
+
+
+def _first_hits(scene: Scene, rays: _Rays) -> _Hits:
     """For every ray that hits something: which part, and where."""
-    # Candidate pairs (part, ray): the ray meets the part's bounding ball. Row-major, so sorted by part.
-    towards = scene.centres @ direction - (origins.T[:, view] * direction).sum(0)
-    square = (scene.centres[:, None] - origins[None]).square().sum(-1)[:, view]
-    is_candidate = (square - towards.clamp_min(0).square()) <= scene.radii.square()[:, None]
-    part, ray = is_candidate.nonzero(as_tuple=True)
-
+    part, ray = _candidates(scene, rays)
     # The same rays in the parts' own coordinates; the ray parameter stays in world units.
-    start = torch.einsum("pij,vpj->ivp", scene.to_local, origins[:, None] - scene.offsets[None])
-    local_origin = start.flatten(1)[:, view[ray] * len(scene.radii) + part]
-    matrix = scene.to_local.flatten(1).T[:, part].reshape(3, 3, -1)
-    local_direction = (matrix * direction[:, ray]).sum(1)
-    begin, end = _box_interval(scene, part, local_origin, local_direction)
-    is_inside = begin < end
-    part, ray, begin, end = part[is_inside], ray[is_inside], begin[is_inside], end[is_inside]
-    local_origin, local_direction = local_origin[:, is_inside], local_direction[:, is_inside]
+    start = torch.einsum("pij,vpj->ivp", scene.to_local, rays.origins[:, None] - scene.offsets[None])
+    origin = start.flatten(1).index_select(1, rays.views[ray] * len(scene.radii) + part)
+    direction = torch.einsum("ijn,jn->in", _matrices(scene, part), rays.directions.index_select(1, ray))
+    begin, end = _box_interval(scene, part, origin, direction)
+    inside = (begin < end).nonzero()[:, 0]
+    part, ray, begin, end = part[inside], ray[inside], begin[inside], end[inside]
+    origin, direction = origin.index_select(1, inside), direction.index_select(1, inside)
 
-    sizes = scene.sizes.T[:, part]
+    sizes = scene.sizes.T.index_select(1, part)
     reached = torch.full_like(begin, torch.inf)
     for kind, rows in _runs(scene, part):
         reached[rows] = _march(
-            kind, local_origin[:, rows], local_direction[:, rows], sizes[:, rows], begin[rows], end[rows]
+            kind, origin[:, rows], direction[:, rows], sizes[:, rows], begin[rows], end[rows]
         )
 
-    nearest = torch.full_like(direction[0], torch.inf).scatter_reduce_(0, ray, reached, "amin")
-    is_first = (reached <= nearest[ray]) & reached.isfinite()
+    nearest = torch.full_like(rays.directions[0], torch.inf).scatter_reduce_(0, ray, reached, "amin")
+    first = ((reached <= nearest[ray]) & reached.isfinite()).nonzero()[:, 0]
     # Two parts that touch the ray at the same point: the later one, so that no ray counts twice.
-    number = torch.arange(len(ray), device=ray.device)
-    winner = torch.full_like(view, -1).scatter_reduce_(0, ray[is_first], number[is_first], "amax")
+    winner = torch.full_like(rays.views, -1).scatter_reduce_(0, ray[first], first, "amax")
     chosen = winner[winner >= 0].sort().values
-    point = local_origin[:, chosen] + reached[chosen] * local_direction[:, chosen]
+    point = origin.index_select(1, chosen) + reached[chosen] * direction.index_select(1, chosen)
     return _Hits(ray=ray[chosen], part=part[chosen], local=point)
+
+
+def _matrices(scene: Scene, part: Int[Tensor, "n"]) -> Float[Tensor, "3 3 n"]:
+    """``to_local`` of each part named; [i, j] is row i."""
+    return scene.to_local.flatten(1).T.contiguous().index_select(1, part).reshape(3, 3, -1)
 
 
 def _box_interval(scene: Scene, part: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
     """Where each ray enters and leaves the box of its part, in front of the camera."""
     tiny = torch.full_like(direction, 1e-12)
     inverse = 1 / torch.where(direction.abs() < 1e-12, tiny, direction)
-    first = (scene.low.T[:, part] - origin) * inverse
-    second = (scene.high.T[:, part] - origin) * inverse
+    first = (scene.low.T.index_select(1, part) - origin) * inverse
+    second = (scene.high.T.index_select(1, part) - origin) * inverse
     begin = torch.minimum(first, second).amax(0).clamp_min(NEAR)
     # A little longer than the box: at a flat face the interval of a grazing ray is empty but for rounding.
     return begin, torch.maximum(first, second).amin(0) + HIT_DISTANCE
@@ -149,7 +178,7 @@ def _march(
         if len(alive) == 0:
             break
         rows, t, end, speed = rows[alive], t[alive], end[alive], speed[alive]
-        origin, direction, sizes = origin[:, alive], direction[:, alive], sizes[:, alive]
+        origin, direction, sizes = (x.index_select(1, alive) for x in (origin, direction, sizes))
     return reached
 
 
@@ -170,13 +199,12 @@ def _runs(scene: Scene, part: Tensor) -> list[tuple[Kind, slice]]:
 
 def _shade(scene: Scene, hits: _Hits) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
     """Light in [0, 1] and paint of every visible point."""
-    sizes = scene.sizes.T[:, hits.part]
+    sizes = scene.sizes.T.index_select(1, hits.part)
     normal = torch.empty_like(hits.local)
     for kind, rows in _runs(scene, hits.part):
         normal[:, rows] = _gradient(kind, hits.local[:, rows], sizes[:, rows])
-    to_local = scene.to_local.flatten(1).T[:, hits.part].reshape(3, 3, -1)
-    normal = torch.nn.functional.normalize((to_local * normal[:, None]).sum(0), dim=0)
-    light = torch.nn.functional.normalize(normal.new_tensor(LIGHT), dim=0)
+    normal = _unit(torch.einsum("ijn,in->jn", _matrices(scene, hits.part), normal))  # transposed inverse
+    light = _unit(normal.new_tensor(LIGHT))
     facing = ((light @ normal + WRAP) / (1 + WRAP)).clamp_min(0)
     sent = AMBIENT + SKY * (0.5 + 0.5 * normal[2]) + DIFFUSE * facing
 
@@ -191,6 +219,11 @@ def _shade(scene: Scene, hits: _Hits) -> tuple[Float[Tensor, "n"], Int[Tensor, "
             box = ((scene.high + scene.low) / 2).T[:, part], ((scene.high - scene.low) / 2).T[:, part]
             is_second[chosen] = _paint_second(kind, name, hits.local[:, chosen], sizes[:, chosen], box)
     return sent, torch.where(is_second, scene.paints[hits.part, 1], scene.paints[hits.part, 0])
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    """Vectors of unit length along the first axis."""
+    return vectors * vectors.square().sum(0).clamp_min(1e-30).rsqrt()
 
 
 def _gradient(kind: Kind, points: Tensor, sizes: Tensor) -> Tensor:
@@ -211,8 +244,7 @@ def _paint_second(
         turn, roll = torch.atan2(p[1], p[0]), torch.atan2(p[2], p[:2].square().sum(0).sqrt() - sizes[0])
         return _ring_pattern(pattern, turn / torch.pi, roll / torch.pi)
     if pattern == "spotted":
-        direction = torch.nn.functional.normalize(unit, dim=0)
-        return (sphere_directions(SPOTS).to(p) @ direction).amax(0) > SPOT_COSINE
+        return (sphere_directions(SPOTS).to(p) @ _unit(unit)).amax(0) > SPOT_COSINE
     if kind.wrap == "flat":
         # A hair smaller, so that faces do not fall on the border between two cells.
         inner = 0.999 * unit
@@ -220,10 +252,11 @@ def _paint_second(
             return _is_odd((inner[2] + 1) * 3)
         return _is_odd_sum((inner + 1) * 2)
     across = unit[:2].square().sum(0).sqrt().clamp_max(1)
-    height = (
-        torch.asin(unit[2].clamp(-1, 1)) / (torch.pi / 2) if kind.name == "ball" else unit[2] + 1 - across
-    )
-    band = 3 * height + 100.0  # positive for every solid
+    if kind.name == "ball":
+        band = 3 * torch.asin(unit[2].clamp(-1, 1)) / (torch.pi / 2)
+    else:  # along the side, then over the top towards the axis
+        reach, rise = half[:2].amax(0), half[2]
+        band = 4 * (unit[2] * rise + (1 - across) * reach) / (reach + rise)
     if pattern == "striped":
         return _is_odd(band)
     azimuth = torch.atan2(p[1], p[0]) / torch.pi

@@ -60,10 +60,10 @@ STRETCHES = {
 }
 NUMBERS = {"one": 1, "two": 2, "three": 3, "four": 4, "five": 5}
 
-# Longest first: the parser takes the first that matches.
+# Longest first, since the first that matches counts; "of" is a filler.
 RELATIONS: tuple[tuple[tuple[str, ...], str], ...] = (
-    (("on", "top", "of"), "on"),
-    (("in", "front", "of"), "in front of"),
+    (("on", "top"), "on"),
+    (("in", "front"), "in front of"),
     (("next", "to"), "next to"),
     (("beside",), "next to"),
     (("near",), "next to"),
@@ -77,9 +77,8 @@ RELATIONS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("underneath",), "under"),
     (("behind",), "behind"),
     (("between",), "between"),
+    (("and",), "next to"),
 )
 ARTICLES = frozenset({"a", "an", "the", "some"})
 # Words of other people's prompts that say nothing about the scene: "a 3d model of a ...".
-FILLERS = frozenset(
-    {"photo", "picture", "image", "render", "rendering", "model", "3d", "of", "single", "standing"}
-)
+FILLERS = frozenset({"photo", "picture", "image", "render", "rendering", "model", "3d", "of"})
