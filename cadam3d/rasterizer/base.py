@@ -14,7 +14,8 @@ BLUR = 0.3  # pixels^2 added to the diagonal of each projected covariance
 ALPHA_MIN = 1 / 255  # a fainter contribution to a pixel is skipped
 ALPHA_MAX = 0.99  # a stronger one is capped, with zero gradient to what is capped
 TRANSMITTANCE_MIN = 1e-4  # a pixel stops before the splat that would bring it to this or below
-NEAR = 0.01  # world units; nearer centres are culled
+NEAR = 0.01  # world units; this near or nearer, centres are culled
+FAR = 1e10  # world units; this far or farther too, before products overflow
 FRUSTUM_MARGIN = 0.15  # the Jacobian is evaluated at most this share of the image size outside the border
 
 
@@ -22,10 +23,13 @@ class Rasterizer(ABC):
     """How we see. A component is its hyper-parameters; it holds no tensors."""
 
     @abstractmethod
-    def render(self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]) -> RenderOutput:
+    def render(
+        self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
+    ) -> RenderOutput:
         """Render every view, differentiably in all five tensors of ``gaussians`` and in ``means2d``.
 
-        ``background`` is one RGB colour per view, in [0, 1]. Whenever gradients are on, ``means2d`` retains its
-        own gradient, so ``output.means2d.grad`` is filled by ``backward()``. Gaussians that are behind a camera,
-        off screen, too faint or not finite are culled: radius 0, no contribution, zero gradient, never a NaN.
+        ``background`` is one RGB colour per view, in [0, 1]. Whenever gradients are on, ``means2d`` retains
+        its own gradient, so ``output.means2d.grad`` is filled by ``backward()``. Gaussians that are behind a
+        camera, off screen, too faint or not finite are culled: radius 0, no contribution, zero gradient,
+        never a NaN.
         """

@@ -1,11 +1,11 @@
 """The reference rasterizer: the image formation model in pure torch, for any dtype and any device.
 
 Every other backend is measured against it. It is EWA splatting (Zwicker et al. 2001) as 3DGS uses it (Kerbl
-et al. 2023, sec. 4-5), with the constants of :mod:`cadam3d.rasterizer.base`. At a pixel with offset ``d`` from
-a projected mean, with ``W`` whitening the blurred 2D covariance:
+et al. 2023, sec. 4-5), with the constants of :mod:`cadam3d.rasterizer.base`. At a pixel with offset ``d``
+from a projected mean, with ``W`` whitening the blurred 2D covariance:
 
 * ``raw = opacity * exp(-|W d|^2 / 2)``; ``alpha = min(raw, ALPHA_MAX)``, or 0 where ``raw < ALPHA_MIN``;
-* front to back ``w = alpha T``, ``T <- T (1 - alpha)``, until ``T`` would fall to ``TRANSMITTANCE_MIN`` or below;
+* front to back ``w = alpha T``, ``T <- T (1 - alpha)``, until ``T`` would fall to ``TRANSMITTANCE_MIN``;
 * ``rgb = sum(w color) + (1 - sum(w)) background``, ``alpha = sum(w)``, ``depth = sum(w z) / sum(w)``.
 
 How it stays quick: splats are binned into square tiles, tiles with about equally many splats are stacked into
@@ -32,6 +32,7 @@ from cadam3d.rasterizer.base import (
     ALPHA_MAX,
     ALPHA_MIN,
     BLUR,
+    FAR,
     FRUSTUM_MARGIN,
     NEAR,
     TRANSMITTANCE_MIN,
@@ -139,7 +140,7 @@ def _splat(gaussians: Gaussians, view: _View) -> _Splats:
 def _see(gaussians: Gaussians, view: _View) -> tuple[Int[Tensor, "m"], Float[Tensor, "m 2"]]:
     """Rows and half-sizes of the visible Gaussians, nearest first.
 
-    The others never meet autograd: no gradient, hence no NaN in one. Each test is written so that a NaN fails.
+    The others never meet autograd: no gradient, hence no NaN in one. Each test is one that a NaN fails.
     """
     projection = _project(gaussians, view)
     reach = torch.log(gaussians.opacities / ALPHA_MIN).mul(2).sqrt()  # standard deviations; NaN if too faint
@@ -147,14 +148,15 @@ def _see(gaussians: Gaussians, view: _View) -> tuple[Int[Tensor, "m"], Float[Ten
     squares = (gaussians.quats * gaussians.quats).sum(dim=-1)
     size = half_sizes.new_tensor([view.width, view.height])
     is_finite = torch.ones_like(squares, dtype=torch.bool)
-    for tensor in (*gaussians.tensors().values(), half_sizes, projection.determinants, squares):
+    derived = (half_sizes, projection.determinants, squares)
+    for tensor in (*gaussians.tensors().values(), *derived):
         is_finite &= tensor.isfinite().reshape(len(gaussians), math.prod(tensor.shape[1:])).all(dim=1)
     has_direction = squares >= QUAT_SQUARE_MIN
-    is_in_front = projection.depths > NEAR
+    is_in_range = (projection.depths > NEAR) & (projection.depths < FAR)
     has_extent = (half_sizes > 0).all(dim=1)
     means2d = projection.means2d
     is_on_screen = ((means2d + half_sizes > 0) & (means2d - half_sizes < size)).all(dim=1)
-    rows = (is_finite & has_direction & is_in_front & has_extent & is_on_screen).nonzero()[:, 0]
+    rows = (is_finite & has_direction & is_in_range & has_extent & is_on_screen).nonzero()[:, 0]
     rows = rows[projection.depths[rows].argsort(stable=True)]
     return rows, half_sizes[rows]
 

@@ -1,0 +1,564 @@
+"""The reference rasterizer against the textbook, its invariances, and inputs that break others."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from cadam3d.core.cameras import Cameras, orbit, turntable
+from cadam3d.core.edit import RowEdit
+from cadam3d.core.gaussians import FIELDS, Gaussians, concatenate
+from cadam3d.core.render import RenderOutput
+from cadam3d.core.sh import rgb_to_sh0, sh_basis
+from cadam3d.rasterizer import reference
+from cadam3d.rasterizer.reference import ReferenceRasterizer
+
+NAN, INF = math.nan, math.inf
+RASTERIZER = ReferenceRasterizer()
+
+
+def scene(n: int = 80, degree: int = 1, seed: int = 0, dtype: torch.dtype = torch.float64) -> Gaussians:
+    """Splats of all sizes, faint to nearly opaque, some colours below zero, the first row out of sight."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    means = 0.4 * normal(n, 3)
+    means[:1] = torch.tensor([3.0, 0.5, 1.5])  # behind all of ``cameras``
+    return Gaussians(
+        means=means,
+        log_scales=-2.2 + 0.6 * normal(n, 3),
+        quats=normal(n, 4),
+        opacity_logits=3 * normal(n) + 1,
+        sh=0.8 * normal(n, (degree + 1) ** 2, 3),
+    ).to(dtype)
+
+
+def cameras(views: int = 2, height: int = 29, width: int = 37, distance: float = 1.6) -> Cameras:
+    """Near enough that some of ``scene`` lies across the frustum's border."""
+    azimuth = torch.arange(views, dtype=torch.float64) * 50 - 20
+    full = torch.ones_like(azimuth)
+    return orbit(azimuth, 25 * full, distance * full, 60 * full, height, width)
+
+
+def facing(size: int = 9, distance: float = 2.0) -> Cameras:
+    """One camera on +x with a focal length of ``size`` pixels, looking along -x."""
+    fov_y_deg = math.degrees(2 * math.atan(0.5))
+    return turntable(1, elevation_deg=0.0, distance=distance, fov_y_deg=fov_y_deg, size=size).to(
+        torch.float64
+    )
+
+
+def balls(*, x: list[float], radius: float, opacity: list[float], rgb: list[list[float]]) -> Gaussians:
+    """Round Gaussians of one colour each on the x axis; ``facing`` sees them all at its image centre."""
+    n = len(x)
+    means = torch.zeros(n, 3, dtype=torch.float64)
+    means[:, 0] = torch.tensor(x)
+    return Gaussians(
+        means=means,
+        log_scales=torch.full((n, 3), math.log(radius), dtype=torch.float64),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64).repeat(n, 1),
+        opacity_logits=torch.tensor(opacity, dtype=torch.float64).logit(),
+        sh=rgb_to_sh0(torch.tensor(rgb, dtype=torch.float64))[:, None],
+    )
+
+
+def backgrounds(views: int) -> Tensor:
+    return torch.linspace(0.1, 0.9, 3 * views, dtype=torch.float64).reshape(views, 3)
+
+
+def render(gaussians: Gaussians, views: Cameras, background: Tensor | None = None) -> RenderOutput:
+    return RASTERIZER.render(gaussians, views, backgrounds(len(views)) if background is None else background)
+
+
+def as_parameters(gaussians: Gaussians) -> Gaussians:
+    return gaussians.map(lambda tensor: tensor.detach().clone().requires_grad_())
+
+
+def images(output: RenderOutput) -> tuple[Tensor, Tensor, Tensor]:
+    return output.rgb, output.alpha, output.depth
+
+
+def score(pictures: tuple[Tensor, ...]) -> Tensor:
+    """Some loss in which every pixel of every output has its own weight."""
+    generator = torch.Generator().manual_seed(5)
+    weights = [torch.rand(p.shape, generator=generator, dtype=torch.float64).to(p) - 0.4 for p in pictures]
+    return torch.stack([(p * weight).sum() for p, weight in zip(pictures, weights, strict=True)]).sum()
+
+
+def gradients(gaussians: Gaussians, views: Cameras) -> dict[str, Tensor]:
+    leaves = as_parameters(gaussians)
+    output = render(leaves, views)
+    score(images(output)).backward()
+    assert output.means2d.grad is not None
+    return {name: tensor.grad for name, tensor in leaves.tensors().items()} | {"means2d": output.means2d.grad}
+
+
+def textbook(gaussians: Gaussians, views: Cameras, background: Tensor) -> tuple[Tensor, ...]:
+    """EWA splatting as the papers write it: matrices, one splat after the other at every pixel."""
+    pictures = []
+    for view in range(len(views)):
+        matrix, intrinsics = views.world_to_camera[view], views.intrinsics[view]
+        in_camera = gaussians.means @ matrix[:3, :3].T + matrix[:3, 3]
+        x, y, z = in_camera.unbind(-1)
+        fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
+        size_x, size_y = views.width, views.height
+        slope_x = (x / z).clamp((-0.15 * size_x - cx) / fx, (1.15 * size_x - cx) / fx)
+        slope_y = (y / z).clamp((-0.15 * size_y - cy) / fy, (1.15 * size_y - cy) / fy)
+        zero = torch.zeros_like(z)
+        jacobian = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1)
+        transform = (
+            jacobian.view(-1, 2, 3) @ matrix[:3, :3] @ gaussians.rotations @ gaussians.scales.diag_embed()
+        )
+        covariance = transform @ transform.transpose(1, 2) + 0.3 * torch.eye(2, dtype=z.dtype)
+        precision = torch.linalg.inv(covariance)
+        direction = torch.nn.functional.normalize(gaussians.means - views.positions[view], dim=-1)
+        basis = sh_basis(direction, gaussians.sh_degree)
+        color = (torch.einsum("nk,nkc->nc", basis, gaussians.sh) + 0.5).clamp_min(0)
+        pixels = torch.cartesian_prod(torch.arange(size_y), torch.arange(size_x)).flip(1).to(z) + 0.5
+        left = torch.ones(size_y * size_x, dtype=z.dtype)
+        stopped = torch.zeros_like(left, dtype=torch.bool)
+        sums = torch.zeros(size_y * size_x, 5, dtype=z.dtype)
+        for i in z.argsort(stable=True).tolist():
+            if z[i] <= 0.01:
+                continue
+            offset = pixels - torch.stack([fx * x[i] / z[i] + cx, fy * y[i] / z[i] + cy])
+            raw = gaussians.opacities[i] * torch.exp(-0.5 * ((offset @ precision[i]) * offset).sum(-1))
+            alpha = torch.where(raw < 1 / 255, 0, raw.clamp_max(0.99))
+            stopped = stopped | (left * (1 - alpha) <= 1e-4)
+            weight = torch.where(stopped, 0, left * alpha)
+            left = torch.where(stopped, left, left * (1 - alpha))
+            sums = sums + weight[:, None] * torch.cat([color[i], z[i : i + 1], torch.ones_like(z[:1])])
+        rgb, depth, alpha = sums.split([3, 1, 1], dim=1)
+        rgb = rgb + left[:, None] * background[view]
+        depth = torch.where(alpha > 0, depth / alpha.clamp_min(1e-9), 0)
+        pictures.append([picture.view(size_y, size_x, -1) for picture in (rgb, alpha, depth)])
+    rgb, alpha, depth = (torch.stack(each) for each in zip(*pictures, strict=True))
+    return rgb, alpha[..., 0], depth[..., 0]
+
+
+# --- the textbook
+
+
+@pytest.mark.parametrize(
+    ("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)], ids=["float64", "float32"]
+)
+@pytest.mark.parametrize(("height", "width", "degree"), [(29, 37, 3), (16, 8, 0), (1, 1, 1), (3, 50, 2)])
+def test_images_and_gradients_are_the_textbooks(height, width, degree, dtype, tolerance):
+    views = cameras(2, height, width).to(dtype)
+    background = backgrounds(2).to(dtype)
+    leaves, textbook_leaves = (as_parameters(scene(60, degree, dtype=dtype)) for _ in range(2))
+    pictures = images(render(leaves, views, background))
+    wanted = textbook(textbook_leaves, views, background)
+    for got, want in zip(pictures, wanted, strict=True):
+        assert got.dtype == dtype
+        torch.testing.assert_close(got, want, rtol=0, atol=tolerance * float(want.detach().abs().max() + 1))
+    score(pictures).backward()
+    score(wanted).backward()
+    for name in FIELDS:
+        got, want = getattr(leaves, name).grad, getattr(textbook_leaves, name).grad
+        torch.testing.assert_close(
+            got, want, rtol=0, atol=tolerance * float(want.abs().max() + 1e-3), msg=name
+        )
+
+
+def test_the_textbook_scene_meets_every_branch():
+    gaussians, views = scene(60, 3), cameras(2)
+    output = render(gaussians, views)
+    in_camera = gaussians.means @ views.world_to_camera[0, :3, :3].T + views.world_to_camera[0, :3, 3]
+    assert (in_camera[:, 2] < 0.01).any(), "someone is behind the camera"
+    assert (gaussians.opacities > 0.99).any(), "someone is capped"
+    assert (gaussians.opacities < 1 / 255).any(), "someone is too faint"
+    assert (output.alpha == 0).any(), "some pixel is empty"
+    assert (output.alpha > 0.9995).any(), "some pixel stops early"
+    outside = (output.means2d[0] < -6) | (output.means2d[0] > 44)
+    assert (outside.any(dim=1) & output.visible[0]).any(), (
+        "someone reaches in from beyond the clamped Jacobian"
+    )
+    direction = torch.nn.functional.normalize(gaussians.means - views.positions[0], dim=-1)
+    colors = torch.einsum("nk,nkc->nc", sh_basis(direction, 3), gaussians.sh) + 0.5
+    assert (colors < 0).any(), "some colour is clamped at zero"
+
+
+# --- facts one can work out by hand
+
+
+def test_a_ball_is_a_gaussian_blot_of_its_projected_size_plus_blur():
+    output = render(
+        balls(x=[0.0], radius=0.2, opacity=[0.8], rgb=[[1, 0.5, 0]]), facing(9), torch.zeros(1, 3)
+    )
+    variance = (9 * 0.2 / 2) ** 2 + 0.3
+    offset = torch.arange(9, dtype=torch.float64) - 4
+    blot = 0.8 * torch.exp(-(offset[:, None] ** 2 + offset**2) / (2 * variance))
+    blot = torch.where(blot < 1 / 255, 0, blot)
+    torch.testing.assert_close(output.alpha[0], blot)
+    torch.testing.assert_close(output.rgb[0], blot[..., None] * torch.tensor([1, 0.5, 0]))
+    torch.testing.assert_close(output.depth[0], torch.where(blot > 0, 2.0, 0.0).double())
+    torch.testing.assert_close(output.means2d, torch.tensor([[[4.5, 4.5]]], dtype=torch.float64))
+    assert output.radii.item() == pytest.approx(math.sqrt(2 * math.log(255 * 0.8) * variance))
+
+
+def test_the_near_one_hides_the_far_one_whatever_their_order():
+    red_near = balls(x=[0.5, -0.5], radius=0.2, opacity=[0.6, 0.5], rgb=[[1, 0, 0], [0, 0, 1]])
+    for rows in ([0, 1], [1, 0]):
+        output = render(red_near.index(torch.tensor(rows)), facing(9), torch.ones(1, 3))
+        rgb = output.rgb[0, 4, 4]
+        torch.testing.assert_close(rgb, torch.tensor([0.6 + 0.2, 0.2, 0.2 + 0.2], dtype=torch.float64))
+        assert output.alpha[0, 4, 4].item() == pytest.approx(0.8)
+        assert output.depth[0, 4, 4].item() == pytest.approx((0.6 * 1.5 + 0.2 * 2.5) / 0.8)
+
+
+def test_equally_distant_splats_blend_in_row_order():
+    pair = balls(x=[0.0, 0.0], radius=0.2, opacity=[0.6, 0.5], rgb=[[1, 0, 0], [0, 0, 1]])
+    rgb = render(pair, facing(9), torch.zeros(1, 3)).rgb[0, 4, 4]
+    torch.testing.assert_close(rgb, torch.tensor([0.6, 0, 0.4 * 0.5], dtype=torch.float64))
+
+
+def test_alpha_is_capped_at_99_percent():
+    opaque = balls(x=[0.0], radius=0.2, opacity=[0.5], rgb=[[1, 1, 1]])
+    opaque.opacity_logits += 60
+    assert opaque.opacities.item() == 1
+    assert render(opaque, facing(9)).alpha.max().item() == pytest.approx(0.99)
+
+
+def test_the_splat_that_would_make_a_pixel_opaque_is_left_out():
+    # Transmittance 0.02, 0.0004, then 0.000008 < 1e-4: the third is not drawn, nor the faint fourth behind.
+    stack = balls(x=[0.3, 0.2, 0.1, 0.0], radius=0.2, opacity=[0.98, 0.98, 0.98, 0.1], rgb=[[1, 1, 1]] * 4)
+    output = render(stack, facing(9))
+    assert 1 - output.alpha[0, 4, 4].item() == pytest.approx(0.0004)
+    assert output.visible.all(), "being hidden is not being culled"
+
+
+def test_nothing_is_drawn_outside_the_radius_and_nothing_forgotten_inside():
+    for opacity in (0.005, 0.1, 0.97):
+        for x_offset in (0.0, 0.3, 0.8):
+            ball = balls(x=[0.0], radius=0.3, opacity=[opacity], rgb=[[1, 1, 1]])
+            ball.means[0, 1] = x_offset
+            output = render(ball, facing(33))
+            offset = (
+                torch.cartesian_prod(torch.arange(33), torch.arange(33)).flip(1) + 0.5 - output.means2d[0, 0]
+            )
+            is_drawn = output.alpha[0].flatten() > 0
+            distance = offset.abs().amax(dim=1)
+            assert not is_drawn[distance > output.radii[0, 0]].any()
+            assert distance[is_drawn].max() > output.radii[0, 0] - 1, "the box touches the ellipse"
+
+
+@pytest.mark.parametrize(
+    ("z", "is_seen"), [(0.01, False), (0.010001, True), (0.0, False), (-1.0, False), (2e10, False)]
+)
+def test_only_what_lies_between_the_near_and_the_far_plane_is_seen(z, is_seen):
+    views = replace(facing(9), world_to_camera=torch.eye(4, dtype=torch.float64)[None])
+    ball = balls(x=[0.0], radius=0.001, opacity=[0.8], rgb=[[1, 1, 1]])
+    ball.means[0, 2] = z
+    output = render(ball, views)
+    assert output.visible.item() == is_seen
+    assert (output.alpha.max() > 0).item() == is_seen
+
+
+def test_a_huge_splat_behind_the_camera_leaves_no_ghost():
+    ball = balls(x=[3.0], radius=50.0, opacity=[0.9], rgb=[[1, 1, 1]])
+    assert render(ball, facing(9)).alpha.max() == 0
+
+
+def test_every_view_has_its_own_background():
+    nothing = scene(0)
+    background = backgrounds(3)
+    output = render(nothing, cameras(3, 4, 5), background)
+    assert torch.equal(output.rgb, background[:, None, None].expand(3, 4, 5, 3))
+
+
+# --- invariances
+
+
+def test_the_order_of_rows_does_not_matter():
+    gaussians, views = scene(), cameras()
+    order = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(1))
+    one, other = render(gaussians, views), render(gaussians.index(order), views)
+    for got, want in zip(images(other), images(one), strict=True):
+        assert torch.equal(got, want)
+    assert torch.equal(other.radii, one.radii[:, order])
+    one_grads, other_grads = gradients(gaussians, views), gradients(gaussians.index(order), views)
+    for name in FIELDS:
+        torch.testing.assert_close(other_grads[name], one_grads[name][order], rtol=1e-12, atol=1e-12)
+
+
+def test_a_batch_is_its_views_one_by_one():
+    gaussians, views, background = scene(), cameras(3), backgrounds(3)
+    batch = render(gaussians, views, background)
+    for view in range(3):
+        only = slice(view, view + 1)
+        single = render(gaussians, views.index(only), background[only])
+        for name in ("rgb", "alpha", "depth", "means2d", "radii"):
+            assert torch.equal(getattr(single, name), getattr(batch, name)[only]), name
+
+
+def test_moving_scene_and_cameras_together_changes_nothing():
+    gaussians, views = scene(degree=0), cameras()
+    quat = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.7, 0.2], dtype=torch.float64), dim=0)
+    turn = gaussians.index(slice(0, 1))
+    turn.quats = quat[None]
+    rotation, shift = turn.rotations[0], torch.tensor([0.4, -1.0, 2.0], dtype=torch.float64)
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3], motion[:3, 3] = rotation, shift
+    moved = replace(
+        gaussians, means=gaussians.means @ rotation.T + shift, quats=multiply_quats(quat, gaussians.quats)
+    )
+    moved_views = replace(views, world_to_camera=views.world_to_camera @ motion.inverse())
+    for got, want in zip(images(render(moved, moved_views)), images(render(gaussians, views)), strict=True):
+        torch.testing.assert_close(got, want, rtol=1e-10, atol=1e-10)
+
+
+def multiply_quats(p: Tensor, q: Tensor) -> Tensor:
+    w = p[0] * q[:, 0] - q[:, 1:] @ p[1:]
+    xyz = p[0] * q[:, 1:] + q[:, :1] * p[1:] + torch.linalg.cross(p[1:].expand_as(q[:, 1:]), q[:, 1:], dim=-1)
+    return torch.cat([w[:, None], xyz], dim=1)
+
+
+def test_culled_gaussians_change_nothing_and_get_no_gradient():
+    seen, views = scene(), cameras()
+    culled = scene(5, seed=9)
+    culled.means[:] = views.positions.mean(dim=0) * 3  # behind both cameras
+    culled.opacity_logits[1] = -50.0
+    both = concatenate([culled, seen])
+    one, other = render(seen, views), render(both, views)
+    assert not other.visible[:, :5].any()
+    for got, want in zip(images(other), images(one), strict=True):
+        assert torch.equal(got, want)
+    grads, both_grads = gradients(seen, views), gradients(both, views)
+    for name in FIELDS:
+        assert torch.equal(both_grads[name][5:], grads[name]), name
+        assert not both_grads[name][:5].any(), name
+    assert not both_grads["means2d"][:, :5].any()
+
+
+def test_fading_a_gaussian_out_removes_it_without_a_jump():
+    gaussians, views = scene().index(slice(1, None)), cameras()
+    without = images(render(gaussians.index(slice(1, None)), views))
+    for opacity, tolerance in ((0.05, 0.1), (1.01 / 255, 0.01), (0.99 / 255, 0.0)):
+        gaussians.opacity_logits[0] = math.log(opacity / (1 - opacity))
+        rgb, alpha, _ = images(render(gaussians, views))
+        torch.testing.assert_close(rgb, without[0], rtol=0, atol=tolerance)
+        torch.testing.assert_close(alpha, without[1], rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize(("tile", "block"), [(1, 1), (4, 1), (8, 100), (16, 2**17), (64, 2**30)])
+def test_tiles_and_blocks_are_nobodys_business(monkeypatch, tile, block):
+    gaussians, views = scene(40), cameras()
+    wanted, wanted_grads = images(render(gaussians, views)), gradients(gaussians, views)
+    monkeypatch.setattr(reference, "TILE", tile)
+    monkeypatch.setattr(reference, "BLOCK", block)
+    for got, want in zip(images(render(gaussians, views)), wanted, strict=True):
+        torch.testing.assert_close(got, want, rtol=1e-12, atol=1e-12)
+    grads = gradients(gaussians, views)
+    for name, want in wanted_grads.items():
+        torch.testing.assert_close(grads[name], want, rtol=1e-10, atol=1e-10)
+
+
+# --- inputs that break others
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_row_with_a_number_that_is_not_finite_is_culled(name, value):
+    gaussians, views = scene(30, dtype=torch.float32), cameras().to(torch.float32)
+    assert render(gaussians, views).visible[:, 3].all()
+    getattr(gaussians, name)[3].view(-1)[-1] = value
+    others = torch.arange(30) != 3
+    output = render(gaussians, views)
+    assert not output.visible[:, 3].any()
+    for got, want in zip(images(output), images(render(gaussians.index(others), views)), strict=True):
+        assert torch.equal(got, want)
+    grads, wanted = gradients(gaussians, views), gradients(gaussians.index(others), views)
+    for field in FIELDS:
+        assert torch.equal(grads[field][others], wanted[field])
+        assert not grads[field][3].any()
+    assert not grads["means2d"][:, 3].any()
+
+
+EXTREMES = [
+    0.0,
+    -0.0,
+    1e-45,
+    1e-38,
+    1e-20,
+    1e-7,
+    1.0,
+    46.0,
+    -46.0,
+    88.0,
+    -88.0,
+    100.0,
+    1e10,
+    -1e10,
+    1e20,
+    3e38,
+    -3e38,
+]
+
+
+@pytest.mark.parametrize("value", EXTREMES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+def test_extreme_numbers_give_finite_images_and_gradients(value, dtype):
+    views = cameras().to(dtype)
+    for name in FIELDS[:4]:  # a colour of 3e38 is honestly infinite
+        for only_one_component in (False, True):
+            gaussians = scene(12, dtype=dtype)
+            row = getattr(gaussians, name)[3].view(-1)
+            row[: 1 if only_one_component else None] = value
+            output = render(gaussians, views)
+            for picture in (*images(output), output.means2d, output.radii):
+                assert picture.isfinite().all(), name
+            for field, grad in gradients(gaussians, views).items():
+                assert grad.isfinite().all(), (name, field)
+
+
+@pytest.mark.parametrize("length", [0.0, 1e-30, 9e-7])
+def test_a_quaternion_without_direction_is_culled(length):
+    gaussians, views = scene(10), cameras()
+    assert render(gaussians, views).visible[:, 1].all()
+    gaussians.quats[1] = torch.tensor([length, 0, 0, 0])
+    assert not render(gaussians, views).visible[:, 1].any()
+    assert not any(grad[1].any() for name, grad in gradients(gaussians, views).items() if name in FIELDS)
+
+
+def test_the_length_of_a_quaternion_does_not_matter():
+    gaussians, views = scene(), cameras()
+    longer = replace(gaussians, quats=gaussians.quats * 1000)
+    for got, want in zip(images(render(longer, views)), images(render(gaussians, views)), strict=True):
+        torch.testing.assert_close(got, want, rtol=1e-12, atol=1e-12)
+
+
+def test_a_huge_splat_fills_the_image_evenly():
+    ball = balls(x=[0.0], radius=1e4, opacity=[0.7], rgb=[[1, 1, 1]])
+    torch.testing.assert_close(
+        render(ball, facing(9)).alpha, torch.full((1, 9, 9), 0.7).double(), rtol=1e-6, atol=0
+    )
+
+
+@pytest.mark.parametrize("n", [0, 4])
+def test_without_anything_to_see_the_background_is_returned_and_gradients_are_zero(n):
+    gaussians, views = scene(n), cameras(2, 5, 7)
+    gaussians.opacity_logits[:] = -20.0
+    output = render(as_parameters(gaussians), views)
+    assert torch.equal(output.rgb, backgrounds(2)[:, None, None].expand(2, 5, 7, 3))
+    assert not output.alpha.any()
+    assert not output.depth.any()
+    assert output.means2d.shape == (2, n, 2)
+    assert output.radii.shape == (2, n)
+    for grad in gradients(gaussians, views).values():
+        assert not grad.any()
+
+
+def test_a_loss_may_look_at_one_output_only():
+    views = cameras()
+    for which in range(3):
+        leaves = as_parameters(scene(20))
+        images(render(leaves, views))[which].sum().backward()
+        assert leaves.means.grad is not None
+        assert leaves.means.grad.any()
+        assert (leaves.sh.grad.any()) == (which == 0), "alpha and depth do not depend on colour"
+
+
+# --- manners
+
+
+def test_the_bits_do_not_depend_on_the_run_or_the_number_of_threads():
+    gaussians, views = scene(150, dtype=torch.float32), cameras(2, 65, 70).to(torch.float32)
+    threads = torch.get_num_threads()
+
+    def everything() -> list[Tensor]:
+        output = render(gaussians, views)
+        return [*images(output), output.means2d, output.radii, *gradients(gaussians, views).values()]
+
+    try:
+        runs = []
+        for count in (1, 2, 2):
+            torch.set_num_threads(count)
+            runs.append(everything())
+    finally:
+        torch.set_num_threads(threads)
+    for run in runs[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(run, runs[0], strict=True))
+
+
+def test_means2d_keeps_its_gradient_exactly_while_gradients_are_on():
+    gaussians, views = scene(20), cameras()
+    with torch.no_grad():
+        assert not render(as_parameters(gaussians), views).means2d.requires_grad
+    gaussians.opacity_logits.requires_grad_()  # nothing that means2d depends on
+    output = render(gaussians, views)
+    output.rgb.sum().backward()
+    assert output.means2d.grad is not None
+    assert output.means2d.grad.shape == (2, 20, 2)
+    assert (output.means2d.grad.any(dim=-1) <= output.visible).all()
+
+
+def test_inputs_are_left_alone():
+    gaussians, views = scene(20), cameras()
+    before = gaussians.map(torch.clone)
+    render(gaussians, views)
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(gaussians.tensors().values(), before.tensors().values(), strict=True)
+    )
+
+
+def test_cameras_and_background_follow_the_gaussians():
+    output = render(scene(20, dtype=torch.float64), cameras().to(torch.float32), torch.ones(2, 3))
+    assert output.rgb.dtype == output.alpha.dtype == output.depth.dtype == torch.float64
+
+
+def test_autocast_does_not_reach_inside():
+    gaussians, views = scene(40, dtype=torch.float32), cameras().to(torch.float32)
+    plain, plain_grads = render(gaussians, views), gradients(gaussians, views)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        cast, cast_grads = render(gaussians, views), gradients(gaussians, views)
+    for got, want in zip(images(cast), images(plain), strict=True):
+        assert torch.equal(got, want)
+    for name in FIELDS:
+        assert torch.equal(cast_grads[name], plain_grads[name]), name
+
+
+def test_tensors_need_not_be_contiguous():
+    gaussians, views = scene(40), cameras()
+    strided = gaussians.map(lambda tensor: torch.stack([tensor, tensor], dim=-1)[..., 0])
+    assert not strided.means.is_contiguous()
+    assert torch.equal(render(strided, views).rgb, render(gaussians, views).rgb)
+
+
+def test_a_render_keeps_little_for_its_backward():
+    # 60 splats fill the image: 60 x 64 x 64 pairs; one float32 array of them would be a megabyte.
+    gaussians = scene(60, dtype=torch.float32).map(lambda tensor: tensor.clone())
+    gaussians.log_scales[:] = 0.0
+    kept: dict[int, int] = {}
+
+    def pack(tensor: Tensor) -> Tensor:
+        kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+        output = render(as_parameters(gaussians), facing(64).to(torch.float32))
+    assert output.visible.sum() > 50
+    assert sum(kept.values()) < 60 * 64 * 64 * 4 / 2
+
+
+def test_a_grown_scene_renders_like_its_parts():
+    gaussians, views = scene(20), cameras()
+    edit = RowEdit(keep=torch.arange(5, 20), children=gaussians.index(slice(0, 5)), parents=torch.arange(5))
+    for got, want in zip(
+        images(render(edit.apply(gaussians), views)), images(render(gaussians, views)), strict=True
+    ):
+        assert torch.equal(got, want)
+
+
+def test_second_derivatives_are_refused():
+    leaves = as_parameters(scene(5))
+    (grad,) = torch.autograd.grad(
+        render(leaves, cameras()).rgb.square().sum(), leaves.means, create_graph=True
+    )
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        grad.sum().backward()
