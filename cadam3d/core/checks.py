@@ -7,7 +7,15 @@ from torch import Tensor
 
 from cadam3d.core.errors import UserError
 
-__all__ = ["UserError", "fail", "require", "require_choice", "require_finite", "require_range"]
+__all__ = [
+    "UserError",
+    "fail",
+    "require",
+    "require_choice",
+    "require_color",
+    "require_finite",
+    "require_range",
+]
 
 
 def fail(key: str, *, wanted: str, got: object, example: str) -> UserError:
@@ -43,10 +51,9 @@ def require_range(
         for sign, bound in ((">=", low), (">", above), ("<=", high), ("<", below))
         if math.isfinite(bound)
     ]
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    is_inside = is_number and low <= value <= high and above < value < below
-    unbounded = is_number and not bounds and math.isfinite(value)
-    if not (is_inside or unbounded):
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    number = value if is_number and value is not None else math.nan
+    if not (low <= number <= high and above < number < below):
         wanted = "a number " + " and ".join(bounds) if bounds else "a finite number"
         raise fail(key, wanted=wanted, got=value, example=f"{key}={example}")
 
@@ -56,6 +63,13 @@ def require_choice(key: str, value: object, choices: Sequence[object]) -> None:
     if value not in choices:
         listed = "|".join(str(choice) for choice in choices)
         raise fail(key, wanted=f"one of {listed}", got=value, example=f"{key}={choices[0]}")
+
+
+def require_color(key: str, value: Sequence[float]) -> None:
+    """Raise unless ``value`` is an RGB colour: three numbers in [0, 1]."""
+    is_color = len(value) == 3 and all(0 <= channel <= 1 for channel in value)
+    example = f"'{key}=[0.5,0.5,0.5]'"
+    require(is_color, key, wanted="three numbers in [0, 1]", got=list(value), example=example)
 
 
 def require_finite(name: str, tensor: Tensor) -> None:
