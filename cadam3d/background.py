@@ -1,0 +1,51 @@
+"""The colour behind the Gaussians. A random one keeps them from painting the background themselves."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.core.checks import require_color, require_range
+
+
+class Background(ABC):
+    """Draws one colour per training view. Frozen hyper-parameters; randomness comes from the generator."""
+
+    @abstractmethod
+    def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
+        """RGB in [0, 1] for each of ``views`` views, on the CPU."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConstantBackground(Background):
+    """The same colour behind every view."""
+
+    color: Sequence[float]  # RGB in [0, 1]
+
+    def __post_init__(self) -> None:
+        require_color("background.color", self.color)
+
+    def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
+        """The colour, for every view."""
+        return torch.tensor([float(channel) for channel in self.color]).repeat(views, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomBackground(Background):
+    """For each view by itself: with ``probability`` a uniformly random colour, else the constant one."""
+
+    probability: float  # in [0, 1]
+    color: Sequence[float]  # RGB in [0, 1]
+
+    def __post_init__(self) -> None:
+        require_range("background.probability", self.probability, low=0, high=1, example=0.5)
+        require_color("background.color", self.color)
+
+    def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
+        """One colour per view; the number of draws does not depend on their outcome."""
+        is_random = torch.rand(views, 1, generator=generator) < self.probability
+        colors = torch.rand(views, 3, generator=generator)
+        return torch.where(is_random, colors, torch.tensor([float(channel) for channel in self.color]))

@@ -1,0 +1,46 @@
+"""Ball: a cloud of near-grey Gaussians around the origin. Needs nothing but a count."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from cadam3d.core.checks import require_color, require_range
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.initializer.base import Initializer
+from cadam3d.initializer.points import gaussians_at, require_points
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ball(Initializer):
+    """``count`` Gaussians at uniformly random points of a ball; the prompt plays no part."""
+
+    count: int
+    radius: float  # world units, at most 1: the object fits in the unit ball
+    scale: (
+        float | None
+    )  # standard deviation in world units; null = mean distance to the three nearest neighbours
+    opacity: float  # in (0, 1)
+    sh_degree: int  # of the colours, 0 to 3
+    color: Sequence[float]  # mean RGB, in [0, 1]
+    color_noise: float  # half-width of a uniform deviation of every channel
+
+    def __post_init__(self) -> None:
+        require_points(self.count, self.scale, self.opacity, self.sh_degree)
+        require_range("initializer.radius", self.radius, above=0, high=1, example=0.6)
+        require_range("initializer.color_noise", self.color_noise, low=0, high=1, example=0.1)
+        require_color("initializer.color", self.color)
+
+    def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
+        """Gaussians with equal density everywhere in the ball."""
+        directions = torch.nn.functional.normalize(torch.randn(self.count, 3, generator=generator), dim=-1)
+        radii = self.radius * torch.rand(self.count, 1, generator=generator) ** (1 / 3)  # volume grows as r^3
+        deviation = self.color_noise * (2 * torch.rand(self.count, 3, generator=generator) - 1)
+        rgb = (torch.tensor([float(channel) for channel in self.color]) + deviation).clamp(0, 1)
+        return gaussians_at(
+            (directions * radii).to(device),
+            rgb.to(device),
+            scale=self.scale,
+            opacity=self.opacity,
+            sh_degree=self.sh_degree,
+        )

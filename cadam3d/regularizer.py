@@ -1,0 +1,100 @@
+"""Regularizers: penalties on Gaussians and renders, added to the guidance loss."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from kornia.losses import total_variation
+from torch import Tensor
+
+from cadam3d.core.checks import require_range
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.render import RenderOutput
+from cadam3d.core.schedule import Schedule, as_schedule
+
+CLEAR = 1e-5  # keeps logarithms finite where a pixel is wholly empty or wholly covered
+
+
+class Regularizer(ABC):
+    """A wish that the prior does not express. Frozen hyper-parameters."""
+
+    @abstractmethod
+    def __call__(self, gaussians: Gaussians, output: RenderOutput, step: int) -> Float[Tensor, ""]:
+        """The weighted penalty at ``step`` (0 is the first), >= 0, with gradient."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weighted(Regularizer):
+    """A penalty times a weight that may follow a schedule."""
+
+    weight: float | Schedule
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.weight, Schedule):
+            require_range("regularizer.*.weight", self.weight, low=0, example=1.0)
+
+    def __call__(self, gaussians: Gaussians, output: RenderOutput, step: int) -> Float[Tensor, ""]:
+        """``weight(step)`` times :meth:`penalty`."""
+        return as_schedule(self.weight)(step) * self.penalty(gaussians, output)
+
+    @abstractmethod
+    def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
+        """The penalty at weight 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeanScale(Weighted):
+    """Mean standard deviation in world units: keeps Gaussians small (LucidDreamer, weight 1)."""
+
+    def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
+        """Mean over Gaussians and axes."""
+        return _mean(gaussians.scales)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutsideBall(Weighted):
+    """Mean squared distance of the centres to the ball that the object has to fit in; zero inside it."""
+
+    radius: float  # world units
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_range("regularizer.*.radius", self.radius, above=0, example=1.0)
+
+    def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
+        """Mean over Gaussians of ``max(|mean| - radius, 0)^2``, in world units squared."""
+        return _mean((gaussians.means.norm(dim=-1) - self.radius).clamp_min(0).square())
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlphaEntropy(Weighted):
+    """Mean binary entropy of the rendered alpha: a pixel should be object or background, not fog."""
+
+    def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
+        """Mean over pixels, in nats: 0 for a clean silhouette, log 2 at most."""
+        alpha = output.alpha.clamp(CLEAR, 1 - CLEAR)
+        return _mean(-alpha * alpha.log() - (1 - alpha) * (1 - alpha).log())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sparsity(Weighted):
+    """Mean of ``sqrt(alpha^2 + 0.01)`` over pixels: empty space should stay empty (as in DreamFusion)."""
+
+    def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
+        """Mean over pixels, in (0.1, 1.005)."""
+        return _mean((output.alpha.square() + 0.01).sqrt())
+
+
+@dataclass(frozen=True, kw_only=True)
+class TotalVariation(Weighted):
+    """Mean absolute difference of neighbouring pixels of the render: suppresses speckle (LucidDreamer)."""
+
+    def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
+        """Mean over views, channels and directions, per pixel."""
+        images = output.rgb.permute(0, 3, 1, 2)
+        return total_variation(images, reduction="mean").mean()
+
+
+def _mean(values: Tensor) -> Float[Tensor, ""]:
+    """The mean; zero of nothing, so that an empty scene is no NaN."""
+    return values.sum() / max(values.numel(), 1)
