@@ -94,5 +94,6 @@ def ddim(
         then, now = now, end
         if k < steps:
             now = start + (end - start).sign() * length.clamp_max(k * stride)
-        noisy = torch.where(per_view(now == then), noisy, prior.path.mix(guess.clean, guess.noise, now))
+        has_arrived = per_view(now) == per_view(then)
+        noisy = torch.where(has_arrived, noisy, prior.path.mix(guess.clean, guess.noise, now))
     return noisy
