@@ -1,0 +1,170 @@
+"""An exact prior for the guidance tests: the images of a prompt are Gaussian around one image."""
+
+from dataclasses import dataclass, field, replace
+
+import pytest
+import torch
+
+from cadam3d.guidance.ism import ISM
+from cadam3d.guidance.sds import SDS
+from cadam3d.guidance.vfds import VFDS
+from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
+from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
+
+SHARED = {
+    "scale": 2.0,
+    "weight": 1.0,
+    "weighting": "unit",
+    "t_min": 0.02,
+    "t_max": 0.98,
+    "shared_t": False,
+    "reduction": "sum",
+    "clip": None,
+}
+OBJECTIVES = {
+    "sds": (SDS, {}),
+    "ism": (ISM, {"delta": 0.05, "inversion_stride": 0.2, "initial_noise": 0.0}),
+    "vfds": (VFDS, {}),
+}
+PATHS = {"ddpm": DDPM(), "flow": RectifiedFlow(), "flow-3": RectifiedFlow(shift=3.0)}
+
+
+@dataclass(frozen=True)
+class Means(Condition):
+    """The mean image of each prompt, one per view."""
+
+    positive: torch.Tensor
+    negative: torch.Tensor
+    empty: torch.Tensor
+    empty_spread: float | None = None  # of images without a prompt; None = the prior's own
+    spread: float | None = None  # of the images of this condition; None = the prior's own
+
+    def unprompted(self):
+        return Means(self.empty, self.empty, self.empty, self.empty_spread, self.empty_spread)
+
+
+@dataclass(frozen=True)
+class MeansEmbedding(PromptEmbedding):
+    means: Means
+
+    def at(self, cameras, background):
+        return self.means
+
+
+@dataclass(frozen=True)
+class Call:
+    """What the prior was asked."""
+
+    t: torch.Tensor
+    scale: float
+    condition: Means
+    gradient: bool
+
+
+@dataclass(frozen=True)
+class GaussianPrior(DiffusionPrior):
+    """x0 ~ N(mean, spread**2): the posterior mean is known in closed form. ``form`` is what it predicts."""
+
+    path: object
+    spread: float = 0.5
+    form: str = "clean"
+    calls: list = field(default_factory=list)
+
+    def embed(self, prompt, negative):
+        means = [torch.full((1, 3, 4, 5), float(len(text))) for text in (prompt, negative, "")]
+        return MeansEmbedding(Means(*means))
+
+    def encode(self, rgb):
+        return rgb.permute(0, 3, 1, 2)
+
+    def predict(self, noisy, t, condition, scale):
+        self.calls.append(Call(t, scale, condition, torch.is_grad_enabled()))
+        with torch.no_grad():
+            mean = condition.negative + scale * (condition.positive - condition.negative)
+            a, b = per_view(self.path.a(t)), per_view(self.path.b(t))
+            spread = self.spread if condition.spread is None else condition.spread
+            variance = a**2 * spread**2 + b**2
+            off = (noisy - a * mean) / torch.where(variance > 0, variance, 1)
+            clean, noise = mean + a * spread**2 * off, b * off
+            if self.form == "clean":
+                return self.path.from_clean(noisy, clean, t)
+            if self.form == "noise":
+                return self.path.from_noise(noisy, noise, t)
+            return self.path.from_velocity(noisy, self.path.velocity(clean, noise, t), t)
+
+
+def random_images(count, seed, views=3):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(count, views, 3, 4, 5, generator=generator, dtype=torch.float64)
+
+
+@pytest.fixture
+def gaussian():
+    """The prior's class."""
+    return GaussianPrior
+
+
+@pytest.fixture
+def means():
+    """Three views of three prompts: positive, negative, empty."""
+    return Means(*random_images(3, seed=5))
+
+
+@pytest.fixture
+def one_image():
+    """Every prompt means the same image."""
+    (image,) = random_images(1, seed=6)
+    return Means(image, image, image)
+
+
+@pytest.fixture
+def one_among_many(one_image):
+    """The prompt names one image; without a prompt nearly anything goes."""
+    return replace(one_image, empty_spread=1e4)
+
+
+@pytest.fixture
+def rgb():
+    """A render, with gradient."""
+    (image,) = random_images(1, seed=7)
+    return image.permute(0, 2, 3, 1).clone().requires_grad_()
+
+
+@pytest.fixture
+def make():
+    """Objectives by name, with every key set; keywords change some."""
+
+    def build(name, **keys):
+        kind, extra = OBJECTIVES[name]
+        return kind(**SHARED | extra | keys)
+
+    return build
+
+
+@pytest.fixture
+def ask():
+    """The guidance on a render as (G / D, output), computed by autograd; the layout is the encoded one."""
+
+    def evaluate(guidance, rgb, condition, prior, *, step=0, seed=0):
+        leaf = rgb.detach().clone().requires_grad_()
+        output = guidance(leaf, condition, prior, step, torch.Generator().manual_seed(seed))
+        (gradient,) = torch.autograd.grad(output.loss, leaf)
+        return gradient.permute(0, 3, 1, 2), output
+
+    return evaluate
+
+
+@pytest.fixture(params=PATHS.values(), ids=PATHS.keys())
+def path(request):
+    return request.param
+
+
+@pytest.fixture
+def prior(path):
+    """The prior on every path."""
+    return GaussianPrior(path)
+
+
+@pytest.fixture(params=OBJECTIVES.keys())
+def objective(request):
+    return request.param

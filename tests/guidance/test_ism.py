@@ -1,0 +1,184 @@
+"""ISM against its closed form on a Gaussian prior, and the laws of DDIM inversion."""
+
+import pytest
+import torch
+
+from cadam3d.core.checks import UserError
+from cadam3d.core.schedule import Linear
+from cadam3d.guidance.ism import ddim
+from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
+
+SPREAD = 0.5
+
+
+def levels(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def drawn_t(views, low, high, seed):
+    generator = torch.Generator().manual_seed(seed)
+    return low + (high - low) * torch.rand(views, generator=generator).double()
+
+
+def step_factor(path, start, end, spread):
+    """What one exact DDIM step multiplies x - a * mean by."""
+    a0, b0, a1, b1 = (per_view(share(t)) for t in (start, end) for share in (path.a, path.b))
+    return (a1 * a0 * spread**2 + b1 * b0) / (a0**2 * spread**2 + b0**2)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1.0, 7.5])
+def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means, rgb):
+    """Every step is affine: follow x - a * mean through 0 -> 0.25 -> s -> t by hand."""
+    keys = {"t_min": 0.4, "t_max": 0.5, "delta": 0.1, "inversion_stride": 0.25, "weighting": "gamma"}
+    gradient, _ = ask(make("ism", scale=scale, **keys), rgb, means, gaussian(path, spread=SPREAD), seed=11)
+
+    clean = rgb.detach().permute(0, 3, 1, 2)
+    t = drawn_t(3, 0.4, 0.5, seed=11)
+    s = t - 0.1
+    now, off = torch.zeros_like(t), clean - means.empty  # off = x - a * mean of the empty prompt
+    for then in (torch.full_like(t, 0.25), s):
+        now, off = then, off * step_factor(path, now, then, SPREAD)
+    a, b = per_view(path.a(s)), per_view(path.b(s))
+    noise_at_s = b * off / (a**2 * SPREAD**2 + b**2)
+    off = off * step_factor(path, s, t, SPREAD)
+    a, b = per_view(path.a(t)), per_view(path.b(t))
+    mean = means.negative + scale * (means.positive - means.negative)
+    noise_at_t = b * (off + a * (means.empty - mean)) / (a**2 * SPREAD**2 + b**2)
+    torch.testing.assert_close(gradient, b / a * (noise_at_t - noise_at_s), rtol=1e-8, atol=1e-9)
+
+
+def test_the_prior_is_asked_as_the_method_says(make, ask, prior, means, rgb):
+    """Unprompted at 0, 0.2, 0.4 and s; prompted, with guidance, at t."""
+    keys = {"t_min": 0.6, "t_max": 0.6 + 1e-9, "delta": 0.1, "inversion_stride": 0.2}
+    ask(make("ism", scale=7.5, **keys), rgb, means, prior)
+    assert [float(call.t[0]) for call in prior.calls] == pytest.approx([0.0, 0.2, 0.4, 0.5, 0.6])
+    *unprompted, prompted = prior.calls
+    assert all(call.condition.positive is means.empty for call in unprompted)
+    assert all(call.condition.negative is means.empty for call in unprompted)
+    assert prompted.condition is means
+    assert prompted.scale == 7.5
+
+
+@pytest.mark.parametrize(
+    ("s", "calls"), [(0.0, 0), (0.1, 1), (0.2, 1), (0.2001, 2), (0.6, 3), (0.93, 5), (1.0, 5)]
+)
+def test_inversion_takes_as_many_steps_as_strides_fit(s, calls, gaussian, means):
+    prior = gaussian(DDPM())
+    ddim(means.positive, levels(0, 0, 0), levels(s, s, s), means, prior, 0.2)
+    assert len(prior.calls) == calls
+
+
+def test_an_interval_longer_than_t_starts_at_the_render(make, ask, gaussian, means, rgb):
+    prior = gaussian(DDPM())
+    ask(make("ism", t_min=0.02, t_max=0.04, delta=0.05), rgb, means, prior)
+    assert [bool((call.t == 0).all()) for call in prior.calls] == [True, False]
+
+
+def test_the_interval_may_be_a_schedule(make, ask, gaussian, means, rgb):
+    guidance = make("ism", delta=Linear(start=0.1, end=0.05, steps=10))
+    for step, delta in ((0, 0.1), (5, 0.075), (10, 0.05)):
+        prior = gaussian(DDPM())
+        ask(guidance, rgb, means, prior, step=step, seed=1)
+        gap = prior.calls[-1].t - prior.calls[-2].t
+        torch.testing.assert_close(gap, torch.full_like(gap, delta))
+
+
+def test_without_initial_noise_it_is_deterministic_given_t(make, ask, prior, means, rgb):
+    keys = {"t_min": 0.5, "t_max": 0.5 + 1e-9}
+    first, again = (ask(make("ism", **keys), rgb, means, prior, seed=s)[0] for s in (0, 1))
+    torch.testing.assert_close(first, again, rtol=1e-6, atol=1e-8)
+    keys |= {"initial_noise": 0.002}
+    first, again = (ask(make("ism", **keys), rgb, means, prior, seed=s)[0] for s in (0, 1))
+    assert (first - again).abs().max() > 1e-4
+
+
+def test_initial_noise_lies_on_the_path(path, make, ask, gaussian, means, rgb):
+    """The inversion starts at t = 0.002 on a x0 + b n; with s below that, at s."""
+    guidance = make("ism", initial_noise=0.002, t_min=0.051, t_max=0.5, delta=0.05, inversion_stride=1.0)
+    prior = gaussian(path, spread=SPREAD)
+    gradient, _ = ask(guidance, rgb, means, prior, seed=4)
+    starts = prior.calls[0].t
+    s = drawn_t(3, 0.051, 0.5, seed=4) - 0.05
+    torch.testing.assert_close(starts, s.clamp_max(0.002))
+
+    clean, generator = rgb.detach().permute(0, 3, 1, 2), torch.Generator().manual_seed(4)
+    torch.rand(3, generator=generator)
+    noise = torch.randn(clean.shape, generator=generator).double()
+    at_s = ddim(path.mix(clean, noise, starts), starts, s, means.unprompted(), prior, 1.0)
+    before = prior.predict(at_s, s, means.unprompted(), 1.0)
+    after = prior.predict(path.mix(before.clean, before.noise, s + 0.05), s + 0.05, means, guidance.scale)
+    torch.testing.assert_close(gradient, after.noise - before.noise, rtol=1e-7, atol=1e-7)
+
+
+def test_inversion_and_sampling_undo_each_other(path, gaussian, means):
+    prior, x0 = gaussian(path, spread=SPREAD), means.positive
+    start, end = levels(0.0, 0.0, 0.0), levels(0.3, 0.6, 0.9)
+    there = ddim(x0, start, end, means, prior, 0.005)
+    back = ddim(there, end, start, means, prior, 0.005)
+    assert (there - x0).abs().max() > 0.1
+    torch.testing.assert_close(back, x0, rtol=0, atol=0.02)
+
+
+def test_the_round_trip_is_exact_without_spread(path, gaussian, means):
+    """The prior knows the image, so it names the noise exactly: any stride will do."""
+    prior = gaussian(path, spread=0.0)
+    start, end = levels(0.1, 0.1, 0.1), levels(0.3, 0.6, 0.9)
+    noisy = path.mix(means.positive, means.empty, start)
+    there = ddim(noisy, start, end, means, prior, 0.5)
+    torch.testing.assert_close(there, path.mix(means.positive, means.empty, end), rtol=0, atol=1e-9)
+    torch.testing.assert_close(ddim(there, end, start, means, prior, 0.5), noisy, rtol=0, atol=1e-9)
+
+
+def test_fine_inversion_follows_the_probability_flow(path, gaussian, means):
+    """The exact trajectory keeps (x - a * mean) / sqrt(a^2 s^2 + b^2) constant."""
+    prior = gaussian(path, spread=SPREAD)
+    start, end = levels(0.01, 0.01, 0.01), levels(0.2, 0.5, 0.8)
+    noisy = path.mix(means.empty, means.negative, start)
+
+    def standardized(x, t):
+        a, b = per_view(path.a(t)), per_view(path.b(t))
+        return (x - a * means.positive) / (a**2 * SPREAD**2 + b**2).sqrt()
+
+    errors = []
+    for stride in (0.01, 0.005):
+        there = ddim(noisy, start, end, means, prior, stride)
+        errors.append(float((standardized(there, end) - standardized(noisy, start)).abs().max()))
+    assert errors[1] < 0.15
+    assert errors[1] == pytest.approx(errors[0] / 2, rel=0.25)  # a first-order method
+
+
+def test_a_view_that_has_arrived_waits_unchanged(path, gaussian, means):
+    start, end = levels(0.0, 0.0, 0.0), levels(0.0, 0.2, 0.9)
+    prior = gaussian(path, spread=SPREAD)
+    together = ddim(means.empty, start, end, means, prior, 0.2)
+    assert torch.equal(together[0], means.empty[0])
+    for view in range(3):
+        one = slice(view, view + 1)
+        own = type(means)(means.positive[one], means.negative[one], means.empty[one])
+        alone = ddim(means.empty[one], start[one], end[one], own, prior, 0.2)
+        torch.testing.assert_close(together[one], alone)
+
+
+def test_at_t_one_of_a_flow_gamma_gives_nothing_rather_than_infinity(make, ask, gaussian, means, rgb):
+    guidance = make("ism", weighting="gamma", t_min=1 - 1e-9, t_max=1.0)  # 1 in single precision
+    single = type(means)(means.positive.float(), means.negative.float(), means.empty.float())
+    gradient, output = ask(guidance, rgb.float(), single, gaussian(RectifiedFlow()))
+    assert (gradient == 0).all()
+    assert output.log["guidance_nonfinite"] == gradient.numel()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("delta", 0.0),
+        ("delta", 1.5),
+        ("delta", Linear(start=0.1, end=-0.1, steps=10)),
+        ("inversion_stride", 0.0),
+        ("inversion_stride", 2.0),
+        ("initial_noise", -0.1),
+        ("initial_noise", 1.0),
+    ],
+)
+def test_wrong_values_are_refused_by_key(key, value, make):
+    with pytest.raises(UserError, match=f"guidance.{key}: "):
+        make("ism", **{key: value})

@@ -1,0 +1,204 @@
+"""Laws of the tiny prior: everything a real one has, except knowledge."""
+
+import pytest
+import torch
+
+from cadam3d.core.cameras import turntable
+from cadam3d.core.checks import UserError
+from cadam3d.prior.path import DDPM, RectifiedFlow
+from cadam3d.prior.tiny import MAX_TOKENS, PADDING, Tiny, tokenize
+
+KEYS = {"predicts": "noise", "path": DDPM(), "width": 16, "downscale": 2, "seed": 0}
+
+
+@pytest.fixture(scope="module")
+def prior():
+    return Tiny(**KEYS)
+
+
+def condition_of(prior, prompt="a red cube", negative="", views=2):
+    cameras = turntable(views, elevation_deg=15.0, distance=3.0, fov_y_deg=40.0, size=32)
+    return prior.embed(prompt, negative).at(cameras, torch.zeros(views, 3))
+
+
+def noisy_of(views=2, size=(12, 12), seed=0):
+    return torch.randn(views, 3, *size, generator=torch.Generator().manual_seed(seed))
+
+
+def levels(views=2, value=0.5):
+    return torch.full((views,), value)
+
+
+@pytest.mark.parametrize("width", [16, 48])
+def test_it_is_tiny(width):
+    network = Tiny(**KEYS | {"width": width}).network
+    assert sum(parameter.numel() for parameter in network.parameters()) < 2_000_000
+
+
+def test_it_is_frozen(prior):
+    assert not any(parameter.requires_grad for parameter in prior.network.parameters())
+
+
+def test_weights_depend_on_the_seed_alone():
+    torch.manual_seed(1)
+    first = Tiny(**KEYS).network.state_dict()
+    torch.manual_seed(2)
+    again = Tiny(**KEYS).network.state_dict()
+    other = Tiny(**KEYS | {"seed": 1}).network.state_dict()
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert not torch.equal(first["enter.weight"], other["enter.weight"])
+
+
+def test_global_randomness_is_left_alone():
+    before = torch.get_rng_state()
+    prior = Tiny(**KEYS)
+    prior.predict(noisy_of(), levels(), condition_of(prior), 7.5)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_a_prediction_repeats_itself(prior):
+    condition = condition_of(prior)
+    first, again = (prior.predict(noisy_of(), levels(), condition, 7.5) for _ in range(2))
+    assert torch.equal(first.clean, again.clean)
+
+
+def test_a_prediction_carries_no_gradient(prior):
+    guess = prior.predict(noisy_of().requires_grad_(), levels(), condition_of(prior), 7.5)
+    assert not guess.clean.requires_grad
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_prediction_keeps_the_dtype(prior, dtype):
+    guess = prior.predict(noisy_of().to(dtype), levels().to(dtype), condition_of(prior), 7.5)
+    assert guess.clean.dtype == guess.noise.dtype == guess.velocity.dtype == dtype
+
+
+@pytest.mark.parametrize("size", [(8, 8), (9, 13), (31, 8), (64, 64)])
+@pytest.mark.parametrize("downscale", [1, 3, 8])
+def test_any_size_from_8_pixels_works(size, downscale):
+    prior = Tiny(**KEYS | {"downscale": downscale})
+    latents = prior.encode(torch.rand(1, *size, 3))
+    assert latents.shape == (1, 3, -(-size[0] // downscale), -(-size[1] // downscale))
+    guess = prior.predict(latents, levels(1), condition_of(prior, views=1), 7.5)
+    assert guess.noise.shape == latents.shape
+    assert guess.clean.isfinite().all()
+
+
+@pytest.mark.parametrize("t", [0.0, 1e-4, 1.0])
+def test_both_ends_of_the_path_are_finite(prior, t):
+    guess = prior.predict(noisy_of(), levels(value=t), condition_of(prior), 7.5)
+    assert guess.clean.isfinite().all()
+    assert guess.noise.isfinite().all()
+
+
+def test_encoding_maps_grey_levels_to_plus_minus_one(prior):
+    for grey, latent in ((0.0, -1.0), (0.5, 0.0), (1.0, 1.0)):
+        encoded = prior.encode(torch.full((1, 9, 9, 3), grey))
+        torch.testing.assert_close(encoded, torch.full((1, 3, 5, 5), latent))
+
+
+def test_encoding_passes_a_gradient_to_every_pixel(prior):
+    rgb = torch.rand(1, 9, 11, 3, requires_grad=True)
+    prior.encode(rgb).sum().backward()
+    assert (rgb.grad > 0).all()
+
+
+def test_guidance_has_the_conventional_form(prior):
+    condition = condition_of(prior, "a red cube", "ugly")
+    negative, positive, guided = (
+        prior.predict(noisy_of(), levels(), condition, s).noise for s in (0.0, 1.0, 7.5)
+    )
+    torch.testing.assert_close(guided, negative + 7.5 * (positive - negative), rtol=1e-4, atol=1e-4)
+
+
+def test_scale_one_is_the_prompt_alone_and_zero_the_negative_alone(prior):
+    mixed = condition_of(prior, "a red cube", "ugly")
+    only_prompt, only_negative = condition_of(prior, "a red cube"), condition_of(prior, "ugly")
+    for scale, alone in ((1.0, only_prompt), (0.0, only_negative)):
+        got = prior.predict(noisy_of(), levels(), mixed, scale).noise
+        torch.testing.assert_close(got, prior.predict(noisy_of(), levels(), alone, 1.0).noise)
+
+
+def test_unprompted_forgets_both_prompts_and_keeps_the_views(prior):
+    blank = condition_of(prior, "a red cube", "ugly").unprompted()
+    empty = condition_of(prior, "", "")
+    torch.testing.assert_close(
+        prior.predict(noisy_of(), levels(), blank, 3.0).noise,
+        prior.predict(noisy_of(), levels(), empty, 1.0).noise,
+    )
+
+
+def noise_of(prior, **keys):
+    return prior.predict(noisy_of(1), levels(1), condition_of(prior, views=1, **keys), 1.0).noise
+
+
+def test_another_prompt_is_another_image(prior):
+    assert (noise_of(prior, prompt="a red cube") - noise_of(prior, prompt="a red cone")).abs().max() > 1e-3
+
+
+def test_word_order_matters(prior):
+    assert (
+        noise_of(prior, prompt="cube on ball") - noise_of(prior, prompt="ball on cube")
+    ).abs().max() > 1e-4
+
+
+def test_another_view_is_another_image(prior):
+    guess = prior.predict(noisy_of(1).repeat(2, 1, 1, 1), levels(), condition_of(prior), 1.0).noise
+    assert (guess[0] - guess[1]).abs().max() > 1e-3
+
+
+def test_another_noise_level_is_another_image(prior):
+    condition = condition_of(prior, views=1)
+    low, high = (prior.predict(noisy_of(1), levels(1, t), condition, 1.0).noise for t in (0.2, 0.8))
+    assert (low - high).abs().max() > 1e-3
+
+
+def test_views_do_not_influence_each_other(prior):
+    together = prior.predict(noisy_of(), levels(), condition_of(prior), 7.5).noise
+    alone = prior.predict(noisy_of()[:1], levels(1), condition_of(prior, views=1), 7.5).noise
+    torch.testing.assert_close(together[:1], alone, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("path", [DDPM(), RectifiedFlow(shift=3.0)], ids=["ddpm", "flow"])
+def test_the_output_means_what_predicts_says(path):
+    """The same network, read as noise and as velocity."""
+    as_noise, as_velocity = (Tiny(**KEYS | {"path": path, "predicts": p}) for p in ("noise", "velocity"))
+    condition = condition_of(as_noise)
+    noise = as_noise.predict(noisy_of(), levels(), condition, 1.0).noise
+    guess = as_velocity.predict(noisy_of(), levels(), condition, 1.0)
+    torch.testing.assert_close(guess.velocity, noise)
+    torch.testing.assert_close(guess.clean, path.from_velocity(noisy_of(), noise, levels()).clean)
+
+
+def test_tokens_are_bytes_between_start_and_padding():
+    tokens = tokenize("aé").tolist()
+    assert tokens[1:4] == list("aé".encode())
+    assert set(tokens[4:]) == {PADDING}
+    assert len(tokens) == len(tokenize("x" * 1000)) == MAX_TOKENS
+
+
+def test_it_tells_the_user_what_it_is(prior):
+    assert "no meaningful object" in prior.notice()
+    assert "prior=shapes" in prior.notice()
+
+
+def test_moving_returns_the_prior(prior):
+    assert prior.to(torch.device("cpu")) is prior
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cuda_agrees_with_the_cpu(prior):
+    there = Tiny(**KEYS).to(torch.device("cuda"))
+    near = prior.predict(noisy_of(), levels(), condition_of(prior), 2.0).noise
+    far = there.predict(noisy_of().cuda(), levels().cuda(), condition_of(there), 2.0).noise
+    torch.testing.assert_close(far.cpu(), near, rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("predicts", "clean"), ("width", 20), ("width", 64), ("downscale", 0), ("seed", -1)],
+)
+def test_wrong_values_are_refused_by_key(key, value):
+    with pytest.raises(UserError, match=f"prior.{key}"):
+        Tiny(**KEYS | {key: value})
