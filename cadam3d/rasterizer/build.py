@@ -1,0 +1,176 @@
+"""The native CPU kernels: compiled once by this machine's compiler, kept in the user's cache folder.
+
+A cached file carries three hashes in its name: of the sources, flags and the machine; of the compiler; of its own
+bytes. So a copied home folder, a new release, another compiler or a damaged file each lead to a fresh build, and
+no lock is needed: whoever finishes first renames its file into place, and any file that fits its name will do.
+"""
+
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from cadam3d.core.checks import UserError
+from cadam3d.rasterizer import base
+
+KERNELS = Path(__file__).parent / "kernels"
+SOURCES = ("cpu.cpp", "simd.h", "splat_math.h")
+FLAGS = (
+    "-std=c++17",
+    "-O3",
+    "-shared",
+    "-fPIC",
+    "-pthread",
+    "-fvisibility=hidden",
+    "-ffp-contract=off",  # fused only where written: forward and backward must see the same bits
+    "-fno-math-errno",  # so that sqrt is one instruction; values stay IEEE
+    "-fno-trapping-math",
+    "-fno-tree-vectorize",  # what is worth it is written as vectors; the rest only gets slower
+    "-Wno-psabi",
+)
+STATIC = ("-static-libstdc++", "-static-libgcc")  # another libstdc++ may already be loaded, an older one
+# Tried in turn until one compiles and runs: not every compiler knows every flag.
+MACHINE_FLAGS = (("-march=native", *STATIC), ("-march=native",), ("-mcpu=native",), ())
+CONSTANTS = ("BLUR", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN", "NEAR", "FRUSTUM_MARGIN")
+SUFFIX = ".dll" if sys.platform == "win32" else ".so"
+SELF_TEST = "import ctypes, sys; sys.exit(ctypes.CDLL(sys.argv[1]).cadam3d_self_test())"
+TIMEOUT = 300  # seconds for one run of the compiler; it needs about three
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """A C++ compiler that answers."""
+
+    command: tuple[str, ...]  # how it is called
+    version: str  # first line of what it says about itself
+
+
+@dataclass(frozen=True)
+class Build:
+    """A compiled library, ready to load."""
+
+    path: Path
+    seconds: float  # spent compiling; 0 if it came from the cache
+
+
+def default_cache_dir() -> Path:
+    """``cadam3d`` in the user's cache folder (``$XDG_CACHE_HOME``, else ``~/.cache``)."""
+    root = os.environ.get("XDG_CACHE_HOME")
+    return (Path(root) if root else Path("~/.cache").expanduser()) / "cadam3d"
+
+
+def find_compiler() -> Compiler | None:
+    """The first that answers of ``$CXX``, ``c++``, ``g++``, ``clang++`` and the ``ziglang`` Python package."""
+    commands = [tuple(os.environ.get("CXX", "").split()), ("c++",), ("g++",), ("clang++",)]
+    if find_spec("ziglang"):
+        commands.append((sys.executable, "-m", "ziglang", "c++"))
+    for command in commands:
+        if command and shutil.which(command[0]):
+            answer = _run([*command, "--version"])
+            if answer.returncode == 0 and answer.stdout.strip():
+                return Compiler(command, answer.stdout.splitlines()[0].strip())
+    return None
+
+
+def find_cached(cache_dir: Path, compiler: Compiler | None) -> Path | None:
+    """An intact library for these sources and this machine, from ``compiler`` (``None``: from any)."""
+    by = _short_hash(compiler.version) if compiler else "*"
+    for path in sorted(cache_dir.glob(f"rasterizer-{_key()}-{by}-*{SUFFIX}")):
+        if path.stem.endswith(_short_hash(path.read_bytes())):
+            return path
+    return None
+
+
+def build(cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAGS) -> Build:
+    """The library in ``cache_dir``, compiled now if it is not there.
+
+    ``machine_flags`` are alternatives, tried in turn. Raises :class:`UserError` if there is neither a cached
+    library nor a compiler, if the compiler fails, or if the folder cannot be written.
+    """
+    compiler = find_compiler()
+    cached = find_cached(cache_dir, compiler) if tuple(machine_flags) == MACHINE_FLAGS else None
+    if cached:
+        return Build(cached, 0.0)
+    if compiler is None:
+        raise UserError(
+            "rasterizer=cpu needs a C++ compiler once, and found none (c++, g++, clang++, $CXX). Install one: "
+            "`apt install g++`, `xcode-select --install` or `pip install ziglang`. "
+            "Or try: rasterizer=reference"
+        )
+    start = time.perf_counter()
+    try:
+        cache_dir.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache_dir, prefix="build-") as folder:
+            path = _compile(compiler, Path(folder) / f"rasterizer{SUFFIX}", machine_flags)
+            by, digest = _short_hash(compiler.version), _short_hash(path.read_bytes())
+            final = cache_dir / f"rasterizer-{_key()}-{by}-{digest}{SUFFIX}"
+            path.replace(final)
+    except OSError as error:
+        raise UserError(
+            f"rasterizer=cpu cannot keep its compiled kernels in {cache_dir}: {error}. "
+            "Try: rasterizer.cache_dir=/tmp/cadam3d"
+        ) from error
+    return Build(final, time.perf_counter() - start)
+
+
+def _compile(compiler: Compiler, target: Path, machine_flags: Sequence[Sequence[str]]) -> Path:
+    defines = [f"-DSPLAT_{name}={getattr(base, name)!r}" for name in CONSTANTS]
+    source = str(KERNELS / SOURCES[0])
+    complaint = ""
+    for flags in machine_flags:
+        answer = _run([*compiler.command, *FLAGS, *flags, *defines, source, "-o", str(target)])
+        if answer.returncode == 0:
+            # In a process of its own: an instruction this machine lacks would end the process.
+            answer = _run([sys.executable, "-I", "-S", "-c", SELF_TEST, str(target)])
+            if answer.returncode == 0:
+                return target
+        complaint = answer.stderr.strip()[-2000:] or f"exit code {answer.returncode}"
+    raise UserError(
+        f"rasterizer=cpu: {' '.join(compiler.command)} ({compiler.version}) could not build the kernels:\n"
+        f"{complaint}\nName another compiler in CXX, or try: rasterizer=reference"
+    )
+
+
+def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return subprocess.CompletedProcess(command, 1, "", str(error))
+
+
+def _key() -> str:
+    parts = [(KERNELS / name).read_text() for name in SOURCES]
+    parts += [repr((FLAGS, MACHINE_FLAGS)), repr([getattr(base, name) for name in CONSTANTS])]
+    return _short_hash("\0".join([*parts, _machine()]))
+
+
+def _machine() -> str:
+    """What ``-march=native`` depends on."""
+    facts = [platform.machine(), sysconfig.get_platform(), platform.processor()]
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        wanted = ("model name", "flags", "Features", "CPU part")
+        lines = [line for line in cpuinfo.read_text().splitlines() if line.startswith(wanted)]
+        facts += sorted(set(lines))  # every core says the same, or nearly
+    elif sys.platform == "darwin":
+        facts.append(_run(["sysctl", "-n", "machdep.cpu.brand_string"]).stdout)
+    return "\n".join(facts)
+
+
+def _short_hash(content: str | bytes) -> str:
+    return hashlib.sha256(content.encode() if isinstance(content, str) else content).hexdigest()[:16]
+
+
+def load(build: Build) -> ctypes.CDLL:
+    """The library as ctypes sees it."""
+    return ctypes.CDLL(str(build.path))
