@@ -2,8 +2,9 @@
 
 Each kind is written in its own coordinates and lives in the world through an affine map. A ray keeps its
 parameter under an affine map, so sphere tracing in own coordinates stays exact for stretched solids too: an
-ellipsoid is a stretched ball, and no approximate distance is needed. Every function here is 1-Lipschitz and has
-the right sign, which is all that sphere tracing asks (Hart 1996, sec. 2); many are the maximum of a few planes.
+ellipsoid is a stretched ball, and no approximate distance is needed. Every function here is 1-Lipschitz and
+has the right sign, which is all that sphere tracing asks (Hart 1996, sec. 2); many are the maximum of a few
+planes.
 """
 
 import math

@@ -1,8 +1,8 @@
 """Sphere tracing: rays march by the distance to the surface until they touch it (Hart 1996).
 
 Every part is traced on its own, only by rays that meet its bounding box, in its own coordinates; the nearest
-hit wins. All parts of one kind march together, so the number of tensor operations does not grow with the number
-of parts. Light is baked into the world and does not depend on the view: an asset of SH degree 0 can match it.
+hit wins. All parts of one kind march together, so the number of tensor operations does not grow with the
+number of parts. Light is baked into the world, not into the view: an asset of SH degree 0 can match it.
 """
 
 import math

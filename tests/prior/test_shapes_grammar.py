@@ -1,0 +1,103 @@
+"""What the grammar understands, and what it says when it does not."""
+
+import pytest
+
+from cadam3d.core.checks import UserError
+from cadam3d.prior.shapes.grammar import Phrase, Sentence, known_words, parse
+from cadam3d.prior.shapes.objects import ALIASES, known_objects, known_primitives
+from cadam3d.prior.shapes.vocabulary import COLOURS
+
+
+def test_the_world_is_as_rich_as_promised() -> None:
+    assert len(known_primitives()) >= 12
+    assert len(known_objects()) >= 10
+
+
+@pytest.mark.parametrize("noun", [*known_primitives(), *known_objects(), *ALIASES])
+def test_every_noun_is_read_alone_and_described(noun: str) -> None:
+    name = ALIASES.get(noun, noun)
+    assert parse(noun) == Sentence(Phrase(name))
+    assert parse(f"A small, dark-green {noun}!") == Sentence(Phrase(name, ("dark green",), size=0.65))
+
+
+@pytest.mark.parametrize("noun", [*known_primitives(), *known_objects()])
+def test_plurals_make_several(noun: str) -> None:
+    plural = {"torus": "tori", "box": "boxes", "arch": "arches"}.get(noun, f"{noun}s")
+    assert parse(f"three {plural}").phrase == Phrase(noun, count=3)
+    assert parse(plural).phrase == Phrase(noun, count=2)
+
+
+def test_every_colour_is_read() -> None:
+    for colour in COLOURS:
+        assert parse(f"a {colour} cube").phrase.colours == (colour,)
+
+
+def test_colours_pattern_and_noun_of_the_demo() -> None:
+    expected = Sentence(Phrase("torus", ("red", "yellow"), "checkered"))
+    assert parse("a red and yellow checkered torus") == expected
+    assert parse("Red-and-yellow CHEQUERED torus") == expected
+    assert parse("red, yellow checkered torus") == expected
+
+
+@pytest.mark.parametrize(
+    ("prompt", "relation"),
+    [
+        ("a cube on a sphere", "on"),
+        ("a cube on top of a sphere", "on"),
+        ("a cube next to a sphere", "next to"),
+        ("a cube beside the sphere", "next to"),
+        ("a cube and a sphere", "next to"),
+        ("a cube underneath a sphere", "under"),
+        ("a cube in front of a sphere", "in front of"),
+        ("a cube behind a sphere", "behind"),
+        ("a cube above a sphere", "above"),
+    ],
+)
+def test_relations(prompt: str, relation: str) -> None:
+    assert parse(prompt) == Sentence(Phrase("cube"), relation, (Sentence(Phrase("sphere")),))
+
+
+def test_between_takes_two_objects_and_chains_nest_to_the_right() -> None:
+    red, blue = Phrase("cube", ("red",)), Phrase("cube", ("blue",))
+    between = parse("a white sphere between a red cube and a blue cube")
+    assert between == Sentence(Phrase("sphere", ("white",)), "between", (Sentence(red), Sentence(blue)))
+    chain = parse("a red cube on a blue cube on a table")
+    assert chain == Sentence(red, "on", (Sentence(blue, "on", (Sentence(Phrase("table")),)),))
+
+
+def test_words_in_two_parts_and_words_about_pictures() -> None:
+    assert parse("a 3D model of a light-house") == Sentence(Phrase("lighthouse"))
+    assert parse("a photo of an ice cream") == Sentence(Phrase("icecream"))
+
+
+def test_unknown_words_are_all_named_with_near_ones_and_the_way_out() -> None:
+    with pytest.raises(UserError) as caught:
+        parse("a fluffy lighthous on a redd cube")
+    message = str(caught.value)
+    assert all(word in message for word in ("'fluffy'", "'lighthous'", "'redd'"))
+    assert "did you mean lighthouse" in message
+    assert all(word in message for group in known_words().values() for word in group)
+    assert "cadam3d doctor" in message
+    assert "prompt=" in message
+    assert "'cube'" not in message
+
+
+@pytest.mark.parametrize(
+    ("prompt", "reason"),
+    [
+        ("red", "an object is missing"),
+        ("  ", "an object is missing"),
+        ("a cube on", "an object is missing"),
+        ("on a cube", "before 'on'"),
+        ("a cube sphere", "relation"),
+        ("a cube red", "relation"),
+        ("a dark cube", "'dark' wants a colour"),
+        ("a dark small red cube", "'dark' wants a colour"),
+        ("a red, green and blue cube", "at most 2 colours"),
+        ("a cube between a sphere", "joined by 'and'"),
+    ],
+)
+def test_broken_sentences_say_what_is_wrong(prompt: str, reason: str) -> None:
+    with pytest.raises(UserError, match=reason) as caught:
+        parse(prompt)
+    assert 'Try: prompt="' in str(caught.value)

@@ -1,0 +1,186 @@
+"""The closed form of the denoiser, proved: against Monte-Carlo, against the score, by sampling with it."""
+
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor
+
+from cadam3d.prior.path import DDPM, NoisePath, RectifiedFlow, per_view
+from cadam3d.prior.shapes.mixture import Mixture
+
+PATHS = [pytest.param(DDPM(), id="ddpm"), pytest.param(RectifiedFlow(), id="flow")]
+WEIGHTS = torch.tensor([0.5, 0.3, 0.2], dtype=torch.float64)
+MEANS = torch.tensor([[-0.6, 0.5], [0.7, 0.6], [0.1, -0.8]], dtype=torch.float64)  # three modes of two pixels
+SIGMA = torch.tensor([0.15, 0.30], dtype=torch.float64)
+
+
+def small(views: int, sigma: Tensor = SIGMA) -> Mixture:
+    """The same three modes in every view: one channel, one row, two pixels."""
+    return Mixture(
+        means=MEANS.reshape(1, 3, 1, 1, 2).expand(views, -1, -1, -1, -1),
+        log_weights=WEIGHTS.log(),
+        variance=sigma.square().reshape(1, 1, 1, 2).expand(views, -1, -1, -1),
+    )
+
+
+def draw(count: int, generator: torch.Generator) -> Tensor:
+    """Samples of the mixture, the plain way."""
+    mode = torch.multinomial(WEIGHTS, count, replacement=True, generator=generator)
+    noise = torch.randn(count, 2, generator=generator, dtype=torch.float64)
+    return (MEANS[mode] + SIGMA * noise).reshape(count, 1, 1, 2)
+
+
+def at(path: NoisePath, t: float, views: int = 1) -> tuple[Tensor, Tensor, Tensor]:
+    times = torch.full((views,), t, dtype=torch.float64)
+    return times, path.a(times), path.b(times)
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("t", [0.1, 0.4, 0.7, 0.95])
+def test_posterior_mean_equals_monte_carlo(path: NoisePath, t: float) -> None:
+    """Weigh samples of the prior by the likelihood of the noisy image: no formula of the mixture is used."""
+    generator = torch.Generator().manual_seed(0)
+    samples = draw(400_000, generator).reshape(-1, 2)
+    _, a, b = at(path, t)
+    for _ in range(4):
+        start = draw(1, generator)
+        noise = torch.randn(1, 1, 1, 2, generator=generator, dtype=torch.float64)
+        noisy = per_view(a) * start + per_view(b) * noise
+        weights = (-0.5 * ((noisy.reshape(2) - a * samples) / b).square().sum(1)).softmax(0)
+        expected = weights @ samples
+        error = (weights.square() @ (samples - expected).square()).sqrt()
+        clean, predicted_noise = small(1).denoise(noisy, a, b)
+        assert bool(((clean.reshape(2) - expected).abs() < 5 * error + 1e-6).all())
+        from_samples = (noisy.reshape(2) - a * expected) / b
+        assert bool(((predicted_noise.reshape(2) - from_samples).abs() < (5 * error + 1e-6) * a / b).all())
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("t", [0.05, 0.5, 1.0])
+def test_noise_is_the_score_of_the_noisy_density(path: NoisePath, t: float) -> None:
+    """Tweedie: E[eps | noisy] = -b d/dnoisy log p(noisy), by central differences of the log-density."""
+    generator = torch.Generator().manual_seed(1)
+    _, a, b = at(path, t)
+    noisy = torch.randn(1, 1, 1, 2, generator=generator, dtype=torch.float64)
+    _, noise = small(1).denoise(noisy, a, b)
+    step = 1e-5
+    for pixel in range(2):
+        shift = torch.zeros_like(noisy)
+        shift[..., pixel] = step
+        slope = (small(1).log_density(noisy + shift, a, b) - small(1).log_density(noisy - shift, a, b)) / (
+            2 * step
+        )
+        torch.testing.assert_close(noise[0, 0, 0, pixel], (-b * slope)[0], rtol=1e-6, atol=1e-8)
+
+
+def test_density_integrates_to_one() -> None:
+    _, a, b = at(DDPM(), 0.3)
+    axis = torch.linspace(-6, 6, 301, dtype=torch.float64)
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    points = torch.stack([y.flatten(), x.flatten()], dim=1).reshape(-1, 1, 1, 2)
+    count = points.shape[0]
+    density = small(count).log_density(points, a.expand(count), b.expand(count)).exp()
+    torch.testing.assert_close(float(density.sum()) * (12 / 300) ** 2, 1.0, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_clean_and_noise_explain_the_noisy_image(path: NoisePath) -> None:
+    generator = torch.Generator().manual_seed(2)
+    for t in (1e-6, 0.2, 0.8, 1.0):
+        _, a, b = at(path, t, 5)
+        noisy = torch.randn(5, 1, 1, 2, generator=generator, dtype=torch.float64)
+        clean, noise = small(5).denoise(noisy, a, b)
+        torch.testing.assert_close(per_view(a) * clean + per_view(b) * noise, noisy)
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("sigma", [0.0, 0.2])
+@pytest.mark.parametrize("t", [0.0, 1e-7, 1 - 1e-7, 1.0])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_ends_of_the_path_are_finite(path: NoisePath, sigma: float, t: float, dtype: torch.dtype) -> None:
+    times = torch.full((2,), t, dtype=dtype)
+    mixture = small(2, torch.full((2,), sigma, dtype=torch.float64))
+    mixture = Mixture(*(getattr(mixture, name).to(dtype) for name in ("means", "log_weights", "variance")))
+    clean, noise = mixture.denoise(torch.ones(2, 1, 1, 2, dtype=dtype), path.a(times), path.b(times))
+    assert bool(clean.isfinite().all())
+    assert bool(noise.isfinite().all())
+    if sigma > 0 and t == 0:
+        torch.testing.assert_close(
+            clean, torch.ones(2, 1, 1, 2, dtype=dtype)
+        )  # a clean image is its own mean
+
+
+def test_pure_noise_gives_the_mean_of_the_mixture() -> None:
+    _, a, b = at(RectifiedFlow(), 1.0)
+    noisy = torch.tensor([[[[3.0, -2.0]]]], dtype=torch.float64)
+    clean, noise = small(1).denoise(noisy, a, b)
+    torch.testing.assert_close(clean.reshape(2), WEIGHTS @ MEANS)
+    torch.testing.assert_close(noise, noisy)
+
+
+def test_certain_modes_answer_with_the_nearest() -> None:
+    _, a, b = at(DDPM(), 0.0)
+    noisy = (MEANS[1] + 0.05).reshape(1, 1, 1, 2)
+    clean, noise = small(1, torch.zeros(2, dtype=torch.float64)).denoise(noisy, a, b)
+    torch.testing.assert_close(clean.reshape(2), MEANS[1])
+    assert float(noise.abs().max()) == 0.0
+
+
+def test_large_images_do_not_underflow() -> None:
+    """A hundred thousand pixels: densities far below the smallest float, responsibilities still right."""
+    means = torch.stack([torch.zeros(3, 200, 200), torch.full((3, 200, 200), 0.01)])[None]
+    mixture = Mixture(means, torch.full((2,), math.log(0.5)), torch.full((1, 3, 200, 200), 0.04))
+    noisy = torch.full((1, 3, 200, 200), 0.005)
+    shares = mixture.responsibilities(noisy, torch.ones(1), torch.full((1,), 0.5))
+    torch.testing.assert_close(shares, torch.full((1, 2), 0.5, dtype=torch.float64), atol=1e-3, rtol=0)
+
+
+def check_recovered(samples: Tensor) -> None:
+    """Mode weights, means and spread of the samples, within five standard errors and the steps' bias."""
+    flat, count = samples.reshape(-1, 2), samples.shape[0]
+    mode = ((flat[:, None] - MEANS) / SIGMA).square().sum(-1).argmin(1)
+    shares = torch.bincount(mode, minlength=3).double() / count
+    torch.testing.assert_close(shares, WEIGHTS, atol=5 * math.sqrt(0.25 / count), rtol=0)
+    for index in range(3):
+        chosen = flat[mode == index]
+        error = SIGMA / math.sqrt(len(chosen))
+        assert bool(((chosen.mean(0) - MEANS[index]).abs() < 5 * error + 0.01).all())
+        torch.testing.assert_close(chosen.std(0), SIGMA, rtol=5 / math.sqrt(2 * len(chosen)), atol=0)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_ode_sampling_recovers_the_distribution(path: NoisePath) -> None:
+    """DDIM steps (on the flow: Euler steps of the velocity) carry noise to the mixture."""
+    count, generator = 8000, torch.Generator().manual_seed(3)
+    times = torch.linspace(1, 0, 151, dtype=torch.float64) ** 2  # finer where the image appears
+    mixture = small(count)
+    _, a, b = at(path, 1.0, count)
+    pure = torch.randn(count, 1, 1, 2, generator=generator, dtype=torch.float64)
+    x = per_view(a) * draw(count, generator) + per_view(b) * pure  # DDPM keeps some signal at t = 1
+    for now, then in pairwise(times):
+        _, a, b = at(path, float(now), count)
+        clean, noise = mixture.denoise(x, a, b)
+        x = path.mix(clean, noise, then.expand(count))
+    check_recovered(x)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_ancestral_sampling_recovers_the_distribution(path: NoisePath) -> None:
+    """DDPM's own sampler: step to the posterior q(x_s | x_t, clean), with fresh noise each time."""
+    count, generator = 8000, torch.Generator().manual_seed(4)
+    times = torch.linspace(1, 0, 301, dtype=torch.float64) ** 2
+    mixture = small(count)
+    _, a, b = at(path, 1.0, count)
+    pure = torch.randn(count, 1, 1, 2, generator=generator, dtype=torch.float64)
+    x = per_view(a) * draw(count, generator) + per_view(b) * pure
+    for now, then in pairwise(times):
+        _, a, b = at(path, float(now), count)
+        _, a_next, b_next = at(path, float(then), count)
+        clean, noise = mixture.denoise(x, a, b)
+        fresh = b_next / b * (b**2 - (a / a_next * b_next) ** 2).clamp_min(0).sqrt()
+        kept = (b_next**2 - fresh**2).clamp_min(0).sqrt()
+        new = torch.randn(count, 1, 1, 2, generator=generator, dtype=torch.float64)
+        x = per_view(a_next) * clean + per_view(kept) * noise + per_view(fresh) * new
+    check_recovered(x)
