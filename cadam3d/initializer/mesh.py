@@ -23,8 +23,8 @@ UPS = ("z", "y")
 class Mesh(Initializer):
     """``count`` Gaussians at uniformly random points of a surface; the prompt plays no part.
 
-    Reads whatever trimesh reads (PLY, OBJ, STL, GLB, OFF, ...), with vertex, face or texture colours. It is moved
-    and scaled so that its bounding box is centred at the origin, its farthest point at ``radius``.
+    Reads whatever trimesh reads (PLY, OBJ, STL, GLB, OFF, ...), with vertex, face or texture colours. It is
+    moved and scaled so that its bounding box is centred at the origin, its farthest point at ``radius``.
     """
 
     path: str  # of the file

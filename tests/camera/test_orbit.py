@@ -1,0 +1,103 @@
+"""Laws of the orbit sampler."""
+
+import pytest
+import torch
+
+from cadam3d.camera.orbit import Orbit
+from cadam3d.core.cameras import Cameras
+from cadam3d.core.checks import UserError
+
+RANGES = {
+    "size": 40,
+    "azimuth_deg": [-180.0, 180.0],
+    "elevation_deg": [-10.0, 60.0],
+    "elevation_law": "uniform",
+    "distance": [2.5, 3.5],
+    "fov_y_deg": [40.0, 50.0],
+}
+
+
+def orbit(**changes) -> Orbit:
+    return Orbit(**{**RANGES, **changes})
+
+
+def sample(views: int, seed: int = 0, step: int = 0, **changes) -> Cameras:
+    return orbit(**changes).sample(step, views, torch.Generator().manual_seed(seed))
+
+
+def fov_y_deg(cameras: Cameras) -> torch.Tensor:
+    return torch.rad2deg(2 * torch.atan(cameras.height / 2 / cameras.intrinsics[:, 1, 1]))
+
+
+def test_every_number_fills_its_range_and_stays_inside():
+    cameras = sample(5000, azimuth_deg=[-30.0, 90.0])
+    for values, (low, high) in (
+        (cameras.azimuth_deg, (-30, 90)),
+        (cameras.elevation_deg, RANGES["elevation_deg"]),
+        (cameras.positions.norm(dim=-1), RANGES["distance"]),
+        (fov_y_deg(cameras), RANGES["fov_y_deg"]),
+    ):
+        width = high - low
+        assert low - 1e-3 <= values.min() < low + 0.01 * width
+        assert high - 0.01 * width < values.max() <= high + 1e-3
+        assert float(values.mean()) == pytest.approx((low + high) / 2, abs=0.02 * width)
+
+
+@pytest.mark.parametrize("views", [1, 2, 4, 7])
+@pytest.mark.parametrize("seed", range(5))
+def test_each_stratum_of_azimuth_holds_one_view(views, seed):
+    azimuth = sample(views, seed, azimuth_deg=[-90.0, 150.0]).azimuth_deg
+    assert ((azimuth + 90) / 240 * views).floor().tolist() == list(range(views))
+
+
+def test_cameras_look_at_the_origin_and_stand_upright():
+    cameras = sample(50)
+    origin, above = torch.zeros(3), torch.tensor([0.0, 0.0, 0.1])
+    for point, is_above in ((origin, False), (above, True)):
+        seen = cameras.world_to_camera[:, :3, :3] @ point + cameras.world_to_camera[:, :3, 3]
+        pixels = (cameras.intrinsics @ seen[..., None])[..., 0]
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        torch.testing.assert_close(pixels[:, 0], torch.full((50,), 20.0), atol=1e-3, rtol=0)
+        assert ((pixels[:, 1] < 19.9) == is_above).all()
+
+
+def test_images_are_square_and_of_the_asked_size():
+    cameras = sample(2, size=33)
+    assert (cameras.height, cameras.width, len(cameras)) == (33, 33, 2)
+
+
+@pytest.mark.parametrize(("law", "power"), [("uniform", 0), ("sphere", 1)])
+def test_the_elevation_law_sets_how_often_the_top_is_seen(law, power):
+    elevation = sample(40_000, elevation_deg=[0.0, 90.0], elevation_law=law).elevation_deg
+    above_30 = float((elevation > 30).float().mean())
+    assert above_30 == pytest.approx([2 / 3, 1 / 2][power], abs=0.01)  # by angle, or by area: 1 - sin 30
+
+
+def test_a_range_may_be_one_point():
+    cameras = sample(3, elevation_deg=[20.0, 20.0], distance=[3.0, 3.0], fov_y_deg=[45.0, 45.0])
+    torch.testing.assert_close(cameras.elevation_deg, torch.full((3,), 20.0))
+    torch.testing.assert_close(cameras.positions.norm(dim=-1), torch.full((3,), 3.0))
+
+
+def test_the_generator_decides_and_the_step_does_not():
+    assert torch.equal(sample(3, seed=1).world_to_camera, sample(3, seed=1, step=99).world_to_camera)
+    assert not torch.equal(sample(3, seed=1).world_to_camera, sample(3, seed=2).world_to_camera)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("size", 0),
+        ("azimuth_deg", [90.0, -90.0]),
+        ("azimuth_deg", [0.0]),
+        ("elevation_deg", [-100.0, 0.0]),
+        ("elevation_law", "gaussian"),
+        ("distance", [0.5, 3.0]),
+        ("fov_y_deg", [0.0, 45.0]),
+        ("fov_y_deg", [45.0, 180.0]),
+        ("fov_y_deg", [45.0, float("nan")]),
+    ],
+)
+def test_an_impossible_value_is_refused_by_name(key, value):
+    with pytest.raises(UserError, match=rf"camera\.{key}"):
+        orbit(**{key: value})

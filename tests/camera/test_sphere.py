@@ -1,0 +1,53 @@
+"""Laws of the sphere sampler."""
+
+import pytest
+import torch
+
+from cadam3d.camera.sphere import Sphere
+from cadam3d.core.cameras import Cameras
+from cadam3d.core.checks import UserError
+
+
+def sample(views: int, seed: int = 0, **changes) -> Cameras:
+    sphere = Sphere(**{"size": 40, "distance": [2.5, 3.5], "fov_y_deg": [40.0, 50.0], **changes})
+    return sphere.sample(0, views, torch.Generator().manual_seed(seed))
+
+
+def test_directions_are_uniform_over_the_whole_sphere():
+    positions = sample(40_000).positions
+    directions = positions / positions.norm(dim=-1, keepdim=True)
+    torch.testing.assert_close(directions.mean(dim=0), torch.zeros(3), atol=0.015, rtol=0)
+    second = directions.T @ directions / len(directions)
+    torch.testing.assert_close(second, torch.eye(3) / 3, atol=0.01, rtol=0)
+    fourth = directions.pow(4).mean(dim=0)
+    torch.testing.assert_close(fourth, torch.full((3,), 1 / 5), atol=0.01, rtol=0)
+
+
+def test_distances_and_lenses_stay_in_their_ranges():
+    cameras = sample(5000)
+    distance = cameras.positions.norm(dim=-1)
+    fov = torch.rad2deg(2 * torch.atan(20 / cameras.intrinsics[:, 1, 1]))
+    assert 2.499 < distance.min() < 2.51
+    assert 3.49 < distance.max() < 3.501
+    assert 39.99 < fov.min() < 40.1
+    assert 49.9 < fov.max() < 50.01
+
+
+def test_angles_agree_with_positions():
+    cameras = sample(100)
+    x, y, z = (cameras.positions / cameras.positions.norm(dim=-1, keepdim=True)).unbind(dim=-1)
+    torch.testing.assert_close(torch.rad2deg(z.asin()), cameras.elevation_deg, atol=0.05, rtol=0)
+    torch.testing.assert_close(torch.rad2deg(torch.atan2(y, x)), cameras.azimuth_deg, atol=0.05, rtol=0)
+
+
+def test_the_generator_decides():
+    assert torch.equal(sample(3, seed=1).world_to_camera, sample(3, seed=1).world_to_camera)
+    assert not torch.equal(sample(3, seed=1).world_to_camera, sample(3, seed=2).world_to_camera)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("size", 0), ("distance", [3.0, 2.0]), ("fov_y_deg", [45.0, 175.0])]
+)
+def test_an_impossible_value_is_refused_by_name(key, value):
+    with pytest.raises(UserError, match=rf"camera\.{key}"):
+        sample(1, **{key: value})

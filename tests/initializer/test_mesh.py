@@ -1,0 +1,164 @@
+"""Laws of the mesh initializer."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from cadam3d.core.checks import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.sh import sh0_to_rgb
+from cadam3d.initializer.mesh import Mesh
+
+CPU = torch.device("cpu")
+GREY = [0.5, 0.5, 0.5]
+
+
+def build(path, seed: int = 0, **changes) -> Gaussians:
+    usual = {
+        "path": str(path),
+        "up": "z",
+        "radius": 0.9,
+        "count": 2000,
+        "scale": 0.02,
+        "opacity": 0.1,
+        "sh_degree": 0,
+        "color": GREY,
+    }
+    return Mesh(**{**usual, **changes}).build("anything", torch.Generator().manual_seed(seed), CPU)
+
+
+def rgb(made: Gaussians) -> torch.Tensor:
+    return sh0_to_rgb(made.sh[:, 0])
+
+
+def save(mesh: trimesh.Trimesh, path):
+    mesh.export(path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "stl", "glb", "off"])
+def test_points_lie_on_the_surface_scaled_to_the_radius(tmp_path, suffix):
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=7.0).apply_translation([3, 4, 5])
+    made = build(save(sphere, tmp_path / f"sphere.{suffix}"))
+    assert len(made) == 2000
+    torch.testing.assert_close(made.means.norm(dim=-1), torch.full((2000,), 0.9), atol=5e-3, rtol=0)
+
+
+def test_the_surface_is_covered_evenly_however_it_is_cut_into_triangles(tmp_path):
+    box = trimesh.creation.box(extents=(2, 2, 2))
+    fine = box.subdivide(np.flatnonzero(box.face_normals[:, 0] > 0.5))  # one side cut into more triangles
+    means = build(save(fine, tmp_path / "box.ply"), count=20_000).means
+    half = 0.9 / 3**0.5
+    for axis in range(3):
+        for sign in (-1, 1):
+            on_side = (sign * means[:, axis] - half).abs() < 1e-4
+            assert float(on_side.float().mean()) == pytest.approx(1 / 6, abs=0.01)
+            other = means[on_side][:, [i for i in range(3) if i != axis]]
+            torch.testing.assert_close(other.var(dim=0), torch.full((2,), half**2 / 3), atol=0.01, rtol=0)
+
+
+def test_the_bounding_box_is_centred(tmp_path):
+    mesh = trimesh.creation.cone(radius=1.0, height=3.0).apply_translation([10, 0, 0])
+    means = build(save(mesh, tmp_path / "cone.ply"), count=20_000).means
+    middle = (means.amin(dim=0) + means.amax(dim=0)) / 2
+    torch.testing.assert_close(middle, torch.zeros(3), atol=0.03, rtol=0)
+
+
+def test_a_file_with_y_up_stands_upright_and_faces_the_front(tmp_path):
+    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 3.0, 0], [0, 0, 2.0]])  # tall in y, its front towards +z
+    mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 1, 3], [0, 2, 3]], process=False)
+    path = save(mesh, tmp_path / "mark.ply")
+    extent = {up: build(path, up=up, count=5000).means for up in ("y", "z")}
+    size = {up: means.amax(dim=0) - means.amin(dim=0) for up, means in extent.items()}
+    assert size["z"].argsort().tolist() == [0, 2, 1]  # as in the file
+    assert size["y"].argsort().tolist() == [1, 0, 2]  # file y is world z, file z is world x
+    top = extent["y"][extent["y"][:, 2].argmax()]
+    assert top[0] < 0  # where the file has z = 0, the back
+
+
+def test_vertex_colors_are_interpolated(tmp_path):
+    box = trimesh.creation.box(extents=(2, 2, 2))
+    colors = np.full((8, 4), 255, dtype=np.uint8)
+    colors[:, 0] = np.where(box.vertices[:, 2] > 0, 255, 0)
+    colors[:, 1:3] = 0
+    box.visual.vertex_colors = colors
+    made = build(save(box, tmp_path / "box.ply"))
+    height = made.means[:, 2] / (0.9 / 3**0.5)
+    torch.testing.assert_close(rgb(made)[:, 0], (height + 1) / 2, atol=0.01, rtol=0)
+    assert rgb(made)[:, 1:].abs().max() < 1e-3
+
+
+def test_face_colors_do_not_bleed(tmp_path):
+    box = trimesh.creation.box(extents=(2, 2, 2))
+    colors = np.zeros((12, 4), dtype=np.uint8)
+    colors[:, 2], colors[:, 3] = np.where(box.face_normals[:, 2] > 0.5, 255, 0), 255
+    box.visual.face_colors = colors
+    made = build(save(box, tmp_path / "box.ply"))
+    is_top = made.means[:, 2] > 0.9 / 3**0.5 - 1e-6
+    assert torch.equal(rgb(made)[:, 2] > 0.5, is_top)
+    assert is_top.any()
+
+
+def test_textures_are_read_at_each_point(tmp_path):
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+    texture = Image.new("RGB", (64, 64), (255, 0, 0))
+    texture.paste((0, 0, 255), (32, 0, 64, 64))  # left half red, right half blue
+    visual = trimesh.visual.TextureVisuals(uv=square[:, :2], image=texture)
+    mesh = trimesh.Trimesh(square, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False)
+    made = build(save(mesh, tmp_path / "square.glb"))
+    inner = made.means[:, 0].abs() > 0.05
+    is_blue = rgb(made)[:, 2] > 0.5
+    assert torch.equal(is_blue[inner], made.means[inner, 0] > 0)
+    assert is_blue.any()
+    assert not is_blue.all()
+
+
+def test_a_file_without_colors_gets_the_given_one(tmp_path):
+    made = build(save(trimesh.creation.box(), tmp_path / "box.stl"), color=[0.2, 0.4, 0.6])
+    torch.testing.assert_close(rgb(made), torch.tensor([[0.2, 0.4, 0.6]]).expand(2000, 3))
+
+
+def test_all_parts_of_a_scene_are_used(tmp_path):
+    near, far = trimesh.creation.box(), trimesh.creation.box().apply_translation([5, 0, 0])
+    trimesh.Scene([near, far]).export(tmp_path / "scene.glb")
+    means = build(tmp_path / "scene.glb", count=1000).means
+    assert float((means[:, 0] > 0).float().mean()) == pytest.approx(0.5, abs=0.05)
+
+
+def test_the_generator_decides(tmp_path):
+    path = save(trimesh.creation.box(), tmp_path / "box.ply")
+    assert torch.equal(build(path, seed=1).means, build(path, seed=1).means)
+    assert not torch.equal(build(path, seed=1).means, build(path, seed=2).means)
+
+
+def test_a_missing_file_is_said_so(tmp_path):
+    with pytest.raises(UserError, match=r"initializer\.path: no file .*nothing\.glb"):
+        build(tmp_path / "nothing.glb")
+
+
+@pytest.mark.parametrize("name", ["broken.glb", "unknown.format"])
+def test_a_file_that_cannot_be_read_is_said_so(tmp_path, name):
+    (tmp_path / name).write_bytes(b"not a mesh")
+    with pytest.raises(UserError, match=r"initializer\.path: .* cannot be read \("):
+        build(tmp_path / name)
+
+
+@pytest.mark.parametrize("kind", ["points", "flat"])
+def test_a_file_without_a_surface_is_said_so(tmp_path, kind):
+    if kind == "points":
+        trimesh.PointCloud(np.eye(3)).export(tmp_path / "it.ply")
+    else:
+        line = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]], dtype=float)
+        trimesh.Trimesh(line, [[0, 1, 2]], process=False).export(tmp_path / "it.ply")
+    with pytest.raises(UserError, match="holds no surface"):
+        build(tmp_path / "it.ply")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("up", "x"), ("radius", 2.0), ("count", 0), ("opacity", 0.0), ("color", [1.0])]
+)
+def test_an_impossible_value_is_refused_by_name(tmp_path, key, value):
+    with pytest.raises(UserError, match=rf"initializer\.{key}"):
+        build(tmp_path / "box.ply", **{key: value})

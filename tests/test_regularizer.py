@@ -1,0 +1,133 @@
+"""Laws of the regularizers."""
+
+import math
+
+import pytest
+import torch
+
+from cadam3d.core.checks import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.render import RenderOutput
+from cadam3d.core.schedule import Linear
+from cadam3d.regularizer import AlphaEntropy, MeanScale, OutsideBall, Sparsity, TotalVariation
+
+EVERY = [
+    MeanScale(weight=2.0),
+    OutsideBall(weight=2.0, radius=1.0),
+    AlphaEntropy(weight=2.0),
+    Sparsity(weight=2.0),
+    TotalVariation(weight=2.0),
+]
+NAMES = [type(each).__name__ for each in EVERY]
+
+
+def gaussians(means: torch.Tensor, scale: float = 0.1) -> Gaussians:
+    n = len(means)
+    return Gaussians(
+        means=means,
+        log_scales=torch.full((n, 3), math.log(scale)),
+        quats=torch.ones(n, 4),
+        opacity_logits=torch.zeros(n),
+        sh=torch.zeros(n, 1, 3),
+    )
+
+
+def output(rgb: torch.Tensor | None = None, alpha: torch.Tensor | None = None) -> RenderOutput:
+    if rgb is None:
+        rgb = torch.zeros(*(alpha.shape if alpha is not None else (1, 4, 4)), 3)
+    alpha = torch.zeros(rgb.shape[:3]) if alpha is None else alpha
+    views = len(alpha)
+    return RenderOutput(
+        rgb=rgb, alpha=alpha, depth=alpha, means2d=torch.zeros(views, 0, 2), radii=torch.zeros(views, 0)
+    )
+
+
+def noise(*shape: int) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(0))
+
+
+def at(regularizer, means=None, rgb=None, alpha=None, step: int = 0) -> float:
+    means = torch.zeros(2, 3) if means is None else means
+    return float(regularizer(gaussians(means), output(rgb, alpha), step))
+
+
+@pytest.mark.parametrize("regularizer", EVERY, ids=NAMES)
+def test_the_weight_multiplies_and_may_follow_the_step(regularizer):
+    scene = gaussians(noise(5, 3) * 4)
+    seen = output(noise(2, 6, 6, 3), noise(2, 6, 6))
+    fields = {"radius": 1.0} if isinstance(regularizer, OutsideBall) else {}
+    fading = type(regularizer)(weight=Linear(start=2.0, end=0.0, steps=10), **fields)
+    full = float(regularizer(scene, seen, 0))
+    assert full > 0
+    assert [float(fading(scene, seen, step)) for step in (0, 5, 10)] == pytest.approx([full, full / 2, 0.0])
+
+
+@pytest.mark.parametrize("regularizer", EVERY, ids=NAMES)
+def test_an_empty_scene_gives_a_number(regularizer):
+    assert math.isfinite(at(regularizer, means=torch.zeros(0, 3)))
+
+
+@pytest.mark.parametrize("regularizer", EVERY, ids=NAMES)
+@pytest.mark.parametrize("extreme", [0.0, 1.0])
+def test_gradients_are_finite_at_the_extremes(regularizer, extreme):
+    scene = gaussians(torch.zeros(2, 3)).map(lambda tensor: tensor.requires_grad_())
+    rgb = torch.full((1, 4, 4, 3), extreme, requires_grad=True)
+    alpha = torch.full((1, 4, 4), extreme, requires_grad=True)
+    (regularizer(scene, output(rgb, alpha), 0) + 0 * (rgb.sum() + alpha.sum() + scene.means.sum())).backward()
+    assert all(tensor.grad.isfinite().all() for tensor in (rgb, alpha, scene.means))
+
+
+def test_mean_scale_is_the_mean_standard_deviation():
+    scene = gaussians(torch.zeros(2, 3))
+    scene.log_scales[1] = math.log(0.3)
+    assert float(MeanScale(weight=1.0)(scene, output(), 0)) == pytest.approx(0.2)
+
+
+def test_the_ball_is_free_inside_and_costs_the_squared_distance_outside():
+    ball = OutsideBall(weight=1.0, radius=0.5)
+    assert at(ball, means=torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.2, 0.0]])) == 0
+    assert at(ball, means=torch.tensor([[0.0, 0.0, 1.5], [0.0, 0.0, 0.0]])) == pytest.approx(0.5)
+
+
+def test_the_ball_pulls_straight_inwards():
+    scene = gaussians(torch.tensor([[0.0, 3.0, 4.0]])).map(lambda tensor: tensor.requires_grad_())
+    OutsideBall(weight=1.0, radius=1.0)(scene, output(), 0).backward()
+    torch.testing.assert_close(scene.means.grad, 2 * 4 * torch.tensor([[0.0, 0.6, 0.8]]))
+
+
+def test_fog_costs_most_entropy_and_a_clean_silhouette_none():
+    entropy = AlphaEntropy(weight=1.0)
+    silhouette = (noise(1, 8, 8) > 0.5).float()
+    assert at(entropy, alpha=silhouette) == pytest.approx(0.0, abs=1e-3)
+    assert at(entropy, alpha=torch.full((1, 8, 8), 0.5)) == pytest.approx(math.log(2), rel=1e-5)
+    assert at(entropy, alpha=torch.full((1, 8, 8), 0.2)) < math.log(2)
+
+
+def test_sparsity_grows_with_what_is_covered():
+    sparsity = Sparsity(weight=1.0)
+    costs = [at(sparsity, alpha=torch.full((1, 8, 8), alpha)) for alpha in (0.0, 0.3, 1.0)]
+    assert costs == pytest.approx([0.1, 0.1**0.5, 1.01**0.5])
+
+
+def test_total_variation_is_the_mean_step_between_neighbours():
+    ramp = torch.linspace(0, 1, 5)[None, None, :, None].expand(2, 5, 5, 3).contiguous()
+    variation = TotalVariation(weight=1.0)
+    assert at(variation, rgb=torch.ones(2, 5, 5, 3)) == 0
+    assert at(variation, rgb=ramp) == pytest.approx(0.25)  # 0 vertically, 1 / 4 horizontally
+    assert at(variation, rgb=ramp + 0.5 * ramp.transpose(1, 2)) == pytest.approx(0.375)
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_repeating_a_view_does_not_raise_a_penalty(views):
+    rgb, alpha = noise(1, 6, 6, 3), noise(1, 6, 6)
+    for regularizer in EVERY:
+        once = at(regularizer, rgb=rgb, alpha=alpha)
+        repeated = at(regularizer, rgb=rgb.repeat(views, 1, 1, 1), alpha=alpha.repeat(views, 1, 1))
+        assert repeated == pytest.approx(once)
+
+
+def test_a_negative_weight_or_radius_is_refused():
+    with pytest.raises(UserError, match="weight"):
+        MeanScale(weight=-1.0)
+    with pytest.raises(UserError, match="radius"):
+        OutsideBall(weight=1.0, radius=0.0)
