@@ -60,9 +60,9 @@ def _unknown_option(error: MissingConfigException, config_name: str, overrides: 
     """A group exists but not the chosen option of it, or the command itself has no YAML."""
     path = error.missing_cfg_file or ""
     group, _, option = path.rpartition("/")
-    if not group or not error.options:
+    options = sorted(error.options or (file.stem for file in (config_dir() / group).glob("*.yaml")))
+    if not group or not options:
         return UserError(f"{path}: no such configuration in {config_dir()}. Try: cadam3d doctor")
-    options = sorted(error.options)
     best = (did_you_mean(option, options) or options)[0]
     return UserError(f"{group}: wanted one of {'|'.join(options)}, got {option!r}. Try: {group}={best}")
 

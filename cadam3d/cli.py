@@ -18,8 +18,8 @@ COMMANDS = {  # what each does, and a line to paste
     "render": ("make pictures or a turntable of an asset", "cadam3d render run=outputs/latest"),
     "export": ("write an asset in another form", "cadam3d export run=outputs/latest"),
     "eval": ("measure a finished run or sweep", "cadam3d eval run=outputs/latest"),
-    "view": ("show the report of a run or a picture of an asset", "cadam3d view run=outputs/latest"),
-    "doctor": ("check this machine, with a hint for each failure", "cadam3d doctor"),
+    "view": ("show the report of a run, or an asset", "cadam3d view run=outputs/latest"),
+    "doctor": ("check this machine, with a hint per failure", "cadam3d doctor"),
 }
 HELP_FLAGS = ("--help", "-h", "help")
 COMPLETION_FLAGS = ("--shell-completion", "-sc")
@@ -69,7 +69,7 @@ def help_text() -> str:
         "",
         "Usage: cadam3d COMMAND [key=value ...]",
         "",
-        *(f"  {name:<8}{summary:<51}{example}" for name, (summary, example) in COMMANDS.items()),
+        *(f"  {name:<8}{summary:<50}{example}" for name, (summary, example) in COMMANDS.items()),
         "",
         "Settings of a command:  cadam3d COMMAND --help",
         'Tab completion (bash):  eval "$(cadam3d -sc install=bash)"',

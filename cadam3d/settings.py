@@ -9,6 +9,7 @@ from typing import Any
 import yaml  # comes with OmegaConf
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -43,8 +44,13 @@ def compose(
     """
     register_resolvers()
     extra = [] if search_path is None else [f"hydra.searchpath=[{quote('file://' + str(search_path))}]"]
-    with initialize_config_dir(str((folder or config_dir()).resolve()), version_base=VERSION_BASE):
-        return hydra_compose(config_name, [*extra, *overrides], return_hydra_config=with_hydra)
+    outer = GlobalHydra.instance().hydra  # we may be asked while a command runs, which is inside Hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str((folder or config_dir()).resolve()), version_base=VERSION_BASE):
+            return hydra_compose(config_name, [*extra, *overrides], return_hydra_config=with_hydra)
+    finally:
+        GlobalHydra.instance().hydra = outer
 
 
 def component(node: DictConfig | ListConfig | None) -> Any:

@@ -1,0 +1,599 @@
+"""What a user types and what comes back: commands, courtesies, errors, sweeps, resume and completion."""
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import yaml
+from hydra.core.hydra_config import HydraConfig
+
+from cadam3d import advice, cli, launch, settings
+from cadam3d.core.errors import UserError
+
+REPOSITORY = Path(__file__).parent.parent
+AWKWARD = (
+    "a corgi, front view",
+    "what's up",
+    "a car (red)",
+    "a [small] {blue} cube",
+    "a=b",
+    "a torus with emoji 😀",
+    "一座灯塔",
+    "null",
+    "true",
+    "12",
+    "a backslash \\ inside",
+    "ends with a backslash \\",
+    "a \\' both",
+    "${oc.env:HOME}",
+    "\\${escaped} and ${open",
+    '"half quoted',
+    "'a' and 'b'",
+    "colon: hash # percent %",
+    " spaces around ",
+    "two\nlines",
+    "???!",
+)
+
+
+@dataclass(frozen=True)
+class Result:
+    code: int
+    out: str
+    err: str
+
+    @property
+    def message(self) -> str:
+        """The one line of an error."""
+        lines = self.err.strip().splitlines()
+        assert len(lines) == 1, self.err
+        assert lines[0].startswith("cadam3d: ")
+        return lines[0].removeprefix("cadam3d: ")
+
+
+@pytest.fixture
+def type_line(monkeypatch, capsys, tmp_path):
+    """Type ``cadam3d ...`` in an empty folder, in this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+
+    def run(*words: str) -> Result:
+        monkeypatch.setattr(sys, "argv", ["cadam3d", *words])
+        with pytest.raises(SystemExit) as exit_info:
+            cli.main()
+        captured = capsys.readouterr()
+        return Result(int(exit_info.value.code or 0), captured.out, captured.err)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def small_configs(tmp_path_factory) -> Path:
+    """The real folders that the command line itself needs, and a train.yaml that composes in no time."""
+    folder = tmp_path_factory.mktemp("configs")
+    for name in ("hydra", "densifier", "grid"):
+        shutil.copytree(REPOSITORY / "configs" / name, folder / name)
+    shutil.copy(REPOSITORY / "configs/sweep.yaml", folder)
+    train = "defaults: [{densifier: cadam}, {hydra: default}, _self_]\n"
+    train += "prompt: ???\nnegative_prompt: ''\nsteps: 600\nseed: 0\nresume: null\n"
+    (folder / "train.yaml").write_text(train, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture
+def jobs(monkeypatch, small_configs):
+    """Instead of training: note the configuration, fail on seeds 7 and 8, else leave a summary."""
+    for module in (settings, launch, advice):
+        monkeypatch.setattr(module, "config_dir", lambda: small_configs)
+    seen = []
+
+    def run(cfg):
+        folder = Path(HydraConfig.get().runtime.output_dir)
+        seen.append((cfg, folder))
+        if cfg.seed == 7:
+            raise UserError("seed: 7 is unlucky. Try: seed=0")
+        if cfg.seed == 8:
+            raise ValueError("a bug")
+        summary = {"prompt": cfg.prompt, "seed": cfg.seed, "outcome": "finished", "num_gaussians": 5}
+        summary |= {"asset_bytes": 340, "seconds": 1.5, "psnr": 20.25}
+        (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+        return 20.25
+
+    monkeypatch.setattr("cadam3d.commands.train.run", run)
+    return seen
+
+
+# --- help, version, the command word --------------------------------------------------------------------
+
+
+def test_help_shows_every_command_on_one_line(type_line):
+    result = type_line("--help")
+    assert result.code == 0
+    for command in cli.COMMANDS:
+        assert len([line for line in result.out.splitlines() if line.startswith(f"  {command} ")]) == 1
+    assert max(len(line) for line in result.out.splitlines()) <= 110
+
+
+def test_no_word_at_all_shows_the_help(type_line):
+    assert type_line() == type_line("--help")
+
+
+def test_version(type_line):
+    assert type_line("--version").out.startswith("cadam3d 0.")
+
+
+def test_help_is_instant_and_imports_nothing_heavy():
+    code = (
+        "import sys, time; start = time.perf_counter()\n"
+        "from cadam3d.cli import dispatch; dispatch(['--help'])\n"
+        "assert time.perf_counter() - start < 0.5\n"
+        "assert not {'torch', 'numpy', 'hydra', 'omegaconf'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY, timeout=60)
+
+
+@pytest.mark.parametrize("command", list(cli.COMMANDS))
+def test_every_command_has_a_module_a_config_and_a_help_page(command, type_line):
+    assert (REPOSITORY / f"cadam3d/commands/{command}.py").is_file()
+    assert (settings.config_dir() / f"{command}.yaml").is_file()
+    result = type_line(command, "--help")
+    assert result.code == 0
+    assert f"cadam3d {command}" in result.out
+    assert "Hydra" not in result.out
+
+
+@pytest.mark.parametrize("command", list(cli.COMMANDS))
+def test_cfg_job_prints_the_settings_without_running(command, type_line):
+    words = ["prompt=a cube", "seed=1,2"] if command == "sweep" else []
+    result = type_line(command, *words, "--cfg", "job")
+    assert result.code == 0
+    assert isinstance(yaml.safe_load(result.out), dict)
+    assert not list(Path.cwd().iterdir())
+
+
+@pytest.mark.parametrize(("typed", "meant"), [("trian", "train"), ("EXPORT", "export"), ("docter", "doctor")])
+def test_an_unknown_command_is_answered_with_the_near_one(typed, meant, type_line):
+    result = type_line(typed, "prompt=a red cube")
+    assert result.code == 1
+    assert result.message.endswith(f"Try: cadam3d {meant} 'prompt=a red cube'")
+
+
+def test_a_bare_sentence_is_answered_with_the_line_it_wanted(type_line):
+    assert type_line("a red cube").message.endswith("Try: cadam3d train 'prompt=a red cube'")
+    assert type_line("prompt=a cube").message.endswith("Try: cadam3d train 'prompt=a cube'")
+
+
+def test_a_word_like_nothing_else_gets_the_list_of_commands(type_line):
+    assert "|".join(cli.COMMANDS) in type_line("qqq").message
+
+
+# --- courtesy 1: prompts are text -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("prompt", AWKWARD)
+@pytest.mark.parametrize("key", ["prompt", "negative_prompt"])
+def test_a_prompt_arrives_as_it_was_typed(key, prompt, type_line, jobs):
+    words = [f"{key}={prompt}"] + (["prompt=a cube"] if key == "negative_prompt" else [])
+    assert type_line("train", *words).code == 0
+    [(cfg, _)] = jobs
+    assert cfg[key] == prompt
+
+
+@pytest.mark.parametrize("prompt", AWKWARD)
+def test_a_prompt_survives_the_config_that_a_run_leaves(prompt, tmp_path, type_line, jobs):
+    from omegaconf import OmegaConf
+
+    type_line("train", f"prompt={prompt}")
+    path = tmp_path / "config.yaml"
+    path.write_text(OmegaConf.to_yaml(jobs[0][0], resolve=True), encoding="utf-8")
+    assert settings.load(path).prompt == prompt
+
+
+@pytest.mark.parametrize("quoted", ["'a corgi, front view'", '"a corgi, front view"'])
+def test_a_prompt_that_is_quoted_already_is_left_alone(quoted, type_line, jobs):
+    type_line("train", f"prompt={quoted}")
+    assert jobs[0][0].prompt == "a corgi, front view"
+
+
+def test_a_prompt_torn_apart_by_the_shell_is_given_back_whole(type_line):
+    assert type_line("train", "prompt=a", "red", "cube").message == (
+        "'red': wanted key=value. Try: cadam3d train prompt='a red cube'"
+    )
+
+
+@pytest.mark.parametrize(
+    ("value", "prompts"),
+    [
+        ("a cube,a ball", ["a cube", "a ball"]),
+        ("a corgi, front view", ["a corgi, front view"]),
+        ("a corgi, front view,what's up", ["a corgi, front view", "what's up"]),
+        ("'a corgi,front view','a cat'", ["a corgi,front view", "a cat"]),
+        ("choice(cube,ball)", ["cube", "ball"]),
+        ("a car (red),${x}", ["a car (red)", "${x}"]),
+    ],
+)
+def test_in_a_sweep_a_comma_without_a_blank_starts_the_next_prompt(value, prompts, type_line, jobs):
+    assert type_line("train", "-m", f"prompt={value}").code == 0
+    assert [cfg.prompt for cfg, _ in jobs] == prompts
+
+
+def test_a_path_with_brackets_and_commas_is_quoted_too(type_line, jobs, tmp_path):
+    folder = tmp_path / "a (run), [one]=1"
+    assert type_line("train", "prompt=a cube", f"hydra.run.dir={folder}").code == 0
+    assert jobs[0][1] == folder
+
+
+# --- courtesy 2: what is missing is asked for before any work -------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "words", [("train",), ("train", "seed=1", "hydra.run.dir=here"), ("train", "-m", "seed=1,2")]
+)
+def test_a_missing_prompt_is_refused_before_anything_happens(words, type_line, jobs, tmp_path):
+    result = type_line(*words)
+    assert result.code == 1
+    assert (
+        result.message
+        == 'prompt: no value given. Try: cadam3d train prompt="a red and yellow checkered torus"'
+    )
+    assert not jobs
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, tmp_path):
+    assert type_line("sweep", "grid=thresholds").message.endswith('torus" grid=thresholds')
+    assert type_line("sweep", "prompt=a cube").message.startswith("sweep: nothing to sweep over. Try: ")
+    assert not list(tmp_path.iterdir())
+
+
+# --- courtesy 3: did you mean ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("line", "ending"),
+    [
+        ("densifier.tau_q=0.5", "Did you mean densifier.tau_Q? Try: densifier.tau_Q=0.5"),
+        ("tau_SNR=0.2", "Did you mean densifier.tau_SNR? Try: densifier.tau_SNR=0.2"),
+        ("densifier.max_gaussians=9", "Did you mean refine.max_gaussians? Try: refine.max_gaussians=9"),
+        ("step=5", "Did you mean steps"),
+        ("qqqq.zzzz=5", "no such setting. Try: cadam3d train --cfg job"),
+        ("densifier=cadm", "wanted one of baseline|cadam|none, got 'cadm'. Try: densifier=cadam"),
+        ("prior=shape", "Try: prior=shapes"),
+        ("callback=[metrics,progres]", "got 'progres'. Try: callback=progress"),
+        ("experiment=smok", "Try: experiment=smoke"),
+        ("steps=1,2", "steps: several values make a sweep. Try: cadam3d sweep steps=1,2"),
+        ("steps=[1", "steps: cannot read the value"),
+        ("+steps=5", "steps"),
+        ("hydra.run.dir=/dev/null/x", "hydra.run.dir: cannot write to /dev/null/x (Not a directory). Try: "),
+    ],
+)
+def test_a_mistake_gets_one_message_that_says_what_to_type(line, ending, type_line):
+    result = type_line("train", "prompt=a cube", line)
+    assert result.code == 1
+    assert ending in result.message
+    assert "HYDRA_FULL_ERROR" not in result.err
+    assert not result.out
+
+
+@pytest.mark.parametrize(
+    ("words", "ending"),
+    [
+        (("train", "--bogus"), "unrecognized arguments: --bogus. Try: cadam3d --help"),
+        (("train", "--cfg", "nope"), "invalid choice: 'nope'"),
+        (("train", "--cfg", "job", "--info", "config"), "exclude one another"),
+        (("eval", "-m", "run=a,b"), "only training can be swept"),
+        (("doctor", "jsn=true"), "Did you mean json? Try: json=true"),
+        (("-sc",), 'Try: eval "$(cadam3d -sc install=bash)"'),
+    ],
+)
+def test_flags_and_other_commands_have_manners_too(words, ending, type_line):
+    result = type_line(*words)
+    assert result.code == 1
+    assert ending in result.message
+
+
+def test_the_traceback_is_there_for_those_who_ask(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.setattr(sys, "argv", ["cadam3d", "train", "densifer=cadam"])
+    with pytest.raises(UserError) as caught:
+        cli.main()
+    assert caught.value.__cause__ is not None
+
+
+def test_a_mistake_found_by_the_command_itself_is_one_message_too(type_line, jobs):
+    result = type_line("train", "prompt=a cube", "seed=7")
+    assert result.code == 1
+    assert result.message == "seed: 7 is unlucky. Try: seed=0"
+
+
+def test_a_bug_keeps_its_traceback(monkeypatch, tmp_path, jobs):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["cadam3d", "train", "prompt=a cube", "seed=8"])
+    with pytest.raises(ValueError, match="a bug"):
+        cli.main()
+
+
+def test_the_environment_and_the_arguments_are_left_as_they_were(type_line, jobs):
+    type_line("train", "prompt=a cube")
+    assert os.environ.get("HYDRA_FULL_ERROR") in (None, "0")
+    assert sys.argv == ["cadam3d", "train", "prompt=a cube"]
+
+
+# --- where things go ------------------------------------------------------------------------------------
+
+
+def test_a_run_gets_a_dated_folder_named_after_its_prompt(type_line, jobs, tmp_path):
+    type_line("train", "prompt=A red car, (fast)!")
+    [(_, folder)] = jobs
+    assert folder.parent.parent == tmp_path / "outputs"
+    assert folder.name.partition("_")[2] == "A-red-car-fast"
+    assert (folder / ".hydra/overrides.yaml").is_file()
+    assert (folder / "train.log").is_file()
+
+
+def test_two_runs_in_one_second_do_not_share_a_folder(type_line, jobs):
+    for _ in range(3):
+        type_line("train", "prompt=a cube", "hydra.job.name=train")
+    assert len({folder for _, folder in jobs}) == 3
+
+
+@pytest.mark.parametrize(
+    ("parts", "name"),
+    [
+        (("A red car!",), "A-red-car"),
+        (("😀",), "untitled"),
+        (("../../etc",), "etc"),
+        (("x" * 300,), "x" * 60),
+    ],
+)
+def test_a_slug_is_a_safe_piece_of_a_file_name(parts, name):
+    assert settings.slug(*parts) == name
+
+
+# --- sweeps ---------------------------------------------------------------------------------------------
+
+
+def read_table(folder: Path) -> list[dict[str, str]]:
+    with (folder / "sweep.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture
+def sweep_folder(tmp_path):
+    def find() -> Path:
+        [folder] = tmp_path.glob("multirun/*/*")
+        return folder
+
+    return find
+
+
+@pytest.mark.parametrize("words", [("sweep",), ("train", "-m"), ("train", "--multirun")])
+def test_a_sweep_leaves_one_row_per_job(words, type_line, jobs, sweep_folder):
+    result = type_line(*words, "prompt=a corgi, front view", "densifier=baseline,cadam", "seed=0,1")
+    assert result.code == 0
+    rows = read_table(sweep_folder())
+    assert [row["seed"] for row in rows] == ["0", "1", "0", "1"]
+    assert {"overrides", "seed", "outcome", "num_gaussians", "asset_bytes", "seconds", "psnr"} <= set(rows[0])
+    assert rows[2]["psnr"] == "20.25"
+    assert "densifier=cadam" in rows[2]["overrides"]
+    assert "4 jobs: " in result.out
+
+
+def test_a_failed_job_is_a_row_and_the_rest_goes_on(type_line, jobs, sweep_folder):
+    result = type_line("sweep", "prompt=a cube", "seed=6,7,8,9")
+    assert result.code == 0
+    rows = read_table(sweep_folder())
+    assert [row["outcome"] for row in rows] == ["finished", "failed", "failed", "finished"]
+    assert rows[1]["message"] == "seed: 7 is unlucky. Try: seed=0"
+    assert rows[2]["message"] == "ValueError: a bug"
+    assert len(jobs) == 4
+
+
+def test_a_sweep_in_which_every_job_fails_exits_with_1(type_line, jobs):
+    assert type_line("sweep", "prompt=a cube", "seed=7,8").code == 1
+
+
+def test_the_table_is_on_disk_after_every_job(type_line, jobs, monkeypatch, sweep_folder):
+    lengths = []
+
+    def run(cfg):
+        path = sweep_folder() / "sweep.csv"
+        lengths.append(len(path.read_text(encoding="utf-8").splitlines()) if path.exists() else 0)
+
+    monkeypatch.setattr("cadam3d.commands.train.run", run)
+    type_line("sweep", "prompt=a cube", "seed=0,1,2")
+    assert lengths == [0, 2, 3]
+
+
+def test_a_job_that_was_killed_is_an_unfinished_row(type_line, jobs, sweep_folder):
+    from cadam3d.commands import sweep
+
+    type_line("sweep", "prompt=a cube", "seed=0,1")
+    (sweep_folder() / jobs[1][1].name / "summary.json").unlink()
+    assert [row["outcome"] for row in sweep.gather(sweep_folder())] == ["finished", "unfinished"]
+
+
+def test_ctrl_c_ends_the_sweep_and_keeps_the_table(type_line, jobs, monkeypatch, sweep_folder):
+    def run(cfg):
+        if cfg.seed == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("cadam3d.commands.train.run", run)
+    result = type_line("sweep", "prompt=a cube", "seed=0,1,2")
+    assert result.code == 130
+    assert len(read_table(sweep_folder())) == 2
+
+
+def test_job_folders_are_numbered_and_say_what_differs(type_line, jobs):
+    type_line("sweep", "prompt=a cube,a ball", "densifier.tau_Q=0.5,0.9")
+    assert jobs[1][1].name.startswith("1_densifier.tau_Q=0.9")
+    assert jobs[2][1].name == "2_densifier.tau_Q=0.5-a-ball"
+
+
+def test_a_grid_can_be_narrowed_on_the_line(type_line, jobs):
+    type_line("sweep", "prompt=a cube", "grid=thresholds", "densifier.tau_SNR=0.2")
+    assert len(jobs) == len({cfg.densifier.tau_Q for cfg, _ in jobs}) > 1
+    assert {cfg.densifier.tau_SNR for cfg, _ in jobs} == {0.2}
+
+
+def test_a_wrong_value_in_the_middle_of_a_sweep_is_refused_with_one_message(type_line, jobs):
+    result = type_line("sweep", "prompt=a cube", "densifier=cadam,cadm")
+    assert result.code == 1
+    assert "got 'cadm'. Try: densifier=cadam" in result.err
+    assert "Traceback" not in result.err
+
+
+# --- resume ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def run_folder(type_line, jobs) -> Path:
+    assert type_line("train", "prompt=a car, (red)", "densifier=baseline", "steps=10", "seed=3").code == 0
+    _, folder = jobs.pop()
+    return folder
+
+
+def test_resume_needs_no_prompt_and_keeps_what_the_run_was_started_with(run_folder, type_line, jobs):
+    assert type_line("train", f"resume={run_folder}").code == 0
+    [(cfg, folder)] = jobs
+    assert (cfg.prompt, cfg.steps, cfg.seed) == ("a car, (red)", 10, 3)
+    assert "baseline" in cfg.densifier._target_
+    assert folder == run_folder
+    assert Path(cfg.resume) == run_folder
+
+
+def test_what_the_line_says_anew_wins_and_sticks(run_folder, type_line, jobs):
+    type_line("train", f"resume={run_folder}", "steps=20", "densifier=cadam")
+    type_line("train", f"resume={run_folder}", "seed=4")
+    assert [(cfg.steps, cfg.seed) for cfg, _ in jobs] == [(20, 3), (20, 4)]
+    assert all("cadam" in cfg.densifier._target_.rpartition(".")[2].lower() for cfg, _ in jobs)
+
+
+def test_resume_follows_a_link_and_takes_a_checkpoint_file(run_folder, type_line, jobs, tmp_path):
+    (tmp_path / "outputs/latest").symlink_to(run_folder)
+    checkpoint = run_folder / "checkpoints/000010.pt"
+    checkpoint.parent.mkdir()
+    checkpoint.touch()
+    type_line("train", "resume=outputs/latest")
+    type_line("train", "resume=outputs/latest/checkpoints/000010.pt")
+    assert [folder for _, folder in jobs] == [run_folder, run_folder]
+    assert Path(jobs[1][0].resume) == checkpoint
+
+
+def test_a_job_of_a_sweep_can_be_resumed(type_line, jobs):
+    type_line("sweep", "prompt=a cube", "grid=densifiers")
+    job = jobs[1][1]
+    jobs.clear()
+    assert type_line("train", f"resume={job}").code == 0
+    assert jobs[0][1] == job
+
+
+@pytest.mark.parametrize("place", ["nowhere", "."])
+def test_resume_from_what_is_no_run_is_refused(place, type_line, jobs):
+    message = type_line("train", f"resume={place}").message
+    assert "wanted the folder of a run" in message
+    assert not jobs
+
+
+def test_resume_stays_in_its_folder_and_out_of_sweeps(run_folder, type_line):
+    assert "stays in its folder" in type_line("train", f"resume={run_folder}", "hydra.run.dir=other").message
+    assert "not a sweep" in type_line("train", "-m", f"resume={run_folder}", "seed=0,1").message
+
+
+# --- courtesy 4: completion -----------------------------------------------------------------------------
+
+
+def complete(line: str, type_line, monkeypatch, shell: str = "bash") -> list[str]:
+    monkeypatch.setenv("COMP_LINE", line)
+    result = type_line("-sc", f"query={shell}")
+    assert result.code == 0
+    assert not result.err
+    return result.out.split()
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("cadam3d ", list(cli.COMMANDS)),
+        ("cadam3d e", ["export", "eval"]),
+        ("cadam3d train densifier=", ["densifier=baseline", "densifier=cadam", "densifier=none"]),
+        ("cadam3d train densifier.tau_", ["densifier.tau_Q=", "densifier.tau_SNR="]),
+        ('cadam3d train prompt="a car, (red)" densifier=ca', ["densifier=cadam"]),
+        ("cadam3d train 'prompt=a car' densifier=ca", ["densifier=cadam"]),
+        ("cadam3d sweep grid=th", ["grid=thresholds"]),
+        ("cadam3d doctor js", ["json="]),
+        ("cadam3d nothing ", []),
+    ],
+)
+def test_completion_crosses_the_command_word(line, expected, type_line, monkeypatch):
+    assert complete(line, type_line, monkeypatch) == expected
+
+
+def test_completion_of_a_wrong_line_is_silent(type_line, monkeypatch):
+    assert complete("cadam3d train densifier=nope steps", type_line, monkeypatch) in ([], ["steps="])
+
+
+def test_fish_gets_one_command_per_line(type_line, monkeypatch):
+    monkeypatch.setenv("COMP_LINE", "cadam3d ")
+    assert type_line("-sc", "query=fish").out.splitlines() == list(cli.COMMANDS)
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_bash_completes_the_command_word(tmp_path):
+    program = tmp_path / "cadam3d"
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m cadam3d "$@"\n', encoding="utf-8")
+    program.chmod(0o755)
+    script = (
+        f'eval "$({program} -sc install=bash)"\n'
+        f'COMP_LINE="{program} tr"; COMP_POINT=${{#COMP_LINE}}; COMP_CWORD=1\n'
+        "hydra_bash_completion; echo ${COMPREPLY[@]}"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.split() == ["train"], done.stderr
+
+
+# --- as a process ---------------------------------------------------------------------------------------
+
+
+def test_ctrl_c_is_one_line_and_130(tmp_path):
+    """The signal comes while Python imports: no command has taken charge of signals yet."""
+    code = (
+        "import sys, time, types\n"
+        "slow = types.ModuleType('cadam3d.commands.train')\n"
+        "slow.run = lambda cfg: (print('started', flush=True), time.sleep(60))\n"
+        "sys.modules[slow.__name__] = slow\n"
+        "from cadam3d.cli import main\n"
+        "sys.argv = ['cadam3d', 'train', 'prompt=a cube']\n"
+        "main()"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "started\n"
+    time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert err.strip() == "cadam3d: interrupted"
+
+
+def test_flags_may_stand_anywhere():
+    words = ["a=1", "-m", "b=2", "--cfg", "job", "c=3"]
+    assert launch.split(words) == (["a=1", "b=2", "c=3"], ["-m", "--cfg", "job"])
