@@ -1,8 +1,8 @@
 """The native CPU kernels: compiled once by this machine's compiler, kept in the user's cache folder.
 
-A cached file carries three hashes in its name: of the sources, flags and the machine; of the compiler; of its own
-bytes. So a copied home folder, a new release, another compiler or a damaged file each lead to a fresh build, and
-no lock is needed: whoever finishes first renames its file into place, and any file that fits its name will do.
+A cached file carries three hashes in its name: of the sources, flags and the machine; of the compiler; of its
+own bytes. So a copied home folder, a new release, another compiler or a damaged file each lead to a fresh
+build, and no lock is needed: who finishes renames the file into place, and any that fits its name will do.
 """
 
 import ctypes
@@ -70,7 +70,7 @@ def default_cache_dir() -> Path:
 
 
 def find_compiler() -> Compiler | None:
-    """The first that answers of ``$CXX``, ``c++``, ``g++``, ``clang++`` and the ``ziglang`` Python package."""
+    """The first that answers of ``$CXX``, ``c++``, ``g++``, ``clang++`` and Python's ``ziglang``."""
     commands = [tuple(os.environ.get("CXX", "").split()), ("c++",), ("g++",), ("clang++",)]
     if find_spec("ziglang"):
         commands.append((sys.executable, "-m", "ziglang", "c++"))
@@ -103,8 +103,8 @@ def build(cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAG
         return Build(cached, 0.0)
     if compiler is None:
         raise UserError(
-            "rasterizer=cpu needs a C++ compiler once, and found none (c++, g++, clang++, $CXX). Install one: "
-            "`apt install g++`, `xcode-select --install` or `pip install ziglang`. "
+            "rasterizer=cpu needs a C++ compiler once, and found none ($CXX, c++, g++, clang++). "
+            "Install one: `apt install g++`, `xcode-select --install` or `pip install ziglang`. "
             "Or try: rasterizer=reference"
         )
     start = time.perf_counter()

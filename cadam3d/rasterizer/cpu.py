@@ -1,7 +1,8 @@
 """The native CPU rasterizer: vectorised, threaded C++ behind the same two autograd steps.
 
-``means -> means2d`` is one step, ``means2d and everything else -> images`` the other, so ``means2d`` is an honest
-node of the graph: its gradient is there to be retained, and a loss may use it. Kernels: ``kernels/cpu.cpp``.
+``means -> means2d`` is one step, ``means2d and everything else -> images`` the other, so ``means2d`` is an
+honest node of the graph: its gradient is there to be retained, and a loss may use it. The kernels are in
+``kernels/cpu.cpp``.
 """
 
 import ctypes
@@ -29,7 +30,7 @@ SH_SIZES = (1, 4, 9, 16)  # coefficients of degree 0 to 3
 class CpuRasterizer(Rasterizer):
     """Renders in float32 on ``torch.get_num_threads()`` threads; the bits do not depend on how many.
 
-    Other dtypes are converted on the way in and out. The kernels are compiled at the first use of this machine.
+    Other dtypes are converted on the way in and out. The kernels are compiled at the first use on a machine.
     """
 
     cache_dir: str | None  # where compiled kernels are kept; None: the user's cache folder
@@ -55,6 +56,12 @@ def works_on(device: torch.device) -> bool:
 def load_kernels(cache_dir: str | None) -> ctypes.CDLL:
     """The compiled kernels; compiles them if they are not in ``cache_dir`` yet. Once per process."""
     return load(build(Path(cache_dir).expanduser() if cache_dir else default_cache_dir()))
+
+
+def instruction_set(kernels: ctypes.CDLL) -> str:
+    """What the kernels were compiled for: ``avx512``, ``avx2``, ``sse2``, ``neon`` or ``generic``."""
+    kernels.cadam3d_instruction_set.restype = ctypes.c_char_p
+    return kernels.cadam3d_instruction_set().decode()
 
 
 def rasterize(
