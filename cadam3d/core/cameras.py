@@ -79,12 +79,12 @@ def look_at(
 ) -> Float[Tensor, "v 4 4"]:
     """World-to-camera matrices of cameras at ``position`` that look at ``target``, image top towards ``up``.
 
-    Looking along ``up`` itself is allowed: then another axis stands in for it (world +x for +z).
+    Looking along ``up`` itself is allowed: then the axis farthest from it stands in (world +x for +z).
     """
     forward = torch.nn.functional.normalize(target - position, dim=-1)
     right = torch.linalg.cross(forward, up, dim=-1)
     is_parallel = right.norm(dim=-1, keepdim=True) < 1e-6 * up.norm(dim=-1, keepdim=True)
-    spare = up.roll(1, -1)  # (0, 0, 1) -> (1, 0, 0); never parallel to an axis-like `up`
+    spare = torch.nn.functional.one_hot(forward.abs().argmin(dim=-1), 3).to(forward)
     right = torch.where(is_parallel, torch.linalg.cross(forward, spare, dim=-1), right)
     right = torch.nn.functional.normalize(right, dim=-1)
     down = torch.linalg.cross(forward, right, dim=-1)

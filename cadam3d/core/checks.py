@@ -34,7 +34,7 @@ def require(claim: bool, key: str, *, wanted: str, got: object, example: str) ->
 
 def require_range(
     key: str,
-    value: float | None,
+    value: object,
     *,
     low: float = -math.inf,
     high: float = math.inf,
@@ -42,7 +42,7 @@ def require_range(
     above: float = -math.inf,
     example: object,
 ) -> None:
-    """Raise unless ``value`` is a number in ``[low, high]``, ``< below`` and ``> above`` (NaN never is).
+    """Raise unless ``value`` is a finite number in ``[low, high]``, ``< below`` and ``> above``.
 
     Example: ``require_range("densifier.tau_Q", tau_Q, low=0, below=1, example=0.9)``.
     """
@@ -51,8 +51,7 @@ def require_range(
         for sign, bound in ((">=", low), (">", above), ("<=", high), ("<", below))
         if math.isfinite(bound)
     ]
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    number = value if is_number and value is not None else math.nan
+    number = value if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
     if not (low <= number <= high and above < number < below):
         wanted = "a number " + " and ".join(bounds) if bounds else "a finite number"
         raise fail(key, wanted=wanted, got=value, example=f"{key}={example}")

@@ -123,7 +123,6 @@ def _views(cameras: Cameras) -> list[_View]:
 
 def _splat(gaussians: Gaussians, view: _View) -> _Splats:
     rows, half_sizes = _see(gaussians, view)
-    # index_select, not brackets: the backward of the latter adds with atomics, in an order that varies.
     seen = gaussians.map(lambda tensor: tensor.index_select(0, rows))
     directions = torch.nn.functional.normalize(seen.means - view.position, dim=-1)
     return _Splats(

@@ -259,6 +259,16 @@ def test_only_what_lies_between_the_near_and_the_far_plane_is_seen(z, is_seen):
     assert (output.alpha.max() > 0).item() == is_seen
 
 
+def test_a_splat_that_is_nowhere_brighter_than_the_faintest_alpha_is_not_seen():
+    ball = balls(x=[0.0], radius=0.3, opacity=[0.5], rgb=[[1, 1, 1]])
+    for logit, is_seen in ((-math.log(254), False), (-math.log(254) + 1e-9, True)):
+        ball.opacity_logits[0] = logit
+        output = render(ball, facing(9))
+        assert ball.opacities.item() == pytest.approx(1 / 255, rel=1e-8)
+        assert output.visible.item() == is_seen
+        assert output.alpha.any().item() == is_seen
+
+
 def test_a_huge_splat_behind_the_camera_leaves_no_ghost():
     ball = balls(x=[3.0], radius=50.0, opacity=[0.9], rgb=[[1, 1, 1]])
     assert render(ball, facing(9)).alpha.max() == 0

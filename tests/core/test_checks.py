@@ -1,0 +1,81 @@
+"""Messages for users: which key, what was wanted, what came, what to type."""
+
+import math
+
+import pytest
+import torch
+
+from cadam3d.core.checks import (
+    UserError,
+    fail,
+    require,
+    require_choice,
+    require_color,
+    require_finite,
+    require_range,
+)
+
+
+def test_a_message_says_key_wanted_got_and_what_to_type():
+    message = str(fail("densifier.tau_Q", wanted="a number >= 0", got=-1, example="densifier.tau_Q=0.9"))
+    assert message == "densifier.tau_Q: wanted a number >= 0, got -1. Try: densifier.tau_Q=0.9"
+
+
+def test_a_true_claim_passes_and_a_false_one_is_a_user_error():
+    require(True, "key", wanted="x", got="y", example="key=x")
+    with pytest.raises(UserError, match=r"key: wanted x, got 'y'\. Try: key=x"):
+        require(False, "key", wanted="x", got="y", example="key=x")
+
+
+@pytest.mark.parametrize("value", [0, 0.0, 0.5, 0.999])
+def test_numbers_inside_pass(value):
+    require_range("key", value, low=0, below=1, example=0.5)
+
+
+@pytest.mark.parametrize("value", [-1e-9, 1, 1.0, math.nan, math.inf, -math.inf, None, "0.5", True, [0.5]])
+def test_numbers_outside_and_things_that_are_no_numbers_do_not(value):
+    with pytest.raises(UserError, match=r"key: wanted a number >= 0 and < 1, got .*\. Try: key=0.5"):
+        require_range("key", value, low=0, below=1, example=0.5)
+
+
+def test_bounds_are_closed_or_open_as_they_say():
+    require_range("key", 3, low=3, high=3, example=3)
+    with pytest.raises(UserError, match="> 3"):
+        require_range("key", 3, above=3, example=4)
+    with pytest.raises(UserError, match="< 3"):
+        require_range("key", 3, below=3, example=2)
+
+
+@pytest.mark.parametrize(
+    ("value", "is_fine"), [(-1e30, True), (0, True), (math.inf, False), (math.nan, False)]
+)
+def test_without_bounds_any_finite_number_passes(value, is_fine):
+    if is_fine:
+        require_range("key", value, example=1)
+    else:
+        with pytest.raises(UserError, match="a finite number"):
+            require_range("key", value, example=1)
+
+
+def test_an_infinite_number_never_passes_a_one_sided_bound():
+    with pytest.raises(UserError, match="key"):
+        require_range("key", math.inf, low=0, example=1)
+
+
+def test_a_choice_lists_what_there_is():
+    require_choice("prior", "tiny", ["shapes", "tiny"])
+    with pytest.raises(UserError, match=r"prior: wanted one of shapes\|tiny, got 'tin'. Try: prior=shapes"):
+        require_choice("prior", "tin", ["shapes", "tiny"])
+
+
+def test_a_colour_is_three_numbers_between_zero_and_one():
+    require_color("background.color", [0, 0.5, 1.0])
+    for wrong in ([0.0, 0.5], [0.0, 0.5, 1.01], [-0.1, 0.0, 0.0], [math.nan, 0.0, 0.0]):
+        with pytest.raises(UserError, match=r"background\.color: wanted three numbers in \[0, 1\]"):
+            require_color("background.color", wrong)
+
+
+def test_numbers_that_are_not_finite_are_counted():
+    require_finite("x.means", torch.zeros(4))
+    with pytest.raises(UserError, match=r"x\.means: 2 of 4 numbers are not finite"):
+        require_finite("x.means", torch.tensor([1.0, math.nan, math.inf, 0.0]))

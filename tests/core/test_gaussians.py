@@ -1,0 +1,95 @@
+"""Gaussians: activations, and that rows stay rows whatever is done with them."""
+
+import math
+
+import pytest
+import torch
+
+from cadam3d.core.gaussians import FIELDS, Gaussians, concatenate
+
+
+def make(n: int, degree: int = 1, seed: int = 0) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+    shapes = {
+        "means": (3,),
+        "log_scales": (3,),
+        "quats": (4,),
+        "opacity_logits": (),
+        "sh": ((degree + 1) ** 2, 3),
+    }
+    return Gaussians(**{name: torch.randn(n, *shape, generator=generator) for name, shape in shapes.items()})
+
+
+def assert_same(got: Gaussians, want: Gaussians) -> None:
+    for name in FIELDS:
+        assert torch.equal(getattr(got, name), getattr(want, name)), name
+
+
+def test_activations_map_raw_numbers_to_physical_ones():
+    gaussians = make(1)
+    gaussians.log_scales[:] = torch.tensor([0.0, math.log(2), -1.0])
+    gaussians.opacity_logits[:] = math.log(3)
+    torch.testing.assert_close(gaussians.scales, torch.tensor([[1.0, 2.0, math.exp(-1)]]))
+    torch.testing.assert_close(gaussians.opacities, torch.tensor([0.75]))
+
+
+@pytest.mark.parametrize(
+    ("axis", "turned"), [(1, [0.0, 0, 1]), (2, [0.0, 1, 0]), (3, [-1.0, 0, 0])], ids=["x", "y", "z"]
+)
+def test_quaternions_are_wxyz_and_turn_by_the_right_hand_rule(axis, turned):
+    gaussians = make(1)
+    gaussians.quats = torch.zeros(1, 4)
+    gaussians.quats[0, 0] = gaussians.quats[0, axis] = 7.0  # a quarter turn; the length does not matter
+    before = torch.tensor([0.0, 1, 0])
+    torch.testing.assert_close(gaussians.rotations[0] @ before, torch.tensor(turned))
+
+
+def test_rotations_are_rotations():
+    rotations = make(50).rotations
+    torch.testing.assert_close(
+        rotations @ rotations.transpose(1, 2), torch.eye(3).expand(50, 3, 3), atol=1e-5, rtol=0
+    )
+    torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(50))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_the_sh_degree_follows_from_the_number_of_coefficients(degree):
+    assert make(2, degree).sh_degree == degree
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [torch.tensor([3, 0, 3]), torch.tensor([True, False, True, True]), slice(1, 3)],
+    ids=["int", "bool", "slice"],
+)
+def test_index_picks_the_same_rows_of_every_tensor(rows):
+    gaussians = make(4)
+    picked = gaussians.index(rows)
+    for name in FIELDS:
+        assert torch.equal(getattr(picked, name), getattr(gaussians, name)[rows])
+
+
+def test_concatenate_undoes_a_split():
+    gaussians = make(6)
+    assert_same(concatenate([gaussians.index(slice(0, 2)), gaussians.index(slice(2, 6))]), gaussians)
+
+
+def test_no_gaussians_are_gaussians_too():
+    assert len(make(0)) == 0
+    assert make(0).rotations.shape == (0, 3, 3)
+    assert_same(concatenate([make(0), make(3)]), make(3))
+
+
+def test_detach_cuts_the_graph_and_keeps_the_numbers():
+    gaussians = make(3).map(lambda tensor: tensor.requires_grad_())
+    cut = gaussians.map(lambda tensor: tensor * 1).detach()
+    assert not any(tensor.requires_grad for tensor in cut.tensors().values())
+    assert_same(cut, gaussians)
+
+
+def test_to_converts_every_tensor_and_map_does_not_touch_the_original():
+    gaussians = make(3)
+    assert all(tensor.dtype == torch.float64 for tensor in gaussians.to(torch.float64).tensors().values())
+    gaussians.map(lambda tensor: tensor + 1)
+    assert_same(gaussians, make(3))
+    assert tuple(gaussians.tensors()) == FIELDS

@@ -1,0 +1,55 @@
+"""Schedules: pure functions of the step."""
+
+import pytest
+
+from cadam3d.core.checks import UserError
+from cadam3d.core.schedule import Constant, Linear, LogLinear, Steps, as_schedule
+
+
+def test_a_constant_never_changes():
+    assert {Constant(0.3)(step) for step in (0, 1, 10**6)} == {0.3}
+
+
+@pytest.mark.parametrize("kind", [Linear, LogLinear])
+def test_ramps_start_and_end_where_they_say_and_stay_there(kind):
+    ramp = kind(start=1e-2, end=1e-4, steps=100, begin=20)
+    assert [ramp(step) for step in (0, 20, 120, 10**6)] == pytest.approx([1e-2, 1e-2, 1e-4, 1e-4])
+    values = [ramp(step) for step in range(20, 121)]
+    assert values == sorted(values, reverse=True)
+
+
+def test_halfway_is_the_mean_on_a_linear_and_the_geometric_mean_on_a_logarithmic_ramp():
+    assert Linear(start=1, end=3, steps=10)(5) == pytest.approx(2)
+    assert LogLinear(start=1e-2, end=1e-4, steps=10)(5) == pytest.approx(1e-3)
+
+
+def test_ramps_may_rise():
+    assert Linear(start=0, end=1, steps=4)(3) == pytest.approx(0.75)
+    assert LogLinear(start=1, end=16, steps=4)(3) == pytest.approx(8)
+
+
+def test_steps_change_exactly_at_their_milestones():
+    schedule = Steps(values=[0.98, 0.5, 0.1], milestones=[10, 20])
+    assert [schedule(step) for step in (0, 9, 10, 19, 20, 99)] == [0.98, 0.98, 0.5, 0.5, 0.1, 0.1]
+
+
+def test_a_number_is_a_constant_schedule_and_a_schedule_is_itself():
+    assert as_schedule(3)(7) == 3.0
+    ramp = Linear(start=0, end=1, steps=4)
+    assert as_schedule(ramp) is ramp
+
+
+@pytest.mark.parametrize(
+    ("build", "key"),
+    [
+        (lambda: Linear(start=0, end=1, steps=0), "schedule.steps"),
+        (lambda: LogLinear(start=1, end=1, steps=0), "schedule.steps"),
+        (lambda: LogLinear(start=0, end=1, steps=5), "schedule.start"),
+        (lambda: LogLinear(start=1, end=-1, steps=5), "schedule.end"),
+        (lambda: Steps(values=[1, 2], milestones=[]), "schedule.values"),
+        (lambda: Steps(values=[1, 2, 3], milestones=[20, 10]), "schedule.values"),
+    ],
+)
+def test_impossible_schedules_name_the_key(build, key):
+    with pytest.raises(UserError, match=key):
+        build()
