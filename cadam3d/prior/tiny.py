@@ -156,9 +156,7 @@ class TinyUNet(nn.Module):
         """The prediction; what it means is the prior's affair."""
         is_padding = tokens == PADDING
         text = self.token(tokens) + self.position.weight
-        share = (~is_padding).float() / (~is_padding).sum(dim=1, keepdim=True)
-        pooled = torch.einsum("bt,btc->bc", share, text)
-        context = self.mixture(self.time(sinusoids(timestep)) + self.view(directions) + pooled)
+        context = self.mixture(self.time(sinusoids(timestep)) + self.view(directions))
 
         fine = self.fine_down(self.enter(noisy), context)
         middle = self.middle_down(self.shrink1(fine), context)
