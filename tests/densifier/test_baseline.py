@@ -95,9 +95,9 @@ def test_a_batch_of_views_is_as_good_as_the_same_views_one_by_one():
 
 
 def test_the_views_of_a_batch_combine_as_asked():
-    pixel = torch.tensor([[[3.0, 0.0]], [[0.0, 4.0]], [[-3.0, 0.0]]])
+    pixel = torch.tensor([[[3.0, 0.0]], [[0.0, 4.0]], [[-6.0, 0.0]]])
     visible = torch.tensor([[True], [True], [True]])
-    expected = {"sum_norm": 10 / 3, "sum_vector": 4.0, "last": 3.0}
+    expected = {"sum_norm": 13 / 3, "sum_vector": 5.0, "last": 6.0}
     for views, norm in expected.items():
         assert float(mean_norms(baseline(views=views), signal(pixel, visible))) == pytest.approx(norm)
 

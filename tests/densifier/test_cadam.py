@@ -361,6 +361,16 @@ def test_a_gradient_that_is_not_finite_skips_the_step_or_its_row(bad, grad_norm)
         assert torch.equal(after.m[0], before.m[0]) == (choice == "skip_step")
 
 
+@pytest.mark.parametrize("grad_norm", ["none", "per_step_rms"])
+def test_under_skip_row_the_others_do_not_notice_a_bad_row(grad_norm):
+    densifier = cadam(nonfinite="skip_row", grad_norm=grad_norm)
+    bad, zero = noise(1, 3)[0], noise(1, 3)[0]
+    bad[1, 2], zero[1] = math.nan, 0.0
+    with_bad, with_zero = (observe(densifier, gradient[None]) for gradient in (bad, zero))
+    assert torch.equal(with_bad.m[[0, 2]], with_zero.m[[0, 2]])
+    assert torch.equal(with_bad.v[[0, 2]], with_zero.v[[0, 2]])
+
+
 # The selective opacity reset (eq. 13).
 
 
