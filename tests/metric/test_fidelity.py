@@ -118,6 +118,7 @@ def test_the_nearest_mode_is_found_and_scored(right):
     measured = measure(renders(0.0), truths(*shifts))
     assert measured["mode"] == right
     assert measured["psnr"] == pytest.approx(40.0, abs=1e-3)
+    assert measured["psnr_min"] == pytest.approx(40.0, abs=1e-3)  # of that mode, not of all
 
 
 def test_one_mode_counts_for_all_views():
