@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import random
 import shutil
 import signal
 import subprocess
@@ -14,6 +15,8 @@ from pathlib import Path
 import pytest
 import yaml
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
 from cadam3d import advice, cli, launch, settings
 from cadam3d.core.errors import UserError
@@ -141,9 +144,14 @@ def test_help_is_instant_and_imports_nothing_heavy():
 
 
 @pytest.mark.parametrize("command", list(cli.COMMANDS))
-def test_every_command_has_a_module_a_config_and_a_help_page(command, type_line):
+def test_every_command_has_a_module_and_says_in_its_yaml_what_it_is_for(command):
     assert (REPOSITORY / f"cadam3d/commands/{command}.py").is_file()
-    assert (settings.config_dir() / f"{command}.yaml").is_file()
+    config = yaml.safe_load((settings.config_dir() / f"{command}.yaml").read_text(encoding="utf-8"))
+    assert f"\n  cadam3d {command}" in config["hydra"]["help"]["header"]
+
+
+@pytest.mark.parametrize("command", ["train", "doctor"])
+def test_the_help_page_of_a_command_is_ours(command, type_line):
     result = type_line(command, "--help")
     assert result.code == 0
     assert f"cadam3d {command}" in result.out
@@ -179,22 +187,30 @@ def test_a_word_like_nothing_else_gets_the_list_of_commands(type_line):
 
 
 @pytest.mark.parametrize("prompt", AWKWARD)
-@pytest.mark.parametrize("key", ["prompt", "negative_prompt"])
-def test_a_prompt_arrives_as_it_was_typed(key, prompt, type_line, jobs):
-    words = [f"{key}={prompt}"] + (["prompt=a cube"] if key == "negative_prompt" else [])
-    assert type_line("train", *words).code == 0
+def test_a_prompt_arrives_as_it_was_typed_and_survives_the_config_of_its_run(
+    prompt, tmp_path, type_line, jobs
+):
+    assert type_line("train", f"prompt={prompt}").code == 0
     [(cfg, _)] = jobs
-    assert cfg[key] == prompt
-
-
-@pytest.mark.parametrize("prompt", AWKWARD)
-def test_a_prompt_survives_the_config_that_a_run_leaves(prompt, tmp_path, type_line, jobs):
-    from omegaconf import OmegaConf
-
-    type_line("train", f"prompt={prompt}")
+    assert cfg.prompt == prompt
     path = tmp_path / "config.yaml"
-    path.write_text(OmegaConf.to_yaml(jobs[0][0], resolve=True), encoding="utf-8")
+    path.write_text(OmegaConf.to_yaml(cfg, resolve=True), encoding="utf-8")
     assert settings.load(path).prompt == prompt
+
+
+def test_a_negative_prompt_is_text_too(type_line, jobs):
+    assert type_line("train", "prompt=a cube", "negative_prompt=blurry, (low) quality=1").code == 0
+    assert jobs[0][0].negative_prompt == "blurry, (low) quality=1"
+
+
+def test_quoting_is_undone_by_hydra_and_omegaconf_for_any_text():
+    letters = ["\\", "'", '"', "${", "}", "$", "{", ",", "(", "]", "=", " ", "a", "\u65e5", "\n", "#", "?"]
+    draw = random.Random(0)
+    parser = OverridesParser.create()
+    for _ in range(500):
+        text = "".join(draw.choices(letters, k=draw.randint(0, 9)))
+        value = parser.parse_override(f"prompt={settings.quote(text)}").value()
+        assert text == "???" or OmegaConf.create({"prompt": value}).prompt == text
 
 
 @pytest.mark.parametrize("quoted", ["'a corgi, front view'", '"a corgi, front view"'])
@@ -246,6 +262,20 @@ def test_a_missing_prompt_is_refused_before_anything_happens(words, type_line, j
     )
     assert not jobs
     assert not list(tmp_path.iterdir())
+
+
+def test_any_other_missing_value_is_asked_for_too(type_line, tmp_path):
+    message = type_line("train", "prompt=a cube", "initializer=mesh").message
+    assert message == "initializer.path: no value given. Try: cadam3d train initializer.path=..."
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_component_from_a_folder_of_the_users_own_is_found(type_line, jobs, tmp_path):
+    own = tmp_path / "my configs, (1)/densifier"
+    own.mkdir(parents=True)
+    (own / "mine.yaml").write_text("_target_: mypackage.Mine\n", encoding="utf-8")
+    assert type_line("train", "--config-dir", str(own.parent), "densifier=mine", "prompt=a cube").code == 0
+    assert jobs[0][0].densifier._target_ == "mypackage.Mine"
 
 
 def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, tmp_path):

@@ -73,7 +73,7 @@ def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
 
 def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
     """Let every exporter of ``cfg`` write ``asset`` into ``folder``; returns what they wrote."""
-    exporters: Sequence[Exporter] = [component(node) for node in (cfg.exporter or {}).values()]
+    exporters: Sequence[Exporter] = [component(node) for node in cfg.exporter.values()]
     if not exporters:
         raise UserError("exporter: wanted at least one, got none. Try: exporter=[images,turntable]")
     try:

@@ -1,0 +1,150 @@
+"""doctor: sees what is there, says what to type about what is not, and fails only where training would."""
+
+import json
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from cadam3d import cli
+from cadam3d.commands import doctor
+from cadam3d.commands.doctor import Verdict
+
+REPOSITORY = Path(__file__).parent.parent.parent
+
+
+@pytest.fixture(scope="module")
+def findings():
+    return {finding.topic: finding for finding in doctor.examine()}
+
+
+def run_doctor(monkeypatch, tmp_path, capsys, *words: str) -> tuple[int, str]:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["cadam3d", "doctor", *words])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    return int(ended.value.code or 0), capsys.readouterr().out
+
+
+def test_this_machine_can_train(findings):
+    assert not [finding for finding in findings.values() if finding.verdict is Verdict.BROKEN]
+
+
+@pytest.mark.parametrize(
+    "topic", ["python", "torch", "device", "ffmpeg", "configs", "c++", "nvcc", "diffusers"]
+)
+def test_it_looks_at(topic, findings):
+    assert findings[topic].found
+
+
+def test_every_rasterizer_and_every_prior_is_tried(findings):
+    for group in ("rasterizer", "prior"):
+        for path in (REPOSITORY / "configs" / group).glob("*.yaml"):
+            assert f"{group}={path.stem}" in findings
+    assert findings["rasterizer=reference"].found == "renders"
+    assert findings["prior=shapes"].verdict is Verdict.OK
+
+
+def test_every_dependency_is_looked_at():
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    declared = {re.match(r"[\w-]+", line).group() for line in project["dependencies"]}
+    assert set(doctor.PACKAGES) == declared
+
+
+def test_a_package_that_does_not_import_is_broken_and_has_a_hint(monkeypatch):
+    monkeypatch.setitem(sys.modules, "tqdm", None)
+    finding = doctor._package("tqdm")
+    assert finding.verdict is Verdict.BROKEN
+    assert finding.hint == "Try: pip install --force-reinstall tqdm"
+
+
+def test_a_torchvision_that_does_not_fit_torch_is_broken(monkeypatch):
+    monkeypatch.setattr(doctor.metadata, "version", lambda name: "0.28.0")
+    said = "Traceback ...\nRuntimeError: operator torchvision::nms does not exist"
+    monkeypatch.setattr(doctor, "_ask", lambda command: (1, said))
+    finding = doctor._torchvision()
+    assert finding.verdict is Verdict.BROKEN
+    assert "nms does not exist" in finding.found
+    assert finding.hint == "Try: pip uninstall torchvision"
+
+
+def test_no_ffmpeg_is_broken(monkeypatch):
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/nowhere/ffmpeg")
+    assert doctor._guarded(doctor._ffmpeg).verdict is Verdict.BROKEN
+
+
+def test_no_compiler_is_worth_a_note_only():
+    assert doctor._compiler("no-such-compiler").verdict is Verdict.NOTE
+
+
+def test_a_check_that_fails_is_a_finding_and_not_a_crash():
+    def _check():
+        raise RuntimeError("surprise")
+
+    finding = doctor._guarded(_check)
+    assert (finding.topic, finding.verdict) == ("check", Verdict.BROKEN)
+    assert "surprise" in finding.found
+
+
+def test_models_on_disk_are_listed_by_name(monkeypatch, tmp_path):
+    (tmp_path / "models--someone--some-model").mkdir()
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    assert doctor._models().found == "someone/some-model"
+
+
+def test_a_program_that_does_not_answer_is_not_waited_for(monkeypatch):
+    monkeypatch.setattr(doctor, "SECONDS", 0.1)
+    code, output = doctor._ask([sys.executable, "-c", "import time; time.sleep(30)"])
+    assert code == 127
+    assert "timed out" in output
+
+
+def sound(monkeypatch, *findings: doctor.Finding) -> None:
+    monkeypatch.setattr(doctor, "examine", lambda: iter(findings))
+
+
+def test_all_well_is_exit_0_and_leaves_nothing_behind(monkeypatch, tmp_path, capsys):
+    sound(monkeypatch, doctor.Finding("torch", Verdict.OK, "2"), doctor.Finding("nvcc", Verdict.NOTE, "none"))
+    code, out = run_doctor(monkeypatch, tmp_path, capsys)
+    assert code == 0
+    assert "Ready to train." in out
+    assert not list(tmp_path.iterdir())
+
+
+def test_something_broken_is_exit_1_with_its_hint(monkeypatch, tmp_path, capsys):
+    sound(monkeypatch, doctor.Finding("torch", Verdict.BROKEN, "gone", "Try: pip install torch"))
+    code, out = run_doctor(monkeypatch, tmp_path, capsys)
+    assert code == 1
+    assert "Try: pip install torch" in out
+
+
+def test_json_is_one_object_for_other_programs(monkeypatch, tmp_path, capsys):
+    sound(monkeypatch, doctor.Finding("torch", Verdict.BROKEN, "gone", "hint"))
+    code, out = run_doctor(monkeypatch, tmp_path, capsys, "json=true")
+    report = json.loads(out)
+    assert code == 1
+    assert report["ok"] is False
+    assert report["findings"] == [{"topic": "torch", "verdict": "broken", "found": "gone", "hint": "hint"}]
+
+
+def test_python_that_is_too_old_is_broken(monkeypatch):
+    monkeypatch.setattr(doctor.sys, "version_info", (3, 10, 0))
+    assert doctor._python().verdict is Verdict.BROKEN
+
+
+def test_a_gpu_that_torch_cannot_use_gets_a_hint(monkeypatch):
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/usr/bin/{name}")
+    monkeypatch.setattr(doctor, "_ask", lambda command: (0, "GPU 0"))
+    finding = doctor._device()
+    assert finding.verdict is Verdict.NOTE
+    assert "there is a GPU" in finding.found
+    assert finding.hint.startswith("Try: pip install")
+
+
+def test_asking_a_missing_program_is_no_crash():
+    assert doctor._ask(["/nowhere/program"])[0] == 127

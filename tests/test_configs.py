@@ -1,0 +1,195 @@
+"""Python declares, YAML decides: every file has exactly the keys of its class, composes, builds, runs."""
+
+import dataclasses
+import sys
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from cadam3d import cli
+from cadam3d.core.errors import UserError
+from cadam3d.io.jsonl import read_json, read_jsonl
+from cadam3d.settings import component, compose, config_dir
+
+CONFIGS = config_dir()
+SEVERAL = ("exporter", "callback", "metric")  # groups of which a run has several at once
+NO_COMPONENTS = ("hydra", "grid", "experiment")
+GROUPS = sorted(path.name for path in CONFIGS.iterdir() if path.is_dir() and path.name not in NO_COMPONENTS)
+FILES = [path for group in GROUPS for path in sorted((CONFIGS / group).glob("*.yaml"))]
+GRIDS = sorted(path.stem for path in (CONFIGS / "grid").glob("*.yaml"))
+EXPERIMENTS = sorted(
+    str(path.relative_to(CONFIGS / "experiment").with_suffix(""))
+    for path in (CONFIGS / "experiment").rglob("*.yaml")
+)
+PROMPT = "prompt=a red cube"
+
+
+def name_of(path: Path) -> str:
+    return str(path.relative_to(CONFIGS).with_suffix(""))
+
+
+def read(path: Path) -> Any:
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
+
+
+def nodes(value: Any) -> Iterator[dict[str, Any]]:
+    """Every node that names a class, the outermost first."""
+    if isinstance(value, dict):
+        if "_target_" in value:
+            yield value
+        value = list(value.values())
+    for item in value if isinstance(value, list) else []:
+        yield from nodes(item)
+
+
+def class_of(node: dict[str, Any]) -> type:
+    module, _, name = node["_target_"].rpartition(".")
+    return getattr(import_module(module), name)
+
+
+def choose(path: Path) -> str:
+    group = path.parent.name
+    return f"{group}=[{path.stem}]" if group in SEVERAL else f"{group}={path.stem}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_a_node_has_exactly_the_keys_of_its_class(path):
+    for node in nodes(read(path)):
+        keys = set(node) - {"_target_"}
+        fields = {field.name: field for field in dataclasses.fields(class_of(node)) if field.init}
+        required = {
+            name
+            for name, field in fields.items()
+            if field.default is field.default_factory is dataclasses.MISSING
+        }
+        assert required <= keys <= set(fields), node["_target_"]
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_a_component_declares_no_values_of_its_own(path):
+    """A number has one home, and it is the YAML; schedules and paths inside a component may have defaults."""
+    content = read(path)
+    for node in [content] if "_target_" in content else content.values():
+        settings = [field for field in dataclasses.fields(class_of(node)) if field.init]
+        assert not [field.name for field in settings if field.default is not dataclasses.MISSING]
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_files_of_groups_with_several_options_live_in_a_node_of_their_own(path):
+    header = path.read_text(encoding="utf-8").splitlines()[0]
+    wanted = f"# @package {path.parent.name}.{path.stem}"
+    assert header == wanted if path.parent.name in SEVERAL else not header.startswith("# @package")
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_every_option_composes_and_builds(path):
+    group = path.parent.name
+    cfg = compose([PROMPT, choose(path)])
+    node = cfg[group][path.stem] if group in SEVERAL else cfg[group]
+    if "???" in path.read_text(encoding="utf-8"):  # needs a value that only the user has
+        with pytest.raises(UserError, match=r"(?i)missing"):
+            component(node)
+    else:
+        assert component(node) is not None
+
+
+def test_the_groups_of_train_are_the_packages_of_components():
+    chosen = [
+        next(iter(entry)) for entry in read(CONFIGS / "train.yaml")["defaults"] if isinstance(entry, dict)
+    ]
+    assert set(GROUPS) == set(chosen) - set(NO_COMPONENTS)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_every_job_of_a_grid_composes(grid):
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    params = read(CONFIGS / "grid" / f"{grid}.yaml")
+    lines = [f"{key}={value}" for key, value in params.items()]
+    for override in OverridesParser.create().parse_overrides(lines):
+        values = list(override.sweep_string_iterator())
+        assert len(values) > 1
+        for value in values:
+            compose([PROMPT, f"{override.get_key_element()}={value}"])
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_runs_two_steps_on_the_tiny_prior(experiment, tmp_path, monkeypatch):
+    raw = read(CONFIGS / "experiment" / f"{experiment}.yaml")
+    lines = [PROMPT, f"experiment={experiment}", "prior=tiny", "rasterizer=reference", "steps=2"]
+    lines += ["camera.size=16", "initializer.count=20", f"hydra.run.dir={tmp_path}"]
+    lines += [line for line in ("exporter=[ply]", "metric=[size]") if line.partition("=")[0] not in raw]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["cadam3d", "train", *lines])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert not ended.value.code
+    assert read_json(tmp_path / "summary.json")["outcome"] == "finished"
+    assert read_jsonl(tmp_path / "metrics.jsonl")
+    assert (tmp_path / "asset.ply").is_file()
+
+
+# --- building ---------------------------------------------------------------------------------------------
+
+
+def node(target: str, **values: Any):
+    from omegaconf import OmegaConf
+
+    return OmegaConf.create({"part": {"_target_": target, **values}}).part
+
+
+def test_a_mistake_found_in_a_constructor_comes_out_as_it_is():
+    with pytest.raises(
+        UserError, match=r"^schedule.steps: wanted a number >= 1, got 0. Try: schedule.steps=600$"
+    ):
+        component(node("cadam3d.core.schedule.Linear", start=1.0, end=0.0, steps=0))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"value": 1.0, "speed": 2}, "part: there is no key speed"),
+        ({}, "part: no value for value"),
+    ],
+)
+def test_wrong_keys_are_named(values, message):
+    with pytest.raises(UserError, match=message):
+        component(node("cadam3d.core.schedule.Constant", **values))
+
+
+@pytest.mark.parametrize("target", ["cadam3d.nowhere.Thing", "cadam3d.core.schedule.Nothing"])
+def test_a_class_that_cannot_be_loaded_is_named(target):
+    with pytest.raises(UserError, match=r"part\._target_: cannot be loaded"):
+        component(node(target))
+
+
+def test_a_value_that_is_still_missing_is_named():
+    with pytest.raises(UserError, match=r"part\.value: "):
+        component(node("cadam3d.core.schedule.Constant", value="???"))
+
+
+def test_a_bug_in_a_constructor_stays_what_it_is():
+    with pytest.raises(ZeroDivisionError):
+        component(node("operator.truediv", _args_=[1, 0]))
+
+
+def test_lists_and_inner_nodes_become_plain_objects():
+    inner = {"_target_": "cadam3d.core.schedule.Constant", "value": 2.0}
+    built = component(node("builtins.dict", numbers=[1, 2], deep={"schedule": inner}))
+    assert type(built["numbers"]) is list
+    assert type(built["deep"]) is dict
+    assert built["deep"]["schedule"](0) == 2.0
+
+
+def test_composing_inside_a_running_command_leaves_it_alone():
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    with initialize_config_dir(str(CONFIGS.resolve()), version_base="1.3"):
+        outer = GlobalHydra.instance().hydra
+        compose([PROMPT])
+        assert GlobalHydra.instance().hydra is outer

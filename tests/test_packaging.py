@@ -1,0 +1,128 @@
+"""What a stranger installs: one wheel that carries its configuration and works from an empty folder."""
+
+import os
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    """Built without network and without a build environment of its own."""
+    folder = tmp_path_factory.mktemp("dist")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder)]
+    done = subprocess.run([*command, str(REPOSITORY)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    [path] = folder.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory) -> Path:
+    """A folder that holds the installed package and nothing else."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target"]
+    subprocess.run([*command, str(folder), str(wheel)], check=True, capture_output=True)
+    return folder
+
+
+def run(installed: Path, where: Path, *command: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(installed), "OMP_NUM_THREADS": "1"}
+    return subprocess.run(command, cwd=where, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_the_wheel_carries_every_config(wheel):
+    inside = {name for name in zipfile.ZipFile(wheel).namelist() if name.startswith("cadam3d/configs/")}
+    here = {
+        f"cadam3d/configs/{path.relative_to(REPOSITORY / 'configs')}" for path in find("configs", "*.yaml")
+    }
+    assert inside == here
+
+
+def test_the_wheel_carries_every_source_and_nothing_else_of_the_repository(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    here = {str(path.relative_to(REPOSITORY)) for path in find("cadam3d", "*.py")}
+    assert {name for name in names if name.endswith(".py")} == here
+    assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"cadam3d"}
+    assert "cadam3d/py.typed" in names
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+
+
+def test_kernel_sources_travel_too(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
+    sources = {path for pattern in ("*.cpp", "*.h", "*.cu", "*.cuh") for path in find("cadam3d", pattern)}
+    assert {str(path.relative_to(REPOSITORY)) for path in sources} <= names
+
+
+def test_there_is_exactly_one_console_script(wheel):
+    archive = zipfile.ZipFile(wheel)
+    [entry] = [name for name in archive.namelist() if name.endswith("entry_points.txt")]
+    assert archive.read(entry).decode().split() == ["[console_scripts]", "cadam3d", "=", "cadam3d.cli:main"]
+
+
+def test_the_installed_program_composes_from_an_empty_folder(installed, tmp_path):
+    program = installed / "bin" / "cadam3d"
+    done = run(installed, tmp_path, str(program), "train", "prompt=a cube", "--cfg", "job")
+    assert done.returncode == 0, done.stderr
+    assert "prompt: a cube" in done.stdout
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_installed_package_reads_its_own_configs(installed, tmp_path):
+    code = "from cadam3d.settings import config_dir; print(config_dir())"
+    done = run(installed, tmp_path, sys.executable, "-c", code)
+    assert Path(done.stdout.strip()) == installed / "cadam3d" / "configs", done.stderr
+
+
+def test_python_minus_m_is_the_same_program(installed, tmp_path):
+    by_module = run(installed, tmp_path, sys.executable, "-m", "cadam3d", "--help")
+    by_script = run(installed, tmp_path, str(installed / "bin" / "cadam3d"), "--help")
+    assert by_module.stdout == by_script.stdout != ""
+
+
+def test_no_dependency_pulls_torchvision():
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    everything = [
+        *project["dependencies"],
+        *(line for lines in project["optional-dependencies"].values() for line in lines),
+    ]
+    assert not [line for line in everything if "torchvision" in line]
+
+
+def test_the_ci_runs_make_test_and_nothing_beside_it():
+    script = REPOSITORY / ".ci" / "run"
+    assert os.access(script, os.X_OK)
+    lines = [line for line in script.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    assert lines == ["set -eu", 'cd "$(dirname "$0")/.."', "exec make test"]
+
+
+@pytest.mark.parametrize(
+    ("goal", "expected"), [("demo", 'train prompt="a red and yellow checkered torus"'), ("test", "-m pytest")]
+)
+def test_make_says_what_it_would_do(goal, expected):
+    done = subprocess.run(["make", "-n", goal], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert expected in done.stdout
+
+
+def test_make_refuses_a_python_that_is_too_old_or_too_new(tmp_path):
+    (tmp_path / "Makefile").symlink_to(REPOSITORY / "Makefile")
+    (tmp_path / "pyproject.toml").touch()
+    old = tmp_path / "python3.8"
+    old.write_text("#!/bin/sh\nexit 1\n", encoding="utf-8")
+    old.chmod(0o755)
+    done = subprocess.run(
+        ["make", "demo", f"PYTHON={old}"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode != 0
+    assert "is not Python 3.11, 3.12 or 3.13. Try: make demo PYTHON=python3.12" in done.stdout
+    assert not (tmp_path / ".venv").exists()
+
+
+def find(folder: str, pattern: str) -> list[Path]:
+    return [path for path in (REPOSITORY / folder).rglob(pattern) if "__pycache__" not in path.parts]
