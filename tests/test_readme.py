@@ -32,7 +32,7 @@ COMMAND_LINES = [(page.name, line) for page in PAGES if page.is_file() for line 
 
 @pytest.fixture
 def workplace(tmp_path, monkeypatch) -> Path:
-    """A folder as the documentation assumes it: ``outputs/latest`` is a run, ``myconfigs`` has a densifier."""
+    """A folder as the documentation assumes it, with a run and with a config folder of the user's own."""
     run = tmp_path / "outputs" / "latest"
     (run / ".hydra").mkdir(parents=True)
     (run / ".hydra" / "overrides.yaml").write_text("- prompt='a cube'\n", encoding="utf-8")
