@@ -78,7 +78,7 @@ def parse(prompt: str) -> Sentence:
 def noun_of(word: str) -> str | None:
     """The catalogue name behind a noun, singular or plural; None if it is not a noun."""
     nouns = {*known_primitives(), *known_objects()}
-    irregular = {"tori": "torus", "boxes": "box", "torches": "torch", "arches": "arch", "dice": "cube"}
+    irregular = {"tori": "torus", "boxes": "box", "arches": "arch"}
     for form in (irregular.get(word, word), word.removesuffix("s"), word.removesuffix("es")):
         name = ALIASES.get(form, form)
         if name in nouns:
