@@ -272,10 +272,9 @@ class _Shading:
 
     def __init__(self, table: Tensor, block: _Block, tiles_x: int) -> None:
         # One more splat, all zero and so transparent, stands where a list is too short.
-        padded = torch.nn.functional.pad(table, (0, 0, 0, 1)).t().contiguous()
-        mean_x, mean_y, self.w_xx, self.w_xy, self.w_yy, opacity, *self.features = padded[
-            :, block.splats, None
-        ]
+        padded = torch.nn.functional.pad(table, (0, 0, 0, 1))
+        rows = padded.index_select(0, block.splats.flatten()).view(*block.splats.shape, 1, -1)
+        mean_x, mean_y, self.w_xx, self.w_xy, self.w_yy, opacity, *self.features = rows.unbind(dim=-1)
         pixel = torch.arange(TILE**2, device=table.device)
         x = block.tiles[:, None] % tiles_x * TILE + pixel % TILE + 0.5
         y = block.tiles[:, None] // tiles_x * TILE + pixel // TILE + 0.5
