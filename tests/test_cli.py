@@ -370,10 +370,10 @@ def test_a_run_gets_a_dated_folder_named_after_its_prompt(type_line, jobs, tmp_p
     assert (folder / "train.log").is_file()
 
 
-def test_two_runs_in_one_second_do_not_share_a_folder(type_line, jobs):
-    for _ in range(3):
-        type_line("train", "prompt=a cube", "hydra.job.name=train")
-    assert len({folder for _, folder in jobs}) == 3
+def test_two_runs_in_one_second_do_not_share_a_folder(tmp_path):
+    claims = [launch._claim(tmp_path / "10-00-00_cube", "hydra.run.dir", is_chosen=False) for _ in range(3)]
+    assert [folder.name for folder in claims] == ["10-00-00_cube", "10-00-00_cube-2", "10-00-00_cube-3"]
+    assert launch._claim(claims[0], "hydra.run.dir", is_chosen=True) == claims[0]
 
 
 @pytest.mark.parametrize(
