@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from cadam3d.core.errors import UserError
 
 VERSION_BASE = "1.3"  # Hydra's behaviour is pinned to this version, whatever is installed
-WRONG_CALL = r"unexpected keyword|missing (?:a|\d+) required"  # how Python words a call with the wrong arguments
+WRONG_CALL = r"unexpected keyword|missing (?:a|\d+) required"  # how Python says it
 SLUG_LENGTH = 60  # characters; even of three bytes each they fit a file name
 
 
