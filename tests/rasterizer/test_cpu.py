@@ -1,8 +1,8 @@
 """The native CPU rasterizer against the reference, and the laws that need no reference.
 
-The image formation model has steps: a contribution below ALPHA_MIN is skipped, one above ALPHA_MAX capped,
+The image formation model has steps: a contribution below ALPHA_MIN is skipped, one above ALPHA_MAX is capped,
 and a pixel stops before TRANSMITTANCE_MIN. Where a number lies within rounding of a step, float32 and float64
-may decide differently and both are right; ``undecided`` finds those pixels, the comparisons leave them out and
+may decide differently, and both are right: ``undecided`` finds those pixels, the comparisons leave them out and
 insist that they are few.
 """
 
@@ -303,7 +303,7 @@ def test_background_alone_where_nobody_is_seen(cpu, n):
         assert not grad.any()
 
 
-POISON = (math.nan, math.inf, -math.inf, 1e38, -1e38, 1e20, 100.0, -100.0, 1e-45, 0.0)
+POISON = (math.nan, math.inf, -math.inf, 1e38, -1e38, 1e20, 100.0, 40.0, -100.0, 1e-45, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -326,6 +326,20 @@ def test_poison_never_spreads(cpu, field, value):
             assert not grads[name][7].any()
             assert torch.equal(grads[name][torch.arange(50) != 7], clean_grads[name])
     assert math.isfinite(value) or not output.visible[:, 7].any()
+
+
+@pytest.mark.parametrize(("z", "is_visible"), [(1e14, True), (1e20, False), (1e38, False)])
+def test_poison_at_the_horizon_never_spreads(cpu, z, is_visible):
+    gaussians, cameras = make_gaussians(50, degree=1, spread=0.2), make_cameras(1, 25, 25)
+    cameras.world_to_camera[0] = torch.eye(4)
+    gaussians.means[:, 2] += 2.0
+    gaussians.means[7] = torch.tensor([0.0, 0.0, z])
+    output, grads = render_and_differentiate(
+        cpu.render, gaussians, cameras, backgrounds(1), make_weights(1, 25, 25)
+    )
+    assert output.visible[0, 7].item() is is_visible
+    for tensor in bits(output, grads):
+        assert tensor.isfinite().all()
 
 
 def test_one_poisoned_number_is_enough_to_cull(cpu):

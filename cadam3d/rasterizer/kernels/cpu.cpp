@@ -65,6 +65,7 @@ class Buffer {
  public:
   void allocate(int64_t count) { memory_.reset(new T[size_t(std::max<int64_t>(count, 1))]); }
   T* data() { return memory_.get(); }
+  const T* data() const { return memory_.get(); }
   T& operator[](int64_t i) { return memory_[size_t(i)]; }
   const T& operator[](int64_t i) const { return memory_[size_t(i)]; }
 
@@ -409,10 +410,11 @@ struct CellBackward {
   Ints last;
 };
 
-// The splat that comes ``AHEAD`` places later is asked for now: lists point all over memory.
+// What is needed ``AHEAD`` places later is asked for now: lists point all over memory.
 constexpr int AHEAD = 6;
-inline void prefetch(const View& view, const Splat* splats, int64_t entry, int64_t begin, int64_t end) {
-  if (entry >= begin && entry < end) __builtin_prefetch(splats + view.entries[entry]);
+inline void prefetch(const void* address) {
+  __builtin_prefetch(address);
+  asm volatile("" : : "r"(address));  // GCC takes a function that only prefetches for one that does nothing
 }
 
 void blend_tile(const Scene& scene, const Frame& frame, View& view, const Splat* splats, int64_t tile,
@@ -435,7 +437,7 @@ void blend_tile(const Scene& scene, const Frame& frame, View& view, const Splat*
   const int64_t begin = view.first_entry[tile], end = view.first_entry[tile + 1];
   const Floats alpha_max = spread(float(SPLAT_ALPHA_MAX)), stop = spread(float(SPLAT_TRANSMITTANCE_MIN));
   for (int64_t entry = begin; entry < end && open_rows > 0; ++entry) {
-    prefetch(view, splats, entry + AHEAD, begin, end);
+    if (entry + AHEAD < end) prefetch(splats + view.entries[entry + AHEAD]);
     const Splat& s = splats[view.entries[entry]];
     const float x = s.x - float(place.x), y = s.y - float(place.y);
     const Window window = window_of(s, x, y);
@@ -452,16 +454,19 @@ void blend_tile(const Scene& scene, const Frame& frame, View& view, const Splat*
         const Falloff fall = falloff(simd::load(CENTRES.x + group * LANES) - centre, l11, u_of_row, t_squared);
         Mask hit = simd::both(simd::less_equal(fall.exponent, cut), open[row][group]);
         if (!simd::any(hit)) continue;
-        const Floats a = simd::min(opacity * simd::exp_minus(fall.exponent), alpha_max);
-        const Floats before = cell.transmittance, after = simd::fma(-a, before, before);
+        Floats a = simd::keep(hit, simd::min(opacity * simd::exp_minus(fall.exponent), alpha_max));
+        const Floats before = cell.transmittance;
+        Floats after = simd::fma(-a, before, before);
         const Mask stops = simd::both(hit, simd::less_equal(after, stop));
         if (simd::any(stops)) {
           open[row][group] = simd::first_only(open[row][group], stops);
           hit = simd::first_only(hit, stops);
+          a = simd::keep(hit, a);
+          after = simd::fma(-a, before, before);
           has_stopped = true;
         }
-        const Floats w = simd::keep(hit, a * before);
-        cell.transmittance = simd::select(hit, after, before);
+        const Floats w = a * before;
+        cell.transmittance = after;
         cell.last = simd::select(hit, mark, cell.last);
         cell.red = simd::fma(w, r, cell.red);
         cell.green = simd::fma(w, g, cell.green);
@@ -555,7 +560,7 @@ void blend_tile_backward(const Scene& scene, const Frame& frame, const View& vie
   const int64_t begin = view.first_entry[tile];
   const Floats alpha_max = spread(float(SPLAT_ALPHA_MAX)), one = spread(1.0f);
   for (int rank = used - 1; rank >= 0; --rank) {
-    prefetch(view, splats, begin + rank - AHEAD, begin, begin + used);
+    if (rank >= AHEAD) prefetch(splats + view.entries[begin + rank - AHEAD]);
     const Splat& s = splats[view.entries[begin + rank]];
     const float x = s.x - float(place.x), y = s.y - float(place.y);
     const Window window = window_of(s, x, y);
@@ -573,16 +578,18 @@ void blend_tile_backward(const Scene& scene, const Frame& frame, const View& vie
         const Falloff fall = falloff(simd::load(CENTRES.x + group * LANES) - centre, l11, u_of_row, t_squared);
         const Mask hit = simd::both(simd::less_equal(fall.exponent, cut), simd::less(index, cell.last));
         if (!simd::any(hit)) continue;
-        const Floats free = opacity * simd::exp_minus(fall.exponent), a = simd::min(free, alpha_max);
+        // Lanes that are not hit have alpha 0 from here on: they change nothing, and meet no slow denormals.
+        const Floats free = simd::keep(hit, opacity * simd::exp_minus(fall.exponent));
+        const Floats a = simd::min(free, alpha_max);
         const Floats after = cell.transmittance, behind = cell.suffix;
         const Floats inverse = one / (one - a), before = after * inverse;
-        const Floats w = simd::keep(hit, a * before);
+        const Floats w = a * before;
         Floats value = (z - cell.depth) * cell.far;
         value = simd::fma(r, cell.red, simd::fma(g, cell.green, simd::fma(b, cell.blue, value)));
         const Floats g_alpha = simd::fma(before, value, -(behind * inverse));
-        const Mask flows = simd::both(hit, simd::less_equal(free, alpha_max));  // a capped alpha has no gradient
+        const Mask flows = simd::less_equal(free, alpha_max);  // a capped alpha has no gradient
         const Floats g_exponent = simd::keep(flows, -a * g_alpha), gu = g_exponent * fall.u;
-        cell.transmittance = simd::select(hit, before, after);
+        cell.transmittance = before;
         cell.suffix = simd::fma(w, value, behind);
         row_g += g_exponent;
         row_gu += gu;
@@ -611,25 +618,37 @@ struct ParameterGradients {
   float *means2d, *means, *log_scales, *quats, *opacity_logits, *sh;
 };
 
-// The records of one Gaussian in one view, tile row by tile row. False if it reached no pixel.
-bool gather(const Scene& scene, const Frame& frame, const View& view, const Splat& s, int64_t i, const float* records,
-            splat::Moments<double>& moments) {
-  double sum[RECORD] = {};
-  bool has_any = false;
+// Calls visit(record) for the records of one Gaussian in one view, tile row by tile row.
+template <class Visit>
+void each_record(const Scene& scene, const Frame& frame, const View& view, const Splat& s, int64_t i,
+                 const float* records, const Visit& visit) {
   const uint32_t begin = view.first_span[i], end = view.first_span[i + 1];
-  int64_t row = begin < end ? tile_rows(s, scene.height).first : 0;
+  if (begin == end) return;
+  int64_t row = tile_rows(s, scene.height).first;
   for (uint32_t span = begin; span < end; ++span, ++row) {
     const Span columns = view.spans[span];
     uint32_t slot = view.first_slot[span];
     for (int64_t column = columns.first; column < columns.end; ++column, ++slot) {
-      const int64_t tile = row * frame.tiles_x + column;
-      const int64_t rank = view.rank_of_slot[slot];
-      if (rank >= view.used[tile]) continue;
-      const float* record = records + (view.first_record[tile] + rank) * RECORD;
-      for (int j = 0; j < RECORD; ++j) sum[j] += record[j];
-      has_any = true;
+      const int64_t tile = row * frame.tiles_x + column, rank = view.rank_of_slot[slot];
+      if (rank < view.used[tile]) visit(records + (view.first_record[tile] + rank) * RECORD);
     }
   }
+}
+
+// The sum of those records. False if there are none: it reached no pixel.
+bool gather(const Scene& scene, const Frame& frame, const View& view, const Splat* splats, int64_t i,
+            const float* records, splat::Moments<double>& moments) {
+  if (i + AHEAD < scene.gaussians)  // records lie in the order of the tiles: ask for them early
+    each_record(scene, frame, view, splats[i + AHEAD], i + AHEAD, records, [](const float* record) {
+      prefetch(record);
+      prefetch(record + RECORD - 1);
+    });
+  double sum[RECORD] = {};
+  bool has_any = false;
+  each_record(scene, frame, view, splats[i], i, records, [&](const float* record) {
+    for (int j = 0; j < RECORD; ++j) sum[j] += record[j];
+    has_any = true;
+  });
   moments = {sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], {sum[6], sum[7], sum[8]}, sum[9]};
   return has_any;
 }
@@ -644,7 +663,7 @@ void gaussian_backward(const Scene& scene, const Frame& frame, int64_t view_begi
   for (int64_t v = view_begin; v < view_end; ++v) {
     const View& view = frame.views[size_t(v)];
     splat::Moments<double> moments;
-    if (!gather(scene, frame, view, frame.splats[v * scene.gaussians + i], i, records, moments)) continue;
+    if (!gather(scene, frame, view, frame.splats.data() + v * scene.gaussians, i, records, moments)) continue;
     if (!is_loaded) {
       gaussian = load_gaussian(scene, i);
       if (!splat::make_shape(gaussian, shape)) return;  // never: the same numbers were sound in the forward

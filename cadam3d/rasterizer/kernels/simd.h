@@ -37,6 +37,7 @@ constexpr int LANES = 4;
 
 typedef float Floats __attribute__((vector_size(4 * LANES)));
 typedef int Ints __attribute__((vector_size(4 * LANES)));
+typedef unsigned Bits __attribute__((vector_size(4 * LANES)));  // wraps around, as masked lanes will
 typedef float Quad __attribute__((vector_size(16)));
 
 inline Floats spread(float x) { return x - Floats{}; }  // x - 0 is x, bit for bit
@@ -127,22 +128,30 @@ inline Floats exp_minus(Floats x) {
   p = fma(p, f, spread(2.4022120e-1f));
   p = fma(p, f, spread(6.9314697e-1f));
   p = fma(p, f, spread(1.0000001f));
-  return as_floats(as_ints(p) + (as_ints(shifted) << 23));
+  return (Floats)((Bits)p + ((Bits)shifted << 23));
 }
 
 // The four lanes of the result are the sums of a, b, c and d, always in the same order.
-#if defined(__SSE2__)
-inline __m128 fold(Floats v) {
 #if defined(SIMD_AVX512)
-  const __m256 half = _mm256_add_ps(_mm512_castps512_ps256((__m512)v), _mm512_extractf32x8_ps((__m512)v, 1));
-  return _mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps(half, 1));
-#elif defined(SIMD_AVX2)
-  return _mm_add_ps(_mm256_castps256_ps128((__m256)v), _mm256_extractf128_ps((__m256)v, 1));
-#else
-  return (__m128)v;
-#endif
-}
 inline Quad sums(Floats a, Floats b, Floats c, Floats d) {
+  const __m512 p = (__m512)a, q = (__m512)b, r = (__m512)c, s = (__m512)d;
+  const __m512 pq = _mm512_add_ps(_mm512_shuffle_f32x4(p, q, 0x44), _mm512_shuffle_f32x4(p, q, 0xEE));
+  const __m512 rs = _mm512_add_ps(_mm512_shuffle_f32x4(r, s, 0x44), _mm512_shuffle_f32x4(r, s, 0xEE));
+  __m512 quads = _mm512_add_ps(_mm512_shuffle_f32x4(pq, rs, 0x88), _mm512_shuffle_f32x4(pq, rs, 0xDD));
+  quads = _mm512_add_ps(quads, _mm512_permute_ps(quads, 0x4E));
+  quads = _mm512_add_ps(quads, _mm512_permute_ps(quads, 0xB1));
+  const __m512i firsts = _mm512_castsi128_si512(_mm_setr_epi32(0, 4, 8, 12));
+  return (Quad)_mm512_castps512_ps128(_mm512_permutexvar_ps(firsts, quads));
+}
+#elif defined(SIMD_AVX2) || defined(SIMD_SSE2)
+inline Quad sums(Floats a, Floats b, Floats c, Floats d) {
+#if defined(SIMD_AVX2)
+  const auto fold = [](Floats v) {
+    return _mm_add_ps(_mm256_castps256_ps128((__m256)v), _mm256_extractf128_ps((__m256)v, 1));
+  };
+#else
+  const auto fold = [](Floats v) { return (__m128)v; };
+#endif
   __m128 p = fold(a), q = fold(b), r = fold(c), s = fold(d);
   _MM_TRANSPOSE4_PS(p, q, r, s);
   return (Quad)_mm_add_ps(_mm_add_ps(p, q), _mm_add_ps(r, s));

@@ -27,6 +27,7 @@ namespace splat {
 constexpr int MAX_COEFFICIENTS = 16;  // spherical harmonics of degree 3
 constexpr float TINY_QUATERNION = 1e-12f;  // squared length; a shorter one has no direction: culled
 constexpr float FLOAT_MAX = 3.402823466e+38f;
+constexpr float DEPTH_MAX = 1e15f;  // world units; the depth gradients of what lies farther leave float32: culled
 
 #if defined(__CUDACC__)
 SPLAT_FN float root(float x) { return sqrtf(x); }
@@ -213,7 +214,7 @@ SPLAT_FN bool project(const Gaussian<Real>& gaussian, const Shape<Real>& shape, 
                       Footprint<Real>& out) {
   for (int i = 0; i < 3; ++i) out.centre[i] = dot3(camera.rotation[i], gaussian.mean) + camera.translation[i];
   const Real z = out.centre[2];
-  if (!(z > Real(SPLAT_NEAR)) || !fits_float(z)) return false;
+  if (!(z > Real(SPLAT_NEAR) && z < Real(DEPTH_MAX))) return false;
   out.inverse_z = 1 / z;
 
   for (int i = 0; i < 3; ++i)
