@@ -44,8 +44,9 @@ class Gaussians:
 
     @property
     def rotations(self) -> Float[Tensor, "n 3 3"]:
-        """Rotation matrices from own axes to world axes."""
-        return quaternion_to_rotation_matrix(self.quats)
+        """Rotation matrices from own axes to world axes; a zero quaternion gives the identity."""
+        largest = self.quats.detach().abs().amax(dim=-1, keepdim=True)  # its square might leave float32
+        return quaternion_to_rotation_matrix(self.quats / largest.clamp_min(torch.finfo(largest.dtype).tiny))
 
     @property
     def device(self) -> torch.device:

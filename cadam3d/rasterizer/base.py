@@ -15,7 +15,7 @@ ALPHA_MIN = 1 / 255  # a fainter contribution to a pixel is skipped
 ALPHA_MAX = 0.99  # a stronger one is capped, with zero gradient to what is capped
 TRANSMITTANCE_MIN = 1e-4  # a pixel stops before the splat that would bring it to this or below
 NEAR = 0.01  # world units; this near or nearer, centres are culled
-FAR = 1e10  # world units; this far or farther too, before products overflow
+FAR = 1e15  # world units; this far or farther too, before gradients of depth leave float32
 FRUSTUM_MARGIN = 0.15  # the Jacobian is evaluated at most this share of the image size outside the border
 
 

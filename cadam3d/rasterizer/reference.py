@@ -147,7 +147,7 @@ def _see(gaussians: Gaussians, view: _View) -> tuple[Int[Tensor, "m"], Float[Ten
     squares = (gaussians.quats * gaussians.quats).sum(dim=-1)
     size = half_sizes.new_tensor([view.width, view.height])
     is_finite = torch.ones_like(squares, dtype=torch.bool)
-    derived = (half_sizes, projection.determinants, squares)
+    derived = (half_sizes, projection.determinants)
     for tensor in (*gaussians.tensors().values(), *derived):
         is_finite &= tensor.isfinite().reshape(len(gaussians), math.prod(tensor.shape[1:])).all(dim=1)
     has_direction = squares >= QUAT_SQUARE_MIN

@@ -38,6 +38,11 @@ def test_numbers_outside_and_things_that_are_no_numbers_do_not(value):
         require_range("key", value, low=0, below=1, example=0.5)
 
 
+def test_a_truth_value_is_not_a_number():
+    with pytest.raises(UserError, match="got True"):
+        require_range("key", True, low=0, high=1, example=1)
+
+
 def test_bounds_are_closed_or_open_as_they_say():
     require_range("key", 3, low=3, high=3, example=3)
     with pytest.raises(UserError, match="> 3"):

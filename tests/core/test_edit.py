@@ -71,10 +71,10 @@ def test_an_edit_leaves_what_it_edits_alone():
 
 
 def test_edited_gaussians_have_no_history():
-    gaussians = numbered(0, 5).map(lambda tensor: tensor.requires_grad_())
-    assert not any(
-        tensor.requires_grad for tensor in edit_of([1], born=1).apply(gaussians).tensors().values()
-    )
+    gaussians, edit = numbered(0, 5), edit_of([1], born=1)
+    for part in (gaussians, edit.children):
+        part.map(lambda tensor: tensor.requires_grad_())
+    assert not any(tensor.requires_grad for tensor in edit.apply(gaussians).tensors().values())
 
 
 def test_every_child_names_one_parent():

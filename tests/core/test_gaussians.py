@@ -44,6 +44,20 @@ def test_quaternions_are_wxyz_and_turn_by_the_right_hand_rule(axis, turned):
     torch.testing.assert_close(gaussians.rotations[0] @ before, torch.tensor(turned))
 
 
+@pytest.mark.parametrize("length", [1e-30, 1e-7, 1e20, 1e38])
+def test_quaternions_may_have_any_length(length):
+    gaussians = make(20)
+    wanted = gaussians.rotations
+    gaussians.quats = gaussians.quats * length
+    torch.testing.assert_close(gaussians.rotations, wanted)
+
+
+def test_a_zero_quaternion_does_not_turn():
+    gaussians = make(1)
+    gaussians.quats = torch.zeros(1, 4)
+    assert torch.equal(gaussians.rotations[0], torch.eye(3))
+
+
 def test_rotations_are_rotations():
     rotations = make(50).rotations
     torch.testing.assert_close(

@@ -248,7 +248,8 @@ def test_nothing_is_drawn_outside_the_radius_and_nothing_forgotten_inside():
 
 
 @pytest.mark.parametrize(
-    ("z", "is_seen"), [(0.01, False), (0.010001, True), (0.0, False), (-1.0, False), (2e10, False)]
+    ("z", "is_seen"),
+    [(0.01, False), (0.010001, True), (0.0, False), (-1.0, False), (1e14, True), (1e15, False)],
 )
 def test_only_what_lies_between_the_near_and_the_far_plane_is_seen(z, is_seen):
     views = replace(facing(9), world_to_camera=torch.eye(4, dtype=torch.float64)[None])
@@ -355,7 +356,7 @@ def test_fading_a_gaussian_out_removes_it_without_a_jump():
         torch.testing.assert_close(alpha, without[1], rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize(("tile", "block"), [(1, 1), (4, 1), (8, 100), (16, 2**17), (64, 2**30)])
+@pytest.mark.parametrize(("tile", "block"), [(2, 1), (4, 1), (8, 100), (16, 2**17), (64, 2**30)])
 def test_tiles_and_blocks_are_nobodys_business(monkeypatch, tile, block):
     gaussians, views = scene(40), cameras()
     wanted, wanted_grads = images(render(gaussians, views)), gradients(gaussians, views)
@@ -435,11 +436,12 @@ def test_a_quaternion_without_direction_is_culled(length):
     assert not any(grad[1].any() for name, grad in gradients(gaussians, views).items() if name in FIELDS)
 
 
-def test_the_length_of_a_quaternion_does_not_matter():
-    gaussians, views = scene(), cameras()
-    longer = replace(gaussians, quats=gaussians.quats * 1000)
+@pytest.mark.parametrize("length", [1e-5, 1000.0, 1e20])
+def test_the_length_of_a_quaternion_does_not_matter(length):
+    gaussians, views = scene(dtype=torch.float32), cameras().to(torch.float32)
+    longer = replace(gaussians, quats=gaussians.quats * length)
     for got, want in zip(images(render(longer, views)), images(render(gaussians, views)), strict=True):
-        torch.testing.assert_close(got, want, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
 
 
 def test_a_huge_splat_fills_the_image_evenly():
