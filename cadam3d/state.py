@@ -67,7 +67,7 @@ class StepReport:
 
 @dataclass(frozen=True)
 class RefineReport:
-    """What one refinement or opacity reset did, in counts of Gaussians, and what the densifier saw before it."""
+    """What one refinement or opacity reset did, in counts of Gaussians, and what the densifier saw."""
 
     step: int
     before: int

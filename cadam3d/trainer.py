@@ -24,7 +24,7 @@ from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.regularizer import Regularizer
 from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState
 
-# Sources of randomness, each with its own generator: two densifiers with one seed see the same views and noise.
+# Each source of randomness has its own generator: two densifiers with one seed see the same views and noise.
 GENERATORS = ("initializer", "camera", "background", "guidance", "refine")
 
 
@@ -113,7 +113,7 @@ class Trainer:
         context: RunContext,
         stop: Callable[[], bool] = never,
     ) -> Outcome:
-        """Advance ``state`` (in place) to ``steps`` or to another outcome; ``stop()`` is asked after every step."""
+        """Advance ``state`` (in place) to ``steps`` or to another outcome; every step asks ``stop()``."""
         for callback in self.callbacks:
             callback.on_start(context, state)
         outcome = self._loop(state, embedding, context, stop)
@@ -173,7 +173,7 @@ class Trainer:
         )
 
     def _refine(self, state: TrainState) -> tuple[RefineReport | None, Outcome | None]:
-        """Grow, prune and reset where the schedule says so: a pure plan, then one edit for every owner of rows."""
+        """Grow, prune and reset where the schedule says so: a pure plan, then one edit for everybody."""
         step = state.step + 1
         refines, resets = self.refine.refines_at(step), self.refine.resets_at(step)
         if not (refines or resets):
@@ -189,7 +189,7 @@ class Trainer:
                 return report, Outcome.MAX_GAUSSIANS
             selected, cloned, split, pruned = plan.selected, plan.cloned, plan.split, plan.pruned
             state.optimizer.apply(plan.edit)
-            state.densifier = state.densifier.carry(plan.edit)
+            state.densifier = self.densifier.carry(state.densifier, plan.edit)
         if resets:
             unreliable = self.densifier.unreliable(state.densifier)
             reset = state.optimizer.reset_opacity(unreliable, self.refine.reset_value)

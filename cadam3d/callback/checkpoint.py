@@ -1,4 +1,4 @@
-"""Checkpoints: written atomically every so many steps and at the end, so that no kill loses more than that."""
+"""Checkpoints: written atomically every so many steps and at the end; no kill loses more than that."""
 
 from dataclasses import dataclass
 

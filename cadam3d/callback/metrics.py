@@ -12,7 +12,7 @@ FILE_NAME = "metrics.jsonl"
 
 @dataclass(frozen=True, kw_only=True)
 class Metrics(Callback):
-    """Appends to ``metrics.jsonl`` in the run folder; a resumed run first drops the lines it will write again."""
+    """Appends to ``metrics.jsonl`` in the run folder; a resumed run first drops what it will write again."""
 
     every: int  # steps between step lines; refinements are always written
 

@@ -12,4 +12,4 @@ class CameraSampler(ABC):
 
     @abstractmethod
     def sample(self, step: int, views: int, generator: torch.Generator) -> Cameras:
-        """``views`` cameras for ``step`` (0 is the first), on the CPU; every draw comes from ``generator``."""
+        """``views`` cameras for ``step`` (0 is the first), on the CPU; all draws come from ``generator``."""

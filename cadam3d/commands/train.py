@@ -14,7 +14,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import __version__
-from cadam3d.core.checks import UserError
+from cadam3d.core.checks import UserError, require
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import read_jsonl, write_json
@@ -43,6 +43,7 @@ class StopOnSignal:
             signal.signal(number, handler)
 
     def __call__(self) -> bool:
+        """Whether a signal came."""
         return self.received is not None
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
@@ -56,6 +57,9 @@ def run(cfg: DictConfig) -> float | None:
     """Train, export, measure and report; returns the PSNR in dB where the prior knows the truth."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     device = resolve_device(cfg.device)
+    for key in ("seed", "steps", "views"):
+        is_whole = isinstance(cfg[key], int) and not isinstance(cfg[key], bool) and cfg[key] >= 0
+        require(is_whole, key, wanted="a whole number >= 0", got=cfg[key], example=f"{key}=3")
     # Same seed, same bytes: on the CPU every operation we use has a deterministic form.
     torch.use_deterministic_algorithms(device.type == "cpu")
     trainer = build_trainer(cfg, device)
@@ -75,7 +79,7 @@ def run(cfg: DictConfig) -> float | None:
     context = RunContext(folder=folder, prompt=cfg.prompt, total_steps=trainer.steps, render=render)
     with StopOnSignal() as stop:
         outcome = trainer.train(state, embedding, context, stop)
-        summary = summarize(cfg, state, outcome)
+        summary = summarize(cfg, state, outcome) | {"backend": trainer.rasterizer.chosen(device)}
         write_json(folder / "summary.json", summary)  # first of all: pictures may fail, the numbers stay
         gaussians = state.gaussians.detach()
         warnings = _export(exporters, gaussians, render, folder)

@@ -1,4 +1,4 @@
-"""Densifier: WHEN a Gaussian may grow. HOW it grows (clone, split, prune) is shared: see refine.py (paper sec. 4.4)."""
+"""Densifier: WHEN a Gaussian may grow. HOW (clone, split, prune) is shared: see refine.py (sec. 4.4)."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cadam3d.core.edit import RowState
+from cadam3d.core.edit import RowEdit, RowState
 
 State = TypeVar("State", bound=RowState)
 
@@ -35,7 +35,7 @@ class Densifier(ABC, Generic[State]):
     def observe(self, state: State, signal: GradientSignal) -> State:
         """The state after one more step; ``state`` itself is left alone. Called at every step.
 
-        A gradient may hold NaN or infinities (the loop then skips the optimizer step); none may enter the state.
+        A gradient may hold NaN or infinities (the loop then skips the optimizer step); the state never may.
         """
 
     @abstractmethod
@@ -45,6 +45,10 @@ class Densifier(ABC, Generic[State]):
     @abstractmethod
     def unreliable(self, state: State) -> Bool[Tensor, "n"]:
         """Whose opacity an opacity reset lowers (the baseline: everybody's)."""
+
+    def carry(self, state: State, edit: RowEdit) -> State:
+        """The state after a refinement; by default survivors keep their rows and newborns start at zero."""
+        return state.carry(edit)
 
     def statistics(self, state: State) -> dict[str, float]:
         """Numbers about the state for logs and plots; never read back."""

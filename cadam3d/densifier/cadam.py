@@ -8,21 +8,23 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cadam3d.core.checks import require_choice, require_range
-from cadam3d.core.edit import RowState
+from cadam3d.core.edit import RowEdit, RowState
 from cadam3d.densifier.base import Densifier, GradientSignal
 
 INVISIBLE = ("zero", "skip")
 QUANTILE_OVER = ("all", "mature", "seen")
 GRAD_NORM = ("none", "per_step_rms")
 NONFINITE = ("skip_step", "skip_row")
+CHILD_STATE = ("zero", "inherit")
+PARENT_STATE = ("keep", "reset")
 
 
 @dataclass
 class CAdamState(RowState):
     """Running moments of the world-space gradient of each Gaussian: 28 bytes each.
 
-    Carried through an edit by the rule of :class:`RowState`: survivors, cloned parents among them, keep their
-    history; newborns start at zero with age 0 (paper sec. 4.2).
+    By the rule of :class:`RowState`, survivors keep their history through an edit and newborns start at zero
+    with age 0 (paper sec. 4.2); see :meth:`CAdam.carry` for the other readings.
     """
 
     m: Float[Tensor, "n 3"]  # first moment; loss per world unit
@@ -48,6 +50,8 @@ class CAdam(Densifier[CAdamState]):
     reset_min_age: int  # updates before a Gaussian may be called unreliable
     grad_norm: str  # "none", or "per_step_rms": divide each step's gradients by their population RMS
     nonfinite: str  # a gradient with NaN or infinity: "skip_step" for all, or "skip_row" for its Gaussian
+    child_state: str  # newborns: "zero" moments and age, or "inherit" both from the parent
+    parent_state: str  # a cloned parent: "keep" its moments and age, or "reset" them to zero
 
     def __post_init__(self) -> None:
         require_range("densifier.tau_Q", self.tau_Q, low=0, below=1, example=0.9)
@@ -61,6 +65,8 @@ class CAdam(Densifier[CAdamState]):
         require_range("densifier.reset_min_age", self.reset_min_age, low=0, example=50)
         require_choice("densifier.grad_norm", self.grad_norm, GRAD_NORM)
         require_choice("densifier.nonfinite", self.nonfinite, NONFINITE)
+        require_choice("densifier.child_state", self.child_state, CHILD_STATE)
+        require_choice("densifier.parent_state", self.parent_state, PARENT_STATE)
 
     def init_state(self, n: int, device: torch.device) -> CAdamState:
         """Zero moments, age 0."""
@@ -97,6 +103,19 @@ class CAdam(Densifier[CAdamState]):
         """Mark the Gaussians dominated by noise, for the selective opacity reset (paper eq. 13)."""
         drift, noise = self.strengths(state)
         return (drift < self.tau_SNR * (noise + self.eps)) & (state.age >= self.reset_min_age)
+
+    def carry(self, state: CAdamState, edit: RowEdit) -> CAdamState:
+        """The state after a refinement, under the chosen reading of who keeps a history."""
+        carried = state.carry(edit)
+        kept = edit.keep.shape[0]
+        if self.child_state == "inherit":
+            for name, rows in carried.to_dict().items():
+                rows[kept:] = getattr(state, name)[edit.parents]
+        if self.parent_state == "reset":
+            is_parent = torch.isin(edit.keep, edit.parents)
+            for rows in carried.to_dict().values():
+                rows[:kept][is_parent] = 0
+        return carried
 
     def strengths(self, state: CAdamState) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
         """Drift ``||m_hat||_2`` and noise ``sqrt(||v_hat||_1)``, their ratio the SNR (eq. 11); 0 at age 0."""

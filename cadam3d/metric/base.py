@@ -11,5 +11,7 @@ class Metric(ABC):
 
     @abstractmethod
     def measure(self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None) -> dict[str, float]:
-        """Named numbers. ``truth`` gives the true images where the prior knows them; without it, a metric that
-        needs them returns nothing."""
+        """Named numbers. ``truth`` gives the true images where the prior knows them.
+
+        Without it, a metric that needs them returns nothing.
+        """

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -33,3 +34,7 @@ class Rasterizer(ABC):
         camera, off screen, too faint or not finite are culled: radius 0, no contribution, zero gradient,
         never a NaN.
         """
+
+    def chosen(self, device: torch.device) -> str:
+        """Name of the backend that renders Gaussians on ``device``: this one, unless it is one that chooses."""
+        return type(self).__name__.removesuffix("Rasterizer").lower()

@@ -51,7 +51,9 @@ def test_checkpoints_appear_at_multiples_and_at_the_end_and_old_ones_go(tmp_path
 
 def test_a_checkpoint_at_the_last_step_is_not_written_twice(tmp_path, monkeypatch):
     written = []
-    monkeypatch.setattr("cadam3d.callback.checkpoint.save_checkpoint", lambda path, _: written.append(path.name))
+    monkeypatch.setattr(
+        "cadam3d.callback.checkpoint.save_checkpoint", lambda path, _: written.append(path.name)
+    )
     train(tmp_path, [Checkpoint(every=2, keep=9)], steps=4)
     assert written == ["step_0000002.pt", "step_0000004.pt"]
 
@@ -68,7 +70,16 @@ def test_metrics_hold_one_line_per_logged_step_and_per_refinement(tmp_path):
         ("step", 7),
     ]
     refinement = lines[1]
-    assert {"before", "after", "selected", "cloned", "split", "pruned", "reset", "statistics"} <= refinement.keys()
+    assert {
+        "before",
+        "after",
+        "selected",
+        "cloned",
+        "split",
+        "pruned",
+        "reset",
+        "statistics",
+    } <= refinement.keys()
     assert {"loss", "num_gaussians", "seconds"} <= lines[0].keys()
 
 
@@ -89,7 +100,14 @@ def test_the_bar_counts_every_step_and_shows_the_gaussians(tmp_path, capsys):
     assert "loss=" in shown
 
 
-@pytest.mark.parametrize(("make", "key"), [(lambda: Checkpoint(every=0, keep=1), "every"), (lambda: Metrics(every=0), "every")])
+@pytest.mark.parametrize(
+    ("make", "key"),
+    [
+        (lambda: Checkpoint(every=0, keep=1), "callback.checkpoint.every=100"),
+        (lambda: Checkpoint(every=1, keep=0), "callback.checkpoint.keep=2"),
+        (lambda: Metrics(every=0), "callback.metrics.every=10"),
+    ],
+)
 def test_zero_intervals_are_refused(make, key):
     with pytest.raises(UserError, match=key):
         make()

@@ -29,6 +29,8 @@ def cadam(**changes) -> CAdam:
         "reset_min_age": 0,
         "grad_norm": "none",
         "nonfinite": "skip_step",
+        "child_state": "zero",
+        "parent_state": "keep",
     }
     return CAdam(**{**paper, **changes})
 
@@ -161,6 +163,22 @@ def test_newborns_start_at_age_zero_without_history_and_their_parents_keep_their
     assert not after.v[3:].any()
     assert torch.equal(after.m[:3], before.m[[0, 1, 3]])
     assert torch.equal(after.v[:3], before.v[[0, 1, 3]])
+
+
+@pytest.mark.parametrize("parent_state", ["keep", "reset"])
+@pytest.mark.parametrize("child_state", ["zero", "inherit"])
+def test_who_keeps_a_history_through_an_edit_can_be_chosen(child_state, parent_state):
+    densifier = cadam(child_state=child_state, parent_state=parent_state)
+    before = observe(densifier, noise(steps=5, n=4))
+    untouched = {name: rows.clone() for name, rows in before.to_dict().items()}
+    after = densifier.carry(before, edit_of(4, keep=[0, 1, 3], parents=[1, 2, 2]))
+    for name, old in untouched.items():
+        new = after.to_dict()[name]
+        assert torch.equal(getattr(before, name), old)
+        assert torch.equal(new[[0, 2]], old[[0, 3]])  # survivors that are nobody's parent
+        assert torch.equal(new[1], old[1] if parent_state == "keep" else torch.zeros_like(old[1]))
+        inherited = old[[1, 2, 2]]
+        assert torch.equal(new[3:], inherited if child_state == "inherit" else torch.zeros_like(inherited))
 
 
 def test_a_newborn_corrects_its_bias_by_its_own_age():

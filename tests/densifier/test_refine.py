@@ -267,6 +267,8 @@ def test_a_plan_exceeds_the_cap_by_its_count_after_the_edit():
             reset_min_age=0,
             grad_norm="none",
             nonfinite="skip_step",
+            child_state="zero",
+            parent_state="keep",
         ),
     ],
     ids=["none", "baseline", "cadam"],
