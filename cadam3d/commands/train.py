@@ -79,7 +79,8 @@ def run(cfg: DictConfig) -> float | None:
     context = RunContext(folder=folder, prompt=cfg.prompt, total_steps=trainer.steps, render=render)
     with StopOnSignal() as stop:
         outcome = trainer.train(state, embedding, context, stop)
-        summary = summarize(cfg, state, outcome) | {"backend": trainer.rasterizer.chosen(device)}
+        summary = summarize(cfg, state, outcome)
+        summary["backend"] = trainer.rasterizer.chosen(device)
         write_json(folder / "summary.json", summary)  # first of all: pictures may fail, the numbers stay
         gaussians = state.gaussians.detach()
         warnings = _export(exporters, gaussians, render, folder)

@@ -36,5 +36,5 @@ class Rasterizer(ABC):
         """
 
     def chosen(self, device: torch.device) -> str:
-        """Name of the backend that renders Gaussians on ``device``: this one, unless it is one that chooses."""
+        """Name of the backend that renders Gaussians on ``device``: this one, unless it chooses another."""
         return type(self).__name__.removesuffix("Rasterizer").lower()
