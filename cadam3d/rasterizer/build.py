@@ -44,7 +44,7 @@ MACHINE_FLAGS = (("-march=native", *STATIC), ("-march=native",), ("-mcpu=native"
 CONSTANTS = ("BLUR", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN", "NEAR", "FRUSTUM_MARGIN")
 SUFFIX = ".dll" if sys.platform == "win32" else ".so"
 SELF_TEST = "import ctypes, sys; sys.exit(ctypes.CDLL(sys.argv[1]).cadam3d_self_test())"
-TIMEOUT = 300  # seconds for one run of the compiler; it needs about three
+TIMEOUT = 900  # seconds for one run of the compiler; most need three, a first `zig c++` minutes
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 The image formation model has steps: a contribution below ALPHA_MIN is skipped, one above ALPHA_MAX is capped,
 and a pixel stops before TRANSMITTANCE_MIN. Where a number lies within rounding of a step, float32 and float64
-may decide differently, and both are right: ``undecided`` finds those pixels, the comparisons leave them out and
-insist that they are few.
+may decide differently, and both are right. ``undecided`` finds those pixels; comparisons leave them out, and
+demand that they are few.
 """
 
 import math

@@ -1,10 +1,10 @@
 // The CPU rasterizer: projection, tile lists, blending and their gradients, behind a C interface.
 //
-// A frame goes through five stages: project every Gaussian into every view; sort each view's visible ones by depth;
-// list for each 16x16 tile who touches it, front to back; blend the tiles. Backward walks each tile back to front,
-// leaves one record per (splat, tile), sums the records of each Gaussian in a fixed order and applies the chain rule.
-// No two threads ever add to the same number, and work is cut into pieces that do not depend on how many threads
-// there are: the bits of every result are the same for any thread count.
+// A frame goes through five stages: project every Gaussian into every view; sort each view's visible ones by
+// depth; list for each 16x16 tile who touches it, front to back; blend the tiles. Backward walks each tile
+// back to front, leaves one record per (splat, tile), sums the records of each Gaussian in a fixed order and
+// applies the chain rule. No two threads ever add to the same number, and work is cut into pieces that do not
+// depend on how many threads there are: the bits of every result are the same for any thread count.
 #include <algorithm>
 #include <atomic>
 #include <cmath>
@@ -32,12 +32,14 @@ using simd::LANES;
 using simd::Mask;
 using simd::spread;
 
-constexpr int TILE = 16;              // pixels; a row of a tile is a whole number of vectors on every machine
+constexpr int TILE = 16;  // pixels; a row of a tile is a whole number of vectors on every machine
 constexpr int AREA = TILE * TILE;
 constexpr int GROUPS = TILE / LANES;  // vectors per row of a tile
 constexpr int64_t BLOCK = 256;        // Gaussians per piece of work
-constexpr int RECORD = 12;            // floats left by the backward per (splat, tile); the last two are padding
-#if !defined(SPLAT_RECORD_BUDGET)  // bytes of records in flight, unless one view needs more; tests set a small one
+constexpr int RECORD = 12;  // floats left by the backward per (splat, tile); the last two are padding
+
+// Bytes of records in flight, unless one view needs more; tests set a small one.
+#if !defined(SPLAT_RECORD_BUDGET)
 #define SPLAT_RECORD_BUDGET (256 << 20)
 #endif
 
@@ -51,11 +53,11 @@ struct Scene {
 
 // What the blend reads of a projected Gaussian: one cache line.
 struct alignas(64) Splat {
-  float x, y;                   // pixels
-  float l11, l12, l22;          // whitening, see splat_math.h
-  float cut, opacity, depth;    // alpha = opacity exp(-|y|^2) where |y|^2 <= cut
+  float x, y;                 // pixels
+  float l11, l12, l22;        // whitening, see splat_math.h
+  float cut, opacity, depth;  // alpha = opacity exp(-|y|^2) where |y|^2 <= cut
   float rgb[3];
-  float reach_x, reach_y;       // half-sizes of its box; 0 = not seen
+  float reach_x, reach_y;  // half-sizes of its box; 0 = not seen
   float spare[3];
 };
 
@@ -80,17 +82,17 @@ struct Span {
 // What one view keeps between forward and backward.
 struct View {
   splat::Camera<double> camera;
-  std::vector<uint32_t> order;       // visible Gaussians, near to far
-  Buffer<uint32_t> first_span;       // gaussians + 1; spans of Gaussian i: first_span[i] .. first_span[i + 1]
+  std::vector<uint32_t> order;  // visible Gaussians, near to far
+  Buffer<uint32_t> first_span;  // gaussians + 1; spans of Gaussian i: first_span[i] .. first_span[i + 1]
   Buffer<Span> spans;
-  Buffer<uint32_t> first_slot;       // spans + 1; one slot per (Gaussian, tile), grouped by Gaussian
-  Buffer<uint32_t> rank_of_slot;     // place of that Gaussian in the list of that tile
-  Buffer<uint32_t> first_entry;      // tiles + 1
-  Buffer<uint32_t> entries;          // Gaussian numbers, tile by tile, near to far
-  Buffer<int32_t> used;              // tiles; entries that reached a pixel lie below
-  Buffer<float> transmittance;       // tiles x AREA; after the last splat
-  Buffer<int32_t> last;              // tiles x AREA; 1 + rank of the last splat that reached the pixel
-  Buffer<int64_t> first_record;      // tiles; while the backward runs
+  Buffer<uint32_t> first_slot;    // spans + 1; one slot per (Gaussian, tile), grouped by Gaussian
+  Buffer<uint32_t> rank_of_slot;  // place of that Gaussian in the list of that tile
+  Buffer<uint32_t> first_entry;   // tiles + 1
+  Buffer<uint32_t> entries;       // Gaussian numbers, tile by tile, near to far
+  Buffer<int32_t> used;           // tiles; entries that reached a pixel lie below
+  Buffer<float> transmittance;    // tiles x AREA; after the last splat
+  Buffer<int32_t> last;           // tiles x AREA; 1 + rank of the last splat that reached the pixel
+  Buffer<int64_t> first_record;   // tiles; while the backward runs
 };
 
 struct Frame {
@@ -100,8 +102,8 @@ struct Frame {
   int64_t tiles() const { return tiles_x * tiles_y; }
 };
 
-// Runs body(0) .. body(items - 1), each once, on up to ``threads`` threads. Threads live for one call: nothing
-// outlives a fork, and starting them costs microseconds.
+// Runs body(0) .. body(items - 1), each once, on up to ``threads`` threads. Threads live for one call:
+// nothing outlives a fork, and starting them costs microseconds.
 template <class Body>
 void parallel_for(int64_t items, int64_t threads, const Body& body) {
   std::atomic<int64_t> next{0};
@@ -155,7 +157,8 @@ void project_gaussian(const Scene& scene, Frame& frame, int64_t i, float* means2
     splat::colour(gaussian, camera, rgb);
     out.x = float(footprint.mean2d[0]), out.y = float(footprint.mean2d[1]);
     out.l11 = float(footprint.l11), out.l12 = float(footprint.l12), out.l22 = float(footprint.l22);
-    out.cut = float(shape.log_cut), out.opacity = float(shape.opacity), out.depth = float(footprint.centre[2]);
+    out.cut = float(shape.log_cut), out.opacity = float(shape.opacity),
+    out.depth = float(footprint.centre[2]);
     for (int c = 0; c < 3; ++c) out.rgb[c] = float(rgb[c]);
     out.reach_x = float(footprint.reach[0]), out.reach_y = float(footprint.reach[1]);
     radii[at] = std::max(out.reach_x, out.reach_y);
@@ -173,7 +176,8 @@ struct Range {
 Range pixels_between(double low, double high, int64_t size) {
   const double slack = 1e-3 + 1e-6 * (std::fabs(low) + std::fabs(high));
   const double first = std::ceil(low - slack - 0.5), last = std::floor(high + slack - 0.5);
-  return {int(std::min(std::max(first, 0.0), double(size))), int(std::max(std::min(last, double(size - 1)), -1.0))};
+  return {int(std::min(std::max(first, 0.0), double(size))),
+          int(std::max(std::min(last, double(size - 1)), -1.0))};
 }
 
 Range pixel_rows(const Splat& s, int64_t height) {
@@ -184,13 +188,14 @@ Range pixel_rows(const Splat& s, int64_t height) {
 Span touched_columns(const Splat& s, Range rows, int64_t width) {
   const double low = rows.first + 0.5 - s.y - 1e-3, high = rows.last + 0.5 - s.y + 1e-3;
   const double slope = -double(s.l12) / s.l11;  // the middle of a row at height d lies at slope * d
-  const double extreme = slope * s.reach_y * (double(s.reach_y) / s.reach_x);  // height of the rightmost point
+  const double extreme = slope * s.reach_y * (double(s.reach_y) / s.reach_x);  // of the rightmost point
   const auto half_width = [&](double d) {
     return std::sqrt(std::max(s.cut - s.l22 * d * s.l22 * d, 0.0)) / s.l11;
   };
   const double right = std::min(std::max(extreme, low), high), left = std::min(std::max(-extreme, low), high);
-  const Range columns = pixels_between(std::max(slope * left - half_width(left), -double(s.reach_x)) + s.x,
-                                       std::min(slope * right + half_width(right), double(s.reach_x)) + s.x, width);
+  const Range columns =
+      pixels_between(std::max(slope * left - half_width(left), -double(s.reach_x)) + s.x,
+                     std::min(slope * right + half_width(right), double(s.reach_x)) + s.x, width);
   if (columns.last < columns.first) return {0, 0};
   return {uint16_t(columns.first / TILE), uint16_t(columns.last / TILE + 1)};
 }
@@ -208,7 +213,8 @@ void sort_by_depth(std::vector<uint32_t>& order, const Splat* splats) {
     uint32_t key;
     std::memcpy(&key, &splats[order[i]].depth, 4);
     items[i] = {key, order[i]};
-    for (int pass = 0; pass < 3; ++pass) ++counts[size_t(pass * BINS) + ((key >> (BITS * pass)) & (BINS - 1))];
+    for (int pass = 0; pass < 3; ++pass)
+      ++counts[size_t(pass * BINS) + ((key >> (BITS * pass)) & (BINS - 1))];
   }
   for (int pass = 0; pass < 3; ++pass) {
     uint32_t* count = counts.data() + pass * BINS;
@@ -263,7 +269,8 @@ void fill_spans(const Scene& scene, View& view, const Splat* splats, int64_t i) 
 
 // How many slots each span needs and where each tile's list starts.
 void count_entries(const Scene& scene, const Frame& frame, View& view, const Splat* splats) {
-  std::vector<int64_t> change(size_t(frame.tiles_y * (frame.tiles_x + 1)), 0);  // of the count, from tile to tile
+  // By how many the lists grow from one tile to the next in its row.
+  std::vector<int64_t> change(size_t(frame.tiles_y * (frame.tiles_x + 1)), 0);
   uint64_t slots = 0;
   for (int64_t i = 0; i < scene.gaussians; ++i) {
     const uint32_t begin = view.first_span[i], end = view.first_span[i + 1];
@@ -337,7 +344,8 @@ void build_tile_lists(const Scene& scene, Frame& frame) {
       fill_spans(scene, frame.views[size_t(v)], splats(v), i);
   });
   each_view([&](View& view, const Splat* of_view) { count_entries(scene, frame, view, of_view); });
-  const int64_t bands = std::min(frame.tiles_y, std::max<int64_t>(ceil_div(scene.threads, std::max<int64_t>(scene.views, 1)), 1));
+  const int64_t bands = std::min(
+      frame.tiles_y, std::max<int64_t>(ceil_div(scene.threads, std::max<int64_t>(scene.views, 1)), 1));
   parallel_for(scene.views * bands, scene.threads, [&](int64_t item) {
     const int64_t v = item / bands, band = item % bands;
     try {
@@ -354,13 +362,14 @@ void build_tile_lists(const Scene& scene, Frame& frame) {
 
 // Where a tile lies in its view and which part of it is inside the image.
 struct Place {
-  int64_t x, y;         // first pixel
-  int columns, rows;    // pixels inside
+  int64_t x, y;       // first pixel
+  int columns, rows;  // pixels inside
 };
 
 Place place_of(const Scene& scene, const Frame& frame, int64_t tile) {
   const int64_t x = tile % frame.tiles_x * TILE, y = tile / frame.tiles_x * TILE;
-  return {x, y, int(std::min<int64_t>(TILE, scene.width - x)), int(std::min<int64_t>(TILE, scene.height - y))};
+  return {x, y, int(std::min<int64_t>(TILE, scene.width - x)),
+          int(std::min<int64_t>(TILE, scene.height - y))};
 }
 
 // Rows and vectors of a tile inside the box of a splat.
@@ -390,7 +399,7 @@ constexpr Columns pixel_centres() {
 }
 constexpr Columns CENTRES = pixel_centres();
 
-// |L d|^2 of a row of pixels. Forward and backward both call it, so they agree to the last bit on who is skipped.
+// |L d|^2 of a row of pixels. Forward and backward both call it and agree to the last bit on who is skipped.
 struct Falloff {
   Floats u, exponent;
 };
@@ -399,8 +408,8 @@ inline Falloff falloff(Floats dx, Floats l11, Floats u_of_row, Floats t_squared)
   return {u, simd::fma(u, u, t_squared)};
 }
 
-// The pixels of one vector, field by field. What a splat touches lies together, and no two fields sit a multiple of
-// 4096 bytes apart, which the processor would take for the same address.
+// The pixels of one vector, field by field. What a splat touches lies together, and no two fields sit a
+// multiple of 4096 bytes apart, which the processor would take for the same address.
 struct Cell {
   Floats transmittance, red, green, blue, weight, depth;  // depth: sum w z, in the end the expected z
   Ints last;
@@ -451,7 +460,8 @@ void blend_tile(const Scene& scene, const Frame& frame, View& view, const Splat*
       bool has_stopped = false;
       for (int group = window.group_begin; group < window.group_end; ++group) {
         Cell& cell = cells[row][group];
-        const Falloff fall = falloff(simd::load(CENTRES.x + group * LANES) - centre, l11, u_of_row, t_squared);
+        const Falloff fall =
+            falloff(simd::load(CENTRES.x + group * LANES) - centre, l11, u_of_row, t_squared);
         Mask hit = simd::both(simd::less_equal(fall.exponent, cut), open[row][group]);
         if (!simd::any(hit)) continue;
         Floats a = simd::keep(hit, simd::min(opacity * simd::exp_minus(fall.exponent), alpha_max));
@@ -510,13 +520,14 @@ void blend_tile(const Scene& scene, const Frame& frame, View& view, const Splat*
 }
 
 struct Images {
-  const float *alpha, *depth;                        // what the forward gave
+  const float *alpha, *depth;                       // what the forward gave
   const float *grad_rgb, *grad_alpha, *grad_depth;  // any may be null, which means zero
 };
 
 // Fills the cells; returns how many rows can hold a gradient, and the last rank of each row.
-void load_gradients(const Scene& scene, const View& view, int64_t tile, const Place& place, const float* background,
-                    const Images& images, CellBackward (&cells)[TILE][GROUPS], int (&row_last)[TILE]) {
+void load_gradients(const Scene& scene, const View& view, int64_t tile, const Place& place,
+                    const float* background, const Images& images, CellBackward (&cells)[TILE][GROUPS],
+                    int (&row_last)[TILE]) {
   for (int row = 0; row < TILE; ++row) {
     row_last[row] = 0;
     for (int group = 0; group < GROUPS; ++group) {
@@ -546,10 +557,11 @@ void load_gradients(const Scene& scene, const View& view, int64_t tile, const Pl
   }
 }
 
-// Back to front. With w = alpha T the loss sees a pixel through sum w (rgb . g_rgb + (z - D) g_depth / A) and through
-// its final transmittance; ``suffix`` is what lies behind, so that dLoss/dalpha = T v - suffix / (1 - alpha).
-void blend_tile_backward(const Scene& scene, const Frame& frame, const View& view, const Splat* splats, int64_t tile,
-                         const float* background, const Images& images, float* records) {
+// Back to front. With w = alpha T the loss sees a pixel through sum w v, where v = rgb . g_rgb +
+// (z - D) g_depth / A, and through its final transmittance. ``suffix`` is what lies behind a splat:
+// dLoss/dalpha = T v - suffix / (1 - alpha).
+void blend_tile_backward(const Scene& scene, const Frame& frame, const View& view, const Splat* splats,
+                         int64_t tile, const float* background, const Images& images, float* records) {
   const int used = view.used[tile];
   if (used == 0) return;
   CellBackward cells[TILE][GROUPS];
@@ -567,7 +579,8 @@ void blend_tile_backward(const Scene& scene, const Frame& frame, const View& vie
     const Floats centre = spread(x), l11 = spread(s.l11), cut = spread(s.cut), opacity = spread(s.opacity);
     const Floats r = spread(s.rgb[0]), g = spread(s.rgb[1]), b = spread(s.rgb[2]), z = spread(s.depth);
     const Ints index = spread(rank);
-    Floats sum_g{}, sum_gu{}, sum_gt{}, sum_guu{}, sum_gut{}, sum_gtt{}, sum_red{}, sum_green{}, sum_blue{}, sum_z{};
+    Floats sum_g{}, sum_gu{}, sum_gt{}, sum_guu{}, sum_gut{}, sum_gtt{};
+    Floats sum_red{}, sum_green{}, sum_blue{}, sum_z{};
     for (int row = window.row_begin; row < window.row_end; ++row) {
       if (rank >= row_last[row]) continue;
       const float dy = (float(row) + 0.5f) - y, t = s.l22 * dy;
@@ -575,7 +588,8 @@ void blend_tile_backward(const Scene& scene, const Frame& frame, const View& vie
       Floats row_g{}, row_gu{};
       for (int group = window.group_begin; group < window.group_end; ++group) {
         CellBackward& cell = cells[row][group];
-        const Falloff fall = falloff(simd::load(CENTRES.x + group * LANES) - centre, l11, u_of_row, t_squared);
+        const Falloff fall =
+            falloff(simd::load(CENTRES.x + group * LANES) - centre, l11, u_of_row, t_squared);
         const Mask hit = simd::both(simd::less_equal(fall.exponent, cut), simd::less(index, cell.last));
         if (!simd::any(hit)) continue;
         // Lanes that are not hit have alpha 0 from here on: they change nothing, and meet no slow denormals.
@@ -654,8 +668,8 @@ bool gather(const Scene& scene, const Frame& frame, const View& view, const Spla
 }
 
 // Adds the gradients that the views [view_begin, view_end) give to one Gaussian.
-void gaussian_backward(const Scene& scene, const Frame& frame, int64_t view_begin, int64_t view_end, int64_t i,
-                       const float* records, const ParameterGradients& out) {
+void gaussian_backward(const Scene& scene, const Frame& frame, int64_t view_begin, int64_t view_end,
+                       int64_t i, const float* records, const ParameterGradients& out) {
   splat::Gaussian<double> gaussian;
   splat::Shape<double> shape;
   splat::Gradient<double> total;
@@ -721,7 +735,7 @@ int guarded(const Body& body) {
 
 }  // namespace
 
-// ---------------------------------------------------------------------------------------------- the C interface
+// ---------------------------------------------------------------------------------------------- C interface
 // Every tensor is contiguous float32 in the shape the Python side gives it. Functions return a Status.
 
 EXPORT const char* cadam3d_instruction_set() { return SIMD_NAME; }
@@ -736,8 +750,8 @@ EXPORT int cadam3d_project(const Scene* scene, float* means2d, float* radii, voi
     frame->splats.allocate(scene->views * scene->gaussians);
     frame->views.resize(size_t(scene->views));
     for (int64_t v = 0; v < scene->views; ++v)
-      frame->views[size_t(v)].camera = splat::make_camera<double>(scene->world_to_camera + 16 * v, scene->intrinsics + 9 * v,
-                                                                  int(scene->width), int(scene->height));
+      frame->views[size_t(v)].camera = splat::make_camera<double>(
+          scene->world_to_camera + 16 * v, scene->intrinsics + 9 * v, int(scene->width), int(scene->height));
     parallel_for(ceil_div(scene->gaussians, BLOCK), scene->threads, [&](int64_t block) {
       for (int64_t i = block * BLOCK; i < std::min((block + 1) * BLOCK, scene->gaussians); ++i)
         project_gaussian(*scene, *frame, i, means2d, radii);
@@ -747,7 +761,8 @@ EXPORT int cadam3d_project(const Scene* scene, float* means2d, float* radii, voi
 }
 
 // Blends. rgb [v h w 3], alpha [v h w], depth [v h w]; ``keeps`` stores what the backward needs.
-EXPORT int cadam3d_blend(const Scene* scene, void* handle, float* rgb, float* alpha, float* depth, int keeps) {
+EXPORT int cadam3d_blend(const Scene* scene, void* handle, float* rgb, float* alpha, float* depth,
+                         int keeps) {
   return guarded([&] {
     Frame& frame = *static_cast<Frame*>(handle);
     build_tile_lists(*scene, frame);
@@ -760,8 +775,9 @@ EXPORT int cadam3d_blend(const Scene* scene, void* handle, float* rgb, float* al
     const int64_t pixels = scene->height * scene->width;
     parallel_for(scene->views * frame.tiles(), scene->threads, [&](int64_t item) {
       const int64_t v = item / frame.tiles();
-      blend_tile(*scene, frame, frame.views[size_t(v)], frame.splats.data() + v * scene->gaussians, item % frame.tiles(),
-                 scene->background + 3 * v, rgb + 3 * v * pixels, alpha + v * pixels, depth + v * pixels, keeps != 0);
+      blend_tile(*scene, frame, frame.views[size_t(v)], frame.splats.data() + v * scene->gaussians,
+                 item % frame.tiles(), scene->background + 3 * v, rgb + 3 * v * pixels, alpha + v * pixels,
+                 depth + v * pixels, keeps != 0);
     });
   });
 }
@@ -770,11 +786,12 @@ EXPORT int cadam3d_blend(const Scene* scene, void* handle, float* rgb, float* al
 // cadam3d_centre_backward: here it only arrives in grad_means2d.
 EXPORT int cadam3d_blend_backward(const Scene* scene, void* handle, const float* alpha, const float* depth,
                                   const float* grad_rgb, const float* grad_alpha, const float* grad_depth,
-                                  float* grad_means2d, float* grad_means, float* grad_log_scales, float* grad_quats,
-                                  float* grad_opacity_logits, float* grad_sh) {
+                                  float* grad_means2d, float* grad_means, float* grad_log_scales,
+                                  float* grad_quats, float* grad_opacity_logits, float* grad_sh) {
   return guarded([&] {
     Frame& frame = *static_cast<Frame*>(handle);
-    const ParameterGradients out{grad_means2d, grad_means, grad_log_scales, grad_quats, grad_opacity_logits, grad_sh};
+    const ParameterGradients out{grad_means2d, grad_means,          grad_log_scales,
+                                 grad_quats,   grad_opacity_logits, grad_sh};
     const int64_t pixels = scene->height * scene->width, tiles = frame.tiles();
     Buffer<float> records;
     for (int64_t begin = 0, end = 0; begin < scene->views; begin = end) {
@@ -784,11 +801,12 @@ EXPORT int cadam3d_blend_backward(const Scene* scene, void* handle, const float*
       parallel_for((end - begin) * tiles, scene->threads, [&](int64_t item) {
         const int64_t v = begin + item / tiles, tile = item % tiles;
         const View& view = frame.views[size_t(v)];
-        const Images images{alpha + v * pixels, depth + v * pixels, grad_rgb ? grad_rgb + 3 * v * pixels : nullptr,
-                            grad_alpha ? grad_alpha + v * pixels : nullptr,
-                            grad_depth ? grad_depth + v * pixels : nullptr};
+        const Images images{
+            alpha + v * pixels, depth + v * pixels, grad_rgb ? grad_rgb + 3 * v * pixels : nullptr,
+            grad_alpha ? grad_alpha + v * pixels : nullptr, grad_depth ? grad_depth + v * pixels : nullptr};
         blend_tile_backward(*scene, frame, view, frame.splats.data() + v * scene->gaussians, tile,
-                            scene->background + 3 * v, images, records.data() + view.first_record[tile] * RECORD);
+                            scene->background + 3 * v, images,
+                            records.data() + view.first_record[tile] * RECORD);
       });
       parallel_for(ceil_div(scene->gaussians, BLOCK), scene->threads, [&](int64_t block) {
         for (int64_t i = block * BLOCK; i < std::min((block + 1) * BLOCK, scene->gaussians); ++i)
@@ -826,8 +844,10 @@ EXPORT void cadam3d_free(void* handle) { delete static_cast<Frame*>(handle); }
 
 // 0 if this machine can run the compiled code: one splat through every stage, forward and backward.
 EXPORT int cadam3d_self_test() {
-  const float means[3] = {0, 0, 2}, log_scales[3] = {-2, -2, -2}, quat[4] = {1, 0, 0, 0}, logit = 2, sh[3] = {1, 1, 1};
-  const float matrix[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1}, intrinsics[9] = {20, 0, 10, 0, 20, 10, 0, 0, 1};
+  const float means[3] = {0, 0, 2}, log_scales[3] = {-2, -2, -2}, quat[4] = {1, 0, 0, 0};
+  const float logit = 2, sh[3] = {1, 1, 1};
+  const float matrix[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
+  const float intrinsics[9] = {20, 0, 10, 0, 20, 10, 0, 0, 1};
   const float background[3] = {};
   const Scene scene{1, 1, 1, 20, 20, 2, means, log_scales, quat, &logit, sh, matrix, intrinsics, background};
   std::vector<float> rgb(1200), alpha(400), depth(400), ones(1200, 1.0f);

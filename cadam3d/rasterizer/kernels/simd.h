@@ -1,8 +1,8 @@
 // A row of pixels at a time: vectors of this machine's own width, and the few operations the blend needs.
 //
-// Wider vectors than the machine has would be lowered to scalar code, so the width follows the instruction set:
-// AVX-512 16 lanes, AVX2 8, everything else (SSE2, NEON, ...) 4. Products that are added are fused where written
-// fma() and nowhere else, so that forward and backward see the same bits.
+// Wider vectors than the machine has would be lowered to scalar code, so the width follows the instruction
+// set: AVX-512 16 lanes, AVX2 8, everything else (SSE2, NEON, ...) 4. Products that are added are fused where
+// written fma() and nowhere else, so that forward and backward see the same bits.
 #pragma once
 
 #if defined(__x86_64__) || defined(_M_X64)
@@ -14,7 +14,12 @@
 
 namespace simd {
 
-#if defined(__AVX512F__) && defined(__AVX512DQ__) && defined(__AVX512VL__)
+// Some clangs have AVX-512 instructions and yet no 64-byte registers: they say so by what they do not define.
+#if __clang_major__ >= 18 && !defined(__EVEX512__)
+#define SIMD_HALF_AVX512 1
+#endif
+
+#if defined(__AVX512F__) && defined(__AVX512DQ__) && defined(__AVX512VL__) && !defined(SIMD_HALF_AVX512)
 #define SIMD_AVX512 1
 #define SIMD_NAME "avx512"
 constexpr int LANES = 16;
@@ -59,10 +64,14 @@ inline Ints as_ints(Floats x) { return (Ints)x; }
 
 // ------------------------------------------------------------------------------------- fused multiply-add
 #if defined(SIMD_AVX512)
-inline Floats fma(Floats a, Floats b, Floats c) { return (Floats)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c); }
+inline Floats fma(Floats a, Floats b, Floats c) {
+  return (Floats)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c);
+}
 inline Floats min(Floats a, Floats b) { return (Floats)_mm512_min_ps((__m512)a, (__m512)b); }
 #elif defined(SIMD_AVX2)
-inline Floats fma(Floats a, Floats b, Floats c) { return (Floats)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c); }
+inline Floats fma(Floats a, Floats b, Floats c) {
+  return (Floats)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c);
+}
 inline Floats min(Floats a, Floats b) { return (Floats)_mm256_min_ps((__m256)a, (__m256)b); }
 #elif defined(SIMD_NEON)
 inline Floats fma(Floats a, Floats b, Floats c) {
@@ -77,8 +86,8 @@ inline Floats fma(Floats a, Floats b, Floats c) { return a * b + c; }
 inline Floats min(Floats a, Floats b) { return a < b ? a : b; }
 #endif
 
-// ------------------------------------------------------------------------------------- masks, one bit per lane
-// A comparison with a NaN is false.
+// ------------------------------------------------------------------------------------- masks
+// One truth per lane; a comparison with a NaN is false.
 #if defined(SIMD_AVX512)
 typedef __mmask16 Mask;
 inline Mask none() { return 0; }
@@ -88,8 +97,12 @@ inline Mask less(Ints a, Ints b) { return _mm512_cmp_epi32_mask((__m512i)a, (__m
 inline Mask both(Mask a, Mask b) { return a & b; }
 inline Mask first_only(Mask a, Mask b) { return a & (Mask)~b; }
 inline bool any(Mask a) { return a != 0; }
-inline Floats select(Mask m, Floats a, Floats b) { return (Floats)_mm512_mask_blend_ps(m, (__m512)b, (__m512)a); }
-inline Ints select(Mask m, Ints a, Ints b) { return (Ints)_mm512_mask_blend_epi32(m, (__m512i)b, (__m512i)a); }
+inline Floats select(Mask m, Floats a, Floats b) {
+  return (Floats)_mm512_mask_blend_ps(m, (__m512)b, (__m512)a);
+}
+inline Ints select(Mask m, Ints a, Ints b) {
+  return (Ints)_mm512_mask_blend_epi32(m, (__m512i)b, (__m512i)a);
+}
 inline Floats keep(Mask m, Floats a) { return (Floats)_mm512_maskz_mov_ps(m, (__m512)a); }
 #else
 typedef Ints Mask;  // all bits of a lane, or none
@@ -115,7 +128,7 @@ inline bool any(Mask a) { return (a[0] | a[1] | a[2] | a[3]) != 0; }
 
 // ------------------------------------------------------------------------------------- exp and sums
 
-// exp(-x) for 0 <= x < 80, relative error below 3e-7; any number outside (its lanes are masked by the caller).
+// exp(-x) for 0 <= x < 80, relative error below 3e-7; anything elsewhere, where the caller masks the lane.
 // exp(-x) = 2^n 2^f with n the nearest integer; the polynomial is the minimax of 2^f on [-1/2, 1/2] (Lawson).
 inline Floats exp_minus(Floats x) {
   const Floats scaled = x * spread(-1.44269504f);

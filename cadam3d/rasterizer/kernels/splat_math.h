@@ -1,19 +1,19 @@
 // One splat, from world to screen and back: the maths every native backend shares.
 //
-// Header-free on purpose (a run-time CUDA compiler has no headers), templated on the scalar, no allocation, no
-// branches on anything but culling. Derived from EWA splatting (Zwicker et al. 2002; Kerbl et al. 2023, sec. 4),
-// with one change of form that costs nothing and keeps long thin splats accurate in float32:
+// Header-free on purpose (a run-time CUDA compiler has no headers), templated on the scalar, no allocation,
+// no branches on anything but culling. Derived from EWA splatting (Zwicker et al. 2002; Kerbl et al. 2023,
+// sec. 4), with one change of form that costs nothing and keeps long thin splats accurate in float32:
 //
-//   screen covariance   C = B B^T + blur I          B = J W R diag(s), two rows of three
-//   its determinant     |B0 x B1|^2 + blur (|B0|^2 + |B1|^2) + blur^2            a sum of squares: no cancellation
-//   its whitening       L^T L = C^-1 / 2, L = [[l11, l12], [0, l22]]             closed form in C and det C
-//   falloff at d        exp(-|L d|^2)                                            >= 0 by construction
+//   screen covariance  C = B B^T + blur I,  B = J W R diag(s): two rows of three
+//   its determinant    |B0 x B1|^2 + blur (|B0|^2 + |B1|^2) + blur^2: a sum of squares, no cancellation
+//   its whitening      L^T L = C^-1 / 2,  L = [[l11, l12], [0, l22]]: closed form in C and det C
+//   falloff at d       exp(-|L d|^2): never above 1, by construction
 //
 // The blend gathers moments of y = L d, not of d; with Y = sum g y y^T and s = sum g y (g = dLoss/d|y|^2) the
 // backward is then  dLoss/dC = -2 L^T Y L,  dLoss/dB = -4 L^T Y (L B),  dLoss/dmean2d = -2 L^T s.
 //
-// The image formation constants (SPLAT_BLUR, SPLAT_ALPHA_MIN, SPLAT_NEAR, SPLAT_FRUSTUM_MARGIN) are given by the
-// build, from cadam3d/rasterizer/base.py: each has one home.
+// The image formation constants (SPLAT_BLUR, SPLAT_ALPHA_MIN, SPLAT_NEAR, SPLAT_FRUSTUM_MARGIN) are given by
+// the build, from cadam3d/rasterizer/base.py: each has one home.
 #pragma once
 
 #if defined(__CUDACC__)
@@ -24,10 +24,10 @@
 
 namespace splat {
 
-constexpr int MAX_COEFFICIENTS = 16;  // spherical harmonics of degree 3
+constexpr int MAX_COEFFICIENTS = 16;       // spherical harmonics of degree 3
 constexpr float TINY_QUATERNION = 1e-12f;  // squared length; a shorter one has no direction: culled
 constexpr float FLOAT_MAX = 3.402823466e+38f;
-constexpr float DEPTH_MAX = 1e15f;  // world units; the depth gradients of what lies farther leave float32: culled
+constexpr float DEPTH_MAX = 1e15f;  // world units; the depth gradients of what lies farther leave float32
 
 #if defined(__CUDACC__)
 SPLAT_FN float root(float x) { return sqrtf(x); }
@@ -69,7 +69,8 @@ struct Camera {
 };
 
 template <class Real>
-SPLAT_FN Camera<Real> make_camera(const float* world_to_camera, const float* intrinsics, int width, int height) {
+SPLAT_FN Camera<Real> make_camera(const float* world_to_camera, const float* intrinsics, int width,
+                                  int height) {
   Camera<Real> camera;
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) camera.rotation[i][j] = world_to_camera[4 * i + j];
@@ -82,7 +83,8 @@ SPLAT_FN Camera<Real> make_camera(const float* world_to_camera, const float* int
   }
   camera.fx = intrinsics[0], camera.cx = intrinsics[2], camera.fy = intrinsics[4], camera.cy = intrinsics[5];
   camera.width = Real(width), camera.height = Real(height);
-  const Real margin_x = Real(SPLAT_FRUSTUM_MARGIN) * camera.width, margin_y = Real(SPLAT_FRUSTUM_MARGIN) * camera.height;
+  const Real margin_x = Real(SPLAT_FRUSTUM_MARGIN) * camera.width,
+             margin_y = Real(SPLAT_FRUSTUM_MARGIN) * camera.height;
   camera.slope_low[0] = (-margin_x - camera.cx) / camera.fx;
   camera.slope_low[1] = (-margin_y - camera.cy) / camera.fy;
   camera.slope_high[0] = (camera.width + margin_x - camera.cx) / camera.fx;
@@ -94,9 +96,9 @@ SPLAT_FN Camera<Real> make_camera(const float* world_to_camera, const float* int
 
 // The real basis of cadam3d/core/sh.py (Y_lm with the Condon-Shortley phase, l = 0..3, m = -l..l).
 constexpr double SH_C0 = 0.28209479177387814, SH_C1 = 0.4886025119029199;
-constexpr double SH_C2[5] = {1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792,
-                             0.5462742152960396};
-constexpr double SH_C3[7] = {-0.5900435899266435, 2.890611442640554,   -0.4570457994644658, 0.3731763325901154,
+constexpr double SH_C2[5] = {1.0925484305920792, -1.0925484305920792, 0.31539156525252005,
+                             -1.0925484305920792, 0.5462742152960396};
+constexpr double SH_C3[7] = {-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
                              -0.4570457994644658, 1.445305721320277, -0.5900435899266435};
 
 template <class Real>
@@ -140,7 +142,8 @@ SPLAT_FN void sh_basis_backward(int coefficients, const Real* unit, const Real* 
   if (coefficients < 16) return;
   const Real xx = x * x, yy = y * y, zz = z * z;
   const Real p = Real(SH_C3[0]) * weight[9], q = Real(SH_C3[1]) * weight[10], r = Real(SH_C3[2]) * weight[11];
-  const Real s = Real(SH_C3[3]) * weight[12], t = Real(SH_C3[4]) * weight[13], u = Real(SH_C3[5]) * weight[14];
+  const Real s = Real(SH_C3[3]) * weight[12], t = Real(SH_C3[4]) * weight[13],
+             u = Real(SH_C3[5]) * weight[14];
   const Real w = Real(SH_C3[6]) * weight[15];
   gradient[0] += 6 * p * x * y + q * y * z - 2 * r * x * y - 6 * s * x * z + t * (4 * zz - 3 * xx - yy) +
                  2 * u * x * z + 3 * w * (xx - yy);
@@ -171,20 +174,21 @@ struct Shape {
 // What one view adds: everything the chain rule needs again.
 template <class Real>
 struct Footprint {
-  Real centre[3];         // in the camera
-  Real axes[3][3];        // Shape::axes in the camera
+  Real centre[3];   // in the camera
+  Real axes[3][3];  // Shape::axes in the camera
   Real inverse_z, slope[2];
-  bool is_held[2];        // the Jacobian sits at the border: its slope is a constant
-  Real rows[2][3];        // B
+  bool is_held[2];  // the Jacobian sits at the border: its slope is a constant
+  Real rows[2][3];  // B
   Real mean2d[2];
   Real cov_xx, cov_xy, cov_yy, l11, l12, l22;
-  Real reach[2];          // half-sizes of the box outside which alpha < alpha_min
+  Real reach[2];  // half-sizes of the box outside which alpha < alpha_min
 };
 
 template <class Real>
 SPLAT_FN bool make_shape(const Gaussian<Real>& gaussian, Shape<Real>& shape) {
   Real poison = gaussian.opacity_logit - gaussian.opacity_logit;  // 0, or NaN if anything is not finite
-  for (int i = 0; i < 3; ++i) poison += (gaussian.mean[i] - gaussian.mean[i]) + (gaussian.log_scale[i] - gaussian.log_scale[i]);
+  for (int i = 0; i < 3; ++i)
+    poison += (gaussian.mean[i] - gaussian.mean[i]) + (gaussian.log_scale[i] - gaussian.log_scale[i]);
   for (int i = 0; i < 3 * gaussian.coefficients; ++i) poison += Real(gaussian.sh[i] - gaussian.sh[i]);
   Real squared = 0;
   for (int i = 0; i < 4; ++i) squared += gaussian.quat[i] * gaussian.quat[i];
@@ -225,16 +229,20 @@ SPLAT_FN bool project(const Gaussian<Real>& gaussian, const Shape<Real>& shape, 
   for (int i = 0; i < 2; ++i) {
     const Real slope = out.centre[i] * out.inverse_z;
     out.mean2d[i] = focal[i] * slope + principal[i];
-    const Real held = slope < camera.slope_low[i] ? camera.slope_low[i] : slope > camera.slope_high[i] ? camera.slope_high[i] : slope;
+    const Real held = slope < camera.slope_low[i]    ? camera.slope_low[i]
+                      : slope > camera.slope_high[i] ? camera.slope_high[i]
+                                                     : slope;
     out.slope[i] = held;
     out.is_held[i] = held != slope;
-    for (int j = 0; j < 3; ++j) out.rows[i][j] = focal[i] * out.inverse_z * (out.axes[i][j] - held * out.axes[2][j]);
+    for (int j = 0; j < 3; ++j)
+      out.rows[i][j] = focal[i] * out.inverse_z * (out.axes[i][j] - held * out.axes[2][j]);
   }
 
   const Real blur = Real(SPLAT_BLUR);
   const Real *b0 = out.rows[0], *b1 = out.rows[1];
   const Real b00 = dot3(b0, b0), b11 = dot3(b1, b1);
-  const Real cross[3] = {b0[1] * b1[2] - b0[2] * b1[1], b0[2] * b1[0] - b0[0] * b1[2], b0[0] * b1[1] - b0[1] * b1[0]};
+  const Real cross[3] = {b0[1] * b1[2] - b0[2] * b1[1], b0[2] * b1[0] - b0[0] * b1[2],
+                         b0[0] * b1[1] - b0[1] * b1[0]};
   const Real determinant = dot3(cross, cross) + blur * (b00 + b11) + blur * blur;
   out.cov_xx = b00 + blur, out.cov_xy = dot3(b0, b1), out.cov_yy = b11 + blur;
   if (!fits_float(out.cov_xx) || !fits_float(out.cov_yy) || !is_finite(determinant)) return false;
@@ -293,21 +301,24 @@ struct Gradient {
 
 template <class Real>
 SPLAT_FN void clear(Gradient<Real>& gradient, int coefficients) {
-  for (int i = 0; i < 3; ++i) gradient.mean[i] = gradient.axes[i][0] = gradient.axes[i][1] = gradient.axes[i][2] = 0;
+  for (int i = 0; i < 3; ++i)
+    gradient.mean[i] = gradient.axes[i][0] = gradient.axes[i][1] = gradient.axes[i][2] = 0;
   gradient.opacity_logit = 0;
   for (int i = 0; i < 3 * coefficients; ++i) gradient.sh[i] = 0;
 }
 
 template <class Real>
-SPLAT_FN void mean2d_gradient(const Footprint<Real>& footprint, const Moments<Real>& moments, Real* gradient) {
+SPLAT_FN void mean2d_gradient(const Footprint<Real>& footprint, const Moments<Real>& moments,
+                              Real* gradient) {
   gradient[0] = -2 * footprint.l11 * moments.gu;
   gradient[1] = -2 * (footprint.l12 * moments.gu + footprint.l22 * moments.gt);
 }
 
 // Adds one view to ``total``; the path through mean2d is left out, see centre_backward.
 template <class Real>
-SPLAT_FN void project_backward(const Gaussian<Real>& gaussian, const Shape<Real>& shape, const Camera<Real>& camera,
-                               const Footprint<Real>& f, const Moments<Real>& moments, Gradient<Real>& total) {
+SPLAT_FN void project_backward(const Gaussian<Real>& gaussian, const Shape<Real>& shape,
+                               const Camera<Real>& camera, const Footprint<Real>& f,
+                               const Moments<Real>& moments, Gradient<Real>& total) {
   total.opacity_logit -= moments.g * (1 - shape.opacity);  // alpha = opacity exp(-|y|^2)
 
   Real centre[3] = {0, 0, moments.depth}, axes[3][3];
@@ -362,19 +373,21 @@ SPLAT_FN void project_backward(const Gaussian<Real>& gaussian, const Shape<Real>
 
 // dLoss/dmean of the pinhole projection alone: the path through mean2d.
 template <class Real>
-SPLAT_FN void centre_backward(const Camera<Real>& camera, const Real* mean, const Real* mean2d_gradient, Real* total) {
+SPLAT_FN void centre_backward(const Camera<Real>& camera, const Real* mean, const Real* mean2d_gradient,
+                              Real* total) {
   Real centre[3];
   for (int i = 0; i < 3; ++i) centre[i] = dot3(camera.rotation[i], mean) + camera.translation[i];
   const Real inverse_z = 1 / centre[2];
   const Real x = camera.fx * inverse_z * mean2d_gradient[0], y = camera.fy * inverse_z * mean2d_gradient[1];
   const Real z = -(x * centre[0] + y * centre[1]) * inverse_z;
-  for (int i = 0; i < 3; ++i) total[i] += camera.rotation[0][i] * x + camera.rotation[1][i] * y + camera.rotation[2][i] * z;
+  for (int i = 0; i < 3; ++i)
+    total[i] += camera.rotation[0][i] * x + camera.rotation[1][i] * y + camera.rotation[2][i] * z;
 }
 
 // From the axes, summed over the views, to log-scales and the raw quaternion.
 template <class Real>
-SPLAT_FN void shape_backward(const Shape<Real>& shape, const Gaussian<Real>& gaussian, const Gradient<Real>& total,
-                             Real* log_scale, Real* quat) {
+SPLAT_FN void shape_backward(const Shape<Real>& shape, const Gaussian<Real>& gaussian,
+                             const Gradient<Real>& total, Real* log_scale, Real* quat) {
   Real g[3][3];
   for (int j = 0; j < 3; ++j) {
     const Real scale = power_e(gaussian.log_scale[j]);
@@ -387,9 +400,12 @@ SPLAT_FN void shape_backward(const Shape<Real>& shape, const Gaussian<Real>& gau
   const Real w = shape.unit_quat[0], x = shape.unit_quat[1], y = shape.unit_quat[2], z = shape.unit_quat[3];
   const Real unit[4] = {
       2 * (x * (g[2][1] - g[1][2]) + y * (g[0][2] - g[2][0]) + z * (g[1][0] - g[0][1])),
-      2 * (y * (g[0][1] + g[1][0]) + z * (g[0][2] + g[2][0]) + w * (g[2][1] - g[1][2]) - 2 * x * (g[1][1] + g[2][2])),
-      2 * (x * (g[0][1] + g[1][0]) + z * (g[1][2] + g[2][1]) + w * (g[0][2] - g[2][0]) - 2 * y * (g[0][0] + g[2][2])),
-      2 * (x * (g[0][2] + g[2][0]) + y * (g[1][2] + g[2][1]) + w * (g[1][0] - g[0][1]) - 2 * z * (g[0][0] + g[1][1])),
+      2 * (y * (g[0][1] + g[1][0]) + z * (g[0][2] + g[2][0]) + w * (g[2][1] - g[1][2]) -
+           2 * x * (g[1][1] + g[2][2])),
+      2 * (x * (g[0][1] + g[1][0]) + z * (g[1][2] + g[2][1]) + w * (g[0][2] - g[2][0]) -
+           2 * y * (g[0][0] + g[2][2])),
+      2 * (x * (g[0][2] + g[2][0]) + y * (g[1][2] + g[2][1]) + w * (g[1][0] - g[0][1]) -
+           2 * z * (g[0][0] + g[1][1])),
   };
   Real along = 0;
   for (int i = 0; i < 4; ++i) along += unit[i] * shape.unit_quat[i];
