@@ -147,8 +147,7 @@ def _see(gaussians: Gaussians, view: _View) -> tuple[Int[Tensor, "m"], Float[Ten
     squares = (gaussians.quats * gaussians.quats).sum(dim=-1)
     size = half_sizes.new_tensor([view.width, view.height])
     is_finite = torch.ones_like(squares, dtype=torch.bool)
-    derived = (half_sizes, projection.determinants)
-    for tensor in (*gaussians.tensors().values(), *derived):
+    for tensor in (*gaussians.tensors().values(), half_sizes, projection.determinants):
         is_finite &= tensor.isfinite().reshape(len(gaussians), math.prod(tensor.shape[1:])).all(dim=1)
     has_direction = squares >= QUAT_SQUARE_MIN
     is_in_range = (projection.depths > NEAR) & (projection.depths < FAR)
@@ -212,34 +211,38 @@ class _Block:
 def _blocks(
     means2d: Float[Tensor, "m 2"], half_sizes: Float[Tensor, "m 2"], tiles_x: int, tiles_y: int
 ) -> Iterator[_Block]:
-    """Bin the boxes of depth-ordered splats into tiles, and the tiles into blocks."""
-    m, device = means2d.shape[0], means2d.device
-    grid = torch.tensor([tiles_x, tiles_y], device=device)
-    # Closed boxes around tile borders, while pixel centres lie half a pixel inside: rounding loses no pixel.
+    """Stack the tiles that any of the depth-ordered splats touches, those with the most splats first."""
+    splats, lengths = _bin(means2d, half_sizes, tiles_x, tiles_y)
+    starts = lengths.cumsum(0) - lengths
+    by_length = lengths.argsort(descending=True, stable=True)
+    host = [length for length in lengths[by_length].tolist() if length > 0]
+    done = 0
+    while done < len(host):
+        count = min(max(1, BLOCK // (host[done] * TILE**2)), len(host) - done)
+        tiles = by_length[done : done + count]
+        rank = torch.arange(host[done], device=splats.device)
+        slots = (starts[tiles, None] + rank).clamp_max(splats.shape[0] - 1)
+        is_filled = rank < lengths[tiles, None]
+        yield _Block(tiles=tiles, splats=torch.where(is_filled, splats[slots], means2d.shape[0]))
+        done += count
+
+
+def _bin(
+    means2d: Float[Tensor, "m 2"], half_sizes: Float[Tensor, "m 2"], tiles_x: int, tiles_y: int
+) -> tuple[Int[Tensor, "e"], Int[Tensor, "t"]]:
+    """List the splats whose box meets each tile, tile after tile, nearest first; and the length of each list."""
+    grid = torch.tensor([tiles_x, tiles_y], device=means2d.device)
+    # Closed boxes against whole tiles, whose pixel centres lie half a pixel inside: rounding loses no pixel.
     first = ((means2d - half_sizes) / TILE).floor().clamp_min(0).minimum(grid).long()
     last = ((means2d + half_sizes) / TILE).floor().clamp_min(-1).minimum(grid - 1).long()
     span = (last - first + 1).clamp_min(0)
     counts = span.prod(dim=1)
-    splats = torch.repeat_interleave(torch.arange(m, device=device), counts)
-    nth = torch.arange(splats.shape[0], device=device) - (counts.cumsum(0) - counts)[splats]
+    splats = torch.arange(means2d.shape[0], device=means2d.device).repeat_interleave(counts)
+    nth = torch.arange(splats.shape[0], device=splats.device) - (counts.cumsum(0) - counts)[splats]
     column = first[splats, 0] + nth % span[splats, 0]
     row = first[splats, 1] + nth // span[splats, 0]
-    tiles, order = (row * tiles_x + column).sort(stable=True)  # stable: within a tile, depth order survives
-    splats = splats[order]
-    lengths = torch.bincount(tiles, minlength=tiles_x * tiles_y)
-    starts = lengths.cumsum(0) - lengths
-    by_length = lengths.argsort(descending=True, stable=True)
-    host = lengths[by_length].tolist()
-    done = 0
-    while done < len(host) and host[done] > 0:
-        longest = host[done]
-        chosen = by_length[done : done + max(1, BLOCK // (longest * TILE**2))]
-        rank = torch.arange(longest, device=device)
-        slots = (starts[chosen, None] + rank).clamp_max(splats.shape[0] - 1)
-        filled = torch.where(rank < lengths[chosen, None], splats[slots], m)
-        keep = lengths[chosen] > 0
-        yield _Block(tiles=chosen[keep], splats=filled[keep])
-        done += chosen.shape[0]
+    tiles, order = (row * tiles_x + column).sort(stable=True)  # stable: the nearest stays first
+    return splats[order], torch.bincount(tiles, minlength=tiles_x * tiles_y)
 
 
 class _Blend(torch.autograd.Function):
