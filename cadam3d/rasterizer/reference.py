@@ -230,7 +230,7 @@ def _blocks(
 def _bin(
     means2d: Float[Tensor, "m 2"], half_sizes: Float[Tensor, "m 2"], tiles_x: int, tiles_y: int
 ) -> tuple[Int[Tensor, "e"], Int[Tensor, "t"]]:
-    """List the splats whose box meets each tile, tile after tile, nearest first; and the length of each list."""
+    """The splats whose box meets each tile, tile after tile, nearest first; and how many each tile has."""
     grid = torch.tensor([tiles_x, tiles_y], device=means2d.device)
     # Closed boxes against whole tiles, whose pixel centres lie half a pixel inside: rounding loses no pixel.
     first = ((means2d - half_sizes) / TILE).floor().clamp_min(0).minimum(grid).long()
