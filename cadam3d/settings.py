@@ -67,6 +67,14 @@ def component(node: DictConfig | ListConfig | None) -> Any:
         raise UserError(f"{error.full_key or 'configuration'}: {str(error.msg).splitlines()[0]}") from error
 
 
+def components(group: DictConfig) -> dict[str, Any]:
+    """Build every chosen member of a group of which several can be chosen, by name.
+
+    An experiment may tune a member that the line did not choose; such a node has keys but no ``_target_``.
+    """
+    return {str(name): component(node) for name, node in group.items() if "_target_" in node}
+
+
 def load(path: Path) -> DictConfig:
     """The resolved ``config.yaml`` of a run: what looks like an interpolation there is somebody's text."""
     return DictConfig(_escaped(yaml.safe_load(path.read_text(encoding="utf-8"))))

@@ -11,7 +11,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.ply import read_ply
-from cadam3d.settings import component, load
+from cadam3d.settings import component, components, load
 from cadam3d.trainer import render_fn, resolve_device
 
 ASSET = "asset.ply"
@@ -73,7 +73,7 @@ def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
 
 def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
     """Let every exporter of ``cfg`` write ``asset`` into ``folder``; returns what they wrote."""
-    exporters: Sequence[Exporter] = [component(node) for node in cfg.exporter.values()]
+    exporters: Sequence[Exporter] = list(components(cfg.exporter).values())
     if not exporters:
         raise UserError("exporter: wanted at least one, got none. Try: exporter=[images,turntable]")
     try:

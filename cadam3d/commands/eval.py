@@ -10,7 +10,7 @@ from cadam3d.commands.asset import find_run, open_run, renderer, run_config, sho
 from cadam3d.commands.sweep import jobs
 from cadam3d.core.checks import UserError
 from cadam3d.io.jsonl import write_json
-from cadam3d.settings import component
+from cadam3d.settings import component, components
 
 RESULT = "eval.json"
 
@@ -42,8 +42,8 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     truth = prior.truth(source.prompt)
     render = renderer(source.rasterizer, asset.gaussians)
     result: dict[str, Any] = {"run": str(shown(folder)), "prompt": source.prompt}
-    for node in cfg.metric.values():
-        result |= component(node).measure(asset.gaussians, render, truth)
+    for metric in components(cfg.metric).values():
+        result |= metric.measure(asset.gaussians, render, truth)
     if truth is None:
         result["note"] = "this prior knows no true images, so there is no psnr and no ssim"
     write_json(folder / RESULT, result)

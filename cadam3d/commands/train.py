@@ -19,7 +19,8 @@ from cadam3d.exporter.base import Exporter
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import read_jsonl, write_json
 from cadam3d.io.report import write_report
-from cadam3d.settings import component
+from cadam3d.metric.base import Metric
+from cadam3d.settings import component, components
 from cadam3d.state import Outcome, RunContext, TrainState
 from cadam3d.trainer import Trainer, resolve_device
 
@@ -63,8 +64,8 @@ def run(cfg: DictConfig) -> float | None:
     # Same seed, same bytes: on the CPU every operation we use has a deterministic form.
     torch.use_deterministic_algorithms(device.type == "cpu")
     trainer = build_trainer(cfg, device)
-    exporters: dict[str, Exporter] = {name: component(node) for name, node in cfg.exporter.items()}
-    metrics = {name: component(node) for name, node in cfg.metric.items()}
+    exporters: dict[str, Exporter] = components(cfg.exporter)
+    metrics: dict[str, Metric] = components(cfg.metric)
 
     embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
     state = _start_or_resume(cfg, trainer, device, folder)
@@ -110,8 +111,8 @@ def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
         densifier=component(cfg.densifier),
         refine=component(cfg.refine),
         optimizer=component(cfg.optimizer),
-        regularizers={name: component(node) for name, node in cfg.regularizer.items()},
-        callbacks=[component(node) for node in cfg.callback.values()],
+        regularizers=components(cfg.regularizer),
+        callbacks=list(components(cfg.callback).values()),
     )
 
 

@@ -1,17 +1,20 @@
 """The best rasterizer for the device the Gaussians live on: what a user who does not care gets."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
+from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.rasterizer.base import Rasterizer
+from cadam3d.rasterizer.cpu import CpuRasterizer, load_kernels
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
 
@@ -24,7 +27,23 @@ class Candidate:
     build: Callable[[], Rasterizer]
 
 
+def has_native_kernels(device: torch.device) -> bool:
+    """Whether the native rasterizer serves ``device``: its kernels are compiled or cached now, to be sure.
+
+    Where that fails, one warning says why and what to install; the reference then takes its place.
+    """
+    if device.type != "cpu":
+        return False
+    try:
+        load_kernels(None)
+    except UserError as error:
+        warnings.warn(f"Rendering with the slow reference rasterizer, for {error}", stacklevel=2)
+        return False
+    return True
+
+
 CANDIDATES = (  # fastest first; the last one works everywhere
+    Candidate("cpu", has_native_kernels, partial(CpuRasterizer, cache_dir=None)),
     Candidate("reference", lambda device: True, ReferenceRasterizer),
 )
 

@@ -1,0 +1,176 @@
+"""The program as a user runs it: real processes, a real prior, real files."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+
+from cadam3d.io.jsonl import read_jsonl
+from cadam3d.io.ply import read_ply
+
+SMALL = ["prompt=a red cube", "experiment=smoke", "rasterizer=reference"]
+SECONDS = 240  # longest wait for one process, on a busy machine
+
+
+def start(folder: Path, *words: str) -> subprocess.Popen:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[1])}
+    return subprocess.Popen(
+        [sys.executable, "-m", "cadam3d", *words],
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def run(folder: Path, *words: str, code: int = 0) -> tuple[str, str]:
+    process = start(folder, *words)
+    out, err = process.communicate(timeout=SECONDS)
+    assert process.returncode == code, f"exit {process.returncode}\n{out}\n{err}"
+    return out, err
+
+
+def wait_for(path: Path, process: subprocess.Popen) -> None:
+    deadline = time.monotonic() + SECONDS
+    while not path.exists():
+        assert process.poll() is None, f"ended before {path.name} was there: {process.communicate()}"
+        assert time.monotonic() < deadline, f"{path.name} never came"
+        time.sleep(0.02)
+
+
+def without_time(lines: list[dict]) -> list[dict]:
+    return [{key: value for key, value in line.items() if key != "seconds"} for line in lines]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    """The folder in which one small run was made, from its first step to its last."""
+    folder = tmp_path_factory.mktemp("user")
+    run(folder, "train", *SMALL)
+    return folder
+
+
+def test_a_run_leaves_everything_that_the_readme_promises(finished):
+    latest = finished / "outputs" / "latest"
+    summary = json.loads((latest / "summary.json").read_text())
+    promised = "prompt seed steps outcome num_gaussians_initial num_gaussians asset_bytes seconds"
+    promised += " densifier guidance prior rasterizer psnr ssim"
+    assert set(promised.split()) <= summary.keys()
+    assert summary["outcome"] == "finished"
+    assert summary["prompt"] == "a red cube"
+    assert (summary["densifier"], summary["guidance"], summary["prior"]) == ("cadam", "sds", "shapes")
+    assert len(read_ply(latest / "asset.ply")) == summary["num_gaussians"]
+    assert (latest / "asset.ply").stat().st_size == summary["asset_bytes"]
+    assert iio.imread(latest / "preview.png").ndim == 3
+    assert len(iio.imread(latest / "turntable.mp4", plugin="FFMPEG")) == 8
+    assert "a red cube" in (latest / "report.html").read_text()
+    assert read_jsonl(latest / "metrics.jsonl")[-1]["step"] == summary["steps"]
+
+
+def test_eval_measures_what_train_measured(finished):
+    run(finished, "eval", "run=outputs/latest", "metric.fidelity.views=4", "metric.fidelity.size=48")
+    latest = finished / "outputs" / "latest"
+    evaluation = json.loads((latest / "eval.json").read_text())
+    summary = json.loads((latest / "summary.json").read_text())
+    for key in ("psnr", "ssim", "num_gaussians", "asset_bytes"):
+        assert evaluation[key] == pytest.approx(summary[key], rel=1e-6)
+
+
+def test_killed_and_resumed_equals_never_interrupted(finished, tmp_path):
+    victim = tmp_path / "run"
+    words = [*SMALL, f"hydra.run.dir={victim}", "callback.checkpoint.every=7", "callback.metrics.every=1"]
+    process = start(tmp_path, "train", *words)
+    wait_for(victim / "checkpoints" / "step_0000014.pt", process)
+    process.kill()  # SIGKILL: nothing gets a chance to say goodbye
+    process.communicate()
+    assert not (victim / "summary.json").exists()
+
+    run(tmp_path, "train", f"resume={victim}")
+    whole = finished / "outputs" / "latest"
+    assert (victim / "asset.ply").read_bytes() == (whole / "asset.ply").read_bytes()
+    lines = read_jsonl(victim / "metrics.jsonl")
+    steps = [line["step"] for line in lines if line["kind"] == "step"]
+    assert steps == list(range(1, 41))
+    logged = [line for line in lines if line["kind"] == "refine" or line["step"] in (1, *range(0, 41, 5))]
+    assert without_time(logged) == without_time(read_jsonl(whole / "metrics.jsonl"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_everything_and_says_how_to_go_on(finished, tmp_path, number):
+    victim = tmp_path / "run"
+    process = start(tmp_path, "train", *SMALL, f"hydra.run.dir={victim}", "callback.checkpoint.every=5")
+    wait_for(victim / "checkpoints" / "step_0000005.pt", process)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=SECONDS)
+    assert process.returncode == 128 + number, err
+    assert "Traceback" not in err
+    summary = json.loads((victim / "summary.json").read_text())
+    assert summary["outcome"] == "interrupted"
+    assert 5 <= summary["steps"] < 40
+    assert len(read_ply(victim / "asset.ply")) == summary["num_gaussians"]
+    assert f"cadam3d train resume={victim.name}" in out
+
+    run(tmp_path, "train", f"resume={victim}")
+    whole = finished / "outputs" / "latest"
+    assert (victim / "asset.ply").read_bytes() == (whole / "asset.ply").read_bytes()
+
+
+@pytest.mark.parametrize("guidance", ["ism", "vfds"])
+@pytest.mark.parametrize("densifier", ["baseline", "none"])
+def test_every_objective_and_densifier_trains(tmp_path, guidance, densifier):
+    words = [*SMALL, f"guidance={guidance}", f"densifier={densifier}", "steps=12", "exporter=[ply]"]
+    out, _ = run(tmp_path, "train", *words)
+    summary = json.loads((tmp_path / "outputs" / "latest" / "summary.json").read_text())
+    assert (summary["guidance"], summary["densifier"]) == (guidance, densifier)
+    assert "PSNR" in out
+
+
+def test_a_dry_run_on_the_tiny_prior_says_that_it_means_nothing(tmp_path):
+    words = [*SMALL, "prior=tiny", "prompt=anything at all", "steps=2", "exporter=[ply]"]
+    out, err = run(tmp_path, "train", *words)
+    assert "Note:" in err
+    assert "PSNR" not in out
+    run(tmp_path, "eval", "run=outputs/latest")
+    evaluation = json.loads((tmp_path / "outputs" / "latest" / "eval.json").read_text())
+    assert "psnr" not in evaluation
+    assert evaluation["num_gaussians"] > 0
+
+
+def test_a_sweep_is_one_row_per_job(tmp_path):
+    words = ["prompt=a red cube", "experiment=smoke", "rasterizer=reference", "steps=12", "exporter=[ply]"]
+    run(tmp_path, "sweep", *words, "densifier=cadam,baseline", "hydra.sweep.dir=table")
+    header, *rows = (tmp_path / "table" / "sweep.csv").read_text().splitlines()
+    wanted = {"overrides", "seed", "outcome", "num_gaussians", "asset_bytes", "seconds", "psnr"}
+    assert wanted <= set(header.split(","))
+    assert len(rows) == 2
+    assert all("finished" in row for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "prompt"),
+        (["prompt=a red florb"], "florb"),
+        (["prompt=a cube", "densifier.tau_Q=1.5"], "densifier.tau_Q"),
+        (["prompt=a cube", "densifier.tau_q=0.5"], "densifier.tau_Q"),
+        (["prompt=a cube", "densifier=cadm"], "densifier=cadam"),
+        (["prompt=a cube", "device=cuda:99"], "device=cpu"),
+        (["prompt=a cube", "seed=abc"], "seed"),
+        (["prompt=a cube", "hydra.run.dir=/proc/nowhere"], "/proc/nowhere"),
+        (["resume=nowhere"], "resume"),
+    ],
+)
+def test_a_mistake_is_one_message_and_exit_code_1(tmp_path, words, said):
+    _, err = run(tmp_path, "train", *words, code=1)
+    assert said in err
+    assert "Traceback" not in err
+    assert "HYDRA_FULL_ERROR" not in err
+    assert len(err.strip().splitlines()) <= 12
+    assert not list(tmp_path.rglob("asset.ply"))
