@@ -1,5 +1,6 @@
 """``cadam3d train``: a prompt in, a run folder with an asset out."""
 
+import logging
 import signal
 import sys
 import time
@@ -23,6 +24,8 @@ from cadam3d.metric.base import Metric
 from cadam3d.settings import component, components
 from cadam3d.state import Outcome, RunContext, TrainState
 from cadam3d.trainer import Trainer, resolve_device
+
+log = logging.getLogger(__name__)
 
 COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "camera", "refine", "optimizer")
 
@@ -76,6 +79,7 @@ def run(cfg: DictConfig) -> float | None:
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         _point_latest_at(folder)
 
+    log.info("prompt %r, seed %d, on %s, from step %d", cfg.prompt, cfg.seed, device, state.step)
     render = trainer.renderer(state)
     context = RunContext(folder=folder, prompt=cfg.prompt, total_steps=trainer.steps, render=render)
     with StopOnSignal() as stop:
@@ -89,6 +93,7 @@ def run(cfg: DictConfig) -> float | None:
         for metric in metrics.values():
             summary |= metric.measure(gaussians, render, truth)
         summary |= {"warnings": warnings}
+        log.info("%s after %d steps: %d Gaussians", outcome, state.step, len(gaussians))
         write_json(folder / "summary.json", summary)
         lines = read_jsonl(folder / "metrics.jsonl")
         report = write_report(folder, summary=summary, metrics=lines, config_text=config_text)
@@ -161,6 +166,7 @@ def _export(exporters: Mapping[str, Exporter], gaussians, render, folder: Path) 
             exporter.export(gaussians, render, folder)
         except UserError as error:
             warnings.append(f"exporter.{name}: {error}")
+            log.info("exporter.%s: %s", name, error)
             print(f"Warning: exporter.{name}: {error}", file=sys.stderr)
     return warnings
 
