@@ -32,9 +32,7 @@ def explain(error: Exception, config_name: str, overrides: Sequence[str]) -> Use
         text = str(error).strip() or str(error.__cause__ or "")
         if key := re.search(r"Could not override '([^']+)'", text):
             return _unknown_key(key.group(1), config_name, overrides)
-        if sweep := re.search(
-            r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)", text, re.M
-        ):
+        if sweep := re.search(SWEEP_COMPLAINT, text, re.M):
             return _several_values(sweep.group(1))
         cause = error.__cause__
         detail = f" ({str(cause).splitlines()[0]})" if isinstance(cause, OmegaConfBaseException) else ""
