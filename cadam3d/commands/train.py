@@ -15,6 +15,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import __version__
+from cadam3d.commands.paths import shown
 from cadam3d.core.checks import UserError, require
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
@@ -218,10 +219,6 @@ def _relative_if_inside(folder: Path, base: Path) -> Path:
 
 
 def _say(folder: Path, summary: Mapping[str, Any], report: Path) -> None:
-    try:
-        shown = folder.resolve().relative_to(Path.cwd())
-    except ValueError:
-        shown = folder
     quality = f", PSNR {summary['psnr']:.2f} dB" if summary.get("psnr") is not None else ""
     print(
         f"{summary['outcome']} after {summary['steps']} steps, {summary['seconds']:.0f} s: "
@@ -229,7 +226,7 @@ def _say(folder: Path, summary: Mapping[str, Any], report: Path) -> None:
     )
     for label, name in (("asset", "asset.ply"), ("video", "turntable.mp4"), ("pictures", "preview.png")):
         if (folder / name).exists():
-            print(f"  {label:<9}{shown / name}")
-    print(f"  {'report':<9}{shown / report.name}")
+            print(f"  {label:<9}{shown(folder / name)}")
+    print(f"  {'report':<9}{shown(report)}")
     if summary["outcome"] == Outcome.INTERRUPTED:
-        print(f"  go on with: cadam3d train resume={shown}")
+        print(f"  go on with: cadam3d train resume={shown(folder)}")
