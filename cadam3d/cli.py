@@ -28,6 +28,8 @@ COMPLETION_FLAGS = ("--shell-completion", "-sc")
 def main() -> None:
     """Run the command line of this process and exit: 0 done, 1 a mistake or a failure, 130 interrupted."""
     wants_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    # Before torch loads OpenMP: idle threads sleep. If they spin, two busy programs slow each other tenfold.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         code = dispatch(sys.argv[1:])
         sys.stdout.flush()

@@ -78,6 +78,17 @@ def type_line(monkeypatch, capsys, tmp_path):
     return run
 
 
+@pytest.mark.parametrize(("before", "after"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
+def test_idle_threads_sleep_unless_the_user_says_otherwise(before, after, type_line, monkeypatch):
+    monkeypatch.setenv("OMP_WAIT_POLICY", "to be restored")
+    if before is None:
+        monkeypatch.delenv("OMP_WAIT_POLICY")
+    else:
+        monkeypatch.setenv("OMP_WAIT_POLICY", before)
+    type_line("--version")
+    assert os.environ["OMP_WAIT_POLICY"] == after
+
+
 @pytest.fixture(scope="session")
 def small_configs(tmp_path_factory) -> Path:
     """The real folders that the command line itself needs, and a train.yaml that composes in no time."""
