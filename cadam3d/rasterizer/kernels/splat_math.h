@@ -18,8 +18,10 @@
 
 #if defined(__CUDACC__)
 #define SPLAT_FN __device__ __forceinline__
+#define SPLAT_TABLE __device__ constexpr
 #else
 #define SPLAT_FN inline
+#define SPLAT_TABLE constexpr
 #endif
 
 namespace splat {
@@ -96,9 +98,9 @@ SPLAT_FN Camera<Real> make_camera(const float* world_to_camera, const float* int
 
 // The real basis of cadam3d/core/sh.py (Y_lm with the Condon-Shortley phase, l = 0..3, m = -l..l).
 constexpr double SH_C0 = 0.28209479177387814, SH_C1 = 0.4886025119029199;
-constexpr double SH_C2[5] = {1.0925484305920792, -1.0925484305920792, 0.31539156525252005,
+SPLAT_TABLE double SH_C2[5] = {1.0925484305920792, -1.0925484305920792, 0.31539156525252005,
                              -1.0925484305920792, 0.5462742152960396};
-constexpr double SH_C3[7] = {-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
+SPLAT_TABLE double SH_C3[7] = {-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
                              -0.4570457994644658, 1.445305721320277, -0.5900435899266435};
 
 template <class Real>
