@@ -10,8 +10,8 @@ honest node of the graph. A frame goes through these kernels (``kernels/*.cuh``)
 * ``blend_forward``: a warp per tile.
 
 Backward is ``blend_backward``, which leaves a record in each slot, and ``project_backward``, which sums the
-slots of each Gaussian in order. There are no float atomics: the same input gives the same bits. The host waits
-for the device once, to learn how many slots there are.
+slots of each Gaussian in order. There are no float atomics: the same input gives the same bits. The host
+waits for the device once, to learn how many slots there are.
 """
 
 from abc import ABC, abstractmethod
@@ -72,8 +72,7 @@ class CudaRasterizer(Rasterizer):
         """See :meth:`Rasterizer.render`. Raises :class:`UserError` off CUDA, or if nothing can compile."""
         if gaussians.device.type != "cuda":
             raise UserError(f"rasterizer=cuda cannot render on {gaussians.device}. Try: rasterizer=auto")
-        with torch.autocast("cuda", enabled=False):
-            return rasterize(load_kernels(self.cache_dir), gaussians, cameras, background)
+        return rasterize(load_kernels(self.cache_dir), gaussians, cameras, background)
 
 
 @cache
@@ -85,7 +84,7 @@ def load_kernels(cache_dir: str | None) -> Launcher:
 
 
 def works_on(device: torch.device) -> bool:
-    """Whether Gaussians on ``device`` can be rendered here: its kernels are compiled or cached now, to be sure.
+    """Whether Gaussians on ``device`` can be rendered here: its kernels are compiled and loaded, to be sure.
 
     Raises :class:`UserError`, which says what is missing, if there is a CUDA device that cannot be served.
     """
@@ -103,12 +102,13 @@ def rasterize(
     dtype, device = gaussians.means.dtype, gaussians.device
     means, *others = (_plain(tensor, device) for tensor in gaussians.tensors().values())
     frame = _Frame(launcher, cameras, device)
-    means2d, radii = _Project.apply(frame, means, *(tensor.detach() for tensor in others))
-    means2d = means2d.to(dtype)
-    if torch.is_grad_enabled():
-        means2d.requires_grad_().retain_grad()
-    images = _Blend.apply(frame, _plain(means2d, device), means, *others, _plain(background, device))
-    rgb, alpha, depth = (image.to(dtype) for image in images)
+    with torch.autocast(device.type, enabled=False):
+        means2d, radii = _Project.apply(frame, means, *(tensor.detach() for tensor in others))
+        means2d = means2d.to(dtype)
+        if torch.is_grad_enabled():
+            means2d.requires_grad_().retain_grad()
+        images = _Blend.apply(frame, _plain(means2d, device), means, *others, _plain(background, device))
+        rgb, alpha, depth = (image.to(dtype) for image in images)
     return RenderOutput(rgb=rgb, alpha=alpha, depth=depth, means2d=means2d, radii=radii.to(dtype))
 
 
@@ -163,14 +163,8 @@ class _Frame:
             self.lists = self._list(launch, n)
             del self.depth_keys
             images = (rgb, alpha, depth, self.transmittance, self.last)
-            _launch_each(
-                launch,
-                "blend_forward",
-                v * self.tiles * WARP,
-                BLEND_BLOCK,
-                *self._blend_inputs(background),
-                *images,
-            )
+            threads, blend = v * self.tiles * WARP, (*self._blend_inputs(background), *images)
+            _launch_each(launch, "blend_forward", threads, BLEND_BLOCK, *blend)
         return rgb, alpha, depth
 
     def _list(self, launch: Launch, n: int) -> "_Lists":
@@ -182,7 +176,7 @@ class _Frame:
         offsets, total = _scan(launch, counts)
         slots = int(total)  # the one time the host waits
         if slots > MOST:
-            raise UserError(f"rasterizer=cuda: {slots} splats in tiles are too many. Try: fewer views at once")
+            raise UserError(f"rasterizer=cuda: {slots} (splat, tile) pairs are too many. Try: fewer views")
         tile_keys, pair_of_slot = _integers(slots, self.device), _integers(slots, self.device)
         first_slot, slot_count = _integers(pairs, self.device), _integers(pairs, self.device)
         inputs = (order, counts, offsets, pairs, n, self.splats, v, *size)
@@ -200,7 +194,7 @@ class _Frame:
     def blend_backward(
         self, parameters: list[Tensor], radii: Tensor, background: Tensor, images: list[Tensor | None]
     ) -> list[Tensor]:
-        """Gradients of means2d and of the parameters, from (alpha, depth, grad_rgb, grad_alpha, grad_depth)."""
+        """Gradients of means2d and the parameters; ``images``: alpha, depth, and gradients of all three."""
         means, *_, sh = parameters
         v, n = self.views, means.shape[0]
         records = means.new_empty(self.lists.slots.shape[0], RECORD)
@@ -209,9 +203,8 @@ class _Frame:
         with self.launcher.on(self.device) as launch:
             seen = (alpha, depth, self.transmittance, self.last, *grad_images)
             threads = (v * self.tiles + 1) * WARP  # one warp more for slots without a tile
-            _launch_each(
-                launch, "blend_backward", threads, BLEND_BLOCK, *self._blend_inputs(background), *seen, records
-            )
+            blend = (*self._blend_inputs(background), *seen, records)
+            _launch_each(launch, "blend_backward", threads, BLEND_BLOCK, *blend)
             slots = (self.lists.first_slot, self.lists.slot_count, records)
             inputs = (*parameters, self.cameras, n, v, radii, *slots)
             _launch_each(launch, f"project_backward_{sh.shape[1]}", n, PROJECT_BLOCK, *inputs, *grads)

@@ -99,9 +99,10 @@ SPLAT_FN Camera<Real> make_camera(const float* world_to_camera, const float* int
 // The real basis of cadam3d/core/sh.py (Y_lm with the Condon-Shortley phase, l = 0..3, m = -l..l).
 constexpr double SH_C0 = 0.28209479177387814, SH_C1 = 0.4886025119029199;
 SPLAT_TABLE double SH_C2[5] = {1.0925484305920792, -1.0925484305920792, 0.31539156525252005,
-                             -1.0925484305920792, 0.5462742152960396};
-SPLAT_TABLE double SH_C3[7] = {-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
-                             -0.4570457994644658, 1.445305721320277, -0.5900435899266435};
+                               -1.0925484305920792, 0.5462742152960396};
+SPLAT_TABLE double SH_C3[7] = {-0.5900435899266435, 2.890611442640554,   -0.4570457994644658,
+                               0.3731763325901154,  -0.4570457994644658, 1.445305721320277,
+                               -0.5900435899266435};
 
 template <class Real>
 SPLAT_FN void sh_basis(int coefficients, const Real* unit, Real* basis) {
@@ -170,7 +171,8 @@ struct Shape {
   Real axes[3][3];      // columns: the own axes in the world, times their standard deviation
   Real rotation[3][3];  // columns: the own axes in the world
   Real unit_quat[4], inverse_length;
-  Real opacity, log_cut;  // log_cut = ln(opacity / alpha_min): the falloff exponent at which it fades out
+  Real opacity, transparency;  // transparency = 1 - opacity, without its cancellation
+  Real log_cut;                // ln(opacity / alpha_min): the falloff exponent at which it fades out
 };
 
 // What one view adds: everything the chain rule needs again.
@@ -196,8 +198,10 @@ SPLAT_FN bool make_shape(const Gaussian<Real>& gaussian, Shape<Real>& shape) {
   for (int i = 0; i < 4; ++i) squared += gaussian.quat[i] * gaussian.quat[i];
   if (!(poison == 0) || !(squared >= Real(TINY_QUATERNION)) || !is_finite(squared)) return false;
 
-  shape.opacity = 1 / (1 + power_e(-gaussian.opacity_logit));
+  const Real odds_against = power_e(-gaussian.opacity_logit);
+  shape.opacity = 1 / (1 + odds_against);
   if (!(shape.opacity > Real(SPLAT_ALPHA_MIN))) return false;
+  shape.transparency = odds_against * shape.opacity;
   shape.log_cut = log_e(shape.opacity / Real(SPLAT_ALPHA_MIN));
 
   shape.inverse_length = 1 / root(squared);
@@ -321,7 +325,7 @@ template <class Real>
 SPLAT_FN void project_backward(const Gaussian<Real>& gaussian, const Shape<Real>& shape,
                                const Camera<Real>& camera, const Footprint<Real>& f,
                                const Moments<Real>& moments, Gradient<Real>& total) {
-  total.opacity_logit -= moments.g * (1 - shape.opacity);  // alpha = opacity exp(-|y|^2)
+  total.opacity_logit -= moments.g * shape.transparency;  // alpha = opacity exp(-|y|^2)
 
   Real centre[3] = {0, 0, moments.depth}, axes[3][3];
   Real rows[2][3];

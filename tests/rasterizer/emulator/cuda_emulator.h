@@ -152,13 +152,12 @@ inline void run_block(int threads) {
 extern "C" char __start_emulated_shared[], __stop_emulated_shared[];
 
 template <class... Parameters, size_t... I>
-void run_grid(void (*kernel)(Parameters...), unsigned blocks, int threads, uint64_t seed, const uint64_t* raw,
+void run_grid(void (*kernel)(Parameters...), unsigned blocks, int threads, uint64_t seed, void** raw,
               std::index_sequence<I...>) {
   static_assert(((sizeof(Parameters) == 8) && ...), "a launch is a list of eight-byte numbers");
   auto call = [&] {
-    const auto as = [](auto* to, uint64_t from) { std::memcpy(to, &from, 8); };
     std::tuple<Parameters...> parameters;
-    (as(&std::get<I>(parameters), raw[I]), ...);
+    (std::memcpy(&std::get<I>(parameters), raw[I], 8), ...);
     kernel(std::get<I>(parameters)...);
   };
   machine.body = [](void* f) { (*static_cast<decltype(call)*>(f))(); };
@@ -179,7 +178,7 @@ void run_grid(void (*kernel)(Parameters...), unsigned blocks, int threads, uint6
 }
 
 template <class... Parameters>
-void launch(void (*kernel)(Parameters...), unsigned blocks, int threads, uint64_t seed, const uint64_t* raw) {
+void launch(void (*kernel)(Parameters...), unsigned blocks, int threads, uint64_t seed, void** raw) {
   run_grid(kernel, blocks, threads, seed, raw, std::index_sequence_for<Parameters...>());
 }
 

@@ -1,46 +1,92 @@
-// Every kernel of the CUDA rasterizer by name, behind a C interface.
+// The CUDA driver, as far as the rasterizer calls it, over the emulator: same functions, same arguments. A
+// module is every kernel below, and the handle of a stream is the seed of the schedule; 0 keeps to the order.
 #include "cuda_emulator.h"
-//
+// The emulator first: it says what __global__ and the like mean to the kernels.
 #include "cuda.cu"
 
-#define TRY(kernel) \
-  if (wanted == #kernel) return emulator::launch(kernel, blocks, threads, seed, arguments)
+typedef void (*Launcher)(unsigned blocks, int threads, uint64_t seed, void** arguments);
 
-static void find_and_launch(const std::string& wanted, unsigned blocks, int threads, uint64_t seed,
-                            const uint64_t* arguments) {
-  TRY(prepare_cameras);
-  TRY(project_forward_1);
-  TRY(project_forward_4);
-  TRY(project_forward_9);
-  TRY(project_forward_16);
-  TRY(project_backward_1);
-  TRY(project_backward_4);
-  TRY(project_backward_9);
-  TRY(project_backward_16);
-  TRY(centre_backward);
-  TRY(scan_short);
-  TRY(scan_reduce);
-  TRY(scan_sums);
-  TRY(scan_apply);
-  TRY(sort_count);
-  TRY(sort_scatter);
-  TRY(tile_count);
-  TRY(tile_list);
-  TRY(tile_ranges);
-  TRY(blend_forward);
-  TRY(blend_backward);
-  throw emulator::Failure("no kernel called " + wanted);
+template <auto kernel>
+static void launch(unsigned blocks, int threads, uint64_t seed, void** arguments) {
+  emulator::launch(kernel, blocks, threads, seed, arguments);
 }
 
-// Null, or what went wrong. Seed 0 keeps threads and blocks in order.
-extern "C" const char* emulate(const char* kernel, int64_t blocks, int64_t threads, uint64_t seed,
-                               const uint64_t* arguments) {
-  static std::string trouble;
+#define ENTRY(kernel) {#kernel, launch<kernel>}
+static const struct {
+  const char* name;
+  Launcher launcher;
+} KERNELS[] = {
+    ENTRY(prepare_cameras),
+    ENTRY(project_forward_1),
+    ENTRY(project_forward_4),
+    ENTRY(project_forward_9),
+    ENTRY(project_forward_16),
+    ENTRY(project_backward_1),
+    ENTRY(project_backward_4),
+    ENTRY(project_backward_9),
+    ENTRY(project_backward_16),
+    ENTRY(centre_backward),
+    ENTRY(scan_short),
+    ENTRY(scan_reduce),
+    ENTRY(scan_sums),
+    ENTRY(scan_apply),
+    ENTRY(sort_count),
+    ENTRY(sort_scatter),
+    ENTRY(tile_count),
+    ENTRY(tile_list),
+    ENTRY(tile_ranges),
+    ENTRY(blend_forward),
+    ENTRY(blend_backward),
+};
+
+enum Status : int { OK = 0, NOT_FOUND = 500, LAUNCH_FAILED = 719 };
+static std::string trouble = "no such kernel";
+static int contexts = 0;  // pushed and not popped
+
+extern "C" {
+
+int cuInit(unsigned) { return OK; }
+int cuDeviceGet(int* device, int ordinal) {
+  *device = ordinal;
+  return OK;
+}
+int cuDevicePrimaryCtxRetain(void** context, int) {
+  *context = &contexts;
+  return OK;
+}
+int cuCtxPushCurrent_v2(void* context) {
+  if (context == &contexts) ++contexts;
+  return OK;
+}
+int cuCtxPopCurrent_v2(void**) {
+  --contexts;
+  return OK;
+}
+int cuModuleLoadData(void** module, const void*) {
+  *module = &trouble;
+  return contexts > 0 ? OK : LAUNCH_FAILED;
+}
+int cuModuleGetFunction(Launcher* function, void*, const char* name) {
+  for (const auto& each : KERNELS) {
+    if (std::strcmp(each.name, name) != 0) continue;
+    *function = each.launcher;
+    return OK;
+  }
+  return NOT_FOUND;
+}
+int cuLaunchKernel(Launcher function, unsigned blocks, unsigned, unsigned, unsigned threads, unsigned, unsigned,
+                   unsigned, uint64_t stream, void** arguments, void**) {
   try {
-    find_and_launch(kernel, unsigned(blocks), int(threads), seed, arguments);
-    return nullptr;
+    if (contexts < 1 || blocks == 0) throw emulator::Failure("no context, or no block");
+    function(blocks, int(threads), stream, arguments);
+    return OK;
   } catch (const std::exception& error) {
     trouble = error.what();
-    return trouble.c_str();
+    return LAUNCH_FAILED;
   }
+}
+int cuGetErrorString(int, const char** message) {
+  *message = trouble.c_str();
+  return OK;
+}
 }
