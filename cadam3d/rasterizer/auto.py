@@ -13,6 +13,7 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
+from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cpu import CpuRasterizer, load_kernels
 from cadam3d.rasterizer.reference import ReferenceRasterizer
@@ -42,7 +43,20 @@ def has_native_kernels(device: torch.device) -> bool:
     return True
 
 
+def has_cuda_kernels(device: torch.device) -> bool:
+    """Whether the CUDA rasterizer serves ``device``: its kernels are compiled and loaded now, to be sure.
+
+    Where that fails on a CUDA device, one warning says why; the reference then takes its place.
+    """
+    try:
+        return cuda.works_on(device)
+    except UserError as error:
+        warnings.warn(f"Rendering with the slow reference rasterizer, for {error}", stacklevel=2)
+        return False
+
+
 CANDIDATES = (  # fastest first; the last one works everywhere
+    Candidate("cuda", has_cuda_kernels, partial(cuda.CudaRasterizer, cache_dir=None)),
     Candidate("cpu", has_native_kernels, partial(CpuRasterizer, cache_dir=None)),
     Candidate("reference", lambda device: True, ReferenceRasterizer),
 )

@@ -11,7 +11,7 @@ import hashlib
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
@@ -144,8 +144,13 @@ def build(cache_dir: Path, capability: tuple[int, int]) -> Cubin:
     return Cubin(final, time.perf_counter() - start)
 
 
-def compile_kernels(compiler: Compiler, architecture: int) -> bytes:
-    """A cubin of every kernel for ``sm_<architecture>``. Raises :class:`UserError` with the log."""
+def compile_kernels(
+    compiler: Compiler, architecture: int, show: Callable[[str], object] | None = None
+) -> bytes:
+    """A cubin of every kernel for ``sm_<architecture>``; ``show`` gets what the compiler said.
+
+    Raises :class:`UserError`, which quotes it, if that was an error.
+    """
     library, program = compiler.library, ctypes.c_void_p()
     headers = [(KERNELS / name).read_bytes() for name in HEADERS]
     strings = ctypes.c_char_p * len(HEADERS)
@@ -164,9 +169,10 @@ def compile_kernels(compiler: Compiler, architecture: int) -> bytes:
         options = [*OPTIONS, *_definitions(), f"--gpu-architecture=sm_{architecture}"]
         array = (ctypes.c_char_p * len(options))(*(option.encode() for option in options))
         status = library.nvrtcCompileProgram(program, len(options), array)
-        if status != 0:
-            log = _fetch(compiler, "nvrtcGetProgramLog", program).rstrip(b"\0").decode(errors="replace")
-            _check(library, status, log[-2000:])
+        log = _fetch(compiler, "nvrtcGetProgramLog", program).rstrip(b"\0").decode(errors="replace")
+        _check(library, status, log[-2000:])
+        if show:
+            show(log)
         return _fetch(compiler, "nvrtcGetCUBIN", program)
     finally:
         library.nvrtcDestroyProgram(ctypes.byref(program))

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from cadam3d.core.cameras import turntable
+from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.rasterizer import auto
 from cadam3d.rasterizer.auto import AutoRasterizer, Candidate
@@ -98,3 +99,18 @@ def test_what_auto_shows_is_what_its_choice_shows():
     want = candidate.build().render(a_ball(), cameras, background)
     assert torch.equal(got.rgb, want.rgb)
     assert torch.equal(got.depth, want.depth)
+
+
+def test_a_cuda_device_that_cannot_be_served_gets_the_reference_and_a_warning(monkeypatch):
+    def fail(device: torch.device) -> bool:
+        raise UserError("rasterizer=cuda found no NVRTC")
+
+    monkeypatch.setattr(auto.cuda, "works_on", fail)
+    with pytest.warns(UserWarning, match="slow reference rasterizer, for rasterizer=cuda found no NVRTC"):
+        assert AutoRasterizer().chosen(torch.device("cuda")) == "reference"
+
+
+def test_a_cuda_device_that_works_gets_the_cuda_kernels(monkeypatch):
+    monkeypatch.setattr(auto.cuda, "works_on", lambda device: device.type == "cuda")
+    assert AutoRasterizer().chosen(torch.device("cuda")) == "cuda"
+    assert AutoRasterizer().chosen(CPU) != "cuda"

@@ -86,8 +86,8 @@ blend_forward(const float4* splats, const u32* slots, const u32* pair_of_slot, c
 
   const i64 begin = ranges[2 * tile], end = ranges[2 * tile + 1];
   for (i64 base = begin; base < end; base += WARP) {
-    // Also keeps the stage from being filled before every lane has left the last one.
     if (!__any_sync(ALL, pixels[0].is_open || pixels[1].is_open)) break;
+    __syncwarp();  // every lane has left the last stage: a vote alone does not order memory
     if (base + lane < end) {
       const float4* from = splats + 3 * i64(pair_of_slot[slots[base + lane]]);
       for (int part = 0; part < 3; ++part) stage[part][lane] = from[part];

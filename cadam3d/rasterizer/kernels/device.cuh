@@ -1,7 +1,7 @@
 // What every CUDA kernel here shares: short names, sizes, and who a thread is.
 //
-// No header of the toolkit is included: a run-time compiler has none. Every kernel parameter is eight bytes, a
-// pointer or an i64, so that a launch is a list of numbers (see ``Launcher`` in ../cuda.py). Grids have one
+// No header of the toolkit is included: a run-time compiler has none. Every kernel parameter is eight bytes,
+// a pointer or an i64, so that a launch is a list of numbers (see ``Launcher`` in ../cuda.py). Grids have one
 // dimension. No kernel adds floats atomically, so every bit of every result follows from the input.
 #pragma once
 

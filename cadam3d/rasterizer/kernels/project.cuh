@@ -12,13 +12,17 @@ prepare_cameras(const float* world_to_camera, const float* intrinsics, i64 views
                 Camera* cameras) {
   const i64 v = thread_index();
   if (v >= views) return;
-  cameras[v] = splat::make_camera<float>(world_to_camera + 16 * v, intrinsics + 9 * v, int(width), int(height));
+  cameras[v] =
+      splat::make_camera<float>(world_to_camera + 16 * v, intrinsics + 9 * v, int(width), int(height));
 }
 
 template <int COEFFICIENTS>
-SPLAT_FN splat::Gaussian<float> load_gaussian(const float* means, const float* log_scales, const float* quats,
+using Gaussian = splat::Gaussian<float, splat::Fixed<COEFFICIENTS>>;
+
+template <int COEFFICIENTS>
+SPLAT_FN Gaussian<COEFFICIENTS> load_gaussian(const float* means, const float* log_scales, const float* quats,
                                               const float* opacity_logits, const float* sh, i64 i) {
-  splat::Gaussian<float> gaussian;
+  Gaussian<COEFFICIENTS> gaussian;
   for (int j = 0; j < 3; ++j) {
     gaussian.mean[j] = means[3 * i + j];
     gaussian.log_scale[j] = log_scales[3 * i + j];
@@ -26,7 +30,6 @@ SPLAT_FN splat::Gaussian<float> load_gaussian(const float* means, const float* l
   for (int j = 0; j < 4; ++j) gaussian.quat[j] = quats[4 * i + j];
   gaussian.opacity_logit = opacity_logits[i];
   gaussian.sh = sh + 3 * COEFFICIENTS * i;
-  gaussian.coefficients = COEFFICIENTS;  // known when compiling: loops over them unroll into registers
   return gaussian;
 }
 
@@ -37,7 +40,7 @@ SPLAT_FN void project_gaussian(const float* means, const float* log_scales, cons
                                i64 views, float4* splats, float* means2d, float* radii, u32* depth_keys) {
   const i64 i = thread_index();
   if (i >= n) return;
-  const splat::Gaussian<float> gaussian =
+  const Gaussian<COEFFICIENTS> gaussian =
       load_gaussian<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, i);
   splat::Shape<float> shape;
   const bool is_sound = splat::make_shape(gaussian, shape);
@@ -74,7 +77,8 @@ SPLAT_FN void sum_records(const float* records, i64 first, i64 count, float* sum
   while (waiting) {
     const int owner = __ffs(int(waiting)) - 1;
     waiting &= waiting - 1;
-    const i64 from = i64(__shfl_sync(ALL, u64(first), owner)), many = i64(__shfl_sync(ALL, u64(count), owner));
+    const i64 from = i64(__shfl_sync(ALL, u64(first), owner)),
+              many = i64(__shfl_sync(ALL, u64(count), owner));
     float part[RECORD] = {};
     for (i64 slot = from + lane; slot < from + many; slot += WARP)
 #pragma unroll
@@ -100,14 +104,13 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
   const bool is_mine = i < n;  // the others stay to help with long runs
   bool is_seen = false;
   for (i64 v = 0; v < views && is_mine; ++v) is_seen = is_seen || radii[v * n + i] > 0;
-  splat::Gaussian<float> gaussian;
+  // Who is not seen loads somebody else's numbers and does not use them: no branch, no doubt about the loops.
+  const Gaussian<COEFFICIENTS> gaussian =
+      load_gaussian<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, is_mine ? i : 0);
   splat::Shape<float> shape;
+  if (is_seen) splat::make_shape(gaussian, shape);
   splat::Gradient<float> total;
   splat::clear(total, COEFFICIENTS);
-  if (is_seen) {
-    gaussian = load_gaussian<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, i);
-    splat::make_shape(gaussian, shape);
-  }
   for (i64 v = 0; v < views; ++v) {
     const i64 pair = v * n + i;
     const bool is_visible = is_mine && radii[pair] > 0;
@@ -133,6 +136,7 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
   }
   for (int j = 0; j < 4; ++j) grad_quats[4 * i + j] = quat[j];
   grad_opacity_logits[i] = total.opacity_logit;
+#pragma unroll
   for (int j = 0; j < 3 * COEFFICIENTS; ++j) grad_sh[3 * COEFFICIENTS * i + j] = total.sh[j];
 }
 
@@ -155,23 +159,23 @@ centre_backward(const float* means, const Camera* cameras, i64 n, i64 views, con
 
 constexpr int PROJECT_BLOCK = 128;  // threads: fewer, for each needs many registers; mirrored in ../cuda.py
 
-#define KERNELS_FOR(COEFFICIENTS)                                                                             \
-  KERNEL(PROJECT_BLOCK)                                                                                       \
-  project_forward_##COEFFICIENTS(const float* means, const float* log_scales, const float* quats,             \
-                                 const float* opacity_logits, const float* sh, const Camera* cameras, i64 n,  \
-                                 i64 views, float4* splats, float* means2d, float* radii, u32* depth_keys) {  \
-    project_gaussian<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, cameras, n, views, splats,   \
-                                   means2d, radii, depth_keys);                                               \
-  }                                                                                                           \
-  KERNEL(PROJECT_BLOCK)                                                                                       \
-  project_backward_##COEFFICIENTS(                                                                            \
-      const float* means, const float* log_scales, const float* quats, const float* opacity_logits,           \
-      const float* sh, const Camera* cameras, i64 n, i64 views, const float* radii, const u32* first_slot,    \
-      const u32* slot_count, const float* records, float* grad_means2d, float* grad_means,                    \
-      float* grad_log_scales, float* grad_quats, float* grad_opacity_logits, float* grad_sh) {                \
-    gaussian_backward<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, cameras, n, views, radii,   \
-                                    first_slot, slot_count, records, grad_means2d, grad_means,                \
-                                    grad_log_scales, grad_quats, grad_opacity_logits, grad_sh);               \
+#define KERNELS_FOR(COEFFICIENTS)                                                                            \
+  KERNEL(PROJECT_BLOCK)                                                                                      \
+  project_forward_##COEFFICIENTS(const float* means, const float* log_scales, const float* quats,            \
+                                 const float* opacity_logits, const float* sh, const Camera* cameras, i64 n, \
+                                 i64 views, float4* splats, float* means2d, float* radii, u32* depth_keys) { \
+    project_gaussian<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, cameras, n, views, splats,  \
+                                   means2d, radii, depth_keys);                                              \
+  }                                                                                                          \
+  KERNEL(PROJECT_BLOCK)                                                                                      \
+  project_backward_##COEFFICIENTS(                                                                           \
+      const float* means, const float* log_scales, const float* quats, const float* opacity_logits,          \
+      const float* sh, const Camera* cameras, i64 n, i64 views, const float* radii, const u32* first_slot,   \
+      const u32* slot_count, const float* records, float* grad_means2d, float* grad_means,                   \
+      float* grad_log_scales, float* grad_quats, float* grad_opacity_logits, float* grad_sh) {               \
+    gaussian_backward<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, cameras, n, views, radii,  \
+                                    first_slot, slot_count, records, grad_means2d, grad_means,               \
+                                    grad_log_scales, grad_quats, grad_opacity_logits, grad_sh);              \
   }
 
 KERNELS_FOR(1)

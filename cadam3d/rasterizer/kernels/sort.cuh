@@ -7,13 +7,13 @@
 
 #include "device.cuh"
 
-constexpr int SCAN_ITEMS = 8;                     // consecutive items of one thread
-constexpr int SCAN_CHUNK = BLOCK * SCAN_ITEMS;    // of one block; mirrored in ../cuda.py
-constexpr int RADIX_BITS = 8;                     // mirrored in ../cuda.py
-constexpr int BINS = 1 << RADIX_BITS;             // one thread of a block per bin
-constexpr int WARPS = BLOCK / WARP;               // of a block
-constexpr int SORT_ROUNDS = 16;                   // items of one thread
-constexpr int SORT_CHUNK = BLOCK * SORT_ROUNDS;   // of one block; mirrored in ../cuda.py
+constexpr int SCAN_ITEMS = 8;                    // consecutive items of one thread
+constexpr int SCAN_CHUNK = BLOCK * SCAN_ITEMS;   // of one block; mirrored in ../cuda.py
+constexpr int RADIX_BITS = 8;                    // mirrored in ../cuda.py
+constexpr int BINS = 1 << RADIX_BITS;            // one thread of a block per bin
+constexpr int WARPS = BLOCK / WARP;              // of a block
+constexpr int SORT_ROUNDS = 16;                  // items of one thread
+constexpr int SORT_CHUNK = BLOCK * SORT_ROUNDS;  // of one block; mirrored in ../cuda.py
 static_assert(BINS == BLOCK, "a thread per bin");
 
 // The sum over the threads before this one; ``total`` is the sum over all of the block. ``sums`` is shared
@@ -38,18 +38,15 @@ SPLAT_FN u64 block_scan(u64 value, u64* sums, u64* total) {
 // Exclusive prefix sums of one chunk, all of them raised by ``carry``; returns the sum of the chunk.
 template <class In, class Out>
 SPLAT_FN u64 scan_chunk(const In* in, i64 begin, i64 n, u64 carry, Out* out, u64* sums) {
-  In items[SCAN_ITEMS];
   const i64 first = begin + i64(threadIdx.x) * SCAN_ITEMS;
-  u64 sum = 0;
-  for (int i = 0; i < SCAN_ITEMS; ++i) {
-    items[i] = first + i < n ? in[first + i] : 0;
-    sum += items[i];
-  }
-  u64 total;
+  const i64 end = first + SCAN_ITEMS < n ? first + SCAN_ITEMS : n;
+  u64 sum = 0, total;
+  for (i64 i = first; i < end; ++i) sum += in[i];
   u64 before = carry + block_scan(sum, sums, &total);
-  for (int i = 0; i < SCAN_ITEMS; ++i) {
-    if (first + i < n) out[first + i] = Out(before);
-    before += items[i];
+  for (i64 i = first; i < end; ++i) {
+    const In item = in[i];  // first, for ``out`` may be ``in``
+    out[i] = Out(before);
+    before += item;
   }
   return total;
 }

@@ -157,12 +157,18 @@ SPLAT_FN void sh_basis_backward(int coefficients, const Real* unit, const Real* 
 
 // ---------------------------------------------------------------------------------------------- one Gaussian
 
-// The raw parameters of one Gaussian, as the optimizer holds them.
-template <class Real>
+// A number known when compiling: loops of so many turns unroll, and what they walk over stays in registers.
+template <int N>
+struct Fixed {
+  SPLAT_FN constexpr operator int() const { return N; }
+};
+
+// The raw parameters of one Gaussian, as the optimizer holds them. Count is int, or Fixed.
+template <class Real, class Count = int>
 struct Gaussian {
   Real mean[3], log_scale[3], quat[4], opacity_logit;
   const float* sh;  // coefficients x 3
-  int coefficients;
+  Count coefficients;
 };
 
 // What does not depend on the view: computed once for a batch.
@@ -188,8 +194,8 @@ struct Footprint {
   Real reach[2];  // half-sizes of the box outside which alpha < alpha_min
 };
 
-template <class Real>
-SPLAT_FN bool make_shape(const Gaussian<Real>& gaussian, Shape<Real>& shape) {
+template <class Real, class Count>
+SPLAT_FN bool make_shape(const Gaussian<Real, Count>& gaussian, Shape<Real>& shape) {
   Real poison = gaussian.opacity_logit - gaussian.opacity_logit;  // 0, or NaN if anything is not finite
   for (int i = 0; i < 3; ++i)
     poison += (gaussian.mean[i] - gaussian.mean[i]) + (gaussian.log_scale[i] - gaussian.log_scale[i]);
@@ -219,9 +225,9 @@ SPLAT_FN bool make_shape(const Gaussian<Real>& gaussian, Shape<Real>& shape) {
 }
 
 // False if the view does not see it. Comparisons are written so that a NaN culls.
-template <class Real>
-SPLAT_FN bool project(const Gaussian<Real>& gaussian, const Shape<Real>& shape, const Camera<Real>& camera,
-                      Footprint<Real>& out) {
+template <class Real, class Count>
+SPLAT_FN bool project(const Gaussian<Real, Count>& gaussian, const Shape<Real>& shape,
+                      const Camera<Real>& camera, Footprint<Real>& out) {
   for (int i = 0; i < 3; ++i) out.centre[i] = dot3(camera.rotation[i], gaussian.mean) + camera.translation[i];
   const Real z = out.centre[2];
   if (!(z > Real(SPLAT_NEAR) && z < Real(DEPTH_MAX))) return false;
@@ -263,8 +269,8 @@ SPLAT_FN bool project(const Gaussian<Real>& gaussian, const Shape<Real>& shape, 
 }
 
 // Unit vector from camera to Gaussian; returns one over their distance.
-template <class Real>
-SPLAT_FN Real direction(const Gaussian<Real>& gaussian, const Camera<Real>& camera, Real* unit) {
+template <class Real, class Count>
+SPLAT_FN Real direction(const Gaussian<Real, Count>& gaussian, const Camera<Real>& camera, Real* unit) {
   for (int i = 0; i < 3; ++i) unit[i] = gaussian.mean[i] - camera.position[i];
   const Real inverse = 1 / root(dot3(unit, unit));
   for (int i = 0; i < 3; ++i) unit[i] *= inverse;
@@ -272,8 +278,8 @@ SPLAT_FN Real direction(const Gaussian<Real>& gaussian, const Camera<Real>& came
 }
 
 // The colour before it is clamped at 0 from below.
-template <class Real>
-SPLAT_FN void raw_colour(const Gaussian<Real>& gaussian, const Real* basis, Real* rgb) {
+template <class Real, class Count>
+SPLAT_FN void raw_colour(const Gaussian<Real, Count>& gaussian, const Real* basis, Real* rgb) {
   for (int c = 0; c < 3; ++c) {
     Real sum = Real(0.5);
     for (int k = 0; k < gaussian.coefficients; ++k) sum += basis[k] * Real(gaussian.sh[3 * k + c]);
@@ -281,8 +287,8 @@ SPLAT_FN void raw_colour(const Gaussian<Real>& gaussian, const Real* basis, Real
   }
 }
 
-template <class Real>
-SPLAT_FN void colour(const Gaussian<Real>& gaussian, const Camera<Real>& camera, Real* rgb) {
+template <class Real, class Count>
+SPLAT_FN void colour(const Gaussian<Real, Count>& gaussian, const Camera<Real>& camera, Real* rgb) {
   Real unit[3] = {0, 0, 1}, basis[MAX_COEFFICIENTS];
   if (gaussian.coefficients > 1) direction(gaussian, camera, unit);
   sh_basis(gaussian.coefficients, unit, basis);
@@ -321,8 +327,8 @@ SPLAT_FN void mean2d_gradient(const Footprint<Real>& footprint, const Moments<Re
 }
 
 // Adds one view to ``total``; the path through mean2d is left out, see centre_backward.
-template <class Real>
-SPLAT_FN void project_backward(const Gaussian<Real>& gaussian, const Shape<Real>& shape,
+template <class Real, class Count>
+SPLAT_FN void project_backward(const Gaussian<Real, Count>& gaussian, const Shape<Real>& shape,
                                const Camera<Real>& camera, const Footprint<Real>& f,
                                const Moments<Real>& moments, Gradient<Real>& total) {
   total.opacity_logit -= moments.g * shape.transparency;  // alpha = opacity exp(-|y|^2)
@@ -391,8 +397,8 @@ SPLAT_FN void centre_backward(const Camera<Real>& camera, const Real* mean, cons
 }
 
 // From the axes, summed over the views, to log-scales and the raw quaternion.
-template <class Real>
-SPLAT_FN void shape_backward(const Shape<Real>& shape, const Gaussian<Real>& gaussian,
+template <class Real, class Count>
+SPLAT_FN void shape_backward(const Shape<Real>& shape, const Gaussian<Real, Count>& gaussian,
                              const Gradient<Real>& total, Real* log_scale, Real* quat) {
   Real g[3][3];
   for (int j = 0; j < 3; ++j) {

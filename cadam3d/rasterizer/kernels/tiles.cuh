@@ -32,9 +32,9 @@ SPLAT_FN void each_tile_row(const Splat& s, const Grid& grid, const Visit& visit
   const float reach_x = s.reach_x, reach_y = sqrtf(s.cut) / s.l22;
   const Range rows = pixels_between(s.y - reach_y, s.y + reach_y, grid.height);
   if (rows.last < rows.first) return;
-  const float slope = -s.l12 / s.l11;                        // the middle of the row at height d: slope * d
+  const float slope = -s.l12 / s.l11;  // the middle of the row at height d: slope * d
   const float extreme = slope * reach_y * (reach_y / reach_x);  // height of the rightmost point
-  const float cut = s.cut * (1 + 1e-5f) + 1e-6f;             // the tips are where rounding would cost most
+  const float cut = s.cut * (1 + 1e-5f) + 1e-6f;                // the tips are where rounding would cost most
   for (int row = rows.first / TILE; row <= rows.last / TILE; ++row) {
     const int top = row * TILE > rows.first ? row * TILE : rows.first;
     const int bottom = row * TILE + TILE - 1 < rows.last ? row * TILE + TILE - 1 : rows.last;
@@ -64,7 +64,8 @@ tile_count(const u32* depth_keys, const u32* order, i64 pairs, const float4* spl
   counts[k] = count;
 }
 
-// Fills the slots [slot, end) of one pair; lane ``first_lane`` of ``lanes`` takes every lanes-th tile of a row.
+// Fills the slots [slot, end) of one pair; lane ``first_lane`` of ``lanes`` takes every lanes-th tile of a
+// row.
 SPLAT_FN void fill_slots(const Splat& s, const Grid& grid, u32 pair, u32 first_key, u32 sentinel, u32 slot,
                          u32 end, int first_lane, int lanes, u32* tile_keys, u32* pair_of_slot) {
   const auto write = [&](u32 at, u32 key) {
