@@ -17,7 +17,7 @@ from cadam3d.rasterizer.base import ALPHA_MAX, ALPHA_MIN, BLUR, FRUSTUM_MARGIN, 
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
 IMAGES = ("rgb", "alpha", "depth")
-POISON = (math.nan, math.inf, -math.inf, 1e38, -1e38, 1e20, 100.0, 40.0, -100.0, 1e-45, 0.0)
+POISON = (math.nan, math.inf, -math.inf, 1e38, -1e38, 1e20, 100.0, 41.0, 40.0, -100.0, 1e-45, 0.0)
 
 
 def make_gaussians(n, *, seed=0, degree=0, spread=0.6, log_scale=-2.0, opacity=0.0) -> Gaussians:
@@ -96,7 +96,7 @@ def make_weights(v, height, width, seed=3):
 
 
 def render_and_differentiate(
-    render, gaussians, cameras, background, weights, *, dtype=torch.float32, device="cpu"
+    render, gaussians, cameras, background, weights, dtype=torch.float32, device="cpu"
 ):
     """The output, and the gradient of ``sum(weights * images)`` in every tensor and means2d, on the CPU."""
     leaves = gaussians.map(lambda tensor: tensor.detach().to(device, dtype, copy=True).requires_grad_())

@@ -15,6 +15,7 @@ from cadam3d.rasterizer.cuda import Launch, Launcher
 from cadam3d.rasterizer.nvrtc import build
 
 LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+OUT_OF_MEMORY = 2  # CUDA_ERROR_OUT_OF_MEMORY
 
 
 class Driver(Launcher):
@@ -93,6 +94,8 @@ class Module:
             message = ctypes.c_char_p()
             self._driver.cuGetErrorString(status, ctypes.byref(message))
             reason = (message.value or b"error").decode()
+            if status == OUT_OF_MEMORY:
+                raise MemoryError(f"rasterizer=cuda: {name}: {reason}")
             raise UserError(f"rasterizer=cuda: {name}: {reason} ({status}). Try: rasterizer=reference")
 
 

@@ -32,6 +32,7 @@ OPTIONS = (
 PATTERN = "*nvrtc64_*.dll" if sys.platform == "win32" else "libnvrtc.so*"
 BUILTINS = "*nvrtc-builtins*.dll" if sys.platform == "win32" else "libnvrtc-builtins.so*"
 SYSTEM = ("libnvrtc.so", "libnvrtc.so.13", "libnvrtc.so.12")
+EMBEDDED = (72, 87, 101)  # of boards; no other device runs their code
 INSTALL = "It comes with torch built for CUDA; try: pip install nvidia-cuda-nvrtc"
 
 
@@ -104,7 +105,12 @@ def _load(path: str) -> Compiler:
 def choose_architecture(capability: tuple[int, int], compiler: Compiler) -> int:
     """The newest architecture that the compiler knows and a device of this compute capability runs."""
     major, minor = capability
-    fitting = [a for a in compiler.architectures if a // 10 == major and a % 10 <= minor]
+    device = 10 * major + minor
+    fitting = [
+        a
+        for a in compiler.architectures
+        if a // 10 == major and (a == device or (a < device and a not in EMBEDDED))
+    ]
     if not fitting:
         version = ".".join(map(str, compiler.version))
         raise UserError(

@@ -264,6 +264,7 @@ SPLAT_FN bool project(const Gaussian<Real, Count>& gaussian, const Shape<Real>& 
 
   out.reach[0] = root(2 * shape.log_cut * out.cov_xx);
   out.reach[1] = root(2 * shape.log_cut * out.cov_yy);
+  if (!fits_float(out.reach[0]) || !fits_float(out.reach[1])) return false;
   return out.mean2d[0] + out.reach[0] > 0 && out.mean2d[0] - out.reach[0] < camera.width &&
          out.mean2d[1] + out.reach[1] > 0 && out.mean2d[1] - out.reach[1] < camera.height;
 }
