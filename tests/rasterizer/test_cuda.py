@@ -328,6 +328,28 @@ def test_refuses_what_would_make_kernels_read_foreign_memory(emulator):
         rasterize(emulator, torn, cameras, backgrounds(2))
 
 
+@pytest.mark.parametrize("most", [100, 500])  # fewer than pixels; fewer than (splat, tile) pairs
+def test_more_than_numbers_can_count_is_refused_before_it_is_allocated(emulator, monkeypatch, most):
+    monkeypatch.setattr(cuda, "MOST", most)
+    with pytest.raises(UserError, match=r"too many\. Try: fewer views"):
+        emulator.render(make_gaussians(200, log_scale=0.0), make_cameras(1, 20, 20), backgrounds(1))
+
+
+@pytest.mark.gpu
+def test_runs_on_the_stream_that_is_current():
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    rasterizer, scene = CudaRasterizer(cache_dir=None), (make_cameras(1, 64, 64), backgrounds(1).cuda())
+    gaussians = make_gaussians(1000).to("cuda")
+    want = rasterizer.render(gaussians, *scene).rgb
+    torch.cuda.synchronize()
+    with torch.cuda.stream(torch.cuda.Stream()):
+        torch.cuda._sleep(10**8)  # what another stream would overtake
+        got = rasterizer.render(gaussians.map(lambda tensor: tensor + 0), *scene).rgb
+    torch.cuda.synchronize()
+    assert torch.equal(got, want)
+
+
 def test_off_cuda_it_says_what_to_type():
     with pytest.raises(UserError, match="rasterizer=auto"):
         CudaRasterizer(cache_dir=None).render(make_gaussians(1), make_cameras(1, 9, 9), backgrounds(1))
