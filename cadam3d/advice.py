@@ -2,14 +2,14 @@
 
 import difflib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 from hydra.errors import CompactHydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from cadam3d.core.errors import UserError
-from cadam3d.settings import compose, config_dir, quote
+from cadam3d.settings import compose, config_dir, flatten, quote
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
 PASTE_PROMPT = 'prompt="a red and yellow checkered torus"'
@@ -32,9 +32,7 @@ def explain(error: Exception, config_name: str, overrides: Sequence[str]) -> Use
         text = str(error).strip() or str(error.__cause__ or "")
         if key := re.search(r"Could not override '([^']+)'", text):
             return _unknown_key(key.group(1), config_name, overrides)
-        if sweep := re.search(
-            r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)", text, re.M
-        ):
+        if sweep := re.search(SWEEP_COMPLAINT, text, re.M):
             return _several_values(sweep.group(1))
         cause = error.__cause__
         detail = f" ({str(cause).splitlines()[0]})" if isinstance(cause, OmegaConfBaseException) else ""
@@ -45,7 +43,7 @@ def explain(error: Exception, config_name: str, overrides: Sequence[str]) -> Use
 def missing_values(cfg: DictConfig) -> list[str]:
     """The dotted keys that still say ``???``, apart from Hydra's own."""
     raw = OmegaConf.to_container(cfg, resolve=False)
-    return [key for key, value in _flatten(raw) if value == "???" and not key.startswith("hydra.")]
+    return [key for key, value in flatten(raw) if value == "???" and not key.startswith("hydra.")]
 
 
 def ask_for(keys: Sequence[str], config_name: str) -> UserError:
@@ -91,7 +89,7 @@ def _known_keys(wrong: str, config_name: str, overrides: Sequence[str]) -> list[
             cfg = compose(attempt, config_name)
         except (CompactHydraException, OmegaConfBaseException):
             continue
-        keys = [key for key, _ in _flatten(OmegaConf.to_container(cfg, resolve=False), with_nodes=True)]
+        keys = [key for key, _ in flatten(OmegaConf.to_container(cfg, resolve=False), with_nodes=True)]
         return [key for key in keys if not key.rpartition(".")[2].startswith("_")]
     return []
 
@@ -106,14 +104,3 @@ def _several_values(override: str) -> UserError:
     return UserError(
         f"{key}: several values make a sweep. Try: cadam3d sweep {override} ... (a list is {key}=[{value}])"
     )
-
-
-def _flatten(node: object, prefix: str = "", *, with_nodes: bool = False) -> Iterator[tuple[str, object]]:
-    """Dotted keys and values of nested dicts; ``with_nodes`` yields the inner dicts as well."""
-    if not isinstance(node, dict):
-        yield prefix, node
-        return
-    if with_nodes and prefix:
-        yield prefix, node
-    for key, value in node.items():
-        yield from _flatten(value, f"{prefix}.{key}" if prefix else str(key), with_nodes=with_nodes)

@@ -25,6 +25,7 @@ TRAINING = ("train", "sweep")  # the commands that own a run folder
 OVERRIDES = ".hydra/overrides.yaml"  # in a run folder: what its line said
 TEXT_KEYS = ("prompt", "negative_prompt")  # always text, so quoted for the user
 PATH_KEYS = ("run", "ply", "output", "resume", "hydra.run.dir", "hydra.sweep.dir")  # quoted if need be
+RUN_MARKS = ("summary.json", "checkpoints")  # what a run folder holds, and an empty one does not
 PLAIN_PATH = re.compile(r"[\w./~+-]*", re.ASCII)
 QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
 SWEEP_CALL = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)", re.DOTALL)
@@ -171,6 +172,10 @@ def _run(
     key = "hydra.sweep.dir" if is_sweep else "hydra.run.dir"
     is_chosen = any(_key(line) == key for line in overrides)
     folder = _claim(Path(OmegaConf.select(cfg, key)), key, is_chosen=is_chosen)
+    if not is_sweep and cfg.resume is None and any((folder / name).exists() for name in RUN_MARKS):
+        raise UserError(
+            f"{key}: {folder} holds a run already. Try: cadam3d train resume={folder}, or another folder"
+        )
     arguments = [line for line in overrides if _key(line) != key] + [f"{key}={quote(str(folder))}"]
     if not is_sweep:
         return run_hydra(command, [*arguments, *flags])

@@ -12,7 +12,7 @@ from torch import Tensor
 from cadam3d.core.checks import UserError, require_range
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.schedule import Schedule, as_schedule
+from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 
 # What Adam sees: the five tensors, with the view-dependent colours apart because they learn more slowly.
 PARTS = ("means", "sh_dc", "sh_rest", "opacity", "scale", "quat")
@@ -35,9 +35,7 @@ class AdamSettings:
 
     def __post_init__(self) -> None:
         for part in PARTS:
-            rate = getattr(self, f"{part}_lr")
-            if not isinstance(rate, Schedule):
-                require_range(f"optimizer.{part}_lr", rate, low=0, example=0.005)
+            require_scheduled(f"optimizer.{part}_lr", getattr(self, f"{part}_lr"), low=0, example=0.005)
         require_range("optimizer.beta1", self.beta1, low=0, below=1, example=0.9)
         require_range("optimizer.beta2", self.beta2, low=0, below=1, example=0.999)
         require_range("optimizer.eps", self.eps, above=0, example=1e-15)

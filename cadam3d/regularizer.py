@@ -10,7 +10,7 @@ from torch import Tensor
 from cadam3d.core.checks import require_range
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
-from cadam3d.core.schedule import Schedule, as_schedule
+from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 
 CLEAR = 1e-5  # keeps logarithms finite where a pixel is wholly empty or wholly covered
 
@@ -30,8 +30,7 @@ class Weighted(Regularizer):
     weight: float | Schedule
 
     def __post_init__(self) -> None:
-        if not isinstance(self.weight, Schedule):
-            require_range("regularizer.*.weight", self.weight, low=0, example=1.0)
+        require_scheduled("regularizer.*.weight", self.weight, low=0, example=1.0)
 
     def __call__(self, gaussians: Gaussians, output: RenderOutput, step: int) -> Float[Tensor, ""]:
         """``weight(step)`` times :meth:`penalty`."""

@@ -2,7 +2,7 @@
 
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +78,17 @@ def components(group: DictConfig) -> dict[str, Any]:
 def load(path: Path) -> DictConfig:
     """The resolved ``config.yaml`` of a run: what looks like an interpolation there is somebody's text."""
     return DictConfig(_escaped(yaml.safe_load(path.read_text(encoding="utf-8"))))
+
+
+def flatten(node: object, prefix: str = "", *, with_nodes: bool = False) -> Iterator[tuple[str, object]]:
+    """Dotted keys and values of nested dicts; ``with_nodes`` yields the inner dicts as well."""
+    if not isinstance(node, dict):
+        yield prefix, node
+        return
+    if with_nodes and prefix:
+        yield prefix, node
+    for key, value in node.items():
+        yield from flatten(value, f"{prefix}.{key}" if prefix else str(key), with_nodes=with_nodes)
 
 
 def register_resolvers() -> None:

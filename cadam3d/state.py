@@ -32,6 +32,8 @@ class TrainState:
     seconds: float  # wall-clock time spent on them
     num_initial: int  # Gaussians at step 0
     skipped: int  # steps without an update, because a gradient was not finite
+    refused: bool  # the refinement of the last step would exceed max_gaussians; it waits for a larger one
+    seed: int  # what the generators descend from
     optimizer: GaussianOptimizer  # owns the Gaussians
     densifier: RowState
     generators: dict[str, torch.Generator]  # one per source of randomness, on the CPU
@@ -48,6 +50,8 @@ class TrainState:
             "seconds": self.seconds,
             "num_initial": self.num_initial,
             "skipped": self.skipped,
+            "refused": self.refused,
+            "seed": self.seed,
             "gaussians": self.gaussians.detach().tensors(),
             "optimizer": self.optimizer.state_dict(),
             "densifier": self.densifier.to_dict(),

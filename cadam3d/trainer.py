@@ -67,6 +67,8 @@ class Trainer:
             seconds=0.0,
             num_initial=len(gaussians),
             skipped=0,
+            refused=False,
+            seed=seed,
             optimizer=self.optimizer.start(gaussians),
             densifier=self.densifier.init_state(len(gaussians), device),
             generators=generators,
@@ -89,6 +91,13 @@ class Trainer:
             got=sorted(expected),
             example="resume without densifier=...",
         )
+        require(
+            all(len(rows) == len(gaussians) for rows in payload["densifier"].values()),
+            "resume",
+            wanted="a checkpoint whose densifier state has one row per Gaussian",
+            got=f"{len(gaussians)} Gaussians and another number of rows",
+            example="resume=RUN/checkpoints/<an earlier one>",
+        )
         generators = {name: torch.Generator() for name in GENERATORS}
         for name, generator in generators.items():
             generator.set_state(payload["generators"][name])
@@ -97,6 +106,8 @@ class Trainer:
             seconds=payload["seconds"],
             num_initial=payload["num_initial"],
             skipped=payload["skipped"],
+            refused=payload["refused"],
+            seed=payload["seed"],
             optimizer=optimizer,
             densifier=type(blank)(**{k: v.to(device) for k, v in payload["densifier"].items()}),
             generators=generators,
@@ -124,28 +135,50 @@ class Trainer:
     def _loop(
         self, state: TrainState, embedding: PromptEmbedding, context: RunContext, stop: Callable[[], bool]
     ) -> Outcome:
-        while state.step < self.steps:
-            started = time.perf_counter()
+        outcome = self._take_up(state, context)
+        while outcome is None and state.step < self.steps:
             try:
-                report = self._step(state, embedding)
-                refined, outcome = self._refine(state)
+                outcome = self._advance(state, embedding, context)
             except (torch.OutOfMemoryError, MemoryError):
                 return Outcome.OUT_OF_MEMORY
             except RuntimeError as error:
                 if "can't allocate memory" in str(error):  # what torch's CPU allocator says
                     return Outcome.OUT_OF_MEMORY
                 raise
-            state.step += 1
-            state.seconds += time.perf_counter() - started
-            for callback in self.callbacks:
-                if refined is not None:
-                    callback.on_refine(context, state, refined)
+            if outcome is None and state.step < self.steps and stop():
+                outcome = Outcome.INTERRUPTED
+        return outcome or Outcome.FINISHED
+
+    def _take_up(self, state: TrainState, context: RunContext) -> Outcome | None:
+        """Begin where a resumed run ended: a refused refinement comes first, perhaps under a larger cap."""
+        if state.refused:
+            refined, outcome = self._refine(state, state.step)
+            self._tell(context, state, refined, None)
+            return outcome
+        return Outcome.VANISHED if len(state.gaussians) == 0 else None
+
+    def _advance(self, state: TrainState, embedding: PromptEmbedding, context: RunContext) -> Outcome | None:
+        """One step with its refinement, and the callbacks' look at it."""
+        started = time.perf_counter()
+        report = self._step(state, embedding)
+        refined, outcome = self._refine(state, state.step + 1)
+        state.step += 1
+        state.seconds += time.perf_counter() - started
+        self._tell(context, state, refined, report)
+        return outcome
+
+    def _tell(
+        self,
+        context: RunContext,
+        state: TrainState,
+        refined: RefineReport | None,
+        report: StepReport | None,
+    ) -> None:
+        for callback in self.callbacks:
+            if refined is not None:
+                callback.on_refine(context, state, refined)
+            if report is not None:
                 callback.on_step(context, state, report)
-            if outcome is not None:
-                return outcome
-            if stop() and state.step < self.steps:
-                return Outcome.INTERRUPTED
-        return Outcome.FINISHED
 
     def _step(self, state: TrainState, embedding: PromptEmbedding) -> StepReport:
         """Render, judge, differentiate, observe and step."""
@@ -172,9 +205,8 @@ class Trainer:
             num_gaussians=len(gaussians),
         )
 
-    def _refine(self, state: TrainState) -> tuple[RefineReport | None, Outcome | None]:
+    def _refine(self, state: TrainState, step: int) -> tuple[RefineReport | None, Outcome | None]:
         """Grow, prune and reset where the schedule says so: a pure plan, then one edit for everybody."""
-        step = state.step + 1
         refines, resets = self.refine.refines_at(step), self.refine.resets_at(step)
         if not (refines or resets):
             return None, None
@@ -183,13 +215,17 @@ class Trainer:
         selected = cloned = split = pruned = reset = 0
         if refines:
             is_selected = self.densifier.select(state.densifier)
+            draws_before = state.generators["refine"].get_state()
             plan = self.refine.plan(state.gaussians, is_selected, step, state.generators["refine"])
-            if self.refine.exceeds(plan):
+            state.refused = self.refine.exceeds(plan)
+            if state.refused:
+                state.generators["refine"].set_state(draws_before)
                 report = RefineReport(step, before, before, plan.selected, 0, 0, 0, 0, statistics)
                 return report, Outcome.MAX_GAUSSIANS
             selected, cloned, split, pruned = plan.selected, plan.cloned, plan.split, plan.pruned
+            carried = self.densifier.carry(state.densifier, plan.edit)
             state.optimizer.apply(plan.edit)
-            state.densifier = self.densifier.carry(state.densifier, plan.edit)
+            state.densifier = carried  # only now: memory may run out above, and owners must agree even then
         if resets:
             unreliable = self.densifier.unreliable(state.densifier)
             reset = state.optimizer.reset_opacity(unreliable, self.refine.reset_value)

@@ -137,6 +137,100 @@ def test_core_knows_tensors_and_the_standard_library_only():
     assert not guilty
 
 
+# Draw from the generator of the process unless they are given another; the in-place ones are methods.
+DRAWS = {"rand", "randn", "randint", "randperm", "multinomial", "normal", "bernoulli", "poisson"}
+DRAWS |= {"rand_like", "randn_like", "randint_like"}
+DRAWS_IN_PLACE = {"bernoulli_", "cauchy_", "exponential_", "geometric_", "log_normal_", "normal_", "random_"}
+DRAWS_IN_PLACE |= {"trunc_normal_", "uniform_"}
+OWN_STATE = {"SeedSequence", "Generator", "PCG64", "Philox", "default_rng", "Random", "SystemRandom"}
+
+
+def global_draws(source: str) -> list[str]:
+    """What ``source`` calls that reads or moves the random state of the process.
+
+    Inside ``with torch.random.fork_rng(...)`` anything goes: that state is put back.
+    """
+    tree = ast.parse(source)
+    full_names = {}  # local name -> what was imported
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            full_names |= {a.asname: a.name for a in node.names if a.asname}
+        elif isinstance(node, ast.ImportFrom):
+            full_names |= {a.asname or a.name: f"{node.module}.{a.name}" for a in node.names}
+    return [name for call in _calls(tree) if _is_global_draw(call, name := _called(call, full_names))]
+
+
+def _calls(node: ast.AST) -> Iterator[ast.Call]:
+    if isinstance(node, ast.With) and "random.fork_rng" in ast.unparse(node.items[0].context_expr):
+        return
+    if isinstance(node, ast.Call):
+        yield node
+    for child in ast.iter_child_nodes(node):
+        yield from _calls(child)
+
+
+def _called(call: ast.Call, full_names: dict[str, str]) -> str:
+    head, *rest = ast.unparse(call.func).split(".")
+    return ".".join([full_names.get(head, head), *rest])
+
+
+def _is_global_draw(call: ast.Call, name: str) -> bool:
+    *modules, last = name.split(".")
+    has_generator = any(keyword.arg == "generator" for keyword in call.keywords)
+    has_seed = bool(call.args or call.keywords)
+    match modules:
+        case ["torch"] if last in DRAWS:
+            return not has_generator
+        case ["torch"] | ["torch", "random" | "default_generator"] | ["torch", "cuda"]:
+            return last in {"manual_seed", "manual_seed_all", "seed", "seed_all", "set_rng_state"}
+        case ["random"] | ["numpy", "random"]:
+            return not (last in OWN_STATE and has_seed)
+        case _:
+            return last in DRAWS_IN_PLACE and not has_generator
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_all_randomness_comes_from_a_generator_that_was_handed_in(path):
+    assert not global_draws(path.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "import torch; torch.rand(3)",
+        "import torch as t; t.randn_like(x)",
+        "from torch import randperm; randperm(3)",
+        "import torch; torch.manual_seed(0)",
+        "import torch; torch.default_generator.manual_seed(0)",
+        "x.normal_()",
+        "import torch; torch.nn.init.uniform_(x)",
+        "import numpy as np; np.random.seed(0)",
+        "import numpy as np; np.random.default_rng()",
+        "from numpy.random import normal; normal()",
+        "import random; random.shuffle(x)",
+        "from random import choice; choice(x)",
+    ],
+)
+def test_a_draw_from_the_global_state_is_noticed(line):
+    assert len(global_draws(line)) == 1
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "import torch; torch.rand(3, generator=generator)",
+        "import torch; torch.Generator().manual_seed(0)",
+        "generator.manual_seed(0)",
+        "x.normal_(generator=generator)",
+        "import numpy as np; np.random.SeedSequence(seed).spawn(3)",
+        "import random; random.Random(0).shuffle(x)",
+        "import torch\nwith torch.random.fork_rng(devices=[]):\n    torch.manual_seed(0)",
+    ],
+)
+def test_a_draw_from_a_state_of_its_own_is_allowed(line):
+    assert not global_draws(line)
+
+
 def test_nothing_is_imported_by_star():
     assert not [path for path in sources() for _, names in imports(path) if "*" in names]
 

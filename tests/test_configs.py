@@ -1,6 +1,7 @@
 """Python declares, YAML decides: every file has exactly the keys of its class, composes, builds, runs."""
 
 import dataclasses
+import inspect
 import sys
 from collections.abc import Iterator
 from importlib import import_module
@@ -10,10 +11,10 @@ from typing import Any
 import pytest
 import yaml
 
-from cadam3d import cli
+from cadam3d import cli, regularizer
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json, read_jsonl
-from cadam3d.settings import component, compose, config_dir
+from cadam3d.settings import component, components, compose, config_dir
 
 CONFIGS = config_dir()
 SEVERAL = ("exporter", "callback", "metric")  # groups of which a run has several at once
@@ -95,6 +96,16 @@ def test_every_option_composes_and_builds(path):
             component(node)
     else:
         assert component(node) is not None
+
+
+def test_every_regularizer_has_a_file_of_its_own_and_several_can_be_chosen():
+    kinds = [kind for _, kind in inspect.getmembers(regularizer, inspect.isclass)]
+    kinds = [kind for kind in kinds if issubclass(kind, regularizer.Regularizer)]
+    classes = {kind.__name__ for kind in kinds if not inspect.isabstract(kind)}
+    names = sorted({path.stem for path in FILES if path.parent.name == "regularizer"} - {"none"})
+    cfg = compose([PROMPT, f"regularizer=[{','.join(names)}]"]).regularizer
+    assert sorted(cfg) == names
+    assert {type(each).__name__ for each in components(cfg).values()} == classes
 
 
 def test_the_groups_of_train_are_the_packages_of_components():

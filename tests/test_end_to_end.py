@@ -102,6 +102,16 @@ def test_killed_and_resumed_equals_never_interrupted(finished, tmp_path):
     assert without_time(logged) == without_time(read_jsonl(whole / "metrics.jsonl"))
 
 
+def test_another_run_does_not_move_into_a_folder_that_holds_one(finished):
+    latest = (finished / "outputs" / "latest").resolve()
+    before = (latest / "asset.ply").read_bytes()
+    _, err = run(finished, "train", *SMALL, f"hydra.run.dir={latest}", "seed=1", code=1)
+    assert "holds a run already" in err
+    _, err = run(finished, "train", f"resume={latest}", "seed=1", code=1)
+    assert "seed: wanted 0" in err
+    assert (latest / "asset.ply").read_bytes() == before
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_everything_and_says_how_to_go_on(finished, tmp_path, number):
     victim = tmp_path / "run"

@@ -1,10 +1,14 @@
 """What a stranger installs: one wheel that carries its configuration and works from an empty folder."""
 
+import ast
 import os
+import re
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -58,6 +62,38 @@ def test_kernel_sources_travel_too(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     sources = {path for pattern in ("*.cpp", "*.h", "*.cu", "*.cuh") for path in find("cadam3d", pattern)}
     assert {str(path.relative_to(REPOSITORY)) for path in sources} <= names
+
+
+def test_the_source_archive_carries_what_its_own_tests_read(tmp_path):
+    command = [sys.executable, "-m", "build", "--sdist", "--no-isolation", "--outdir", str(tmp_path)]
+    subprocess.run([*command, str(REPOSITORY)], check=True, capture_output=True)
+    [path] = tmp_path.glob("*.tar.gz")
+    with tarfile.open(path) as archive:
+        modes = {member.name.partition("/")[2]: member.mode for member in archive.getmembers()}
+    everything = [*find("cadam3d", "*.py"), *find("configs", "*.yaml"), *find("docs", "*.md")]
+    everything += [*find("tests", "*.py"), *REPOSITORY.glob("*.md")]
+    names = {str(path.relative_to(REPOSITORY)) for path in everything}
+    assert names | {"Makefile", "LICENSE", "pyproject.toml", ".ci/run"} <= set(modes)
+    assert modes[".ci/run"] & 0o100
+
+
+def test_every_import_is_declared_or_ours():
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    declared = {re.match(r"[\w-]+", line).group() for line in project["dependencies"]}
+    provides = metadata.packages_distributions()
+    imported = set()
+    for path in find("cadam3d", "*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                imported.add(str(node.module).partition(".")[0])
+    foreign = imported - set(sys.stdlib_module_names) - {"cadam3d"}
+    undeclared = {
+        name for name in foreign if not {each.lower() for each in provides.get(name, [])} & declared
+    }
+    assert foreign
+    assert not undeclared
 
 
 def test_there_is_exactly_one_console_script(wheel):

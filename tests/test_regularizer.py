@@ -129,5 +129,7 @@ def test_repeating_a_view_does_not_raise_a_penalty(views):
 def test_a_negative_weight_or_radius_is_refused():
     with pytest.raises(UserError, match="weight"):
         MeanScale(weight=-1.0)
+    with pytest.raises(UserError, match="weight"):
+        MeanScale(weight=Linear(start=1.0, end=-1.0, steps=10))
     with pytest.raises(UserError, match="radius"):
         OutsideBall(weight=1.0, radius=0.0)

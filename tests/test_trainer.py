@@ -164,10 +164,30 @@ def test_growth_beyond_max_gaussians_is_an_outcome_and_is_not_applied(tmp_path):
     assert witness.refinements[-1].selected > 0
 
 
+def test_a_resumed_run_with_a_larger_cap_equals_one_that_never_met_it(tmp_path):
+    free, whole = make()
+    go(free, whole, tmp_path)
+
+    capped, state = make(["refine.max_gaussians=30"])
+    assert go(capped, state, tmp_path) is Outcome.MAX_GAUSSIANS
+    torch.save(state.to_payload(), tmp_path / "capped.pt")
+
+    def restored() -> TrainState:
+        return free.restore(torch.load(tmp_path / "capped.pt", weights_only=True), CPU)
+
+    again = restored()
+    assert go(capped, again, tmp_path) is Outcome.MAX_GAUSSIANS  # the same cap refuses the same refinement
+    assert again.step == state.step
+    resumed = restored()
+    assert go(free, resumed, tmp_path) is Outcome.FINISHED
+    assert same(whole.to_payload(), resumed.to_payload())
+
+
 def test_losing_every_gaussian_is_an_outcome(tmp_path):
     trainer, state = make(["refine.min_opacity=0.999999", "refine.reset_interval=null"])
     assert go(trainer, state, tmp_path) is Outcome.VANISHED
     assert len(state.gaussians) == 0
+    assert go(trainer, state, tmp_path) is Outcome.VANISHED  # and so it stays
     camera = component(compose(SMALL).camera).sample(0, 1, torch.Generator())
     image = trainer.renderer(state)(camera, torch.ones(1, 3))
     assert torch.equal(image.rgb, torch.ones_like(image.rgb))
@@ -186,6 +206,20 @@ def test_running_out_of_memory_is_an_outcome(tmp_path, error, monkeypatch):
     monkeypatch.setattr(type(trainer.rasterizer), "render", exhausted)
     assert go(trainer, state, tmp_path) is Outcome.OUT_OF_MEMORY
     assert state.step == 0
+
+
+@pytest.mark.parametrize("where", ["cadam3d.densifier.cadam.CAdam.carry", "cadam3d.core.edit.RowEdit.apply"])
+def test_owners_of_rows_agree_even_if_memory_runs_out_within_a_refinement(tmp_path, monkeypatch, where):
+    trainer, state = make()
+
+    def exhausted(*_args):
+        raise MemoryError
+
+    monkeypatch.setattr(where, exhausted)
+    assert go(trainer, state, tmp_path) is Outcome.OUT_OF_MEMORY
+    rows = len(state.gaussians)
+    assert state.densifier.to_dict()["m"].shape[0] == rows
+    assert state.optimizer.state_dict()["exp_avg"]["means"].shape[0] == rows
 
 
 def test_another_runtime_error_is_not_swallowed(tmp_path, monkeypatch):

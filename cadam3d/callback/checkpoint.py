@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from cadam3d.callback.base import Callback
 from cadam3d.core.checks import require_range
-from cadam3d.io.checkpoint import prune_checkpoints, save_checkpoint
+from cadam3d.io.checkpoint import checkpoint_name, drop_after, prune_checkpoints, save_checkpoint
 from cadam3d.state import Outcome, RunContext, StepReport, TrainState
 
 
@@ -19,17 +19,24 @@ class Checkpoint(Callback):
         require_range("callback.checkpoint.every", self.every, low=1, example=100)
         require_range("callback.checkpoint.keep", self.keep, low=1, example=2)
 
+    def on_start(self, context: RunContext, state: TrainState) -> None:
+        """Delete checkpoints of later steps: they belong to a future that this run will not have."""
+        drop_after(context.folder / "checkpoints", state.step)
+
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
         """Save at every multiple of ``every``."""
         if state.step % self.every == 0:
             self._save(context, state)
 
     def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
-        """Save where the run ended, unless that step is saved already."""
-        if state.step % self.every != 0:
+        """Save where the run ended, unless that step is saved already.
+
+        Out of memory, a step was left half done that no resumed run could repeat: the last file stands.
+        """
+        if state.step % self.every != 0 and outcome is not Outcome.OUT_OF_MEMORY:
             self._save(context, state)
 
     def _save(self, context: RunContext, state: TrainState) -> None:
         folder = context.folder / "checkpoints"
-        save_checkpoint(folder / f"step_{state.step:07d}.pt", state.to_payload())
+        save_checkpoint(folder / checkpoint_name(state.step), state.to_payload())
         prune_checkpoints(folder, keep=self.keep)

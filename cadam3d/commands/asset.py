@@ -6,6 +6,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from cadam3d.commands.paths import shown
 from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn
@@ -83,12 +84,6 @@ def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
         raise UserError(f"output: cannot write to {folder} ({reason}). Try: output=/tmp/cadam3d") from error
     render = renderer(cfg.rasterizer, asset.gaussians)
     return [path for exporter in exporters for path in exporter.export(asset.gaussians, render, folder)]
-
-
-def shown(path: Path) -> Path:
-    """``path`` as a user in the current folder would write it."""
-    path = path.resolve()
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def _any_job(sweep: Path) -> str:

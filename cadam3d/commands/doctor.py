@@ -20,8 +20,8 @@ from cadam3d.core.errors import UserError
 from cadam3d.settings import component, compose, config_dir
 
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "imageio", "imageio-ffmpeg", "jaxtyping", "kornia")
-PACKAGES += ("pillow", "tqdm", "trimesh")
-IMPORT_NAMES = {"hydra-core": "hydra", "imageio-ffmpeg": "imageio_ffmpeg", "pillow": "PIL"}
+PACKAGES += ("pillow", "pyyaml", "tqdm", "trimesh")
+IMPORT_NAMES = {"hydra-core": "hydra", "imageio-ffmpeg": "imageio_ffmpeg", "pillow": "PIL", "pyyaml": "yaml"}
 COMPILERS = ("c++", "g++", "clang++", "nvcc")
 SECONDS = 60  # longest wait for a program that we ask for its version
 
@@ -167,12 +167,12 @@ def _compiler(name: str) -> Finding:
     return Finding(name, Verdict.OK, (release or lines)[0].strip())
 
 
-def _components(group: str, attempt: Callable[[DictConfig], str]) -> Iterator[Finding]:
+def _components(group: str, attempt: Callable[[str, DictConfig], str]) -> Iterator[Finding]:
     """Try every option of a group as a user would get it."""
     for path in sorted((config_dir() / group).glob("*.yaml")):
         topic = f"{group}={path.stem}"
         try:
-            found = attempt(compose(["prompt=test", topic])[group])
+            found = attempt(path.stem, compose(["prompt=test", topic])[group])
             yield Finding(topic, Verdict.OK, found)
         except (UserError, ImportError, OSError) as error:  # not available here, and it says why
             yield Finding(topic, Verdict.NOTE, str(error).splitlines()[0])
@@ -181,29 +181,44 @@ def _components(group: str, attempt: Callable[[DictConfig], str]) -> Iterator[Fi
             yield Finding(topic, Verdict.BROKEN, reason, "Try: pip install --force-reinstall cadam3d")
 
 
-def _try_rasterizer(node: DictConfig) -> str:
-    """Render one Gaussian from one view."""
+def _try_rasterizer(name: str, node: DictConfig) -> str:
+    """Render one Gaussian from one view, where training would: on the device, or with ``cpu`` on the CPU."""
     import torch
 
     from cadam3d.core.cameras import turntable
     from cadam3d.core.gaussians import Gaussians
+    from cadam3d.rasterizer.base import Rasterizer
+    from cadam3d.trainer import resolve_device
 
+    rasterizer: Rasterizer = component(node)
+    device = resolve_device("auto")
+    chosen = rasterizer.chosen(device)
     gaussians = Gaussians(
         means=torch.zeros(1, 3),
         log_scales=torch.full((1, 3), -1.0),
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
         opacity_logits=torch.full((1,), 4.0),
         sh=torch.zeros(1, 1, 3),
-    )
+    ).to("cpu" if chosen == "cpu" else device)
     camera = turntable(1, elevation_deg=0.0, distance=3.0, fov_y_deg=40.0, size=16)
     with torch.no_grad():
-        alpha = float(component(node).render(gaussians, camera, torch.zeros(1, 3)).alpha[0, 8, 8])
+        alpha = float(rasterizer.render(gaussians, camera, torch.zeros(1, 3)).alpha[0, 8, 8])
     if not 0.9 < alpha < 1:
         raise RuntimeError(f"rendered alpha {alpha:.3f} where it should be 0.98")
-    return "renders"
+    if name == "cpu":
+        return f"renders, {_kernels(node.cache_dir)}"
+    return "renders" if chosen == name else f"renders with {chosen}"
 
 
-def _try_prior(node: DictConfig) -> str:
+def _kernels(cache_dir: str | None) -> str:
+    """What the native kernels are compiled for, and where they are kept."""
+    from cadam3d.rasterizer.build import default_cache_dir
+    from cadam3d.rasterizer.cpu import instruction_set, load_kernels
+
+    return f"{instruction_set(load_kernels(cache_dir))} kernels in {cache_dir or default_cache_dir()}"
+
+
+def _try_prior(_: str, node: DictConfig) -> str:
     prior = component(node)
     return (prior.notice() or "ready").splitlines()[0]
 

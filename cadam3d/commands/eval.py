@@ -6,7 +6,8 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from cadam3d.commands.asset import find_run, open_run, renderer, run_config, shown
+from cadam3d.commands.asset import find_run, open_run, renderer, run_config
+from cadam3d.commands.paths import shown
 from cadam3d.commands.sweep import jobs
 from cadam3d.core.checks import UserError
 from cadam3d.io.jsonl import write_json

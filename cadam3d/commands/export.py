@@ -5,7 +5,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from cadam3d.commands.asset import Asset, export_all, open_asset, shown
+from cadam3d.commands.asset import Asset, export_all, open_asset
+from cadam3d.commands.paths import shown
 from cadam3d.core.checks import UserError
 
 

@@ -4,7 +4,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from cadam3d.commands.asset import export_all, open_asset, shown
+from cadam3d.commands.asset import export_all, open_asset
+from cadam3d.commands.paths import shown
 
 
 def run(cfg: DictConfig) -> None:

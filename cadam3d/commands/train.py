@@ -1,5 +1,6 @@
 """``cadam3d train``: a prompt in, a run folder with an asset out."""
 
+import logging
 import signal
 import sys
 import time
@@ -14,15 +15,18 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import __version__
+from cadam3d.commands.paths import shown
 from cadam3d.core.checks import UserError, require
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import read_jsonl, write_json
 from cadam3d.io.report import write_report
 from cadam3d.metric.base import Metric
-from cadam3d.settings import component, components
+from cadam3d.settings import component, components, flatten, load
 from cadam3d.state import Outcome, RunContext, TrainState
 from cadam3d.trainer import Trainer, resolve_device
+
+log = logging.getLogger(__name__)
 
 COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "camera", "refine", "optimizer")
 
@@ -58,9 +62,9 @@ def run(cfg: DictConfig) -> float | None:
     """Train, export, measure and report; returns the PSNR in dB where the prior knows the truth."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     device = resolve_device(cfg.device)
-    for key in ("seed", "steps", "views"):
-        is_whole = isinstance(cfg[key], int) and not isinstance(cfg[key], bool) and cfg[key] >= 0
-        require(is_whole, key, wanted="a whole number >= 0", got=cfg[key], example=f"{key}=3")
+    for key, least in (("seed", 0), ("steps", 1), ("views", 1)):
+        is_whole = isinstance(cfg[key], int) and not isinstance(cfg[key], bool) and cfg[key] >= least
+        require(is_whole, key, wanted=f"a whole number >= {least}", got=cfg[key], example=f"{key}=3")
     # Same seed, same bytes: on the CPU every operation we use has a deterministic form.
     torch.use_deterministic_algorithms(device.type == "cpu")
     trainer = build_trainer(cfg, device)
@@ -76,6 +80,7 @@ def run(cfg: DictConfig) -> float | None:
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         _point_latest_at(folder)
 
+    log.info("prompt %r, seed %d, on %s, from step %d", cfg.prompt, cfg.seed, device, state.step)
     render = trainer.renderer(state)
     context = RunContext(folder=folder, prompt=cfg.prompt, total_steps=trainer.steps, render=render)
     with StopOnSignal() as stop:
@@ -89,6 +94,9 @@ def run(cfg: DictConfig) -> float | None:
         for metric in metrics.values():
             summary |= metric.measure(gaussians, render, truth)
         summary |= {"warnings": warnings}
+        if (asset := folder / "asset.ply").is_file():
+            summary["asset_bytes"] = asset.stat().st_size
+        log.info("%s after %d steps: %d Gaussians", outcome, state.step, len(gaussians))
         write_json(folder / "summary.json", summary)
         lines = read_jsonl(folder / "metrics.jsonl")
         report = write_report(folder, summary=summary, metrics=lines, config_text=config_text)
@@ -139,18 +147,44 @@ def summarize(cfg: DictConfig, state: TrainState, outcome: Outcome) -> dict[str,
 
 
 def _start_or_resume(cfg: DictConfig, trainer: Trainer, device: torch.device, folder: Path) -> TrainState:
-    start = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, device)
-    if cfg.resume is None:
-        return start
-    path = Path(cfg.resume)
-    path = path if path.is_file() else latest_checkpoint(folder / "checkpoints")
+    path = _checkpoint(cfg, folder)
     if path is None:
-        print(f"No checkpoint in {folder / 'checkpoints'} yet: starting at step 0.", file=sys.stderr)
-        return start
+        return trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, device)
     state = trainer.restore(load_checkpoint(path), device)
+    require(
+        cfg.seed == state.seed,
+        "seed",
+        wanted=f"{state.seed}, which this run was started with",
+        got=cfg.seed,
+        example="resume without seed=..., or start another run",
+    )
+    _say_what_changed(cfg, folder)
     if state.step >= trainer.steps:
         print(f"{path.name} has all {state.step} steps; writing the outputs again.", file=sys.stderr)
     return state
+
+
+def _checkpoint(cfg: DictConfig, folder: Path) -> Path | None:
+    """What to go on from; None: start at the beginning."""
+    if cfg.resume is None:
+        return None
+    asked = Path(cfg.resume)
+    path = asked if asked.is_file() else latest_checkpoint(folder / "checkpoints")
+    if path is None:
+        print(f"No checkpoint in {folder / 'checkpoints'} yet: starting at step 0.", file=sys.stderr)
+    return path
+
+
+def _say_what_changed(cfg: DictConfig, folder: Path) -> None:
+    """A resumed run equals an uninterrupted one only under the same settings: name those that differ."""
+    file = folder / "config.yaml"
+    if not file.is_file():
+        return
+    before = dict(flatten(OmegaConf.to_container(load(file), resolve=True)))
+    now = dict(flatten(OmegaConf.to_container(cfg, resolve=True)))
+    for key in sorted(before.keys() | now.keys()):
+        if key != "resume" and before.get(key) != now.get(key):
+            print(f"Note: {key} was {before.get(key)!r}, is now {now.get(key)!r}", file=sys.stderr)
 
 
 def _export(exporters: Mapping[str, Exporter], gaussians, render, folder: Path) -> list[str]:
@@ -159,8 +193,9 @@ def _export(exporters: Mapping[str, Exporter], gaussians, render, folder: Path) 
     for name, exporter in exporters.items():
         try:
             exporter.export(gaussians, render, folder)
-        except UserError as error:
+        except (UserError, MemoryError, torch.OutOfMemoryError) as error:
             warnings.append(f"exporter.{name}: {error}")
+            log.info("exporter.%s: %s", name, error)
             print(f"Warning: exporter.{name}: {error}", file=sys.stderr)
     return warnings
 
@@ -184,10 +219,6 @@ def _relative_if_inside(folder: Path, base: Path) -> Path:
 
 
 def _say(folder: Path, summary: Mapping[str, Any], report: Path) -> None:
-    try:
-        shown = folder.resolve().relative_to(Path.cwd())
-    except ValueError:
-        shown = folder
     quality = f", PSNR {summary['psnr']:.2f} dB" if summary.get("psnr") is not None else ""
     print(
         f"{summary['outcome']} after {summary['steps']} steps, {summary['seconds']:.0f} s: "
@@ -195,7 +226,7 @@ def _say(folder: Path, summary: Mapping[str, Any], report: Path) -> None:
     )
     for label, name in (("asset", "asset.ply"), ("video", "turntable.mp4"), ("pictures", "preview.png")):
         if (folder / name).exists():
-            print(f"  {label:<9}{shown / name}")
-    print(f"  {'report':<9}{shown / report.name}")
+            print(f"  {label:<9}{shown(folder / name)}")
+    print(f"  {'report':<9}{shown(report)}")
     if summary["outcome"] == Outcome.INTERRUPTED:
-        print(f"  go on with: cadam3d train resume={shown}")
+        print(f"  go on with: cadam3d train resume={shown(folder)}")

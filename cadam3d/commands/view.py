@@ -7,7 +7,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from cadam3d.commands.asset import export_all, find_run, open_asset, shown
+from cadam3d.commands.asset import export_all, find_run, open_asset
+from cadam3d.commands.paths import shown
 
 REPORT = "report.html"
 

@@ -3,8 +3,6 @@
 import math
 from collections.abc import Sequence
 
-from torch import Tensor
-
 from cadam3d.core.errors import UserError
 
 __all__ = [
@@ -13,7 +11,6 @@ __all__ = [
     "require",
     "require_choice",
     "require_color",
-    "require_finite",
     "require_range",
 ]
 
@@ -69,10 +66,3 @@ def require_color(key: str, value: Sequence[float]) -> None:
     is_color = len(value) == 3 and all(0 <= channel <= 1 for channel in value)
     example = f"'{key}=[0.5,0.5,0.5]'"
     require(is_color, key, wanted="three numbers in [0, 1]", got=list(value), example=example)
-
-
-def require_finite(name: str, tensor: Tensor) -> None:
-    """Raise if ``tensor`` holds a NaN or an infinity; the message counts them."""
-    bad = int((~tensor.isfinite()).sum())
-    if bad:
-        raise UserError(f"{name}: {bad} of {tensor.numel()} numbers are not finite")

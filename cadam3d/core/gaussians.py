@@ -20,7 +20,7 @@ class Gaussians:
 
     means: Float[Tensor, "n 3"]  # world units
     log_scales: Float[Tensor, "n 3"]  # natural log of standard deviations in world units
-    quats: Float[Tensor, "n 4"]  # wxyz, any length
+    quats: Float[Tensor, "n 4"]  # wxyz, any length but (nearly) zero
     opacity_logits: Float[Tensor, "n"]
     sh: Float[Tensor, "n k 3"]  # k = (degree + 1)**2; coefficient 0 is the view-independent one
 

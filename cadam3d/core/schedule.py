@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 from cadam3d.core.checks import require, require_range
 
+FAR_STEP = 10**9  # every schedule has come to rest by then
+
 
 class Schedule(ABC):
     """A number that depends on the optimization step (0 is the first step)."""
@@ -91,6 +93,19 @@ class Steps(Schedule):
 def as_schedule(value: float | Schedule) -> Schedule:
     """A plain number is a constant schedule."""
     return value if isinstance(value, Schedule) else Constant(float(value))
+
+
+def require_scheduled(key: str, value: object, *, example: object, **bounds: float) -> None:
+    """Raise unless ``value`` is a number in range, or a schedule that starts and comes to rest in range.
+
+    ``bounds`` are those of :func:`~cadam3d.core.checks.require_range`: ``low``, ``high``, ``below`` and
+    ``above``.
+    """
+    is_one = isinstance(value, int | float | Schedule)
+    require(is_one, key, wanted="a number or a schedule", got=value, example=f"{key}={example}")
+    for step in (0, FAR_STEP):  # most mistakes show at an end
+        number = value(step) if isinstance(value, Schedule) else value
+        require_range(key, number, example=example, **bounds)
 
 
 def _progress(step: int, begin: int, steps: int) -> float:

@@ -69,8 +69,3 @@ def evaluate_sh(
 def rgb_to_sh0(rgb: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """The view-independent coefficient that shows ``rgb`` (in [0, 1])."""
     return (rgb - 0.5) / SH_C0
-
-
-def sh0_to_rgb(sh0: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """The colour of a view-independent coefficient; may lie outside [0, 1]."""
-    return sh0 * SH_C0 + 0.5

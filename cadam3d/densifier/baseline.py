@@ -30,9 +30,11 @@ class BaselineState(RowState):
 class Baseline(Densifier[BaselineState]):
     """Select whoever's mean gradient norm reaches a fixed threshold; a reset lowers everybody's opacity.
 
-    The mean runs over the steps since the last refinement that saw the Gaussian. Gradients are taken in
-    normalised device coordinates (image half-widths), as 3DGS and gsplat do, so the threshold does not depend
-    on the image size. It does depend on the scale of the loss and of its noise (paper sec. 4.1: the dilemma).
+    The mean runs over the sightings of the Gaussian since the last refinement: over single views with
+    ``views=sum_norm``, else over steps. Gradients are taken in normalised device coordinates (image
+    half-widths), as 3DGS and gsplat do. With a loss that is a mean over pixels (``guidance.reduction=mean``)
+    the threshold then does not depend on the image size; the other reductions sum over pixels, and there it
+    does. It always depends on the scale of the loss and of its noise (paper sec. 4.1: the dilemma).
     """
 
     tau_pos: float  # loss per NDC unit

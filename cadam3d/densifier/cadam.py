@@ -132,6 +132,7 @@ class CAdam(Densifier[CAdamState]):
         population = drift[self._population(state)]
         numbers = {f"snr_p{p}": quantile(snr, p / 100) for p in (10, 50, 90)}
         numbers |= {
+            "tau_SNR": self.tau_SNR,
             "share_above_tau_SNR": (snr > self.tau_SNR).float().mean(),
             "age_median": quantile(state.age.float(), 0.5),
             "drift_median": quantile(drift, 0.5),

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import fail, require, require_choice, require_range
-from cadam3d.core.schedule import Schedule, as_schedule
+from cadam3d.core.checks import require, require_choice, require_range
+from cadam3d.core.schedule import FAR_STEP, Schedule, as_schedule, require_scheduled
 from cadam3d.guidance.base import Guidance, GuidanceOutput
 from cadam3d.prior.base import Condition, DiffusionPrior
 from cadam3d.prior.path import NoisePath, per_view
@@ -28,7 +28,6 @@ DIVISORS: dict[str, Callable[[torch.Size], int]] = {
     "sum_per_view": lambda shape: shape[0],
     "sum": lambda shape: 1,
 }
-FAR_STEP = 10**9  # every schedule has come to rest by then
 
 
 @dataclass(frozen=True)
@@ -74,9 +73,12 @@ class Distillation(Guidance):
         require_choice("guidance.weighting", self.weighting, list(WEIGHTINGS))
         require_choice("guidance.shared_t", self.shared_t, (True, False))
         require_choice("guidance.reduction", self.reduction, list(DIVISORS))
-        for step in (0, FAR_STEP):  # most mistakes show at an end; the steps between are checked as they come
+        require_scheduled("guidance.t_min", self.t_min, example=0.02)
+        require_scheduled("guidance.t_max", self.t_max, example=0.98)
+        if self.clip is not None:
+            require_scheduled("guidance.clip", self.clip, above=0, example="null")
+        for step in (0, FAR_STEP):  # the steps between are checked as they come
             self._window(step)
-            self._bound(step)
 
     @abstractmethod
     def compare(
@@ -137,8 +139,7 @@ class Distillation(Guidance):
         )
 
     def _window(self, step: int) -> tuple[float, float]:
-        low = scheduled("guidance.t_min", self.t_min, step, example=0.02)
-        high = scheduled("guidance.t_max", self.t_max, step, example=0.98)
+        low, high = as_schedule(self.t_min)(step), as_schedule(self.t_max)(step)
         require(
             0 <= low < high <= 1,
             "guidance.t_max",
@@ -151,7 +152,7 @@ class Distillation(Guidance):
     def _bound(self, step: int) -> float | None:
         if self.clip is None:
             return None
-        bound = scheduled("guidance.clip", self.clip, step, example="null")
+        bound = as_schedule(self.clip)(step)
         require_range("guidance.clip", bound, above=0, example="null")
         return bound
 
@@ -164,14 +165,6 @@ def surrogate(
     The inner bracket is opened: x0 - stopgrad(x0) is exactly 0; x0 - (x0 - G) would round a small G away.
     """
     return 0.5 * (clean - clean.detach() + gradient).square().sum() / divisor
-
-
-def scheduled(key: str, value: float | Schedule, step: int, *, example: object) -> float:
-    """The value at ``step`` of a number or a schedule. Raises ``UserError`` for anything else."""
-    try:
-        return as_schedule(value)(step)
-    except (TypeError, ValueError):
-        raise fail(key, wanted="a number or a schedule", got=value, example=f"{key}={example}") from None
 
 
 def standard_normal(like: Float[Tensor, "v c h w"], generator: torch.Generator) -> Float[Tensor, "v c h w"]:

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.checks import require_range
-from cadam3d.core.schedule import Schedule
-from cadam3d.guidance.distill import FAR_STEP, Comparison, Distillation, scheduled, standard_normal
+from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.guidance.distill import Comparison, Distillation, standard_normal
 from cadam3d.prior.base import Condition, DiffusionPrior
 from cadam3d.prior.path import per_view
 
@@ -41,8 +41,7 @@ class ISM(Distillation):
         super().__post_init__()
         require_range("guidance.inversion_stride", self.inversion_stride, above=0, high=1, example=0.2)
         require_range("guidance.initial_noise", self.initial_noise, low=0, below=1, example=0.0)
-        for step in (0, FAR_STEP):
-            self._interval(step)
+        require_scheduled("guidance.delta", self.delta, above=0, high=1, example=0.05)
 
     def compare(
         self,
@@ -67,7 +66,7 @@ class ISM(Distillation):
         return Comparison(difference=after.noise - before.noise, clean=after.clean)
 
     def _interval(self, step: int) -> float:
-        delta = scheduled("guidance.delta", self.delta, step, example=0.05)
+        delta = as_schedule(self.delta)(step)
         require_range("guidance.delta", delta, above=0, high=1, example=0.05)
         return delta
 

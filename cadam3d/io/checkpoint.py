@@ -78,6 +78,18 @@ def latest_checkpoint(folder: Path) -> Path | None:
     return None
 
 
+def checkpoint_name(step: int) -> str:
+    """The file name of the checkpoint of ``step``; names sort as steps do."""
+    return f"step_{step:07d}.pt"
+
+
+def drop_after(folder: Path, step: int) -> None:
+    """Delete the checkpoints in ``folder`` of steps after ``step``."""
+    for path in folder.glob(PATTERN):
+        if path.name > checkpoint_name(step):
+            path.unlink(missing_ok=True)
+
+
 def prune_checkpoints(folder: Path, *, keep: int) -> None:
     """Delete all but the ``keep`` newest checkpoints in ``folder``, and half-written ones of killed runs."""
     remove_leftovers(folder)

@@ -31,8 +31,9 @@ class Rasterizer(ABC):
 
         ``background`` is one RGB colour per view, in [0, 1]. Whenever gradients are on, ``means2d`` retains
         its own gradient, so ``output.means2d.grad`` is filled by ``backward()``. Gaussians that are behind a
-        camera, off screen, too faint or not finite are culled: radius 0, no contribution, zero gradient,
-        never a NaN.
+        camera, ``FAR`` or farther in front of it, off screen, too faint or not finite, and those whose
+        quaternion has a squared length below 1e-12 and so no direction, are culled: radius 0, no
+        contribution, zero gradient, never a NaN.
         """
 
     def chosen(self, device: torch.device) -> str:

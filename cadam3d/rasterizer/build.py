@@ -41,7 +41,7 @@ FLAGS = (
 STATIC = ("-static-libstdc++", "-static-libgcc")  # another libstdc++ may already be loaded, an older one
 # Tried in turn until one compiles and runs: not every compiler knows every flag.
 MACHINE_FLAGS = (("-march=native", *STATIC), ("-march=native",), ("-mcpu=native",), ())
-CONSTANTS = ("BLUR", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN", "NEAR", "FRUSTUM_MARGIN")
+CONSTANTS = ("BLUR", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN", "NEAR", "FAR", "FRUSTUM_MARGIN")
 SUFFIX = ".dll" if sys.platform == "win32" else ".so"
 SELF_TEST = "import ctypes, sys; sys.exit(ctypes.CDLL(sys.argv[1]).cadam3d_self_test())"
 TIMEOUT = 900  # seconds for one run of the compiler; most need three, a first `zig c++` minutes

@@ -21,7 +21,7 @@ from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.rasterizer.base import Rasterizer
-from cadam3d.rasterizer.build import build, default_cache_dir, find_cached, find_compiler, load
+from cadam3d.rasterizer.build import build, default_cache_dir, load
 
 SH_SIZES = (1, 4, 9, 16)  # coefficients of degree 0 to 3
 
@@ -42,14 +42,6 @@ class CpuRasterizer(Rasterizer):
         if gaussians.device.type != "cpu":
             raise UserError(f"rasterizer=cpu cannot render on {gaussians.device}. Try: rasterizer=auto")
         return rasterize(load_kernels(self.cache_dir), gaussians, cameras, background)
-
-
-def works_on(device: torch.device) -> bool:
-    """Whether Gaussians on ``device`` can be rendered here, as far as can be told without compiling."""
-    if device.type != "cpu":
-        return False
-    compiler = find_compiler()
-    return compiler is not None or find_cached(default_cache_dir(), None) is not None
 
 
 @cache

@@ -12,13 +12,14 @@ from cadam3d.commands.train import build_trainer
 from cadam3d.core.checks import UserError
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import append_jsonl, read_jsonl
+from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.settings import component, compose
 from cadam3d.state import Outcome, RunContext
 
 CPU = torch.device("cpu")
 
 
-def train(tmp_path, callbacks, steps: int = 7):
+def train(tmp_path, callbacks, steps: int = 7, outcome: Outcome = Outcome.FINISHED):
     cfg = compose(
         [
             "prompt=a red cube",
@@ -36,7 +37,7 @@ def train(tmp_path, callbacks, steps: int = 7):
     trainer = replace(build_trainer(cfg, CPU), callbacks=callbacks)
     state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
     context = RunContext(tmp_path, cfg.prompt, trainer.steps, trainer.renderer(state))
-    assert trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context) is Outcome.FINISHED
+    assert trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context) is outcome
     return state
 
 
@@ -56,6 +57,27 @@ def test_a_checkpoint_at_the_last_step_is_not_written_twice(tmp_path, monkeypatc
     )
     train(tmp_path, [Checkpoint(every=2, keep=9)], steps=4)
     assert written == ["step_0000002.pt", "step_0000004.pt"]
+
+
+def test_checkpoints_of_a_future_that_will_not_be_are_dropped(tmp_path):
+    train(tmp_path, [Checkpoint(every=2, keep=9)], steps=6)
+    train(tmp_path, [Checkpoint(every=3, keep=9)], steps=5)  # another run, from step 0
+    names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
+    assert names == ["step_0000003.pt", "step_0000005.pt"]
+
+
+def test_out_of_memory_the_last_checkpoint_stands(tmp_path, monkeypatch):
+    calls = iter(range(100))
+
+    def exhausted(self, *args, real=ReferenceRasterizer.render):
+        if next(calls) == 5:
+            raise MemoryError
+        return real(self, *args)
+
+    monkeypatch.setattr(ReferenceRasterizer, "render", exhausted)
+    train(tmp_path, [Checkpoint(every=2, keep=9)], outcome=Outcome.OUT_OF_MEMORY)
+    names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
+    assert names == ["step_0000002.pt", "step_0000004.pt"]
 
 
 def test_metrics_hold_one_line_per_logged_step_and_per_refinement(tmp_path):

@@ -11,6 +11,11 @@ import pytest
 from cadam3d import cli
 from cadam3d.commands import doctor
 from cadam3d.commands.doctor import Verdict
+from cadam3d.core.errors import UserError
+from cadam3d.rasterizer import auto, cpu
+from cadam3d.rasterizer.auto import AutoRasterizer
+from cadam3d.rasterizer.build import find_compiler
+from cadam3d.trainer import resolve_device
 
 REPOSITORY = Path(__file__).parent.parent.parent
 
@@ -18,6 +23,10 @@ REPOSITORY = Path(__file__).parent.parent.parent
 @pytest.fixture(scope="module")
 def findings():
     return {finding.topic: finding for finding in doctor.examine()}
+
+
+def rasterizers() -> list[doctor.Finding]:
+    return list(doctor._components("rasterizer", doctor._try_rasterizer))
 
 
 def run_doctor(monkeypatch, tmp_path, capsys, *words: str) -> tuple[int, str]:
@@ -44,7 +53,38 @@ def test_every_rasterizer_and_every_prior_is_tried(findings):
         for path in (REPOSITORY / "configs" / group).glob("*.yaml"):
             assert f"{group}={path.stem}" in findings
     assert findings["rasterizer=reference"].found == "renders"
+    chosen = AutoRasterizer().chosen(resolve_device("auto"))
+    assert findings["rasterizer=auto"].found == f"renders with {chosen}"
     assert findings["prior=shapes"].verdict is Verdict.OK
+
+
+def test_the_choice_of_auto_is_named(monkeypatch):
+    monkeypatch.setattr(AutoRasterizer, "chosen", lambda self, device: "another")
+    [finding] = [each for each in rasterizers() if each.topic == "rasterizer=auto"]
+    assert finding.found == "renders with another"
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
+def test_the_native_kernels_say_what_they_are_compiled_for_and_where_they_are_kept(findings):
+    finding = findings["rasterizer=cpu"]
+    words = re.fullmatch(r"renders, (avx512|avx2|sse2|neon|generic) kernels in (.+)", finding.found)
+    assert words
+    assert list(Path(words.group(2)).glob("rasterizer-*"))
+
+
+def test_no_compiler_leaves_the_reference_and_says_so(monkeypatch):
+    def no_kernels(cache_dir: str | None):
+        raise UserError("rasterizer=cpu needs a C++ compiler")
+
+    auto._choose.cache_clear()
+    monkeypatch.setattr(cpu, "load_kernels", no_kernels)
+    monkeypatch.setattr(auto, "load_kernels", no_kernels)
+    with pytest.warns(UserWarning, match="slow reference rasterizer"):
+        found = {finding.topic: finding for finding in rasterizers()}
+    auto._choose.cache_clear()
+    assert found["rasterizer=auto"].found == "renders with reference"
+    assert found["rasterizer=cpu"].verdict is Verdict.NOTE
+    assert "needs a C++ compiler" in found["rasterizer=cpu"].found
 
 
 def test_every_dependency_is_looked_at():

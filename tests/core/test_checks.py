@@ -3,7 +3,6 @@
 import math
 
 import pytest
-import torch
 
 from cadam3d.core.checks import (
     UserError,
@@ -11,7 +10,6 @@ from cadam3d.core.checks import (
     require,
     require_choice,
     require_color,
-    require_finite,
     require_range,
 )
 
@@ -78,9 +76,3 @@ def test_a_colour_is_three_numbers_between_zero_and_one():
     for wrong in ([0.0, 0.5], [0.0, 0.5, 1.01], [-0.1, 0.0, 0.0], [math.nan, 0.0, 0.0]):
         with pytest.raises(UserError, match=r"background\.color: wanted three numbers in \[0, 1\]"):
             require_color("background.color", wrong)
-
-
-def test_numbers_that_are_not_finite_are_counted():
-    require_finite("x.means", torch.zeros(4))
-    with pytest.raises(UserError, match=r"x\.means: 2 of 4 numbers are not finite"):
-        require_finite("x.means", torch.tensor([1.0, math.nan, math.inf, 0.0]))

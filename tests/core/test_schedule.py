@@ -1,9 +1,11 @@
 """Schedules: pure functions of the step."""
 
+import math
+
 import pytest
 
 from cadam3d.core.checks import UserError
-from cadam3d.core.schedule import Constant, Linear, LogLinear, Steps, as_schedule
+from cadam3d.core.schedule import Constant, Linear, LogLinear, Steps, as_schedule, require_scheduled
 
 
 def test_a_constant_never_changes():
@@ -53,3 +55,22 @@ def test_a_number_is_a_constant_schedule_and_a_schedule_is_itself():
 def test_impossible_schedules_name_the_key(build, key):
     with pytest.raises(UserError, match=key):
         build()
+
+
+@pytest.mark.parametrize("value", [0, 0.5, 1, Linear(start=1, end=0, steps=10), Steps([1, 0.5], [3])])
+def test_numbers_and_schedules_in_range_pass(value):
+    require_scheduled("key", value, low=0, high=1, example=0.5)
+
+
+@pytest.mark.parametrize(
+    "value", [-1, 2.0, True, math.nan, Linear(start=1, end=-1, steps=10), Linear(start=2, end=1, steps=10)]
+)
+def test_numbers_and_schedules_that_start_or_end_outside_do_not(value):
+    with pytest.raises(UserError, match=r"key: wanted a number >= 0 and <= 1, got .*\. Try: key=0\.5"):
+        require_scheduled("key", value, low=0, high=1, example=0.5)
+
+
+@pytest.mark.parametrize("value", [None, "0.5", [0.5], {"start": 1.0}])
+def test_what_is_neither_a_number_nor_a_schedule_does_not(value):
+    with pytest.raises(UserError, match="key: wanted a number or a schedule, got"):
+        require_scheduled("key", value, low=0, example=0.5)

@@ -8,7 +8,7 @@ from PIL import Image
 
 from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.sh import sh0_to_rgb
+from cadam3d.core.sh import SH_C0
 from cadam3d.initializer.mesh import Mesh
 
 CPU = torch.device("cpu")
@@ -30,7 +30,7 @@ def build(path, seed: int = 0, **changes) -> Gaussians:
 
 
 def rgb(made: Gaussians) -> torch.Tensor:
-    return sh0_to_rgb(made.sh[:, 0])
+    return 0.5 + SH_C0 * made.sh[:, 0]
 
 
 def save(mesh: trimesh.Trimesh, path):

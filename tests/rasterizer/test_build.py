@@ -1,6 +1,7 @@
 """Building the native kernels: with a compiler that is only played, so that a test costs no compilation."""
 
 import multiprocessing
+import re
 import shlex
 import sys
 
@@ -71,6 +72,22 @@ def test_names_the_constants_of_the_image_formation_model(play, tmp_path):
     build(tmp_path / "cache")
     for name in module.CONSTANTS:
         assert f"-DSPLAT_{name}={getattr(module.base, name)!r}" in calls()[0].split()
+
+
+def test_every_constant_of_the_model_reaches_the_kernels():
+    declared = {name for name, value in vars(module.base).items() if isinstance(value, float)}
+    text = "".join((KERNELS / name).read_text(encoding="utf-8") for name in SOURCES)
+    assert set(module.CONSTANTS) == declared
+    assert not [name for name in declared if not re.search(rf"(?:Real|float|spread)\(SPLAT_{name}\)", text)]
+
+
+@pytest.mark.parametrize("name", module.CONSTANTS)
+def test_another_constant_means_another_build(name, tmp_path, monkeypatch, play):
+    calls = play()
+    build(tmp_path / "cache")
+    monkeypatch.setattr(module.base, name, getattr(module.base, name) / 2)
+    build(tmp_path / "cache")
+    assert len(calls()) == 2
 
 
 @pytest.mark.parametrize("damage", [b"", b"not a library", None])

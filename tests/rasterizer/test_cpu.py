@@ -26,7 +26,7 @@ from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import FIELDS
 from cadam3d.rasterizer.base import NEAR
 from cadam3d.rasterizer.build import build, find_compiler, load
-from cadam3d.rasterizer.cpu import CpuRasterizer, instruction_set, rasterize, works_on
+from cadam3d.rasterizer.cpu import CpuRasterizer, instruction_set, rasterize
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
@@ -322,8 +322,3 @@ def test_refuses_what_it_cannot_render(cpu):
     gaussians.sh = gaussians.sh.repeat(1, 2, 1)  # two coefficients: no degree
     with pytest.raises(ValueError, match="sh"):
         cpu.render(gaussians, cameras, backgrounds(1))
-
-
-def test_works_on_the_cpu_alone():
-    assert works_on(CPU)
-    assert not works_on(torch.device("cuda"))

@@ -12,8 +12,8 @@
 // The blend gathers moments of y = L d, not of d; with Y = sum g y y^T and s = sum g y (g = dLoss/d|y|^2) the
 // backward is then  dLoss/dC = -2 L^T Y L,  dLoss/dB = -4 L^T Y (L B),  dLoss/dmean2d = -2 L^T s.
 //
-// The image formation constants (SPLAT_BLUR, SPLAT_ALPHA_MIN, SPLAT_NEAR, SPLAT_FRUSTUM_MARGIN) are given by
-// the build, from cadam3d/rasterizer/base.py: each has one home.
+// The image formation constants (SPLAT_BLUR, SPLAT_ALPHA_MIN, SPLAT_NEAR, SPLAT_FAR, SPLAT_FRUSTUM_MARGIN) are
+// given by the build, from cadam3d/rasterizer/base.py: each has one home.
 #pragma once
 
 #if defined(__CUDACC__)
@@ -29,7 +29,6 @@ namespace splat {
 constexpr int MAX_COEFFICIENTS = 16;       // spherical harmonics of degree 3
 constexpr float TINY_QUATERNION = 1e-12f;  // squared length; a shorter one has no direction: culled
 constexpr float FLOAT_MAX = 3.402823466e+38f;
-constexpr float DEPTH_MAX = 1e15f;  // world units; the depth gradients of what lies farther leave float32
 
 #if defined(__CUDACC__)
 SPLAT_FN float root(float x) { return sqrtf(x); }
@@ -230,7 +229,7 @@ SPLAT_FN bool project(const Gaussian<Real, Count>& gaussian, const Shape<Real>& 
                       const Camera<Real>& camera, Footprint<Real>& out) {
   for (int i = 0; i < 3; ++i) out.centre[i] = dot3(camera.rotation[i], gaussian.mean) + camera.translation[i];
   const Real z = out.centre[2];
-  if (!(z > Real(SPLAT_NEAR) && z < Real(DEPTH_MAX))) return false;
+  if (!(z > Real(SPLAT_NEAR) && z < Real(SPLAT_FAR))) return false;
   out.inverse_z = 1 / z;
 
   for (int i = 0; i < 3; ++i)
