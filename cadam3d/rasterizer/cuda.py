@@ -1,7 +1,6 @@
-"""The CUDA rasterizer: own kernels, compiled at run time, behind the two autograd steps of the native one.
+"""The CUDA rasterizer: kernels of our own, compiled at run time.
 
-``means -> means2d`` is one step, ``means2d and everything else -> images`` the other, so ``means2d`` is an
-honest node of the graph. A frame goes through these kernels (``kernels/*.cuh``), all views at once:
+A frame goes through these kernels (``kernels/*.cuh``), all views at once:
 
 * ``project_forward``: splats, and a depth key per (view, Gaussian) pair; who is culled has the largest key;
 * a stable radix sort of the pairs by depth, which also moves the culled ones out of the way;
@@ -24,7 +23,6 @@ from pathlib import Path
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import UserError
@@ -32,6 +30,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.build import default_cache_dir
+from cadam3d.rasterizer.native import Frame, render_frame, require_shapes
 
 # Mirrors of kernels/*.cuh
 BLOCK, PROJECT_BLOCK, BLEND_BLOCK, WARP = 256, 128, 128, 32  # threads
@@ -39,7 +38,6 @@ TILE = 8  # pixels along the edge of a tile
 SPLAT, RECORD, CAMERA = 12, 10, 25  # floats
 SCAN_CHUNK, SORT_CHUNK, RADIX_BITS = 2048, 4096, 8
 
-SH_SIZES = (1, 4, 9, 16)  # coefficients of degree 0 to 3
 DEPTH_BITS = 32
 SCAN_SHORT = 8 * SCAN_CHUNK  # up to here one block scans it all, faster than three launches
 MOST = 2**31 - 1  # pairs, slots or pixels: their numbers have 32 bits
@@ -98,40 +96,26 @@ def rasterize(
     launcher: Launcher, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
 ) -> RenderOutput:
     """Render with the kernels at hand; see :meth:`Rasterizer.render`."""
-    _require_shapes(gaussians, cameras, background)
-    dtype, device = gaussians.means.dtype, gaussians.device
-    means, *others = (_plain(tensor, device) for tensor in gaussians.tensors().values())
-    frame = _Frame(launcher, cameras, device)
-    with torch.autocast(device.type, enabled=False):
-        means2d, radii = _Project.apply(frame, means, *(tensor.detach() for tensor in others))
-        means2d = means2d.to(dtype)
-        if torch.is_grad_enabled():
-            means2d.requires_grad_().retain_grad()
-        images = _Blend.apply(frame, _plain(means2d, device), means, *others, _plain(background, device))
-        rgb, alpha, depth = (image.to(dtype) for image in images)
-    return RenderOutput(rgb=rgb, alpha=alpha, depth=depth, means2d=means2d, radii=radii.to(dtype))
+    require_shapes(gaussians, cameras, background)
+    v, n = len(cameras), len(gaussians)
+    if max(v * n, v * cameras.height * cameras.width) > MOST:
+        raise UserError(f"rasterizer=cuda: {v} views at once are too many. Try: fewer views, or fewer pixels")
+    return render_frame(_Frame(launcher, cameras, gaussians.device), gaussians, background)
 
 
-class _Frame:
-    """One call of the rasterizer: its cameras, and what the kernels keep for the way back."""
+class _Frame(Frame):
+    """See :class:`Frame`."""
 
     cameras: Tensor  # [v CAMERA]
     splats: Tensor  # [v n SPLAT]
-    radii: Tensor  # [v n]
     depth_keys: Tensor  # [v n]
     lists: "_Lists"
     transmittance: Tensor  # [v h w]; after the last splat
     last: Tensor  # [v h w]; 1 + rank of the last splat that reached the pixel
 
     def __init__(self, launcher: Launcher, cameras: Cameras, device: torch.device) -> None:
-        self.launcher, self.device = launcher, device
-        self.height, self.width = cameras.height, cameras.width
-        self.matrices = _plain(cameras.world_to_camera.detach(), device)
-        self.intrinsics = _plain(cameras.intrinsics.detach(), device)
-
-    @property
-    def views(self) -> int:
-        return self.matrices.shape[0]
+        super().__init__(cameras, device)
+        self.launcher = launcher
 
     @property
     def tiles(self) -> int:
@@ -139,7 +123,7 @@ class _Frame:
         return _pieces(self.height, TILE) * _pieces(self.width, TILE)
 
     def project(self, parameters: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Fill the frame's splats; ``means2d`` [v n 2] and ``radii`` [v n]."""
+        """See :meth:`Frame.project`; fills the frame's splats."""
         means, *_, sh = parameters
         v, n = self.views, means.shape[0]
         self.cameras = means.new_empty(v, CAMERA)
@@ -154,13 +138,15 @@ class _Frame:
             _launch_each(launch, kernel, n, PROJECT_BLOCK, *parameters, self.cameras, n, v, *results)
         return means2d, radii
 
-    def blend(self, n: int, background: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """``rgb`` [v h w 3], ``alpha`` and ``depth`` [v h w]."""
+    def blend(
+        self, parameters: list[Tensor], background: Tensor, keeps: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """See :meth:`Frame.blend`; what the backward needs is small and always kept."""
         v, size = self.views, (self.views, self.height, self.width)
         rgb, alpha, depth = (background.new_empty(*size, *channels) for channels in ((3,), (), ()))
         self.transmittance, self.last = torch.empty_like(alpha), torch.empty_like(alpha, dtype=torch.int32)
         with self.launcher.on(self.device) as launch:
-            self.lists = self._list(launch, n)
+            self.lists = self._list(launch, parameters[0].shape[0])
             del self.depth_keys
             images = (rgb, alpha, depth, self.transmittance, self.last)
             threads, blend = v * self.tiles * WARP, (*self._blend_inputs(background), *images)
@@ -192,9 +178,9 @@ class _Frame:
         return (self.splats, *lists, self.views * self.tiles, background, self.height, self.width)
 
     def blend_backward(
-        self, parameters: list[Tensor], radii: Tensor, background: Tensor, images: list[Tensor | None]
+        self, parameters: list[Tensor], background: Tensor, images: list[Tensor | None]
     ) -> list[Tensor]:
-        """Gradients of means2d and the parameters; ``images``: alpha, depth, and gradients of all three."""
+        """See :meth:`Frame.blend_backward`."""
         means, *_, sh = parameters
         v, n = self.views, means.shape[0]
         records = means.new_empty(self.lists.slots.shape[0], RECORD)
@@ -206,13 +192,14 @@ class _Frame:
             blend = (*self._blend_inputs(background), *seen, records)
             _launch_each(launch, "blend_backward", threads, BLEND_BLOCK, *blend)
             slots = (self.lists.first_slot, self.lists.slot_count, records)
-            inputs = (*parameters, self.cameras, n, v, radii, *slots)
+            inputs = (*parameters, self.cameras, n, v, *slots)
             _launch_each(launch, f"project_backward_{sh.shape[1]}", n, PROJECT_BLOCK, *inputs, *grads)
         return grads
 
-    def centre_backward(self, means: Tensor, radii: Tensor, grad_means2d: Tensor) -> Tensor:
-        """Gradient of the means through the projected centres."""
-        n, grad_means = means.shape[0], torch.empty_like(means)
+    def centre_backward(self, parameters: list[Tensor], radii: Tensor, grad_means2d: Tensor) -> Tensor:
+        """See :meth:`Frame.centre_backward`."""
+        means, grad_means = parameters[0], torch.empty_like(parameters[0])
+        n = means.shape[0]
         with self.launcher.on(self.device) as launch:
             inputs = (means, self.cameras, n, self.views, radii, grad_means2d)
             _launch_each(launch, "centre_backward", n, BLOCK, *inputs, grad_means)
@@ -274,64 +261,3 @@ def _pieces(count: int, size: int) -> int:
 
 def _integers(count: int, device: torch.device) -> Tensor:
     return torch.empty(count, dtype=torch.int32, device=device)  # the kernels take the bits as unsigned
-
-
-class _Project(torch.autograd.Function):
-    """Gaussians to ``means2d`` and ``radii``; differentiable in the means alone, as a centre is."""
-
-    @staticmethod
-    def forward(ctx, frame: _Frame, *parameters: Tensor) -> tuple[Tensor, Tensor]:
-        means2d, radii = frame.project(list(parameters))
-        frame.radii = radii
-        ctx.frame = frame
-        ctx.save_for_backward(parameters[0], radii)
-        ctx.mark_non_differentiable(radii)
-        return means2d, radii
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        means, radii = ctx.saved_tensors
-        grad_means = ctx.frame.centre_backward(means, radii, grads[0].contiguous())
-        return None, grad_means, None, None, None, None
-
-
-class _Blend(torch.autograd.Function):
-    """``means2d``, the raw parameters and the backgrounds to images."""
-
-    @staticmethod
-    def forward(ctx, frame: _Frame, means2d: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
-        rgb, alpha, depth = frame.blend(means2d.shape[1], tensors[-1])
-        ctx.frame = frame
-        ctx.save_for_backward(*tensors, frame.radii, alpha, depth)
-        ctx.set_materialize_grads(False)
-        return rgb, alpha, depth
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        *parameters, background, radii, alpha, depth = ctx.saved_tensors
-        images = [alpha, depth, *(None if grad is None else grad.contiguous() for grad in grads)]
-        totals = ctx.frame.blend_backward(parameters, radii, background, images)
-        grad_background = None
-        if ctx.needs_input_grad[-1] and grads[0] is not None:
-            grad_background = (grads[0] * (1 - alpha)[..., None]).sum(dim=(1, 2))
-        return None, *totals, grad_background
-
-
-def _plain(tensor: Tensor, device: torch.device) -> Tensor:
-    return tensor.to(device, torch.float32).contiguous()
-
-
-def _require_shapes(gaussians: Gaussians, cameras: Cameras, background: Tensor) -> None:
-    # Kernels trust what they are told: a wrong shape would read foreign memory.
-    n, v, k = len(gaussians), len(cameras), gaussians.sh.shape[1]
-    wanted = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "opacity_logits": (n,), "sh": (n, k, 3)}
-    shapes = {name: tuple(tensor.shape) for name, tensor in gaussians.tensors().items()}
-    if shapes != wanted or k not in SH_SIZES:
-        raise ValueError(f"Gaussians: wanted {wanted} with k in {SH_SIZES}, got {shapes}")
-    views = [tuple(each.shape) for each in (cameras.world_to_camera, cameras.intrinsics, background)]
-    if views != [(v, 4, 4), (v, 3, 3), (v, 3)] or min(cameras.height, cameras.width) < 1:
-        raise ValueError(f"cameras and background: wanted (v, 4, 4), (v, 3, 3), (v, 3), got {views}")
-    if max(v * n, v * cameras.height * cameras.width) > MOST:
-        raise UserError(f"rasterizer=cuda: {v} views at once are too many. Try: fewer views, or fewer pixels")

@@ -96,14 +96,13 @@ SPLAT_FN void sum_records(const float* records, i64 first, i64 count, float* sum
 template <int COEFFICIENTS>
 SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, const float* quats,
                                 const float* opacity_logits, const float* sh, const Camera* cameras, i64 n,
-                                i64 views, const float* radii, const u32* first_slot, const u32* slot_count,
-                                const float* records, float* grad_means2d, float* grad_means,
-                                float* grad_log_scales, float* grad_quats, float* grad_opacity_logits,
-                                float* grad_sh) {
+                                i64 views, const u32* first_slot, const u32* slot_count, const float* records,
+                                float* grad_means2d, float* grad_means, float* grad_log_scales,
+                                float* grad_quats, float* grad_opacity_logits, float* grad_sh) {
   const i64 i = thread_index();
   const bool is_mine = i < n;  // the others stay to help with long runs
   bool is_seen = false;
-  for (i64 v = 0; v < views && is_mine; ++v) is_seen = is_seen || radii[v * n + i] > 0;
+  for (i64 v = 0; v < views && is_mine; ++v) is_seen = is_seen || slot_count[v * n + i] > 0;
   // Who is not seen loads somebody else's numbers and does not use them: no branch, no doubt about the loops.
   const Gaussian<COEFFICIENTS> gaussian =
       load_gaussian<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, is_mine ? i : 0);
@@ -113,7 +112,7 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
   splat::clear(total, COEFFICIENTS);
   for (i64 v = 0; v < views; ++v) {
     const i64 pair = v * n + i;
-    const bool is_visible = is_mine && radii[pair] > 0;
+    const bool is_visible = is_mine && slot_count[pair] > 0;
     float sum[RECORD];
     sum_records(records, is_visible ? first_slot[pair] : 0, is_visible ? slot_count[pair] : 0, sum);
     float centre[2] = {0, 0};
@@ -170,10 +169,10 @@ constexpr int PROJECT_BLOCK = 128;  // threads: fewer, for each needs many regis
   KERNEL(PROJECT_BLOCK)                                                                                      \
   project_backward_##COEFFICIENTS(                                                                           \
       const float* means, const float* log_scales, const float* quats, const float* opacity_logits,          \
-      const float* sh, const Camera* cameras, i64 n, i64 views, const float* radii, const u32* first_slot,   \
+      const float* sh, const Camera* cameras, i64 n, i64 views, const u32* first_slot,                       \
       const u32* slot_count, const float* records, float* grad_means2d, float* grad_means,                   \
       float* grad_log_scales, float* grad_quats, float* grad_opacity_logits, float* grad_sh) {               \
-    gaussian_backward<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, cameras, n, views, radii,  \
+    gaussian_backward<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, cameras, n, views,         \
                                     first_slot, slot_count, records, grad_means2d, grad_means,               \
                                     grad_log_scales, grad_quats, grad_opacity_logits, grad_sh);              \
   }
