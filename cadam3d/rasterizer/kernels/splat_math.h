@@ -18,8 +18,10 @@
 
 #if defined(__CUDACC__)
 #define SPLAT_FN __device__ __forceinline__
+#define SPLAT_TABLE __device__ constexpr
 #else
 #define SPLAT_FN inline
+#define SPLAT_TABLE constexpr
 #endif
 
 namespace splat {
@@ -95,10 +97,11 @@ SPLAT_FN Camera<Real> make_camera(const float* world_to_camera, const float* int
 
 // The real basis of cadam3d/core/sh.py (Y_lm with the Condon-Shortley phase, l = 0..3, m = -l..l).
 constexpr double SH_C0 = 0.28209479177387814, SH_C1 = 0.4886025119029199;
-constexpr double SH_C2[5] = {1.0925484305920792, -1.0925484305920792, 0.31539156525252005,
-                             -1.0925484305920792, 0.5462742152960396};
-constexpr double SH_C3[7] = {-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
-                             -0.4570457994644658, 1.445305721320277, -0.5900435899266435};
+SPLAT_TABLE double SH_C2[5] = {1.0925484305920792, -1.0925484305920792, 0.31539156525252005,
+                               -1.0925484305920792, 0.5462742152960396};
+SPLAT_TABLE double SH_C3[7] = {-0.5900435899266435, 2.890611442640554,   -0.4570457994644658,
+                               0.3731763325901154,  -0.4570457994644658, 1.445305721320277,
+                               -0.5900435899266435};
 
 template <class Real>
 SPLAT_FN void sh_basis(int coefficients, const Real* unit, Real* basis) {
@@ -153,12 +156,18 @@ SPLAT_FN void sh_basis_backward(int coefficients, const Real* unit, const Real* 
 
 // ---------------------------------------------------------------------------------------------- one Gaussian
 
-// The raw parameters of one Gaussian, as the optimizer holds them.
-template <class Real>
+// A number known when compiling: loops of so many turns unroll, and what they walk over stays in registers.
+template <int N>
+struct Fixed {
+  SPLAT_FN constexpr operator int() const { return N; }
+};
+
+// The raw parameters of one Gaussian, as the optimizer holds them. Count is int, or Fixed.
+template <class Real, class Count = int>
 struct Gaussian {
   Real mean[3], log_scale[3], quat[4], opacity_logit;
   const float* sh;  // coefficients x 3
-  int coefficients;
+  Count coefficients;
 };
 
 // What does not depend on the view: computed once for a batch.
@@ -167,7 +176,8 @@ struct Shape {
   Real axes[3][3];      // columns: the own axes in the world, times their standard deviation
   Real rotation[3][3];  // columns: the own axes in the world
   Real unit_quat[4], inverse_length;
-  Real opacity, log_cut;  // log_cut = ln(opacity / alpha_min): the falloff exponent at which it fades out
+  Real opacity, transparency;  // transparency = 1 - opacity, without its cancellation
+  Real log_cut;                // ln(opacity / alpha_min): the falloff exponent at which it fades out
 };
 
 // What one view adds: everything the chain rule needs again.
@@ -183,8 +193,8 @@ struct Footprint {
   Real reach[2];  // half-sizes of the box outside which alpha < alpha_min
 };
 
-template <class Real>
-SPLAT_FN bool make_shape(const Gaussian<Real>& gaussian, Shape<Real>& shape) {
+template <class Real, class Count>
+SPLAT_FN bool make_shape(const Gaussian<Real, Count>& gaussian, Shape<Real>& shape) {
   Real poison = gaussian.opacity_logit - gaussian.opacity_logit;  // 0, or NaN if anything is not finite
   for (int i = 0; i < 3; ++i)
     poison += (gaussian.mean[i] - gaussian.mean[i]) + (gaussian.log_scale[i] - gaussian.log_scale[i]);
@@ -193,8 +203,10 @@ SPLAT_FN bool make_shape(const Gaussian<Real>& gaussian, Shape<Real>& shape) {
   for (int i = 0; i < 4; ++i) squared += gaussian.quat[i] * gaussian.quat[i];
   if (!(poison == 0) || !(squared >= Real(TINY_QUATERNION)) || !is_finite(squared)) return false;
 
-  shape.opacity = 1 / (1 + power_e(-gaussian.opacity_logit));
+  const Real odds_against = power_e(-gaussian.opacity_logit);
+  shape.opacity = 1 / (1 + odds_against);
   if (!(shape.opacity > Real(SPLAT_ALPHA_MIN))) return false;
+  shape.transparency = odds_against * shape.opacity;
   shape.log_cut = log_e(shape.opacity / Real(SPLAT_ALPHA_MIN));
 
   shape.inverse_length = 1 / root(squared);
@@ -212,9 +224,9 @@ SPLAT_FN bool make_shape(const Gaussian<Real>& gaussian, Shape<Real>& shape) {
 }
 
 // False if the view does not see it. Comparisons are written so that a NaN culls.
-template <class Real>
-SPLAT_FN bool project(const Gaussian<Real>& gaussian, const Shape<Real>& shape, const Camera<Real>& camera,
-                      Footprint<Real>& out) {
+template <class Real, class Count>
+SPLAT_FN bool project(const Gaussian<Real, Count>& gaussian, const Shape<Real>& shape,
+                      const Camera<Real>& camera, Footprint<Real>& out) {
   for (int i = 0; i < 3; ++i) out.centre[i] = dot3(camera.rotation[i], gaussian.mean) + camera.translation[i];
   const Real z = out.centre[2];
   if (!(z > Real(SPLAT_NEAR) && z < Real(SPLAT_FAR))) return false;
@@ -251,13 +263,14 @@ SPLAT_FN bool project(const Gaussian<Real>& gaussian, const Shape<Real>& shape, 
 
   out.reach[0] = root(2 * shape.log_cut * out.cov_xx);
   out.reach[1] = root(2 * shape.log_cut * out.cov_yy);
+  if (!fits_float(out.reach[0]) || !fits_float(out.reach[1])) return false;
   return out.mean2d[0] + out.reach[0] > 0 && out.mean2d[0] - out.reach[0] < camera.width &&
          out.mean2d[1] + out.reach[1] > 0 && out.mean2d[1] - out.reach[1] < camera.height;
 }
 
 // Unit vector from camera to Gaussian; returns one over their distance.
-template <class Real>
-SPLAT_FN Real direction(const Gaussian<Real>& gaussian, const Camera<Real>& camera, Real* unit) {
+template <class Real, class Count>
+SPLAT_FN Real direction(const Gaussian<Real, Count>& gaussian, const Camera<Real>& camera, Real* unit) {
   for (int i = 0; i < 3; ++i) unit[i] = gaussian.mean[i] - camera.position[i];
   const Real inverse = 1 / root(dot3(unit, unit));
   for (int i = 0; i < 3; ++i) unit[i] *= inverse;
@@ -265,8 +278,8 @@ SPLAT_FN Real direction(const Gaussian<Real>& gaussian, const Camera<Real>& came
 }
 
 // The colour before it is clamped at 0 from below.
-template <class Real>
-SPLAT_FN void raw_colour(const Gaussian<Real>& gaussian, const Real* basis, Real* rgb) {
+template <class Real, class Count>
+SPLAT_FN void raw_colour(const Gaussian<Real, Count>& gaussian, const Real* basis, Real* rgb) {
   for (int c = 0; c < 3; ++c) {
     Real sum = Real(0.5);
     for (int k = 0; k < gaussian.coefficients; ++k) sum += basis[k] * Real(gaussian.sh[3 * k + c]);
@@ -274,8 +287,8 @@ SPLAT_FN void raw_colour(const Gaussian<Real>& gaussian, const Real* basis, Real
   }
 }
 
-template <class Real>
-SPLAT_FN void colour(const Gaussian<Real>& gaussian, const Camera<Real>& camera, Real* rgb) {
+template <class Real, class Count>
+SPLAT_FN void colour(const Gaussian<Real, Count>& gaussian, const Camera<Real>& camera, Real* rgb) {
   Real unit[3] = {0, 0, 1}, basis[MAX_COEFFICIENTS];
   if (gaussian.coefficients > 1) direction(gaussian, camera, unit);
   sh_basis(gaussian.coefficients, unit, basis);
@@ -314,11 +327,11 @@ SPLAT_FN void mean2d_gradient(const Footprint<Real>& footprint, const Moments<Re
 }
 
 // Adds one view to ``total``; the path through mean2d is left out, see centre_backward.
-template <class Real>
-SPLAT_FN void project_backward(const Gaussian<Real>& gaussian, const Shape<Real>& shape,
+template <class Real, class Count>
+SPLAT_FN void project_backward(const Gaussian<Real, Count>& gaussian, const Shape<Real>& shape,
                                const Camera<Real>& camera, const Footprint<Real>& f,
                                const Moments<Real>& moments, Gradient<Real>& total) {
-  total.opacity_logit -= moments.g * (1 - shape.opacity);  // alpha = opacity exp(-|y|^2)
+  total.opacity_logit -= moments.g * shape.transparency;  // alpha = opacity exp(-|y|^2)
 
   Real centre[3] = {0, 0, moments.depth}, axes[3][3];
   Real rows[2][3];
@@ -384,8 +397,8 @@ SPLAT_FN void centre_backward(const Camera<Real>& camera, const Real* mean, cons
 }
 
 // From the axes, summed over the views, to log-scales and the raw quaternion.
-template <class Real>
-SPLAT_FN void shape_backward(const Shape<Real>& shape, const Gaussian<Real>& gaussian,
+template <class Real, class Count>
+SPLAT_FN void shape_backward(const Shape<Real>& shape, const Gaussian<Real, Count>& gaussian,
                              const Gradient<Real>& total, Real* log_scale, Real* quat) {
   Real g[3][3];
   for (int j = 0; j < 3; ++j) {

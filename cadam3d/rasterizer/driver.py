@@ -1,0 +1,109 @@
+"""Runs compiled kernels through the CUDA driver, on torch's current stream, in torch's own context."""
+
+import ctypes
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from cadam3d.core.checks import UserError
+from cadam3d.rasterizer.cuda import Launch, Launcher
+from cadam3d.rasterizer.nvrtc import build
+
+LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+OUT_OF_MEMORY = 2  # CUDA_ERROR_OUT_OF_MEMORY
+
+
+class Driver(Launcher):
+    """The kernels on every CUDA device of this machine, each compiled and loaded when first asked for."""
+
+    def __init__(self, cache_dir: Path) -> None:
+        self._cache_dir = cache_dir
+        self._modules: dict[int, Module] = {}
+
+    @contextmanager
+    def on(self, device: torch.device) -> Iterator[Launch]:
+        """See :meth:`Launcher.on`. Raises :class:`UserError` if the kernels cannot be had for ``device``."""
+        index = torch.cuda.current_device() if device.index is None else device.index
+        with torch.cuda.device(index):
+            if index not in self._modules:
+                cubin = build(self._cache_dir, torch.cuda.get_device_capability(index))
+                self._modules[index] = Module(load_driver(), index, cubin.path.read_bytes())
+            with self._modules[index].launching(torch.cuda.current_stream(index).cuda_stream) as launch:
+                yield launch
+
+
+def load_driver() -> ctypes.CDLL:
+    """The CUDA driver's library. Raises :class:`UserError` if there is none."""
+    try:
+        return ctypes.CDLL(LIBRARY)
+    except OSError as error:
+        raise UserError(f"rasterizer=cuda cannot load the driver: {error}. Try: nvidia-smi") from error
+
+
+class Module:
+    """Compiled kernels in the memory of one device."""
+
+    def __init__(self, driver: ctypes.CDLL, index: int, cubin: bytes) -> None:
+        self._driver = driver
+        self._functions: dict[str, ctypes.c_void_p] = {}
+        self._context, self._handle, ordinal = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_int()
+        self._call("cuInit", 0)
+        self._call("cuDeviceGet", ctypes.byref(ordinal), index)
+        # The context that torch uses too; never released, for it lives as long as the process.
+        self._call("cuDevicePrimaryCtxRetain", ctypes.byref(self._context), ordinal)
+        with self._current():
+            self._call("cuModuleLoadData", ctypes.byref(self._handle), cubin)
+
+    @contextmanager
+    def launching(self, stream: int) -> Iterator[Launch]:
+        """Yield ``launch`` (see :meth:`Launcher.on`) for a stream of the device."""
+        with self._current():
+            yield partial(self._launch, ctypes.c_void_p(stream))
+
+    def _launch(self, stream: ctypes.c_void_p, kernel: str, blocks: int, threads: int, *arguments) -> None:
+        values = (ctypes.c_uint64 * len(arguments))(*map(_as_number, arguments))
+        start = ctypes.addressof(values)
+        pointers = (ctypes.c_void_p * len(arguments))(*range(start, start + 8 * len(arguments), 8))
+        size = (blocks, 1, 1, threads, 1, 1)
+        self._call("cuLaunchKernel", self._function(kernel), *size, 0, stream, pointers, None)
+
+    def _function(self, kernel: str) -> ctypes.c_void_p:
+        if kernel not in self._functions:
+            function = ctypes.c_void_p()
+            self._call("cuModuleGetFunction", ctypes.byref(function), self._handle, kernel.encode())
+            self._functions[kernel] = function
+        return self._functions[kernel]
+
+    @contextmanager
+    def _current(self) -> Iterator[None]:
+        # Autograd's threads may not have a context yet.
+        self._call("cuCtxPushCurrent_v2", self._context)
+        try:
+            yield
+        finally:
+            self._call("cuCtxPopCurrent_v2", ctypes.byref(ctypes.c_void_p()))
+
+    def _call(self, name: str, *arguments: object) -> None:
+        status = getattr(self._driver, name)(*arguments)
+        if status != 0:
+            message = ctypes.c_char_p()
+            self._driver.cuGetErrorString(status, ctypes.byref(message))
+            reason = (message.value or b"error").decode()
+            if status == OUT_OF_MEMORY:
+                raise MemoryError(f"rasterizer=cuda: {name}: {reason}")
+            raise UserError(f"rasterizer=cuda: {name}: {reason} ({status}). Try: rasterizer=reference")
+
+
+def _as_number(argument: object) -> int:
+    """A kernel's argument in eight bytes: a tensor's address, null for ``None``, or a number."""
+    if isinstance(argument, Tensor):
+        return argument.data_ptr()
+    if argument is None:
+        return 0
+    assert isinstance(argument, int), argument
+    return argument

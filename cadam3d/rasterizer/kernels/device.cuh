@@ -1,0 +1,44 @@
+// What every CUDA kernel here shares: short names, sizes, and who a thread is.
+//
+// No header of the toolkit is included: a run-time compiler has none. Every kernel parameter is eight bytes,
+// a pointer or an i64, so that a launch is a list of numbers (see ``Launcher`` in ../cuda.py). Grids have one
+// dimension. No kernel adds floats atomically, so every bit of every result follows from the input.
+#pragma once
+
+#include "splat_math.h"
+
+#define KERNEL(threads) extern "C" __global__ void __launch_bounds__(threads)
+
+typedef unsigned int u32;
+typedef unsigned long long u64;
+typedef long long i64;
+
+constexpr int WARP = 32;
+constexpr u32 ALL = 0xffffffffu;  // every lane of a warp
+constexpr int BLOCK = 256;        // threads of most kernels; mirrored in ../cuda.py
+constexpr int TILE = 8;           // pixels along the edge of a tile; mirrored in ../cuda.py
+constexpr int RECORD = 10;        // floats that the blend leaves per (splat, tile); mirrored in ../cuda.py
+constexpr u32 CULLED = ALL;       // depth key of who is not seen: behind every other
+
+SPLAT_FN i64 thread_index() { return i64(blockIdx.x) * blockDim.x + threadIdx.x; }
+SPLAT_FN int lane_index() { return int(threadIdx.x) % WARP; }
+
+// What tile lists and blend read of a projected Gaussian: three vectors of four.
+struct Splat {
+  float x, y;           // pixels
+  float l11, l12, l22;  // whitening, see splat_math.h
+  float cut, opacity;   // alpha = opacity exp(-|y|^2) where |y|^2 <= cut
+  float depth;          // camera z
+  float red, green, blue;
+  float reach_x;  // half the width of its box; half the height is sqrt(cut) / l22
+};
+
+SPLAT_FN void store_splat(float4* to, const Splat& s) {
+  to[0] = make_float4(s.x, s.y, s.l11, s.l12);
+  to[1] = make_float4(s.l22, s.cut, s.opacity, s.depth);
+  to[2] = make_float4(s.red, s.green, s.blue, s.reach_x);
+}
+
+SPLAT_FN Splat make_splat(float4 a, float4 b, float4 c) {
+  return {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, c.x, c.y, c.z, c.w};
+}

@@ -1,0 +1,183 @@
+// From Gaussians to splats and from records back to Gaussians: one thread per Gaussian, looping over views.
+#pragma once
+
+#include "device.cuh"
+
+typedef splat::Camera<float> Camera;
+static_assert(sizeof(Camera) == 25 * sizeof(float), "mirrored in ../cuda.py");
+
+// One thread per view; the others read what it wrote.
+KERNEL(BLOCK)
+prepare_cameras(const float* world_to_camera, const float* intrinsics, i64 views, i64 height, i64 width,
+                Camera* cameras) {
+  const i64 v = thread_index();
+  if (v >= views) return;
+  cameras[v] =
+      splat::make_camera<float>(world_to_camera + 16 * v, intrinsics + 9 * v, int(width), int(height));
+}
+
+template <int COEFFICIENTS>
+using Gaussian = splat::Gaussian<float, splat::Fixed<COEFFICIENTS>>;
+
+template <int COEFFICIENTS>
+SPLAT_FN Gaussian<COEFFICIENTS> load_gaussian(const float* means, const float* log_scales, const float* quats,
+                                              const float* opacity_logits, const float* sh, i64 i) {
+  Gaussian<COEFFICIENTS> gaussian;
+  for (int j = 0; j < 3; ++j) {
+    gaussian.mean[j] = means[3 * i + j];
+    gaussian.log_scale[j] = log_scales[3 * i + j];
+  }
+  for (int j = 0; j < 4; ++j) gaussian.quat[j] = quats[4 * i + j];
+  gaussian.opacity_logit = opacity_logits[i];
+  gaussian.sh = sh + 3 * COEFFICIENTS * i;
+  return gaussian;
+}
+
+// splats [v n 3 float4], means2d [v n 2], radii [v n], depth_keys [v n]
+template <int COEFFICIENTS>
+SPLAT_FN void project_gaussian(const float* means, const float* log_scales, const float* quats,
+                               const float* opacity_logits, const float* sh, const Camera* cameras, i64 n,
+                               i64 views, float4* splats, float* means2d, float* radii, u32* depth_keys) {
+  const i64 i = thread_index();
+  if (i >= n) return;
+  const Gaussian<COEFFICIENTS> gaussian =
+      load_gaussian<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, i);
+  splat::Shape<float> shape;
+  const bool is_sound = splat::make_shape(gaussian, shape);
+  for (i64 v = 0; v < views; ++v) {
+    const i64 pair = v * n + i;
+    splat::Footprint<float> footprint;
+    if (!is_sound || !splat::project(gaussian, shape, cameras[v], footprint)) {
+      means2d[2 * pair] = means2d[2 * pair + 1] = radii[pair] = 0;
+      depth_keys[pair] = CULLED;
+      continue;
+    }
+    float rgb[3];
+    splat::colour(gaussian, cameras[v], rgb);
+    const float *at = footprint.mean2d, *reach = footprint.reach, depth = footprint.centre[2];
+    store_splat(splats + 3 * pair, {at[0], at[1], footprint.l11, footprint.l12, footprint.l22, shape.log_cut,
+                                    shape.opacity, depth, rgb[0], rgb[1], rgb[2], reach[0]});
+    means2d[2 * pair] = at[0], means2d[2 * pair + 1] = at[1];
+    radii[pair] = reach[0] > reach[1] ? reach[0] : reach[1];
+    depth_keys[pair] = __float_as_uint(depth);  // positive floats sort like their bits
+  }
+}
+
+constexpr i64 LONG_RUN = 64;  // records; a longer run is summed by the whole warp
+
+// The sum of ``count`` records from ``first`` on, for every lane its own. All lanes of a warp must call it.
+SPLAT_FN void sum_records(const float* records, i64 first, i64 count, float* sum) {
+  for (int j = 0; j < RECORD; ++j) sum[j] = 0;
+  if (count <= LONG_RUN)
+    for (i64 slot = first; slot < first + count; ++slot)
+#pragma unroll
+      for (int j = 0; j < RECORD; ++j) sum[j] += records[RECORD * slot + j];
+  const int lane = lane_index();
+  u32 waiting = __ballot_sync(ALL, count > LONG_RUN);
+  while (waiting) {
+    const int owner = __ffs(int(waiting)) - 1;
+    waiting &= waiting - 1;
+    const i64 from = i64(__shfl_sync(ALL, u64(first), owner)),
+              many = i64(__shfl_sync(ALL, u64(count), owner));
+    float part[RECORD] = {};
+    for (i64 slot = from + lane; slot < from + many; slot += WARP)
+#pragma unroll
+      for (int j = 0; j < RECORD; ++j) part[j] += records[RECORD * slot + j];
+#pragma unroll
+    for (int j = 0; j < RECORD; ++j) {
+#pragma unroll
+      for (int reach = WARP / 2; reach > 0; reach /= 2) part[j] += __shfl_xor_sync(ALL, part[j], reach);
+      if (lane == owner) sum[j] = part[j];
+    }
+  }
+}
+
+// Every gradient of one Gaussian but the path through means2d, which only arrives in grad_means2d [v n 2].
+template <int COEFFICIENTS>
+SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, const float* quats,
+                                const float* opacity_logits, const float* sh, const Camera* cameras, i64 n,
+                                i64 views, const u32* first_slot, const u32* slot_count, const float* records,
+                                float* grad_means2d, float* grad_means, float* grad_log_scales,
+                                float* grad_quats, float* grad_opacity_logits, float* grad_sh) {
+  const i64 i = thread_index();
+  const bool is_mine = i < n;  // the others stay to help with long runs
+  bool is_seen = false;
+  for (i64 v = 0; v < views && is_mine; ++v) is_seen = is_seen || slot_count[v * n + i] > 0;
+  // Who is not seen loads somebody else's numbers and does not use them: no branch, no doubt about the loops.
+  const Gaussian<COEFFICIENTS> gaussian =
+      load_gaussian<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, is_mine ? i : 0);
+  splat::Shape<float> shape;
+  if (is_seen) splat::make_shape(gaussian, shape);
+  splat::Gradient<float> total;
+  splat::clear(total, COEFFICIENTS);
+  for (i64 v = 0; v < views; ++v) {
+    const i64 pair = v * n + i;
+    const bool is_visible = is_mine && slot_count[pair] > 0;
+    float sum[RECORD];
+    sum_records(records, is_visible ? first_slot[pair] : 0, is_visible ? slot_count[pair] : 0, sum);
+    float centre[2] = {0, 0};
+    if (is_visible) {
+      splat::Footprint<float> footprint;
+      splat::project(gaussian, shape, cameras[v], footprint);
+      const splat::Moments<float> moments = {
+          sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], {sum[6], sum[7], sum[8]}, sum[9]};
+      splat::mean2d_gradient(footprint, moments, centre);
+      splat::project_backward(gaussian, shape, cameras[v], footprint, moments, total);
+    }
+    if (is_mine) grad_means2d[2 * pair] = centre[0], grad_means2d[2 * pair + 1] = centre[1];
+  }
+  if (!is_mine) return;
+  float log_scale[3] = {0, 0, 0}, quat[4] = {0, 0, 0, 0};
+  if (is_seen) splat::shape_backward(shape, gaussian, total, log_scale, quat);
+  for (int j = 0; j < 3; ++j) {
+    grad_means[3 * i + j] = total.mean[j];
+    grad_log_scales[3 * i + j] = log_scale[j];
+  }
+  for (int j = 0; j < 4; ++j) grad_quats[4 * i + j] = quat[j];
+  grad_opacity_logits[i] = total.opacity_logit;
+#pragma unroll
+  for (int j = 0; j < 3 * COEFFICIENTS; ++j) grad_sh[3 * COEFFICIENTS * i + j] = total.sh[j];
+}
+
+// dLoss/dmeans [n 3] through the projected centres, from dLoss/dmeans2d [v n 2]; who is culled gets none.
+KERNEL(BLOCK)
+centre_backward(const float* means, const Camera* cameras, i64 n, i64 views, const float* radii,
+                const float* grad_means2d, float* grad_means) {
+  const i64 i = thread_index();
+  if (i >= n) return;
+  const float mean[3] = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
+  float total[3] = {0, 0, 0};
+  for (i64 v = 0; v < views; ++v) {
+    const i64 pair = v * n + i;
+    if (!(radii[pair] > 0)) continue;
+    const float gradient[2] = {grad_means2d[2 * pair], grad_means2d[2 * pair + 1]};
+    splat::centre_backward(cameras[v], mean, gradient, total);
+  }
+  for (int j = 0; j < 3; ++j) grad_means[3 * i + j] = total[j];
+}
+
+constexpr int PROJECT_BLOCK = 128;  // threads: fewer, for each needs many registers; mirrored in ../cuda.py
+
+#define KERNELS_FOR(COEFFICIENTS)                                                                            \
+  KERNEL(PROJECT_BLOCK)                                                                                      \
+  project_forward_##COEFFICIENTS(const float* means, const float* log_scales, const float* quats,            \
+                                 const float* opacity_logits, const float* sh, const Camera* cameras, i64 n, \
+                                 i64 views, float4* splats, float* means2d, float* radii, u32* depth_keys) { \
+    project_gaussian<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, cameras, n, views, splats,  \
+                                   means2d, radii, depth_keys);                                              \
+  }                                                                                                          \
+  KERNEL(PROJECT_BLOCK)                                                                                      \
+  project_backward_##COEFFICIENTS(                                                                           \
+      const float* means, const float* log_scales, const float* quats, const float* opacity_logits,          \
+      const float* sh, const Camera* cameras, i64 n, i64 views, const u32* first_slot,                       \
+      const u32* slot_count, const float* records, float* grad_means2d, float* grad_means,                   \
+      float* grad_log_scales, float* grad_quats, float* grad_opacity_logits, float* grad_sh) {               \
+    gaussian_backward<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, cameras, n, views,         \
+                                    first_slot, slot_count, records, grad_means2d, grad_means,               \
+                                    grad_log_scales, grad_quats, grad_opacity_logits, grad_sh);              \
+  }
+
+KERNELS_FOR(1)
+KERNELS_FOR(4)
+KERNELS_FOR(9)
+KERNELS_FOR(16)

@@ -1,0 +1,144 @@
+// Prefix sums and a stable radix sort.
+//
+// The sort takes eight bits a pass, least significant first. A pass counts the digits of each chunk, turns
+// the counts (digit after digit, chunk after chunk) into positions by one prefix sum, and scatters: within a
+// chunk a warp owns consecutive items and ranks them by votes, so equal keys keep their order.
+#pragma once
+
+#include "device.cuh"
+
+constexpr int SCAN_ITEMS = 8;                    // consecutive items of one thread
+constexpr int SCAN_CHUNK = BLOCK * SCAN_ITEMS;   // of one block; mirrored in ../cuda.py
+constexpr int RADIX_BITS = 8;                    // mirrored in ../cuda.py
+constexpr int BINS = 1 << RADIX_BITS;            // one thread of a block per bin
+constexpr int WARPS = BLOCK / WARP;              // of a block
+constexpr int SORT_ROUNDS = 16;                  // items of one thread
+constexpr int SORT_CHUNK = BLOCK * SORT_ROUNDS;  // of one block; mirrored in ../cuda.py
+static_assert(BINS == BLOCK, "a thread per bin");
+
+// The sum over the threads before this one; ``total`` is the sum over all of the block. ``sums`` is shared
+// memory for BLOCK of them.
+SPLAT_FN u64 block_scan(u64 value, u64* sums, u64* total) {
+  const int t = int(threadIdx.x);
+  u64 inclusive = value;
+  sums[t] = inclusive;
+  __syncthreads();
+  for (int reach = 1; reach < BLOCK; reach *= 2) {
+    const u64 before = t >= reach ? sums[t - reach] : 0;
+    __syncthreads();
+    inclusive += before;
+    sums[t] = inclusive;
+    __syncthreads();
+  }
+  *total = sums[BLOCK - 1];
+  __syncthreads();  // the memory may be used again
+  return inclusive - value;
+}
+
+// Exclusive prefix sums of one chunk, all of them raised by ``carry``; returns the sum of the chunk.
+template <class In, class Out>
+SPLAT_FN u64 scan_chunk(const In* in, i64 begin, i64 n, u64 carry, Out* out, u64* sums) {
+  const i64 first = begin + i64(threadIdx.x) * SCAN_ITEMS;
+  const i64 end = first + SCAN_ITEMS < n ? first + SCAN_ITEMS : n;
+  u64 sum = 0, total;
+  for (i64 i = first; i < end; ++i) sum += in[i];
+  u64 before = carry + block_scan(sum, sums, &total);
+  for (i64 i = first; i < end; ++i) {
+    const In item = in[i];  // first, for ``out`` may be ``in``
+    out[i] = Out(before);
+    before += item;
+  }
+  return total;
+}
+
+// One block walks over all chunks: for short arrays, and for the sums of chunks.
+template <class In, class Out>
+SPLAT_FN void scan_serially(const In* in, i64 n, Out* out, u64* total, u64* sums) {
+  u64 carry = 0;
+  for (i64 begin = 0; begin < n; begin += SCAN_CHUNK) carry += scan_chunk(in, begin, n, carry, out, sums);
+  if (threadIdx.x == 0) *total = carry;
+}
+
+KERNEL(BLOCK) scan_short(const u32* in, i64 n, u32* out, u64* total) {
+  __shared__ u64 shared[BLOCK];
+  scan_serially(in, n, out, total, shared);
+}
+
+// A long array in three kernels: sums of the chunks, their prefix sums, and then each chunk on its own.
+KERNEL(BLOCK) scan_reduce(const u32* in, i64 n, u64* sums) {
+  __shared__ u64 shared[BLOCK];
+  const i64 first = i64(blockIdx.x) * SCAN_CHUNK + i64(threadIdx.x) * SCAN_ITEMS;
+  u64 sum = 0, total;
+  for (int i = 0; i < SCAN_ITEMS; ++i) sum += first + i < n ? in[first + i] : 0;
+  block_scan(sum, shared, &total);
+  if (threadIdx.x == 0) sums[blockIdx.x] = total;
+}
+
+KERNEL(BLOCK) scan_sums(u64* sums, i64 n, u64* total) {
+  __shared__ u64 shared[BLOCK];
+  scan_serially(sums, n, sums, total, shared);
+}
+
+KERNEL(BLOCK) scan_apply(const u32* in, i64 n, const u64* sums, u32* out) {
+  __shared__ u64 shared[BLOCK];
+  scan_chunk(in, i64(blockIdx.x) * SCAN_CHUNK, n, sums[blockIdx.x], out, shared);
+}
+
+SPLAT_FN u32 digit_of(u32 key, i64 shift) { return (key >> shift) & (BINS - 1); }
+
+// counts [BINS chunks]
+KERNEL(BLOCK) sort_count(const u32* keys, i64 n, i64 shift, i64 chunks, u32* counts) {
+  __shared__ u32 bins[BINS];
+  const int t = int(threadIdx.x);
+  bins[t] = 0;
+  __syncthreads();
+  const i64 begin = i64(blockIdx.x) * SORT_CHUNK;
+  for (int round = 0; round < SORT_ROUNDS; ++round) {
+    const i64 i = begin + round * BLOCK + t;
+    if (i < n) atomicAdd(&bins[digit_of(keys[i], shift)], 1u);
+  }
+  __syncthreads();
+  counts[t * chunks + blockIdx.x] = bins[t];
+}
+
+// ``positions`` are the prefix sums of the counts. Without ``values`` each item carries its index.
+KERNEL(BLOCK)
+sort_scatter(const u32* keys, const u32* values, i64 n, i64 shift, i64 chunks, const u32* positions,
+             u32* sorted_keys, u32* sorted_values) {
+  __shared__ u32 bins[WARPS][BINS];  // first how many, then where the next one goes
+  const int t = int(threadIdx.x), lane = lane_index(), warp = t / WARP;
+  for (int w = 0; w < WARPS; ++w) bins[w][t] = 0;
+  __syncthreads();
+  const i64 begin = i64(blockIdx.x) * SORT_CHUNK + warp * (WARP * SORT_ROUNDS) + lane;
+  for (int round = 0; round < SORT_ROUNDS; ++round) {
+    const i64 i = begin + round * WARP;
+    if (i < n) atomicAdd(&bins[warp][digit_of(keys[i], shift)], 1u);
+  }
+  __syncthreads();
+  u32 position = positions[t * chunks + blockIdx.x];
+  for (int w = 0; w < WARPS; ++w) {
+    const u32 count = bins[w][t];
+    bins[w][t] = position;
+    position += count;
+  }
+  __syncthreads();
+  for (int round = 0; round < SORT_ROUNDS; ++round) {
+    const i64 i = begin + round * WARP;
+    const bool is_item = i < n;
+    const u32 key = is_item ? keys[i] : 0, digit = digit_of(key, shift);
+    u32 peers = __ballot_sync(ALL, is_item);  // lanes with the same digit
+    for (int bit = 0; bit < RADIX_BITS; ++bit) {
+      const bool is_set = (digit >> bit) & 1;
+      const u32 votes = __ballot_sync(ALL, is_set);
+      peers &= is_set ? votes : ~votes;
+    }
+    const u32 at = bins[warp][digit] + u32(__popc(peers & ((1u << lane) - 1)));
+    __syncwarp();  // all have read before one of the peers, the last, moves the bin on
+    if (is_item && peers >> lane == 1) bins[warp][digit] = at + 1;
+    __syncwarp();
+    if (is_item) {
+      sorted_keys[at] = key;
+      sorted_values[at] = values ? values[i] : u32(i);
+    }
+  }
+}

@@ -1,0 +1,121 @@
+// Which tiles a splat touches: counted, listed, and cut into one list per tile.
+//
+// A splat gets one slot per tile it touches. Slots are numbered in depth order, so a stable sort by tile puts
+// every list in depth order; the slots of a splat stay together, where the backward leaves its records.
+#pragma once
+
+#include "device.cuh"
+
+struct Grid {
+  int tiles_x, tiles_y, width, height;
+};
+
+SPLAT_FN Grid make_grid(i64 height, i64 width) {
+  return {int((width + TILE - 1) / TILE), int((height + TILE - 1) / TILE), int(width), int(height)};
+}
+
+struct Range {
+  int first, last;  // both included; empty if last < first
+};
+
+// Pixels whose centres lie in [low, high], widened by more than the rounding of either bound.
+SPLAT_FN Range pixels_between(float low, float high, int size) {
+  const float slack = 2e-3f + 2e-6f * (fabsf(low) + fabsf(high));
+  const float first = ceilf(low - slack - 0.5f), last = floorf(high + slack - 0.5f);
+  return {int(fminf(fmaxf(first, 0.0f), float(size))), int(fmaxf(fminf(last, float(size - 1)), -1.0f))};
+}
+
+// Calls visit(tile row, first column, last column) for each row of tiles that the ellipse |L d|^2 <= cut
+// meets, top to bottom. Counting and listing both come here, so they agree on every tile.
+template <class Visit>
+SPLAT_FN void each_tile_row(const Splat& s, const Grid& grid, const Visit& visit) {
+  const float reach_x = s.reach_x, reach_y = sqrtf(s.cut) / s.l22;
+  const Range rows = pixels_between(s.y - reach_y, s.y + reach_y, grid.height);
+  if (rows.last < rows.first) return;
+  const float slope = -s.l12 / s.l11;  // the middle of the row at height d: slope * d
+  const float extreme = slope * reach_y * (reach_y / reach_x);  // height of the rightmost point
+  const float cut = s.cut * (1 + 1e-5f) + 1e-6f;                // the tips are where rounding would cost most
+  for (int row = rows.first / TILE; row <= rows.last / TILE; ++row) {
+    const int top = row * TILE > rows.first ? row * TILE : rows.first;
+    const int bottom = row * TILE + TILE - 1 < rows.last ? row * TILE + TILE - 1 : rows.last;
+    const float low = float(top) + 0.5f - s.y - 1e-3f, high = float(bottom) + 0.5f - s.y + 1e-3f;
+    const float left = fminf(fmaxf(-extreme, low), high), right = fminf(fmaxf(extreme, low), high);
+    const float left_t = s.l22 * left, right_t = s.l22 * right;
+    const float left_width = sqrtf(fmaxf(cut - left_t * left_t, 0.0f)) / s.l11;
+    const float right_width = sqrtf(fmaxf(cut - right_t * right_t, 0.0f)) / s.l11;
+    const Range columns = pixels_between(fmaxf(slope * left - left_width, -reach_x) + s.x,
+                                         fminf(slope * right + right_width, reach_x) + s.x, grid.width);
+    if (columns.first <= columns.last) visit(row, columns.first / TILE, columns.last / TILE);
+  }
+}
+
+// How many tiles each pair (view, Gaussian) touches, nearest pair first. counts [v n]
+KERNEL(BLOCK)
+tile_count(const u32* depth_keys, const u32* order, i64 pairs, const float4* splats, i64 height, i64 width,
+           u32* counts) {
+  const i64 k = thread_index();
+  if (k >= pairs) return;
+  u32 count = 0;
+  if (depth_keys[k] != CULLED) {
+    const float4* at = splats + 3 * i64(order[k]);
+    each_tile_row(make_splat(at[0], at[1], at[2]), make_grid(height, width),
+                  [&](int, int first, int last) { count += u32(last - first + 1); });
+  }
+  counts[k] = count;
+}
+
+// Fills the slots [slot, end) of one pair; lane ``first_lane`` of ``lanes`` takes every lanes-th tile of a
+// row.
+SPLAT_FN void fill_slots(const Splat& s, const Grid& grid, u32 pair, u32 first_key, u32 sentinel, u32 slot,
+                         u32 end, int first_lane, int lanes, u32* tile_keys, u32* pair_of_slot) {
+  const auto write = [&](u32 at, u32 key) {
+    if (at < end) tile_keys[at] = key, pair_of_slot[at] = pair;
+  };
+  each_tile_row(s, grid, [&](int row, int first, int last) {
+    for (int column = first + first_lane; column <= last; column += lanes)
+      write(slot + u32(column - first), first_key + u32(row * grid.tiles_x + column));
+    slot += u32(last - first + 1);
+  });
+  for (u32 rest = slot + u32(first_lane); rest < end; rest += u32(lanes)) write(rest, sentinel);
+}
+
+constexpr u32 MANY_TILES = 32;  // a splat with more is listed by the whole warp
+
+// tile_keys, pair_of_slot [slots]; first_slot, slot_count [v n] say where the slots of a pair are.
+KERNEL(BLOCK)
+tile_list(const u32* order, const u32* counts, const u32* offsets, i64 pairs, i64 n, const float4* splats,
+          i64 views, i64 height, i64 width, u32* tile_keys, u32* pair_of_slot, u32* first_slot,
+          u32* slot_count) {
+  const i64 k = thread_index();
+  const Grid grid = make_grid(height, width);
+  const u32 tiles = u32(grid.tiles_x) * u32(grid.tiles_y), sentinel = u32(views) * tiles;
+  u32 pair = 0, slot = 0, count = 0;
+  if (k < pairs) {
+    pair = order[k], slot = offsets[k], count = counts[k];
+    first_slot[pair] = slot, slot_count[pair] = count;
+  }
+  const auto fill = [&](u32 of_pair, u32 from, u32 many, int first_lane, int lanes) {
+    const float4* at = splats + 3 * i64(of_pair);
+    fill_slots(make_splat(at[0], at[1], at[2]), grid, of_pair, u32(of_pair / n) * tiles, sentinel, from,
+               from + many, first_lane, lanes, tile_keys, pair_of_slot);
+  };
+  if (count > 0 && count <= MANY_TILES) fill(pair, slot, count, 0, 1);
+  u32 waiting = __ballot_sync(ALL, count > MANY_TILES);
+  while (waiting) {
+    const int owner = __ffs(int(waiting)) - 1;
+    waiting &= waiting - 1;
+    const u32 of_pair = __shfl_sync(ALL, pair, owner), from = __shfl_sync(ALL, slot, owner);
+    const u32 many = __shfl_sync(ALL, count, owner);
+    fill(of_pair, from, many, lane_index(), WARP);
+  }
+}
+
+// ranges [v tiles + 1, 2]: begin and end of each list among the sorted keys; arrives zeroed. The last list
+// holds the slots that listing left over: none, as long as it agrees with counting.
+KERNEL(BLOCK) tile_ranges(const u32* tile_keys, i64 slots, u32* ranges) {
+  const i64 e = thread_index();
+  if (e >= slots) return;
+  const u32 key = tile_keys[e];
+  if (e == 0 || tile_keys[e - 1] != key) ranges[2 * i64(key)] = u32(e);
+  if (e == slots - 1 || tile_keys[e + 1] != key) ranges[2 * i64(key) + 1] = u32(e + 1);
+}

@@ -1,0 +1,214 @@
+"""Compiles the CUDA kernels at run time with the NVRTC that torch's wheels bring: no toolkit, no nvcc.
+
+Compiled for real architectures only (a cubin), never to PTX, which a driver older than the compiler refuses.
+A cached file's name says the architecture and carries two hashes: of the sources, constants, options and the
+compiler's version; of its own bytes. So a new release, another torch or a damaged file each lead to a fresh
+build, and no lock is needed: who finishes renames the file into place, and any that fits its name will do.
+"""
+
+import ctypes
+import hashlib
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+
+from cadam3d.core.checks import UserError
+from cadam3d.rasterizer import base
+from cadam3d.rasterizer.build import CONSTANTS, KERNELS
+
+SOURCE = "cuda.cu"
+HEADERS = ("blend.cuh", "device.cuh", "project.cuh", "sort.cuh", "splat_math.h", "tiles.cuh")
+OPTIONS = (
+    "--std=c++17",
+    "--fmad=false",  # fused only where written: forward and backward must see the same bits
+)
+PATTERN = "*nvrtc64_*.dll" if sys.platform == "win32" else "libnvrtc.so*"
+BUILTINS = "*nvrtc-builtins*.dll" if sys.platform == "win32" else "libnvrtc-builtins.so*"
+SYSTEM = ("libnvrtc.so", "libnvrtc.so.13", "libnvrtc.so.12")
+EMBEDDED = (72, 87, 101)  # of boards; no other device runs their code
+INSTALL = "It comes with torch built for CUDA; try: pip install nvidia-cuda-nvrtc"
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """An NVRTC library, loaded."""
+
+    library: ctypes.CDLL
+    path: str
+    version: tuple[int, int]  # of CUDA
+    architectures: tuple[int, ...]  # such as 75 for sm_75, ascending
+
+
+@dataclass(frozen=True)
+class Cubin:
+    """Compiled kernels, ready for the driver."""
+
+    path: Path
+    seconds: float  # spent compiling; 0 if it came from the cache
+
+
+@cache
+def find_compiler() -> Compiler | None:
+    """The first NVRTC that loads: of torch's own CUDA version, then of any, then the system's."""
+    for path in (
+        *sorted(_bundled(), key=_distance_from_torch),
+        "libnvrtc.so",
+        "libnvrtc.so.13",
+        "libnvrtc.so.12",
+    ):
+        try:
+            return _load(str(path))
+        except OSError:
+            continue
+    return None
+
+
+def _bundled() -> Iterator[Path]:
+    """NVRTC libraries in the wheels that are installed here."""
+    namespace = find_spec("nvidia")
+    folders = [Path(root) for root in (namespace.submodule_search_locations or [])] if namespace else []
+    for root in folders:
+        for folder in ("lib", "bin", "bin/x86_64"):
+            yield from root.glob(f"*/{folder}/{PATTERN}")
+    yield from (Path(torch.__file__).parent / "lib").glob(PATTERN)
+
+
+def _distance_from_torch(path: Path) -> tuple[bool, bool, str]:
+    # What torch was built for is what the driver is known to load.
+    major = (torch.version.cuda or "").split(".")[0]
+    fits = bool(major) and (path.name.endswith(f".so.{major}") or f"64_{major}" in path.name)
+    return ".alt." in path.name, not fits, path.name
+
+
+def _load(path: str) -> Compiler:
+    # Some releases look for their built-in functions on the loader's path alone: have them there before.
+    for builtins in sorted(Path(path).parent.glob(BUILTINS)) if Path(path).is_absolute() else ():
+        if ".alt." not in builtins.name:
+            ctypes.CDLL(str(builtins), mode=ctypes.RTLD_GLOBAL)
+    library = ctypes.CDLL(path)
+    library.nvrtcGetErrorString.restype = ctypes.c_char_p
+    major, minor, count = ctypes.c_int(), ctypes.c_int(), ctypes.c_int()
+    _check(library, library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)))
+    _check(library, library.nvrtcGetNumSupportedArchs(ctypes.byref(count)))
+    architectures = (ctypes.c_int * count.value)()
+    _check(library, library.nvrtcGetSupportedArchs(architectures))
+    return Compiler(library, path, (major.value, minor.value), tuple(sorted(architectures)))
+
+
+def choose_architecture(capability: tuple[int, int], compiler: Compiler) -> int:
+    """The newest architecture that the compiler knows and a device of this compute capability runs."""
+    major, minor = capability
+    device = 10 * major + minor
+    fitting = [
+        a
+        for a in compiler.architectures
+        if a // 10 == major and (a == device or (a < device and a not in EMBEDDED))
+    ]
+    if not fitting:
+        version = ".".join(map(str, compiler.version))
+        raise UserError(
+            f"rasterizer=cuda: the NVRTC of CUDA {version} cannot compile for compute capability "
+            f"{major}.{minor}. Install a torch for this GPU, or try: rasterizer=reference"
+        )
+    return max(fitting)
+
+
+def build(cache_dir: Path, capability: tuple[int, int]) -> Cubin:
+    """The kernels for a device of this compute capability, compiled now if ``cache_dir`` does not hold them.
+
+    Raises :class:`UserError` if there is no NVRTC, if it fails, or if the folder cannot be written.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        raise UserError(f"rasterizer=cuda found no NVRTC. {INSTALL}. Or try: rasterizer=reference")
+    architecture = choose_architecture(capability, compiler)
+    name = f"rasterizer-{_key(compiler)}-sm{architecture}"
+    for path in sorted(cache_dir.glob(f"{name}-*.cubin")):
+        if path.stem.endswith(_short_hash(path.read_bytes())):
+            return Cubin(path, 0.0)
+    start = time.perf_counter()
+    code = compile_kernels(compiler, architecture)
+    final = cache_dir / f"{name}-{_short_hash(code)}.cubin"
+    try:
+        cache_dir.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache_dir, prefix="build-") as folder:
+            path = Path(folder) / "rasterizer.cubin"
+            path.write_bytes(code)
+            path.replace(final)
+    except OSError as error:
+        raise UserError(
+            f"rasterizer=cuda cannot keep its compiled kernels in {cache_dir}: {error}. "
+            "Try: rasterizer.cache_dir=/tmp/cadam3d"
+        ) from error
+    return Cubin(final, time.perf_counter() - start)
+
+
+def compile_kernels(
+    compiler: Compiler, architecture: int, show: Callable[[str], object] | None = None
+) -> bytes:
+    """A cubin of every kernel for ``sm_<architecture>``; ``show`` gets what the compiler said.
+
+    Raises :class:`UserError`, which quotes it, if that was an error.
+    """
+    library, program = compiler.library, ctypes.c_void_p()
+    headers = [(KERNELS / name).read_bytes() for name in HEADERS]
+    strings = ctypes.c_char_p * len(HEADERS)
+    _check(
+        library,
+        library.nvrtcCreateProgram(
+            ctypes.byref(program),
+            (KERNELS / SOURCE).read_bytes(),
+            SOURCE.encode(),
+            len(HEADERS),
+            strings(*headers),
+            strings(*(name.encode() for name in HEADERS)),
+        ),
+    )
+    try:
+        options = [*OPTIONS, *_definitions(), f"--gpu-architecture=sm_{architecture}"]
+        array = (ctypes.c_char_p * len(options))(*(option.encode() for option in options))
+        status = library.nvrtcCompileProgram(program, len(options), array)
+        log = _fetch(compiler, "nvrtcGetProgramLog", program).rstrip(b"\0").decode(errors="replace")
+        _check(library, status, log[-2000:])
+        if show:
+            show(log)
+        return _fetch(compiler, "nvrtcGetCUBIN", program)
+    finally:
+        library.nvrtcDestroyProgram(ctypes.byref(program))
+
+
+def _fetch(compiler: Compiler, what: str, program: ctypes.c_void_p) -> bytes:
+    library, size = compiler.library, ctypes.c_size_t()
+    _check(library, getattr(library, f"{what}Size")(program, ctypes.byref(size)))
+    content = ctypes.create_string_buffer(size.value)
+    _check(library, getattr(library, what)(program, content))
+    return content.raw
+
+
+def _check(library: ctypes.CDLL, status: int, log: str = "") -> None:
+    if status != 0:
+        reason = library.nvrtcGetErrorString(status).decode()
+        raise UserError(
+            f"rasterizer=cuda: NVRTC says {reason}. {log}\nTry: pip install --force-reinstall torch, "
+            "or: rasterizer=reference"
+        )
+
+
+def _definitions() -> list[str]:
+    return [f"-DSPLAT_{name}={getattr(base, name)!r}" for name in CONSTANTS]
+
+
+def _key(compiler: Compiler) -> str:
+    parts = [(KERNELS / name).read_text() for name in (SOURCE, *HEADERS)]
+    return _short_hash("\0".join([*parts, *OPTIONS, *_definitions(), repr(compiler.version)]).encode())
+
+
+def _short_hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]

@@ -1,0 +1,259 @@
+// Runs CUDA kernels on a CPU, one fiber per thread, so that tests can judge the very source that a GPU runs.
+//
+// A thread runs until it meets a barrier or a warp operation, and then another of its block goes on, in an
+// order shuffled by a seed. So a result that depends on who comes first changes with the seed, a barrier that
+// is missing lets a thread read what nobody has written yet (shared memory starts as garbage in each block),
+// and a barrier that not everybody reaches is a deadlock that is reported. What this cannot show: the order
+// in which a real memory system lets others see a store, and the rounding of a real GPU's exponential.
+#pragma once
+
+#include <setjmp.h>
+#include <ucontext.h>
+
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+struct Index {
+  unsigned x;
+};
+inline Index threadIdx, blockIdx, blockDim, gridDim;  // of the thread that runs now
+
+struct float4 {
+  float x, y, z, w;
+};
+inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
+
+namespace emulator {
+
+constexpr int WARP = 32;
+constexpr size_t STACK = 64 << 10;
+
+struct Failure : std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
+
+// Where threads wait for one another. All of them must come, for the same reason.
+struct Meeting {
+  int members = 0, arrived = 0;
+  unsigned generation = 0;
+  const char* reason = nullptr;
+  uint64_t values[2][WARP];  // of this generation and the one before: a slow reader is at most one behind
+};
+
+struct Fiber {
+  ucontext_t start;
+  jmp_buf place;
+  std::unique_ptr<char[]> stack{new char[STACK]};
+  bool has_started = false, has_ended = false;
+  const Meeting* waits_at = nullptr;
+  unsigned waits_since = 0;
+  bool can_run() const { return !has_ended && (!waits_at || waits_at->generation != waits_since); }
+};
+
+// Small numbers in a fixed, lawless order (xorshift, Marsaglia 2003); quicker to compile than <random>.
+struct Random {
+  uint64_t state = 1;
+  void seed(uint64_t seed) { state = seed * 0x9e3779b97f4a7c15u | 1; }
+  unsigned operator()() {
+    state ^= state << 13;
+    state ^= state >> 7;
+    state ^= state << 17;
+    return unsigned(state >> 32);
+  }
+};
+
+struct Machine {
+  Random random;
+  bool is_shuffled = false;
+  std::vector<Fiber> fibers;
+  std::vector<Meeting> warps;
+  Meeting block;
+  int running = 0;
+  jmp_buf scheduler;
+  std::string trouble;
+  void (*body)(void*) = nullptr;
+  void* argument = nullptr;
+};
+inline Machine machine;
+
+inline void yield() {
+  if (_setjmp(machine.fibers[size_t(machine.running)].place) == 0) _longjmp(machine.scheduler, 1);
+}
+
+inline void fail(const std::string& trouble) {
+  if (machine.trouble.empty()) machine.trouble = trouble;
+  for (;;) yield();
+}
+
+// Returns the generation that the meeting had; its values stay until the next but one.
+inline unsigned meet(Meeting& meeting, const char* reason, int seat, uint64_t value) {
+  Fiber& self = machine.fibers[size_t(machine.running)];
+  const unsigned generation = meeting.generation;
+  if (meeting.arrived > 0 && std::strcmp(meeting.reason, reason) != 0)
+    fail(std::string("divergence: ") + reason + " meets " + meeting.reason);
+  meeting.reason = reason;
+  meeting.values[generation % 2][seat] = value;
+  if (++meeting.arrived == meeting.members) {
+    meeting.arrived = 0;
+    ++meeting.generation;
+  }
+  self.waits_at = &meeting;
+  self.waits_since = generation;
+  yield();
+  self.waits_at = nullptr;
+  return generation;
+}
+
+inline void fiber_main() {
+  machine.body(machine.argument);
+  machine.fibers[size_t(machine.running)].has_ended = true;
+  for (;;) yield();
+}
+
+inline void resume(int index) {
+  Fiber& fiber = machine.fibers[size_t(index)];
+  machine.running = index;
+  threadIdx.x = unsigned(index);
+  if (_setjmp(machine.scheduler) != 0) return;
+  if (fiber.has_started) _longjmp(fiber.place, 1);
+  fiber.has_started = true;
+  setcontext(&fiber.start);
+}
+
+inline void run_block(int threads) {
+  machine.fibers.resize(size_t(threads));
+  machine.warps.assign(size_t((threads + WARP - 1) / WARP), Meeting());
+  machine.block = Meeting();
+  machine.block.members = threads;
+  std::vector<int> order;
+  for (int i = 0; i < threads; ++i) {
+    Fiber& fiber = machine.fibers[size_t(i)];
+    fiber.has_started = fiber.has_ended = false;
+    fiber.waits_at = nullptr;
+    getcontext(&fiber.start);
+    fiber.start.uc_stack.ss_sp = fiber.stack.get();
+    fiber.start.uc_stack.ss_size = STACK;
+    fiber.start.uc_link = nullptr;
+    makecontext(&fiber.start, fiber_main, 0);
+    ++machine.warps[size_t(i / WARP)].members;
+    order.push_back(i);
+  }
+  for (int alive = threads; alive > 0;) {
+    if (machine.is_shuffled)
+      for (size_t i = order.size() - 1; i > 0; --i) std::swap(order[i], order[machine.random() % (i + 1)]);
+    bool has_run = false;
+    for (const int i : order) {
+      if (!machine.fibers[size_t(i)].can_run()) continue;
+      has_run = true;
+      resume(i);
+      alive -= machine.fibers[size_t(i)].has_ended;
+      if (!machine.trouble.empty()) throw Failure(machine.trouble);
+    }
+    if (!has_run) throw Failure("deadlock: some threads wait where others never come");
+  }
+}
+
+extern "C" char __start_emulated_shared[], __stop_emulated_shared[];
+
+template <class... Parameters, size_t... I>
+void run_grid(void (*kernel)(Parameters...), unsigned blocks, int threads, uint64_t seed, void** raw,
+              std::index_sequence<I...>) {
+  static_assert(((sizeof(Parameters) == 8) && ...), "a launch is a list of eight-byte numbers");
+  auto call = [&] {
+    std::tuple<Parameters...> parameters;
+    (std::memcpy(&std::get<I>(parameters), raw[I], 8), ...);
+    kernel(std::get<I>(parameters)...);
+  };
+  machine.body = [](void* f) { (*static_cast<decltype(call)*>(f))(); };
+  machine.argument = &call;
+  machine.random.seed(seed);
+  machine.is_shuffled = seed != 0;
+  machine.trouble.clear();
+  blockDim.x = unsigned(threads), gridDim.x = blocks;
+  std::vector<unsigned> order(blocks);
+  for (unsigned i = 0; i < blocks; ++i) order[i] = i;
+  if (machine.is_shuffled)
+    for (unsigned i = blocks; i > 1; --i) std::swap(order[i - 1], order[machine.random() % i]);
+  for (const unsigned block : order) {
+    blockIdx.x = block;
+    std::memset(__start_emulated_shared, 0xff, size_t(__stop_emulated_shared - __start_emulated_shared));
+    run_block(threads);
+  }
+}
+
+template <class... Parameters>
+void launch(void (*kernel)(Parameters...), unsigned blocks, int threads, uint64_t seed, void** raw) {
+  run_grid(kernel, blocks, threads, seed, raw, std::index_sequence_for<Parameters...>());
+}
+
+inline int lane() { return machine.running % WARP; }
+inline Meeting& warp() { return machine.warps[size_t(machine.running / WARP)]; }
+
+inline void require_all(unsigned mask) {
+  if (mask != 0xffffffffu) fail("only operations of a whole warp are emulated");
+}
+
+template <class T>
+T shuffle(const char* reason, unsigned mask, T value, int source) {
+  static_assert(sizeof(T) <= 8);
+  require_all(mask);
+  uint64_t bits = 0;
+  std::memcpy(&bits, &value, sizeof(T));
+  const unsigned generation = meet(warp(), reason, lane(), bits);
+  bits = warp().values[generation % 2][source % WARP];
+  std::memcpy(&value, &bits, sizeof(T));
+  return value;
+}
+
+inline unsigned ballot(const char* reason, unsigned mask, bool vote) {
+  require_all(mask);
+  const unsigned generation = meet(warp(), reason, lane(), vote);
+  unsigned votes = 0;
+  for (int i = 0; i < WARP; ++i) votes |= unsigned(warp().values[generation % 2][i]) << i;
+  return votes;
+}
+
+}  // namespace emulator
+
+#define __global__
+#define __device__ static
+#define __forceinline__ inline
+#define __launch_bounds__(threads)
+#define __shared__ static __attribute__((section("emulated_shared")))
+#define __expf(x) std::exp(float(x))
+#define __fdividef(a, b) ((a) / (b))
+#define __fmaf_rn(a, b, c) std::fmaf(a, b, c)
+#define __popc(x) __builtin_popcount(x)
+#define __ffs(x) __builtin_ffs(x)
+
+inline unsigned __float_as_uint(float x) {
+  unsigned bits;
+  std::memcpy(&bits, &x, 4);
+  return bits;
+}
+inline void __syncthreads() { emulator::meet(emulator::machine.block, "__syncthreads", 0, 0); }
+inline void __syncwarp() { emulator::meet(emulator::warp(), "__syncwarp", emulator::lane(), 0); }
+inline unsigned __ballot_sync(unsigned mask, bool vote) {
+  return emulator::ballot("__ballot_sync", mask, vote);
+}
+inline bool __any_sync(unsigned mask, bool vote) { return emulator::ballot("__any_sync", mask, vote) != 0; }
+template <class T>
+T __shfl_sync(unsigned mask, T value, int source) {
+  return emulator::shuffle("__shfl_sync", mask, value, source);
+}
+template <class T>
+T __shfl_xor_sync(unsigned mask, T value, int reach) {
+  return emulator::shuffle("__shfl_xor_sync", mask, value, emulator::lane() ^ reach);
+}
+inline unsigned atomicAdd(unsigned* to, unsigned value) {
+  const unsigned before = *to;
+  *to += value;
+  return before;
+}

@@ -1,0 +1,78 @@
+// The CUDA driver, as far as the rasterizer calls it, over the emulator: same functions, same arguments. A
+// module is every kernel below, and the handle of a stream is the seed of the schedule; 0 keeps to the order.
+#include "cuda_emulator.h"
+// The emulator first: it says what __global__ and the like mean to the kernels.
+#include "cuda.cu"
+
+typedef void (*Launcher)(unsigned blocks, int threads, uint64_t seed, void** arguments);
+
+template <auto kernel>
+static void launch(unsigned blocks, int threads, uint64_t seed, void** arguments) {
+  emulator::launch(kernel, blocks, threads, seed, arguments);
+}
+
+#define ENTRY(kernel) {#kernel, launch<kernel>}
+static const struct {
+  const char* name;
+  Launcher launcher;
+} KERNELS[] = {
+    ENTRY(prepare_cameras),    ENTRY(project_forward_1),  ENTRY(project_forward_4),
+    ENTRY(project_forward_9),  ENTRY(project_forward_16), ENTRY(project_backward_1),
+    ENTRY(project_backward_4), ENTRY(project_backward_9), ENTRY(project_backward_16),
+    ENTRY(centre_backward),    ENTRY(scan_short),         ENTRY(scan_reduce),
+    ENTRY(scan_sums),          ENTRY(scan_apply),         ENTRY(sort_count),
+    ENTRY(sort_scatter),       ENTRY(tile_count),         ENTRY(tile_list),
+    ENTRY(tile_ranges),        ENTRY(blend_forward),      ENTRY(blend_backward),
+};
+
+enum Status : int { OK = 0, NOT_FOUND = 500, LAUNCH_FAILED = 719 };
+static std::string trouble = "no such kernel";
+static int contexts = 0;  // pushed and not popped
+
+extern "C" {
+
+int cuInit(unsigned) { return OK; }
+int cuDeviceGet(int* device, int ordinal) {
+  *device = ordinal;
+  return OK;
+}
+int cuDevicePrimaryCtxRetain(void** context, int) {
+  *context = &contexts;
+  return OK;
+}
+int cuCtxPushCurrent_v2(void* context) {
+  if (context == &contexts) ++contexts;
+  return OK;
+}
+int cuCtxPopCurrent_v2(void**) {
+  --contexts;
+  return OK;
+}
+int cuModuleLoadData(void** module, const void*) {
+  *module = &trouble;
+  return contexts > 0 ? OK : LAUNCH_FAILED;
+}
+int cuModuleGetFunction(Launcher* function, void*, const char* name) {
+  for (const auto& each : KERNELS) {
+    if (std::strcmp(each.name, name) != 0) continue;
+    *function = each.launcher;
+    return OK;
+  }
+  return NOT_FOUND;
+}
+int cuLaunchKernel(Launcher function, unsigned blocks, unsigned, unsigned, unsigned threads, unsigned,
+                   unsigned, unsigned, uint64_t stream, void** arguments, void**) {
+  try {
+    if (contexts < 1 || blocks == 0) throw emulator::Failure("no context, or no block");
+    function(blocks, int(threads), stream, arguments);
+    return OK;
+  } catch (const std::exception& error) {
+    trouble = error.what();
+    return LAUNCH_FAILED;
+  }
+}
+int cuGetErrorString(int, const char** message) {
+  *message = trouble.c_str();
+  return OK;
+}
+}

@@ -1,0 +1,127 @@
+"""Compiling the CUDA kernels at run time: for every architecture, cached, and with errors that help."""
+
+import ctypes
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+
+from cadam3d.core.checks import UserError
+from cadam3d.rasterizer import nvrtc
+from cadam3d.rasterizer.build import KERNELS
+from cadam3d.rasterizer.nvrtc import build, choose_architecture, compile_kernels, find_compiler
+
+ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
+# Registers per thread. Two pixels a lane at 64 fill half of an SM; a full house of threads needs 32 or fewer.
+BUDGETS = {"project_backward_16": 200, "project_backward": 128, "": 64}
+
+
+@pytest.fixture(scope="module")
+def compiler():
+    found = find_compiler()
+    if found is None:
+        pytest.skip("no NVRTC: pip install nvidia-cuda-nvrtc")
+    return found
+
+
+def budget(kernel: str) -> int:
+    return next(most for prefix, most in BUDGETS.items() if kernel.startswith(prefix))
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_every_kernel_fits_every_architecture_without_spills(compiler, architecture, monkeypatch):
+    if architecture not in compiler.architectures:
+        pytest.skip(f"the NVRTC of CUDA {compiler.version} does not know sm_{architecture}")
+    monkeypatch.setattr(nvrtc, "OPTIONS", (*nvrtc.OPTIONS, "--ptxas-options=-v"))
+    logs = []
+    compiled = compile_kernels(compiler, architecture, logs.append)
+    assert compiled.startswith(b"\x7fELF")
+    [log] = logs
+    usage = re.findall(
+        r"entry function '(\w+)'.*?(\d+) bytes stack frame, (\d+) bytes spill stores.*?Used (\d+) registers",
+        log,
+        flags=re.DOTALL,
+    )
+    kernels = "".join(path.read_text() for path in KERNELS.glob("*.cuh"))
+    single = set(re.findall(r"^KERNEL\(\w+\)\s+(\w+)\(", kernels, flags=re.MULTILINE))
+    several = {f"project_{way}_{k}" for way in ("forward", "backward") for k in (1, 4, 9, 16)}
+    assert {name for name, *_ in usage} == single | several
+    for name, stack, spills, registers in usage:
+        assert (int(stack), int(spills)) == (0, 0), name
+        assert int(registers) <= budget(name), name
+
+
+def test_a_second_build_comes_from_the_cache(compiler, tmp_path):
+    first = build(tmp_path, (8, 6))
+    assert first.seconds > 0
+    assert "-sm86-" in first.path.name
+    second = build(tmp_path, (8, 6))
+    assert second.path == first.path
+    assert second.seconds == 0
+    assert list(tmp_path.iterdir()) == [first.path]  # nothing half-done is left
+
+
+def test_a_damaged_file_is_built_again(compiler, tmp_path):
+    first = build(tmp_path, (8, 0))
+    intact = first.path.read_bytes()
+    first.path.write_bytes(intact[:-1])
+    assert build(tmp_path, (8, 0)).seconds > 0
+    assert first.path.read_bytes() == intact
+
+
+@pytest.mark.parametrize(
+    ("capability", "wanted"),
+    [((7, 5), 75), ((8, 0), 80), ((8, 6), 86), ((8, 7), 87), ((8, 8), 86), ((10, 3), 100), ((12, 1), 120)],
+)
+def test_the_newest_architecture_that_runs_on_the_device_is_chosen(capability, wanted):
+    compiler = nvrtc.Compiler(ctypes.CDLL(None), "", (13, 0), (75, 80, 86, 87, 90, 100, 101, 120))
+    assert choose_architecture(capability, compiler) == wanted
+
+
+@pytest.mark.parametrize("capability", [(6, 1), (7, 0), (11, 0)])
+def test_a_device_that_the_compiler_does_not_know_is_refused(capability):
+    compiler = nvrtc.Compiler(ctypes.CDLL(None), "", (13, 0), (75, 80, 86, 87, 90, 100, 101, 120))
+    with pytest.raises(UserError, match=rf"CUDA 13\.0 .* capability {capability[0]}\.{capability[1]}"):
+        choose_architecture(capability, compiler)
+
+
+def test_without_a_compiler_it_says_what_to_install(monkeypatch, tmp_path):
+    monkeypatch.setattr(nvrtc, "find_compiler", lambda: None)
+    with pytest.raises(UserError, match="pip install nvidia-cuda-nvrtc"):
+        build(tmp_path, (8, 0))
+
+
+def test_a_kernel_that_does_not_compile_is_quoted(compiler, monkeypatch):
+    monkeypatch.setattr(nvrtc, "OPTIONS", (*nvrtc.OPTIONS, "-DRECORD=nonsense*"))
+    with pytest.raises(UserError, match="NVRTC_ERROR_COMPILATION"):
+        compile_kernels(compiler, compiler.architectures[-1])
+
+
+def test_a_folder_that_cannot_be_written_is_named(compiler, tmp_path, monkeypatch):
+    monkeypatch.setattr(nvrtc, "compile_kernels", lambda *_: b"")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"rasterizer\.cache_dir="):
+        build(tmp_path / "file", (8, 0))
+
+
+def test_the_cache_knows_sources_options_and_compiler_apart(compiler, monkeypatch):
+    keys = {nvrtc._key(compiler), nvrtc._key(replace(compiler, version=(99, 0)))}
+    monkeypatch.setattr(nvrtc, "OPTIONS", ())
+    keys.add(nvrtc._key(compiler))
+    monkeypatch.setattr(nvrtc.base, "BLUR", 0.1)
+    keys.add(nvrtc._key(compiler))
+    assert len(keys) == 4
+
+
+def test_every_source_is_passed_to_the_compiler():
+    assert {path.name for path in KERNELS.glob("*.cuh")} < set(nvrtc.HEADERS)
+    for name in (nvrtc.SOURCE, *nvrtc.HEADERS):
+        for header in re.findall(r'#include [<"](.*)[>"]', (KERNELS / name).read_text()):
+            assert header in nvrtc.HEADERS
+
+
+def test_the_library_of_torchs_own_cuda_comes_first(monkeypatch, tmp_path):
+    monkeypatch.setattr(torch.version, "cuda", "12.8")
+    names = ("libnvrtc.alt.so.12", "libnvrtc.so.13", "libnvrtc.so.12")
+    assert min((tmp_path / name for name in names), key=nvrtc._distance_from_torch).name == "libnvrtc.so.12"
