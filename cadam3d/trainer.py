@@ -127,7 +127,12 @@ class Trainer:
         """Advance ``state`` (in place) to ``steps`` or to another outcome; every step asks ``stop()``."""
         for callback in self.callbacks:
             callback.on_start(context, state)
-        outcome = self._loop(state, embedding, context, stop)
+        try:
+            outcome = self._loop(state, embedding, context, stop)
+        except BaseException:
+            for callback in self.callbacks:
+                callback.on_abort(context)
+            raise
         for callback in self.callbacks:
             callback.on_end(context, state, outcome)
         return outcome

@@ -261,3 +261,18 @@ def test_an_unknown_or_absent_device_says_what_to_type():
     with pytest.raises(UserError, match="device=cpu"):
         resolve_device("toaster")
     assert resolve_device("cpu") == CPU
+
+
+def test_a_loop_that_breaks_tells_its_callbacks_to_let_go(tmp_path, monkeypatch):
+    class Holder(Callback):
+        let_go = False
+
+        def on_abort(self, context: RunContext) -> None:
+            self.let_go = True
+
+    trainer, state = make()
+    holder = Holder()
+    monkeypatch.setattr(type(trainer.rasterizer), "render", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        go(replace(trainer, callbacks=[holder]), state, tmp_path)
+    assert holder.let_go

@@ -19,3 +19,6 @@ class Callback(ABC):  # noqa: B024 (every hook has a sensible default: do nothin
 
     def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:  # noqa: B027
         """After the last step, whatever the outcome."""
+
+    def on_abort(self, context: RunContext) -> None:  # noqa: B027
+        """When the loop raised: let go of the terminal. The state may be half done, so it is not shown."""

@@ -34,5 +34,9 @@ class Progress(Callback):
 
     def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
         """Close the bar, leaving its last line."""
+        self.on_abort(context)
+
+    def on_abort(self, context: RunContext) -> None:
+        """Close the bar, so that what follows starts on a line of its own."""
         if self._bar is not None:
             self._bar.close()

@@ -20,7 +20,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.settings import component, compose, config_dir
 
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "imageio", "imageio-ffmpeg", "jaxtyping", "kornia")
-PACKAGES += ("pillow", "pyyaml", "tqdm", "trimesh")
+PACKAGES += ("pillow", "pyyaml", "scipy", "tqdm", "trimesh")
 IMPORT_NAMES = {"hydra-core": "hydra", "imageio-ffmpeg": "imageio_ffmpeg", "pillow": "PIL", "pyyaml": "yaml"}
 COMPILERS = ("c++", "g++", "clang++", "nvcc")
 SECONDS = 60  # longest wait for a program that we ask for its version

@@ -18,6 +18,7 @@ from cadam3d import __version__
 from cadam3d.commands.paths import shown
 from cadam3d.core.checks import UserError, require
 from cadam3d.exporter.base import Exporter
+from cadam3d.io.atomic import remove_leftovers
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import read_jsonl, write_json
 from cadam3d.io.report import write_report
@@ -55,7 +56,7 @@ class StopOnSignal:
         if self.received is not None:
             raise KeyboardInterrupt
         self.received = number
-        print("\nStopping after this step and saving; once more to stop at once.", file=sys.stderr)
+        print("\nStopping as soon as all is saved; once more to stop at once.", file=sys.stderr)
 
 
 def run(cfg: DictConfig) -> float | None:
@@ -75,6 +76,7 @@ def run(cfg: DictConfig) -> float | None:
     state = _start_or_resume(cfg, trainer, device, folder)
     if notice := trainer.prior.notice():
         print(f"Note: {notice}", file=sys.stderr)
+    remove_leftovers(folder)
     config_text = OmegaConf.to_yaml(cfg, resolve=True)
     (folder / "config.yaml").write_text(config_text, encoding="utf-8")
     if HydraConfig.get().mode != RunMode.MULTIRUN:
@@ -101,7 +103,7 @@ def run(cfg: DictConfig) -> float | None:
         lines = read_jsonl(folder / "metrics.jsonl")
         report = write_report(folder, summary=summary, metrics=lines, config_text=config_text)
     _say(folder, summary, report)
-    if outcome is Outcome.INTERRUPTED and stop.received is not None:
+    if stop.received is not None:  # also where training was done already: a sweep must not go on
         sys.exit(128 + stop.received)
     return summary.get("psnr")
 
@@ -208,7 +210,10 @@ def _point_latest_at(folder: Path) -> None:
         fresh = link.with_name(f".latest-{folder.name}")
         fresh.unlink(missing_ok=True)
         fresh.symlink_to(_relative_if_inside(folder, link.parent))
-        fresh.replace(link)
+        try:
+            fresh.replace(link)
+        finally:
+            fresh.unlink(missing_ok=True)
     except OSError as error:
         print(f"Note: outputs/latest not updated ({error.strerror}).", file=sys.stderr)
 

@@ -1,5 +1,6 @@
 """Checkpoints: plain tensors, numbers and names in one file that appears whole or not at all."""
 
+import io
 import pickle
 import zipfile
 from collections.abc import Mapping
@@ -24,8 +25,10 @@ def save_checkpoint(path: Path, payload: Mapping[str, Any]) -> None:
     refuse: better now than when the run has to be resumed.
     """
     content = {"format": FORMAT, "version": VERSION, "payload": _plain(payload)}
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        torch.save(content, file)
+    buffer = io.BytesIO()  # a full disk would otherwise surface as an error inside torch's archive writer
+    torch.save(content, buffer)
+    with replacing(path) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
@@ -47,7 +50,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise UserError(
             f"{path}: cannot be read as a checkpoint ({reason}). "
-            "Try: resume=RUN with the folder of a run, which takes the newest sound one"
+            "Try: another file of the same folder, as in resume=RUN/checkpoints/step_0000100.pt"
         ) from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise UserError(f"{path}: not a cadam3d checkpoint. Try: resume=RUN with the folder of a run")

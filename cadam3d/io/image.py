@@ -29,7 +29,7 @@ def to_uint8(rgb: Float[Tensor, "*batch h w 3"]) -> UInt8[np.ndarray, "*batch h 
 def write_png(path: Path, rgb: Float[Tensor, "h w 3"]) -> None:
     """Write one image in [0, 1] as 8-bit sRGB, atomically. Raises ``UserError`` if it cannot be written."""
     with replacing(path) as temporary:
-        imageio.imwrite(temporary, to_uint8(rgb), extension=".png")
+        temporary.write_bytes(imageio.imwrite("<bytes>", to_uint8(rgb), extension=".png"))
 
 
 def colorize(values: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch h w 3"]:
