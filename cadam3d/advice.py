@@ -2,16 +2,18 @@
 
 import difflib
 import re
+import shlex
 from collections.abc import Sequence
 
 from hydra.errors import CompactHydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
 from cadam3d.core.errors import UserError
 from cadam3d.settings import compose, config_dir, flatten, quote
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
+NO_NAME_COMPLAINT = "Config group override must be a string or a list"
 PASTE_PROMPT = 'prompt="a red and yellow checkered torus"'
 
 
@@ -28,15 +30,16 @@ def explain(error: Exception, config_name: str, overrides: Sequence[str]) -> Use
         return _unknown_option(error, config_name, overrides)
     if isinstance(error, OverrideParseException):
         return _unreadable(error.override, str(error).splitlines()[0])
+    if isinstance(error, ValueError) and str(error).startswith(NO_NAME_COMPLAINT):
+        return _no_name(str(error), overrides)
+    if isinstance(error, InterpolationResolutionError):
+        reason = str(error).splitlines()[0]
+        key = error.full_key or "a setting"
+        return UserError(
+            f"{key}: {reason}. Try: a plain value; cadam3d {config_name} --cfg job lists the keys"
+        )
     if isinstance(error, (CompactHydraException, OmegaConfBaseException)):
-        text = str(error).strip() or str(error.__cause__ or "")
-        if key := re.search(r"Could not override '([^']+)'", text):
-            return _unknown_key(key.group(1), config_name, overrides)
-        if sweep := re.search(SWEEP_COMPLAINT, text, re.M):
-            return _several_values(sweep.group(1))
-        cause = error.__cause__
-        detail = f" ({str(cause).splitlines()[0]})" if isinstance(cause, OmegaConfBaseException) else ""
-        return UserError(f"{' '.join(text.split())}{detail}")
+        return _reworded(error, config_name, overrides)
     return None
 
 
@@ -54,6 +57,18 @@ def ask_for(keys: Sequence[str], config_name: str) -> UserError:
     return UserError(f"{', '.join(keys)}: no value given. Try: cadam3d {config_name} {example}{grid}")
 
 
+def _reworded(error: Exception, config_name: str, overrides: Sequence[str]) -> UserError:
+    """A complaint that only its text tells from others."""
+    text = str(error).strip() or str(error.__cause__ or "")
+    if key := re.search(r"Could not override '([^']+)'", text):
+        return _unknown_key(key.group(1), config_name, overrides)
+    if sweep := re.search(SWEEP_COMPLAINT, text, re.M):
+        return _several_values(sweep.group(1))
+    cause = error.__cause__
+    detail = f" ({str(cause).splitlines()[0]})" if isinstance(cause, OmegaConfBaseException) else ""
+    return UserError(f"{' '.join(text.split())}{detail}")
+
+
 def _unknown_option(error: MissingConfigException, config_name: str, overrides: Sequence[str]) -> UserError:
     """A group exists but not the chosen option of it, or the command itself has no YAML."""
     path = error.missing_cfg_file or ""
@@ -65,8 +80,24 @@ def _unknown_option(error: MissingConfigException, config_name: str, overrides: 
     return UserError(f"{group}: wanted one of {'|'.join(options)}, got {option!r}. Try: {group}={best}")
 
 
+def _no_name(reason: str, overrides: Sequence[str]) -> UserError:
+    """A group was given null, a number or a dict where the name of an option belongs."""
+    for line in overrides:
+        key, _, value = line.lstrip("+").partition("=")
+        options = sorted(file.stem for file in (config_dir() / key).glob("*.yaml")) if key else []
+        if options and value not in options and not value.startswith("["):
+            best = "none" if "none" in options else options[0]
+            return UserError(f"{key}: wanted one of {'|'.join(options)}, got {value}. Try: {key}={best}")
+    return UserError(f"{reason}. Try: the name of an option instead of null")
+
+
 def _unknown_key(key: str, config_name: str, overrides: Sequence[str]) -> UserError:
     """A key that the configuration does not have: look for it in another spelling or another place."""
+    if key == "grid" and config_name == "train":
+        name = next((line.partition("=")[2] for line in overrides if line.startswith("grid=")), "thresholds")
+        return UserError(
+            f"grid: grids belong to sweeps. Try: cadam3d sweep {shlex.quote('grid=' + name)} ..."
+        )
     value = next((line.split("=", 1)[1] for line in overrides if line.startswith(f"{key}=")), "...")
     known = _known_keys(key, config_name, overrides)
     last = key.rpartition(".")[2].lower()
@@ -77,7 +108,9 @@ def _unknown_key(key: str, config_name: str, overrides: Sequence[str]) -> UserEr
             f"{key}: no such setting. Try: cadam3d {config_name} --cfg job (it lists all of them)"
         )
     meant = " or ".join(suggestions[:3])
-    return UserError(f"{key}: no such setting. Did you mean {meant}? Try: {suggestions[0]}={value}")
+    return UserError(
+        f"{key}: no such setting. Did you mean {meant}? Try: {shlex.quote(f'{suggestions[0]}={value}')}"
+    )
 
 
 def _known_keys(wrong: str, config_name: str, overrides: Sequence[str]) -> list[str]:
@@ -96,11 +129,14 @@ def _known_keys(wrong: str, config_name: str, overrides: Sequence[str]) -> list[
 
 def _unreadable(override: str, reason: str) -> UserError:
     key, _, value = override.partition("=")
-    return UserError(f'{key}: cannot read the value ({reason}). Try: "{key}={quote(value)}"')
+    line = f"{key}={quote(value)}"
+    typed = shlex.quote(line) if re.search(r'["$`\\!]', line) else f'"{line}"'
+    return UserError(f"{key}: cannot read the value ({reason}). Try: {typed}")
 
 
 def _several_values(override: str) -> UserError:
     key, _, value = override.partition("=")
     return UserError(
-        f"{key}: several values make a sweep. Try: cadam3d sweep {override} ... (a list is {key}=[{value}])"
+        f"{key}: several values make a sweep. Try: cadam3d sweep {shlex.quote(override)} ... "
+        f"(a list is {shlex.quote(f'{key}=[{value}]')})"
     )

@@ -104,7 +104,7 @@ def complete(words: Sequence[str]) -> int:
     the script that makes it ask.
     """
     action, _, shell = words[1].partition("=") if len(words) > 1 else ("", "", "")
-    if not shell:
+    if action not in ("install", "uninstall", "query") or shell not in ("bash", "zsh", "fish"):
         raise UserError('-sc: wanted install=bash|zsh|fish. Try: eval "$(cadam3d -sc install=bash)"')
     if action == "query":
         line = os.environ.get("COMP_LINE", "")

@@ -16,6 +16,7 @@ import yaml
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 
 from cadam3d.advice import ask_for, explain, missing_values
 from cadam3d.core.errors import UserError
@@ -24,9 +25,12 @@ from cadam3d.settings import VERSION_BASE, compose, config_dir, quote, register_
 TRAINING = ("train", "sweep")  # the commands that own a run folder
 OVERRIDES = ".hydra/overrides.yaml"  # in a run folder: what its line said
 TEXT_KEYS = ("prompt", "negative_prompt")  # always text, so quoted for the user
-PATH_KEYS = ("run", "ply", "output", "resume", "hydra.run.dir", "hydra.sweep.dir")  # quoted if need be
+PATH_KEYS = (  # quoted if need be
+    *("run", "ply", "output", "resume", "hydra.run.dir", "hydra.sweep.dir"),
+    *("initializer.path", "rasterizer.cache_dir"),
+)
 RUN_MARKS = ("summary.json", "checkpoints")  # what a run folder holds, and an empty one does not
-PLAIN_PATH = re.compile(r"[\w./~+-]*", re.ASCII)
+PLAIN_PATH = re.compile(r"[\w./+-]*", re.ASCII)  # to Hydra's grammar; it cannot read "~"
 QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
 SWEEP_CALL = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)", re.DOTALL)
 PIECE = re.compile(r"(?:[^,]|,(?=\s|$))*", re.DOTALL)  # up to a comma that no blank follows
@@ -46,12 +50,15 @@ class Task:
 
     def __call__(self, cfg: DictConfig) -> Any:
         """Run the command on its composed configuration."""
+        command = import_module(f"cadam3d.commands.{self.module}")
         self.has_started = True
         try:
-            return import_module(f"cadam3d.commands.{self.module}").run(cfg)
+            return command.run(cfg)
         except UserError as error:
             self.mistake = error
-            return None
+        except InterpolationResolutionError as error:  # such as ${hydra:...}, which only a job can resolve
+            self.mistake = explain(error, self.module, ())
+        return None
 
 
 def launch(command: str, words: Sequence[str]) -> int:
@@ -107,11 +114,11 @@ def quoted(line: str, *, is_sweep: bool) -> str:
 
 def resumed(overrides: Sequence[str], *, is_sweep: bool) -> list[str]:
     """With ``resume=RUN`` in the line: what RUN was started with, changed by what the line says anew."""
-    given = {_key(line): line for line in overrides}
+    given = {_entry(line): line for line in overrides}
     if "resume" not in given or (text := _text(given["resume"])) in ("null", ""):
         return list(overrides)
     if is_sweep:
-        raise UserError(f"resume: continues one run, not a sweep. Try: cadam3d train resume={text}")
+        raise UserError(f"resume: continues one run, not a sweep. Try: cadam3d train {_resume(text)}")
     path = Path(text).expanduser().resolve()
     holders = [place for place in (path, *path.parents) if (place / OVERRIDES).is_file()]
     folder = holders[0] if path.exists() and holders else None
@@ -120,13 +127,14 @@ def resumed(overrides: Sequence[str], *, is_sweep: bool) -> list[str]:
             f"resume: wanted the folder of a run (it holds {OVERRIDES}), got {text!r}. "
             "Try: cadam3d train resume=outputs/latest"
         )
-    if "hydra.run.dir" in given and Path(_text(given["hydra.run.dir"])).resolve() != folder:
-        raise UserError(f"hydra.run.dir: a resumed run stays in its folder. Try: cadam3d train resume={text}")
+    if "hydra.run.dir" in given and Path(_text(given["hydra.run.dir"])).expanduser().resolve() != folder:
+        raise UserError(
+            f"hydra.run.dir: a resumed run stays in its folder. Try: cadam3d train {_resume(text)}"
+        )
     before = yaml.safe_load((folder / OVERRIDES).read_text(encoding="utf-8")) or []
-    merged = {_key(line): line for line in before if _key(line) != "grid"}
-    for key, line in given.items():
-        old = merged.get(key, "")
-        merged[key] = old[: len(old) - len(old.lstrip("+"))] + line if line[0] not in "+~" else line
+    merged = {_entry(line): line for line in before if _key(line) != "grid"}
+    for entry, line in given.items():
+        _merge(merged, entry, line)
     merged["resume"] = f"resume={quote(str(path))}"
     merged["hydra.run.dir"] = f"hydra.run.dir={quote(str(folder))}"
     return list(merged.values())
@@ -142,6 +150,8 @@ def run_hydra(command: str, arguments: Sequence[str], task: Task | None = None) 
     try:
         hydra.main(version_base=VERSION_BASE, config_path=str(config_dir()), config_name=command)(task)()
     except Exception as error:
+        if not task.has_started:
+            _pass_on_interrupt(error)
         advice = None if task.has_started else explain(error, command, split(arguments)[0])
         if advice is None:
             raise
@@ -167,16 +177,25 @@ def _run(
     cfg = _compose(command, first, options)
     if missing := missing_values(cfg):
         raise ask_for(missing, command)
+    _refuse_holes(cfg, command, first)
     if command not in TRAINING:
         return run_hydra(command, [*overrides, *flags])
     key = "hydra.sweep.dir" if is_sweep else "hydra.run.dir"
     is_chosen = any(_key(line) == key for line in overrides)
-    folder = _claim(Path(OmegaConf.select(cfg, key)), key, is_chosen=is_chosen)
+    try:
+        place = OmegaConf.select(cfg, key)
+    except InterpolationResolutionError as error:
+        raise explain(error, command, first) or error from error
+    if not place:
+        raise UserError(f"{key}: wanted a folder, got nothing. Try: {key}=outputs/mine, or without it")
+    folder = _claim(Path(str(place)), key, is_chosen=is_chosen)
     if not is_sweep and cfg.resume is None and any((folder / name).exists() for name in RUN_MARKS):
         raise UserError(
-            f"{key}: {folder} holds a run already. Try: cadam3d train resume={folder}, or another folder"
+            f"{key}: {folder} holds a run already. Try: cadam3d train {_resume(folder)}, or another folder"
         )
     arguments = [line for line in overrides if _key(line) != key] + [f"{key}={quote(str(folder))}"]
+    if not is_sweep and cfg.resume is not None:
+        return _run_again(command, [*arguments, *flags], folder)
     if not is_sweep:
         return run_hydra(command, [*arguments, *flags])
     from cadam3d.commands import sweep
@@ -187,6 +206,39 @@ def _run(
     finally:
         code = sweep.finish(folder)
     return code
+
+
+def _run_again(command: str, arguments: Sequence[str], folder: Path) -> int:
+    """Resume the run in ``folder``. A line that is refused leaves no trace in what the run remembers."""
+    remembered = {path: path.read_bytes() for path in (folder / OVERRIDES).parent.glob("*.yaml")}
+    try:
+        return run_hydra(command, arguments)
+    except UserError:
+        for path, content in remembered.items():  # Hydra has written the refused line there already
+            path.write_bytes(content)
+        raise
+
+
+def _refuse_holes(cfg: DictConfig, command: str, overrides: Sequence[str]) -> None:
+    """Refuse a line that takes a whole setting away or refers to one that does not exist."""
+    for line in overrides:
+        key = _key(line)
+        if line.startswith("~") and "." not in key and "/" not in key and key not in cfg:
+            raise UserError(
+                f"~{key}: a setting can be changed, not taken away. "
+                f"Try: cadam3d {command} without it; cadam3d {command} --help lists the choices"
+            )
+    for key in cfg:
+        if key == "hydra":  # holds what only a running job knows
+            continue
+        try:
+            value = cfg[key]
+            if OmegaConf.is_config(value):
+                OmegaConf.to_container(value, resolve=True)
+        except InterpolationKeyError as error:
+            raise explain(error, command, overrides) or error from error
+        except InterpolationResolutionError:  # may be resolved while the job runs: ${hydra:...}
+            continue
 
 
 def _first_job(command: str, overrides: Sequence[str], options: Namespace) -> list[str]:
@@ -222,6 +274,7 @@ def _compose(command: str, overrides: Sequence[str], options: Namespace) -> Dict
             with_hydra=True,
         )
     except Exception as error:
+        _pass_on_interrupt(error)
         advice = explain(error, command, overrides)
         if advice is None:
             raise
@@ -288,6 +341,40 @@ def _prompts(value: str) -> list[str]:
 
 def _key(line: str) -> str:
     return line.partition("=")[0].lstrip("+~")
+
+
+def _entry(line: str) -> str:
+    """What an override is about; taking a key away (``~key``) and giving it a value are two entries."""
+    return ("~" if line.startswith("~") else "") + _key(line)
+
+
+def _merge(merged: dict[str, str], entry: str, line: str) -> None:
+    """Add one more override to those of a run, in place; it takes the place of what it makes void."""
+    key = _key(line)
+    old = merged.get(key, "")
+    if entry != key:  # ~key
+        merged.pop(key, None)
+        if not old.startswith("+") or entry in merged:  # else the key was an addition and is just gone
+            merged[entry] = line
+    elif line.startswith("+"):
+        merged[key] = line
+    else:
+        if not old:
+            merged.pop(f"~{key}", None)  # the key is back
+        merged[key] = old[: len(old) - len(old.lstrip("+"))] + line
+
+
+def _resume(place: str | Path) -> str:
+    return shlex.quote(f"resume={place}")
+
+
+def _pass_on_interrupt(error: BaseException) -> None:
+    """Raise ``KeyboardInterrupt`` if ``error`` only hides one, as OmegaConf's clean-up can make it do."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, KeyboardInterrupt):
+            raise KeyboardInterrupt from error
+        seen = seen.__cause__ or seen.__context__
 
 
 def _text(line: str) -> str:

@@ -258,6 +258,21 @@ def test_a_path_with_brackets_and_commas_is_quoted_too(type_line, jobs, tmp_path
     assert jobs[0][1] == folder
 
 
+@pytest.mark.parametrize("key", launch.PATH_KEYS)
+def test_a_path_below_the_home_folder_is_text(key):
+    for text in ("~/x", "~", "a~b/my mesh (1).ply"):
+        line = launch.quoted(f"{key}={text}", is_sweep=False)
+        assert OverridesParser.create().parse_override(line).value() == text
+        assert launch._text(line) == text
+
+
+def test_a_run_below_the_home_folder_is_written_and_resumed_there(type_line, jobs, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert type_line("train", "prompt=a cube", "hydra.run.dir=~/x").code == 0
+    assert type_line("train", "resume=~/x", "hydra.run.dir=~/x").code == 0
+    assert [folder for _, folder in jobs] == [tmp_path / "home/x"] * 2
+
+
 # --- courtesy 2: what is missing is asked for before any work -------------------------------------------
 
 
@@ -311,6 +326,17 @@ def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, 
         ("callback=[metrics,progres]", "got 'progres'. Try: callback=progress"),
         ("experiment=smok", "Try: experiment=smoke"),
         ("steps=1,2", "steps: several values make a sweep. Try: cadam3d sweep steps=1,2"),
+        ("~steps", "~steps: a setting can be changed, not taken away. Try: "),
+        ("~densifier", "~densifier: a setting can be changed"),
+        ("densifier=null", "wanted one of baseline|cadam|none, got null. Try: densifier=none"),
+        ("camera=null", "camera: wanted one of "),
+        ("exporter=null", "exporter: wanted one of "),
+        ("steps=${nope}", "steps: Interpolation key 'nope' not found. Try: "),
+        ("hydra.run.dir=o_${seedd}", "hydra.run.dir: Interpolation key 'seedd' not found. Try: "),
+        ("hydra.run.dir=", "hydra.run.dir: wanted a folder, got nothing. Try: "),
+        ("promt=a b", "Try: 'prompt=a b'"),
+        ("seed=1,2 3", "Try: cadam3d sweep 'seed=1,2 3' ... (a list is 'seed=[1,2 3]')"),
+        ("grid=densifiers", "grids belong to sweeps. Try: cadam3d sweep grid=densifiers ..."),
         ("steps=[1", "steps: cannot read the value"),
         ("+steps=5", "steps"),
         ("hydra.run.dir=/dev/null/x", "hydra.run.dir: cannot write to /dev/null/x (Not a directory). Try: "),
@@ -333,6 +359,8 @@ def test_a_mistake_gets_one_message_that_says_what_to_type(line, ending, type_li
         (("eval", "-m", "run=a,b"), "only training can be swept"),
         (("doctor", "jsn=true"), "Did you mean json? Try: json=true"),
         (("-sc",), 'Try: eval "$(cadam3d -sc install=bash)"'),
+        (("-sc", "install=nope"), 'Try: eval "$(cadam3d -sc install=bash)"'),
+        (("-sc", "foo=bash"), 'Try: eval "$(cadam3d -sc install=bash)"'),
     ],
 )
 def test_flags_and_other_commands_have_manners_too(words, ending, type_line):
@@ -550,6 +578,35 @@ def test_resume_stays_in_its_folder_and_out_of_sweeps(run_folder, type_line):
     assert "not a sweep" in type_line("train", "-m", f"resume={run_folder}", "seed=0,1").message
 
 
+def test_a_refused_resume_leaves_the_run_as_it_was(run_folder, type_line, jobs):
+    before = {path: path.read_bytes() for path in run_folder.glob(".hydra/*.yaml")}
+    assert type_line("train", f"resume={run_folder}", "seed=7", "steps=20").code == 1
+    assert len(before) == 3
+    assert {path: path.read_bytes() for path in run_folder.glob(".hydra/*.yaml")} == before
+    assert type_line("train", f"resume={run_folder}").code == 0
+    assert [(cfg.seed, cfg.steps) for cfg, _ in jobs] == [(7, 20), (3, 10)]
+
+
+@pytest.mark.parametrize(
+    ("before", "anew", "after"),
+    [
+        (["~a.b", "+a.b={c:1}"], [], ["~a.b", "+a.b={c:1}"]),
+        (["~a.b", "+a.b={c:1}"], ["a.b={c:2}"], ["~a.b", "+a.b={c:2}"]),
+        (["~a.b", "+a.b={c:1}"], ["~a.b"], ["~a.b"]),
+        (["~a.b"], ["a.b=5"], ["a.b=5"]),
+        (["~a.b"], ["+a.b=5"], ["~a.b", "+a.b=5"]),
+        (["a.b=5"], ["~a.b"], ["~a.b"]),
+        (["+a.b=5"], ["~a.b"], []),
+        (["+a.b=5"], ["a.b=6"], ["+a.b=6"]),
+    ],
+)
+def test_taking_a_key_away_and_giving_it_anew_both_survive_a_resume(before, anew, after, tmp_path):
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / launch.OVERRIDES).write_text(yaml.safe_dump(before), encoding="utf-8")
+    lines = launch.resumed([f"resume='{tmp_path}'", *anew], is_sweep=False)
+    assert [line for line in lines if not line.startswith(("resume=", "hydra.run.dir="))] == after
+
+
 # --- courtesy 4: completion -----------------------------------------------------------------------------
 
 
@@ -633,6 +690,19 @@ def test_ctrl_c_is_one_line_and_130(tmp_path):
     _, err = process.communicate(timeout=30)
     assert process.returncode == 130
     assert err.strip() == "cadam3d: interrupted"
+
+
+@pytest.mark.parametrize("function", ["compose", "hydra.main"])
+def test_ctrl_c_that_another_exception_hides_is_still_ctrl_c(function, type_line, monkeypatch, jobs):
+    def hide(*args, **kwargs):
+        try:
+            raise KeyboardInterrupt
+        finally:
+            raise AttributeError("what clean-up stumbled over")
+
+    monkeypatch.setattr(f"cadam3d.launch.{function}", hide)
+    result = type_line("train", "prompt=a cube")
+    assert (result.code, result.message) == (130, "interrupted")
 
 
 def test_flags_may_stand_anywhere():
