@@ -228,7 +228,9 @@ def _refuse_holes(cfg: DictConfig, command: str, overrides: Sequence[str]) -> No
                 f"~{key}: a setting can be changed, not taken away. "
                 f"Try: cadam3d {command} without it; cadam3d {command} --help lists the choices"
             )
-    for key in cfg:
+    raw = OmegaConf.to_container(cfg, resolve=False)
+    assert isinstance(raw, dict)
+    for key in sorted(raw, key=lambda key: isinstance(raw[key], dict)):  # a culprit before what refers to it
         if key == "hydra":  # holds what only a running job knows
             continue
         try:

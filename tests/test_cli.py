@@ -331,7 +331,7 @@ def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, 
         ("densifier=null", "wanted one of baseline|cadam|none, got null. Try: densifier=none"),
         ("camera=null", "camera: wanted one of "),
         ("exporter=null", "exporter: wanted one of "),
-        ("steps=${nope}", "steps: Interpolation key 'nope' not found. Try: "),
+        ("steps=${nope}", "cadam3d: steps: Interpolation key 'nope' not found. Try: "),
         ("hydra.run.dir=o_${seedd}", "hydra.run.dir: Interpolation key 'seedd' not found. Try: "),
         ("hydra.run.dir=", "hydra.run.dir: wanted a folder, got nothing. Try: "),
         ("promt=a b", "Try: 'prompt=a b'"),
@@ -345,7 +345,7 @@ def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, 
 def test_a_mistake_gets_one_message_that_says_what_to_type(line, ending, type_line):
     result = type_line("train", "prompt=a cube", line)
     assert result.code == 1
-    assert ending in result.message
+    assert ending in f"cadam3d: {result.message}"
     assert "HYDRA_FULL_ERROR" not in result.err
     assert not result.out
 
