@@ -46,7 +46,7 @@ class AdamSettings:
 
     def learning_rates(self, step: int) -> dict[str, float]:
         """The rate of each part at ``step`` (0 is the first)."""
-        return {part: as_schedule(getattr(self, f"{part}_lr"))(step) for part in PARTS}
+        return {part: float(as_schedule(getattr(self, f"{part}_lr"))(step)) for part in PARTS}
 
 
 class GaussianOptimizer:
@@ -144,8 +144,8 @@ class GaussianOptimizer:
         parts = _parts(self._gaussians.detach())
         self._adam = torch.optim.Adam(
             [{"params": [part], "name": name} for name, part in parts.items()],
-            betas=(self.settings.beta1, self.settings.beta2),
-            eps=self.settings.eps,
+            betas=(float(self.settings.beta1), float(self.settings.beta2)),  # torch refuses the integer 0
+            eps=float(self.settings.eps),
         )
         for name, part in parts.items():
             self._adam.state[part] = {

@@ -155,7 +155,7 @@ def node(target: str, **values: Any):
 
 def test_a_mistake_found_in_a_constructor_comes_out_as_it_is():
     with pytest.raises(
-        UserError, match=r"^schedule.steps: wanted a number >= 1, got 0. Try: schedule.steps=600$"
+        UserError, match=r"^schedule.steps: wanted a whole number >= 1, got 0. Try: schedule.steps=600$"
     ):
         component(node("cadam3d.core.schedule.Linear", start=1.0, end=0.0, steps=0))
 

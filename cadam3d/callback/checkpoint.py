@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from cadam3d.callback.base import Callback
-from cadam3d.core.checks import require_range
+from cadam3d.core.checks import require_whole
 from cadam3d.io.checkpoint import checkpoint_name, drop_after, prune_checkpoints, save_checkpoint
 from cadam3d.state import Outcome, RunContext, StepReport, TrainState
 
@@ -16,8 +16,8 @@ class Checkpoint(Callback):
     keep: int  # newest files to keep
 
     def __post_init__(self) -> None:
-        require_range("callback.checkpoint.every", self.every, low=1, example=100)
-        require_range("callback.checkpoint.keep", self.keep, low=1, example=2)
+        require_whole("callback.checkpoint.every", self.every, low=1, example=100)
+        require_whole("callback.checkpoint.keep", self.keep, low=1, example=2)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Delete checkpoints of later steps: they belong to a future that this run will not have."""

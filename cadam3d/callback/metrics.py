@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from cadam3d.callback.base import Callback
-from cadam3d.core.checks import require_range
+from cadam3d.core.checks import require_whole
 from cadam3d.io.jsonl import append_jsonl, truncate_after
 from cadam3d.state import RefineReport, RunContext, StepReport, TrainState
 
@@ -17,7 +17,7 @@ class Metrics(Callback):
     every: int  # steps between step lines; refinements are always written
 
     def __post_init__(self) -> None:
-        require_range("callback.metrics.every", self.every, low=1, example=10)
+        require_whole("callback.metrics.every", self.every, low=1, example=10)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Forget lines of steps that a killed run had done after its last checkpoint."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cadam3d.camera.base import CameraSampler
 from cadam3d.core.cameras import Cameras, orbit
-from cadam3d.core.checks import require, require_choice, require_range
+from cadam3d.core.checks import are_numbers, require, require_choice, require_whole
 
 ELEVATION_LAWS = ("uniform", "sphere")
 
@@ -30,7 +30,7 @@ class Orbit(CameraSampler):
     fov_y_deg: Sequence[float]  # vertical field of view
 
     def __post_init__(self) -> None:
-        require_range("camera.size", self.size, low=1, example=128)
+        require_whole("camera.size", self.size, low=1, example=128)
         require_interval("camera.azimuth_deg", self.azimuth_deg, low=-360, high=360, example="[-180,180]")
         require_interval("camera.elevation_deg", self.elevation_deg, low=-90, high=90, example="[-10,60]")
         require_choice("camera.elevation_law", self.elevation_law, ELEVATION_LAWS)
@@ -62,19 +62,21 @@ def uniform(interval: Sequence[float], views: int, generator: torch.Generator) -
     return low + (high - low) * torch.rand(views, generator=generator)
 
 
-def require_interval(key: str, interval: Sequence[float], *, low: float, high: float, example: str) -> None:
+def require_interval(key: str, interval: object, *, low: float, high: float, example: str) -> None:
     """Raise ``UserError`` unless ``interval`` is two ascending numbers in ``[low, high]``."""
-    is_interval = len(interval) == 2 and low <= interval[0] <= interval[1] <= high
+    is_interval = (
+        are_numbers(interval, low=low, high=high) and len(interval) == 2 and interval[0] <= interval[1]
+    )
     require(
         is_interval,
         key,
         wanted=f"[low, high] in ascending order between {low:g} and {high:g}",
-        got=list(interval),
+        got=interval,
         example=f"'{key}={example}'",
     )
 
 
-def require_lens(distance: Sequence[float], fov_y_deg: Sequence[float]) -> None:
+def require_lens(distance: object, fov_y_deg: object) -> None:
     """Raise ``UserError`` unless distances lie outside the unit ball and fields of view are possible."""
     require_interval("camera.distance", distance, low=1, high=1000, example="[3.0,3.6]")
     require_interval("camera.fov_y_deg", fov_y_deg, low=1, high=170, example="[40,45]")

@@ -8,7 +8,7 @@ import torch
 from cadam3d.camera.base import CameraSampler
 from cadam3d.camera.orbit import require_lens, uniform
 from cadam3d.core.cameras import Cameras, orbit
-from cadam3d.core.checks import require_range
+from cadam3d.core.checks import require_whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,7 @@ class Sphere(CameraSampler):
     fov_y_deg: Sequence[float]  # [low, high], vertical field of view
 
     def __post_init__(self) -> None:
-        require_range("camera.size", self.size, low=1, example=128)
+        require_whole("camera.size", self.size, low=1, example=128)
         require_lens(self.distance, self.fov_y_deg)
 
     def sample(self, step: int, views: int, generator: torch.Generator) -> Cameras:

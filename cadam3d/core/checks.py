@@ -2,16 +2,19 @@
 
 import math
 from collections.abc import Sequence
+from typing import TypeGuard
 
 from cadam3d.core.errors import UserError
 
 __all__ = [
     "UserError",
+    "are_numbers",
     "fail",
     "require",
     "require_choice",
     "require_color",
     "require_range",
+    "require_whole",
 ]
 
 
@@ -54,15 +57,35 @@ def require_range(
         raise fail(key, wanted=wanted, got=value, example=f"{key}={example}")
 
 
+def require_whole(
+    key: str, value: object, *, low: float = -math.inf, high: float = math.inf, example: object
+) -> None:
+    """Raise unless ``value`` is an ``int`` in ``[low, high]``; 2.0 and ``True`` are none.
+
+    Example: ``require_whole("refine.interval", interval, low=1, example=50)``.
+    """
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+        bounds = [f"{sign} {bound}" for sign, bound in ((">=", low), ("<=", high)) if math.isfinite(bound)]
+        wanted = " ".join(["a whole number", " and ".join(bounds)]).rstrip()
+        raise fail(key, wanted=wanted, got=value, example=f"{key}={example}")
+
+
 def require_choice(key: str, value: object, choices: Sequence[object]) -> None:
-    """Raise unless ``value`` is one of ``choices``; the message lists them."""
-    if value not in choices:
+    """Raise unless ``value`` is one of ``choices``, of the same type; the message lists them."""
+    if not any(type(value) is type(choice) and value == choice for choice in choices):  # True == 1 == 1.0
         listed = "|".join(str(choice) for choice in choices)
         raise fail(key, wanted=f"one of {listed}", got=value, example=f"{key}={choices[0]}")
 
 
-def require_color(key: str, value: Sequence[float]) -> None:
+def require_color(key: str, value: object) -> None:
     """Raise unless ``value`` is an RGB colour: three numbers in [0, 1]."""
-    is_color = len(value) == 3 and all(0 <= channel <= 1 for channel in value)
+    is_color = are_numbers(value, low=0, high=1) and len(value) == 3
     example = f"'{key}=[0.5,0.5,0.5]'"
-    require(is_color, key, wanted="three numbers in [0, 1]", got=list(value), example=example)
+    require(is_color, key, wanted="three numbers in [0, 1]", got=value, example=example)
+
+
+def are_numbers(value: object, *, low: float, high: float) -> TypeGuard[Sequence[float]]:
+    """Whether ``value`` is a sequence of numbers in ``[low, high]``; text and truth values are none."""
+    return isinstance(value, Sequence) and all(
+        isinstance(item, int | float) and not isinstance(item, bool) and low <= item <= high for item in value
+    )

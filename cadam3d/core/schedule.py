@@ -4,11 +4,12 @@
 """
 
 import math
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from cadam3d.core.checks import require, require_range
+from cadam3d.core.checks import are_numbers, require, require_range, require_whole
 
 FAR_STEP = 10**9  # every schedule has come to rest by then
 
@@ -27,6 +28,9 @@ class Constant(Schedule):
 
     value: float
 
+    def __post_init__(self) -> None:
+        require_range("schedule.value", self.value, example=0.001)
+
     def __call__(self, step: int) -> float:
         """The value, whatever the step."""
         return self.value
@@ -42,7 +46,10 @@ class Linear(Schedule):
     begin: int = 0
 
     def __post_init__(self) -> None:
-        require_range("schedule.steps", self.steps, low=1, example=600)
+        require_whole("schedule.steps", self.steps, low=1, example=600)
+        require_whole("schedule.begin", self.begin, example=0)
+        require_range("schedule.start", self.start, example=1e-3)
+        require_range("schedule.end", self.end, example=1e-5)
 
     def __call__(self, step: int) -> float:
         """The value at ``step``."""
@@ -59,7 +66,8 @@ class LogLinear(Schedule):
     begin: int = 0
 
     def __post_init__(self) -> None:
-        require_range("schedule.steps", self.steps, low=1, example=600)
+        require_whole("schedule.steps", self.steps, low=1, example=600)
+        require_whole("schedule.begin", self.begin, example=0)
         require_range("schedule.start", self.start, above=0, example=1e-3)
         require_range("schedule.end", self.end, above=0, example=1e-5)
 
@@ -78,10 +86,13 @@ class Steps(Schedule):
 
     def __post_init__(self) -> None:
         require(
-            len(self.values) == len(self.milestones) + 1 and list(self.milestones) == sorted(self.milestones),
+            are_numbers(self.values, low=-sys.float_info.max, high=sys.float_info.max)
+            and are_numbers(self.milestones, low=-FAR_STEP, high=FAR_STEP)
+            and len(self.values) == len(self.milestones) + 1
+            and list(self.milestones) == sorted(self.milestones),
             "schedule.values",
-            wanted="one value more than milestones, milestones ascending",
-            got=(list(self.values), list(self.milestones)),
+            wanted="one value more than milestones, all numbers, milestones ascending",
+            got=(self.values, self.milestones),
             example="{values: [0.98, 0.5], milestones: [500]}",
         )
 

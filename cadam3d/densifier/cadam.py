@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cadam3d.core.checks import require_choice, require_range
+from cadam3d.core.checks import require_choice, require_range, require_whole
 from cadam3d.core.edit import RowEdit, RowState
 from cadam3d.densifier.base import Densifier, GradientSignal
 
@@ -60,9 +60,9 @@ class CAdam(Densifier[CAdamState]):
         require_range("densifier.beta2", self.beta2, low=0, below=1, example=0.999)
         require_range("densifier.eps", self.eps, above=0, example=1e-15)
         require_choice("densifier.invisible", self.invisible, INVISIBLE)
-        require_range("densifier.min_age", self.min_age, low=0, example=20)
+        require_whole("densifier.min_age", self.min_age, low=0, example=20)
         require_choice("densifier.quantile_over", self.quantile_over, QUANTILE_OVER)
-        require_range("densifier.reset_min_age", self.reset_min_age, low=0, example=50)
+        require_whole("densifier.reset_min_age", self.reset_min_age, low=0, example=50)
         require_choice("densifier.grad_norm", self.grad_norm, GRAD_NORM)
         require_choice("densifier.nonfinite", self.nonfinite, NONFINITE)
         require_choice("densifier.child_state", self.child_state, CHILD_STATE)

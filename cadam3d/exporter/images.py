@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from cadam3d.core.cameras import turntable
-from cadam3d.core.checks import require_range
+from cadam3d.core.checks import require_whole
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn
 from cadam3d.core.viewing import require_elevations, require_viewing
@@ -29,7 +29,7 @@ class ImagesExporter(Exporter):
     background: Sequence[float]  # RGB in [0, 1]
 
     def __post_init__(self) -> None:
-        require_range("exporter.images.views", self.views, low=1, example=8)
+        require_whole("exporter.images.views", self.views, low=1, example=8)
         require_elevations("exporter.images", self.elevations_deg)
         require_viewing(
             "exporter.images",

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from cadam3d.core.cameras import turntable
-from cadam3d.core.checks import require_range
+from cadam3d.core.checks import require_choice, require_whole
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn
 from cadam3d.core.viewing import require_elevations, require_viewing
@@ -30,7 +30,7 @@ class PreviewExporter(Exporter):
     labels: bool  # write azimuth and elevation into the corner of each picture
 
     def __post_init__(self) -> None:
-        require_range("exporter.preview.views", self.views, low=1, example=8)
+        require_whole("exporter.preview.views", self.views, low=1, example=8)
         require_elevations("exporter.preview", self.elevations_deg)
         require_viewing(
             "exporter.preview",
@@ -39,6 +39,7 @@ class PreviewExporter(Exporter):
             size=self.size,
             background=self.background,
         )
+        require_choice("exporter.preview.labels", self.labels, (True, False))
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
         """Render row by row and write the sheet."""

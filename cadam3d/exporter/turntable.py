@@ -9,7 +9,7 @@ import torch
 from jaxtyping import UInt8
 
 from cadam3d.core.cameras import Cameras, turntable
-from cadam3d.core.checks import require_choice, require_range
+from cadam3d.core.checks import require_choice, require_range, require_whole
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.core.viewing import require_viewing
@@ -35,9 +35,9 @@ class TurntableExporter(Exporter):
     beside: str  # depth, alpha or none: the second picture of each frame
 
     def __post_init__(self) -> None:
-        require_range("exporter.turntable.views", self.views, low=1, example=60)
+        require_whole("exporter.turntable.views", self.views, low=1, example=60)
         require_range("exporter.turntable.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
-        require_range("exporter.turntable.fps", self.fps, low=1, example=30)
+        require_whole("exporter.turntable.fps", self.fps, low=1, example=30)
         require_viewing(
             "exporter.turntable",
             distance=self.distance,

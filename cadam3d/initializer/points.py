@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cadam3d.core.checks import require_range
+from cadam3d.core.checks import require_range, require_whole
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE, rgb_to_sh0
 
@@ -59,13 +59,13 @@ def neighbour_distance(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     return result.clamp_min(SMALLEST)
 
 
-def require_points(count: int, scale: float | None, opacity: float, sh_degree: int) -> None:
+def require_points(count: object, scale: object, opacity: object, sh_degree: object) -> None:
     """Raise ``UserError`` unless these keys of an initializer make sense."""
-    require_range("initializer.count", count, low=1, example=2000)
+    require_whole("initializer.count", count, low=1, example=2000)
     if scale is not None:
         require_range("initializer.scale", scale, above=0, example=0.03)
     require_range("initializer.opacity", opacity, above=0, below=1, example=0.1)
-    require_range("initializer.sh_degree", sh_degree, low=0, high=MAX_DEGREE, example=0)
+    require_whole("initializer.sh_degree", sh_degree, low=0, high=MAX_DEGREE, example=0)
 
 
 def _blocks(points: Float[Tensor, "n 3"], rows: Int[Tensor, "rows"]) -> list[Tensor]:

@@ -9,7 +9,7 @@ from kornia.metrics import psnr, ssim
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, orbit
-from cadam3d.core.checks import require_range
+from cadam3d.core.checks import require_whole
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, TruthFn
 from cadam3d.core.viewing import require_elevations, require_viewing
@@ -37,7 +37,7 @@ class Fidelity(Metric):
     background: Sequence[float]  # RGB in [0, 1]; render and truth stand before the same one
 
     def __post_init__(self) -> None:
-        require_range("metric.fidelity.views", self.views, low=1, example=12)
+        require_whole("metric.fidelity.views", self.views, low=1, example=12)
         require_elevations("metric.fidelity", self.elevations_deg)
         require_viewing(
             "metric.fidelity",
@@ -46,7 +46,7 @@ class Fidelity(Metric):
             size=self.size,
             background=self.background,
         )
-        require_range("metric.fidelity.size", self.size, low=SSIM_WINDOW, example=128)
+        require_whole("metric.fidelity.size", self.size, low=SSIM_WINDOW, example=128)
 
     def cameras(self) -> Cameras:
         """The held-out views: azimuths half a step off those of a turntable, each elevation shifted a

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require_range
+from cadam3d.core.checks import require_range, require_whole
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class DDPM(NoisePath):
     beta_end: float = 0.012
 
     def __post_init__(self) -> None:
-        require_range("prior.path.train_steps", self.train_steps, low=1, example=1000)
+        require_whole("prior.path.train_steps", self.train_steps, low=1, example=1000)
         require_range("prior.path.beta_start", self.beta_start, above=0, below=1, example=0.00085)
         require_range("prior.path.beta_end", self.beta_end, low=self.beta_start, below=1, example=0.012)
 

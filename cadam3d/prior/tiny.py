@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (the name everybody knows)
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import require, require_choice
+from cadam3d.core.checks import require_choice, require_whole
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import NoisePath, Prediction
 
@@ -66,13 +66,7 @@ class Tiny(DiffusionPrior):
         require_choice("prior.predicts", self.predicts, ("noise", "velocity"))
         require_choice("prior.width", self.width, range(16, 49, GROUPS))
         require_choice("prior.downscale", self.downscale, range(1, 9))
-        require(
-            isinstance(self.seed, int) and self.seed >= 0,
-            "prior.seed",
-            wanted="a whole number >= 0",
-            got=self.seed,
-            example="prior.seed=0",
-        )
+        require_whole("prior.seed", self.seed, low=0, high=2**62, example=0)
 
     @cached_property
     def network(self) -> "TinyUNet":

@@ -11,6 +11,7 @@ from cadam3d.core.checks import (
     require_choice,
     require_color,
     require_range,
+    require_whole,
 )
 
 
@@ -65,6 +66,34 @@ def test_an_infinite_number_never_passes_a_one_sided_bound():
         require_range("key", math.inf, low=0, example=1)
 
 
+@pytest.mark.parametrize("value", [2, 3, 16])
+def test_whole_numbers_inside_pass(value):
+    require_whole("key", value, low=2, high=16, example=2)
+
+
+@pytest.mark.parametrize("value", [1, 17, 2.0, 2.5, True, False, None, "3", [3], math.nan, math.inf])
+def test_everything_but_whole_numbers_inside_is_refused(value):
+    with pytest.raises(UserError, match=r"^key: wanted a whole number >= 2 and <= 16, got .*\. Try: key=2$"):
+        require_whole("key", value, low=2, high=16, example=2)
+
+
+def test_bounds_of_whole_numbers_are_optional():
+    require_whole("key", -(10**400), example=0)
+    with pytest.raises(UserError, match=r"^key: wanted a whole number, got 0\.5\. Try: key=0$"):
+        require_whole("key", 0.5, example=0)
+    with pytest.raises(UserError, match=r"^key: wanted a whole number >= 1, got True\. Try: key=5$"):
+        require_whole("key", True, low=1, example=5)
+
+
+@pytest.mark.parametrize(
+    ("value", "choices"),
+    [(0, (True, False)), (True, range(4)), (1.0, range(4)), ([], range(4)), (None, "ab")],
+)
+def test_a_choice_has_the_type_of_what_it_equals(value, choices):
+    with pytest.raises(UserError, match="key: wanted one of"):
+        require_choice("key", value, choices)
+
+
 def test_a_choice_lists_what_there_is():
     require_choice("prior", "tiny", ["shapes", "tiny"])
     with pytest.raises(UserError, match=r"prior: wanted one of shapes\|tiny, got 'tin'. Try: prior=shapes"):
@@ -73,6 +102,15 @@ def test_a_choice_lists_what_there_is():
 
 def test_a_colour_is_three_numbers_between_zero_and_one():
     require_color("background.color", [0, 0.5, 1.0])
-    for wrong in ([0.0, 0.5], [0.0, 0.5, 1.01], [-0.1, 0.0, 0.0], [math.nan, 0.0, 0.0]):
+    for wrong in (
+        [0.0, 0.5],
+        [0.0, 0.5, 1.01],
+        [-0.1, 0.0, 0.0],
+        [math.nan, 0.0, 0.0],
+        1,
+        None,
+        "abc",
+        [True] * 3,
+    ):
         with pytest.raises(UserError, match=r"background\.color: wanted three numbers in \[0, 1\]"):
             require_color("background.color", wrong)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
-from cadam3d.core.checks import UserError, require_range
+from cadam3d.core.checks import UserError, require_range, require_whole
 from cadam3d.core.render import TruthFn
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import NoisePath, Prediction, per_view
@@ -102,9 +102,9 @@ class ShapesPrior(DiffusionPrior):
         require_range("prior.spread", self.spread, low=0, high=10, example=0.1)
         require_range("prior.edge_spread", self.edge_spread, low=0, high=10, example=0.1)
         require_range("prior.model_error", self.model_error, low=0, high=10, example=0.1)
-        require_range("prior.samples_per_pixel", self.samples_per_pixel, low=1, high=8, example=2)
-        require_range("prior.census_size", self.census_size, low=2, high=256, example=24)
-        require_range("prior.seed", self.seed, low=0, high=2**62, example=0)
+        require_whole("prior.samples_per_pixel", self.samples_per_pixel, low=1, high=8, example=2)
+        require_whole("prior.census_size", self.census_size, low=2, high=256, example=24)
+        require_whole("prior.seed", self.seed, low=0, high=2**62, example=0)
 
     def embed(self, prompt: str, negative: str) -> ShapesEmbedding:
         """Parse both prompts; the empty negative prompt is the whole world.

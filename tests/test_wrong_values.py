@@ -1,0 +1,162 @@
+"""A value of the wrong type is a message that names its key, whichever component it is meant for."""
+
+from functools import cache
+
+import jaxtyping
+import pytest
+import torch
+import yaml
+from omegaconf import DictConfig, OmegaConf
+
+from cadam3d.core.errors import UserError
+from cadam3d.settings import component, compose
+
+WHOLE = {  # what to choose, and the keys that count something
+    "camera=orbit": ["camera.size"],
+    "camera=sphere": ["camera.size"],
+    "initializer=ball": ["initializer.count", "initializer.sh_degree"],
+    "initializer=mesh": ["initializer.count", "initializer.sh_degree"],
+    "prior=shapes": ["prior.samples_per_pixel", "prior.census_size", "prior.seed", "prior.path.train_steps"],
+    "prior=tiny": ["prior.width", "prior.downscale", "prior.seed", "prior.path.train_steps"],
+    "refine=default": [
+        "refine.start",
+        "refine.end",
+        "refine.interval",
+        "refine.split_children",
+        "refine.prune_from",
+        "refine.reset_interval",
+        "refine.reset_from",
+        "refine.reset_until",
+        "refine.prune_grace",
+        "refine.max_gaussians",
+    ],
+    "densifier=cadam": ["densifier.min_age", "densifier.reset_min_age"],
+    "exporter=[images]": ["exporter.images.views", "exporter.images.size"],
+    "exporter=[preview]": ["exporter.preview.views", "exporter.preview.size"],
+    "exporter=[turntable]": [
+        "exporter.turntable.views",
+        "exporter.turntable.size",
+        "exporter.turntable.fps",
+    ],
+    "exporter=[ply]": ["exporter.ply.pad_sh"],
+    "metric=[fidelity]": ["metric.fidelity.views", "metric.fidelity.size"],
+    "callback=[metrics]": ["callback.metrics.every"],
+    "callback=[checkpoint]": ["callback.checkpoint.every", "callback.checkpoint.keep"],
+}
+LISTS = {
+    "camera=orbit": ["camera.azimuth_deg", "camera.elevation_deg", "camera.distance", "camera.fov_y_deg"],
+    "camera=sphere": ["camera.distance", "camera.fov_y_deg"],
+    "background=grey": ["background.color"],
+    "background=random": ["background.color"],
+    "initializer=ball": ["initializer.color"],
+    "initializer=mesh": ["initializer.color"],
+    "exporter=[images]": ["exporter.images.elevations_deg", "exporter.images.background"],
+    "exporter=[preview]": ["exporter.preview.elevations_deg", "exporter.preview.background"],
+    "exporter=[turntable]": ["exporter.turntable.background"],
+    "metric=[fidelity]": ["metric.fidelity.elevations_deg", "metric.fidelity.background"],
+}
+TRUTHS = {
+    "guidance=sds": ["guidance.shared_t"],
+    "guidance=ism": ["guidance.shared_t"],
+    "exporter=[preview]": ["exporter.preview.labels"],
+}
+NEVER_WHOLE = ("2.5", "16.0", "true", "abc", "[1]", "-1000000000000.5")
+NEVER_A_LIST = ("5", "null", "abc", "[a,b,c]", "[true,true,true]", "[null,null]", "[]")
+NEVER_A_TRUTH = ("0", "1", "1.0", "null", "abc")
+
+
+@pytest.fixture(autouse=True)
+def as_users_run_it():
+    """Without the type checks of the test suite, which would refuse a wrong type before the component can."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@cache
+def composed(choice: str) -> DictConfig:
+    path = ["initializer.path=a.ply"] if choice == "initializer=mesh" else []
+    return compose(["prompt=a red cube", choice, *path])
+
+
+def build(choice: str, *lines: str):
+    """The component that ``choice`` chooses, with ``lines`` of YAML values on top."""
+    group, _, name = choice.partition("=")
+    cfg = composed(choice).copy()
+    for line in lines:
+        key, _, value = line.partition("=")
+        OmegaConf.update(cfg, key, yaml.safe_load(value), merge=False, force_add=True)
+    return component(cfg[group][name.strip("[]")] if name.startswith("[") else cfg[group])
+
+
+def pairs(table: dict[str, list[str]]) -> list[tuple[str, str]]:
+    return [(choice, key) for choice, keys in table.items() for key in keys]
+
+
+def refuses(choice: str, line: str) -> None:
+    key = line.partition("=")[0]
+    with pytest.raises(UserError) as raised:
+        build(choice, line)
+    message = str(raised.value)
+    assert message.startswith(f"{key}: wanted ")
+    assert f"{key}=" in message.partition("Try: ")[2]
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(("choice", "key"), pairs(WHOLE))
+def test_what_is_counted_is_a_whole_number(choice, key):
+    for value in NEVER_WHOLE:
+        refuses(choice, f"{key}={value}")
+    if key not in ("refine.reset_interval", "refine.max_gaussians"):  # where null means never
+        refuses(choice, f"{key}=null")
+
+
+@pytest.mark.parametrize(("choice", "key"), pairs(LISTS))
+def test_a_list_of_numbers_is_nothing_else(choice, key):
+    for value in NEVER_A_LIST:
+        refuses(choice, f"{key}={value}")
+
+
+@pytest.mark.parametrize(("choice", "key"), pairs(TRUTHS))
+def test_a_switch_is_true_or_false(choice, key):
+    for value in NEVER_A_TRUTH:
+        refuses(choice, f"{key}={value}")
+
+
+def test_a_truth_value_bounds_nothing():
+    refuses("guidance=sds", "guidance.clip=true")
+    refuses("guidance=sds", "guidance.clip=abc")
+
+
+def test_a_parent_has_a_bounded_number_of_children():
+    assert build("refine=default", "refine.split_children=16").split_children == 16
+    refuses("refine=default", "refine.split_children=17")
+
+
+@pytest.mark.parametrize("key", ["steps", "begin"])
+@pytest.mark.parametrize("value", ["2.5", "true", "null", "abc"])
+def test_a_schedule_counts_whole_steps(key, value):
+    with pytest.raises(UserError, match=rf"^schedule\.{key}: wanted a whole number"):
+        build("optimizer=adam", f"optimizer.means_lr.{key}={value}")
+
+
+@pytest.mark.parametrize("key", ["start", "end"])
+@pytest.mark.parametrize("kind", ["Linear", "LogLinear"])
+@pytest.mark.parametrize("value", ["true", "null", "abc"])
+def test_a_schedule_goes_from_number_to_number(key, kind, value):
+    with pytest.raises(UserError, match=rf"^schedule\.{key}: wanted a"):
+        build(
+            "optimizer=adam",
+            f"optimizer.means_lr._target_=cadam3d.core.schedule.{kind}",
+            f"optimizer.means_lr.{key}={value}",
+        )
+
+
+def test_an_integer_is_a_fine_rate_of_decay():
+    gaussians = build("initializer=ball", "initializer.count=3").build(
+        "", torch.Generator().manual_seed(0), torch.device("cpu")
+    )
+    lines = ["optimizer.beta1=0", "optimizer.beta2=0", "optimizer.eps=1", "optimizer.quat_lr=0"]
+    optimizer = build("optimizer=adam", *lines).start(gaussians)
+    optimizer.step(0)
+    assert torch.equal(optimizer.gaussians.quats, gaussians.quats)
