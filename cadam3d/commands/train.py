@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import __version__
 from cadam3d.commands.paths import shown
-from cadam3d.core.checks import UserError, require
+from cadam3d.core.checks import UserError, require, require_whole
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.atomic import remove_leftovers
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
@@ -64,8 +64,7 @@ def run(cfg: DictConfig) -> float | None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     device = resolve_device(cfg.device)
     for key, least in (("seed", 0), ("steps", 1), ("views", 1)):
-        is_whole = isinstance(cfg[key], int) and not isinstance(cfg[key], bool) and cfg[key] >= least
-        require(is_whole, key, wanted=f"a whole number >= {least}", got=cfg[key], example=f"{key}=3")
+        require_whole(key, cfg[key], low=least, example=3)
     # Same seed, same bytes: on the CPU every operation we use has a deterministic form.
     torch.use_deterministic_algorithms(device.type == "cpu")
     trainer = build_trainer(cfg, device)
