@@ -1,19 +1,15 @@
 """The CUDA rasterizer: its very kernels, on fibers everywhere, and on a GPU where there is one."""
 
-import ctypes
 import faulthandler
 import math
 import os
 import shutil
-import subprocess
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
-from pathlib import Path
 
 import pytest
 import torch
+from emulation import Emulator, compile_emulator
 from splats import (
     IMAGES,
     POISON,
@@ -34,60 +30,14 @@ from splats import (
 
 from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import FIELDS, Gaussians
-from cadam3d.core.render import RenderOutput
-from cadam3d.rasterizer import base, cuda
-from cadam3d.rasterizer.build import CONSTANTS, KERNELS, find_compiler
-from cadam3d.rasterizer.cuda import CudaRasterizer, Launch, Launcher, rasterize, works_on
-from cadam3d.rasterizer.driver import Module
+from cadam3d.rasterizer import cuda
+from cadam3d.rasterizer.build import KERNELS
+from cadam3d.rasterizer.cuda import CudaRasterizer, rasterize, works_on
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
-EMULATOR = Path(__file__).parent / "emulator"
+pytestmark = pytest.mark.usefixtures("garbage_in_new_memory")
+
 CPU = torch.device("cpu")
-FLAGS = ("-std=c++17", "-shared", "-fPIC", "-ffp-contract=off", "-U_FORTIFY_SOURCE")
-FLAGS += ("-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas")
-
-
-class Emulator(Launcher):
-    """Runs kernels on fibers, through the code that talks to a real driver."""
-
-    def __init__(self, module: Module, seed: int) -> None:
-        self.module, self.seed = module, seed
-
-    @contextmanager
-    def on(self, device: torch.device) -> Iterator[Launch]:
-        """See :meth:`Launcher.on`; the seed of the schedule travels as the stream."""
-        assert device == CPU
-        with self.module.launching(self.seed) as launch:
-            yield launch
-
-    def render(self, gaussians, cameras, background) -> RenderOutput:
-        """See ``Rasterizer.render``."""
-        return rasterize(self, gaussians, cameras, background)
-
-    def shuffled(self, seed: int) -> "Emulator":
-        """The same kernels, in another order."""
-        return Emulator(self.module, seed)
-
-
-def compile_emulator(folder: Path, kernels: Path = KERNELS, optimize: str = "-O1") -> Emulator:
-    compiler = find_compiler()
-    if compiler is None:
-        pytest.skip("no C++ compiler")
-    library = folder / "emulator.so"
-    defines = [f"-DSPLAT_{name}={getattr(base, name)!r}" for name in CONSTANTS]
-    paths = [optimize, f"-I{kernels}", str(EMULATOR / "emulator.cpp"), "-o", str(library)]
-    done = subprocess.run(
-        [*compiler.command, *FLAGS, *defines, *paths], capture_output=True, text=True, check=False
-    )
-    if done.returncode != 0 and "ucontext.h" in done.stderr:
-        pytest.skip("no ucontext.h")
-    assert done.returncode == 0, done.stderr
-    return Emulator(Module(ctypes.CDLL(str(library)), 0, b""), seed=1)
-
-
-@pytest.fixture(scope="session")
-def emulator(tmp_path_factory) -> Emulator:
-    return compile_emulator(tmp_path_factory.mktemp("emulator"))
 
 
 @dataclass(frozen=True)
@@ -111,14 +61,6 @@ def backend(request, tmp_path_factory) -> Backend:
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     return Backend(CudaRasterizer(cache_dir=str(tmp_path_factory.mktemp("cubin"))), "cuda")
-
-
-@pytest.fixture(autouse=True)
-def _garbage_in_new_memory():
-    """Every ``torch.empty`` holds NaN or the largest number: to read what nobody wrote shows."""
-    torch.use_deterministic_algorithms(True)
-    yield
-    torch.use_deterministic_algorithms(False)
 
 
 # -------------------------------------------------------------------------- agreement with the reference
