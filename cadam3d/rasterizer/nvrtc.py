@@ -57,12 +57,7 @@ class Cubin:
 @cache
 def find_compiler() -> Compiler | None:
     """The first NVRTC that loads: of torch's own CUDA version, then of any, then the system's."""
-    for path in (
-        *sorted(_bundled(), key=_distance_from_torch),
-        "libnvrtc.so",
-        "libnvrtc.so.13",
-        "libnvrtc.so.12",
-    ):
+    for path in (*sorted(_bundled(), key=_distance_from_torch), *SYSTEM):
         try:
             return _load(str(path))
         except OSError:
