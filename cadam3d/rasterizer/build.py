@@ -104,8 +104,8 @@ def build(cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAG
     if compiler is None:
         raise UserError(
             "rasterizer=cpu needs a C++ compiler once, and found none ($CXX, c++, g++, clang++). "
-            "Install one: `apt install g++`, `xcode-select --install` or `pip install ziglang`. "
-            "Or try: rasterizer=reference"
+            "Install one: `apt install g++`, `xcode-select --install` or `pip install \"cadam3d[compiler]\"`. "
+            "Or settle for: rasterizer=reference"
         )
     start = time.perf_counter()
     try:
