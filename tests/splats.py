@@ -57,8 +57,8 @@ def backgrounds(v):
     return torch.rand(v, 3, generator=torch.Generator().manual_seed(5))
 
 
-def undecided(gaussians: Gaussians, cameras: Cameras) -> torch.Tensor:
-    """[v h w]: pixels where some number lies within float32 rounding of a step. A dense twin, in float64."""
+def undecided(gaussians: Gaussians, cameras: Cameras, within: float = 1e-3) -> torch.Tensor:
+    """[v h w]: pixels where some number is ``within`` so much of a step. A dense twin, in float64."""
     g, pixels = gaussians.detach().to(torch.float64), []
     y, x = torch.meshgrid(torch.arange(cameras.height), torch.arange(cameras.width), indexing="ij")
     size = torch.tensor([cameras.width, cameras.height], dtype=torch.float64)
@@ -83,7 +83,7 @@ def undecided(gaussians: Gaussians, cameras: Cameras) -> torch.Tensor:
         alpha = torch.where(raw < ALPHA_MIN, 0.0, raw.clamp_max(ALPHA_MAX))
         after = (1 - alpha).cumprod(dim=0)
         is_close = [
-            (numbers / step - 1).abs() < 1e-3
+            (numbers / step - 1).abs() < within
             for numbers, step in ((raw, ALPHA_MIN), (raw, ALPHA_MAX), (after, TRANSMITTANCE_MIN))
         ]
         pixels.append(torch.stack(is_close).flatten(0, 1).any(dim=0))

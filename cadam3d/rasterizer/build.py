@@ -104,7 +104,7 @@ def build(cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAG
     if compiler is None:
         raise UserError(
             "rasterizer=cpu needs a C++ compiler once, and found none ($CXX, c++, g++, clang++). "
-            "Install one: `apt install g++`, `xcode-select --install` or `pip install \"cadam3d[compiler]\"`. "
+            "Install one: `apt install g++`, `xcode-select --install` or `pip install 'cadam3d[compiler]'`. "
             "Or settle for: rasterizer=reference"
         )
     start = time.perf_counter()

@@ -132,7 +132,7 @@ def test_two_processes_at_once_both_get_a_library(play, tmp_path):
 
 def test_says_what_to_install_where_there_is_no_compiler(tmp_path, monkeypatch):
     remove_compilers(monkeypatch)
-    with pytest.raises(UserError, match=r'apt install g\+\+.*"cadam3d\[compiler\]".*rasterizer=reference'):
+    with pytest.raises(UserError, match=r"apt install g\+\+.*'cadam3d\[compiler\]'.*rasterizer=reference"):
         build(tmp_path)
 
 

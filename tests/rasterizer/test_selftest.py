@@ -1,0 +1,193 @@
+"""The self-test: honest about rounding, deaf to nothing else."""
+
+import math
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from splats import undecided
+
+from cadam3d.core.gaussians import FIELDS, Gaussians
+from cadam3d.rasterizer import reference
+from cadam3d.rasterizer.base import NEAR, Rasterizer
+from cadam3d.rasterizer.build import find_compiler
+from cadam3d.rasterizer.cpu import CpuRasterizer
+from cadam3d.rasterizer.reference import ReferenceRasterizer
+from cadam3d.rasterizer.selftest import (
+    HEIGHT,
+    MOST_GRADIENTS,
+    MOST_IMAGES,
+    WIDTH,
+    Agreement,
+    make_scene,
+    self_test,
+)
+
+CPU = torch.device("cpu")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bent(Rasterizer):
+    """The reference with one thing wrong about it: ``before`` or ``after`` it renders."""
+
+    before: object = staticmethod(lambda gaussians, cameras, background: (gaussians, cameras, background))
+    after: object = staticmethod(lambda output: output)
+
+    def render(self, gaussians, cameras, background):
+        return self.after(ReferenceRasterizer().render(*self.before(gaussians, cameras, background)))
+
+
+class _Bend(torch.autograd.Function):
+    """The identity, with a gradient that is not one."""
+
+    @staticmethod
+    def forward(ctx, tensor, bend):
+        ctx.bend = bend
+        return tensor.clone()
+
+    @staticmethod
+    def backward(ctx, grad):
+        return ctx.bend(grad), None
+
+
+def bent_gradient(field, bend) -> Bent:
+    def before(gaussians, cameras, background):
+        tensors = gaussians.tensors()
+        return Gaussians(**tensors | {field: _Bend.apply(tensors[field], bend)}), cameras, background
+
+    return Bent(before=before)
+
+
+def test_float32_agrees_with_float64_far_inside_the_limits():
+    agreement = self_test(ReferenceRasterizer(), CPU)
+    assert agreement.holds
+    assert agreement.repeats
+    assert agreement.worst_image < MOST_IMAGES / 5
+    assert agreement.worst_gradient < MOST_GRADIENTS / 20
+    assert set(agreement.gradients) == {*FIELDS, "means2d"}
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
+def test_the_native_kernels_pass(kernel_build):
+    agreement = self_test(CpuRasterizer(cache_dir=str(kernel_build.path.parent)), CPU)
+    assert agreement.holds, agreement
+    assert agreement.repeats
+
+
+# -------------------------------------------------------------------------- the scene
+
+
+def test_no_number_of_the_scene_lies_near_a_step():
+    scene = make_scene()
+    assert not undecided(scene.gaussians, scene.cameras, within=1e-4).any()
+
+
+@pytest.mark.parametrize(
+    "name", ["BLUR", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN", "FRUSTUM_MARGIN", "NEAR"]
+)
+def test_every_constant_of_the_model_shows(name, monkeypatch):
+    honest = {name: getattr(reference, name)}
+    moved = {"BLUR": 0.31, "ALPHA_MIN": 1 / 250, "ALPHA_MAX": 0.98, "TRANSMITTANCE_MIN": 2e-4}
+    moved |= {"FRUSTUM_MARGIN": 0.1, "NEAR": 0.3}
+
+    def before(*scene):
+        monkeypatch.setattr(reference, name, moved[name])
+        return scene
+
+    def after(output):
+        monkeypatch.setattr(reference, name, honest[name])
+        return output
+
+    assert not self_test(Bent(before=before, after=after), CPU).holds
+
+
+def test_the_scene_has_gaussians_behind_beside_and_across_the_border():
+    scene = make_scene()
+    output = ReferenceRasterizer().render(scene.gaussians, scene.cameras, scene.background)
+    assert 0.5 < output.visible.double().mean() < 1
+    is_outside = (output.means2d < 0) | (output.means2d > torch.tensor([WIDTH, HEIGHT]))
+    assert (is_outside.any(dim=-1) & output.visible).any()
+    homogeneous = torch.nn.functional.pad(scene.gaussians.means, (0, 1), value=1.0)
+    depths = homogeneous @ scene.cameras.world_to_camera[:, 2].T
+    assert (depths < NEAR).any()
+    assert output.alpha.min() < 0.1
+    assert output.alpha.max() > 0.99
+
+
+def test_the_scene_is_the_same_whatever_torch_draws():
+    before = make_scene()
+    state = torch.get_rng_state()
+    torch.rand(1)
+    assert torch.equal(before.gaussians.means, make_scene().gaussians.means)
+    torch.set_rng_state(state)
+    self_test(ReferenceRasterizer(), CPU)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+# -------------------------------------------------------------------------- what it notices
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_a_gradient_that_is_a_thousandth_too_large_is_noticed(field):
+    agreement = self_test(bent_gradient(field, lambda grad: grad * 1.001), CPU)
+    assert not agreement.holds
+    assert agreement.gradients[field] == pytest.approx(1e-3, rel=0.01)
+    assert agreement.worst_image <= MOST_IMAGES
+
+
+@pytest.mark.parametrize("bend", [lambda grad: grad * math.nan, lambda grad: grad / 0, torch.zeros_like])
+def test_a_gradient_that_is_none_is_noticed(bend):
+    agreement = self_test(bent_gradient("opacity_logits", bend), CPU)
+    assert not agreement.holds
+    assert agreement.worst_gradient >= 1
+
+
+def test_one_gaussian_less_is_noticed():
+    def before(gaussians, cameras, background):
+        logits = gaussians.opacity_logits.clone()
+        logits[150] = -100.0
+        return replace(gaussians, opacity_logits=logits), cameras, background
+
+    agreement = self_test(Bent(before=before), CPU)
+    assert not agreement.holds
+    assert agreement.images["radii"] > MOST_IMAGES
+
+
+@pytest.mark.parametrize(
+    "after",
+    [
+        lambda output: replace(output, rgb=output.rgb.flip(0)),
+        lambda output: replace(output, alpha=output.alpha.roll(1, dims=2)),
+        lambda output: replace(output, depth=output.depth * 1.0001),
+        lambda output: replace(output, radii=output.radii + 0.01),
+        lambda output: replace(output, rgb=output.rgb * math.nan),
+    ],
+    ids=["views swapped", "pixels shifted", "depth", "radii", "not a number"],
+)
+def test_a_wrong_image_is_noticed(after):
+    assert not self_test(Bent(after=after), CPU).holds
+
+
+def test_bits_that_differ_from_run_to_run_are_noticed():
+    runs = []
+
+    def after(output):
+        runs.append(1)
+        return replace(output, alpha=output.alpha * (1 + 1e-6 * len(runs)))
+
+    agreement = self_test(Bent(after=after), CPU)
+    assert agreement.holds
+    assert not agreement.repeats
+    assert str(agreement).endswith("; other bits the second time")
+
+
+def test_gradients_may_be_off_around_it():
+    with torch.no_grad():
+        assert self_test(ReferenceRasterizer(), CPU).holds
+
+
+def test_the_verdict_is_one_line():
+    good = Agreement({"rgb": 2e-6, "alpha": 1e-7}, {"means": 8e-6}, repeats=True)
+    assert str(good) == "agrees with the reference: images 2e-6, gradients 8e-6; same bits twice"
+    bad = replace(good, gradients={"means": math.inf})
+    assert str(bad) == "disagrees with the reference: images 2e-6, gradients inf; same bits twice"
