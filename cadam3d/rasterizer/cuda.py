@@ -1,20 +1,24 @@
 """The CUDA rasterizer: kernels of our own, compiled at run time.
 
-A frame goes through these kernels (``kernels/*.cuh``), all views at once:
+A frame goes through these kernels (``kernels/*.cuh``):
 
-* ``project_forward``: splats, and a depth key per (view, Gaussian) pair; who is culled has the largest key;
+* ``project_forward``: splats, how many tiles each touches, and a depth key per (view, Gaussian) pair; who is
+  culled has the largest key;
 * a stable radix sort of the pairs by depth, which also moves the culled ones out of the way;
-* ``tile_count``, a prefix sum, ``tile_list``: a slot per (splat, tile), numbered in depth order;
+* a prefix sum, ``tile_list``: a slot per (splat, tile), numbered in depth order;
 * a stable radix sort of the slots by tile, ``tile_ranges``: a list per tile, nearest splat first;
 * ``blend_forward``: a warp per tile.
 
 Backward is ``blend_backward``, which leaves a record in each slot, and ``project_backward``, which sums the
 slots of each Gaussian in order. There are no float atomics: the same input gives the same bits. The host
 waits for the device once, to learn how many slots there are.
+
+All views go at once, but where their records would fill more than ``RECORD_MEMORY``: then, all but projection
+goes group of views by group of views, and the bits stay the same.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache
@@ -40,7 +44,8 @@ SCAN_CHUNK, SORT_CHUNK, RADIX_BITS = 2048, 4096, 8
 
 DEPTH_BITS = 32
 SCAN_SHORT = 8 * SCAN_CHUNK  # up to here one block scans it all, faster than three launches
-MOST = 2**31 - 1  # pairs, slots or pixels: their numbers have 32 bits
+MOST = 2**31 - 1  # pairs, slots or tiles of a group, pixels of a view: their numbers have 32 bits
+RECORD_MEMORY = 256 * 2**20  # bytes; a group has one view at least, whatever that needs
 
 # A kernel, how many blocks of how many threads, and its arguments: a tensor is its address, None is null.
 Launch = Callable[..., None]
@@ -97,9 +102,10 @@ def rasterize(
 ) -> RenderOutput:
     """Render with the kernels at hand; see :meth:`Rasterizer.render`."""
     require_shapes(gaussians, cameras, background)
-    v, n = len(cameras), len(gaussians)
-    if max(v * n, v * cameras.height * cameras.width) > MOST:
-        raise UserError(f"rasterizer=cuda: {v} views at once are too many. Try: fewer views, or fewer pixels")
+    if max(len(gaussians), cameras.height * cameras.width) > MOST:
+        raise UserError(
+            f"rasterizer=cuda: more than {MOST} Gaussians or pixels in a view are too many. Try: fewer"
+        )
     return render_frame(_Frame(launcher, cameras, gaussians.device), gaussians, background)
 
 
@@ -109,7 +115,9 @@ class _Frame(Frame):
     cameras: Tensor  # [v CAMERA]
     splats: Tensor  # [v n SPLAT]
     depth_keys: Tensor  # [v n]
-    lists: "_Lists"
+    slot_count: Tensor  # [v n]
+    first_slot: Tensor  # [v n]; among those of the group
+    groups: list["_Group"]
     transmittance: Tensor  # [v h w]; after the last splat
     last: Tensor  # [v h w]; 1 + rank of the last splat that reached the pixel
 
@@ -128,54 +136,70 @@ class _Frame(Frame):
         v, n = self.views, means.shape[0]
         self.cameras = means.new_empty(v, CAMERA)
         self.splats = means.new_empty(v, n, SPLAT)
-        self.depth_keys = _integers(v * n, self.device)
+        self.depth_keys, self.slot_count, self.first_slot = (
+            torch.empty(v, n, dtype=torch.int32, device=self.device) for _ in range(3)
+        )
         means2d, radii = means.new_empty(v, n, 2), means.new_empty(v, n)
         with self.launcher.on(self.device) as launch:
             views = (self.matrices, self.intrinsics, v, self.height, self.width, self.cameras)
             _launch_each(launch, "prepare_cameras", v, BLOCK, *views)
             kernel = f"project_forward_{sh.shape[1]}"
-            results = (self.splats, means2d, radii, self.depth_keys)
-            _launch_each(launch, kernel, n, PROJECT_BLOCK, *parameters, self.cameras, n, v, *results)
+            results = (self.splats, means2d, radii, self.depth_keys, self.slot_count)
+            inputs = (*parameters, self.cameras, n, v, self.height, self.width)
+            _launch_each(launch, kernel, n, PROJECT_BLOCK, *inputs, *results)
         return means2d, radii
 
     def blend(
         self, parameters: list[Tensor], background: Tensor, keeps: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """See :meth:`Frame.blend`; what the backward needs is small and always kept."""
-        v, size = self.views, (self.views, self.height, self.width)
+        """See :meth:`Frame.blend`."""
+        size = (self.views, self.height, self.width)
         rgb, alpha, depth = (background.new_empty(*size, *channels) for channels in ((3,), (), ()))
         self.transmittance, self.last = torch.empty_like(alpha), torch.empty_like(alpha, dtype=torch.int32)
+        images = (rgb, alpha, depth, self.transmittance, self.last)
+        self.groups = []
         with self.launcher.on(self.device) as launch:
-            self.lists = self._list(launch, parameters[0].shape[0])
-            del self.depth_keys
-            images = (rgb, alpha, depth, self.transmittance, self.last)
-            threads, blend = v * self.tiles * WARP, (*self._blend_inputs(background), *images)
-            _launch_each(launch, "blend_forward", threads, BLEND_BLOCK, *blend)
+            for views, slots in self._split():
+                group = self._list(launch, views, slots)
+                inputs = self._blend_inputs(group, background)
+                threads = group.tiles * WARP
+                _launch_each(launch, "blend_forward", threads, BLEND_BLOCK, *inputs, *_of(views, images))
+                if keeps:
+                    self.groups.append(group)
+        del self.depth_keys
         return rgb, alpha, depth
 
-    def _list(self, launch: Launch, n: int) -> "_Lists":
-        """For every tile, the slots of the splats that touch it."""
-        v, pairs, size = self.views, self.views * n, (self.height, self.width)
-        keys, order = _sort(launch, self.depth_keys, DEPTH_BITS)
-        counts = _integers(pairs, self.device)
-        _launch_each(launch, "tile_count", pairs, BLOCK, keys, order, pairs, self.splats, *size, counts)
-        offsets, total = _scan(launch, counts)
-        slots = int(total)  # the one time the host waits
-        if slots > MOST:
-            raise UserError(f"rasterizer=cuda: {slots} (splat, tile) pairs are too many. Try: fewer views")
-        tile_keys, pair_of_slot = _integers(slots, self.device), _integers(slots, self.device)
-        first_slot, slot_count = _integers(pairs, self.device), _integers(pairs, self.device)
-        inputs = (order, counts, offsets, pairs, n, self.splats, v, *size)
-        results = (tile_keys, pair_of_slot, first_slot, slot_count)
-        _launch_each(launch, "tile_list", pairs, BLOCK, *inputs, *results)
-        keys, by_tile = _sort(launch, tile_keys, (v * self.tiles).bit_length())
-        ranges = torch.zeros(v * self.tiles + 1, 2, dtype=torch.int32, device=self.device)
-        _launch_each(launch, "tile_ranges", slots, BLOCK, keys, slots, ranges)
-        return _Lists(by_tile, pair_of_slot, ranges, first_slot, slot_count)
+    def _split(self) -> list[tuple[slice, int]]:
+        """Groups of views that go together, and how many slots each has."""
+        slots = self.slot_count.sum(dim=1, dtype=torch.int64).tolist()  # the one time the host waits
+        largest = max(slots, default=0)
+        if largest > MOST:
+            raise UserError(
+                f"rasterizer=cuda: {largest} (splat, tile) pairs in a view are too many. Try: fewer pixels"
+            )
+        most_slots = min(RECORD_MEMORY // (4 * RECORD), MOST)
+        most_views = MOST // max(self.slot_count.shape[1], self.tiles)
+        return _split_views(slots, most_slots, most_views)
 
-    def _blend_inputs(self, background: Tensor) -> tuple[object, ...]:
-        lists = (self.lists.slots, self.lists.pair_of_slot, self.lists.ranges)
-        return (self.splats, *lists, self.views * self.tiles, background, self.height, self.width)
+    def _list(self, launch: Launch, views: slice, slots: int) -> "_Group":
+        """For every tile of some views, the slots of the splats that touch it; fills their ``first_slot``."""
+        v, n = views.stop - views.start, self.slot_count.shape[1]
+        tiles, counts = v * self.tiles, self.slot_count[views].flatten()
+        _, order = _sort(launch, self.depth_keys[views].flatten(), DEPTH_BITS)
+        offsets = _scan(launch, counts.index_select(0, order))
+        tile_keys, pair_of_slot = _integers(slots, self.device), _integers(slots, self.device)
+        inputs = (order, counts, offsets, v * n, n, self.splats[views], v, self.height, self.width)
+        results = (tile_keys, pair_of_slot, self.first_slot[views])
+        _launch_each(launch, "tile_list", v * n, BLOCK, *inputs, *results)
+        keys, by_tile = _sort(launch, tile_keys, tiles.bit_length())
+        ranges = torch.zeros(tiles + 1, 2, dtype=torch.int32, device=self.device)
+        _launch_each(launch, "tile_ranges", slots, BLOCK, keys, slots, ranges)
+        return _Group(views, tiles, by_tile, pair_of_slot, ranges)
+
+    def _blend_inputs(self, group: "_Group", background: Tensor) -> tuple[object, ...]:
+        splats, behind = _of(group.views, (self.splats, background))
+        lists = (group.slots, group.pair_of_slot, group.ranges)
+        return (splats, *lists, group.tiles, behind, self.height, self.width)
 
     def blend_backward(
         self, parameters: list[Tensor], background: Tensor, images: list[Tensor | None]
@@ -183,17 +207,20 @@ class _Frame(Frame):
         """See :meth:`Frame.blend_backward`."""
         means, *_, sh = parameters
         v, n = self.views, means.shape[0]
-        records = means.new_empty(self.lists.slots.shape[0], RECORD)
+        records = means.new_empty(max((group.slots.shape[0] for group in self.groups), default=0), RECORD)
+        grad_axes = means.new_empty(n, 9) if len(self.groups) > 1 else None
         grads = [means.new_empty(v, n, 2), *(torch.empty_like(tensor) for tensor in parameters)]
         alpha, depth, *grad_images = images
+        seen = (alpha, depth, self.transmittance, self.last, *grad_images)
         with self.launcher.on(self.device) as launch:
-            seen = (alpha, depth, self.transmittance, self.last, *grad_images)
-            threads = (v * self.tiles + 1) * WARP  # one warp more for slots without a tile
-            blend = (*self._blend_inputs(background), *seen, records)
-            _launch_each(launch, "blend_backward", threads, BLEND_BLOCK, *blend)
-            slots = (self.lists.first_slot, self.lists.slot_count, records)
-            inputs = (*parameters, self.cameras, n, v, *slots)
-            _launch_each(launch, f"project_backward_{sh.shape[1]}", n, PROJECT_BLOCK, *inputs, *grads)
+            for group in self.groups:
+                threads = (group.tiles + 1) * WARP  # one warp more for slots without a tile
+                blend = (*self._blend_inputs(group, background), *_of(group.views, seen), records)
+                _launch_each(launch, "blend_backward", threads, BLEND_BLOCK, *blend)
+                span = (v, group.views.start, group.views.stop)
+                sums = (self.first_slot, self.slot_count, records, grad_axes)
+                inputs = (*parameters, self.cameras, n, *span, *sums)
+                _launch_each(launch, f"project_backward_{sh.shape[1]}", n, PROJECT_BLOCK, *inputs, *grads)
         return grads
 
     def centre_backward(self, parameters: list[Tensor], radii: Tensor, grad_means2d: Tensor) -> Tensor:
@@ -207,29 +234,46 @@ class _Frame(Frame):
 
 
 @dataclass(frozen=True)
-class _Lists:
-    """Slots: one per (splat, tile), numbered in depth order."""
+class _Group:
+    """Views that go together, and their slots: one per (splat, tile), numbered in depth order."""
 
+    views: slice
+    tiles: int  # of all of them
     slots: Tensor  # tile after tile, nearest first
-    pair_of_slot: Tensor  # view * n + Gaussian
-    ranges: Tensor  # [v tiles + 1, 2]; where in ``slots`` the list of a tile begins and ends
-    first_slot: Tensor  # [v n]
-    slot_count: Tensor  # [v n]
+    pair_of_slot: Tensor  # (view - first view) * n + Gaussian
+    ranges: Tensor  # [tiles + 1, 2]; where in ``slots`` the list of a tile begins and ends
 
 
-def _scan(launch: Launch, values: Tensor) -> tuple[Tensor, Tensor]:
-    """Exclusive prefix sums of 32-bit numbers, and their 64-bit total."""
+def _split_views(slots: list[int], most_slots: int, most_views: int) -> list[tuple[slice, int]]:
+    """Groups of views in a row, from the slots of each: as many views as fit, but at least one."""
+    groups: list[tuple[slice, int]] = []
+    for view, count in enumerate(slots):
+        if groups:
+            views, total = groups[-1]
+            if total + count <= most_slots and view - views.start < most_views:
+                groups[-1] = (slice(views.start, view + 1), total + count)
+                continue
+        groups.append((slice(view, view + 1), count))
+    return groups
+
+
+def _of(views: slice, tensors: Sequence[Tensor | None]) -> list[Tensor | None]:
+    """What of the tensors belongs to the views."""
+    return [None if tensor is None else tensor[views] for tensor in tensors]
+
+
+def _scan(launch: Launch, values: Tensor) -> Tensor:
+    """Exclusive prefix sums of numbers whose sum has 32 bits."""
     n, sums = values.shape[0], torch.empty_like(values)
-    total = torch.zeros(1, dtype=torch.int64, device=values.device)
     if n <= SCAN_SHORT:
-        launch("scan_short", 1, BLOCK, values, n, sums, total)
-        return sums, total
+        launch("scan_short", 1, BLOCK, values, n, sums)
+        return sums
     chunks = _pieces(n, SCAN_CHUNK)
-    of_chunks = torch.empty(chunks, dtype=torch.int64, device=values.device)
+    of_chunks = _integers(chunks, values.device)
     launch("scan_reduce", chunks, BLOCK, values, n, of_chunks)
-    launch("scan_sums", 1, BLOCK, of_chunks, chunks, total)
+    launch("scan_short", 1, BLOCK, of_chunks, chunks, of_chunks)
     launch("scan_apply", chunks, BLOCK, values, n, of_chunks, sums)
-    return sums, total
+    return sums
 
 
 def _sort(launch: Launch, keys: Tensor, bits: int) -> tuple[Tensor, Tensor]:
@@ -240,7 +284,7 @@ def _sort(launch: Launch, keys: Tensor, bits: int) -> tuple[Tensor, Tensor]:
     for shift in range(0, bits, RADIX_BITS):
         counts = _integers(2**RADIX_BITS * chunks, keys.device)
         launch("sort_count", chunks, BLOCK, keys, n, shift, chunks, counts)
-        positions, _ = _scan(launch, counts)
+        positions = _scan(launch, counts)
         sorted_keys, sorted_order = torch.empty_like(keys), torch.empty_like(keys)
         inputs = (keys, order, n, shift, chunks, positions)
         launch("sort_scatter", chunks, BLOCK, *inputs, sorted_keys, sorted_order)

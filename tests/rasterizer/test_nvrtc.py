@@ -15,28 +15,26 @@ from cadam3d.rasterizer.nvrtc import build, choose_architecture, compile_kernels
 
 # Every one since Turing; the oldest that CUDA 13 still compiles for.
 ARCHITECTURES = (75, 80, 86, 87, 88, 89, 90, 100, 101, 103, 107, 110, 120, 121)
-# The most registers per thread that any of them takes, with the NVRTC of CUDA 12.6, 12.8, 13.0 and 13.5. Blends
-# at 64 fill half of an SM; the backward of degree 3 keeps its 48 coefficients at hand and fills an eighth.
+# The most registers per thread that any of them takes, with the NVRTC of CUDA 12.6, 12.8, 13.0 and 13.5. Half
+# of an SM is in use at 64; the backward of degree 3 keeps its 48 coefficients at hand: an eighth.
 REGISTERS = {
     "blend_backward": 64,
     "blend_forward": 64,
     "centre_backward": 42,
     "prepare_cameras": 48,
-    "project_backward_1": 96,
+    "project_backward_1": 126,
     "project_backward_4": 128,
     "project_backward_9": 163,
     "project_backward_16": 191,
-    "project_forward_1": 61,
-    "project_forward_4": 62,
-    "project_forward_9": 62,
+    "project_forward_1": 64,
+    "project_forward_4": 64,
+    "project_forward_9": 64,
     "project_forward_16": 64,
-    "scan_apply": 58,
-    "scan_reduce": 29,
-    "scan_short": 64,
-    "scan_sums": 62,
+    "scan_apply": 39,
+    "scan_reduce": 26,
+    "scan_short": 51,
     "sort_count": 36,
     "sort_scatter": 43,
-    "tile_count": 38,
     "tile_list": 60,
     "tile_ranges": 12,
 }

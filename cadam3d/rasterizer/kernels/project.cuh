@@ -1,7 +1,7 @@
 // From Gaussians to splats and from records back to Gaussians: one thread per Gaussian, looping over views.
 #pragma once
 
-#include "device.cuh"
+#include "tiles.cuh"
 
 typedef splat::Camera<float> Camera;
 static_assert(sizeof(Camera) == 25 * sizeof(float), "mirrored in ../cuda.py");
@@ -33,11 +33,12 @@ SPLAT_FN Gaussian<COEFFICIENTS> load_gaussian(const float* means, const float* l
   return gaussian;
 }
 
-// splats [v n 3 float4], means2d [v n 2], radii [v n], depth_keys [v n]
+// splats [v n 3 float4], means2d [v n 2], radii [v n], depth_keys [v n], and in how many tiles: counts [v n]
 template <int COEFFICIENTS>
 SPLAT_FN void project_gaussian(const float* means, const float* log_scales, const float* quats,
                                const float* opacity_logits, const float* sh, const Camera* cameras, i64 n,
-                               i64 views, float4* splats, float* means2d, float* radii, u32* depth_keys) {
+                               i64 views, const Grid& grid, float4* splats, float* means2d, float* radii,
+                               u32* depth_keys, u32* counts) {
   const i64 i = thread_index();
   if (i >= n) return;
   const Gaussian<COEFFICIENTS> gaussian =
@@ -49,14 +50,16 @@ SPLAT_FN void project_gaussian(const float* means, const float* log_scales, cons
     splat::Footprint<float> footprint;
     if (!is_sound || !splat::project(gaussian, shape, cameras[v], footprint)) {
       means2d[2 * pair] = means2d[2 * pair + 1] = radii[pair] = 0;
-      depth_keys[pair] = CULLED;
+      depth_keys[pair] = CULLED, counts[pair] = 0;
       continue;
     }
     float rgb[3];
     splat::colour(gaussian, cameras[v], rgb);
     const float *at = footprint.mean2d, *reach = footprint.reach, depth = footprint.centre[2];
-    store_splat(splats + 3 * pair, {at[0], at[1], footprint.l11, footprint.l12, footprint.l22, shape.log_cut,
-                                    shape.opacity, depth, rgb[0], rgb[1], rgb[2], reach[0]});
+    const Splat s = {at[0],         at[1], footprint.l11, footprint.l12, footprint.l22, shape.log_cut,
+                     shape.opacity, depth, rgb[0],        rgb[1],        rgb[2],        reach[0]};
+    store_splat(splats + 3 * pair, s);
+    counts[pair] = count_tiles(s, grid);
     means2d[2 * pair] = at[0], means2d[2 * pair + 1] = at[1];
     radii[pair] = reach[0] > reach[1] ? reach[0] : reach[1];
     depth_keys[pair] = __float_as_uint(depth);  // positive floats sort like their bits
@@ -92,13 +95,38 @@ SPLAT_FN void sum_records(const float* records, i64 first, i64 count, float* sum
   }
 }
 
-// Every gradient of one Gaussian but the path through means2d, which only arrives in grad_means2d [v n 2].
+// What the views add to one by one. A launch takes some views in a row and the next one goes on, adding in the
+// same order as if there were one. ``axes`` [n 9] may be null if one launch takes them all.
+template <int COEFFICIENTS>
+struct Totals {
+  float *means, *axes, *opacity_logits, *sh;
+
+  SPLAT_FN void load(i64 i, splat::Gradient<float>& total) const {
+    for (int j = 0; j < 3; ++j) total.mean[j] = means[3 * i + j];
+    for (int j = 0; j < 9; ++j) total.axes[j / 3][j % 3] = axes[9 * i + j];
+    total.opacity_logit = opacity_logits[i];
+#pragma unroll
+    for (int j = 0; j < 3 * COEFFICIENTS; ++j) total.sh[j] = sh[3 * COEFFICIENTS * i + j];
+  }
+  SPLAT_FN void store(i64 i, const splat::Gradient<float>& total) const {
+    for (int j = 0; j < 3; ++j) means[3 * i + j] = total.mean[j];
+    if (axes)
+      for (int j = 0; j < 9; ++j) axes[9 * i + j] = total.axes[j / 3][j % 3];
+    opacity_logits[i] = total.opacity_logit;
+#pragma unroll
+    for (int j = 0; j < 3 * COEFFICIENTS; ++j) sh[3 * COEFFICIENTS * i + j] = total.sh[j];
+  }
+};
+
+// Every gradient of one Gaussian but the path through means2d, which only arrives in grad_means2d [v n 2]; of
+// the views first_view .. end_view - 1, whose records are there. The last views bring log-scales and quaternions.
 template <int COEFFICIENTS>
 SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, const float* quats,
                                 const float* opacity_logits, const float* sh, const Camera* cameras, i64 n,
-                                i64 views, const u32* first_slot, const u32* slot_count, const float* records,
-                                float* grad_means2d, float* grad_means, float* grad_log_scales,
-                                float* grad_quats, float* grad_opacity_logits, float* grad_sh) {
+                                i64 views, i64 first_view, i64 end_view, const u32* first_slot,
+                                const u32* slot_count, const float* records, float* grad_means2d,
+                                const Totals<COEFFICIENTS>& totals, float* grad_log_scales,
+                                float* grad_quats) {
   const i64 i = thread_index();
   const bool is_mine = i < n;  // the others stay to help with long runs
   bool is_seen = false;
@@ -110,7 +138,8 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
   if (is_seen) splat::make_shape(gaussian, shape);
   splat::Gradient<float> total;
   splat::clear(total, COEFFICIENTS);
-  for (i64 v = 0; v < views; ++v) {
+  if (is_mine && first_view > 0) totals.load(i, total);
+  for (i64 v = first_view; v < end_view; ++v) {
     const i64 pair = v * n + i;
     const bool is_visible = is_mine && slot_count[pair] > 0;
     float sum[RECORD];
@@ -127,16 +156,12 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
     if (is_mine) grad_means2d[2 * pair] = centre[0], grad_means2d[2 * pair + 1] = centre[1];
   }
   if (!is_mine) return;
+  totals.store(i, total);
+  if (end_view < views) return;
   float log_scale[3] = {0, 0, 0}, quat[4] = {0, 0, 0, 0};
   if (is_seen) splat::shape_backward(shape, gaussian, total, log_scale, quat);
-  for (int j = 0; j < 3; ++j) {
-    grad_means[3 * i + j] = total.mean[j];
-    grad_log_scales[3 * i + j] = log_scale[j];
-  }
+  for (int j = 0; j < 3; ++j) grad_log_scales[3 * i + j] = log_scale[j];
   for (int j = 0; j < 4; ++j) grad_quats[4 * i + j] = quat[j];
-  grad_opacity_logits[i] = total.opacity_logit;
-#pragma unroll
-  for (int j = 0; j < 3 * COEFFICIENTS; ++j) grad_sh[3 * COEFFICIENTS * i + j] = total.sh[j];
 }
 
 // dLoss/dmeans [n 3] through the projected centres, from dLoss/dmeans2d [v n 2]; who is culled gets none.
@@ -162,19 +187,22 @@ constexpr int PROJECT_BLOCK = 128;  // threads: fewer, for each needs many regis
   KERNEL(PROJECT_BLOCK)                                                                                      \
   project_forward_##COEFFICIENTS(const float* means, const float* log_scales, const float* quats,            \
                                  const float* opacity_logits, const float* sh, const Camera* cameras, i64 n, \
-                                 i64 views, float4* splats, float* means2d, float* radii, u32* depth_keys) { \
-    project_gaussian<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, cameras, n, views, splats,  \
-                                   means2d, radii, depth_keys);                                              \
+                                 i64 views, i64 height, i64 width, float4* splats, float* means2d,           \
+                                 float* radii, u32* depth_keys, u32* counts) {                               \
+    project_gaussian<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, cameras, n, views,          \
+                                   make_grid(height, width), splats, means2d, radii, depth_keys, counts);    \
   }                                                                                                          \
   KERNEL(PROJECT_BLOCK)                                                                                      \
   project_backward_##COEFFICIENTS(                                                                           \
       const float* means, const float* log_scales, const float* quats, const float* opacity_logits,          \
-      const float* sh, const Camera* cameras, i64 n, i64 views, const u32* first_slot,                       \
-      const u32* slot_count, const float* records, float* grad_means2d, float* grad_means,                   \
-      float* grad_log_scales, float* grad_quats, float* grad_opacity_logits, float* grad_sh) {               \
+      const float* sh, const Camera* cameras, i64 n, i64 views, i64 first_view, i64 end_view,                \
+      const u32* first_slot, const u32* slot_count, const float* records, float* grad_axes,                  \
+      float* grad_means2d, float* grad_means, float* grad_log_scales, float* grad_quats,                     \
+      float* grad_opacity_logits, float* grad_sh) {                                                          \
     gaussian_backward<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, cameras, n, views,         \
-                                    first_slot, slot_count, records, grad_means2d, grad_means,               \
-                                    grad_log_scales, grad_quats, grad_opacity_logits, grad_sh);              \
+                                    first_view, end_view, first_slot, slot_count, records, grad_means2d,     \
+                                    {grad_means, grad_axes, grad_opacity_logits, grad_sh}, grad_log_scales,  \
+                                    grad_quats);                                                             \
   }
 
 KERNELS_FOR(1)

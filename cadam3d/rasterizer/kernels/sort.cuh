@@ -1,4 +1,4 @@
-// Prefix sums and a stable radix sort.
+// Prefix sums and a stable radix sort, of numbers whose sum has 32 bits.
 //
 // The sort takes eight bits a pass, least significant first. A pass counts the digits of each chunk, turns
 // the counts (digit after digit, chunk after chunk) into positions by one prefix sum, and scatters: within a
@@ -18,13 +18,13 @@ static_assert(BINS == BLOCK, "a thread per bin");
 
 // The sum over the threads before this one; ``total`` is the sum over all of the block. ``sums`` is shared
 // memory for BLOCK of them.
-SPLAT_FN u64 block_scan(u64 value, u64* sums, u64* total) {
+SPLAT_FN u32 block_scan(u32 value, u32* sums, u32* total) {
   const int t = int(threadIdx.x);
-  u64 inclusive = value;
+  u32 inclusive = value;
   sums[t] = inclusive;
   __syncthreads();
   for (int reach = 1; reach < BLOCK; reach *= 2) {
-    const u64 before = t >= reach ? sums[t - reach] : 0;
+    const u32 before = t >= reach ? sums[t - reach] : 0;
     __syncthreads();
     inclusive += before;
     sums[t] = inclusive;
@@ -35,52 +35,41 @@ SPLAT_FN u64 block_scan(u64 value, u64* sums, u64* total) {
   return inclusive - value;
 }
 
-// Exclusive prefix sums of one chunk, all of them raised by ``carry``; returns the sum of the chunk.
-template <class In, class Out>
-SPLAT_FN u64 scan_chunk(const In* in, i64 begin, i64 n, u64 carry, Out* out, u64* sums) {
+// Exclusive prefix sums of one chunk, all of them raised by ``carry``; returns the sum of the chunk. ``out`` may
+// be ``in``: a thread reads and writes its own items alone.
+SPLAT_FN u32 scan_chunk(const u32* in, i64 begin, i64 n, u32 carry, u32* out, u32* sums) {
   const i64 first = begin + i64(threadIdx.x) * SCAN_ITEMS;
   const i64 end = first + SCAN_ITEMS < n ? first + SCAN_ITEMS : n;
-  u64 sum = 0, total;
+  u32 sum = 0, total;
   for (i64 i = first; i < end; ++i) sum += in[i];
-  u64 before = carry + block_scan(sum, sums, &total);
+  u32 before = carry + block_scan(sum, sums, &total);
   for (i64 i = first; i < end; ++i) {
-    const In item = in[i];  // first, for ``out`` may be ``in``
-    out[i] = Out(before);
+    const u32 item = in[i];
+    out[i] = before;
     before += item;
   }
   return total;
 }
 
-// One block walks over all chunks: for short arrays, and for the sums of chunks.
-template <class In, class Out>
-SPLAT_FN void scan_serially(const In* in, i64 n, Out* out, u64* total, u64* sums) {
-  u64 carry = 0;
-  for (i64 begin = 0; begin < n; begin += SCAN_CHUNK) carry += scan_chunk(in, begin, n, carry, out, sums);
-  if (threadIdx.x == 0) *total = carry;
+// One block walks over all chunks: for short arrays, and in place for the sums of chunks.
+KERNEL(BLOCK) scan_short(const u32* in, i64 n, u32* out) {
+  __shared__ u32 shared[BLOCK];
+  u32 carry = 0;
+  for (i64 begin = 0; begin < n; begin += SCAN_CHUNK) carry += scan_chunk(in, begin, n, carry, out, shared);
 }
 
-KERNEL(BLOCK) scan_short(const u32* in, i64 n, u32* out, u64* total) {
-  __shared__ u64 shared[BLOCK];
-  scan_serially(in, n, out, total, shared);
-}
-
-// A long array in three kernels: sums of the chunks, their prefix sums, and then each chunk on its own.
-KERNEL(BLOCK) scan_reduce(const u32* in, i64 n, u64* sums) {
-  __shared__ u64 shared[BLOCK];
+// A long array in three kernels: sums of the chunks, their prefix sums by scan_short, then each chunk alone.
+KERNEL(BLOCK) scan_reduce(const u32* in, i64 n, u32* sums) {
+  __shared__ u32 shared[BLOCK];
   const i64 first = i64(blockIdx.x) * SCAN_CHUNK + i64(threadIdx.x) * SCAN_ITEMS;
-  u64 sum = 0, total;
+  u32 sum = 0, total;
   for (int i = 0; i < SCAN_ITEMS; ++i) sum += first + i < n ? in[first + i] : 0;
   block_scan(sum, shared, &total);
   if (threadIdx.x == 0) sums[blockIdx.x] = total;
 }
 
-KERNEL(BLOCK) scan_sums(u64* sums, i64 n, u64* total) {
-  __shared__ u64 shared[BLOCK];
-  scan_serially(sums, n, sums, total, shared);
-}
-
-KERNEL(BLOCK) scan_apply(const u32* in, i64 n, const u64* sums, u32* out) {
-  __shared__ u64 shared[BLOCK];
+KERNEL(BLOCK) scan_apply(const u32* in, i64 n, const u32* sums, u32* out) {
+  __shared__ u32 shared[BLOCK];
   scan_chunk(in, i64(blockIdx.x) * SCAN_CHUNK, n, sums[blockIdx.x], out, shared);
 }
 

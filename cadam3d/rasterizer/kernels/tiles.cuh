@@ -49,19 +49,10 @@ SPLAT_FN void each_tile_row(const Splat& s, const Grid& grid, const Visit& visit
   }
 }
 
-// How many tiles each pair (view, Gaussian) touches, nearest pair first. counts [v n]
-KERNEL(BLOCK)
-tile_count(const u32* depth_keys, const u32* order, i64 pairs, const float4* splats, i64 height, i64 width,
-           u32* counts) {
-  const i64 k = thread_index();
-  if (k >= pairs) return;
+SPLAT_FN u32 count_tiles(const Splat& s, const Grid& grid) {
   u32 count = 0;
-  if (depth_keys[k] != CULLED) {
-    const float4* at = splats + 3 * i64(order[k]);
-    each_tile_row(make_splat(at[0], at[1], at[2]), make_grid(height, width),
-                  [&](int, int first, int last) { count += u32(last - first + 1); });
-  }
-  counts[k] = count;
+  each_tile_row(s, grid, [&](int, int first, int last) { count += u32(last - first + 1); });
+  return count;
 }
 
 // Fills the slots [slot, end) of one pair; lane ``first_lane`` of ``lanes`` takes every lanes-th tile of a
@@ -81,18 +72,18 @@ SPLAT_FN void fill_slots(const Splat& s, const Grid& grid, u32 pair, u32 first_k
 
 constexpr u32 MANY_TILES = 32;  // a splat with more is listed by the whole warp
 
-// tile_keys, pair_of_slot [slots]; first_slot, slot_count [v n] say where the slots of a pair are.
+// order, offsets [pairs]: nearest first, and the prefix sums of their counts. tile_keys, pair_of_slot [slots];
+// counts, first_slot [v n]: how many slots a pair has, and where they begin.
 KERNEL(BLOCK)
 tile_list(const u32* order, const u32* counts, const u32* offsets, i64 pairs, i64 n, const float4* splats,
-          i64 views, i64 height, i64 width, u32* tile_keys, u32* pair_of_slot, u32* first_slot,
-          u32* slot_count) {
+          i64 views, i64 height, i64 width, u32* tile_keys, u32* pair_of_slot, u32* first_slot) {
   const i64 k = thread_index();
   const Grid grid = make_grid(height, width);
   const u32 tiles = u32(grid.tiles_x) * u32(grid.tiles_y), sentinel = u32(views) * tiles;
   u32 pair = 0, slot = 0, count = 0;
   if (k < pairs) {
-    pair = order[k], slot = offsets[k], count = counts[k];
-    first_slot[pair] = slot, slot_count[pair] = count;
+    pair = order[k], slot = offsets[k], count = counts[pair];
+    first_slot[pair] = slot;
   }
   const auto fill = [&](u32 of_pair, u32 from, u32 many, int first_lane, int lanes) {
     const float4* at = splats + 3 * i64(of_pair);

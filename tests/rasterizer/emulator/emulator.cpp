@@ -16,13 +16,13 @@ static const struct {
   const char* name;
   Launcher launcher;
 } KERNELS[] = {
-    ENTRY(prepare_cameras),    ENTRY(project_forward_1),  ENTRY(project_forward_4),
-    ENTRY(project_forward_9),  ENTRY(project_forward_16), ENTRY(project_backward_1),
-    ENTRY(project_backward_4), ENTRY(project_backward_9), ENTRY(project_backward_16),
-    ENTRY(centre_backward),    ENTRY(scan_short),         ENTRY(scan_reduce),
-    ENTRY(scan_sums),          ENTRY(scan_apply),         ENTRY(sort_count),
-    ENTRY(sort_scatter),       ENTRY(tile_count),         ENTRY(tile_list),
-    ENTRY(tile_ranges),        ENTRY(blend_forward),      ENTRY(blend_backward),
+    ENTRY(prepare_cameras),     ENTRY(project_forward_1),  ENTRY(project_forward_4),
+    ENTRY(project_forward_9),   ENTRY(project_forward_16), ENTRY(project_backward_1),
+    ENTRY(project_backward_4),  ENTRY(project_backward_9), ENTRY(project_backward_16),
+    ENTRY(centre_backward),     ENTRY(scan_short),         ENTRY(scan_reduce),
+    ENTRY(scan_apply),          ENTRY(sort_count),         ENTRY(sort_scatter),
+    ENTRY(tile_list),           ENTRY(tile_ranges),        ENTRY(blend_forward),
+    ENTRY(blend_backward),
 };
 
 enum Status : int { OK = 0, NOT_FOUND = 500, LAUNCH_FAILED = 719 };
