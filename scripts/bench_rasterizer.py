@@ -1,148 +1,185 @@
-"""Time rasterizers against one another in one process: forward, and forward plus backward.
+"""Check rasterizers against the reference, then time them against one another, in one process.
 
-    python scripts/bench_rasterizer.py --backends reference cpu --counts 3000 10000 --sizes 128 256
+    python scripts/bench_rasterizer.py                  # this CPU: reference and cpu
+    python scripts/bench_rasterizer.py --device cuda    # this GPU: cuda, stage by stage, beside gsplat
 
-The scene is a bumpy shell of Gaussians whose size follows their spacing, seen from all around, with a loss on
-colour, alpha and depth. Backends take turns within each repetition, so that whatever else the machine does
-hits them alike. Reported are medians; the ratio is to the first backend.
+A backend that disagrees with the reference, or with itself from run to run, is not timed: the script says
+where it differs, times the others, and ends with exit code 1. Times are medians of milliseconds (`best`: the
+least); the ratio is the time of the first backend over this one's. docs/performance.md says what is measured.
 """
 
 import argparse
-import json
-import math
-import platform
-import statistics
-import time
-from collections.abc import Callable
+import sys
+from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
+from typing import NoReturn
 
 import torch
 from omegaconf import OmegaConf
+from rasterizer_bench.check import check, check_long_sort
+from rasterizer_bench.gsplat_yardstick import GsplatRasterizer, why_absent
+from rasterizer_bench.report import HEADER, SceneStages, make_rows, show_stages, start_report
+from rasterizer_bench.scenes import make_scene, make_shell
+from rasterizer_bench.stages import copy_speed, time_stages
+from rasterizer_bench.timing import OUT_OF_MEMORY, take_turns
 
-from cadam3d.core.cameras import Cameras, turntable
-from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.checks import UserError
 from cadam3d.rasterizer.base import Rasterizer
+from cadam3d.rasterizer.cuda import Launcher, load_kernels
 from cadam3d.settings import component, config_dir
 
-RADIUS = 0.6  # world units, of the shell
+DEFAULTS = {
+    "cpu": {
+        "backends": ["reference", "cpu"],
+        "counts": [3_000, 10_000],
+        "sizes": [128, 256],
+        "views": [1],
+        "degrees": [0],
+    },
+    "cuda": {  # the table of targets
+        "backends": ["gsplat", "cuda"],
+        "counts": [20_000, 100_000, 500_000, 1_000_000, 3_400_000],
+        "sizes": [512, 1024],
+        "views": [1, 4],
+        "degrees": [0, 3],
+    },
+}
+GSPLAT = "gsplat"  # the one backend that has no file in configs/rasterizer
+COPY_BYTES = {"cuda": 2**31, "cpu": 2**25}  # of the copy that gives the floor
+LONG_SORT = 2**27 + 1  # keys: one more than a counter of 27 bits takes
 
 
-def shell(count: int, degree: int, device: torch.device) -> Gaussians:
-    """Splats on a bumpy sphere, about as large as the distance to the next one."""
-    generator = torch.Generator().manual_seed(0)
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
 
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator)
+    def error(self, message: str) -> NoReturn:
+        """End the program."""
+        self.exit(2, f"{self.prog}: {message}\n")
 
-    directions = torch.nn.functional.normalize(normal(count, 3), dim=-1)
-    spacing = math.sqrt(4 * math.pi * RADIUS**2 / count)
-    gaussians = Gaussians(
-        means=directions * (RADIUS + 0.05 * normal(count, 1)),
-        log_scales=math.log(0.7 * spacing) + 0.3 * normal(count, 3),
-        quats=normal(count, 4),
-        opacity_logits=0.4 + normal(count),
-        sh=0.5 * normal(count, (degree + 1) ** 2, 3),
+
+def whole(low: int):
+    """A parser of whole numbers that are at least ``low``."""
+
+    def parse_whole(word: str) -> int:
+        number = int(word)
+        if number < low:
+            raise ValueError
+        return number
+
+    parse_whole.__name__ = f"whole number >= {low}"  # what argparse calls it when it complains
+    return parse_whole
+
+
+def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
+    parser = Parser(
+        "bench_rasterizer", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    return gaussians.to(device).map(lambda tensor: tensor.requires_grad_())
+    several = {"nargs": "+", "metavar": "N"}
+    known = sorted(path.stem for path in (config_dir() / "rasterizer").glob("*.yaml"))
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--backends", nargs="+", choices=[*known, GSPLAT], help="the first is compared with")
+    parser.add_argument("--counts", type=whole(1), **several, help="of Gaussians")
+    parser.add_argument("--sizes", type=whole(1), **several, help="of the square images, in pixels")
+    parser.add_argument("--views", type=whole(1), **several, help="rendered at once")
+    parser.add_argument("--degrees", type=int, choices=range(4), **several, help="of spherical harmonics")
+    parser.add_argument("--repeats", type=whole(1), default=10, metavar="N")
+    # One by default: with more, what else the machine does shows in every number.
+    parser.add_argument("--threads", type=whole(1), default=1, metavar="N")
+    parser.add_argument("--check", action=argparse.BooleanOptionalAction, default=True)
+    parser.add_argument("--check-only", action="store_true", help="time nothing")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write everything there")
+    args = parser.parse_args(words)
+    for name, value in DEFAULTS[args.device].items():
+        if getattr(args, name) is None:
+            setattr(args, name, value)
+    if args.check_only and not args.check:
+        parser.error("--check-only and --no-check leave nothing to do. Leave one of them out")
+    if args.json and not args.json.absolute().parent.is_dir():
+        parser.error(f"--json: there is no folder {args.json.parent}. Try: mkdir -p {args.json.parent}")
+    return args
 
 
-def forward(rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras) -> None:
-    with torch.no_grad():
-        rasterizer.render(gaussians, cameras, torch.ones(len(cameras), 3, device=gaussians.device))
+def make_backends(names: Sequence[str], device: torch.device) -> dict[str, Rasterizer]:
+    """By name, without gsplat where it cannot run. Raises :class:`UserError` if none is left."""
+    backends: dict[str, Rasterizer] = {}
+    for name in names:
+        if name != GSPLAT:
+            backends[name] = component(OmegaConf.load(config_dir() / "rasterizer" / f"{name}.yaml"))
+        elif reason := why_absent(device):
+            print(f"gsplat is left out: {reason}", flush=True)
+        else:
+            backends[name] = GsplatRasterizer()
+    if not backends:
+        raise UserError("no backend is left. Try: --backends cuda")
+    return backends
 
 
-def forward_backward(rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras) -> None:
-    output = rasterizer.render(gaussians, cameras, torch.ones(len(cameras), 3, device=gaussians.device))
-    (output.rgb.square().sum() + output.alpha.sum() + output.depth.sum()).backward()
+def check_all(
+    backends: dict[str, Rasterizer], launcher: Launcher | None, device: torch.device
+) -> dict[str, Rasterizer]:
+    """The backends that agree with the reference; says of each whether it does."""
+    agreeing: dict[str, Rasterizer] = {}
+    for name, rasterizer in backends.items():
+        troubles = check(name, rasterizer, device)
+        if launcher and name == device.type == "cuda":
+            try:
+                troubles += check_long_sort(launcher, device, LONG_SORT)
+            except OUT_OF_MEMORY:
+                print(f"no memory to check a sort of {LONG_SORT} keys")
+        if not troubles:
+            agreeing[name] = rasterizer
+        verdict = "agrees with the reference" if not troubles else "REFUSED, and not timed"
+        print(f"check {name}: {verdict}", *troubles, sep="\n  ", flush=True)
+    return agreeing
 
 
-def milliseconds(work: Callable[[], None], device: torch.device) -> float:
-    def now() -> float:
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-        return time.perf_counter()
-
-    start = now()
-    work()
-    return (now() - start) * 1e3
-
-
-def processor() -> str:
-    """The name of the CPU, as well as it can be known."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
-
-
-def measure(
-    backends: dict[str, Rasterizer], gaussians: Gaussians, cameras: Cameras, repeats: int
-) -> list[dict]:
-    """One row per backend, for one scene; the first, uncounted round warms up."""
-    times: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in backends}
-    for repeat in range(repeats + 1):
-        for name, rasterizer in backends.items():
-            for work, samples in zip((forward, forward_backward), times[name], strict=True):
-                taken = milliseconds(lambda: work(rasterizer, gaussians, cameras), gaussians.device)  # noqa: B023
-                if repeat > 0:
-                    samples.append(taken)
-    first = statistics.median(times[next(iter(backends))][1])
-    return [
-        {
-            "count": len(gaussians),
-            "size": cameras.height,
-            "backend": name,
-            "forward_ms": statistics.median(times[name][0]),
-            "forward_backward_ms": statistics.median(times[name][1]),
-            "forward_backward_min_ms": min(times[name][1]),
-            "speedup": first / statistics.median(times[name][1]),
-        }
-        for name in backends
-    ]
+def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher: Launcher | None) -> None:
+    device = torch.device(args.device)
+    report = start_report(device, {name: value for name, value in vars(args).items() if name != "json"})
+    if launcher:
+        report.copy_bytes_per_ms = copy_speed(device, COPY_BYTES[device.type])
+    name = str(report.device["name"])
+    print(f"{name}, {args.threads} thread(s), {args.repeats} repetitions; milliseconds\n{HEADER}")
+    for degree, count in product(args.degrees, args.counts):
+        gaussians = make_shell(count, degree, device)
+        for size, views in product(args.sizes, args.views):
+            at, scene = (count, size, views, degree), make_scene(gaussians, size, views)
+            timings = take_turns(backends, scene, args.repeats)
+            rows = make_rows(at, timings, name)
+            report.rows += rows
+            print(*rows, sep="\n", flush=True)
+            if launcher and timings["cuda"]:
+                stages = time_stages(launcher, scene, args.repeats, report.copy_bytes_per_ms)
+                report.stages.append(SceneStages(*at, stages))
+                print(show_stages(stages), flush=True)
+            if args.json:  # now, for a later scene may be one too many
+                report.write(args.json)
+    verdicts = [row.is_met for row in report.rows if row.is_met is not None]
+    if verdicts:
+        print(f"{sum(verdicts)} of {len(verdicts)} demands met")
 
 
-def parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--backends", nargs="+", default=["reference"], help="names from configs/rasterizer")
-    parser.add_argument("--counts", nargs="+", type=int, default=[3000], help="numbers of Gaussians")
-    parser.add_argument("--sizes", nargs="+", type=int, default=[128], help="image sizes in pixels")
-    parser.add_argument("--views", type=int, default=1)
-    parser.add_argument("--degree", type=int, default=0, choices=range(4), help="of the spherical harmonics")
-    parser.add_argument("--repeats", type=int, default=10)
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
-    parser.add_argument("--json", type=Path, help="also write the numbers to this file")
-    return parser.parse_args()
-
-
-def main() -> None:
-    args = parse()
+def run(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher: Launcher | None) -> int:
+    """The exit code; ``launcher`` is that of the backend ``cuda``, if its stages are to be timed."""
     torch.set_num_threads(args.threads)
-    folder = config_dir() / "rasterizer"
-    backends = {name: component(OmegaConf.load(folder / f"{name}.yaml")) for name in args.backends}
-    print(f"{args.views} view(s), SH degree {args.degree}, {args.threads} thread(s), {args.device}")
-    print(f"{'N':>9} {'pixels':>7} {'backend':>12} {'forward ms':>11} {'fwd+bwd ms':>11} {'ratio':>7}")
-    rows = []
-    for count in args.counts:
-        gaussians = shell(count, args.degree, args.device)
-        for size in args.sizes:
-            cameras = turntable(args.views, elevation_deg=20.0, distance=3.0, fov_y_deg=40.0, size=size)
-            for row in measure(backends, gaussians, cameras.to(args.device), args.repeats):
-                rows.append(row)
-                print(
-                    f"{row['count']:>9} {row['size']:>7} {row['backend']:>12} {row['forward_ms']:>11.2f} "
-                    f"{row['forward_backward_ms']:>11.2f} {row['speedup']:>6.2f}x",
-                    flush=True,
-                )
-    if args.json:
-        on_cuda = args.device.type == "cuda"
-        setting = {name: getattr(args, name) for name in ("views", "degree", "threads", "repeats")}
-        setting["device"] = torch.cuda.get_device_name(args.device) if on_cuda else processor()
-        setting["torch"] = torch.__version__
-        args.json.write_text(json.dumps({"setting": setting, "rows": rows}, indent=2) + "\n")
+    good = check_all(backends, launcher, torch.device(args.device)) if args.check else backends
+    if good and not args.check_only:
+        time_all(args, good, launcher if "cuda" in good else None)
+    return 0 if len(good) == len(backends) else 1
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    args = parse(words)
+    try:
+        if args.device == "cuda" and not torch.cuda.is_available():
+            raise UserError("--device cuda: torch sees no CUDA device. Try: nvidia-smi, or --device cpu")
+        backends = make_backends(args.backends, torch.device(args.device))
+        return run(args, backends, load_kernels(None) if "cuda" in backends else None)
+    except UserError as error:
+        print(f"bench_rasterizer: {error}", file=sys.stderr)
+        return 2
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,0 +1,128 @@
+"""Whether a backend may be timed: it must show what the reference shows, and the same bits every time."""
+
+from collections.abc import Iterator
+
+import torch
+from rasterizer_bench.scenes import Scene, make_scene, make_shell
+from torch import Tensor
+
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.rasterizer import cuda
+from cadam3d.rasterizer.base import Rasterizer
+from cadam3d.rasterizer.cuda import Launcher
+from cadam3d.rasterizer.reference import ReferenceRasterizer
+from cadam3d.rasterizer.selftest import self_test
+
+PROMISE_BITS = ("cpu", "cuda")  # backends that sum in an order of their own making
+RUNS = 5
+SPLATS, SIZE, VIEWS = 150, 45, 2  # of the small scenes; no multiple of any tile
+CROWD = {"cpu": (500, 64), "cuda": (100_000, 256)}  # splats and pixels of what is rendered again and again
+
+# Relative to the largest number of each tensor. A pixel further off lies on a step of the image formation
+# model (see selftest.py), where float32 may go either way: it is left out of the loss, and there must be few.
+MOST_IMAGE, MOST_GRADIENT, MOST_OUTLIERS = 1e-4, 2e-3, 0.03
+
+
+def check(name: str, rasterizer: Rasterizer, device: torch.device) -> list[str]:
+    """What is wrong with the backend, in words."""
+    if name == "gsplat":  # it caps alpha elsewhere: compared where nothing comes near the cap
+        return differences(rasterizer, small_scene(make_shell(SPLATS, 3, device)))
+    agreement = self_test(rasterizer, device)
+    troubles = [] if agreement.holds else [f"self-test: {agreement}"]
+    for kind, gaussians in adversaries(device):
+        troubles += [
+            f"{kind}: {difference}" for difference in differences(rasterizer, small_scene(gaussians))
+        ]
+    if name in PROMISE_BITS:
+        count, size = CROWD[device.type]
+        troubles += changes(rasterizer, make_scene(make_shell(count, 1, device), size, VIEWS))
+    return troubles
+
+
+def small_scene(gaussians: Gaussians) -> Scene:
+    return make_scene(gaussians, SIZE, VIEWS)
+
+
+def adversaries(device: torch.device) -> Iterator[tuple[str, Gaussians]]:
+    """Scenes that find mistakes which a benign one forgives."""
+
+    def shell(means: float = 1.0, log_scale: Tensor | float = 0.0, opacity: float = 0.0) -> Gaussians:
+        plain = make_shell(SPLATS, 3, torch.device("cpu")).detach()
+        changed = {
+            "means": plain.means * means,
+            "log_scales": plain.log_scales + log_scale,
+            "opacity_logits": plain.opacity_logits + opacity,
+        }
+        return Gaussians(**plain.tensors() | changed)
+
+    equal = shell().index(torch.arange(SPLATS // 3).repeat(3))
+    for kind, gaussians in {
+        "needles": shell(log_scale=torch.tensor([2.0, -4.0, -4.0])),
+        "flat discs": shell(log_scale=torch.tensor([0.5, 0.5, -9.0])),
+        "opaque": shell(opacity=9.0),
+        "faint": shell(opacity=-4.0),
+        "each fills the screen": shell(log_scale=2.5, opacity=-2.0),
+        "smaller than a pixel": shell(log_scale=-4.0, opacity=2.0),
+        "around the camera": shell(means=6.0, log_scale=1.0),
+        "equal depths": equal,
+    }.items():
+        yield kind, gaussians.to(device).map(lambda tensor: tensor.requires_grad_())
+
+
+def differences(rasterizer: Rasterizer, scene: Scene) -> list[str]:
+    """Where the images, or the gradients of the parameters, are not those of the reference in float64."""
+    exact = scene.to(torch.device("cpu"), torch.float64)
+    want, got = exact.render(ReferenceRasterizer()), scene.render(rasterizer)
+    if not all(image.isfinite().all() for image in got):
+        return ["an image is not finite"]
+    is_off = torch.stack(
+        [_deviation(ours.detach().cpu(), theirs.detach()) for ours, theirs in zip(got, want, strict=True)]
+    ).amax(dim=0)
+    is_off = is_off > MOST_IMAGE
+    share = is_off.double().mean().item()
+    if share > MOST_OUTLIERS:
+        return [f"{share:.1%} of the pixels are wrong"]
+    exact.without(is_off).backward(want)
+    scene.without(is_off).backward(got)
+    troubles = []
+    for name, theirs in exact.gaussians.tensors().items():
+        ours = scene.gaussians.tensors()[name].grad
+        if ours is None or not ours.isfinite().all():
+            troubles.append(f"the gradient of {name} is missing or not finite")
+            continue
+        error = ((ours.cpu() - theirs.grad).abs().max() / theirs.grad.abs().max().clamp_min(1e-20)).item()
+        if error > MOST_GRADIENT:
+            troubles.append(f"the gradient of {name} is off by {error:.1e} of its largest")
+    return troubles
+
+
+def _deviation(got: Tensor, want: Tensor) -> Tensor:
+    """[v h w]: of each pixel, relative to the largest number of the image."""
+    error = (got - want).abs() / want.abs().max().clamp_min(1e-20)
+    return error.amax(dim=-1) if error.ndim == 4 else error
+
+
+def changes(rasterizer: Rasterizer, scene: Scene) -> list[str]:
+    """What is not the same to the last bit in every run."""
+    first: dict[str, Tensor] = {}
+    changed: set[str] = set()
+    for _ in range(RUNS):
+        scene.forget()
+        images = scene.render(rasterizer)
+        scene.backward(images)
+        numbers = dict(zip(("rgb", "alpha", "depth"), images, strict=True))
+        numbers |= {f"the gradient of {name}": t.grad for name, t in scene.gaussians.tensors().items()}
+        first = first or numbers
+        changed |= {name for name, tensor in numbers.items() if not torch.equal(tensor, first[name])}
+    return [f"{name} is not the same in {RUNS} runs" for name in sorted(changed)]
+
+
+def check_long_sort(launcher: Launcher, device: torch.device, keys: int) -> list[str]:
+    """Whether the kernels sort as many keys as torch does, to the same order."""
+    generator = torch.Generator(device).manual_seed(0)
+    unsorted = torch.randint(0, 2**31 - 1, (keys,), dtype=torch.int32, device=device, generator=generator)
+    with launcher.on(device) as launch:
+        got, order = cuda._sort(launch, unsorted, cuda.DEPTH_BITS)
+    want, want_order = unsorted.sort(stable=True)
+    is_right = torch.equal(got, want) and torch.equal(order, want_order.int())
+    return [] if is_right else [f"{keys} keys are sorted wrongly"]

@@ -1,0 +1,65 @@
+"""gsplat behind our interface, to be timed beside ours; written from its documented ``rasterization``."""
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.core.cameras import Cameras
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.render import RenderOutput
+from cadam3d.rasterizer.base import FAR, NEAR, Rasterizer
+
+
+def why_absent(device: torch.device) -> str | None:
+    """Why gsplat cannot be timed here, in words; ``None`` if it can."""
+    if device.type != "cuda":
+        return "it renders on CUDA only"
+    if find_spec("gsplat") is None:
+        return "not installed. Try: pip install gsplat==1.5.3"
+    try:
+        from gsplat.cuda._backend import _C  # compiled now, if it came without binaries
+    except Exception as error:  # whatever a build by an unknown toolkit raises
+        return f"it does not import here: {error}"
+    return None if _C is not None else "it found no CUDA toolkit to build itself with"
+
+
+@dataclass(frozen=True)
+class GsplatRasterizer(Rasterizer):
+    """gsplat with the settings nearest to our image formation: classic, expected depth, unpacked."""
+
+    def render(
+        self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
+    ) -> RenderOutput:
+        """See :meth:`Rasterizer.render`; activations are timed along, for ours are part of the kernels."""
+        from gsplat import rasterization
+
+        images, alphas, extra = rasterization(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.log_scales.exp(),
+            gaussians.opacity_logits.sigmoid(),
+            gaussians.sh,
+            cameras.world_to_camera,
+            cameras.intrinsics,
+            cameras.width,
+            cameras.height,
+            near_plane=NEAR,
+            far_plane=FAR,
+            sh_degree=round(gaussians.sh.shape[1] ** 0.5) - 1,
+            packed=False,
+            backgrounds=background,
+            render_mode="RGB+ED",
+        )
+        means2d, radii = extra["means2d"], extra["radii"]
+        if means2d.requires_grad:
+            means2d.retain_grad()
+        return RenderOutput(
+            rgb=images[..., :3],
+            alpha=alphas[..., 0],
+            depth=images[..., 3],
+            means2d=means2d,
+            radii=(radii.amax(dim=-1) if radii.ndim == 3 else radii).to(means2d.dtype),
+        )

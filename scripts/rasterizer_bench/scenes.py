@@ -1,0 +1,78 @@
+"""What is rendered: a bumpy shell of splats about as large as the distance to the next, seen all around."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from cadam3d.core.cameras import Cameras, turntable
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.rasterizer.base import Rasterizer
+
+RADIUS = 0.6  # world units, of the shell
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All a backend is given, and the gradient that comes back to it; the same for every backend."""
+
+    gaussians: Gaussians  # leaves
+    cameras: Cameras
+    background: Tensor  # [v 3]
+    gradients: tuple[Tensor, Tensor, Tensor]  # of rgb, alpha and depth
+
+    def render(self, rasterizer: Rasterizer) -> tuple[Tensor, Tensor, Tensor]:
+        """The three images."""
+        output = rasterizer.render(self.gaussians, self.cameras, self.background)
+        return output.rgb, output.alpha, output.depth
+
+    def backward(self, images: tuple[Tensor, Tensor, Tensor]) -> None:
+        """From fixed gradients, so that no loss is timed along with the rasterizer."""
+        torch.autograd.backward(images, self.gradients)
+
+    def without(self, pixels: Tensor) -> "Scene":
+        """The same, with no gradient from some pixels [v h w]; Gaussians are shared."""
+        keeps = ~pixels.to(self.background.device)
+        rgb, alpha, depth = self.gradients
+        return replace(self, gradients=(rgb * keeps[..., None], alpha * keeps, depth * keeps))
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> "Scene":
+        """A copy elsewhere, with leaves of its own."""
+        gaussians = self.gaussians.map(lambda t: t.detach().to(device, dtype, copy=True).requires_grad_())
+        rgb, alpha, depth = (gradient.to(device, dtype) for gradient in self.gradients)
+        cameras = self.cameras.to(device)
+        return Scene(gaussians, cameras, self.background.to(device, dtype), (rgb, alpha, depth))
+
+    def forget(self) -> None:
+        """Drop the gradients, as an optimizer does before each step."""
+        for tensor in self.gaussians.tensors().values():
+            tensor.grad = None
+
+
+def make_shell(count: int, degree: int, device: torch.device) -> Gaussians:
+    """``count`` splats on a bumpy sphere, with colours up to ``degree``."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    directions = torch.nn.functional.normalize(normal(count, 3), dim=-1)
+    spacing = math.sqrt(4 * math.pi * RADIUS**2 / count)
+    gaussians = Gaussians(
+        means=directions * (RADIUS + 0.05 * normal(count, 1)),
+        log_scales=math.log(0.7 * spacing) + 0.3 * normal(count, 3),
+        quats=normal(count, 4),
+        opacity_logits=0.4 + normal(count),
+        sh=0.5 * normal(count, (degree + 1) ** 2, 3),
+    )
+    return gaussians.to(device).map(lambda tensor: tensor.requires_grad_())
+
+
+def make_scene(gaussians: Gaussians, size: int, views: int) -> Scene:
+    """The splats from ``views`` sides, in squares of ``size`` pixels before white."""
+    generator, device = torch.Generator().manual_seed(1), gaussians.device
+    cameras = turntable(views, elevation_deg=20.0, distance=3.0, fov_y_deg=40.0, size=size)
+    gradients = [torch.randn(views, size, size, *more, generator=generator) for more in ((3,), (), ())]
+    rgb, alpha, depth = (gradient.to(device) for gradient in gradients)
+    return Scene(gaussians, cameras.to(device), torch.ones(views, 3, device=device), (rgb, alpha, depth))

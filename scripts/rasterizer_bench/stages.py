@@ -1,0 +1,225 @@
+"""Where the time of the CUDA rasterizer goes: each launch between two events, next to what its bytes need.
+
+The bytes are those that a stage must read and write at least once; divided by the measured speed of a plain
+copy they give a floor. It is a floor of bandwidth alone: a stage that computes much per byte, as both blends
+do, will not come near it. It also supposes that no tile closes before its list ends.
+"""
+
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from jaxtyping import Float
+from rasterizer_bench.scenes import Scene
+from rasterizer_bench.timing import now
+from torch import Tensor
+
+from cadam3d.core.cameras import Cameras
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.render import RenderOutput
+from cadam3d.rasterizer import cuda
+from cadam3d.rasterizer.base import Rasterizer
+from cadam3d.rasterizer.cuda import Launch, Launcher, rasterize
+
+STAGES = {  # in order, and how the names of their kernels begin; sorts and prefix sums serve several
+    "project": ("prepare_cameras", "project_forward"),
+    "depth sort": (),
+    "tile lists": ("tile_list",),
+    "tile sort": ("tile_ranges",),
+    "blend forward": ("blend_forward",),
+    "blend backward": ("blend_backward",),
+    "project backward": ("project_backward", "centre_backward"),
+}
+REST = "rest"  # what no launch of ours explains: allocation, autograd, the host, one wait for the device
+WORD = 4  # bytes of a float and of an index
+SPLAT, RECORD = WORD * cuda.SPLAT, WORD * cuda.RECORD
+
+
+@dataclass(frozen=True)
+class KernelRasterizer(Rasterizer):
+    """The CUDA rasterizer on a launcher of choice."""
+
+    launcher: Launcher
+
+    def render(
+        self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
+    ) -> RenderOutput:
+        """See :meth:`Rasterizer.render`."""
+        return rasterize(self.launcher, gaussians, cameras, background)
+
+
+@dataclass(frozen=True)
+class Span:
+    """One launch, between two events."""
+
+    kernel: str
+    stage: str
+    begin: object
+    end: object
+
+
+class StageClock(Launcher):
+    """Passes every launch on, and notes when it began and ended."""
+
+    def __init__(self, inner: Launcher) -> None:
+        self._inner = inner
+        self.spans: list[Span] = []
+        self.slots = 0  # (splat, tile) pairs since ``spans`` was emptied
+
+    @contextmanager
+    def on(self, device: torch.device) -> Iterator[Launch]:
+        """See :meth:`Launcher.on`."""
+        with self._inner.on(device) as launch:
+            yield partial(self._launch, launch, _event if device.type == "cuda" else time.perf_counter)
+
+    def _launch(
+        self, launch: Launch, mark: Callable[[], object], kernel: str, blocks: int, threads: int, *arguments
+    ) -> None:
+        if kernel == "tile_ranges":
+            self.slots += arguments[1]
+        begin = mark()
+        launch(kernel, blocks, threads, *arguments)
+        stage = stage_of(kernel, self.spans[-1] if self.spans else None)
+        self.spans.append(Span(kernel, stage, begin, mark()))
+
+    def take(self) -> tuple[dict[str, float], dict[str, int]]:
+        """Milliseconds and launches by stage since the last call; the device must be done."""
+        times, launches = dict.fromkeys(STAGES, 0.0), dict.fromkeys(STAGES, 0)
+        for span in self.spans:
+            times[span.stage] = times.get(span.stage, 0.0) + _milliseconds(span)
+            launches[span.stage] = launches.get(span.stage, 0) + 1
+        self.spans.clear()
+        self.slots = 0
+        return times, launches
+
+
+def stage_of(kernel: str, before: Span | None) -> str:
+    """The stage of a launch, from the launch before it; a kernel unknown here is a stage of its own."""
+    stage = before.stage if before else ""
+    if kernel.startswith("sort_"):
+        return "tile sort" if stage in ("tile lists", "tile sort") else "depth sort"
+    if kernel.startswith("scan_"):  # within a sort, or after one: where the slots of each splat begin
+        return "tile lists" if before and before.kernel == "sort_scatter" else stage
+    return next((name for name, prefixes in STAGES.items() if kernel.startswith(prefixes)), kernel)
+
+
+def _event() -> torch.cuda.Event:
+    event = torch.cuda.Event(enable_timing=True)
+    event.record()
+    return event
+
+
+def _milliseconds(span: Span) -> float:
+    if isinstance(span.begin, torch.cuda.Event):
+        return span.begin.elapsed_time(span.end)
+    return (span.end - span.begin) * 1e3
+
+
+@dataclass(frozen=True)
+class Load:
+    """How much there is to do in one frame."""
+
+    gaussians: int
+    coefficients: int  # of spherical harmonics
+    views: int
+    visible: int  # (view, Gaussian) pairs that are seen
+    slots: int  # (splat, tile) pairs
+    pixels: int  # of all views
+    tiles: int  # of all views
+
+    @property
+    def pairs(self) -> int:
+        """Of a view and a Gaussian."""
+        return self.views * self.gaussians
+
+
+def sorted_bytes(items: int, bits: int) -> int:
+    """A pass reads keys to count, keys and values to scatter, and writes both; the first has no values."""
+    passes = -(-bits // cuda.RADIX_BITS)
+    return items * WORD * (5 * passes - 1)
+
+
+def stage_bytes(load: Load) -> dict[str, int]:
+    """What each stage reads and writes at least, in bytes: each number once per kernel, all views at once."""
+    parameters = load.gaussians * WORD * (11 + 3 * load.coefficients)
+    pairs, slots, pixels = load.pairs * WORD, load.slots, load.pixels
+    entry = 2 * WORD + SPLAT  # of a tile's list: slot, pair, splat
+    return {
+        "project": parameters + 5 * pairs + load.visible * SPLAT,  # centre, radius, depth key, count
+        "depth sort": sorted_bytes(load.pairs, cuda.DEPTH_BITS),
+        # Prefix sum: in, out. List: order, count, offset, first slot; tile and pair of every slot.
+        "tile lists": 6 * pairs + load.visible * SPLAT + slots * 2 * WORD,
+        "tile sort": sorted_bytes(slots, load.tiles.bit_length()) + slots * WORD + load.tiles * 2 * WORD,
+        "blend forward": slots * entry + pixels * 7 * WORD,  # rgb, alpha, depth, transmittance, last
+        "blend backward": slots * (entry + RECORD) + pixels * 9 * WORD,  # those but rgb, and 5 gradients
+        # Where the slots are, and the centre's gradient; radius and the latter again; means in and out again.
+        "project backward": 2 * parameters + slots * RECORD + 7 * pairs + load.gaussians * 6 * WORD,
+    }
+
+
+@dataclass(frozen=True)
+class StageTiming:
+    """One stage of one scene."""
+
+    stage: str
+    launches: int
+    median_ms: float
+    bytes: int | None  # None where nothing was counted
+    floor_ms: float | None  # bytes over the speed of a copy
+
+
+def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: float) -> list[StageTiming]:
+    """Stage by stage, forward and backward; the last one is ``REST``."""
+    clock, device = StageClock(launcher), scene.gaussians.device
+    rasterizer, samples = KernelRasterizer(clock), []
+    launches, slots = {}, 0
+    for _ in range(repeats + 1):
+        scene.forget()
+        start = now(device)
+        scene.backward(scene.render(rasterizer))
+        wall = (now(device) - start) * 1e3
+        slots = clock.slots
+        times, launches = clock.take()
+        samples.append(times | {REST: wall - sum(times.values())})
+    needed = stage_bytes(measure_load(rasterizer, scene, slots))
+    return [
+        StageTiming(
+            stage,
+            launches.get(stage, 0),
+            statistics.median(times[stage] for times in samples[1:]),  # the first one warms up
+            needed.get(stage),
+            needed[stage] / bytes_per_ms if stage in needed else None,
+        )
+        for stage in samples[-1]
+    ]
+
+
+def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:
+    with torch.no_grad():
+        output = rasterizer.render(scene.gaussians, scene.cameras, scene.background)
+    views, height, width = output.alpha.shape
+    return Load(
+        gaussians=len(scene.gaussians),
+        coefficients=scene.gaussians.sh.shape[1],
+        views=views,
+        visible=int(output.visible.sum()),
+        slots=slots,
+        pixels=views * height * width,
+        tiles=views * (-(-height // cuda.TILE)) * (-(-width // cuda.TILE)),
+    )
+
+
+def copy_speed(device: torch.device, size: int) -> float:
+    """Bytes per millisecond, read and written together, of the fastest of some copies of ``size`` bytes."""
+    source = torch.zeros(size, dtype=torch.uint8, device=device)
+    target = torch.empty_like(source)
+    fastest = float("inf")
+    for _ in range(8):
+        start = now(device)
+        target.copy_(source)
+        fastest = min(fastest, now(device) - start)
+    return 2 * size / (fastest * 1e3)

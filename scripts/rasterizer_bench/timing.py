@@ -1,0 +1,102 @@
+"""How long the phases of a step take, and how much memory they need."""
+
+import statistics
+import time
+from dataclasses import dataclass
+
+import torch
+from rasterizer_bench.scenes import Scene
+
+from cadam3d.rasterizer.base import Rasterizer
+
+PHASES = ("forward", "backward", "forward_backward")
+OUT_OF_MEMORY = (torch.OutOfMemoryError, MemoryError)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Of one backend and scene, over all repetitions."""
+
+    median_ms: dict[str, float]  # by phase
+    min_ms: dict[str, float]
+    peak_bytes: int | None  # above what the scene itself occupies; None where it cannot be measured
+
+
+def take_turns(backends: dict[str, Rasterizer], scene: Scene, repeats: int) -> dict[str, Timing | None]:
+    """Time every backend; ``None`` for those that ran out of memory.
+
+    Backends take turns within each repetition, so whatever else the machine does hits them alike. The first,
+    uncounted round warms up, and measures memory.
+    """
+    samples: dict[str, list[dict[str, float]]] = {name: [] for name in backends}
+    peaks: dict[str, int | None] = {}
+    failed: set[str] = set()
+    for repeat in range(repeats + 1):
+        for name, rasterizer in backends.items():
+            if name in failed:
+                continue
+            try:
+                if repeat == 0:
+                    peaks[name] = peak_memory(rasterizer, scene)
+                else:
+                    samples[name].append(time_phases(rasterizer, scene))
+            except OUT_OF_MEMORY:
+                failed.add(name)
+            scene.forget()
+    return {name: None if name in failed else summarize(samples[name], peaks[name]) for name in backends}
+
+
+def summarize(samples: list[dict[str, float]], peak: int | None) -> Timing:
+    by_phase = {phase: [sample[phase] for sample in samples] for phase in PHASES}
+    return Timing(
+        {phase: statistics.median(each) for phase, each in by_phase.items()},
+        {phase: min(each) for phase, each in by_phase.items()},
+        peak,
+    )
+
+
+def time_phases(rasterizer: Rasterizer, scene: Scene) -> dict[str, float]:
+    """Milliseconds of each phase; both together are timed anew, with no wait for the device in between."""
+    device = scene.gaussians.device
+    scene.forget()
+    start = now(device)
+    images = scene.render(rasterizer)
+    middle = now(device)
+    scene.backward(images)
+    end = now(device)
+    del images
+    scene.forget()
+    again = now(device)
+    scene.backward(scene.render(rasterizer))
+    whole = now(device) - again
+    return {
+        "forward": (middle - start) * 1e3,
+        "backward": (end - middle) * 1e3,
+        "forward_backward": whole * 1e3,
+    }
+
+
+def now(device: torch.device) -> float:
+    """Seconds, once the device has done all it was asked to."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def peak_memory(rasterizer: Rasterizer, scene: Scene) -> int | None:
+    """Bytes that a forward and backward needs at its worst, gradients of the parameters included.
+
+    Only what torch allocates on a CUDA device is counted to the byte. On a CPU the system sees pages, and an
+    allocator that keeps what was freed before: no honest number comes out, so there is none.
+    """
+    device = scene.gaussians.device
+    scene.forget()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+        before = torch.cuda.memory_allocated(device)
+        torch.cuda.reset_peak_memory_stats(device)
+    scene.backward(scene.render(rasterizer))
+    if device.type != "cuda":
+        return None
+    torch.cuda.synchronize(device)
+    return torch.cuda.max_memory_allocated(device) - before

@@ -1,0 +1,388 @@
+"""The script that checks and times rasterizers: it runs as it would on a GPU, with fibers in place of one."""
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import cycle
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from cadam3d.core.cameras import Cameras
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.rasterizer import cuda
+from cadam3d.rasterizer.base import FAR, NEAR, Rasterizer
+from cadam3d.rasterizer.cpu import CpuRasterizer
+from cadam3d.rasterizer.cuda import Launcher
+from cadam3d.rasterizer.reference import ReferenceRasterizer
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))  # as Python does for a script
+
+import bench_rasterizer
+from rasterizer_bench import check, report, stages, targets, timing
+from rasterizer_bench.gsplat_yardstick import GsplatRasterizer
+from rasterizer_bench.scenes import make_scene, make_shell
+
+CPU = torch.device("cpu")
+TINY = ("--counts", "60", "--sizes", "20", "--repeats", "2", "--views", "2")
+
+
+@pytest.fixture(autouse=True)
+def _one_thread_as_before():
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+@dataclass(frozen=True)
+class Wrong(Rasterizer):
+    """The reference, and one mistake."""
+
+    mistake: Callable[[Gaussians], Gaussians]
+
+    def render(self, gaussians, cameras, background):
+        return ReferenceRasterizer().render(self.mistake(gaussians), cameras, background)
+
+
+def changed(gaussians: Gaussians, **tensors: torch.Tensor) -> Gaussians:
+    return Gaussians(**gaussians.tensors() | tensors)
+
+
+def run(words, backends, launcher: Launcher | None = None) -> int:
+    return bench_rasterizer.run(bench_rasterizer.parse(words), backends, launcher)
+
+
+# -------------------------------------------------------------------------- the whole way
+
+
+def test_checks_times_and_writes_every_backend_on_every_scene(kernel_build, tmp_path, capsys):
+    path = tmp_path / "bench.json"
+    cpu = CpuRasterizer(cache_dir=str(kernel_build.path.parent))
+    words = ["--counts", "50", "80", "--sizes", "16", "24", "--degrees", "0", "1", "--repeats", "2"]
+    code = run([*words, "--json", str(path)], {"reference": ReferenceRasterizer(), "cpu": cpu})
+    shown = capsys.readouterr().out
+    assert code == 0, shown
+    assert "check reference: agrees" in shown
+    assert "check cpu: agrees" in shown
+    written = json.loads(path.read_text())
+    scenes = [(row["count"], row["size"], row["degree"]) for row in written["rows"]]
+    assert scenes[::2] == scenes[1::2] == [(n, s, d) for d in (0, 1) for n in (50, 80) for s in (16, 24)]
+    for row in written["rows"]:
+        assert 0 < row["forward_backward_min_ms"] <= row["forward_backward_ms"]
+        assert min(row["forward_ms"], row["backward_ms"]) > 0
+        assert row["peak_bytes"] is None  # no honest number for a CPU
+        assert f"{row['forward_backward_ms']:.2f}" in shown
+    first, second = written["rows"][:2]
+    assert first["ratio"] == 1
+    assert second["ratio"] == first["forward_backward_ms"] / second["forward_backward_ms"]
+    assert written["device"]["name"]
+    assert written["versions"]["torch"] == torch.__version__
+    assert written["settings"]["counts"] == [50, 80]
+    assert not written["stages"]
+
+
+def test_runs_stage_by_stage_on_kernels(emulator, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(check, "CROWD", {"cpu": (60, 20)})
+    path = tmp_path / "bench.json"
+    code = run(
+        [*TINY, "--json", str(path)],
+        {"reference": ReferenceRasterizer(), "cuda": stages.KernelRasterizer(emulator)},
+        emulator,
+    )
+    shown = capsys.readouterr().out
+    assert code == 0, shown
+    written = json.loads(path.read_text())
+    (of_scene,) = written["stages"]
+    assert [each["stage"] for each in of_scene["stages"]] == [*stages.STAGES, stages.REST]
+    for each in of_scene["stages"][:-1]:
+        assert min(each["launches"], each["median_ms"], each["bytes"], each["floor_ms"]) > 0
+        assert each["floor_ms"] == pytest.approx(each["bytes"] / written["copy_bytes_per_ms"])
+        assert each["stage"] in shown
+
+
+def test_as_a_user_calls_it(kernel_build, monkeypatch, capsys):
+    monkeypatch.setattr(
+        bench_rasterizer, "component", lambda _: CpuRasterizer(cache_dir=str(kernel_build.path.parent))
+    )
+    assert bench_rasterizer.main(["--backends", "cpu", "--check-only"]) == 0
+    shown = capsys.readouterr().out
+    assert shown == "check cpu: agrees with the reference\n"
+
+
+# -------------------------------------------------------------------------- who disagrees is not timed
+
+
+def turns_everybody_a_little(gaussians):
+    return changed(gaussians, quats=gaussians.quats + 1e-3)
+
+
+def detaches(gaussians):
+    return changed(gaussians, log_scales=gaussians.log_scales.detach() + 0 * gaussians.log_scales)
+
+
+def loses_the_last(gaussians):
+    fainter = torch.zeros_like(gaussians.opacity_logits)
+    fainter[-1] = 50.0
+    return changed(gaussians, opacity_logits=gaussians.opacity_logits - fainter)
+
+
+def test_a_backend_that_disagrees_is_not_timed(monkeypatch, capsys):
+    timed = []
+    monkeypatch.setattr(bench_rasterizer, "time_all", lambda _, backends, __: timed.extend(backends))
+    assert run(TINY, {"auto": Wrong(detaches), "reference": ReferenceRasterizer()}) == 1
+    shown = capsys.readouterr().out
+    assert timed == ["reference"]
+    assert "check reference: agrees" in shown
+    assert "check auto: REFUSED" in shown
+    assert "the gradient of log_scales is off" in shown
+
+
+@pytest.mark.parametrize("mistake", [turns_everybody_a_little, detaches, loses_the_last])
+def test_adversaries_find_the_mistake_without_the_self_test(mistake):
+    adversaries = dict(check.adversaries(CPU))
+    for kind in ("needles", "flat discs", "equal depths"):
+        assert check.differences(Wrong(mistake), check.small_scene(adversaries[kind])), kind
+
+
+def test_a_backend_that_promises_the_same_bits_has_to_keep_it(monkeypatch):
+    factors = cycle([1, 1 + 2e-7])  # less than any tolerance
+
+    def wobbles(gaussians):
+        return changed(gaussians, means=gaussians.means * next(factors))
+
+    monkeypatch.setattr(check, "CROWD", {"cpu": (60, 20)})
+    assert not check.check("reference", Wrong(wobbles), CPU)  # which promises no bits
+    troubles = check.check("cuda", Wrong(wobbles), CPU)
+    assert troubles
+    assert all(f"not the same in {check.RUNS} runs" in trouble for trouble in troubles)
+
+
+def test_no_check_times_whoever_comes(capsys):
+    assert run([*TINY, "--no-check"], {"reference": ReferenceRasterizer()}) == 0
+    assert "check" not in capsys.readouterr().out
+
+
+def test_a_sort_that_is_wrong_is_found(emulator, monkeypatch):
+    assert not check.check_long_sort(emulator, CPU, 5000)
+    sort = cuda._sort
+    monkeypatch.setattr(cuda, "_sort", lambda launch, keys, bits: sort(launch, keys, bits - 8))
+    assert check.check_long_sort(emulator, CPU, 5000) == ["5000 keys are sorted wrongly"]
+
+
+def gsplat_stand_in() -> ModuleType:
+    """``gsplat.rasterization`` as it is documented, by means of the reference."""
+
+    def rasterization(  # noqa: PLR0917
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmats,
+        Ks,
+        width,
+        height,
+        *,
+        near_plane,
+        far_plane,
+        sh_degree,
+        packed,
+        backgrounds,
+        render_mode,
+    ):
+        assert (near_plane, far_plane, packed, render_mode) == (NEAR, FAR, False, "RGB+ED")
+        assert colors.shape[1] == (sh_degree + 1) ** 2
+        gaussians = Gaussians(means, scales.log(), quats, opacities.logit(), colors)
+        views = torch.zeros(len(viewmats))
+        cameras = Cameras(viewmats, Ks, height, width, views, views)
+        output = ReferenceRasterizer().render(gaussians, cameras, backgrounds)
+        images = torch.cat([output.rgb, output.depth[..., None]], dim=-1)
+        radii = output.radii.ceil().int()[..., None].expand(-1, -1, 2)  # one per axis
+        return images, output.alpha[..., None], {"means2d": output.means2d, "radii": radii}
+
+    module = ModuleType("gsplat")
+    module.rasterization = rasterization
+    return module
+
+
+def test_gsplat_is_asked_for_what_we_render(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", gsplat_stand_in())
+    assert not check.check("gsplat", GsplatRasterizer(), CPU)
+    scene = make_scene(make_shell(50, 2, CPU), 20, 3)
+    output = GsplatRasterizer().render(scene.gaussians, scene.cameras, scene.background)
+    scene.backward((output.rgb, output.alpha, output.depth))
+    assert output.radii.shape == (3, 50)
+    assert output.means2d.grad is not None
+
+
+# -------------------------------------------------------------------------- timing
+
+
+@dataclass(frozen=True)
+class Greedy(Rasterizer):
+    def render(self, gaussians, cameras, background):
+        raise torch.OutOfMemoryError
+
+
+def test_who_runs_out_of_memory_is_out_and_the_others_go_on(capsys):
+    backends = {"auto": Greedy(), "reference": ReferenceRasterizer()}
+    assert run([*TINY, "--no-check"], backends) == 0
+    assert "auto   out of memory" in capsys.readouterr().out
+    timings = timing.take_turns(backends, make_scene(make_shell(20, 0, CPU), 9, 1), 1)
+    assert timings["auto"] is None
+    assert timings["reference"] is not None
+
+
+def test_every_turn_starts_without_gradients():
+    scene = make_scene(make_shell(20, 1, CPU), 9, 1)
+    scene.backward(scene.render(ReferenceRasterizer()))
+    once = {name: tensor.grad.clone() for name, tensor in scene.gaussians.tensors().items()}
+    timing.time_phases(ReferenceRasterizer(), scene)
+    for name, tensor in scene.gaussians.tensors().items():
+        torch.testing.assert_close(tensor.grad, once[name])
+
+
+# -------------------------------------------------------------------------- stages
+
+
+def test_every_launch_belongs_to_a_stage_we_know(emulator):
+    # The names of kernels live elsewhere: a new one must be put into a stage.
+    clock = stages.StageClock(emulator)
+    scene = make_scene(make_shell(300, 1, CPU), 24, 2)
+    scene.backward(scene.render(stages.KernelRasterizer(clock)))
+    kernels = {stage: [] for stage in stages.STAGES}
+    for span in clock.spans:
+        kernels[span.stage].append(span.kernel)  # KeyError: unknown
+    passes = cuda.DEPTH_BITS // cuda.RADIX_BITS
+    assert kernels["depth sort"] == ["sort_count", "scan_short", "sort_scatter"] * passes
+    assert kernels["tile lists"] == ["scan_short", "tile_list"]
+    assert kernels["tile sort"] == ["sort_count", "scan_short", "sort_scatter", "tile_ranges"]
+    assert kernels["blend forward"] == ["blend_forward"]
+    assert kernels["blend backward"] == ["blend_backward"]
+    assert kernels["project backward"] == ["project_backward_4", "centre_backward"]
+
+
+def test_load_counts_what_is_there(emulator):
+    clock = stages.StageClock(emulator)
+    gaussians = make_shell(1, 0, CPU).detach()
+    gaussians.means.zero_()
+    gaussians.log_scales.fill_(1.0)  # larger than the screen: every tile of 20 x 20 pixels in both views
+    scene = make_scene(gaussians.map(lambda tensor: tensor.requires_grad_()), 20, 2)
+    scene.render(stages.KernelRasterizer(clock))
+    load = stages.measure_load(ReferenceRasterizer(), scene, clock.slots)
+    assert load == stages.Load(
+        gaussians=1, coefficients=1, views=2, visible=2, slots=18, pixels=800, tiles=18
+    )
+
+
+def test_bytes_of_a_stage_are_those_of_its_arguments(emulator):
+    """As long as every pair is seen and lies in one tile, what is needed is what was handed over."""
+    given = dict.fromkeys(stages.STAGES, 0)
+
+    class Scales(stages.StageClock):
+        def _launch(self, launch, mark, kernel, blocks, threads, *arguments):
+            super()._launch(launch, mark, kernel, blocks, threads, *arguments)
+            tensors = [each for each in arguments if isinstance(each, torch.Tensor)]
+            given[self.spans[-1].stage] += sum(tensor.nbytes for tensor in tensors)
+
+    n = 2000  # many, so that cameras, bins and ranges weigh little
+    gaussians = make_shell(n, 1, CPU).detach()
+    gaussians.means.mul_(0.02)
+    gaussians.log_scales.fill_(-9.0)
+    gaussians.opacity_logits.fill_(-2.0)
+    clock = Scales(emulator)
+    scene = make_scene(gaussians.map(lambda tensor: tensor.requires_grad_()), 7, 1)  # one tile
+    scene.backward(scene.render(stages.KernelRasterizer(clock)))
+    load = stages.measure_load(ReferenceRasterizer(), scene, clock.slots)
+    assert load.visible == load.slots == n
+    needed = stages.stage_bytes(load)
+    for stage in stages.STAGES:
+        assert needed[stage] == pytest.approx(given[stage], rel=0.1), stage
+
+
+# -------------------------------------------------------------------------- demands
+
+
+def rows_of(scene, device="NVIDIA H200", **both_ms):
+    timings = {
+        name: timing.Timing(dict.fromkeys(timing.PHASES, ms), dict.fromkeys(timing.PHASES, ms), 2**20)
+        for name, ms in both_ms.items()
+    }
+    return {row.backend: row for row in report.make_rows(scene, timings, device)}
+
+
+@pytest.mark.parametrize(
+    ("scene", "times", "is_met"),
+    [
+        ((1_000_000, 1024, 4, 0), {"cuda": 11.0}, True),
+        ((1_000_000, 1024, 4, 0), {"cuda": 11.1}, False),
+        ((1_000_000, 1024, 4, 0), {"gsplat": 19.8, "cuda": 11.0}, True),
+        ((1_000_000, 1024, 4, 0), {"gsplat": 19.7, "cuda": 11.0}, False),  # 1.79 times as fast
+        ((1_000_000, 1024, 4, 3), {"gsplat": 19.7, "cuda": 11.0}, False),  # the ratio is demanded anywhere
+        ((20_000, 512, 1, 0), {"cuda": 0.5}, True),
+        ((20_000, 512, 1, 0), {"cuda": 0.6}, False),
+        ((1_000_000, 1024, 1, 0), {"cuda": 99.0}, None),
+    ],
+)
+def test_demands_are_met_or_missed(scene, times, is_met):
+    row = rows_of(scene, **times)["cuda"]
+    assert row.is_met is is_met
+    assert ("MISSED" in str(row), ": met" in str(row)) == (is_met is False, is_met is True)
+
+
+def test_nothing_is_demanded_of_others_or_on_unknown_devices():
+    scene = (1_000_000, 1024, 4, 0)
+    assert rows_of(scene, gsplat=1.0, cuda=1.0)["gsplat"].is_met is None
+    assert rows_of(scene, device="a new card", cuda=99.0)["cuda"].is_met is None
+
+
+def test_more_work_is_never_demanded_in_less_time():
+    for table in targets.MOST_MS.values():
+        for size in (512, 1024):
+            by_count = [ms for (_, pixels), ms in sorted(table.items()) if pixels == size]
+            assert by_count == sorted(by_count)
+        assert all(ms < table[count, 1024] for (count, pixels), ms in table.items() if pixels == 512)
+
+
+# -------------------------------------------------------------------------- what is typed
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("--backends nobody", "invalid choice: 'nobody'"),
+        ("--counts 0", "invalid whole number >= 1 value: '0'"),
+        ("--sizes big", "invalid whole number >= 1 value: 'big'"),
+        ("--degrees 4", "invalid choice: 4"),
+        ("--check-only --no-check", "leave nothing to do"),
+        ("--json nowhere/bench.json", "Try: mkdir -p nowhere"),
+        ("--backends gsplat", "no backend is left"),
+        ("--backends cuda", "rasterizer=cuda cannot render on cpu"),
+        pytest.param(
+            "--device cuda",
+            "torch sees no CUDA device",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is one"),
+        ),
+    ],
+)
+def test_a_mistake_is_one_line(words, says, capsys):
+    try:
+        code = bench_rasterizer.main(words.split())
+    except SystemExit as ended:
+        code = ended.code
+    error = capsys.readouterr().err
+    assert code == 2
+    assert says in error
+    assert error.startswith("bench_rasterizer: ")
+    assert error.count("\n") == 1
+
+
+def test_each_device_has_its_own_defaults():
+    cpu, gpu = (bench_rasterizer.parse(["--device", device]) for device in ("cpu", "cuda"))
+    assert (cpu.backends, cpu.counts, cpu.sizes) == (["reference", "cpu"], [3_000, 10_000], [128, 256])
+    assert set(targets.MOST_MS["H200"]) <= {(count, size) for count in gpu.counts for size in gpu.sizes}
+    assert {1, 4} == set(gpu.views)
+    assert bench_rasterizer.parse(["--device", "cuda", "--counts", "5"]).counts == [5]
