@@ -108,7 +108,7 @@ class _Frame(Frame):
 
     def centre_backward(self, parameters: list[Tensor], radii: Tensor, grad_means2d: Tensor) -> Tensor:
         """See :meth:`Frame.centre_backward`."""
-        grad_means, scene = torch.empty_like(parameters[0]), self.scene(parameters, None)
+        grad_means, scene = torch.zeros_like(parameters[0]), self.scene(parameters, None)
         self.call("cadam3d_centre_backward", ctypes.byref(scene), radii, grad_means2d, grad_means)
         return grad_means
 

@@ -1,10 +1,13 @@
 // The CPU rasterizer: projection, tile lists, blending and their gradients, behind a C interface.
 //
 // A frame goes through five stages: project every Gaussian into every view; sort each view's visible ones by
-// depth; list for each 16x16 tile who touches it, front to back; blend the tiles. Backward walks each tile
-// back to front, leaves one record per (splat, tile), sums the records of each Gaussian in a fixed order and
-// applies the chain rule. No two threads ever add to the same number, and work is cut into pieces that do not
-// depend on how many threads there are: the bits of every result are the same for any thread count.
+// depth; list for each 16x16 tile whose box touches it, front to back; blend the tiles. Backward walks each
+// tile back to front, leaves one record per (Gaussian, tile), sums the records of each Gaussian in a fixed
+// order and applies the chain rule. No two threads ever add to the same number, and work is cut into pieces
+// that do not depend on how many threads there are: the bits of every result are the same for any number.
+//
+// Vectors hold LANES Gaussians where Gaussians are projected. Where tiles are blended they hold LANES pixels
+// of a cell of 4x4: splats are small, and a square wastes fewer lanes on them than a row.
 #include <algorithm>
 #include <atomic>
 #include <cmath>
@@ -24,6 +27,14 @@
 #define EXPORT extern "C" __attribute__((visibility("default")))
 #endif
 
+namespace splat {
+template <>
+struct Kinds<simd::Wide> {
+  typedef simd::Truths Truth;
+  typedef simd::Wide Stored;
+};
+}  // namespace splat
+
 namespace {
 
 using simd::Floats;
@@ -31,12 +42,18 @@ using simd::Ints;
 using simd::LANES;
 using simd::Mask;
 using simd::spread;
+using simd::Truths;
+using simd::Wide;
 
-constexpr int TILE = 16;  // pixels; a row of a tile is a whole number of vectors on every machine
+constexpr int TILE = 16;  // pixels along the edge
 constexpr int AREA = TILE * TILE;
-constexpr int GROUPS = TILE / LANES;  // vectors per row of a tile
-constexpr int64_t BLOCK = 256;        // Gaussians per piece of work
-constexpr int RECORD = 12;  // floats left by the backward per (splat, tile); the last two are padding
+constexpr int CELL = 4;  // pixels along the edge
+constexpr int CELLS = (TILE / CELL) * (TILE / CELL);
+constexpr int PARTS = CELL * CELL / LANES;  // vectors per cell
+constexpr int64_t BLOCK = 256;              // Gaussians per piece of work; a whole number of vectors
+constexpr int RECORD = 16;   // floats left by the backward per (Gaussian, tile): one cache line
+constexpr int MOMENTS = 10;  // of them in use
+static_assert(CELLS == CELL * CELL && BLOCK % LANES == 0, "a vector of cells is as long as one of pixels");
 
 // Bytes of records in flight, unless one view needs more; tests set a small one.
 #if !defined(SPLAT_RECORD_BUDGET)
@@ -57,9 +74,16 @@ struct alignas(64) Splat {
   float l11, l12, l22;        // whitening, see splat_math.h
   float cut, opacity, depth;  // alpha = opacity exp(-|y|^2) where |y|^2 <= cut
   float rgb[3];
-  float reach_x, reach_y;  // half-sizes of its box; 0 = not seen
+  uint32_t columns, rows;  // of tiles that its box touches: the first, and the end shifted by 16; 0 = none
   float spare[3];
 };
+constexpr int SPLAT_FIELDS = 13;
+
+struct Range {
+  uint32_t first, end;
+  uint32_t size() const { return end - first; }
+};
+inline Range unpack(uint32_t range) { return {range & 0xffff, range >> 16}; }
 
 // Memory whose first content does not matter; std::vector would write zeros first.
 template <class T>
@@ -75,24 +99,26 @@ class Buffer {
   std::unique_ptr<T[]> memory_;
 };
 
-struct Span {
-  uint16_t first, end;  // tile columns [first, end) touched in one tile row
+struct alignas(64) Record {
+  float sums[RECORD];
+};
+
+// One Gaussian in the list of one tile, and where the record of the two lies.
+struct Entry {
+  uint32_t gaussian, slot;
 };
 
 // What one view keeps between forward and backward.
 struct View {
-  splat::Camera<double> camera;
-  std::vector<uint32_t> order;  // visible Gaussians, near to far
-  Buffer<uint32_t> first_span;  // gaussians + 1; spans of Gaussian i: first_span[i] .. first_span[i + 1]
-  Buffer<Span> spans;
-  Buffer<uint32_t> first_slot;    // spans + 1; one slot per (Gaussian, tile), grouped by Gaussian
-  Buffer<uint32_t> rank_of_slot;  // place of that Gaussian in the list of that tile
-  Buffer<uint32_t> first_entry;   // tiles + 1
-  Buffer<uint32_t> entries;       // Gaussian numbers, tile by tile, near to far
-  Buffer<int32_t> used;           // tiles; entries that reached a pixel lie below
-  Buffer<float> transmittance;    // tiles x AREA; after the last splat
-  Buffer<int32_t> last;           // tiles x AREA; 1 + rank of the last splat that reached the pixel
-  Buffer<int64_t> first_record;   // tiles; while the backward runs
+  splat::Camera<Wide> camera;
+  std::vector<uint32_t> order;   // Gaussians on the screen, near to far
+  Buffer<uint32_t> first_slot;   // gaussians + 1; one slot per (Gaussian, tile), grouped by Gaussian
+  Buffer<uint32_t> first_entry;  // tiles + 1
+  Buffer<Entry> entries;         // tile by tile, near to far
+  Buffer<uint16_t> reached;      // entries; the cells it reached, a bit each
+  Buffer<uint32_t> used;         // tiles; entries walked before every pixel was opaque
+  Buffer<float> transmittance;   // tiles x AREA; after the last splat
+  Buffer<int32_t> last;          // tiles x AREA; rank of the splat at which the pixel was opaque
 };
 
 struct Frame {
@@ -125,210 +151,226 @@ void parallel_for(int64_t items, int64_t threads, const Body& body) {
 
 int64_t ceil_div(int64_t a, int64_t b) { return (a + b - 1) / b; }
 
-splat::Gaussian<double> load_gaussian(const Scene& scene, int64_t i) {
-  splat::Gaussian<double> gaussian;
-  for (int j = 0; j < 3; ++j) {
-    gaussian.mean[j] = scene.means[3 * i + j];
-    gaussian.log_scale[j] = scene.log_scales[3 * i + j];
+// LANES rows of a tensor from ``first`` on; the last one again where there are no more.
+struct Rows {
+  int64_t first, of_lane[LANES];
+  int count;
+
+  Rows(const Scene& scene, int64_t first_)
+      : first(first_), count(int(std::min<int64_t>(LANES, scene.gaussians - first))) {
+    for (int lane = 0; lane < LANES; ++lane) of_lane[lane] = first + std::min(lane, count - 1);
   }
-  for (int j = 0; j < 4; ++j) gaussian.quat[j] = scene.quats[4 * i + j];
-  gaussian.opacity_logit = scene.opacity_logits[i];
-  gaussian.sh = scene.sh + 3 * scene.coefficients * i;
-  gaussian.coefficients = int(scene.coefficients);
-  return gaussian;
+  Wide gather(const float* from, int64_t stride) const {
+    float x[LANES];
+    for (int lane = 0; lane < LANES; ++lane) x[lane] = from[of_lane[lane] * stride];
+    return simd::load(x);
+  }
+  void add(float* to, int64_t stride, Wide x) const {
+    float part[LANES];
+    simd::store(part, x.lanes);
+    for (int lane = 0; lane < count; ++lane) to[(first + lane) * stride] += part[lane];
+  }
+};
+
+// As many Gaussians.
+struct Batch : Rows {
+  splat::Gaussian<Wide> gaussian;
+  Wide sh[3 * splat::MAX_COEFFICIENTS];
+
+  Batch(const Scene& scene, int64_t first_) : Rows(scene, first_) {
+    for (int j = 0; j < 3; ++j) {
+      gaussian.mean[j] = gather(scene.means + j, 3);
+      gaussian.log_scale[j] = gather(scene.log_scales + j, 3);
+    }
+    for (int j = 0; j < 4; ++j) gaussian.quat[j] = gather(scene.quats + j, 4);
+    gaussian.opacity_logit = gather(scene.opacity_logits, 1);
+    const int64_t stride = 3 * scene.coefficients;
+    for (int64_t j = 0; j < stride; ++j) sh[j] = gather(scene.sh + j, stride);
+    gaussian.sh = sh;
+    gaussian.coefficients = int(scene.coefficients);
+  }
+  Batch(const Batch&) = delete;  // ``gaussian`` points into it
+};
+
+// Calls body(first) for all batches, a block of them at a time.
+template <class Body>
+void each_batch(const Scene& scene, const Body& body) {
+  parallel_for(ceil_div(scene.gaussians, BLOCK), scene.threads, [&](int64_t block) {
+    const int64_t end = std::min((block + 1) * BLOCK, scene.gaussians);
+    for (int64_t first = block * BLOCK; first < end; first += LANES) body(first);
+  });
+}
+
+splat::Camera<Wide> camera_of(const Scene& scene, int64_t v) {
+  return splat::make_camera<Wide>(scene.world_to_camera + 16 * v, scene.intrinsics + 9 * v, int(scene.width),
+                                  int(scene.height));
 }
 
 // ---------------------------------------------------------------------------------------------- project
 
-void project_gaussian(const Scene& scene, Frame& frame, int64_t i, float* means2d, float* radii) {
-  const splat::Gaussian<double> gaussian = load_gaussian(scene, i);
-  splat::Shape<double> shape;
-  const bool is_sound = splat::make_shape(gaussian, shape);
+// The tiles of one axis that hold pixel centres within ``reach`` of ``centre``, as in ``Splat``.
+Ints touched_tiles(Floats centre, Floats reach, int64_t tiles, Mask is_seen) {
+  const Floats slack = 1e-3f + 1e-6f * (simd::absolute(centre) + reach);  // more than the rounding
+  const auto tile = [&](Floats pixel) {
+    return simd::to_ints(simd::min(simd::max(pixel * (1.0f / TILE), Floats{}), spread(float(tiles))));
+  };
+  const Ints first = tile(centre - reach + 0.5f - slack);
+  const Ints end = tile(centre + reach - 0.5f + slack + float(TILE));
+  return simd::select(simd::both(is_seen, simd::less(first, end)), first | end << 16, Ints{});
+}
+
+void project_batch(const Scene& scene, Frame& frame, int64_t first, float* means2d, float* radii) {
+  const Batch batch(scene, first);
+  splat::Shape<Wide> shape;
+  const Truths is_sound = splat::make_shape(batch.gaussian, shape);
   for (int64_t v = 0; v < scene.views; ++v) {
-    const splat::Camera<double>& camera = frame.views[size_t(v)].camera;
-    const int64_t at = v * scene.gaussians + i;
-    Splat& out = frame.splats[at];
-    splat::Footprint<double> footprint;
-    if (!is_sound || !splat::project(gaussian, shape, camera, footprint)) {
-      out.reach_x = out.reach_y = radii[at] = means2d[2 * at] = means2d[2 * at + 1] = 0;
-      continue;
+    const splat::Camera<Wide>& camera = frame.views[size_t(v)].camera;
+    splat::Footprint<Wide> footprint;
+    const Mask is_seen = (is_sound & splat::project(batch.gaussian, shape, camera, footprint)).mask;
+    Wide rgb[3];
+    splat::colour(batch.gaussian, camera, rgb);
+    const Wide &x = footprint.mean2d[0], &y = footprint.mean2d[1];
+    const Floats reach[2] = {footprint.reach[0].lanes, footprint.reach[1].lanes};
+    Ints columns = touched_tiles(x.lanes, reach[0], frame.tiles_x, is_seen);
+    Ints rows = touched_tiles(y.lanes, reach[1], frame.tiles_y, is_seen);
+    const Mask is_on_tiles = simd::both(simd::less(Ints{}, columns), simd::less(Ints{}, rows));
+    columns = simd::select(is_on_tiles, columns, Ints{}), rows = simd::select(is_on_tiles, rows, Ints{});
+    const Wide fields[SPLAT_FIELDS] = {x,
+                                       y,
+                                       footprint.l11,
+                                       footprint.l12,
+                                       footprint.l22,
+                                       shape.log_cut,
+                                       shape.opacity,
+                                       footprint.centre[2],
+                                       rgb[0],
+                                       rgb[1],
+                                       rgb[2],
+                                       simd::as_floats(columns),
+                                       simd::as_floats(rows)};
+    float radius[LANES], centre[2][LANES];
+    simd::store(radius, simd::keep(is_seen, simd::max(reach[0], reach[1])));
+    for (int j = 0; j < 2; ++j) simd::store(centre[j], simd::keep(is_seen, fields[j].lanes));
+    const int64_t at = v * scene.gaussians + first;
+    for (int lane = 0; lane < batch.count; ++lane) {
+      char* out = reinterpret_cast<char*>(&frame.splats[at + lane]);
+      for (int j = 0; j < SPLAT_FIELDS; ++j)
+        std::memcpy(out + 4 * j, reinterpret_cast<const char*>(fields + j) + 4 * lane, 4);
+      radii[at + lane] = radius[lane];
+      for (int j = 0; j < 2; ++j) means2d[2 * (at + lane) + j] = centre[j][lane];
     }
-    double rgb[3];
-    splat::colour(gaussian, camera, rgb);
-    out.x = float(footprint.mean2d[0]), out.y = float(footprint.mean2d[1]);
-    out.l11 = float(footprint.l11), out.l12 = float(footprint.l12), out.l22 = float(footprint.l22);
-    out.cut = float(shape.log_cut), out.opacity = float(shape.opacity),
-    out.depth = float(footprint.centre[2]);
-    for (int c = 0; c < 3; ++c) out.rgb[c] = float(rgb[c]);
-    out.reach_x = float(footprint.reach[0]), out.reach_y = float(footprint.reach[1]);
-    radii[at] = std::max(out.reach_x, out.reach_y);
-    means2d[2 * at] = out.x, means2d[2 * at + 1] = out.y;
   }
 }
 
 // ---------------------------------------------------------------------------------------------- tile lists
 
-struct Range {
-  int first, last;  // both included; empty if last < first
-};
-
-// Pixels whose centres lie in [low, high], widened by more than the rounding of either bound.
-Range pixels_between(double low, double high, int64_t size) {
-  const double slack = 1e-3 + 1e-6 * (std::fabs(low) + std::fabs(high));
-  const double first = std::ceil(low - slack - 0.5), last = std::floor(high + slack - 0.5);
-  return {int(std::min(std::max(first, 0.0), double(size))),
-          int(std::max(std::min(last, double(size - 1)), -1.0))};
-}
-
-Range pixel_rows(const Splat& s, int64_t height) {
-  return pixels_between(double(s.y) - s.reach_y, double(s.y) + s.reach_y, height);
-}
-
-// The tile columns where the ellipse |L d|^2 <= cut meets the pixel rows [first, last].
-Span touched_columns(const Splat& s, Range rows, int64_t width) {
-  const double low = rows.first + 0.5 - s.y - 1e-3, high = rows.last + 0.5 - s.y + 1e-3;
-  const double slope = -double(s.l12) / s.l11;  // the middle of a row at height d lies at slope * d
-  const double extreme = slope * s.reach_y * (double(s.reach_y) / s.reach_x);  // of the rightmost point
-  const auto half_width = [&](double d) {
-    return std::sqrt(std::max(s.cut - s.l22 * d * s.l22 * d, 0.0)) / s.l11;
-  };
-  const double right = std::min(std::max(extreme, low), high), left = std::min(std::max(-extreme, low), high);
-  const Range columns =
-      pixels_between(std::max(slope * left - half_width(left), -double(s.reach_x)) + s.x,
-                     std::min(slope * right + half_width(right), double(s.reach_x)) + s.x, width);
-  if (columns.last < columns.first) return {0, 0};
-  return {uint16_t(columns.first / TILE), uint16_t(columns.last / TILE + 1)};
-}
-
-// Stable least-significant-digit radix sort of ``order`` by positive depth.
+// Stable least-significant-digit radix sort of ``order`` by positive depth, over the bits in which depths
+// differ.
 void sort_by_depth(std::vector<uint32_t>& order, const Splat* splats) {
-  constexpr int BITS = 11, BINS = 1 << BITS;
+  constexpr int BITS = 12, BINS = 1 << BITS;
   struct Item {
     uint32_t key, gaussian;
   };
   const size_t n = order.size();
-  std::vector<Item> items(n), swap(n);
-  std::vector<uint32_t> counts(3 * BINS, 0);
+  if (n == 0) return;
+  Buffer<Item> items, swap;
+  items.allocate(int64_t(n)), swap.allocate(int64_t(n));
+  uint32_t low = UINT32_MAX, high = 0;
   for (size_t i = 0; i < n; ++i) {
     uint32_t key;
     std::memcpy(&key, &splats[order[i]].depth, 4);
-    items[i] = {key, order[i]};
-    for (int pass = 0; pass < 3; ++pass)
-      ++counts[size_t(pass * BINS) + ((key >> (BITS * pass)) & (BINS - 1))];
+    items[int64_t(i)] = {key, order[i]};
+    low = std::min(low, key), high = std::max(high, key);
   }
-  for (int pass = 0; pass < 3; ++pass) {
-    uint32_t* count = counts.data() + pass * BINS;
-    uint32_t sum = 0;
-    for (int bin = 0; bin < BINS; ++bin) {
-      const uint32_t here = count[bin];
-      count[bin] = sum;
+  for (int shift = 0; shift < 32 && (high - low) >> shift > 0; shift += BITS) {
+    uint32_t counts[BINS] = {}, sum = 0;
+    const auto bin = [&](const Item& item) { return (item.key - low) >> shift & (BINS - 1); };
+    for (size_t i = 0; i < n; ++i) ++counts[bin(items[int64_t(i)])];
+    for (uint32_t& count : counts) {
+      const uint32_t here = count;
+      count = sum;
       sum += here;
     }
-    for (const Item& item : items) swap[count[(item.key >> (BITS * pass)) & (BINS - 1)]++] = item;
-    items.swap(swap);
+    for (size_t i = 0; i < n; ++i) swap[counts[bin(items[int64_t(i)])]++] = items[int64_t(i)];
+    std::swap(items, swap);
   }
-  for (size_t i = 0; i < n; ++i) order[i] = items[i].gaussian;
+  for (size_t i = 0; i < n; ++i) order[i] = items[int64_t(i)].gaussian;
 }
 
-Range tile_rows(const Splat& s, int64_t height) {
-  const Range rows = pixel_rows(s, height);
-  return rows.last < rows.first ? Range{0, -1} : Range{rows.first / TILE, rows.last / TILE};
-}
-
-// Visible Gaussians in depth order, and room for the spans of each.
+// Who is on the screen in depth order, the slots of each, and where the list of each tile starts.
 void order_view(const Scene& scene, const Frame& frame, View& view, const Splat* splats) {
-  view.first_span.allocate(scene.gaussians + 1);
-  uint32_t spans = 0;
-  for (int64_t i = 0; i < scene.gaussians; ++i) {
-    view.first_span[i] = spans;
-    if (splats[i].reach_x <= 0) continue;
-    const Range rows = tile_rows(splats[i], scene.height);
-    if (rows.last < rows.first) continue;
-    const uint32_t count = uint32_t(rows.last - rows.first + 1);
-    if (spans > UINT32_MAX - count) throw Status(TOO_LARGE);
-    spans += count;
-    view.order.push_back(uint32_t(i));
-  }
-  view.first_span[scene.gaussians] = spans;
-  view.spans.allocate(spans);
-  view.first_slot.allocate(int64_t(spans) + 1);
-  view.first_entry.allocate(frame.tiles() + 1);
-  sort_by_depth(view.order, splats);
-}
-
-void fill_spans(const Scene& scene, View& view, const Splat* splats, int64_t i) {
-  const uint32_t begin = view.first_span[i], end = view.first_span[i + 1];
-  if (begin == end) return;
-  const Range pixels = pixel_rows(splats[i], scene.height);
-  for (uint32_t span = begin; span < end; ++span) {
-    const int top = (pixels.first / TILE + int(span - begin)) * TILE;
-    view.spans[span] = touched_columns(
-        splats[i], {std::max(pixels.first, top), std::min(pixels.last, top + TILE - 1)}, scene.width);
-  }
-}
-
-// How many slots each span needs and where each tile's list starts.
-void count_entries(const Scene& scene, const Frame& frame, View& view, const Splat* splats) {
-  // By how many the lists grow from one tile to the next in its row.
-  std::vector<int64_t> change(size_t(frame.tiles_y * (frame.tiles_x + 1)), 0);
+  const int64_t stride = frame.tiles_x + 1;
+  // By how many the lists grow from one tile to the next, along x and y: four changes per box.
+  std::vector<int64_t> change(size_t(stride * (frame.tiles_y + 1)), 0);
+  view.first_slot.allocate(scene.gaussians + 1);
+  view.order.resize(size_t(scene.gaussians));
   uint64_t slots = 0;
+  size_t visible = 0;
   for (int64_t i = 0; i < scene.gaussians; ++i) {
-    const uint32_t begin = view.first_span[i], end = view.first_span[i + 1];
-    if (begin == end) continue;
-    int64_t row = tile_rows(splats[i], scene.height).first;
-    for (uint32_t span = begin; span < end; ++span, ++row) {
-      view.first_slot[span] = uint32_t(slots);
-      const Span columns = view.spans[span];
-      slots += uint64_t(columns.end - columns.first);
-      ++change[size_t(row * (frame.tiles_x + 1) + columns.first)];
-      --change[size_t(row * (frame.tiles_x + 1) + columns.end)];
-    }
+    const Range columns = unpack(splats[i].columns), rows = unpack(splats[i].rows);
+    view.first_slot[i] = uint32_t(slots);
+    view.order[visible] = uint32_t(i);
+    visible += rows.size() > 0;
+    slots += uint64_t(columns.size()) * rows.size();
     if (slots > UINT32_MAX) throw Status(TOO_LARGE);
+    ++change[size_t(rows.first * stride + columns.first)];
+    --change[size_t(rows.first * stride + columns.end)];
+    --change[size_t(rows.end * stride + columns.first)];
+    ++change[size_t(rows.end * stride + columns.end)];
   }
-  view.first_slot[view.first_span[scene.gaussians]] = uint32_t(slots);
+  view.first_slot[scene.gaussians] = uint32_t(slots);
+  view.order.resize(visible);
+  sort_by_depth(view.order, splats);
+
+  view.first_entry.allocate(frame.tiles() + 1);
   uint32_t entries = 0;
   for (int64_t row = 0; row < frame.tiles_y; ++row) {
     int64_t here = 0;
     for (int64_t column = 0; column < frame.tiles_x; ++column) {
       view.first_entry[row * frame.tiles_x + column] = entries;
-      here += change[size_t(row * (frame.tiles_x + 1) + column)];
+      int64_t& along_y = change[size_t(row * stride + column)];
+      if (row > 0) along_y += change[size_t((row - 1) * stride + column)];
+      here += along_y;
       entries += uint32_t(here);
     }
   }
   view.first_entry[frame.tiles()] = entries;
-  view.entries.allocate(int64_t(slots));
-  view.rank_of_slot.allocate(int64_t(slots));
+  view.entries.allocate(entries);
+}
+
+// What is needed ``AHEAD`` places later is asked for now: lists point all over memory.
+constexpr int AHEAD = 6;
+inline void prefetch(const void* address) {
+  __builtin_prefetch(address);
+  asm volatile("" : : "r"(address));  // GCC takes a function that only prefetches for one that does nothing
 }
 
 // Writes the lists of the tile rows [row_begin, row_end): near splats first, so every list is in depth order.
-void fill_entries(const Scene& scene, const Frame& frame, View& view, const Splat* splats, int64_t row_begin,
-                  int64_t row_end) {
-  std::vector<uint32_t> filled(size_t((row_end - row_begin) * frame.tiles_x), 0);
-  for (const uint32_t i : view.order) {
-    const int64_t first_row = tile_rows(splats[i], scene.height).first;
-    const int64_t begin = view.first_span[i], end = view.first_span[i + 1];
-    const int64_t from = std::max(first_row, row_begin), to = std::min(first_row + (end - begin), row_end);
+void fill_entries(const Frame& frame, View& view, const Splat* splats, int64_t row_begin, int64_t row_end) {
+  std::vector<uint32_t> next(size_t((row_end - row_begin) * frame.tiles_x));
+  const int64_t first_tile = row_begin * frame.tiles_x;
+  for (size_t tile = 0; tile < next.size(); ++tile) next[tile] = view.first_entry[first_tile + int64_t(tile)];
+  const size_t n = view.order.size();
+  for (size_t nth = 0; nth < n; ++nth) {
+    if (nth + AHEAD < n) prefetch(&splats[view.order[nth + AHEAD]].columns);
+    const uint32_t i = view.order[nth];
+    const Range columns = unpack(splats[i].columns), rows = unpack(splats[i].rows);
+    const int64_t from = std::max<int64_t>(rows.first, row_begin), to = std::min<int64_t>(rows.end, row_end);
     for (int64_t row = from; row < to; ++row) {
-      const int64_t span = begin + (row - first_row);
-      const Span columns = view.spans[span];
-      uint32_t slot = view.first_slot[span];
-      for (int64_t column = columns.first; column < columns.end; ++column, ++slot) {
-        const uint32_t rank = filled[size_t((row - row_begin) * frame.tiles_x + column)]++;
-        view.entries[view.first_entry[row * frame.tiles_x + column] + rank] = i;
-        view.rank_of_slot[slot] = rank;
-      }
+      uint32_t slot = view.first_slot[i] + uint32_t(row - rows.first) * columns.size();
+      uint32_t* const of_row = next.data() + (row - row_begin) * frame.tiles_x;
+      for (uint32_t column = columns.first; column < columns.end; ++column)
+        view.entries[of_row[column]++] = {i, slot++};
     }
   }
 }
 
 void build_tile_lists(const Scene& scene, Frame& frame) {
-  const int64_t blocks = ceil_div(scene.gaussians, BLOCK);
-  const auto splats = [&](int64_t v) { return frame.splats.data() + v * scene.gaussians; };
   std::atomic<int> trouble{OK};  // an exception must not leave a thread
-  const auto each_view = [&](auto&& stage) {
-    parallel_for(scene.views, scene.threads, [&](int64_t v) {
+  const auto each = [&](int64_t items, auto&& stage) {
+    parallel_for(items, scene.threads, [&](int64_t item) {
       try {
-        stage(frame.views[size_t(v)], splats(v));
+        stage(item);
       } catch (Status status) {
         trouble = status;
       } catch (...) {
@@ -337,25 +379,15 @@ void build_tile_lists(const Scene& scene, Frame& frame) {
     });
     if (trouble != OK) throw Status(trouble.load());
   };
-  each_view([&](View& view, const Splat* of_view) { order_view(scene, frame, view, of_view); });
-  parallel_for(scene.views * blocks, scene.threads, [&](int64_t item) {
-    const int64_t v = item / blocks, begin = item % blocks * BLOCK;
-    for (int64_t i = begin; i < std::min(begin + BLOCK, scene.gaussians); ++i)
-      fill_spans(scene, frame.views[size_t(v)], splats(v), i);
-  });
-  each_view([&](View& view, const Splat* of_view) { count_entries(scene, frame, view, of_view); });
+  const auto splats = [&](int64_t v) { return frame.splats.data() + v * scene.gaussians; };
+  each(scene.views, [&](int64_t v) { order_view(scene, frame, frame.views[size_t(v)], splats(v)); });
   const int64_t bands = std::min(
       frame.tiles_y, std::max<int64_t>(ceil_div(scene.threads, std::max<int64_t>(scene.views, 1)), 1));
-  parallel_for(scene.views * bands, scene.threads, [&](int64_t item) {
+  each(scene.views * bands, [&](int64_t item) {
     const int64_t v = item / bands, band = item % bands;
-    try {
-      fill_entries(scene, frame, frame.views[size_t(v)], splats(v), band * frame.tiles_y / bands,
-                   (band + 1) * frame.tiles_y / bands);
-    } catch (...) {
-      trouble = OUT_OF_MEMORY;
-    }
+    fill_entries(frame, frame.views[size_t(v)], splats(v), band * frame.tiles_y / bands,
+                 (band + 1) * frame.tiles_y / bands);
   });
-  if (trouble != OK) throw Status(trouble.load());
 }
 
 // ---------------------------------------------------------------------------------------------- blend
@@ -372,150 +404,180 @@ Place place_of(const Scene& scene, const Frame& frame, int64_t tile) {
           int(std::min<int64_t>(TILE, scene.height - y))};
 }
 
-// Rows and vectors of a tile inside the box of a splat.
-struct Window {
-  int row_begin, row_end, group_begin, group_end;
+// Where the pixels of a cell lie from its middle, and the middles of the cells from the corner of the tile.
+struct Grid {
+  float offset_x[CELL * CELL], offset_y[CELL * CELL], middle_x[CELLS], middle_y[CELLS];
+};
+constexpr Grid make_grid() {
+  Grid grid{};
+  for (int i = 0; i < CELL * CELL; ++i) {
+    grid.offset_x[i] = float(i % CELL) - 1.5f, grid.offset_y[i] = float(i / CELL) - 1.5f;
+    grid.middle_x[i] = float(CELL * (i % CELL)) + 2.0f, grid.middle_y[i] = float(CELL * (i / CELL)) + 2.0f;
+  }
+  return grid;
+}
+constexpr Grid GRID = make_grid();
+
+// y = L d of a splat: at the middle of each cell, and what a pixel adds to that.
+struct Aim {
+  alignas(64) float u[CELLS], t[CELLS];
+  Floats pixel_u[PARTS], pixel_t[PARTS];
 };
 
-inline int clamp_to_tile(float pixel) { return int(std::min(std::max(pixel, 0.0f), float(TILE))); }
-
-inline Window window_of(const Splat& s, float x, float y) {  // centre relative to the tile
-  const float slack_x = 1e-3f + 1e-6f * (std::fabs(s.x) + s.reach_x);
-  const float slack_y = 1e-3f + 1e-6f * (std::fabs(s.y) + s.reach_y);
-  const int top = clamp_to_tile(std::floor(y - s.reach_y - slack_y + 0.5f));
-  const int bottom = clamp_to_tile(std::floor(y + s.reach_y + slack_y + 0.5f));
-  const int left = clamp_to_tile(std::floor(x - s.reach_x - slack_x + 0.5f));
-  const int right = clamp_to_tile(std::floor(x + s.reach_x + slack_x + 0.5f));
-  return {top, bottom, left / LANES, (right + LANES - 1) / LANES};
+// Forward and backward both call it and ``falloff``: they agree to the last bit on who is skipped. ``x`` and
+// ``y`` are the centre, relative to the tile.
+inline void take_aim(const Splat& s, float x, float y, Aim& aim) {
+  const Floats l11 = spread(s.l11), l12 = spread(s.l12), l22 = spread(s.l22);
+  for (int part = 0; part < PARTS; ++part) {
+    const int at = part * LANES;
+    const Floats dx = simd::load(GRID.middle_x + at) - x, dy = simd::load(GRID.middle_y + at) - y;
+    simd::store(aim.u + at, simd::fma(l11, dx, l12 * dy));
+    simd::store(aim.t + at, l22 * dy);
+    const Floats offset_y = simd::load(GRID.offset_y + at);
+    aim.pixel_u[part] = simd::fma(l11, simd::load(GRID.offset_x + at), l12 * offset_y);
+    aim.pixel_t[part] = l22 * offset_y;
+  }
 }
 
-struct Columns {
-  float x[TILE];
-};
-constexpr Columns pixel_centres() {
-  Columns columns{};
-  for (int i = 0; i < TILE; ++i) columns.x[i] = float(i) + 0.5f;
-  return columns;
+// A bit for each cell that |L d|^2 <= cut can reach: within a cell, u and t leave their middle by so much
+// only.
+inline uint32_t reachable_cells(const Splat& s, const Aim& aim) {
+  const Floats margin_u = spread(1.5f * (s.l11 + std::fabs(s.l12))), margin_t = spread(1.5f * s.l22);
+  const Floats cut = spread(s.cut + 1e-3f);  // and more than the rounding
+  uint32_t cells = 0;
+  for (int part = 0; part < PARTS; ++part) {
+    const Floats u = simd::max(simd::absolute(simd::load(aim.u + part * LANES)) - margin_u, Floats{});
+    const Floats t = simd::max(simd::absolute(simd::load(aim.t + part * LANES)) - margin_t, Floats{});
+    cells |= simd::bits(simd::less_equal(simd::fma(u, u, t * t), cut)) << (part * LANES);
+  }
+  return cells;
 }
-constexpr Columns CENTRES = pixel_centres();
 
-// |L d|^2 of a row of pixels. Forward and backward both call it and agree to the last bit on who is skipped.
 struct Falloff {
-  Floats u, exponent;
+  Floats u, t, exponent;
 };
-inline Falloff falloff(Floats dx, Floats l11, Floats u_of_row, Floats t_squared) {
-  const Floats u = simd::fma(l11, dx, u_of_row);
-  return {u, simd::fma(u, u, t_squared)};
+inline Falloff falloff(const Aim& aim, int cell, int part) {
+  const Floats u = aim.pixel_u[part] + aim.u[cell], t = aim.pixel_t[part] + aim.t[cell];
+  return {u, t, simd::fma(u, u, t * t)};
 }
 
-// The pixels of one vector, field by field. What a splat touches lies together, and no two fields sit a
-// multiple of 4096 bytes apart, which the processor would take for the same address.
-struct Cell {
+// The pixels of one vector, field by field: what a splat touches lies together.
+struct Pixels {
   Floats transmittance, red, green, blue, weight, depth;  // depth: sum w z, in the end the expected z
-  Ints last;
 };
-struct CellBackward {
+struct PixelsBackward {
   Floats transmittance, suffix, red, green, blue, far, depth;  // red .. far: gradients of what a weight adds
   Ints last;
 };
 
-// What is needed ``AHEAD`` places later is asked for now: lists point all over memory.
-constexpr int AHEAD = 6;
-inline void prefetch(const void* address) {
-  __builtin_prefetch(address);
-  asm volatile("" : : "r"(address));  // GCC takes a function that only prefetches for one that does nothing
+// Calls visit(vector, lane, pixel) for the pixels of a tile that lie inside the image.
+template <class Visit>
+void each_pixel(const Scene& scene, const Place& place, const Visit& visit) {
+  for (int row = 0; row < place.rows; ++row) {
+    const int64_t first = (place.y + row) * scene.width + place.x;
+    for (int column = 0; column < place.columns; ++column) {
+      const int cell = row / CELL * (TILE / CELL) + column / CELL;
+      const int at = cell * CELL * CELL + row % CELL * CELL + column % CELL;
+      visit(at / LANES, at % LANES, first + column);
+    }
+  }
 }
+
+inline float* floats_of(Floats& vector) { return reinterpret_cast<float*>(&vector); }
+
+constexpr int NEVER = INT32_MAX;
 
 void blend_tile(const Scene& scene, const Frame& frame, View& view, const Splat* splats, int64_t tile,
                 const float* background, float* rgb, float* alpha, float* depth, bool keeps) {
-  Cell cells[TILE][GROUPS];
-  Mask open[TILE][GROUPS];
-  bool row_is_open[TILE];
+  Pixels pixels[CELLS * PARTS];
+  Ints last[CELLS * PARTS];
+  Mask open[CELLS * PARTS];
+  uint32_t open_cells = 0;
   const Place place = place_of(scene, frame, tile);
-  int open_rows = place.rows;
-  for (int row = 0; row < TILE; ++row) {
-    row_is_open[row] = row < place.rows;
-    for (int group = 0; group < GROUPS; ++group) {
-      const Floats x = simd::load(CENTRES.x + group * LANES);
-      open[row][group] = row_is_open[row] ? simd::less_equal(x, spread(float(place.columns))) : simd::none();
-      cells[row][group] = Cell{};
-      cells[row][group].transmittance = spread(1.0f);
+  for (int cell = 0; cell < CELLS; ++cell) {
+    for (int part = 0; part < PARTS; ++part) {
+      const int at = cell * PARTS + part;
+      pixels[at] = Pixels{};
+      pixels[at].transmittance = spread(1.0f);
+      const Floats x = simd::load(GRID.offset_x + part * LANES) + GRID.middle_x[cell];
+      const Floats y = simd::load(GRID.offset_y + part * LANES) + GRID.middle_y[cell];
+      open[at] = simd::both(simd::less_equal(x, spread(float(place.columns))),
+                            simd::less_equal(y, spread(float(place.rows))));
+      last[at] = simd::select(open[at], spread(NEVER), Ints{});
+      open_cells |= uint32_t(simd::any(open[at])) << cell;
     }
   }
 
   const int64_t begin = view.first_entry[tile], end = view.first_entry[tile + 1];
   const Floats alpha_max = spread(float(SPLAT_ALPHA_MAX)), stop = spread(float(SPLAT_TRANSMITTANCE_MIN));
-  for (int64_t entry = begin; entry < end && open_rows > 0; ++entry) {
-    if (entry + AHEAD < end) prefetch(splats + view.entries[entry + AHEAD]);
-    const Splat& s = splats[view.entries[entry]];
-    const float x = s.x - float(place.x), y = s.y - float(place.y);
-    const Window window = window_of(s, x, y);
-    const Floats centre = spread(x), l11 = spread(s.l11), cut = spread(s.cut), opacity = spread(s.opacity);
+  int64_t entry = begin;
+  for (; entry < end && open_cells != 0; ++entry) {
+    if (entry + AHEAD < end) prefetch(splats + view.entries[entry + AHEAD].gaussian);
+    const Splat& s = splats[view.entries[entry].gaussian];
+    Aim aim;
+    take_aim(s, s.x - float(place.x), s.y - float(place.y), aim);
+    const Floats cut = spread(s.cut), opacity = spread(s.opacity);
     const Floats r = spread(s.rgb[0]), g = spread(s.rgb[1]), b = spread(s.rgb[2]), z = spread(s.depth);
-    const Ints mark = spread(int(entry - begin) + 1);
-    for (int row = window.row_begin; row < window.row_end; ++row) {
-      if (!row_is_open[row]) continue;
-      const float dy = (float(row) + 0.5f) - y, t = s.l22 * dy;
-      const Floats u_of_row = spread(s.l12 * dy), t_squared = spread(t * t);
-      bool has_stopped = false;
-      for (int group = window.group_begin; group < window.group_end; ++group) {
-        Cell& cell = cells[row][group];
-        const Falloff fall =
-            falloff(simd::load(CENTRES.x + group * LANES) - centre, l11, u_of_row, t_squared);
-        Mask hit = simd::both(simd::less_equal(fall.exponent, cut), open[row][group]);
+    uint32_t reached = 0, closed = 0;
+    for (uint32_t left = reachable_cells(s, aim) & open_cells; left != 0; left &= left - 1) {
+      const int cell = __builtin_ctz(left);
+      for (int part = 0; part < PARTS; ++part) {
+        const int at = cell * PARTS + part;
+        const Falloff fall = falloff(aim, cell, part);
+        Mask hit = simd::both(simd::less_equal(fall.exponent, cut), open[at]);
         if (!simd::any(hit)) continue;
+        reached |= 1u << cell;
+        Pixels& p = pixels[at];
         Floats a = simd::keep(hit, simd::min(opacity * simd::exp_minus(fall.exponent), alpha_max));
-        const Floats before = cell.transmittance;
+        const Floats before = p.transmittance;
         Floats after = simd::fma(-a, before, before);
         const Mask stops = simd::both(hit, simd::less_equal(after, stop));
         if (simd::any(stops)) {
-          open[row][group] = simd::first_only(open[row][group], stops);
+          open[at] = simd::first_only(open[at], stops);
+          last[at] = simd::select(stops, spread(int(entry - begin)), last[at]);
           hit = simd::first_only(hit, stops);
           a = simd::keep(hit, a);
           after = simd::fma(-a, before, before);
-          has_stopped = true;
+          closed |= 1u << cell;
         }
         const Floats w = a * before;
-        cell.transmittance = after;
-        cell.last = simd::select(hit, mark, cell.last);
-        cell.red = simd::fma(w, r, cell.red);
-        cell.green = simd::fma(w, g, cell.green);
-        cell.blue = simd::fma(w, b, cell.blue);
-        cell.depth = simd::fma(w, z, cell.depth);
-        cell.weight += w;
+        p.transmittance = after;
+        p.red = simd::fma(w, r, p.red);
+        p.green = simd::fma(w, g, p.green);
+        p.blue = simd::fma(w, b, p.blue);
+        p.depth = simd::fma(w, z, p.depth);
+        p.weight += w;
       }
-      if (has_stopped) {
-        bool is_open = false;
-        for (int group = 0; group < GROUPS; ++group) is_open = is_open || simd::any(open[row][group]);
-        row_is_open[row] = is_open;
-        open_rows -= !is_open;
-      }
+    }
+    if (keeps) view.reached[entry] = uint16_t(reached);
+    for (; closed != 0; closed &= closed - 1) {
+      const int cell = __builtin_ctz(closed);
+      bool is_open = false;
+      for (int part = 0; part < PARTS; ++part) is_open = is_open || simd::any(open[cell * PARTS + part]);
+      if (!is_open) open_cells &= ~(1u << cell);
     }
   }
 
-  int used = 0;
-  for (int row = 0; row < place.rows; ++row) {
-    for (int column = 0; column < place.columns; ++column) {
-      Cell& cell = cells[row][column / LANES];
-      const int lane = column % LANES;
-      const int64_t pixel = (place.y + row) * scene.width + place.x + column;
-      const float through = cell.transmittance[lane], weight = cell.weight[lane];
-      rgb[3 * pixel] = cell.red[lane] + through * background[0];
-      rgb[3 * pixel + 1] = cell.green[lane] + through * background[1];
-      rgb[3 * pixel + 2] = cell.blue[lane] + through * background[2];
-      alpha[pixel] = weight;
-      depth[pixel] = weight > 0 ? cell.depth[lane] / weight : 0.0f;
-      used = std::max(used, int(cell.last[lane]));
-    }
+  for (Pixels& p : pixels) {
+    p.red = simd::fma(p.transmittance, spread(background[0]), p.red);
+    p.green = simd::fma(p.transmittance, spread(background[1]), p.green);
+    p.blue = simd::fma(p.transmittance, spread(background[2]), p.blue);
+    const Mask is_touched = simd::greater(p.weight, Floats{});
+    p.depth = simd::keep(is_touched, p.depth / simd::select(is_touched, p.weight, spread(1.0f)));
   }
+  each_pixel(scene, place, [&](int vector, int lane, int64_t pixel) {
+    Pixels& p = pixels[vector];
+    rgb[3 * pixel] = floats_of(p.red)[lane];
+    rgb[3 * pixel + 1] = floats_of(p.green)[lane];
+    rgb[3 * pixel + 2] = floats_of(p.blue)[lane];
+    alpha[pixel] = floats_of(p.weight)[lane];
+    depth[pixel] = floats_of(p.depth)[lane];
+  });
   if (!keeps) return;
-  view.used[tile] = used;
-  for (int row = 0; row < TILE; ++row) {
-    for (int group = 0; group < GROUPS; ++group) {
-      const int64_t at = tile * AREA + row * TILE + group * LANES;
-      simd::store(&view.transmittance[at], cells[row][group].transmittance);
-      simd::store(&view.last[at], cells[row][group].last);
-    }
+  view.used[tile] = uint32_t(entry - begin);
+  for (int at = 0; at < CELLS * PARTS; ++at) {
+    simd::store(&view.transmittance[tile * AREA + at * LANES], pixels[at].transmittance);
+    simd::store(&view.last[tile * AREA + at * LANES], last[at]);
   }
 }
 
@@ -524,36 +586,30 @@ struct Images {
   const float *grad_rgb, *grad_alpha, *grad_depth;  // any may be null, which means zero
 };
 
-// Fills the cells; returns how many rows can hold a gradient, and the last rank of each row.
 void load_gradients(const Scene& scene, const View& view, int64_t tile, const Place& place,
-                    const float* background, const Images& images, CellBackward (&cells)[TILE][GROUPS],
-                    int (&row_last)[TILE]) {
-  for (int row = 0; row < TILE; ++row) {
-    row_last[row] = 0;
-    for (int group = 0; group < GROUPS; ++group) {
-      const int64_t at = tile * AREA + row * TILE + group * LANES;
-      cells[row][group] = CellBackward{};
-      cells[row][group].transmittance = simd::load(&view.transmittance[at]);
-      cells[row][group].last = simd::load(&view.last[at]);
-      for (int lane = 0; lane < LANES; ++lane) row_last[row] = std::max(row_last[row], view.last[at + lane]);
+                    const float* background, const Images& images, PixelsBackward (&pixels)[CELLS * PARTS]) {
+  Floats through[CELLS * PARTS] = {}, weight[CELLS * PARTS] = {};
+  for (PixelsBackward& p : pixels) p = PixelsBackward{};
+  each_pixel(scene, place, [&](int vector, int lane, int64_t pixel) {
+    PixelsBackward& p = pixels[vector];
+    if (images.grad_rgb) {
+      floats_of(p.red)[lane] = images.grad_rgb[3 * pixel];
+      floats_of(p.green)[lane] = images.grad_rgb[3 * pixel + 1];
+      floats_of(p.blue)[lane] = images.grad_rgb[3 * pixel + 2];
     }
-  }
-  for (int row = 0; row < place.rows; ++row) {
-    for (int column = 0; column < place.columns; ++column) {
-      CellBackward& cell = cells[row][column / LANES];
-      const int lane = column % LANES;
-      const int64_t pixel = (place.y + row) * scene.width + place.x + column;
-      float through = images.grad_alpha ? images.grad_alpha[pixel] : 0.0f;
-      if (images.grad_rgb) {
-        const float* grad = images.grad_rgb + 3 * pixel;
-        cell.red[lane] = grad[0], cell.green[lane] = grad[1], cell.blue[lane] = grad[2];
-        through -= grad[0] * background[0] + grad[1] * background[1] + grad[2] * background[2];
-      }
-      const float weight = images.alpha[pixel];
-      if (images.grad_depth && weight > 0) cell.far[lane] = images.grad_depth[pixel] / weight;
-      cell.depth[lane] = images.depth[pixel];
-      cell.suffix[lane] = -cell.transmittance[lane] * through;
-    }
+    if (images.grad_alpha) floats_of(through[vector])[lane] = images.grad_alpha[pixel];
+    if (images.grad_depth) floats_of(p.far)[lane] = images.grad_depth[pixel];
+    floats_of(p.depth)[lane] = images.depth[pixel];
+    floats_of(weight[vector])[lane] = images.alpha[pixel];
+  });
+  for (int at = 0; at < CELLS * PARTS; ++at) {
+    PixelsBackward& p = pixels[at];
+    p.transmittance = simd::load(&view.transmittance[tile * AREA + at * LANES]);
+    p.last = simd::load(&view.last[tile * AREA + at * LANES]);
+    const Mask is_touched = simd::greater(weight[at], Floats{});
+    p.far = simd::keep(is_touched, p.far / simd::select(is_touched, weight[at], spread(1.0f)));
+    const Floats behind = p.red * background[0] + p.green * background[1] + p.blue * background[2];
+    p.suffix = p.transmittance * (behind - through[at]);
   }
 }
 
@@ -561,68 +617,67 @@ void load_gradients(const Scene& scene, const View& view, int64_t tile, const Pl
 // (z - D) g_depth / A, and through its final transmittance. ``suffix`` is what lies behind a splat:
 // dLoss/dalpha = T v - suffix / (1 - alpha).
 void blend_tile_backward(const Scene& scene, const Frame& frame, const View& view, const Splat* splats,
-                         int64_t tile, const float* background, const Images& images, float* records) {
-  const int used = view.used[tile];
+                         int64_t tile, const float* background, const Images& images, Record* records) {
+  const int64_t begin = view.first_entry[tile], end = view.first_entry[tile + 1];
+  const int64_t used = view.used[tile];
+  for (int64_t entry = begin + used; entry < end; ++entry) records[view.entries[entry].slot] = Record{};
   if (used == 0) return;
-  CellBackward cells[TILE][GROUPS];
-  int row_last[TILE];
+  PixelsBackward pixels[CELLS * PARTS];
   const Place place = place_of(scene, frame, tile);
-  load_gradients(scene, view, tile, place, background, images, cells, row_last);
+  load_gradients(scene, view, tile, place, background, images, pixels);
 
-  const int64_t begin = view.first_entry[tile];
   const Floats alpha_max = spread(float(SPLAT_ALPHA_MAX)), one = spread(1.0f);
-  for (int rank = used - 1; rank >= 0; --rank) {
-    if (rank >= AHEAD) prefetch(splats + view.entries[begin + rank - AHEAD]);
-    const Splat& s = splats[view.entries[begin + rank]];
-    const float x = s.x - float(place.x), y = s.y - float(place.y);
-    const Window window = window_of(s, x, y);
-    const Floats centre = spread(x), l11 = spread(s.l11), cut = spread(s.cut), opacity = spread(s.opacity);
+  for (int64_t rank = used - 1; rank >= 0; --rank) {
+    if (rank >= AHEAD) prefetch(splats + view.entries[begin + rank - AHEAD].gaussian);
+    const Entry entry = view.entries[begin + rank];
+    const uint32_t reached = view.reached[begin + rank];
+    if (reached == 0) {
+      records[entry.slot] = Record{};
+      continue;
+    }
+    const Splat& s = splats[entry.gaussian];
+    Aim aim;
+    take_aim(s, s.x - float(place.x), s.y - float(place.y), aim);
+    const Floats cut = spread(s.cut), opacity = spread(s.opacity);
     const Floats r = spread(s.rgb[0]), g = spread(s.rgb[1]), b = spread(s.rgb[2]), z = spread(s.depth);
-    const Ints index = spread(rank);
+    const Ints index = spread(int(rank));
     Floats sum_g{}, sum_gu{}, sum_gt{}, sum_guu{}, sum_gut{}, sum_gtt{};
     Floats sum_red{}, sum_green{}, sum_blue{}, sum_z{};
-    for (int row = window.row_begin; row < window.row_end; ++row) {
-      if (rank >= row_last[row]) continue;
-      const float dy = (float(row) + 0.5f) - y, t = s.l22 * dy;
-      const Floats u_of_row = spread(s.l12 * dy), t_squared = spread(t * t), t_of_row = spread(t);
-      Floats row_g{}, row_gu{};
-      for (int group = window.group_begin; group < window.group_end; ++group) {
-        CellBackward& cell = cells[row][group];
-        const Falloff fall =
-            falloff(simd::load(CENTRES.x + group * LANES) - centre, l11, u_of_row, t_squared);
-        const Mask hit = simd::both(simd::less_equal(fall.exponent, cut), simd::less(index, cell.last));
-        if (!simd::any(hit)) continue;
+    for (uint32_t left = reached; left != 0; left &= left - 1) {
+      const int cell = __builtin_ctz(left);
+      for (int part = 0; part < PARTS; ++part) {
+        PixelsBackward& p = pixels[cell * PARTS + part];
+        const Falloff fall = falloff(aim, cell, part);
+        const Mask hit = simd::both(simd::less_equal(fall.exponent, cut), simd::less(index, p.last));
+        if (PARTS > 1 && !simd::any(hit)) continue;
         // Lanes that are not hit have alpha 0 from here on: they change nothing, and meet no slow denormals.
         const Floats free = simd::keep(hit, opacity * simd::exp_minus(fall.exponent));
         const Floats a = simd::min(free, alpha_max);
-        const Floats after = cell.transmittance, behind = cell.suffix;
-        const Floats inverse = one / (one - a), before = after * inverse;
+        const Floats after = p.transmittance, behind = p.suffix;
+        const Floats inverse = simd::reciprocal(one - a), before = after * inverse;
         const Floats w = a * before;
-        Floats value = (z - cell.depth) * cell.far;
-        value = simd::fma(r, cell.red, simd::fma(g, cell.green, simd::fma(b, cell.blue, value)));
+        Floats value = (z - p.depth) * p.far;
+        value = simd::fma(r, p.red, simd::fma(g, p.green, simd::fma(b, p.blue, value)));
         const Floats g_alpha = simd::fma(before, value, -(behind * inverse));
         const Mask flows = simd::less_equal(free, alpha_max);  // a capped alpha has no gradient
-        const Floats g_exponent = simd::keep(flows, -a * g_alpha), gu = g_exponent * fall.u;
-        cell.transmittance = before;
-        cell.suffix = simd::fma(w, value, behind);
-        row_g += g_exponent;
-        row_gu += gu;
+        const Floats g_exponent = simd::keep(flows, -a * g_alpha);
+        const Floats gu = g_exponent * fall.u, gt = g_exponent * fall.t;
+        p.transmittance = before;
+        p.suffix = simd::fma(w, value, behind);
+        sum_g += g_exponent;
+        sum_gu += gu;
+        sum_gt += gt;
         sum_guu = simd::fma(gu, fall.u, sum_guu);
-        sum_red = simd::fma(w, cell.red, sum_red);
-        sum_green = simd::fma(w, cell.green, sum_green);
-        sum_blue = simd::fma(w, cell.blue, sum_blue);
-        sum_z = simd::fma(w, cell.far, sum_z);
+        sum_gut = simd::fma(gu, fall.t, sum_gut);
+        sum_gtt = simd::fma(gt, fall.t, sum_gtt);
+        sum_red = simd::fma(w, p.red, sum_red);
+        sum_green = simd::fma(w, p.green, sum_green);
+        sum_blue = simd::fma(w, p.blue, sum_blue);
+        sum_z = simd::fma(w, p.far, sum_z);
       }
-      sum_g += row_g;
-      sum_gu += row_gu;
-      sum_gt = simd::fma(row_g, t_of_row, sum_gt);
-      sum_gut = simd::fma(row_gu, t_of_row, sum_gut);
-      sum_gtt = simd::fma(row_g, t_squared, sum_gtt);
     }
-    const simd::Quad record[3] = {simd::sums(sum_g, sum_gu, sum_gt, sum_guu),
-                                  simd::sums(sum_gut, sum_gtt, sum_red, sum_green),
-                                  simd::sums(sum_blue, sum_z, sum_z, sum_z)};
-    std::memcpy(records + int64_t(rank) * RECORD, record, sizeof record);
+    simd::store_sums(records[entry.slot].sums,
+                     {sum_g, sum_gu, sum_gt, sum_guu, sum_gut, sum_gtt, sum_red, sum_green, sum_blue, sum_z});
   }
 }
 
@@ -632,91 +687,80 @@ struct ParameterGradients {
   float *means2d, *means, *log_scales, *quats, *opacity_logits, *sh;
 };
 
-// Calls visit(record) for the records of one Gaussian in one view, tile row by tile row.
-template <class Visit>
-void each_record(const Scene& scene, const Frame& frame, const View& view, const Splat& s, int64_t i,
-                 const float* records, const Visit& visit) {
-  const uint32_t begin = view.first_span[i], end = view.first_span[i + 1];
-  if (begin == end) return;
-  int64_t row = tile_rows(s, scene.height).first;
-  for (uint32_t span = begin; span < end; ++span, ++row) {
-    const Span columns = view.spans[span];
-    uint32_t slot = view.first_slot[span];
-    for (int64_t column = columns.first; column < columns.end; ++column, ++slot) {
-      const int64_t tile = row * frame.tiles_x + column, rank = view.rank_of_slot[slot];
-      if (rank < view.used[tile]) visit(records + (view.first_record[tile] + rank) * RECORD);
-    }
+// The sums over the tiles of one view; false if no Gaussian of the batch is on the screen.
+bool gather_moments(const View& view, const Batch& batch, const Record* records,
+                    splat::Moments<Wide>& moments) {
+  if (view.first_slot[batch.first] == view.first_slot[batch.first + batch.count]) return false;
+  float sums[RECORD][LANES] = {};
+  for (int lane = 0; lane < batch.count; ++lane) {
+    const int64_t i = batch.first + lane;
+    alignas(64) Record sum{};
+    for (uint32_t slot = view.first_slot[i]; slot < view.first_slot[i + 1]; ++slot)
+      for (int j = 0; j < RECORD; j += LANES)
+        simd::store(sum.sums + j, simd::load(sum.sums + j) + simd::load(records[slot].sums + j));
+    for (int j = 0; j < MOMENTS; ++j) sums[j][lane] = sum.sums[j];
   }
+  Wide of[MOMENTS];
+  for (int j = 0; j < MOMENTS; ++j) of[j] = simd::load(sums[j]);
+  moments = {of[0], of[1], of[2], of[3], of[4], of[5], {of[6], of[7], of[8]}, of[9]};
+  return true;
 }
 
-// The sum of those records. False if there are none: it reached no pixel.
-bool gather(const Scene& scene, const Frame& frame, const View& view, const Splat* splats, int64_t i,
-            const float* records, splat::Moments<double>& moments) {
-  if (i + AHEAD < scene.gaussians)  // records lie in the order of the tiles: ask for them early
-    each_record(scene, frame, view, splats[i + AHEAD], i + AHEAD, records, [](const float* record) {
-      prefetch(record);
-      prefetch(record + RECORD - 1);
-    });
-  double sum[RECORD] = {};
-  bool has_any = false;
-  each_record(scene, frame, view, splats[i], i, records, [&](const float* record) {
-    for (int j = 0; j < RECORD; ++j) sum[j] += record[j];
-    has_any = true;
-  });
-  moments = {sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], {sum[6], sum[7], sum[8]}, sum[9]};
-  return has_any;
+void add_where(Truths condition, const splat::Gradient<Wide>& part, int64_t coefficients,
+               splat::Gradient<Wide>& total) {
+  for (int i = 0; i < 3; ++i) {
+    total.mean[i] += select(condition, part.mean[i], 0);
+    for (int j = 0; j < 3; ++j) total.axes[i][j] += select(condition, part.axes[i][j], 0);
+  }
+  total.opacity_logit += select(condition, part.opacity_logit, 0);
+  for (int64_t j = 0; j < 3 * coefficients; ++j) total.sh[j] += select(condition, part.sh[j], 0);
 }
 
-// Adds the gradients that the views [view_begin, view_end) give to one Gaussian.
-void gaussian_backward(const Scene& scene, const Frame& frame, int64_t view_begin, int64_t view_end,
-                       int64_t i, const float* records, const ParameterGradients& out) {
-  splat::Gaussian<double> gaussian;
-  splat::Shape<double> shape;
-  splat::Gradient<double> total;
-  bool is_loaded = false;
+// Adds the gradients that the views [view_begin, view_end) give to LANES Gaussians.
+void batch_backward(const Scene& scene, const Frame& frame, int64_t view_begin, int64_t view_end,
+                    int64_t first, const Record* const* records, const ParameterGradients& out) {
+  const Batch batch(scene, first);
+  splat::Shape<Wide> shape;
+  const Truths is_sound = splat::make_shape(batch.gaussian, shape);
+  splat::Gradient<Wide> total, of_view;
+  splat::clear(total, int(scene.coefficients));
+  Truths has_any{simd::none()};
   for (int64_t v = view_begin; v < view_end; ++v) {
     const View& view = frame.views[size_t(v)];
-    splat::Moments<double> moments;
-    if (!gather(scene, frame, view, frame.splats.data() + v * scene.gaussians, i, records, moments)) continue;
-    if (!is_loaded) {
-      gaussian = load_gaussian(scene, i);
-      if (!splat::make_shape(gaussian, shape)) return;  // never: the same numbers were sound in the forward
-      splat::clear(total, gaussian.coefficients);
-      is_loaded = true;
-    }
-    splat::Footprint<double> footprint;
-    if (!splat::project(gaussian, shape, view.camera, footprint)) continue;  // never, likewise
-    double centre[2];
+    splat::Moments<Wide> moments;
+    if (!gather_moments(view, batch, records[v], moments)) continue;
+    splat::Footprint<Wide> footprint;
+    const Truths is_seen = is_sound & splat::project(batch.gaussian, shape, view.camera, footprint);
+    has_any = has_any | is_seen;
+    Wide centre[2];
     splat::mean2d_gradient(footprint, moments, centre);
-    for (int j = 0; j < 2; ++j) out.means2d[2 * (v * scene.gaussians + i) + j] = float(centre[j]);
-    splat::project_backward(gaussian, shape, view.camera, footprint, moments, total);
+    float* const means2d = out.means2d + 2 * v * scene.gaussians;
+    for (int j = 0; j < 2; ++j) batch.add(means2d + j, 2, select(is_seen, centre[j], 0));
+    splat::clear(of_view, int(scene.coefficients));
+    splat::project_backward(batch.gaussian, shape, view.camera, footprint, moments, of_view);
+    add_where(is_seen, of_view, scene.coefficients, total);
   }
-  if (!is_loaded) return;
-  double log_scale[3], quat[4];
-  splat::shape_backward(shape, gaussian, total, log_scale, quat);
+  if (!simd::any(has_any.mask)) return;
+  Wide log_scale[3], quat[4];
+  splat::shape_backward(shape, batch.gaussian, total, log_scale, quat);
   for (int j = 0; j < 3; ++j) {
-    out.means[3 * i + j] += float(total.mean[j]);
-    out.log_scales[3 * i + j] += float(log_scale[j]);
+    batch.add(out.means + j, 3, total.mean[j]);
+    batch.add(out.log_scales + j, 3, select(has_any, log_scale[j], 0));
   }
-  for (int j = 0; j < 4; ++j) out.quats[4 * i + j] += float(quat[j]);
-  out.opacity_logits[i] += float(total.opacity_logit);
-  float* sh = out.sh + 3 * scene.coefficients * i;
-  for (int64_t j = 0; j < 3 * scene.coefficients; ++j) sh[j] += float(total.sh[j]);
+  for (int j = 0; j < 4; ++j) batch.add(out.quats + j, 4, select(has_any, quat[j], 0));
+  batch.add(out.opacity_logits, 1, total.opacity_logit);
+  const int64_t stride = 3 * scene.coefficients;
+  for (int64_t j = 0; j < stride; ++j) batch.add(out.sh + j, stride, total.sh[j]);
 }
 
 // Views are taken in groups whose records fit the budget, at least one at a time.
-int64_t group_end(Frame& frame, int64_t begin, int64_t& records) {
+int64_t group_end(const Scene& scene, const Frame& frame, int64_t begin, int64_t& records) {
   records = 0;
   int64_t v = begin;
-  for (; v < int64_t(frame.views.size()); ++v) {
-    View& view = frame.views[size_t(v)];
-    int64_t of_view = 0;
-    for (int64_t tile = 0; tile < frame.tiles(); ++tile) of_view += view.used[tile];
-    if (v > begin && (records + of_view) * RECORD * int64_t(sizeof(float)) > SPLAT_RECORD_BUDGET) break;
-    for (int64_t tile = 0; tile < frame.tiles(); ++tile) {
-      view.first_record[tile] = records;
-      records += view.used[tile];
-    }
+  for (; v < scene.views; ++v) {
+    const int64_t of_view = frame.views[size_t(v)].first_slot[scene.gaussians];
+    if (v > begin && (records + of_view) * int64_t(sizeof(Record)) > SPLAT_RECORD_BUDGET) break;
+    records += of_view;
   }
   return v;
 }
@@ -749,13 +793,8 @@ EXPORT int cadam3d_project(const Scene* scene, float* means2d, float* radii, voi
       throw Status(TOO_LARGE);
     frame->splats.allocate(scene->views * scene->gaussians);
     frame->views.resize(size_t(scene->views));
-    for (int64_t v = 0; v < scene->views; ++v)
-      frame->views[size_t(v)].camera = splat::make_camera<double>(
-          scene->world_to_camera + 16 * v, scene->intrinsics + 9 * v, int(scene->width), int(scene->height));
-    parallel_for(ceil_div(scene->gaussians, BLOCK), scene->threads, [&](int64_t block) {
-      for (int64_t i = block * BLOCK; i < std::min((block + 1) * BLOCK, scene->gaussians); ++i)
-        project_gaussian(*scene, *frame, i, means2d, radii);
-    });
+    for (int64_t v = 0; v < scene->views; ++v) frame->views[size_t(v)].camera = camera_of(*scene, v);
+    each_batch(*scene, [&](int64_t first) { project_batch(*scene, *frame, first, means2d, radii); });
     *out = frame.release();
   });
 }
@@ -768,7 +807,7 @@ EXPORT int cadam3d_blend(const Scene* scene, void* handle, float* rgb, float* al
     build_tile_lists(*scene, frame);
     if (keeps) {
       for (View& view : frame.views) {
-        view.used.allocate(frame.tiles()), view.first_record.allocate(frame.tiles());
+        view.used.allocate(frame.tiles()), view.reached.allocate(view.first_entry[frame.tiles()]);
         view.last.allocate(frame.tiles() * AREA), view.transmittance.allocate(frame.tiles() * AREA);
       }
     }
@@ -793,24 +832,26 @@ EXPORT int cadam3d_blend_backward(const Scene* scene, void* handle, const float*
     const ParameterGradients out{grad_means2d, grad_means,          grad_log_scales,
                                  grad_quats,   grad_opacity_logits, grad_sh};
     const int64_t pixels = scene->height * scene->width, tiles = frame.tiles();
-    Buffer<float> records;
+    Buffer<Record> records;
+    std::vector<Record*> of_view(size_t(scene->views));
     for (int64_t begin = 0, end = 0; begin < scene->views; begin = end) {
       int64_t count = 0;
-      end = group_end(frame, begin, count);
-      records.allocate(count * RECORD);
+      end = group_end(*scene, frame, begin, count);
+      records.allocate(count);
+      for (int64_t v = begin, first = 0; v < end; ++v) {
+        of_view[size_t(v)] = records.data() + first;
+        first += frame.views[size_t(v)].first_slot[scene->gaussians];
+      }
       parallel_for((end - begin) * tiles, scene->threads, [&](int64_t item) {
-        const int64_t v = begin + item / tiles, tile = item % tiles;
-        const View& view = frame.views[size_t(v)];
+        const int64_t v = begin + item / tiles;
         const Images images{
             alpha + v * pixels, depth + v * pixels, grad_rgb ? grad_rgb + 3 * v * pixels : nullptr,
             grad_alpha ? grad_alpha + v * pixels : nullptr, grad_depth ? grad_depth + v * pixels : nullptr};
-        blend_tile_backward(*scene, frame, view, frame.splats.data() + v * scene->gaussians, tile,
-                            scene->background + 3 * v, images,
-                            records.data() + view.first_record[tile] * RECORD);
+        blend_tile_backward(*scene, frame, frame.views[size_t(v)], frame.splats.data() + v * scene->gaussians,
+                            item % tiles, scene->background + 3 * v, images, of_view[size_t(v)]);
       });
-      parallel_for(ceil_div(scene->gaussians, BLOCK), scene->threads, [&](int64_t block) {
-        for (int64_t i = block * BLOCK; i < std::min((block + 1) * BLOCK, scene->gaussians); ++i)
-          gaussian_backward(*scene, frame, begin, end, i, records.data(), out);
+      each_batch(*scene, [&](int64_t first) {
+        batch_backward(*scene, frame, begin, end, first, of_view.data(), out);
       });
     }
   });
@@ -820,22 +861,22 @@ EXPORT int cadam3d_blend_backward(const Scene* scene, void* handle, const float*
 EXPORT int cadam3d_centre_backward(const Scene* scene, const float* radii, const float* grad_means2d,
                                    float* grad_means) {
   return guarded([&] {
-    std::vector<splat::Camera<double>> cameras;
-    for (int64_t v = 0; v < scene->views; ++v)
-      cameras.push_back(splat::make_camera<double>(scene->world_to_camera + 16 * v, scene->intrinsics + 9 * v,
-                                                   int(scene->width), int(scene->height)));
-    parallel_for(ceil_div(scene->gaussians, BLOCK), scene->threads, [&](int64_t block) {
-      for (int64_t i = block * BLOCK; i < std::min((block + 1) * BLOCK, scene->gaussians); ++i) {
-        const double mean[3] = {scene->means[3 * i], scene->means[3 * i + 1], scene->means[3 * i + 2]};
-        double total[3] = {};
-        for (int64_t v = 0; v < scene->views; ++v) {
-          const int64_t at = v * scene->gaussians + i;
-          if (!(radii[at] > 0)) continue;
-          const double gradient[2] = {grad_means2d[2 * at], grad_means2d[2 * at + 1]};
-          splat::centre_backward(cameras[size_t(v)], mean, gradient, total);
-        }
-        for (int j = 0; j < 3; ++j) grad_means[3 * i + j] = float(total[j]);
+    std::vector<splat::Camera<Wide>> cameras;
+    for (int64_t v = 0; v < scene->views; ++v) cameras.push_back(camera_of(*scene, v));
+    each_batch(*scene, [&](int64_t first) {
+      const Rows rows(*scene, first);
+      const Wide mean[3] = {rows.gather(scene->means, 3), rows.gather(scene->means + 1, 3),
+                            rows.gather(scene->means + 2, 3)};
+      Wide total[3] = {0, 0, 0};
+      for (int64_t v = 0; v < scene->views; ++v) {
+        const float* const of_view = grad_means2d + 2 * v * scene->gaussians;
+        const Truths is_seen = rows.gather(radii + v * scene->gaussians, 1) > Wide(0);
+        const Wide gradient[2] = {rows.gather(of_view, 2), rows.gather(of_view + 1, 2)};
+        Wide part[3] = {0, 0, 0};
+        splat::centre_backward(cameras[size_t(v)], mean, gradient, part);
+        for (int j = 0; j < 3; ++j) total[j] += select(is_seen, part[j], 0);
       }
+      for (int j = 0; j < 3; ++j) rows.add(grad_means + j, 3, total[j]);
     });
   });
 }

@@ -1,4 +1,4 @@
-// A row of pixels at a time: vectors of this machine's own width, and the few operations the blend needs.
+// Many pixels or many Gaussians at a time: vectors of this machine's own width, and what is done with them.
 //
 // Wider vectors than the machine has would be lowered to scalar code, so the width follows the instruction
 // set: AVX-512 16 lanes, AVX2 8, everything else (SSE2, NEON, ...) 4. Products that are added are fused where
@@ -68,33 +68,58 @@ inline Floats fma(Floats a, Floats b, Floats c) {
   return (Floats)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c);
 }
 inline Floats min(Floats a, Floats b) { return (Floats)_mm512_min_ps((__m512)a, (__m512)b); }
+inline Floats max(Floats a, Floats b) { return (Floats)_mm512_max_ps((__m512)a, (__m512)b); }
+inline Floats root(Floats x) { return (Floats)_mm512_sqrt_ps((__m512)x); }
+inline Floats reciprocal(Floats x) {  // within 2 units in the last place; a division takes longer
+  const Floats guess = (Floats)_mm512_rcp14_ps((__m512)x);
+  return fma(fma(-x, guess, spread(1.0f)), guess, guess);
+}
 #elif defined(SIMD_AVX2)
 inline Floats fma(Floats a, Floats b, Floats c) {
   return (Floats)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c);
 }
 inline Floats min(Floats a, Floats b) { return (Floats)_mm256_min_ps((__m256)a, (__m256)b); }
+inline Floats max(Floats a, Floats b) { return (Floats)_mm256_max_ps((__m256)a, (__m256)b); }
+inline Floats root(Floats x) { return (Floats)_mm256_sqrt_ps((__m256)x); }
 #elif defined(SIMD_NEON)
 inline Floats fma(Floats a, Floats b, Floats c) {
   return (Floats)vfmaq_f32((float32x4_t)c, (float32x4_t)a, (float32x4_t)b);
 }
 inline Floats min(Floats a, Floats b) { return (Floats)vminq_f32((float32x4_t)a, (float32x4_t)b); }
+inline Floats max(Floats a, Floats b) { return (Floats)vmaxq_f32((float32x4_t)a, (float32x4_t)b); }
+inline Floats root(Floats x) { return (Floats)vsqrtq_f32((float32x4_t)x); }
 #elif defined(SIMD_SSE2)
 inline Floats fma(Floats a, Floats b, Floats c) { return a * b + c; }
 inline Floats min(Floats a, Floats b) { return (Floats)_mm_min_ps((__m128)a, (__m128)b); }
+inline Floats max(Floats a, Floats b) { return (Floats)_mm_max_ps((__m128)a, (__m128)b); }
+inline Floats root(Floats x) { return (Floats)_mm_sqrt_ps((__m128)x); }
 #else
 inline Floats fma(Floats a, Floats b, Floats c) { return a * b + c; }
 inline Floats min(Floats a, Floats b) { return a < b ? a : b; }
+inline Floats max(Floats a, Floats b) { return a > b ? a : b; }
+inline Floats root(Floats x) {
+  for (int lane = 0; lane < LANES; ++lane) x[lane] = __builtin_sqrtf(x[lane]);
+  return x;
+}
 #endif
+#if !defined(SIMD_AVX512)
+inline Floats reciprocal(Floats x) { return spread(1.0f) / x; }
+#endif
+inline Floats absolute(Floats x) { return (Floats)((Ints)x & 0x7fffffff); }
+inline Floats to_floats(Ints x) { return __builtin_convertvector(x, Floats); }
+inline Ints to_ints(Floats x) { return __builtin_convertvector(x, Ints); }  // towards zero
 
 // ------------------------------------------------------------------------------------- masks
 // One truth per lane; a comparison with a NaN is false.
 #if defined(SIMD_AVX512)
 typedef __mmask16 Mask;
 inline Mask none() { return 0; }
+inline unsigned bits(Mask a) { return a; }
 inline Mask less_equal(Floats a, Floats b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OQ); }
 inline Mask greater(Floats a, Floats b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ); }
 inline Mask less(Ints a, Ints b) { return _mm512_cmp_epi32_mask((__m512i)a, (__m512i)b, _MM_CMPINT_LT); }
 inline Mask both(Mask a, Mask b) { return a & b; }
+inline Mask either(Mask a, Mask b) { return a | b; }
 inline Mask first_only(Mask a, Mask b) { return a & (Mask)~b; }
 inline bool any(Mask a) { return a != 0; }
 inline Floats select(Mask m, Floats a, Floats b) {
@@ -111,18 +136,23 @@ inline Mask less_equal(Floats a, Floats b) { return a <= b; }
 inline Mask greater(Floats a, Floats b) { return a > b; }
 inline Mask less(Ints a, Ints b) { return a < b; }
 inline Mask both(Mask a, Mask b) { return a & b; }
+inline Mask either(Mask a, Mask b) { return a | b; }
 inline Mask first_only(Mask a, Mask b) { return a & ~b; }
 inline Ints select(Mask m, Ints a, Ints b) { return (m & a) | (~m & b); }
 inline Floats select(Mask m, Floats a, Floats b) { return as_floats(select(m, as_ints(a), as_ints(b))); }
 inline Floats keep(Mask m, Floats a) { return as_floats(m & as_ints(a)); }
 #if defined(SIMD_AVX2)
-inline bool any(Mask a) { return _mm256_movemask_ps((__m256)a) != 0; }
+inline unsigned bits(Mask a) { return unsigned(_mm256_movemask_ps((__m256)a)); }
+inline bool any(Mask a) { return bits(a) != 0; }
 #elif defined(SIMD_SSE2)
-inline bool any(Mask a) { return _mm_movemask_ps((__m128)a) != 0; }
+inline unsigned bits(Mask a) { return unsigned(_mm_movemask_ps((__m128)a)); }
+inline bool any(Mask a) { return bits(a) != 0; }
 #elif defined(SIMD_NEON)
+inline unsigned bits(Mask a) { return vaddvq_u32((uint32x4_t)(a & Ints{1, 2, 4, 8})); }
 inline bool any(Mask a) { return vmaxvq_u32((uint32x4_t)a) != 0; }
 #else
-inline bool any(Mask a) { return (a[0] | a[1] | a[2] | a[3]) != 0; }
+inline unsigned bits(Mask a) { return unsigned((a[0] & 1) | (a[1] & 2) | (a[2] & 4) | (a[3] & 8)); }
+inline bool any(Mask a) { return bits(a) != 0; }
 #endif
 #endif
 
@@ -144,19 +174,63 @@ inline Floats exp_minus(Floats x) {
   return (Floats)((Bits)p + ((Bits)shifted << 23));
 }
 
-// The four lanes of the result are the sums of a, b, c and d, always in the same order.
-#if defined(SIMD_AVX512)
-inline Quad sums(Floats a, Floats b, Floats c, Floats d) {
-  const __m512 p = (__m512)a, q = (__m512)b, r = (__m512)c, s = (__m512)d;
-  const __m512 pq = _mm512_add_ps(_mm512_shuffle_f32x4(p, q, 0x44), _mm512_shuffle_f32x4(p, q, 0xEE));
-  const __m512 rs = _mm512_add_ps(_mm512_shuffle_f32x4(r, s, 0x44), _mm512_shuffle_f32x4(r, s, 0xEE));
-  __m512 quads = _mm512_add_ps(_mm512_shuffle_f32x4(pq, rs, 0x88), _mm512_shuffle_f32x4(pq, rs, 0xDD));
-  quads = _mm512_add_ps(quads, _mm512_permute_ps(quads, 0x4E));
-  quads = _mm512_add_ps(quads, _mm512_permute_ps(quads, 0xB1));
-  const __m512i firsts = _mm512_castsi128_si512(_mm_setr_epi32(0, 4, 8, 12));
-  return (Quad)_mm512_castps512_ps128(_mm512_permutexvar_ps(firsts, quads));
+// exp(x) for any x that is a number, relative error below 3e-7 but for denormals; inf beyond the largest
+// float.
+inline Floats exp(Floats x) {
+  x = min(max(x, spread(-104.0f)), spread(89.0f));
+  const Floats magic = spread(12582912.0f);
+  const Floats shifted = fma(x, spread(1.44269504f), magic), n = shifted - magic;
+  const Floats r = fma(n, spread(-1.42860677e-6f), fma(n, spread(-0.693145752f), x));  // ln 2 in two parts
+  Floats p = spread(1.3888889e-3f);
+  p = fma(p, r, spread(8.3333333e-3f));
+  p = fma(p, r, spread(4.1666667e-2f));
+  p = fma(p, r, spread(1.6666667e-1f));
+  p = fma(p, r, spread(0.5f));
+  p = fma(p * r, r, r) + spread(1.0f);
+  const Ints whole = to_ints(n), half = whole >> 1;  // 2^n may leave the floats where its halves do not
+  return p * as_floats((half + 127) << 23) * as_floats((whole - half + 127) << 23);
 }
-#elif defined(SIMD_AVX2) || defined(SIMD_SSE2)
+
+// The natural logarithm of a normal positive number, absolute error below 1e-7 times 1 + its size.
+inline Floats log(Floats x) {
+  const Ints above = as_ints(x) - 0x3f3504f3;  // of the root of 1/2
+  const Floats m = as_floats((above & 0x7fffff) + 0x3f3504f3), n = to_floats(above >> 23);
+  const Floats s = (m - 1.0f) / (m + 1.0f), square = s * s;  // ln m = 2 artanh s
+  Floats p = spread(2.2222222e-1f);
+  p = fma(p, square, spread(2.8571429e-1f));
+  p = fma(p, square, spread(0.4f));
+  p = fma(p, square, spread(6.6666667e-1f));
+  return fma(n, spread(0.693147181f), fma(p * square, s, s + s));
+}
+
+// Writes the sums over the lanes of each vector to ``to[0] .. to[15]``, always added in the same order; what
+// lies behind the N-th is some number. ``to`` starts a cache line.
+#if defined(SIMD_AVX512)
+// Lanes with the bit DISTANCE set belong to b, the others to a; each adds its partner DISTANCE lanes away.
+template <int DISTANCE>
+inline Floats fold(Floats a, Floats b) {
+  const auto from = [](int lane) { return (lane ^ DISTANCE) + (lane & DISTANCE ? 16 : 0); };
+  const __m512i partner =
+      _mm512_setr_epi32(from(0), from(1), from(2), from(3), from(4), from(5), from(6), from(7), from(8),
+                        from(9), from(10), from(11), from(12), from(13), from(14), from(15));
+  constexpr __mmask16 OF_B = DISTANCE == 8   ? 0xff00
+                             : DISTANCE == 4 ? 0xf0f0
+                             : DISTANCE == 2 ? 0xcccc
+                                             : 0xaaaa;
+  return (Floats)_mm512_add_ps(_mm512_mask_blend_ps(OF_B, (__m512)a, (__m512)b),
+                               _mm512_permutex2var_ps((__m512)a, partner, (__m512)b));
+}
+inline void store_sums(float* to, const Floats (&x)[10]) {
+  const Floats a = fold<4>(fold<8>(x[0], x[1]), fold<8>(x[2], x[3]));
+  const Floats b = fold<4>(fold<8>(x[4], x[5]), fold<8>(x[6], x[7]));
+  const Floats c = fold<8>(x[8], x[9]), d = fold<4>(c, c);
+  const Floats all = fold<1>(fold<2>(a, b), fold<2>(d, d));
+  const __m512i home = _mm512_setr_epi32(0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 0, 0, 0, 0, 0, 0);
+  _mm512_store_ps(to, _mm512_permutexvar_ps(home, (__m512)all));
+}
+#else
+// The four lanes of the result are the sums of a, b, c and d.
+#if defined(SIMD_AVX2) || defined(SIMD_SSE2)
 inline Quad sums(Floats a, Floats b, Floats c, Floats d) {
 #if defined(SIMD_AVX2)
   const auto fold = [](Floats v) {
@@ -173,5 +247,50 @@ inline Quad sums(Floats a, Floats b, Floats c, Floats d) {
 inline float sum(Floats v) { return (v[0] + v[1]) + (v[2] + v[3]); }
 inline Quad sums(Floats a, Floats b, Floats c, Floats d) { return Quad{sum(a), sum(b), sum(c), sum(d)}; }
 #endif
+inline void store_sums(float* to, const Floats (&x)[10]) {
+  const Quad all[4] = {sums(x[0], x[1], x[2], x[3]), sums(x[4], x[5], x[6], x[7]),
+                       sums(x[8], x[9], x[9], x[9]), Quad{}};
+  __builtin_memcpy(to, all, sizeof all);
+}
+#endif
+
+// ------------------------------------------------------------------------------------- as a scalar
+
+// One truth, or one float, per lane, with the manners of bool and float: what is written for one Gaussian
+// (splat_math.h) then works on LANES of them.
+struct Truths {
+  Mask mask;
+  friend Truths operator&(Truths a, Truths b) { return {both(a.mask, b.mask)}; }
+  friend Truths operator|(Truths a, Truths b) { return {either(a.mask, b.mask)}; }
+};
+
+struct Wide {
+  Floats lanes;
+  Wide() = default;
+  Wide(Floats x) : lanes(x) {}
+  Wide(float x) : lanes(spread(x)) {}
+  Wide(double x) : Wide(float(x)) {}
+  Wide(int x) : Wide(float(x)) {}
+  Wide& operator+=(Wide b) { return *this = *this + b; }
+  Wide& operator-=(Wide b) { return *this = *this - b; }
+  Wide& operator*=(Wide b) { return *this = *this * b; }
+  Wide operator-() const { return -lanes; }
+  friend Wide operator+(Wide a, Wide b) { return a.lanes + b.lanes; }
+  friend Wide operator-(Wide a, Wide b) { return a.lanes - b.lanes; }
+  friend Wide operator*(Wide a, Wide b) { return a.lanes * b.lanes; }
+  friend Wide operator/(Wide a, Wide b) { return a.lanes / b.lanes; }
+  friend Truths operator<=(Wide a, Wide b) { return {less_equal(a.lanes, b.lanes)}; }
+  friend Truths operator>=(Wide a, Wide b) { return {less_equal(b.lanes, a.lanes)}; }
+  friend Truths operator>(Wide a, Wide b) { return {greater(a.lanes, b.lanes)}; }
+  friend Truths operator<(Wide a, Wide b) { return {greater(b.lanes, a.lanes)}; }
+  friend Truths operator==(Wide a, Wide b) { return (a <= b) & (a >= b); }
+};
+
+inline Wide select(Truths condition, Wide yes, Wide no) {
+  return select(condition.mask, yes.lanes, no.lanes);
+}
+inline Wide root(Wide x) { return root(x.lanes); }
+inline Wide power_e(Wide x) { return exp(x.lanes); }
+inline Wide log_e(Wide x) { return log(x.lanes); }
 
 }  // namespace simd

@@ -1,8 +1,9 @@
 // One splat, from world to screen and back: the maths every native backend shares.
 //
-// Header-free on purpose (a run-time CUDA compiler has no headers), templated on the scalar, no allocation,
-// no branches on anything but culling. Derived from EWA splatting (Zwicker et al. 2002; Kerbl et al. 2023,
-// sec. 4), with one change of form that costs nothing and keeps long thin splats accurate in float32:
+// Header-free on purpose (a run-time CUDA compiler has no headers), templated on the scalar, no allocation
+// and no branches, so that the scalar may also be many Gaussians at a time (``simd::Wide``). Derived from EWA
+// splatting (Zwicker et al. 2002; Kerbl et al. 2023, sec. 4), with one change of form that costs nothing and
+// keeps long thin splats accurate in float32:
 //
 //   screen covariance  C = B B^T + blur I,  B = J W R diag(s): two rows of three
 //   its determinant    |B0 x B1|^2 + blur (|B0|^2 + |B1|^2) + blur^2: a sum of squares, no cancellation
@@ -12,8 +13,8 @@
 // The blend gathers moments of y = L d, not of d; with Y = sum g y y^T and s = sum g y (g = dLoss/d|y|^2) the
 // backward is then  dLoss/dC = -2 L^T Y L,  dLoss/dB = -4 L^T Y (L B),  dLoss/dmean2d = -2 L^T s.
 //
-// The image formation constants (SPLAT_BLUR, SPLAT_ALPHA_MIN, SPLAT_NEAR, SPLAT_FAR, SPLAT_FRUSTUM_MARGIN) are
-// given by the build, from cadam3d/rasterizer/base.py: each has one home.
+// The image formation constants (SPLAT_BLUR, SPLAT_ALPHA_MIN, SPLAT_NEAR, SPLAT_FAR, SPLAT_FRUSTUM_MARGIN)
+// are given by the build, from cadam3d/rasterizer/base.py: each has one home.
 #pragma once
 
 #if defined(__CUDACC__)
@@ -32,27 +33,34 @@ constexpr float FLOAT_MAX = 3.402823466e+38f;
 
 #if defined(__CUDACC__)
 SPLAT_FN float root(float x) { return sqrtf(x); }
-SPLAT_FN double root(double x) { return sqrt(x); }
 SPLAT_FN float power_e(float x) { return expf(x); }
-SPLAT_FN double power_e(double x) { return exp(x); }
 SPLAT_FN float log_e(float x) { return logf(x); }
-SPLAT_FN double log_e(double x) { return log(x); }
 #else
 SPLAT_FN float root(float x) { return __builtin_sqrtf(x); }
-SPLAT_FN double root(double x) { return __builtin_sqrt(x); }
 SPLAT_FN float power_e(float x) { return __builtin_expf(x); }
-SPLAT_FN double power_e(double x) { return __builtin_exp(x); }
 SPLAT_FN float log_e(float x) { return __builtin_logf(x); }
-SPLAT_FN double log_e(double x) { return __builtin_log(x); }
 #endif
+template <class Real>
+SPLAT_FN Real select(bool condition, Real yes, Real no) {
+  return condition ? yes : no;
+}
+
+// What a comparison of two numbers gives, and how a coefficient is held; another for many numbers at a time.
+template <class Real>
+struct Kinds {
+  typedef bool Truth;
+  typedef float Stored;
+};
+template <class Real>
+using Truth = typename Kinds<Real>::Truth;
 
 template <class Real>
-SPLAT_FN bool is_finite(Real x) {
+SPLAT_FN Truth<Real> is_finite(Real x) {
   return x - x == Real(0);
 }
 template <class Real>
-SPLAT_FN bool fits_float(Real x) {  // false for NaN too
-  return x <= Real(FLOAT_MAX) && x >= Real(-FLOAT_MAX);
+SPLAT_FN Truth<Real> fits_float(Real x) {  // false for NaN too
+  return (x <= Real(FLOAT_MAX)) & (x >= Real(-FLOAT_MAX));
 }
 template <class Real>
 SPLAT_FN Real dot3(const Real* a, const Real* b) {
@@ -166,7 +174,7 @@ struct Fixed {
 template <class Real, class Count = int>
 struct Gaussian {
   Real mean[3], log_scale[3], quat[4], opacity_logit;
-  const float* sh;  // coefficients x 3
+  const typename Kinds<Real>::Stored* sh;  // coefficients x 3
   Count coefficients;
 };
 
@@ -186,26 +194,25 @@ struct Footprint {
   Real centre[3];   // in the camera
   Real axes[3][3];  // Shape::axes in the camera
   Real inverse_z, slope[2];
-  bool is_held[2];  // the Jacobian sits at the border: its slope is a constant
-  Real rows[2][3];  // B
+  Truth<Real> is_held[2];  // the Jacobian sits at the border: its slope is a constant
+  Real rows[2][3];         // B
   Real mean2d[2];
   Real cov_xx, cov_xy, cov_yy, l11, l12, l22;
   Real reach[2];  // half-sizes of the box outside which alpha < alpha_min
 };
 
+// False if it cannot be seen from anywhere.
 template <class Real, class Count>
-SPLAT_FN bool make_shape(const Gaussian<Real, Count>& gaussian, Shape<Real>& shape) {
+SPLAT_FN Truth<Real> make_shape(const Gaussian<Real, Count>& gaussian, Shape<Real>& shape) {
   Real poison = gaussian.opacity_logit - gaussian.opacity_logit;  // 0, or NaN if anything is not finite
   for (int i = 0; i < 3; ++i)
     poison += (gaussian.mean[i] - gaussian.mean[i]) + (gaussian.log_scale[i] - gaussian.log_scale[i]);
   for (int i = 0; i < 3 * gaussian.coefficients; ++i) poison += Real(gaussian.sh[i] - gaussian.sh[i]);
   Real squared = 0;
   for (int i = 0; i < 4; ++i) squared += gaussian.quat[i] * gaussian.quat[i];
-  if (!(poison == 0) || !(squared >= Real(TINY_QUATERNION)) || !is_finite(squared)) return false;
 
   const Real odds_against = power_e(-gaussian.opacity_logit);
   shape.opacity = 1 / (1 + odds_against);
-  if (!(shape.opacity > Real(SPLAT_ALPHA_MIN))) return false;
   shape.transparency = odds_against * shape.opacity;
   shape.log_cut = log_e(shape.opacity / Real(SPLAT_ALPHA_MIN));
 
@@ -220,16 +227,16 @@ SPLAT_FN bool make_shape(const Gaussian<Real, Count>& gaussian, Shape<Real>& sha
     const Real scale = power_e(gaussian.log_scale[j]);
     for (int i = 0; i < 3; ++i) shape.axes[i][j] = r[i][j] * scale;
   }
-  return true;
+  return (poison == Real(0)) & (squared >= Real(TINY_QUATERNION)) & is_finite(squared) &
+         (shape.opacity > Real(SPLAT_ALPHA_MIN));
 }
 
 // False if the view does not see it. Comparisons are written so that a NaN culls.
 template <class Real, class Count>
-SPLAT_FN bool project(const Gaussian<Real, Count>& gaussian, const Shape<Real>& shape,
-                      const Camera<Real>& camera, Footprint<Real>& out) {
+SPLAT_FN Truth<Real> project(const Gaussian<Real, Count>& gaussian, const Shape<Real>& shape,
+                             const Camera<Real>& camera, Footprint<Real>& out) {
   for (int i = 0; i < 3; ++i) out.centre[i] = dot3(camera.rotation[i], gaussian.mean) + camera.translation[i];
   const Real z = out.centre[2];
-  if (!(z > Real(SPLAT_NEAR) && z < Real(SPLAT_FAR))) return false;
   out.inverse_z = 1 / z;
 
   for (int i = 0; i < 3; ++i)
@@ -240,11 +247,10 @@ SPLAT_FN bool project(const Gaussian<Real, Count>& gaussian, const Shape<Real>& 
   for (int i = 0; i < 2; ++i) {
     const Real slope = out.centre[i] * out.inverse_z;
     out.mean2d[i] = focal[i] * slope + principal[i];
-    const Real held = slope < camera.slope_low[i]    ? camera.slope_low[i]
-                      : slope > camera.slope_high[i] ? camera.slope_high[i]
-                                                     : slope;
+    const Truth<Real> is_low = slope<camera.slope_low[i], is_high = slope> camera.slope_high[i];
+    const Real held = select(is_low, camera.slope_low[i], select(is_high, camera.slope_high[i], slope));
     out.slope[i] = held;
-    out.is_held[i] = held != slope;
+    out.is_held[i] = is_low | is_high;
     for (int j = 0; j < 3; ++j)
       out.rows[i][j] = focal[i] * out.inverse_z * (out.axes[i][j] - held * out.axes[2][j]);
   }
@@ -256,16 +262,16 @@ SPLAT_FN bool project(const Gaussian<Real, Count>& gaussian, const Shape<Real>& 
                          b0[0] * b1[1] - b0[1] * b1[0]};
   const Real determinant = dot3(cross, cross) + blur * (b00 + b11) + blur * blur;
   out.cov_xx = b00 + blur, out.cov_xy = dot3(b0, b1), out.cov_yy = b11 + blur;
-  if (!fits_float(out.cov_xx) || !fits_float(out.cov_yy) || !is_finite(determinant)) return false;
   out.l11 = root(Real(0.5) * out.cov_yy / determinant);
   out.l12 = -out.l11 * out.cov_xy / out.cov_yy;
   out.l22 = root(Real(0.5) / out.cov_yy);
 
   out.reach[0] = root(2 * shape.log_cut * out.cov_xx);
   out.reach[1] = root(2 * shape.log_cut * out.cov_yy);
-  if (!fits_float(out.reach[0]) || !fits_float(out.reach[1])) return false;
-  return out.mean2d[0] + out.reach[0] > 0 && out.mean2d[0] - out.reach[0] < camera.width &&
-         out.mean2d[1] + out.reach[1] > 0 && out.mean2d[1] - out.reach[1] < camera.height;
+  return (z > Real(SPLAT_NEAR)) & (z < Real(SPLAT_FAR)) & fits_float(out.cov_xx) & fits_float(out.cov_yy) &
+         is_finite(determinant) & fits_float(out.reach[0]) & fits_float(out.reach[1]) &
+         (out.mean2d[0] + out.reach[0] > Real(0)) & (out.mean2d[0] - out.reach[0] < camera.width) &
+         (out.mean2d[1] + out.reach[1] > Real(0)) & (out.mean2d[1] - out.reach[1] < camera.height);
 }
 
 // Unit vector from camera to Gaussian; returns one over their distance.
@@ -293,7 +299,7 @@ SPLAT_FN void colour(const Gaussian<Real, Count>& gaussian, const Camera<Real>& 
   if (gaussian.coefficients > 1) direction(gaussian, camera, unit);
   sh_basis(gaussian.coefficients, unit, basis);
   raw_colour(gaussian, basis, rgb);
-  for (int c = 0; c < 3; ++c) rgb[c] = rgb[c] > 0 ? rgb[c] : Real(0);
+  for (int c = 0; c < 3; ++c) rgb[c] = select(rgb[c] > Real(0), rgb[c], Real(0));
 }
 
 // ---------------------------------------------------------------------------------------------- backward
@@ -350,11 +356,9 @@ SPLAT_FN void project_backward(const Gaussian<Real, Count>& gaussian, const Shap
       axes[2][j] -= scale * f.slope[i] * rows[i][j];
     }
     centre[2] -= dot3(f.rows[i], rows[i]) * f.inverse_z;
-    if (!f.is_held[i]) {
-      const Real slope = -scale * dot3(f.axes[2], rows[i]);
-      centre[i] += slope * f.inverse_z;
-      centre[2] -= slope * f.slope[i] * f.inverse_z;
-    }
+    const Real slope = select(f.is_held[i], Real(0), -scale * dot3(f.axes[2], rows[i]));
+    centre[i] += slope * f.inverse_z;
+    centre[2] -= slope * f.slope[i] * f.inverse_z;
   }
   for (int i = 0; i < 3; ++i) {
     for (int k = 0; k < 3; ++k) {
@@ -368,13 +372,13 @@ SPLAT_FN void project_backward(const Gaussian<Real, Count>& gaussian, const Shap
   if (coefficients > 1) inverse = direction(gaussian, camera, unit);
   sh_basis(coefficients, unit, basis);
   raw_colour(gaussian, basis, rgb);
-  for (int c = 0; c < 3; ++c) rgb[c] = rgb[c] >= 0 ? moments.rgb[c] : Real(0);
+  for (int c = 0; c < 3; ++c) rgb[c] = select(rgb[c] >= Real(0), moments.rgb[c], Real(0));
   for (int k = 0; k < coefficients; ++k)
     for (int c = 0; c < 3; ++c) total.sh[3 * k + c] += basis[k] * rgb[c];
   if (coefficients > 1) {
     Real weight[MAX_COEFFICIENTS], towards[3];
     for (int k = 0; k < coefficients; ++k) {
-      const float* sh = gaussian.sh + 3 * k;
+      const auto* sh = gaussian.sh + 3 * k;
       weight[k] = Real(sh[0]) * rgb[0] + Real(sh[1]) * rgb[1] + Real(sh[2]) * rgb[2];
     }
     sh_basis_backward(coefficients, unit, weight, towards);
