@@ -1,0 +1,366 @@
+"""The ways rasterizers are known to break, one by one: rules that every one of ours keeps."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from splats import (
+    IMAGES,
+    POISON,
+    assert_close,
+    assert_same_bits,
+    at_tile_corners,
+    backgrounds,
+    bits,
+    ellipses,
+    facing_camera,
+    make_cameras,
+    make_gaussians,
+    make_weights,
+    saturated,
+    stack,
+)
+
+from cadam3d.core.gaussians import FIELDS, Gaussians
+from cadam3d.rasterizer.base import ALPHA_MIN, NEAR
+from cadam3d.rasterizer.reference import ReferenceRasterizer
+
+pytestmark = pytest.mark.usefixtures("garbage_in_new_memory")
+
+NAN, INF = math.nan, math.inf
+ABOVE_NEAR = torch.tensor(NEAR).nextafter(torch.tensor(1.0)).item()  # the least float32 that is farther
+
+
+def one_in_a_heap(**fields):
+    """Twenty Gaussians around (0, 0, 2) that ``facing_camera`` sees, number 7 changed."""
+    gaussians = make_gaussians(20, degree=1, spread=0.2)
+    gaussians.means[:, 2] += 2.0
+    for name, value in fields.items():
+        getattr(gaussians, name)[7] = torch.as_tensor(value)
+    return gaussians
+
+
+def assert_leaves_no_trace(backend, gaussians, row, cameras):
+    """Without ``row`` the others have the same bits; it has nothing; and every number is finite."""
+    output, grads = backend.differentiate(gaussians, cameras)
+    others = torch.arange(len(gaussians)) != row
+    clean, clean_grads = backend.differentiate(gaussians.index(others), cameras)
+    assert not output.visible[:, row].any()
+    assert not output.means2d[:, row].any()
+    assert not grads["means2d"][:, row].any()
+    for tensor in bits(output, grads):
+        assert tensor.isfinite().all()
+    assert_same_bits([getattr(output, n) for n in IMAGES], [getattr(clean, n) for n in IMAGES])
+    for name in FIELDS:
+        assert not grads[name][row].any(), name
+        assert torch.equal(grads[name][others], clean_grads[name]), name
+
+
+def assert_is_drawn(backend, gaussians, row, cameras):
+    """Finite numbers, and ``row`` can be seen; returns its gradients."""
+    output, grads = backend.differentiate(gaussians, cameras)
+    for tensor in bits(output, grads):
+        assert tensor.isfinite().all()
+    assert output.visible[0, row]
+    return {name: grads[name][row] for name in FIELDS}
+
+
+# -------------------------------------------------------------------------- numbers that break others
+
+
+@pytest.mark.parametrize("quat", [[0.0] * 4, [9e-7, 0.0, 0.0, 0.0], [0.0, 0.0, 1e-30, 0.0], [1e-45] * 4])
+def test_a_zero_or_tiny_quaternion_is_culled(any_backend, quat):
+    assert_leaves_no_trace(any_backend, one_in_a_heap(quats=quat), 7, facing_camera(11, 13))
+
+
+@pytest.mark.parametrize("length", [1.1e-6, 1e-3, 1e3, 1e18])
+def test_the_length_of_any_other_quaternion_does_not_matter(any_backend, length):
+    gaussians, cameras = one_in_a_heap(), facing_camera(11, 13)
+    gaussians.quats[7] /= gaussians.quats[7].norm()
+    plain, output = any_backend.show(gaussians, cameras), None
+    gaussians.quats[7] *= length
+    assert_is_drawn(any_backend, gaussians, 7, cameras)
+    output = any_backend.show(gaussians, cameras)
+    assert_close("alpha", output.alpha, plain.alpha, 1e-5)
+
+
+@pytest.mark.parametrize("log_scale", [-60.0, -104.0, -1e3, -1e38])  # the last two are scales of exactly zero
+def test_a_zero_scale_is_a_dot_of_the_blurs_size(any_backend, log_scale):
+    cameras = facing_camera(11, 13)
+    grads = assert_is_drawn(any_backend, one_in_a_heap(log_scales=[log_scale] * 3), 7, cameras)
+    assert grads["log_scales"].abs().max() < 1e-20
+    assert grads["means"].any()
+    small, none = (
+        any_backend.show(one_in_a_heap(log_scales=[value] * 3), cameras) for value in (-30.0, log_scale)
+    )
+    assert_close("rgb", none.rgb, small.rgb, 1e-6)
+
+
+@pytest.mark.parametrize("log_scale", [[46.0] * 3, [46.0, -46.0, 0.0], [88.0, 0.0, 0.0], [0.0, 0.0, 700.0]])
+@pytest.mark.parametrize("z", [0.0, -2.0])
+def test_a_huge_scale_at_depth_zero_or_behind_is_culled(any_backend, log_scale, z):
+    gaussians = one_in_a_heap(means=[0.0, 0.0, z], log_scales=log_scale)
+    assert_leaves_no_trace(any_backend, gaussians, 7, facing_camera(11, 13))
+
+
+@pytest.mark.parametrize("log_scale", [INF, 1e38, NAN])
+def test_an_infinite_scale_is_culled_not_a_splat_of_any_size(any_backend, log_scale):
+    for axis in range(3):
+        scales = [0.0, 0.0, 0.0]
+        scales[axis] = log_scale
+        assert_leaves_no_trace(any_backend, one_in_a_heap(log_scales=scales), 7, facing_camera(11, 13))
+
+
+@pytest.mark.parametrize(("z", "is_seen"), [(NEAR, False), (ABOVE_NEAR, True), (0.0, False), (-1.0, False)])
+def test_on_the_near_plane_is_culled_and_the_next_number_is_not(any_backend, z, is_seen):
+    gaussians = one_in_a_heap(means=[0.0, 0.0, z], log_scales=[-8.0] * 3)
+    if is_seen:
+        assert_is_drawn(any_backend, gaussians, 7, facing_camera(11, 13))
+    else:
+        assert_leaves_no_trace(any_backend, gaussians, 7, facing_camera(11, 13))
+
+
+@pytest.mark.parametrize(("z", "is_seen"), [(1e14, True), (1e20, False), (1e38, False)])
+def test_at_the_horizon_nothing_overflows(any_backend, z, is_seen):
+    gaussians = one_in_a_heap(means=[0.0, 0.0, z])
+    if is_seen:
+        assert_is_drawn(any_backend, gaussians, 7, facing_camera(11, 13))
+    else:
+        assert_leaves_no_trace(any_backend, gaussians, 7, facing_camera(11, 13))
+
+
+@pytest.mark.parametrize(
+    ("field", "culled", "seen"),
+    [
+        ("opacity_logits", -math.log(256.0), -math.log(250.0)),
+        ("means", [40.0, 0.0, 2.0], [0.1, 0.0, 2.0]),
+        ("means", [0.0, -40.0, 2.0], [0.0, -0.1, 2.0]),
+    ],
+)
+def test_what_is_too_faint_or_off_screen_is_culled(any_backend, field, culled, seen):
+    assert_leaves_no_trace(any_backend, one_in_a_heap(**{field: culled}), 7, facing_camera(11, 13))
+    assert_is_drawn(any_backend, one_in_a_heap(**{field: seen}), 7, facing_camera(11, 13))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    # A colour of 1e38 is seen, and what it gives its neighbours exceeds float32 by right.
+    [(field, value) for field in FIELDS for value in POISON if (field, abs(value)) != ("sh", 1e38)],
+)
+def test_poison_never_spreads(backend, field, value):
+    gaussians, cameras = make_gaussians(30, degree=1), make_cameras(2, 17, 17)
+    getattr(gaussians, field).view(30, -1)[7] = value
+    output, grads = backend.differentiate(gaussians, cameras)
+    for tensor in bits(output, grads):
+        assert tensor.isfinite().all()
+    if not output.visible[:, 7].any():
+        assert_leaves_no_trace(backend, gaussians, 7, cameras)
+    assert math.isfinite(value) or not output.visible[:, 7].any()
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_one_poisoned_number_is_enough_to_cull(any_backend, field):
+    gaussians, cameras = make_gaussians(1, degree=3, spread=0.0), make_cameras(1, 9, 9)
+    assert any_backend.show(gaussians, cameras).visible.all()
+    getattr(gaussians, field).view(-1)[-1] = NAN
+    assert not any_backend.show(gaussians, cameras).visible.any()
+
+
+# -------------------------------------------------------------------------- splats that are too much
+
+
+def test_huge_splats_that_touch_more_tiles_than_one_thread_takes(backend):
+    # 100 tiles of 8x8 each: on a GPU the whole warp lists one of these, and sums its records.
+    backend.agrees(make_gaussians(5, seed=16, log_scale=1.5, opacity=-1.0), make_cameras(1, 75, 80), most=0.8)
+
+
+def test_many_huge_splats_stop_where_those_of_the_reference_do(backend):
+    gaussians = make_gaussians(10_000, seed=4, log_scale=1.5, opacity=-1.0)
+    output, _ = backend.agrees(gaussians, make_cameras(1, 5, 6), most=0.4)
+    assert (output.alpha < 1).all()
+    assert (output.alpha > 0.999).all()
+
+
+@pytest.mark.parametrize("logit", [5.0, 20.0, 40.0, 1e38])  # the last three are opacities of exactly one
+def test_a_saturated_alpha_teaches_colour_but_neither_opacity_nor_shape(any_backend, logit):
+    output, grads = any_backend.differentiate(stack(logit), facing_camera(5, 6))
+    assert_close("alpha", output.alpha, torch.full_like(output.alpha, 0.99), 1e-6)
+    for name in ("log_scales", "quats", "opacity_logits", "means2d"):
+        assert not grads[name].any(), name
+    assert grads["sh"].any()
+    assert grads["means"][0, 2] != 0  # the depth of the pixel is its own
+    assert any_backend.differentiate(stack(4.0), facing_camera(5, 6))[1]["opacity_logits"].any()
+
+
+def test_deep_stacks_of_saturated_splats_have_the_gradients_of_the_reference(backend):
+    gaussians = saturated(60)
+    gaussians.means *= 0.5
+    _, grads = backend.agrees(gaussians, make_cameras(1, 13, 14), most=0.5, tolerance=backend.rounding)
+    assert grads["opacity_logits"].any()
+
+
+def test_forward_and_backward_stop_at_the_same_splat(any_backend):
+    # Transmittance 0.02, 0.0004, then 0.000008 < 1e-4: the third is not drawn, nor the fourth.
+    logit = math.log(0.98 / 0.02)
+    gaussians = stack(logit, logit, logit, -2.0)
+    output, grads = any_backend.differentiate(gaussians, facing_camera(2, 3))
+    assert_close("alpha", 1 - output.alpha, torch.full_like(output.alpha, 0.0004), 0.05)
+    for name in FIELDS:
+        assert not grads[name][2:].any(), name
+    for name in ("opacity_logits", "sh", "log_scales"):
+        assert grads[name].view(4, -1)[:2].any(dim=1).all(), name
+    assert output.visible.all(), "being hidden is not being culled"
+
+
+# -------------------------------------------------------------------------- borders
+
+
+@pytest.mark.parametrize("log_scales", [[-1.5, -2.5, -3.0], [-0.9, -4.0, -4.0], [-2.5, -2.5, -2.5]])
+def test_an_ellipse_reaches_a_pixel_across_the_border_of_a_tile_exactly_or_not_at_all(
+    any_backend, log_scales
+):
+    gaussians, cameras = at_tile_corners(log_scales)
+    output = any_backend.show(gaussians, cameras)
+    exponents = torch.cat(
+        [ellipses(gaussians, cameras, view).exponents(32, 32) for view in range(len(cameras))]
+    )
+    cut = torch.log(gaussians.opacities.double() / ALPHA_MIN)
+    is_decided = (exponents / cut - 1).abs() > 1e-5
+    assert is_decided.double().mean() > 0.999
+    corner = (exponents / cut - 1)[:, 15:17, 15:17].flatten(1).abs().amin(dim=1)
+    assert (corner < 1e-2).all(), "every view has a pixel at the very edge"
+    assert torch.equal((output.alpha > 0)[is_decided], (exponents < cut)[is_decided])
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 19), (8, 8), (9, 7), (16, 16), (17, 15), (33, 7)])
+def test_sizes_that_are_no_multiple_of_a_tile(backend, height, width):
+    gaussians = make_gaussians(60, seed=2, degree=1, log_scale=-1.0)
+    backend.agrees(gaussians, make_cameras(3, height, width), most=0.3)
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 8192), (8192, 1)])
+def test_images_of_8192_pixels(backend, height, width):
+    # Centres near pixel 8000 are known to 1/2000 of a pixel in float32; the splats are wide enough for that.
+    gaussians, cameras = make_gaussians(15, seed=6, spread=1.0, log_scale=-2.0), facing_camera(height, width)
+    cameras.intrinsics[:, 0, 0], cameras.intrinsics[:, 1, 1] = width / 2.0, height / 2.0
+    gaussians.means[:, 2] += 3.0
+    output, _ = backend.agrees(gaussians, cameras, most=0.8, tolerance=1e-3, gradient_tolerance=1e-3)
+    drawn = (output.alpha[0] > 0).amax(dim=0 if width > height else 1).nonzero()
+    assert drawn.min() < 1000
+    assert drawn.max() > 7000
+
+
+# -------------------------------------------------------------------------- nothing to do
+
+
+@pytest.mark.parametrize("n", [0, 40])
+def test_nothing_visible_gives_the_background_and_gradients_of_zero(any_backend, n):
+    gaussians, cameras = make_gaussians(n), make_cameras(2, 20, 30)
+    gaussians.opacity_logits -= 50.0
+    output, grads = any_backend.differentiate(gaussians, cameras)
+    behind = backgrounds(2).to(any_backend.dtype)[:, None, None].expand(2, 20, 30, 3)
+    assert torch.equal(output.rgb, behind)
+    assert not output.alpha.any()
+    assert not output.depth.any()
+    assert not output.visible.any()
+    for name, grad in grads.items():
+        assert grad.shape == (output.means2d.shape if name == "means2d" else getattr(gaussians, name).shape)
+        assert not grad.any()
+
+
+def test_one_view_that_sees_nothing_among_others(backend):
+    cameras = make_cameras(3, 20, 30)
+    cameras.world_to_camera[1, 2, 3] = -9.0  # everything is behind this one
+    output, grads = backend.agrees(make_gaussians(40), cameras)
+    assert output.visible.any(dim=1).tolist() == [True, False, True]
+    assert not grads["means2d"][1].any()
+
+
+def test_a_loss_on_means2d_alone(backend):
+    cameras = make_cameras(2, 20, 30)
+
+    def gradient(render, put):
+        leaves = put(make_gaussians(40)).map(lambda tensor: tensor.requires_grad_())
+        render(leaves, cameras, put(backgrounds(2))).means2d.square().sum().backward()
+        assert not any(grad is not None and grad.any() for grad in (leaves.sh.grad, leaves.quats.grad))
+        return leaves.means.grad.cpu()
+
+    got = gradient(backend.render, backend.put)
+    want = gradient(ReferenceRasterizer().render, lambda tensors: tensors.to(torch.float64))
+    assert_close("gradient of means", got, want, 1e-5)
+
+
+# -------------------------------------------------------------------------- tensors as they come
+
+
+def test_tensors_that_are_not_contiguous(any_backend):
+    gaussians, cameras = any_backend.put(make_gaussians(60, degree=1)), make_cameras(2, 31, 31)
+    background = any_backend.put(backgrounds(2))
+
+    def scatter(tensor):
+        return torch.stack([tensor, torch.full_like(tensor, NAN)], dim=-1)[..., 0]
+
+    def everything(change):
+        leaves = gaussians.map(lambda tensor: change(tensor).requires_grad_())
+        views = replace(
+            cameras,
+            world_to_camera=change(cameras.world_to_camera),
+            intrinsics=change(cameras.intrinsics),
+        )
+        output = any_backend.render(leaves, views, change(background))
+        output.alpha.sum().backward()  # whose gradient is one number, expanded with stride 0
+        images = [getattr(output, name).detach() for name in IMAGES]
+        return [
+            *images,
+            *(tensor.grad for tensor in (leaves.means, leaves.log_scales, leaves.opacity_logits)),
+        ]
+
+    assert not gaussians.map(scatter).means.is_contiguous()
+    plain = everything(torch.clone)
+    assert_same_bits(plain, everything(scatter))
+    assert plain[3].any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
+def test_other_dtypes_come_and_go(backend, dtype):
+    gaussians, cameras = make_gaussians(40).to(dtype), make_cameras(1, 20, 20)
+    weights, background = (
+        [w.to(dtype).float() for w in make_weights(1, 20, 20)],
+        backgrounds(1).to(dtype).float(),
+    )
+    output, grads = replace(backend, dtype=dtype).differentiate(gaussians, cameras, weights, background)
+    same, same_grads = backend.differentiate(gaussians, cameras, weights, background)
+    for got, want in zip(bits(output, grads), bits(same, same_grads), strict=True):
+        assert got.dtype == dtype
+        assert_close("output", got.float(), want, 0.02)
+    if dtype == torch.float64:
+        assert torch.equal(output.rgb.float(), same.rgb)
+
+
+def test_autocast_does_not_reach_inside(any_backend):
+    gaussians, cameras = make_gaussians(30, degree=1), make_cameras(1, 20, 20)
+    plain = bits(*any_backend.differentiate(gaussians, cameras))
+    with torch.autocast(any_backend.device, dtype=torch.bfloat16):
+        assert_same_bits(plain, bits(*any_backend.differentiate(gaussians, cameras)))
+
+
+def test_cameras_and_background_follow_the_gaussians(backend):
+    gaussians, cameras = backend.put(make_gaussians(20)), make_cameras(2, 9, 9)
+    wanted = backend.render(gaussians, cameras, backend.put(backgrounds(2)))
+    output = backend.render(gaussians, cameras.to(torch.float64), backgrounds(2).double())
+    for name in IMAGES:
+        assert getattr(output, name).dtype == torch.float32
+        assert getattr(output, name).device.type == backend.device
+        assert torch.equal(getattr(output, name), getattr(wanted, name))
+
+
+def test_shapes_that_would_make_kernels_read_foreign_memory_are_refused(backend):
+    gaussians, cameras, background = backend.put(make_gaussians(4)), make_cameras(2, 9, 9), backgrounds(2)
+    with pytest.raises(ValueError, match="wanted"):
+        backend.render(gaussians, cameras.index(slice(0, 1)), background)
+    for coefficients in (2, 5, 25):  # of no degree, or of one too high
+        torn = Gaussians(**gaussians.tensors() | {"sh": torch.zeros(4, coefficients, 3)})
+        with pytest.raises(ValueError, match="wanted"):
+            backend.render(torn, cameras, background)
+    assert backend.render(gaussians, cameras, background).visible.any()
