@@ -3,6 +3,7 @@
 import os
 import re
 import shlex
+import shutil
 import sys
 import tempfile
 from argparse import Namespace
@@ -63,6 +64,8 @@ class Task:
 
 def launch(command: str, words: Sequence[str]) -> int:
     """Run ``cadam3d <command> <words>`` and return its exit code; the user's mistakes raise ``UserError``."""
+    if command == "doctor":
+        words = ["json=true" if word == "--json" else word for word in words]
     overrides, flags = split(words)
     _refuse_bare_words(command, overrides)
     options = _read_flags(flags)
@@ -188,7 +191,9 @@ def _run(
         raise explain(error, command, first) or error from error
     if not place:
         raise UserError(f"{key}: wanted a folder, got nothing. Try: {key}=outputs/mine, or without it")
-    folder = _claim(Path(str(place)), key, is_chosen=is_chosen)
+    wanted = Path(str(place)).expanduser()
+    stood = _standing(wanted if is_chosen else wanted.parent)
+    folder = _claim(wanted, key, is_chosen=is_chosen)
     if not is_sweep and cfg.resume is None and any((folder / name).exists() for name in RUN_MARKS):
         raise UserError(
             f"{key}: {folder} holds a run already. Try: cadam3d train {_resume(folder)}, or another folder"
@@ -197,7 +202,7 @@ def _run(
     if not is_sweep and cfg.resume is not None:
         return _run_again(command, [*arguments, *flags], folder)
     if not is_sweep:
-        return run_hydra(command, [*arguments, *flags])
+        return _run_anew(command, [*arguments, *flags], folder, stood)
     from cadam3d.commands import sweep
 
     flags = flags if options.multirun else [*flags, "--multirun"]
@@ -206,6 +211,22 @@ def _run(
     finally:
         code = sweep.finish(folder)
     return code
+
+
+def _run_anew(command: str, arguments: Sequence[str], folder: Path, stood: Path) -> int:
+    """Run in a new ``folder``. A refused line leaves nothing behind but ``stood``, which was there."""
+    try:
+        return run_hydra(command, arguments)
+    except (UserError, KeyboardInterrupt):
+        if folder != stood and all(
+            path.name == ".hydra" or path.suffix == ".log" for path in folder.iterdir()
+        ):
+            shutil.rmtree(folder, ignore_errors=True)
+            for parent in folder.parents:
+                if parent == stood or any(parent.iterdir()):
+                    break
+                parent.rmdir()
+        raise
 
 
 def _run_again(command: str, arguments: Sequence[str], folder: Path) -> int:
@@ -283,9 +304,13 @@ def _compose(command: str, overrides: Sequence[str], options: Namespace) -> Dict
         raise advice from error
 
 
+def _standing(folder: Path) -> Path:
+    """``folder``, or the nearest of those around it that exists."""
+    return next((place for place in (folder, *folder.parents) if place.exists()), folder)
+
+
 def _claim(folder: Path, key: str, *, is_chosen: bool) -> Path:
     """Make the folder and prove that it can be written; a name of our own that is taken gets a number."""
-    folder = folder.expanduser()
     number = 1
     wanted = folder
     while not is_chosen and folder.exists():

@@ -409,6 +409,31 @@ def test_a_run_gets_a_dated_folder_named_after_its_prompt(type_line, jobs, tmp_p
     assert (folder / "train.log").is_file()
 
 
+@pytest.mark.parametrize("place", [(), ("hydra.run.dir=deep/down/here",)])
+def test_a_refused_line_leaves_no_folder_behind(place, type_line, jobs, tmp_path):
+    assert type_line("train", "prompt=a cube", "seed=7", *place).code == 1
+    assert len(jobs) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_refused_line_removes_neither_what_was_there_nor_what_was_made(
+    type_line, jobs, tmp_path, monkeypatch
+):
+    (tmp_path / "mine").mkdir()
+    assert type_line("train", "prompt=a cube", "seed=7", "hydra.run.dir=mine/deep/er").code == 1
+    assert type_line("train", "prompt=a cube", "seed=7", "hydra.run.dir=mine").code == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+    assert not (tmp_path / "mine/deep").exists()
+
+    def run(cfg):
+        (Path(HydraConfig.get().runtime.output_dir) / "metrics.jsonl").touch()
+        raise UserError("disk full. Try: another one")
+
+    monkeypatch.setattr("cadam3d.commands.train.run", run)
+    assert type_line("train", "prompt=a cube", "hydra.run.dir=begun").code == 1
+    assert (tmp_path / "begun/metrics.jsonl").exists()
+
+
 def test_two_runs_in_one_second_do_not_share_a_folder(tmp_path):
     claims = [launch._claim(tmp_path / "10-00-00_cube", "hydra.run.dir", is_chosen=False) for _ in range(3)]
     assert [folder.name for folder in claims] == ["10-00-00_cube", "10-00-00_cube-2", "10-00-00_cube-3"]

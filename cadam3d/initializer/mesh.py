@@ -63,12 +63,13 @@ class Mesh(Initializer):
         )
 
     def _load(self) -> trimesh.Trimesh:
-        if not Path(self.path).is_file():
+        path = Path(self.path).expanduser()
+        if not path.is_file():
             raise UserError(
                 f"initializer.path: no file {self.path!r}. Try: initializer.path=/path/to/mesh.glb"
             )
         try:
-            mesh = trimesh.load_mesh(self.path)
+            mesh = trimesh.load_mesh(path)
         except Exception as error:  # every format has its own parser, with its own exceptions
             reason = str(error) or type(error).__name__
             raise UserError(

@@ -133,6 +133,12 @@ def test_the_generator_decides(tmp_path):
     assert not torch.equal(build(path, seed=1).means, build(path, seed=2).means)
 
 
+def test_a_path_below_the_home_folder_is_found(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    path = save(trimesh.creation.box(), tmp_path / "box.ply")
+    assert torch.equal(build("~/box.ply").means, build(path).means)
+
+
 def test_a_missing_file_is_said_so(tmp_path):
     with pytest.raises(UserError, match=r"initializer\.path: no file .*nothing\.glb"):
         build(tmp_path / "nothing.glb")
