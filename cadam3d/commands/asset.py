@@ -4,14 +4,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from jaxtyping import Float
 from omegaconf import DictConfig
+from torch import Tensor
 
+from cadam3d.commands.notes import note_backend
 from cadam3d.commands.paths import shown
+from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderFn
+from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.ply import read_ply
+from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.settings import component, components, load
 from cadam3d.trainer import render_fn, resolve_device
 
@@ -68,8 +73,15 @@ def run_config(folder: Path) -> DictConfig:
 
 
 def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
-    """Renders ``gaussians`` with the rasterizer that the configuration names."""
-    return render_fn(component(rasterizer), lambda: gaussians)
+    """Renders ``gaussians`` with the rasterizer that the configuration names, prepared when first used."""
+    built: Rasterizer = component(rasterizer)
+    render = render_fn(built, lambda: gaussians)
+
+    def render_with_note(cameras: Cameras, background: Float[Tensor, "v 3"]) -> RenderOutput:
+        note_backend(built.prepare(gaussians.device))
+        return render(cameras, background)
+
+    return render_with_note
 
 
 def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:

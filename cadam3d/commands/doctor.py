@@ -8,40 +8,25 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
-from enum import StrEnum
+from dataclasses import asdict
+from functools import partial
 from importlib import import_module, metadata
 from pathlib import Path
 
 from omegaconf import DictConfig
 
 from cadam3d import __version__
-from cadam3d.core.errors import UserError
+from cadam3d.commands.finding import Finding, Verdict, attempt
 from cadam3d.settings import component, compose, config_dir
 
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "imageio", "imageio-ffmpeg", "jaxtyping", "kornia")
 PACKAGES += ("pillow", "pyyaml", "scipy", "tqdm", "trimesh")
 IMPORT_NAMES = {"hydra-core": "hydra", "imageio-ffmpeg": "imageio_ffmpeg", "pillow": "PIL", "pyyaml": "yaml"}
-COMPILERS = ("c++", "g++", "clang++", "nvcc")
+COMPILERS = {  # and what to say where there is none
+    **dict.fromkeys(("c++", "g++", "clang++"), "not found; one C++ compiler is enough"),
+    "nvcc": "not found, not needed",
+}
 SECONDS = 60  # longest wait for a program that we ask for its version
-
-
-class Verdict(StrEnum):
-    """What a finding means for training."""
-
-    OK = "ok"
-    NOTE = "note"  # absent, and not needed by default
-    BROKEN = "broken"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line of the report."""
-
-    topic: str
-    verdict: Verdict
-    found: str
-    hint: str = ""  # what to type, unless all is well
 
 
 def run(cfg: DictConfig) -> None:
@@ -67,8 +52,8 @@ def examine() -> Iterator[Finding]:
     for check in (_torchvision, _device, _ffmpeg, _configs):
         yield _guarded(check)
     yield from map(_compiler, COMPILERS)
-    yield from _components("rasterizer", _try_rasterizer)
-    yield from _components("prior", _try_prior)
+    yield from _rasterizers()
+    yield from _priors()
     yield from map(_guarded, (_diffusers, _models))
 
 
@@ -158,7 +143,7 @@ def _configs() -> Finding:
 def _compiler(name: str) -> Finding:
     path = shutil.which(name)
     if path is None:
-        return Finding(name, Verdict.NOTE, "not found; only native kernels would need it")
+        return Finding(name, Verdict.NOTE, COMPILERS.get(name, "not found"))
     code, output = _ask([path, "--version"])
     if code != 0:
         return Finding(name, Verdict.NOTE, f"{path} does not run")
@@ -167,60 +152,25 @@ def _compiler(name: str) -> Finding:
     return Finding(name, Verdict.OK, (release or lines)[0].strip())
 
 
-def _components(group: str, attempt: Callable[[str, DictConfig], str]) -> Iterator[Finding]:
-    """Try every option of a group as a user would get it."""
-    for path in sorted((config_dir() / group).glob("*.yaml")):
-        topic = f"{group}={path.stem}"
-        try:
-            found = attempt(path.stem, compose(["prompt=test", topic])[group])
-            yield Finding(topic, Verdict.OK, found)
-        except (UserError, ImportError, OSError) as error:  # not available here, and it says why
-            yield Finding(topic, Verdict.NOTE, str(error).splitlines()[0])
-        except Exception as error:
-            reason = f"{type(error).__name__}: {error}".splitlines()[0]
-            yield Finding(topic, Verdict.BROKEN, reason, "Try: pip install --force-reinstall cadam3d")
+def _rasterizers() -> Iterator[Finding]:
+    try:
+        from cadam3d.commands.proofs import prove_rasterizers
+    except Exception as error:  # such as a torch that does not load, which has its own line above
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        yield Finding("rasterizers", Verdict.BROKEN, f"none can be loaded: {reason}")
+        return
+    yield from prove_rasterizers()
 
 
-def _try_rasterizer(name: str, node: DictConfig) -> str:
-    """Render one Gaussian from one view, where training would: on the device, or with ``cpu`` on the CPU."""
-    import torch
-
-    from cadam3d.core.cameras import turntable
-    from cadam3d.core.gaussians import Gaussians
-    from cadam3d.rasterizer.base import Rasterizer
-    from cadam3d.trainer import resolve_device
-
-    rasterizer: Rasterizer = component(node)
-    device = resolve_device("auto")
-    chosen = rasterizer.chosen(device)
-    gaussians = Gaussians(
-        means=torch.zeros(1, 3),
-        log_scales=torch.full((1, 3), -1.0),
-        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        opacity_logits=torch.full((1,), 4.0),
-        sh=torch.zeros(1, 1, 3),
-    ).to("cpu" if chosen == "cpu" else device)
-    camera = turntable(1, elevation_deg=0.0, distance=3.0, fov_y_deg=40.0, size=16)
-    with torch.no_grad():
-        alpha = float(rasterizer.render(gaussians, camera, torch.zeros(1, 3)).alpha[0, 8, 8])
-    if not 0.9 < alpha < 1:
-        raise RuntimeError(f"rendered alpha {alpha:.3f} where it should be 0.98")
-    if name == "cpu":
-        return f"renders, {_kernels(node.cache_dir)}"
-    return "renders" if chosen == name else f"renders with {chosen}"
+def _priors() -> Iterator[Finding]:
+    for path in sorted((config_dir() / "prior").glob("*.yaml")):
+        topic = f"prior={path.stem}"
+        yield attempt(topic, partial(_prior, topic))
 
 
-def _kernels(cache_dir: str | None) -> str:
-    """What the native kernels are compiled for, and where they are kept."""
-    from cadam3d.rasterizer.build import default_cache_dir
-    from cadam3d.rasterizer.cpu import instruction_set, load_kernels
-
-    return f"{instruction_set(load_kernels(cache_dir))} kernels in {cache_dir or default_cache_dir()}"
-
-
-def _try_prior(_: str, node: DictConfig) -> str:
-    prior = component(node)
-    return (prior.notice() or "ready").splitlines()[0]
+def _prior(topic: str) -> Finding:
+    prior = component(compose(["prompt=test", topic]).prior)
+    return Finding(topic, Verdict.OK, (prior.notice() or "ready").splitlines()[0])
 
 
 def _diffusers() -> Finding:

@@ -15,6 +15,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import __version__
+from cadam3d.commands.notes import note, note_backend
 from cadam3d.commands.paths import shown
 from cadam3d.core.checks import UserError, require, require_whole
 from cadam3d.exporter.base import Exporter
@@ -68,13 +69,15 @@ def run(cfg: DictConfig) -> float | None:
     # Same seed, same bytes: on the CPU every operation we use has a deterministic form.
     torch.use_deterministic_algorithms(device.type == "cpu")
     trainer = build_trainer(cfg, device)
+    backend = trainer.rasterizer.prepare(device)
     exporters: dict[str, Exporter] = components(cfg.exporter)
     metrics: dict[str, Metric] = components(cfg.metric)
 
     embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
     state = _start_or_resume(cfg, trainer, device, folder)
     if notice := trainer.prior.notice():
-        print(f"Note: {notice}", file=sys.stderr)
+        note(notice)
+    note_backend(backend)
     remove_leftovers(folder)
     config_text = OmegaConf.to_yaml(cfg, resolve=True)
     (folder / "config.yaml").write_text(config_text, encoding="utf-8")
@@ -82,12 +85,15 @@ def run(cfg: DictConfig) -> float | None:
         _point_latest_at(folder)
 
     log.info("prompt %r, seed %d, on %s, from step %d", cfg.prompt, cfg.seed, device, state.step)
+    log.info("rasterizer=%s; %s", backend.name, backend.reason or "nothing faster is known here")
     render = trainer.renderer(state)
     context = RunContext(folder=folder, prompt=cfg.prompt, total_steps=trainer.steps, render=render)
     with StopOnSignal() as stop:
         outcome = trainer.train(state, embedding, context, stop)
         summary = summarize(cfg, state, outcome)
-        summary["backend"] = trainer.rasterizer.chosen(device)
+        summary["backend"] = backend.name
+        if backend.reason:
+            summary["backend_reason"] = backend.reason
         write_json(folder / "summary.json", summary)  # first of all: pictures may fail, the numbers stay
         gaussians = state.gaussians.detach()
         warnings = _export(exporters, gaussians, render, folder)

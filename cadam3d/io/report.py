@@ -34,6 +34,8 @@ LABELS = {
     "psnr_min": "PSNR of the worst view (dB)",
     "ssim": "SSIM",
     "mode": "Mode of the prior it matches",
+    "backend": "Rasterizer that rendered",
+    "backend_reason": "Why no faster one",
     "seconds": "Seconds",
     "steps": "Steps done",
     "steps_asked": "Steps asked for",

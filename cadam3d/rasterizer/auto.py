@@ -1,9 +1,8 @@
 """The best rasterizer for the device the Gaussians live on: what a user who does not care gets."""
 
-import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cache, partial
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from jaxtyping import Float
@@ -13,62 +12,99 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
-from cadam3d.rasterizer.base import Rasterizer
-from cadam3d.rasterizer.cpu import CpuRasterizer, load_kernels
+from cadam3d.rasterizer.base import Backend, Rasterizer
+from cadam3d.rasterizer.cpu import CpuRasterizer
+from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
+from cadam3d.rasterizer.selftest import self_test
 
-
-@dataclass(frozen=True)
-class Candidate:
-    """A backend, and the question whether it works here."""
-
-    name: str  # what a user types to have it: rasterizer=<name>
-    works_on: Callable[[torch.device], bool]  # must answer, not raise
-    build: Callable[[], Rasterizer]
-
-
-def has_native_kernels(device: torch.device) -> bool:
-    """Whether the native rasterizer serves ``device``: its kernels are compiled or cached now, to be sure.
-
-    Where that fails, one warning says why and what to install; the reference then takes its place.
-    """
-    if device.type != "cpu":
-        return False
-    try:
-        load_kernels(None)
-    except UserError as error:
-        warnings.warn(f"Rendering with the slow reference rasterizer, for {error}", stacklevel=2)
-        return False
-    return True
-
-
-CANDIDATES = (  # fastest first; the last one works everywhere
-    Candidate("cpu", has_native_kernels, partial(CpuRasterizer, cache_dir=None)),
-    Candidate("reference", lambda device: True, ReferenceRasterizer),
+REPORT = (
+    "Please report this with the output of `cadam3d doctor`. Until mended, settle for: rasterizer=reference"
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class AutoRasterizer(Rasterizer):
-    """Renders with the first of ``CANDIDATES`` that works on the device of the Gaussians.
+    """Renders with the compiled kernels for the device of the Gaussians, or else with the reference.
 
-    The question is asked once per device, at the first render; the answer holds as long as the process lives.
+    The question is asked once per device; the answer holds as long as the process lives.
     """
 
     def render(
         self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
     ) -> RenderOutput:
         """See :meth:`Rasterizer.render`."""
-        _, rasterizer = _choose(gaussians.device)
-        return rasterizer.render(gaussians, cameras, background)
+        return choose(gaussians.device).rasterizer.render(gaussians, cameras, background)
 
-    def chosen(self, device: torch.device) -> str:
-        """Name of the backend that renders Gaussians on ``device``, as in ``rasterizer=<name>``."""
-        name, _ = _choose(device)
-        return name
+    def prepare(self, device: torch.device) -> Backend:
+        """See :meth:`Rasterizer.prepare`. Where the reference stands in, the reason is there."""
+        return choose(device).backend
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A rasterizer that works on a device, and how it is called."""
+
+    rasterizer: Rasterizer
+    backend: Backend
+
+
+def choose(device: torch.device) -> Choice:
+    """What ``rasterizer=auto`` takes on ``device``."""
+    if device.type == "cuda" and device.index is None and torch.cuda.is_available():
+        device = torch.device("cuda", torch.cuda.current_device())
+    return _choose(device)
 
 
 @cache
-def _choose(device: torch.device) -> tuple[str, Rasterizer]:
-    candidate = next(candidate for candidate in CANDIDATES if candidate.works_on(device))
-    return candidate.name, candidate.build()
+def _choose(device: torch.device) -> Choice:
+    reference = ReferenceRasterizer()
+    if device.type not in FASTEST:
+        return Choice(reference, reference.prepare(device))
+    try:
+        rasterizer = FASTEST[device.type](device)
+        return Choice(rasterizer, rasterizer.prepare(device))
+    except UserError as error:
+        _refuse_broken(device)
+        return Choice(reference, replace(reference.prepare(device), reason=str(error)))
+
+
+def native(device: torch.device) -> Rasterizer:
+    """The native rasterizer; its kernels have proved themselves when they were built."""
+    rasterizer = CpuRasterizer(cache_dir=None)
+    rasterizer.prepare(device)
+    return rasterizer
+
+
+def proven_cuda(device: torch.device) -> Rasterizer:
+    """The CUDA rasterizer, if it passes the self-test on this very device; else :class:`UserError`."""
+    rasterizer = CudaRasterizer(cache_dir=None)
+    rasterizer.prepare(device)
+    name = torch.cuda.get_device_name(device)
+    try:
+        agreement = self_test(rasterizer, device)
+    except (RuntimeError, MemoryError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(
+            f"rasterizer=cuda cannot finish its self-test on {name}: {reason}. {REPORT}"
+        ) from error
+    if not (agreement.holds and agreement.repeats):
+        raise UserError(f"rasterizer=cuda fails its self-test on {name}: it {agreement}. {REPORT}")
+    return rasterizer
+
+
+# By type of device; each returns a rasterizer that works there, or raises UserError.
+FASTEST: Mapping[str, Callable[[torch.device], Rasterizer]] = {"cpu": native, "cuda": proven_cuda}
+
+
+def _refuse_broken(device: torch.device) -> None:
+    """A kernel that touches what it must not takes the whole device from this process, the reference too."""
+    if device.type == "cuda" and torch.cuda.is_available():
+        try:
+            torch.cuda.synchronize(device)
+        except RuntimeError as error:
+            reason = str(error).splitlines()[0]
+            raise UserError(
+                f"rasterizer=auto: the self-test of rasterizer=cuda broke {device} ({reason}). "
+                "Try: rasterizer=reference"
+            ) from error

@@ -1,6 +1,7 @@
 """Rasterizer: Gaussians and cameras in, images and their gradients out."""
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -20,6 +21,14 @@ FAR = 1e15  # world units; this far or farther too, before gradients of depth le
 FRUSTUM_MARGIN = 0.15  # the Jacobian is evaluated at most this share of the image size outside the border
 
 
+@dataclass(frozen=True)
+class Backend:
+    """What renders on a device."""
+
+    name: str  # as in rasterizer=<name>
+    reason: str | None = None  # why nothing faster does, and what to type; None if nothing faster exists
+
+
 class Rasterizer(ABC):
     """How we see. A component is its hyper-parameters; it holds no tensors."""
 
@@ -36,6 +45,9 @@ class Rasterizer(ABC):
         contribution, zero gradient, never a NaN.
         """
 
-    def chosen(self, device: torch.device) -> str:
-        """Name of the backend that renders Gaussians on ``device``: this one, unless it chooses another."""
-        return type(self).__name__.removesuffix("Rasterizer").lower()
+    def prepare(self, device: torch.device) -> Backend:
+        """Compile and load now what rendering on ``device`` needs, and say what will render there.
+
+        Raises :class:`UserError` if it cannot be had. Without this call, the first render does it.
+        """
+        return Backend(type(self).__name__.removesuffix("Rasterizer").lower())

@@ -14,7 +14,7 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
-from cadam3d.rasterizer.base import Rasterizer
+from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.rasterizer.build import build, default_cache_dir, load
 from cadam3d.rasterizer.native import Frame, render_frame, require_shapes
 
@@ -32,9 +32,15 @@ class CpuRasterizer(Rasterizer):
         self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
     ) -> RenderOutput:
         """See :meth:`Rasterizer.render`. Raises :class:`UserError` off the CPU or without a compiler."""
-        if gaussians.device.type != "cpu":
-            raise UserError(f"rasterizer=cpu cannot render on {gaussians.device}. Try: rasterizer=auto")
+        self.prepare(gaussians.device)
         return rasterize(load_kernels(self.cache_dir), gaussians, cameras, background)
+
+    def prepare(self, device: torch.device) -> Backend:
+        """See :meth:`Rasterizer.prepare`."""
+        if device.type != "cpu":
+            raise UserError(f"rasterizer=cpu cannot render on {device}. Try: rasterizer=auto")
+        load_kernels(self.cache_dir)
+        return super().prepare(device)
 
 
 @cache

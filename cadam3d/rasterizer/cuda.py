@@ -32,7 +32,7 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
-from cadam3d.rasterizer.base import Rasterizer
+from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.rasterizer.build import default_cache_dir
 from cadam3d.rasterizer.native import Frame, render_frame, require_shapes
 
@@ -73,9 +73,21 @@ class CudaRasterizer(Rasterizer):
         self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
     ) -> RenderOutput:
         """See :meth:`Rasterizer.render`. Raises :class:`UserError` off CUDA, or if nothing can compile."""
-        if gaussians.device.type != "cuda":
-            raise UserError(f"rasterizer=cuda cannot render on {gaussians.device}. Try: rasterizer=auto")
+        _refuse_others(gaussians.device)
         return rasterize(load_kernels(self.cache_dir), gaussians, cameras, background)
+
+    def prepare(self, device: torch.device) -> Backend:
+        """See :meth:`Rasterizer.prepare`."""
+        _refuse_others(device)
+        if not torch.cuda.is_available():
+            raise UserError("rasterizer=cuda: torch sees no CUDA device. Try: cadam3d doctor")
+        with load_kernels(self.cache_dir).on(device):
+            return super().prepare(device)
+
+
+def _refuse_others(device: torch.device) -> None:
+    if device.type != "cuda":
+        raise UserError(f"rasterizer=cuda cannot render on {device}. Try: rasterizer=auto")
 
 
 @cache

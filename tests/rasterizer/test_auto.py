@@ -1,17 +1,22 @@
-"""The automatic choice: the first backend that works on the device, asked once, and then simply used."""
+"""The automatic choice: compiled kernels that have proved themselves, else the reference and the reason."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 
 from cadam3d.core.cameras import turntable
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.rasterizer import auto
-from cadam3d.rasterizer.auto import AutoRasterizer, Candidate
+from cadam3d.rasterizer.auto import AutoRasterizer, choose, proven_cuda
+from cadam3d.rasterizer.base import Backend
+from cadam3d.rasterizer.build import find_compiler
+from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
+from cadam3d.rasterizer.selftest import self_test
 
-CPU, META = torch.device("cpu"), torch.device("meta")
+CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,57 +49,149 @@ def brightest(rasterizer: AutoRasterizer) -> float:
     return rasterizer.render(a_ball(), cameras, torch.zeros(1, 3)).alpha.max().item()
 
 
-def test_the_first_candidate_that_works_on_the_device_renders(monkeypatch):
-    candidates = (
-        Candidate("elsewhere", lambda device: device.type == "meta", Flat),
-        Candidate("flat", lambda device: True, Flat),
-        Candidate("reference", lambda device: True, ReferenceRasterizer),
-    )
-    monkeypatch.setattr(auto, "CANDIDATES", candidates)
-    assert AutoRasterizer().chosen(CPU) == "flat"
-    assert AutoRasterizer().chosen(META) == "elsewhere"
+def refuse(device):
+    raise UserError("no compiler. Try: to get one")
+
+
+def test_the_fastest_for_the_device_renders(monkeypatch):
+    monkeypatch.setattr(auto, "FASTEST", {"cpu": lambda device: Flat()})
+    assert AutoRasterizer().prepare(CPU) == Backend("flat", reason=None)
     assert brightest(AutoRasterizer()) == 0
 
 
-def test_a_backend_is_asked_and_built_once(monkeypatch):
-    asked, built = [], []
+def test_where_it_cannot_be_had_the_reference_renders_and_the_reason_is_there(monkeypatch):
+    monkeypatch.setattr(auto, "FASTEST", {"cpu": refuse})
+    assert AutoRasterizer().prepare(CPU) == Backend("reference", reason="no compiler. Try: to get one")
+    assert brightest(AutoRasterizer()) > 0
 
-    def works_on(device: torch.device) -> bool:
+
+def test_the_reference_needs_no_reason_where_nothing_faster_exists():
+    assert AutoRasterizer().prepare(torch.device("meta")) == Backend("reference", reason=None)
+
+
+def test_a_device_is_asked_once(monkeypatch):
+    asked = []
+
+    def fastest(device):
         asked.append(device)
-        return True
-
-    def build() -> ReferenceRasterizer:
-        built.append(1)
         return ReferenceRasterizer()
 
-    monkeypatch.setattr(auto, "CANDIDATES", (Candidate("counted", works_on, build),))
-    assert brightest(AutoRasterizer()) > 0
-    assert brightest(AutoRasterizer()) > 0
-    assert AutoRasterizer().chosen(CPU) == "counted"
+    monkeypatch.setattr(auto, "FASTEST", {"cpu": fastest})
+    brightest(AutoRasterizer())
+    brightest(AutoRasterizer())
+    AutoRasterizer().prepare(CPU)
     assert asked == [CPU]
-    assert built == [1]
 
 
-def test_nothing_is_asked_before_the_first_render(monkeypatch):
-    def works_on(device: torch.device) -> bool:
+def test_nothing_is_asked_before_it_is_needed(monkeypatch):
+    def fastest(device):
         raise AssertionError("asked too early")
 
-    monkeypatch.setattr(auto, "CANDIDATES", (Candidate("eager", works_on, Flat),))
+    monkeypatch.setattr(auto, "FASTEST", {"cpu": fastest})
     AutoRasterizer()
 
 
-@pytest.mark.parametrize("device", ["cpu", "cuda", "mps", "meta"])
+@pytest.mark.parametrize("device", ["cpu", "mps", "meta", "cuda"])
 def test_there_is_a_backend_for_every_device(device):
-    assert auto.CANDIDATES[-1].works_on(torch.device(device))
-    assert AutoRasterizer().chosen(torch.device(device)) in {candidate.name for candidate in auto.CANDIDATES}
+    assert AutoRasterizer().prepare(torch.device(device)).name in ("cpu", "cuda", "reference")
 
 
-def test_what_auto_shows_is_what_its_choice_shows():
-    chosen = AutoRasterizer().chosen(CPU)
-    candidate = next(candidate for candidate in auto.CANDIDATES if candidate.name == chosen)
+@pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
+def test_what_auto_shows_on_a_cpu_is_what_the_native_rasterizer_shows():
+    choice = choose(CPU)
+    assert choice.backend == Backend("cpu", reason=None)
     cameras = turntable(2, elevation_deg=10.0, distance=2.0, fov_y_deg=40.0, size=8)
     background = torch.rand(2, 3)
     got = AutoRasterizer().render(a_ball(), cameras, background)
-    want = candidate.build().render(a_ball(), cameras, background)
+    want = choice.rasterizer.render(a_ball(), cameras, background)
     assert torch.equal(got.rgb, want.rgb)
     assert torch.equal(got.depth, want.depth)
+
+
+# -------------------------------------------------------------------------- the gate before CUDA
+
+
+@pytest.fixture
+def a_gpu(monkeypatch):
+    """A CUDA device on which the kernels compile and load; what its self-test comes to, the test says."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "a GPU")
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: None)
+    monkeypatch.setattr(CudaRasterizer, "prepare", lambda self, device: Backend("cuda"))
+
+    def behave(test):
+        def counted(rasterizer, device):
+            tested.append((rasterizer, device))
+            return test()
+
+        tested = []
+        monkeypatch.setattr(auto, "self_test", counted)
+        return tested
+
+    return behave
+
+
+@pytest.fixture(scope="module")
+def agreement():
+    return self_test(ReferenceRasterizer(), CPU)
+
+
+def raising(error):
+    def test():
+        raise error
+
+    return test
+
+
+def test_cuda_kernels_that_pass_the_self_test_are_taken_and_tested_once(a_gpu, agreement):
+    tested = a_gpu(lambda: agreement)
+    for device in (GPU, torch.device("cuda"), GPU):  # with or without a number, it is one device
+        assert choose(device).backend == Backend("cuda", reason=None)
+    assert tested == [(CudaRasterizer(cache_dir=None), GPU)]
+
+
+@pytest.mark.parametrize(
+    "change", [{"gradients": {"means": 0.5}}, {"images": {"rgb": 0.5}}, {"repeats": False}]
+)
+def test_cuda_kernels_that_fail_the_self_test_are_not_taken(change, a_gpu, agreement):
+    a_gpu(lambda: replace(agreement, **change))
+    backend = choose(GPU).backend
+    assert backend.name == "reference"
+    assert "rasterizer=cuda fails its self-test on a GPU: it " in backend.reason
+    assert "report" in backend.reason
+    assert "\n" not in backend.reason
+
+
+@pytest.mark.parametrize("error", [RuntimeError("CUDA error\nat line 1"), MemoryError("full")])
+def test_cuda_kernels_that_crash_in_the_self_test_are_not_taken(error, a_gpu):
+    a_gpu(raising(error))
+    backend = choose(GPU).backend
+    assert backend.name == "reference"
+    assert "rasterizer=cuda cannot finish its self-test on a GPU: " in backend.reason
+    assert "\n" not in backend.reason
+
+
+def test_a_device_that_a_crash_has_broken_is_not_rendered_on(a_gpu, monkeypatch):
+    def synchronize(device):
+        raise RuntimeError("an illegal memory access was encountered")
+
+    a_gpu(raising(RuntimeError("an illegal memory access was encountered")))
+    monkeypatch.setattr(torch.cuda, "synchronize", synchronize)
+    with pytest.raises(
+        UserError, match=r"broke cuda:0 \(an illegal memory access.*Try: rasterizer=reference"
+    ):
+        choose(GPU)
+
+
+def test_kernels_that_do_not_compile_are_not_tested(a_gpu, monkeypatch):
+    tested = a_gpu(raising(AssertionError("tested")))
+    monkeypatch.setattr(CudaRasterizer, "prepare", lambda self, device: refuse(device))
+    assert choose(GPU).backend.reason == "no compiler. Try: to get one"
+    assert not tested
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_the_gate_opens_on_this_gpu():
+    assert proven_cuda(GPU) == CudaRasterizer(cache_dir=None)

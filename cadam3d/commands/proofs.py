@@ -1,0 +1,126 @@
+"""What ``cadam3d doctor`` says of the rasterizers: how each was compiled, and what its self-test shows."""
+
+import math
+import time
+from collections.abc import Iterator, Mapping
+from functools import partial
+
+import torch
+
+from cadam3d.commands.finding import Finding, Verdict, attempt
+from cadam3d.rasterizer import build, nvrtc
+from cadam3d.rasterizer.auto import AutoRasterizer
+from cadam3d.rasterizer.base import Rasterizer
+from cadam3d.rasterizer.cpu import CpuRasterizer, instruction_set
+from cadam3d.rasterizer.cuda import CudaRasterizer
+from cadam3d.rasterizer.reference import ReferenceRasterizer
+from cadam3d.rasterizer.selftest import self_test
+
+CPU = torch.device("cpu")
+
+
+def prove_rasterizers() -> Iterator[Finding]:
+    """Compile and prove each backend on each device; ``auto`` last, for it would compile unseen."""
+    gpus = [torch.device("cuda", i) for i in range(torch.cuda.device_count())]
+    yield (kernels := attempt("kernels for cpu", _cpu_kernels))
+    if kernels.verdict is Verdict.OK:
+        yield _proof("rasterizer=cpu", CpuRasterizer(cache_dir=None), CPU)
+    if not gpus:
+        yield attempt("kernels for cuda", _no_cuda)
+    for gpu in gpus:
+        yield (kernels := attempt("kernels for cuda", partial(_cuda_kernels, gpu)))
+        if kernels.verdict is Verdict.OK:
+            yield _proof("rasterizer=cuda", CudaRasterizer(cache_dir=None), gpu)
+    for device in (CPU, *gpus):
+        yield _proof("rasterizer=reference", ReferenceRasterizer(), device)
+    for device in (CPU, *gpus):
+        yield attempt("rasterizer=auto", partial(_choice, device))
+
+
+def _cpu_kernels() -> Finding:
+    built, compiler = build.build(build.default_cache_dir()), build.find_compiler()
+    instructions = instruction_set(build.load(built))
+    version = compiler.version if compiler else None
+    facts = {"compiler": version, "instruction_set": instructions, **_kept(built)}
+    found = f"{instructions} by {version or 'a compiler that is gone'}, {_when(built)}"
+    return Finding("kernels for cpu", Verdict.OK, found, facts=facts)
+
+
+def _cuda_kernels(device: torch.device) -> Finding:
+    name, capability = torch.cuda.get_device_name(device), torch.cuda.get_device_capability(device)
+    built, compiler = nvrtc.build(build.default_cache_dir(), capability), nvrtc.find_compiler()
+    assert compiler is not None, "build() has just needed it"
+    facts = {
+        "device": name,
+        "compute_capability": ".".join(map(str, capability)),
+        "architecture": f"sm_{nvrtc.choose_architecture(capability, compiler)}",
+        **_nvrtc(compiler),
+        **_kept(built),
+    }
+    found = (
+        f"{facts['architecture']} for {name} (compute capability {facts['compute_capability']}) "
+        f"by NVRTC {facts['nvrtc_version']} in {compiler.path}, {_when(built)}"
+    )
+    return Finding("kernels for cuda", Verdict.OK, found, facts=facts)
+
+
+def _no_cuda() -> Finding:
+    compiler = nvrtc.find_compiler()
+    if compiler is None:
+        return Finding("kernels for cuda", Verdict.NOTE, "torch sees no CUDA device; no NVRTC is here")
+    facts = _nvrtc(compiler)
+    found = f"torch sees no CUDA device; NVRTC {facts['nvrtc_version']} is here: {compiler.path}"
+    return Finding("kernels for cuda", Verdict.NOTE, found, facts=facts)
+
+
+def _proof(topic: str, rasterizer: Rasterizer, device: torch.device) -> Finding:
+    return attempt(topic, partial(_prove, topic, rasterizer, device))
+
+
+def _prove(topic: str, rasterizer: Rasterizer, device: torch.device) -> Finding:
+    start = time.perf_counter()
+    agreement = self_test(rasterizer, device)
+    facts = {
+        "device": str(device),
+        "agrees": agreement.holds,
+        "same_bits": agreement.repeats,
+        "images": _as_json(agreement.images),
+        "gradients": _as_json(agreement.gradients),
+        "seconds": time.perf_counter() - start,
+    }
+    found = f"{agreement}, on {device}"
+    promises_bits = topic != "rasterizer=reference" or device.type == "cpu"
+    if agreement.holds and (agreement.repeats or not promises_bits):
+        return Finding(topic, Verdict.OK, found, facts=facts)
+    # What auto does not take breaks nobody's training.
+    verdict = Verdict.NOTE if topic == "rasterizer=cuda" else Verdict.BROKEN
+    return Finding(topic, verdict, found, "Please report this. Until mended: rasterizer=reference", facts)
+
+
+def _choice(device: torch.device) -> Finding:
+    backend = AutoRasterizer().prepare(device)
+    facts = {"device": str(device), "backend": backend.name, "reason": backend.reason}
+    if backend.reason is None:
+        found = f"takes {backend.name} on {device}: the fastest there is, and it works"
+        return Finding("rasterizer=auto", Verdict.OK, found, facts=facts)
+    first, *others = backend.reason.splitlines()
+    found = f"takes {backend.name} on {device}, which is slow: {first}"
+    return Finding("rasterizer=auto", Verdict.NOTE, found, others[-1] if others else "", facts)
+
+
+def _kept(built: build.Build | nvrtc.Cubin) -> dict[str, object]:
+    return {"path": str(built.path), "compiled_now": built.seconds > 0, "compile_seconds": built.seconds}
+
+
+def _when(built: build.Build | nvrtc.Cubin) -> str:
+    how = f"compiled now in {built.seconds:.1f} s, kept in" if built.seconds else "from the cache in"
+    return f"{how} {built.path.parent}"
+
+
+def _nvrtc(compiler: nvrtc.Compiler) -> dict[str, object]:
+    return {"nvrtc": compiler.path, "nvrtc_version": ".".join(map(str, compiler.version))}
+
+
+def _as_json(deviations: Mapping[str, float]) -> dict[str, float | None]:
+    # JSON has no infinity, which is what a deviation is where something is not finite.
+    return {name: value if math.isfinite(value) else None for name, value in deviations.items()}

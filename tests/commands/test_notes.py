@@ -1,0 +1,109 @@
+"""Notes: said plainly, once; and a training without the fast kernels says so everywhere it should."""
+
+import json
+import sys
+
+import pytest
+
+from cadam3d import cli
+from cadam3d.commands import notes
+from cadam3d.core.errors import UserError
+from cadam3d.rasterizer import auto, cpu
+from cadam3d.rasterizer.base import Backend
+
+NEEDED = "rasterizer=cpu needs a C++ compiler. Install one"
+SMALL = [
+    "prompt=a red cube",
+    "experiment=smoke",
+    "prior=tiny",
+    "device=cpu",
+    "steps=1",
+    "initializer.count=9",
+]
+SMALL += ["exporter=[ply]", "metric=[]", "camera.size=16"]
+
+
+@pytest.fixture(autouse=True)
+def _nothing_said_yet():
+    notes.note.cache_clear()
+    auto._choose.cache_clear()
+    yield
+    notes.note.cache_clear()
+    auto._choose.cache_clear()
+
+
+@pytest.fixture
+def no_compiler(monkeypatch):
+    def no_kernels(cache_dir):
+        raise UserError(NEEDED)
+
+    monkeypatch.setattr(cpu, "load_kernels", no_kernels)
+
+
+@pytest.fixture
+def type_line(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: str) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["cadam3d", *words])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return int(ended.value.code or 0), capsys.readouterr().err
+
+    return run
+
+
+def test_a_note_is_printed_once(capsys):
+    notes.note("mind the gap")
+    notes.note("mind the gap")
+    notes.note("mind the step")
+    assert capsys.readouterr().err == "Note: mind the gap\nNote: mind the step\n"
+
+
+def test_a_backend_is_noted_only_where_something_faster_was_wanted(capsys):
+    notes.note_backend(Backend("cpu"))
+    notes.note_backend(Backend("reference", reason="No compiler. Install one"))
+    assert capsys.readouterr().err == (
+        "Note: rendering with rasterizer=reference, which is slow: No compiler. Install one\n"
+    )
+
+
+def test_a_training_without_a_compiler_says_so_once_and_writes_it_down(type_line, no_compiler, tmp_path):
+    code, err = type_line("train", *SMALL)
+    assert code == 0
+    assert err.count(NEEDED) == 1
+    assert f"\nNote: rendering with rasterizer=reference, which is slow: {NEEDED}\n" in err
+    assert "Warning" not in err
+    run = tmp_path / "outputs/latest"
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    assert (summary["rasterizer"], summary["backend"], summary["backend_reason"]) == (
+        *("auto", "reference"),
+        NEEDED,
+    )
+    assert NEEDED in (run / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_jobs_of_a_sweep_say_it_once(type_line, no_compiler):
+    code, err = type_line("sweep", *SMALL, "seed=0,1")
+    assert code == 0
+    assert err.count(NEEDED) == 1
+
+
+def test_another_command_says_it_when_it_renders(type_line, no_compiler):
+    assert type_line("train", *SMALL, "rasterizer=reference")[0] == 0
+    code, err = type_line("export", "run=outputs/latest", "output=copy.ply")
+    assert (code, err.count(NEEDED)) == (0, 0)
+    code, err = type_line("render", "run=outputs/latest", "exporter=[images]", "exporter.images.views=1")
+    assert (code, err.count(NEEDED)) == (0, 1)
+
+
+def test_a_rasterizer_that_cannot_be_had_is_refused_before_anything_is_touched(
+    type_line, no_compiler, tmp_path
+):
+    assert type_line("train", *SMALL, "rasterizer=reference")[0] == 0
+    latest = (tmp_path / "outputs/latest").resolve()
+    before = sorted(tmp_path.rglob("*"))
+    code, err = type_line("train", *SMALL, "rasterizer=cpu")
+    assert (code, err) == (1, f"cadam3d: {NEEDED}\n")
+    assert (tmp_path / "outputs/latest").resolve() == latest
+    assert sorted(tmp_path.rglob("*")) == before
