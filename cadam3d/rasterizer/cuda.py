@@ -98,17 +98,6 @@ def load_kernels(cache_dir: str | None) -> Launcher:
     return Driver(Path(cache_dir).expanduser() if cache_dir else default_cache_dir())
 
 
-def works_on(device: torch.device) -> bool:
-    """Whether Gaussians on ``device`` can be rendered here: its kernels are compiled and loaded, to be sure.
-
-    Raises :class:`UserError`, which says what is missing, if there is a CUDA device that cannot be served.
-    """
-    if device.type != "cuda" or not torch.cuda.is_available():
-        return False
-    with load_kernels(None).on(device):
-        return True
-
-
 def rasterize(
     launcher: Launcher, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
 ) -> RenderOutput:

@@ -25,7 +25,7 @@ from splats import (
 from cadam3d.core.checks import UserError
 from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.build import KERNELS
-from cadam3d.rasterizer.cuda import CudaRasterizer, works_on
+from cadam3d.rasterizer.cuda import CudaRasterizer
 
 pytestmark = pytest.mark.usefixtures("garbage_in_new_memory")
 
@@ -69,8 +69,14 @@ def test_runs_on_the_stream_that_is_current():
 def test_off_cuda_it_says_what_to_type():
     with pytest.raises(UserError, match="rasterizer=auto"):
         CudaRasterizer(cache_dir=None).render(make_gaussians(1), make_cameras(1, 9, 9), backgrounds(1))
-    assert not works_on(CPU)
-    assert works_on(torch.device("cuda")) is torch.cuda.is_available()
+    with pytest.raises(UserError, match="rasterizer=auto"):
+        CudaRasterizer(cache_dir=None).prepare(CPU)
+
+
+def test_without_a_cuda_device_it_says_so_before_it_compiles_anything(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(UserError, match="sees no CUDA device"):
+        CudaRasterizer(cache_dir=None).prepare(torch.device("cuda"))
 
 
 # -------------------------------------------------------------------------- the parts

@@ -74,6 +74,17 @@ def test_the_native_kernels_pass(kernel_build):
     assert agreement.repeats
 
 
+def test_the_cuda_kernels_pass_in_the_emulator(emulator):
+    @dataclass(frozen=True)
+    class Emulated(Rasterizer):
+        def render(self, gaussians, cameras, background):
+            return emulator.render(gaussians, cameras, background)
+
+    agreement = self_test(Emulated(), CPU)
+    assert agreement.holds, agreement
+    assert agreement.repeats
+
+
 # -------------------------------------------------------------------------- the scene
 
 
