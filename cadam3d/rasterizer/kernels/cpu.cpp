@@ -77,7 +77,7 @@ struct alignas(64) Splat {
   uint32_t columns, rows;  // of tiles that its box touches: the first, and the end shifted by 16; 0 = none
   float spare[3];
 };
-constexpr int SPLAT_FIELDS = 13;
+constexpr int SPLAT_FIELDS = 13;  // four bytes each; ``project_batch`` lists them in this order
 
 struct Range {
   uint32_t first, end;
@@ -235,19 +235,11 @@ void project_batch(const Scene& scene, Frame& frame, int64_t first, float* means
     Ints rows = touched_tiles(y.lanes, reach[1], frame.tiles_y, is_seen);
     const Mask is_on_tiles = simd::both(simd::less(Ints{}, columns), simd::less(Ints{}, rows));
     columns = simd::select(is_on_tiles, columns, Ints{}), rows = simd::select(is_on_tiles, rows, Ints{});
-    const Wide fields[SPLAT_FIELDS] = {x,
-                                       y,
-                                       footprint.l11,
-                                       footprint.l12,
-                                       footprint.l22,
-                                       shape.log_cut,
-                                       shape.opacity,
-                                       footprint.centre[2],
-                                       rgb[0],
-                                       rgb[1],
-                                       rgb[2],
-                                       simd::as_floats(columns),
-                                       simd::as_floats(rows)};
+    // clang-format off
+    const Wide fields[SPLAT_FIELDS] = {
+        x, y, footprint.l11, footprint.l12, footprint.l22, shape.log_cut, shape.opacity, footprint.centre[2],
+        rgb[0], rgb[1], rgb[2], simd::as_floats(columns), simd::as_floats(rows)};
+    // clang-format on
     float radius[LANES], centre[2][LANES];
     simd::store(radius, simd::keep(is_seen, simd::max(reach[0], reach[1])));
     for (int j = 0; j < 2; ++j) simd::store(centre[j], simd::keep(is_seen, fields[j].lanes));
@@ -264,8 +256,7 @@ void project_batch(const Scene& scene, Frame& frame, int64_t first, float* means
 
 // ---------------------------------------------------------------------------------------------- tile lists
 
-// Stable least-significant-digit radix sort of ``order`` by positive depth, over the bits in which depths
-// differ.
+// Stable least-significant-digit radix sort of ``order`` by positive depth; as many passes as depths differ in.
 void sort_by_depth(std::vector<uint32_t>& order, const Splat* splats) {
   constexpr int BITS = 12, BINS = 1 << BITS;
   struct Item {
@@ -789,7 +780,7 @@ EXPORT int cadam3d_project(const Scene* scene, float* means2d, float* radii, voi
   return guarded([&] {
     auto frame = std::make_unique<Frame>();
     frame->tiles_x = ceil_div(scene->width, TILE), frame->tiles_y = ceil_div(scene->height, TILE);
-    if (frame->tiles_x > UINT16_MAX || frame->tiles_y > UINT16_MAX || scene->gaussians >= UINT32_MAX)
+    if (frame->tiles_x > INT16_MAX || frame->tiles_y > INT16_MAX || scene->gaussians >= UINT32_MAX)
       throw Status(TOO_LARGE);
     frame->splats.allocate(scene->views * scene->gaussians);
     frame->views.resize(size_t(scene->views));
