@@ -16,7 +16,7 @@ from cadam3d.rasterizer.nvrtc import build, choose_architecture, compile_kernels
 # Every one since Turing; the oldest that CUDA 13 still compiles for.
 ARCHITECTURES = (75, 80, 86, 87, 88, 89, 90, 100, 101, 103, 107, 110, 120, 121)
 # The most registers per thread that any of them takes, with the NVRTC of CUDA 12.6, 12.8, 13.0 and 13.5. Half
-# of an SM is in use at 64; the backward of degree 3, with its 48 coefficients at hand, uses less than a fifth.
+# of an SM is in use at 64; the backward of degree 3, 48 coefficients at hand, less than a fifth.
 REGISTERS = {
     "blend_backward": 64,
     "blend_forward": 64,
