@@ -19,7 +19,7 @@ from cadam3d.rasterizer.base import ALPHA_MAX, ALPHA_MIN, BLUR, FRUSTUM_MARGIN, 
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
 IMAGES = ("rgb", "alpha", "depth")
-POISON = (math.nan, math.inf, -math.inf, 1e38, -1e38, 1e20, 100.0, 41.0, 40.0, -100.0, 1e-45, 0.0)
+POISON = (math.nan, math.inf, -math.inf, 1e38, -1e38, 1e20, 100.0, 46.0, 41.0, 40.0, -100.0, 1e-45, 0.0)
 
 
 def make_gaussians(n, *, seed=0, degree=0, spread=0.6, log_scale=-2.0, opacity=0.0) -> Gaussians:

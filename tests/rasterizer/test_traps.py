@@ -97,11 +97,22 @@ def test_a_zero_scale_is_a_dot_of_the_blurs_size(any_backend, log_scale):
     assert_close("rgb", none.rgb, small.rgb, 1e-6)
 
 
-@pytest.mark.parametrize("log_scale", [[46.0] * 3, [46.0, -46.0, 0.0], [88.0, 0.0, 0.0], [0.0, 0.0, 700.0]])
+@pytest.mark.parametrize(
+    "log_scale", [[5.0] * 3, [46.0] * 3, [46.0, -46.0, 0.0], [88.0, 0.0, 0.0], [0.0, 0.0, 700.0]]
+)
 @pytest.mark.parametrize("z", [0.0, -2.0])
 def test_a_huge_scale_at_depth_zero_or_behind_is_culled(any_backend, log_scale, z):
     gaussians = one_in_a_heap(means=[0.0, 0.0, z], log_scales=log_scale)
     assert_leaves_no_trace(any_backend, gaussians, 7, facing_camera(11, 13))
+
+
+@pytest.mark.parametrize("log_scale", [[46.0] * 3, [46.0, -46.0, 0.0]])  # exp(46) = 1e20
+def test_a_scale_whose_square_leaves_float32_is_culled(any_backend, log_scale):
+    gaussians = one_in_a_heap(means=[0.0, 0.0, 2.0], log_scales=log_scale)
+    if any_backend.dtype == torch.float64:  # there it is a number like any other
+        assert_is_drawn(any_backend, gaussians, 7, facing_camera(11, 13))
+    else:
+        assert_leaves_no_trace(any_backend, gaussians, 7, facing_camera(11, 13))
 
 
 @pytest.mark.parametrize("log_scale", [INF, 1e38, NAN])
