@@ -15,14 +15,14 @@ CPU = torch.device("cpu")
 
 
 def baseline(**changes) -> Baseline:
-    return Baseline(**{"tau_pos": 2e-4, "views": "sum_norm", "grad_multiplier": 1.0, **changes})
+    return Baseline(**{"tau_pos": 2e-4, "views": "sum_norm", "grad_multiplier": 1.0, "screen_px": None, **changes})
 
 
 def signal(means2d: torch.Tensor, visible: torch.Tensor | None = None, height=2, width=2) -> GradientSignal:
     """At 2 x 2 pixels one pixel is one NDC unit."""
     visible = torch.ones(means2d.shape[:2], dtype=torch.bool) if visible is None else visible
     return GradientSignal(
-        means=torch.zeros(means2d.shape[1], 3), means2d=means2d, visible=visible, height=height, width=width
+        means=torch.zeros(means2d.shape[1], 3), means2d=means2d, radii=visible.float(), height=height, width=width
     )
 
 
@@ -155,7 +155,7 @@ def test_observe_never_waits_for_the_device(views):
     evidence = GradientSignal(
         means=torch.empty(4, 3, device=meta),
         means2d=torch.empty(2, 4, 2, device=meta),
-        visible=torch.empty(2, 4, dtype=torch.bool, device=meta),
+        radii=torch.empty(2, 4, device=meta),
         height=8,
         width=8,
     )

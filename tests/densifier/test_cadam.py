@@ -19,18 +19,25 @@ CPU = torch.device("cpu")
 def cadam(**changes) -> CAdam:
     paper = {
         "tau_Q": 0.9,
+        "tau_m": None,
         "tau_SNR": 0.1,
+        "alpha": None,
         "beta1": 0.9,
         "beta2": 0.999,
         "eps": 1e-15,
+        "eps_mode": "abs",
+        "grad_source": "total",
+        "grad_norm": "none",
         "invisible": "zero",
+        "nonfinite": "skip_step",
         "min_age": 0,
         "quantile_over": "all",
-        "reset_min_age": 0,
-        "grad_norm": "none",
-        "nonfinite": "skip_step",
         "child_state": "zero",
         "parent_state": "keep",
+        "reset": "unreliable",
+        "tau_reset": None,
+        "reset_min_age": 0,
+        "reset_moments": False,
     }
     return CAdam(**{**paper, **changes})
 
@@ -39,7 +46,7 @@ def signal(means: torch.Tensor, visible: torch.Tensor | None = None) -> Gradient
     n = len(means)
     visible = torch.ones(1, n, dtype=torch.bool) if visible is None else visible
     return GradientSignal(
-        means=means, means2d=torch.zeros(len(visible), n, 2), visible=visible, height=8, width=8
+        means=means, means2d=torch.zeros(len(visible), n, 2), radii=visible.float(), height=8, width=8
     )
 
 
@@ -139,7 +146,7 @@ def test_observe_never_waits_for_the_device(choice):
     evidence = GradientSignal(
         means=torch.empty(4, 3, device=meta),
         means2d=torch.empty(2, 4, 2, device=meta),
-        visible=torch.empty(2, 4, dtype=torch.bool, device=meta),
+        radii=torch.empty(2, 4, device=meta),
         height=8,
         width=8,
     )
