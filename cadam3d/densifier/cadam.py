@@ -279,10 +279,8 @@ def quantile(values: Float[Tensor, "n"], share: float) -> Float[Tensor, ""]:
         return values.new_tensor(math.inf)
     rank = Fraction(str(share)) * (len(values) - 1)
     below = math.floor(rank)
-    low = values.kthvalue(below + 1).values
-    if rank == below:
-        return low
-    return torch.lerp(low, values.kthvalue(below + 2).values, float(rank - below))
+    ordered = values.sort().values  # kthvalue is faster on most values, and quadratic on ordered ones
+    return torch.lerp(ordered[below], ordered[math.ceil(rank)], float(rank - below))
 
 
 def _bias_correction(beta: float, age: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
