@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from fractions import Fraction
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -272,15 +271,15 @@ class CAdam(Densifier[CAdamState]):
 def quantile(values: Float[Tensor, "n"], share: float) -> Float[Tensor, ""]:
     """``torch.quantile`` (linear interpolation) for any ``n``: that one refuses more than 2^24 values.
 
-    The rank is a fraction of whole numbers, so 0.9 of 10 intervals is the 9th to the last digit. Infinity if
-    there are no values: nothing exceeds it.
+    The rank is a double, so no ``n`` of this world costs it its whole numbers. Infinity if there are no
+    values: nothing exceeds it.
     """
     if len(values) == 0:
         return values.new_tensor(math.inf)
-    rank = Fraction(str(share)) * (len(values) - 1)
+    rank = share * (len(values) - 1)
     below = math.floor(rank)
     ordered = values.sort().values  # kthvalue is faster on most values, and quadratic on ordered ones
-    return torch.lerp(ordered[below], ordered[math.ceil(rank)], float(rank - below))
+    return torch.lerp(ordered[below], ordered[math.ceil(rank)], rank - below)
 
 
 def _bias_correction(beta: float, age: Int[Tensor, "n"]) -> Float[Tensor, "n"]:

@@ -544,7 +544,7 @@ def test_quantile_has_no_limit_on_the_count():
 
 
 def test_a_rank_that_is_whole_is_whole_for_a_decimal_share():
-    assert 0.29 * 100 != 29  # hence the fractions
+    assert 0.29 * 100 != 29
     for percent in range(101):
         assert float(quantile(torch.arange(101.0) ** 2, percent / 100)) == percent**2
 
