@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from cadam3d.core.edit import RowState
 from cadam3d.core.gaussians import Gaussians
@@ -70,6 +72,20 @@ class StepReport:
 
 
 @dataclass(frozen=True)
+class Population:
+    """The Gaussians that a refinement or reset was decided on, for pictures of the decision.
+
+    References, not copies, good until the next step; at a reset without refinement the opacities are those
+    after it. While callbacks look, they keep alive what the edit replaced: per Gaussian 56 bytes at SH degree
+    0, 1 of the mask and 4 per score (CAdam has three).
+    """
+
+    gaussians: Gaussians  # before the edit, without gradient
+    is_selected: Bool[Tensor, "n"]  # by the densifier, to grow
+    scores: dict[str, Float[Tensor, "n"]]  # of the densifier
+
+
+@dataclass(frozen=True)
 class RefineReport:
     """What one refinement or opacity reset did, in counts of Gaussians, and what the densifier saw."""
 
@@ -82,6 +98,7 @@ class RefineReport:
     pruned: int
     reset: int  # opacities lowered
     statistics: dict[str, float]  # of the densifier
+    population: Population  # before the edit
 
 
 @dataclass(frozen=True)

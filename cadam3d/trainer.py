@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from cadam3d.optimizer import AdamSettings
 from cadam3d.prior.base import DiffusionPrior, PromptEmbedding
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.regularizer import Regularizer
-from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState
+from cadam3d.state import Outcome, Population, RefineReport, RunContext, StepReport, TrainState
 
 # Each source of randomness has its own generator: two densifiers with one seed see the same views and noise.
 GENERATORS = ("initializer", "camera", "background", "guidance", "refine")
@@ -195,9 +195,15 @@ class Trainer:
         judged = self.guidance(output.rgb, condition, self.prior, state.step, draw["guidance"])
         penalties = {name: fn(gaussians, output, state.step) for name, fn in self.regularizers.items()}
         loss = sum(penalties.values(), start=judged.loss)
-        loss.backward()
+        if penalties and self.densifier.guidance_only:
+            judged.loss.backward(retain_graph=True)
+            signal = _signal(gaussians, output)
+            torch.stack(list(penalties.values())).sum().backward()
+        else:
+            loss.backward()
+            signal = _signal(gaussians, output)
 
-        state.densifier = self.densifier.observe(state.densifier, _signal(gaussians, output))
+        state.densifier = self.densifier.observe(state.densifier, signal)
         if state.optimizer.finite_gradients():
             state.optimizer.step(state.step)
         else:
@@ -215,28 +221,56 @@ class Trainer:
         refines, resets = self.refine.refines_at(step), self.refine.resets_at(step)
         if not (refines or resets):
             return None, None
-        statistics = self.densifier.statistics(state.densifier)
-        before = len(state.gaussians)
-        selected = cloned = split = pruned = reset = 0
+        report = self._look(state, step, refines)
         if refines:
-            is_selected = self.densifier.select(state.densifier)
-            draws_before = state.generators["refine"].get_state()
-            plan = self.refine.plan(state.gaussians, is_selected, step, state.generators["refine"])
-            state.refused = self.refine.exceeds(plan)
+            report = self._grow(state, report)
             if state.refused:
-                state.generators["refine"].set_state(draws_before)
-                report = RefineReport(step, before, before, plan.selected, 0, 0, 0, 0, statistics)
                 return report, Outcome.MAX_GAUSSIANS
-            selected, cloned, split, pruned = plan.selected, plan.cloned, plan.split, plan.pruned
-            carried = self.densifier.carry(state.densifier, plan.edit)
-            state.optimizer.apply(plan.edit)
-            state.densifier = carried  # only now: memory may run out above, and owners must agree even then
         if resets:
             unreliable = self.densifier.unreliable(state.densifier)
-            reset = state.optimizer.reset_opacity(unreliable, self.refine.reset_value)
+            lowered = state.optimizer.reset_opacity(unreliable, self.refine.reset_value)
+            state.densifier = self.densifier.after_reset(state.densifier, unreliable)
+            report = replace(report, reset=lowered)
+        return report, (Outcome.VANISHED if report.after == 0 else None)
+
+    def _look(self, state: TrainState, step: int, refines: bool) -> RefineReport:
+        """What the densifier sees and wants, before anything changes."""
+        gaussians, seen = state.gaussians.detach(), state.densifier
+        n = len(gaussians)
+        nobody = torch.zeros(n, dtype=torch.bool, device=gaussians.device)
+        return RefineReport(
+            step=step,
+            before=n,
+            after=n,
+            selected=0,
+            cloned=0,
+            split=0,
+            pruned=0,
+            reset=0,
+            statistics=self.densifier.statistics(seen),
+            population=Population(
+                gaussians=gaussians,
+                is_selected=self.densifier.select(seen) if refines else nobody,
+                scores=self.densifier.scores(seen),
+            ),
+        )
+
+    def _grow(self, state: TrainState, report: RefineReport) -> RefineReport:
+        """Apply one refinement to all owners of rows, or refuse it whole; ``state.refused`` says which."""
+        generator = state.generators["refine"]
+        draws_before = generator.get_state()
+        wanted, unwanted = report.population.is_selected, self.densifier.unwanted(state.densifier)
+        plan = self.refine.plan(state.gaussians, wanted, report.step, generator, unwanted)
+        report = replace(report, selected=plan.selected)
+        state.refused = self.refine.exceeds(plan)
+        if state.refused:
+            generator.set_state(draws_before)
+            return report
+        carried = self.densifier.carry(state.densifier, plan.edit)
+        state.optimizer.apply(plan.edit)
+        state.densifier = carried  # only now: memory may run out above, and owners must agree even then
         after = len(state.gaussians)
-        report = RefineReport(step, before, after, selected, cloned, split, pruned, reset, statistics)
-        return report, (Outcome.VANISHED if after == 0 else None)
+        return replace(report, after=after, cloned=plan.cloned, split=plan.split, pruned=plan.pruned)
 
 
 def render_fn(rasterizer: Rasterizer, gaussians: Callable[[], Gaussians]) -> RenderFn:
@@ -267,12 +301,13 @@ def resolve_device(name: str) -> torch.device:
 
 
 def _signal(gaussians: Gaussians, output: RenderOutput) -> GradientSignal:
+    """What the last backward pass left: copies, for another pass would add to it in place."""
     means = gaussians.means.grad
     means2d = output.means2d.grad
     return GradientSignal(
         means=torch.zeros_like(gaussians.means) if means is None else means.detach().clone(),
-        means2d=torch.zeros_like(output.means2d) if means2d is None else means2d.detach(),
-        visible=output.visible.detach(),
+        means2d=torch.zeros_like(output.means2d) if means2d is None else means2d.detach().clone(),
+        radii=output.radii.detach(),
         height=output.rgb.shape[1],
         width=output.rgb.shape[2],
     )

@@ -21,6 +21,8 @@ SEVERAL = ("exporter", "callback", "metric")  # groups of which a run has severa
 NO_COMPONENTS = ("hydra", "grid", "experiment")
 GROUPS = sorted(path.name for path in CONFIGS.iterdir() if path.is_dir() and path.name not in NO_COMPONENTS)
 FILES = [path for group in GROUPS for path in sorted((CONFIGS / group).glob("*.yaml"))]
+VARIANTS = [path for path in FILES if "defaults" in yaml.safe_load(path.read_text(encoding="utf-8"))]
+COMPLETE = [path for path in FILES if path not in VARIANTS]
 GRIDS = sorted(path.stem for path in (CONFIGS / "grid").glob("*.yaml"))
 EXPERIMENTS = sorted(
     str(path.relative_to(CONFIGS / "experiment").with_suffix(""))
@@ -57,7 +59,7 @@ def choose(path: Path) -> str:
     return f"{group}=[{path.stem}]" if group in SEVERAL else f"{group}={path.stem}"
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
+@pytest.mark.parametrize("path", COMPLETE, ids=name_of)
 def test_a_node_has_exactly_the_keys_of_its_class(path):
     for node in nodes(read(path)):
         keys = set(node) - {"_target_"}
@@ -70,7 +72,24 @@ def test_a_node_has_exactly_the_keys_of_its_class(path):
         assert required <= keys <= set(fields), node["_target_"]
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
+@pytest.mark.parametrize("path", VARIANTS, ids=name_of)
+def test_a_variant_changes_values_of_what_it_builds_on(path):
+    changes = read(path)
+    base, itself = changes.pop("defaults")
+    original = read(path.with_stem(base))
+    assert itself == "_self_"
+    assert set(changes) < set(original)
+    assert not [key for key, value in changes.items() if value == original[key]]
+
+
+def test_the_momentum_ablation_differs_from_cadam_in_its_own_keys_only():
+    """It cannot build on cadam's file: Hydra lets no ``???`` replace a value."""
+    cadam, momentum = (read(CONFIGS / "densifier" / f"{name}.yaml") for name in ("cadam", "cadam_momentum"))
+    differing = {key for key in cadam if cadam[key] != momentum[key]}
+    assert differing == {"tau_Q", "tau_m", "tau_SNR", "reset"}
+
+
+@pytest.mark.parametrize("path", COMPLETE, ids=name_of)
 def test_a_component_declares_no_values_of_its_own(path):
     """A number has one home, and it is the YAML; schedules and paths inside a component may have defaults."""
     content = read(path)

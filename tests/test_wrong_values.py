@@ -56,6 +56,7 @@ LISTS = {
     "metric=[fidelity]": ["metric.fidelity.elevations_deg", "metric.fidelity.background"],
 }
 TRUTHS = {
+    "densifier=cadam": ["densifier.reset_moments"],
     "guidance=sds": ["guidance.shared_t"],
     "guidance=ism": ["guidance.shared_t"],
     "exporter=[preview]": ["exporter.preview.labels"],

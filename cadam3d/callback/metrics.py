@@ -37,5 +37,6 @@ class Metrics(Callback):
             append_jsonl(context.folder / FILE_NAME, line)
 
     def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
-        """Write every refinement and reset."""
-        append_jsonl(context.folder / FILE_NAME, {"kind": "refine", **vars(report)})
+        """Write every refinement and reset, without the Gaussians themselves."""
+        numbers = {name: value for name, value in vars(report).items() if name != "population"}
+        append_jsonl(context.folder / FILE_NAME, {"kind": "refine", **numbers})

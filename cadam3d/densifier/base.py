@@ -19,13 +19,27 @@ class GradientSignal:
 
     means: Float[Tensor, "n 3"]  # dLoss/dmeans, loss per world unit: CAdam's evidence
     means2d: Float[Tensor, "v n 2"]  # dLoss/dmeans2d, loss per pixel, every view: the baseline's evidence
-    visible: Bool[Tensor, "v n"]
+    radii: Float[Tensor, "v n"]  # on screen, in pixels; 0 = not seen
     height: int  # image size in pixels, to turn means2d into NDC units
     width: int
 
+    @property
+    def visible(self) -> Bool[Tensor, "v n"]:
+        """Which Gaussians touched which view."""
+        return self.radii > 0
+
 
 class Densifier(ABC, Generic[State]):
-    """Frozen hyper-parameters; the per-Gaussian tensors live in a state that the trainer holds."""
+    """Frozen hyper-parameters; the per-Gaussian tensors live in a state that the trainer holds.
+
+    Every method is pure: it returns a new state and leaves its arguments alone. Working in place saves no
+    time (``scripts/bench_densifier.py``), and this way a step that fails half way has changed nothing.
+    """
+
+    @property
+    def guidance_only(self) -> bool:
+        """Whether signals leave the regularizers out: where there are some, another backward pass."""
+        return False
 
     @abstractmethod
     def init_state(self, n: int, device: torch.device) -> State:
@@ -46,9 +60,24 @@ class Densifier(ABC, Generic[State]):
     def unreliable(self, state: State) -> Bool[Tensor, "n"]:
         """Whose opacity an opacity reset lowers (the baseline: everybody's)."""
 
+    def unwanted(self, state: State) -> Bool[Tensor, "n"] | None:
+        """Whom a refinement prunes besides the faint and the large, once ``refine.prune_from`` is over.
+
+        Nobody by default (``None``). Asked before the edit: newborns are not meant.
+        """
+        return None
+
+    def after_reset(self, state: State, rows: Bool[Tensor, "n"]) -> State:
+        """The state after an opacity reset of ``rows``; by default the statistics do not notice."""
+        return state
+
     def carry(self, state: State, edit: RowEdit) -> State:
         """The state after a refinement; by default survivors keep their rows and newborns start at zero."""
         return state.carry(edit)
+
+    def scores(self, state: State) -> dict[str, Float[Tensor, "n"]]:
+        """Numbers per Gaussian for pictures and histograms, such as the SNR; never read back."""
+        return {}
 
     def statistics(self, state: State) -> dict[str, float]:
         """Numbers about the state for logs and plots; never read back."""

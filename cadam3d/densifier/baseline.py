@@ -15,15 +15,17 @@ VIEWS = ("sum_norm", "sum_vector", "last")
 
 @dataclass
 class BaselineState(RowState):
-    """Gradient norms since the last refinement."""
+    """Gradient norms and sizes since the last refinement: 12 bytes per Gaussian."""
 
     norm_sum: Float[Tensor, "n"]  # of view-space gradients; loss per NDC unit
     sightings: Int[Tensor, "n"]  # how many norms were added
+    radius: Float[Tensor, "n"]  # the largest on screen, in pixels
 
     def carry(self, edit: RowEdit) -> "BaselineState":
         """All zero after every refinement, survivors included: 3DGS averages over one interval at a time."""
-        rows = edit.rows_after
-        return BaselineState(norm_sum=self.norm_sum.new_zeros(rows), sightings=self.sightings.new_zeros(rows))
+        return BaselineState(
+            **{name: rows.new_zeros(edit.rows_after) for name, rows in self.to_dict().items()}
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,16 +42,21 @@ class Baseline(Densifier[BaselineState]):
     tau_pos: float  # loss per NDC unit
     views: str  # how the views of one batch are combined, see `_norms`
     grad_multiplier: float  # applied to gradients first, for recipes that threshold scaled losses
+    screen_px: float | None  # larger ones on screen since the last refinement are pruned; null = never
 
     def __post_init__(self) -> None:
         require_range("densifier.tau_pos", self.tau_pos, above=0, example=2e-4)
         require_choice("densifier.views", self.views, VIEWS)
         require_range("densifier.grad_multiplier", self.grad_multiplier, above=0, example=1.0)
+        if self.screen_px is not None:
+            require_range("densifier.screen_px", self.screen_px, above=0, example=20)
 
     def init_state(self, n: int, device: torch.device) -> BaselineState:
         """Nothing accumulated."""
         return BaselineState(
-            norm_sum=torch.zeros(n, device=device), sightings=torch.zeros(n, dtype=torch.int32, device=device)
+            norm_sum=torch.zeros(n, device=device),
+            sightings=torch.zeros(n, dtype=torch.int32, device=device),
+            radius=torch.zeros(n, device=device),
         )
 
     def observe(self, state: BaselineState, signal: GradientSignal) -> BaselineState:
@@ -58,7 +65,11 @@ class Baseline(Densifier[BaselineState]):
         gradients = signal.means2d * (half_size * self.grad_multiplier)
         seen = signal.visible & gradients.isfinite().all(dim=-1)
         norms, sightings = self._norms(gradients.masked_fill(~seen[..., None], 0.0), seen)
-        return BaselineState(norm_sum=state.norm_sum + norms, sightings=state.sightings + sightings)
+        return BaselineState(
+            norm_sum=state.norm_sum + norms,
+            sightings=state.sightings + sightings,
+            radius=torch.maximum(state.radius, signal.radii.amax(dim=0)),
+        )
 
     def select(self, state: BaselineState) -> Bool[Tensor, "n"]:
         """Mark the Gaussians to grow: A_i >= tau_pos (paper eq. 1; ``>=`` as in 3DGS)."""
@@ -67,6 +78,18 @@ class Baseline(Densifier[BaselineState]):
     def unreliable(self, state: BaselineState) -> Bool[Tensor, "n"]:
         """Everybody: the global opacity reset of 3DGS."""
         return torch.ones_like(state.sightings, dtype=torch.bool)
+
+    def unwanted(self, state: BaselineState) -> Bool[Tensor, "n"] | None:
+        """Who was larger on screen than ``screen_px`` in any view since the last refinement.
+
+        3DGS wants this (20 pixels) but clears its radii before it looks, so as shipped nobody is pruned:
+        ``null``.
+        """
+        return None if self.screen_px is None else state.radius > self.screen_px
+
+    def scores(self, state: BaselineState) -> dict[str, Float[Tensor, "n"]]:
+        """The mean gradient norm, in loss per NDC unit, which ``tau_pos`` is compared with."""
+        return {"mean_norm": self._mean_norms(state)}
 
     def statistics(self, state: BaselineState) -> dict[str, float]:
         """Quantiles of the mean gradient norm, and the share of Gaussians that reach the threshold."""

@@ -34,7 +34,7 @@ class Refine:
     split_shrink: float  # children's standard deviations are the parent's divided by this
     min_opacity: float  # fainter Gaussians are pruned at every refinement
     max_scale: float | None  # Gaussians with a longer standard deviation are pruned; null = never
-    prune_from: int  # `max_scale` prunes only after this step
+    prune_from: int  # `max_scale`, and the densifier's own pruning, only after this step
     reset_interval: int | None  # opacity resets at its multiples in [reset_from, reset_until); null = never
     reset_from: int
     reset_until: int
@@ -95,12 +95,18 @@ class Refine:
         return self.reset_from <= step < self.reset_until and step % self.reset_interval == 0
 
     def plan(
-        self, gaussians: Gaussians, selected: Bool[Tensor, "n"], step: int, generator: torch.Generator
+        self,
+        gaussians: Gaussians,
+        selected: Bool[Tensor, "n"],
+        step: int,
+        generator: torch.Generator,
+        unwanted: Bool[Tensor, "n"] | None = None,
     ) -> RefinePlan:
         """Decide one refinement; nothing is changed but ``generator`` (on the CPU; one draw per split child).
 
         Clones and splits come from the one mask ``selected`` of the population before the edit, so they are
-        disjoint. Pruning then judges the grown population, newborns included.
+        disjoint. Pruning then judges the grown population, newborns included; ``unwanted`` (none if ``None``)
+        names rows of the population before the edit that are pruned too, at the times of ``max_scale``.
         """
         gaussians = gaussians.detach()
         is_split = selected & (gaussians.scales.amax(dim=-1) > self.tau_scale)
@@ -109,6 +115,8 @@ class Refine:
         parents = torch.cat([clones, splits.repeat_interleave(self.split_children)])
 
         keeps, child_keeps = self._keeps(gaussians, step), self._keeps(children, step)
+        if unwanted is not None and step > self.prune_from:
+            keeps &= ~unwanted
         edit = RowEdit(
             keep=(keeps & ~is_split).nonzero()[:, 0],
             children=children.index(child_keeps),

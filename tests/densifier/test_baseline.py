@@ -9,20 +9,26 @@ from cadam3d.core.checks import UserError
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.densifier.base import GradientSignal
-from cadam3d.densifier.baseline import VIEWS, Baseline, BaselineState
+from cadam3d.densifier.baseline import VIEWS, Baseline
 
 CPU = torch.device("cpu")
 
 
 def baseline(**changes) -> Baseline:
-    return Baseline(**{"tau_pos": 2e-4, "views": "sum_norm", "grad_multiplier": 1.0, **changes})
+    return Baseline(
+        **{"tau_pos": 2e-4, "views": "sum_norm", "grad_multiplier": 1.0, "screen_px": None, **changes}
+    )
 
 
 def signal(means2d: torch.Tensor, visible: torch.Tensor | None = None, height=2, width=2) -> GradientSignal:
     """At 2 x 2 pixels one pixel is one NDC unit."""
     visible = torch.ones(means2d.shape[:2], dtype=torch.bool) if visible is None else visible
     return GradientSignal(
-        means=torch.zeros(means2d.shape[1], 3), means2d=means2d, visible=visible, height=height, width=width
+        means=torch.zeros(means2d.shape[1], 3),
+        means2d=means2d,
+        radii=visible.float(),
+        height=height,
+        width=width,
     )
 
 
@@ -30,7 +36,7 @@ def mean_norms(densifier: Baseline, *signals: GradientSignal) -> torch.Tensor:
     state = densifier.init_state(signals[0].means.shape[0], CPU)
     for one in signals:
         state = densifier.observe(state, one)
-    return state.norm_sum / state.sightings.clamp_min(1)
+    return densifier.scores(state)["mean_norm"]
 
 
 def gradients(views: int, n: int, seed: int = 0) -> torch.Tensor:
@@ -139,13 +145,12 @@ def test_the_accumulators_are_cleared_by_every_refinement():
 
 def test_observe_leaves_the_old_state_and_the_signal_alone():
     before = baseline().observe(baseline().init_state(4, CPU), signal(gradients(2, 4)))
-    copy = BaselineState(norm_sum=before.norm_sum.clone(), sightings=before.sightings.clone())
+    copy = {name: rows.clone() for name, rows in before.to_dict().items()}
     pixel = gradients(2, 4, seed=1)
     evidence = signal(pixel.clone())
     for views in VIEWS:
         baseline(views=views).observe(before, evidence)
-    assert torch.equal(before.norm_sum, copy.norm_sum)
-    assert torch.equal(before.sightings, copy.sightings)
+    assert all(torch.equal(rows, copy[name]) for name, rows in before.to_dict().items())
     assert torch.equal(evidence.means2d, pixel)
 
 
@@ -155,7 +160,7 @@ def test_observe_never_waits_for_the_device(views):
     evidence = GradientSignal(
         means=torch.empty(4, 3, device=meta),
         means2d=torch.empty(2, 4, 2, device=meta),
-        visible=torch.empty(2, 4, dtype=torch.bool, device=meta),
+        radii=torch.empty(2, 4, device=meta),
         height=8,
         width=8,
     )
@@ -173,6 +178,39 @@ def test_a_gradient_that_is_not_finite_counts_as_not_seen(views, bad):
     torch.testing.assert_close(
         mean_norms(densifier, signal(broken, visible)), mean_norms(densifier, signal(pixel, hidden))
     )
+
+
+def test_a_gaussian_too_large_on_screen_in_any_view_is_unwanted_until_the_next_refinement():
+    first, second = torch.tensor([[30.0, 3.0, 20.0], [0.0, 9.0, 1.0]]), torch.tensor([[2.0, 25.0, 0.0]])
+    shipped, intended = baseline(), baseline(screen_px=20.0)
+    state = intended.init_state(3, CPU)
+    for radii in (first, second):
+        signal = GradientSignal(
+            means=torch.zeros(3, 3),
+            means2d=torch.zeros(len(radii), 3, 2),
+            radii=radii,
+            height=64,
+            width=64,
+        )
+        state = intended.observe(state, signal)
+    assert intended.unwanted(state).tolist() == [True, True, False]  # 20 itself is not too large
+    assert shipped.unwanted(state) is None
+    nothing = Gaussians(
+        means=torch.zeros(0, 3),
+        log_scales=torch.zeros(0, 3),
+        quats=torch.ones(0, 4),
+        opacity_logits=torch.zeros(0),
+        sh=torch.zeros(0, 1, 3),
+    )
+    after = state.carry(RowEdit(keep=torch.tensor([0, 1]), children=nothing, parents=torch.arange(0)))
+    assert intended.unwanted(after).tolist() == [False, False]
+
+
+def test_the_score_is_what_the_threshold_is_compared_with():
+    state = baseline().observe(baseline().init_state(50, CPU), signal(gradients(2, 50)))
+    norms = baseline().scores(state)["mean_norm"]
+    median = float(norms.median())
+    assert torch.equal(baseline(tau_pos=median).select(state), norms >= median)
 
 
 def test_everybody_is_reset():
@@ -198,7 +236,9 @@ def test_an_empty_scene_is_no_problem():
     assert baseline().statistics(state) == {}
 
 
-@pytest.mark.parametrize(("key", "value"), [("tau_pos", 0.0), ("views", "first"), ("grad_multiplier", 0.0)])
+@pytest.mark.parametrize(
+    ("key", "value"), [("tau_pos", 0.0), ("views", "first"), ("grad_multiplier", 0.0), ("screen_px", 0.0)]
+)
 def test_an_impossible_value_is_refused_by_name(key, value):
     with pytest.raises(UserError, match=rf"densifier\.{key}"):
         baseline(**{key: value})

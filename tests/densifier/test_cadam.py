@@ -19,18 +19,25 @@ CPU = torch.device("cpu")
 def cadam(**changes) -> CAdam:
     paper = {
         "tau_Q": 0.9,
+        "tau_m": None,
         "tau_SNR": 0.1,
+        "alpha": None,
         "beta1": 0.9,
         "beta2": 0.999,
         "eps": 1e-15,
+        "eps_mode": "abs",
+        "grad_source": "total",
+        "grad_norm": "none",
         "invisible": "zero",
+        "nonfinite": "skip_step",
         "min_age": 0,
         "quantile_over": "all",
-        "reset_min_age": 0,
-        "grad_norm": "none",
-        "nonfinite": "skip_step",
         "child_state": "zero",
         "parent_state": "keep",
+        "reset": "unreliable",
+        "tau_reset": None,
+        "reset_min_age": 0,
+        "reset_moments": False,
     }
     return CAdam(**{**paper, **changes})
 
@@ -39,7 +46,7 @@ def signal(means: torch.Tensor, visible: torch.Tensor | None = None) -> Gradient
     n = len(means)
     visible = torch.ones(1, n, dtype=torch.bool) if visible is None else visible
     return GradientSignal(
-        means=means, means2d=torch.zeros(len(visible), n, 2), visible=visible, height=8, width=8
+        means=means, means2d=torch.zeros(len(visible), n, 2), radii=visible.float(), height=8, width=8
     )
 
 
@@ -77,29 +84,31 @@ def adam() -> AdamSettings:
 
 def edit_of(n: int, keep: list[int], parents: list[int]) -> RowEdit:
     return RowEdit(
-        keep=torch.tensor(keep),
-        children=some_gaussians(n).index(parents_of(parents)),
-        parents=parents_of(parents),
+        keep=rows_of(keep),
+        children=some_gaussians(n).index(rows_of(parents)),
+        parents=rows_of(parents),
     )
 
 
-def parents_of(parents: list[int]) -> torch.Tensor:
-    return torch.tensor(parents, dtype=torch.int64)
+def rows_of(rows: list[int]) -> torch.Tensor:
+    return torch.tensor(rows, dtype=torch.int64)
 
 
 # The moments (eq. 8 and 10).
 
 
-def test_moments_of_a_never_densified_gaussian_are_those_of_adam():
-    densifier, optimizer = cadam(), adam().start(some_gaussians(6))
-    state = densifier.init_state(6, CPU)
-    for step, gradient in enumerate(noise(40, 6)):
+@pytest.mark.parametrize("choice", [{}, {"nonfinite": "skip_row"}, {"invisible": "skip"}])
+@pytest.mark.parametrize("n", [1, 6, 1001])  # vector units have a tail
+def test_moments_of_a_never_densified_gaussian_are_those_of_adam_to_the_bit(n, choice):
+    densifier, optimizer = cadam(**choice), adam().start(some_gaussians(n))
+    state = densifier.init_state(n, CPU)
+    for step, gradient in enumerate(noise(40, n) * torch.logspace(-9, 3, 40)[:, None, None]):
         state = densifier.observe(state, signal(gradient))
         optimizer.gaussians.means.grad = gradient
         optimizer.step(step)
     saved = optimizer.state_dict()
-    torch.testing.assert_close(state.m, saved["exp_avg"]["means"], rtol=0, atol=1e-6)
-    torch.testing.assert_close(state.v, saved["exp_avg_sq"]["means"], rtol=2e-6, atol=0)
+    assert torch.equal(state.m, saved["exp_avg"]["means"])
+    assert torch.equal(state.v, saved["exp_avg_sq"]["means"])
 
 
 @pytest.mark.parametrize("age", [1, 2, 7, 400])
@@ -139,7 +148,7 @@ def test_observe_never_waits_for_the_device(choice):
     evidence = GradientSignal(
         means=torch.empty(4, 3, device=meta),
         means2d=torch.empty(2, 4, 2, device=meta),
-        visible=torch.empty(2, 4, dtype=torch.bool, device=meta),
+        radii=torch.empty(2, 4, device=meta),
         height=8,
         width=8,
     )
@@ -166,7 +175,7 @@ def test_newborns_start_at_age_zero_without_history_and_their_parents_keep_their
 
 
 @pytest.mark.parametrize("parent_state", ["keep", "reset"])
-@pytest.mark.parametrize("child_state", ["zero", "inherit"])
+@pytest.mark.parametrize("child_state", ["zero", "inherit", "inherit_half"])
 def test_who_keeps_a_history_through_an_edit_can_be_chosen(child_state, parent_state):
     densifier = cadam(child_state=child_state, parent_state=parent_state)
     before = observe(densifier, noise(steps=5, n=4))
@@ -177,8 +186,15 @@ def test_who_keeps_a_history_through_an_edit_can_be_chosen(child_state, parent_s
         assert torch.equal(getattr(before, name), old)
         assert torch.equal(new[[0, 2]], old[[0, 3]])  # survivors that are nobody's parent
         assert torch.equal(new[1], old[1] if parent_state == "keep" else torch.zeros_like(old[1]))
-        inherited = old[[1, 2, 2]]
-        assert torch.equal(new[3:], inherited if child_state == "inherit" else torch.zeros_like(inherited))
+        share = {"zero": 0, "inherit": 1, "inherit_half": {"m": 0.5, "v": 0.25, "age": 1}[name]}[child_state]
+        assert torch.equal(new[3:], (old[[1, 2, 2]] * share).to(old.dtype))
+
+
+def test_inheriting_half_is_the_history_of_a_gaussian_with_half_the_gradients():
+    densifier, gradients = cadam(child_state="inherit_half"), noise(steps=7, n=4)
+    after = densifier.carry(observe(densifier, gradients), edit_of(4, keep=[], parents=[0, 1, 2, 3]))
+    halved = observe(densifier, gradients / 2)
+    assert all(torch.equal(rows, getattr(halved, name)) for name, rows in after.to_dict().items())
 
 
 def test_a_newborn_corrects_its_bias_by_its_own_age():
@@ -389,7 +405,82 @@ def test_under_skip_row_the_others_do_not_notice_a_bad_row(grad_norm):
     assert torch.equal(with_bad.v[[0, 2]], with_zero.v[[0, 2]])
 
 
-# The selective opacity reset (eq. 13).
+def test_eps_relative_to_the_median_noise_is_free_of_the_scale_and_an_absolute_one_is_not():
+    gradients = noise(60, 501)
+    for mode, is_free in (("abs", False), ("rel_median", True)):
+        densifier = cadam(eps=0.5, eps_mode=mode)
+        plain, tiny = observe(densifier, gradients), observe(densifier, gradients * 2.0**-20)
+        equal = torch.allclose(densifier.scores(plain)["snr"], densifier.scores(tiny)["snr"])
+        assert equal == is_free
+    drift, strength = cadam().strengths(plain)
+    expected = drift / (strength + 0.5 * strength.quantile(0.5))
+    torch.testing.assert_close(cadam(eps=0.5, eps_mode="rel_median").scores(plain)["snr"], expected)
+
+
+def test_the_median_noise_leaves_out_who_never_had_a_gradient_who_stay_unreliable():
+    gradients = noise(30, 40)
+    gradients[:, 10:] = 0.0
+    densifier = cadam(eps=1e-3, eps_mode="rel_median")
+    state = observe(densifier, gradients)
+    snr_alone = densifier.scores(observe(densifier, gradients[:, :10]))["snr"]
+    torch.testing.assert_close(densifier.scores(state)["snr"][:10], snr_alone)
+    assert densifier.unreliable(state)[10:].all()
+    assert densifier.unreliable(observe(densifier, gradients[:, 10:])).all()
+
+
+def test_an_absolute_threshold_selects_by_drift_alone():
+    state = observe(cadam(), noise(30, 200))
+    drift = cadam().strengths(state)[0]
+    tau_m = float(drift.median())
+    momentum = cadam(tau_Q=None, tau_SNR=None, tau_m=tau_m, reset="everybody")
+    assert torch.equal(momentum.select(state), drift > tau_m)
+    both = cadam(tau_Q=0.2, tau_SNR=0.25, tau_m=tau_m)
+    expected = cadam(tau_Q=0.2, tau_SNR=0.25).select(state) & (drift > tau_m)
+    assert torch.equal(both.select(state), expected)
+    assert 0 < both.select(state).sum() < momentum.select(state).sum()
+
+
+def test_without_gates_everybody_with_a_gradient_is_selected():
+    gradients = noise(30, 20)
+    gradients[:, 12:] = 0.0
+    densifier = cadam(tau_Q=None, tau_SNR=None, reset="nobody")
+    assert densifier.select(observe(densifier, gradients)).tolist() == [True] * 12 + [False] * 8
+
+
+def test_without_the_quantile_the_gate_alone_selects():
+    gradients = noise(60, 300)
+    densifier = cadam(tau_Q=None, tau_SNR=0.2)
+    state = observe(densifier, gradients)
+    assert torch.equal(densifier.select(state), snr(densifier, state) > 0.2)
+    assert "drift_threshold" not in densifier.statistics(state)
+
+
+# The selective opacity reset (eq. 13), and the others.
+
+
+@pytest.mark.parametrize(("reset", "share"), [("everybody", 1.0), ("nobody", 0.0)])
+def test_a_reset_of_everybody_or_nobody_asks_nobody(reset, share):
+    densifier = cadam(reset=reset)
+    assert float(densifier.unreliable(observe(densifier, noise(30, 40))).float().mean()) == share
+
+
+def test_distrust_has_a_threshold_of_its_own_if_asked():
+    state = observe(cadam(), noise(60, 300))
+    ratio = snr(cadam(), state)
+    assert torch.equal(cadam().unreliable(state), ratio < 0.1)
+    for choice in ({"tau_SNR": 0.1}, {"tau_SNR": None}, {"tau_SNR": None, "alpha": 0.05}):
+        assert torch.equal(cadam(tau_reset=0.3, **choice).unreliable(state), ratio < 0.3)
+
+
+def test_a_reset_clears_the_moments_of_its_gaussians_if_asked():
+    before = observe(cadam(), noise(9, 6))
+    rows = torch.tensor([True, False, True, False, False, False])
+    assert cadam().after_reset(before, rows) is before
+    after = cadam(reset_moments=True).after_reset(before, rows)
+    for name, old in before.to_dict().items():
+        assert not getattr(after, name)[rows].any()
+        assert torch.equal(getattr(after, name)[~rows], old[~rows])
+        assert old[rows].any()
 
 
 def test_the_selective_reset_lowers_only_noisy_gaussians_and_never_raises_one():
@@ -429,6 +520,16 @@ def test_the_young_are_not_called_unreliable():
 # The quantile, the statistics, the checks.
 
 
+def test_scores_are_what_the_gates_compare():
+    state = observe(cadam(), noise(40, 100))
+    scores = cadam().scores(state)
+    drift, strength = cadam().strengths(state)
+    assert torch.equal(scores["drift"], drift)
+    assert torch.equal(scores["noise"], strength)
+    torch.testing.assert_close(scores["snr"], drift / strength)
+    assert set(scores) == {"drift", "noise", "snr"}
+
+
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999, 1.0])
 @pytest.mark.parametrize("n", [1, 2, 3, 10, 1001])
 def test_quantile_is_that_of_torch(n, share):
@@ -437,8 +538,15 @@ def test_quantile_is_that_of_torch(n, share):
 
 
 def test_quantile_has_no_limit_on_the_count():
-    n = 2**24 + 1  # torch.quantile refuses this many
-    assert float(quantile(torch.arange(n - 1, -1, -1, dtype=torch.float32), 0.25)) == 2**22
+    n = 2**24 + 3  # torch.quantile refuses this many, and float32 cannot count them
+    descending = torch.arange(n - 1, -1, -1, dtype=torch.int32).sub_(n // 2).float()
+    assert float(quantile(descending, 0.25)) == (n - 1) / 4 - n // 2  # half way between two
+
+
+def test_a_rank_that_is_whole_is_whole_for_a_decimal_share():
+    assert 0.29 * 100 != 29
+    for percent in range(101):
+        assert float(quantile(torch.arange(101.0) ** 2, percent / 100)) == percent**2
 
 
 def test_statistics_say_what_the_densifier_saw():
@@ -465,6 +573,7 @@ def test_an_empty_scene_is_no_problem():
     [
         ("tau_Q", 1.0),
         ("tau_Q", -0.1),
+        ("tau_m", -1.0),
         ("tau_SNR", -1.0),
         ("tau_SNR", math.nan),
         ("beta1", 1.0),
@@ -476,8 +585,29 @@ def test_an_empty_scene_is_no_problem():
         ("reset_min_age", -1),
         ("grad_norm", "max"),
         ("nonfinite", "crash"),
+        ("eps_mode", "rel"),
+        ("grad_source", "all"),
+        ("child_state", "half"),
+        ("parent_state", "lose"),
+        ("reset", "some"),
+        ("tau_reset", -0.1),
     ],
 )
 def test_an_impossible_value_is_refused_by_name(key, value):
     with pytest.raises(UserError, match=rf"densifier\.{key}"):
         cadam(**{key: value})
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"tau_reset": 0.1, "reset": "everybody"}, "tau_reset"),  # nobody would look at it
+        ({"tau_SNR": None}, "tau_reset"),  # whom would a reset distrust?
+        ({"alpha": 0.05}, "tau_SNR"),  # two gates on one ratio
+        ({"alpha": 1.0, "tau_SNR": None, "tau_reset": 0.1}, "alpha"),
+        ({"alpha": 0.05, "tau_SNR": None, "tau_reset": 0.1, "beta2": 0.8}, "beta2"),
+    ],
+)
+def test_a_key_that_would_do_nothing_or_mislead_is_refused(changes, key):
+    with pytest.raises(UserError, match=rf"densifier\.{key}: wanted .* Try: densifier\."):
+        cadam(**changes)

@@ -24,7 +24,7 @@ def test_nobody_grows_and_nobody_is_reset_whatever_the_gradients():
     loud = GradientSignal(
         means=torch.full((4, 3), 1e6),
         means2d=torch.full((2, 4, 2), 1e6),
-        visible=torch.ones(2, 4, dtype=torch.bool),
+        radii=torch.ones(2, 4),
         height=8,
         width=8,
     )

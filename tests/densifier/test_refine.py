@@ -247,6 +247,19 @@ def test_a_plan_exceeds_the_cap_by_its_count_after_the_edit():
     assert not refine(max_gaussians=None).exceeds(plan)
 
 
+def test_the_unwanted_are_pruned_as_the_large_are_but_their_children_live():
+    scene = gaussians(6)  # 0..2 are cloned, 3..5 split
+    selected = torch.tensor([True, False, False, True, False, False])
+    unwanted = torch.tensor([True, True, False, True, True, False])
+    schedule = refine(prune_from=500)
+    before = schedule.plan(scene, selected, 500, draw(), unwanted)
+    assert before.edit.keep.tolist() == [0, 1, 2, 4, 5]
+    after = schedule.plan(scene, selected, 501, draw(), unwanted)
+    assert after.edit.keep.tolist() == [2, 5]
+    assert after.edit.parents.tolist() == before.edit.parents.tolist() == [0, 3, 3]
+    assert after.pruned == 3
+
+
 # The three owners of rows.
 
 
@@ -254,21 +267,28 @@ def test_a_plan_exceeds_the_cap_by_its_count_after_the_edit():
     "densifier",
     [
         NoGrowth(),
-        Baseline(tau_pos=0.1, views="sum_norm", grad_multiplier=1.0),
+        Baseline(tau_pos=0.1, views="sum_norm", grad_multiplier=1.0, screen_px=None),
         CAdam(
             tau_Q=0.7,
+            tau_m=None,
             tau_SNR=0.1,
+            alpha=None,
             beta1=0.9,
             beta2=0.999,
             eps=1e-15,
+            eps_mode="abs",
+            grad_source="total",
+            grad_norm="none",
             invisible="zero",
+            nonfinite="skip_step",
             min_age=0,
             quantile_over="all",
-            reset_min_age=0,
-            grad_norm="none",
-            nonfinite="skip_step",
             child_state="zero",
             parent_state="keep",
+            reset="unreliable",
+            tau_reset=None,
+            reset_min_age=0,
+            reset_moments=False,
         ),
     ],
     ids=["none", "baseline", "cadam"],
@@ -285,7 +305,7 @@ def test_gaussians_moments_and_densifier_state_stay_in_step_through_many_edits(d
         signal = GradientSignal(
             means=optimizer.gaussians.means.grad.clone(),
             means2d=torch.randn(2, n, 2, generator=noise) * 0.02,
-            visible=torch.ones(2, n, dtype=torch.bool),
+            radii=torch.ones(2, n),
             height=8,
             width=8,
         )

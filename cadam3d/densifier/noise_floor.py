@@ -1,0 +1,46 @@
+"""How large the SNR of pure noise is, and how rarely it is larger: what a threshold on the SNR means.
+
+Let the gradients of a Gaussian be zero-mean noise, independent from step to step, equally strong along the
+three axes. Then the bias-corrected first moment is a weighted mean with
+
+    s(beta, a) = sum of squared weights = (1 - beta)(1 + beta^a) / ((1 + beta)(1 - beta^a))
+
+after ``a`` updates, so E[SNR^2] is about s(beta1, a): 1 at age 1, and (1 - beta1) / (1 + beta1) in the end.
+
+For its distribution, stack the gradients of ``n`` equally weighted steps into one vector of 3n numbers. Its
+direction is uniform, and the share of its energy that lies in a fixed subspace of 3 dimensions (the weights
+of the first moment, once per axis) follows Beta(3/2, 3 (n - 1)/2). The second moment weighs not quite
+equally; n = 1 / s(beta2, a) is its effective number of steps. Hence
+
+    SNR^2 ~ s(beta1, a) n Beta(3/2, 3 (n - 1)/2),
+
+exact for an infinite memory of v and, by ``tests/densifier/test_noise_floor.py``, close for any that is at
+least as long as beta2 = beta1^2; for large n it becomes s(beta1, a) chi^2_3 / 3.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.special import betaincinv
+from torch import Tensor
+
+AXES = 3  # along which the noise is taken to be equally strong
+
+
+def snr_threshold(alpha: float, beta1: float, beta2: float, age: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """The SNR that pure noise of this ``age`` (in updates) exceeds with probability ``alpha``.
+
+    Infinite below age 2: of one gradient nobody can say whether it is consistent. Waits for the device.
+    """
+    ages, rows = age.unique(return_inverse=True)
+    grown = np.maximum(ages.cpu().numpy().astype(np.float64), 2)
+    steps = 1 / squared_weights(beta2, grown)
+    share = betaincinv(AXES / 2, AXES * (steps - 1) / 2, 1 - alpha)
+    thresholds = torch.from_numpy(np.sqrt(squared_weights(beta1, grown) * steps * share))
+    return thresholds.float().to(age.device)[rows].masked_fill(age < 2, torch.inf)
+
+
+def squared_weights(beta: float, age: np.ndarray) -> np.ndarray:
+    """Sum of the squared weights of a bias-corrected moving average: 1 / its effective number of steps."""
+    fading = beta**age
+    return (1 - beta) * (1 + fading) / ((1 + beta) * (1 - fading))

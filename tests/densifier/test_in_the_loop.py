@@ -1,0 +1,201 @@
+"""Laws of densifiers inside the training loop: what they are told, and what follows from their answers."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from cadam3d.callback.base import Callback
+from cadam3d.commands.train import build_trainer
+from cadam3d.core.gaussians import FIELDS, Gaussians
+from cadam3d.densifier.base import GradientSignal
+from cadam3d.settings import component, compose
+from cadam3d.state import Outcome, RefineReport, RunContext, TrainState
+
+CPU = torch.device("cpu")
+SMALL = [
+    "prompt=a red cube",
+    "prior=tiny",
+    "rasterizer=reference",
+    "steps=6",
+    "camera.size=16",
+    "initializer.count=30",
+    "refine.start=0",
+    "refine.end=100",
+    "refine.interval=2",
+    "refine.prune_from=0",
+    "refine.max_scale=null",
+    "refine.min_opacity=0",
+    "refine.reset_interval=4",
+    "refine.reset_from=4",
+    "refine.reset_until=100",
+    "callback=[]",
+]
+REGULARIZED = ["regularizer=[mean_scale,total_variation]", "regularizer.total_variation.weight=50"]
+
+
+@dataclass
+class Witness(Callback):
+    """Remembers what it was shown, and the Gaussians as they were before each step's refinement."""
+
+    reports: list[RefineReport] = field(default_factory=list)
+    states: list[dict[str, torch.Tensor]] = field(default_factory=list)
+
+    def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
+        self.reports.append(report)
+        self.states.append({name: rows.clone() for name, rows in state.densifier.to_dict().items()})
+
+
+def run(overrides: Sequence[str], folder: Path) -> tuple[TrainState, Witness, Outcome]:
+    is_cadam = not any(line.startswith("densifier=") and "cadam" not in line for line in overrides)
+    cfg = compose([*SMALL, *(["densifier.min_age=0"] if is_cadam else []), *overrides])
+    witness = Witness()
+    trainer = replace(build_trainer(cfg, CPU), callbacks=[witness])
+    state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
+    context = RunContext(folder, cfg.prompt, trainer.steps, trainer.renderer(state))
+    outcome = trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context)
+    return state, witness, outcome
+
+
+def test_the_moments_of_whoever_was_never_densified_are_those_of_the_optimizer_to_the_bit(tmp_path):
+    state, witness, _ = run(["densifier.reset=everybody", *REGULARIZED], tmp_path)
+    old = state.densifier.age == state.step
+    assert any(report.cloned + report.split for report in witness.reports)
+    assert 5 < int(old.sum()) < len(old)
+    saved = state.optimizer.state_dict()
+    assert torch.equal(state.densifier.m[old], saved["exp_avg"]["means"][old])
+    assert torch.equal(state.densifier.v[old], saved["exp_avg_sq"]["means"][old])
+    assert state.densifier.m[old].abs().max() > 0
+
+
+# The signal.
+
+
+def test_the_guidance_alone_is_observed_if_asked_while_the_optimizer_follows_the_whole_loss(tmp_path):
+    once = ["steps=1"]
+    bare, _, _ = run(once, tmp_path)
+    total, _, _ = run([*once, *REGULARIZED], tmp_path)
+    guided, _, _ = run([*once, *REGULARIZED, "densifier.grad_source=guidance"], tmp_path)
+    assert torch.equal(guided.densifier.m, bare.densifier.m)
+    assert not torch.allclose(total.densifier.m, bare.densifier.m, rtol=0.01)
+    for kind in ("exp_avg", "exp_avg_sq"):
+        whole, split = (each.optimizer.state_dict()[kind]["means"] for each in (total, guided))
+        torch.testing.assert_close(split, whole, rtol=1e-3, atol=1e-4 * float(whole.norm()))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "passes"),
+    [
+        ([], 1),
+        (REGULARIZED, 1),
+        (["densifier.grad_source=guidance"], 1),
+        (["densifier.grad_source=guidance", *REGULARIZED], 2),
+    ],
+)
+def test_a_second_backward_pass_happens_only_if_it_is_needed(overrides, passes, tmp_path, monkeypatch):
+    calls, backward = [], torch.Tensor.backward
+    monkeypatch.setattr(
+        torch.Tensor, "backward", lambda *args, **kwargs: (calls.append(1), backward(*args, **kwargs))
+    )
+    run(["steps=1", *overrides], tmp_path)
+    assert len(calls) == passes
+
+
+class Asynchronous(TorchDispatchMode):
+    """Fails on operations that make a CUDA program wait for the device."""
+
+    WAITS = ("_local_scalar_dense", "nonzero", "item", "is_nonzero", "equal", "unique", "masked_select")
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.__name__.partition(".")[0].lstrip("_")
+        assert name not in {wait.lstrip("_") for wait in self.WAITS}, f"{func} waits for the device"
+        indices = args[1] if name == "index" else ()
+        assert not any(i is not None and i.dtype == torch.bool for i in indices), "a mask as index waits"
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize(
+    "choice",
+    [
+        "none",
+        "baseline",
+        "baseline densifier.screen_px=20",
+        "cadam",
+        "cadam densifier.invisible=skip",
+        "cadam densifier.nonfinite=skip_row",
+        "cadam_strict",
+        "cadam_calibrated",
+    ],
+)
+def test_observing_never_waits_for_the_device(choice):
+    densifier = component(compose(["prompt=a red cube", *f"densifier={choice}".split()]).densifier)
+    evidence = GradientSignal(
+        means=torch.ones(5, 3), means2d=torch.ones(2, 5, 2), radii=torch.ones(2, 5), height=8, width=8
+    )
+    state = densifier.init_state(5, CPU)
+    with Asynchronous():
+        densifier.observe(state, evidence)
+    with pytest.raises(AssertionError, match="waits"), Asynchronous():
+        bool(evidence.means.sum())
+
+
+# The report, for pictures.
+
+
+def test_a_report_shows_the_population_before_the_edit_and_who_was_chosen(tmp_path, monkeypatch):
+    seen: list[Gaussians] = []
+    refine = type(component(compose(SMALL).refine))
+    plan = refine.plan
+
+    def spy(self, gaussians, *args):
+        seen.append(gaussians.map(lambda tensor: tensor.detach().clone()))
+        return plan(self, gaussians, *args)
+
+    monkeypatch.setattr(refine, "plan", spy)
+    _, witness, _ = run([], tmp_path)
+    assert any(report.after > report.before for report in witness.reports)
+    for report, gaussians in zip(witness.reports, seen, strict=True):
+        population = report.population
+        for name in FIELDS:
+            assert torch.equal(getattr(population.gaussians, name), getattr(gaussians, name))
+            assert not getattr(population.gaussians, name).requires_grad
+        assert int(population.is_selected.sum()) == report.selected
+        assert {len(rows) for rows in population.scores.values()} == {report.before}
+        chosen = population.scores["snr"][population.is_selected]
+        assert (chosen > 0.1).all()
+
+
+def test_a_reset_without_refinement_reports_that_nobody_was_chosen(tmp_path):
+    _, witness, _ = run(["refine.end=0"], tmp_path)
+    assert [report.step for report in witness.reports] == [4]
+    assert not witness.reports[0].population.is_selected.any()
+    assert set(witness.reports[0].population.scores) == {"drift", "noise", "snr"}
+
+
+# The answers.
+
+
+@pytest.mark.parametrize(("screen_px", "outcome"), [("null", Outcome.FINISHED), ("0.01", Outcome.VANISHED)])
+def test_screen_size_prunes_as_intended_or_as_shipped(screen_px, outcome, tmp_path):
+    quiet = ["densifier=baseline", "densifier.tau_pos=1e9", "refine.reset_interval=null"]
+    assert run([*quiet, f"densifier.screen_px={screen_px}"], tmp_path)[2] is outcome
+
+
+@pytest.mark.parametrize(("choice", "everybody"), [("cadam_no_reset", False), ("cadam_global_reset", True)])
+def test_the_reset_is_for_whom_the_densifier_says(choice, everybody, tmp_path):
+    _, witness, _ = run([f"densifier={choice}"], tmp_path)
+    at_reset = witness.reports[1]
+    assert at_reset.step == 4
+    assert at_reset.reset == (at_reset.after if everybody else 0)
+
+
+@pytest.mark.parametrize("clears", ["false", "true"])
+def test_a_reset_makes_its_gaussians_young_again_if_asked(clears, tmp_path):
+    line = f"densifier.reset_moments={clears}"
+    _, witness, _ = run(["densifier=cadam_global_reset", line, "densifier.tau_m=1e9"], tmp_path)
+    ages, m = witness.states[1]["age"], witness.states[1]["m"]
+    assert ages.tolist() == [0 if clears == "true" else 4] * len(ages)
+    assert bool(m.any()) == (clears == "false")

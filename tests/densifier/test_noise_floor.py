@@ -1,0 +1,242 @@
+"""What the SNR of pure noise is, when tau_SNR = 0.1 bites, and whether a calibrated gate keeps its promise.
+
+Everything is simulated through ``CAdam.observe``: 4,000 Gaussians whose gradients are zero-mean noise. The
+tables of docs/method.md are these numbers.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from cadam3d.densifier.base import GradientSignal
+from cadam3d.densifier.cadam import CAdam, CAdamState
+from cadam3d.densifier.noise_floor import snr_threshold, squared_weights
+from cadam3d.prior.path import DDPM
+from cadam3d.settings import component, compose
+
+CPU = torch.device("cpu")
+N = 4000
+ALPHA = 0.05
+ERROR = 0.015  # above four standard errors of a share near ALPHA of N
+AGES = (5, 10, 20, 50, 100, 300, 1000)
+
+
+def cadam(**changes) -> CAdam:
+    return component(
+        compose(["prompt=noise", *(f"densifier.{key}={value}" for key, value in changes.items())]).densifier
+    )
+
+
+def isotropic(draw: torch.Generator) -> torch.Tensor:
+    return torch.randn(N, 3, generator=draw)
+
+
+def one_axis(draw: torch.Generator) -> torch.Tensor:
+    return isotropic(draw) * torch.tensor([1.0, 0.0, 0.0])
+
+
+def one_plane(draw: torch.Generator) -> torch.Tensor:
+    return isotropic(draw) * torch.tensor([1.0, 1.0, 0.0])
+
+
+def heavy(draw: torch.Generator) -> torch.Tensor:
+    """Student's t with 3 degrees of freedom: no fourth moment."""
+    return isotropic(draw) / isotropic(draw).square().mean(dim=-1, keepdim=True).sqrt()
+
+
+def simulate(densifier: CAdam, scales, *, noise=isotropic, visibility=1.0, looks) -> dict[int, CAdamState]:
+    """States at the steps ``looks``, under noise times the ``scales`` of the steps."""
+    draw, state, states = torch.Generator().manual_seed(0), densifier.init_state(N, CPU), {}
+    for step, scale in enumerate(scales, start=1):
+        seen = torch.rand(N, generator=draw) < visibility
+        gradient = torch.where(seen[:, None], noise(draw) * scale, 0.0)
+        signal = GradientSignal(
+            means=gradient, means2d=torch.zeros(1, N, 2), radii=seen[None].float(), height=8, width=8
+        )
+        state = densifier.observe(state, signal)
+        if step in looks:
+            states[step] = state
+    return states
+
+
+def passes(densifier: CAdam, state: CAdamState, tau: float = 0.1) -> float:
+    """Share above an SNR of ``tau``, in percent."""
+    return 100 * float((densifier.scores(state)["snr"] > tau).float().mean())
+
+
+def alarms(densifier: CAdam, state: CAdamState, alpha: float = ALPHA) -> float:
+    """Share of the noise that the calibrated gate lets pass."""
+    threshold = snr_threshold(alpha, densifier.beta1, densifier.beta2, state.age)
+    return float((densifier.scores(state)["snr"] > threshold).float().mean())
+
+
+def falling(steps: int) -> list[float]:
+    return torch.logspace(0, -1, steps).tolist()
+
+
+def rising(steps: int) -> list[float]:
+    return torch.logspace(0, 1, steps).tolist()
+
+
+def gamma_of_ism(steps: int) -> list[float]:
+    """ISM's published weight of each step: t is uniform up to a bound that sinks from 0.98 to 0.5."""
+    draw = torch.Generator().manual_seed(1)
+    bound = 0.98 - 0.48 * (torch.arange(steps) / 1500).clamp_max(1)
+    t = 0.02 + (bound - 0.02) * torch.rand(steps, generator=draw)
+    return DDPM().gamma(t).tolist()
+
+
+# The floor, and when the published gate bites.
+
+
+@pytest.mark.parametrize("beta1", [0.0, 0.9, 0.98])
+def test_white_noise_has_a_root_mean_square_snr_of_the_square_root_of_its_weights(beta1):
+    densifier = cadam(beta1=beta1)
+    for age, state in simulate(densifier, [1.0] * 300, looks=(1, 5, 20, 300)).items():
+        rms = float(densifier.scores(state)["snr"].square().mean().sqrt())
+        expected = math.sqrt(squared_weights(beta1, np.array([float(age)]))[0])
+        assert rms == pytest.approx(expected, rel=0.04)
+    assert math.sqrt(0.1 / 1.9) == pytest.approx(0.229, abs=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("case", "beta2", "scales", "percent"),
+    [
+        ("stationary", 0.999, [1.0] * 600, 90),
+        ("a scale that falls tenfold, long memory", 0.999, falling(600), 2),
+        ("a scale that falls tenfold, short memory", 0.99, falling(600), 63),
+        ("a scale that rises tenfold", 0.999, rising(600), 98),
+    ],
+)
+def test_the_published_gate_passes_noise_unless_its_scale_falls(case, beta2, scales, percent):
+    densifier = cadam(beta2=beta2)
+    state = simulate(densifier, scales, looks=(600,))[600]
+    assert passes(densifier, state) == pytest.approx(percent, abs=3), case
+
+
+@pytest.mark.parametrize(("visibility", "zero", "skip"), [(0.3, 84, 90), (0.1, 64, 91), (0.02, 29, 96)])
+def test_the_published_gate_bites_the_rarely_seen_unless_their_pauses_are_skipped(visibility, zero, skip):
+    for choice, percent in (("zero", zero), ("skip", skip)):
+        densifier = cadam(invisible=choice)
+        state = simulate(densifier, [1.0] * 600, visibility=visibility, looks=(600,))[600]
+        assert passes(densifier, state) == pytest.approx(percent, abs=3)
+
+
+def test_under_a_weight_common_to_all_the_gate_opens_and_shuts_for_everybody():
+    densifier = cadam()
+    states = simulate(densifier, gamma_of_ism(1500), looks=range(200, 1501, 100))
+    shares = [passes(densifier, state) for state in states.values()]
+    assert max(shares) - min(shares) > 40
+    strict = cadam(grad_norm="per_step_rms")
+    states = simulate(strict, gamma_of_ism(600), looks=range(200, 601, 100))
+    assert [passes(strict, state) for state in states.values()] == pytest.approx([90] * 5, abs=3)
+
+
+def test_cadam_strict_passes_a_sixth_of_the_noise():
+    densifier = cadam(grad_norm="per_step_rms")
+    state = simulate(densifier, [1.0] * 300, looks=(300,))[300]
+    assert passes(densifier, state, tau=0.3) == pytest.approx(16, abs=3)
+
+
+# The calibrated gate.
+
+
+@pytest.mark.parametrize(
+    ("beta1", "beta2"), [(0.9, 0.81), (0.9, 0.99), (0.9, 0.999), (0.98, 0.99), (0.98, 0.999)]
+)
+def test_isotropic_noise_passes_as_often_as_alpha_says_at_every_age(beta1, beta2):
+    densifier = cadam(beta1=beta1, beta2=beta2)
+    states = simulate(densifier, [1.0] * AGES[-1], looks=AGES)
+    for alpha in (0.01, 0.05, 0.2):
+        rates = [alarms(densifier, state, alpha) for state in states.values()]
+        chance = 4 * math.sqrt(alpha * (1 - alpha) / N)
+        assert rates == pytest.approx([alpha] * len(AGES), abs=chance + 0.1 * alpha)
+        mean = sum(rates) / len(rates)
+        assert mean == pytest.approx(alpha, abs=chance / math.sqrt(len(rates)) + 0.06 * alpha)
+
+
+@pytest.mark.parametrize("visibility", [0.1, 0.3, 1.0])
+def test_skipping_the_pauses_makes_visibility_irrelevant(visibility):
+    densifier = cadam(invisible="skip", beta2=0.81)
+    for state in simulate(densifier, [1.0] * 300, visibility=visibility, looks=(100, 300)).values():
+        grown = densifier.scores(state)["snr"][state.age >= 5]
+        threshold = snr_threshold(ALPHA, 0.9, 0.81, state.age)[state.age >= 5]
+        assert float((grown > threshold).float().mean()) == pytest.approx(ALPHA, abs=ERROR)
+
+
+@pytest.mark.parametrize("noise", [isotropic, heavy])
+@pytest.mark.parametrize("visibility", [0.02, 0.1, 0.3, 1.0])
+def test_with_beta2_of_beta1_squared_noise_never_passes_more_often_than_alpha(noise, visibility):
+    densifier = cadam(beta2=0.81)
+    states = simulate(densifier, [1.0] * 300, noise=noise, visibility=visibility, looks=AGES)
+    assert max(alarms(densifier, state) for state in states.values()) < ALPHA + ERROR
+
+
+@pytest.mark.parametrize(
+    "scales", [falling(600), rising(600), gamma_of_ism(600)], ids=["falls", "rises", "ism"]
+)
+def test_with_beta2_of_beta1_squared_no_change_of_scale_lets_more_noise_pass(scales):
+    looks = range(100, 601, 50)
+    short, long = cadam(beta2=0.81), cadam(beta2=0.999)
+    rates = [alarms(short, state) for state in simulate(short, scales, looks=looks).values()]
+    assert 0.01 < min(rates) <= max(rates) < ALPHA + ERROR
+    rates = [alarms(long, state) for state in simulate(long, scales, looks=looks).values()]
+    assert max(rates) > 2 * ALPHA or min(rates) < 0.01  # a long memory holds no such promise
+
+
+def test_noise_along_fewer_axes_passes_more_often():
+    densifier = cadam(beta2=0.81)
+    expected = {one_plane: 0.078, one_axis: 0.117}
+    for noise, rate in expected.items():
+        state = simulate(densifier, [1.0] * 100, noise=noise, looks=(100,))[100]
+        assert alarms(densifier, state) == pytest.approx(rate, abs=ERROR)
+
+
+def test_drift_of_the_strength_of_the_noise_passes_the_calibrated_gate():
+    def drifting(draw: torch.Generator) -> torch.Tensor:
+        return isotropic(draw) + torch.tensor([1.0, 1.0, 1.0])
+
+    densifier = cadam(beta2=0.81)
+    state = simulate(densifier, [1.0] * 60, noise=drifting, looks=(60,))[60]
+    assert alarms(densifier, state) > 0.97
+
+
+def test_select_uses_the_threshold_of_each_age():
+    densifier = component(
+        compose(["prompt=noise", "densifier=cadam_calibrated", "densifier.min_age=0"]).densifier
+    )
+    state = simulate(densifier, [1.0] * 60, looks=(60,))[60]
+    state = CAdamState(m=state.m, v=state.v, age=state.age.clone())
+    state.age[::2] = 30
+    drift, noise = densifier.strengths(state)
+    threshold = snr_threshold(ALPHA, 0.9, 0.81, state.age)
+    assert len(threshold.unique()) == 2
+    expected = (drift > threshold * noise) & (drift > drift.quantile(0.9))
+    assert torch.equal(densifier.select(state), expected)
+    assert densifier.statistics(state)["share_above_tau_SNR"] == pytest.approx(
+        float((drift > threshold * noise).float().mean())
+    )
+
+
+# The function.
+
+
+def test_fewer_alarms_take_a_higher_threshold_at_every_age():
+    ages = torch.arange(2, 2000)
+    strict, usual, lax = (snr_threshold(alpha, 0.9, 0.999, ages) for alpha in (0.01, 0.05, 0.5))
+    assert (strict > usual).all()
+    assert (usual > lax).all()
+
+
+def test_nobody_passes_on_one_gradient():
+    assert snr_threshold(0.5, 0.9, 0.999, torch.tensor([0, 1, 2])).isinf().tolist() == [True, True, False]
+    assert snr_threshold(0.5, 0.9, 0.999, torch.arange(0)).shape == (0,)
+
+
+def test_in_the_end_the_threshold_is_that_of_chi_square():
+    from scipy.stats import chi2
+
+    expected = math.sqrt(0.1 / 1.9 * chi2.ppf(0.95, 3) / 3)
+    assert float(snr_threshold(0.05, 0.9, 0.9999, torch.tensor([10**6]))) == pytest.approx(expected, rel=1e-3)
