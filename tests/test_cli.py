@@ -22,6 +22,7 @@ from cadam3d import advice, cli, launch, settings
 from cadam3d.core.errors import UserError
 
 REPOSITORY = Path(__file__).parent.parent
+DENSIFIERS = sorted(path.stem for path in (settings.config_dir() / "densifier").glob("*.yaml"))
 AWKWARD = (
     "a corgi, front view",
     "what's up",
@@ -321,14 +322,14 @@ def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, 
         ("densifier.max_gaussians=9", "Did you mean refine.max_gaussians? Try: refine.max_gaussians=9"),
         ("step=5", "Did you mean steps"),
         ("qqqq.zzzz=5", "no such setting. Try: cadam3d train --cfg job"),
-        ("densifier=cadm", "wanted one of baseline|cadam|none, got 'cadm'. Try: densifier=cadam"),
+        ("densifier=cadm", f"wanted one of {'|'.join(DENSIFIERS)}, got 'cadm'. Try: densifier=cadam"),
         ("prior=shape", "Try: prior=shapes"),
         ("callback=[metrics,progres]", "got 'progres'. Try: callback=progress"),
         ("experiment=smok", "Try: experiment=smoke"),
         ("steps=1,2", "steps: several values make a sweep. Try: cadam3d sweep steps=1,2"),
         ("~steps", "~steps: a setting can be changed, not taken away. Try: "),
         ("~densifier", "~densifier: a setting can be changed"),
-        ("densifier=null", "wanted one of baseline|cadam|none, got null. Try: densifier=none"),
+        ("densifier=null", f"wanted one of {'|'.join(DENSIFIERS)}, got null. Try: densifier=none"),
         ("camera=null", "camera: wanted one of "),
         ("exporter=null", "exporter: wanted one of "),
         ("steps=${nope}", "cadam3d: steps: Interpolation key 'nope' not found. Try: "),
@@ -648,10 +649,13 @@ def complete(line: str, type_line, monkeypatch, shell: str = "bash") -> list[str
     [
         ("cadam3d ", list(cli.COMMANDS)),
         ("cadam3d e", ["export", "eval"]),
-        ("cadam3d train densifier=", ["densifier=baseline", "densifier=cadam", "densifier=none"]),
-        ("cadam3d train densifier.tau_", ["densifier.tau_Q=", "densifier.tau_SNR="]),
-        ('cadam3d train prompt="a car, (red)" densifier=ca', ["densifier=cadam"]),
-        ("cadam3d train 'prompt=a car' densifier=ca", ["densifier=cadam"]),
+        ("cadam3d train densifier=", [f"densifier={name}" for name in DENSIFIERS]),
+        (
+            "cadam3d train densifier.tau_",
+            ["densifier.tau_Q=", "densifier.tau_SNR=", "densifier.tau_m=", "densifier.tau_reset="],
+        ),
+        ('cadam3d train prompt="a car, (red)" densifier=cadam_c', ["densifier=cadam_calibrated"]),
+        ("cadam3d train 'prompt=a car' densifier=cadam_c", ["densifier=cadam_calibrated"]),
         ("cadam3d sweep grid=th", ["grid=thresholds"]),
         ("cadam3d doctor js", ["json="]),
         ("cadam3d nothing ", []),
