@@ -32,8 +32,9 @@ class GradientSignal:
 class Densifier(ABC, Generic[State]):
     """Frozen hyper-parameters; the per-Gaussian tensors live in a state that the trainer holds.
 
-    Every method is pure: it returns a new state and leaves its arguments alone. Working in place saves no
-    time (``scripts/bench_densifier.py``), and this way a step that fails half way has changed nothing.
+    Every method is pure: it returns a new state and leaves its arguments alone, so a step that fails half way
+    has changed nothing. Working in place would save CAdam about a third of 11 ms per million Gaussians on one
+    core, where the cheapest step takes 770 ms (``scripts/bench_densifier.py``).
     """
 
     @property
