@@ -1,7 +1,7 @@
 """An outside opinion: gsplat's own CPU projection, spherical harmonics and ``accumulate``, with autograd.
 
-Runs after ``pip install -e .[oracle]`` and skips itself otherwise. gsplat needs ``nerfacc`` for two small
-functions, which are given here, and a list of (Gaussian, pixel) hits, which its CUDA code would make.
+It comes with ``pip install -e .[dev]``; without it the tests skip themselves. It needs ``nerfacc`` for two
+small functions, which are given here, and a list of (Gaussian, pixel) hits, which its CUDA code would make.
 """
 
 import sys
@@ -17,7 +17,7 @@ from cadam3d.core.sh import sh_basis
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
 pytestmark = pytest.mark.oracle
-pytest.importorskip("gsplat", reason="pip install -e .[oracle]")
+pytest.importorskip("gsplat", reason="pip install -e .[dev]")
 
 from gsplat.cuda import _torch_impl as gsplat  # noqa: E402
 
