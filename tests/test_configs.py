@@ -18,7 +18,7 @@ from cadam3d.settings import component, components, compose, config_dir
 
 CONFIGS = config_dir()
 SEVERAL = ("exporter", "callback", "metric")  # groups of which a run has several at once
-NO_COMPONENTS = ("hydra", "grid", "experiment")
+NO_COMPONENTS = ("hydra", "grid", "experiment", "noise")
 GROUPS = sorted(path.name for path in CONFIGS.iterdir() if path.is_dir() and path.name not in NO_COMPONENTS)
 FILES = [path for group in GROUPS for path in sorted((CONFIGS / group).glob("*.yaml"))]
 VARIANTS = [path for path in FILES if "defaults" in yaml.safe_load(path.read_text(encoding="utf-8"))]
