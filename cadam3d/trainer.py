@@ -247,10 +247,10 @@ class Trainer:
             split=0,
             pruned=0,
             reset=0,
-            statistics=self.densifier.statistics(seen),
+            statistics=self.densifier.statistics(seen, step),
             population=Population(
                 gaussians=gaussians,
-                is_selected=self.densifier.select(seen) if refines else nobody,
+                is_selected=self.densifier.select(seen, step) if refines else nobody,
                 scores=self.densifier.scores(seen),
             ),
         )

@@ -103,7 +103,7 @@ def measure(densifier: Densifier, steps: list[float], signal: GradientSignal, re
     with Held() as held:
         densifier.observe(state, signal)
     observing = [milliseconds(lambda: densifier.observe(state, signal), device) for _ in range(repeats)]
-    selecting = [milliseconds(lambda: densifier.select(state), device) for _ in range(3)]
+    selecting = [milliseconds(lambda: densifier.select(state, step=100), device) for _ in range(3)]
     observe, step = statistics.median(observing), statistics.median(steps)
     state_bytes = sum(rows.nbytes for rows in state.to_dict().values()) // n
     return (

@@ -54,8 +54,11 @@ class Densifier(ABC, Generic[State]):
         """
 
     @abstractmethod
-    def select(self, state: State) -> Bool[Tensor, "n"]:
-        """Whom to grow. Called at refinement steps only; the one real difference between densifiers."""
+    def select(self, state: State, step: int) -> Bool[Tensor, "n"]:
+        """Whom to grow. Called at refinement steps only; the one real difference between densifiers.
+
+        ``step`` (1 after the first step) is for schedules; the evidence is in the state.
+        """
 
     @abstractmethod
     def unreliable(self, state: State) -> Bool[Tensor, "n"]:
@@ -80,6 +83,6 @@ class Densifier(ABC, Generic[State]):
         """Numbers per Gaussian for pictures and histograms, such as the SNR; never read back."""
         return {}
 
-    def statistics(self, state: State) -> dict[str, float]:
+    def statistics(self, state: State, step: int) -> dict[str, float]:
         """Numbers about the state for logs and plots; never read back."""
         return {}

@@ -71,7 +71,7 @@ class Baseline(Densifier[BaselineState]):
             radius=torch.maximum(state.radius, signal.radii.amax(dim=0)),
         )
 
-    def select(self, state: BaselineState) -> Bool[Tensor, "n"]:
+    def select(self, state: BaselineState, step: int) -> Bool[Tensor, "n"]:
         """Mark the Gaussians to grow: A_i >= tau_pos (paper eq. 1; ``>=`` as in 3DGS)."""
         return self._mean_norms(state) >= self.tau_pos
 
@@ -91,7 +91,7 @@ class Baseline(Densifier[BaselineState]):
         """The mean gradient norm, in loss per NDC unit, which ``tau_pos`` is compared with."""
         return {"mean_norm": self._mean_norms(state)}
 
-    def statistics(self, state: BaselineState) -> dict[str, float]:
+    def statistics(self, state: BaselineState, step: int) -> dict[str, float]:
         """Quantiles of the mean gradient norm, and the share of Gaussians that reach the threshold."""
         norms = self._mean_norms(state)
         if len(norms) == 0:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from cadam3d.core.checks import require, require_choice, require_range, require_whole
 from cadam3d.core.edit import RowEdit, RowState
+from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.densifier.base import Densifier, GradientSignal
 from cadam3d.densifier.noise_floor import snr_threshold
 
@@ -44,7 +45,9 @@ class CAdam(Densifier[CAdamState]):
     and variants in ``configs/densifier/cadam_*.yaml`` are settings of this class.
     """
 
-    tau_Q: float | None  # in [0, 1): quantile of drift that candidates exceed (paper eq. 9); null = no gate
+    tau_Q: (
+        float | Schedule | None
+    )  # in [0, 1): quantile of drift that candidates exceed (eq. 9); null = no gate
     tau_m: float | None  # absolute drift that candidates exceed, loss per world unit; null = no gate (paper)
     tau_SNR: float | None  # SNR that candidates exceed (paper eq. 11); null, like 0, = no gate
     alpha: float | None  # in (0, 1): how often pure noise may pass, instead of tau_SNR; null = tau_SNR
@@ -84,7 +87,7 @@ class CAdam(Densifier[CAdamState]):
 
     def _check_gates(self) -> None:
         if self.tau_Q is not None:
-            require_range("densifier.tau_Q", self.tau_Q, low=0, below=1, example=0.9)
+            require_scheduled("densifier.tau_Q", self.tau_Q, low=0, below=1, example=0.9)
         if self.tau_m is not None:
             require_range("densifier.tau_m", self.tau_m, low=0, example=1e-4)
         if self.tau_SNR is not None:
@@ -161,12 +164,12 @@ class CAdam(Densifier[CAdamState]):
             age=state.age + is_updated,
         )
 
-    def select(self, state: CAdamState) -> Bool[Tensor, "n"]:
+    def select(self, state: CAdamState, step: int) -> Bool[Tensor, "n"]:
         """Mark the Gaussians to grow: drift above its quantile, and above its noise (paper eq. 9 and 11)."""
         drift, noise = self.strengths(state)
         selected = drift > self._gate(state) * (noise + self._eps(noise))  # compare; never divide by ~0
         if self.tau_Q is not None:
-            selected &= drift > quantile(drift[self._population(state)], self.tau_Q)
+            selected &= drift > quantile(drift[self._population(state)], as_schedule(self.tau_Q)(step))
         if self.tau_m is not None:
             selected &= drift > self.tau_m
         return selected & (state.age >= self.min_age)
@@ -220,7 +223,7 @@ class CAdam(Densifier[CAdamState]):
         drift, noise = self.strengths(state)
         return {"drift": drift, "noise": noise, "snr": drift / (noise + self._eps(noise))}
 
-    def statistics(self, state: CAdamState) -> dict[str, float]:
+    def statistics(self, state: CAdamState, step: int) -> dict[str, float]:
         """The quantile threshold, the spread of the SNR, and how many stand above the gate.
 
         The gate is ``tau_SNR``; under ``alpha`` each Gaussian has its own, and the median is told.
@@ -238,7 +241,7 @@ class CAdam(Densifier[CAdamState]):
         }
         population = drift[self._population(state)]
         if self.tau_Q is not None and len(population):  # an empty one has no quantile, and JSON no infinity
-            numbers["drift_threshold"] = quantile(population, self.tau_Q)
+            numbers["drift_threshold"] = quantile(population, as_schedule(self.tau_Q)(step))
         return {name: float(number) for name, number in numbers.items() if math.isfinite(number)}
 
     def _updated(self, signal: GradientSignal) -> Bool[Tensor, ""] | Bool[Tensor, "n"]:

@@ -12,6 +12,7 @@ from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.baseline import VIEWS, Baseline
 
 CPU = torch.device("cpu")
+STEP = 100  # of a call; no matter, unless a schedule asks
 
 
 def baseline(**changes) -> Baseline:
@@ -54,7 +55,7 @@ def test_noise_that_cancels_still_counts_in_full():
     state = baseline().init_state(1, CPU)
     for one in there_and_back:
         state = baseline().observe(state, one)
-    assert baseline().select(state).all()  # the dilemma of paper sec. 4.1
+    assert baseline().select(state, STEP).all()  # the dilemma of paper sec. 4.1
 
 
 def test_steps_that_do_not_see_a_gaussian_do_not_dilute_its_mean():
@@ -67,7 +68,7 @@ def test_steps_that_do_not_see_a_gaussian_do_not_dilute_its_mean():
 def test_a_gaussian_never_seen_is_never_selected():
     hidden = signal(torch.ones(1, 2, 2), torch.tensor([[True, False]]))
     state = baseline().observe(baseline().init_state(2, CPU), hidden)
-    assert baseline().select(state).tolist() == [True, False]
+    assert baseline().select(state, STEP).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("views", VIEWS)
@@ -120,7 +121,7 @@ def test_reaching_the_threshold_is_enough():
     norms = torch.tensor([[[0.5, 0.0], [0.25, 0.0], [0.1875, 0.0]]])
     densifier = baseline(tau_pos=0.25)
     state = densifier.observe(densifier.init_state(3, CPU), signal(norms))
-    assert densifier.select(state).tolist() == [True, True, False]
+    assert densifier.select(state, STEP).tolist() == [True, True, False]
 
 
 def test_the_multiplier_undoes_a_loss_scale():
@@ -210,7 +211,7 @@ def test_the_score_is_what_the_threshold_is_compared_with():
     state = baseline().observe(baseline().init_state(50, CPU), signal(gradients(2, 50)))
     norms = baseline().scores(state)["mean_norm"]
     median = float(norms.median())
-    assert torch.equal(baseline(tau_pos=median).select(state), norms >= median)
+    assert torch.equal(baseline(tau_pos=median).select(state, STEP), norms >= median)
 
 
 def test_everybody_is_reset():
@@ -222,7 +223,7 @@ def test_statistics_say_what_the_densifier_saw():
     pixel = torch.zeros(1, 11, 2)
     pixel[0, :, 0] = torch.arange(11) * 1e-4
     numbers = baseline(tau_pos=4.5e-4).statistics(
-        baseline().observe(baseline().init_state(11, CPU), signal(pixel))
+        baseline().observe(baseline().init_state(11, CPU), signal(pixel)), STEP
     )
     assert numbers["gradient_p10"] == pytest.approx(1e-4)
     assert numbers["gradient_p50"] == pytest.approx(5e-4)
@@ -232,8 +233,8 @@ def test_statistics_say_what_the_densifier_saw():
 
 def test_an_empty_scene_is_no_problem():
     state = baseline().observe(baseline().init_state(0, CPU), signal(torch.zeros(2, 0, 2)))
-    assert baseline().select(state).shape == (0,)
-    assert baseline().statistics(state) == {}
+    assert baseline().select(state, STEP).shape == (0,)
+    assert baseline().statistics(state, STEP) == {}
 
 
 @pytest.mark.parametrize(
