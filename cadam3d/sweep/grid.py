@@ -1,10 +1,11 @@
 """Which jobs a sweep has: the arms of a grid, changed by what the command line says, as one list.
 
-A comparison is a union of products, such as a baseline at eight thresholds beside one CAdam, each for the same
-prompts and seeds. A single product, which is what ``key=a,b`` on a line says, cannot express it.
+A comparison is a union of products, such as a baseline at eight thresholds beside one CAdam, each for the
+same prompts and seeds. A single product, which is what ``key=a,b`` on a line says, cannot express it.
 """
 
 import hashlib
+import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,10 +18,9 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import to_json
 from cadam3d.settings import TEXT_KEYS, quote, slug
 
-IDENTIFIER = re.compile(
-    r"[A-Za-z_][\w./-]*", re.ASCII
-)  # what Hydra's grammar reads as the same text unquoted
+IDENTIFIER = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)  # the same text to Hydra, quoted or not
 RESERVED = ("null", "true", "false", "nan", "inf")
+ALWAYS_TOLD = ("prompt", "seed")  # by tables and by the names of folders
 EXAMPLE = "{each: {seed: [0, 1]}, arms: {mine: {densifier: cadam}}}"
 
 
@@ -31,6 +31,11 @@ class Setting:
     key: str  # without a leading + or ~
     line: str  # as it was written for Hydra
     value: str  # as JSON: the same for every way to write it
+
+    @property
+    def text(self) -> str:
+        """The value for people: text without quotes."""
+        return json.loads(self.value) if self.value.startswith('"') else self.value
 
     @property
     def identity(self) -> str:
@@ -85,7 +90,7 @@ def read_grid(node: Any) -> Grid:
 
 
 def read_line(overrides: Iterable[str]) -> Axes:
-    """The axes that a command line gives; ``a,b``, ``choice()``, ``range()`` and ``glob()`` are several values.
+    """The axes that a command line gives; ``a,b``, ``choice()`` and ``range()`` are several values.
 
     A key that comes twice has the later value. Raises Hydra's ``OverrideParseException``.
     """
@@ -125,25 +130,28 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
                 other = found.setdefault(frozenset(setting.identity for setting in settings), job)
                 if other.arm != name and (guilty := [key for key in axes if key in line]):
                     raise UserError(
-                        f"{', '.join(guilty)}: tells the arms {other.arm} and {name} apart, so the line cannot "
-                        f"set it for both. Try: '~grid.arms.{name}', or without {guilty[0]}="
+                        f"{guilty[0]}: tells the arms {other.arm} and {name} apart, so the line cannot set "
+                        f"it for both. Try: '~grid.arms.{name}', or without {guilty[0]}="
                     )
     return list(found.values())
 
 
 def swept_keys(grid: Grid, line: Axes) -> list[str]:
-    """The keys in which jobs may differ: all of the grid's, and those to which the line gives several values."""
+    """The keys in which jobs may differ: those of the grid and those to which the line gives several values.
+
+    Also prompt and seed where the line gives them: another prompt is another job, not another setting of all.
+    """
     keys = [*grid.each, *(key for axes in grid.arms.values() for key in axes)]
-    keys += [key for key, axis in line.items() if len(axis) > 1]
+    keys += [key for key, axis in line.items() if len(axis) > 1 or key in ALWAYS_TOLD]
     return list(dict.fromkeys(keys))
 
 
 def sweep_name(grid_name: str | None, line: Axes) -> str:
-    """The name of the folder of a sweep: its grid's, or else one that says what the line says, in any order."""
+    """The name of the folder of a sweep: its grid's, or else one that says what the line says."""
     if grid_name:
         return slug(grid_name)
-    keys = sorted(line, key=lambda key: (key not in TEXT_KEYS, key))
-    values = {key: ",".join(setting.value for setting in line[key]) for key in keys}
+    keys = sorted(line, key=lambda key: (key not in TEXT_KEYS, len(line[key]) == 1, key))
+    values = {key: ",".join(setting.text for setting in line[key]) for key in keys}
     words = [values[key] if key in TEXT_KEYS else f"{key}={values[key]}" for key in keys]
     return f"{slug(*words)}_{_digest(setting.identity for key in keys for setting in line[key])}"
 
@@ -210,14 +218,15 @@ def _foreign(
 def _told(grid: Grid, line: Axes) -> set[str]:
     """The keys that the name of a folder tells: those that may vary, whether the line narrows them or not."""
     varied = {key for axes in grid.arms.values() for key, axis in axes.items() if len(axis) > 1}
-    return {*grid.each, *varied, *(key for key, axis in line.items() if len(axis) > 1)}
+    fixed = {key for axes in grid.arms.values() for key in axes} - varied
+    return {key for key in swept_keys(grid, line) if key not in fixed or len(line.get(key, ())) > 1}
 
 
 def _folder_name(arm: str, settings: Sequence[Setting], told: set[str], counted: Sequence[str]) -> str:
     """A readable name, and a digest of all that makes this job another one than its neighbours."""
     shown = sorted((each for each in settings if each.key in told), key=lambda each: each.key)
-    words = [each.value for each in shown if each.key in TEXT_KEYS]
-    words += [f"{each.key.rpartition('.')[2]}={each.value}" for each in shown if each.key not in TEXT_KEYS]
+    words = [each.text for each in shown if each.key in TEXT_KEYS]
+    words += [f"{each.key.rpartition('.')[2]}={each.text}" for each in shown if each.key not in TEXT_KEYS]
     digest = _digest([arm, *sorted(each.identity for each in settings if each.key in counted)])
     return "_".join([*([slug(arm)] if arm else []), slug(*words), digest])
 

@@ -1,10 +1,11 @@
 """From a line to the jobs of a sweep: every one is composed, so that mistakes show before anything runs."""
 
-import copy
 import re
 from argparse import Namespace
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -15,7 +16,7 @@ from cadam3d.advice import ask_for, explain, missing_values
 from cadam3d.core.errors import UserError
 from cadam3d.launch import compose_line, key_of, refuse_holes
 from cadam3d.settings import flatten
-from cadam3d.sweep.grid import Axes, Grid, Job, expand, read_grid, read_line, swept_keys
+from cadam3d.sweep.grid import ALWAYS_TOLD, Axes, Grid, Job, expand, read_grid, read_line, swept_keys
 
 FOLDER = "hydra.sweep.dir"
 PLAIN_KEY = re.compile(r"[A-Za-z_][\w.]*=")  # neither an addition nor a deletion nor a package
@@ -25,7 +26,6 @@ NOT_FOR_SWEEPS = re.compile(r"hydra\.run\.dir$|hydra\.sweep\.subdir$|hydra[./]sw
 NOTHING_TO_SWEEP = (
     "sweep: nothing to sweep over. Try: cadam3d sweep grid=thresholds ... or densifier=baseline,cadam"
 )
-ALWAYS_TOLD = ("prompt", "seed")
 
 
 @dataclass(frozen=True)
@@ -66,50 +66,76 @@ class Composed:
         return self.choices[key] if key in self.choices else self.values.get(key)
 
 
+@dataclass(frozen=True)
+class Base:
+    """A composed job, of which others differ in values only."""
+
+    cfg: DictConfig
+    plain: dict[str, Any]  # leaves by dotted key
+    referring: list[str]  # leaves that interpolations make
+
+    @classmethod
+    def of(cls, cfg: DictConfig) -> "Base":
+        """Sort the leaves of ``cfg``, apart from Hydra's own."""
+        raw = OmegaConf.to_container(cfg, resolve=False)
+        assert isinstance(raw, dict)
+        raw.pop("hydra", None)
+        leaves = dict(flatten(raw))
+        referring = [key for key, value in leaves.items() if "${" in str(value)]
+        return cls(cfg, {key: leaves[key] for key in leaves.keys() - set(referring)}, referring)
+
+    def composed(self, values: Mapping[str, Any]) -> Composed:
+        """The job with ``values`` instead, put in as Hydra does."""
+        for key, value in values.items():
+            OmegaConf.update(self.cfg, key, value, merge=True)
+        resolved = {}
+        for key in self.referring:
+            with suppress(InterpolationResolutionError):  # such as ${hydra:...}
+                node = OmegaConf.select(self.cfg, key)
+                resolved[key] = (
+                    OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+                )
+        return Composed(values={**self.plain, **values, **resolved}, choices=self.cfg.hydra.runtime.choices)
+
+
 class Composer:
     """Composes ``cadam3d train`` with many lines quickly.
 
-    Composing takes Hydra a sixth of a second, and most jobs of a sweep differ in plain values only. So lines
-    that choose the same parts are composed once, and values are put in afterwards, as Hydra itself does.
+    One line takes Hydra a sixth of a second, and most jobs of a sweep differ in plain values only. So lines
+    that choose the same parts and set the same keys are composed once.
     """
 
     def __init__(self, command: str, options: Namespace, common: Sequence[str]) -> None:
-        self._command, self._options = command, options
-        self._bases: dict[tuple[str, ...], tuple[DictConfig, set[str]]] = {}
-        self._common = list(common)
-        _, self._leaves = self._base(())
+        self._command, self._options, self._common = command, options, list(common)
+        self._bases: dict[tuple[str, ...], Base] = {}
+        self._leaves = set(self._base([]).plain)
 
     def compose(self, overrides: Sequence[str]) -> Composed:
-        """The settings under ``overrides``. Raises ``UserError`` for what cannot be composed or is missing."""
-        cfg = self._composed(overrides)
-        if missing := missing_values(cfg):
-            raise ask_for(missing, self._command)
-        refuse_holes(cfg, self._command, overrides)
-        return Composed(values=dict(_resolved(cfg)), choices=cfg.hydra.runtime.choices)
+        """The settings under ``overrides``. Raises ``UserError`` if they do not compose or lack a value."""
+        values = {}
+        key_lines = []
+        for line in overrides:
+            is_value = PLAIN_KEY.match(line) and key_of(line) in self._leaves and "${" not in line
+            if is_value:
+                values[key_of(line)] = _value(line)
+            key_lines.append(key_of(line) if is_value else line)
+        known = tuple(key_lines)
+        if known not in self._bases:
+            base = self._base(overrides)
+            if missing := missing_values(base.cfg):
+                raise ask_for(missing, self._command)
+            refuse_holes(base.cfg, self._command, overrides)
+            self._bases[known] = base
+        return self._bases[known].composed(values)
 
     def has(self, overrides: Sequence[str], key: str) -> bool:
         """Whether a job under ``overrides`` has a setting or a group called ``key``."""
-        cfg, _ = self._base(tuple(overrides))
-        return key in cfg.hydra.runtime.choices or OmegaConf.select(cfg, key, default=self) is not self
+        base = self._base(overrides)
+        leaves = (*base.plain, *base.referring, *base.cfg.hydra.runtime.choices)
+        return any(f"{leaf}.".startswith(f"{key}.") for leaf in leaves)
 
-    def _composed(self, overrides: Sequence[str]) -> DictConfig:
-        is_value = {line: bool(PLAIN_KEY.match(line)) and key_of(line) in self._leaves for line in overrides}
-        cfg, leaves = self._base(tuple(line for line in overrides if not is_value[line]))
-        values = [line for line in overrides if is_value[line]]
-        if not leaves.issuperset(map(key_of, values)):
-            return self._base(tuple(overrides))[0]  # Hydra says what is wrong
-        cfg = copy.deepcopy(cfg)
-        for line in values:
-            value = OverridesParser.create().parse_override(line).value()
-            OmegaConf.update(cfg, key_of(line), value, merge=True)
-        return cfg
-
-    def _base(self, overrides: tuple[str, ...]) -> tuple[DictConfig, set[str]]:
-        if overrides not in self._bases:
-            cfg = compose_line("train", [*self._common, *overrides], self._options)
-            raw = OmegaConf.to_container(cfg, resolve=False)
-            self._bases[overrides] = cfg, {key for key, _ in flatten(raw)}
-        return self._bases[overrides]
+    def _base(self, overrides: Sequence[str]) -> Base:
+        return Base.of(compose_line("train", [*self._common, *overrides], self._options))
 
 
 def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> tuple[Sweep, Composer]:
@@ -155,7 +181,7 @@ def sort_out(overrides: Sequence[str]) -> Line:
 
 
 def compose_all(sweep: Sweep, composer: Composer) -> list[Composed]:
-    """The settings of every job. Raises ``UserError``, with the name of the arm, for a job that cannot run."""
+    """The settings of every job. Raises ``UserError``, naming the arm, for a job that cannot run."""
     composed = []
     for job in sweep.jobs:
         try:
@@ -174,20 +200,6 @@ def _search_path(overrides: Sequence[str]) -> list[str]:
     return [line for line in overrides if key_of(line) == "hydra.searchpath"]
 
 
-def _resolved(cfg: DictConfig) -> Iterator[tuple[str, Any]]:
-    raw = OmegaConf.to_container(cfg, resolve=False)
-    assert isinstance(raw, dict)
-    raw.pop("hydra", None)
-    for key, value in flatten(raw):
-        if not _may_refer(value):
-            yield key, value
-            continue
-        try:
-            node = OmegaConf.select(cfg, key)
-        except InterpolationResolutionError:  # such as ${hydra:...}
-            continue
-        yield key, OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
-
-
-def _may_refer(value: Any) -> bool:
-    return "${" in str(value)
+@cache
+def _value(line: str) -> Any:
+    return OverridesParser.create().parse_override(line).value()

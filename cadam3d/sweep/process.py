@@ -33,6 +33,7 @@ from cadam3d.sweep.folder import (
 
 POLL_SECONDS = 0.2
 STOPPED = (128 + signal.SIGINT, 128 + signal.SIGTERM)  # exit codes of a run that was asked to stop
+MESSAGE, TRACEBACK = "cadam3d: ", "Traceback (most recent call last)"  # how a reason begins
 TAIL = 20_000  # bytes of the console in which the reason of a failure is looked for
 
 
@@ -59,11 +60,14 @@ def run_job(sweep: Path, number: int) -> None:
 
 
 def _wait(plan: Plan, row: Row, stop: Path) -> int:
-    """Start the process, wait for it and return its exit code; a negative one is the signal that killed it."""
+    """Start the process, wait for it and return its exit code; minus the signal if one killed it."""
     words = [f"resume={quote(str(row.folder))}"] if row.has_checkpoint else row.overrides
     command = [sys.executable, "-m", __name__, str(os.getpid()), "train", *words]
     command += [*plan.flags, f"hydra.run.dir={quote(str(row.folder))}"]
     environment = dict(os.environ)
+    environment.pop(
+        "HYDRA_FULL_ERROR", None
+    )  # set while Hydra is at work here: a mistake is one message there
     if plan.threads is not None:
         environment["OMP_NUM_THREADS"] = str(plan.threads)
     with (row.folder / CONSOLE).open("ab") as console, _signals() as signals:
@@ -93,8 +97,8 @@ def _wait(plan: Plan, row: Row, stop: Path) -> int:
 def _signals() -> Iterator[list[int]]:
     """The signals that came meanwhile, if nobody in this process has taken charge of them.
 
-    In the process of the sweep its own handler is in charge. A worker of a launcher leaves Ctrl-C to that one,
-    for good, since it may come between two jobs; a SIGTERM is for the job that runs.
+    In the process of the sweep its own handler is in charge. A worker of a launcher leaves Ctrl-C to that
+    one, for good, since it may come between two jobs; a SIGTERM is for the job that runs.
     """
     received: list[int] = []
     is_ours = signal.getsignal(signal.SIGINT) in (signal.default_int_handler, signal.SIG_IGN, signal.SIG_DFL)
@@ -110,7 +114,7 @@ def _signals() -> Iterator[list[int]]:
 
 
 def _note_outcome(folder: Path, code: int) -> None:
-    """Leave in ``summary.json`` how the process ended, unless training itself has told all there is to tell."""
+    """Leave in ``summary.json`` how the process ended, unless training itself has told all."""
     summary = read_summary(folder)
     if is_complete(summary):
         return
@@ -132,12 +136,16 @@ def _signal_name(number: int) -> str:
 
 
 def _last_words(console: Path) -> str:
-    """The last line that a process said, without the name of the program."""
+    """Why a process failed, in its own words: its message, or the last line of its traceback."""
     with console.open("rb") as file:
         file.seek(max(0, console.stat().st_size - TAIL))
         lines = file.read().decode(errors="replace").split("\n")
-    said = [line.rpartition("\r")[2].strip() for line in lines]
-    return next((line for line in reversed(said) if line), "").removeprefix("cadam3d: ")
+    said = [line.rpartition("\r")[2].strip() for line in lines]  # a progress bar draws over itself
+    said = [line for line in said if line]
+    starts = [number for number, line in enumerate(said) if line.startswith((MESSAGE, TRACEBACK))]
+    if starts and said[starts[-1]].startswith(MESSAGE):
+        return " ".join(said[starts[-1] :]).removeprefix(MESSAGE)
+    return said[-1] if said else ""
 
 
 def _end_with(parent: int) -> None:

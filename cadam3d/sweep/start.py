@@ -69,7 +69,7 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
 
 
 class Stop:
-    """The first SIGINT or SIGTERM asks every job to save and end, wherever it runs; the second ends at once."""
+    """The first SIGINT or SIGTERM asks all jobs, wherever they run, to save and end; the second is final."""
 
     def __init__(self, folder: Path) -> None:
         self.received: int | None = None

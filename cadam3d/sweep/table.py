@@ -29,17 +29,27 @@ def write_table(sweep: Path) -> list[Row]:
 
 
 def as_text(rows: Sequence[Row]) -> str:
-    """The rows as a table for the terminal; what is the same for all jobs is left out."""
-    keys = [key for key in _swept_keys(rows) if len({to_json(row.swept.get(key)) for row in rows}) > 1]
-    arms = ["arm"] if any(row.arm for row in rows) else []
-    lines = [["job", *arms, *keys, "outcome", *SHOWN]]
+    """The rows as a table for the terminal, without what the arm tells or all jobs share."""
+    keys = varying_keys(rows)
+    has_arms = any(row.arm for row in rows)
+    lines = [["job", *(["arm"] if has_arms else []), *keys, "outcome", *SHOWN]]
     for row in rows:
-        values = [*([row.arm] if arms else []), *(row.swept.get(key) for key in keys), row.outcome]
-        values += [row.summary.get(name) for name in SHOWN]
-        lines.append([_cell(value) for value in (row.number, *values)])
+        values = [row.number, *([row.arm] if has_arms else []), *(row.swept.get(key) for key in keys)]
+        facts = [row.outcome, *(row.summary.get(name) for name in SHOWN)]
+        lines.append([_cell(value) for value in (*values, *facts)])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     padded = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines]
     return "\n".join("  ".join(line).rstrip() for line in padded)
+
+
+def varying_keys(rows: Sequence[Row]) -> list[str]:
+    """The keys in which jobs of one arm differ."""
+    arms = len({row.arm for row in rows})
+    return [
+        key
+        for key in _swept_keys(rows)
+        if len({(row.arm, to_json(row.swept.get(key))) for row in rows}) > arms
+    ]
 
 
 def _write(path: Path, rows: Sequence[Row]) -> None:
@@ -64,6 +74,4 @@ def _plain(value: Any) -> Any:
 def _cell(value: Any) -> str:
     if value is None:
         return "-"
-    if isinstance(value, float):
-        return f"{value:.2f}" if value >= 1 else f"{value:g}"
-    return str(_plain(value))
+    return f"{value:.4g}" if isinstance(value, float) else str(_plain(value))

@@ -1,5 +1,6 @@
 """What a sweep says while it runs: one line for each job that has ended, wherever it ran."""
 
+import textwrap
 import threading
 import time
 from collections.abc import Sequence
@@ -65,7 +66,7 @@ def result(summary: dict[str, Any]) -> str:
     """What became of a job in a few words."""
     outcome = summary.get("outcome", "ended without a word")
     if message := summary.get("message"):
-        return f"{outcome}: {message}"
+        return f"{outcome}: {textwrap.shorten(message, 160, placeholder=' ...')}"
     facts = [] if outcome == Outcome.FINISHED else [str(outcome)]
     if "num_gaussians" in summary:
         facts.append(f"{summary['num_gaussians']:,} Gaussians")
