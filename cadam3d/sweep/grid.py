@@ -13,6 +13,7 @@ from itertools import product
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import to_json
@@ -80,9 +81,7 @@ def read_grid(node: Any) -> Grid:
     arms = node.get("arms")
     arms = {"": {}} if arms is None else arms
     if not isinstance(arms, dict) or not arms:
-        raise UserError(
-            f"grid.arms: wanted at least one named arm, got {arms}. Try: a file that says {EXAMPLE}"
-        )
+        raise UserError(f"grid.arms: wanted named arms, got {arms}. Try: a file that says {EXAMPLE}")
     return Grid(
         each=_axes(node.get("each"), "grid.each"),
         arms={str(name): _axes(axes, f"grid.arms.{name}") for name, axes in arms.items()},
@@ -186,7 +185,7 @@ def _grammar(key: str, value: Any) -> str:
 
 
 def _alternatives(line: str) -> list[str]:
-    override = OverridesParser.create().parse_override(line)
+    override = _parsed(line)
     if not override.is_sweep_override():
         return [line]
     key = override.get_key_element()
@@ -196,8 +195,13 @@ def _alternatives(line: str) -> list[str]:
 
 
 def _setting(line: str) -> Setting:
-    value = OverridesParser.create().parse_override(line).value()
+    value = _parsed(line).value()
     return Setting(key=line.partition("=")[0].lstrip("+~"), line=line, value=to_json(value))
+
+
+def _parsed(line: str) -> Override:
+    [override] = OverridesParser.create().parse_overrides([line])
+    return override
 
 
 def _foreign(

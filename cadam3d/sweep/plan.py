@@ -163,9 +163,7 @@ def sort_out(overrides: Sequence[str]) -> Line:
     for override in overrides:
         key = key_of(override)
         if NOT_FOR_SWEEPS.match(key):
-            raise UserError(
-                f"{key}: not for sweeps, whose jobs lie in one folder. Try: {FOLDER}=multirun/mine"
-            )
+            raise UserError(f"{key}: not for sweeps. Try: {FOLDER}=multirun/mine, where all jobs are")
         if key == "hydra.mode":
             continue
         if OF_THE_GRID.match(key):
