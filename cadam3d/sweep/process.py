@@ -32,7 +32,7 @@ from cadam3d.sweep.folder import (
 )
 
 POLL_SECONDS = 0.2
-STOPPED = (128 + signal.SIGINT, 128 + signal.SIGTERM)  # exit codes of a run that was asked to stop
+STOPPED = (128 + signal.SIGINT, 128 + signal.SIGTERM, -signal.SIGINT, -signal.SIGTERM)  # exit codes: asked to
 MESSAGE, TRACEBACK = "cadam3d: ", "Traceback (most recent call last)"  # how a reason begins
 TAIL = 20_000  # bytes of the console in which the reason of a failure is looked for
 
@@ -118,11 +118,11 @@ def _note_outcome(folder: Path, code: int) -> None:
     summary = read_summary(folder)
     if is_complete(summary):
         return
-    if code < 0:
-        outcome = Outcome.KILLED
-        message = f"killed by {_signal_name(-code)}" + " (out of memory?)" * (code == -signal.SIGKILL)
-    elif code in STOPPED:
+    if code in STOPPED:
         outcome, message = Outcome.INTERRUPTED, "stopped"
+    elif code < 0:
+        outcome = Outcome.KILLED
+        message = f"by {_signal_name(-code)}" + " (out of memory?)" * (code == -signal.SIGKILL)
     else:
         outcome, message = Outcome.FAILED, _last_words(folder / CONSOLE) or f"exit code {code}"
     write_json(folder / SUMMARY, {**summary, "outcome": str(outcome), "message": message})

@@ -35,6 +35,8 @@ if prompt == "a bug":
 if prompt == "a mistake":
     print("Note: before\ncadam3d: prompt: I know\n  no mistake. Try: a cube")
     sys.exit(1)
+if prompt == "a scancel":
+    os.kill(os.getpid(), signal.SIGTERM)
 if prompt == "a kill":
     (folder / "checkpoints").mkdir()
     (folder / "checkpoints" / "step_0000002.pt").touch()

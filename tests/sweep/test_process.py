@@ -48,7 +48,8 @@ def ended(folder: Path) -> tuple[Row, dict]:
         ("a crowd", "out_of_memory", None, 0, True),
         ("a bug", "failed", "ValueError: one two", 1, False),
         ("a mistake", "failed", "prompt: I know no mistake. Try: a cube", 1, False),
-        ("a kill", "killed", "killed by SIGKILL (out of memory?)", -signal.SIGKILL, False),
+        ("a scancel", "interrupted", "stopped", -signal.SIGTERM, False),
+        ("a kill", "killed", "by SIGKILL (out of memory?)", -signal.SIGKILL, False),
     ],
 )
 def test_however_a_process_ends_is_an_outcome(sweep, prompt, outcome, message, code, has_result):
