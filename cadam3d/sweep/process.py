@@ -33,6 +33,7 @@ from cadam3d.sweep.folder import (
 
 POLL_SECONDS = 0.2
 STOPPED = (128 + signal.SIGINT, 128 + signal.SIGTERM, -signal.SIGINT, -signal.SIGTERM)  # exit codes: asked to
+ANNOUNCING = (signal.SIGUSR1, signal.SIGUSR2)  # that a launcher is about to end the job
 MESSAGE, TRACEBACK = "cadam3d: ", "Traceback (most recent call last)"  # how a reason begins
 TAIL = 20_000  # bytes of the console in which the reason of a failure is looked for
 
@@ -98,7 +99,8 @@ def _signals() -> Iterator[list[int]]:
     """The signals that came meanwhile, if nobody in this process has taken charge of them.
 
     In the process of the sweep its own handler is in charge. A worker of a launcher leaves Ctrl-C to that
-    one, for good, since it may come between two jobs; a SIGTERM is for the job that runs.
+    one, for good, since it may come between two jobs; a SIGTERM is for the job that runs. The signal by which
+    Slurm announces that time is up is the launcher's, to queue the job again: once the job has saved.
     """
     received: list[int] = []
     is_ours = signal.getsignal(signal.SIGINT) in (signal.default_int_handler, signal.SIG_IGN, signal.SIG_DFL)
@@ -106,11 +108,18 @@ def _signals() -> Iterator[list[int]]:
         yield received
         return
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    previous = signal.signal(signal.SIGTERM, lambda number, _frame: received.append(number))
+    announcing = [number for number in ANNOUNCING if callable(signal.getsignal(number))]
+    previous = {
+        number: signal.signal(number, lambda number, _frame: received.append(number))
+        for number in (signal.SIGTERM, *announcing)
+    }
     try:
         yield received
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+    for number in set(received).intersection(announcing):
+        signal.raise_signal(number)
 
 
 def _note_outcome(folder: Path, code: int) -> None:

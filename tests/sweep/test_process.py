@@ -140,22 +140,39 @@ def test_a_running_job_is_asked_to_save_when_the_sweep_is_stopped(sweep):
     assert (row.outcome, row.has_result, end["exit_code"]) == ("interrupted", False, 130)
 
 
-def test_sigterm_of_a_worker_reaches_its_job(sweep, tmp_path):
-    """As Slurm sends it when a job is cancelled. Ctrl-C is left to the process of the sweep."""
-    folder = sweep("a wait")
+def start_worker(folder: Path, before: str = "") -> subprocess.Popen:
+    """A process as a launcher has them, at work on job 0."""
     code = (
-        f"import sys; sys.executable = {sys.executable!r}\n"
+        f"import signal, sys; sys.executable = {sys.executable!r}\n"
         "from pathlib import Path; from cadam3d.sweep.process import run_job\n"
-        f"run_job(Path({str(folder)!r}), 0)"
+        f"sweep = Path({str(folder)!r})\n{before}\nrun_job(sweep, 0)"
     )
     worker = subprocess.Popen([PYTHON, "-c", code], env={**os.environ, "PYTHONPATH": str(REPOSITORY)})
     wait_for(folder / "job_1/waiting")
+    return worker
+
+
+def test_sigterm_of_a_worker_reaches_its_job(sweep):
+    """As Slurm sends it when a job is cancelled. Ctrl-C is left to the process of the sweep."""
+    folder = sweep("a wait")
+    worker = start_worker(folder)
     worker.send_signal(signal.SIGINT)
     time.sleep(0.5)
     assert worker.poll() is None
     worker.terminate()
     assert worker.wait(20) == 0
     assert load(folder)[0].outcome == "interrupted"
+
+
+def test_a_launcher_that_announces_the_end_has_its_turn_when_the_job_has_saved(sweep):
+    """As submitit does when the time of a Slurm job is up: its handler queues the job again and exits."""
+    folder = sweep("a wait")
+    outcome = "(sweep / 'job_1/summary.json').read_text()"
+    handler = f"signal.signal(signal.SIGUSR2, lambda *_: sys.exit(5 if 'interrupted' in {outcome} else 6))"
+    worker = start_worker(folder, handler)
+    worker.send_signal(signal.SIGUSR2)
+    assert worker.wait(20) == 5
+    assert not (folder / "job_1/job.json").exists()  # it will go on
 
 
 def test_a_job_ends_with_the_process_that_started_it():
