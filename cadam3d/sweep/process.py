@@ -170,6 +170,8 @@ def _end_with(parent: int) -> None:
 
 def main(words: Sequence[str]) -> None:
     """``cadam3d`` with ``words[1:]``, for as long as process ``words[0]`` lives."""
+    for number in ANNOUNCING:  # Slurm tells all processes; the job hears of it through its launcher
+        signal.signal(number, signal.SIG_IGN)
     from cadam3d import cli
 
     _end_with(int(words[0]))

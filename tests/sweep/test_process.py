@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from cadam3d.sweep import process
 from cadam3d.sweep.folder import STOP, Plan, PlannedJob, Row, load, write_plan
 from cadam3d.sweep.process import run_job
 
@@ -193,6 +194,21 @@ def test_a_job_ends_with_the_process_that_started_it():
     while is_alive(pid):
         assert time.monotonic() < deadline
         time.sleep(0.1)
+
+
+def test_a_job_does_not_hear_what_is_meant_for_its_launcher(monkeypatch):
+    heard = []
+    monkeypatch.setattr("cadam3d.sweep.process._end_with", lambda parent: None)
+    monkeypatch.setattr("cadam3d.cli.main", lambda: heard.extend(map(signal.getsignal, process.ANNOUNCING)))
+    monkeypatch.setattr(sys, "argv", ["to be restored"])
+    before = [(number, signal.getsignal(number)) for number in process.ANNOUNCING]
+    try:
+        process.main(["1", "train", "seed=0"])
+        assert heard == [signal.SIG_IGN] * 2
+        assert sys.argv == ["cadam3d", "train", "seed=0"]
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)
 
 
 def is_alive(pid: int) -> bool:
