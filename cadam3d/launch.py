@@ -195,19 +195,6 @@ def _run(command: str, overrides: list[str], flags: list[str], options: Namespac
     return _run_anew(command, [*arguments, *flags], folder, stood)
 
 
-def _sweep(command: str, overrides: list[str], flags: list[str], options: Namespace) -> int:
-    """Run a sweep, or show the settings of its first job."""
-    from cadam3d.sweep.plan import read_sweep
-    from cadam3d.sweep.start import start
-
-    if not options.cfg:
-        return start(command, overrides, flags, options)
-    sweep, _ = read_sweep(command, overrides, options)
-    line = sweep.line
-    shown = [flag for flag in flags if flag not in ("-m", "--multirun")]
-    return run_hydra("sweep", [*line.grid, *line.launcher, *line.folder, *sweep.jobs[0].overrides, *shown])
-
-
 def _run_anew(command: str, arguments: Sequence[str], folder: Path, stood: Path) -> int:
     """Run in a new ``folder``. A refused line leaves nothing behind but ``stood``, which was there."""
     try:
@@ -233,6 +220,19 @@ def _run_again(command: str, arguments: Sequence[str], folder: Path) -> int:
         for path, content in remembered.items():  # Hydra has written the refused line there already
             path.write_bytes(content)
         raise
+
+
+def _sweep(command: str, overrides: list[str], flags: list[str], options: Namespace) -> int:
+    """Run a sweep, or show the settings of its first job."""
+    from cadam3d.sweep.plan import read_sweep
+    from cadam3d.sweep.start import start
+
+    if not options.cfg:
+        return start(command, overrides, flags, options)
+    sweep, _ = read_sweep(command, overrides, options)
+    line = sweep.line
+    shown = [flag for flag in flags if flag not in ("-m", "--multirun")]
+    return run_hydra("sweep", [*line.grid, *line.launcher, *line.folder, *sweep.jobs[0].overrides, *shown])
 
 
 def refuse_holes(cfg: DictConfig, command: str, overrides: Sequence[str]) -> None:

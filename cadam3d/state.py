@@ -14,7 +14,7 @@ from cadam3d.core.outcome import Outcome
 from cadam3d.core.render import RenderFn
 from cadam3d.optimizer import GaussianOptimizer
 
-__all__ = ["Outcome", "RefineReport", "RunContext", "StepReport", "TrainState"]
+__all__ = ["Outcome", "Population", "RefineReport", "RunContext", "StepReport", "TrainState"]
 
 
 @dataclass
