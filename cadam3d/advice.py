@@ -14,6 +14,12 @@ from cadam3d.settings import compose, config_dir, flatten, quote
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
 NO_NAME_COMPLAINT = "Config group override must be a string or a list"
+LAUNCHERS = {  # Hydra's plugins by what they add to hydra/launcher
+    "joblib": "hydra-joblib-launcher",
+    "submitit_slurm": "hydra-submitit-launcher",
+    "submitit_local": "hydra-submitit-launcher",
+    "ray": "hydra-ray-launcher",
+}
 PASTE_PROMPT = 'prompt="a red and yellow checkered torus"'
 
 
@@ -73,6 +79,9 @@ def _unknown_option(error: MissingConfigException, config_name: str, overrides: 
     """A group exists but not the chosen option of it, or the command itself has no YAML."""
     path = error.missing_cfg_file or ""
     group, _, option = path.rpartition("/")
+    if group == "hydra/launcher" and option in LAUNCHERS:
+        package = LAUNCHERS[option]
+        return UserError(f"launcher: {package} is not installed. Try: pip install {package}")
     options = sorted(error.options or (file.stem for file in (config_dir() / group).glob("*.yaml")))
     if not group or not options:
         return UserError(f"{path}: no such configuration in {config_dir()}. Try: cadam3d doctor")

@@ -21,11 +21,10 @@ from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 
 from cadam3d.advice import ask_for, explain, missing_values
 from cadam3d.core.errors import UserError
-from cadam3d.settings import VERSION_BASE, compose, config_dir, quote, register_resolvers
+from cadam3d.settings import TEXT_KEYS, VERSION_BASE, compose, config_dir, quote, register_resolvers
 
 TRAINING = ("train", "sweep")  # the commands that own a run folder
 OVERRIDES = ".hydra/overrides.yaml"  # in a run folder: what its line said
-TEXT_KEYS = ("prompt", "negative_prompt")  # always text, so quoted for the user
 PATH_KEYS = (  # quoted if need be
     *("run", "ply", "output", "resume", "hydra.run.dir", "hydra.sweep.dir"),
     *("initializer.path", "rasterizer.cache_dir"),
@@ -77,11 +76,11 @@ def launch(command: str, words: Sequence[str]) -> int:
         raise UserError(f"{command}: only training can be swept. Try: cadam3d {command} once for each asset")
     if options.help or options.hydra_help or options.info or options.shell_completion:
         return run_hydra(command, [*overrides, *flags])
-    first = _first_job(command, overrides, options) if is_sweep else overrides
+    if is_sweep:
+        return _sweep(command, overrides, flags, options)
     if options.cfg:
-        shown = [flag for flag in flags if flag not in ("-m", "--multirun")]
-        return run_hydra(command, [*first, *shown])
-    return _run(command, overrides, first, flags, options, is_sweep=is_sweep)
+        return run_hydra(command, [*overrides, *flags])
+    return _run(command, overrides, flags, options)
 
 
 def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -135,7 +134,7 @@ def resumed(overrides: Sequence[str], *, is_sweep: bool) -> list[str]:
             f"hydra.run.dir: a resumed run stays in its folder. Try: cadam3d train {_resume(text)}"
         )
     before = yaml.safe_load((folder / OVERRIDES).read_text(encoding="utf-8")) or []
-    merged = {_entry(line): line for line in before if _key(line) != "grid"}
+    merged = {_entry(line): line for line in before if key_of(line) != "grid"}
     for entry, line in given.items():
         _merge(merged, entry, line)
     merged["resume"] = f"resume={quote(str(path))}"
@@ -167,50 +166,33 @@ def run_hydra(command: str, arguments: Sequence[str], task: Task | None = None) 
     return 0
 
 
-def _run(
-    command: str,
-    overrides: list[str],
-    first: list[str],
-    flags: list[str],
-    options: Namespace,
-    *,
-    is_sweep: bool,
-) -> int:
+def _run(command: str, overrides: list[str], flags: list[str], options: Namespace) -> int:
     """Check what can be checked without working, fix the output folder, and start."""
-    cfg = _compose(command, first, options)
+    cfg = compose_line(command, overrides, options)
     if missing := missing_values(cfg):
         raise ask_for(missing, command)
-    _refuse_holes(cfg, command, first)
+    refuse_holes(cfg, command, overrides)
     if command not in TRAINING:
         return run_hydra(command, [*overrides, *flags])
-    key = "hydra.sweep.dir" if is_sweep else "hydra.run.dir"
-    is_chosen = any(_key(line) == key for line in overrides)
+    key = "hydra.run.dir"
+    is_chosen = any(key_of(line) == key for line in overrides)
     try:
         place = OmegaConf.select(cfg, key)
     except InterpolationResolutionError as error:
-        raise explain(error, command, first) or error from error
+        raise explain(error, command, overrides) or error from error
     if not place:
         raise UserError(f"{key}: wanted a folder, got nothing. Try: {key}=outputs/mine, or without it")
     wanted = Path(str(place)).expanduser()
     stood = _standing(wanted if is_chosen else wanted.parent)
-    folder = _claim(wanted, key, is_chosen=is_chosen)
-    if not is_sweep and cfg.resume is None and any((folder / name).exists() for name in RUN_MARKS):
+    folder = claim(wanted, key, is_chosen=is_chosen)
+    if cfg.resume is None and any((folder / name).exists() for name in RUN_MARKS):
         raise UserError(
             f"{key}: {folder} holds a run already. Try: cadam3d train {_resume(folder)}, or another folder"
         )
-    arguments = [line for line in overrides if _key(line) != key] + [f"{key}={quote(str(folder))}"]
-    if not is_sweep and cfg.resume is not None:
+    arguments = [line for line in overrides if key_of(line) != key] + [f"{key}={quote(str(folder))}"]
+    if cfg.resume is not None:
         return _run_again(command, [*arguments, *flags], folder)
-    if not is_sweep:
-        return _run_anew(command, [*arguments, *flags], folder, stood)
-    from cadam3d.commands import sweep
-
-    flags = flags if options.multirun else [*flags, "--multirun"]
-    try:
-        run_hydra(command, [*arguments, *flags], Task("sweep"))
-    finally:
-        code = sweep.finish(folder)
-    return code
+    return _run_anew(command, [*arguments, *flags], folder, stood)
 
 
 def _run_anew(command: str, arguments: Sequence[str], folder: Path, stood: Path) -> int:
@@ -240,10 +222,23 @@ def _run_again(command: str, arguments: Sequence[str], folder: Path) -> int:
         raise
 
 
-def _refuse_holes(cfg: DictConfig, command: str, overrides: Sequence[str]) -> None:
+def _sweep(command: str, overrides: list[str], flags: list[str], options: Namespace) -> int:
+    """Run a sweep, or show the settings of its first job."""
+    from cadam3d.sweep.plan import read_sweep
+    from cadam3d.sweep.start import start
+
+    if not options.cfg:
+        return start(command, overrides, flags, options)
+    sweep, _ = read_sweep(command, overrides, options)
+    line = sweep.line
+    shown = [flag for flag in flags if flag not in ("-m", "--multirun")]
+    return run_hydra("sweep", [*line.grid, *line.launcher, *line.folder, *sweep.jobs[0].overrides, *shown])
+
+
+def refuse_holes(cfg: DictConfig, command: str, overrides: Sequence[str]) -> None:
     """Refuse a line that takes a whole setting away or refers to one that does not exist."""
     for line in overrides:
-        key = _key(line)
+        key = key_of(line)
         if line.startswith("~") and "." not in key and "/" not in key and key not in cfg:
             raise UserError(
                 f"~{key}: a setting can be changed, not taken away. "
@@ -264,30 +259,8 @@ def _refuse_holes(cfg: DictConfig, command: str, overrides: Sequence[str]) -> No
             continue
 
 
-def _first_job(command: str, overrides: Sequence[str], options: Namespace) -> list[str]:
-    """The overrides of the first job of a sweep. With nothing to sweep over, ``cadam3d sweep`` is refused."""
-    cfg = _compose(command, [line for line in overrides if _key(line) == "grid"], options)
-    grid = OmegaConf.select(cfg, "hydra.sweeper.params") or {}
-    lines = {key: f"{key}={value}" for key, value in grid.items()} | {_key(line): line for line in overrides}
-    try:
-        parsed = OverridesParser.create().parse_overrides(list(lines.values()))
-    except Exception as error:
-        raise explain(error, command, overrides) or error from error
-    if command == "sweep" and not any(override.is_sweep_override() for override in parsed):
-        raise UserError(
-            "sweep: nothing to sweep over. Try: cadam3d sweep grid=thresholds ... or densifier=baseline,cadam"
-        )
-    first = []
-    for line, override in zip(lines.values(), parsed, strict=True):
-        if override.is_sweep_override() and override.is_discrete_sweep():
-            value = next(iter(override.sweep_string_iterator()))
-            first.append(f"{override.get_key_element()}={value}")
-        else:
-            first.append(line)
-    return first
-
-
-def _compose(command: str, overrides: Sequence[str], options: Namespace) -> DictConfig:
+def compose_line(command: str, overrides: Sequence[str], options: Namespace) -> DictConfig:
+    """The configuration of a line, with Hydra's node. Raises ``UserError`` if it cannot be composed."""
     try:
         return compose(
             overrides,
@@ -309,7 +282,7 @@ def _standing(folder: Path) -> Path:
     return next((place for place in (folder, *folder.parents) if place.exists()), folder)
 
 
-def _claim(folder: Path, key: str, *, is_chosen: bool) -> Path:
+def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:
     """Make the folder and prove that it can be written; a name of our own that is taken gets a number."""
     number = 1
     wanted = folder
@@ -341,7 +314,7 @@ def _refuse_bare_words(command: str, overrides: Sequence[str]) -> None:
     """A word without ``=`` is what the shell makes of a prompt that was not quoted: give it back whole."""
     bare = [line for line in overrides if "=" not in line and not line.startswith("~")]
     if bare:
-        before = [line for line in overrides[: overrides.index(bare[0])] if _key(line) in TEXT_KEYS]
+        before = [line for line in overrides[: overrides.index(bare[0])] if key_of(line) in TEXT_KEYS]
         key, _, start = before[-1].partition("=") if before else ("prompt", "", "")
         whole = " ".join([start, *bare]).strip()
         example = f"cadam3d {command} {key}={shlex.quote(whole)}" if command in TRAINING else f"run={bare[0]}"
@@ -366,18 +339,19 @@ def _prompts(value: str) -> list[str]:
         rest = rest[match.end() + 1 :]
 
 
-def _key(line: str) -> str:
+def key_of(line: str) -> str:
+    """The key of an override."""
     return line.partition("=")[0].lstrip("+~")
 
 
 def _entry(line: str) -> str:
     """What an override is about; taking a key away (``~key``) and giving it a value are two entries."""
-    return ("~" if line.startswith("~") else "") + _key(line)
+    return ("~" if line.startswith("~") else "") + key_of(line)
 
 
 def _merge(merged: dict[str, str], entry: str, line: str) -> None:
     """Add one more override to those of a run, in place; it takes the place of what it makes void."""
-    key = _key(line)
+    key = key_of(line)
     old = merged.get(key, "")
     if entry != key:  # ~key
         merged.pop(key, None)

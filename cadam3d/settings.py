@@ -19,6 +19,7 @@ from cadam3d.core.errors import UserError
 
 VERSION_BASE = "1.3"  # Hydra's behaviour is pinned to this version, whatever is installed
 WRONG_CALL = r"unexpected keyword|missing (?:a|\d+) required"  # how Python says it
+TEXT_KEYS = ("prompt", "negative_prompt")  # always text, so quoted for the user
 SLUG_LENGTH = 60  # characters; even of three bytes each they fit a file name
 
 

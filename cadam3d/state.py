@@ -1,7 +1,6 @@
 """TrainState: everything a run needs to go on, and the reports that callbacks see."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +10,11 @@ from torch import Tensor
 
 from cadam3d.core.edit import RowState
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.outcome import Outcome
 from cadam3d.core.render import RenderFn
 from cadam3d.optimizer import GaussianOptimizer
 
-
-class Outcome(StrEnum):
-    """How a run ended. Running out of memory is an outcome, written down, not a crash."""
-
-    FINISHED = "finished"
-    INTERRUPTED = "interrupted"
-    MAX_GAUSSIANS = "max_gaussians"
-    OUT_OF_MEMORY = "out_of_memory"
-    VANISHED = "vanished"  # every Gaussian was pruned
-    FAILED = "failed"
+__all__ = ["Outcome", "Population", "RefineReport", "RunContext", "StepReport", "TrainState"]
 
 
 @dataclass

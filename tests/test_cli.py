@@ -1,6 +1,5 @@
 """What a user types and what comes back: commands, courtesies, errors, sweeps, resume and completion."""
 
-import csv
 import json
 import os
 import random
@@ -94,7 +93,7 @@ def test_idle_threads_sleep_unless_the_user_says_otherwise(before, after, type_l
 def small_configs(tmp_path_factory) -> Path:
     """The real folders that the command line itself needs, and a train.yaml that composes in no time."""
     folder = tmp_path_factory.mktemp("configs")
-    for name in ("hydra", "densifier", "grid"):
+    for name in ("hydra", "densifier", "grid", "launcher"):
         shutil.copytree(REPOSITORY / "configs" / name, folder / name)
     shutil.copy(REPOSITORY / "configs/sweep.yaml", folder)
     train = "defaults: [{densifier: cadam}, {hydra: default}, _self_]\n"
@@ -248,9 +247,12 @@ def test_a_prompt_torn_apart_by_the_shell_is_given_back_whole(type_line):
         ("a car (red),${x}", ["a car (red)", "${x}"]),
     ],
 )
-def test_in_a_sweep_a_comma_without_a_blank_starts_the_next_prompt(value, prompts, type_line, jobs):
-    assert type_line("train", "-m", f"prompt={value}").code == 0
-    assert [cfg.prompt for cfg, _ in jobs] == prompts
+def test_in_a_sweep_a_comma_without_a_blank_starts_the_next_prompt(value, prompts):
+    line = launch.quoted(f"prompt={value}", is_sweep=True)
+    override = OverridesParser.create().parse_override(line)
+    pieces = list(override.sweep_string_iterator()) if override.is_sweep_override() else [line[7:]]
+    found = [OverridesParser.create().parse_override(f"prompt={piece}").value() for piece in pieces]
+    assert [OmegaConf.create({"prompt": value}).prompt for value in found] == prompts
 
 
 def test_a_path_with_brackets_and_commas_is_quoted_too(type_line, jobs, tmp_path):
@@ -436,9 +438,9 @@ def test_a_refused_line_removes_neither_what_was_there_nor_what_was_made(
 
 
 def test_two_runs_in_one_second_do_not_share_a_folder(tmp_path):
-    claims = [launch._claim(tmp_path / "10-00-00_cube", "hydra.run.dir", is_chosen=False) for _ in range(3)]
+    claims = [launch.claim(tmp_path / "10-00-00_cube", "hydra.run.dir", is_chosen=False) for _ in range(3)]
     assert [folder.name for folder in claims] == ["10-00-00_cube", "10-00-00_cube-2", "10-00-00_cube-3"]
-    assert launch._claim(claims[0], "hydra.run.dir", is_chosen=True) == claims[0]
+    assert launch.claim(claims[0], "hydra.run.dir", is_chosen=True) == claims[0]
 
 
 @pytest.mark.parametrize(
@@ -452,99 +454,6 @@ def test_two_runs_in_one_second_do_not_share_a_folder(tmp_path):
 )
 def test_a_slug_is_a_safe_piece_of_a_file_name(parts, name):
     assert settings.slug(*parts) == name
-
-
-# --- sweeps ---------------------------------------------------------------------------------------------
-
-
-def read_table(folder: Path) -> list[dict[str, str]]:
-    with (folder / "sweep.csv").open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
-
-
-@pytest.fixture
-def sweep_folder(tmp_path):
-    def find() -> Path:
-        [folder] = tmp_path.glob("multirun/*/*")
-        return folder
-
-    return find
-
-
-@pytest.mark.parametrize("words", [("sweep",), ("train", "-m"), ("train", "--multirun")])
-def test_a_sweep_leaves_one_row_per_job(words, type_line, jobs, sweep_folder):
-    result = type_line(*words, "prompt=a corgi, front view", "densifier=baseline,cadam", "seed=0,1")
-    assert result.code == 0
-    rows = read_table(sweep_folder())
-    assert [row["seed"] for row in rows] == ["0", "1", "0", "1"]
-    assert {"overrides", "seed", "outcome", "num_gaussians", "asset_bytes", "seconds", "psnr"} <= set(rows[0])
-    assert rows[2]["psnr"] == "20.25"
-    assert "densifier=cadam" in rows[2]["overrides"]
-    assert "4 jobs: " in result.out
-
-
-def test_a_failed_job_is_a_row_and_the_rest_goes_on(type_line, jobs, sweep_folder):
-    result = type_line("sweep", "prompt=a cube", "seed=6,7,8,9")
-    assert result.code == 0
-    rows = read_table(sweep_folder())
-    assert [row["outcome"] for row in rows] == ["finished", "failed", "failed", "finished"]
-    assert rows[1]["message"] == "seed: 7 is unlucky. Try: seed=0"
-    assert rows[2]["message"] == "ValueError: a bug"
-    assert len(jobs) == 4
-
-
-def test_a_sweep_in_which_every_job_fails_exits_with_1(type_line, jobs):
-    assert type_line("sweep", "prompt=a cube", "seed=7,8").code == 1
-
-
-def test_the_table_is_on_disk_after_every_job(type_line, jobs, monkeypatch, sweep_folder):
-    lengths = []
-
-    def run(cfg):
-        path = sweep_folder() / "sweep.csv"
-        lengths.append(len(path.read_text(encoding="utf-8").splitlines()) if path.exists() else 0)
-
-    monkeypatch.setattr("cadam3d.commands.train.run", run)
-    type_line("sweep", "prompt=a cube", "seed=0,1,2")
-    assert lengths == [0, 2, 3]
-
-
-def test_a_job_that_was_killed_is_an_unfinished_row(type_line, jobs, sweep_folder):
-    from cadam3d.commands import sweep
-
-    type_line("sweep", "prompt=a cube", "seed=0,1")
-    (sweep_folder() / jobs[1][1].name / "summary.json").unlink()
-    assert [row["outcome"] for row in sweep.gather(sweep_folder())] == ["finished", "unfinished"]
-
-
-def test_ctrl_c_ends_the_sweep_and_keeps_the_table(type_line, jobs, monkeypatch, sweep_folder):
-    def run(cfg):
-        if cfg.seed == 1:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr("cadam3d.commands.train.run", run)
-    result = type_line("sweep", "prompt=a cube", "seed=0,1,2")
-    assert result.code == 130
-    assert len(read_table(sweep_folder())) == 2
-
-
-def test_job_folders_are_numbered_and_say_what_differs(type_line, jobs):
-    type_line("sweep", "prompt=a cube,a ball", "densifier.tau_Q=0.5,0.9")
-    assert jobs[1][1].name.startswith("1_densifier.tau_Q=0.9")
-    assert jobs[2][1].name == "2_densifier.tau_Q=0.5-a-ball"
-
-
-def test_a_grid_can_be_narrowed_on_the_line(type_line, jobs):
-    type_line("sweep", "prompt=a cube", "grid=thresholds", "densifier.tau_SNR=0.2")
-    assert len(jobs) == len({cfg.densifier.tau_Q for cfg, _ in jobs}) > 1
-    assert {cfg.densifier.tau_SNR for cfg, _ in jobs} == {0.2}
-
-
-def test_a_wrong_value_in_the_middle_of_a_sweep_is_refused_with_one_message(type_line, jobs):
-    result = type_line("sweep", "prompt=a cube", "densifier=cadam,cadm")
-    assert result.code == 1
-    assert "got 'cadm'. Try: densifier=cadam" in result.err
-    assert "Traceback" not in result.err
 
 
 # --- resume ---------------------------------------------------------------------------------------------
@@ -582,14 +491,6 @@ def test_resume_follows_a_link_and_takes_a_checkpoint_file(run_folder, type_line
     type_line("train", "resume=outputs/latest/checkpoints/000010.pt")
     assert [folder for _, folder in jobs] == [run_folder, run_folder]
     assert Path(jobs[1][0].resume) == checkpoint
-
-
-def test_a_job_of_a_sweep_can_be_resumed(type_line, jobs):
-    type_line("sweep", "prompt=a cube", "grid=densifiers")
-    job = jobs[1][1]
-    jobs.clear()
-    assert type_line("train", f"resume={job}").code == 0
-    assert jobs[0][1] == job
 
 
 @pytest.mark.parametrize("place", ["nowhere", "."])
@@ -657,6 +558,7 @@ def complete(line: str, type_line, monkeypatch, shell: str = "bash") -> list[str
         ('cadam3d train prompt="a car, (red)" densifier=cadam_c', ["densifier=cadam_calibrated"]),
         ("cadam3d train 'prompt=a car' densifier=cadam_c", ["densifier=cadam_calibrated"]),
         ("cadam3d sweep grid=th", ["grid=thresholds"]),
+        ("cadam3d sweep launcher=jo", ["launcher=joblib"]),
         ("cadam3d doctor js", ["json="]),
         ("cadam3d nothing ", []),
     ],

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import re
 import sys
 from collections.abc import Iterator
 from importlib import import_module
@@ -10,15 +11,18 @@ from typing import Any
 
 import pytest
 import yaml
+from omegaconf import OmegaConf
 
-from cadam3d import cli, regularizer
+from cadam3d import advice, cli, regularizer
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json, read_jsonl
-from cadam3d.settings import component, components, compose, config_dir
+from cadam3d.launch import _read_flags
+from cadam3d.settings import component, components, compose, config_dir, flatten
+from cadam3d.sweep.plan import compose_all, read_sweep
 
 CONFIGS = config_dir()
 SEVERAL = ("exporter", "callback", "metric")  # groups of which a run has several at once
-NO_COMPONENTS = ("hydra", "grid", "experiment", "noise")
+NO_COMPONENTS = ("hydra", "grid", "launcher", "experiment", "noise")
 GROUPS = sorted(path.name for path in CONFIGS.iterdir() if path.is_dir() and path.name not in NO_COMPONENTS)
 FILES = [path for group in GROUPS for path in sorted((CONFIGS / group).glob("*.yaml"))]
 VARIANTS = [path for path in FILES if "defaults" in yaml.safe_load(path.read_text(encoding="utf-8"))]
@@ -29,6 +33,7 @@ EXPERIMENTS = sorted(
     for path in (CONFIGS / "experiment").rglob("*.yaml")
 )
 PROMPT = "prompt=a red cube"
+NO_FLAGS = _read_flags([])
 
 
 def name_of(path: Path) -> str:
@@ -136,15 +141,28 @@ def test_the_groups_of_train_are_the_packages_of_components():
 
 @pytest.mark.parametrize("grid", GRIDS)
 def test_every_job_of_a_grid_composes(grid):
-    from hydra.core.override_parser.overrides_parser import OverridesParser
+    sweep, composer = read_sweep("sweep", ["prompt='a red cube'", f"grid={grid}"], NO_FLAGS)
+    jobs = compose_all(sweep, composer)
+    assert len(jobs) > 1
+    claimed = re.search(r": (\d+) jobs", (CONFIGS / "grid" / f"{grid}.yaml").read_text(encoding="utf-8"))
+    assert claimed is None or int(claimed.group(1)) == len(jobs)
+    for job, settings in zip(sweep.jobs[:3], jobs[:3], strict=True):  # as Hydra composes them one by one
+        cfg = OmegaConf.to_container(compose(job.overrides), resolve=True)
+        assert settings.values == dict(flatten(cfg))
 
-    params = read(CONFIGS / "grid" / f"{grid}.yaml")
-    lines = [f"{key}={value}" for key, value in params.items()]
-    for override in OverridesParser.create().parse_overrides(lines):
-        values = list(override.sweep_string_iterator())
-        assert len(values) > 1
-        for value in values:
-            compose([PROMPT, f"{override.get_key_element()}={value}"])
+
+@pytest.mark.parametrize("path", sorted((CONFIGS / "launcher").glob("*.yaml")), ids=lambda path: path.stem)
+def test_a_launcher_fills_in_a_launcher_of_hydra(path):
+    """Whether its plugin is installed or not; test_sweeps.py runs the one that is."""
+    text = path.read_text(encoding="utf-8")
+    assert text.startswith("# @package _global_\n")
+    assert "pip install" in text
+    content = yaml.safe_load(text)
+    [override] = content["defaults"]
+    name = override["override /hydra/launcher"]
+    assert name in advice.LAUNCHERS
+    used = set(re.findall(r"\$\{launcher\.(\w+)\}", text))
+    assert used | {"threads"} == content["launcher"].keys()
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)

@@ -1,5 +1,6 @@
 """The program as a user runs it: real processes, a real prior, real files."""
 
+import csv
 import json
 import os
 import signal
@@ -153,14 +154,38 @@ def test_a_dry_run_on_the_tiny_prior_says_that_it_means_nothing(tmp_path):
     assert evaluation["num_gaussians"] > 0
 
 
-def test_a_sweep_is_one_row_per_job(tmp_path):
-    words = ["prompt=a red cube", "experiment=smoke", "rasterizer=reference", "steps=12", "exporter=[ply]"]
-    run(tmp_path, "sweep", *words, "densifier=cadam,baseline", "hydra.sweep.dir=table")
-    header, *rows = (tmp_path / "table" / "sweep.csv").read_text().splitlines()
-    wanted = {"overrides", "seed", "outcome", "num_gaussians", "asset_bytes", "seconds", "psnr"}
-    assert wanted <= set(header.split(","))
-    assert len(rows) == 2
-    assert all("finished" in row for row in rows)
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the process of a job in /proc")
+def test_a_sweep_survives_the_death_of_a_job_and_the_same_line_finishes_it(finished, tmp_path):
+    words = [*SMALL, "densifier=cadam,none", "callback.checkpoint.every=7", "hydra.sweep.dir=table"]
+    table = tmp_path / "table"
+    process = start(tmp_path, "sweep", *words)
+    wait_for(table / "jobs.json", process)
+    jobs = [table / job["folder"] for job in json.loads((table / "jobs.json").read_text())["jobs"]]
+    wait_for(jobs[0] / "checkpoints" / "step_0000014.pt", process)
+    [child] = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    os.kill(int(child), signal.SIGKILL)
+    _, err = process.communicate(timeout=SECONDS)
+    assert process.returncode == 1
+    assert "1 of 2 jobs without a result (1 killed). The same line again runs only those." in err
+    assert [row["outcome"] for row in rows_of(table)] == ["killed", "finished"]
+    untouched = (jobs[1] / "summary.json").stat().st_mtime_ns
+
+    run(tmp_path, "sweep", *reversed(words), "launcher=joblib")
+    assert [row["outcome"] for row in rows_of(table)] == ["finished", "finished"]
+    assert (jobs[1] / "summary.json").stat().st_mtime_ns == untouched
+    whole = finished / "outputs" / "latest"
+    assert (jobs[0] / "asset.ply").read_bytes() == (whole / "asset.ply").read_bytes()
+    assert {row["prompt"] for row in rows_of(table)} == {"a red cube"}
+    assert all(float(row["psnr"]) > 5 and int(row["num_gaussians"]) > 0 for row in rows_of(table))
+
+    _, err = run(tmp_path, "sweep", *words, "views=2", code=1)
+    assert err.startswith("cadam3d: views: was 1 in table/")
+    assert "is 2 now. Try: hydra.sweep.dir=table-2" in err
+
+
+def rows_of(sweep: Path) -> list[dict[str, str]]:
+    with (sweep / "sweep.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
 
 
 @pytest.mark.parametrize(

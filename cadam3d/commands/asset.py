@@ -18,6 +18,7 @@ from cadam3d.exporter.base import Exporter
 from cadam3d.io.ply import read_ply
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.settings import component, components, load
+from cadam3d.sweep.folder import is_sweep
 from cadam3d.trainer import render_fn, resolve_device
 
 ASSET = "asset.ply"
@@ -60,7 +61,7 @@ def find_run(text: str) -> Path:
         return folder
     if not folder.is_dir():
         reason = "no such folder"
-    elif (folder / "multirun.yaml").is_file():
+    elif is_sweep(folder):
         reason = f"a sweep, which holds many runs; one of them is {_any_job(folder)}"
     else:
         reason = f"it holds no {CONFIG}"

@@ -8,10 +8,10 @@ from omegaconf import DictConfig
 
 from cadam3d.commands.asset import find_run, open_run, renderer, run_config
 from cadam3d.commands.paths import shown
-from cadam3d.commands.sweep import jobs
 from cadam3d.core.checks import UserError
 from cadam3d.io.jsonl import write_json
 from cadam3d.settings import component, components
+from cadam3d.sweep.folder import is_sweep, load
 
 RESULT = "eval.json"
 
@@ -21,7 +21,7 @@ def run(cfg: DictConfig) -> None:
     if cfg.run is None:
         raise UserError("run: wanted a finished run or a sweep. Try: cadam3d eval run=outputs/latest")
     folder = Path(cfg.run).expanduser().resolve()
-    if (folder / "multirun.yaml").is_file():
+    if is_sweep(folder):
         _evaluate_sweep(cfg, folder)
         return
     result = evaluate(cfg, find_run(cfg.run))
@@ -53,7 +53,7 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
 
 def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
     results, failures = [], 0
-    for job in jobs(folder):
+    for job in (row.folder for row in load(folder)):
         try:
             results.append(evaluate(cfg, find_run(str(job))))
         except UserError as error:

@@ -30,14 +30,20 @@ from cadam3d.trainer import Trainer, resolve_device
 
 log = logging.getLogger(__name__)
 
+TOGETHER_SECONDS = 1.0  # signals closer than this are one
 COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "camera", "refine", "optimizer")
 
 
 class StopOnSignal:
-    """The first SIGINT or SIGTERM asks the loop to stop and save; the second one stops at once."""
+    """The first SIGINT or SIGTERM asks the loop to stop and save; a later one stops at once.
+
+    Later than ``TOGETHER_SECONDS``: a scheduler sends its signal to a process and to its parent, which passes
+    it on, and means one.
+    """
 
     def __init__(self) -> None:
         self.received: int | None = None
+        self._received_at = 0.0
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> "StopOnSignal":
@@ -55,8 +61,10 @@ class StopOnSignal:
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
         if self.received is not None:
+            if time.monotonic() - self._received_at < TOGETHER_SECONDS:
+                return
             raise KeyboardInterrupt
-        self.received = number
+        self.received, self._received_at = number, time.monotonic()
         print("\nStopping as soon as all is saved; once more to stop at once.", file=sys.stderr)
 
 

@@ -14,6 +14,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.jsonl import read_json
 from cadam3d.io.ply import read_ply, write_ply
 from cadam3d.settings import compose
+from cadam3d.sweep.folder import Plan, PlannedJob, write_plan
 
 SMALL = ("metric.fidelity.views=2", "metric.fidelity.elevations_deg=[0]", "metric.fidelity.size=24")
 
@@ -159,32 +160,35 @@ def test_eval_says_what_a_prior_without_truth_cannot_tell(tmp_path, gaussians, t
     assert "knows no true images" in out
 
 
+def make_sweep(folder: Path, *names: str) -> Path:
+    folder.mkdir()
+    jobs = [PlannedJob("", name, [], {}) for name in names]
+    write_plan(folder, Plan(cwd=str(folder), flags=[], threads=None, jobs=jobs))
+    return folder
+
+
 def test_eval_of_a_sweep_measures_every_job_and_names_those_it_cannot(tmp_path, gaussians, type_line):
-    sweep = tmp_path / "sweep"
-    for number in (0, 1, 10, 2):
-        job = make_run(sweep / f"{number}_job", gaussians)
-        (job / ".hydra").mkdir()
-        (job / ".hydra/overrides.yaml").write_text("[]", encoding="utf-8")
-    (sweep / "multirun.yaml").touch()
-    (sweep / "1_job/asset.ply").unlink()
+    sweep = make_sweep(tmp_path / "sweep", "b", "a", "never-started", "c")
+    for name in ("a", "b", "c", "of-another-sweep"):
+        make_run(sweep / name, gaussians)
+    (sweep / "a/asset.ply").unlink()
     code, _, err = type_line("eval", "run=sweep", *SMALL)
     assert code == 0
     results = read_json(sweep / "eval.json")
-    assert [Path(result["run"]).name for result in results] == ["0_job", "1_job", "2_job", "10_job"]
-    assert ["psnr" in result for result in results] == [True, False, True, True]
-    assert "1_job" in err
-    assert (sweep / "2_job/eval.json").is_file()
+    assert [Path(result["run"]).name for result in results] == ["b", "a", "never-started", "c"]
+    assert ["psnr" in result for result in results] == [True, False, False, True]
+    assert "cadam3d: a: " in err
+    assert "cadam3d: never-started: " in err
+    assert (sweep / "c/eval.json").is_file()
 
 
 def test_eval_of_a_sweep_without_any_asset_fails(tmp_path, type_line):
-    (tmp_path / "sweep").mkdir()
-    (tmp_path / "sweep/multirun.yaml").touch()
+    make_sweep(tmp_path / "sweep", "a")
     assert type_line("eval", "run=sweep")[0] == 1
 
 
 def test_other_commands_point_from_a_sweep_to_one_of_its_jobs(tmp_path, gaussians, type_line):
-    make_run(tmp_path / "sweep/0_job", gaussians)
-    (tmp_path / "sweep/multirun.yaml").touch()
+    make_run(make_sweep(tmp_path / "sweep", "0_job") / "0_job", gaussians)
     code, _, err = type_line("render", "run=sweep")
     assert code == 1
     assert "one of them is 0_job" in err

@@ -1,0 +1,239 @@
+"""Which jobs a sweep has: the arms of a grid, changed by what the command line says, as one list.
+
+A comparison is a union of products, such as a baseline at eight thresholds beside one CAdam, each for the
+same prompts and seeds. A single product, which is what ``key=a,b`` on a line says, cannot express it.
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+
+from cadam3d.core.errors import UserError
+from cadam3d.io.jsonl import to_json
+from cadam3d.settings import TEXT_KEYS, quote, slug
+
+IDENTIFIER = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)  # the same text to Hydra, quoted or not
+RESERVED = ("null", "true", "false", "nan", "inf")
+ALWAYS_TOLD = ("prompt", "seed")  # by tables and by the names of folders
+EXAMPLE = "{each: {seed: [0, 1]}, arms: {mine: {densifier: cadam}}}"
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One override: a key with one value."""
+
+    key: str  # without a leading + or ~
+    line: str  # as it was written for Hydra
+    value: str  # as JSON: the same for every way to write it
+
+    @property
+    def text(self) -> str:
+        """The value for people: text without quotes."""
+        return json.loads(self.value) if self.value.startswith('"') else self.value
+
+    @property
+    def identity(self) -> str:
+        """The same for every way to write this setting."""
+        head = self.line[: len(self.line) - len(self.line.lstrip("+~"))]
+        return f"{head}{self.key}={self.value}"
+
+
+Axes = dict[str, list[Setting]]  # of each key, every job takes one
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A named comparison. Every job takes one setting of each axis of ``each`` and of one arm."""
+
+    each: Axes
+    arms: dict[str, Axes]  # at least one; "" is the arm of a sweep without a grid
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a sweep."""
+
+    arm: str
+    name: str  # of its folder: the same whenever its arm and its settings are
+    overrides: tuple[str, ...]  # of ``cadam3d train``
+
+
+HasSetting = Callable[[Sequence[str], str], bool]
+
+
+def read_grid(node: Any) -> Grid:
+    """The grid that plain dicts and lists describe; None is a grid of one nameless arm.
+
+    Raises ``UserError`` for anything but ``each`` and ``arms``.
+    """
+    if node is None:
+        return Grid(each={}, arms={"": {}})
+    if not isinstance(node, dict) or not node or not node.keys() <= {"each", "arms"}:
+        got = "|".join(map(str, node)) if isinstance(node, dict) else node
+        raise UserError(f"grid: wanted each and arms, got {got}. Try: a file that says {EXAMPLE}")
+    arms = node.get("arms")
+    arms = {"": {}} if arms is None else arms
+    if not isinstance(arms, dict) or not arms:
+        raise UserError(f"grid.arms: wanted named arms, got {arms}. Try: a file that says {EXAMPLE}")
+    return Grid(
+        each=_axes(node.get("each"), "grid.each"),
+        arms={str(name): _axes(axes, f"grid.arms.{name}") for name, axes in arms.items()},
+    )
+
+
+def read_line(overrides: Iterable[str]) -> Axes:
+    """The axes that a command line gives; ``a,b``, ``choice()`` and ``range()`` are several values.
+
+    A key that comes twice has the later value. Raises Hydra's ``OverrideParseException``.
+    """
+    axes: Axes = {}
+    for line in overrides:
+        settings = [_setting(each) for each in _alternatives(line)]
+        entry = f"~{settings[0].key}" if line.startswith("~") else settings[0].key
+        axes[entry] = settings
+    return axes
+
+
+def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) -> list[Job]:
+    """The jobs of all arms, each once: prompt by prompt and seed by seed, so that comparisons fill up evenly.
+
+    What the line says wins over the grid. It goes to every arm that has such a setting, since densifiers have
+    different ones: ``has_setting(overrides of an arm, key)`` tells. A setting that no arm has is left in, for
+    Hydra to complain about. Raises ``UserError`` if the line makes two arms the same.
+    """
+    common = {key: axis for key, axis in line.items() if key not in grid.each}
+    common |= {key: line.get(key, axis) for key, axis in grid.each.items()}
+    arms = {
+        name: {key: line.get(key, axis) for key, axis in axes.items()} for name, axes in grid.arms.items()
+    }
+    foreign = _foreign(grid, line, arms, has_setting)
+    told, counted = _told(grid, line), swept_keys(grid, line)
+    found: dict[frozenset[str], Job] = {}
+    for shared in product(*common.values()):
+        for name, axes in arms.items():
+            taken = [setting for setting in shared if setting.key not in {*axes, *foreign[name]}]
+            for own in product(*axes.values()):
+                settings = (*taken, *own)
+                job = Job(
+                    arm=name,
+                    name=_folder_name(name, settings, told, counted),
+                    overrides=tuple(setting.line for setting in settings),
+                )
+                other = found.setdefault(frozenset(setting.identity for setting in settings), job)
+                if other.arm != name and (guilty := [key for key in axes if key in line]):
+                    raise UserError(
+                        f"{guilty[0]}: tells the arms {other.arm} and {name} apart, so the line cannot set "
+                        f"it for both. Try: '~grid.arms.{name}', or without {guilty[0]}="
+                    )
+    return list(found.values())
+
+
+def swept_keys(grid: Grid, line: Axes) -> list[str]:
+    """The keys in which jobs may differ: those of the grid and those to which the line gives several values.
+
+    Also prompt and seed where the line gives them: another prompt is another job, not another setting of all.
+    """
+    keys = [*grid.each, *(key for axes in grid.arms.values() for key in axes)]
+    keys += [key for key, axis in line.items() if len(axis) > 1 or key in ALWAYS_TOLD]
+    return list(dict.fromkeys(keys))
+
+
+def sweep_name(grid_name: str | None, line: Axes) -> str:
+    """The name of the folder of a sweep: its grid's, or else one that says what the line says."""
+    if grid_name:
+        return slug(grid_name)
+    keys = sorted(line, key=lambda key: (key not in TEXT_KEYS, len(line[key]) == 1, key))
+    values = {key: ",".join(setting.text for setting in line[key]) for key in keys}
+    words = [values[key] if key in TEXT_KEYS else f"{key}={values[key]}" for key in keys]
+    return f"{slug(*words)}_{_digest(setting.identity for key in keys for setting in line[key])}"
+
+
+def _axes(node: Any, where: str) -> Axes:
+    if node is None:
+        return {}
+    if not isinstance(node, dict):
+        raise UserError(f"{where}: wanted keys with values, got {node!r}. Try: {where}={{seed: [0, 1]}}")
+    return {str(key).lstrip("+"): _axis(str(key), value, where) for key, value in node.items()}
+
+
+def _axis(key: str, value: Any, where: str) -> list[Setting]:
+    values = value if isinstance(value, list) else [value]
+    if not values:
+        raise UserError(f"{where}: {key} has no values. Try: at least one")
+    return [_setting(f"{key}={_grammar(key, each)}") for each in values]
+
+
+def _grammar(key: str, value: Any) -> str:
+    """A plain value as Hydra's grammar reads it back."""
+    if key in TEXT_KEYS:
+        return quote(str(value))
+    if isinstance(value, str):
+        is_plain = IDENTIFIER.fullmatch(value) and value.lower() not in RESERVED
+        return value if is_plain else quote(value)
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{name}:{_grammar('', each)}" for name, each in value.items()) + "}"
+    if isinstance(value, Sequence):
+        return "[" + ",".join(_grammar("", each) for each in value) + "]"
+    return "null" if value is None else str(value)
+
+
+def _alternatives(line: str) -> list[str]:
+    override = _parsed(line)
+    if not override.is_sweep_override():
+        return [line]
+    key = override.get_key_element()
+    if not override.is_discrete_sweep():
+        raise UserError(f"{key}: wanted values one by one, got an interval. Try: {key}=range(0,1,0.25)")
+    return [f"{key}={value}" for value in override.sweep_string_iterator()]
+
+
+def _setting(line: str) -> Setting:
+    value = _parsed(line).value()
+    return Setting(key=line.partition("=")[0].lstrip("+~"), line=line, value=to_json(value))
+
+
+def _parsed(line: str) -> Override:
+    [override] = OverridesParser.create().parse_overrides([line])
+    return override
+
+
+def _foreign(
+    grid: Grid, line: Axes, arms: Mapping[str, Axes], has_setting: HasSetting
+) -> dict[str, set[str]]:
+    """For each arm, the keys of the line that it has no setting for, while another arm has."""
+    if len(arms) == 1:
+        return {name: set() for name in arms}
+    asked = [key for key in line if key not in grid.each and not line[key][0].line.startswith(("+", "~"))]
+    missing: dict[str, set[str]] = {}
+    for name, axes in arms.items():
+        base = [axis[0].line for key, axis in (grid.each | axes).items() if key not in asked]
+        missing[name] = {key for key in asked if key not in axes and not has_setting(base, key)}
+    nobodys = set.intersection(*missing.values())
+    return {name: keys - nobodys for name, keys in missing.items()}
+
+
+def _told(grid: Grid, line: Axes) -> set[str]:
+    """The keys that the name of a folder tells: those that may vary, whether the line narrows them or not."""
+    varied = {key for axes in grid.arms.values() for key, axis in axes.items() if len(axis) > 1}
+    fixed = {key for axes in grid.arms.values() for key in axes} - varied
+    return {key for key in swept_keys(grid, line) if key not in fixed or len(line.get(key, ())) > 1}
+
+
+def _folder_name(arm: str, settings: Sequence[Setting], told: set[str], counted: Sequence[str]) -> str:
+    """A readable name, and a digest of all that makes this job another one than its neighbours."""
+    shown = sorted((each for each in settings if each.key in told), key=lambda each: each.key)
+    words = [each.text for each in shown if each.key in TEXT_KEYS]
+    words += [f"{each.key.rpartition('.')[2]}={each.text}" for each in shown if each.key not in TEXT_KEYS]
+    digest = _digest([arm, *sorted(each.identity for each in settings if each.key in counted)])
+    return "_".join([*([slug(arm)] if arm else []), slug(*words), digest])
+
+
+def _digest(parts: Iterable[str]) -> str:
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:8]

@@ -1,0 +1,183 @@
+"""One job of a sweep as a process of its own, so that whatever ends it ends nothing else.
+
+This side waits for it, passes on the wish to stop, and writes down how it ended. What runs in the process is
+``cadam3d train``, started through this module's last lines, which make it end with the sweep.
+"""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from cadam3d.core.outcome import Outcome
+from cadam3d.io.jsonl import write_json
+from cadam3d.settings import quote
+from cadam3d.sweep.folder import (
+    CONSOLE,
+    ENDED,
+    STOP,
+    SUMMARY,
+    Plan,
+    Row,
+    is_complete,
+    load,
+    read_plan,
+    read_summary,
+)
+
+POLL_SECONDS = 0.2
+STOPPED = (128 + signal.SIGINT, 128 + signal.SIGTERM, -signal.SIGINT, -signal.SIGTERM)  # exit codes: asked to
+ANNOUNCING = (signal.SIGUSR1, signal.SIGUSR2)  # that a launcher is about to end the job
+MESSAGE, TRACEBACK = "cadam3d: ", "Traceback (most recent call last)"  # how a reason begins
+TAIL = 20_000  # bytes of the console in which the reason of a failure is looked for
+
+
+def run_job(sweep: Path, number: int) -> None:
+    """Run job ``number`` of the sweep to its end, from its checkpoint if it has one.
+
+    Nothing happens if the sweep is being stopped or the job has a result.
+    """
+    plan, row = read_plan(sweep), load(sweep)[number]
+    stop = sweep / STOP
+    if stop.exists() or row.has_result:
+        return
+    started = time.monotonic()
+    row.folder.mkdir(parents=True, exist_ok=True)
+    if not row.has_checkpoint:  # half-made files of an earlier attempt would be taken for this one's
+        shutil.rmtree(row.folder)
+        row.folder.mkdir()
+    for name in (SUMMARY, ENDED):
+        (row.folder / name).unlink(missing_ok=True)
+    code = _wait(plan, row, stop)
+    row.folder.mkdir(exist_ok=True)  # a run that was refused may have tidied up after itself
+    _note_outcome(row.folder, code)
+    write_json(row.folder / ENDED, {"exit_code": code, "seconds": round(time.monotonic() - started, 2)})
+
+
+def _wait(plan: Plan, row: Row, stop: Path) -> int:
+    """Start the process, wait for it and return its exit code; minus the signal if one killed it."""
+    words = [f"resume={quote(str(row.folder))}"] if row.has_checkpoint else row.overrides
+    command = [sys.executable, "-m", __name__, str(os.getpid()), "train", *words]
+    command += [*plan.flags, f"hydra.run.dir={quote(str(row.folder))}"]
+    environment = dict(os.environ)
+    environment.pop(
+        "HYDRA_FULL_ERROR", None
+    )  # set while Hydra is at work here: a mistake is one message there
+    if plan.threads is not None:
+        environment["OMP_NUM_THREADS"] = str(plan.threads)
+    with (row.folder / CONSOLE).open("ab") as console, _signals() as signals:
+        process = subprocess.Popen(
+            command,
+            cwd=plan.cwd,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=console,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,  # Ctrl-C reaches it through us only: twice would mean at once
+        )
+        is_told = False
+        try:
+            while True:
+                with suppress(subprocess.TimeoutExpired):
+                    return process.wait(POLL_SECONDS)
+                if not is_told and (signals or stop.exists()):
+                    process.send_signal(signal.SIGINT)
+                    is_told = True
+        finally:
+            process.kill()  # only an exception leaves it running
+            process.wait()
+
+
+@contextmanager
+def _signals() -> Iterator[list[int]]:
+    """The signals that came meanwhile, if nobody in this process has taken charge of them.
+
+    In the process of the sweep its own handler is in charge. A worker of a launcher leaves Ctrl-C to that
+    one, for good, since it may come between two jobs; a SIGTERM is for the job that runs. The signal by which
+    Slurm announces that time is up is the launcher's, to queue the job again: once the job has saved.
+    """
+    received: list[int] = []
+    is_ours = signal.getsignal(signal.SIGINT) in (signal.default_int_handler, signal.SIG_IGN, signal.SIG_DFL)
+    if not is_ours or threading.current_thread() is not threading.main_thread():
+        yield received
+        return
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    announcing = [number for number in ANNOUNCING if callable(signal.getsignal(number))]
+    previous = {
+        number: signal.signal(number, lambda number, _frame: received.append(number))
+        for number in (signal.SIGTERM, *announcing)
+    }
+    try:
+        yield received
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+    for number in set(received).intersection(announcing):
+        signal.raise_signal(number)
+
+
+def _note_outcome(folder: Path, code: int) -> None:
+    """Leave in ``summary.json`` how the process ended, unless training itself has told all."""
+    summary = read_summary(folder)
+    if is_complete(summary):
+        return
+    if code in STOPPED:
+        outcome, message = Outcome.INTERRUPTED, "stopped"
+    elif code < 0:
+        outcome = Outcome.KILLED
+        message = f"by {_signal_name(-code)}" + " (out of memory?)" * (code == -signal.SIGKILL)
+    else:
+        outcome, message = Outcome.FAILED, _last_words(folder / CONSOLE) or f"exit code {code}"
+    write_json(folder / SUMMARY, {**summary, "outcome": str(outcome), "message": message})
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _last_words(console: Path) -> str:
+    """Why a process failed, in its own words: its message, or the last line of its traceback."""
+    with console.open("rb") as file:
+        file.seek(max(0, console.stat().st_size - TAIL))
+        lines = file.read().decode(errors="replace").split("\n")
+    said = [line.rpartition("\r")[2].strip() for line in lines]  # a progress bar draws over itself
+    said = [line for line in said if line]
+    starts = [number for number, line in enumerate(said) if line.startswith((MESSAGE, TRACEBACK))]
+    if starts and said[starts[-1]].startswith(MESSAGE):
+        return " ".join(said[starts[-1] :]).removeprefix(MESSAGE)
+    return said[-1] if said else ""
+
+
+def _end_with(parent: int) -> None:
+    """End this process at once when ``parent`` is gone: the sweep, run again, must find nobody at work."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def main(words: Sequence[str]) -> None:
+    """``cadam3d`` with ``words[1:]``, for as long as process ``words[0]`` lives."""
+    for number in ANNOUNCING:  # Slurm tells all processes; the job hears of it through its launcher
+        signal.signal(number, signal.SIG_IGN)
+    from cadam3d import cli
+
+    _end_with(int(words[0]))
+    sys.argv = ["cadam3d", *words[1:]]
+    cli.main()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,77 @@
+"""``sweep.csv``: one row per job, gathered from the disk whenever it is asked for."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from cadam3d.io.atomic import replacing
+from cadam3d.io.jsonl import to_json
+from cadam3d.sweep.folder import Row, load
+
+TABLE = "sweep.csv"
+FACTS = ("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "asset_bytes", "message")
+SHOWN = ("num_gaussians", "psnr", "seconds")  # in the terminal, beside what jobs differ in and the outcome
+
+
+def write_table(sweep: Path) -> list[Row]:
+    """Write the table of a sweep in one move, and return what it was made of.
+
+    Jobs that end side by side all write it. Each looks at the disk again afterwards, so the last to write has
+    seen every job that ended before.
+    """
+    rows = load(sweep)
+    while True:
+        _write(sweep / TABLE, rows)
+        written, rows = rows, load(sweep)
+        if rows == written:
+            return rows
+
+
+def as_text(rows: Sequence[Row]) -> str:
+    """The rows as a table for the terminal, without what the arm tells or all jobs share."""
+    keys = varying_keys(rows)
+    has_arms = any(row.arm for row in rows)
+    lines = [["job", *(["arm"] if has_arms else []), *keys, "outcome", *SHOWN]]
+    for row in rows:
+        values = [row.number, *([row.arm] if has_arms else []), *(row.swept.get(key) for key in keys)]
+        facts = [row.outcome, *(row.summary.get(name) for name in SHOWN)]
+        lines.append([_cell(value) for value in (*values, *facts)])
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    padded = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines]
+    return "\n".join("  ".join(line).rstrip() for line in padded)
+
+
+def varying_keys(rows: Sequence[Row]) -> list[str]:
+    """The keys in which jobs of one arm differ."""
+    arms = len({row.arm for row in rows})
+    return [
+        key
+        for key in _swept_keys(rows)
+        if len({(row.arm, to_json(row.swept.get(key))) for row in rows}) > arms
+    ]
+
+
+def _write(path: Path, rows: Sequence[Row]) -> None:
+    keys = _swept_keys(rows)
+    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["job", "arm", *keys, "outcome", *FACTS, "folder"])
+        for row in rows:
+            swept = [_plain(row.swept.get(key)) for key in keys]
+            facts = [row.summary.get(name) for name in FACTS]
+            writer.writerow([row.number, row.arm, *swept, row.outcome, *facts, row.folder.name])
+
+
+def _swept_keys(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(key for row in rows for key in row.swept))
+
+
+def _plain(value: Any) -> Any:
+    return value if value is None or isinstance(value, str | int | float) else to_json(value)
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(_plain(value))

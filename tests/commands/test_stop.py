@@ -1,0 +1,42 @@
+"""How training takes signals: the first one is a wish, a later one an order."""
+
+import os
+import signal
+
+import pytest
+
+from cadam3d.commands.train import TOGETHER_SECONDS, StopOnSignal
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("cadam3d.commands.train.time.monotonic", lambda: now[0])
+    return now
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_signal_is_noted_and_the_handlers_are_put_back(number, clock):
+    before = signal.getsignal(number)
+    with StopOnSignal() as stop:
+        assert not stop()
+        os.kill(os.getpid(), number)
+        assert stop()
+        assert stop.received == number
+    assert signal.getsignal(number) == before
+
+
+def test_one_signal_that_came_on_two_ways_is_one(clock):
+    with StopOnSignal() as stop:
+        os.kill(os.getpid(), signal.SIGTERM)
+        clock[0] += 0.9 * TOGETHER_SECONDS
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop.received == signal.SIGTERM
+
+
+def test_a_later_signal_stops_at_once(clock):
+    with StopOnSignal():
+        os.kill(os.getpid(), signal.SIGINT)
+        clock[0] += 1.1 * TOGETHER_SECONDS
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)

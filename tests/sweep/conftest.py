@@ -1,0 +1,76 @@
+"""A program that stands in for ``cadam3d train``, so that sweeps can be tested in a blink."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+# Called as: PROGRAM -m cadam3d.sweep.process PARENT train key=value ...
+# It does what prompt= says, after noting how it was called in calls.jsonl beside the job folders.
+STAND_IN = r"""#!{python} -S
+import json, os, pathlib, signal, sys, time
+given = dict(word.lstrip("+~").partition("=")[::2] for word in sys.argv[5:] if "=" in word)
+folder = pathlib.Path(given["hydra.run.dir"].strip("'"))
+note = {{"folder": folder.name, "words": sys.argv[4:], "threads": os.environ.get("OMP_NUM_THREADS")}}
+note["files"] = sorted(path.name for path in folder.iterdir())
+with (folder.parent / "calls.jsonl").open("a") as file:
+    file.write(json.dumps(note) + "\n")
+prompt = given.get("prompt", "'a cube'").strip("'")
+steps, seed = int(given.get("steps", 5)), int(given.get("seed", 0))
+summary = dict(prompt=prompt, seed=seed, num_gaussians_initial=4, num_gaussians=steps, seconds=1.5)
+
+def write(outcome, **more):
+    (folder / "summary.json").write_text(json.dumps(dict(summary, outcome=outcome, **more)))
+
+def stop(number, frame):
+    write("interrupted", warnings=[])
+    sys.exit(128 + number)
+
+signal.signal(signal.SIGINT, stop)
+print("at work on", prompt, flush=True)
+if prompt == "a bug":
+    print("Traceback (most recent call last):\n  ...\nValueError: one two")
+    sys.exit(1)
+if prompt == "a mistake":
+    print("Note: before\ncadam3d: prompt: I know\n  no mistake. Try: a cube")
+    sys.exit(1)
+if prompt == "a scancel":
+    os.kill(os.getpid(), signal.SIGTERM)
+if prompt == "a kill":
+    (folder / "checkpoints").mkdir()
+    (folder / "checkpoints" / "step_0000002.pt").touch()
+    if (folder.parent / "config.yaml").is_file():
+        (folder / "config.yaml").write_bytes((folder.parent / "config.yaml").read_bytes())
+    write("finished")  # the numbers are there, exports are not
+    os.kill(os.getpid(), signal.SIGKILL)
+if prompt == "a deaf one":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+if prompt in ("a wait", "a deaf one"):
+    (folder / "waiting").touch()
+    time.sleep(60)
+if prompt == "a crowd":
+    write("out_of_memory", warnings=[])
+    sys.exit(0)
+write("finished", psnr=20.25, ssim=0.5, asset_bytes=340, warnings=[])
+"""
+
+
+@pytest.fixture
+def stand_in(tmp_path_factory) -> Path:
+    """The program; put it into ``sys.executable``."""
+    path = tmp_path_factory.mktemp("bin") / "train"
+    path.write_text(STAND_IN.format(python=sys.executable), encoding="utf-8")
+    path.chmod(0o755)
+    return path
+
+
+@pytest.fixture
+def calls():
+    """How the program was called, from the folder of a sweep."""
+
+    def read(sweep: Path) -> list[dict]:
+        path = sweep / "calls.jsonl"
+        return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+
+    return read

@@ -1,0 +1,535 @@
+"""``cadam3d sweep`` from its line to its table, with a stand-in for training."""
+
+import csv
+import importlib.machinery
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from cadam3d import advice, cli, launch, settings
+from cadam3d.core.errors import UserError
+from cadam3d.sweep import plan, start
+from cadam3d.sweep.folder import JOBS, Row, load, read_plan
+from cadam3d.sweep.table import as_text, varying_keys, write_table
+from cadam3d.sweep.watch import duration
+
+REPOSITORY = Path(__file__).parents[2]
+PYTHON = sys.executable
+TRAIN = """
+defaults: [{densifier: cadam}, {hydra: default}, _self_]
+refine: {interval: 50}
+optimizer: {steps: "${steps}"}
+prompt: ???
+negative_prompt: ''
+steps: 5
+seed: 0
+resume: null
+"""
+
+
+@dataclass(frozen=True)
+class Result:
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture(scope="session")
+def small_configs(tmp_path_factory) -> Path:
+    """The folders that sweeps need, and a train.yaml that composes in no time."""
+    folder = tmp_path_factory.mktemp("configs")
+    for name in ("hydra", "densifier", "grid", "launcher"):
+        shutil.copytree(REPOSITORY / "configs" / name, folder / name)
+    for name in ("sweep.yaml", "jobs.yaml"):
+        shutil.copy(REPOSITORY / "configs" / name, folder)
+    (folder / "train.yaml").write_text(TRAIN, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture
+def sweep(monkeypatch, capfd, tmp_path, small_configs, stand_in):
+    """Type ``cadam3d sweep ...`` in an empty folder, in this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    for module in (settings, launch, advice):
+        monkeypatch.setattr(module, "config_dir", lambda: small_configs)
+    monkeypatch.setattr(sys, "executable", str(stand_in))
+
+    def run(*words: str, command: str = "sweep") -> Result:
+        monkeypatch.setattr(sys, "argv", ["cadam3d", command, *words])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        captured = capfd.readouterr()
+        return Result(int(ended.value.code or 0), captured.out, captured.err)
+
+    return run
+
+
+def read_table(folder: Path) -> list[dict[str, str]]:
+    with (folder / "sweep.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def only_sweep() -> Path:
+    [folder] = Path("multirun").iterdir()
+    return folder
+
+
+# --- one row per job --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("command", "flags"),
+    [("sweep", ()), ("train", ("-m",)), ("train", ("--multirun",)), ("train", ("hydra.mode=MULTIRUN",))],
+)
+def test_a_sweep_leaves_one_row_per_job(command, flags, sweep):
+    result = sweep(
+        *flags, "prompt=a corgi, front view", "densifier=baseline,cadam", "seed=0,1", command=command
+    )
+    assert result.code == 0, result.err
+    rows = read_table(only_sweep())
+    assert list(rows[0]) == [
+        *("job", "arm", "prompt", "seed", "densifier", "outcome", "num_gaussians", "num_gaussians_initial"),
+        *("psnr", "ssim", "seconds", "asset_bytes", "message", "folder"),
+    ]
+    assert [(row["densifier"], row["seed"]) for row in rows] == [
+        ("baseline", "0"),
+        ("baseline", "1"),
+        ("cadam", "0"),
+        ("cadam", "1"),
+    ]
+    assert {row["psnr"] for row in rows} == {"20.25"}
+    assert all((only_sweep() / row["folder"] / "summary.json").is_file() for row in rows)
+
+
+def test_each_job_is_told_as_it_ends(sweep):
+    lines = sweep("prompt=a cube", "seed=0,1,2").out.splitlines()
+    assert lines[0].startswith("3 jobs in multirun/")
+    assert lines[1].startswith("[1/3] seed=0: 5 Gaussians, 20.25 dB, 2 s; about ")
+    assert lines[3] == "[3/3] seed=2: 5 Gaussians, 20.25 dB, 2 s"
+    assert lines[-1] == f"3 jobs: {only_sweep()}/sweep.csv"
+
+
+def test_a_grid_gives_its_name_and_its_arms(sweep):
+    result = sweep("prompt=a cube", "grid=densifiers", "seed=0,1")
+    rows = read_table(Path("multirun/densifiers"))
+    assert [row["arm"] for row in rows] == ["baseline", "cadam", "none"] * 2
+    assert [row["densifier"] for row in rows] == ["baseline", "cadam", "none"] * 2
+    assert "[1/6] baseline, seed=0: " in result.out
+    assert "densifier" not in result.out.split("job  ")[1].splitlines()[0]  # the arm says it
+
+
+def test_an_arm_can_be_left_out(sweep):
+    assert sweep("prompt=a cube", "grid=densifiers", "~grid.arms.none").code == 0
+    assert [row["arm"] for row in read_table(Path("multirun/densifiers"))] == ["baseline", "cadam"]
+
+
+def test_failed_and_killed_jobs_are_rows_and_the_rest_goes_on(sweep, calls):
+    Path("multirun").mkdir()
+    result = sweep("prompt=a cube,a mistake,a bug,a kill,a crowd,a ball", "hydra.sweep.dir=multirun/x")
+    rows = read_table(Path("multirun/x"))
+    outcomes = ["finished", "failed", "failed", "killed", "out_of_memory", "finished"]
+    assert [row["outcome"] for row in rows] == outcomes
+    assert rows[1]["message"] == "prompt: I know no mistake. Try: a cube"
+    assert rows[2]["message"] == "ValueError: one two"
+    assert rows[3]["message"].startswith("by SIGKILL")
+    assert result.code == 1
+    assert result.err == (
+        "cadam3d: 3 of 6 jobs without a result (2 failed, 1 killed). The same line again runs only those.\n"
+    )
+
+
+def test_the_table_is_right_after_every_job(sweep, monkeypatch):
+    seen = []
+    original = write_table
+
+    def note(folder):
+        rows = original(folder)
+        seen.append([row["outcome"] for row in read_table(folder)])
+        return rows
+
+    monkeypatch.setattr("cadam3d.commands.sweep.write_table", note)
+    sweep("prompt=a cube", "seed=0,1,2")
+    finished, waiting = "finished", "unfinished"
+    assert seen == [[finished, waiting, waiting], [finished, finished, waiting], [finished] * 3]
+
+
+def test_several_writers_leave_what_the_last_of_them_saw(tmp_path, monkeypatch):
+    """A job that ended while the table was being written is in it none the less."""
+    before = Row(0, "", tmp_path / "a", [], {"seed": 0}, {})
+    after = Row(0, "", tmp_path / "a", [], {"seed": 0}, {"outcome": "finished"})
+    states = iter([[before], [after], [after]])
+    monkeypatch.setattr("cadam3d.sweep.table.load", lambda folder: next(states))
+    assert write_table(tmp_path) == [after]
+    assert read_table(tmp_path)[0]["outcome"] == "finished"
+
+
+def test_values_that_are_no_text_are_json_in_the_table(tmp_path):
+    row = Row(0, "", tmp_path, [], {"exporter": ["ply", "preview"], "on": True}, {})
+    assert as_text([row, Row(1, "", tmp_path, [], {"exporter": [], "on": None}, {})]).splitlines()[1:] == [
+        '0    ["ply", "preview"]  True  unfinished  -              -     -',
+        "1    []                  -     unfinished  -              -     -",
+    ]
+
+
+def test_what_the_arm_tells_is_not_told_again(tmp_path):
+    rows = [
+        Row(0, "a", tmp_path, [], {"densifier": "x", "seed": 0, "steps": 5}, {}),
+        Row(1, "a", tmp_path, [], {"densifier": "x", "seed": 1, "steps": 5}, {}),
+        Row(2, "b", tmp_path, [], {"densifier": "y", "seed": 0, "steps": 5}, {}),
+    ]
+    assert varying_keys(rows) == ["seed"]
+
+
+# --- the same line again ----------------------------------------------------------------------------------
+
+
+def test_finished_jobs_are_skipped_and_the_others_run_again(sweep, calls):
+    line = ("prompt=a cube", "seed=0,1,2")
+    sweep(*line)
+    rows = load(only_sweep().resolve())
+    (rows[1].folder / "summary.json").unlink()
+    result = sweep("seed=range(0,3)", 'prompt="a cube"')  # the same, said otherwise
+    assert result.code == 0
+    assert "3 jobs in " in result.out
+    assert "2 with a result already" in result.out
+    assert "[3/3] seed=1: 5 Gaussians" in result.out
+    assert [call["folder"] for call in calls(only_sweep())] == [row.folder.name for row in (*rows, rows[1])]
+
+
+def test_a_sweep_that_is_done_only_tells_its_table(sweep, calls):
+    sweep("prompt=a cube", "grid=densifiers")
+    Path("multirun/densifiers/sweep.csv").unlink()
+    result = sweep("prompt=a cube", "grid=densifiers")
+    assert result.code == 0
+    assert len(calls(Path("multirun/densifiers"))) == 3
+    assert len(read_table(Path("multirun/densifiers"))) == 3
+
+
+def test_a_killed_job_goes_on_from_its_checkpoint(sweep, calls, small_configs):
+    folder = Path("multirun/x")
+    folder.mkdir(parents=True)
+    config = yaml_of(sweep, "prompt=a kill")
+    (folder / "config.yaml").write_text(config)
+    line = ("prompt=a kill,a cube", "hydra.sweep.dir=multirun/x")
+    assert sweep(*line).code == 1
+    assert sweep(*line).code == 0
+    assert [call["words"][1].partition("=")[0] for call in calls(folder)] == ["prompt", "prompt", "resume"]
+
+
+def yaml_of(sweep, *words: str) -> str:
+    return sweep(*words, "--cfg", "job", "--resolve", command="train").out
+
+
+@pytest.mark.parametrize("seeds", ["0", "1,0"])
+def test_a_narrower_line_finds_the_jobs_of_the_wider_one(seeds, sweep, calls):
+    sweep("prompt=a cube", "grid=densifiers", "seed=0,1,2")
+    result = sweep("prompt=a cube", "grid=densifiers", f"seed={seeds}")
+    assert result.code == 0
+    assert len(calls(Path("multirun/densifiers"))) == 9
+    rows = read_table(Path("multirun/densifiers"))
+    assert {row["seed"] for row in rows} == set(seeds.split(","))  # the table is of this line
+
+
+def test_other_settings_in_the_same_folder_are_refused_with_the_key(sweep, calls):
+    folder = Path("multirun/densifiers")
+    sweep("prompt=a cube", "grid=densifiers")
+    for row in load(folder):
+        (row.folder / "config.yaml").write_text(yaml_of(sweep, "prompt=a cube", row.overrides[1]))
+    table = (folder / "sweep.csv").read_bytes()
+    assert sweep("prompt=a cube", "grid=densifiers").code == 0
+    result = sweep("prompt=a cube", "grid=densifiers", "steps=9")
+    assert result.code == 1
+    assert result.err.startswith(f"cadam3d: optimizer.steps: was 5 in {folder}/baseline_a-cube_")
+    assert result.err.endswith(
+        ", is 9 now. Try: hydra.sweep.dir=multirun/densifiers-2, which is another folder, "
+        "or the settings of before\n"
+    )
+    assert (folder / "sweep.csv").read_bytes() == table
+    assert not Path("multirun/densifiers-2").exists()
+    assert len(calls(folder)) == 3
+
+
+def test_a_job_that_failed_may_run_with_other_settings(sweep):
+    sweep("prompt=a bug", "grid=densifiers")
+    for row in load(Path("multirun/densifiers")):
+        (row.folder / "config.yaml").write_text("steps: 4")
+    result = sweep("prompt=a bug", "grid=densifiers", "steps=9")
+    assert "The same line again" in result.err
+
+
+def test_rows_of_another_line_do_not_appear(sweep):
+    sweep("prompt=a cube", "grid=densifiers")
+    sweep("prompt=a ball", "grid=densifiers")
+    rows = read_table(Path("multirun/densifiers"))
+    assert {row["prompt"] for row in rows} == {"a ball"}
+    assert len(rows) == 3
+
+
+def test_a_second_sweep_in_the_folder_of_a_running_one_is_refused(sweep):
+    folder = Path("multirun/densifiers")
+    folder.mkdir(parents=True)
+    with start._locked(folder):
+        result = sweep("prompt=a cube", "grid=densifiers")
+    assert result.code == 1
+    assert "another sweep is at work in multirun/densifiers" in result.err
+    assert not (folder / JOBS).exists()
+    assert sweep("prompt=a cube", "grid=densifiers").code == 0
+
+
+# --- stopping ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def start_sweep(tmp_path, small_configs, stand_in):
+    """Start a sweep as a process of its own; its launcher's workers too meet the stand-in."""
+    python = tmp_path / "python"
+    is_job = 'case "$*" in *cadam3d.sweep.process*)'
+    python.write_text(f'#!/bin/sh\n{is_job} exec {stand_in} "$@";; esac\nexec {PYTHON} "$@"\n')
+    python.chmod(0o755)
+    site = tmp_path / "site"
+    site.mkdir()
+    (site / "sitecustomize.py").write_text(f"import sys; sys.executable = {str(python)!r}")
+
+    def run(*words: str) -> subprocess.Popen:
+        code = (
+            "import sys; from pathlib import Path; from cadam3d import advice, cli, launch, settings\n"
+            "for module in (settings, launch, advice):\n"
+            f"    module.config_dir = lambda: Path({str(small_configs)!r})\n"
+            f"sys.argv = {['cadam3d', 'sweep', *words]!r}\n"
+            "cli.main()"
+        )
+        environment = {**os.environ, "PYTHONPATH": f"{site}:{REPOSITORY}", "OMP_NUM_THREADS": "1"}
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        return subprocess.Popen([PYTHON, "-c", code], cwd=tmp_path, env=environment, **pipes)
+
+    return run
+
+
+@pytest.mark.parametrize(("launcher", "running"), [((), 1), (("launcher=joblib", "launcher.n_jobs=2"), 2)])
+def test_sigint_stops_all_running_jobs_and_leaves_the_table_true(launcher, running, start_sweep, tmp_path):
+    process = start_sweep("prompt=a wait", "seed=0,1,2,3,4,5", "hydra.sweep.dir=x", *launcher)
+    deadline = time.monotonic() + 90
+    while len(list(tmp_path.glob("x/*/waiting"))) < running:  # side by side, or it will never be
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "Stopping as soon as all running jobs have saved" in err
+    assert f"6 of 6 jobs without a result ({running} interrupted, {6 - running} unfinished)" in err
+    assert "Traceback" not in err
+    outcomes = [row["outcome"] for row in read_table(tmp_path / "x")]
+    assert sorted(outcomes) == ["interrupted"] * running + ["unfinished"] * (6 - running)
+    assert out.count("interrupted") == 2 * running  # as it ended, and in the table
+
+
+def test_a_second_sigint_ends_at_once(start_sweep, tmp_path):
+    process = start_sweep("prompt=a deaf one", "seed=0,1", "hydra.sweep.dir=x")
+    wait_for(tmp_path, "x/*/waiting", process)
+    process.send_signal(signal.SIGINT)
+    assert process.stderr.readline() == "\n"
+    assert "once more to stop at once" in process.stderr.readline()
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert err.endswith("cadam3d: interrupted\n")
+    assert [row["outcome"] for row in read_table(tmp_path / "x")] == ["unfinished"] * 2
+
+
+def wait_for(folder: Path, pattern: str, process: subprocess.Popen) -> None:
+    deadline = time.monotonic() + 90
+    while not list(folder.glob(pattern)):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline, f"{pattern} never came"
+        time.sleep(0.05)
+
+
+# --- launchers --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("spelling", ["launcher=joblib", "+launcher=joblib"])
+def test_joblib_runs_the_whole_sweep(spelling, start_sweep, tmp_path):
+    words = ("prompt=a cube,a mistake", "seed=0,1", "hydra.sweep.dir=x", spelling, "launcher.n_jobs=2")
+    out, err = start_sweep(*words).communicate(timeout=90)
+    rows = read_table(tmp_path / "x")
+    assert [row["outcome"] for row in rows] == ["finished", "finished", "failed", "failed"], err
+    assert "[4/4]" in out
+
+
+@pytest.mark.parametrize(
+    ("launcher", "pending", "cores", "threads"),
+    [
+        ({"n_jobs": 4}, 100, 16, 4),
+        ({"n_jobs": 3}, 100, 16, 5),
+        ({"n_jobs": -1}, 100, 16, 1),
+        ({"n_jobs": -1}, 2, 16, 8),
+        ({"n_jobs": -2}, 100, 2, 2),
+        ({"n_jobs": 8}, 100, 2, 1),
+        ({"n_jobs": 4, "threads": 3}, 100, 16, 3),
+        (None, 100, 16, None),
+    ],
+)
+def test_jobs_side_by_side_share_the_cores(launcher, pending, cores, threads, monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: range(cores), raising=False)
+    cfg = OmegaConf.create({"launcher": launcher, "hydra": {"launcher": {}}})
+    assert start._threads(cfg, pending) == threads
+    monkeypatch.setenv("OMP_NUM_THREADS", "5")
+    assert start._threads(cfg, pending) is None
+
+
+def test_a_launcher_whose_plugin_is_missing_is_named(sweep, monkeypatch):
+    result = sweep("prompt=a cube", "grid=densifiers", "launcher=ray")
+    if result.code == 0:
+        pytest.skip("Hydra's plugin for Ray is installed here")
+    assert (
+        result.err
+        == "cadam3d: launcher: hydra-ray-launcher is not installed. Try: pip install hydra-ray-launcher\n"
+    )
+    assert not Path("multirun").exists()
+
+
+def test_a_launcher_that_breaks_down_leaves_the_table_true(sweep, monkeypatch):
+    def fail(*args, **kwargs):
+        raise RuntimeError("a worker was lost\nfor reasons")
+
+    monkeypatch.setattr(start, "run_hydra", fail)
+    result = sweep("prompt=a cube", "seed=0,1")
+    assert result.code == 1
+    assert result.err.splitlines()[0] == "cadam3d: the launcher gave up. RuntimeError: a worker was lost"
+    assert "2 of 2 jobs without a result (2 unfinished)" in result.err
+
+
+# --- mistakes ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("densifier=cadam,cadm",), "wanted one of baseline|cadam|none, got 'cadm'. Try: densifier=cadam"),
+        (("seed=0,1", "densifier.tau_q=1"), "Did you mean densifier.tau_Q?"),
+        (
+            ("grid=densifiers", "densifier.tau_Q=0.5", "nonsense.key=1"),
+            "arm baseline: nonsense.key: no such setting",
+        ),
+        (("grid=nope",), "grid: wanted one of densifiers|objectives|thresholds, got 'nope'"),
+        (("grid=densifiers", "densifier=none"), "densifier: tells the arms baseline and cadam apart"),
+        (("seed=0,1", "launcher=jobli"), "Try: launcher=joblib"),
+        (("seed=0,1", "launcher=joblib", "launcher.jobs=2"), "launcher.jobs: no such setting. Did you mean "),
+        (
+            ("seed=0,1", "hydra.run.dir=x"),
+            "hydra.run.dir: not for sweeps. Try: hydra.sweep.dir=multirun/mine",
+        ),
+        (("seed=0,1", "hydra/sweeper=optuna"), "hydra/sweeper: not for sweeps"),
+        (("seed=0,1", "hydra.sweep.dir="), "hydra.sweep.dir: wanted a folder, got nothing"),
+        (("seed=0,1", "hydra.sweep.dir=x_${seedd}"), "hydra.sweep.dir: Interpolation key 'seedd' not found"),
+        (("seed=interval(0,1)",), "one by one, got an interval"),
+        (("seed=0,1", "steps=[1"), "steps: cannot read the value"),
+        (("steps=7",), "sweep: nothing to sweep over"),
+    ],
+)
+def test_a_mistake_is_one_message_before_anything_runs(words, said, sweep):
+    result = sweep("prompt=a cube", *words)
+    assert result.code == 1
+    assert said in result.err
+    assert len(result.err.splitlines()) == 1
+    assert not list(Path.cwd().iterdir())
+
+
+def test_a_folder_that_holds_a_run_is_refused(sweep):
+    Path("run").mkdir()
+    Path("run/summary.json").write_text("{}")
+    result = sweep("prompt=a cube", "seed=0,1", "hydra.sweep.dir=run")
+    assert result.code == 1
+    assert "holds a run. Try: hydra.sweep.dir=multirun/mine" in result.err
+
+
+def test_cfg_job_shows_the_first_job(sweep):
+    result = sweep("prompt=a cube", "grid=objectives", "seed=3,4", "~grid.each.guidance", "--cfg", "job")
+    assert result.code == 0, result.err
+    assert "seed: 3" in result.out
+    assert "densifier.baseline" in result.out
+    assert not list(Path.cwd().iterdir())
+
+
+# --- plans ------------------------------------------------------------------------------------------------
+
+
+LINES = (
+    ["prompt='a cube'"],
+    ["prompt='a ball'", "steps=7", "densifier.tau_Q=0.5"],
+    ["prompt='a cube'", "steps=9", "densifier.tau_Q=0.25"],
+    ["prompt='a cube'", "densifier=baseline", "densifier.tau_pos=0.5"],
+    ["prompt='a cube'", "densifier=baseline", "densifier.tau_pos=null", "+extra={a: 1}"],
+    ["prompt='a cube'", "densifier=baseline", "densifier.tau_pos=0.25", "+extra={a: 2}"],
+    ["prompt='\\${x}'", "refine.interval=${steps}", "steps=8"],
+    ["prompt='a cube'", "refine.interval=3", "steps=8"],
+    ["prompt='a cube'", "~refine.interval", "densifier.reset_min_age=1"],
+)
+
+
+def test_settings_put_in_afterwards_equal_those_that_hydra_composes(sweep):
+    composer = plan.Composer("sweep", launch._read_flags([]), [])
+    for _ in range(2):  # the second time nothing is composed anew
+        for line in LINES:
+            cfg = OmegaConf.to_container(settings.compose(line), resolve=True)
+            assert composer.compose(line).values == dict(settings.flatten(cfg)), line
+
+
+def test_many_jobs_that_differ_in_values_are_composed_once(sweep, monkeypatch):
+    counted = []
+    original = plan.compose_line
+    monkeypatch.setattr(plan, "compose_line", lambda *args: counted.append(args) or original(*args))
+    line = ["prompt='a cube'", "seed=range(0,30)", "densifier.tau_Q=0.5,0.7"]
+    found = plan.compose_all(*plan.read_sweep("sweep", line, launch._read_flags([])))
+    assert [job.get("seed") for job in found] == [seed for seed in range(30) for _ in range(2)]
+    assert len(counted) == 3  # the sweep, what its plain values are, and one job
+
+
+def test_what_the_plan_remembers(sweep, tmp_path):
+    own = tmp_path / "own/densifier"
+    own.mkdir(parents=True)
+    (own / "mine.yaml").write_text("_target_: mypackage.Mine\n", encoding="utf-8")
+    result = sweep("--config-dir", "own", "prompt=a cube", "densifier=mine,none", "hydra.sweep.dir=x")
+    assert result.code == 0, result.err
+    remembered = read_plan(Path("x"))
+    assert remembered.cwd == str(tmp_path)
+    assert remembered.flags == ["--config-dir", "own"]
+    assert [job.swept["densifier"] for job in remembered.jobs] == ["mine", "none"]
+
+
+def test_a_plan_that_is_none_is_named(tmp_path):
+    (tmp_path / JOBS).write_text('{"jobs": [{"what": 1}]}')
+    with pytest.raises(UserError, match=r"jobs.json: not the plan of a sweep"):
+        load(tmp_path)
+
+
+def test_the_comparison_is_made_of_a_sweep_where_there_is_one(sweep, monkeypatch):
+    made = []
+    module = type(sys)("comparison_of_mine")
+    module.write = made.append
+    monkeypatch.setitem(sys.modules, "comparison_of_mine", module)
+    module.__spec__ = importlib.machinery.ModuleSpec("comparison_of_mine", None)
+    monkeypatch.setattr(start, "COMPARISON", "comparison_of_mine")
+    sweep("prompt=a cube", "grid=densifiers")
+    assert made == [Path("multirun/densifiers").resolve()]
+
+
+def test_preparing_a_sweep_needs_no_torch(start_sweep, tmp_path):
+    code = "import sys, cadam3d.sweep.start, cadam3d.commands.sweep; assert 'torch' not in sys.modules"
+    subprocess.run([PYTHON, "-c", code], check=True, cwd=REPOSITORY)
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(5.4, "5 s"), (240, "4 min"), (30_000, "8.3 h")])
+def test_durations_are_as_precise_as_estimates_are(seconds, text):
+    assert duration(seconds) == text
