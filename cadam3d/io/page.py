@@ -28,6 +28,14 @@ def outcome_chip(outcome: str) -> str:
     return f'<span class="outcome {mood}">{escape(outcome.replace("_", " "))}</span>'
 
 
+def tile(label: str, value: str, remark: str) -> str:
+    """A number that people ask for first, as a card."""
+    return (
+        f'<div class="card tile"><p>{escape(label)}</p><strong>{escape(value)}</strong>'
+        f"<p>{escape(remark)}</p></div>"
+    )
+
+
 def note(text: object) -> str:
     """A remark across the page."""
     return f'<p class="note warn">{escape(str(text))}</p>'

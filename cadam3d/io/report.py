@@ -7,7 +7,18 @@ from typing import Any
 
 from cadam3d import __version__
 from cadam3d.io.atomic import replacing
-from cadam3d.io.page import data_url, details, duration, note, number, outcome_chip, page, show, shown_bytes
+from cadam3d.io.page import (
+    data_url,
+    details,
+    duration,
+    note,
+    number,
+    outcome_chip,
+    page,
+    show,
+    shown_bytes,
+    tile,
+)
 from cadam3d.io.plot import Band, Bar, Chart, Curve, Point, smooth
 
 FILE_NAME = "report.html"
@@ -82,11 +93,7 @@ def _header(prompt: str, summary: Mapping[str, Any]) -> str:
 
 
 def _hero(folder: Path, summary: Mapping[str, Any], prompt: str) -> str:
-    tiles = "".join(
-        f'<div class="card tile"><p>{escape(label)}</p><strong>{escape(value)}</strong>'
-        f"<p>{escape(remark)}</p></div>"
-        for label, value, remark in _tiles(summary)
-    )
+    tiles = "".join(tile(*entry) for entry in _tiles(summary))
     video, preview = folder / "turntable.mp4", folder / "preview.png"
     left = _video(video) if video.is_file() else _image(preview, prompt)
     below = _image(preview, prompt) if video.is_file() else ""
