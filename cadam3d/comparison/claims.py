@@ -330,15 +330,18 @@ def over_seeds(values: Mapping[Cell, float]) -> float | None:
 def _by_prompt(values: Mapping[Cell, float]) -> dict[Cell, list[float]]:
     """The values of each cell without its seed."""
     groups: dict[Cell, list[float]] = defaultdict(list)
-    for cell, value in values.items():
+    for cell, value in sorted(values.items()):  # in an order of their own: same rows, same bootstrap
         groups[cell.without(SEED)].append(value)
     return dict(groups)
 
 
 def _bootstrap(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
-    generator = np.random.default_rng(BOOTSTRAP_SEED)
-    draws = generator.integers(len(groups), size=(RESAMPLES, len(groups)))
-    medians = [np.median(np.concatenate([groups[i] for i in draw])) for draw in draws]
+    """The interval of the median of all values when whole groups are drawn."""
+    padded = np.full((len(groups), max(map(len, groups))), np.nan)
+    for row, group in zip(padded, groups, strict=True):
+        row[: len(group)] = group
+    draws = np.random.default_rng(BOOTSTRAP_SEED).integers(len(groups), size=(RESAMPLES, len(groups)))
+    medians = np.nanmedian(padded[draws].reshape(RESAMPLES, -1), axis=1)
     low, high = np.quantile(medians, ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
     return float(low), float(high)
 

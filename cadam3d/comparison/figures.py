@@ -274,7 +274,7 @@ def snr_figure(rows: Sequence[Row]) -> Figure | None:
     return figure
 
 
-class _SnrMap:
+class SnrMap:
     """Shares of Gaussians by SNR and refinement, averaged over jobs, and the lines that belong to them."""
 
     def __init__(self, rows: Sequence[Row]) -> None:
@@ -297,8 +297,8 @@ class _SnrMap:
         self.floor = noise_floor(settings.get("beta1"), settings.get("beta2"))
 
 
-def _snr_map(rows: Sequence[Row]) -> _SnrMap | None:
-    heat = _SnrMap(rows)
+def _snr_map(rows: Sequence[Row]) -> SnrMap | None:
+    heat = SnrMap(rows)
     return heat if heat.shares.size else None
 
 
@@ -309,7 +309,7 @@ def noise_floor(beta1: float | None, beta2: float | None) -> float | None:
     return math.sqrt((1 - beta1) / (1 + beta1))
 
 
-def _draw_snr(axes: Axes, heat: _SnrMap) -> None:
+def _draw_snr(axes: Axes, heat: SnrMap) -> None:
     edges = 10 ** (np.arange(heat.first, heat.first + len(heat.shares) + 1) / heat.per_decade)
     steps = np.array(heat.steps, dtype=float)
     half = (np.diff(steps).min() if len(steps) > 1 else 10.0) / 2

@@ -14,10 +14,11 @@ from matplotlib.figure import Figure
 from cadam3d import __version__
 from cadam3d.comparison import figures, pictures, tables, words
 from cadam3d.comparison.claims import compare, standard
-from cadam3d.comparison.rows import COMPLETE, NOISE, PROMPT, SEED, UNFINISHED, Row, read
+from cadam3d.comparison.rows import COMPLETE, NOISE, PLAN, PROMPT, SEED, UNFINISHED, Row, read
 from cadam3d.comparison.style import css, inline, styled, write_figure
 from cadam3d.core.checks import UserError, fail
 from cadam3d.io.atomic import replacing
+from cadam3d.io.jsonl import read_json
 from cadam3d.io.page import details, outcome_chip, page, tile
 
 FILE_NAME = "report.html"
@@ -99,7 +100,7 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None) -> Path:
         details("Every setting", tables.as_html(frontiers)) if frontiers else "",
         _failures(rows),
         details(f"All {len(rows)} jobs", tables.as_html(tables.jobs_table(rows), links="job")),
-        _command(sweep_folder),
+        _commands(sweep_folder),
         _footer(sweep_folder),
     ]
     path = sweep_folder / FILE_NAME
@@ -109,13 +110,15 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None) -> Path:
 
 
 def _wanted(sweep_folder: Path, names: Sequence[str] | None) -> list[str]:
-    chosen = list(names if names is not None else FIGURES)
-    for name in chosen:
+    plan = sweep_folder / PLAN
+    if names is None and plan.is_file():
+        names = read_json(plan).get("figures")  # what the grid asked for
+    for name in names or ():
         if name not in FIGURES:
             raise fail(
                 "figures", wanted=f"some of {'|'.join(FIGURES)}", got=name, example="figures=[frontier]"
             )
-    return chosen
+    return list(FIGURES if names is None else names)
 
 
 def _header(sweep_folder: Path, rows: Sequence[Row]) -> str:
@@ -198,14 +201,18 @@ def _style() -> str:
     return css() + resources.files("cadam3d.comparison").joinpath("page.css").read_text(encoding="utf-8")
 
 
-def _command(sweep_folder: Path) -> str:
-    path = sweep_folder / "multirun.yaml"
-    if not path.is_file():
+def _commands(sweep_folder: Path) -> str:
+    """What to type for the same jobs again: the line of the sweep, or each job's own where that is kept."""
+    plan, multirun = sweep_folder / PLAN, sweep_folder / "multirun.yaml"
+    if plan.is_file():
+        lines = [["train", *job["overrides"]] for job in read_json(plan)["jobs"]]
+    elif multirun.is_file():
+        told = yaml.safe_load(multirun.read_text(encoding="utf-8")) or {}
+        lines = [["sweep", *(((told.get("hydra") or {}).get("overrides") or {}).get("task") or [])]]
+    else:
         return ""
-    told = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    lines = ((told.get("hydra") or {}).get("overrides") or {}).get("task") or []
-    command = shlex.join(["cadam3d", "sweep", *map(str, lines)])
-    return details("The command", f"<pre>{escape(command)}</pre>")
+    text = "\n".join(shlex.join(["cadam3d", *map(str, line)]) for line in lines)
+    return details("The commands" if len(lines) > 1 else "The command", f"<pre>{escape(text)}</pre>")
 
 
 def _name(sweep_folder: Path) -> str:

@@ -12,6 +12,7 @@ from cadam3d.comparison.figures import arm_of_two_thresholds, arms_of, level_tit
 from cadam3d.comparison.rows import GUIDANCE, NOISE, Cell, Row, config, histograms, measured
 from cadam3d.comparison.style import SOFT, looks, new_figure, pictures_only
 
+PREVIEW = "preview.png"
 MAX_COLUMNS = 7  # pictures beside one another
 MAX_VIEWS = 4  # of an asset, in a strip
 PICTURE_INCH = 1.45
@@ -32,7 +33,7 @@ def masks_figure(rows: Sequence[Row]) -> Figure | None:
         chosen = {each.step: (sum(each.selected), sum(each.counts)) for each in histograms(row)}
         for axes, step in zip(line, steps, strict=True):
             if step in found:
-                axes.imshow(_mask(imageio.imread(found[step])), interpolation="antialiased")
+                axes.imshow(mask_of(imageio.imread(found[step])), interpolation="antialiased")
             if step in chosen:
                 _caption(axes, "{:,} of {:,}".format(*chosen[step]))
         _row_title(line[0], row.arm, looks([row.arm])[row.arm].color)
@@ -44,10 +45,10 @@ def masks_figure(rows: Sequence[Row]) -> Figure | None:
 
 def ablation_figure(rows: Sequence[Row]) -> Figure | None:
     """One strip per arm in one cell: the asset from some sides, its count, quality and outcome (fig. 7)."""
-    shown = showcase([row for row in rows if views(row)])
+    shown = showcase([row for row in rows if has_views(row)])
     if shown is None:
         return None
-    members = [row for row in standard_rows(rows, shown) if views(row)]
+    members = [row for row in standard_rows(rows, shown) if has_views(row)]
     if len(members) < 2:
         return None
     strips = {row.folder: views(row)[:MAX_VIEWS] for row in members}
@@ -73,7 +74,7 @@ def objectives_figure(rows: Sequence[Row]) -> Figure | None:
     """Rows are objectives, columns arms, in one cell (paper fig. 4)."""
     rows = [row for row in measured(rows) if row.cell[GUIDANCE]]
     objectives = sorted({row.cell[GUIDANCE] for row in rows})
-    shown = showcase([row for row in rows if views(row)])
+    shown = showcase([row for row in rows if has_views(row)])
     if len(objectives) < 2 or shown is None:
         return None
     cells = {row.cell for row in rows if row.cell.without(GUIDANCE) == shown.without(GUIDANCE)}
@@ -83,8 +84,8 @@ def objectives_figure(rows: Sequence[Row]) -> Figure | None:
         cell = next((each for each in cells if each[GUIDANCE] == objective), None)
         members = {row.arm: row for row in standard_rows(rows, cell)} if cell else {}
         for axes, arm in zip(line, arms, strict=True):
-            if (row := members.get(arm)) and (pictures := views(row)):
-                axes.imshow(pictures[0], interpolation="antialiased")
+            if (row := members.get(arm)) and has_views(row):
+                axes.imshow(views(row)[0], interpolation="antialiased")
                 _caption(axes, f"{row.count:,.0f}, {row.psnr:.2f} dB")
         _row_title(line[0], objective.upper())
     for axes, arm in zip(panels[0], arms, strict=True):
@@ -98,7 +99,7 @@ def regimes_figure(rows: Sequence[Row]) -> Figure | None:
     arm = arm_of_two_thresholds(rows)
     if arm is None:
         return None
-    rows = [row for row in measured(rows) if row.arm == arm and views(row)]
+    rows = [row for row in measured(rows) if row.arm == arm and has_views(row)]
     shown = showcase(rows)
     if shown is None:
         return None
@@ -142,18 +143,20 @@ def candidate_pictures(row: Row) -> dict[int, str]:
     return {int(path.stem.removeprefix("step_")): str(path) for path in found}
 
 
+def has_views(row: Row) -> bool:
+    """Whether the job left pictures of its asset."""
+    return (row.folder / PREVIEW).is_file()
+
+
 def views(row: Row) -> list[np.ndarray]:
-    """The single pictures of the first row of ``preview.png``; [] without one."""
-    path = row.folder / "preview.png"
-    if not path.is_file():
-        return []
-    sheet = imageio.imread(path)[..., :3]
+    """The single pictures of the first row of ``preview.png``, which must be there."""
+    sheet = imageio.imread(row.folder / PREVIEW)[..., :3]
     preview = (config(row).get("exporter") or {}).get("preview") or {}
     size = int(preview.get("size") or sheet.shape[0])
     return [sheet[:size, left : left + size] for left in range(0, sheet.shape[1] - size + 1, size)]
 
 
-def _mask(picture: np.ndarray) -> np.ndarray:
+def mask_of(picture: np.ndarray) -> np.ndarray:
     """The mask of the first view: pictures come in pairs of a look and a mask, all square."""
     size = picture.shape[0]
     return picture[:, size : 2 * size]

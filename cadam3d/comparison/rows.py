@@ -8,6 +8,7 @@ Gaussians and see the same views and noise, so settings are compared within cell
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -201,9 +202,14 @@ def _job(folder: Path, lines: Sequence[str], arm: str = "") -> Job:
     return replace(job, arm=arm or _densifier(job) or "default")
 
 
-def _parsed(overrides: Sequence[str]) -> dict[str, Any]:
-    parsed = OverridesParser.create().parse_overrides([str(line) for line in overrides])
-    return {each.get_key_element().lstrip("+~"): each.value() for each in parsed}
+def _parsed(lines: Sequence[str]) -> dict[str, Any]:
+    return dict(_pair(str(line)) for line in lines)
+
+
+@cache  # the lines of a sweep's jobs repeat, and the parser takes milliseconds for each
+def _pair(line: str) -> tuple[str, Any]:
+    override = OverridesParser.create().parse_override(line)
+    return override.get_key_element().lstrip("+~"), override.value()
 
 
 def counts(row: Row) -> list[tuple[float, float]]:
@@ -269,6 +275,7 @@ def measured(rows: Iterable[Row]) -> list[Row]:
     return [row for row in rows if row.is_measured]
 
 
+@cache
 def _shipped(arm: str) -> Mapping[str, Any]:
     """The settings of ``configs/densifier/<arm>.yaml``; empty for an arm from elsewhere."""
     if not arm or not (config_dir() / ARM / f"{arm}.yaml").is_file():

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
+from cadam3d.comparison.rows import Row, read
+
 SIZE = 12  # pixels of a picture
 STEPS = (40, 80, 120)
 
@@ -89,9 +91,10 @@ def jobs(tmp_path) -> Jobs:
     return Jobs(tmp_path)
 
 
-@pytest.fixture
-def bench(jobs) -> Path:
+@pytest.fixture(scope="session")
+def bench(tmp_path_factory) -> Path:
     """A whole comparison: 3 prompts, 2 seeds, 3 noise levels; the baseline at 3 thresholds, CAdam at 4."""
+    jobs = Jobs(tmp_path_factory.mktemp("bench"))
     rng = np.random.default_rng(0)
     for level, loss in (("none", 0.0), ("medium", 2.0), ("strong", 6.0)):
         for p, prompt in enumerate(("a cube", "a torus", "a tower")):
@@ -117,3 +120,8 @@ def bench(jobs) -> Path:
         "cadam", "prompt=a cube", "seed=2", "noise=strong", n=0, psnr=None, outcome="failed", message="no <b>"
     )
     return jobs.folder
+
+
+@pytest.fixture(scope="session")
+def bench_rows(bench) -> list[Row]:
+    return read(bench)
