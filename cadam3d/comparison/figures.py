@@ -36,6 +36,7 @@ from cadam3d.io.plot import log_ticks, short
 
 NO_NOISE = ("photometric", "none")  # the levels whose gradients have no noise
 MAX_HEAT_ROWS = 4  # arms in one heat map figure
+EARLY = "\u2020"  # a dagger: some of its jobs ended before their last step
 ROOM = 0.07  # between labels, in shares of the axis
 
 
@@ -99,17 +100,19 @@ def _frontier_curve(axes: Axes, arm: str, points: Sequence[FrontierPoint], look:
     for point, place in zip(points, places, strict=True):
         _bars(axes, point, look)
         is_main = point.is_standard or len(points) == 1
+        is_whole = point.cells == max(other.cells for other in points)
         axes.plot(
             *place,
             marker=look.marker,
             ms=7.5 if is_main else 4.5,
             color=look.color,
-            mec=INK if is_main else look.color,
-            mew=1.1 if is_main else 0.5,
+            mfc=look.color if is_whole else PAPER,
+            mec=INK if is_main and is_whole else look.color,
+            mew=1.1 if is_main or not is_whole else 0.5,
             zorder=5 if is_main else 4,
         )
         if is_line:
-            _annotate(axes, point.setting.values, place, (0, -11))
+            _annotate(axes, point.setting.values + EARLY * (point.early > 0), place, (0, -11))
     if len(points) > 1 and not is_line:  # too many to name each: the ends, and by its ring the standard one
         _annotate(axes, points[0].setting.values, places[0], (-6, -2), ha="right")
         _annotate(axes, points[-1].setting.values, places[-1], (6, -2), ha="left")

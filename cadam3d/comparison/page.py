@@ -30,7 +30,8 @@ FIGURES: dict[str, tuple[Draw, str, str]] = {  # name -> how, title, what to see
         "Quality against count",
         "Up and to the left is better: more PSNR from fewer Gaussians. A mark is one setting, its thresholds "
         "beside it, the standard one ringed: medians over cells. Thick bars are the spread over seeds, thin "
-        "ones quartiles over cells. Dashed: the best that any arm reaches with the same seeds without noise.",
+        "ones quartiles over cells. Hollow: cells are missing; dagger: jobs ended early. Dashed: the best that "
+        "any arm reaches with the same seeds without noise.",
     ),
     "growth": (
         figures.growth_figure,

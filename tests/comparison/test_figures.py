@@ -66,6 +66,21 @@ def test_a_frontier_puts_each_setting_where_its_median_is(jobs):
     assert marks == [(100.0, 0.0), (2000.0, 3.0)]
 
 
+def test_a_setting_that_lacks_cells_is_hollow_and_an_early_end_has_a_dagger(jobs):
+    for seed in (0, 1):
+        jobs.add("baseline", "densifier.tau_pos=0.0002", f"seed={seed}", n=1000, psnr=20.0)
+    jobs.add("baseline", "densifier.tau_pos=0.001", "seed=0", n=500, psnr=19.0, outcome="max_gaussians")
+    figure = draw("frontier", read(jobs.folder))
+    fills = {
+        float(line.get_xdata()[0]): line.get_markerfacecolor()
+        for line in figure.axes[0].lines
+        if line.get_marker() == "o"
+    }
+    assert fills == {1000.0: "#d55e00", 500.0: "#ffffff"}
+    assert "0.001\u2020" in texts(figure)
+    assert "0.0002\u2020" not in texts(figure)
+
+
 def test_growth_is_the_median_over_cells_at_each_step():
     steps, low, middle, high = figures.over_time(
         [[(0, 100), (50, 100), (50, 200)], [(0, 100), (50, 100), (50, 400)], [(0, 100), (100, 300)]]
