@@ -30,8 +30,8 @@ FIGURES: dict[str, tuple[Draw, str, str]] = {  # name -> how, title, what to see
         "Quality against count",
         "Up and to the left is better: more PSNR from fewer Gaussians. A mark is one setting, its thresholds "
         "beside it, the standard one ringed: medians over cells. Thick bars are the spread over seeds, thin "
-        "ones quartiles over cells. Hollow: cells are missing; dagger: jobs ended early. Dashed: the best that "
-        "any arm reaches with the same seeds without noise.",
+        "ones quartiles over cells. Hollow: cells are missing; dagger: jobs ended early. Dashed: the best "
+        "that any arm reaches with the same seeds without noise.",
     ),
     "growth": (
         figures.growth_figure,
@@ -212,8 +212,14 @@ def _commands(sweep_folder: Path) -> str:
         lines = [["sweep", *(((told.get("hydra") or {}).get("overrides") or {}).get("task") or [])]]
     else:
         return ""
-    text = "\n".join(shlex.join(["cadam3d", *map(str, line)]) for line in lines)
+    text = "\n".join(" ".join(["cadam3d", *(for_shell(str(word)) for word in line)]) for line in lines)
     return details("The commands" if len(lines) > 1 else "The command", f"<pre>{escape(text)}</pre>")
+
+
+def for_shell(word: str) -> str:
+    """A word as people would type it: in double quotes where those suffice."""
+    plain = shlex.quote(word)
+    return plain if plain == word or set(word) & set('"$`\\!') else f'"{word}"'
 
 
 def _name(sweep_folder: Path) -> str:

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shlex
 
 import pytest
 import yaml
@@ -107,6 +108,12 @@ def test_the_plan_of_a_sweep_may_name_its_figures(jobs):
     plan.write_text(json.dumps({"jobs": [planned], "figures": ["pie"]}))
     with pytest.raises(UserError, match="pie"):
         comparison.write(jobs.folder)
+
+
+def test_commands_can_be_pasted():
+    words = ["densifier=cadam", "prompt='a cube'", "prompt='it''s $5'", "seed=0"]
+    assert [shlex.split(page.for_shell(word)) for word in words] == [[word] for word in words]
+    assert page.for_shell("prompt='a cube'") == "\"prompt='a cube'\""
 
 
 def test_a_figure_can_be_asked_for_by_name(jobs):
