@@ -18,7 +18,7 @@ RESULT = "eval.json"
 
 
 def run(cfg: DictConfig) -> None:
-    """Measure ``run=`` and write its ``eval.json``; for a sweep every job, one file of all, and its report."""
+    """Measure ``run=`` and write its ``eval.json``; for a sweep every job, one file of all and its report."""
     if cfg.run is None:
         raise UserError("run: wanted a finished run or a sweep. Try: cadam3d eval run=outputs/latest")
     folder = Path(cfg.run).expanduser().resolve()
