@@ -1,6 +1,6 @@
 """Figures of a sweep that show assets: rows and columns of pictures, each with its numbers underneath."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 
 import imageio.v3 as imageio
 import numpy as np
@@ -100,7 +100,7 @@ def regimes_figure(rows: Sequence[Row]) -> Figure | None:
     if arm is None:
         return None
     rows = [row for row in measured(rows) if row.arm == arm and has_views(row)]
-    shown = showcase(rows)
+    shown = showcase(rows, kind=lambda row: row.setting)
     if shown is None:
         return None
     here = sorted((row for row in rows if row.cell == shown), key=lambda row: row.count or 0)
@@ -117,11 +117,11 @@ def regimes_figure(rows: Sequence[Row]) -> Figure | None:
     return figure
 
 
-def showcase(rows: Sequence[Row]) -> Cell | None:
-    """The cell to show: the one with most arms, of those medium noise before weak, then the first."""
-    cells: dict[Cell, set[str]] = {}
+def showcase(rows: Sequence[Row], kind: Callable[[Row], Hashable] = lambda row: row.arm) -> Cell | None:
+    """The cell to show: the one with most arms (or kinds), medium noise before weak, then the first."""
+    cells: dict[Cell, set[Hashable]] = {}
     for row in measured(rows):
-        cells.setdefault(row.cell, set()).add(row.arm)
+        cells.setdefault(row.cell, set()).add(kind(row))
     preference = {level: i for i, level in enumerate(EXPECTED_NOISE)}
     worst = len(preference)
     return min(cells, key=lambda c: (-len(cells[c]), preference.get(c[NOISE], worst), c), default=None)

@@ -143,6 +143,17 @@ def test_pictures_of_a_preview_are_cut_apart(bench_rows):
     assert [picture.shape for picture in pictures.views(row)] == [(12, 12, 3)] * 3
 
 
+def test_regimes_are_shown_in_the_cell_that_has_them_all(jobs):
+    for seed, settings in ((0, {0.9: 500}), (1, {0.95: 400, 0.9: 500, 0.7: 900})):
+        for tau, n in settings.items():
+            keys = (f"densifier.tau_Q={tau}", f"densifier.tau_SNR={0.1 if tau == 0.9 else 0.3}")
+            jobs.files(jobs.add("cadam", *keys, f"seed={seed}", n=n, psnr=20.0), n)
+    said = texts(draw("regimes", read(jobs.folder)))
+    assert "seed 1" in said
+    assert "fewest: tau_Q 0.95" in said
+    assert "standard: tau_Q 0.9" in said
+
+
 def test_an_ablation_tells_count_quality_and_outcome(bench_rows):
     said = texts(draw("ablation", bench_rows))
     assert said.count("Gaussians\n") == 3
