@@ -13,6 +13,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.outcome import Outcome
 from cadam3d.core.render import RenderFn
 from cadam3d.optimizer import GaussianOptimizer
+from cadam3d.rasterizer.base import Rasterizer
 
 __all__ = ["Outcome", "Population", "RefineReport", "RunContext", "StepReport", "TrainState"]
 
@@ -100,3 +101,4 @@ class RunContext:
     prompt: str
     total_steps: int
     render: RenderFn  # the Gaussians as they stand, without gradient
+    rasterizer: Rasterizer  # for other Gaussians, such as those before a refinement

@@ -20,7 +20,7 @@ from cadam3d.commands.finding import Finding, Verdict, attempt
 from cadam3d.settings import component, compose, config_dir
 
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "imageio", "imageio-ffmpeg", "jaxtyping", "kornia")
-PACKAGES += ("pillow", "pyyaml", "scipy", "tqdm", "trimesh")
+PACKAGES += ("matplotlib", "pillow", "pyyaml", "scipy", "tqdm", "trimesh")
 IMPORT_NAMES = {"hydra-core": "hydra", "imageio-ffmpeg": "imageio_ffmpeg", "pillow": "PIL", "pyyaml": "yaml"}
 COMPILERS = {  # and what to say where there is none
     **dict.fromkeys(("c++", "g++", "clang++"), "not found; one C++ compiler is enough"),

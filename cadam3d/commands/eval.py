@@ -6,6 +6,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from cadam3d import comparison
 from cadam3d.commands.asset import find_run, open_run, renderer, run_config
 from cadam3d.commands.paths import shown
 from cadam3d.core.checks import UserError
@@ -17,7 +18,7 @@ RESULT = "eval.json"
 
 
 def run(cfg: DictConfig) -> None:
-    """Measure ``run=`` and write its ``eval.json``; for a sweep, every job, and one ``eval.json`` of all."""
+    """Measure ``run=`` and write its ``eval.json``; for a sweep every job, one file of all and its report."""
     if cfg.run is None:
         raise UserError("run: wanted a finished run or a sweep. Try: cadam3d eval run=outputs/latest")
     folder = Path(cfg.run).expanduser().resolve()
@@ -67,4 +68,4 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
     if failures == len(results):
         raise UserError(f"run={cfg.run}: no job of this sweep could be measured. Try: cadam3d sweep again")
     write_json(folder / RESULT, results)
-    print(f"\n{len(results)} jobs: {shown(folder / RESULT)}")
+    print(f"\n{len(results)} jobs: {shown(folder / RESULT)}\nreport: {shown(comparison.write(folder))}")

@@ -95,7 +95,13 @@ def run(cfg: DictConfig) -> float | None:
     log.info("prompt %r, seed %d, on %s, from step %d", cfg.prompt, cfg.seed, device, state.step)
     log.info("rasterizer=%s; %s", backend.name, backend.reason or "nothing faster is known here")
     render = trainer.renderer(state)
-    context = RunContext(folder=folder, prompt=cfg.prompt, total_steps=trainer.steps, render=render)
+    context = RunContext(
+        folder=folder,
+        prompt=cfg.prompt,
+        total_steps=trainer.steps,
+        render=render,
+        rasterizer=trainer.rasterizer,
+    )
     with StopOnSignal() as stop:
         outcome = trainer.train(state, embedding, context, stop)
         summary = summarize(cfg, state, outcome)

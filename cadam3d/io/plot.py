@@ -179,7 +179,7 @@ class _Axis:
             room = 0.5 if log else (abs(high) * 0.1 or 1.0)
             low, high = low - room, high + room
         if log:
-            ticks = _log_ticks(low, high)
+            ticks = log_ticks(low, high)
         else:
             ticks = _ticks(low, high)
             if not tight:  # to the next round number outside the data
@@ -205,7 +205,7 @@ def _ticks(low: float, high: float) -> list[float]:
     return [i * step for i in range(first, last + 1)]
 
 
-def _log_ticks(low: float, high: float) -> list[float]:
+def log_ticks(low: float, high: float) -> list[float]:
     """Round numbers between ``10**low`` and ``10**high``: as the range shrinks, every so many powers of
     ten, then 1, 2 and 5 times those, then equal distances.
     """

@@ -1,22 +1,30 @@
 """report.html: one file that shows a run to somebody who was not there. No scripts, nothing fetched."""
 
-import base64
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from cadam3d import __version__
 from cadam3d.io.atomic import replacing
+from cadam3d.io.page import (
+    data_url,
+    details,
+    duration,
+    note,
+    number,
+    outcome_chip,
+    page,
+    show,
+    shown_bytes,
+    tile,
+)
 from cadam3d.io.plot import Band, Bar, Chart, Curve, Point, smooth
 
 FILE_NAME = "report.html"
 EMBED_BYTES = 8 << 20  # a larger video is linked, not embedded
 SMOOTHING = 15  # shares of a noisy curve's length; the median runs over one of them
 COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "device")
-GOOD, SERIOUS = ("finished",), ("failed", "vanished")  # outcomes; the others stopped early with an asset
 SHARE = "share_above_"  # prefix of a share of all Gaussians that a densifier logs
 DRAWN = ("kind", "step", "loss", "num_gaussians", "seconds")  # of a step line; its other numbers go below
 LABELS = {
@@ -57,53 +65,35 @@ def write_report(
     prompt = str(summary.get("prompt") or "Untitled")
     steps = [line for line in metrics if line.get("kind") == "step"]
     refinements = [_flat(line) for line in metrics if line.get("kind") == "refine"]
-    end = max((_number(line.get("step")) or 0 for line in metrics), default=0) or 1
+    end = max((number(line.get("step")) or 0 for line in metrics), default=0) or 1
     body = [
         _header(prompt, summary),
-        *(_note(warning) for warning in summary.get("warnings") or ()),
+        *(note(warning) for warning in summary.get("warnings") or ()),
         _hero(folder, summary, prompt),
         _charts("While it grew", _growth_charts(steps, refinements, (0, end))),
         _charts("What the densifier saw", _evidence_charts(refinements, (0, end))),
         _facts(summary),
         _refinement_table(refinements),
         _more_numbers(steps, (0, end)),
-        _details("Configuration", f"<pre>{escape(config_text)}</pre>"),
+        details("Configuration", f"<pre>{escape(config_text)}</pre>"),
         _footer(folder),
     ]
-    style = resources.files("cadam3d.io").joinpath("report.css").read_text(encoding="utf-8")
-    page = (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(prompt)} - cadam3d</title>\n<style>\n{style}</style>\n</head>\n<body>\n<main>\n"
-        + "\n".join(part for part in body if part)
-        + "\n</main>\n</body>\n</html>\n"
-    )
     path = folder / FILE_NAME
     with replacing(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(page(f"{prompt} - cadam3d", body), encoding="utf-8")
     return path
 
 
 def _header(prompt: str, summary: Mapping[str, Any]) -> str:
-    outcome = str(summary.get("outcome", "unknown"))
-    mood = "good" if outcome in GOOD else "bad" if outcome in SERIOUS else "warn"
-    chips = [f'<span class="outcome {mood}">{escape(outcome.replace("_", " "))}</span>']
+    chips = [outcome_chip(str(summary.get("outcome", "unknown")))]
     for name in (*COMPONENTS, "seed"):
         if summary.get(name) is not None:
             chips.append(f"<span>{escape(name)} <b>{escape(str(summary[name]))}</b></span>")
     return f'<header><h1>{escape(prompt)}</h1><div class="chips">{"".join(chips)}</div></header>'
 
 
-def _note(text: object) -> str:
-    return f'<p class="note warn">{escape(str(text))}</p>'
-
-
 def _hero(folder: Path, summary: Mapping[str, Any], prompt: str) -> str:
-    tiles = "".join(
-        f'<div class="card tile"><p>{escape(label)}</p><strong>{escape(value)}</strong>'
-        f"<p>{escape(remark)}</p></div>"
-        for label, value, remark in _tiles(summary)
-    )
+    tiles = "".join(tile(*entry) for entry in _tiles(summary))
     video, preview = folder / "turntable.mp4", folder / "preview.png"
     left = _video(video) if video.is_file() else _image(preview, prompt)
     below = _image(preview, prompt) if video.is_file() else ""
@@ -115,7 +105,7 @@ def _hero(folder: Path, summary: Mapping[str, Any], prompt: str) -> str:
 
 def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Label, value and remark of the numbers that people ask for first."""
-    numbers = {name: _number(value) for name, value in summary.items()}
+    numbers = {name: number(value) for name, value in summary.items()}
     count, initial = numbers.get("num_gaussians"), numbers.get("num_gaussians_initial")
     size, per_gaussian = numbers.get("asset_bytes"), numbers.get("bytes_per_gaussian")
     psnr, ssim = numbers.get("psnr"), numbers.get("ssim")
@@ -126,10 +116,12 @@ def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     if psnr is not None:
         tiles.append(("PSNR", f"{psnr:.2f} dB", f"SSIM {ssim:.3f}" if ssim is not None else "held-out views"))
     if size is not None:
-        tiles.append(("asset.ply", _size(size), f"{per_gaussian:.0f} B per Gaussian" if per_gaussian else ""))
+        tiles.append(
+            ("asset.ply", shown_bytes(size), f"{per_gaussian:.0f} B per Gaussian" if per_gaussian else "")
+        )
     if seconds is not None:
         rate = f"{done / seconds:.1f} steps per second" if done and seconds else ""
-        tiles.append(("Time", _duration(seconds), rate))
+        tiles.append(("Time", duration(seconds), rate))
     if done is not None and len(tiles) < 4:
         tiles.append(("Steps", f"{done:,.0f}", f"of {asked:,.0f}" if asked is not None else ""))
     return tiles
@@ -137,7 +129,7 @@ def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 
 def _video(path: Path) -> str:
     is_small = path.stat().st_size <= EMBED_BYTES
-    source = _data_url(path, "video/mp4") if is_small else path.name
+    source = data_url(path, "video/mp4") if is_small else path.name
     return (
         f'<figure class="card picture"><video src="{source}" autoplay loop muted playsinline controls>'
         f'<a href="{path.name}">{path.name}</a></video>'
@@ -149,14 +141,10 @@ def _image(path: Path, prompt: str) -> str:
     if not path.is_file():
         return ""
     return (
-        f'<figure class="card picture"><img src="{_data_url(path, "image/png")}" '
+        f'<figure class="card picture"><img src="{data_url(path, "image/png")}" '
         f'alt="{escape(prompt)}, seen from all around">'
         "<p>From all around; azimuth and elevation in degrees</p></figure>"
     )
-
-
-def _data_url(path: Path, kind: str) -> str:
-    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
 
 
 def _growth_charts(steps: Sequence[Mapping], refinements: Sequence[Mapping], x_range: Point) -> list[Chart]:
@@ -291,8 +279,8 @@ def _counts(steps: Sequence[Mapping], refinements: Sequence[Mapping]) -> list[Po
 def _refinement_bars(refinements: Sequence[Mapping]) -> list[Bar]:
     bars = []
     for line in refinements:
-        step = _number(line.get("step"))
-        cloned, split, pruned = (_number(line.get(key)) or 0.0 for key in ("cloned", "split", "pruned"))
+        step = number(line.get("step"))
+        cloned, split, pruned = (number(line.get(key)) or 0.0 for key in ("cloned", "split", "pruned"))
         if step is not None and cloned + split + pruned > 0:
             hint = f"step {step:g}: {cloned:,.0f} cloned, {split:,.0f} split, {pruned:,.0f} pruned"
             bars.append(Bar(step, 0, cloned, 1, hint))
@@ -325,7 +313,7 @@ def _facts(summary: Mapping[str, Any]) -> str:
     ordered = [*(key for key in LABELS if key in summary), *(key for key in summary if key not in LABELS)]
     rows = "".join(
         f"<div><dt>{escape(LABELS.get(key) or key.replace('_', ' '))}</dt>"
-        f"<dd>{escape(_show(summary[key]))}</dd></div>"
+        f"<dd>{escape(show(summary[key]))}</dd></div>"
         for key in ordered
         if key != "warnings"
     )
@@ -338,11 +326,11 @@ def _refinement_table(refinements: Sequence[Mapping]) -> str:
     columns = [key for key in dict.fromkeys(key for line in refinements for key in line) if key != "kind"]
     head = "".join(f"<th>{escape(key)}</th>" for key in columns)
     rows = "".join(
-        "<tr>" + "".join(f"<td>{escape(_show(line.get(key)))}</td>" for key in columns) + "</tr>"
+        "<tr>" + "".join(f"<td>{escape(show(line.get(key)))}</td>" for key in columns) + "</tr>"
         for line in refinements
     )
     table = f'<div class="scroll"><table class="numbers"><tr>{head}</tr>{rows}</table></div>'
-    return _details(f"All {len(refinements)} refinements and resets", table)
+    return details(f"All {len(refinements)} refinements and resets", table)
 
 
 def _more_numbers(steps: Sequence[Mapping], x_range: Point) -> str:
@@ -354,11 +342,7 @@ def _more_numbers(steps: Sequence[Mapping], x_range: Point) -> str:
         if (points := _points(steps, key))
     ]
     cards = "".join(f"<div><h3>{escape(chart.title)}</h3>{chart.svg()}</div>" for chart in charts)
-    return _details("Everything else that was logged", f'<div class="charts">{cards}</div>') if cards else ""
-
-
-def _details(title: str, content: str) -> str:
-    return f'<details class="card"><summary>{escape(title)}</summary>{content}</details>'
+    return details("Everything else that was logged", f'<div class="charts">{cards}</div>') if cards else ""
 
 
 def _footer(folder: Path) -> str:
@@ -376,39 +360,5 @@ def _flat(line: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _points(lines: Iterable[Mapping], key: str) -> list[Point]:
-    pairs = ((_number(line.get("step")), _number(line.get(key))) for line in lines)
+    pairs = ((number(line.get("step")), number(line.get(key))) for line in lines)
     return [(step, value) for step, value in pairs if step is not None and value is not None]
-
-
-def _number(value: object) -> float | None:
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-    return float(value) if is_number else None  # pyright: ignore[reportArgumentType]
-
-
-def _show(value: object) -> str:
-    if value is None or value == "" or (isinstance(value, float) and not math.isfinite(value)):
-        return "-"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, int):
-        return f"{value:,}" if abs(value) >= 10_000 else str(value)
-    if isinstance(value, float):
-        return f"{value:,.0f}" if value.is_integer() and abs(value) < 1e15 else f"{value:.4g}"
-    if isinstance(value, (list, tuple)):
-        return ", ".join(str(item) for item in value) or "-"
-    return str(value)
-
-
-def _size(count: float) -> str:
-    for unit, size in (("GiB", 1 << 30), ("MiB", 1 << 20), ("KiB", 1 << 10)):
-        if count >= size:
-            return f"{count / size:.1f} {unit}"
-    return f"{count:.0f} B"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"

@@ -40,6 +40,7 @@ class Plan:
     flags: list[str]  # of every job, such as --config-dir
     threads: int | None  # OpenMP threads of a job; None: whatever its machine finds right
     jobs: list[PlannedJob]
+    figures: list[str] | None = None  # of the report; None: whatever the jobs have data for
 
 
 @dataclass(frozen=True)

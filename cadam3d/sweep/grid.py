@@ -54,6 +54,7 @@ class Grid:
 
     each: Axes
     arms: dict[str, Axes]  # at least one; "" is the arm of a sweep without a grid
+    figures: list[str] | None = None  # of its report; None: whatever the jobs have data for
 
 
 @dataclass(frozen=True)
@@ -71,20 +72,24 @@ HasSetting = Callable[[Sequence[str], str], bool]
 def read_grid(node: Any) -> Grid:
     """The grid that plain dicts and lists describe; None is a grid of one nameless arm.
 
-    Raises ``UserError`` for anything but ``each`` and ``arms``.
+    Raises ``UserError`` for anything but ``each``, ``arms`` and ``figures``.
     """
     if node is None:
         return Grid(each={}, arms={"": {}})
-    if not isinstance(node, dict) or not node or not node.keys() <= {"each", "arms"}:
+    if not isinstance(node, dict) or not node or not node.keys() <= {"each", "arms", "figures"}:
         got = "|".join(map(str, node)) if isinstance(node, dict) else node
-        raise UserError(f"grid: wanted each and arms, got {got}. Try: a file that says {EXAMPLE}")
+        raise UserError(f"grid: wanted each, arms and figures, got {got}. Try: a file that says {EXAMPLE}")
     arms = node.get("arms")
     arms = {"": {}} if arms is None else arms
     if not isinstance(arms, dict) or not arms:
         raise UserError(f"grid.arms: wanted named arms, got {arms}. Try: a file that says {EXAMPLE}")
+    figures = node.get("figures")
+    if figures is not None and not (isinstance(figures, list) and all(isinstance(f, str) for f in figures)):
+        raise UserError(f"grid.figures: wanted a list of names, got {figures}. Try: figures: [frontier]")
     return Grid(
         each=_axes(node.get("each"), "grid.each"),
         arms={str(name): _axes(axes, f"grid.arms.{name}") for name, axes in arms.items()},
+        figures=figures,
     )
 
 

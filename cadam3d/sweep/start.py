@@ -32,7 +32,7 @@ from cadam3d.sweep.table import TABLE, as_text, write_table
 from cadam3d.sweep.watch import Watch
 
 PLACE = Path("multirun")
-COMPARISON = "cadam3d.commands.comparison"  # makes figures and a report of the rows of a sweep
+COMPARISON = "cadam3d.comparison"  # makes figures and a report of the rows of a sweep
 FOR_JOBS = ("--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn")  # flags that they need too
 
 
@@ -52,7 +52,14 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
         rows = rows_of(folder, jobs)
         pending = [row for row in rows if not row.has_result]
         threads = _threads(sweep.cfg, len(pending))
-        write_plan(folder, Plan(cwd=str(Path.cwd()), flags=_flags_of_jobs(flags), threads=threads, jobs=jobs))
+        plan = Plan(
+            cwd=str(Path.cwd()),
+            flags=_flags_of_jobs(flags),
+            threads=threads,
+            jobs=jobs,
+            figures=sweep.grid.figures,
+        )
+        write_plan(folder, plan)
         done = len(rows) - len(pending)
         print(f"{_jobs(len(rows))} in {shown(folder)}" + f"; {done} with a result already" * (done > 0))
         problem = ""

@@ -55,7 +55,7 @@ def run(overrides: Sequence[str], folder: Path) -> tuple[TrainState, Witness, Ou
     witness = Witness()
     trainer = replace(build_trainer(cfg, CPU), callbacks=[witness])
     state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
-    context = RunContext(folder, cfg.prompt, trainer.steps, trainer.renderer(state))
+    context = RunContext(folder, cfg.prompt, trainer.steps, trainer.renderer(state), trainer.rasterizer)
     outcome = trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context)
     return state, witness, outcome
 

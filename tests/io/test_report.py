@@ -3,6 +3,7 @@
 import base64
 import re
 from html.parser import HTMLParser
+from importlib import resources
 
 import pytest
 
@@ -240,7 +241,7 @@ def test_warnings_are_shown(tmp_path):
 
 
 def test_light_and_dark_define_the_same_colours():
-    css = (report.resources.files("cadam3d.io") / "report.css").read_text(encoding="utf-8")
+    css = (resources.files("cadam3d.io") / "report.css").read_text(encoding="utf-8")
     light, dark = css.split("@media (prefers-color-scheme: dark)")
     dark = dark[: dark.index("}")]
     assert set(re.findall(r"(--[\w-]+):", light)) == set(re.findall(r"(--[\w-]+):", dark))

@@ -1,0 +1,10 @@
+"""What a sweep says: its jobs as rows, claims about densifiers, figures, and the page that shows them."""
+
+from pathlib import Path
+
+
+def write(sweep_folder: Path) -> Path:
+    """Write ``report.html`` and ``figures/`` of a sweep, from whatever jobs are there; returns the page."""
+    from cadam3d.comparison.page import write as write_page  # matplotlib and scipy: only when they are used
+
+    return write_page(sweep_folder)

@@ -1,0 +1,103 @@
+"""Verdicts in words, generated from numbers alone: what a reader should take home, and how sure it is."""
+
+import math
+from collections.abc import Sequence
+
+from cadam3d.comparison.claims import Comparison, Standing, compare, stand, standard
+from cadam3d.comparison.figures import level_title, levels_of
+from cadam3d.comparison.rows import Row, at_noise
+
+OURS, THEIRS = "cadam", "baseline"
+
+
+def headline(rows: Sequence[Row]) -> list[str]:
+    """The paper's claim over everything, then, by noise level, where the tuned baseline stands."""
+    sentences = []
+    ours, theirs = standard(rows, OURS), standard(rows, THEIRS)
+    if ours and theirs and (comparison := compare(rows, ours, theirs)):
+        sentences.append(reduction_sentence(comparison))
+    for level in levels_of(rows):
+        here = at_noise(rows, level)
+        if ours and (standing := stand(here, ours, THEIRS)) and standing.settings > 1:
+            sentences.append(standing_sentence(standing, level))
+    return sentences
+
+
+def reduction_sentence(comparison: Comparison) -> str:
+    """How many Gaussians fewer, at which price, over how many cells, and what ended early."""
+    fewer, psnr = comparison.reduction, comparison.psnr
+    many = "fewer" if fewer.median >= 0 else "more"
+    sentence = (
+        f"{comparison.ours.name} ends with {abs(fewer.median):.1%} {many} Gaussians than "
+        f"{comparison.theirs.name} (median of {_cells(comparison.cells)}; quartiles {fewer.low:.1%} to "
+        f"{fewer.high:.1%} fewer), at {psnr.median:+.2f} dB PSNR ({psnr.low:+.2f} to {psnr.high:+.2f})"
+    )
+    if comparison.psnr_over_seeds is not None:
+        sentence += f", {comparison.psnr_over_seeds:.2f} dB spread over seeds"
+    for name, early in (
+        (comparison.ours.arm, comparison.early),
+        (comparison.theirs.arm, comparison.theirs_early),
+    ):
+        if early:
+            sentence += f"; {name} ended early in {_cells(early)}"
+    return sentence + "."
+
+
+def standing_sentence(standing: Standing, level: str = "") -> str:
+    """Where a setting lies against the whole frontier of another arm."""
+    who, whom = standing.setting.name, standing.arm
+    outside = _outside(standing)
+    if standing.psnr is None:
+        return f"{_where(level)}{who} has no equal count on {whom}'s frontier: {outside}."
+    estimate = standing.psnr
+    side = "above" if estimate.median >= 0 else "below"
+    share = f"{standing.above} of {_cells(estimate.cells)}"
+    interval = "" if estimate.low is None else f" [{estimate.low:+.2f}, {estimate.high:+.2f}]"
+    sentence = (
+        f"{_where(level)}{who} lies {abs(estimate.median):.2f} dB{interval} {side} the best of {whom}'s "
+        f"{standing.settings} thresholds at equal count, above it in {share}"
+    )
+    if not is_certain(standing):
+        sentence += ", which is no certain difference"
+    if outside:
+        sentence += f"; {outside}"
+    return sentence + needed_clause(standing) + "."
+
+
+def needed_clause(standing: Standing) -> str:
+    """How many Gaussians the other arm would need for the same quality; empty where that is unknown."""
+    ratio = standing.count_ratio
+    if ratio is None:
+        return ""
+    if math.isinf(ratio):
+        return f"; {standing.arm} reaches that PSNR at no threshold in {_cells(standing.never)}"
+    never = f", and never gets there in {_cells(standing.never)}" if standing.never else ""
+    return f"; for the same PSNR {standing.arm} needs {ratio:.2g} times as many{never}"
+
+
+def is_certain(standing: Standing) -> bool:
+    """Whether the bootstrap interval excludes zero; without an interval nothing is certain."""
+    estimate = standing.psnr
+    if estimate is None or estimate.low is None or estimate.high is None:
+        return False
+    return estimate.low > 0 or estimate.high < 0
+
+
+def _outside(standing: Standing) -> str:
+    parts = []
+    if standing.fewer:
+        parts.append(
+            f"in {_cells(standing.fewer)} it has fewer Gaussians than any of {standing.arm}'s settings"
+        )
+    if standing.more:
+        parts.append(f"in {_cells(standing.more)} it has more than any of them")
+    return " and ".join(parts)
+
+
+def _where(level: str) -> str:
+    title = level_title(level)
+    return f"{'Without noise' if title == 'no noise' else 'At ' + title}: " if title else ""
+
+
+def _cells(count: int) -> str:
+    return "1 cell" if count == 1 else f"{count} cells"

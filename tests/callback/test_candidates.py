@@ -1,0 +1,162 @@
+"""What the candidates callback draws and counts, and that it changes nothing."""
+
+from dataclasses import replace
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+
+from cadam3d.callback.candidates import OTHERS, SELECTED, Candidates, histogram, marked, pictures
+from cadam3d.commands.train import build_trainer
+from cadam3d.core.cameras import turntable
+from cadam3d.core.checks import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.io.jsonl import append_jsonl, read_jsonl
+from cadam3d.rasterizer.reference import ReferenceRasterizer
+from cadam3d.settings import component, compose
+from cadam3d.state import Outcome, RunContext
+
+CPU = torch.device("cpu")
+LINE = (
+    *("prompt=a red cube", "prior=tiny", "rasterizer=reference", "steps=7", "camera.size=12"),
+    *("initializer.count=30", "refine.start=0", "refine.end=100", "refine.interval=2"),
+    *("densifier.min_age=0", "callback=[candidates]", "callback.candidates.every=4"),
+    *("callback.candidates.size=16", "callback.candidates.azimuths_deg=[30,210]"),
+)
+CALLBACK = {
+    "every": 4,
+    "azimuths_deg": [30.0],
+    "elevation_deg": 20.0,
+    "distance": 3.0,
+    "fov_y_deg": 40.0,
+    "size": 16,
+    "background": [1.0, 1.0, 1.0],
+    "bins_per_decade": 10,
+}
+
+
+def train(folder, *, with_callback: bool):
+    cfg = compose([*LINE])
+    trainer = build_trainer(cfg, CPU)
+    if not with_callback:
+        trainer = replace(trainer, callbacks=[])
+    state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
+    context = RunContext(folder, cfg.prompt, trainer.steps, trainer.renderer(state), trainer.rasterizer)
+    assert trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context) is Outcome.FINISHED
+    return state
+
+
+def test_a_run_that_is_looked_at_equals_one_that_is_not(tmp_path):
+    watched, alone = train(tmp_path, with_callback=True), train(tmp_path, with_callback=False)
+    assert len(watched.gaussians) != 30, "nothing grew: the test would say little"
+    for name, tensor in alone.gaussians.tensors().items():
+        assert torch.equal(watched.gaussians.tensors()[name], tensor), name
+    for name, rows in alone.densifier.to_dict().items():
+        assert torch.equal(watched.densifier.to_dict()[name], rows), name
+    for name, generator in alone.generators.items():
+        assert torch.equal(watched.generators[name].get_state(), generator.get_state()), name
+
+
+def test_pictures_come_at_multiples_and_histograms_at_every_refinement(tmp_path):
+    train(tmp_path, with_callback=True)
+    assert [step for step, _ in pictures(tmp_path)] == [4]
+    lines = read_jsonl(tmp_path / "candidates/histograms.jsonl")
+    assert {line["step"] for line in lines} == {2, 4, 6}
+    assert {line["score"] for line in lines} >= {"snr", "drift"}
+
+
+def test_a_picture_is_a_look_and_a_mask_for_each_view(tmp_path):
+    train(tmp_path, with_callback=True)
+    image = imageio.imread(pictures(tmp_path)[0][1])
+    assert image.shape == (16, 2 * 16 * 2, 3)
+
+
+def test_the_population_is_counted_whole_in_every_histogram(tmp_path):
+    state = train(tmp_path, with_callback=True)
+    lines = read_jsonl(tmp_path / "candidates/histograms.jsonl")
+    for line in lines:
+        assert all(s <= n for s, n in zip(line["selected"], line["counts"], strict=True))
+    first = [line for line in lines if line["step"] == 2]
+    assert {sum(line["counts"]) + line["without_log"] for line in first} == {state.num_initial}
+
+
+def test_what_a_killed_run_had_written_is_dropped(tmp_path):
+    folder = tmp_path / "candidates"
+    folder.mkdir()
+    (folder / "step_000099.png").write_bytes(b"old")
+    append_jsonl(folder / "histograms.jsonl", {"step": 99, "score": "old"})
+    train(tmp_path, with_callback=True)
+    assert 99 not in [step for step, _ in pictures(tmp_path)]
+    assert "old" not in {line["score"] for line in read_jsonl(folder / "histograms.jsonl")}
+
+
+def test_selected_gaussians_are_drawn_in_one_colour_and_the_others_in_another():
+    gaussians = Gaussians(
+        means=torch.tensor([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0]]),
+        log_scales=torch.full((2, 3), -2.0),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2),
+        opacity_logits=torch.full((2,), 9.0),
+        sh=torch.randn(2, 4, 3, generator=torch.Generator().manual_seed(0)),
+    )
+    camera = turntable(1, elevation_deg=0.0, distance=3.0, fov_y_deg=40.0, size=33)
+    painted = marked(gaussians, torch.tensor([True, False]))
+    image = ReferenceRasterizer().render(painted, camera, torch.ones(1, 3)).rgb[0]
+    columns = [int(x) for x in (16.5 + 0.5 / 3 * camera.intrinsics[0, 0, 0] * torch.tensor([-1, 1])).tolist()]
+    seen = image[16, columns]  # the camera stands on +x and looks back: +y is at its right
+    assert torch.allclose(seen, torch.tensor([SELECTED, OTHERS]), atol=0.03)
+
+
+def test_bins_hold_what_their_edges_say():
+    values = torch.tensor([0.0, 0.99e-2, 1.01e-2, 0.5, 0.99, 1.01, 9.9, float("inf")])
+    line = histogram(values, values > 0.9, bins_per_decade=1)
+    assert line == {
+        "bins_per_decade": 1,
+        "first": -3,
+        "counts": [1, 1, 2, 2],  # from 0.001, 0.01, 0.1 and 1 on
+        "selected": [0, 0, 1, 2],
+        "without_log": 2,
+    }
+
+
+def test_bins_do_not_depend_on_the_data():
+    """So that histograms of two runs, or of two steps, can be added."""
+    generator = torch.Generator().manual_seed(0)
+    values = torch.rand(500, generator=generator).double().exp()
+    nobody = torch.zeros(500, dtype=torch.bool)
+    whole = histogram(values, nobody, 10)
+    lines = [histogram(part, nobody[:250], 10) for part in values.sort().values.split(250)]
+    total = np.zeros(60, dtype=int)
+    for line in lines:
+        at = line["first"] - whole["first"]
+        total[at : at + len(line["counts"])] += line["counts"]
+    assert total[: len(whole["counts"])].tolist() == whole["counts"]
+    assert total.sum() == 500
+
+
+def test_an_extreme_value_does_not_blow_a_histogram_up():
+    values = torch.tensor([1e-38, 1.0, 1e38])
+    line = histogram(values, torch.zeros(3, dtype=torch.bool), bins_per_decade=10)
+    assert len(line["counts"]) == 180
+    assert sum(line["counts"]) == 3
+
+
+def test_no_gaussian_no_bin():
+    line = histogram(torch.empty(0), torch.empty(0, dtype=torch.bool), bins_per_decade=10)
+    assert line["counts"] == line["selected"] == []
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("every", 0),
+        ("azimuths_deg", []),
+        ("elevation_deg", 100.0),
+        ("distance", 0.0),
+        ("size", 0),
+        ("bins_per_decade", 0),
+    ],
+)
+def test_settings_that_cannot_be_are_refused_by_name(key, value):
+    with pytest.raises(UserError, match=rf"callback\.candidates\.{key}"):
+        Candidates(**{**CALLBACK, key: value})

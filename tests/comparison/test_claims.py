@@ -1,0 +1,268 @@
+"""What is claimed of hand-made rows: comparisons, frontiers, and one against the other."""
+
+import math
+
+import numpy as np
+import pytest
+
+from cadam3d.comparison.claims import (
+    Estimate,
+    Hull,
+    Spread,
+    compare,
+    frontier,
+    has_no_growth,
+    over_seeds,
+    settings_of,
+    stand,
+    standard,
+    standings,
+)
+from cadam3d.comparison.rows import Cell, Setting, at_noise, read
+
+OURS, THEIRS = Setting("cadam"), Setting("baseline")
+
+
+def pair(jobs, ours, theirs, **cell):
+    """One cell with both arms; ``ours`` and ``theirs`` are count and PSNR."""
+    line = [f"{key}={value}" for key, value in cell.items()]
+    for arm, (n, psnr) in (("cadam", ours), ("baseline", theirs)):
+        jobs.add(arm, *line, n=n, psnr=psnr)
+
+
+def cell(prompt: str, seed: int) -> Cell:
+    return Cell((("prompt", prompt), ("seed", str(seed))))
+
+
+def test_reduction_and_difference_are_paired_within_cells(jobs):
+    pair(jobs, (100, 20.0), (1000, 21.0), prompt="a cube", seed=0)
+    pair(jobs, (100, 30.0), (200, 30.5), prompt="a torus", seed=0)
+    pair(jobs, (100, 10.0), (400, 10.1), prompt="a tower", seed=0)
+    found = compare(read(jobs.folder), OURS, THEIRS)
+    assert found is not None
+    assert found.cells == 3
+    assert found.reduction.median == pytest.approx(0.75)
+    assert found.psnr.median == pytest.approx(-0.5)  # the difference of the medians would be -1
+    assert found.ssim is not None
+    assert found.ssim.median == pytest.approx(0)
+
+
+def test_a_cell_without_its_partner_is_counted_not_compared(jobs):
+    pair(jobs, (100, 20.0), (1000, 21.0), seed=0)
+    jobs.add("cadam", "seed=1", n=100, psnr=20.0)
+    jobs.add("baseline", "seed=1", n=100, psnr=20.0, outcome="failed")
+    found = compare(read(jobs.folder), OURS, THEIRS)
+    assert found is not None
+    assert (found.cells, found.unpaired) == (1, 1)
+
+
+def test_an_early_end_is_compared_and_told(jobs):
+    jobs.add("cadam", n=100, psnr=20.0)
+    jobs.add("baseline", n=1000, psnr=19.0, outcome="max_gaussians")
+    found = compare(read(jobs.folder), OURS, THEIRS)
+    assert found is not None
+    assert (found.early, found.theirs_early) == (0, 1)
+
+
+def test_nothing_shared_nothing_compared(jobs):
+    jobs.add("cadam", "seed=0", n=100, psnr=20.0)
+    jobs.add("baseline", "seed=1", n=100, psnr=20.0)
+    assert compare(read(jobs.folder), OURS, THEIRS) is None
+
+
+def test_the_spread_over_seeds_leaves_out_that_of_prompts():
+    values = {cell("a", 0): 1.0, cell("a", 1): 3.0, cell("b", 0): 101.0, cell("b", 1): 105.0}
+    assert over_seeds(values) == pytest.approx((math.sqrt(2) + 2 * math.sqrt(2)) / 2)
+    assert over_seeds({cell("a", 0): 1.0, cell("b", 0): 2.0}) is None
+
+
+def test_quartiles_of_one_value_are_that_value():
+    assert Spread.of([3.0]) == Spread(3.0, 3.0, 3.0)
+
+
+# Hulls: the best that an arm can do.
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_hull_is_above_every_setting_rising_and_concave(seed):
+    rng = np.random.default_rng(seed)
+    points = [(float(10 ** rng.uniform(2, 5)), float(rng.uniform(10, 30))) for _ in range(9)]
+    hull = Hull(points)
+    assert all(hull.psnr_at(n) >= psnr - 1e-9 for n, psnr in points)
+    slopes = [
+        (y1 - y0) / (x1 - x0) for (x0, y0), (x1, y1) in zip(hull.corners, hull.corners[1:], strict=False)
+    ]
+    assert all(slope >= 0 for slope in slopes)
+    assert slopes == sorted(slopes, reverse=True)
+
+
+def test_a_hull_touches_settings_only():
+    points = [(100.0, 10.0), (1000.0, 20.0), (10000.0, 22.0)]
+    assert [10**x for x, _ in Hull(points).corners] == pytest.approx([n for n, _ in points])
+
+
+def test_between_settings_a_hull_is_straight_in_log_count():
+    hull = Hull([(100.0, 10.0), (10000.0, 20.0)])
+    assert hull.psnr_at(1000.0) == pytest.approx(15.0)
+    assert hull.count_for(15.0) == pytest.approx(1000.0)
+
+
+def test_a_setting_under_the_line_of_others_does_not_pull_a_hull_down():
+    assert Hull([(100.0, 10.0), (1000.0, 11.0), (10000.0, 20.0)]).psnr_at(1000.0) == pytest.approx(15.0)
+
+
+def test_more_gaussians_that_only_hurt_leave_a_hull_level():
+    hull = Hull([(100.0, 10.0), (1000.0, 20.0), (10000.0, 5.0)])
+    assert hull.psnr_at(10000.0) == pytest.approx(20.0)
+    assert hull.count_for(20.0) == pytest.approx(1000.0)
+
+
+def test_nothing_is_extrapolated():
+    hull = Hull([(100.0, 10.0), (1000.0, 20.0)])
+    assert hull.psnr_at(99.0) is None
+    assert hull.psnr_at(1001.0) is None
+    assert hull.count_for(9.0) is None
+    assert hull.count_for(21.0) == math.inf
+    assert hull.psnr_at(100.0) == pytest.approx(10.0)
+    assert hull.psnr_at(1000.0) == pytest.approx(20.0)
+
+
+def test_one_setting_is_a_hull_of_one_point():
+    hull = Hull([(100.0, 10.0)])
+    assert hull.psnr_at(100.0) == pytest.approx(10.0)
+    assert hull.psnr_at(101.0) is None
+
+
+# Frontier against frontier.
+
+
+def baseline_frontier(jobs, settings, **where):
+    line = [f"{key}={value}" for key, value in where.items()]
+    for tau, (n, psnr) in settings.items():
+        jobs.add("baseline", f"densifier.tau_pos={tau}", *line, n=n, psnr=psnr)
+
+
+def test_a_setting_stands_against_the_best_of_the_other_at_its_count(jobs):
+    for prompt, shift in (("a cube", 0.0), ("a torus", 5.0), ("a tower", -5.0)):
+        where = {"prompt": prompt, "seed": 0}
+        baseline_frontier(jobs, {0.001: (100, 10.0 + shift), 0.0002: (10000, 20.0 + shift)}, **where)
+        jobs.add("cadam", f"prompt={prompt}", "seed=0", n=1000, psnr=17.5 + shift)
+    found = stand(read(jobs.folder), OURS, "baseline")
+    assert found is not None
+    assert found.psnr is not None
+    assert found.psnr.median == pytest.approx(2.5)
+    assert found.psnr.low == found.psnr.high == pytest.approx(2.5)
+    assert (found.above, found.fewer, found.more, found.never) == (3, 0, 0, 0)
+    assert found.count_ratio == pytest.approx(10**0.5)
+
+
+def test_what_is_outside_the_range_is_said_not_guessed(jobs):
+    for seed, n in enumerate((50, 1000, 50000)):
+        baseline_frontier(jobs, {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, seed=seed)
+        jobs.add("cadam", f"seed={seed}", n=n, psnr=25.0)
+    found = stand(read(jobs.folder), OURS, "baseline")
+    assert found is not None
+    assert found.psnr is not None
+    assert (found.psnr.cells, found.fewer, found.more) == (1, 1, 1)
+    assert found.never == 3
+    assert found.count_ratio == math.inf
+
+
+def test_no_setting_stands_above_its_own_frontier(bench_rows):
+    rows = at_noise(bench_rows, "medium")
+    for arm in ("baseline", "cadam"):
+        for found in standings(rows, arm, arm):
+            assert found.psnr is not None
+            assert found.psnr.median <= 1e-9
+
+
+def test_a_ratio_of_counts_is_free_of_their_scale(jobs):
+    for seed, scale in enumerate((1, 7)):
+        baseline_frontier(jobs, {0.001: (100 * scale, 10.0), 0.0002: (10000 * scale, 20.0)}, seed=seed)
+        jobs.add("cadam", f"seed={seed}", n=1000 * scale, psnr=16.0)
+    found = stand(read(jobs.folder), OURS, "baseline")
+    assert found is not None
+    assert found.count_ratio == pytest.approx(10**0.2)
+    assert found.psnr is not None
+    assert found.psnr.median == pytest.approx(1.0)
+
+
+# How sure.
+
+
+def test_a_constant_has_an_interval_of_no_width():
+    found = Estimate.of({cell(prompt, 0): 1.0 for prompt in "abcd"})
+    assert (found.median, found.low, found.high) == (1.0, 1.0, 1.0)
+    assert found.p_value == pytest.approx(2 * 0.5**4)
+
+
+def test_seeds_are_no_prompts():
+    """Many seeds of two prompts witness for two prompts: no interval, and a sign test of two."""
+    found = Estimate.of({cell(prompt, seed): 1.0 for prompt in "ab" for seed in range(50)})
+    assert found.low is found.high is None
+    assert found.p_value == pytest.approx(0.5)
+
+
+def test_an_interval_covers_the_truth_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    hits = 0
+    for _ in range(60):
+        values = {cell(str(prompt), 0): float(rng.standard_normal()) for prompt in range(12)}
+        found = Estimate.of(values)
+        assert found.low is not None
+        assert found.high is not None
+        hits += found.low <= 0 <= found.high
+    assert 50 <= hits <= 60
+
+
+def test_same_rows_same_interval():
+    values = {cell(prompt, seed): float(ord(prompt) * seed % 7) for prompt in "abcdef" for seed in range(3)}
+    assert Estimate.of(values) == Estimate.of(dict(reversed(values.items())))
+
+
+# Frontiers over cells.
+
+
+def test_gains_are_counted_from_the_same_cell_without_growth(jobs):
+    for prompt, zero in (("a cube", 10.0), ("a torus", 30.0)):
+        jobs.add("none", f"prompt={prompt}", n=100, psnr=zero)
+        jobs.add("cadam", f"prompt={prompt}", n=200, psnr=zero + 2.0)
+    rows = read(jobs.folder)
+    assert has_no_growth(rows)
+    point = frontier(rows, "cadam")[0]
+    assert point.gain == Spread(2.0, 2.0, 2.0)
+    assert (point.count.median, point.cells) == (200, 2)
+
+
+def test_without_a_job_without_growth_it_is_plain_psnr(jobs):
+    jobs.add("cadam", n=200, psnr=12.0)
+    assert frontier(read(jobs.folder), "cadam")[0].gain.median == 12.0
+
+
+def test_a_cell_that_lacks_its_job_without_growth_is_left_out(jobs):
+    jobs.add("none", "seed=0", n=100, psnr=10.0)
+    for seed in (0, 1):
+        jobs.add("cadam", f"seed={seed}", n=200, psnr=12.0 + 10 * seed)
+    point = frontier(read(jobs.folder), "cadam")[0]
+    assert (point.cells, point.gain.median) == (1, 2.0)
+
+
+def test_gains_of_one_level_can_be_counted_from_another(jobs):
+    """So that the curve without noise can be drawn where there is noise."""
+    jobs.add("none", "noise=strong", n=100, psnr=10.0)
+    jobs.add("none", "noise=none", n=100, psnr=15.0)
+    jobs.add("cadam", "noise=none", n=200, psnr=18.0)
+    rows = read(jobs.folder)
+    clean, noisy = at_noise(rows, "none"), at_noise(rows, "strong")
+    assert frontier(clean, "cadam")[0].gain.median == pytest.approx(3.0)
+    assert frontier(clean, "cadam", zero=noisy)[0].gain.median == pytest.approx(8.0)
+
+
+def test_the_standard_setting_is_the_shipped_one_or_the_only_one(jobs):
+    jobs.add("baseline", "densifier.tau_pos=0.001", n=100, psnr=20.0)
+    assert standard(read(jobs.folder), "baseline") == Setting("baseline")
+    jobs.add("baseline", "densifier.tau_pos=0.004", n=100, psnr=20.0)
+    assert standard(read(jobs.folder), "baseline") is None
+    jobs.add("baseline", "densifier.tau_pos=0.0002", n=100, psnr=20.0)
+    assert standard(read(jobs.folder), "baseline") == Setting("baseline", (("tau_pos", 0.0002),))
+    assert len(settings_of(read(jobs.folder), "baseline")) == 3

@@ -1,0 +1,210 @@
+"""Figures show the rows they are given, and nothing where there is nothing."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+
+from cadam3d.comparison import figures, pictures
+from cadam3d.comparison.page import FIGURES
+from cadam3d.comparison.rows import at_noise, read
+from cadam3d.comparison.style import DARK, css, inline, looks, spread_labels, styled, write_figure
+
+
+def texts(figure) -> str:
+    return " | ".join(
+        text.get_text() for text in figure.findobj(match=lambda each: hasattr(each, "get_text"))
+    )
+
+
+def draw(name, rows):
+    with styled():
+        return FIGURES[name][0](rows)
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_no_jobs_no_figure(name):
+    assert draw(name, []) is None
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_jobs_that_failed_before_they_wrote_anything_make_no_figure(name, jobs):
+    jobs.add("cadam", n=0, psnr=None, outcome="failed")
+    assert draw(name, read(jobs.folder)) is None
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_jobs_without_any_file_but_the_summary_are_no_trouble(name, jobs):
+    for arm in ("cadam", "baseline"):
+        for guidance in ("sds", "ism"):
+            jobs.add(arm, f"guidance={guidance}", n=100, psnr=20.0)
+    draw(name, read(jobs.folder))
+
+
+def test_a_frontier_has_a_panel_per_noise_level_and_names_thresholds(bench_rows):
+    figure = draw("frontier", bench_rows)
+    assert [axes.get_title(loc="left") for axes in figure.axes] == [
+        "no noise",
+        "medium noise",
+        "strong noise",
+    ]
+    said = texts(figure)
+    for expected in ("0.0002", "0.004", "baseline: tau_pos", "cadam: tau_Q, tau_SNR", "without noise"):
+        assert expected in said
+
+
+def test_a_frontier_puts_each_setting_where_its_median_is(jobs):
+    for seed, psnr in enumerate((20.0, 21.0, 22.0)):
+        jobs.add("cadam", f"seed={seed}", n=1000 * (seed + 1), psnr=psnr)
+        jobs.add("none", f"seed={seed}", n=100, psnr=18.0)
+    marks = [
+        tuple(float(x) for x in (*line.get_xdata(), *line.get_ydata()))
+        for line in draw("frontier", read(jobs.folder)).axes[0].lines
+        if line.get_marker() not in (None, "None", "")
+    ]
+    assert marks == [(100.0, 0.0), (2000.0, 3.0)]
+
+
+def test_a_setting_that_lacks_cells_is_hollow_and_an_early_end_has_a_dagger(jobs):
+    for seed in (0, 1):
+        jobs.add("baseline", "densifier.tau_pos=0.0002", f"seed={seed}", n=1000, psnr=20.0)
+    jobs.add("baseline", "densifier.tau_pos=0.001", "seed=0", n=500, psnr=19.0, outcome="max_gaussians")
+    figure = draw("frontier", read(jobs.folder))
+    fills = {
+        float(line.get_xdata()[0]): line.get_markerfacecolor()
+        for line in figure.axes[0].lines
+        if line.get_marker() == "o"
+    }
+    assert fills == {1000.0: "#d55e00", 500.0: "#ffffff"}
+    assert "0.001\u2020" in texts(figure)
+    assert "0.0002\u2020" not in texts(figure)
+
+
+def test_growth_is_the_median_over_cells_at_each_step():
+    steps, low, middle, high = figures.over_time(
+        [[(0, 100), (50, 100), (50, 200)], [(0, 100), (50, 100), (50, 400)], [(0, 100), (100, 300)]]
+    )
+    assert steps.tolist() == [0, 50, 100]
+    assert middle.tolist() == [100, 200, 300]
+    assert (low <= middle).all()
+    assert (middle <= high).all()
+
+
+def test_a_job_that_ended_early_keeps_its_count():
+    assert figures.over_time([[(0, 100), (10, 500)], [(0, 100), (20, 100)]])[2].tolist() == [100, 300, 300]
+
+
+def test_shares_of_an_snr_map_add_to_one_at_every_step(bench_rows):
+    rows = [row for row in at_noise(bench_rows, "medium") if row.arm == "cadam"]
+    heat = figures.SnrMap(rows)
+    assert heat.steps == [40, 80, 120]
+    assert np.allclose(heat.shares.sum(axis=0), 1)
+    assert heat.tau == 0.1
+    assert heat.floor == pytest.approx(0.2294, abs=1e-4)
+
+
+def test_the_noise_floor_is_what_white_noise_leaves():
+    rng = np.random.default_rng(0)
+    m, v = np.zeros((4000, 3)), np.zeros((4000, 3))
+    for _ in range(3000):  # until the second moment has forgotten that it began at zero
+        gradient = rng.standard_normal((4000, 3))
+        m, v = 0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient**2
+    snr = np.linalg.norm(m, axis=1) / np.sqrt(v.sum(axis=1) / (1 - 0.999**3000))
+    assert np.sqrt((snr**2).mean()) == pytest.approx(figures.noise_floor(0.9, 0.999), rel=0.02)
+
+
+def test_a_short_second_moment_has_no_such_floor():
+    assert figures.noise_floor(0.9, 0.81) is None
+    assert figures.noise_floor(None, 0.999) is None
+
+
+def test_the_arm_with_two_thresholds_is_found(bench_rows):
+    assert figures.arm_of_two_thresholds(bench_rows) == "cadam"
+    figure = draw("thresholds", bench_rows)
+    assert len(figure.axes) == 6
+    assert figure.axes[0].get_xlabel() == "tau_Q"
+
+
+def test_masks_show_arms_by_steps(bench_rows):
+    figure = draw("masks", bench_rows)
+    assert len(figure.axes) == 9
+    assert "10 of 100" in texts(figure)
+    assert "medium noise" in texts(figure)
+
+
+def test_a_mask_is_the_right_half_of_a_pair(bench_rows):
+    pair = np.arange(2 * 4 * 4 * 3).reshape(4, 8, 3)
+    assert (pictures.mask_of(pair) == pair[:, 4:]).all()
+
+
+def test_pictures_of_a_preview_are_cut_apart(bench_rows):
+    row = next(row for row in bench_rows if row.arm == "cadam")
+    assert [picture.shape for picture in pictures.views(row)] == [(12, 12, 3)] * 3
+
+
+def test_regimes_are_shown_in_the_cell_that_has_them_all(jobs):
+    for seed, settings in ((0, {0.9: 500}), (1, {0.95: 400, 0.9: 500, 0.7: 900})):
+        for tau, n in settings.items():
+            keys = (f"densifier.tau_Q={tau}", f"densifier.tau_SNR={0.1 if tau == 0.9 else 0.3}")
+            jobs.files(jobs.add("cadam", *keys, f"seed={seed}", n=n, psnr=20.0), n)
+    said = texts(draw("regimes", read(jobs.folder)))
+    assert "seed 1" in said
+    assert "fewest: tau_Q 0.95" in said
+    assert "standard: tau_Q 0.9" in said
+
+
+def test_an_ablation_tells_count_quality_and_outcome(bench_rows):
+    said = texts(draw("ablation", bench_rows))
+    assert said.count("Gaussians\n") == 3
+    assert "finished" in said
+
+
+def test_objectives_need_two_of_them(bench_rows, jobs):
+    assert draw("objectives", bench_rows) is None
+    for arm in ("baseline", "cadam"):
+        for guidance in ("sds", "vfds"):
+            jobs.files(jobs.add(arm, f"guidance={guidance}", n=500, psnr=21.0), 500)
+    figure = draw("objectives", read(jobs.folder))
+    assert len(figure.axes) == 4
+    assert "VFDS" in texts(figure)
+    assert "500, 21.00 dB" in texts(figure)
+
+
+def test_an_arm_looks_the_same_in_every_figure_and_arms_look_different():
+    few, many = looks(["cadam", "baseline"]), looks(["none", "cadam", "baseline", "cadam_calibrated", "mcmc"])
+    assert few["cadam"] == many["cadam"]
+    assert len({look.color for look in many.values()}) == len({look.marker for look in many.values()}) == 5
+
+
+def test_labels_keep_their_distance_and_their_order():
+    moved = spread_labels({"a": 0.0, "b": 0.1, "c": 5.0}, least=1.0)
+    assert moved["b"] - moved["a"] >= 1.0 - 1e-12
+    assert moved["c"] > moved["b"]
+    assert sum(moved.values()) == pytest.approx(5.1)
+
+
+def test_written_figures_keep_their_text_and_leave_colours_to_the_page(tmp_path, bench_rows):
+    rows = bench_rows
+    with styled():
+        svg = write_figure(draw("growth", rows), tmp_path, "growth")
+        again = write_figure(draw("growth", rows), tmp_path, "growth")
+    assert svg == again
+    assert (tmp_path / "growth.png").stat().st_size > 1000
+    assert re.search(r"<text[^>]*>\s*cadam\s*</text>", svg)
+    page = inline(svg)
+    assert page.startswith("<svg")
+    assert "<?xml" not in page
+    for color in DARK:
+        assert color not in re.sub(r"var\([^)]*\)", "", page)
+    named = set(re.findall(r"var\(--(arm-\w+)", page))
+    assert named <= set(re.findall(r"--(arm-\w+):", css()))
+    assert named
+
+
+def test_numbers_on_a_log_axis_are_plain(bench_rows):
+    figure = draw("growth", bench_rows)
+    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert "1k" in labels
+    assert not any("10^" in label for label in labels)
+    assert all(math.isfinite(value) for value in figure.axes[0].get_ylim())

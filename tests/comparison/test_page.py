@@ -1,0 +1,160 @@
+"""The report of a sweep stands alone, says what failed, and believes nothing that a user typed."""
+
+import csv
+import json
+import re
+import shlex
+
+import pytest
+import yaml
+
+from cadam3d import comparison
+from cadam3d.comparison import page, tables
+from cadam3d.comparison.rows import read
+from cadam3d.core.checks import UserError
+
+
+@pytest.fixture(scope="module")
+def whole(bench):
+    (bench / "multirun.yaml").write_text(
+        yaml.safe_dump({"hydra": {"overrides": {"task": ["grid=pareto", "prompt='a <b>cube</b>'"]}}})
+    )
+    return comparison.write(bench).read_text(encoding="utf-8")
+
+
+def text_of(html: str) -> str:
+    return " ".join(re.sub(r"<[^>]*>", " ", html).split())
+
+
+def test_a_whole_comparison_has_verdict_figures_tables_failures_and_command(whole, bench):
+    said = text_of(whole)
+    for expected in (
+        *("finished 144", "failed 1", "3 noise levels"),
+        *(
+            "fewer Gaussians than baseline (tau_pos 0.0002)",
+            "At strong noise: cadam (tau_Q 0.9, tau_SNR 0.1)",
+        ),
+        *("Quality against count", "Gaussians over time", "Whom each arm chose", "Arm by arm"),
+        *("Ended early, failed or not done", "failed (no &lt;b&gt;)", "All 146 jobs"),
+    ):
+        assert expected in said, expected
+    assert "cadam3d sweep grid=pareto" in said
+
+
+def test_figures_and_tables_lie_beside_it(whole, bench):
+    names = {path.name for path in (bench / "figures").iterdir()}
+    drawn = {"frontier", "growth", "snr", "masks", "thresholds", "regimes", "ablation"}
+    assert {f"{name}.{kind}" for name in drawn for kind in ("svg", "png")} <= names
+    assert {"objectives.csv", "frontiers.csv", "standings.csv"} <= names
+    with (bench / "figures/frontiers.csv").open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 3 * 8
+    assert {line["noise"] for line in lines} == {"none", "medium", "strong"}
+
+
+def test_it_needs_nothing_from_elsewhere_and_runs_nothing(whole):
+    assert "<script" not in whole
+    assert not re.findall(r'(?:src|href)="https?:', re.sub(r'xmlns(:\w+)?="[^"]*"', "", whole))
+    assert not re.findall(r"@import|url\(http", whole)
+
+
+def test_every_job_links_to_its_own_report(whole, bench):
+    links = set(re.findall(r'href="([^"]*)/report\.html"', whole))
+    assert links == {row.folder.name for row in read(bench)}
+
+
+def test_ids_are_not_shared_between_figures(whole):
+    ids = re.findall(r'<clipPath id="([^"]*)"', whole)
+    assert len(ids) == len(set(ids)) > 0
+
+
+def test_half_a_sweep_has_a_page_too(jobs):
+    folder = jobs.add("cadam", n=100, psnr=20.0)
+    jobs.add("baseline", n=1000, psnr=20.5)
+    (folder / "summary.json").unlink()
+    said = text_of(comparison.write(jobs.folder).read_text(encoding="utf-8"))
+    assert "1 jobs are not done" in said
+    assert "baseline" in said
+
+
+def test_a_sweep_whose_jobs_all_failed_has_a_page_too(jobs):
+    jobs.add("cadam", n=0, psnr=None, outcome="failed", message="out of luck")
+    assert "failed (out of luck)" in text_of(comparison.write(jobs.folder).read_text(encoding="utf-8"))
+
+
+def test_nothing_that_a_user_typed_becomes_markup(jobs):
+    nasty = "<i>&"
+    folder = jobs.add("cadam", n=100, psnr=20.0, outcome="failed", message=nasty)
+    (folder / ".hydra/overrides.yaml").write_text(json.dumps(["densifier=cadam", f"prompt='{nasty}'"]))
+    jobs.add("cadam", "seed=1", n=100, psnr=20.0)
+    assert nasty not in comparison.write(jobs.folder).read_text(encoding="utf-8")
+
+
+def test_a_folder_without_jobs_is_refused(tmp_path):
+    with pytest.raises(UserError, match="without jobs"):
+        comparison.write(tmp_path)
+
+
+def test_the_plan_of_a_sweep_may_name_its_figures(jobs):
+    folder = jobs.add("cadam", n=100, psnr=20.0)
+    jobs.files(folder, 100)
+    planned = {"folder": folder.name, "arm": "paper", "overrides": ["densifier=cadam", "seed=0"]}
+    plan = jobs.folder / "jobs.json"
+    plan.write_text(json.dumps({"jobs": [planned], "figures": ["growth"]}))
+    said = text_of(comparison.write(jobs.folder).read_text(encoding="utf-8"))
+    assert "Gaussians over time" in said
+    assert "Signal to noise" not in said
+    assert "cadam3d train densifier=cadam seed=0" in said
+    plan.write_text(json.dumps({"jobs": [planned], "figures": ["pie"]}))
+    with pytest.raises(UserError, match="pie"):
+        comparison.write(jobs.folder)
+
+
+def test_commands_can_be_pasted():
+    words = ["densifier=cadam", "prompt='a cube'", "prompt='it''s $5'", "seed=0"]
+    assert [shlex.split(page.for_shell(word)) for word in words] == [[word] for word in words]
+    assert page.for_shell("prompt='a cube'") == "\"prompt='a cube'\""
+
+
+def test_a_figure_can_be_asked_for_by_name(jobs):
+    jobs.files(jobs.add("cadam", n=100, psnr=20.0), 100)
+    page.write(jobs.folder, ["snr"])
+    assert sorted(path.stem for path in (jobs.folder / "figures").glob("*.svg")) == ["snr"]
+
+
+def test_light_and_dark_define_the_same_arms():
+    light, dark = page.css().split("@media")
+    assert set(re.findall(r"(--arm-\w+):", light)) == set(re.findall(r"(--arm-\w+):", dark)) != set()
+
+
+# Tables.
+
+
+def test_the_key_table_has_a_line_per_objective_level_and_arm(jobs):
+    for guidance in ("sds", "ism"):
+        for arm, n in (("baseline", 1000), ("cadam", 100)):
+            jobs.add(arm, f"guidance={guidance}", n=n, psnr=20.0)
+    lines = tables.objectives_table(read(jobs.folder))
+    assert [(line["objective"], line["arm"]) for line in lines] == [
+        *(("ism", "baseline"), ("ism", "cadam"), ("sds", "baseline"), ("sds", "cadam")),
+    ]
+    assert lines[1]["fewer than baseline"] == "90.0%"
+    assert lines[1]["MiB"] == pytest.approx(68 * 100 / 2**20, abs=1e-3)
+
+
+def test_columns_that_say_nothing_are_left_out(jobs):
+    jobs.add("cadam", n=100, psnr=20.0)
+    lines = tables.objectives_table(read(jobs.folder))
+    assert "noise" not in lines[0]
+    assert "fewer than baseline" not in lines[0]
+
+
+def test_numbers_of_a_column_have_the_same_decimals():
+    html = tables.as_html([{"PSNR": 20.9, "n": 12345}, {"PSNR": 21.25, "n": 1}])
+    assert re.findall(r"<td>([^<]*)</td>", html) == ["20.90", "12,345", "21.25", "1"]
+
+
+def test_standings_need_a_frontier(jobs):
+    jobs.add("cadam", n=100, psnr=20.0)
+    jobs.add("baseline", n=1000, psnr=20.0)
+    assert tables.standings_table(read(jobs.folder)) == []

@@ -1,0 +1,72 @@
+"""Sentences say what the numbers say, no more."""
+
+from cadam3d.comparison.rows import read
+from cadam3d.comparison.words import headline
+
+
+def cells(jobs, ours, baseline, prompts=("a cube", "a torus", "a tower"), noise="medium"):
+    for prompt in prompts:
+        for tau, (n, psnr) in baseline.items():
+            jobs.add(
+                "baseline", f"densifier.tau_pos={tau}", f"prompt={prompt}", f"noise={noise}", n=n, psnr=psnr
+            )
+        jobs.add("cadam", f"prompt={prompt}", f"noise={noise}", n=ours[0], psnr=ours[1])
+
+
+def test_the_paper_s_claim_comes_first_then_the_tuned_baseline(jobs):
+    cells(jobs, (1000, 17.5), {0.001: (100, 10.0), 0.0002: (10000, 20.0)})
+    first, second = headline(read(jobs.folder))
+    assert first.startswith(
+        "cadam ends with 90.0% fewer Gaussians than baseline (tau_pos 0.0002) (median of 3"
+    )
+    assert "at -2.50 dB PSNR" in first
+    assert second.startswith(
+        "At medium noise: cadam lies 2.50 dB [+2.50, +2.50] above the best of baseline's 2"
+    )
+    assert "above it in 3 of 3 cells; for the same PSNR baseline needs 3.2 times as many" in second
+
+
+def test_more_gaussians_are_called_more(jobs):
+    cells(jobs, (2000, 20.0), {0.0002: (1000, 20.0)})
+    assert headline(read(jobs.folder))[0].startswith("cadam ends with 100.0% more Gaussians")
+
+
+def test_a_worse_setting_is_called_worse(jobs):
+    cells(jobs, (1000, 12.0), {0.001: (100, 10.0), 0.0002: (10000, 20.0)})
+    assert "3.00 dB [-3.00, -3.00] below the best" in headline(read(jobs.folder))[1]
+
+
+def test_a_difference_that_chance_explains_is_not_claimed(jobs):
+    for prompt, psnr in (("a cube", 14.0), ("a torus", 15.1), ("a tower", 16.0)):
+        cells(jobs, (1000, psnr), {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, prompts=[prompt])
+    assert "no certain difference" in headline(read(jobs.folder))[1]
+
+
+def test_two_prompts_are_too_few_to_be_certain(jobs):
+    cells(jobs, (1000, 19.0), {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, prompts=("a cube", "a torus"))
+    sentence = headline(read(jobs.folder))[1]
+    assert "no certain difference" in sentence
+    assert "[" not in sentence
+
+
+def test_an_early_end_is_told(jobs):
+    jobs.add("cadam", n=100, psnr=20.0)
+    jobs.add("baseline", n=1000, psnr=19.0, outcome="out_of_memory")
+    assert headline(read(jobs.folder))[0].endswith("; baseline ended early in 1 cell.")
+
+
+def test_an_unreached_quality_is_told(jobs):
+    cells(jobs, (1000, 25.0), {0.001: (100, 10.0), 0.0002: (10000, 20.0)})
+    assert "baseline reaches that PSNR at no threshold in 3 cells" in headline(read(jobs.folder))[1]
+
+
+def test_a_range_that_does_not_overlap_is_told(jobs):
+    cells(jobs, (50, 25.0), {0.001: (100, 10.0), 0.0002: (10000, 20.0)})
+    sentence = headline(read(jobs.folder))[1]
+    assert "no equal count" in sentence
+    assert "in 3 cells it has fewer Gaussians than any of baseline's settings" in sentence
+
+
+def test_without_a_baseline_nothing_is_claimed(jobs):
+    jobs.add("cadam", n=100, psnr=20.0)
+    assert headline(read(jobs.folder)) == []
