@@ -144,8 +144,11 @@ def test_every_job_of_a_grid_composes(grid):
     sweep, composer = read_sweep("sweep", ["prompt='a red cube'", f"grid={grid}"], NO_FLAGS)
     jobs = compose_all(sweep, composer)
     assert len(jobs) > 1
-    claimed = re.search(r": (\d+) jobs", (CONFIGS / "grid" / f"{grid}.yaml").read_text(encoding="utf-8"))
-    assert claimed is None or int(claimed.group(1)) == len(jobs)
+    text = (CONFIGS / "grid" / f"{grid}.yaml").read_text(encoding="utf-8")
+    claimed = re.search(r": ([\d,]+) jobs", text)
+    prompts = yaml.safe_load(text).get("each", {}).get("prompt", [])  # of which the line above made one
+    each = len(prompts) if isinstance(prompts, list) and prompts else 1
+    assert claimed is None or int(claimed.group(1).replace(",", "")) == each * len(jobs)
     for job, settings in zip(sweep.jobs[:3], jobs[:3], strict=True):  # as Hydra composes them one by one
         cfg = OmegaConf.to_container(compose(job.overrides), resolve=True)
         assert settings.values == dict(flatten(cfg))

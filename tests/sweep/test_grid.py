@@ -191,8 +191,8 @@ def test_all_keys_in_which_jobs_may_differ_are_told(pareto):
 @pytest.mark.parametrize(
     ("node", "said"),
     [
-        ({"densifier": "baseline,cadam"}, "grid: wanted each and arms, got densifier"),
-        ([1], "grid: wanted each and arms"),
+        ({"densifier": "baseline,cadam"}, "grid: wanted each, arms and figures, got densifier"),
+        ([1], "grid: wanted each, arms and figures"),
         ({"arms": {}}, "grid.arms: wanted named arms"),
         ({"arms": ["a"]}, "grid.arms: wanted named arms"),
         ({"arms": {"a": 1}}, "grid.arms.a: wanted keys with values, got 1"),
