@@ -58,8 +58,9 @@ class Sweep:
 class Composed:
     """The settings that a job would run with."""
 
-    values: dict[str, Any]  # by dotted key; what only a running job can resolve is left out
+    values: dict[str, Any]  # by dotted key
     choices: Mapping[str, Any]  # by group
+    unknown: set[str]  # keys whose value only the running job knows
 
     def get(self, key: str) -> Any:
         """A value, or what was chosen of a group; None if the job has no such key."""
@@ -95,7 +96,11 @@ class Base:
                 resolved[key] = (
                     OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
                 )
-        return Composed(values={**self.plain, **values, **resolved}, choices=self.cfg.hydra.runtime.choices)
+        return Composed(
+            values={**self.plain, **values, **resolved},
+            choices=self.cfg.hydra.runtime.choices,
+            unknown=set(self.referring) - resolved.keys(),
+        )
 
 
 class Composer:
@@ -141,7 +146,8 @@ class Composer:
 def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> tuple[Sweep, Composer]:
     """What the line asks for. Raises ``UserError`` for a line that asks for no sweep or for too much."""
     line = sort_out(overrides)
-    cfg = compose_line("sweep", [*line.grid, *line.launcher, *line.folder], options)
+    own = Namespace(**{**vars(options), "config_name": None})  # another name concerns the jobs
+    cfg = compose_line("sweep", [*line.grid, *line.launcher, *line.folder], own)
     node = cfg.get("grid")
     grid = read_grid(None if node is None else OmegaConf.to_container(node, resolve=True))
     try:
@@ -158,7 +164,7 @@ def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> tu
 
 
 def sort_out(overrides: Sequence[str]) -> Line:
-    """Tell the overrides of jobs from those of the sweep itself."""
+    """Tell the overrides of jobs from those of the sweep. Raises ``UserError`` for what fits in none."""
     line = Line(grid=[], launcher=[], folder=[], jobs=[])
     for override in overrides:
         key = key_of(override)

@@ -129,7 +129,7 @@ def _refuse_other_settings(folder: Path, rows: Sequence[Row], composed: Sequence
         if not config.is_file() or not (row.has_result or row.has_checkpoint):
             continue
         before = dict(flatten(_read_yaml(config)))
-        for key in sorted((before.keys() | now.values.keys()) - {"resume"}):
+        for key in sorted((before.keys() | now.values.keys()) - now.unknown - {"resume"}):
             if before.get(key) != now.values.get(key):
                 raise UserError(
                     f"{key}: was {before.get(key)} in {shown(row.folder)}, is {now.values.get(key)} now. "
