@@ -8,6 +8,7 @@ import torch
 from cadam3d.core.checks import UserError
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.schedule import Linear
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.cadam import CAdam, CAdamState, quantile
 from cadam3d.densifier.refine import Refine
@@ -240,6 +241,15 @@ def test_drift_is_preferred_to_stronger_noise():
     chosen = cadam().select(observe(cadam(), gradients), STEP)
     assert chosen[:50].all()
     assert gradients[:, :50].norm(dim=-1).mean() < gradients[:, 50:].norm(dim=-1).mean()
+
+
+def test_a_quantile_that_rises_lets_many_grow_early_and_few_late():
+    densifier = cadam(tau_Q=Linear(start=0.5, end=0.98, begin=100, steps=150), tau_SNR=0.0)
+    state = observe(densifier, noise(30, 1001))
+    selected = [int(densifier.select(state, step).sum()) for step in (1, 100, 175, 250, 10_000)]
+    assert selected == [500, 500, 260, 20, 20]
+    at_each = [densifier.statistics(state, step)["drift_threshold"] for step in (100, 250)]
+    assert at_each[0] < at_each[1]
 
 
 @pytest.mark.parametrize("tau_Q", [0.0, 0.5, 0.9, 0.99])
@@ -574,6 +584,7 @@ def test_an_empty_scene_is_no_problem():
     [
         ("tau_Q", 1.0),
         ("tau_Q", -0.1),
+        ("tau_Q", Linear(start=0.5, end=1.0, steps=10)),
         ("tau_m", -1.0),
         ("tau_SNR", -1.0),
         ("tau_SNR", math.nan),
