@@ -308,7 +308,7 @@ def test_a_component_from_a_folder_of_the_users_own_is_found(type_line, jobs, tm
 
 
 def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, tmp_path):
-    assert type_line("sweep", "grid=thresholds").message.endswith('torus" grid=thresholds')
+    assert type_line("sweep", "grid=densifiers").message.endswith('torus" grid=thresholds')
     assert type_line("sweep", "prompt=a cube").message.startswith("sweep: nothing to sweep over. Try: ")
     assert not list(tmp_path.iterdir())
 

@@ -8,7 +8,7 @@ from cadam3d.rasterizer.base import Backend
 
 @cache
 def note(text: str) -> None:
-    """Print ``text`` as a note, once per process: the jobs of a sweep have the same things to say."""
+    """Print ``text`` as a note, once per process."""
     print(f"Note: {text}", file=sys.stderr)
 
 

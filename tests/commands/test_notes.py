@@ -83,12 +83,6 @@ def test_a_training_without_a_compiler_says_so_once_and_writes_it_down(type_line
     assert NEEDED in (run / "report.html").read_text(encoding="utf-8")
 
 
-def test_the_jobs_of_a_sweep_say_it_once(type_line, no_compiler):
-    code, err = type_line("sweep", *SMALL, "seed=0,1")
-    assert code == 0
-    assert err.count(NEEDED) == 1
-
-
 def test_another_command_says_it_when_it_renders(type_line, no_compiler):
     assert type_line("train", *SMALL, "rasterizer=reference")[0] == 0
     code, err = type_line("export", "run=outputs/latest", "output=copy.ply")
