@@ -223,6 +223,15 @@ def test_finished_jobs_are_skipped_and_the_others_run_again(sweep, calls):
     assert [call["folder"] for call in calls(only_sweep())] == [row.folder.name for row in (*rows, rows[1])]
 
 
+def test_numbers_without_exports_are_no_result(sweep, calls):
+    """Training writes them first. If the whole machine goes down then, there is nobody to say killed."""
+    sweep("prompt=a cube", "seed=0,1")
+    [row, _] = load(only_sweep().resolve())
+    (row.folder / "summary.json").write_text('{"outcome": "finished", "num_gaussians": 5}')
+    assert sweep("prompt=a cube", "seed=0,1").code == 0
+    assert [call["folder"] for call in calls(only_sweep())[2:]] == [row.folder.name]
+
+
 def test_a_sweep_that_is_done_only_tells_its_table(sweep, calls):
     sweep("prompt=a cube", "grid=densifiers")
     Path("multirun/densifiers/sweep.csv").unlink()
@@ -503,6 +512,7 @@ def test_cfg_job_shows_the_first_job(sweep):
 
 LINES = (
     ["prompt='a cube'"],
+    ["prompt='\\${x}'"],
     ["prompt='a ball'", "steps=7", "densifier.tau_Q=0.5"],
     ["prompt='a cube'", "steps=9", "densifier.tau_Q=0.25"],
     ["prompt='a cube'", "densifier=baseline", "densifier.tau_pos=0.5"],
