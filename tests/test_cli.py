@@ -597,7 +597,8 @@ def test_bash_completes_the_command_word(tmp_path):
 def test_ctrl_c_is_one_line_and_130(tmp_path):
     """The signal comes while Python imports: no command has taken charge of signals yet."""
     code = (
-        "import sys, time, types\n"
+        "import signal, sys, time, types\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a suite in the background ignores it
         "slow = types.ModuleType('cadam3d.commands.train')\n"
         "slow.run = lambda cfg: (print('started', flush=True), time.sleep(60))\n"
         "sys.modules[slow.__name__] = slow\n"
