@@ -108,7 +108,7 @@ class Distillation(Guidance):
         with torch.no_grad():
             t = self._draw_t(clean, step, generator)
             found = self.compare(clean.detach(), t, condition, prior, step, generator)
-            weights = self.weight * WEIGHTINGS[self.weighting](prior.path, t)
+            weights = self.weight * WEIGHTINGS[self.weighting](prior.noise_path, t)
             raw = per_view(weights) * found.difference
             is_finite = raw.isfinite()
             gradient = torch.where(is_finite, raw, 0).to(clean.dtype)

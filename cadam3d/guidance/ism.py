@@ -58,10 +58,10 @@ class ISM(Distillation):
         start = s.clamp_max(self.initial_noise)
         at_start = clean
         if self.initial_noise > 0:
-            at_start = prior.path.mix(clean, standard_normal(clean, generator), start)
+            at_start = prior.noise_path.mix(clean, standard_normal(clean, generator), start)
         at_s = ddim(at_start, start, s, unprompted, prior, self.inversion_stride)
         before = prior.predict(at_s, s, unprompted, UNGUIDED)
-        at_t = prior.path.mix(before.clean, before.noise, t)
+        at_t = prior.noise_path.mix(before.clean, before.noise, t)
         after = prior.predict(at_t, t, condition, self.scale)
         return Comparison(difference=after.noise - before.noise, clean=after.clean)
 
@@ -94,5 +94,5 @@ def ddim(
         if k < steps:
             now = start + (end - start).sign() * length.clamp_max(k * stride)
         has_arrived = per_view(now) == per_view(then)
-        noisy = torch.where(has_arrived, noisy, prior.path.mix(guess.clean, guess.noise, now))
+        noisy = torch.where(has_arrived, noisy, prior.noise_path.mix(guess.clean, guess.noise, now))
     return noisy

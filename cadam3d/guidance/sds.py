@@ -34,5 +34,5 @@ class SDS(Distillation):
     ) -> Comparison:
         """Predicted noise minus added noise. One guided prediction per view."""
         noise = standard_normal(clean, generator)
-        guess = prior.predict(prior.path.mix(clean, noise, t), t, condition, self.scale)
+        guess = prior.predict(prior.noise_path.mix(clean, noise, t), t, condition, self.scale)
         return Comparison(difference=guess.noise - noise, clean=guess.clean)

@@ -36,6 +36,6 @@ class VFDS(Distillation):
     ) -> Comparison:
         """Predicted velocity minus the velocity of the pair. One guided prediction per view."""
         noise = standard_normal(clean, generator)
-        guess = prior.predict(prior.path.mix(clean, noise, t), t, condition, self.scale)
-        velocity = prior.path.velocity(clean, noise, t)
+        guess = prior.predict(prior.noise_path.mix(clean, noise, t), t, condition, self.scale)
+        velocity = prior.noise_path.velocity(clean, noise, t)
         return Comparison(difference=guess.velocity - velocity, clean=guess.clean)

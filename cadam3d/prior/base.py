@@ -30,7 +30,7 @@ class PromptEmbedding(ABC):
 class DiffusionPrior(ABC):
     """A denoiser of images. ``t`` in [0, 1]: 0 is clean, 1 is noise, for diffusion and flow models alike."""
 
-    path: NoisePath  # how this model mixes images with noise; not a property, so that it can be a field
+    noise_path: NoisePath  # how this model mixes images with noise; not a property, so that it can be a field
 
     @abstractmethod
     def embed(self, prompt: str, negative: str) -> PromptEmbedding:

@@ -57,7 +57,7 @@ class Tiny(DiffusionPrior):
     """
 
     predicts: str  # noise | velocity
-    path: NoisePath
+    noise_path: NoisePath
     width: int  # channels at full size
     downscale: int  # pixels per latent, per side
     seed: int
@@ -94,13 +94,13 @@ class Tiny(DiffusionPrior):
         copies = len(prompts)
         output = self.network(
             noisy.float().repeat(copies, 1, 1, 1),
-            self.path.timestep(t).float().repeat(copies),
+            self.noise_path.timestep(t).float().repeat(copies),
             torch.stack(prompts).to(noisy.device).repeat_interleave(noisy.shape[0], dim=0),
             condition.directions.to(noisy.device, torch.float32).repeat(copies, 1),
         )
         halves = output.to(noisy.dtype).chunk(copies)
         guess = torch.lerp(halves[0], halves[-1], scale)
-        complete = self.path.from_noise if self.predicts == "noise" else self.path.from_velocity
+        complete = self.noise_path.from_noise if self.predicts == "noise" else self.noise_path.from_velocity
         return complete(noisy, guess, t)
 
     def notice(self) -> str:

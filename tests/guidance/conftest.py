@@ -65,7 +65,7 @@ class Call:
 class GaussianPrior(DiffusionPrior):
     """x0 ~ N(mean, spread**2): the posterior mean is known in closed form. ``form`` is what it predicts."""
 
-    path: object
+    noise_path: object
     spread: float = 0.5
     form: str = "clean"
     calls: list = field(default_factory=list)
@@ -81,16 +81,16 @@ class GaussianPrior(DiffusionPrior):
         self.calls.append(Call(t, scale, condition, torch.is_grad_enabled()))
         with torch.no_grad():
             mean = condition.negative + scale * (condition.positive - condition.negative)
-            a, b = per_view(self.path.a(t)), per_view(self.path.b(t))
+            a, b = per_view(self.noise_path.a(t)), per_view(self.noise_path.b(t))
             spread = self.spread if condition.spread is None else condition.spread
             variance = a**2 * spread**2 + b**2
             off = (noisy - a * mean) / torch.where(variance > 0, variance, 1)
             clean, noise = mean + a * spread**2 * off, b * off
             if self.form == "clean":
-                return self.path.from_clean(noisy, clean, t)
+                return self.noise_path.from_clean(noisy, clean, t)
             if self.form == "noise":
-                return self.path.from_noise(noisy, noise, t)
-            return self.path.from_velocity(noisy, self.path.velocity(clean, noise, t), t)
+                return self.noise_path.from_noise(noisy, noise, t)
+            return self.noise_path.from_velocity(noisy, self.noise_path.velocity(clean, noise, t), t)
 
 
 def random_images(count, seed, views=3):

@@ -113,7 +113,7 @@ def test_weightings_follow_their_formula(weighting, objective, make, ask, prior,
     unit, _ = ask(make(objective), rgb, means, prior)
     weighted, _ = ask(make(objective, weighting=weighting), rgb, means, prior)
     t = prior.calls[-1].t
-    expected = per_view(FORMULAS[weighting](prior.path.a(t), prior.path.b(t)))
+    expected = per_view(FORMULAS[weighting](prior.noise_path.a(t), prior.noise_path.b(t)))
     torch.testing.assert_close(weighted, expected * unit, rtol=1e-9, atol=0)
 
 
@@ -244,7 +244,7 @@ def test_the_residual_is_measured_against_the_last_guess(make, ask, gaussian, on
     ("predicts", "noise_path"), [("noise", DDPM()), ("velocity", RectifiedFlow(shift=3.0))]
 )
 def test_it_runs_on_a_network(predicts, noise_path, objective, make):
-    prior = Tiny(predicts=predicts, path=noise_path, width=16, downscale=2, seed=0)
+    prior = Tiny(predicts=predicts, noise_path=noise_path, width=16, downscale=2, seed=0)
     cameras = turntable(2, elevation_deg=15.0, distance=3.0, fov_y_deg=40.0, size=17)
     condition = prior.embed("a red cube", "blurry").at(cameras, torch.zeros(2, 3))
     render = torch.rand(2, 17, 17, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()

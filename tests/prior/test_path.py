@@ -226,11 +226,11 @@ def test_equal_paths_are_equal():
 @pytest.mark.parametrize(
     ("build", "key"),
     [
-        (lambda: RectifiedFlow(shift=0.0), "prior.path.shift"),
-        (lambda: RectifiedFlow(shift=math.nan), "prior.path.shift"),
-        (lambda: DDPM(train_steps=0), "prior.path.train_steps"),
-        (lambda: DDPM(beta_start=0.0), "prior.path.beta_start"),
-        (lambda: DDPM(beta_end=0.0001), "prior.path.beta_end"),
+        (lambda: RectifiedFlow(shift=0.0), "prior.noise_path.shift"),
+        (lambda: RectifiedFlow(shift=math.nan), "prior.noise_path.shift"),
+        (lambda: DDPM(train_steps=0), "prior.noise_path.train_steps"),
+        (lambda: DDPM(beta_start=0.0), "prior.noise_path.beta_start"),
+        (lambda: DDPM(beta_end=0.0001), "prior.noise_path.beta_end"),
     ],
 )
 def test_impossible_paths_are_refused_by_key(build, key):

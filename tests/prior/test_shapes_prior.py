@@ -24,7 +24,7 @@ SIZE = 20
 
 def prior(**changes: object) -> ShapesPrior:
     exact = ShapesPrior(
-        path=DDPM(),
+        noise_path=DDPM(),
         spread=0.1,
         edge_spread=0.1,
         model_error=0.0,
@@ -54,7 +54,7 @@ def forms(prediction: Prediction) -> dict[str, Tensor]:
 @pytest.mark.parametrize("path", PATHS)
 @pytest.mark.parametrize("error", [0.0, 0.3])
 def test_three_forms_agree(path: NoisePath, error: float) -> None:
-    model = prior(path=path, model_error=error)
+    model = prior(noise_path=path, model_error=error)
     condition, t = condition_of(model), torch.tensor([0.3, 0.8])
     noisy = noisy_image()
     guess = model.predict(noisy, t, condition, 7.5)
@@ -70,7 +70,7 @@ def test_three_forms_agree(path: NoisePath, error: float) -> None:
 @pytest.mark.parametrize("path", PATHS)
 @pytest.mark.parametrize("spread", [0.0, 0.1])
 def test_both_ends_are_finite_and_explain_the_noisy_image(path: NoisePath, spread: float) -> None:
-    model = prior(path=path, spread=spread, edge_spread=0.0, model_error=0.1)
+    model = prior(noise_path=path, spread=spread, edge_spread=0.0, model_error=0.1)
     condition = condition_of(model)
     for t in (torch.tensor([0.0, 1.0]), torch.tensor([1e-6, 1 - 1e-6])):
         guess = model.predict(noisy_image(), t, condition, 7.5)
@@ -87,14 +87,14 @@ def test_a_mode_is_kept_and_its_noise_found() -> None:
     noise = noisy_image()
     for mode in (0, 5):
         image = condition.positive.means[:, mode]
-        guess = model.predict(model.path.mix(image, noise, t), t, condition, 1.0)
+        guess = model.predict(model.noise_path.mix(image, noise, t), t, condition, 1.0)
         assert float((guess.clean - image).abs().max()) < 2e-3
         assert float((guess.noise - noise).abs().max()) < 5e-3
 
 
 @pytest.mark.parametrize("path", PATHS)
 def test_guidance_is_linear_in_its_scale(path: NoisePath) -> None:
-    model = prior(path=path, model_error=0.1)
+    model = prior(noise_path=path, model_error=0.1)
     condition, t = condition_of(model), torch.tensor([0.4, 0.7])
     zero, one, seven = (forms(model.predict(noisy_image(), t, condition, scale)) for scale in (0.0, 1.0, 7.5))
     for name, value in seven.items():
@@ -104,7 +104,7 @@ def test_guidance_is_linear_in_its_scale(path: NoisePath) -> None:
 def test_scales_zero_and_one_are_single_branches() -> None:
     model = prior()
     condition, t = condition_of(model), torch.tensor([0.4, 0.7])
-    a, b = model.path.a(t), model.path.b(t)
+    a, b = model.noise_path.a(t), model.noise_path.b(t)
     one = model.predict(noisy_image(), t, condition, 1.0)
     zero = model.predict(noisy_image(), t, condition, 0.0)
     assert torch.equal(one.clean, condition.positive.denoise(noisy_image(), a, b)[0])
@@ -226,7 +226,7 @@ def test_error_is_continuous() -> None:
 @pytest.mark.parametrize("path", PATHS)
 def test_configured_error_is_measured_in_the_prediction(path: NoisePath) -> None:
     t = torch.tensor([0.3, 1.0])
-    exact, wrong = prior(path=path), prior(path=path, model_error=0.4)
+    exact, wrong = prior(noise_path=path), prior(noise_path=path, model_error=0.4)
     condition, total = condition_of(exact), torch.zeros(2)
     for seed in range(20):
         noisy = noisy_image(seed)

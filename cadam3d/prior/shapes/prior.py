@@ -90,7 +90,7 @@ class ShapesEmbedding(PromptEmbedding):
 class ShapesPrior(DiffusionPrior):
     """A Gaussian mixture over images of the scene, one mode per choice that the prompt leaves open."""
 
-    path: NoisePath
+    noise_path: NoisePath
     spread: float  # standard deviation of every pixel around its mode, model space ([-1, 1])
     edge_spread: float  # added to it where a silhouette crosses the pixel
     model_error: float  # rms of the smooth prediction error, model space at full noise; 0 = exact
@@ -156,7 +156,7 @@ class ShapesPrior(DiffusionPrior):
                 continue
             guess_clean, guess_noise = self._guess(noisy, t, mixture, branch)
             clean, noise = clean + share * guess_clean, noise + share * guess_noise
-        return Prediction(clean=clean, noise=noise, velocity=self.path.velocity(clean, noise, t))
+        return Prediction(clean=clean, noise=noise, velocity=self.noise_path.velocity(clean, noise, t))
 
     def truth(self, prompt: str) -> TruthFn:
         """Images of every mode of ``prompt``: (cameras, background "v 3") -> "m v h w 3" in [0, 1]."""
@@ -173,7 +173,7 @@ class ShapesPrior(DiffusionPrior):
         return trace(scene, cameras, self.samples_per_pixel), scene
 
     def _guess(self, noisy: Tensor, t: Tensor, mixture: Mixture, branch: int) -> tuple[Tensor, Tensor]:
-        a, b = self.path.a(t), self.path.b(t)
+        a, b = self.noise_path.a(t), self.noise_path.b(t)
         clean, noise = mixture.denoise(noisy, a, b)
         if self.model_error == 0:
             return clean, noise
