@@ -182,6 +182,16 @@ def test_the_window_follows_its_schedules(make, ask, gaussian, means, rgb):
         assert ((prior.calls[-1].t >= low) & (prior.calls[-1].t <= high)).all()
 
 
+def test_a_window_of_no_width_leaves_t_to_its_schedule(objective, make, ask, prior, means, rgb):
+    """DreamGaussian's annealing: t = 1 - step / 500, for every view and seed."""
+    anneal = Linear(start=0.9, end=0.2, steps=7)
+    guidance = make(objective, t_min=anneal, t_max=anneal)
+    for step, t in ((0, 0.9), (3, 0.6), (9, 0.2)):
+        _, output = ask(guidance, rgb, means, prior, step=step, seed=step)
+        assert prior.calls[-1].t.tolist() == pytest.approx([t] * 3)
+        assert output.log["t"] == pytest.approx(t)
+
+
 @pytest.mark.parametrize("is_shared", [True, False])
 def test_views_share_t_if_asked(is_shared, objective, make, ask, prior, means, rgb):
     ask(make(objective, shared_t=is_shared), rgb, means, prior)
@@ -263,7 +273,7 @@ def test_it_runs_on_a_network(predicts, noise_path, objective, make):
         ("reduction", "max"),
         ("clip", 0.0),
         ("clip", Linear(start=1.0, end=-1.0, steps=10)),
-        ("t_max", 0.02),
+        ("t_max", 0.01),
         ("t_max", 1.1),
         ("t_max", Linear(start=0.98, end=0.0, steps=10)),
     ],
