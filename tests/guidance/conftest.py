@@ -7,6 +7,7 @@ import torch
 
 from cadam3d.guidance.ism import ISM
 from cadam3d.guidance.sds import SDS
+from cadam3d.guidance.ucm import UCM
 from cadam3d.guidance.vfds import VFDS
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
@@ -25,6 +26,7 @@ OBJECTIVES = {
     "sds": (SDS, {}),
     "ism": (ISM, {"delta": 0.05, "inversion_stride": 0.2, "initial_noise": 0.0}),
     "vfds": (VFDS, {}),
+    "ucm": (UCM, {"inversion_steps": 3, "inversion_grid": "t", "fresh_noise": 0.0}),
 }
 PATHS = {"ddpm": DDPM(), "flow": RectifiedFlow(), "flow-3": RectifiedFlow(shift=3.0)}
 

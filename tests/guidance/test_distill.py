@@ -41,7 +41,7 @@ def test_descent_points_at_the_image(objective, path, make, ask, gaussian, one_a
 
 def test_descent_arrives_at_the_image(objective, path, make, ask, gaussian, one_among_many, rgb):
     """Gradient descent with the x0-residual as gradient, from anywhere, on a prior with little spread."""
-    weighting = {"sds": "gamma", "ism": "gamma", "vfds": "sigma"}[objective]
+    weighting = {"sds": "gamma", "ism": "gamma", "vfds": "sigma", "ucm": "sigma"}[objective]
     guidance = make(objective, scale=1.0, weighting=weighting, t_min=0.3, t_max=0.7)
     prior, render = gaussian(path, spread=0.02), rgb.detach()
     target = one_among_many.positive.permute(0, 2, 3, 1)
