@@ -65,6 +65,7 @@ TRUTHS = {
     "densifier=cadam": ["densifier.reset_moments"],
     "guidance=sds": ["guidance.shared_t"],
     "guidance=ism": ["guidance.shared_t"],
+    "guidance=gcs": ["guidance.shared_t", "guidance.fixed_noise"],
     "exporter=[preview]": ["exporter.preview.labels"],
 }
 NEVER_WHOLE = ("2.5", "16.0", "true", "abc", "[1]", "-1000000000000.5")
