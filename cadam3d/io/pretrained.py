@@ -71,12 +71,13 @@ class Source:
     def _local(self) -> "Pretrained":
         folder = Path(str(self.path)).expanduser()
         if not (folder / INDEX).is_file():
-            what = (
-                f"no {INDEX} in it" if folder.is_dir() else "a file" if folder.exists() else "nothing there"
-            )
+            what = "nothing there"
+            if folder.exists():
+                what = f"no {INDEX} in it" if folder.is_dir() else "that is a file"
             raise UserError(
                 f"{self.key}.path: wanted a folder with a {INDEX} (a model in the layout of diffusers), got "
-                f"{str(self.path)!r}: {what}. Try: {self.key}.path=DIR, or {self.key}.path=null for {self._listed()}"
+                f"{str(self.path)!r}: {what}. Try: {self.key}.path=DIR, "
+                f"or {self.key}.path=null for {' or '.join(self.ids) or 'the ids (there are none)'}"
             )
         return Pretrained(self, str(folder), None, folder / INDEX, _read_index(self.key, folder / INDEX))
 
