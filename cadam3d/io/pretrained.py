@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from cadam3d.core.checks import UserError, require, require_choice
+from cadam3d.core.checks import UserError, require
 from cadam3d.io.jsonl import read_json
 
 INDEX = "model_index.json"
@@ -126,6 +126,7 @@ class Pretrained:
         options: dict[str, Any] = {"subfolder": name, "revision": self.revision}
         if dtype is not None:
             options |= {"dtype": dtype, "variant": self.source.variant}
+        _silence()
         try:
             loaded = self._kind(name).from_pretrained(self.where, **options)
         except (OSError, ValueError, KeyError, RuntimeError, TypeError) as error:
@@ -173,8 +174,8 @@ class Pretrained:
         return json.dumps([str(Path(self.where).resolve()), facts])
 
     def _kind(self, name: str) -> Any:
-        library, kind = (self.index.get(name) or (None, None))[:2]
-        if library not in LIBRARIES or not hasattr(import_module(library), str(kind)):
+        library, kind = (str(entry) for entry in (self.index.get(name) or (None, None))[:2])
+        if library not in LIBRARIES or not hasattr(import_module(library), kind):
             raise UserError(
                 f"{self.source.key}: {self.where} says that its {name} is a {library}.{kind}, which the "
                 f"installed libraries do not have. Try: pip install -U 'cadam3d[diffusers]', or another model"
@@ -187,11 +188,6 @@ def require_extra(key: str) -> None:
     missing = [name for name in EXTRA if find_spec(name) is None]
     if missing:
         raise UserError(f"{key}: needs {', '.join(missing)}. Try: pip install 'cadam3d[diffusers]'")
-
-
-def require_dtype(key: str, value: object) -> None:
-    """Raise ``UserError`` unless ``value`` names a floating-point type of networks."""
-    require_choice(key, value, list(DTYPES))
 
 
 def _read_index(key: str, file: Path) -> dict[str, Any]:
@@ -240,3 +236,12 @@ def _fetch_index(name: str, revision: str | None, can_ask: bool) -> tuple[Path |
     finally:
         utils.logging.set_verbosity(verbosity)
     return None, reason, can_ask
+
+
+def _silence() -> None:
+    """No progress bars of other libraries between ours."""
+    import diffusers
+    import transformers
+
+    transformers.utils.logging.disable_progress_bar()
+    diffusers.utils.logging.disable_progress_bar()
