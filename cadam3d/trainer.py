@@ -221,7 +221,7 @@ class Trainer:
         refines, resets = self.refine.refines_at(step), self.refine.resets_at(step)
         if not (refines or resets):
             return None, None
-        report = self._look(state, step, refines)
+        report = self._look(state, step)
         if refines:
             report = self._grow(state, report)
             if state.refused:
@@ -233,11 +233,10 @@ class Trainer:
             report = replace(report, reset=lowered)
         return report, (Outcome.VANISHED if report.after == 0 else None)
 
-    def _look(self, state: TrainState, step: int, refines: bool) -> RefineReport:
-        """What the densifier sees and wants, before anything changes."""
+    def _look(self, state: TrainState, step: int) -> RefineReport:
+        """What the densifier sees, before anything is decided."""
         gaussians, seen = state.gaussians.detach(), state.densifier
         n = len(gaussians)
-        nobody = torch.zeros(n, dtype=torch.bool, device=gaussians.device)
         return RefineReport(
             step=step,
             before=n,
@@ -250,7 +249,7 @@ class Trainer:
             statistics=self.densifier.statistics(seen, step),
             population=Population(
                 gaussians=gaussians,
-                is_selected=self.densifier.select(seen, step) if refines else nobody,
+                is_selected=torch.zeros(n, dtype=torch.bool, device=gaussians.device),
                 scores=self.densifier.scores(seen),
             ),
         )
@@ -259,9 +258,9 @@ class Trainer:
         """Apply one refinement to all owners of rows, or refuse it whole; ``state.refused`` says which."""
         generator = state.generators["refine"]
         draws_before = generator.get_state()
-        wanted, unwanted = report.population.is_selected, self.densifier.unwanted(state.densifier)
-        plan = self.refine.plan(state.gaussians, wanted, report.step, generator, unwanted)
-        report = replace(report, selected=plan.selected)
+        plan = self.densifier.plan(state.densifier, state.gaussians, report.step, self.refine, generator)
+        population = replace(report.population, is_selected=plan.is_selected)
+        report = replace(report, selected=plan.selected, population=population)
         state.refused = self.refine.exceeds(plan)
         if state.refused:
             generator.set_state(draws_before)

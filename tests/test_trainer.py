@@ -80,7 +80,7 @@ def same(left: dict, right: dict) -> bool:
     return True
 
 
-@pytest.mark.parametrize("densifier", ["cadam", "baseline", "none"])
+@pytest.mark.parametrize("densifier", ["cadam", "baseline", "none", "random"])
 def test_same_seed_same_bytes(tmp_path, densifier):
     payloads = []
     for _ in range(2):
@@ -100,7 +100,7 @@ def test_another_seed_gives_another_result(tmp_path):
     assert not torch.equal(results[0]["gaussians"]["means"][:10], results[1]["gaussians"]["means"][:10])
 
 
-@pytest.mark.parametrize("densifier", ["cadam", "baseline"])
+@pytest.mark.parametrize("densifier", ["cadam", "baseline", "random"])
 @pytest.mark.parametrize("cut", [1, 4, 5])
 def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, densifier, cut):
     trainer, whole = make([f"densifier={densifier}"])
@@ -164,11 +164,12 @@ def test_growth_beyond_max_gaussians_is_an_outcome_and_is_not_applied(tmp_path):
     assert witness.refinements[-1].selected > 0
 
 
-def test_a_resumed_run_with_a_larger_cap_equals_one_that_never_met_it(tmp_path):
-    free, whole = make()
+@pytest.mark.parametrize("densifier", ["cadam", "random"])
+def test_a_resumed_run_with_a_larger_cap_equals_one_that_never_met_it(tmp_path, densifier):
+    free, whole = make([f"densifier={densifier}"])
     go(free, whole, tmp_path)
 
-    capped, state = make(["refine.max_gaussians=30"])
+    capped, state = make([f"densifier={densifier}", "refine.max_gaussians=30"])
     assert go(capped, state, tmp_path) is Outcome.MAX_GAUSSIANS
     torch.save(state.to_payload(), tmp_path / "capped.pt")
 

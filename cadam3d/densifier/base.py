@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.core.edit import RowEdit, RowState
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.densifier.refine import Refine, RefinePlan
 
 State = TypeVar("State", bound=RowState)
 
@@ -54,10 +56,11 @@ class Densifier(ABC, Generic[State]):
         """
 
     @abstractmethod
-    def select(self, state: State, step: int) -> Bool[Tensor, "n"]:
+    def select(self, state: State, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
         """Whom to grow. Called at refinement steps only; the one real difference between densifiers.
 
-        ``step`` (1 after the first step) is for schedules; the evidence is in the state.
+        ``step`` (1 after the first step) is for schedules; the evidence is in the state. ``generator`` (on
+        the CPU) is for those who draw lots.
         """
 
     @abstractmethod
@@ -70,6 +73,16 @@ class Densifier(ABC, Generic[State]):
         Nobody by default (``None``). Asked before the edit: newborns are not meant.
         """
         return None
+
+    def plan(
+        self, state: State, gaussians: Gaussians, step: int, refine: Refine, generator: torch.Generator
+    ) -> RefinePlan:
+        """One refinement, decided, not applied: whom by :meth:`select`, how by ``refine``.
+
+        A densifier with a "how" of its own overrides it. Nothing is changed but ``generator``, on the CPU.
+        """
+        selected = self.select(state, step, generator)
+        return refine.plan(gaussians, selected, step, generator, self.unwanted(state))
 
     def after_reset(self, state: State, rows: Bool[Tensor, "n"]) -> State:
         """The state after an opacity reset of ``rows``; by default the statistics do not notice."""

@@ -29,7 +29,7 @@ class NoGrowth(Densifier[NoGrowthState]):
         """The same state: gradients change nothing here."""
         return state
 
-    def select(self, state: NoGrowthState, step: int) -> Bool[Tensor, "n"]:
+    def select(self, state: NoGrowthState, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
         """Nobody grows."""
         return state.nobody
 

@@ -16,10 +16,15 @@ class RefinePlan:
     """One refinement, decided, not applied: rows after = before + cloned + (children - 1) split - pruned."""
 
     edit: RowEdit
-    selected: int  # marked by the densifier = cloned + split
+    is_selected: Bool[Tensor, "n"]  # marked by the densifier, of those before the edit: cloned or split
     cloned: int  # parents that stay and get one twin
     split: int  # parents that are replaced by their children
     pruned: int  # survivors and newborns removed
+
+    @property
+    def selected(self) -> int:
+        """How many were marked."""
+        return int(self.is_selected.sum())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +130,7 @@ class Refine:
         grown = len(gaussians) - len(splits) + len(children)
         return RefinePlan(
             edit=edit,
-            selected=len(clones) + len(splits),
+            is_selected=selected,
             cloned=len(clones),
             split=len(splits),
             pruned=grown - edit.rows_after,
