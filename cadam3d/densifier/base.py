@@ -31,6 +31,18 @@ class GradientSignal:
         return self.radii > 0
 
 
+@dataclass
+class Headcount(RowState):
+    """The state of a densifier that remembers nothing but how many Gaussians there are."""
+
+    nobody: Bool[Tensor, "n"]  # all False
+
+    @classmethod
+    def of(cls, n: int, device: torch.device) -> "Headcount":
+        """The count of ``n``."""
+        return cls(nobody=torch.zeros(n, dtype=torch.bool, device=device))
+
+
 class Densifier(ABC, Generic[State]):
     """Frozen hyper-parameters; the per-Gaussian tensors live in a state that the trainer holds.
 
@@ -87,6 +99,16 @@ class Densifier(ABC, Generic[State]):
     def after_reset(self, state: State, rows: Bool[Tensor, "n"]) -> State:
         """The state after an opacity reset of ``rows``; by default the statistics do not notice."""
         return state
+
+    def perturb(
+        self, gaussians: Gaussians, lr: float, generator: torch.Generator
+    ) -> Float[Tensor, "n 3"] | None:
+        """What an optimizer step is followed by: displacements of the means, in world units.
+
+        None by default (``None``). ``lr`` is the learning rate of the means at that step; ``generator`` is on
+        the CPU, and nobody else draws from it.
+        """
+        return None
 
     def carry(self, state: State, edit: RowEdit) -> State:
         """The state after a refinement; by default survivors keep their rows and newborns start at zero."""

@@ -68,7 +68,7 @@ def test_selecting_leaves_the_state_alone():
     densifier = RandomGrowth(share=0.5)
     state = densifier.init_state(8, CPU)
     assert densifier.select(state, STEP, lots()).any()
-    assert not state.blank.any()
+    assert not state.nobody.any()
 
 
 def test_a_schedule_of_the_share_is_followed():
