@@ -16,7 +16,12 @@ WHOLE = {  # what to choose, and the keys that count something
     "camera=sphere": ["camera.size"],
     "initializer=ball": ["initializer.count", "initializer.sh_degree"],
     "initializer=mesh": ["initializer.count", "initializer.sh_degree"],
-    "prior=shapes": ["prior.samples_per_pixel", "prior.census_size", "prior.seed", "prior.noise_path.train_steps"],
+    "prior=shapes": [
+        "prior.samples_per_pixel",
+        "prior.census_size",
+        "prior.seed",
+        "prior.noise_path.train_steps",
+    ],
     "prior=tiny": ["prior.width", "prior.downscale", "prior.seed", "prior.noise_path.train_steps"],
     "refine=default": [
         "refine.start",

@@ -32,8 +32,8 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
+from cadam3d.io.cache import default_cache_dir
 from cadam3d.rasterizer.base import Backend, Rasterizer
-from cadam3d.rasterizer.build import default_cache_dir
 from cadam3d.rasterizer.native import Frame, render_frame, require_shapes
 
 # Mirrors of kernels/*.cuh

@@ -162,7 +162,9 @@ def test_views_do_not_influence_each_other(prior):
 @pytest.mark.parametrize("path", [DDPM(), RectifiedFlow(shift=3.0)], ids=["ddpm", "flow"])
 def test_the_output_means_what_predicts_says(path):
     """The same network, read as noise and as velocity."""
-    as_noise, as_velocity = (Tiny(**KEYS | {"noise_path": path, "predicts": p}) for p in ("noise", "velocity"))
+    as_noise, as_velocity = (
+        Tiny(**KEYS | {"noise_path": path, "predicts": p}) for p in ("noise", "velocity")
+    )
     condition = condition_of(as_noise)
     noise = as_noise.predict(noisy_of(), levels(), condition, 1.0).noise
     guess = as_velocity.predict(noisy_of(), levels(), condition, 1.0)
