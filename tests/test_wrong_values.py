@@ -23,6 +23,7 @@ WHOLE = {  # what to choose, and the keys that count something
         "prior.noise_path.train_steps",
     ],
     "prior=tiny": ["prior.width", "prior.downscale", "prior.seed", "prior.noise_path.train_steps"],
+    "guidance=ucm": ["guidance.inversion_steps"],
     "refine=default": [
         "refine.start",
         "refine.end",
