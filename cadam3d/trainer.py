@@ -53,6 +53,7 @@ class Trainer:
     def __post_init__(self) -> None:
         require_range("steps", self.steps, low=1, example=600)
         require_range("views", self.views, low=1, example=2)
+        self.camera.check_views(self.views)
 
     def start(self, prompt: str, initializer: Initializer, seed: int, device: torch.device) -> TrainState:
         """The state before the first step; every later draw descends from ``seed``."""

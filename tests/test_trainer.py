@@ -257,6 +257,12 @@ def test_a_checkpoint_of_another_densifier_is_refused():
         other.restore(state.to_payload(), CPU)
 
 
+def test_a_number_of_views_that_the_cameras_cannot_give_is_refused_before_the_start():
+    with pytest.raises(UserError, match=r"^views: .* Try: views=4$"):
+        make(["camera=multiview", "views=2"])
+    make(["camera=multiview", "views=4"])
+
+
 def test_an_unknown_or_absent_device_says_what_to_type():
     with pytest.raises(UserError, match="device=cpu"):
         resolve_device("toaster")
