@@ -60,6 +60,7 @@ LISTS = {
     ],
     "background=grey": ["background.color"],
     "background=random": ["background.color"],
+    "background=lucid": ["background.color"],
     "initializer=ball": ["initializer.color"],
     "initializer=mesh": ["initializer.color"],
     "exporter=[images]": ["exporter.images.elevations_deg", "exporter.images.background"],

@@ -48,7 +48,7 @@ class Multiview(CameraSampler):
         require(
             self.relative_distance[0] >= least,
             "camera.relative_distance",
-            wanted=f"cameras outside the unit ball: {least:.3g} or more at camera.fov_y_deg={self.fov_y_deg[1]:g}",
+            wanted=f"cameras outside the unit ball: from {least:.3g} on, at {self.fov_y_deg[1]:g} degrees",
             got=self.relative_distance,
             example="'camera.relative_distance=[0.8,1]' 'camera.fov_y_deg=[15,60]'",
         )
