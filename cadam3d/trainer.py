@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from cadam3d.augmentation import Augmentation
 from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
@@ -25,7 +26,8 @@ from cadam3d.regularizer import Regularizer
 from cadam3d.state import Outcome, Population, RefineReport, RunContext, StepReport, TrainState
 
 # Each source of randomness has its own generator: two densifiers with one seed see the same views and noise.
-GENERATORS = ("initializer", "camera", "background", "guidance", "refine")
+# New names go to the end: a seed gives each the stream of its place.
+GENERATORS = ("initializer", "camera", "background", "guidance", "refine", "augmentation")
 
 
 def never() -> bool:
@@ -41,6 +43,7 @@ class Trainer:
     views: int  # per step
     camera: CameraSampler
     background: Background
+    augmentation: Augmentation
     rasterizer: Rasterizer
     prior: DiffusionPrior
     guidance: Guidance
@@ -57,11 +60,7 @@ class Trainer:
 
     def start(self, prompt: str, initializer: Initializer, seed: int, device: torch.device) -> TrainState:
         """The state before the first step; every later draw descends from ``seed``."""
-        children = np.random.SeedSequence(seed).spawn(len(GENERATORS))
-        generators = {
-            name: torch.Generator().manual_seed(int(child.generate_state(1, np.uint64)[0] >> 1))
-            for name, child in zip(GENERATORS, children, strict=True)
-        }
+        generators = start_generators(seed)
         gaussians = initializer.build(prompt, generators["initializer"], device)
         return TrainState(
             step=0,
@@ -99,9 +98,10 @@ class Trainer:
             got=f"{len(gaussians)} Gaussians and another number of rows",
             example="resume=RUN/checkpoints/<an earlier one>",
         )
-        generators = {name: torch.Generator() for name in GENERATORS}
+        generators = start_generators(payload["seed"])
         for name, generator in generators.items():
-            generator.set_state(payload["generators"][name])
+            if name in payload["generators"]:  # a checkpoint from before the name was: nothing was drawn yet
+                generator.set_state(payload["generators"][name])
         return TrainState(
             step=payload["step"],
             seconds=payload["seconds"],
@@ -191,10 +191,12 @@ class Trainer:
         gaussians, draw = state.gaussians, state.generators
         cameras = self.camera.sample(state.step, self.views, draw["camera"]).to(gaussians.device)
         background = self.background.sample(self.views, draw["background"]).to(gaussians.device)
-        output = self.rasterizer.render(gaussians, cameras, background)
+        rendered = self.augmentation.perturb(gaussians, draw["augmentation"])
+        output = self.rasterizer.render(rendered, cameras, background)
+        images = self.augmentation.show(output, draw["augmentation"])
         condition = embedding.at(cameras, background)
-        judged = self.guidance(output.rgb, condition, self.prior, state.step, draw["guidance"])
-        penalties = {name: fn(gaussians, output, state.step) for name, fn in self.regularizers.items()}
+        judged = self.guidance(images, condition, self.prior, state.step, draw["guidance"])
+        penalties = {name: fn(rendered, output, state.step) for name, fn in self.regularizers.items()}
         loss = sum(penalties.values(), start=judged.loss)
         if penalties and self.densifier.guidance_only:
             judged.loss.backward(retain_graph=True)
@@ -272,6 +274,15 @@ class Trainer:
         state.densifier = carried  # only now: memory may run out above, and owners must agree even then
         after = len(state.gaussians)
         return replace(report, after=after, cloned=plan.cloned, split=plan.split, pruned=plan.pruned)
+
+
+def start_generators(seed: int) -> dict[str, torch.Generator]:
+    """Every source of randomness as it is before the first draw."""
+    children = np.random.SeedSequence(seed).spawn(len(GENERATORS))
+    return {
+        name: torch.Generator().manual_seed(int(child.generate_state(1, np.uint64)[0] >> 1))
+        for name, child in zip(GENERATORS, children, strict=True)
+    }
 
 
 def render_fn(rasterizer: Rasterizer, gaussians: Callable[[], Gaussians]) -> RenderFn:

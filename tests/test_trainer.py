@@ -4,15 +4,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from cadam3d.augmentation import LucidAugmentation
 from cadam3d.callback.base import Callback
 from cadam3d.commands.train import build_trainer
 from cadam3d.core.checks import UserError
+from cadam3d.regularizer import MeanScale
 from cadam3d.settings import component, compose
 from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState
-from cadam3d.trainer import Trainer, resolve_device
+from cadam3d.trainer import Trainer, resolve_device, start_generators
 
 CPU = torch.device("cpu")
 SMALL = [
@@ -122,6 +125,92 @@ def test_densifiers_with_one_seed_see_the_same_views_and_noise(tmp_path):
         ends[densifier] = state.to_payload()["generators"]
     for source in ("camera", "background", "guidance"):
         assert torch.equal(ends["cadam"][source], ends["none"][source])
+
+
+def test_a_stream_depends_on_its_place_and_on_no_later_name():
+    """So that a new source of randomness moves no other, and old results can be had again."""
+    children = np.random.SeedSequence(7).spawn(5)  # as before there was an augmentation
+    old = [
+        torch.Generator().manual_seed(int(child.generate_state(1, np.uint64)[0] >> 1)) for child in children
+    ]
+    names = ("initializer", "camera", "background", "guidance", "refine")
+    new = start_generators(7)
+    for name, generator in zip(names, old, strict=True):
+        assert torch.equal(new[name].get_state(), generator.get_state())
+
+
+AUGMENTED = ["augmentation=lucid", "augmentation.disparity=0.5"]
+
+
+def test_an_augmented_run_is_another_run_in_which_all_other_streams_are_the_same(tmp_path):
+    ends = {}
+    for lines in ([], AUGMENTED):
+        trainer, state = make(["densifier=none", *lines])
+        go(trainer, state, tmp_path)
+        ends[len(lines)] = state.to_payload()
+    assert not torch.equal(ends[0]["gaussians"]["log_scales"], ends[2]["gaussians"]["log_scales"])
+    for name in ("initializer", "camera", "background", "guidance", "refine"):
+        assert torch.equal(ends[0]["generators"][name], ends[2]["generators"][name])
+    fresh = start_generators(0)["augmentation"].get_state()
+    assert torch.equal(ends[0]["generators"]["augmentation"], fresh)
+    assert not torch.equal(ends[2]["generators"]["augmentation"], fresh)
+
+
+def test_guidance_judges_what_is_shown_and_regularizers_what_is_rendered(tmp_path):
+    seen = {}
+
+    class Eye(LucidAugmentation):
+        def perturb(self, gaussians, generator):
+            seen["perturbed"] = super().perturb(gaussians, generator)
+            return seen["perturbed"]
+
+        def show(self, output, generator):
+            seen["output"], seen["shown"] = output, super().show(output, generator)
+            return seen["shown"]
+
+    class Ear(type(make()[0].guidance)):
+        def __call__(self, rgb, *args):
+            assert rgb is seen["shown"]
+            return super().__call__(rgb, *args)
+
+    class Hand(MeanScale):
+        def penalty(self, gaussians, output):
+            assert gaussians is seen["perturbed"]
+            assert output is seen["output"]
+            return super().penalty(gaussians, output)
+
+    trainer, state = make(["steps=2"])
+    watched = replace(
+        trainer,
+        augmentation=Eye(scale_noise=0.1, disparity=0.5, flip=1.0),
+        guidance=Ear(**vars(trainer.guidance)),
+        regularizers={"mean_scale": Hand(weight=1.0)},
+    )
+    assert go(watched, state, tmp_path) is Outcome.FINISHED
+    assert seen.keys() == {"perturbed", "output", "shown"}
+
+
+def test_an_augmented_run_resumes_to_the_bit(tmp_path):
+    trainer, whole = make(AUGMENTED)
+    go(trainer, whole, tmp_path)
+    _, state = make(AUGMENTED)
+    go(replace(trainer, steps=3), state, tmp_path)
+    torch.save(state.to_payload(), tmp_path / "half.pt")
+    resumed = trainer.restore(torch.load(tmp_path / "half.pt", weights_only=True), CPU)
+    go(trainer, resumed, tmp_path)
+    assert same(whole.to_payload(), resumed.to_payload())
+
+
+def test_a_checkpoint_from_before_there_were_augmentations_goes_on_as_if_it_had_one_of_today(tmp_path):
+    trainer, whole = make()
+    go(trainer, whole, tmp_path)
+    _, state = make()
+    go(replace(trainer, steps=3), state, tmp_path)
+    old = state.to_payload()
+    del old["generators"]["augmentation"]
+    resumed = trainer.restore(old, CPU)
+    go(trainer, resumed, tmp_path)
+    assert same(whole.to_payload(), resumed.to_payload())
 
 
 def test_rows_of_all_three_owners_agree_after_every_refinement(tmp_path):

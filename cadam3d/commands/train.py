@@ -134,6 +134,7 @@ def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
         views=cfg.views,
         camera=component(cfg.camera),
         background=component(cfg.background),
+        augmentation=component(cfg.augmentation),
         rasterizer=component(cfg.rasterizer),
         prior=component(cfg.prior).to(device),
         guidance=component(cfg.guidance),
