@@ -17,6 +17,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.densifier.base import Densifier, GradientSignal
 from cadam3d.densifier.refine import Refine
+from cadam3d.exposure import Exposure
 from cadam3d.guidance.base import Guidance
 from cadam3d.initializer.base import Initializer
 from cadam3d.optimizer import AdamSettings
@@ -50,6 +51,7 @@ class Trainer:
     densifier: Densifier
     refine: Refine
     optimizer: AdamSettings
+    exposure: Exposure
     regularizers: Mapping[str, Regularizer]
     callbacks: Sequence[Callback]
 
@@ -67,6 +69,7 @@ class Trainer:
             seconds=0.0,
             num_initial=len(gaussians),
             skipped=0,
+            dimmed=0,
             refused=False,
             seed=seed,
             optimizer=self.optimizer.start(gaussians),
@@ -107,6 +110,7 @@ class Trainer:
             seconds=payload["seconds"],
             num_initial=payload["num_initial"],
             skipped=payload["skipped"],
+            dimmed=payload.get("dimmed", 0),  # a checkpoint from before there was a guard
             refused=payload["refused"],
             seed=payload["seed"],
             optimizer=optimizer,
@@ -212,11 +216,14 @@ class Trainer:
         else:
             state.skipped += 1
             state.optimizer.zero_grad()
+        log = {**judged.log, **{name: float(value.detach()) for name, value in penalties.items()}}
+        if (factor := self.exposure.dimming(output, background, state.step + 1)) is not None:
+            state.optimizer.scale_colors(factor)
+            state.dimmed += 1
+        if state.dimmed:
+            log["dimmed"] = float(state.dimmed)
         return StepReport(
-            step=state.step + 1,
-            loss=float(loss.detach()),
-            log={**judged.log, **{name: float(value.detach()) for name, value in penalties.items()}},
-            num_gaussians=len(gaussians),
+            step=state.step + 1, loss=float(loss.detach()), log=log, num_gaussians=len(gaussians)
         )
 
     def _refine(self, state: TrainState, step: int) -> tuple[RefineReport | None, Outcome | None]:

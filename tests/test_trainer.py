@@ -213,6 +213,62 @@ def test_a_checkpoint_from_before_there_were_augmentations_goes_on_as_if_it_had_
     assert same(whole.to_payload(), resumed.to_payload())
 
 
+ALWAYS = ["exposure=beg", "exposure.begin=2", "exposure.end=6", "exposure.threshold=0", "exposure.rate=0.5"]
+
+
+def test_colours_are_dimmed_after_the_steps_that_were_judged_too_bright_and_counted(tmp_path):
+    trainer, state = make(["densifier=none", *ALWAYS])
+    witness = Witness()
+    go(replace(trainer, callbacks=[witness]), state, tmp_path)
+    counts = [report.log.get("dimmed") for report in witness.steps]
+    assert counts == [None, None, 1, 2, 3, 3, 3, 3]
+    assert state.to_payload()["dimmed"] == 3
+
+
+def test_dimming_comes_after_the_step_and_touches_nothing_else(tmp_path):
+    results = []
+    for lines in (["exposure=none"], [*ALWAYS, "exposure.begin=7", "exposure.end=9"]):
+        trainer, state = make(["densifier=none", *lines])
+        go(trainer, state, tmp_path)
+        results.append(state.to_payload())
+    plain, dimmed = results
+    torch.testing.assert_close(dimmed["gaussians"]["sh"], 0.5 * plain["gaussians"]["sh"])
+    for name in ("means", "log_scales", "quats", "opacity_logits"):
+        assert torch.equal(dimmed["gaussians"][name], plain["gaussians"][name])
+    assert not dimmed["optimizer"]["exp_avg"]["sh_dc"].any()
+
+
+def test_a_dimmed_run_resumes_to_the_bit_and_keeps_its_count(tmp_path):
+    trainer, whole = make(ALWAYS)
+    go(trainer, whole, tmp_path)
+    _, state = make(ALWAYS)
+    go(replace(trainer, steps=4), state, tmp_path)
+    torch.save(state.to_payload(), tmp_path / "half.pt")
+    resumed = trainer.restore(torch.load(tmp_path / "half.pt", weights_only=True), CPU)
+    assert resumed.dimmed == 2
+    go(trainer, resumed, tmp_path)
+    assert same(whole.to_payload(), resumed.to_payload())
+
+
+def test_a_checkpoint_from_before_there_was_a_guard_has_dimmed_nothing():
+    trainer, state = make()
+    old = state.to_payload()
+    del old["dimmed"]
+    assert trainer.restore(old, CPU).dimmed == 0
+
+
+def test_the_densifier_observes_gradients_that_are_not_clipped(tmp_path):
+    states = {}
+    for bound in ("null", "1e-6"):
+        trainer, state = make(["steps=1", f"optimizer.clip_norm={bound}"])
+        go(trainer, state, tmp_path)
+        states[bound] = state.to_payload()
+    assert torch.equal(states["null"]["densifier"]["m"], states["1e-6"]["densifier"]["m"])
+    clipped = states["1e-6"]["optimizer"]["exp_avg"]["means"]
+    assert float(clipped.norm()) == pytest.approx(1e-7, rel=1e-4)
+    assert float(states["null"]["optimizer"]["exp_avg"]["means"].norm()) > 1e-4
+
+
 def test_rows_of_all_three_owners_agree_after_every_refinement(tmp_path):
     class Auditor(Callback):
         def on_refine(self, context, state, report):

@@ -38,6 +38,7 @@ WHOLE = {  # what to choose, and the keys that count something
         "refine.max_gaussians",
     ],
     "densifier=cadam": ["densifier.min_age", "densifier.reset_min_age"],
+    "exposure=beg": ["exposure.begin", "exposure.end"],
     "exporter=[images]": ["exporter.images.views", "exporter.images.size"],
     "exporter=[preview]": ["exporter.preview.views", "exporter.preview.size"],
     "exporter=[turntable]": [
