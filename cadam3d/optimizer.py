@@ -73,8 +73,8 @@ class GaussianOptimizer:
     def step(self, step: int) -> None:
         """One Adam step at the learning rates of ``step`` (0 is the first), then forget the gradients.
 
-        A tensor without a gradient has the gradient zero: its moments decay like everybody's. If ``clip_norm``
-        is set, only Adam sees clipped gradients: densifiers have looked before.
+        A tensor without a gradient has the gradient zero: its moments decay like everybody's. With a
+        ``clip_norm``, only Adam sees clipped gradients: densifiers have looked before.
         """
         rates, bound = self.settings.learning_rates(step), self.settings.largest_norm(step)
         gradients = self._gaussians.map(
