@@ -51,6 +51,7 @@ WHOLE = {  # what to choose, and the keys that count something
     "exporter=[ply]": ["exporter.ply.pad_sh"],
     "metric=[fidelity]": ["metric.fidelity.views", "metric.fidelity.size"],
     "callback=[metrics]": ["callback.metrics.every"],
+    "callback=[previews]": ["callback.previews.every", "callback.previews.views", "callback.previews.size"],
     "callback=[checkpoint]": ["callback.checkpoint.every", "callback.checkpoint.keep"],
 }
 LISTS = {
@@ -69,6 +70,7 @@ LISTS = {
     "exporter=[images]": ["exporter.images.elevations_deg", "exporter.images.background"],
     "exporter=[preview]": ["exporter.preview.elevations_deg", "exporter.preview.background"],
     "exporter=[turntable]": ["exporter.turntable.background"],
+    "callback=[previews]": ["callback.previews.background"],
     "metric=[fidelity]": ["metric.fidelity.elevations_deg", "metric.fidelity.background"],
 }
 TRUTHS = {
@@ -77,6 +79,7 @@ TRUTHS = {
     "guidance=ism": ["guidance.shared_t"],
     "exporter=[preview]": ["exporter.preview.labels"],
 }
+NULL_IS_NEVER = ("refine.reset_interval", "refine.max_gaussians", "callback.previews.every")
 NEVER_WHOLE = ("2.5", "16.0", "true", "abc", "[1]", "-1000000000000.5")
 NEVER_A_LIST = ("5", "null", "abc", "[a,b,c]", "[true,true,true]", "[null,null]", "[]")
 NEVER_A_TRUTH = ("0", "1", "1.0", "null", "abc")
@@ -124,7 +127,7 @@ def refuses(choice: str, line: str) -> None:
 def test_what_is_counted_is_a_whole_number(choice, key):
     for value in NEVER_WHOLE:
         refuses(choice, f"{key}={value}")
-    if key not in ("refine.reset_interval", "refine.max_gaussians"):  # where null means never
+    if key not in NULL_IS_NEVER:
         refuses(choice, f"{key}=null")
 
 
