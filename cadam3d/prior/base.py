@@ -72,7 +72,8 @@ class DiffusionPrior(ABC):
     ) -> Prediction:
         """One guess, without gradient, under guidance: negative + scale * (positive - negative).
 
-        ``scale`` 1 is the prompt alone, 0 the negative prompt alone (the empty one unless the user gave one).
+        ``scale`` 1 is the prompt alone, 0 the negative prompt alone (the empty one unless the user gave one);
+        below 0 it leads away from the prompt (SDI inverts so).
         """
 
     def truth(self, prompt: str) -> TruthFn | None:

@@ -7,6 +7,7 @@ import torch
 
 from cadam3d.guidance.csd import CSD
 from cadam3d.guidance.ism import ISM
+from cadam3d.guidance.sdi import SDI
 from cadam3d.guidance.sds import SDS
 from cadam3d.guidance.ucm import UCM
 from cadam3d.guidance.vfds import VFDS
@@ -26,6 +27,7 @@ GUIDED = {  # by classifier-free guidance
     "sds": (SDS, {}),
     "ism": (ISM, {"delta": 0.05, "inversion_stride": 0.2, "initial_noise": 0.0}),
     "vfds": (VFDS, {}),
+    "sdi": (SDI, {"inversion_scale": -2.0, "inversion_stride": 0.25, "overshoot": 0.03, "eta": 0.3}),
     "ucm": (UCM, {"inversion_steps": 3, "inversion_grid": "t", "fresh_noise": 0.0}),
 }
 OBJECTIVES = {name: (kind, {"scale": 2.0} | keys) for name, (kind, keys) in GUIDED.items()} | {

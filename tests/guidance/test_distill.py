@@ -39,7 +39,7 @@ def test_descent_points_at_the_image(guided, path, make, ask, gaussian, one_amon
 
 def test_descent_arrives_at_the_image(guided, path, make, ask, gaussian, one_among_many, rgb):
     """Gradient descent with the x0-residual as gradient, from anywhere, on a prior with little spread."""
-    weighting = {"sds": "gamma", "ism": "gamma", "vfds": "sigma", "ucm": "sigma"}[guided]
+    weighting = {"vfds": "sigma", "ucm": "sigma"}.get(guided, "gamma")
     guidance = make(guided, scale=1.0, weighting=weighting, t_min=0.3, t_max=0.7)
     prior, render = gaussian(path, spread=0.02), rgb.detach()
     target = one_among_many.positive.permute(0, 2, 3, 1)
@@ -208,6 +208,7 @@ def test_noise_levels_stay_precise_when_latents_are_half(make, gaussian, one_ima
     assert render.grad.isfinite().all()
 
 
+@pytest.mark.parametrize("guided", ["sds", "ism", "vfds", "ucm"])  # sdi inverts under both prompts
 def test_scale_one_ignores_the_negative_prompt(guided, make, ask, prior, means, rgb):
     other = type(means)(means.positive, means.negative + 1, means.empty)
     first, _ = ask(make(guided, scale=1.0), rgb, means, prior)
@@ -215,6 +216,7 @@ def test_scale_one_ignores_the_negative_prompt(guided, make, ask, prior, means, 
     torch.testing.assert_close(first, again, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.parametrize("guided", ["sds", "ism", "vfds", "ucm"])  # sdi inverts under both prompts
 def test_scale_zero_is_the_negative_prompt_alone(guided, make, ask, prior, means, rgb):
     swapped = type(means)(means.negative, means.positive, means.empty)
     first, _ = ask(make(guided, scale=0.0), rgb, means, prior)
