@@ -14,6 +14,8 @@ from cadam3d.settings import component, compose
 WHOLE = {  # what to choose, and the keys that count something
     "camera=orbit": ["camera.size"],
     "camera=sphere": ["camera.size"],
+    "camera=multiview": ["camera.size"],
+    "camera=progressive": ["camera.size", "camera.begin", "camera.every"],
     "initializer=ball": ["initializer.count", "initializer.sh_degree"],
     "initializer=mesh": ["initializer.count", "initializer.sh_degree"],
     "prior=shapes": [
@@ -23,6 +25,7 @@ WHOLE = {  # what to choose, and the keys that count something
         "prior.noise_path.train_steps",
     ],
     "prior=tiny": ["prior.width", "prior.downscale", "prior.seed", "prior.noise_path.train_steps"],
+    "guidance=ucm": ["guidance.inversion_steps"],
     "refine=default": [
         "refine.start",
         "refine.end",
@@ -36,6 +39,8 @@ WHOLE = {  # what to choose, and the keys that count something
         "refine.max_gaussians",
     ],
     "densifier=cadam": ["densifier.min_age", "densifier.reset_min_age"],
+    "densifier=mcmc": ["densifier.cap"],
+    "exposure=beg": ["exposure.begin", "exposure.end"],
     "exporter=[images]": ["exporter.images.views", "exporter.images.size"],
     "exporter=[preview]": ["exporter.preview.views", "exporter.preview.size"],
     "exporter=[turntable]": [
@@ -51,8 +56,14 @@ WHOLE = {  # what to choose, and the keys that count something
 LISTS = {
     "camera=orbit": ["camera.azimuth_deg", "camera.elevation_deg", "camera.distance", "camera.fov_y_deg"],
     "camera=sphere": ["camera.distance", "camera.fov_y_deg"],
+    "camera=multiview": ["camera.elevation_deg", "camera.relative_distance", "camera.fov_y_deg"],
+    "camera=progressive": [
+        *("camera.azimuth_deg.start", "camera.elevation_deg.end", "camera.distance.end"),
+        *("camera.fov_y_deg.start", "camera.fov_y_deg.factor", "camera.distance.factor"),
+    ],
     "background=grey": ["background.color"],
     "background=random": ["background.color"],
+    "background=lucid": ["background.color"],
     "initializer=ball": ["initializer.color"],
     "initializer=mesh": ["initializer.color"],
     "exporter=[images]": ["exporter.images.elevations_deg", "exporter.images.background"],
@@ -128,6 +139,13 @@ def test_a_list_of_numbers_is_nothing_else(choice, key):
 def test_a_switch_is_true_or_false(choice, key):
     for value in NEVER_A_TRUTH:
         refuses(choice, f"{key}={value}")
+
+
+@pytest.mark.parametrize("value", [*NEVER_A_LIST, "[10,20]"])
+def test_a_range_that_widens_has_a_start_an_end_and_a_factor(value):
+    refuses("camera=progressive", f"camera.fov_y_deg={value}")
+    if value not in ("5", "[10,20]"):
+        refuses("camera=progressive", f"camera.elevation_deg.about={value}")
 
 
 def test_a_truth_value_bounds_nothing():
