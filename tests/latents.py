@@ -18,6 +18,7 @@ KEYS = {  # of every pretrained prior; path and cache_dir are the test's
     "micro_batch": None,
     "tiling": False,
     "compile": False,
+    "text_device": "auto",
 }
 
 
@@ -38,6 +39,17 @@ def encodes_what_the_autoencoder_says(prior: LatentPrior, vae) -> None:
     mean = vae.encode(2 * images - 1).latent_dist.mean
     expected = (mean - (vae.config.shift_factor or 0)) * vae.config.scaling_factor
     torch.testing.assert_close(prior.encode(rgb), expected, rtol=1e-4, atol=1e-5)
+
+
+def memory_is_foreseen(prior: LatentPrior) -> None:
+    """From configurations alone: the weights exactly, and something for the work and the texts."""
+    unloaded = replace(prior)
+    estimate = unloaded.memory("a prompt that nobody has embedded", "", 2, None)
+    assert not {"vae", "network"} & set(unloaded.__dict__)
+    parameters = [*prior.network.parameters(), *prior.vae.parameters()]
+    assert estimate.weights == sum(each.numel() * each.element_size() for each in parameters)
+    assert estimate.working > 0
+    assert estimate.texts > 0
 
 
 def micro_batch_changes_nothing(prior: LatentPrior, size: int, views: int, channels: int) -> None:

@@ -13,12 +13,11 @@ from torch.nn import functional as F  # noqa: N812  (the name everybody knows)
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require, require_choice
 from cadam3d.io.pretrained import Pretrained
-from cadam3d.prior.latent import LatentPrior, Texts, free, tokenize
+from cadam3d.prior.latent import T5_TOKENS, LatentPrior, Texts, free, tokenize
 from cadam3d.prior.path import NoisePath, Prediction, RectifiedFlow
 from cadam3d.prior.text import penultimate
 
 T5 = "text_encoder_3"
-T5_TOKENS = 256  # per text, as in the pipeline of diffusers
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from latents import KEYS, condition_of, encodes_what_the_autoencoder_says, micro_batch_changes_nothing, normal
+from latents import (
+    KEYS,
+    condition_of,
+    encodes_what_the_autoencoder_says,
+    memory_is_foreseen,
+    micro_batch_changes_nothing,
+    normal,
+)
 
 from cadam3d.prior.sdxl import StableDiffusionXL
 
@@ -88,6 +95,10 @@ def test_the_network_is_told_the_size(prior):
 
 def test_latents_are_those_of_the_pipelines_autoencoder(prior, pipe):
     encodes_what_the_autoencoder_says(prior, pipe.vae)
+
+
+def test_memory_is_foreseen(prior):
+    memory_is_foreseen(prior)
 
 
 def test_micro_batch_changes_nothing(prior):

@@ -5,7 +5,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from latents import KEYS, condition_of, encodes_what_the_autoencoder_says, micro_batch_changes_nothing, normal
+from latents import (
+    KEYS,
+    condition_of,
+    encodes_what_the_autoencoder_says,
+    memory_is_foreseen,
+    micro_batch_changes_nothing,
+    normal,
+)
 
 from cadam3d.core.checks import UserError
 from cadam3d.io.jsonl import read_json, write_json
@@ -136,6 +143,10 @@ def test_the_shift_is_the_models_own(prior, folder, tmp_path):
 def test_latents_are_those_of_the_pipelines_autoencoder(prior, pipe):
     assert pipe.vae.config.shift_factor
     encodes_what_the_autoencoder_says(prior, pipe.vae)
+
+
+def test_memory_is_foreseen(prior):
+    memory_is_foreseen(prior)
 
 
 def test_micro_batch_changes_nothing(prior):
