@@ -78,6 +78,7 @@ TRUTHS = {
     "guidance=sds": ["guidance.shared_t"],
     "guidance=ism": ["guidance.shared_t"],
     "exporter=[preview]": ["exporter.preview.labels"],
+    "prior=stable_diffusion_3": ["prior.t5"],
 }
 NULL_IS_NEVER = ("refine.reset_interval", "refine.max_gaussians", "callback.previews.every")
 NEVER_WHOLE = ("2.5", "16.0", "true", "abc", "[1]", "-1000000000000.5")
