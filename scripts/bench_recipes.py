@@ -3,8 +3,8 @@
     python scripts/bench_recipes.py --device cuda --steps 50 --vram low --json recipes.json
     python scripts/bench_recipes.py --estimates     # what each would need, without a GPU or weights
 
-What an object looks like means nothing here; what a step costs does. Weights are drawn once and saved as a real
-model is, so that loading is timed too (Stable Diffusion 2.1: 1.9 GB, 3.5-medium: 4.7 GB in 16 bit).
+What an object looks like means nothing here; what a step costs does. Weights are drawn once and saved as a
+real model is, so that loading is timed too (Stable Diffusion 2.1: 1.9 GB, 3.5-medium: 4.7 GB in 16 bit).
 """
 
 import argparse
