@@ -77,6 +77,7 @@ TRUTHS = {
     "densifier=cadam": ["densifier.reset_moments"],
     "guidance=sds": ["guidance.shared_t"],
     "guidance=ism": ["guidance.shared_t"],
+    "guidance=gcs": ["guidance.shared_t", "guidance.fixed_noise"],
     "exporter=[preview]": ["exporter.preview.labels"],
     "prior=stable_diffusion_3": ["prior.t5"],
 }

@@ -140,6 +140,14 @@ def test_no_gradient_flows_through_a_prediction_but_it_does_through_encode() -> 
     assert not model.predict(encoded, torch.tensor([0.4, 0.7]), condition_of(model), 7.5).noise.requires_grad
 
 
+def test_decoding_undoes_encoding_and_stays_in_range() -> None:
+    model, rgb = prior(), torch.rand(2, SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(model.decode(model.encode(rgb), SIZE, SIZE), rgb)
+    decoded = model.decode(3 * noisy_image().requires_grad_(), SIZE, SIZE)
+    assert not decoded.requires_grad
+    assert (decoded.min(), decoded.max()) == (0, 1)
+
+
 def test_spread_is_wider_at_silhouettes() -> None:
     model = prior(spread=0.1, edge_spread=0.2)
     variance = condition_of(model).positive.variance
