@@ -28,7 +28,15 @@ from cadam3d.state import Outcome, Population, RefineReport, RunContext, StepRep
 
 # Each source of randomness has its own generator: two densifiers with one seed see the same views and noise.
 # New names go to the end: a seed gives each the stream of its place.
-GENERATORS = ("initializer", "camera", "background", "guidance", "refine", "augmentation")
+GENERATORS = (
+    "initializer",
+    "camera",
+    "background",
+    "guidance",
+    "refine",
+    "densifier",
+    "augmentation",
+)
 
 
 def never() -> bool:
@@ -213,6 +221,7 @@ class Trainer:
         state.densifier = self.densifier.observe(state.densifier, signal)
         if state.optimizer.finite_gradients():
             state.optimizer.step(state.step)
+            self._perturb(state)
         else:
             state.skipped += 1
             state.optimizer.zero_grad()
@@ -226,12 +235,19 @@ class Trainer:
             step=state.step + 1, loss=float(loss.detach()), log=log, num_gaussians=len(gaussians)
         )
 
+    def _perturb(self, state: TrainState) -> None:
+        """Move the means at random, if the densifier wants it."""
+        lr = self.optimizer.learning_rates(state.step)["means"]
+        offsets = self.densifier.perturb(state.gaussians.detach(), lr, state.generators["densifier"])
+        if offsets is not None:
+            state.optimizer.displace(offsets)
+
     def _refine(self, state: TrainState, step: int) -> tuple[RefineReport | None, Outcome | None]:
         """Grow, prune and reset where the schedule says so: a pure plan, then one edit for everybody."""
         refines, resets = self.refine.refines_at(step), self.refine.resets_at(step)
         if not (refines or resets):
             return None, None
-        report = self._look(state, step, refines)
+        report = self._look(state, step)
         if refines:
             report = self._grow(state, report)
             if state.refused:
@@ -243,11 +259,10 @@ class Trainer:
             report = replace(report, reset=lowered)
         return report, (Outcome.VANISHED if report.after == 0 else None)
 
-    def _look(self, state: TrainState, step: int, refines: bool) -> RefineReport:
-        """What the densifier sees and wants, before anything changes."""
+    def _look(self, state: TrainState, step: int) -> RefineReport:
+        """What the densifier sees, before anything is decided."""
         gaussians, seen = state.gaussians.detach(), state.densifier
         n = len(gaussians)
-        nobody = torch.zeros(n, dtype=torch.bool, device=gaussians.device)
         return RefineReport(
             step=step,
             before=n,
@@ -260,7 +275,7 @@ class Trainer:
             statistics=self.densifier.statistics(seen, step),
             population=Population(
                 gaussians=gaussians,
-                is_selected=self.densifier.select(seen, step) if refines else nobody,
+                is_selected=torch.zeros(n, dtype=torch.bool, device=gaussians.device),
                 scores=self.densifier.scores(seen),
             ),
         )
@@ -269,9 +284,9 @@ class Trainer:
         """Apply one refinement to all owners of rows, or refuse it whole; ``state.refused`` says which."""
         generator = state.generators["refine"]
         draws_before = generator.get_state()
-        wanted, unwanted = report.population.is_selected, self.densifier.unwanted(state.densifier)
-        plan = self.refine.plan(state.gaussians, wanted, report.step, generator, unwanted)
-        report = replace(report, selected=plan.selected)
+        plan = self.densifier.plan(state.densifier, state.gaussians, report.step, self.refine, generator)
+        population = replace(report.population, is_selected=plan.is_selected)
+        report = replace(report, selected=plan.selected, population=population)
         state.refused = self.refine.exceeds(plan)
         if state.refused:
             generator.set_state(draws_before)

@@ -25,6 +25,7 @@ WHOLE = {  # what to choose, and the keys that count something
         "prior.noise_path.train_steps",
     ],
     "prior=tiny": ["prior.width", "prior.downscale", "prior.seed", "prior.noise_path.train_steps"],
+    "guidance=ucm": ["guidance.inversion_steps"],
     "refine=default": [
         "refine.start",
         "refine.end",
@@ -38,6 +39,7 @@ WHOLE = {  # what to choose, and the keys that count something
         "refine.max_gaussians",
     ],
     "densifier=cadam": ["densifier.min_age", "densifier.reset_min_age"],
+    "densifier=mcmc": ["densifier.cap"],
     "exposure=beg": ["exposure.begin", "exposure.end"],
     "exporter=[images]": ["exporter.images.views", "exporter.images.size"],
     "exporter=[preview]": ["exporter.preview.views", "exporter.preview.size"],
@@ -76,6 +78,7 @@ TRUTHS = {
     "guidance=sds": ["guidance.shared_t"],
     "guidance=ism": ["guidance.shared_t"],
     "exporter=[preview]": ["exporter.preview.labels"],
+    "prior=stable_diffusion_3": ["prior.t5"],
 }
 NULL_IS_NEVER = ("refine.reset_interval", "refine.max_gaussians", "callback.previews.every")
 NEVER_WHOLE = ("2.5", "16.0", "true", "abc", "[1]", "-1000000000000.5")

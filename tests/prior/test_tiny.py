@@ -103,12 +103,13 @@ def test_encoding_passes_a_gradient_to_every_pixel(prior):
     assert (rgb.grad > 0).all()
 
 
-def test_guidance_has_the_conventional_form(prior):
+@pytest.mark.parametrize("scale", [7.5, -7.5])
+def test_guidance_has_the_conventional_form(prior, scale):
     condition = condition_of(prior, "a red cube", "ugly")
     negative, positive, guided = (
-        prior.predict(noisy_of(), levels(), condition, s).noise for s in (0.0, 1.0, 7.5)
+        prior.predict(noisy_of(), levels(), condition, s).noise for s in (0.0, 1.0, scale)
     )
-    torch.testing.assert_close(guided, negative + 7.5 * (positive - negative), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(guided, negative + scale * (positive - negative), rtol=1e-4, atol=1e-4)
 
 
 def test_scale_one_is_the_prompt_alone_and_zero_the_negative_alone(prior):
