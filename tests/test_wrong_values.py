@@ -16,6 +16,7 @@ WHOLE = {  # what to choose, and the keys that count something
     "camera=sphere": ["camera.size"],
     "initializer=ball": ["initializer.count", "initializer.sh_degree"],
     "initializer=mesh": ["initializer.count", "initializer.sh_degree"],
+    "initializer=ply": ["initializer.count", "initializer.sh_degree", "initializer.replicate"],
     "prior=shapes": [
         "prior.samples_per_pixel",
         "prior.census_size",
@@ -55,6 +56,7 @@ LISTS = {
     "background=random": ["background.color"],
     "initializer=ball": ["initializer.color"],
     "initializer=mesh": ["initializer.color"],
+    "initializer=ply": ["initializer.color"],
     "exporter=[images]": ["exporter.images.elevations_deg", "exporter.images.background"],
     "exporter=[preview]": ["exporter.preview.elevations_deg", "exporter.preview.background"],
     "exporter=[turntable]": ["exporter.turntable.background"],
@@ -65,6 +67,10 @@ TRUTHS = {
     "guidance=sds": ["guidance.shared_t"],
     "guidance=ism": ["guidance.shared_t"],
     "exporter=[preview]": ["exporter.preview.labels"],
+}
+NULLABLE = {  # where null means never, all, or as it is
+    "refine=default": ("refine.reset_interval", "refine.max_gaussians"),
+    "initializer=ply": ("initializer.count", "initializer.sh_degree"),
 }
 NEVER_WHOLE = ("2.5", "16.0", "true", "abc", "[1]", "-1000000000000.5")
 NEVER_A_LIST = ("5", "null", "abc", "[a,b,c]", "[true,true,true]", "[null,null]", "[]")
@@ -81,7 +87,7 @@ def as_users_run_it():
 
 @cache
 def composed(choice: str) -> DictConfig:
-    path = ["initializer.path=a.ply"] if choice == "initializer=mesh" else []
+    path = ["initializer.path=a.ply"] if choice in ("initializer=mesh", "initializer=ply") else []
     return compose(["prompt=a red cube", choice, *path])
 
 
@@ -113,7 +119,7 @@ def refuses(choice: str, line: str) -> None:
 def test_what_is_counted_is_a_whole_number(choice, key):
     for value in NEVER_WHOLE:
         refuses(choice, f"{key}={value}")
-    if key not in ("refine.reset_interval", "refine.max_gaussians"):  # where null means never
+    if key not in NULLABLE.get(choice, ()):
         refuses(choice, f"{key}=null")
 
 
