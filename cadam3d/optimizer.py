@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.core.checks import UserError, require_range
@@ -94,6 +94,11 @@ class GaussianOptimizer:
         for kind in MOMENTS:
             moments[kind] = {name: edit.carry(rows) for name, rows in moments[kind].items()}
         self._install(edit.apply(self._gaussians), moments)
+
+    @torch.no_grad()
+    def displace(self, offsets: Float[Tensor, "n 3"]) -> None:
+        """Add ``offsets`` (world units) to the means; all moments stay as they are."""
+        self._gaussians.means.add_(offsets)
 
     @torch.no_grad()
     def reset_opacity(self, rows: Bool[Tensor, "n"], value: float) -> int:

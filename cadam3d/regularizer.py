@@ -43,11 +43,23 @@ class Weighted(Regularizer):
 
 @dataclass(frozen=True, kw_only=True)
 class MeanScale(Weighted):
-    """Mean standard deviation in world units: keeps Gaussians small (LucidDreamer, weight 1)."""
+    """Mean standard deviation in world units: keeps Gaussians small (LucidDreamer, weight 1).
+
+    3DGS-MCMC gives it a weight of 0.01.
+    """
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
         """Mean over Gaussians and axes."""
         return _mean(gaussians.scales)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeanOpacity(Weighted):
+    """Mean opacity: whoever is not needed fades away (3DGS-MCMC, Kheradmand et al. 2024, weight 0.01)."""
+
+    def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
+        """Mean over Gaussians, in (0, 1)."""
+        return _mean(gaussians.opacities)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,8 @@ from cadam3d.regularizer import Regularizer
 from cadam3d.state import Outcome, Population, RefineReport, RunContext, StepReport, TrainState
 
 # Each source of randomness has its own generator: two densifiers with one seed see the same views and noise.
-GENERATORS = ("initializer", "camera", "background", "guidance", "refine")
+# Appended to, never reordered: the place of a name is part of its seed.
+GENERATORS = ("initializer", "camera", "background", "guidance", "refine", "densifier")
 
 
 def never() -> bool:
@@ -56,11 +57,7 @@ class Trainer:
 
     def start(self, prompt: str, initializer: Initializer, seed: int, device: torch.device) -> TrainState:
         """The state before the first step; every later draw descends from ``seed``."""
-        children = np.random.SeedSequence(seed).spawn(len(GENERATORS))
-        generators = {
-            name: torch.Generator().manual_seed(int(child.generate_state(1, np.uint64)[0] >> 1))
-            for name, child in zip(GENERATORS, children, strict=True)
-        }
+        generators = _generators(seed)
         gaussians = initializer.build(prompt, generators["initializer"], device)
         return TrainState(
             step=0,
@@ -98,9 +95,11 @@ class Trainer:
             got=f"{len(gaussians)} Gaussians and another number of rows",
             example="resume=RUN/checkpoints/<an earlier one>",
         )
-        generators = {name: torch.Generator() for name in GENERATORS}
-        for name, generator in generators.items():
-            generator.set_state(payload["generators"][name])
+        generators = _generators(payload["seed"])
+        for name, drawn in payload[
+            "generators"
+        ].items():  # who is too new for the checkpoint has drawn nothing
+            generators[name].set_state(drawn)
         return TrainState(
             step=payload["step"],
             seconds=payload["seconds"],
@@ -206,6 +205,7 @@ class Trainer:
         state.densifier = self.densifier.observe(state.densifier, signal)
         if state.optimizer.finite_gradients():
             state.optimizer.step(state.step)
+            self._perturb(state)
         else:
             state.skipped += 1
             state.optimizer.zero_grad()
@@ -216,12 +216,19 @@ class Trainer:
             num_gaussians=len(gaussians),
         )
 
+    def _perturb(self, state: TrainState) -> None:
+        """Move the means at random, if the densifier wants it."""
+        lr = self.optimizer.learning_rates(state.step)["means"]
+        offsets = self.densifier.perturb(state.gaussians.detach(), lr, state.generators["densifier"])
+        if offsets is not None:
+            state.optimizer.displace(offsets)
+
     def _refine(self, state: TrainState, step: int) -> tuple[RefineReport | None, Outcome | None]:
         """Grow, prune and reset where the schedule says so: a pure plan, then one edit for everybody."""
         refines, resets = self.refine.refines_at(step), self.refine.resets_at(step)
         if not (refines or resets):
             return None, None
-        report = self._look(state, step, refines)
+        report = self._look(state, step)
         if refines:
             report = self._grow(state, report)
             if state.refused:
@@ -233,11 +240,10 @@ class Trainer:
             report = replace(report, reset=lowered)
         return report, (Outcome.VANISHED if report.after == 0 else None)
 
-    def _look(self, state: TrainState, step: int, refines: bool) -> RefineReport:
-        """What the densifier sees and wants, before anything changes."""
+    def _look(self, state: TrainState, step: int) -> RefineReport:
+        """What the densifier sees, before anything is decided."""
         gaussians, seen = state.gaussians.detach(), state.densifier
         n = len(gaussians)
-        nobody = torch.zeros(n, dtype=torch.bool, device=gaussians.device)
         return RefineReport(
             step=step,
             before=n,
@@ -250,7 +256,7 @@ class Trainer:
             statistics=self.densifier.statistics(seen, step),
             population=Population(
                 gaussians=gaussians,
-                is_selected=self.densifier.select(seen, step) if refines else nobody,
+                is_selected=torch.zeros(n, dtype=torch.bool, device=gaussians.device),
                 scores=self.densifier.scores(seen),
             ),
         )
@@ -259,9 +265,9 @@ class Trainer:
         """Apply one refinement to all owners of rows, or refuse it whole; ``state.refused`` says which."""
         generator = state.generators["refine"]
         draws_before = generator.get_state()
-        wanted, unwanted = report.population.is_selected, self.densifier.unwanted(state.densifier)
-        plan = self.refine.plan(state.gaussians, wanted, report.step, generator, unwanted)
-        report = replace(report, selected=plan.selected)
+        plan = self.densifier.plan(state.densifier, state.gaussians, report.step, self.refine, generator)
+        population = replace(report.population, is_selected=plan.is_selected)
+        report = replace(report, selected=plan.selected, population=population)
         state.refused = self.refine.exceeds(plan)
         if state.refused:
             generator.set_state(draws_before)
@@ -271,6 +277,15 @@ class Trainer:
         state.densifier = carried  # only now: memory may run out above, and owners must agree even then
         after = len(state.gaussians)
         return replace(report, after=after, cloned=plan.cloned, split=plan.split, pruned=plan.pruned)
+
+
+def _generators(seed: int) -> dict[str, torch.Generator]:
+    """One per source of randomness, as they are before the first draw."""
+    children = np.random.SeedSequence(seed).spawn(len(GENERATORS))
+    return {
+        name: torch.Generator().manual_seed(int(child.generate_state(1, np.uint64)[0] >> 1))
+        for name, child in zip(GENERATORS, children, strict=True)
+    }
 
 
 def render_fn(rasterizer: Rasterizer, gaussians: Callable[[], Gaussians]) -> RenderFn:

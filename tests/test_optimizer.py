@@ -184,6 +184,21 @@ def test_everybody_may_vanish():
     assert len(optimizer.gaussians) == 0
 
 
+def test_a_displacement_moves_the_means_and_leaves_the_moments():
+    optimizer = settings().start(gaussians(5))
+    train(optimizer, range(3))
+    before, moments = optimizer.gaussians.map(torch.clone).detach(), as_named(optimizer.state_dict())
+    offsets = gaussians(5, seed=7).means
+    optimizer.displace(offsets)
+    assert torch.equal(optimizer.gaussians.means, before.means + offsets)
+    assert all(torch.equal(rows, moments[name]) for name, rows in as_named(optimizer.state_dict()).items())
+    assert optimizer.gaussians.means.requires_grad
+    twin = settings().start(gaussians(5))
+    train(twin, range(4))
+    train(optimizer, range(3, 4))  # what Adam moves is what was displaced
+    torch.testing.assert_close(optimizer.gaussians.means, twin.gaussians.means + offsets)
+
+
 def test_a_reset_never_raises_an_opacity():
     optimizer = settings().start(gaussians(50))
     optimizer.gaussians.opacity_logits.data.uniform_(-8, 3, generator=torch.Generator().manual_seed(0))

@@ -9,10 +9,11 @@ from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.core.schedule import Linear
-from cadam3d.regularizer import AlphaEntropy, MeanScale, OutsideBall, Sparsity, TotalVariation
+from cadam3d.regularizer import AlphaEntropy, MeanOpacity, MeanScale, OutsideBall, Sparsity, TotalVariation
 
 EVERY = [
     MeanScale(weight=2.0),
+    MeanOpacity(weight=2.0),
     OutsideBall(weight=2.0, radius=1.0),
     AlphaEntropy(weight=2.0),
     Sparsity(weight=2.0),
@@ -81,6 +82,12 @@ def test_mean_scale_is_the_mean_standard_deviation():
     scene = gaussians(torch.zeros(2, 3))
     scene.log_scales[1] = math.log(0.3)
     assert float(MeanScale(weight=1.0)(scene, output(), 0)) == pytest.approx(0.2)
+
+
+def test_mean_opacity_is_the_mean_opacity():
+    scene = gaussians(torch.zeros(4, 3))
+    scene.opacity_logits = torch.tensor([0.1, 0.2, 0.3, 0.8]).logit()
+    assert float(MeanOpacity(weight=0.5)(scene, output(), 0)) == pytest.approx(0.5 * 0.35)
 
 
 def test_the_ball_is_free_inside_and_costs_the_squared_distance_outside():

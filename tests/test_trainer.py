@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -80,7 +81,7 @@ def same(left: dict, right: dict) -> bool:
     return True
 
 
-@pytest.mark.parametrize("densifier", ["cadam", "baseline", "none"])
+@pytest.mark.parametrize("densifier", ["cadam", "baseline", "none", "random", "mcmc"])
 def test_same_seed_same_bytes(tmp_path, densifier):
     payloads = []
     for _ in range(2):
@@ -100,7 +101,7 @@ def test_another_seed_gives_another_result(tmp_path):
     assert not torch.equal(results[0]["gaussians"]["means"][:10], results[1]["gaussians"]["means"][:10])
 
 
-@pytest.mark.parametrize("densifier", ["cadam", "baseline"])
+@pytest.mark.parametrize("densifier", ["cadam", "baseline", "random", "mcmc"])
 @pytest.mark.parametrize("cut", [1, 4, 5])
 def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, densifier, cut):
     trainer, whole = make([f"densifier={densifier}"])
@@ -122,6 +123,28 @@ def test_densifiers_with_one_seed_see_the_same_views_and_noise(tmp_path):
         ends[densifier] = state.to_payload()["generators"]
     for source in ("camera", "background", "guidance"):
         assert torch.equal(ends["cadam"][source], ends["none"][source])
+
+
+def test_a_source_of_randomness_has_its_stream_by_its_place_among_the_first_ones():
+    """A name that is appended moves nobody's stream: runs of before can be repeated."""
+    _, state = make(["seed=3"])
+    children = np.random.SeedSequence(3).spawn(5)
+    for name, child in zip(
+        ("initializer", "camera", "background", "guidance", "refine"), children, strict=True
+    ):
+        assert state.generators[name].initial_seed() == int(child.generate_state(1, np.uint64)[0] >> 1)
+
+
+@pytest.mark.parametrize("densifier", ["cadam", "mcmc"])
+def test_a_checkpoint_older_than_a_source_of_randomness_goes_on_as_if_it_had_been_there(tmp_path, densifier):
+    trainer, whole = make([f"densifier={densifier}"])
+    payload = whole.to_payload()
+    del payload["generators"]["densifier"]
+    torch.save(payload, tmp_path / "old.pt")
+    resumed = trainer.restore(torch.load(tmp_path / "old.pt", weights_only=True), CPU)
+    go(trainer, whole, tmp_path)
+    go(trainer, resumed, tmp_path)
+    assert same(whole.to_payload(), resumed.to_payload())
 
 
 def test_rows_of_all_three_owners_agree_after_every_refinement(tmp_path):
@@ -164,11 +187,12 @@ def test_growth_beyond_max_gaussians_is_an_outcome_and_is_not_applied(tmp_path):
     assert witness.refinements[-1].selected > 0
 
 
-def test_a_resumed_run_with_a_larger_cap_equals_one_that_never_met_it(tmp_path):
-    free, whole = make()
+@pytest.mark.parametrize("densifier", ["cadam", "random", "mcmc"])
+def test_a_resumed_run_with_a_larger_cap_equals_one_that_never_met_it(tmp_path, densifier):
+    free, whole = make([f"densifier={densifier}"])
     go(free, whole, tmp_path)
 
-    capped, state = make(["refine.max_gaussians=30"])
+    capped, state = make([f"densifier={densifier}", "refine.max_gaussians=30"])
     assert go(capped, state, tmp_path) is Outcome.MAX_GAUSSIANS
     torch.save(state.to_payload(), tmp_path / "capped.pt")
 
@@ -233,8 +257,9 @@ def test_another_runtime_error_is_not_swallowed(tmp_path, monkeypatch):
         go(trainer, state, tmp_path)
 
 
-def test_a_step_with_a_non_finite_gradient_changes_nothing_but_is_counted(tmp_path):
-    trainer, state = make(["steps=1"])
+@pytest.mark.parametrize("densifier", ["cadam", "mcmc"])
+def test_a_step_with_a_non_finite_gradient_changes_nothing_but_is_counted(tmp_path, densifier):
+    trainer, state = make(["steps=1", f"densifier={densifier}"])
 
     class Poison(type(trainer.guidance)):
         def __call__(self, rgb, *args):
@@ -246,7 +271,7 @@ def test_a_step_with_a_non_finite_gradient_changes_nothing_but_is_counted(tmp_pa
     go(replace(trainer, guidance=poisoned), state, tmp_path)
     after = state.to_payload()
     assert after["skipped"] == 1
-    for owner in ("gaussians", "optimizer", "densifier"):
+    for owner in ("gaussians", "optimizer", "densifier"):  # nor do means that tremble by themselves
         assert same({owner: before[owner]}, {owner: after[owner]})
 
 

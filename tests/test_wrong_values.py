@@ -24,6 +24,7 @@ WHOLE = {  # what to choose, and the keys that count something
         "prior.noise_path.train_steps",
     ],
     "prior=tiny": ["prior.width", "prior.downscale", "prior.seed", "prior.noise_path.train_steps"],
+    "guidance=ucm": ["guidance.inversion_steps"],
     "refine=default": [
         "refine.start",
         "refine.end",
@@ -37,6 +38,7 @@ WHOLE = {  # what to choose, and the keys that count something
         "refine.max_gaussians",
     ],
     "densifier=cadam": ["densifier.min_age", "densifier.reset_min_age"],
+    "densifier=mcmc": ["densifier.cap"],
     "exporter=[images]": ["exporter.images.views", "exporter.images.size"],
     "exporter=[preview]": ["exporter.preview.views", "exporter.preview.size"],
     "exporter=[turntable]": [

@@ -128,6 +128,8 @@ class Asynchronous(TorchDispatchMode):
         "cadam densifier.nonfinite=skip_row",
         "cadam_strict",
         "cadam_calibrated",
+        "random",
+        "mcmc",
     ],
 )
 def test_observing_never_waits_for_the_device(choice):
@@ -190,6 +192,20 @@ def test_the_reset_is_for_whom_the_densifier_says(choice, everybody, tmp_path):
     at_reset = witness.reports[1]
     assert at_reset.step == 4
     assert at_reset.reset == (at_reset.after if everybody else 0)
+
+
+def test_the_means_tremble_after_the_step_of_the_optimizer_and_nothing_else_does(tmp_path):
+    still, _, _ = run(["densifier=mcmc", "densifier.noise_lr=0", "steps=1"], tmp_path)
+    moved, _, _ = run(["densifier=mcmc", "densifier.noise_lr=1e5", "steps=1"], tmp_path)
+    cfg = compose([*SMALL, "densifier=mcmc", "densifier.noise_lr=1e5"])
+    trainer = build_trainer(cfg, CPU)
+    draws = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU).generators["densifier"]
+    lr = trainer.optimizer.learning_rates(0)["means"]
+    wanted = trainer.densifier.perturb(still.gaussians.detach(), lr, draws)
+    torch.testing.assert_close(moved.gaussians.means - still.gaussians.means, wanted, rtol=1e-3, atol=1e-6)
+    assert wanted.abs().max() > 1e-3
+    for name in set(FIELDS) - {"means"}:
+        assert torch.equal(getattr(moved.gaussians, name), getattr(still.gaussians, name))
 
 
 @pytest.mark.parametrize("clears", ["false", "true"])

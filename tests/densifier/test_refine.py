@@ -16,6 +16,7 @@ from cadam3d.optimizer import AdamSettings
 
 CPU = torch.device("cpu")
 STEP = 100  # of a call; no matter, unless a schedule asks
+LOTS = torch.Generator()  # nobody here draws any
 LATE = 10_000  # a step at which nothing is scheduled
 
 
@@ -313,7 +314,7 @@ def test_gaussians_moments_and_densifier_state_stay_in_step_through_many_edits(d
         state = densifier.observe(state, signal)
         optimizer.step(step)
         if step % 10 == 0:
-            plan = refine().plan(optimizer.gaussians, densifier.select(state, STEP), LATE, noise)
+            plan = refine().plan(optimizer.gaussians, densifier.select(state, STEP, LOTS), LATE, noise)
             optimizer.apply(plan.edit)
             state = state.carry(plan.edit)
         counts = {len(rows) for rows in state.to_dict().values()}

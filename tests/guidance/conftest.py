@@ -5,14 +5,15 @@ from dataclasses import dataclass, field, replace
 import pytest
 import torch
 
+from cadam3d.guidance.csd import CSD
 from cadam3d.guidance.ism import ISM
 from cadam3d.guidance.sds import SDS
+from cadam3d.guidance.ucm import UCM
 from cadam3d.guidance.vfds import VFDS
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
 
 SHARED = {
-    "scale": 2.0,
     "weight": 1.0,
     "weighting": "unit",
     "t_min": 0.02,
@@ -21,10 +22,14 @@ SHARED = {
     "reduction": "sum",
     "clip": None,
 }
-OBJECTIVES = {
+GUIDED = {  # by classifier-free guidance
     "sds": (SDS, {}),
     "ism": (ISM, {"delta": 0.05, "inversion_stride": 0.2, "initial_noise": 0.0}),
     "vfds": (VFDS, {}),
+    "ucm": (UCM, {"inversion_steps": 3, "inversion_grid": "t", "fresh_noise": 0.0}),
+}
+OBJECTIVES = {name: (kind, {"scale": 2.0} | keys) for name, (kind, keys) in GUIDED.items()} | {
+    "csd": (CSD, {"empty_share": 0.0}),
 }
 PATHS = {"ddpm": DDPM(), "flow": RectifiedFlow(), "flow-3": RectifiedFlow(shift=3.0)}
 
@@ -38,6 +43,7 @@ class Means(Condition):
     empty: torch.Tensor
     empty_spread: float | None = None  # of images without a prompt; None = the prior's own
     spread: float | None = None  # of the images of this condition; None = the prior's own
+    negative_spread: float | None = None  # of those of its negative prompt; None = as of its prompt
 
     def unprompted(self):
         return Means(self.empty, self.empty, self.empty, self.empty_spread, self.empty_spread)
@@ -80,17 +86,24 @@ class GaussianPrior(DiffusionPrior):
     def predict(self, noisy, t, condition, scale):
         self.calls.append(Call(t, scale, condition, torch.is_grad_enabled()))
         with torch.no_grad():
-            mean = condition.negative + scale * (condition.positive - condition.negative)
             a, b = per_view(self.noise_path.a(t)), per_view(self.noise_path.b(t))
             spread = self.spread if condition.spread is None else condition.spread
-            variance = a**2 * spread**2 + b**2
-            off = (noisy - a * mean) / torch.where(variance > 0, variance, 1)
-            clean, noise = mean + a * spread**2 * off, b * off
+            wide = spread if condition.negative_spread is None else condition.negative_spread
+            positive = posterior_means(noisy, a, b, condition.positive, spread)
+            negative = posterior_means(noisy, a, b, condition.negative, wide)
+            clean, noise = (n + scale * (p - n) for p, n in zip(positive, negative, strict=True))
             if self.form == "clean":
                 return self.noise_path.from_clean(noisy, clean, t)
             if self.form == "noise":
                 return self.noise_path.from_noise(noisy, noise, t)
             return self.noise_path.from_velocity(noisy, self.noise_path.velocity(clean, noise, t), t)
+
+
+def posterior_means(noisy, a, b, mean, spread):
+    """Of the clean image and of the noise, given ``noisy``, for images around ``mean``."""
+    variance = a**2 * spread**2 + b**2
+    off = (noisy - a * mean) / torch.where(variance > 0, variance, 1)
+    return mean + a * spread**2 * off, b * off
 
 
 def random_images(count, seed, views=3):
@@ -167,4 +180,10 @@ def prior(path):
 
 @pytest.fixture(params=OBJECTIVES.keys())
 def objective(request):
+    return request.param
+
+
+@pytest.fixture(params=GUIDED.keys())
+def guided(request):
+    """An objective whose guess is under classifier-free guidance."""
     return request.param

@@ -25,24 +25,22 @@ def test_a_perfect_guess_has_zero_gradient(objective, path, make, ask, gaussian,
     """The render is the only image of the prompt, and the prior knows it."""
     render = one_image.positive.permute(0, 2, 3, 1)
     for seed in range(5):
-        gradient, output = ask(
-            make(objective, scale=7.5), render, one_image, gaussian(path, spread=0.0), seed=seed
-        )
+        gradient, output = ask(make(objective), render, one_image, gaussian(path, spread=0.0), seed=seed)
         torch.testing.assert_close(gradient, torch.zeros_like(gradient), rtol=0, atol=1e-10)
         assert output.loss < 1e-18
 
 
-def test_descent_points_at_the_image(objective, path, make, ask, gaussian, one_among_many, rgb):
+def test_descent_points_at_the_image(guided, path, make, ask, gaussian, one_among_many, rgb):
     """If the prompt names one image, every element of -G points from the render to it."""
-    gradient, _ = ask(make(objective, scale=1.0), rgb, one_among_many, gaussian(path, spread=0.0))
+    gradient, _ = ask(make(guided, scale=1.0), rgb, one_among_many, gaussian(path, spread=0.0))
     offset = rgb.detach().permute(0, 3, 1, 2) - one_among_many.positive
     assert (gradient * offset > 0).all()
 
 
-def test_descent_arrives_at_the_image(objective, path, make, ask, gaussian, one_among_many, rgb):
+def test_descent_arrives_at_the_image(guided, path, make, ask, gaussian, one_among_many, rgb):
     """Gradient descent with the x0-residual as gradient, from anywhere, on a prior with little spread."""
-    weighting = {"sds": "gamma", "ism": "gamma", "vfds": "sigma"}[objective]
-    guidance = make(objective, scale=1.0, weighting=weighting, t_min=0.3, t_max=0.7)
+    weighting = {"sds": "gamma", "ism": "gamma", "vfds": "sigma", "ucm": "sigma"}[guided]
+    guidance = make(guided, scale=1.0, weighting=weighting, t_min=0.3, t_max=0.7)
     prior, render = gaussian(path, spread=0.02), rgb.detach()
     target = one_among_many.positive.permute(0, 2, 3, 1)
     before = (render - target).square().mean().sqrt()
@@ -182,6 +180,16 @@ def test_the_window_follows_its_schedules(make, ask, gaussian, means, rgb):
         assert ((prior.calls[-1].t >= low) & (prior.calls[-1].t <= high)).all()
 
 
+def test_a_window_of_no_width_leaves_t_to_its_schedule(objective, make, ask, prior, means, rgb):
+    """DreamGaussian's annealing: t = 1 - step / 500, for every view and seed."""
+    anneal = Linear(start=0.9, end=0.2, steps=7)
+    guidance = make(objective, t_min=anneal, t_max=anneal)
+    for step, t in ((0, 0.9), (3, 0.6), (9, 0.2)):
+        _, output = ask(guidance, rgb, means, prior, step=step, seed=step)
+        assert prior.calls[-1].t.tolist() == pytest.approx([t] * 3)
+        assert output.log["t"] == pytest.approx(t)
+
+
 @pytest.mark.parametrize("is_shared", [True, False])
 def test_views_share_t_if_asked(is_shared, objective, make, ask, prior, means, rgb):
     ask(make(objective, shared_t=is_shared), rgb, means, prior)
@@ -200,25 +208,23 @@ def test_noise_levels_stay_precise_when_latents_are_half(make, gaussian, one_ima
     assert render.grad.isfinite().all()
 
 
-def test_scale_one_ignores_the_negative_prompt(objective, make, ask, prior, means, rgb):
+def test_scale_one_ignores_the_negative_prompt(guided, make, ask, prior, means, rgb):
     other = type(means)(means.positive, means.negative + 1, means.empty)
-    first, _ = ask(make(objective, scale=1.0), rgb, means, prior)
-    again, _ = ask(make(objective, scale=1.0), rgb, other, prior)
+    first, _ = ask(make(guided, scale=1.0), rgb, means, prior)
+    again, _ = ask(make(guided, scale=1.0), rgb, other, prior)
     torch.testing.assert_close(first, again, rtol=1e-12, atol=1e-14)
 
 
-def test_scale_zero_is_the_negative_prompt_alone(objective, make, ask, prior, means, rgb):
+def test_scale_zero_is_the_negative_prompt_alone(guided, make, ask, prior, means, rgb):
     swapped = type(means)(means.negative, means.positive, means.empty)
-    first, _ = ask(make(objective, scale=0.0), rgb, means, prior)
-    again, _ = ask(make(objective, scale=1.0), rgb, swapped, prior)
+    first, _ = ask(make(guided, scale=0.0), rgb, means, prior)
+    again, _ = ask(make(guided, scale=1.0), rgb, swapped, prior)
     torch.testing.assert_close(first, again, rtol=1e-12, atol=1e-14)
 
 
-def test_a_scale_of_100_counted_from_the_prompt_is_101(objective, make, ask, prior, means, rgb):
+def test_a_scale_of_100_counted_from_the_prompt_is_101(guided, make, ask, prior, means, rgb):
     """GaussianDreamer writes eps_y + 100 (eps_y - eps_n); G is affine in the prediction, so in the scale."""
-    negative, positive, guided = (
-        ask(make(objective, scale=s), rgb, means, prior)[0] for s in (0.0, 1.0, 101.0)
-    )
+    negative, positive, guided = (ask(make(guided, scale=s), rgb, means, prior)[0] for s in (0.0, 1.0, 101.0))
     torch.testing.assert_close(guided, positive + 100 * (positive - negative), rtol=1e-9, atol=1e-9)
 
 
@@ -257,13 +263,12 @@ def test_it_runs_on_a_network(predicts, noise_path, objective, make):
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("scale", -1.0),
         ("weight", 0.0),
         ("weighting", "sds"),
         ("reduction", "max"),
         ("clip", 0.0),
         ("clip", Linear(start=1.0, end=-1.0, steps=10)),
-        ("t_max", 0.02),
+        ("t_max", 0.01),
         ("t_max", 1.1),
         ("t_max", Linear(start=0.98, end=0.0, steps=10)),
     ],
@@ -275,12 +280,19 @@ def test_wrong_values_are_refused_by_key(key, value, objective, make):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("shared_t", "maybe"), ("t_min", None), ("t_max", "late"), ("clip", {"start": 1.5}), ("scale", "high")],
+    [("shared_t", "maybe"), ("t_min", None), ("t_max", "late"), ("clip", {"start": 1.5})],
 )
 def test_wrong_types_are_refused_by_key(key, value, objective, make, monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as outside of the test suite
     with pytest.raises(UserError, match=f"guidance.{key}: "):
         make(objective, **{key: value})
+
+
+@pytest.mark.parametrize("value", [-1.0, "high", None])
+def test_a_scale_is_a_number_from_zero_up(value, guided, make, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    with pytest.raises(UserError, match=r"guidance.scale: "):
+        make(guided, scale=value)
 
 
 def test_a_window_that_closes_in_between_is_refused_when_it_does(make, ask, gaussian, means, rgb):
