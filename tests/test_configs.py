@@ -142,6 +142,13 @@ def test_every_option_of_a_nested_group_composes_and_builds(path):
     assert component(cfg[outer]) is not None
 
 
+def test_what_an_initializer_falls_back_on_has_the_values_it_has_by_itself():
+    for path in sorted((CONFIGS / "initializer/fallback").glob("*.yaml")):
+        cfg = compose([PROMPT, "initializer=shap_e", f"initializer/fallback={path.stem}"])
+        assert cfg.initializer.fallback == compose([PROMPT, f"initializer={path.stem}"]).initializer
+        assert component(cfg.initializer).fallback is not None
+
+
 def test_every_regularizer_has_a_file_of_its_own_and_several_can_be_chosen():
     kinds = [kind for _, kind in inspect.getmembers(regularizer, inspect.isclass)]
     kinds = [kind for kind in kinds if issubclass(kind, regularizer.Regularizer)]

@@ -17,6 +17,14 @@ WHOLE = {  # what to choose, and the keys that count something
     "initializer=ball": ["initializer.count", "initializer.sh_degree"],
     "initializer=mesh": ["initializer.count", "initializer.sh_degree"],
     "initializer=ply": ["initializer.count", "initializer.sh_degree", "initializer.replicate"],
+    "initializer=shap_e": [
+        "initializer.steps",
+        "initializer.grid_size",
+        "initializer.count",
+        "initializer.grow_points",
+        "initializer.replicate",
+        "initializer.sh_degree",
+    ],
     "prior=shapes": [
         "prior.samples_per_pixel",
         "prior.census_size",
@@ -73,6 +81,7 @@ TRUTHS = {
 NULLABLE = {  # where null means never, all, or as it is
     "refine=default": ("refine.reset_interval", "refine.max_gaussians"),
     "initializer=ply": ("initializer.count", "initializer.sh_degree"),
+    "initializer=shap_e": ("initializer.count",),
 }
 NEVER_WHOLE = ("2.5", "16.0", "true", "abc", "[1]", "-1000000000000.5")
 NEVER_A_LIST = ("5", "null", "abc", "[a,b,c]", "[true,true,true]", "[null,null]", "[]")
@@ -135,6 +144,11 @@ def test_a_list_of_numbers_is_nothing_else(choice, key):
 def test_a_switch_is_true_or_false(choice, key):
     for value in NEVER_A_TRUTH:
         refuses(choice, f"{key}={value}")
+
+
+def test_a_name_is_no_initializer_to_fall_back_on():
+    with pytest.raises(UserError, match=r"^initializer\.fallback: wanted .* Try: initializer/fallback=ball$"):
+        build("initializer=shap_e", "initializer.fallback=ball")
 
 
 def test_a_truth_value_bounds_nothing():

@@ -100,6 +100,23 @@ def replicated(cloud: PointCloud, times: int, radius: float, generator: torch.Ge
     return PointCloud(points, cloud.rgb.repeat_interleave(times, dim=0))
 
 
+def grown(
+    cloud: PointCloud, candidates: int, distance: float, noise: float, generator: torch.Generator
+) -> PointCloud:
+    """Noisy point growing (GaussianDreamer): the cloud, and random points of its bounding box.
+
+    Of ``candidates`` points those stay that are nearer than ``distance`` to a point of the cloud; to each
+    channel of its colour up to ``noise`` is added.
+    """
+    low, high = cloud.points.amin(dim=0), cloud.points.amax(dim=0)
+    drawn = low + (high - low) * torch.rand(candidates, 3, generator=generator)
+    _, nearest = KDTree(cloud.points.numpy()).query(drawn.numpy(), distance_upper_bound=distance)
+    neighbour = torch.from_numpy(nearest)
+    is_near = neighbour < len(cloud)  # equal means: nobody is
+    rgb = cloud.rgb[neighbour[is_near]] + noise * torch.rand(int(is_near.sum()), 3, generator=generator)
+    return PointCloud(torch.cat([cloud.points, drawn[is_near]]), torch.cat([cloud.rgb, rgb.clamp_max(1)]))
+
+
 def fit(points: Float[Tensor, "n 3"], radius: float | None) -> tuple[Float[Tensor, "3"], float]:
     """The centre of the bounding box, and the factor that then brings the farthest point to ``radius``.
 
