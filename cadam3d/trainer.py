@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from cadam3d.background import Background
 from cadam3d.callback.base import Callback
@@ -189,7 +190,7 @@ class Trainer:
         gaussians, draw = state.gaussians, state.generators
         cameras = self.camera.sample(state.step, self.views, draw["camera"]).to(gaussians.device)
         background = self.background.sample(self.views, draw["background"]).to(gaussians.device)
-        output = self.rasterizer.render(gaussians, cameras, background)
+        output = self.rasterizer.render(gaussians, cameras, background, self.densifier.needs_absgrad)
         condition = embedding.at(cameras, background)
         judged = self.guidance(output.rgb, condition, self.prior, state.step, draw["guidance"])
         penalties = {name: fn(gaussians, output, state.step) for name, fn in self.regularizers.items()}
@@ -317,12 +318,16 @@ def resolve_device(name: str) -> torch.device:
 
 def _signal(gaussians: Gaussians, output: RenderOutput) -> GradientSignal:
     """What the last backward pass left: copies, for another pass would add to it in place."""
-    means = gaussians.means.grad
-    means2d = output.means2d.grad
     return GradientSignal(
-        means=torch.zeros_like(gaussians.means) if means is None else means.detach().clone(),
-        means2d=torch.zeros_like(output.means2d) if means2d is None else means2d.detach().clone(),
+        means=_gradient_of(gaussians.means),
+        means2d=_gradient_of(output.means2d),
         radii=output.radii.detach(),
         height=output.rgb.shape[1],
         width=output.rgb.shape[2],
+        absgrad=None if output.absgrad is None else _gradient_of(output.absgrad),
     )
+
+
+def _gradient_of(tensor: Tensor) -> Tensor:
+    """A copy of what backward left there; zeros if that was nothing."""
+    return torch.zeros_like(tensor) if tensor.grad is None else tensor.grad.detach().clone()
