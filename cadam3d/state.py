@@ -26,6 +26,7 @@ class TrainState:
     seconds: float  # wall-clock time spent on them
     num_initial: int  # Gaussians at step 0
     skipped: int  # steps without an update, because a gradient was not finite
+    dimmed: int  # steps after which the exposure guard dimmed all colours
     refused: bool  # the refinement of the last step would exceed max_gaussians; it waits for a larger one
     seed: int  # what the generators descend from
     optimizer: GaussianOptimizer  # owns the Gaussians
@@ -44,6 +45,7 @@ class TrainState:
             "seconds": self.seconds,
             "num_initial": self.num_initial,
             "skipped": self.skipped,
+            "dimmed": self.dimmed,
             "refused": self.refused,
             "seed": self.seed,
             "gaussians": self.gaussians.detach().tensors(),

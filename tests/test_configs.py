@@ -22,11 +22,9 @@ from cadam3d.sweep.plan import compose_all, read_sweep
 
 CONFIGS = config_dir()
 SEVERAL = ("exporter", "callback", "metric")  # groups of which a run has several at once
-NO_COMPONENTS = ("hydra", "grid", "launcher", "experiment", "noise")
+NO_COMPONENTS = ("hydra", "grid", "launcher", "experiment", "noise", "vram")
 GROUPS = sorted(path.name for path in CONFIGS.iterdir() if path.is_dir() and path.name not in NO_COMPONENTS)
 FILES = [path for group in GROUPS for path in sorted((CONFIGS / group).glob("*.yaml"))]
-VARIANTS = [path for path in FILES if "defaults" in yaml.safe_load(path.read_text(encoding="utf-8"))]
-COMPLETE = [path for path in FILES if path not in VARIANTS]
 GRIDS = sorted(path.stem for path in (CONFIGS / "grid").glob("*.yaml"))
 EXPERIMENTS = sorted(
     str(path.relative_to(CONFIGS / "experiment").with_suffix(""))
@@ -42,6 +40,10 @@ def name_of(path: Path) -> str:
 
 def read(path: Path) -> Any:
     return yaml.safe_load(path.read_text(encoding="utf-8"))
+
+
+VARIANTS = [path for path in FILES if "defaults" in read(path)]
+COMPLETE = [path for path in FILES if path not in VARIANTS]
 
 
 def nodes(value: Any) -> Iterator[dict[str, Any]]:

@@ -14,6 +14,8 @@ from cadam3d.settings import component, compose
 WHOLE = {  # what to choose, and the keys that count something
     "camera=orbit": ["camera.size"],
     "camera=sphere": ["camera.size"],
+    "camera=multiview": ["camera.size"],
+    "camera=progressive": ["camera.size", "camera.begin", "camera.every"],
     "initializer=ball": ["initializer.count", "initializer.sh_degree"],
     "initializer=mesh": ["initializer.count", "initializer.sh_degree"],
     "prior=shapes": [
@@ -23,6 +25,7 @@ WHOLE = {  # what to choose, and the keys that count something
         "prior.noise_path.train_steps",
     ],
     "prior=tiny": ["prior.width", "prior.downscale", "prior.seed", "prior.noise_path.train_steps"],
+    "guidance=ucm": ["guidance.inversion_steps"],
     "refine=default": [
         "refine.start",
         "refine.end",
@@ -37,6 +40,7 @@ WHOLE = {  # what to choose, and the keys that count something
     ],
     "densifier=cadam": ["densifier.min_age", "densifier.reset_min_age"],
     "densifier=mcmc": ["densifier.cap"],
+    "exposure=beg": ["exposure.begin", "exposure.end"],
     "exporter=[images]": ["exporter.images.views", "exporter.images.size"],
     "exporter=[preview]": ["exporter.preview.views", "exporter.preview.size"],
     "exporter=[turntable]": [
@@ -47,26 +51,37 @@ WHOLE = {  # what to choose, and the keys that count something
     "exporter=[ply]": ["exporter.ply.pad_sh"],
     "metric=[fidelity]": ["metric.fidelity.views", "metric.fidelity.size"],
     "callback=[metrics]": ["callback.metrics.every"],
+    "callback=[previews]": ["callback.previews.every", "callback.previews.views", "callback.previews.size"],
     "callback=[checkpoint]": ["callback.checkpoint.every", "callback.checkpoint.keep"],
 }
 LISTS = {
     "camera=orbit": ["camera.azimuth_deg", "camera.elevation_deg", "camera.distance", "camera.fov_y_deg"],
     "camera=sphere": ["camera.distance", "camera.fov_y_deg"],
+    "camera=multiview": ["camera.elevation_deg", "camera.relative_distance", "camera.fov_y_deg"],
+    "camera=progressive": [
+        *("camera.azimuth_deg.start", "camera.elevation_deg.end", "camera.distance.end"),
+        *("camera.fov_y_deg.start", "camera.fov_y_deg.factor", "camera.distance.factor"),
+    ],
     "background=grey": ["background.color"],
     "background=random": ["background.color"],
+    "background=lucid": ["background.color"],
     "initializer=ball": ["initializer.color"],
     "initializer=mesh": ["initializer.color"],
     "exporter=[images]": ["exporter.images.elevations_deg", "exporter.images.background"],
     "exporter=[preview]": ["exporter.preview.elevations_deg", "exporter.preview.background"],
     "exporter=[turntable]": ["exporter.turntable.background"],
+    "callback=[previews]": ["callback.previews.background"],
     "metric=[fidelity]": ["metric.fidelity.elevations_deg", "metric.fidelity.background"],
 }
 TRUTHS = {
     "densifier=cadam": ["densifier.reset_moments"],
     "guidance=sds": ["guidance.shared_t"],
     "guidance=ism": ["guidance.shared_t"],
+    "guidance=gcs": ["guidance.shared_t", "guidance.fixed_noise"],
     "exporter=[preview]": ["exporter.preview.labels"],
+    "prior=stable_diffusion_3": ["prior.t5"],
 }
+NULL_IS_NEVER = ("refine.reset_interval", "refine.max_gaussians", "callback.previews.every")
 NEVER_WHOLE = ("2.5", "16.0", "true", "abc", "[1]", "-1000000000000.5")
 NEVER_A_LIST = ("5", "null", "abc", "[a,b,c]", "[true,true,true]", "[null,null]", "[]")
 NEVER_A_TRUTH = ("0", "1", "1.0", "null", "abc")
@@ -114,7 +129,7 @@ def refuses(choice: str, line: str) -> None:
 def test_what_is_counted_is_a_whole_number(choice, key):
     for value in NEVER_WHOLE:
         refuses(choice, f"{key}={value}")
-    if key not in ("refine.reset_interval", "refine.max_gaussians"):  # where null means never
+    if key not in NULL_IS_NEVER:
         refuses(choice, f"{key}=null")
 
 
@@ -128,6 +143,13 @@ def test_a_list_of_numbers_is_nothing_else(choice, key):
 def test_a_switch_is_true_or_false(choice, key):
     for value in NEVER_A_TRUTH:
         refuses(choice, f"{key}={value}")
+
+
+@pytest.mark.parametrize("value", [*NEVER_A_LIST, "[10,20]"])
+def test_a_range_that_widens_has_a_start_an_end_and_a_factor(value):
+    refuses("camera=progressive", f"camera.fov_y_deg={value}")
+    if value not in ("5", "[10,20]"):
+        refuses("camera=progressive", f"camera.elevation_deg.about={value}")
 
 
 def test_a_truth_value_bounds_nothing():

@@ -1,4 +1,4 @@
-"""Distillation: what SDS, ISM and VFDS share; they differ in the guesses they subtract (paper sec. 3.2)."""
+"""Distillation: what the objectives share that differ only in the guesses they subtract (paper sec. 3.2)."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -8,11 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_choice, require_range
-from cadam3d.core.schedule import FAR_STEP, Schedule, as_schedule, require_scheduled
-from cadam3d.guidance.base import Guidance, GuidanceOutput
+from cadam3d.core.checks import require_choice, require_range
+from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.guidance.base import GuidanceOutput
+from cadam3d.guidance.window import WindowedGuidance
 from cadam3d.prior.base import Condition, DiffusionPrior
-from cadam3d.prior.path import NoisePath, per_view
+from cadam3d.prior.path import NoisePath, Prediction, per_view
 
 # w(t) by name. On a DDPM path a = sqrt(abar), b = sqrt(1 - abar); on a flow path a = 1 - sigma, b = sigma.
 WEIGHTINGS: dict[str, Callable[[NoisePath, Tensor], Tensor]] = {
@@ -31,6 +32,27 @@ DIVISORS: dict[str, Callable[[torch.Size], int]] = {
 
 
 @dataclass(frozen=True)
+class Case:
+    """What an objective has to judge: encoded renders at their noise levels, and the prior to ask."""
+
+    clean: Float[Tensor, "v c h w"]  # the encoded renders, without gradient
+    t: Float[Tensor, "v"]
+    condition: Condition
+    prior: DiffusionPrior
+    step: int
+    generator: torch.Generator
+
+    def draw_noise(self) -> Float[Tensor, "v c h w"]:
+        """Fresh noise for every view."""
+        return standard_normal(self.clean, self.generator)
+
+    def guess(self, noise: Float[Tensor, "v c h w"], scale: float) -> Prediction:
+        """The prior's guess about the renders under ``noise``, at their levels."""
+        noisy = self.prior.noise_path.mix(self.clean, noise, self.t)
+        return self.prior.predict(noisy, self.t, self.condition, scale)
+
+
+@dataclass(frozen=True)
 class Comparison:
     """Two guesses, subtracted."""
 
@@ -39,7 +61,7 @@ class Comparison:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Distillation(Guidance):
+class Distillation(WindowedGuidance):
     """Turn the difference of two guesses into a loss (paper eq. 4).
 
     Per element of the encoded render x0,
@@ -58,39 +80,22 @@ class Distillation(Guidance):
     guess), ``guidance_nonfinite`` (elements replaced by 0).
     """
 
-    scale: float  # classifier-free guidance, conventional: negative + scale * (positive - negative)
     weight: float  # of the objective; the repositories call it lambda_guidance
     weighting: str  # w(t), one of WEIGHTINGS
-    t_min: float | Schedule  # in [0, t_max)
-    t_max: float | Schedule  # in (t_min, 1]
-    shared_t: bool  # one t for all views of a step, or one each
     reduction: str  # one of DIVISORS
     clip: float | Schedule | None  # largest |G| per element; None = off
 
     def __post_init__(self) -> None:
-        require_range("guidance.scale", self.scale, low=0, example=7.5)
+        super().__post_init__()
         require_range("guidance.weight", self.weight, above=0, example=1.0)
         require_choice("guidance.weighting", self.weighting, list(WEIGHTINGS))
-        require_choice("guidance.shared_t", self.shared_t, (True, False))
         require_choice("guidance.reduction", self.reduction, list(DIVISORS))
-        require_scheduled("guidance.t_min", self.t_min, example=0.02)
-        require_scheduled("guidance.t_max", self.t_max, example=0.98)
         if self.clip is not None:
             require_scheduled("guidance.clip", self.clip, above=0, example="null")
-        for step in (0, FAR_STEP):  # the steps between are checked as they come
-            self._window(step)
 
     @abstractmethod
-    def compare(
-        self,
-        clean: Float[Tensor, "v c h w"],
-        t: Float[Tensor, "v"],
-        condition: Condition,
-        prior: DiffusionPrior,
-        step: int,
-        generator: torch.Generator,
-    ) -> Comparison:
-        """The objective itself; called without gradient, ``clean`` being the encoded render."""
+    def compare(self, case: Case) -> Comparison:
+        """The objective itself; called without gradient."""
 
     def __call__(
         self,
@@ -106,48 +111,21 @@ class Distillation(Guidance):
         """
         clean = prior.encode(rgb)
         with torch.no_grad():
-            t = self._draw_t(clean, step, generator)
-            found = self.compare(clean.detach(), t, condition, prior, step, generator)
+            t = self.draw_t(clean, step, generator)
+            found = self.compare(Case(clean.detach(), t, condition, prior, step, generator))
             weights = self.weight * WEIGHTINGS[self.weighting](prior.noise_path, t)
-            raw = per_view(weights) * found.difference
-            is_finite = raw.isfinite()
-            gradient = torch.where(is_finite, raw, 0).to(clean.dtype)
+            gradient, nonfinite = finite(per_view(weights) * found.difference)
             if (bound := self._bound(step)) is not None:
                 gradient = gradient.clamp(-bound, bound)
         return GuidanceOutput(
             loss=surrogate(clean, gradient, DIVISORS[self.reduction](clean.shape)),
             log={
                 "t": float(t.mean()),
-                "guidance_rms": _rms(gradient),
-                "residual_rms": _rms(clean.detach() - found.clean),
-                "guidance_nonfinite": float((~is_finite).sum()),
+                "guidance_rms": rms(gradient),
+                "residual_rms": rms(clean.detach() - found.clean),
+                "guidance_nonfinite": float(nonfinite),
             },
         )
-
-    def _draw_t(
-        self, clean: Float[Tensor, "v c h w"], step: int, generator: torch.Generator
-    ) -> Float[Tensor, "v"]:
-        """Uniform in [t_min, t_max), on the device of ``clean`` and never in half precision."""
-        low, high = self._window(step)
-        views = clean.shape[0]
-        uniform = torch.rand(1 if self.shared_t else views, generator=generator, dtype=torch.float32)
-        dtype = torch.promote_types(clean.dtype, torch.float32)
-        return torch.lerp(
-            torch.full((views,), low, dtype=dtype, device=clean.device),
-            torch.full((views,), high, dtype=dtype, device=clean.device),
-            uniform.to(clean.device, dtype).expand(views),
-        )
-
-    def _window(self, step: int) -> tuple[float, float]:
-        low, high = as_schedule(self.t_min)(step), as_schedule(self.t_max)(step)
-        require(
-            0 <= low < high <= 1,
-            "guidance.t_max",
-            wanted="0 <= t_min < t_max <= 1 at every step",
-            got=f"t_min {low:g} and t_max {high:g}",
-            example="guidance.t_min=0.02 guidance.t_max=0.98",
-        )
-        return low, high
 
     def _bound(self, step: int) -> float | None:
         if self.clip is None:
@@ -157,14 +135,27 @@ class Distillation(Guidance):
         return bound
 
 
+@dataclass(frozen=True, kw_only=True)
+class GuidedDistillation(Distillation):
+    """A distillation whose guess of the clean image is under classifier-free guidance."""
+
+    scale: float  # conventional: negative + scale * (positive - negative)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_range("guidance.scale", self.scale, low=0, example=7.5)
+
+
 def surrogate(
     clean: Float[Tensor, "v c h w"], gradient: Float[Tensor, "v c h w"], divisor: int
 ) -> Float[Tensor, ""]:
     """||x0 - stopgrad(x0 - G)||^2 / (2 * divisor), whose gradient with respect to x0 is G / divisor.
 
-    The inner bracket is opened: x0 - stopgrad(x0) is exactly 0; x0 - (x0 - G) would round a small G away.
+    The inner bracket is opened: x0 - stopgrad(x0) is exactly 0; x0 - (x0 - G) would round a small G away. The
+    sum is never in half precision, where it would overflow.
     """
-    return 0.5 * (clean - clean.detach() + gradient).square().sum() / divisor
+    wide = clean.to(torch.promote_types(clean.dtype, torch.float32))
+    return 0.5 * (wide - wide.detach() + gradient).square().sum() / divisor
 
 
 def standard_normal(like: Float[Tensor, "v c h w"], generator: torch.Generator) -> Float[Tensor, "v c h w"]:
@@ -173,7 +164,13 @@ def standard_normal(like: Float[Tensor, "v c h w"], generator: torch.Generator) 
     return noise.to(like)
 
 
-def _rms(values: Tensor) -> float:
+def finite(gradient: Tensor) -> tuple[Tensor, int]:
+    """``gradient`` with 0 for what is not finite, and how many elements that were."""
+    is_finite = gradient.isfinite()
+    return torch.where(is_finite, gradient, 0), int((~is_finite).sum())
+
+
+def rms(values: Tensor) -> float:
     """Root mean square over the finite elements; 0 if there are none."""
-    finite = values[values.isfinite()]
-    return float(finite.square().mean().sqrt()) if finite.numel() else 0.0
+    finite_ones = values[values.isfinite()]
+    return float(finite_ones.square().mean().sqrt()) if finite_ones.numel() else 0.0

@@ -2,16 +2,11 @@
 
 from dataclasses import dataclass
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
-from cadam3d.guidance.distill import Comparison, Distillation, standard_normal
-from cadam3d.prior.base import Condition, DiffusionPrior
+from cadam3d.guidance.distill import Case, Comparison, GuidedDistillation
 
 
 @dataclass(frozen=True, kw_only=True)
-class SDS(Distillation):
+class SDS(GuidedDistillation):
     """Score distillation sampling (Poole et al. 2023, eq. 3; GaussianDreamer's objective).
 
     With x_t = a x0 + b eps, eps ~ N(0, I), on any path,
@@ -23,16 +18,8 @@ class SDS(Distillation):
     100 counts from the prompt, eps_y + 100 (eps_y - eps_n), which is 101 here.
     """
 
-    def compare(
-        self,
-        clean: Float[Tensor, "v c h w"],
-        t: Float[Tensor, "v"],
-        condition: Condition,
-        prior: DiffusionPrior,
-        step: int,
-        generator: torch.Generator,
-    ) -> Comparison:
+    def compare(self, case: Case) -> Comparison:
         """Predicted noise minus added noise. One guided prediction per view."""
-        noise = standard_normal(clean, generator)
-        guess = prior.predict(prior.noise_path.mix(clean, noise, t), t, condition, self.scale)
+        noise = case.draw_noise()
+        guess = case.guess(noise, self.scale)
         return Comparison(difference=guess.noise - noise, clean=guess.clean)

@@ -2,16 +2,11 @@
 
 from dataclasses import dataclass
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
-from cadam3d.guidance.distill import Comparison, Distillation, standard_normal
-from cadam3d.prior.base import Condition, DiffusionPrior
+from cadam3d.guidance.distill import Case, Comparison, GuidedDistillation
 
 
 @dataclass(frozen=True, kw_only=True)
-class VFDS(Distillation):
+class VFDS(GuidedDistillation):
     """Vector field distillation sampling (FlowDreamer; paper sec. 3.2).
 
     With x_t = a x0 + b eps, eps ~ N(0, I),
@@ -25,17 +20,9 @@ class VFDS(Distillation):
     so that at equal b and an equal clean guess the two paths give the same G, and G is SDS's divided by a.
     """
 
-    def compare(
-        self,
-        clean: Float[Tensor, "v c h w"],
-        t: Float[Tensor, "v"],
-        condition: Condition,
-        prior: DiffusionPrior,
-        step: int,
-        generator: torch.Generator,
-    ) -> Comparison:
+    def compare(self, case: Case) -> Comparison:
         """Predicted velocity minus the velocity of the pair. One guided prediction per view."""
-        noise = standard_normal(clean, generator)
-        guess = prior.predict(prior.noise_path.mix(clean, noise, t), t, condition, self.scale)
-        velocity = prior.noise_path.velocity(clean, noise, t)
+        noise = case.draw_noise()
+        guess = case.guess(noise, self.scale)
+        velocity = case.prior.noise_path.velocity(case.clean, noise, case.t)
         return Comparison(difference=guess.velocity - velocity, clean=guess.clean)

@@ -5,7 +5,7 @@ a text encoder, a tokenizer) is loaded when it is needed and alone: what nobody 
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
@@ -52,19 +52,19 @@ class Source:
                 is_name, f"{key}.{name}", wanted="a name or null", got=value, example=f"{key}.{name}=null"
             )
 
-    def find(self, kinds: Sequence[str]) -> "Pretrained":
+    def find(self, kinds: Sequence[str], others: Mapping[str, str]) -> "Pretrained":
         """The model, of which only the index has been read; on the hub, the first id that can be had.
 
-        ``kinds`` are the pipeline classes that will do. Raises ``UserError`` if the extra is not installed,
-        or with a line for everything that was tried.
+        ``kinds`` are the pipeline classes that will do, ``others`` what to type for those that will not.
+        Raises ``UserError`` if the extra is not installed, or with a reason for everything that was tried.
         """
         require_extra(self.key)
         found = self._local() if self.path is not None else self._remote()
-        kind = found.index.get("_class_name")
+        kind = str(found.index.get("_class_name"))
         if kind not in kinds:
+            advice = others.get(kind, f"another {self.key}.path")
             raise UserError(
-                f"{self.key}: {found.where} is a {kind}, not a {' or '.join(kinds)}. "
-                f"Try: another {self.key}, or another {self.key}.path"
+                f"{self.key}: {found.where} is a {kind}, not a {' or '.join(kinds)}. Try: {advice}"
             )
         return found
 
@@ -154,15 +154,21 @@ class Pretrained:
             return dict(kind.load_config(self.where, subfolder=name, revision=self.revision))
         return kind.config_class.from_pretrained(self.where, subfolder=name, revision=self.revision).to_dict()
 
-    def num_parameters(self, name: str) -> int:
-        """How many numbers a part holds, from its configuration alone: nothing is loaded."""
+    def skeleton(self, name: str, dtype: torch.dtype) -> Any:
+        """A network without numbers, on the meta device, from its configuration alone: nothing is loaded."""
         kind, config = self._kind(name), self.config(name)
-        with torch.device("meta"):
-            if hasattr(kind, "from_config"):
-                network = kind.from_config(config)
-            else:
-                network = kind(kind.config_class.from_dict(config))
-        return sum(parameter.numel() for parameter in network.parameters())
+        usual = torch.get_default_dtype()
+        torch.set_default_dtype(dtype)
+        try:
+            with torch.device("meta"):
+                network = (
+                    kind.from_config(config)
+                    if hasattr(kind, "from_config")
+                    else kind(kind.config_class.from_dict(config))
+                )
+        finally:
+            torch.set_default_dtype(usual)
+        return network.requires_grad_(False).eval()
 
     @property
     def identity(self) -> str:

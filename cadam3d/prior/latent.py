@@ -8,7 +8,7 @@ import gc
 import hashlib
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,15 +19,22 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (the name everybody knows)
 from torch.utils.checkpoint import checkpoint
 
-from cadam3d.core.cameras import Cameras
+from cadam3d.core.cameras import Cameras, orbit
 from cadam3d.core.checks import UserError, require, require_choice, require_whole
 from cadam3d.io.atomic import replacing
 from cadam3d.io.cache import default_cache_dir
 from cadam3d.io.pretrained import DTYPES, Pretrained, Source
-from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
+from cadam3d.prior.base import Condition, DiffusionPrior, MemoryEstimate, PromptEmbedding
+from cadam3d.prior.memory import working_bytes
 from cadam3d.prior.path import DDPM, NoisePath, Prediction
 from cadam3d.prior.prompting import Mix, Prompting, guide
 
+PRIORS = {  # what to type for a model of this class
+    "StableDiffusionPipeline": "prior=stable_diffusion",
+    "StableDiffusionXLPipeline": "prior=sdxl",
+    "StableDiffusion3Pipeline": "prior=stable_diffusion_3",
+}
+TOKENS, T5_TOKENS = 77, 256  # of CLIP and of T5, per text
 FACTOR = 8  # pixels per latent, per side, in every model of this family
 
 
@@ -87,10 +94,10 @@ class LatentEmbedding(PromptEmbedding):
 class LatentPrior(DiffusionPrior):
     """A pretrained model that denoises what an autoencoder makes of images.
 
-    Renders of any size are resized to ``size``; latents are the mean of the autoencoder's posterior (the
-    released codes sample it, at a spread far below one grey level). ``micro_batch`` bounds how many images are
-    in a network at once: the autoencoder is then run again in the backward pass, image by image, so memory no
-    longer grows with the number of views, and the gradient stays what it is.
+    Renders of any size are resized to ``size``. Latents are the mean of the autoencoder's posterior, where
+    the released codes draw from it. ``micro_batch`` bounds how many images are in a network at once: the
+    autoencoder is then run again in the backward pass, part by part, so that memory no longer grows with the
+    number of views, and the gradient stays what it is.
     """
 
     path: str | None  # a folder in the layout of diffusers; wins over ids
@@ -103,6 +110,7 @@ class LatentPrior(DiffusionPrior):
     micro_batch: int | None  # images in a network at a time; None = all
     tiling: bool  # decode and encode large images in tiles
     compile: bool  # torch.compile for the denoiser
+    text_device: str  # where prompts are embedded: "auto" (with the rest) or "cpu"
     cache_dir: str | None  # of embedded texts; None = the user's cache folder
 
     kinds: ClassVar[tuple[str, ...]]  # pipeline classes that this prior can use
@@ -118,7 +126,7 @@ class LatentPrior(DiffusionPrior):
             "prior.prompting",
             wanted="a way to word prompts",
             got=self.prompting,
-            example="prior/prompting=discrete",
+            example="prompting=discrete",
         )
         if self.size is not None:
             require_whole("prior.size", self.size, low=FACTOR, example=512)
@@ -129,6 +137,7 @@ class LatentPrior(DiffusionPrior):
         require_choice("prior.dtype", self.dtype, ("auto", *DTYPES))
         if self.micro_batch is not None:
             require_whole("prior.micro_batch", self.micro_batch, low=1, example=1)
+        require_choice("prior.text_device", self.text_device, ("auto", "cpu"))
         require_choice("prior.tiling", self.tiling, (False, True))
         require_choice("prior.compile", self.compile, (False, True))
 
@@ -154,8 +163,8 @@ class LatentPrior(DiffusionPrior):
 
     def embed(self, prompt: str, negative: str) -> LatentEmbedding:
         """Embed the prompt's texts, the negative prompt and the empty text, from the cache where they are."""
-        listed = [*self.prompting.texts(prompt), negative, ""]
-        return LatentEmbedding(texts=self._embedded(listed).to(self.device), prompting=self.prompting)
+        texts = self._embedded(self._listed(prompt, negative))
+        return LatentEmbedding(texts=texts.to(self.device), prompting=self.prompting)
 
     def encode(self, rgb: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v c lh lw"]:
         """Images in [0, 1] to scaled latents; differentiable."""
@@ -203,8 +212,30 @@ class LatentPrior(DiffusionPrior):
             )
         return self.complete(noisy, guess.to(noisy.dtype), t)
 
-    def notice(self) -> None:
-        """Nothing to say."""
+    def memory(self, prompt: str, negative: str, views: int, size: int | None) -> MemoryEstimate:
+        """Weights, the larger of what denoiser and autoencoder need at once, and the text encoders.
+
+        From the model's configurations alone. Renders have ``size`` (or 512) where the prior has none.
+        """
+        pixels = self.size or size or 512
+        branches = 2 + self.prompting.mix(_views(1)).repelled.shape[1]
+        vae = self.found.skeleton("vae", self._vae_dtype)
+        network = self.found.skeleton(self.network_part, self.torch_dtype)
+        working = max(
+            self._denoising(network, self._at_once(views * branches), vae.config.latent_channels, pixels),
+            _encoding(vae, self._at_once(views), pixels),
+        )
+        is_known = all(self._cache_file(text).is_file() for text in self._listed(prompt, negative))
+        is_elsewhere = self.text_device == "cpu" and self.device.type != "cpu"
+        encoders = (
+            [] if is_known or is_elsewhere else [part for part in self.encoders if self.found.has(part)]
+        )
+        texts = sum(_weights(self.found.skeleton(part, self.torch_dtype)) for part in encoders)
+        return MemoryEstimate(weights=_weights(vae) + _weights(network), working=working, texts=texts)
+
+    def load(self) -> None:
+        """Load the autoencoder and the denoiser."""
+        _ = self.vae, self.network
 
     def to(self, device: torch.device) -> "LatentPrior":
         """Networks loaded from now on go to ``device``; those that are loaded move."""
@@ -236,7 +267,7 @@ class LatentPrior(DiffusionPrior):
     @cached_property
     def found(self) -> Pretrained:
         """The model, found but not loaded."""
-        return self.source.find(self.kinds)
+        return self.source.find(self.kinds, PRIORS)
 
     @cached_property
     def scheduler(self) -> Mapping[str, Any]:
@@ -246,8 +277,7 @@ class LatentPrior(DiffusionPrior):
     @cached_property
     def vae(self) -> Any:
         """The autoencoder, frozen, on the device."""
-        dtype = self.torch_dtype
-        vae = self.found.part("vae", torch.float32 if self.upcasts and dtype == torch.float16 else dtype)
+        vae = self.found.part("vae", self._vae_dtype)
         if self.tiling:
             vae.enable_tiling()
         return vae.to(self.device)
@@ -263,6 +293,11 @@ class LatentPrior(DiffusionPrior):
     @cached_property
     def _place(self) -> dict[str, torch.device]:
         return {"device": torch.device("cpu")}
+
+    @property
+    def _vae_dtype(self) -> torch.dtype:
+        overflows = self.upcasts and self.torch_dtype == torch.float16
+        return torch.float32 if overflows else self.torch_dtype
 
     # --- work ----------------------------------------------------------------------------------------------
 
@@ -304,14 +339,34 @@ class LatentPrior(DiffusionPrior):
         return torch.cat(outputs)
 
     def _parts(self, rows: Tensor) -> Sequence[Tensor]:
-        return rows.split(self.micro_batch or len(rows))
+        return rows.split(self._at_once(len(rows)))
+
+    def _at_once(self, images: int) -> int:
+        return min(images, self.micro_batch or images)
+
+    def _listed(self, prompt: str, negative: str) -> list[str]:
+        return [*self.prompting.texts(prompt), negative, ""]
+
+    def _denoising(self, network: Any, count: int, channels: int, pixels: int) -> int:
+        """Scratch bytes of one pass of a skeleton of the denoiser over ``count`` images."""
+        ghost = replace(self)  # this prior, with a network that has no numbers
+        object.__setattr__(ghost, "network", network)
+        side = pixels // FACTOR
+        with torch.device("meta"):
+            noisy = torch.empty(count, channels, side, side, dtype=self.torch_dtype)
+            timestep = torch.empty(count)
+            texts = blank_texts(count, network.config, self.torch_dtype)
+        cameras = _views(count).to("meta")
+        with torch.no_grad():
+            return working_bytes(lambda: ghost.denoise(noisy, timestep, texts, cameras), network.parameters())
 
     def _embedded(self, listed: Sequence[str]) -> Texts:
         """Rows for ``listed``, in order; only texts that are not in the cache cost anything."""
         rows = {text: self._cached(text) for text in dict.fromkeys(listed)}
         missing = [text for text, row in rows.items() if row is None]
         if missing:
-            made = self.embed_texts(self.found, missing, self.device)
+            device = torch.device("cpu") if self.text_device == "cpu" else self.device
+            made = self.embed_texts(self.found, missing, device)
             free()
             for i, text in enumerate(missing):
                 row = Texts(made.tokens[i : i + 1], None if made.pooled is None else made.pooled[i : i + 1])
@@ -376,6 +431,18 @@ def ddpm_path(scheduler: Mapping[str, Any]) -> NoisePath:
     )
 
 
+def blank_texts(count: int, config: Any, dtype: torch.dtype) -> Texts:
+    """Texts of the shapes that a denoiser with this configuration reads, without meaning."""
+    joint = getattr(config, "joint_attention_dim", None)
+    tokens = torch.empty(count, TOKENS + (T5_TOKENS if joint else 0), joint or config.cross_attention_dim)
+    width = getattr(config, "pooled_projection_dim", None)
+    if (
+        getattr(config, "addition_embed_type", None) == "text_time"
+    ):  # SDXL: the rest are six numbers about sizes
+        width = config.projection_class_embeddings_input_dim - 6 * config.addition_time_embed_dim
+    return Texts(tokens.to(dtype), None if width is None else torch.empty(count, width).to(dtype))
+
+
 def tokenize(tokenizer: Any, texts: Sequence[str], length: int | None = None) -> Tensor:
     """Token numbers, cut or padded to ``length`` (None: the tokenizer's own)."""
     return tokenizer(
@@ -413,3 +480,19 @@ def completion(path: NoisePath, scheduler: Mapping[str, Any]) -> Complete:
         example="another model",
     )
     return ways[kind]
+
+
+def _encoding(vae: Any, count: int, pixels: int) -> int:
+    """Bytes that a skeleton of the autoencoder keeps for the backward pass through ``count`` images."""
+    with torch.device("meta"):
+        images = torch.empty(count, 3, pixels, pixels, dtype=vae.dtype, requires_grad=True)
+    return working_bytes(lambda: vae.encode(images).latent_dist.mode(), vae.parameters())  # noqa: PLW0108
+
+
+def _weights(network: Any) -> int:
+    return sum(parameter.numel() * parameter.element_size() for parameter in network.parameters())
+
+
+def _views(count: int) -> Cameras:
+    zeros = torch.zeros(count)
+    return orbit(zeros, zeros, zeros + 3, zeros + 45, FACTOR, FACTOR)

@@ -16,6 +16,8 @@ from torch import Tensor
 
 from cadam3d.core.checks import require_range, require_whole
 
+HALVINGS = 53  # until an interval of length 1 is as short as double precision can tell
+
 
 @dataclass(frozen=True)
 class Prediction:
@@ -70,6 +72,20 @@ class NoisePath(ABC):
     def gamma(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
         """Noise-to-signal ratio b / a (paper sec. 3.2); infinite where a is 0."""
         return self.b(t) / self.a(t)
+
+    def t_at(self, b: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        """The ``t`` at which the share of noise is ``b``: by bisection, since b rises with t.
+
+        Exactly 0 and 1 at the ends of the path, and for a ``b`` that lies beyond them.
+        """
+        low, high = torch.zeros_like(b, dtype=torch.float64), torch.ones_like(b, dtype=torch.float64)
+        wanted, most = b.double(), self.b(high)
+        for _ in range(HALVINGS):
+            middle = (low + high) / 2
+            is_below = self.b(middle) < wanted
+            low, high = torch.where(is_below, middle, low), torch.where(is_below, high, middle)
+        t = torch.where(wanted < most, high, 1.0)
+        return torch.where(wanted > 0, t, 0.0).to(b.dtype)
 
     def mix(
         self, clean: Float[Tensor, "v c h w"], noise: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]

@@ -5,26 +5,27 @@ from dataclasses import dataclass, field, replace
 import pytest
 import torch
 
+from cadam3d.guidance.csd import CSD
+from cadam3d.guidance.gcs import GCS
 from cadam3d.guidance.ism import ISM
+from cadam3d.guidance.sdi import SDI
 from cadam3d.guidance.sds import SDS
+from cadam3d.guidance.ucm import UCM
 from cadam3d.guidance.vfds import VFDS
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
 
-SHARED = {
-    "scale": 2.0,
-    "weight": 1.0,
-    "weighting": "unit",
-    "t_min": 0.02,
-    "t_max": 0.98,
-    "shared_t": False,
-    "reduction": "sum",
-    "clip": None,
-}
-OBJECTIVES = {
+SHARED = {"weight": 1.0, "t_min": 0.02, "t_max": 0.98, "shared_t": False, "reduction": "sum"}
+GUIDED = {  # distillations whose guess is under classifier-free guidance
     "sds": (SDS, {}),
     "ism": (ISM, {"delta": 0.05, "inversion_stride": 0.2, "initial_noise": 0.0}),
     "vfds": (VFDS, {}),
+    "sdi": (SDI, {"inversion_scale": -2.0, "inversion_stride": 0.25, "overshoot": 0.03, "eta": 0.3}),
+    "ucm": (UCM, {"inversion_steps": 3, "inversion_grid": "t", "fresh_noise": 0.0}),
+}
+DISTILLATIONS = GUIDED | {"csd": (CSD, {"empty_share": 0.0})}  # weighted differences of two guesses
+OBJECTIVES = DISTILLATIONS | {
+    "gcs": (GCS, {"w_cc": 1.0, "w_gc": 0.5, "w_cp": 0.5, "delta": 0.05, "fixed_noise": False})
 }
 PATHS = {"ddpm": DDPM(), "flow": RectifiedFlow(), "flow-3": RectifiedFlow(shift=3.0)}
 
@@ -38,6 +39,7 @@ class Means(Condition):
     empty: torch.Tensor
     empty_spread: float | None = None  # of images without a prompt; None = the prior's own
     spread: float | None = None  # of the images of this condition; None = the prior's own
+    negative_spread: float | None = None  # of those of its negative prompt; None = as of its prompt
 
     def unprompted(self):
         return Means(self.empty, self.empty, self.empty, self.empty_spread, self.empty_spread)
@@ -77,20 +79,31 @@ class GaussianPrior(DiffusionPrior):
     def encode(self, rgb):
         return rgb.permute(0, 3, 1, 2)
 
+    def decode(self, latents, height, width):
+        """Without the clamp, so that images of any range do."""
+        return latents.permute(0, 2, 3, 1)
+
     def predict(self, noisy, t, condition, scale):
         self.calls.append(Call(t, scale, condition, torch.is_grad_enabled()))
         with torch.no_grad():
-            mean = condition.negative + scale * (condition.positive - condition.negative)
             a, b = per_view(self.noise_path.a(t)), per_view(self.noise_path.b(t))
             spread = self.spread if condition.spread is None else condition.spread
-            variance = a**2 * spread**2 + b**2
-            off = (noisy - a * mean) / torch.where(variance > 0, variance, 1)
-            clean, noise = mean + a * spread**2 * off, b * off
+            wide = spread if condition.negative_spread is None else condition.negative_spread
+            positive = posterior_means(noisy, a, b, condition.positive, spread)
+            negative = posterior_means(noisy, a, b, condition.negative, wide)
+            clean, noise = (n + scale * (p - n) for p, n in zip(positive, negative, strict=True))
             if self.form == "clean":
                 return self.noise_path.from_clean(noisy, clean, t)
             if self.form == "noise":
                 return self.noise_path.from_noise(noisy, noise, t)
             return self.noise_path.from_velocity(noisy, self.noise_path.velocity(clean, noise, t), t)
+
+
+def posterior_means(noisy, a, b, mean, spread):
+    """Of the clean image and of the noise, given ``noisy``, for images around ``mean``."""
+    variance = a**2 * spread**2 + b**2
+    off = (noisy - a * mean) / torch.where(variance > 0, variance, 1)
+    return mean + a * spread**2 * off, b * off
 
 
 def random_images(count, seed, views=3):
@@ -136,7 +149,9 @@ def make():
 
     def build(name, **keys):
         kind, extra = OBJECTIVES[name]
-        return kind(**SHARED | extra | keys)
+        scale = {} if name == "csd" else {"scale": 2.0}
+        compared = {"weighting": "unit", "clip": None} if name in DISTILLATIONS else {}
+        return kind(**SHARED | scale | compared | extra | keys)
 
     return build
 
@@ -167,4 +182,17 @@ def prior(path):
 
 @pytest.fixture(params=OBJECTIVES.keys())
 def objective(request):
+    """Any objective."""
+    return request.param
+
+
+@pytest.fixture(params=DISTILLATIONS.keys())
+def distillation(request):
+    """An objective that is a weighted difference of two guesses."""
+    return request.param
+
+
+@pytest.fixture(params=GUIDED.keys())
+def guided(request):
+    """A distillation whose guess is under classifier-free guidance."""
     return request.param

@@ -57,6 +57,22 @@ def test_a_falls_and_b_rises(path):
     assert (path.gamma(t)[:-1].diff() > 0).all()
 
 
+@every_path
+@every_dtype
+def test_a_share_of_noise_belongs_to_one_t(path, dtype):
+    t = torch.cat([torch.tensor([1e-4]), inner_levels(50)]).to(dtype)
+    found = path.t_at(path.b(t))
+    assert found.dtype == dtype
+    torch.testing.assert_close(found, t, rtol=0, atol=1e-9 if dtype == torch.float64 else 1e-4)
+
+
+@every_path
+def test_the_ends_are_found_exactly(path):
+    ends = torch.tensor([0, 1], dtype=torch.float64)
+    assert torch.equal(path.t_at(path.b(ends)), ends)
+    assert path.t_at(torch.tensor([-0.1, 1.1])).tolist() == [0, 1]
+
+
 @pytest.mark.parametrize("name", ["ddpm", "ddpm-10"])
 def test_ddpm_preserves_variance(name):
     t = inner_levels(500)

@@ -1,0 +1,59 @@
+"""The window of noise levels that a guidance draws from; it may slide while training runs."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.core.checks import require, require_choice
+from cadam3d.core.schedule import FAR_STEP, Schedule, as_schedule, require_scheduled
+from cadam3d.guidance.base import Guidance
+
+
+@dataclass(frozen=True, kw_only=True)
+class WindowedGuidance(Guidance):
+    """Guidance at noise levels drawn uniformly from [t_min, t_max).
+
+    With t_min = t_max nothing is left to chance: one schedule for both is DreamGaussian's annealing of t.
+    """
+
+    t_min: float | Schedule  # in [0, t_max]
+    t_max: float | Schedule  # in [t_min, 1]
+    shared_t: bool  # one t for all views of a step, or one each
+
+    def __post_init__(self) -> None:
+        require_choice("guidance.shared_t", self.shared_t, (True, False))
+        require_scheduled("guidance.t_min", self.t_min, example=0.02)
+        require_scheduled("guidance.t_max", self.t_max, example=0.98)
+        for step in (0, FAR_STEP):  # the steps between are checked as they come
+            self.window(step)
+
+    def window(self, step: int) -> tuple[float, float]:
+        """t_min and t_max at ``step``. Raises ``UserError`` if a schedule leaves its range there."""
+        low, high = as_schedule(self.t_min)(step), as_schedule(self.t_max)(step)
+        require(
+            0 <= low <= high <= 1,
+            "guidance.t_max",
+            wanted="0 <= t_min <= t_max <= 1 at every step",
+            got=f"t_min {low:g} and t_max {high:g}",
+            example="guidance.t_min=0.02 guidance.t_max=0.98",
+        )
+        return low, high
+
+    def draw_t(
+        self, clean: Float[Tensor, "v c h w"], step: int, generator: torch.Generator
+    ) -> Float[Tensor, "v"]:
+        """Noise levels for the encoded renders ``clean``; see :meth:`uniform`."""
+        low, high = self.window(step)
+        uniform = self.uniform(clean, generator)
+        return torch.lerp(torch.full_like(uniform, low), torch.full_like(uniform, high), uniform)
+
+    def uniform(self, clean: Float[Tensor, "v c h w"], generator: torch.Generator) -> Float[Tensor, "v"]:
+        """Draws from [0, 1), shared or not as ``shared_t`` says.
+
+        On the device of ``clean``, and never in half precision: noise levels must stay precise.
+        """
+        views = clean.shape[0]
+        drawn = torch.rand(1 if self.shared_t else views, generator=generator, dtype=torch.float32)
+        return drawn.to(clean.device, torch.promote_types(clean.dtype, torch.float32)).expand(views)
