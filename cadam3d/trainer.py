@@ -72,11 +72,13 @@ class Trainer:
     def start(self, prompt: str, initializer: Initializer, seed: int, device: torch.device) -> TrainState:
         """The state before the first step; every later draw descends from ``seed``."""
         generators = start_generators(seed)
-        gaussians = initializer.build(prompt, generators["initializer"], device)
+        beginning = initializer.begin(prompt, generators["initializer"], device)
+        gaussians = beginning.gaussians
         return TrainState(
             step=0,
             seconds=0.0,
             num_initial=len(gaussians),
+            initial_note=beginning.note,
             skipped=0,
             dimmed=0,
             refused=False,
@@ -118,6 +120,7 @@ class Trainer:
             step=payload["step"],
             seconds=payload["seconds"],
             num_initial=payload["num_initial"],
+            initial_note=payload.get("initial_note"),  # older checkpoints have none
             skipped=payload["skipped"],
             dimmed=payload.get("dimmed", 0),  # a checkpoint from before there was a guard
             refused=payload["refused"],

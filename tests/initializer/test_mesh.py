@@ -19,6 +19,7 @@ def build(path, seed: int = 0, **changes) -> Gaussians:
     usual = {
         "path": str(path),
         "up": "z",
+        "turn_deg": 0,
         "radius": 0.9,
         "count": 2000,
         "scale": 0.02,
@@ -76,6 +77,23 @@ def test_a_file_with_y_up_stands_upright_and_faces_the_front(tmp_path):
     assert size["y"].argsort().tolist() == [1, 0, 2]  # file y is world z, file z is world x
     top = extent["y"][extent["y"][:, 2].argmax()]
     assert top[0] < 0  # where the file has z = 0, the back
+
+
+def test_a_turn_brings_one_side_to_the_front(tmp_path):
+    corners = np.array(
+        [[0, 0, 0], [0, -3.0, 0], [0, 0, 1]]
+    )  # long towards -y, the front of Blender's objects
+    path = save(trimesh.Trimesh(corners, [[0, 1, 2]], process=False), tmp_path / "mark.ply")
+    means = build(path, turn_deg=90).means
+    torch.testing.assert_close(means[:, 1], torch.zeros(2000), atol=1e-5, rtol=0)
+    assert means[means[:, 2].argmax(), 0] < means[:, 0].mean()  # the tip stands where the long side begins
+
+
+def test_without_a_radius_it_stays_as_it_is(tmp_path):
+    mesh = trimesh.creation.box(extents=(0.2, 0.2, 0.2)).apply_translation([0.1, 0.5, 0])
+    means = build(save(mesh, tmp_path / "box.ply"), radius=None).means
+    torch.testing.assert_close(means.amin(dim=0), torch.tensor([0.0, 0.4, -0.1]), atol=0.01, rtol=0)
+    torch.testing.assert_close(means.amax(dim=0), torch.tensor([0.2, 0.6, 0.1]), atol=0.01, rtol=0)
 
 
 def test_vertex_colors_are_interpolated(tmp_path):
@@ -163,7 +181,8 @@ def test_a_file_without_a_surface_is_said_so(tmp_path, kind):
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("up", "x"), ("radius", 2.0), ("count", 0), ("opacity", 0.0), ("color", [1.0])]
+    ("key", "value"),
+    [("up", "x"), ("turn_deg", 45), ("radius", 2.0), ("count", 0), ("opacity", 0.0), ("color", [1.0])],
 )
 def test_an_impossible_value_is_refused_by_name(tmp_path, key, value):
     with pytest.raises(UserError, match=rf"initializer\.{key}"):
