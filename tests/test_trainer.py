@@ -83,7 +83,7 @@ def same(left: dict, right: dict) -> bool:
     return True
 
 
-@pytest.mark.parametrize("densifier", ["cadam", "baseline", "none", "random", "mcmc"])
+@pytest.mark.parametrize("densifier", ["cadam", "baseline", "absgrad", "none", "random", "mcmc"])
 def test_same_seed_same_bytes(tmp_path, densifier):
     payloads = []
     for _ in range(2):
