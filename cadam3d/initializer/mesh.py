@@ -18,6 +18,7 @@ from cadam3d.initializer.points import (
     fit,
     found_file,
     gaussians_at,
+    one_color,
     points_on_surface,
     require_place,
     require_points,
@@ -63,8 +64,7 @@ class Mesh(Initializer):
         corners = self._place(corners.flatten(end_dim=1)).view_as(corners)
         faces, weights = points_on_surface(corners, self.count, generator)
         points = (weights[..., None] * corners[faces]).sum(dim=1)
-        rgb = self._colors(parts, faces, weights)
-        cloud = PointCloud(points.to(device), rgb.to(device))
+        cloud = PointCloud(points, self._colors(parts, faces, weights)).to(device)
         return gaussians_at(cloud, scale=self.scale, opacity=self.opacity, sh_degree=self.sh_degree)
 
     def _load(self) -> list[trimesh.Trimesh]:
@@ -96,7 +96,7 @@ class Mesh(Initializer):
         self, parts: Sequence[trimesh.Trimesh], faces: Int[Tensor, "n"], weights: Float[Tensor, "n 3"]
     ) -> Float[Tensor, "n 3"]:
         """RGB of the sampled points, in [0, 1]; ``faces`` count through all parts."""
-        rgb = torch.tensor([float(channel) for channel in self.color]).repeat(len(faces), 1)
+        rgb = one_color(self.color, len(faces))
         first = 0
         for part in parts:
             is_here = (faces >= first) & (faces < first + len(part.faces))
