@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from cadam3d.augmentation import Augmentation
 from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
@@ -16,6 +17,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.densifier.base import Densifier, GradientSignal
 from cadam3d.densifier.refine import Refine
+from cadam3d.exposure import Exposure
 from cadam3d.guidance.base import Guidance
 from cadam3d.initializer.base import Initializer
 from cadam3d.optimizer import AdamSettings
@@ -25,8 +27,16 @@ from cadam3d.regularizer import Regularizer
 from cadam3d.state import Outcome, Population, RefineReport, RunContext, StepReport, TrainState
 
 # Each source of randomness has its own generator: two densifiers with one seed see the same views and noise.
-# Appended to, never reordered: the place of a name is part of its seed.
-GENERATORS = ("initializer", "camera", "background", "guidance", "refine", "densifier")
+# New names go to the end: a seed gives each the stream of its place.
+GENERATORS = (
+    "initializer",
+    "camera",
+    "background",
+    "guidance",
+    "refine",
+    "densifier",
+    "augmentation",
+)
 
 
 def never() -> bool:
@@ -42,22 +52,25 @@ class Trainer:
     views: int  # per step
     camera: CameraSampler
     background: Background
+    augmentation: Augmentation
     rasterizer: Rasterizer
     prior: DiffusionPrior
     guidance: Guidance
     densifier: Densifier
     refine: Refine
     optimizer: AdamSettings
+    exposure: Exposure
     regularizers: Mapping[str, Regularizer]
     callbacks: Sequence[Callback]
 
     def __post_init__(self) -> None:
         require_range("steps", self.steps, low=1, example=600)
         require_range("views", self.views, low=1, example=2)
+        self.camera.check_views(self.views)
 
     def start(self, prompt: str, initializer: Initializer, seed: int, device: torch.device) -> TrainState:
         """The state before the first step; every later draw descends from ``seed``."""
-        generators = _generators(seed)
+        generators = start_generators(seed)
         beginning = initializer.begin(prompt, generators["initializer"], device)
         gaussians = beginning.gaussians
         return TrainState(
@@ -66,6 +79,7 @@ class Trainer:
             num_initial=len(gaussians),
             initial_note=beginning.note,
             skipped=0,
+            dimmed=0,
             refused=False,
             seed=seed,
             optimizer=self.optimizer.start(gaussians),
@@ -97,17 +111,17 @@ class Trainer:
             got=f"{len(gaussians)} Gaussians and another number of rows",
             example="resume=RUN/checkpoints/<an earlier one>",
         )
-        generators = _generators(payload["seed"])
-        for name, drawn in payload[
-            "generators"
-        ].items():  # who is too new for the checkpoint has drawn nothing
-            generators[name].set_state(drawn)
+        generators = start_generators(payload["seed"])
+        for name, generator in generators.items():
+            if name in payload["generators"]:  # a checkpoint from before the name was: nothing was drawn yet
+                generator.set_state(payload["generators"][name])
         return TrainState(
             step=payload["step"],
             seconds=payload["seconds"],
             num_initial=payload["num_initial"],
             initial_note=payload.get("initial_note"),  # older checkpoints have none
             skipped=payload["skipped"],
+            dimmed=payload.get("dimmed", 0),  # a checkpoint from before there was a guard
             refused=payload["refused"],
             seed=payload["seed"],
             optimizer=optimizer,
@@ -192,10 +206,12 @@ class Trainer:
         gaussians, draw = state.gaussians, state.generators
         cameras = self.camera.sample(state.step, self.views, draw["camera"]).to(gaussians.device)
         background = self.background.sample(self.views, draw["background"]).to(gaussians.device)
-        output = self.rasterizer.render(gaussians, cameras, background)
+        rendered = self.augmentation.perturb(gaussians, draw["augmentation"])
+        output = self.rasterizer.render(rendered, cameras, background)
+        images = self.augmentation.show(output, draw["augmentation"])
         condition = embedding.at(cameras, background)
-        judged = self.guidance(output.rgb, condition, self.prior, state.step, draw["guidance"])
-        penalties = {name: fn(gaussians, output, state.step) for name, fn in self.regularizers.items()}
+        judged = self.guidance(images, condition, self.prior, state.step, draw["guidance"])
+        penalties = {name: fn(rendered, output, state.step) for name, fn in self.regularizers.items()}
         loss = sum(penalties.values(), start=judged.loss)
         if penalties and self.densifier.guidance_only:
             judged.loss.backward(retain_graph=True)
@@ -212,11 +228,14 @@ class Trainer:
         else:
             state.skipped += 1
             state.optimizer.zero_grad()
+        log = {**judged.log, **{name: float(value.detach()) for name, value in penalties.items()}}
+        if (factor := self.exposure.dimming(output, background, state.step + 1)) is not None:
+            state.optimizer.scale_colors(factor)
+            state.dimmed += 1
+        if state.dimmed:
+            log["dimmed"] = float(state.dimmed)
         return StepReport(
-            step=state.step + 1,
-            loss=float(loss.detach()),
-            log={**judged.log, **{name: float(value.detach()) for name, value in penalties.items()}},
-            num_gaussians=len(gaussians),
+            step=state.step + 1, loss=float(loss.detach()), log=log, num_gaussians=len(gaussians)
         )
 
     def _perturb(self, state: TrainState) -> None:
@@ -282,8 +301,8 @@ class Trainer:
         return replace(report, after=after, cloned=plan.cloned, split=plan.split, pruned=plan.pruned)
 
 
-def _generators(seed: int) -> dict[str, torch.Generator]:
-    """One per source of randomness, as they are before the first draw."""
+def start_generators(seed: int) -> dict[str, torch.Generator]:
+    """Every source of randomness as it is before the first draw."""
     children = np.random.SeedSequence(seed).spawn(len(GENERATORS))
     return {
         name: torch.Generator().manual_seed(int(child.generate_state(1, np.uint64)[0] >> 1))

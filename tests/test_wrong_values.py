@@ -14,6 +14,8 @@ from cadam3d.settings import component, compose
 WHOLE = {  # what to choose, and the keys that count something
     "camera=orbit": ["camera.size"],
     "camera=sphere": ["camera.size"],
+    "camera=multiview": ["camera.size"],
+    "camera=progressive": ["camera.size", "camera.begin", "camera.every"],
     "initializer=ball": ["initializer.count", "initializer.sh_degree"],
     "initializer=mesh": ["initializer.count", "initializer.sh_degree"],
     "initializer=ply": ["initializer.count", "initializer.sh_degree", "initializer.replicate"],
@@ -47,6 +49,7 @@ WHOLE = {  # what to choose, and the keys that count something
     ],
     "densifier=cadam": ["densifier.min_age", "densifier.reset_min_age"],
     "densifier=mcmc": ["densifier.cap"],
+    "exposure=beg": ["exposure.begin", "exposure.end"],
     "exporter=[images]": ["exporter.images.views", "exporter.images.size"],
     "exporter=[preview]": ["exporter.preview.views", "exporter.preview.size"],
     "exporter=[turntable]": [
@@ -57,28 +60,39 @@ WHOLE = {  # what to choose, and the keys that count something
     "exporter=[ply]": ["exporter.ply.pad_sh"],
     "metric=[fidelity]": ["metric.fidelity.views", "metric.fidelity.size"],
     "callback=[metrics]": ["callback.metrics.every"],
+    "callback=[previews]": ["callback.previews.every", "callback.previews.views", "callback.previews.size"],
     "callback=[checkpoint]": ["callback.checkpoint.every", "callback.checkpoint.keep"],
 }
 LISTS = {
     "camera=orbit": ["camera.azimuth_deg", "camera.elevation_deg", "camera.distance", "camera.fov_y_deg"],
     "camera=sphere": ["camera.distance", "camera.fov_y_deg"],
+    "camera=multiview": ["camera.elevation_deg", "camera.relative_distance", "camera.fov_y_deg"],
+    "camera=progressive": [
+        *("camera.azimuth_deg.start", "camera.elevation_deg.end", "camera.distance.end"),
+        *("camera.fov_y_deg.start", "camera.fov_y_deg.factor", "camera.distance.factor"),
+    ],
     "background=grey": ["background.color"],
     "background=random": ["background.color"],
+    "background=lucid": ["background.color"],
     "initializer=ball": ["initializer.color"],
     "initializer=mesh": ["initializer.color"],
     "initializer=ply": ["initializer.color"],
     "exporter=[images]": ["exporter.images.elevations_deg", "exporter.images.background"],
     "exporter=[preview]": ["exporter.preview.elevations_deg", "exporter.preview.background"],
     "exporter=[turntable]": ["exporter.turntable.background"],
+    "callback=[previews]": ["callback.previews.background"],
     "metric=[fidelity]": ["metric.fidelity.elevations_deg", "metric.fidelity.background"],
 }
 TRUTHS = {
     "densifier=cadam": ["densifier.reset_moments"],
     "guidance=sds": ["guidance.shared_t"],
     "guidance=ism": ["guidance.shared_t"],
+    "guidance=gcs": ["guidance.shared_t", "guidance.fixed_noise"],
     "exporter=[preview]": ["exporter.preview.labels"],
+    "prior=stable_diffusion_3": ["prior.t5"],
 }
 NULLABLE = {  # where null means never, all, or as it is
+    "callback=[previews]": ("callback.previews.every",),
     "refine=default": ("refine.reset_interval", "refine.max_gaussians"),
     "initializer=ply": ("initializer.count", "initializer.sh_degree"),
     "initializer=shap_e": ("initializer.count",),
@@ -144,6 +158,13 @@ def test_a_list_of_numbers_is_nothing_else(choice, key):
 def test_a_switch_is_true_or_false(choice, key):
     for value in NEVER_A_TRUTH:
         refuses(choice, f"{key}={value}")
+
+
+@pytest.mark.parametrize("value", [*NEVER_A_LIST, "[10,20]"])
+def test_a_range_that_widens_has_a_start_an_end_and_a_factor(value):
+    refuses("camera=progressive", f"camera.fov_y_deg={value}")
+    if value not in ("5", "[10,20]"):
+        refuses("camera=progressive", f"camera.elevation_deg.about={value}")
 
 
 def test_a_name_is_no_initializer_to_fall_back_on():

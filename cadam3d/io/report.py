@@ -49,6 +49,7 @@ LABELS = {
     "steps": "Steps done",
     "steps_asked": "Steps asked for",
     "skipped_steps": "Steps skipped (gradient not finite)",
+    "dimmed_steps": "Steps that dimmed all colours",
     "seed": "Seed",
 }
 

@@ -297,9 +297,9 @@ def test_the_unwanted_are_pruned_as_the_large_are_but_their_children_live():
 )
 def test_gaussians_moments_and_densifier_state_stay_in_step_through_many_edits(densifier):
     rates = ("means_lr", "sh_dc_lr", "sh_rest_lr", "opacity_lr", "scale_lr", "quat_lr")
-    optimizer = AdamSettings(**dict.fromkeys(rates, 0.01), beta1=0.9, beta2=0.999, eps=1e-15).start(
-        gaussians(30)
-    )
+    optimizer = AdamSettings(
+        **dict.fromkeys(rates, 0.01), beta1=0.9, beta2=0.999, eps=1e-15, clip_norm=None
+    ).start(gaussians(30))
     state, noise = densifier.init_state(30, CPU), draw(5)
     for step in range(1, 40):
         n = len(optimizer.gaussians)
