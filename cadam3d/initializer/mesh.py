@@ -18,6 +18,7 @@ from cadam3d.initializer.points import (
     fit,
     found_file,
     gaussians_at,
+    one_color,
     points_on_surface,
     require_place,
     require_points,
@@ -58,49 +59,68 @@ class Mesh(Initializer):
 
         Raises ``UserError`` if the file is missing, cannot be read or holds no surface.
         """
-        mesh = self._load()
-        corners = self._place(torch.as_tensor(np.asarray(mesh.vertices), dtype=torch.float32))
-        corners = corners[torch.as_tensor(np.asarray(mesh.faces), dtype=torch.int64)]
+        parts = self._load()
+        corners = torch.cat([_corners(part) for part in parts])
+        corners = self._place(corners.flatten(end_dim=1)).view_as(corners)
         faces, weights = points_on_surface(corners, self.count, generator)
         points = (weights[..., None] * corners[faces]).sum(dim=1)
-        cloud = PointCloud(points.to(device), self._colors(mesh, faces, weights).to(device))
+        cloud = PointCloud(points, self._colors(parts, faces, weights)).to(device)
         return gaussians_at(cloud, scale=self.scale, opacity=self.opacity, sh_degree=self.sh_degree)
 
-    def _load(self) -> trimesh.Trimesh:
+    def _load(self) -> list[trimesh.Trimesh]:
+        """The surfaces of the file, each where it stands and with its own colours."""
         path = found_file(self.path, "/path/to/mesh.glb")
         try:
-            mesh = trimesh.load_mesh(path)
+            parts = [part for part in trimesh.load_scene(path).dump() if isinstance(part, trimesh.Trimesh)]
         except Exception as error:  # every format has its own parser, with its own exceptions
             reason = str(error) or type(error).__name__
             raise UserError(
                 f"initializer.path: {self.path!r} cannot be read ({reason}). Try: a PLY, OBJ, STL or GLB file"
             ) from error
-        if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all() or mesh.area <= 0:
+        is_finite = all(np.isfinite(part.vertices).all() for part in parts)
+        if not is_finite or sum(float(part.area) for part in parts) <= 0:
+            vertices, faces = (sum(len(getattr(part, of)) for part in parts) for of in ("vertices", "faces"))
             raise UserError(
-                f"initializer.path: {self.path!r} holds no surface ({len(mesh.vertices)} vertices, "
-                f"{len(mesh.faces)} faces). Try: a file with triangles"
+                f"initializer.path: {self.path!r} holds no surface ({vertices} vertices, {faces} faces). "
+                "Try: a file with triangles"
             )
-        return mesh
+        return parts
 
-    def _place(self, vertices: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
-        """World positions of the file's vertices."""
-        upright = turned_points(points_to_world(vertices, f"+{self.up}"), self.turn_deg)
+    def _place(self, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+        """World positions of the file's points."""
+        upright = turned_points(points_to_world(points, f"+{self.up}"), self.turn_deg)
         center, factor = fit(upright, self.radius)
         return (upright - center) * factor
 
     def _colors(
-        self, mesh: trimesh.Trimesh, faces: Int[Tensor, "n"], weights: Float[Tensor, "n 3"]
+        self, parts: Sequence[trimesh.Trimesh], faces: Int[Tensor, "n"], weights: Float[Tensor, "n 3"]
     ) -> Float[Tensor, "n 3"]:
-        """RGB of the sampled points, in [0, 1]."""
-        rows = np.asarray(mesh.faces)[faces.numpy()]
-        barycentric = weights.numpy()[..., None]
-        visual: Any = mesh.visual
-        if visual.kind == "vertex":
-            rgba = (barycentric * visual.vertex_colors[rows]).sum(axis=1)
-        elif visual.kind == "face":
-            rgba = visual.face_colors[faces.numpy()]
-        elif visual.kind == "texture" and visual.uv is not None:
-            rgba = visual.material.to_color((barycentric * visual.uv[rows]).sum(axis=1))
-        else:
-            return torch.tensor([float(channel) for channel in self.color]).repeat(len(rows), 1)
-        return torch.as_tensor(np.asarray(rgba)[:, :3] / 255.0, dtype=torch.float32)
+        """RGB of the sampled points, in [0, 1]; ``faces`` count through all parts."""
+        rgb = one_color(self.color, len(faces))
+        first = 0
+        for part in parts:
+            is_here = (faces >= first) & (faces < first + len(part.faces))
+            colors = _colors_of(part, (faces[is_here] - first).numpy(), weights[is_here].numpy()[..., None])
+            if colors is not None:
+                rgb[is_here] = torch.as_tensor(colors[:, :3] / 255.0, dtype=torch.float32)
+            first += len(part.faces)
+        return rgb
+
+
+def _corners(part: trimesh.Trimesh) -> Float[Tensor, "f 3 3"]:
+    return torch.as_tensor(np.asarray(part.vertices)[np.asarray(part.faces)], dtype=torch.float32)
+
+
+def _colors_of(part: trimesh.Trimesh, faces: np.ndarray, barycentric: np.ndarray) -> np.ndarray | None:
+    """RGBA at points of ``faces``, 0 to 255; None where the part has no colours."""
+    visual: Any = part.visual
+    rows = np.asarray(part.faces)[faces]
+    if visual.kind == "vertex":
+        return (barycentric * visual.vertex_colors[rows]).sum(axis=1)
+    if visual.kind == "face":
+        return visual.face_colors[faces]
+    if visual.kind == "texture" and visual.uv is not None:
+        return np.asarray(visual.material.to_color((barycentric * visual.uv[rows]).sum(axis=1)))
+    if visual.kind == "texture":
+        return np.tile(visual.material.main_color, (len(faces), 1))
+    return None

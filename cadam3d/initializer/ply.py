@@ -18,6 +18,7 @@ from cadam3d.initializer.points import (
     fit,
     found_file,
     gaussians_at,
+    one_color,
     replicated,
     require_copies,
     require_place,
@@ -96,8 +97,7 @@ class Ply(Initializer):
         rows = rows_of(len(points), self.count, generator)
         center, factor = fit(points[rows], self.radius)
         cloud = PointCloud((points[rows] - center) * factor, rgb[rows])
-        cloud = replicated(cloud, self.replicate, self.replicate_radius, generator)
-        cloud = PointCloud(cloud.points.to(device), cloud.rgb.to(device))
+        cloud = replicated(cloud, self.replicate, self.replicate_radius, generator).to(device)
         degree = self.sh_degree or 0
         return gaussians_at(cloud, scale=self.scale, opacity=self.opacity, sh_degree=degree)
 
@@ -118,7 +118,7 @@ class Ply(Initializer):
         _require_finite(path, "points", points)
         colors = np.asarray(loaded.colors)
         if len(colors) == 0:
-            return points, torch.tensor([float(channel) for channel in self.color]).repeat(len(points), 1)
+            return points, one_color(self.color, len(points))
         return points, torch.as_tensor(colors[:, :3] / 255.0, dtype=torch.float32)
 
 

@@ -1,6 +1,7 @@
 """From coloured points to Gaussians: what every initializer that starts from a point cloud shares."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +28,10 @@ class PointCloud:
 
     def __len__(self) -> int:
         return self.points.shape[0]
+
+    def to(self, device: torch.device) -> "PointCloud":
+        """The same cloud on ``device``."""
+        return PointCloud(self.points.to(device), self.rgb.to(device))
 
 
 def gaussians_at(cloud: PointCloud, *, scale: float | None, opacity: float, sh_degree: int) -> Gaussians:
@@ -59,6 +64,11 @@ def neighbour_distance(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     array = points.cpu().numpy()
     distances, _ = KDTree(array).query(array, k=count + 1)  # the first is the point itself
     return torch.from_numpy(distances[:, 1:].mean(axis=1)).to(points).clamp_min(SMALLEST)
+
+
+def one_color(color: Sequence[float], count: int) -> Float[Tensor, "count 3"]:
+    """The same RGB for everybody."""
+    return torch.tensor([float(channel) for channel in color]).repeat(count, 1)
 
 
 def points_in_ball(count: int, radius: float, generator: torch.Generator) -> Float[Tensor, "count 3"]:

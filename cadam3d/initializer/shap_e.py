@@ -173,8 +173,7 @@ class ShapE(Initializer):
         upright = turned_points(cloud.points, self.turn_deg)
         center, factor = fit(upright, self.radius)
         cloud = PointCloud((upright - center) * factor, cloud.rgb)
-        cloud = replicated(cloud, self.replicate, self.replicate_radius, generator)
-        cloud = PointCloud(cloud.points.to(device), cloud.rgb.to(device))
+        cloud = replicated(cloud, self.replicate, self.replicate_radius, generator).to(device)
         return gaussians_at(cloud, scale=self.scale, opacity=self.opacity, sh_degree=self.sh_degree)
 
     def _points(self, mesh: ColoredMesh, generator: torch.Generator) -> PointCloud:
