@@ -10,7 +10,7 @@ WORDS = "a corgi red cube blue sphere front side back overhead view ugly blurry 
 WIDTH = 32  # of every text encoder
 
 
-def clip_tokenizer(folder: Path):
+def clip_tokenizer(folder: Path, **options):
     """CLIP's tokenizer with the byte alphabet and five merges, read from files as the real one is."""
     from tokenizers.pre_tokenizers import ByteLevel
     from transformers import CLIPTokenizer
@@ -22,7 +22,7 @@ def clip_tokenizer(folder: Path):
     pieces += ["<|startoftext|>", "<|endoftext|>"]
     (folder / "vocab.json").write_text(json.dumps({piece: i for i, piece in enumerate(pieces)}))
     (folder / "merges.txt").write_text("#version: 0.2\n" + "\n".join(merges) + "\n")
-    return CLIPTokenizer.from_pretrained(folder, model_max_length=77)
+    return CLIPTokenizer.from_pretrained(folder, model_max_length=77, **options)
 
 
 def t5_tokenizer():
@@ -38,36 +38,36 @@ def t5_tokenizer():
     return T5TokenizerFast(tokenizer_object=tokenizer, extra_ids=0)
 
 
-def clip_text(tokenizer, *, projected: bool = False, layers: int = 2):
+def clip_text(tokenizer, *, projected: bool = False, layers: int = 2, **options):
     """A CLIP text encoder, with or without the projection of its pooled output."""
     from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection
 
     last = len(tokenizer) - 1
-    config = CLIPTextConfig(
-        vocab_size=len(tokenizer),
-        hidden_size=WIDTH,
-        intermediate_size=48,
-        num_hidden_layers=layers,
-        num_attention_heads=2,
-        projection_dim=WIDTH,
-        bos_token_id=last - 1,
-        eos_token_id=last,
-        pad_token_id=last,
-    )
-    return (CLIPTextModelWithProjection if projected else CLIPTextModel)(config)
+    usual = {
+        "vocab_size": len(tokenizer),
+        "hidden_size": WIDTH,
+        "intermediate_size": 48,
+        "num_hidden_layers": layers,
+        "num_attention_heads": 2,
+        "projection_dim": WIDTH,
+        "bos_token_id": last - 1,
+        "eos_token_id": last,
+        "pad_token_id": last,
+    }
+    return (CLIPTextModelWithProjection if projected else CLIPTextModel)(CLIPTextConfig(**usual | options))
 
 
-def vae(channels: int, scaling: float, shift: float | None = None):
+def vae(channels: int, scaling: float, shift: float | None = None, *, width: int = 8, groups: int = 4):
     """An image autoencoder: four blocks, so that it keeps the real factor of eight."""
     from diffusers import AutoencoderKL
 
     return AutoencoderKL(
-        block_out_channels=(8, 8, 8, 8),
+        block_out_channels=(width,) * 4,
         down_block_types=("DownEncoderBlock2D",) * 4,
         up_block_types=("UpDecoderBlock2D",) * 4,
         latent_channels=channels,
         layers_per_block=1,
-        norm_num_groups=4,
+        norm_num_groups=groups,
         scaling_factor=scaling,
         shift_factor=shift,
         use_quant_conv=shift is None,
@@ -80,20 +80,20 @@ def unet(cross: int, **options):
     """A UNet of two blocks, with text cross-attention."""
     from diffusers import UNet2DConditionModel
 
-    return UNet2DConditionModel(
-        sample_size=8,
-        in_channels=4,
-        out_channels=4,
-        block_out_channels=(16, 32),
-        layers_per_block=1,
-        norm_num_groups=8,
-        down_block_types=("CrossAttnDownBlock2D", "DownBlock2D"),
-        up_block_types=("UpBlock2D", "CrossAttnUpBlock2D"),
-        cross_attention_dim=cross,
-        attention_head_dim=8,
-        use_linear_projection=True,
-        **options,
-    )
+    usual = {
+        "sample_size": 8,
+        "in_channels": 4,
+        "out_channels": 4,
+        "block_out_channels": (16, 32),
+        "layers_per_block": 1,
+        "norm_num_groups": 8,
+        "down_block_types": ("CrossAttnDownBlock2D", "DownBlock2D"),
+        "up_block_types": ("UpBlock2D", "CrossAttnUpBlock2D"),
+        "cross_attention_dim": cross,
+        "attention_head_dim": 8,
+        "use_linear_projection": True,
+    }
+    return UNet2DConditionModel(**usual | options)
 
 
 def ddim(prediction: str = "epsilon"):
@@ -268,3 +268,31 @@ def triangles_of_cubes() -> tuple[torch.Tensor, torch.Tensor]:
         for row, (second, third) in enumerate(list(pairwise(cut[1:]))[:5]):
             cases[case, row], masks[case, row] = torch.tensor([cut[0], second, third]), True
     return cases, masks
+
+
+def mvdream(folder: Path) -> Path:
+    """MVDream in small: what its published file does not say (groups, heads of 64 channels) is as there."""
+    from diffusers import StableDiffusionPipeline
+
+    width = 64
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        tokenizer = clip_tokenizer(folder / "tokens", pad_token="!")
+        StableDiffusionPipeline(
+            vae=vae(4, 0.18215, width=32, groups=32),
+            text_encoder=clip_text(tokenizer, hidden_size=width, num_attention_heads=1, hidden_act="gelu"),
+            tokenizer=tokenizer,
+            unet=unet(
+                width,
+                block_out_channels=(width, 2 * width),
+                norm_num_groups=32,
+                attention_head_dim=(1, 2),
+                class_embed_type="projection",
+                projection_class_embeddings_input_dim=16,
+            ),
+            scheduler=ddim(),
+            safety_checker=None,
+            feature_extractor=None,
+            requires_safety_checker=False,
+        ).save_pretrained(folder)
+    return folder

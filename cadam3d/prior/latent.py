@@ -33,6 +33,7 @@ PRIORS = {  # what to type for a model of this class
     "StableDiffusionPipeline": "prior=stable_diffusion",
     "StableDiffusionXLPipeline": "prior=sdxl",
     "StableDiffusion3Pipeline": "prior=stable_diffusion_3",
+    "MVDreamPipeline": "prior=mvdream",
 }
 TOKENS, T5_TOKENS = 77, 256  # of CLIP and of T5, per text
 FACTOR = 8  # pixels per latent, per side, in every model of this family
@@ -159,6 +160,16 @@ class LatentPrior(DiffusionPrior):
     ) -> Prediction:
         """What the (guided) output of the network means."""
 
+    def tempered(
+        self,
+        noisy: Float[Tensor, "v c h w"],
+        guided: Prediction,
+        output: Float[Tensor, "v c h w"],
+        t: Float[Tensor, "v"],
+    ) -> Prediction:
+        """``guided`` itself; a family may weaken it where it is far from ``output``, the prompt's alone."""
+        return guided
+
     # --- the interface of a prior --------------------------------------------------------------------------
 
     def embed(self, prompt: str, negative: str) -> LatentEmbedding:
@@ -202,15 +213,17 @@ class LatentPrior(DiffusionPrior):
             branches = [mix.positive]
         outputs = self._outputs(noisy.float(), t, condition, torch.cat(branches)).chunk(len(branches))
         guess = outputs[0]
-        if len(branches) > 1:
-            guess = guide(
-                outputs[0],
-                outputs[1],
-                torch.stack([*outputs[2:]]) if repelled else guess[None][:0],
-                mix.strengths,
-                scale,
-            )
-        return self.complete(noisy, guess.to(noisy.dtype), t)
+        if len(branches) == 1:
+            return self.complete(noisy, guess.to(noisy.dtype), t)
+        guess = guide(
+            outputs[0],
+            outputs[1],
+            torch.stack([*outputs[2:]]) if repelled else guess[None][:0],
+            mix.strengths,
+            scale,
+        )
+        guided = self.complete(noisy, guess.to(noisy.dtype), t)
+        return self.tempered(noisy, guided, outputs[1].to(noisy.dtype), t)
 
     def memory(self, prompt: str, negative: str, views: int, size: int | None) -> MemoryEstimate:
         """Weights, the larger of what denoiser and autoencoder need at once, and the text encoders.

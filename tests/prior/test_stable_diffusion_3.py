@@ -150,4 +150,4 @@ def test_memory_is_foreseen(prior):
 
 
 def test_micro_batch_changes_nothing(prior):
-    micro_batch_changes_nothing(prior, size=1, views=2, channels=16)
+    micro_batch_changes_nothing(prior, size=1, condition=condition_of(prior), channels=16)
