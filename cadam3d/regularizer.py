@@ -108,7 +108,7 @@ class TotalVariation(Weighted):
 
 @dataclass(frozen=True, kw_only=True)
 class SquaredVariation(Weighted):
-    """Mean squared difference of neighbouring pixels of the render: LucidDreamer's total variation, weight 1."""
+    """Mean squared difference of neighbouring pixels: LucidDreamer's total variation, weight 1."""
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
         """Twice the sum, over the two directions, of the mean over views, channels and pixels."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from cadam3d.augmentation import Augmentation
 from cadam3d.background import Background
@@ -71,11 +72,13 @@ class Trainer:
     def start(self, prompt: str, initializer: Initializer, seed: int, device: torch.device) -> TrainState:
         """The state before the first step; every later draw descends from ``seed``."""
         generators = start_generators(seed)
-        gaussians = initializer.build(prompt, generators["initializer"], device)
+        beginning = initializer.begin(prompt, generators["initializer"], device)
+        gaussians = beginning.gaussians
         return TrainState(
             step=0,
             seconds=0.0,
             num_initial=len(gaussians),
+            initial_note=beginning.note,
             skipped=0,
             dimmed=0,
             refused=False,
@@ -117,6 +120,7 @@ class Trainer:
             step=payload["step"],
             seconds=payload["seconds"],
             num_initial=payload["num_initial"],
+            initial_note=payload.get("initial_note"),  # older checkpoints have none
             skipped=payload["skipped"],
             dimmed=payload.get("dimmed", 0),  # a checkpoint from before there was a guard
             refused=payload["refused"],
@@ -204,7 +208,7 @@ class Trainer:
         cameras = self.camera.sample(state.step, self.views, draw["camera"]).to(gaussians.device)
         background = self.background.sample(self.views, draw["background"]).to(gaussians.device)
         rendered = self.augmentation.perturb(gaussians, draw["augmentation"])
-        output = self.rasterizer.render(rendered, cameras, background)
+        output = self.rasterizer.render(rendered, cameras, background, self.densifier.needs_absgrad)
         images = self.augmentation.show(output, draw["augmentation"])
         condition = embedding.at(cameras, background)
         judged = self.guidance(images, condition, self.prior, state.step, draw["guidance"])
@@ -336,12 +340,16 @@ def resolve_device(name: str) -> torch.device:
 
 def _signal(gaussians: Gaussians, output: RenderOutput) -> GradientSignal:
     """What the last backward pass left: copies, for another pass would add to it in place."""
-    means = gaussians.means.grad
-    means2d = output.means2d.grad
     return GradientSignal(
-        means=torch.zeros_like(gaussians.means) if means is None else means.detach().clone(),
-        means2d=torch.zeros_like(output.means2d) if means2d is None else means2d.detach().clone(),
+        means=_gradient_of(gaussians.means),
+        means2d=_gradient_of(output.means2d),
         radii=output.radii.detach(),
         height=output.rgb.shape[1],
         width=output.rgb.shape[2],
+        absgrad=None if output.absgrad is None else _gradient_of(output.absgrad),
     )
+
+
+def _gradient_of(tensor: Tensor) -> Tensor:
+    """A copy of what backward left there; zeros if that was nothing."""
+    return torch.zeros_like(tensor) if tensor.grad is None else tensor.grad.detach().clone()

@@ -1,6 +1,7 @@
 """Tiny pipelines of the real classes with random weights, saved as real ones are: nothing is downloaded."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -232,3 +233,66 @@ def mvdream(folder: Path) -> Path:
             requires_safety_checker=False,
         ).save_pretrained(folder)
     return folder
+
+
+def shap_e(folder: Path, surface: bool = True) -> Path:
+    """Shap-E in small. Without a surface, its table of triangles is empty, as in a model made anew."""
+    from diffusers import HeunDiscreteScheduler, PriorTransformer, ShapEPipeline
+    from diffusers.pipelines.shap_e import ShapERenderer
+
+    width, layers = 8, 4  # of the renderer's network; each row of its weights is one token of the latent
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        tokenizer = clip_tokenizer(folder / "tokens")
+        renderer = ShapERenderer(
+            param_shapes=((width, 93), *((width, width),) * (layers - 1)), d_latent=16, d_hidden=width
+        )
+        if surface:
+            renderer.mesh_decoder.cases, renderer.mesh_decoder.masks = triangles_of_cubes()
+        ShapEPipeline(
+            prior=PriorTransformer(
+                num_attention_heads=2,
+                attention_head_dim=8,
+                num_layers=2,
+                embedding_dim=16,
+                num_embeddings=width * layers,
+                additional_embeddings=0,
+                time_embed_act_fn="gelu",
+                norm_in_type="layer",
+                encoder_hid_proj_type=None,
+                added_emb_type=None,
+                time_embed_dim=16,
+                embedding_proj_dim=WIDTH,
+                clip_embed_dim=32,
+            ),
+            text_encoder=clip_text(tokenizer, projected=True),
+            tokenizer=tokenizer,
+            scheduler=HeunDiscreteScheduler(
+                beta_schedule="exp",
+                num_train_timesteps=1024,
+                prediction_type="sample",
+                use_karras_sigmas=True,
+                clip_sample=True,
+            ),
+            shap_e_renderer=renderer,
+        ).save_pretrained(folder)
+    return folder
+
+
+def triangles_of_cubes() -> tuple[torch.Tensor, torch.Tensor]:
+    """A table for marching cubes: a fan over the cut edges of each cube: a surface, if a crumpled one.
+
+    Bit x + 2 y + 4 z of a case says whether that corner is inside. Edges along x come first, then y, then z.
+    """
+    corners = [(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]
+    edges = []
+    for axis in range(3):
+        for low in (corner for corner in corners if corner[axis] == 0):
+            high = tuple(1 if i == axis else value for i, value in enumerate(low))
+            edges.append((corners.index(low), corners.index(high)))
+    cases, masks = torch.zeros(256, 5, 3, dtype=torch.long), torch.zeros(256, 5, dtype=torch.bool)
+    for case in range(256):
+        cut = [i for i, (low, high) in enumerate(edges) if (case >> low & 1) != (case >> high & 1)]
+        for row, (second, third) in enumerate(list(pairwise(cut[1:]))[:5]):
+            cases[case, row], masks[case, row] = torch.tensor([cut[0], second, third]), True
+    return cases, masks

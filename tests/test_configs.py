@@ -25,7 +25,6 @@ SEVERAL = ("exporter", "callback", "metric")  # groups of which a run has severa
 NO_COMPONENTS = ("hydra", "grid", "launcher", "experiment", "noise", "vram")
 GROUPS = sorted(path.name for path in CONFIGS.iterdir() if path.is_dir() and path.name not in NO_COMPONENTS)
 FILES = [path for group in GROUPS for path in sorted((CONFIGS / group).glob("*.yaml"))]
-NESTED = sorted((CONFIGS / "prior").glob("*/*.yaml"))  # groups inside of a group: prior/prompting
 GRIDS = sorted(path.stem for path in (CONFIGS / "grid").glob("*.yaml"))
 EXPERIMENTS = sorted(
     str(path.relative_to(CONFIGS / "experiment").with_suffix(""))
@@ -44,11 +43,12 @@ def read(path: Path) -> Any:
 
 
 def nested_groups(path: Path) -> set[str]:
-    """Keys that another group fills in, such as ``prompting`` of a prior."""
+    """Keys that a group inside of this group fills in, such as ``fallback`` of an initializer."""
     entries = read(path).get("defaults", [])
     return {name for entry in entries if isinstance(entry, dict) for name in entry}
 
 
+NESTED = sorted((CONFIGS / "initializer").glob("*/*.yaml"))  # groups inside of a group
 VARIANTS = [path for path in FILES if "defaults" in read(path) and not nested_groups(path)]
 COMPLETE = [path for path in FILES if path not in VARIANTS]
 
@@ -73,12 +73,10 @@ def choose(path: Path) -> str:
     return f"{group}=[{path.stem}]" if group in SEVERAL else f"{group}={path.stem}"
 
 
-@pytest.mark.parametrize("path", [*COMPLETE, *NESTED], ids=name_of)
+@pytest.mark.parametrize("path", COMPLETE, ids=name_of)
 def test_a_node_has_exactly_the_keys_of_its_class(path):
-    outermost = read(path)
-    for node in nodes(outermost):
+    for node in nodes(read(path)):
         keys = set(node) - {"_target_", "defaults"}
-        keys |= nested_groups(path) if node == outermost else set()
         fields = {field.name: field for field in dataclasses.fields(class_of(node)) if field.init}
         required = {
             name
@@ -105,7 +103,7 @@ def test_the_momentum_ablation_differs_from_cadam_in_its_own_keys_only():
     assert differing == {"tau_Q", "tau_m", "tau_SNR", "reset"}
 
 
-@pytest.mark.parametrize("path", [*COMPLETE, *NESTED], ids=name_of)
+@pytest.mark.parametrize("path", COMPLETE, ids=name_of)
 def test_a_component_declares_no_values_of_its_own(path):
     """A number has one home, and it is the YAML; schedules and paths inside a component may have defaults."""
     content = read(path)
@@ -140,6 +138,13 @@ def test_every_option_of_a_nested_group_composes_and_builds(path):
     cfg = compose([PROMPT, f"{outer}={owner.stem}", f"{outer}/{inner}={path.stem}"])
     assert cfg[outer][inner]._target_ == read(path)["_target_"]
     assert component(cfg[outer]) is not None
+
+
+def test_what_an_initializer_falls_back_on_has_the_values_it_has_by_itself():
+    for path in sorted((CONFIGS / "initializer/fallback").glob("*.yaml")):
+        cfg = compose([PROMPT, "initializer=shap_e", f"initializer/fallback={path.stem}"])
+        assert cfg.initializer.fallback == compose([PROMPT, f"initializer={path.stem}"]).initializer
+        assert component(cfg.initializer).fallback is not None
 
 
 def test_every_regularizer_has_a_file_of_its_own_and_several_can_be_chosen():

@@ -83,7 +83,7 @@ def same(left: dict, right: dict) -> bool:
     return True
 
 
-@pytest.mark.parametrize("densifier", ["cadam", "baseline", "none", "random", "mcmc"])
+@pytest.mark.parametrize("densifier", ["cadam", "baseline", "absgrad", "none", "random", "mcmc"])
 def test_same_seed_same_bytes(tmp_path, densifier):
     payloads = []
     for _ in range(2):
@@ -91,6 +91,16 @@ def test_same_seed_same_bytes(tmp_path, densifier):
         go(trainer, state, tmp_path)
         payloads.append(state.to_payload())
     assert same(*payloads)
+
+
+def test_what_stood_in_for_the_initializer_is_remembered_by_checkpoints():
+    lines = ["initializer=shap_e", "initializer.path=nowhere", "initializer/fallback=ball"]
+    trainer, state = make(lines)
+    assert state.initial_note.startswith("Ball stands in for Shap-E")
+    assert len(state.gaussians) == state.num_initial == 4000
+    assert trainer.restore(state.to_payload(), CPU).initial_note == state.initial_note
+    before_there_were_notes = {k: v for k, v in state.to_payload().items() if k != "initial_note"}
+    assert trainer.restore(before_there_were_notes, CPU).initial_note is None
 
 
 def test_another_seed_gives_another_result(tmp_path):

@@ -18,6 +18,15 @@ WHOLE = {  # what to choose, and the keys that count something
     "camera=progressive": ["camera.size", "camera.begin", "camera.every"],
     "initializer=ball": ["initializer.count", "initializer.sh_degree"],
     "initializer=mesh": ["initializer.count", "initializer.sh_degree"],
+    "initializer=ply": ["initializer.count", "initializer.sh_degree", "initializer.replicate"],
+    "initializer=shap_e": [
+        "initializer.steps",
+        "initializer.grid_size",
+        "initializer.count",
+        "initializer.grow_points",
+        "initializer.replicate",
+        "initializer.sh_degree",
+    ],
     "prior=shapes": [
         "prior.samples_per_pixel",
         "prior.census_size",
@@ -51,6 +60,7 @@ WHOLE = {  # what to choose, and the keys that count something
     "exporter=[ply]": ["exporter.ply.pad_sh"],
     "metric=[fidelity]": ["metric.fidelity.views", "metric.fidelity.size"],
     "callback=[metrics]": ["callback.metrics.every"],
+    "callback=[previews]": ["callback.previews.every", "callback.previews.views", "callback.previews.size"],
     "callback=[checkpoint]": ["callback.checkpoint.every", "callback.checkpoint.keep"],
 }
 LISTS = {
@@ -66,17 +76,26 @@ LISTS = {
     "background=lucid": ["background.color"],
     "initializer=ball": ["initializer.color"],
     "initializer=mesh": ["initializer.color"],
+    "initializer=ply": ["initializer.color"],
     "exporter=[images]": ["exporter.images.elevations_deg", "exporter.images.background"],
     "exporter=[preview]": ["exporter.preview.elevations_deg", "exporter.preview.background"],
     "exporter=[turntable]": ["exporter.turntable.background"],
+    "callback=[previews]": ["callback.previews.background"],
     "metric=[fidelity]": ["metric.fidelity.elevations_deg", "metric.fidelity.background"],
 }
 TRUTHS = {
     "densifier=cadam": ["densifier.reset_moments"],
     "guidance=sds": ["guidance.shared_t"],
     "guidance=ism": ["guidance.shared_t"],
+    "guidance=gcs": ["guidance.shared_t", "guidance.fixed_noise"],
     "exporter=[preview]": ["exporter.preview.labels"],
     "prior=stable_diffusion_3": ["prior.t5"],
+}
+NULLABLE = {  # where null means never, all, or as it is
+    "callback=[previews]": ("callback.previews.every",),
+    "refine=default": ("refine.reset_interval", "refine.max_gaussians"),
+    "initializer=ply": ("initializer.count", "initializer.sh_degree"),
+    "initializer=shap_e": ("initializer.count",),
 }
 NEVER_WHOLE = ("2.5", "16.0", "true", "abc", "[1]", "-1000000000000.5")
 NEVER_A_LIST = ("5", "null", "abc", "[a,b,c]", "[true,true,true]", "[null,null]", "[]")
@@ -93,7 +112,7 @@ def as_users_run_it():
 
 @cache
 def composed(choice: str) -> DictConfig:
-    path = ["initializer.path=a.ply"] if choice == "initializer=mesh" else []
+    path = ["initializer.path=a.ply"] if choice in ("initializer=mesh", "initializer=ply") else []
     return compose(["prompt=a red cube", choice, *path])
 
 
@@ -125,7 +144,7 @@ def refuses(choice: str, line: str) -> None:
 def test_what_is_counted_is_a_whole_number(choice, key):
     for value in NEVER_WHOLE:
         refuses(choice, f"{key}={value}")
-    if key not in ("refine.reset_interval", "refine.max_gaussians"):  # where null means never
+    if key not in NULLABLE.get(choice, ()):
         refuses(choice, f"{key}=null")
 
 
@@ -146,6 +165,11 @@ def test_a_range_that_widens_has_a_start_an_end_and_a_factor(value):
     refuses("camera=progressive", f"camera.fov_y_deg={value}")
     if value not in ("5", "[10,20]"):
         refuses("camera=progressive", f"camera.elevation_deg.about={value}")
+
+
+def test_a_name_is_no_initializer_to_fall_back_on():
+    with pytest.raises(UserError, match=r"^initializer\.fallback: wanted .* Try: initializer/fallback=ball$"):
+        build("initializer=shap_e", "initializer.fallback=ball")
 
 
 def test_a_truth_value_bounds_nothing():

@@ -34,7 +34,7 @@ class Multiview(CameraSampler):
     size: int | Schedule  # pixels; images are square
     elevation_deg: Sequence[float]  # 0 = horizon, 90 = from above
     elevation_law: str  # uniform, sphere or mixture: see camera/ranges.py
-    relative_distance: Sequence[float]  # times 1 / tan(fov / 2): the half height of the image at the origin
+    relative_distance: Sequence[float]  # times 1 / tan(fov / 2): half the image's height at the origin
     fov_y_deg: Sequence[float]  # vertical field of view
 
     def __post_init__(self) -> None:
@@ -70,9 +70,8 @@ class Multiview(CameraSampler):
         starts = torch.rand(groups, 1, generator=generator)
         turns = (starts + torch.arange(GROUP)) / GROUP  # [groups 4], in [0, 1)
         fov_y_deg = uniform(self.fov_y_deg, groups, generator)
-        distance = uniform(self.relative_distance, groups, generator) / torch.tan(
-            torch.deg2rad(fov_y_deg) / 2
-        )
+        half_height = uniform(self.relative_distance, groups, generator)  # of the image, at the origin
+        distance = half_height / torch.tan(torch.deg2rad(fov_y_deg) / 2)
         elevation_deg = elevations(self.elevation_law, self.elevation_deg, groups, generator)
         size = image_size(self.size, step)
         return orbit(

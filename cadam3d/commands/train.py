@@ -84,10 +84,10 @@ def run(cfg: DictConfig) -> float | None:
 
     estimate = _estimate_memory(cfg, trainer)
     embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
-    trainer.prior.load()
     state = _start_or_resume(cfg, trainer, device, folder)
-    if notice := trainer.prior.notice():
-        note(notice)
+    trainer.prior.load()  # only now: an initializer may have needed the memory, and has given it back
+    for text in filter(None, (trainer.prior.notice(), state.initial_note)):
+        note(text)
     note_backend(backend)
     remove_leftovers(folder)
     config_text = OmegaConf.to_yaml(cfg, resolve=True)
@@ -167,6 +167,7 @@ def summarize(cfg: DictConfig, state: TrainState, outcome: Outcome) -> dict[str,
         "skipped_steps": state.skipped,
         "dimmed_steps": state.dimmed,
         **{name: choices.get(name) for name in COMPONENTS},
+        **({"initializer_note": state.initial_note} if state.initial_note else {}),
         "device": str(state.gaussians.device),
         "cadam3d": __version__,
         "torch": torch.__version__,

@@ -22,6 +22,9 @@ class RenderOutput:
     depth: Float[Tensor, "v h w"]  # expected camera z, sum(w z) / sum(w), world units; 0 where alpha is 0
     means2d: Float[Tensor, "v n 2"]  # pixels; keeps its gradient while training
     radii: Float[Tensor, "v n"]  # pixels; 0 = not seen
+    # Only where it was asked for, and gradients are on: zeros. What a backward pass leaves as their gradient
+    # is no derivative, but the sum over pixels of |dLoss/dmeans2d|, each axis by itself (AbsGS).
+    absgrad: Float[Tensor, "v n 2"] | None = None
 
     @property
     def visible(self) -> Bool[Tensor, "v n"]:

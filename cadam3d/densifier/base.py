@@ -24,6 +24,8 @@ class GradientSignal:
     radii: Float[Tensor, "v n"]  # on screen, in pixels; 0 = not seen
     height: int  # image size in pixels, to turn means2d into NDC units
     width: int
+    # Sums over pixels of |dLoss/dmeans2d|, for a densifier that needs them.
+    absgrad: Float[Tensor, "v n 2"] | None = None
 
     @property
     def visible(self) -> Bool[Tensor, "v n"]:
@@ -54,6 +56,11 @@ class Densifier(ABC, Generic[State]):
     @property
     def guidance_only(self) -> bool:
         """Whether signals leave the regularizers out: where there are some, another backward pass."""
+        return False
+
+    @property
+    def needs_absgrad(self) -> bool:
+        """Whether signals bring ``absgrad``, which rasterizers do not sum unless somebody wants it."""
         return False
 
     @abstractmethod

@@ -62,7 +62,7 @@ class Baseline(Densifier[BaselineState]):
 
     def observe(self, state: BaselineState, signal: GradientSignal) -> BaselineState:
         """Add the norms of one batch. A gradient that is not finite counts as not seen."""
-        x, y = signal.means2d.unbind(dim=-1)  # a row of two broadcasts slowly
+        x, y = self._pulls(signal).unbind(dim=-1)  # a row of two broadcasts slowly
         x = x * (self.grad_multiplier * signal.width / 2)  # pixels per NDC unit: half the size
         y = y * (self.grad_multiplier * signal.height / 2)
         norms, sightings = self._norms(x, y, signal.visible)
@@ -104,6 +104,10 @@ class Baseline(Densifier[BaselineState]):
             **{f"gradient_p{p}": float(ordered[round(last * p / 100)]) for p in (10, 50, 90)},
             "share_above_tau_pos": float((norms >= tau_pos).float().mean()),
         }
+
+    def _pulls(self, signal: GradientSignal) -> Float[Tensor, "v n 2"]:
+        """The evidence, in loss per pixel."""
+        return signal.means2d
 
     def _norms(
         self, x: Float[Tensor, "v n"], y: Float[Tensor, "v n"], visible: Bool[Tensor, "v n"]

@@ -181,12 +181,13 @@ class Pretrained:
 
     def _kind(self, name: str) -> Any:
         library, kind = (str(entry) for entry in (self.index.get(name) or (None, None))[:2])
-        if library not in LIBRARIES or not hasattr(import_module(library), kind):
+        module = _module(library)
+        if module is None or not hasattr(module, kind):
             raise UserError(
                 f"{self.source.key}: {self.where} says that its {name} is a {library}.{kind}, which the "
                 f"installed libraries do not have. Try: pip install -U 'cadam3d[diffusers]', or another model"
             )
-        return getattr(import_module(library), kind)
+        return getattr(module, kind)
 
 
 def require_extra(key: str) -> None:
@@ -194,6 +195,14 @@ def require_extra(key: str) -> None:
     missing = [name for name in EXTRA if find_spec(name) is None]
     if missing:
         raise UserError(f"{key}: needs {', '.join(missing)}. Try: pip install 'cadam3d[diffusers]'")
+
+
+def _module(library: str) -> Any:
+    """Where an index says that a class lives: a library, or a pipeline of diffusers; None for all else."""
+    if library in LIBRARIES:
+        return import_module(library)
+    own = f"diffusers.pipelines.{library}"  # parts that only one pipeline has, such as Shap-E's renderer
+    return import_module(own) if library.isidentifier() and find_spec(own) is not None else None
 
 
 def _read_index(key: str, file: Path) -> dict[str, Any]:

@@ -67,12 +67,22 @@ class DiffusionPrior(ABC):
         """Images in [0, 1] to the space that the model denoises in; differentiable."""
 
     @abstractmethod
+    def decode(
+        self, latents: Float[Tensor, "v c lh lw"], height: int, width: int
+    ) -> Float[Tensor, "v h w 3"]:
+        """The way back from :meth:`encode`: images in [0, 1], without gradient.
+
+        ``height`` and ``width`` are those of the images that were encoded, in pixels.
+        """
+
+    @abstractmethod
     def predict(
         self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: Condition, scale: float
     ) -> Prediction:
         """One guess, without gradient, under guidance: negative + scale * (positive - negative).
 
-        ``scale`` 1 is the prompt alone, 0 the negative prompt alone (the empty one unless the user gave one).
+        ``scale`` 1 is the prompt alone, 0 the negative prompt alone (the empty one unless the user gave one);
+        below 0 it leads away from the prompt (SDI inverts so).
         """
 
     def truth(self, prompt: str) -> TruthFn | None:

@@ -127,7 +127,7 @@ class LatentPrior(DiffusionPrior):
             "prior.prompting",
             wanted="a way to word prompts",
             got=self.prompting,
-            example="prior/prompting=discrete",
+            example="prompting=discrete",
         )
         if self.size is not None:
             require_whole("prior.size", self.size, low=FACTOR, example=512)

@@ -62,15 +62,15 @@ class Discrete(Prompting):
     overhead_deg: float  # elevations above this are overhead
 
     def __post_init__(self) -> None:
-        require_range("prior.prompting.front_deg", self.front_deg, low=0, high=180, example=45)
-        require_range("prior.prompting.back_deg", self.back_deg, low=0, high=180, example=45)
-        require_range("prior.prompting.overhead_deg", self.overhead_deg, low=-90, high=90, example=60)
+        require_range("prompting.front_deg", self.front_deg, low=0, high=180, example=45)
+        require_range("prompting.back_deg", self.back_deg, low=0, high=180, example=45)
+        require_range("prompting.overhead_deg", self.overhead_deg, low=-90, high=90, example=60)
         require(
             self.front_deg + self.back_deg <= 180,
-            "prior.prompting.back_deg",
+            "prompting.back_deg",
             wanted="front_deg + back_deg <= 180",
             got=(self.front_deg, self.back_deg),
-            example="prior.prompting.back_deg=45",
+            example="prompting.back_deg=45",
         )
 
     def texts(self, prompt: str) -> list[str]:
@@ -126,9 +126,9 @@ class PerpNeg(Prompting):
     overhead_deg: float | None  # elevations above this are overhead views; null = there are none
 
     def __post_init__(self) -> None:
-        require_choice("prior.prompting.curve", self.curve, ("lucid", "threestudio"))
+        require_choice("prompting.curve", self.curve, ("lucid", "threestudio"))
         if self.overhead_deg is not None:
-            require_range("prior.prompting.overhead_deg", self.overhead_deg, low=-90, high=90, example=60)
+            require_range("prompting.overhead_deg", self.overhead_deg, low=-90, high=90, example=60)
 
     def texts(self, prompt: str) -> list[str]:
         """The prompt with each of the four suffixes."""

@@ -86,6 +86,15 @@ class Tiny(DiffusionPrior):
         return 2 * F.avg_pool2d(pixels, self.downscale, ceil_mode=True) - 1
 
     @torch.no_grad()
+    def decode(
+        self, latents: Float[Tensor, "v c lh lw"], height: int, width: int
+    ) -> Float[Tensor, "v h w 3"]:
+        """Three channels in [-1, 1] to images in [0, 1], clamped; a latent fills the pixels it averaged."""
+        rows = latents.repeat_interleave(self.downscale, dim=2)[:, :, :height]
+        pixels = rows.repeat_interleave(self.downscale, dim=3)[..., :width]
+        return ((pixels.permute(0, 2, 3, 1) + 1) / 2).clamp(0, 1)
+
+    @torch.no_grad()
     def predict(
         self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: TinyCondition, scale: float
     ) -> Prediction:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from cadam3d.camera.progressive import Progressive, Widening
-from cadam3d.core.cameras import Cameras
+from cadam3d.core.cameras import Cameras, around
 from cadam3d.core.checks import UserError
 from cadam3d.settings import component, compose
 
@@ -136,6 +136,13 @@ def test_without_jitter_cameras_look_at_the_origin_and_stand_upright():
         pixels = pixels[:, :2] / pixels[:, 2:]
         torch.testing.assert_close(pixels[:, 0], torch.full((50,), 20.0), atol=1e-3, rtol=0)
         assert ((pixels[:, 1] < 19.99) == is_above).all()
+
+
+def test_the_named_angles_are_where_the_cameras_stand():
+    cameras = draw(changed(published(), **STILL), views=50)
+    outward, _ = around(cameras.azimuth_deg, cameras.elevation_deg)
+    position = cameras.positions
+    torch.testing.assert_close(position / position.norm(dim=-1, keepdim=True), outward, atol=1e-4, rtol=0)
 
 
 def test_each_jitter_has_its_published_size():

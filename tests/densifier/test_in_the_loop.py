@@ -130,18 +130,46 @@ class Asynchronous(TorchDispatchMode):
         "cadam_calibrated",
         "random",
         "mcmc",
+        "absgrad",
     ],
 )
 def test_observing_never_waits_for_the_device(choice):
     densifier = component(compose(["prompt=a red cube", *f"densifier={choice}".split()]).densifier)
     evidence = GradientSignal(
-        means=torch.ones(5, 3), means2d=torch.ones(2, 5, 2), radii=torch.ones(2, 5), height=8, width=8
+        means=torch.ones(5, 3),
+        means2d=torch.ones(2, 5, 2),
+        radii=torch.ones(2, 5),
+        height=8,
+        width=8,
+        absgrad=torch.ones(2, 5, 2),
     )
     state = densifier.init_state(5, CPU)
     with Asynchronous():
         densifier.observe(state, evidence)
     with pytest.raises(AssertionError, match="waits"), Asynchronous():
         bool(evidence.means.sum())
+
+
+@pytest.mark.parametrize(("choice", "wants"), [("absgrad", True), ("baseline", False), ("cadam", False)])
+def test_absolute_gradients_are_summed_for_who_needs_them_and_for_nobody_else(
+    choice, wants, tmp_path, monkeypatch
+):
+    seen: list[GradientSignal] = []
+    densifier = type(component(compose([*SMALL, f"densifier={choice}"]).densifier))
+    observe = densifier.observe
+    monkeypatch.setattr(
+        densifier,
+        "observe",
+        lambda self, state, signal: (seen.append(signal), observe(self, state, signal))[1],
+    )
+    run([f"densifier={choice}", "steps=2"], tmp_path)
+    assert len(seen) == 2
+    for signal in seen:
+        assert (signal.absgrad is not None) == wants
+        if wants:
+            slack = 1e-5 * float(signal.absgrad.max())
+            assert (signal.absgrad >= signal.means2d.abs() - slack).all()
+            assert (signal.absgrad > 1.01 * signal.means2d.abs() + slack).any()
 
 
 # The report, for pictures.

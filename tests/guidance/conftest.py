@@ -6,30 +6,26 @@ import pytest
 import torch
 
 from cadam3d.guidance.csd import CSD
+from cadam3d.guidance.gcs import GCS
 from cadam3d.guidance.ism import ISM
+from cadam3d.guidance.sdi import SDI
 from cadam3d.guidance.sds import SDS
 from cadam3d.guidance.ucm import UCM
 from cadam3d.guidance.vfds import VFDS
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
 
-SHARED = {
-    "weight": 1.0,
-    "weighting": "unit",
-    "t_min": 0.02,
-    "t_max": 0.98,
-    "shared_t": False,
-    "reduction": "sum",
-    "clip": None,
-}
-GUIDED = {  # by classifier-free guidance
+SHARED = {"weight": 1.0, "t_min": 0.02, "t_max": 0.98, "shared_t": False, "reduction": "sum"}
+GUIDED = {  # distillations whose guess is under classifier-free guidance
     "sds": (SDS, {}),
     "ism": (ISM, {"delta": 0.05, "inversion_stride": 0.2, "initial_noise": 0.0}),
     "vfds": (VFDS, {}),
+    "sdi": (SDI, {"inversion_scale": -2.0, "inversion_stride": 0.25, "overshoot": 0.03, "eta": 0.3}),
     "ucm": (UCM, {"inversion_steps": 3, "inversion_grid": "t", "fresh_noise": 0.0}),
 }
-OBJECTIVES = {name: (kind, {"scale": 2.0} | keys) for name, (kind, keys) in GUIDED.items()} | {
-    "csd": (CSD, {"empty_share": 0.0}),
+DISTILLATIONS = GUIDED | {"csd": (CSD, {"empty_share": 0.0})}  # weighted differences of two guesses
+OBJECTIVES = DISTILLATIONS | {
+    "gcs": (GCS, {"w_cc": 1.0, "w_gc": 0.5, "w_cp": 0.5, "delta": 0.05, "fixed_noise": False})
 }
 PATHS = {"ddpm": DDPM(), "flow": RectifiedFlow(), "flow-3": RectifiedFlow(shift=3.0)}
 
@@ -82,6 +78,10 @@ class GaussianPrior(DiffusionPrior):
 
     def encode(self, rgb):
         return rgb.permute(0, 3, 1, 2)
+
+    def decode(self, latents, height, width):
+        """Without the clamp, so that images of any range do."""
+        return latents.permute(0, 2, 3, 1)
 
     def predict(self, noisy, t, condition, scale):
         self.calls.append(Call(t, scale, condition, torch.is_grad_enabled()))
@@ -149,7 +149,9 @@ def make():
 
     def build(name, **keys):
         kind, extra = OBJECTIVES[name]
-        return kind(**SHARED | extra | keys)
+        scale = {} if name == "csd" else {"scale": 2.0}
+        compared = {"weighting": "unit", "clip": None} if name in DISTILLATIONS else {}
+        return kind(**SHARED | scale | compared | extra | keys)
 
     return build
 
@@ -180,10 +182,17 @@ def prior(path):
 
 @pytest.fixture(params=OBJECTIVES.keys())
 def objective(request):
+    """Any objective."""
+    return request.param
+
+
+@pytest.fixture(params=DISTILLATIONS.keys())
+def distillation(request):
+    """An objective that is a weighted difference of two guesses."""
     return request.param
 
 
 @pytest.fixture(params=GUIDED.keys())
 def guided(request):
-    """An objective whose guess is under classifier-free guidance."""
+    """A distillation whose guess is under classifier-free guidance."""
     return request.param

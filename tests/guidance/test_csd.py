@@ -28,6 +28,22 @@ def test_between_two_images_of_one_spread_it_is_a_constant_pull(path, make, ask,
         torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-9)
 
 
+def test_against_a_wider_prompt_it_rests_beyond_the_image(path, make, ask, gaussian, means):
+    """At y + (y - n) (s_y^2 + gamma^2) / (s_n^2 - s_y^2) nothing but the noise pulls."""
+    t, wide = drawn_t(3, 0.2, 0.9, seed=11), 0.8
+    a, b = per_view(path.a(t)), per_view(path.b(t))
+    ratio = (SPREAD**2 + (b / a) ** 2) / (wide**2 - SPREAD**2)
+    place = means.positive + (means.positive - means.negative) * ratio
+    condition = replace(means, negative_spread=wide)
+    guidance, render = make("csd", t_min=0.2, t_max=0.9), place.permute(0, 2, 3, 1)
+    gradient, _ = ask(guidance, render, condition, gaussian(path, spread=SPREAD), seed=11)
+    generator = torch.Generator().manual_seed(11)
+    torch.rand(3, generator=generator)
+    noise = torch.randn(place.shape, generator=generator).double()
+    narrow, broad = (1 / (a**2 * s**2 + b**2) for s in (SPREAD, wide))
+    torch.testing.assert_close(gradient, b**2 * noise * (narrow - broad), rtol=1e-8, atol=1e-8)
+
+
 def test_it_is_what_sds_gains_from_more_guidance(make, ask, prior, means, rgb):
     one, four = (ask(make("sds", scale=scale), rgb, means, prior, seed=3)[0] for scale in (1.0, 4.0))
     gradient, _ = ask(make("csd"), rgb, means, prior, seed=3)

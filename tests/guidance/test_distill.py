@@ -39,7 +39,7 @@ def test_descent_points_at_the_image(guided, path, make, ask, gaussian, one_amon
 
 def test_descent_arrives_at_the_image(guided, path, make, ask, gaussian, one_among_many, rgb):
     """Gradient descent with the x0-residual as gradient, from anywhere, on a prior with little spread."""
-    weighting = {"sds": "gamma", "ism": "gamma", "vfds": "sigma", "ucm": "sigma"}[guided]
+    weighting = {"vfds": "sigma", "ucm": "sigma"}.get(guided, "gamma")
     guidance = make(guided, scale=1.0, weighting=weighting, t_min=0.3, t_max=0.7)
     prior, render = gaussian(path, spread=0.02), rgb.detach()
     target = one_among_many.positive.permute(0, 2, 3, 1)
@@ -51,11 +51,11 @@ def test_descent_arrives_at_the_image(guided, path, make, ask, gaussian, one_amo
 
 
 def test_the_gradient_is_that_of_the_surrogate_with_a_frozen_target(
-    objective, make, ask, gaussian, means, rgb
+    distillation, make, ask, gaussian, means, rgb
 ):
     """Finite differences of ||x0 - target||^2 / (2 D), target = x0 - G held fixed."""
     divisor = rgb.numel()
-    gradient, output = ask(make(objective, reduction="mean"), rgb, means, gaussian(DDPM()))
+    gradient, output = ask(make(distillation, reduction="mean"), rgb, means, gaussian(DDPM()))
     clean = rgb.detach().permute(0, 3, 1, 2)
     target = clean - gradient * divisor
 
@@ -77,6 +77,15 @@ def test_a_small_gradient_survives_single_precision():
     assert torch.equal(clean.grad, gradient)
 
 
+def test_the_sum_does_not_overflow_in_half_precision():
+    """The largest half is 65,504."""
+    clean = torch.ones(1, 1, 2, 2, dtype=torch.float16, requires_grad=True)
+    loss = surrogate(clean, torch.full_like(clean, 300), 1)
+    loss.backward()
+    assert loss == 180_000
+    assert (clean.grad == 300).all()
+
+
 @pytest.mark.parametrize("form", ["noise", "velocity"])
 def test_what_the_prior_predicts_does_not_matter(form, objective, make, ask, prior, means, rgb):
     expected, _ = ask(make(objective), rgb, means, prior)
@@ -94,8 +103,8 @@ def test_reductions_differ_by_the_counts(objective, make, ask, prior, means, rgb
         assert output.log == out.log
 
 
-def test_the_loss_is_half_the_squared_norm_of_the_gradient(objective, make, ask, prior, means, rgb):
-    gradient, output = ask(make(objective), rgb, means, prior)
+def test_the_loss_is_half_the_squared_norm_of_the_gradient(distillation, make, ask, prior, means, rgb):
+    gradient, output = ask(make(distillation), rgb, means, prior)
     assert output.loss.item() == pytest.approx(0.5 * float(gradient.square().sum()), rel=1e-12)
     assert output.log["guidance_rms"] == pytest.approx(float(gradient.square().mean().sqrt()), rel=1e-12)
 
@@ -107,9 +116,9 @@ def test_weight_multiplies_the_gradient(objective, make, ask, prior, means, rgb)
 
 
 @pytest.mark.parametrize("weighting", FORMULAS)
-def test_weightings_follow_their_formula(weighting, objective, make, ask, prior, means, rgb):
-    unit, _ = ask(make(objective), rgb, means, prior)
-    weighted, _ = ask(make(objective, weighting=weighting), rgb, means, prior)
+def test_weightings_follow_their_formula(weighting, distillation, make, ask, prior, means, rgb):
+    unit, _ = ask(make(distillation), rgb, means, prior)
+    weighted, _ = ask(make(distillation, weighting=weighting), rgb, means, prior)
     t = prior.calls[-1].t
     expected = per_view(FORMULAS[weighting](prior.noise_path.a(t), prior.noise_path.b(t)))
     torch.testing.assert_close(weighted, expected * unit, rtol=1e-9, atol=0)
@@ -141,10 +150,10 @@ def test_no_gradient_enters_the_prior(objective, make, prior, means, rgb):
     assert rgb.grad.abs().max() > 0
 
 
-def test_clip_clamps_every_element(objective, make, ask, prior, means, rgb):
-    free, _ = ask(make(objective), rgb, means, prior)
+def test_clip_clamps_every_element(distillation, make, ask, prior, means, rgb):
+    free, _ = ask(make(distillation), rgb, means, prior)
     bound = float(free.abs().median())
-    clipped, output = ask(make(objective, clip=bound), rgb, means, prior)
+    clipped, output = ask(make(distillation, clip=bound), rgb, means, prior)
     torch.testing.assert_close(clipped, free.clamp(-bound, bound))
     assert output.log["guidance_rms"] < bound
 
@@ -156,8 +165,8 @@ def test_clip_may_be_a_schedule(make, ask, gaussian, means, rgb):
         assert float(gradient.abs().max()) == pytest.approx(bound)
 
 
-def test_t_stays_in_its_window_and_fills_it(objective, make, ask, prior, means, rgb):
-    guidance = make(objective, t_min=0.3, t_max=0.4)
+def test_t_stays_in_its_window_and_fills_it(distillation, make, ask, prior, means, rgb):
+    guidance = make(distillation, t_min=0.3, t_max=0.4)
     drawn = []
     for seed in range(60):
         _, output = ask(guidance, rgb, means, prior, seed=seed)
@@ -180,10 +189,10 @@ def test_the_window_follows_its_schedules(make, ask, gaussian, means, rgb):
         assert ((prior.calls[-1].t >= low) & (prior.calls[-1].t <= high)).all()
 
 
-def test_a_window_of_no_width_leaves_t_to_its_schedule(objective, make, ask, prior, means, rgb):
+def test_a_window_of_no_width_leaves_t_to_its_schedule(distillation, make, ask, prior, means, rgb):
     """DreamGaussian's annealing: t = 1 - step / 500, for every view and seed."""
     anneal = Linear(start=0.9, end=0.2, steps=7)
-    guidance = make(objective, t_min=anneal, t_max=anneal)
+    guidance = make(distillation, t_min=anneal, t_max=anneal)
     for step, t in ((0, 0.9), (3, 0.6), (9, 0.2)):
         _, output = ask(guidance, rgb, means, prior, step=step, seed=step)
         assert prior.calls[-1].t.tolist() == pytest.approx([t] * 3)
@@ -208,6 +217,7 @@ def test_noise_levels_stay_precise_when_latents_are_half(make, gaussian, one_ima
     assert render.grad.isfinite().all()
 
 
+@pytest.mark.parametrize("guided", ["sds", "ism", "vfds", "ucm"])  # sdi inverts under both prompts
 def test_scale_one_ignores_the_negative_prompt(guided, make, ask, prior, means, rgb):
     other = type(means)(means.positive, means.negative + 1, means.empty)
     first, _ = ask(make(guided, scale=1.0), rgb, means, prior)
@@ -215,6 +225,7 @@ def test_scale_one_ignores_the_negative_prompt(guided, make, ask, prior, means, 
     torch.testing.assert_close(first, again, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.parametrize("guided", ["sds", "ism", "vfds", "ucm"])  # sdi inverts under both prompts
 def test_scale_zero_is_the_negative_prompt_alone(guided, make, ask, prior, means, rgb):
     swapped = type(means)(means.negative, means.positive, means.empty)
     first, _ = ask(make(guided, scale=0.0), rgb, means, prior)
@@ -228,10 +239,10 @@ def test_a_scale_of_100_counted_from_the_prompt_is_101(guided, make, ask, prior,
     torch.testing.assert_close(guided, positive + 100 * (positive - negative), rtol=1e-9, atol=1e-9)
 
 
-def test_numbers_that_are_not_finite_become_zero_and_are_counted(objective, make, ask, prior, means, rgb):
-    healthy, before = ask(make(objective), rgb, means, prior)
+def test_numbers_that_are_not_finite_become_zero_and_are_counted(distillation, make, ask, prior, means, rgb):
+    healthy, before = ask(make(distillation), rgb, means, prior)
     means.positive[0, 0, 0, 0], means.positive[1, 2, 3, 4] = torch.nan, torch.inf
-    sick, after = ask(make(objective), rgb, means, prior)
+    sick, after = ask(make(distillation), rgb, means, prior)
     is_sick = ~means.positive.isfinite()
     assert (sick[is_sick] == 0).all()
     torch.testing.assert_close(sick[~is_sick], healthy[~is_sick])
@@ -264,10 +275,7 @@ def test_it_runs_on_a_network(predicts, noise_path, objective, make):
     ("key", "value"),
     [
         ("weight", 0.0),
-        ("weighting", "sds"),
         ("reduction", "max"),
-        ("clip", 0.0),
-        ("clip", Linear(start=1.0, end=-1.0, steps=10)),
         ("t_max", 0.01),
         ("t_max", 1.1),
         ("t_max", Linear(start=0.98, end=0.0, steps=10)),
@@ -280,12 +288,24 @@ def test_wrong_values_are_refused_by_key(key, value, objective, make):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("shared_t", "maybe"), ("t_min", None), ("t_max", "late"), ("clip", {"start": 1.5})],
+    [("weighting", "sds"), ("clip", 0.0), ("clip", Linear(start=1.0, end=-1.0, steps=10))],
 )
+def test_wrong_weightings_and_clips_are_refused_by_key(key, value, distillation, make):
+    with pytest.raises(UserError, match=f"guidance.{key}: "):
+        make(distillation, **{key: value})
+
+
+@pytest.mark.parametrize(("key", "value"), [("shared_t", "maybe"), ("t_min", None), ("t_max", "late")])
 def test_wrong_types_are_refused_by_key(key, value, objective, make, monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as outside of the test suite
     with pytest.raises(UserError, match=f"guidance.{key}: "):
         make(objective, **{key: value})
+
+
+def test_a_clip_is_a_number_or_a_schedule(distillation, make, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    with pytest.raises(UserError, match=r"guidance.clip: "):
+        make(distillation, clip={"start": 1.5})
 
 
 @pytest.mark.parametrize("value", [-1.0, "high", None])

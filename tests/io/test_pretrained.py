@@ -131,11 +131,20 @@ def test_a_damaged_part_is_one_line(model, tmp_path):
             ask("vae")
 
 
-def test_code_of_strangers_is_not_run(model, tmp_path):
-    index = json.loads((model / "model_index.json").read_text()) | {"unet": ["os", "system"]}
+@pytest.mark.parametrize("entry", [("os", "system"), ("shap_e", "Nothing"), ("shap_e.os", "system")])
+def test_code_of_strangers_is_not_run(model, tmp_path, entry):
+    index = json.loads((model / "model_index.json").read_text()) | {"unet": list(entry)}
     (tmp_path / "model_index.json").write_text(json.dumps(index))
-    with pytest.raises(UserError, match=r"os\.system"):
+    with pytest.raises(UserError, match=r"\.".join(entry)):
         source(path=str(tmp_path)).find(KINDS, OTHERS).part("unet", torch.float32)
+
+
+def test_a_part_that_only_one_pipeline_of_diffusers_has_is_found(tmp_path):
+    import pipelines
+    from diffusers.pipelines.shap_e import ShapERenderer
+
+    found = source(path=str(pipelines.shap_e(tmp_path))).find(("ShapEPipeline",), {})
+    assert isinstance(found.part("shap_e_renderer", torch.float32), ShapERenderer)
 
 
 def test_ids_are_tried_in_order_and_the_first_that_answers_is_taken(model, hub):

@@ -145,10 +145,10 @@ def test_what_lies_along_the_prompt_is_not_repelled():
 @pytest.mark.parametrize(
     ("make", "key"),
     [
-        (lambda: Discrete(front_deg=100, back_deg=100, overhead_deg=60), "prior.prompting.back_deg"),
-        (lambda: Discrete(front_deg=-1, back_deg=45, overhead_deg=60), "prior.prompting.front_deg"),
-        (lambda: PerpNeg(curve="other", overhead_deg=None), "prior.prompting.curve"),
-        (lambda: PerpNeg(curve="lucid", overhead_deg=100), "prior.prompting.overhead_deg"),
+        (lambda: Discrete(front_deg=100, back_deg=100, overhead_deg=60), "prompting.back_deg"),
+        (lambda: Discrete(front_deg=-1, back_deg=45, overhead_deg=60), "prompting.front_deg"),
+        (lambda: PerpNeg(curve="other", overhead_deg=None), "prompting.curve"),
+        (lambda: PerpNeg(curve="lucid", overhead_deg=100), "prompting.overhead_deg"),
     ],
 )
 def test_what_cannot_be(make, key):

@@ -92,13 +92,14 @@ def test_a_mode_is_kept_and_its_noise_found() -> None:
         assert float((guess.noise - noise).abs().max()) < 5e-3
 
 
+@pytest.mark.parametrize("scale", [7.5, -7.5])
 @pytest.mark.parametrize("path", PATHS)
-def test_guidance_is_linear_in_its_scale(path: NoisePath) -> None:
+def test_guidance_is_linear_in_its_scale(path: NoisePath, scale: float) -> None:
     model = prior(noise_path=path, model_error=0.1)
     condition, t = condition_of(model), torch.tensor([0.4, 0.7])
-    zero, one, seven = (forms(model.predict(noisy_image(), t, condition, scale)) for scale in (0.0, 1.0, 7.5))
-    for name, value in seven.items():
-        torch.testing.assert_close(value, zero[name] + 7.5 * (one[name] - zero[name]), rtol=1e-4, atol=1e-4)
+    zero, one, far = (forms(model.predict(noisy_image(), t, condition, s)) for s in (0.0, 1.0, scale))
+    for name, value in far.items():
+        torch.testing.assert_close(value, zero[name] + scale * (one[name] - zero[name]), rtol=1e-4, atol=1e-4)
 
 
 def test_scales_zero_and_one_are_single_branches() -> None:
@@ -137,6 +138,14 @@ def test_no_gradient_flows_through_a_prediction_but_it_does_through_encode() -> 
     assert encoded.requires_grad
     torch.testing.assert_close(encoded[:, 1], 2 * rgb[..., 1] - 1)
     assert not model.predict(encoded, torch.tensor([0.4, 0.7]), condition_of(model), 7.5).noise.requires_grad
+
+
+def test_decoding_undoes_encoding_and_stays_in_range() -> None:
+    model, rgb = prior(), torch.rand(2, SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(model.decode(model.encode(rgb), SIZE, SIZE), rgb)
+    decoded = model.decode(3 * noisy_image().requires_grad_(), SIZE, SIZE)
+    assert not decoded.requires_grad
+    assert (decoded.min(), decoded.max()) == (0, 1)
 
 
 def test_spread_is_wider_at_silhouettes() -> None:

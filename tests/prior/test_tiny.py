@@ -103,12 +103,29 @@ def test_encoding_passes_a_gradient_to_every_pixel(prior):
     assert (rgb.grad > 0).all()
 
 
-def test_guidance_has_the_conventional_form(prior):
+@pytest.mark.parametrize("size", [(8, 8), (9, 13)])
+@pytest.mark.parametrize("downscale", [1, 2, 3, 8])
+def test_what_was_decoded_encodes_to_what_it_was(size, downscale):
+    prior = Tiny(**KEYS | {"downscale": downscale})
+    latents = prior.encode(torch.rand(2, *size, 3, generator=torch.Generator().manual_seed(0)))
+    decoded = prior.decode(latents, *size)
+    assert decoded.shape == (2, *size, 3)
+    torch.testing.assert_close(prior.encode(decoded), latents)
+
+
+def test_decoded_images_stay_in_range_and_carry_no_gradient(prior):
+    decoded = prior.decode(3 * noisy_of().requires_grad_(), 24, 24)
+    assert not decoded.requires_grad
+    assert (decoded.min(), decoded.max()) == (0, 1)
+
+
+@pytest.mark.parametrize("scale", [7.5, -7.5])
+def test_guidance_has_the_conventional_form(prior, scale):
     condition = condition_of(prior, "a red cube", "ugly")
     negative, positive, guided = (
-        prior.predict(noisy_of(), levels(), condition, s).noise for s in (0.0, 1.0, 7.5)
+        prior.predict(noisy_of(), levels(), condition, s).noise for s in (0.0, 1.0, scale)
     )
-    torch.testing.assert_close(guided, negative + 7.5 * (positive - negative), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(guided, negative + scale * (positive - negative), rtol=1e-4, atol=1e-4)
 
 
 def test_scale_one_is_the_prompt_alone_and_zero_the_negative_alone(prior):

@@ -125,6 +125,12 @@ class ShapesPrior(DiffusionPrior):
         """Images in [0, 1] to [-1, 1]; the model denoises pixels."""
         return 2 * rgb.permute(0, 3, 1, 2) - 1
 
+    @torch.no_grad()
+    def decode(self, latents: Float[Tensor, "v 3 h w"], height: int, width: int) -> Float[Tensor, "v h w 3"]:
+        """[-1, 1] to images in [0, 1], clamped; pixels stay where they are."""
+        assert latents.shape[2:] == (height, width)
+        return ((latents.permute(0, 2, 3, 1) + 1) / 2).clamp(0, 1)
+
     def mixture(self, scene: Scene, cameras: Cameras, background: Float[Tensor, "v 3"]) -> Mixture:
         """The distribution of images of a scene."""
         layers, scene = self._layers(scene, cameras)

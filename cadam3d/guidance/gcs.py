@@ -1,0 +1,180 @@
+"""GCS: the prior's trajectory through the render, held against the one that the prompt would take."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.core.checks import require, require_choice, require_range
+from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.guidance.base import GuidanceOutput
+from cadam3d.guidance.distill import DIVISORS, Case, finite, rms, standard_normal, surrogate
+from cadam3d.guidance.trajectory import UNGUIDED
+from cadam3d.guidance.window import WindowedGuidance
+from cadam3d.prior.base import Condition, DiffusionPrior
+from cadam3d.prior.path import Prediction, per_view
+
+ROW = 0.001  # one of the thousand of Stable Diffusion's noise table, in t: the least e
+GAP = 10 * ROW  # least distance between e and s
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Three noise levels, e <= s < t."""
+
+    e: Float[Tensor, "v"]
+    s: Float[Tensor, "v"]
+    t: Float[Tensor, "v"]
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What the three terms ask of the encoded renders and of the renders, before their weights."""
+
+    consistency: Float[Tensor, "v c lh lw"]  # CC
+    guidance: Float[Tensor, "v c lh lw"]  # GC
+    pixels: Float[Tensor, "v h w 3"]  # CP
+    clean: Float[Tensor, "v c lh lw"]  # the prior's guess of the clean image
+
+
+@dataclass(frozen=True, kw_only=True)
+class GCS(WindowedGuidance):
+    """Guided consistency sampling (Li et al. 2024, GCS-BEG), without its brightness rule.
+
+    With t from the window, s = t - ``delta`` and a random e in [t - 2 delta, s - 0.01), the render x0 is
+    noised to x_e = a x0 + b n and follows the prior without a prompt to x_s and x_t. From x_t the prompt
+    leads back to y_s and y_e. Phi(x, p -> q) is one DDIM step (DPM-Solver++ of order 1) without a prompt,
+    x0_hat a clean guess without and x0_bar with it, under classifier-free guidance as the way back:
+
+        CC = || Phi(x_t, t -> e) - Phi(y_s, s -> e) ||^2                 compact consistency
+        GC = || x0_hat(x_e, e) - x0_bar(y_e, e) ||^2                     conditional guidance
+        CP = || decode(x0_hat(x_e, e)) - decode(x0_bar(y_e, e)) ||^2     pixel constraint
+        loss = weight (w_cc CC + w_gc GC + w_cp CP) / D
+
+    Second arguments and networks are constants. The chain of DDIM steps that carries x0 into a first argument
+    has a slope that telescopes, to a(e) for CC and 1 for GC. CP hands its difference to the pixels of the
+    render themselves, past the encoder. The gradients, before D, are
+
+        2 weight (a(e) w_cc [CC's difference] + w_gc [GC's])  on x0,    2 weight w_cp [CP's]  on the render.
+
+    There is no w(t), and no factor 1/2 as elsewhere. D follows ``reduction``; ``mean`` divides each part by
+    its own number of elements, latents or pixels. The value of the loss that is returned is half the squared
+    norm of the gradients.
+
+    ``fixed_noise`` takes the same n at every step. It follows the seed of the guidance's generator, which a
+    checkpoint keeps, so a resumed run goes on with it; another number of views has other noise.
+
+    The prior is asked six times, four of them without guidance; less for a weight of 0. CP decodes twice.
+
+    Log: ``t`` (mean), ``guidance_rms`` (of the gradient on x0 before D), ``cc_rms``, ``gc_rms``, ``cp_rms``
+    (of each term's part, with its weights), ``residual_rms`` (of x0 minus the last clean guess),
+    ``guidance_nonfinite`` (elements replaced by 0).
+    """
+
+    scale: float  # classifier-free guidance, conventional: negative + scale * (positive - negative)
+    weight: float  # of the objective; the repository calls it lambda_guidance
+    w_cc: float  # of compact consistency; >= 0
+    w_gc: float  # of conditional guidance; >= 0
+    w_cp: float  # of the pixel constraint; >= 0
+    delta: float | Schedule  # from s to t, in t units; in (0.01, 0.5]
+    fixed_noise: bool  # one noise for the whole run, or new noise at every step
+    reduction: str  # one of DIVISORS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_range("guidance.scale", self.scale, low=0, example=7.5)
+        require_range("guidance.weight", self.weight, above=0, example=0.1)
+        for key, value in (("w_cc", self.w_cc), ("w_gc", self.w_gc), ("w_cp", self.w_cp)):
+            require_range(f"guidance.{key}", value, low=0, example=0.5)
+        is_any = max(self.w_cc, self.w_gc, self.w_cp) > 0
+        require(is_any, "guidance.w_gc", wanted="a term with a weight", got=0, example="guidance.w_gc=0.5")
+        require_scheduled("guidance.delta", self.delta, above=GAP, high=0.5, example=0.08)
+        require_choice("guidance.fixed_noise", self.fixed_noise, (True, False))
+        require_choice("guidance.reduction", self.reduction, list(DIVISORS))
+
+    def __call__(
+        self,
+        rgb: Float[Tensor, "v h w 3"],
+        condition: Condition,
+        prior: DiffusionPrior,
+        step: int,
+        generator: torch.Generator,
+    ) -> GuidanceOutput:
+        """Judge the render ``rgb`` (in [0, 1], with gradient); all draws come from the CPU ``generator``.
+
+        Raises ``UserError`` if a schedule leaves its range at ``step``.
+        """
+        clean = prior.encode(rgb)
+        with torch.no_grad():
+            levels = self.draw_levels(clean, step, generator)
+            case = Case(clean.detach(), levels.t, condition, prior, step, generator)
+            terms = self.terms(case, levels, rgb)
+            slope = per_view(prior.noise_path.a(levels.e))
+            cc = 2 * self.weight * self.w_cc * slope * terms.consistency
+            gc = 2 * self.weight * self.w_gc * terms.guidance
+            cp = 2 * self.weight * self.w_cp * terms.pixels
+            on_latents, lost_latents = finite(cc + gc)
+            on_pixels, lost_pixels = finite(cp)
+        divisor = DIVISORS[self.reduction]
+        return GuidanceOutput(
+            loss=surrogate(clean, on_latents, divisor(clean.shape))
+            + surrogate(rgb, on_pixels, divisor(rgb.shape)),
+            log={
+                "t": float(levels.t.mean()),
+                "guidance_rms": rms(on_latents),
+                "cc_rms": rms(cc),
+                "gc_rms": rms(gc),
+                "cp_rms": rms(cp),
+                "residual_rms": rms(clean.detach() - terms.clean),
+                "guidance_nonfinite": float(lost_latents + lost_pixels),
+            },
+        )
+
+    def draw_levels(self, clean: Float[Tensor, "v c h w"], step: int, generator: torch.Generator) -> Levels:
+        """t from the window, but at least delta + 0.001; s and e below it."""
+        delta = as_schedule(self.delta)(step)
+        require_range("guidance.delta", delta, above=GAP, high=0.5, example=0.08)
+        t = self.draw_t(clean, step, generator).clamp_min(delta + ROW)
+        s = t - delta
+        lowest, highest = (s - delta).clamp_min(0), (s - GAP).clamp_min(ROW)
+        e = torch.lerp(lowest, highest, self.uniform(clean, generator)).clamp_min(ROW)
+        return Levels(e=e, s=s, t=t)
+
+    def draw_noise(self, case: Case) -> Float[Tensor, "v c h w"]:
+        """n: the run's own, or new."""
+        if not self.fixed_noise:
+            return case.draw_noise()
+        seed = (case.generator.initial_seed() + 1) % 2**63  # another stream than that of t
+        return standard_normal(case.clean, torch.Generator().manual_seed(seed))
+
+    def terms(self, case: Case, levels: Levels, rgb: Float[Tensor, "v h w 3"]) -> Terms:
+        """There without a prompt, back with it, and what lies between the two."""
+        path, unprompted = case.prior.noise_path, case.condition.unprompted()
+        height, width = rgb.shape[1:3]
+
+        def freely(x: Tensor, t: Tensor) -> Prediction:
+            return case.prior.predict(x, t, unprompted, UNGUIDED)
+
+        def guided(x: Tensor, t: Tensor) -> Prediction:
+            return case.prior.predict(x, t, case.condition, self.scale)
+
+        def step(guess: Prediction, q: Tensor) -> Tensor:
+            return path.mix(guess.clean, guess.noise, q)
+
+        at_e = freely(path.mix(case.clean, self.draw_noise(case), levels.e), levels.e)
+        at_s = freely(step(at_e, levels.s), levels.s)
+        x_t = step(at_s, levels.t)
+        back = guided(x_t, levels.t)
+        consistency, guidance, pixels = torch.zeros_like(x_t), torch.zeros_like(x_t), torch.zeros_like(rgb)
+        target = back.clean
+        if self.w_cc > 0:
+            straight, bent = freely(x_t, levels.t), freely(step(back, levels.s), levels.s)
+            consistency = step(straight, levels.e) - step(bent, levels.e)
+        if self.w_gc > 0 or self.w_cp > 0:
+            target = guided(step(back, levels.e), levels.e).clean
+            guidance = at_e.clean - target
+        if self.w_cp > 0:
+            now, wanted = (case.prior.decode(x, height, width) for x in (at_e.clean, target))
+            pixels = now - wanted
+        return Terms(consistency=consistency, guidance=guidance, pixels=pixels, clean=target)

@@ -1,0 +1,135 @@
+"""SDI against its closed form on a Gaussian prior."""
+
+import pytest
+import torch
+
+from cadam3d.core.checks import UserError
+from cadam3d.guidance.distill import Case
+from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
+
+SPREAD = 0.5
+STILL = {"overshoot": 0.0, "eta": 0.0, "t_min": 0.6, "t_max": 0.6}
+
+
+def redraw(like, low, high, seed):
+    """t, tau / overshoot and the added noise, in the order in which SDI draws them."""
+    generator = torch.Generator().manual_seed(seed)
+    t, tau = (torch.rand(like.shape[0], generator=generator).double() for _ in range(2))
+    return low + (high - low) * t, tau, torch.randn(like.shape, generator=generator).double()
+
+
+def step_factor(path, start, end):
+    """What one exact DDIM step multiplies x - a * mean by."""
+    a0, b0, a1, b1 = (per_view(share(t)) for t in (start, end) for share in (path.a, path.b))
+    return (a1 * a0 * SPREAD**2 + b1 * b0) / (a0**2 * SPREAD**2 + b0**2)
+
+
+def invert(guidance, clean, t, condition, prior, seed=0):
+    return guidance.invert(Case(clean, t, condition, prior, 0, torch.Generator().manual_seed(seed)))
+
+
+@pytest.mark.parametrize("scales", [(1.0, 1.0), (7.5, -7.5), (7.5, 0.0)])
+def test_gradient_equals_the_closed_form(scales, path, make, ask, gaussian, means, rgb):
+    """Every step is affine around the mean under its guidance: 0 -> 0.25 -> 0.5 -> t', and one guess at t."""
+    scale, inversion_scale = scales
+    keys = {"scale": scale, "inversion_scale": inversion_scale, "inversion_stride": 0.25}
+    guidance = make("sdi", overshoot=0.1, eta=0.3, t_min=0.5, t_max=0.6, **keys)
+    gradient, _ = ask(guidance, rgb, means, gaussian(path, spread=SPREAD), seed=11)
+
+    clean = rgb.detach().permute(0, 3, 1, 2)
+    t, tau, fresh = redraw(clean, 0.5, 0.6, seed=11)
+    beyond = t + 0.1 * tau
+
+    def guided(by):
+        return means.negative + by * (means.positive - means.negative)
+
+    now, off = torch.zeros_like(t), clean - guided(inversion_scale)
+    for then in (torch.full_like(t, 0.25), torch.full_like(t, 0.5), beyond):
+        now, off = then, off * step_factor(path, now, then)
+    a, b = per_view(path.a(beyond)), per_view(path.b(beyond))
+    noise = (off + a * guided(inversion_scale) - a * clean) / b + 0.3 * b * fresh
+    a, b = per_view(path.a(t)), per_view(path.b(t))
+    expected = b * (a * (clean - guided(scale)) + b * noise) / (a**2 * SPREAD**2 + b**2) - noise
+    torch.testing.assert_close(gradient, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_the_published_weight_leaves_the_distance_to_the_clean_guess(make, ask, prior, means, rgb):
+    """G = x0 - x0_hat: a mean squared error against the image that the prior makes of the render."""
+    gradient, output = ask(make("sdi", weighting="gamma", **STILL), rgb, means, prior)
+    clean = rgb.detach().permute(0, 3, 1, 2)
+    t = torch.full((3,), 0.6, dtype=torch.float64)
+    noise = invert(make("sdi", **STILL), clean, t, means, prior)
+    guess = prior.predict(prior.noise_path.mix(clean, noise, t), t, means, 2.0)
+    torch.testing.assert_close(gradient, clean - guess.clean, rtol=1e-8, atol=1e-8)
+    assert output.log["guidance_rms"] == pytest.approx(output.log["residual_rms"], rel=1e-8)
+
+
+def test_the_prior_is_asked_as_the_method_says(make, ask, prior, means, rgb):
+    """Ten steps for t = 1, fewer for a smaller t, under the prompt and the inversion's own scale."""
+    keys = {"inversion_stride": 0.1, "overshoot": 0.0, "t_min": 0.35, "t_max": 0.35}
+    ask(make("sdi", scale=7.5, inversion_scale=-7.5, **keys), rgb, means, prior)
+    *inversion, last = prior.calls
+    assert [float(call.t[0]) for call in inversion] == pytest.approx([0, 0.1, 0.2, 0.3])
+    assert {call.scale for call in inversion} == {-7.5}
+    assert all(call.condition is means for call in prior.calls)
+    assert (last.scale, float(last.t[0])) == (7.5, pytest.approx(0.35))
+
+
+def test_the_inversion_overshoots_but_never_leaves_the_path(make, ask, gaussian, means, rgb):
+    """With a stride of 1 it is one step from the render; what is asked next lies back at t."""
+    prior, path = gaussian(RectifiedFlow()), RectifiedFlow()
+    clean, t = rgb.detach().permute(0, 3, 1, 2), torch.tensor([0.5, 0.9, 0.99], dtype=torch.float64)
+    guidance = make("sdi", overshoot=0.3, eta=0.0, inversion_stride=1.0, inversion_scale=1.0)
+    noise = invert(guidance, clean, t, means, prior, seed=5)
+    tau = torch.rand(3, generator=torch.Generator().manual_seed(5)).double()
+    beyond = (t + 0.3 * tau).clamp_max(1)
+    assert (beyond == 1).any()
+    assert (beyond < 1).any()
+    first = prior.predict(clean, torch.zeros(3).double(), means, 1.0)
+    pushed = path.mix(first.clean, first.noise, beyond)
+    torch.testing.assert_close(path.mix(clean, noise, beyond), pushed, rtol=1e-9, atol=1e-9)
+
+
+def test_without_overshoot_and_eta_it_is_deterministic_given_t(make, ask, prior, means, rgb):
+    first, again = (ask(make("sdi", **STILL), rgb, means, prior, seed=seed)[0] for seed in (0, 1))
+    assert torch.equal(first, again)
+
+
+def test_eta_adds_noise_in_proportion_to_b(path, make, gaussian, means, rgb):
+    clean, t = rgb.detach().permute(0, 3, 1, 2), torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
+    still, moved = (
+        invert(make("sdi", **STILL | {"eta": eta}), clean, t, means, gaussian(path)) for eta in (0, 0.3)
+    )
+    generator = torch.Generator().manual_seed(0)
+    torch.rand(3, generator=generator)
+    fresh = torch.randn(clean.shape, generator=generator).double()
+    torch.testing.assert_close(moved - still, 0.3 * per_view(path.b(t)) * fresh, rtol=1e-9, atol=1e-12)
+
+
+def test_only_the_inversion_may_be_guided_backwards(make):
+    assert make("sdi", inversion_scale=-7.5).inversion_scale == -7.5
+    with pytest.raises(UserError, match=r"guidance.scale: wanted a number >= 0"):
+        make("sdi", scale=-7.5)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("inversion_scale", float("nan")),
+        ("inversion_scale", float("-inf")),
+        ("inversion_stride", 0.0),
+        ("inversion_stride", 1.5),
+        ("overshoot", -0.1),
+        ("overshoot", 1.0),
+        ("eta", -0.3),
+    ],
+)
+def test_wrong_values_are_refused_by_key(key, value, make):
+    with pytest.raises(UserError, match=f"guidance.{key}: "):
+        make("sdi", **{key: value})
+
+
+def test_views_that_share_t_share_the_overshoot(make, ask, gaussian, means, rgb):
+    prior = gaussian(DDPM())
+    ask(make("sdi", shared_t=True, overshoot=0.2, inversion_stride=0.05), rgb, means, prior)
+    assert all(len(call.t.unique()) == 1 for call in prior.calls)
