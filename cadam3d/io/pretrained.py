@@ -139,7 +139,7 @@ class Pretrained:
             ) from error
         if isinstance(loaded, torch.nn.Module):
             loaded.requires_grad_(False).eval()
-        if name.startswith("tokenizer"):
+        elif name.startswith("tokenizer"):
             self._check_vocabulary(name, len(loaded))
         return loaded
 
