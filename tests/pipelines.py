@@ -207,6 +207,34 @@ def stable_diffusion_3(folder: Path, t5: bool = True) -> Path:
     return folder
 
 
+def mvdream(folder: Path) -> Path:
+    """MVDream in small: what its published file does not say (groups, heads of 64 channels) is as there."""
+    from diffusers import StableDiffusionPipeline
+
+    width = 64
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        tokenizer = clip_tokenizer(folder / "tokens", pad_token="!")
+        StableDiffusionPipeline(
+            vae=vae(4, 0.18215, width=32, groups=32),
+            text_encoder=clip_text(tokenizer, hidden_size=width, num_attention_heads=1, hidden_act="gelu"),
+            tokenizer=tokenizer,
+            unet=unet(
+                width,
+                block_out_channels=(width, 2 * width),
+                norm_num_groups=32,
+                attention_head_dim=(1, 2),
+                class_embed_type="projection",
+                projection_class_embeddings_input_dim=16,
+            ),
+            scheduler=ddim(),
+            safety_checker=None,
+            feature_extractor=None,
+            requires_safety_checker=False,
+        ).save_pretrained(folder)
+    return folder
+
+
 def shap_e(folder: Path, surface: bool = True) -> Path:
     """Shap-E in small. Without a surface, its table of triangles is empty, as in a model made anew."""
     from diffusers import HeunDiscreteScheduler, PriorTransformer, ShapEPipeline
@@ -268,31 +296,3 @@ def triangles_of_cubes() -> tuple[torch.Tensor, torch.Tensor]:
         for row, (second, third) in enumerate(list(pairwise(cut[1:]))[:5]):
             cases[case, row], masks[case, row] = torch.tensor([cut[0], second, third]), True
     return cases, masks
-
-
-def mvdream(folder: Path) -> Path:
-    """MVDream in small: what its published file does not say (groups, heads of 64 channels) is as there."""
-    from diffusers import StableDiffusionPipeline
-
-    width = 64
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        tokenizer = clip_tokenizer(folder / "tokens", pad_token="!")
-        StableDiffusionPipeline(
-            vae=vae(4, 0.18215, width=32, groups=32),
-            text_encoder=clip_text(tokenizer, hidden_size=width, num_attention_heads=1, hidden_act="gelu"),
-            tokenizer=tokenizer,
-            unet=unet(
-                width,
-                block_out_channels=(width, 2 * width),
-                norm_num_groups=32,
-                attention_head_dim=(1, 2),
-                class_embed_type="projection",
-                projection_class_embeddings_input_dim=16,
-            ),
-            scheduler=ddim(),
-            safety_checker=None,
-            feature_extractor=None,
-            requires_safety_checker=False,
-        ).save_pretrained(folder)
-    return folder

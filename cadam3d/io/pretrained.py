@@ -139,6 +139,8 @@ class Pretrained:
             ) from error
         if isinstance(loaded, torch.nn.Module):
             loaded.requires_grad_(False).eval()
+        elif name.startswith("tokenizer"):
+            self._check_vocabulary(name, len(loaded))
         return loaded
 
     def config(self, name: str) -> dict[str, Any]:
@@ -178,6 +180,16 @@ class Pretrained:
         files = sorted(path for path in Path(self.where).rglob("*") if path.is_file())
         facts = [(str(f.relative_to(self.where)), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
         return json.dumps([str(Path(self.where).resolve()), facts])
+
+    def _check_vocabulary(self, name: str, size: int) -> None:
+        """Where a tokenizer has no files, transformers makes one up that knows no word, and says nothing."""
+        encoder = name.replace("tokenizer", "text_encoder")
+        wanted = self._kind(encoder).config_class.from_dict(self.config(encoder)).vocab_size
+        if size < wanted / 2:  # T5's encoder has room for a few more pieces than there are
+            raise UserError(
+                f"{self.source.key}: {name} of {self.where} knows {size} of the {wanted} pieces of text that "
+                f"{encoder} reads: files are missing. Try: download it again"
+            )
 
     def _kind(self, name: str) -> Any:
         library, kind = (str(entry) for entry in (self.index.get(name) or (None, None))[:2])

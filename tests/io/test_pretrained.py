@@ -62,6 +62,21 @@ def test_a_folder_wins_over_ids_and_needs_no_hub(model, hub):
     assert not found.has("text_encoder_3")
 
 
+@pytest.mark.parametrize("lost", ["tokenizer", "tokenizer/*"])
+def test_a_tokenizer_without_files_is_no_tokenizer(model, tmp_path, lost):
+    """Transformers makes one that knows no word; every prompt would read the same."""
+    folder = tmp_path / "model"
+    shutil.copytree(model, folder)
+    if lost == "tokenizer":
+        shutil.rmtree(folder / lost)
+    else:
+        for file in folder.glob(lost):
+            file.unlink()
+    found = source(path=str(folder)).find(KINDS, OTHERS)
+    with pytest.raises(UserError, match=r"^prior: tokenizer of .* knows 2 of the 519 pieces"):
+        found.part("tokenizer")
+
+
 def test_parts_are_frozen_and_have_the_type_asked_for(model):
     found = source(path=str(model)).find(KINDS, OTHERS)
     for name in ("unet", "vae", "text_encoder"):

@@ -78,7 +78,7 @@ def test_t5_that_is_not_wanted_need_not_be_there(prior, folder, tmp_path):
     assert there.found.has("text_encoder_3")
     expected = replace(prior, t5=False).embed("a red cube", "").texts.tokens
     torch.testing.assert_close(there.embed("a red cube", "").texts.tokens, expected)
-    with pytest.raises(UserError, match=r"^prior: text_encoder_3 of .* cannot be loaded"):
+    with pytest.raises(UserError, match=r"^prior: .*text_encoder_3"):
         replace(there, t5=True).embed("a red cube", "")
 
 
