@@ -49,3 +49,38 @@ class RandomBackground(Background):
         is_random = torch.rand(views, 1, generator=generator) < self.probability
         colors = torch.rand(views, 3, generator=generator)
         return torch.where(is_random, colors, torch.tensor([float(channel) for channel in self.color]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LucidBackground(Background):
+    """For each view by itself: usually a random colour or black, else the constant one (LucidDreamer)."""
+
+    probability: float  # in [0, 1]; of a colour other than the constant one
+    black: float  # in [0, 1]; how many of those are black, the others being uniformly random
+    color: Sequence[float]  # RGB in [0, 1]
+
+    def __post_init__(self) -> None:
+        require_range("background.probability", self.probability, low=0, high=1, example=0.66)
+        require_range("background.black", self.black, low=0, high=1, example=0.5)
+        require_color("background.color", self.color)
+
+    def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
+        """One colour per view; the number of draws does not depend on their outcome."""
+        is_other = torch.rand(views, 1, generator=generator) < self.probability
+        is_black = torch.rand(views, 1, generator=generator) < self.black
+        colors = torch.where(is_black, 0.0, torch.rand(views, 3, generator=generator))
+        return torch.where(is_other, colors, torch.tensor([float(channel) for channel in self.color]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlackOrWhite(Background):
+    """For each view by itself: white with probability ``white``, else black (DreamGaussian)."""
+
+    white: float  # in [0, 1]
+
+    def __post_init__(self) -> None:
+        require_range("background.white", self.white, low=0, high=1, example=0.5)
+
+    def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
+        """One shade per view."""
+        return (torch.rand(views, 1, generator=generator) < self.white).float().repeat(1, 3)

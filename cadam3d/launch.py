@@ -25,9 +25,9 @@ from cadam3d.settings import TEXT_KEYS, VERSION_BASE, compose, config_dir, quote
 
 TRAINING = ("train", "sweep")  # the commands that own a run folder
 OVERRIDES = ".hydra/overrides.yaml"  # in a run folder: what its line said
-PATH_KEYS = (  # quoted if need be
+PATH_KEYS = (  # quoted if need be; so is a text that may be null
     *("run", "ply", "output", "resume", "hydra.run.dir", "hydra.sweep.dir"),
-    *("initializer.path", "rasterizer.cache_dir"),
+    *("initializer.path", "initializer.prompt", "rasterizer.cache_dir"),
 )
 RUN_MARKS = ("summary.json", "checkpoints")  # what a run folder holds, and an empty one does not
 PLAIN_PATH = re.compile(r"[\w./+-]*", re.ASCII)  # to Hydra's grammar; it cannot read "~"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.core.checks import UserError, require_range
@@ -16,6 +16,7 @@ from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 
 # What Adam sees: the five tensors, with the view-dependent colours apart because they learn more slowly.
 PARTS = ("means", "sh_dc", "sh_rest", "opacity", "scale", "quat")
+COLOR_PARTS = ("sh_dc", "sh_rest")
 MOMENTS = ("exp_avg", "exp_avg_sq")  # as torch names them
 
 
@@ -32,6 +33,7 @@ class AdamSettings:
     beta1: float
     beta2: float
     eps: float  # far below any gradient: world gradients can be tiny
+    clip_norm: float | Schedule | None  # largest Euclidean norm of each part's whole gradient; None = off
 
     def __post_init__(self) -> None:
         for part in PARTS:
@@ -39,6 +41,8 @@ class AdamSettings:
         require_range("optimizer.beta1", self.beta1, low=0, below=1, example=0.9)
         require_range("optimizer.beta2", self.beta2, low=0, below=1, example=0.999)
         require_range("optimizer.eps", self.eps, above=0, example=1e-15)
+        if self.clip_norm is not None:
+            require_scheduled("optimizer.clip_norm", self.clip_norm, above=0, example="null")
 
     def start(self, gaussians: Gaussians) -> "GaussianOptimizer":
         """An optimizer that owns a copy of ``gaussians``, with zero moments."""
@@ -47,6 +51,10 @@ class AdamSettings:
     def learning_rates(self, step: int) -> dict[str, float]:
         """The rate of each part at ``step`` (0 is the first)."""
         return {part: float(as_schedule(getattr(self, f"{part}_lr"))(step)) for part in PARTS}
+
+    def largest_norm(self, step: int) -> float | None:
+        """What :attr:`clip_norm` allows at ``step`` (0 is the first); None: anything."""
+        return None if self.clip_norm is None else float(as_schedule(self.clip_norm)(step))
 
 
 class GaussianOptimizer:
@@ -65,15 +73,16 @@ class GaussianOptimizer:
     def step(self, step: int) -> None:
         """One Adam step at the learning rates of ``step`` (0 is the first), then forget the gradients.
 
-        A tensor without a gradient has the gradient zero: its moments decay like everybody's.
+        A tensor without a gradient has the gradient zero: its moments decay like everybody's. With a
+        ``clip_norm``, only Adam sees clipped gradients: densifiers have looked before.
         """
-        rates = self.settings.learning_rates(step)
+        rates, bound = self.settings.learning_rates(step), self.settings.largest_norm(step)
         gradients = self._gaussians.map(
             lambda tensor: torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
         )
         for group, gradient in zip(self._adam.param_groups, _parts(gradients).values(), strict=True):
             group["lr"] = rates[group["name"]]
-            group["params"][0].grad = gradient
+            group["params"][0].grad = gradient if bound is None else _clipped(gradient, bound)
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
         self.zero_grad()
@@ -96,6 +105,11 @@ class GaussianOptimizer:
         self._install(edit.apply(self._gaussians), moments)
 
     @torch.no_grad()
+    def displace(self, offsets: Float[Tensor, "n 3"]) -> None:
+        """Add ``offsets`` (world units) to the means; all moments stay as they are."""
+        self._gaussians.means.add_(offsets)
+
+    @torch.no_grad()
     def reset_opacity(self, rows: Bool[Tensor, "n"], value: float) -> int:
         """Lower the opacity of ``rows`` to at most ``value`` (paper sec. 4.4); nobody's is ever raised.
 
@@ -110,6 +124,18 @@ class GaussianOptimizer:
         for kind in MOMENTS:
             moments[kind].masked_fill_(rows, 0.0)
         return int(lowered.sum())
+
+    @torch.no_grad()
+    def scale_colors(self, factor: float) -> None:
+        """Multiply every colour coefficient, the view-independent one too, and forget the colours' momentum.
+
+        Coefficients are zero at mid grey, so a factor below 1 draws bright and dark colours towards it
+        (GCS-BEG). All other tensors and moments stay.
+        """
+        self._gaussians.sh.mul_(factor)
+        for part in COLOR_PARTS:
+            for kind in MOMENTS:
+                self._moments(part)[kind].zero_()
 
     def state_dict(self) -> dict[str, Any]:
         """Steps done and both moments by part: plain numbers and tensors. The Gaussians are saved apart."""
@@ -165,3 +191,9 @@ def _parts(gaussians: Gaussians) -> dict[str, Tensor]:
         gaussians.quats,
     )
     return dict(zip(PARTS, tensors, strict=True))
+
+
+def _clipped(gradient: Tensor, bound: float) -> Tensor:
+    """``gradient``, shortened to the Euclidean norm ``bound`` if it is longer; all elements together."""
+    norm = torch.linalg.vector_norm(gradient)
+    return gradient * (bound / norm.clamp_min(bound))

@@ -43,11 +43,23 @@ class Weighted(Regularizer):
 
 @dataclass(frozen=True, kw_only=True)
 class MeanScale(Weighted):
-    """Mean standard deviation in world units: keeps Gaussians small (LucidDreamer, weight 1)."""
+    """Mean standard deviation in world units: keeps Gaussians small (LucidDreamer, weight 1).
+
+    3DGS-MCMC gives it a weight of 0.01.
+    """
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
         """Mean over Gaussians and axes."""
         return _mean(gaussians.scales)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeanOpacity(Weighted):
+    """Mean opacity: whoever is not needed fades away (3DGS-MCMC, Kheradmand et al. 2024, weight 0.01)."""
+
+    def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
+        """Mean over Gaussians, in (0, 1)."""
+        return _mean(gaussians.opacities)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,12 +98,34 @@ class Sparsity(Weighted):
 
 @dataclass(frozen=True, kw_only=True)
 class TotalVariation(Weighted):
-    """Mean absolute difference of neighbouring pixels of the render: suppresses speckle (LucidDreamer)."""
+    """Mean absolute difference of neighbouring pixels of the render: suppresses speckle."""
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
         """Mean over views, channels and directions, per pixel."""
         images = output.rgb.permute(0, 3, 1, 2)
         return total_variation(images, reduction="mean").mean()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SquaredVariation(Weighted):
+    """Mean squared difference of neighbouring pixels: LucidDreamer's total variation, weight 1."""
+
+    def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
+        """Twice the sum, over the two directions, of the mean over views, channels and pixels."""
+        return _squared_variation(output.rgb.permute(0, 3, 1, 2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DisparityVariation(Weighted):
+    """As :class:`SquaredVariation`, of the disparity: suppresses floaters (LucidDreamer, weight 1)."""
+
+    def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
+        """Of the grey image in [0, 1] that ``output.disparity()`` is."""
+        return _squared_variation(output.disparity()[:, None])
+
+
+def _squared_variation(images: Float[Tensor, "v c h w"]) -> Float[Tensor, ""]:
+    return 2 * (_mean(images.diff(dim=2).square()) + _mean(images.diff(dim=3).square()))
 
 
 def _mean(values: Tensor) -> Float[Tensor, ""]:

@@ -25,7 +25,9 @@ class TrainState:
     step: int  # steps done
     seconds: float  # wall-clock time spent on them
     num_initial: int  # Gaussians at step 0
+    initial_note: str | None  # where they are not from the initializer that was asked for: why, and from what
     skipped: int  # steps without an update, because a gradient was not finite
+    dimmed: int  # steps after which the exposure guard dimmed all colours
     refused: bool  # the refinement of the last step would exceed max_gaussians; it waits for a larger one
     seed: int  # what the generators descend from
     optimizer: GaussianOptimizer  # owns the Gaussians
@@ -43,7 +45,9 @@ class TrainState:
             "step": self.step,
             "seconds": self.seconds,
             "num_initial": self.num_initial,
+            "initial_note": self.initial_note,
             "skipped": self.skipped,
+            "dimmed": self.dimmed,
             "refused": self.refused,
             "seed": self.seed,
             "gaussians": self.gaussians.detach().tensors(),

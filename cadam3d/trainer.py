@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from cadam3d.augmentation import Augmentation
 from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
@@ -16,6 +18,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.densifier.base import Densifier, GradientSignal
 from cadam3d.densifier.refine import Refine
+from cadam3d.exposure import Exposure
 from cadam3d.guidance.base import Guidance
 from cadam3d.initializer.base import Initializer
 from cadam3d.optimizer import AdamSettings
@@ -25,7 +28,16 @@ from cadam3d.regularizer import Regularizer
 from cadam3d.state import Outcome, Population, RefineReport, RunContext, StepReport, TrainState
 
 # Each source of randomness has its own generator: two densifiers with one seed see the same views and noise.
-GENERATORS = ("initializer", "camera", "background", "guidance", "refine")
+# New names go to the end: a seed gives each the stream of its place.
+GENERATORS = (
+    "initializer",
+    "camera",
+    "background",
+    "guidance",
+    "refine",
+    "densifier",
+    "augmentation",
+)
 
 
 def never() -> bool:
@@ -41,32 +53,34 @@ class Trainer:
     views: int  # per step
     camera: CameraSampler
     background: Background
+    augmentation: Augmentation
     rasterizer: Rasterizer
     prior: DiffusionPrior
     guidance: Guidance
     densifier: Densifier
     refine: Refine
     optimizer: AdamSettings
+    exposure: Exposure
     regularizers: Mapping[str, Regularizer]
     callbacks: Sequence[Callback]
 
     def __post_init__(self) -> None:
         require_range("steps", self.steps, low=1, example=600)
         require_range("views", self.views, low=1, example=2)
+        self.camera.check_views(self.views)
 
     def start(self, prompt: str, initializer: Initializer, seed: int, device: torch.device) -> TrainState:
         """The state before the first step; every later draw descends from ``seed``."""
-        children = np.random.SeedSequence(seed).spawn(len(GENERATORS))
-        generators = {
-            name: torch.Generator().manual_seed(int(child.generate_state(1, np.uint64)[0] >> 1))
-            for name, child in zip(GENERATORS, children, strict=True)
-        }
-        gaussians = initializer.build(prompt, generators["initializer"], device)
+        generators = start_generators(seed)
+        beginning = initializer.begin(prompt, generators["initializer"], device)
+        gaussians = beginning.gaussians
         return TrainState(
             step=0,
             seconds=0.0,
             num_initial=len(gaussians),
+            initial_note=beginning.note,
             skipped=0,
+            dimmed=0,
             refused=False,
             seed=seed,
             optimizer=self.optimizer.start(gaussians),
@@ -98,14 +112,17 @@ class Trainer:
             got=f"{len(gaussians)} Gaussians and another number of rows",
             example="resume=RUN/checkpoints/<an earlier one>",
         )
-        generators = {name: torch.Generator() for name in GENERATORS}
+        generators = start_generators(payload["seed"])
         for name, generator in generators.items():
-            generator.set_state(payload["generators"][name])
+            if name in payload["generators"]:  # a checkpoint from before the name was: nothing was drawn yet
+                generator.set_state(payload["generators"][name])
         return TrainState(
             step=payload["step"],
             seconds=payload["seconds"],
             num_initial=payload["num_initial"],
+            initial_note=payload.get("initial_note"),  # older checkpoints have none
             skipped=payload["skipped"],
+            dimmed=payload.get("dimmed", 0),  # a checkpoint from before there was a guard
             refused=payload["refused"],
             seed=payload["seed"],
             optimizer=optimizer,
@@ -190,10 +207,12 @@ class Trainer:
         gaussians, draw = state.gaussians, state.generators
         cameras = self.camera.sample(state.step, self.views, draw["camera"]).to(gaussians.device)
         background = self.background.sample(self.views, draw["background"]).to(gaussians.device)
-        output = self.rasterizer.render(gaussians, cameras, background)
+        rendered = self.augmentation.perturb(gaussians, draw["augmentation"])
+        output = self.rasterizer.render(rendered, cameras, background, self.densifier.needs_absgrad)
+        images = self.augmentation.show(output, draw["augmentation"])
         condition = embedding.at(cameras, background)
-        judged = self.guidance(output.rgb, condition, self.prior, state.step, draw["guidance"])
-        penalties = {name: fn(gaussians, output, state.step) for name, fn in self.regularizers.items()}
+        judged = self.guidance(images, condition, self.prior, state.step, draw["guidance"])
+        penalties = {name: fn(rendered, output, state.step) for name, fn in self.regularizers.items()}
         loss = sum(penalties.values(), start=judged.loss)
         if penalties and self.densifier.guidance_only:
             judged.loss.backward(retain_graph=True)
@@ -206,22 +225,33 @@ class Trainer:
         state.densifier = self.densifier.observe(state.densifier, signal)
         if state.optimizer.finite_gradients():
             state.optimizer.step(state.step)
+            self._perturb(state)
         else:
             state.skipped += 1
             state.optimizer.zero_grad()
+        log = {**judged.log, **{name: float(value.detach()) for name, value in penalties.items()}}
+        if (factor := self.exposure.dimming(output, background, state.step + 1)) is not None:
+            state.optimizer.scale_colors(factor)
+            state.dimmed += 1
+        if state.dimmed:
+            log["dimmed"] = float(state.dimmed)
         return StepReport(
-            step=state.step + 1,
-            loss=float(loss.detach()),
-            log={**judged.log, **{name: float(value.detach()) for name, value in penalties.items()}},
-            num_gaussians=len(gaussians),
+            step=state.step + 1, loss=float(loss.detach()), log=log, num_gaussians=len(gaussians)
         )
+
+    def _perturb(self, state: TrainState) -> None:
+        """Move the means at random, if the densifier wants it."""
+        lr = self.optimizer.learning_rates(state.step)["means"]
+        offsets = self.densifier.perturb(state.gaussians.detach(), lr, state.generators["densifier"])
+        if offsets is not None:
+            state.optimizer.displace(offsets)
 
     def _refine(self, state: TrainState, step: int) -> tuple[RefineReport | None, Outcome | None]:
         """Grow, prune and reset where the schedule says so: a pure plan, then one edit for everybody."""
         refines, resets = self.refine.refines_at(step), self.refine.resets_at(step)
         if not (refines or resets):
             return None, None
-        report = self._look(state, step, refines)
+        report = self._look(state, step)
         if refines:
             report = self._grow(state, report)
             if state.refused:
@@ -233,11 +263,10 @@ class Trainer:
             report = replace(report, reset=lowered)
         return report, (Outcome.VANISHED if report.after == 0 else None)
 
-    def _look(self, state: TrainState, step: int, refines: bool) -> RefineReport:
-        """What the densifier sees and wants, before anything changes."""
+    def _look(self, state: TrainState, step: int) -> RefineReport:
+        """What the densifier sees, before anything is decided."""
         gaussians, seen = state.gaussians.detach(), state.densifier
         n = len(gaussians)
-        nobody = torch.zeros(n, dtype=torch.bool, device=gaussians.device)
         return RefineReport(
             step=step,
             before=n,
@@ -250,7 +279,7 @@ class Trainer:
             statistics=self.densifier.statistics(seen, step),
             population=Population(
                 gaussians=gaussians,
-                is_selected=self.densifier.select(seen, step) if refines else nobody,
+                is_selected=torch.zeros(n, dtype=torch.bool, device=gaussians.device),
                 scores=self.densifier.scores(seen),
             ),
         )
@@ -259,9 +288,9 @@ class Trainer:
         """Apply one refinement to all owners of rows, or refuse it whole; ``state.refused`` says which."""
         generator = state.generators["refine"]
         draws_before = generator.get_state()
-        wanted, unwanted = report.population.is_selected, self.densifier.unwanted(state.densifier)
-        plan = self.refine.plan(state.gaussians, wanted, report.step, generator, unwanted)
-        report = replace(report, selected=plan.selected)
+        plan = self.densifier.plan(state.densifier, state.gaussians, report.step, self.refine, generator)
+        population = replace(report.population, is_selected=plan.is_selected)
+        report = replace(report, selected=plan.selected, population=population)
         state.refused = self.refine.exceeds(plan)
         if state.refused:
             generator.set_state(draws_before)
@@ -271,6 +300,15 @@ class Trainer:
         state.densifier = carried  # only now: memory may run out above, and owners must agree even then
         after = len(state.gaussians)
         return replace(report, after=after, cloned=plan.cloned, split=plan.split, pruned=plan.pruned)
+
+
+def start_generators(seed: int) -> dict[str, torch.Generator]:
+    """Every source of randomness as it is before the first draw."""
+    children = np.random.SeedSequence(seed).spawn(len(GENERATORS))
+    return {
+        name: torch.Generator().manual_seed(int(child.generate_state(1, np.uint64)[0] >> 1))
+        for name, child in zip(GENERATORS, children, strict=True)
+    }
 
 
 def render_fn(rasterizer: Rasterizer, gaussians: Callable[[], Gaussians]) -> RenderFn:
@@ -302,12 +340,16 @@ def resolve_device(name: str) -> torch.device:
 
 def _signal(gaussians: Gaussians, output: RenderOutput) -> GradientSignal:
     """What the last backward pass left: copies, for another pass would add to it in place."""
-    means = gaussians.means.grad
-    means2d = output.means2d.grad
     return GradientSignal(
-        means=torch.zeros_like(gaussians.means) if means is None else means.detach().clone(),
-        means2d=torch.zeros_like(output.means2d) if means2d is None else means2d.detach().clone(),
+        means=_gradient_of(gaussians.means),
+        means2d=_gradient_of(output.means2d),
         radii=output.radii.detach(),
         height=output.rgb.shape[1],
         width=output.rgb.shape[2],
+        absgrad=None if output.absgrad is None else _gradient_of(output.absgrad),
     )
+
+
+def _gradient_of(tensor: Tensor) -> Tensor:
+    """A copy of what backward left there; zeros if that was nothing."""
+    return torch.zeros_like(tensor) if tensor.grad is None else tensor.grad.detach().clone()

@@ -98,12 +98,12 @@ class Held(TorchDispatchMode):
 
 
 def measure(densifier: Densifier, steps: list[float], signal: GradientSignal, repeats: int) -> str:
-    n, device = signal.means.shape[0], signal.means.device
+    n, device, draw = signal.means.shape[0], signal.means.device, torch.Generator()
     state = densifier.observe(densifier.init_state(n, device), signal)
     with Held() as held:
         densifier.observe(state, signal)
     observing = [milliseconds(lambda: densifier.observe(state, signal), device) for _ in range(repeats)]
-    selecting = [milliseconds(lambda: densifier.select(state, step=100), device) for _ in range(3)]
+    selecting = [milliseconds(lambda: densifier.select(state, 100, draw), device) for _ in range(3)]
     observe, step = statistics.median(observing), statistics.median(steps)
     state_bytes = sum(rows.nbytes for rows in state.to_dict().values()) // n
     return (

@@ -1,14 +1,18 @@
 """The CUDA kernels on fibers: the very source a GPU runs, compiled by the C++ compiler of this machine."""
 
 import ctypes
+import faulthandler
+import os
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
 import torch
 
+from cadam3d.core.errors import UserError
 from cadam3d.core.render import RenderOutput
 from cadam3d.rasterizer import base
 from cadam3d.rasterizer.build import CONSTANTS, KERNELS, find_compiler
@@ -33,9 +37,9 @@ class Emulator(Launcher):
         with self.module.launching(self.seed) as launch:
             yield launch
 
-    def render(self, gaussians, cameras, background) -> RenderOutput:
+    def render(self, gaussians, cameras, background, absgrad=False) -> RenderOutput:
         """See ``Rasterizer.render``."""
-        return rasterize(self, gaussians, cameras, background)
+        return rasterize(self, gaussians, cameras, background, absgrad)
 
     def shuffled(self, seed: int) -> "Emulator":
         """The same kernels, in another order."""
@@ -59,3 +63,23 @@ def compile_emulator(
         pytest.skip("no ucontext.h")
     assert done.returncode == 0, done.stderr
     return Emulator(Module(ctypes.CDLL(str(library)), 0, b""), seed=1)
+
+
+def is_acquitted(emulator: Emulator, judge: Callable[[Emulator], None]) -> bool:
+    """In a process of its own: a mutant may write anywhere."""
+
+    def trial() -> None:
+        torch.set_num_threads(1)  # threads do not survive a fork
+        faulthandler.disable()  # to crash is one way to be found guilty
+        try:
+            judge(emulator)
+        except (AssertionError, UserError):
+            os._exit(1)
+        os._exit(0)
+
+    process = get_context("fork").Process(target=trial)
+    process.start()
+    process.join(60)
+    process.kill()  # no more than a mutant that never ends is left
+    process.join()
+    return process.exitcode == 0

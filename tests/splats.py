@@ -120,14 +120,15 @@ def make_weights(v, height, width, seed=3):
 
 
 def render_and_differentiate(
-    render, gaussians, cameras, background, weights, dtype=torch.float32, device="cpu"
+    render, gaussians, cameras, background, weights, dtype=torch.float32, device="cpu", *, absgrad=False
 ):
     """The output, and the gradient of ``sum(weights * images)`` in every tensor and means2d, on the CPU.
 
     An image whose weight is ``None`` is no part of the loss: no gradient comes back for it, not even zeros.
+    ``absgrad`` comes last, where it is asked for.
     """
     leaves = gaussians.map(lambda tensor: tensor.detach().to(device, dtype, copy=True).requires_grad_())
-    output = render(leaves, cameras, background.to(device, dtype))
+    output = render(leaves, cameras, background.to(device, dtype), *([True] if absgrad else []))
     terms = [
         (getattr(output, name) * weight.to(device, dtype)).sum()
         for name, weight in zip(IMAGES, weights, strict=True)
@@ -137,6 +138,7 @@ def render_and_differentiate(
     grads = {name: tensor.grad for name, tensor in leaves.tensors().items()} | {
         "means2d": output.means2d.grad
     }
+    grads |= {"absgrad": output.absgrad.grad} if absgrad else {}
     fields = ("rgb", "alpha", "depth", "means2d", "radii")
     output = RenderOutput(**{name: getattr(output, name).detach().cpu() for name in fields})
     return output, {name: grad.cpu() for name, grad in grads.items()}
@@ -168,6 +170,7 @@ def assert_agrees(
     tolerance=2e-5,
     gradient_tolerance=1e-4,
     device="cpu",
+    absgrad=False,
 ):
     """``render`` shows what the reference shows in float64, in value and in every gradient."""
     v, height, width = len(cameras), cameras.height, cameras.width
@@ -178,8 +181,10 @@ def assert_agrees(
         for name, weight in zip(IMAGES, make_weights(v, height, width), strict=True)
     ]
     scene = gaussians, cameras, backgrounds(v), weights
-    got, got_grads = render_and_differentiate(render, *scene, device=device)
-    want, want_grads = render_and_differentiate(ReferenceRasterizer().render, *scene, dtype=torch.float64)
+    got, got_grads = render_and_differentiate(render, *scene, device=device, absgrad=absgrad)
+    want, want_grads = render_and_differentiate(
+        ReferenceRasterizer().render, *scene, dtype=torch.float64, absgrad=absgrad
+    )
     for name in IMAGES:
         assert_close(name, getattr(got, name)[decided], getattr(want, name)[decided], tolerance)
     for name in ("means2d", "radii"):
@@ -209,7 +214,7 @@ class Backend:
         """See :func:`assert_agrees`."""
         return assert_agrees(self.render, gaussians, cameras, device=self.device, **kwargs)
 
-    def differentiate(self, gaussians, cameras, weights=None, background=None):
+    def differentiate(self, gaussians, cameras, weights=None, background=None, absgrad=False):
         """See :func:`render_and_differentiate`; without ``weights`` every number of every image counts."""
         v, size = len(cameras), (cameras.height, cameras.width)
         return render_and_differentiate(
@@ -220,6 +225,7 @@ class Backend:
             make_weights(v, *size) if weights is None else weights,
             self.dtype,
             self.device,
+            absgrad=absgrad,
         )
 
     def show(self, gaussians, cameras):

@@ -13,7 +13,7 @@ FLOORS = {  # part of cadam3d -> floor; parts of one floor may meet only as MAY_
     **dict.fromkeys(("core",), 0.0),
     **dict.fromkeys(("io",), 0.5),  # core, then io
     **dict.fromkeys(("camera", "background", "initializer", "rasterizer", "prior", "densifier"), 1.0),
-    **dict.fromkeys(("optimizer", "regularizer", "exporter", "metric"), 1.0),
+    **dict.fromkeys(("augmentation", "optimizer", "exposure", "regularizer", "exporter", "metric"), 1.0),
     **dict.fromkeys(("state", "callback", "guidance"), 2.0),
     **dict.fromkeys(("trainer",), 3.0),
     **dict.fromkeys(TOP, 4.0),
@@ -248,7 +248,7 @@ def test_no_module_level_future_annotations():
 def test_components_are_not_told_apart_by_their_class():
     """No ``isinstance`` against a component: an interface that does not suffice is to be changed instead."""
     interfaces = ("CameraSampler", "Initializer", "Rasterizer", "DiffusionPrior", "Guidance", "Densifier")
-    interfaces += ("Exporter", "Metric", "Callback", "Background", "Regularizer")
+    interfaces += ("Exporter", "Metric", "Callback", "Background", "Regularizer", "Augmentation", "Exposure")
     guilty = []
     for path in sources():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from cadam3d.background import ConstantBackground, RandomBackground
+from cadam3d.background import BlackOrWhite, ConstantBackground, LucidBackground, RandomBackground
 from cadam3d.core.checks import UserError
 
 
@@ -37,25 +37,68 @@ def test_a_random_background_is_random_with_its_probability(probability):
         torch.testing.assert_close(drawn.var(dim=0), torch.full((3,), 1 / 12), atol=0.005, rtol=0)
 
 
+@pytest.mark.parametrize(("probability", "black"), [(0.66, 0.5), (0.3, 0.2), (1.0, 0.0), (0.0, 0.5)])
+def test_a_lucid_background_is_random_black_or_constant_with_its_probabilities(probability, black):
+    constant = torch.tensor([2.0**-20, 0.5, 1.0])
+    background = LucidBackground(probability=probability, black=black, color=constant.tolist())
+    colors = background.sample(20_000, draw())
+    is_black, is_constant = (colors == 0).all(dim=-1), (colors == constant).all(dim=-1)
+    is_random = ~(is_black | is_constant)
+    shares = [float(rows.float().mean()) for rows in (is_black, is_random, is_constant)]
+    wanted = [probability * black, probability * (1 - black), 1 - probability]
+    assert shares == pytest.approx(wanted, abs=0.01)
+    assert ((colors >= 0) & (colors <= 1)).all()
+    if wanted[1] > 0:
+        drawn = colors[is_random]
+        torch.testing.assert_close(drawn.mean(dim=0), torch.full((3,), 1 / 2), atol=0.02, rtol=0)
+        torch.testing.assert_close(drawn.var(dim=0), torch.full((3,), 1 / 12), atol=0.005, rtol=0)
+
+
+@pytest.mark.parametrize("white", [0.0, 0.5, 0.8, 1.0])
+def test_black_or_white_is_nothing_else_and_white_with_its_probability(white):
+    colors = BlackOrWhite(white=white).sample(20_000, draw())
+    assert set(colors.unique().tolist()) <= {0.0, 1.0}
+    assert (colors == colors[:, :1]).all()
+    assert float(colors.mean()) == pytest.approx(white, abs=0.01)
+
+
 def test_views_are_drawn_apart():
     colors = RandomBackground(probability=1.0, color=[0.0, 0.0, 0.0]).sample(5, draw())
     assert len(colors.unique(dim=0)) == 5
+    lucid = LucidBackground(probability=1.0, black=0.0, color=[0.0, 0.0, 0.0])
+    assert len(lucid.sample(5, draw()).unique(dim=0)) == 5
+    assert len(BlackOrWhite(white=0.5).sample(20, draw()).unique(dim=0)) == 2
 
 
-def test_the_generator_decides():
-    background = RandomBackground(probability=0.5, color=[0.0, 0.0, 0.0])
+CHANGING = [
+    RandomBackground(probability=0.5, color=[0.0, 0.0, 0.0]),
+    LucidBackground(probability=0.66, black=0.5, color=[1.0, 1.0, 1.0]),
+    BlackOrWhite(white=0.5),
+]
+
+
+@pytest.mark.parametrize("background", CHANGING, ids=lambda background: type(background).__name__)
+def test_the_generator_decides(background):
     assert torch.equal(background.sample(9, draw(1)), background.sample(9, draw(1)))
     assert not torch.equal(background.sample(9, draw(1)), background.sample(9, draw(2)))
 
 
-def test_what_is_drawn_later_does_not_depend_on_the_probability():
-    rest = []
-    for probability in (0.0, 0.5, 1.0):
-        generator = draw()
-        RandomBackground(probability=probability, color=[0.0, 0.0, 0.0]).sample(4, generator)
-        rest.append(generator.get_state())
-    assert torch.equal(rest[0], rest[1])
-    assert torch.equal(rest[1], rest[2])
+def after(background) -> torch.Tensor:
+    """The state of the generator once four views are drawn."""
+    generator = draw()
+    background.sample(4, generator)
+    return generator.get_state()
+
+
+def test_what_is_drawn_later_does_not_depend_on_the_probabilities():
+    black = [0.0, 0.0, 0.0]
+    for family in (
+        [RandomBackground(probability=p, color=black) for p in (0.0, 0.5, 1.0)],
+        [LucidBackground(probability=p, black=b, color=black) for p in (0.0, 1.0) for b in (0.0, 1.0)],
+        [BlackOrWhite(white=p) for p in (0.0, 1.0)],
+    ):
+        first, *others = [after(background) for background in family]
+        assert all(torch.equal(first, other) for other in others)
 
 
 @pytest.mark.parametrize("color", [[0.0, 0.0], [0.0, 0.0, 1.5], [-0.1, 0.0, 0.0], [float("nan"), 0.0, 0.0]])
@@ -64,9 +107,17 @@ def test_what_is_no_color_is_refused(color):
         ConstantBackground(color=color)
     with pytest.raises(UserError, match=r"background\.color: wanted three numbers"):
         RandomBackground(probability=0.5, color=color)
+    with pytest.raises(UserError, match=r"background\.color: wanted three numbers"):
+        LucidBackground(probability=0.5, black=0.5, color=color)
 
 
 @pytest.mark.parametrize("probability", [-0.1, 1.1])
 def test_an_impossible_probability_is_refused(probability):
     with pytest.raises(UserError, match=r"background\.probability"):
         RandomBackground(probability=probability, color=[0.0, 0.0, 0.0])
+    with pytest.raises(UserError, match=r"background\.probability"):
+        LucidBackground(probability=probability, black=0.5, color=[0.0, 0.0, 0.0])
+    with pytest.raises(UserError, match=r"background\.black"):
+        LucidBackground(probability=0.5, black=probability, color=[0.0, 0.0, 0.0])
+    with pytest.raises(UserError, match=r"background\.white"):
+        BlackOrWhite(white=probability)

@@ -22,11 +22,9 @@ from cadam3d.sweep.plan import compose_all, read_sweep
 
 CONFIGS = config_dir()
 SEVERAL = ("exporter", "callback", "metric")  # groups of which a run has several at once
-NO_COMPONENTS = ("hydra", "grid", "launcher", "experiment", "noise")
+NO_COMPONENTS = ("hydra", "grid", "launcher", "experiment", "noise", "vram")
 GROUPS = sorted(path.name for path in CONFIGS.iterdir() if path.is_dir() and path.name not in NO_COMPONENTS)
 FILES = [path for group in GROUPS for path in sorted((CONFIGS / group).glob("*.yaml"))]
-VARIANTS = [path for path in FILES if "defaults" in yaml.safe_load(path.read_text(encoding="utf-8"))]
-COMPLETE = [path for path in FILES if path not in VARIANTS]
 GRIDS = sorted(path.stem for path in (CONFIGS / "grid").glob("*.yaml"))
 EXPERIMENTS = sorted(
     str(path.relative_to(CONFIGS / "experiment").with_suffix(""))
@@ -42,6 +40,17 @@ def name_of(path: Path) -> str:
 
 def read(path: Path) -> Any:
     return yaml.safe_load(path.read_text(encoding="utf-8"))
+
+
+def nested_groups(path: Path) -> set[str]:
+    """Keys that a group inside of this group fills in, such as ``fallback`` of an initializer."""
+    entries = read(path).get("defaults", [])
+    return {name for entry in entries if isinstance(entry, dict) for name in entry}
+
+
+NESTED = sorted((CONFIGS / "initializer").glob("*/*.yaml"))  # groups inside of a group
+VARIANTS = [path for path in FILES if "defaults" in read(path) and not nested_groups(path)]
+COMPLETE = [path for path in FILES if path not in VARIANTS]
 
 
 def nodes(value: Any) -> Iterator[dict[str, Any]]:
@@ -67,7 +76,7 @@ def choose(path: Path) -> str:
 @pytest.mark.parametrize("path", COMPLETE, ids=name_of)
 def test_a_node_has_exactly_the_keys_of_its_class(path):
     for node in nodes(read(path)):
-        keys = set(node) - {"_target_"}
+        keys = set(node) - {"_target_", "defaults"}
         fields = {field.name: field for field in dataclasses.fields(class_of(node)) if field.init}
         required = {
             name
@@ -120,6 +129,22 @@ def test_every_option_composes_and_builds(path):
             component(node)
     else:
         assert component(node) is not None
+
+
+@pytest.mark.parametrize("path", NESTED, ids=name_of)
+def test_every_option_of_a_nested_group_composes_and_builds(path):
+    outer, inner = path.parent.parent.name, path.parent.name
+    [owner, *_] = [file for file in FILES if file.parent.name == outer and inner in nested_groups(file)]
+    cfg = compose([PROMPT, f"{outer}={owner.stem}", f"{outer}/{inner}={path.stem}"])
+    assert "_target_" in cfg[outer][inner]
+    assert component(cfg[outer]) is not None
+
+
+def test_what_an_initializer_falls_back_on_has_the_values_it_has_by_itself():
+    for path in sorted((CONFIGS / "initializer/fallback").glob("*.yaml")):
+        cfg = compose([PROMPT, "initializer=shap_e", f"initializer/fallback={path.stem}"])
+        assert cfg.initializer.fallback == compose([PROMPT, f"initializer={path.stem}"]).initializer
+        assert component(cfg.initializer).fallback is not None
 
 
 def test_every_regularizer_has_a_file_of_its_own_and_several_can_be_chosen():

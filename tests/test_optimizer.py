@@ -9,6 +9,7 @@ from cadam3d.core.checks import UserError
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.core.schedule import Linear
+from cadam3d.core.sh import rgb_to_sh0
 from cadam3d.optimizer import MOMENTS, PARTS, AdamSettings, GaussianOptimizer, _parts
 
 RATES = {
@@ -22,7 +23,7 @@ RATES = {
 
 
 def settings(**changes) -> AdamSettings:
-    return AdamSettings(**{**RATES, "beta1": 0.9, "beta2": 0.999, "eps": 1e-15, **changes})
+    return AdamSettings(**{**RATES, "beta1": 0.9, "beta2": 0.999, "eps": 1e-15, "clip_norm": None, **changes})
 
 
 def gaussians(n: int, seed: int = 0, k: int = 4) -> Gaussians:
@@ -128,6 +129,50 @@ def test_rates_follow_their_schedule():
     assert moved == pytest.approx([1.0, 0.5, 0.0], abs=1e-5)
 
 
+def norms(optimizer: GaussianOptimizer) -> dict[str, float]:
+    """The norm of the gradient that Adam saw at its first step, by part."""
+    moments = optimizer.state_dict()["exp_avg"]
+    return {name: float(moments[name].norm()) / (1 - 0.9) for name in PARTS}
+
+
+def test_a_long_gradient_is_shortened_to_the_bound_and_keeps_its_direction():
+    clipped, plain = settings(clip_norm=2.0).start(gaussians(20)), settings().start(gaussians(20))
+    for optimizer in (clipped, plain):
+        push(optimizer, seed=0)
+        optimizer.gaussians.opacity_logits.grad *= 0.01  # a short one
+        optimizer.step(0)
+    assert norms(plain)["opacity"] < 0.1
+    assert norms(clipped)["opacity"] == norms(plain)["opacity"]
+    for name in set(PARTS) - {"opacity"}:
+        assert norms(plain)[name] > 2.5
+        assert norms(clipped)[name] == pytest.approx(2.0, rel=1e-5)
+        now, before = (each.state_dict()["exp_avg"][name] for each in (clipped, plain))
+        torch.testing.assert_close(now / now.norm(), before / before.norm())
+
+
+def test_the_bound_follows_its_schedule_as_published():
+    bound = settings(clip_norm=Linear(start=2.0, end=8.0, steps=1000))
+    assert [bound.largest_norm(step) for step in (0, 500, 1000, 4000)] == pytest.approx([2.0, 5.0, 8.0, 8.0])
+    optimizer = bound.start(gaussians(200))
+    push(optimizer, seed=0)
+    optimizer.step(500)
+    assert norms(optimizer)["means"] == pytest.approx(5.0, rel=1e-5)
+
+
+def test_a_bound_that_nobody_reaches_changes_no_bit():
+    plain, bounded = settings().start(gaussians(6)), settings(clip_norm=1e6).start(gaussians(6))
+    train(plain, range(5))
+    train(bounded, range(5))
+    for name in FIELDS:
+        assert torch.equal(getattr(plain.gaussians, name), getattr(bounded.gaussians, name))
+
+
+def test_a_zero_gradient_stays_zero_under_a_bound():
+    optimizer = settings(clip_norm=2.0).start(gaussians(6, k=1))  # sh_rest has no element at all
+    optimizer.step(0)
+    assert all(tensor.isfinite().all() for tensor in optimizer.gaussians.tensors().values())
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", FIELDS)
 def test_one_bad_gradient_is_noticed(name, bad):
@@ -184,6 +229,21 @@ def test_everybody_may_vanish():
     assert len(optimizer.gaussians) == 0
 
 
+def test_a_displacement_moves_the_means_and_leaves_the_moments():
+    optimizer = settings().start(gaussians(5))
+    train(optimizer, range(3))
+    before, moments = optimizer.gaussians.map(torch.clone).detach(), as_named(optimizer.state_dict())
+    offsets = gaussians(5, seed=7).means
+    optimizer.displace(offsets)
+    assert torch.equal(optimizer.gaussians.means, before.means + offsets)
+    assert all(torch.equal(rows, moments[name]) for name, rows in as_named(optimizer.state_dict()).items())
+    assert optimizer.gaussians.means.requires_grad
+    twin = settings().start(gaussians(5))
+    train(twin, range(4))
+    train(optimizer, range(3, 4))  # what Adam moves is what was displaced
+    torch.testing.assert_close(optimizer.gaussians.means, twin.gaussians.means + offsets)
+
+
 def test_a_reset_never_raises_an_opacity():
     optimizer = settings().start(gaussians(50))
     optimizer.gaussians.opacity_logits.data.uniform_(-8, 3, generator=torch.Generator().manual_seed(0))
@@ -222,6 +282,39 @@ def test_a_reset_moves_what_is_rendered_next():
     assert float(leaf.detach().sigmoid().max()) < 0.02
 
 
+def test_dimming_multiplies_every_colour_coefficient_and_forgets_their_momentum_only():
+    optimizer = settings().start(gaussians(10))
+    train(optimizer, range(5))
+    leaf = optimizer.gaussians.sh
+    values, moments = optimizer.gaussians.detach().map(torch.clone), as_named(optimizer.state_dict())
+    optimizer.scale_colors(0.8)
+    assert optimizer.gaussians.sh is leaf
+    torch.testing.assert_close(leaf.detach(), 0.8 * values.sh)
+    for name in set(FIELDS) - {"sh"}:
+        assert torch.equal(getattr(optimizer.gaussians, name), getattr(values, name))
+    for name, now in as_named(optimizer.state_dict()).items():
+        is_color = name.endswith(("/sh_dc", "/sh_rest"))
+        assert torch.equal(now, torch.zeros_like(now) if is_color else moments[name]), name
+        assert moments[name].any()
+
+
+def test_dimmed_colours_are_drawn_towards_mid_grey_and_train_on():
+    optimizer = settings().start(gaussians(10, k=1))
+    bright = rgb_to_sh0(torch.tensor([[1.2, 0.5, 0.0]])).expand(10, 3)
+    optimizer.gaussians.sh.data[:, 0] = bright
+    optimizer.scale_colors(0.8)
+    shown = optimizer.gaussians.sh.detach()[:, 0] - rgb_to_sh0(torch.zeros(1, 3))
+    torch.testing.assert_close(shown * rgb_per_sh0(), torch.tensor([[1.06, 0.5, 0.1]]).expand(10, 3))
+    before = optimizer.gaussians.sh.detach().clone()
+    train(optimizer, range(1))
+    assert (optimizer.gaussians.sh != before).all()
+
+
+def rgb_per_sh0() -> float:
+    grey, black = rgb_to_sh0(torch.full((1, 3), 0.5)), rgb_to_sh0(torch.zeros(1, 3))
+    return 0.5 / float((grey - black)[0, 0])
+
+
 def test_resuming_from_disk_is_bit_exact(tmp_path):
     whole = settings().start(gaussians(6))
     train(whole, range(10))
@@ -254,7 +347,7 @@ def test_moments_of_other_gaussians_are_refused():
         settings().start(gaussians(4)).load_state_dict(settings().start(gaussians(5)).state_dict())
 
 
-@pytest.mark.parametrize("key", [*RATES, "beta1", "beta2", "eps"])
+@pytest.mark.parametrize("key", [*RATES, "beta1", "beta2", "eps", "clip_norm"])
 def test_an_impossible_number_is_refused_by_name(key):
     with pytest.raises(UserError, match=rf"optimizer\.{key}"):
         settings(**{key: -1.0})

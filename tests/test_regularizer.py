@@ -9,14 +9,26 @@ from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.core.schedule import Linear
-from cadam3d.regularizer import AlphaEntropy, MeanScale, OutsideBall, Sparsity, TotalVariation
+from cadam3d.regularizer import (
+    AlphaEntropy,
+    DisparityVariation,
+    MeanOpacity,
+    MeanScale,
+    OutsideBall,
+    Sparsity,
+    SquaredVariation,
+    TotalVariation,
+)
 
 EVERY = [
     MeanScale(weight=2.0),
+    MeanOpacity(weight=2.0),
     OutsideBall(weight=2.0, radius=1.0),
     AlphaEntropy(weight=2.0),
     Sparsity(weight=2.0),
     TotalVariation(weight=2.0),
+    SquaredVariation(weight=2.0),
+    DisparityVariation(weight=2.0),
 ]
 NAMES = [type(each).__name__ for each in EVERY]
 
@@ -38,7 +50,7 @@ def output(rgb: torch.Tensor | None = None, alpha: torch.Tensor | None = None) -
     alpha = torch.zeros(rgb.shape[:3]) if alpha is None else alpha
     views = len(alpha)
     return RenderOutput(
-        rgb=rgb, alpha=alpha, depth=alpha, means2d=torch.zeros(views, 0, 2), radii=torch.zeros(views, 0)
+        rgb=rgb, alpha=alpha, depth=2 + alpha, means2d=torch.zeros(views, 0, 2), radii=torch.zeros(views, 0)
     )
 
 
@@ -83,6 +95,12 @@ def test_mean_scale_is_the_mean_standard_deviation():
     assert float(MeanScale(weight=1.0)(scene, output(), 0)) == pytest.approx(0.2)
 
 
+def test_mean_opacity_is_the_mean_opacity():
+    scene = gaussians(torch.zeros(4, 3))
+    scene.opacity_logits = torch.tensor([0.1, 0.2, 0.3, 0.8]).logit()
+    assert float(MeanOpacity(weight=0.5)(scene, output(), 0)) == pytest.approx(0.5 * 0.35)
+
+
 def test_the_ball_is_free_inside_and_costs_the_squared_distance_outside():
     ball = OutsideBall(weight=1.0, radius=0.5)
     assert at(ball, means=torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.2, 0.0]])) == 0
@@ -115,6 +133,32 @@ def test_total_variation_is_the_mean_step_between_neighbours():
     assert at(variation, rgb=torch.ones(2, 5, 5, 3)) == 0
     assert at(variation, rgb=ramp) == pytest.approx(0.25)  # 0 vertically, 1 / 4 horizontally
     assert at(variation, rgb=ramp + 0.5 * ramp.transpose(1, 2)) == pytest.approx(0.375)
+
+
+def test_squared_variation_is_the_published_formula():
+    images = noise(3, 6, 5, 3)
+    channels = images.permute(0, 3, 1, 2)
+    rows, columns = channels[:, :, 1:] - channels[:, :, :-1], channels[..., 1:] - channels[..., :-1]
+    published = 2 * (rows.square().sum() / (3 * 5 * 5) + columns.square().sum() / (3 * 6 * 4)) / 3
+    assert at(SquaredVariation(weight=1.0), rgb=images) == pytest.approx(float(published))
+    assert at(SquaredVariation(weight=1.0), rgb=torch.ones(2, 5, 5, 3)) == 0
+
+
+def test_a_step_costs_squared_variation_more_than_a_ramp_and_total_variation_the_same():
+    ramp = torch.linspace(0, 1, 5)[None, None, :, None].expand(1, 5, 5, 3).contiguous()
+    step = (ramp > 0.5).float()
+    total, squared = TotalVariation(weight=1.0), SquaredVariation(weight=1.0)
+    assert at(total, rgb=ramp) == pytest.approx(at(total, rgb=step))
+    assert at(squared, rgb=step) == pytest.approx(4 * at(squared, rgb=ramp))
+
+
+def test_disparity_variation_is_the_squared_variation_of_the_disparity_and_sees_no_colour():
+    rgb, alpha = noise(2, 6, 6, 3), 0.9 + 0.1 * noise(2, 6, 6)
+    grey = output(rgb, alpha).disparity()[..., None].repeat(1, 1, 1, 3)
+    variation = at(DisparityVariation(weight=1.0), rgb=rgb, alpha=alpha)
+    assert variation == pytest.approx(at(SquaredVariation(weight=1.0), rgb=grey))
+    assert variation > 0
+    assert at(DisparityVariation(weight=1.0), rgb=0 * rgb, alpha=alpha) == variation
 
 
 @pytest.mark.parametrize("views", [1, 3])

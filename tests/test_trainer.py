@@ -4,15 +4,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from cadam3d.augmentation import LucidAugmentation
 from cadam3d.callback.base import Callback
 from cadam3d.commands.train import build_trainer
 from cadam3d.core.checks import UserError
+from cadam3d.regularizer import MeanScale
 from cadam3d.settings import component, compose
 from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState
-from cadam3d.trainer import Trainer, resolve_device
+from cadam3d.trainer import Trainer, resolve_device, start_generators
 
 CPU = torch.device("cpu")
 SMALL = [
@@ -80,7 +83,7 @@ def same(left: dict, right: dict) -> bool:
     return True
 
 
-@pytest.mark.parametrize("densifier", ["cadam", "baseline", "none"])
+@pytest.mark.parametrize("densifier", ["cadam", "baseline", "absgrad", "none", "random", "mcmc"])
 def test_same_seed_same_bytes(tmp_path, densifier):
     payloads = []
     for _ in range(2):
@@ -88,6 +91,16 @@ def test_same_seed_same_bytes(tmp_path, densifier):
         go(trainer, state, tmp_path)
         payloads.append(state.to_payload())
     assert same(*payloads)
+
+
+def test_what_stood_in_for_the_initializer_is_remembered_by_checkpoints():
+    lines = ["initializer=shap_e", "initializer.path=nowhere", "initializer/fallback=ball"]
+    trainer, state = make(lines)
+    assert state.initial_note.startswith("Ball stands in for Shap-E")
+    assert len(state.gaussians) == state.num_initial == 4000
+    assert trainer.restore(state.to_payload(), CPU).initial_note == state.initial_note
+    before_there_were_notes = {k: v for k, v in state.to_payload().items() if k != "initial_note"}
+    assert trainer.restore(before_there_were_notes, CPU).initial_note is None
 
 
 def test_another_seed_gives_another_result(tmp_path):
@@ -100,7 +113,7 @@ def test_another_seed_gives_another_result(tmp_path):
     assert not torch.equal(results[0]["gaussians"]["means"][:10], results[1]["gaussians"]["means"][:10])
 
 
-@pytest.mark.parametrize("densifier", ["cadam", "baseline"])
+@pytest.mark.parametrize("densifier", ["cadam", "baseline", "random", "mcmc"])
 @pytest.mark.parametrize("cut", [1, 4, 5])
 def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, densifier, cut):
     trainer, whole = make([f"densifier={densifier}"])
@@ -122,6 +135,160 @@ def test_densifiers_with_one_seed_see_the_same_views_and_noise(tmp_path):
         ends[densifier] = state.to_payload()["generators"]
     for source in ("camera", "background", "guidance"):
         assert torch.equal(ends["cadam"][source], ends["none"][source])
+
+
+@pytest.mark.parametrize("densifier", ["cadam", "mcmc"])
+def test_a_checkpoint_older_than_a_source_of_randomness_goes_on_as_if_it_had_been_there(tmp_path, densifier):
+    trainer, whole = make([f"densifier={densifier}"])
+    payload = whole.to_payload()
+    del payload["generators"]["densifier"]
+    torch.save(payload, tmp_path / "old.pt")
+    resumed = trainer.restore(torch.load(tmp_path / "old.pt", weights_only=True), CPU)
+    go(trainer, whole, tmp_path)
+    go(trainer, resumed, tmp_path)
+    assert same(whole.to_payload(), resumed.to_payload())
+
+
+def test_a_stream_depends_on_its_place_and_on_no_later_name():
+    """So that a new source of randomness moves no other, and old results can be had again."""
+    children = np.random.SeedSequence(7).spawn(5)  # as before there was an augmentation
+    old = [
+        torch.Generator().manual_seed(int(child.generate_state(1, np.uint64)[0] >> 1)) for child in children
+    ]
+    names = ("initializer", "camera", "background", "guidance", "refine")
+    new = start_generators(7)
+    for name, generator in zip(names, old, strict=True):
+        assert torch.equal(new[name].get_state(), generator.get_state())
+
+
+AUGMENTED = ["augmentation=lucid", "augmentation.disparity=0.5"]
+
+
+def test_an_augmented_run_is_another_run_in_which_all_other_streams_are_the_same(tmp_path):
+    ends = {}
+    for lines in ([], AUGMENTED):
+        trainer, state = make(["densifier=none", *lines])
+        go(trainer, state, tmp_path)
+        ends[len(lines)] = state.to_payload()
+    assert not torch.equal(ends[0]["gaussians"]["log_scales"], ends[2]["gaussians"]["log_scales"])
+    for name in ("initializer", "camera", "background", "guidance", "refine"):
+        assert torch.equal(ends[0]["generators"][name], ends[2]["generators"][name])
+    fresh = start_generators(0)["augmentation"].get_state()
+    assert torch.equal(ends[0]["generators"]["augmentation"], fresh)
+    assert not torch.equal(ends[2]["generators"]["augmentation"], fresh)
+
+
+def test_guidance_judges_what_is_shown_and_regularizers_what_is_rendered(tmp_path):
+    seen = {}
+
+    class Eye(LucidAugmentation):
+        def perturb(self, gaussians, generator):
+            seen["perturbed"] = super().perturb(gaussians, generator)
+            return seen["perturbed"]
+
+        def show(self, output, generator):
+            seen["output"], seen["shown"] = output, super().show(output, generator)
+            return seen["shown"]
+
+    class Ear(type(make()[0].guidance)):
+        def __call__(self, rgb, *args):
+            assert rgb is seen["shown"]
+            return super().__call__(rgb, *args)
+
+    class Hand(MeanScale):
+        def penalty(self, gaussians, output):
+            assert gaussians is seen["perturbed"]
+            assert output is seen["output"]
+            return super().penalty(gaussians, output)
+
+    trainer, state = make(["steps=2"])
+    watched = replace(
+        trainer,
+        augmentation=Eye(scale_noise=0.1, disparity=0.5, flip=1.0),
+        guidance=Ear(**vars(trainer.guidance)),
+        regularizers={"mean_scale": Hand(weight=1.0)},
+    )
+    assert go(watched, state, tmp_path) is Outcome.FINISHED
+    assert seen.keys() == {"perturbed", "output", "shown"}
+
+
+def test_an_augmented_run_resumes_to_the_bit(tmp_path):
+    trainer, whole = make(AUGMENTED)
+    go(trainer, whole, tmp_path)
+    _, state = make(AUGMENTED)
+    go(replace(trainer, steps=3), state, tmp_path)
+    torch.save(state.to_payload(), tmp_path / "half.pt")
+    resumed = trainer.restore(torch.load(tmp_path / "half.pt", weights_only=True), CPU)
+    go(trainer, resumed, tmp_path)
+    assert same(whole.to_payload(), resumed.to_payload())
+
+
+def test_a_checkpoint_from_before_there_were_augmentations_goes_on_as_if_it_had_one_of_today(tmp_path):
+    trainer, whole = make()
+    go(trainer, whole, tmp_path)
+    _, state = make()
+    go(replace(trainer, steps=3), state, tmp_path)
+    old = state.to_payload()
+    del old["generators"]["augmentation"]
+    resumed = trainer.restore(old, CPU)
+    go(trainer, resumed, tmp_path)
+    assert same(whole.to_payload(), resumed.to_payload())
+
+
+ALWAYS = ["exposure=beg", "exposure.begin=2", "exposure.end=6", "exposure.threshold=0", "exposure.rate=0.5"]
+
+
+def test_colours_are_dimmed_after_the_steps_that_were_judged_too_bright_and_counted(tmp_path):
+    trainer, state = make(["densifier=none", *ALWAYS])
+    witness = Witness()
+    go(replace(trainer, callbacks=[witness]), state, tmp_path)
+    counts = [report.log.get("dimmed") for report in witness.steps]
+    assert counts == [None, None, 1, 2, 3, 3, 3, 3]
+    assert state.to_payload()["dimmed"] == 3
+
+
+def test_dimming_comes_after_the_step_and_touches_nothing_else(tmp_path):
+    results = []
+    for lines in (["exposure=none"], [*ALWAYS, "exposure.begin=7", "exposure.end=9"]):
+        trainer, state = make(["densifier=none", *lines])
+        go(trainer, state, tmp_path)
+        results.append(state.to_payload())
+    plain, dimmed = results
+    torch.testing.assert_close(dimmed["gaussians"]["sh"], 0.5 * plain["gaussians"]["sh"])
+    for name in ("means", "log_scales", "quats", "opacity_logits"):
+        assert torch.equal(dimmed["gaussians"][name], plain["gaussians"][name])
+    assert not dimmed["optimizer"]["exp_avg"]["sh_dc"].any()
+
+
+def test_a_dimmed_run_resumes_to_the_bit_and_keeps_its_count(tmp_path):
+    trainer, whole = make(ALWAYS)
+    go(trainer, whole, tmp_path)
+    _, state = make(ALWAYS)
+    go(replace(trainer, steps=4), state, tmp_path)
+    torch.save(state.to_payload(), tmp_path / "half.pt")
+    resumed = trainer.restore(torch.load(tmp_path / "half.pt", weights_only=True), CPU)
+    assert resumed.dimmed == 2
+    go(trainer, resumed, tmp_path)
+    assert same(whole.to_payload(), resumed.to_payload())
+
+
+def test_a_checkpoint_from_before_there_was_a_guard_has_dimmed_nothing():
+    trainer, state = make()
+    old = state.to_payload()
+    del old["dimmed"]
+    assert trainer.restore(old, CPU).dimmed == 0
+
+
+def test_the_densifier_observes_gradients_that_are_not_clipped(tmp_path):
+    states = {}
+    for bound in ("null", "1e-6"):
+        trainer, state = make(["steps=1", f"optimizer.clip_norm={bound}"])
+        go(trainer, state, tmp_path)
+        states[bound] = state.to_payload()
+    assert torch.equal(states["null"]["densifier"]["m"], states["1e-6"]["densifier"]["m"])
+    clipped = states["1e-6"]["optimizer"]["exp_avg"]["means"]
+    assert float(clipped.norm()) == pytest.approx(1e-7, rel=1e-4)
+    assert float(states["null"]["optimizer"]["exp_avg"]["means"].norm()) > 1e-4
 
 
 def test_rows_of_all_three_owners_agree_after_every_refinement(tmp_path):
@@ -164,11 +331,12 @@ def test_growth_beyond_max_gaussians_is_an_outcome_and_is_not_applied(tmp_path):
     assert witness.refinements[-1].selected > 0
 
 
-def test_a_resumed_run_with_a_larger_cap_equals_one_that_never_met_it(tmp_path):
-    free, whole = make()
+@pytest.mark.parametrize("densifier", ["cadam", "random", "mcmc"])
+def test_a_resumed_run_with_a_larger_cap_equals_one_that_never_met_it(tmp_path, densifier):
+    free, whole = make([f"densifier={densifier}"])
     go(free, whole, tmp_path)
 
-    capped, state = make(["refine.max_gaussians=30"])
+    capped, state = make([f"densifier={densifier}", "refine.max_gaussians=30"])
     assert go(capped, state, tmp_path) is Outcome.MAX_GAUSSIANS
     torch.save(state.to_payload(), tmp_path / "capped.pt")
 
@@ -233,8 +401,9 @@ def test_another_runtime_error_is_not_swallowed(tmp_path, monkeypatch):
         go(trainer, state, tmp_path)
 
 
-def test_a_step_with_a_non_finite_gradient_changes_nothing_but_is_counted(tmp_path):
-    trainer, state = make(["steps=1"])
+@pytest.mark.parametrize("densifier", ["cadam", "mcmc"])
+def test_a_step_with_a_non_finite_gradient_changes_nothing_but_is_counted(tmp_path, densifier):
+    trainer, state = make(["steps=1", f"densifier={densifier}"])
 
     class Poison(type(trainer.guidance)):
         def __call__(self, rgb, *args):
@@ -246,7 +415,7 @@ def test_a_step_with_a_non_finite_gradient_changes_nothing_but_is_counted(tmp_pa
     go(replace(trainer, guidance=poisoned), state, tmp_path)
     after = state.to_payload()
     assert after["skipped"] == 1
-    for owner in ("gaussians", "optimizer", "densifier"):
+    for owner in ("gaussians", "optimizer", "densifier"):  # nor do means that tremble by themselves
         assert same({owner: before[owner]}, {owner: after[owner]})
 
 
@@ -255,6 +424,12 @@ def test_a_checkpoint_of_another_densifier_is_refused():
     other, _ = make(["densifier=cadam"])
     with pytest.raises(UserError, match="densifier"):
         other.restore(state.to_payload(), CPU)
+
+
+def test_a_number_of_views_that_the_cameras_cannot_give_is_refused_before_the_start():
+    with pytest.raises(UserError, match=r"^views: .* Try: views=4$"):
+        make(["camera=multiview", "views=2"])
+    make(["camera=multiview", "views=4"])
 
 
 def test_an_unknown_or_absent_device_says_what_to_type():

@@ -14,8 +14,19 @@ from cadam3d.settings import component, compose
 WHOLE = {  # what to choose, and the keys that count something
     "camera=orbit": ["camera.size"],
     "camera=sphere": ["camera.size"],
+    "camera=multiview": ["camera.size"],
+    "camera=progressive": ["camera.size", "camera.begin", "camera.every"],
     "initializer=ball": ["initializer.count", "initializer.sh_degree"],
     "initializer=mesh": ["initializer.count", "initializer.sh_degree"],
+    "initializer=ply": ["initializer.count", "initializer.sh_degree", "initializer.replicate"],
+    "initializer=shap_e": [
+        "initializer.steps",
+        "initializer.grid_size",
+        "initializer.count",
+        "initializer.grow_points",
+        "initializer.replicate",
+        "initializer.sh_degree",
+    ],
     "prior=shapes": [
         "prior.samples_per_pixel",
         "prior.census_size",
@@ -37,6 +48,8 @@ WHOLE = {  # what to choose, and the keys that count something
         "refine.max_gaussians",
     ],
     "densifier=cadam": ["densifier.min_age", "densifier.reset_min_age"],
+    "densifier=mcmc": ["densifier.cap"],
+    "exposure=beg": ["exposure.begin", "exposure.end"],
     "exporter=[images]": ["exporter.images.views", "exporter.images.size"],
     "exporter=[preview]": ["exporter.preview.views", "exporter.preview.size"],
     "exporter=[turntable]": [
@@ -47,18 +60,27 @@ WHOLE = {  # what to choose, and the keys that count something
     "exporter=[ply]": ["exporter.ply.pad_sh"],
     "metric=[fidelity]": ["metric.fidelity.views", "metric.fidelity.size"],
     "callback=[metrics]": ["callback.metrics.every"],
+    "callback=[previews]": ["callback.previews.every", "callback.previews.views", "callback.previews.size"],
     "callback=[checkpoint]": ["callback.checkpoint.every", "callback.checkpoint.keep"],
 }
 LISTS = {
     "camera=orbit": ["camera.azimuth_deg", "camera.elevation_deg", "camera.distance", "camera.fov_y_deg"],
     "camera=sphere": ["camera.distance", "camera.fov_y_deg"],
+    "camera=multiview": ["camera.elevation_deg", "camera.relative_distance", "camera.fov_y_deg"],
+    "camera=progressive": [
+        *("camera.azimuth_deg.start", "camera.elevation_deg.end", "camera.distance.end"),
+        *("camera.fov_y_deg.start", "camera.fov_y_deg.factor", "camera.distance.factor"),
+    ],
     "background=grey": ["background.color"],
     "background=random": ["background.color"],
+    "background=lucid": ["background.color"],
     "initializer=ball": ["initializer.color"],
     "initializer=mesh": ["initializer.color"],
+    "initializer=ply": ["initializer.color"],
     "exporter=[images]": ["exporter.images.elevations_deg", "exporter.images.background"],
     "exporter=[preview]": ["exporter.preview.elevations_deg", "exporter.preview.background"],
     "exporter=[turntable]": ["exporter.turntable.background"],
+    "callback=[previews]": ["callback.previews.background"],
     "metric=[fidelity]": ["metric.fidelity.elevations_deg", "metric.fidelity.background"],
 }
 TRUTHS = {
@@ -67,6 +89,13 @@ TRUTHS = {
     "guidance=ism": ["guidance.shared_t"],
     "guidance=gcs": ["guidance.shared_t", "guidance.fixed_noise"],
     "exporter=[preview]": ["exporter.preview.labels"],
+    "prior=stable_diffusion_3": ["prior.t5"],
+}
+NULLABLE = {  # where null means never, all, or as it is
+    "callback=[previews]": ("callback.previews.every",),
+    "refine=default": ("refine.reset_interval", "refine.max_gaussians"),
+    "initializer=ply": ("initializer.count", "initializer.sh_degree"),
+    "initializer=shap_e": ("initializer.count",),
 }
 NEVER_WHOLE = ("2.5", "16.0", "true", "abc", "[1]", "-1000000000000.5")
 NEVER_A_LIST = ("5", "null", "abc", "[a,b,c]", "[true,true,true]", "[null,null]", "[]")
@@ -83,7 +112,7 @@ def as_users_run_it():
 
 @cache
 def composed(choice: str) -> DictConfig:
-    path = ["initializer.path=a.ply"] if choice == "initializer=mesh" else []
+    path = ["initializer.path=a.ply"] if choice in ("initializer=mesh", "initializer=ply") else []
     return compose(["prompt=a red cube", choice, *path])
 
 
@@ -115,7 +144,7 @@ def refuses(choice: str, line: str) -> None:
 def test_what_is_counted_is_a_whole_number(choice, key):
     for value in NEVER_WHOLE:
         refuses(choice, f"{key}={value}")
-    if key not in ("refine.reset_interval", "refine.max_gaussians"):  # where null means never
+    if key not in NULLABLE.get(choice, ()):
         refuses(choice, f"{key}=null")
 
 
@@ -129,6 +158,18 @@ def test_a_list_of_numbers_is_nothing_else(choice, key):
 def test_a_switch_is_true_or_false(choice, key):
     for value in NEVER_A_TRUTH:
         refuses(choice, f"{key}={value}")
+
+
+@pytest.mark.parametrize("value", [*NEVER_A_LIST, "[10,20]"])
+def test_a_range_that_widens_has_a_start_an_end_and_a_factor(value):
+    refuses("camera=progressive", f"camera.fov_y_deg={value}")
+    if value not in ("5", "[10,20]"):
+        refuses("camera=progressive", f"camera.elevation_deg.about={value}")
+
+
+def test_a_name_is_no_initializer_to_fall_back_on():
+    with pytest.raises(UserError, match=r"^initializer\.fallback: wanted .* Try: initializer/fallback=ball$"):
+        build("initializer=shap_e", "initializer.fallback=ball")
 
 
 def test_a_truth_value_bounds_nothing():

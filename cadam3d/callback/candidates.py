@@ -15,7 +15,7 @@ from cadam3d.core.checks import are_numbers, require, require_range, require_who
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import rgb_to_sh0
 from cadam3d.core.viewing import require_viewing
-from cadam3d.io.image import write_png
+from cadam3d.io.image import step_picture, step_pictures, write_png
 from cadam3d.io.jsonl import append_jsonl, truncate_after
 from cadam3d.state import RefineReport, RunContext, TrainState
 
@@ -79,7 +79,7 @@ class Candidates(Callback):
             line |= histogram(values, population.is_selected, self.bins_per_decade)
             append_jsonl(context.folder / FOLDER_NAME / HISTOGRAMS, line)
         if report.step % self.every == 0 and report.before > 0:
-            path = context.folder / FOLDER_NAME / f"step_{report.step:06d}.png"
+            path = step_picture(context.folder / FOLDER_NAME, report.step)
             write_png(path, self._picture(context, population.gaussians, population.is_selected))
 
     def _picture(
@@ -144,5 +144,4 @@ def _selected_counts(bins: Int[Tensor, "m"], is_selected: Bool[Tensor, "m"], len
 
 def pictures(run_folder: Path) -> list[tuple[int, Path]]:
     """Step and path of every picture of a run, in order."""
-    found = (run_folder / FOLDER_NAME).glob("step_*.png")
-    return sorted((int(path.stem.removeprefix("step_")), path) for path in found)
+    return step_pictures(run_folder / FOLDER_NAME)

@@ -1,22 +1,34 @@
-"""The progress bar: step, Gaussians, loss scale, steps per second, time left."""
+"""The progress bar: step, Gaussians, loss scale, speed, when it will be done, and peak memory of the GPU."""
 
+import time
 from dataclasses import dataclass, field
 
+import torch
 from tqdm import tqdm
 
 from cadam3d.callback.base import Callback
 from cadam3d.state import Outcome, RunContext, StepReport, TrainState
 
+DAY = 24 * 3600
+GIB = 2**30
+
 
 @dataclass(kw_only=True)
 class Progress(Callback):
-    """A tqdm bar on standard error; plain lines where that is not a terminal."""
+    """A tqdm bar on standard error; plain lines where that is not a terminal.
+
+    ``done`` is the time of day at which the last step will be over if steps go on taking as long as they did
+    in this session on average. ``VRAM``, on a CUDA device only, is the most that tensors have needed at once;
+    torch's cache and the driver hold more.
+    """
 
     refresh_seconds: float  # at most one redraw in this time
     _bar: tqdm | None = field(default=None, init=False, repr=False)
+    _begun: tuple[int, float] = field(default=(0, 0.0), init=False, repr=False)  # step and time of day
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Open the bar where the run stands."""
+        self._begun = state.step, time.time()
         self._bar = tqdm(
             total=context.total_steps,
             initial=state.step,
@@ -28,9 +40,18 @@ class Progress(Callback):
 
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
         """Advance by one."""
-        if self._bar is not None:
-            self._bar.set_postfix(N=report.num_gaussians, loss=f"{report.loss:.3g}", refresh=False)
-            self._bar.update(1)
+        if self._bar is None:
+            return
+        shown = {"N": report.num_gaussians, "loss": f"{report.loss:.3g}"}
+        first_step, first_time = self._begun
+        if first_step < report.step < context.total_steps:
+            now = time.time()
+            pace = (now - first_time) / (report.step - first_step)
+            shown["done"] = clock(now, pace * (context.total_steps - report.step))
+        if (peak := peak_memory(state.gaussians.device)) is not None:
+            shown["VRAM"] = f"{peak / GIB:.1f}GiB"
+        self._bar.set_postfix(shown, refresh=False)
+        self._bar.update(1)
 
     def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
         """Close the bar, leaving its last line."""
@@ -40,3 +61,14 @@ class Progress(Callback):
         """Close the bar, so that what follows starts on a line of its own."""
         if self._bar is not None:
             self._bar.close()
+
+
+def clock(now: float, seconds: float) -> str:
+    """The local time of day ``seconds`` after ``now`` (since the epoch), with the weekday from a day on."""
+    wanted = "%H:%M" if seconds < DAY else "%a %H:%M"
+    return time.strftime(wanted, time.localtime(now + seconds))
+
+
+def peak_memory(device: torch.device) -> int | None:
+    """The most bytes that tensors on ``device`` have taken at once in this process; None without CUDA."""
+    return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None

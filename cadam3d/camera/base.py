@@ -13,3 +13,6 @@ class CameraSampler(ABC):
     @abstractmethod
     def sample(self, step: int, views: int, generator: torch.Generator) -> Cameras:
         """``views`` cameras for ``step`` (0 is the first), on the CPU; all draws come from ``generator``."""
+
+    def check_views(self, views: int) -> None:  # noqa: B027 (most samplers can draw any number)
+        """Raise ``UserError`` if there cannot be ``views`` per step; asked before anything is loaded."""

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from importlib import import_module, metadata
@@ -183,13 +184,29 @@ def _diffusers() -> Finding:
 
 
 def _models() -> Finding:
-    """Models in the cache of the Hugging Face hub, by name; nothing is loaded."""
+    """Models in the cache of the Hugging Face hub, and what reads them; nothing is loaded."""
     home = Path(os.environ.get("HF_HOME") or Path("~/.cache/huggingface").expanduser())
     cache = Path(os.environ.get("HF_HUB_CACHE") or home / "hub")
-    names = sorted(path.name.removeprefix("models--").replace("--", "/") for path in cache.glob("models--*"))
-    if not names:
+    folders = sorted(cache.glob("models--*"))
+    if not folders:
         return Finding("models on disk", Verdict.NOTE, f"none in {cache}; prior=shapes needs none")
-    return Finding("models on disk", Verdict.OK, ", ".join(names))
+    return Finding("models on disk", Verdict.OK, ", ".join(map(_model, folders)))
+
+
+def _model(folder: Path) -> str:
+    """The name of a cached model and, as far as its index says so, what to type to use it."""
+    from cadam3d.initializer import shap_e
+    from cadam3d.io.pretrained import INDEX
+    from cadam3d.prior.latent import PRIORS
+
+    readers = PRIORS | {shap_e.KIND: "initializer=shap_e"}
+    name = folder.name.removeprefix("models--").replace("--", "/")
+    uses = set[str]()
+    for index in folder.glob(f"snapshots/*/{INDEX}"):
+        with suppress(OSError, ValueError, LookupError, TypeError):  # whatever a lost connection left there
+            kind = str(json.loads(index.read_text(encoding="utf-8"))["_class_name"])
+            uses |= {readers[kind]} if kind in readers else set()
+    return f"{name} ({', '.join(sorted(uses))})" if uses else name
 
 
 def _ask(command: list[str]) -> tuple[int, str]:

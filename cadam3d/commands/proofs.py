@@ -8,6 +8,7 @@ from functools import partial
 import torch
 
 from cadam3d.commands.finding import Finding, Verdict, attempt
+from cadam3d.io.cache import default_cache_dir
 from cadam3d.rasterizer import build, nvrtc
 from cadam3d.rasterizer.auto import AutoRasterizer
 from cadam3d.rasterizer.base import Rasterizer
@@ -38,7 +39,7 @@ def prove_rasterizers() -> Iterator[Finding]:
 
 
 def _cpu_kernels() -> Finding:
-    built, compiler = build.build(build.default_cache_dir()), build.find_compiler()
+    built, compiler = build.build(default_cache_dir()), build.find_compiler()
     instructions = instruction_set(build.load(built))
     version = compiler.version if compiler else None
     facts = {"compiler": version, "instruction_set": instructions, **_kept(built)}
@@ -48,7 +49,7 @@ def _cpu_kernels() -> Finding:
 
 def _cuda_kernels(device: torch.device) -> Finding:
     name, capability = torch.cuda.get_device_name(device), torch.cuda.get_device_capability(device)
-    built, compiler = nvrtc.build(build.default_cache_dir(), capability), nvrtc.find_compiler()
+    built, compiler = nvrtc.build(default_cache_dir(), capability), nvrtc.find_compiler()
     assert compiler is not None, "build() has just needed it"
     facts = {
         "device": name,

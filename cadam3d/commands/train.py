@@ -24,6 +24,7 @@ from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import read_jsonl, write_json
 from cadam3d.io.report import write_report
 from cadam3d.metric.base import Metric
+from cadam3d.prior.base import MemoryEstimate
 from cadam3d.settings import component, components, flatten, load
 from cadam3d.state import Outcome, RunContext, TrainState
 from cadam3d.trainer import Trainer, resolve_device
@@ -81,10 +82,12 @@ def run(cfg: DictConfig) -> float | None:
     exporters: dict[str, Exporter] = components(cfg.exporter)
     metrics: dict[str, Metric] = components(cfg.metric)
 
+    estimate = _estimate_memory(cfg, trainer)
     embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
     state = _start_or_resume(cfg, trainer, device, folder)
-    if notice := trainer.prior.notice():
-        note(notice)
+    trainer.prior.load()  # only now: an initializer may have needed the memory, and has given it back
+    for text in filter(None, (trainer.prior.notice(), state.initial_note)):
+        note(text)
     note_backend(backend)
     remove_leftovers(folder)
     config_text = OmegaConf.to_yaml(cfg, resolve=True)
@@ -108,6 +111,7 @@ def run(cfg: DictConfig) -> float | None:
         summary["backend"] = backend.name
         if backend.reason:
             summary["backend_reason"] = backend.reason
+        summary |= _memory(estimate, device)
         write_json(folder / "summary.json", summary)  # first of all: pictures may fail, the numbers stay
         gaussians = state.gaussians.detach()
         warnings = _export(exporters, gaussians, render, folder)
@@ -134,12 +138,14 @@ def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
         views=cfg.views,
         camera=component(cfg.camera),
         background=component(cfg.background),
+        augmentation=component(cfg.augmentation),
         rasterizer=component(cfg.rasterizer),
         prior=component(cfg.prior).to(device),
         guidance=component(cfg.guidance),
         densifier=component(cfg.densifier),
         refine=component(cfg.refine),
         optimizer=component(cfg.optimizer),
+        exposure=component(cfg.exposure),
         regularizers=components(cfg.regularizer),
         callbacks=list(components(cfg.callback).values()),
     )
@@ -159,12 +165,31 @@ def summarize(cfg: DictConfig, state: TrainState, outcome: Outcome) -> dict[str,
         "num_gaussians": len(state.gaussians),
         "seconds": round(state.seconds, 2),
         "skipped_steps": state.skipped,
+        "dimmed_steps": state.dimmed,
         **{name: choices.get(name) for name in COMPONENTS},
+        **({"initializer_note": state.initial_note} if state.initial_note else {}),
         "device": str(state.gaussians.device),
         "cadam3d": __version__,
         "torch": torch.__version__,
         "finished_at": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
+
+
+def _estimate_memory(cfg: DictConfig, trainer: Trainer) -> MemoryEstimate | None:
+    """Say what the prior will need before it is loaded: better now than by a failure minutes later."""
+    size = cfg.camera.get("size")
+    estimate = trainer.prior.memory(cfg.prompt, cfg.negative_prompt, trainer.views, size)
+    if estimate is not None:
+        note(f"The prior will need about {estimate}. Less: vram=low, or fewer views.")
+    return estimate
+
+
+def _memory(estimate: MemoryEstimate | None, device: torch.device) -> dict[str, float]:
+    """The estimate beside what CUDA saw at its peak, in GiB; the Gaussians' share is in the latter only."""
+    facts = {} if estimate is None else {"memory_estimate_gib": round(estimate.total / 2**30, 3)}
+    if device.type == "cuda":
+        facts["memory_peak_gib"] = round(torch.cuda.max_memory_allocated(device) / 2**30, 3)
+    return facts
 
 
 def _start_or_resume(cfg: DictConfig, trainer: Trainer, device: torch.device, folder: Path) -> TrainState:

@@ -104,6 +104,28 @@ def pinhole(fov_y_deg: Float[Tensor, "v"], height: int, width: int) -> Float[Ten
     return matrix
 
 
+def around(
+    azimuth_deg: Float[Tensor, "v"], elevation_deg: Float[Tensor, "v"]
+) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "v 3"]]:
+    """Unit vectors from the origin towards a viewer, and the image's up there.
+
+    Up is the direction of growing elevation: +z as the image sees it, and well defined at the poles too.
+    """
+    azimuth, elevation = torch.deg2rad(azimuth_deg), torch.deg2rad(elevation_deg)
+    outward = torch.stack(
+        [elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()], dim=-1
+    )
+    up = torch.stack(
+        [-elevation.sin() * azimuth.cos(), -elevation.sin() * azimuth.sin(), elevation.cos()], dim=-1
+    )
+    return outward, up
+
+
+def wrapped(azimuth_deg: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+    """The same azimuths in [-180, 180)."""
+    return (azimuth_deg + 180) % 360 - 180
+
+
 def orbit(
     azimuth_deg: Float[Tensor, "v"],
     elevation_deg: Float[Tensor, "v"],
@@ -116,21 +138,14 @@ def orbit(
 
     ``distance`` is in world units, angles in degrees; azimuth 0 sees the front (camera on +x).
     """
-    azimuth, elevation = torch.deg2rad(azimuth_deg), torch.deg2rad(elevation_deg)
-    direction = torch.stack(
-        [elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()], dim=-1
-    )
-    position = distance[:, None] * direction
-    # The direction of growing elevation: +z as the image sees it, and well defined at the poles too.
-    up = torch.stack(
-        [-elevation.sin() * azimuth.cos(), -elevation.sin() * azimuth.sin(), elevation.cos()], dim=-1
-    )
+    outward, up = around(azimuth_deg, elevation_deg)
+    position = distance[:, None] * outward
     return Cameras(
         world_to_camera=look_at(position, torch.zeros_like(position), up),
         intrinsics=pinhole(fov_y_deg, height, width),
         height=height,
         width=width,
-        azimuth_deg=(azimuth_deg + 180) % 360 - 180,
+        azimuth_deg=wrapped(azimuth_deg),
         elevation_deg=elevation_deg,
     )
 

@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.core.edit import RowEdit, RowState
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.densifier.refine import Refine, RefinePlan
 
 State = TypeVar("State", bound=RowState)
 
@@ -22,11 +24,25 @@ class GradientSignal:
     radii: Float[Tensor, "v n"]  # on screen, in pixels; 0 = not seen
     height: int  # image size in pixels, to turn means2d into NDC units
     width: int
+    # Sums over pixels of |dLoss/dmeans2d|, for a densifier that needs them.
+    absgrad: Float[Tensor, "v n 2"] | None = None
 
     @property
     def visible(self) -> Bool[Tensor, "v n"]:
         """Which Gaussians touched which view."""
         return self.radii > 0
+
+
+@dataclass
+class Headcount(RowState):
+    """The state of a densifier that remembers nothing but how many Gaussians there are."""
+
+    nobody: Bool[Tensor, "n"]  # all False
+
+    @classmethod
+    def of(cls, n: int, device: torch.device) -> "Headcount":
+        """The count of ``n``."""
+        return cls(nobody=torch.zeros(n, dtype=torch.bool, device=device))
 
 
 class Densifier(ABC, Generic[State]):
@@ -42,6 +58,11 @@ class Densifier(ABC, Generic[State]):
         """Whether signals leave the regularizers out: where there are some, another backward pass."""
         return False
 
+    @property
+    def needs_absgrad(self) -> bool:
+        """Whether signals bring ``absgrad``, which rasterizers do not sum unless somebody wants it."""
+        return False
+
     @abstractmethod
     def init_state(self, n: int, device: torch.device) -> State:
         """The state of ``n`` newborn Gaussians."""
@@ -54,10 +75,11 @@ class Densifier(ABC, Generic[State]):
         """
 
     @abstractmethod
-    def select(self, state: State, step: int) -> Bool[Tensor, "n"]:
+    def select(self, state: State, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
         """Whom to grow. Called at refinement steps only; the one real difference between densifiers.
 
-        ``step`` (1 after the first step) is for schedules; the evidence is in the state.
+        ``step`` (1 after the first step) is for schedules; the evidence is in the state. ``generator`` (on
+        the CPU) is for those who draw lots.
         """
 
     @abstractmethod
@@ -71,9 +93,29 @@ class Densifier(ABC, Generic[State]):
         """
         return None
 
+    def plan(
+        self, state: State, gaussians: Gaussians, step: int, refine: Refine, generator: torch.Generator
+    ) -> RefinePlan:
+        """One refinement, decided, not applied: whom by :meth:`select`, how by ``refine``.
+
+        A densifier with a "how" of its own overrides it. Nothing is changed but ``generator``, on the CPU.
+        """
+        selected = self.select(state, step, generator)
+        return refine.plan(gaussians, selected, step, generator, self.unwanted(state))
+
     def after_reset(self, state: State, rows: Bool[Tensor, "n"]) -> State:
         """The state after an opacity reset of ``rows``; by default the statistics do not notice."""
         return state
+
+    def perturb(
+        self, gaussians: Gaussians, lr: float, generator: torch.Generator
+    ) -> Float[Tensor, "n 3"] | None:
+        """What an optimizer step is followed by: displacements of the means, in world units.
+
+        None by default (``None``). ``lr`` is the learning rate of the means at that step; ``generator`` is on
+        the CPU, and nobody else draws from it.
+        """
+        return None
 
     def carry(self, state: State, edit: RowEdit) -> State:
         """The state after a refinement; by default survivors keep their rows and newborns start at zero."""

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from cadam3d.core.checks import require_choice, require_range
 from cadam3d.core.edit import RowEdit, RowState
+from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.densifier.base import Densifier, GradientSignal
 
 VIEWS = ("sum_norm", "sum_vector", "last")
@@ -39,13 +40,13 @@ class Baseline(Densifier[BaselineState]):
     does. It always depends on the scale of the loss and of its noise (paper sec. 4.1: the dilemma).
     """
 
-    tau_pos: float  # loss per NDC unit
+    tau_pos: float | Schedule  # loss per NDC unit
     views: str  # how the views of one batch are combined, see `_norms`
     grad_multiplier: float  # applied to gradients first, for recipes that threshold scaled losses
     screen_px: float | None  # larger ones on screen since the last refinement are pruned; null = never
 
     def __post_init__(self) -> None:
-        require_range("densifier.tau_pos", self.tau_pos, above=0, example=2e-4)
+        require_scheduled("densifier.tau_pos", self.tau_pos, above=0, example=2e-4)
         require_choice("densifier.views", self.views, VIEWS)
         require_range("densifier.grad_multiplier", self.grad_multiplier, above=0, example=1.0)
         if self.screen_px is not None:
@@ -61,7 +62,7 @@ class Baseline(Densifier[BaselineState]):
 
     def observe(self, state: BaselineState, signal: GradientSignal) -> BaselineState:
         """Add the norms of one batch. A gradient that is not finite counts as not seen."""
-        x, y = signal.means2d.unbind(dim=-1)  # a row of two broadcasts slowly
+        x, y = self._pulls(signal).unbind(dim=-1)  # a row of two broadcasts slowly
         x = x * (self.grad_multiplier * signal.width / 2)  # pixels per NDC unit: half the size
         y = y * (self.grad_multiplier * signal.height / 2)
         norms, sightings = self._norms(x, y, signal.visible)
@@ -71,9 +72,9 @@ class Baseline(Densifier[BaselineState]):
             radius=torch.maximum(state.radius, signal.radii.amax(dim=0)),
         )
 
-    def select(self, state: BaselineState, step: int) -> Bool[Tensor, "n"]:
+    def select(self, state: BaselineState, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
         """Mark the Gaussians to grow: A_i >= tau_pos (paper eq. 1; ``>=`` as in 3DGS)."""
-        return self._mean_norms(state) >= self.tau_pos
+        return self._mean_norms(state) >= as_schedule(self.tau_pos)(step)
 
     def unreliable(self, state: BaselineState) -> Bool[Tensor, "n"]:
         """Everybody: the global opacity reset of 3DGS."""
@@ -97,11 +98,16 @@ class Baseline(Densifier[BaselineState]):
         if len(norms) == 0:
             return {}
         ordered, last = norms.sort().values, len(norms) - 1
+        tau_pos = as_schedule(self.tau_pos)(step)
         return {
-            "tau_pos": self.tau_pos,
+            "tau_pos": tau_pos,
             **{f"gradient_p{p}": float(ordered[round(last * p / 100)]) for p in (10, 50, 90)},
-            "share_above_tau_pos": float((norms >= self.tau_pos).float().mean()),
+            "share_above_tau_pos": float((norms >= tau_pos).float().mean()),
         }
+
+    def _pulls(self, signal: GradientSignal) -> Float[Tensor, "v n 2"]:
+        """The evidence, in loss per pixel."""
+        return signal.means2d
 
     def _norms(
         self, x: Float[Tensor, "v n"], y: Float[Tensor, "v n"], visible: Bool[Tensor, "v n"]

@@ -164,7 +164,7 @@ class CAdam(Densifier[CAdamState]):
             age=state.age + is_updated,
         )
 
-    def select(self, state: CAdamState, step: int) -> Bool[Tensor, "n"]:
+    def select(self, state: CAdamState, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
         """Mark the Gaussians to grow: drift above its quantile, and above its noise (paper eq. 9 and 11)."""
         drift, noise = self.strengths(state)
         selected = drift > self._gate(state) * (noise + self._eps(noise))  # compare; never divide by ~0

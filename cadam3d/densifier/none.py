@@ -6,33 +6,25 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from cadam3d.core.edit import RowState
-from cadam3d.densifier.base import Densifier, GradientSignal
-
-
-@dataclass
-class NoGrowthState(RowState):
-    """Nothing to remember but how many there are."""
-
-    nobody: Bool[Tensor, "n"]  # all False
+from cadam3d.densifier.base import Densifier, GradientSignal, Headcount
 
 
 @dataclass(frozen=True, kw_only=True)
-class NoGrowth(Densifier[NoGrowthState]):
+class NoGrowth(Densifier[Headcount]):
     """Selects nobody and distrusts nobody."""
 
-    def init_state(self, n: int, device: torch.device) -> NoGrowthState:
-        """The mask of nobody among ``n``."""
-        return NoGrowthState(nobody=torch.zeros(n, dtype=torch.bool, device=device))
+    def init_state(self, n: int, device: torch.device) -> Headcount:
+        """Nothing to remember."""
+        return Headcount.of(n, device)
 
-    def observe(self, state: NoGrowthState, signal: GradientSignal) -> NoGrowthState:
+    def observe(self, state: Headcount, signal: GradientSignal) -> Headcount:
         """The same state: gradients change nothing here."""
         return state
 
-    def select(self, state: NoGrowthState, step: int) -> Bool[Tensor, "n"]:
+    def select(self, state: Headcount, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
         """Nobody grows."""
         return state.nobody
 
-    def unreliable(self, state: NoGrowthState) -> Bool[Tensor, "n"]:
+    def unreliable(self, state: Headcount) -> Bool[Tensor, "n"]:
         """Nobody's opacity is reset."""
         return state.nobody

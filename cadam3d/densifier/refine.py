@@ -13,13 +13,22 @@ from cadam3d.core.gaussians import Gaussians, concatenate
 
 @dataclass(frozen=True)
 class RefinePlan:
-    """One refinement, decided, not applied: rows after = before + cloned + (children - 1) split - pruned."""
+    """One refinement, decided, not applied: rows after = before + cloned + (children - 1) split - pruned.
+
+    Of :meth:`Refine.plan`, whose ``selected = cloned + split``; a densifier with its own "how" may give one
+    parent many copies.
+    """
 
     edit: RowEdit
-    selected: int  # marked by the densifier = cloned + split
-    cloned: int  # parents that stay and get one twin
+    is_selected: Bool[Tensor, "n"]  # of those before the edit, who was chosen to have children
+    cloned: int  # newborns besides whom they are copies of; each selected parent has one, if it is not split
     split: int  # parents that are replaced by their children
     pruned: int  # survivors and newborns removed
+
+    @property
+    def selected(self) -> int:
+        """How many were chosen."""
+        return int(self.is_selected.sum())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +123,7 @@ class Refine:
         children = concatenate([gaussians.index(clones), self._split(gaussians.index(splits), generator)])
         parents = torch.cat([clones, splits.repeat_interleave(self.split_children)])
 
-        keeps, child_keeps = self._keeps(gaussians, step), self._keeps(children, step)
+        keeps, child_keeps = self.keeps(gaussians, step), self.keeps(children, step)
         if unwanted is not None and step > self.prune_from:
             keeps &= ~unwanted
         edit = RowEdit(
@@ -125,11 +134,20 @@ class Refine:
         grown = len(gaussians) - len(splits) + len(children)
         return RefinePlan(
             edit=edit,
-            selected=len(clones) + len(splits),
+            is_selected=selected,
             cloned=len(clones),
             split=len(splits),
             pruned=grown - edit.rows_after,
         )
+
+    def keeps(self, gaussians: Gaussians, step: int) -> Bool[Tensor, "n"]:
+        """Who is not pruned. The comparisons ask for health, so a row with NaN is pruned too."""
+        keeps = gaussians.means.isfinite().all(dim=-1)
+        if not self._spares_faint_at(step):
+            keeps &= gaussians.opacities >= self.min_opacity
+        if self.max_scale is not None and step > self.prune_from:
+            keeps &= gaussians.scales.amax(dim=-1) <= self.max_scale
+        return keeps
 
     def exceeds(self, plan: RefinePlan) -> bool:
         """Whether ``plan`` would leave more than ``max_gaussians``.
@@ -150,15 +168,6 @@ class Refine:
             opacity_logits=each.opacity_logits,
             sh=each.sh,
         )
-
-    def _keeps(self, gaussians: Gaussians, step: int) -> Bool[Tensor, "n"]:
-        """Who is not pruned. The comparisons ask for health, so a row with NaN is pruned too."""
-        keeps = gaussians.means.isfinite().all(dim=-1)
-        if not self._spares_faint_at(step):
-            keeps &= gaussians.opacities >= self.min_opacity
-        if self.max_scale is not None and step > self.prune_from:
-            keeps &= gaussians.scales.amax(dim=-1) <= self.max_scale
-        return keeps
 
     def _spares_faint_at(self, step: int) -> bool:
         """Whether a reset lies at most ``prune_grace`` steps back."""

@@ -8,7 +8,7 @@ import torch
 from cadam3d.core.checks import require_color, require_range
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
-from cadam3d.initializer.points import gaussians_at, require_points
+from cadam3d.initializer.points import PointCloud, gaussians_at, one_color, points_in_ball, require_points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,14 +33,8 @@ class Ball(Initializer):
 
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
         """Gaussians with equal density everywhere in the ball."""
-        directions = torch.nn.functional.normalize(torch.randn(self.count, 3, generator=generator), dim=-1)
-        radii = self.radius * torch.rand(self.count, 1, generator=generator) ** (1 / 3)  # volume grows as r^3
+        points = points_in_ball(self.count, self.radius, generator)
         deviation = self.color_noise * (2 * torch.rand(self.count, 3, generator=generator) - 1)
-        rgb = (torch.tensor([float(channel) for channel in self.color]) + deviation).clamp(0, 1)
-        return gaussians_at(
-            (directions * radii).to(device),
-            rgb.to(device),
-            scale=self.scale,
-            opacity=self.opacity,
-            sh_degree=self.sh_degree,
-        )
+        rgb = (one_color(self.color, self.count) + deviation).clamp(0, 1)
+        cloud = PointCloud(points, rgb).to(device)
+        return gaussians_at(cloud, scale=self.scale, opacity=self.opacity, sh_degree=self.sh_degree)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,20 @@ import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cadam3d.core.checks import UserError, require_choice, require_color, require_range
+from cadam3d.core.checks import UserError, require_choice, require_color
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
-from cadam3d.initializer.points import gaussians_at, require_points
+from cadam3d.initializer.points import (
+    PointCloud,
+    fit,
+    found_file,
+    gaussians_at,
+    one_color,
+    points_on_surface,
+    require_place,
+    require_points,
+)
+from cadam3d.io.frames import points_to_world, turned_points
 
 UPS = ("z", "y")
 
@@ -29,7 +38,8 @@ class Mesh(Initializer):
 
     path: str  # of the file
     up: str  # which axis of the file points up: "z", or "y" (glTF and most OBJ files, whose front is then +z)
-    radius: float  # world units, at most 1: the object fits in the unit ball
+    turn_deg: int  # then turned about the up axis, counterclockwise from above: 0, 90, 180 or 270
+    radius: float | None  # world units, at most 1: the object fits in the unit ball; null = as it is
     count: int
     scale: (
         float | None
@@ -41,7 +51,7 @@ class Mesh(Initializer):
     def __post_init__(self) -> None:
         require_points(self.count, self.scale, self.opacity, self.sh_degree)
         require_choice("initializer.up", self.up, UPS)
-        require_range("initializer.radius", self.radius, above=0, high=1, example=0.9)
+        require_place(self.turn_deg, self.radius)
         require_color("initializer.color", self.color)
 
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
@@ -49,71 +59,68 @@ class Mesh(Initializer):
 
         Raises ``UserError`` if the file is missing, cannot be read or holds no surface.
         """
-        mesh = self._load()
-        corners = self._place(torch.as_tensor(np.asarray(mesh.vertices), dtype=torch.float32))
-        corners = corners[torch.as_tensor(np.asarray(mesh.faces), dtype=torch.int64)]
-        faces, weights = self._sample(corners, generator)
+        parts = self._load()
+        corners = torch.cat([_corners(part) for part in parts])
+        corners = self._place(corners.flatten(end_dim=1)).view_as(corners)
+        faces, weights = points_on_surface(corners, self.count, generator)
         points = (weights[..., None] * corners[faces]).sum(dim=1)
-        return gaussians_at(
-            points.to(device),
-            self._colors(mesh, faces, weights).to(device),
-            scale=self.scale,
-            opacity=self.opacity,
-            sh_degree=self.sh_degree,
-        )
+        cloud = PointCloud(points, self._colors(parts, faces, weights)).to(device)
+        return gaussians_at(cloud, scale=self.scale, opacity=self.opacity, sh_degree=self.sh_degree)
 
-    def _load(self) -> trimesh.Trimesh:
-        path = Path(self.path).expanduser()
-        if not path.is_file():
-            raise UserError(
-                f"initializer.path: no file {self.path!r}. Try: initializer.path=/path/to/mesh.glb"
-            )
+    def _load(self) -> list[trimesh.Trimesh]:
+        """The surfaces of the file, each where it stands and with its own colours."""
+        path = found_file(self.path, "/path/to/mesh.glb")
         try:
-            mesh = trimesh.load_mesh(path)
+            parts = [part for part in trimesh.load_scene(path).dump() if isinstance(part, trimesh.Trimesh)]
         except Exception as error:  # every format has its own parser, with its own exceptions
             reason = str(error) or type(error).__name__
             raise UserError(
                 f"initializer.path: {self.path!r} cannot be read ({reason}). Try: a PLY, OBJ, STL or GLB file"
             ) from error
-        if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all() or mesh.area <= 0:
+        is_finite = all(np.isfinite(part.vertices).all() for part in parts)
+        if not is_finite or sum(float(part.area) for part in parts) <= 0:
+            vertices, faces = (sum(len(getattr(part, of)) for part in parts) for of in ("vertices", "faces"))
             raise UserError(
-                f"initializer.path: {self.path!r} holds no surface ({len(mesh.vertices)} vertices, "
-                f"{len(mesh.faces)} faces). Try: a file with triangles"
+                f"initializer.path: {self.path!r} holds no surface ({vertices} vertices, {faces} faces). "
+                "Try: a file with triangles"
             )
-        return mesh
+        return parts
 
-    def _place(self, vertices: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
-        """World positions of the file's vertices."""
-        if self.up == "y":
-            vertices = vertices[:, [2, 0, 1]]  # (x, y, z) of the file is (y, z, x) of the world: a rotation
-        vertices = vertices - (vertices.amin(dim=0) + vertices.amax(dim=0)) / 2
-        return vertices * (self.radius / vertices.norm(dim=-1).max())
-
-    def _sample(
-        self, corners: Float[Tensor, "f 3 3"], generator: torch.Generator
-    ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 3"]]:
-        """Random faces, in proportion to their areas, and uniform barycentric weights within each."""
-        edges = corners[:, 1:] - corners[:, :1]
-        areas = torch.linalg.cross(edges[:, 0], edges[:, 1], dim=-1).norm(dim=-1).double().cumsum(dim=0)
-        drawn = torch.rand(self.count, generator=generator, dtype=torch.float64) * areas[-1]
-        faces = torch.searchsorted(areas, drawn, right=True).clamp_max(len(areas) - 1)
-        root, share = torch.rand(self.count, 2, generator=generator).unbind(dim=1)
-        root = root.sqrt()  # uniform over the area of the triangle
-        return faces, torch.stack([1 - root, root * (1 - share), root * share], dim=1)
+    def _place(self, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+        """World positions of the file's points."""
+        upright = turned_points(points_to_world(points, f"+{self.up}"), self.turn_deg)
+        center, factor = fit(upright, self.radius)
+        return (upright - center) * factor
 
     def _colors(
-        self, mesh: trimesh.Trimesh, faces: Int[Tensor, "n"], weights: Float[Tensor, "n 3"]
+        self, parts: Sequence[trimesh.Trimesh], faces: Int[Tensor, "n"], weights: Float[Tensor, "n 3"]
     ) -> Float[Tensor, "n 3"]:
-        """RGB of the sampled points, in [0, 1]."""
-        rows = np.asarray(mesh.faces)[faces.numpy()]
-        barycentric = weights.numpy()[..., None]
-        visual: Any = mesh.visual
-        if visual.kind == "vertex":
-            rgba = (barycentric * visual.vertex_colors[rows]).sum(axis=1)
-        elif visual.kind == "face":
-            rgba = visual.face_colors[faces.numpy()]
-        elif visual.kind == "texture" and visual.uv is not None:
-            rgba = visual.material.to_color((barycentric * visual.uv[rows]).sum(axis=1))
-        else:
-            return torch.tensor([float(channel) for channel in self.color]).repeat(len(rows), 1)
-        return torch.as_tensor(np.asarray(rgba)[:, :3] / 255.0, dtype=torch.float32)
+        """RGB of the sampled points, in [0, 1]; ``faces`` count through all parts."""
+        rgb = one_color(self.color, len(faces))
+        first = 0
+        for part in parts:
+            is_here = (faces >= first) & (faces < first + len(part.faces))
+            colors = _colors_of(part, (faces[is_here] - first).numpy(), weights[is_here].numpy()[..., None])
+            if colors is not None:
+                rgb[is_here] = torch.as_tensor(colors[:, :3] / 255.0, dtype=torch.float32)
+            first += len(part.faces)
+        return rgb
+
+
+def _corners(part: trimesh.Trimesh) -> Float[Tensor, "f 3 3"]:
+    return torch.as_tensor(np.asarray(part.vertices)[np.asarray(part.faces)], dtype=torch.float32)
+
+
+def _colors_of(part: trimesh.Trimesh, faces: np.ndarray, barycentric: np.ndarray) -> np.ndarray | None:
+    """RGBA at points of ``faces``, 0 to 255; None where the part has no colours."""
+    visual: Any = part.visual
+    rows = np.asarray(part.faces)[faces]
+    if visual.kind == "vertex":
+        return (barycentric * visual.vertex_colors[rows]).sum(axis=1)
+    if visual.kind == "face":
+        return visual.face_colors[faces]
+    if visual.kind == "texture" and visual.uv is not None:
+        return np.asarray(visual.material.to_color((barycentric * visual.uv[rows]).sum(axis=1)))
+    if visual.kind == "texture":
+        return np.tile(visual.material.main_color, (len(faces), 1))
+    return None

@@ -1,37 +1,49 @@
 """From coloured points to Gaussians: what every initializer that starts from a point cloud shares."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 from torch import Tensor
 
-from cadam3d.core.checks import require_range, require_whole
+from cadam3d.core.checks import UserError, require_choice, require_range, require_whole
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE, rgb_to_sh0
+from cadam3d.io.frames import TURNS
 
 NEIGHBOURS = 3  # as 3DGS (Kerbl et al. 2023, sec. 5.1)
-BLOCK = 256  # points whose neighbours are sought together
 SMALLEST = 1e-4  # world units; coincident points would have no size at all
 
 
-def gaussians_at(
-    points: Float[Tensor, "n 3"],
-    rgb: Float[Tensor, "n 3"],
-    *,
-    scale: float | None,
-    opacity: float,
-    sh_degree: int,
-) -> Gaussians:
-    """Round Gaussians at ``points`` (world units) that show ``rgb`` (in [0, 1]) from every side.
+@dataclass(frozen=True)
+class PointCloud:
+    """Coloured points."""
+
+    points: Float[Tensor, "n 3"]
+    rgb: Float[Tensor, "n 3"]  # in [0, 1]
+
+    def __len__(self) -> int:
+        return self.points.shape[0]
+
+    def to(self, device: torch.device) -> "PointCloud":
+        """The same cloud on ``device``."""
+        return PointCloud(self.points.to(device), self.rgb.to(device))
+
+
+def gaussians_at(cloud: PointCloud, *, scale: float | None, opacity: float, sh_degree: int) -> Gaussians:
+    """Round Gaussians at the points (world units) that show their colours from every side.
 
     ``scale`` is their standard deviation in world units; None gives each the mean distance to its three
     nearest neighbours, so that they just overlap.
     """
-    n = len(points)
+    points, n = cloud.points, len(cloud)
     scales = neighbour_distance(points) if scale is None else points.new_full((n,), scale)
     sh = points.new_zeros(n, (sh_degree + 1) ** 2, 3)
-    sh[:, 0] = rgb_to_sh0(rgb)
+    sh[:, 0] = rgb_to_sh0(cloud.rgb)
     return Gaussians(
         means=points,
         log_scales=scales.log()[:, None].repeat(1, 3),
@@ -49,14 +61,90 @@ def neighbour_distance(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     count = min(NEIGHBOURS, len(points) - 1)
     if count < 1:
         return torch.ones_like(points[:, 0])
-    result = torch.empty_like(points[:, 0])
-    for rows in _blocks(points, torch.arange(len(points), device=points.device)):
-        block = points[rows]
-        # No point of the block has its neighbours farther away than within the block itself.
-        reach = _nearest(block, block, count).max()
-        is_near = ((points >= block.amin(dim=0) - reach) & (points <= block.amax(dim=0) + reach)).all(dim=-1)
-        result[rows] = _nearest(block, points[is_near], count).mean(dim=1)
-    return result.clamp_min(SMALLEST)
+    array = points.cpu().numpy()
+    distances, _ = KDTree(array).query(array, k=count + 1)  # the first is the point itself
+    return torch.from_numpy(distances[:, 1:].mean(axis=1)).to(points).clamp_min(SMALLEST)
+
+
+def one_color(color: Sequence[float], count: int) -> Float[Tensor, "count 3"]:
+    """The same RGB for everybody."""
+    return torch.tensor([float(channel) for channel in color]).repeat(count, 1)
+
+
+def points_in_ball(count: int, radius: float, generator: torch.Generator) -> Float[Tensor, "count 3"]:
+    """Random points with equal density everywhere in a ball around the origin."""
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    radii = radius * torch.rand(count, 1, generator=generator) ** (1 / 3)  # volume grows as r^3
+    return directions * radii
+
+
+def points_on_surface(
+    corners: Float[Tensor, "f 3 3"], count: int, generator: torch.Generator
+) -> tuple[Int[Tensor, "count"], Float[Tensor, "count 3"]]:
+    """Random triangles, in proportion to their areas, and uniform barycentric weights within each."""
+    edges = corners[:, 1:] - corners[:, :1]
+    areas = torch.linalg.cross(edges[:, 0], edges[:, 1], dim=-1).norm(dim=-1).double().cumsum(dim=0)
+    drawn = torch.rand(count, generator=generator, dtype=torch.float64) * areas[-1]
+    faces = torch.searchsorted(areas, drawn, right=True).clamp_max(len(areas) - 1)
+    root, share = torch.rand(count, 2, generator=generator).unbind(dim=1)
+    root = root.sqrt()  # uniform over the area of the triangle
+    return faces, torch.stack([1 - root, root * (1 - share), root * share], dim=1)
+
+
+def rows_of(n: int, count: int | None, generator: torch.Generator) -> Int[Tensor, "rows"]:
+    """At most ``count`` of ``n`` rows, drawn at random, in their order; all of them if ``count`` is None."""
+    if count is None or count >= n:
+        return torch.arange(n)
+    return torch.randperm(n, generator=generator)[:count].sort().values
+
+
+def replicated(cloud: PointCloud, times: int, radius: float, generator: torch.Generator) -> PointCloud:
+    """Each point ``times`` times, all displaced by the same random offsets of a ball (LucidDreamer).
+
+    With ``times`` 1 nothing is displaced, and nothing drawn.
+    """
+    if times == 1:
+        return cloud
+    offsets = points_in_ball(times, radius, generator)
+    points = cloud.points.repeat_interleave(times, dim=0) + offsets.repeat(len(cloud), 1)
+    return PointCloud(points, cloud.rgb.repeat_interleave(times, dim=0))
+
+
+def grown(
+    cloud: PointCloud, candidates: int, distance: float, noise: float, generator: torch.Generator
+) -> PointCloud:
+    """Noisy point growing (GaussianDreamer): the cloud, and random points of its bounding box.
+
+    Of ``candidates`` points those stay that are nearer than ``distance`` to a point of the cloud; to each
+    channel of its colour up to ``noise`` is added.
+    """
+    low, high = cloud.points.amin(dim=0), cloud.points.amax(dim=0)
+    drawn = low + (high - low) * torch.rand(candidates, 3, generator=generator)
+    _, nearest = KDTree(cloud.points.numpy()).query(drawn.numpy(), distance_upper_bound=distance)
+    neighbour = torch.from_numpy(nearest)
+    is_near = neighbour < len(cloud)  # equal means: nobody is
+    rgb = cloud.rgb[neighbour[is_near]] + noise * torch.rand(int(is_near.sum()), 3, generator=generator)
+    return PointCloud(torch.cat([cloud.points, drawn[is_near]]), torch.cat([cloud.rgb, rgb.clamp_max(1)]))
+
+
+def fit(points: Float[Tensor, "n 3"], radius: float | None) -> tuple[Float[Tensor, "3"], float]:
+    """The centre of the bounding box, and the factor that then brings the farthest point to ``radius``.
+
+    The origin and 1 if ``radius`` is None: everything stays as it is.
+    """
+    if radius is None:
+        return torch.zeros_like(points[0]), 1.0
+    center = (points.amin(dim=0) + points.amax(dim=0)) / 2
+    farthest = float((points - center).norm(dim=-1).max())
+    return center, radius / farthest if farthest > 0 else 1.0
+
+
+def found_file(path: str, example: str) -> Path:
+    """The file that ``initializer.path`` names. Raises ``UserError`` if there is none."""
+    found = Path(path).expanduser()
+    if not found.is_file():
+        raise UserError(f"initializer.path: no file {path!r}. Try: initializer.path={example}")
+    return found
 
 
 def require_points(count: object, scale: object, opacity: object, sh_degree: object) -> None:
@@ -68,20 +156,14 @@ def require_points(count: object, scale: object, opacity: object, sh_degree: obj
     require_whole("initializer.sh_degree", sh_degree, low=0, high=MAX_DEGREE, example=0)
 
 
-def _blocks(points: Float[Tensor, "n 3"], rows: Int[Tensor, "rows"]) -> list[Tensor]:
-    """Row numbers in compact groups: halved along the widest axis until small (a k-d tree)."""
-    if len(rows) <= BLOCK:
-        return [rows]
-    inside = points[rows]
-    axis = int((inside.amax(dim=0) - inside.amin(dim=0)).argmax())
-    ordered = rows[inside[:, axis].argsort(stable=True)]
-    half = len(rows) // 2
-    return _blocks(points, ordered[:half]) + _blocks(points, ordered[half:])
+def require_place(turn_deg: object, radius: object) -> None:
+    """Raise ``UserError`` unless an object can be turned and sized like this; no radius means as it is."""
+    require_choice("initializer.turn_deg", turn_deg, TURNS)
+    if radius is not None:
+        require_range("initializer.radius", radius, above=0, high=1, example=0.9)
 
 
-def _nearest(
-    block: Float[Tensor, "b 3"], others: Float[Tensor, "m 3"], count: int
-) -> Float[Tensor, "b count"]:
-    """Distances to the ``count`` nearest of ``others``, which contain the block itself."""
-    distances = torch.cdist(block, others, compute_mode="donot_use_mm_for_euclid_dist")
-    return distances.topk(count + 1, dim=1, largest=False).values[:, 1:]  # the first is the point itself
+def require_copies(replicate: object, replicate_radius: object) -> None:
+    """Raise ``UserError`` unless points can be replicated like this."""
+    require_whole("initializer.replicate", replicate, low=1, example=20)
+    require_range("initializer.replicate_radius", replicate_radius, above=0, high=1, example=0.05)

@@ -29,6 +29,7 @@ FRAMES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "+z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),  # ours, Blender
 }
 UPS = tuple(FRAMES)
+TURNS = (0, 90, 180, 270)  # degrees; only quarter turns permute axes
 
 
 def world_to_file(gaussians: Gaussians, up: str) -> Gaussians:
@@ -41,18 +42,44 @@ def file_to_world(gaussians: Gaussians, up: str) -> Gaussians:
     return _rotate(gaussians, _axes(up).T)
 
 
+def points_to_world(points: Float[Tensor, "n 3"], up: str) -> Float[Tensor, "n 3"]:
+    """Positions of a file in the world, bit for bit; ``up`` is the file's up axis as above."""
+    return _permute(points, _axes(up).T)
+
+
+def turned(gaussians: Gaussians, turn_deg: int) -> Gaussians:
+    """The same object, turned about the world's +z; counterclockwise from above, one of ``TURNS``."""
+    return _rotate(gaussians, _turn(turn_deg))
+
+
+def turned_points(points: Float[Tensor, "n 3"], turn_deg: int) -> Float[Tensor, "n 3"]:
+    """The same positions, turned likewise."""
+    return _permute(points, _turn(turn_deg))
+
+
 def _axes(up: str) -> Float[Tensor, "3 3"]:
     require_choice("up", up, UPS)
     return torch.tensor(FRAMES[up], dtype=torch.float64)
 
 
+def _turn(turn_deg: int) -> Float[Tensor, "3 3"]:
+    require_choice("turn_deg", turn_deg, TURNS)
+    quarter = torch.tensor([[0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+    return torch.linalg.matrix_power(quarter, turn_deg // 90)
+
+
+def _permute(vectors: Float[Tensor, "n 3"], axes: Float[Tensor, "3 3"]) -> Float[Tensor, "n 3"]:
+    old_axis, sign = axes.abs().argmax(dim=1), axes.sum(dim=1)
+    return vectors[:, old_axis.to(vectors.device)] * sign.to(vectors)
+
+
 def _rotate(gaussians: Gaussians, axes: Float[Tensor, "3 3"]) -> Gaussians:
     if torch.equal(axes, torch.eye(3, dtype=axes.dtype)):
         return gaussians
-    old_axis, sign = axes.abs().argmax(dim=1), axes.sum(dim=1)
+    old_axis = axes.abs().argmax(dim=1)
 
     def permute(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        return vectors[:, old_axis.to(vectors.device)] * sign.to(vectors)
+        return _permute(vectors, axes)
 
     return Gaussians(
         means=permute(gaussians.means),

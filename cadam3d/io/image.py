@@ -32,6 +32,16 @@ def write_png(path: Path, rgb: Float[Tensor, "h w 3"]) -> None:
         temporary.write_bytes(imageio.imwrite("<bytes>", to_uint8(rgb), extension=".png"))
 
 
+def step_picture(folder: Path, step: int) -> Path:
+    """Where the picture of ``step`` belongs in ``folder``; names sort as steps do."""
+    return folder / f"step_{step:06d}.png"
+
+
+def step_pictures(folder: Path) -> list[tuple[int, Path]]:
+    """Step and path of every such picture in ``folder``, in order; none if there is no such folder."""
+    return sorted((int(path.stem.removeprefix("step_")), path) for path in folder.glob("step_*.png"))
+
+
 def colorize(values: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch h w 3"]:
     """Viridis colours of values in [0, 1]; outside values are clamped, NaN counts as 0."""
     table = torch.tensor(VIRIDIS, dtype=values.dtype, device=values.device) / 255

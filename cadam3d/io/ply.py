@@ -35,6 +35,7 @@ COLUMNS = {  # of each tensor that is stored as it is
 }
 NORMALS = ["nx", "ny", "nz"]  # unread by anybody, but readers with a fixed record size count on them
 SH0 = ["f_dc_0", "f_dc_1", "f_dc_2"]
+SIGNS = {"f_dc_0", "scale_0", "rot_0", "packed_position"}  # of Gaussians; points have none of them
 REST_SIZES = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_DEGREE + 1)]
 MAX_HEADER_BYTES = 1 << 16
 NUMPY_TYPES = {
@@ -111,6 +112,19 @@ def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
         sh=torch.from_numpy(np.ascontiguousarray(sh)),
     )
     return file_to_world(local, header.up or up)
+
+
+def holds_gaussians(path: Path) -> bool:
+    """Whether the properties of a PLY file are those of Gaussians, whole or not, rather than of mere points.
+
+    Raises ``UserError`` if ``path`` is no PLY file.
+    """
+    try:
+        with path.open("rb") as file:
+            words = [line for line in _header_lines(path, file) if line[0] == "property"]
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror or error}). Try: another file") from error
+    return not SIGNS.isdisjoint(line[-1] for line in words)
 
 
 def ply_bytes(num_gaussians: int, sh_degree: int) -> int:

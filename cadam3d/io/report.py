@@ -32,6 +32,7 @@ LABELS = {
     "negative_prompt": "Negative prompt",
     "outcome": "Outcome",
     "num_gaussians_initial": "Gaussians at the start",
+    "initializer_note": "Not from the initializer asked for",
     "num_gaussians": "Gaussians",
     "asset_bytes": "Bytes of asset.ply",
     "asset_mib": "MiB of asset.ply",
@@ -48,6 +49,7 @@ LABELS = {
     "steps": "Steps done",
     "steps_asked": "Steps asked for",
     "skipped_steps": "Steps skipped (gradient not finite)",
+    "dimmed_steps": "Steps that dimmed all colours",
     "seed": "Seed",
 }
 

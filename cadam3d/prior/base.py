@@ -1,6 +1,7 @@
 """DiffusionPrior: what knows images, behind one interface for networks and for exact models."""
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -25,6 +26,31 @@ class PromptEmbedding(ABC):
     @abstractmethod
     def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> Condition:
         """The condition of these views: view-dependent wording, and the backdrop behind the render."""
+
+
+@dataclass(frozen=True)
+class MemoryEstimate:
+    """What a prior will hold while it trains, in bytes, guessed before anything is loaded."""
+
+    weights: int  # of the networks that stay
+    working: int  # the most that one of them needs beside its weights
+    texts: int  # the most while prompts are embedded, before the rest is loaded; 0 if they are known
+
+    @property
+    def total(self) -> int:
+        """The peak, in bytes."""
+        return max(self.weights + self.working, self.texts)
+
+    def __str__(self) -> str:
+        return (
+            f"{amount(self.total)}: weights {amount(self.weights)}, working memory {amount(self.working)}, "
+            f"and {amount(self.texts)} before them for the encoders of text"
+        )
+
+
+def amount(count: int) -> str:
+    """Bytes in words: ``"5.2 GiB"``, ``"310 MiB"``."""
+    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"
 
 
 class DiffusionPrior(ABC):
@@ -62,6 +88,14 @@ class DiffusionPrior(ABC):
     def truth(self, prompt: str) -> TruthFn | None:
         """The true images of ``prompt``, for a prior that knows them; None for one that does not."""
         return None
+
+    def memory(self, prompt: str, negative: str, views: int, size: int | None) -> MemoryEstimate | None:
+        """What training on ``views`` renders of ``size`` pixels a side will hold; None if next to nothing."""
+        return None
+
+    def load(self) -> None:
+        """Load what training needs, so that a missing file shows before the first step; may take minutes."""
+        return
 
     def notice(self) -> str | None:
         """A sentence the user must read before training with this prior, if any."""

@@ -31,10 +31,14 @@ class AutoRasterizer(Rasterizer):
     """
 
     def render(
-        self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        background: Float[Tensor, "v 3"],
+        absgrad: bool = False,
     ) -> RenderOutput:
         """See :meth:`Rasterizer.render`."""
-        return choose(gaussians.device).rasterizer.render(gaussians, cameras, background)
+        return choose(gaussians.device).rasterizer.render(gaussians, cameras, background, absgrad)
 
     def prepare(self, device: torch.device) -> Backend:
         """See :meth:`Rasterizer.prepare`. Where the reference stands in, the reason is there."""

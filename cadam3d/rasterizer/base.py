@@ -34,7 +34,11 @@ class Rasterizer(ABC):
 
     @abstractmethod
     def render(
-        self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        background: Float[Tensor, "v 3"],
+        absgrad: bool = False,
     ) -> RenderOutput:
         """Render every view, differentiably in all five tensors of ``gaussians`` and in ``means2d``.
 
@@ -43,6 +47,9 @@ class Rasterizer(ABC):
         camera, ``FAR`` or farther in front of it, off screen, too faint or not finite, and those whose
         quaternion has a squared length below 1e-12 and so no direction, are culled: radius 0, no
         contribution, zero gradient, never a NaN.
+
+        With ``absgrad``, ``output.absgrad.grad`` is filled too: what each pixel adds to ``means2d.grad``, in
+        absolute value and summed, so that opposite pulls do not cancel. It changes nothing else.
         """
 
     def prepare(self, device: torch.device) -> Backend:
@@ -51,3 +58,8 @@ class Rasterizer(ABC):
         Raises :class:`UserError` if it cannot be had. Without this call, the first render does it.
         """
         return Backend(type(self).__name__.removesuffix("Rasterizer").lower())
+
+
+def absgrad_probe(means2d: Float[Tensor, "v n 2"], wanted: bool) -> Float[Tensor, "v n 2"] | None:
+    """What a backend hands out as ``absgrad``; ``None`` where it is not wanted, or gradients are off."""
+    return torch.zeros_like(means2d, requires_grad=True) if wanted and torch.is_grad_enabled() else None

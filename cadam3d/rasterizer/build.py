@@ -63,12 +63,6 @@ class Build:
     seconds: float  # spent compiling; 0 if it came from the cache
 
 
-def default_cache_dir() -> Path:
-    """``cadam3d`` in the user's cache folder (``$XDG_CACHE_HOME``, else ``~/.cache``)."""
-    root = os.environ.get("XDG_CACHE_HOME")
-    return (Path(root) if root else Path("~/.cache").expanduser()) / "cadam3d"
-
-
 def find_compiler() -> Compiler | None:
     """The first that answers of ``$CXX``, ``c++``, ``g++``, ``clang++`` and Python's ``ziglang``."""
     commands = [tuple(os.environ.get("CXX", "").split()), ("c++",), ("g++",), ("clang++",)]

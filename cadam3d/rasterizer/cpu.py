@@ -14,8 +14,9 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
+from cadam3d.io.cache import default_cache_dir
 from cadam3d.rasterizer.base import Backend, Rasterizer
-from cadam3d.rasterizer.build import build, default_cache_dir, load
+from cadam3d.rasterizer.build import build, load
 from cadam3d.rasterizer.native import Frame, render_frame, require_shapes
 
 
@@ -29,11 +30,15 @@ class CpuRasterizer(Rasterizer):
     cache_dir: str | None  # where compiled kernels are kept; None: the user's cache folder
 
     def render(
-        self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        background: Float[Tensor, "v 3"],
+        absgrad: bool = False,
     ) -> RenderOutput:
         """See :meth:`Rasterizer.render`. Raises :class:`UserError` off the CPU or without a compiler."""
         self.prepare(gaussians.device)
-        return rasterize(load_kernels(self.cache_dir), gaussians, cameras, background)
+        return rasterize(load_kernels(self.cache_dir), gaussians, cameras, background, absgrad)
 
     def prepare(self, device: torch.device) -> Backend:
         """See :meth:`Rasterizer.prepare`."""
@@ -56,11 +61,15 @@ def instruction_set(kernels: ctypes.CDLL) -> str:
 
 
 def rasterize(
-    kernels: ctypes.CDLL, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
+    kernels: ctypes.CDLL,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    background: Float[Tensor, "v 3"],
+    absgrad: bool = False,
 ) -> RenderOutput:
     """Render with the kernels at hand; see :meth:`Rasterizer.render`."""
     require_shapes(gaussians, cameras, background)
-    return render_frame(_Frame(kernels, cameras), gaussians, background)
+    return render_frame(_Frame(kernels, cameras, absgrad), gaussians, background)
 
 
 class _Scene(ctypes.Structure):
@@ -79,8 +88,8 @@ class _Scene(ctypes.Structure):
 class _Frame(Frame):
     """See :class:`Frame`."""
 
-    def __init__(self, kernels: ctypes.CDLL, cameras: Cameras) -> None:
-        super().__init__(cameras, torch.device("cpu"))
+    def __init__(self, kernels: ctypes.CDLL, cameras: Cameras, absgrad: bool) -> None:
+        super().__init__(cameras, torch.device("cpu"), absgrad)
         self.kernels, self.handle = kernels, ctypes.c_void_p()
 
     def project(self, parameters: list[Tensor]) -> tuple[Tensor, Tensor]:
@@ -104,9 +113,10 @@ class _Frame(Frame):
 
     def blend_backward(
         self, parameters: list[Tensor], background: Tensor, images: list[Tensor | None]
-    ) -> list[Tensor]:
+    ) -> list[Tensor | None]:
         """See :meth:`Frame.blend_backward`."""
-        grads = [torch.zeros(self.views, parameters[0].shape[0], 2)]
+        on_screen = (self.views, parameters[0].shape[0], 2)
+        grads = [torch.zeros(on_screen), torch.zeros(on_screen) if self.absgrad else None]
         grads += [torch.zeros_like(tensor) for tensor in parameters]
         scene = self.scene(parameters, background)
         self.call("cadam3d_blend_backward", ctypes.byref(scene), self.handle, *images, *grads)

@@ -32,14 +32,14 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
+from cadam3d.io.cache import default_cache_dir
 from cadam3d.rasterizer.base import Backend, Rasterizer
-from cadam3d.rasterizer.build import default_cache_dir
 from cadam3d.rasterizer.native import Frame, render_frame, require_shapes
 
 # Mirrors of kernels/*.cuh
 BLOCK, PROJECT_BLOCK, BLEND_BLOCK, WARP = 256, 128, 128, 32  # threads
 TILE = 8  # pixels along the edge of a tile
-SPLAT, RECORD, CAMERA = 12, 10, 25  # floats
+SPLAT, RECORD, ABSOLUTES, CAMERA = 12, 10, 2, 25  # floats
 SCAN_CHUNK, SORT_CHUNK, RADIX_BITS = 2048, 4096, 8
 
 DEPTH_BITS = 32
@@ -70,11 +70,15 @@ class CudaRasterizer(Rasterizer):
     cache_dir: str | None  # where compiled kernels are kept; None: the user's cache folder
 
     def render(
-        self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        background: Float[Tensor, "v 3"],
+        absgrad: bool = False,
     ) -> RenderOutput:
         """See :meth:`Rasterizer.render`. Raises :class:`UserError` off CUDA, or if nothing can compile."""
         _refuse_others(gaussians.device)
-        return rasterize(load_kernels(self.cache_dir), gaussians, cameras, background)
+        return rasterize(load_kernels(self.cache_dir), gaussians, cameras, background, absgrad)
 
     def prepare(self, device: torch.device) -> Backend:
         """See :meth:`Rasterizer.prepare`."""
@@ -99,7 +103,11 @@ def load_kernels(cache_dir: str | None) -> Launcher:
 
 
 def rasterize(
-    launcher: Launcher, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
+    launcher: Launcher,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    background: Float[Tensor, "v 3"],
+    absgrad: bool = False,
 ) -> RenderOutput:
     """Render with the kernels at hand; see :meth:`Rasterizer.render`."""
     require_shapes(gaussians, cameras, background)
@@ -107,7 +115,7 @@ def rasterize(
         raise UserError(
             f"rasterizer=cuda: more than {MOST} Gaussians or pixels in a view are too many. Try: fewer"
         )
-    return render_frame(_Frame(launcher, cameras, gaussians.device), gaussians, background)
+    return render_frame(_Frame(launcher, cameras, gaussians.device, absgrad), gaussians, background)
 
 
 class _Frame(Frame):
@@ -122,8 +130,10 @@ class _Frame(Frame):
     transmittance: Tensor  # [v h w]; after the last splat
     last: Tensor  # [v h w]; 1 + rank of the last splat that reached the pixel
 
-    def __init__(self, launcher: Launcher, cameras: Cameras, device: torch.device) -> None:
-        super().__init__(cameras, device)
+    def __init__(
+        self, launcher: Launcher, cameras: Cameras, device: torch.device, absgrad: bool = False
+    ) -> None:
+        super().__init__(cameras, device, absgrad)
         self.launcher = launcher
 
     @property
@@ -178,7 +188,8 @@ class _Frame(Frame):
             raise UserError(
                 f"rasterizer=cuda: {largest} (splat, tile) pairs in a view are too many. Try: fewer pixels"
             )
-        most_slots = min(RECORD_MEMORY // (4 * RECORD), MOST)
+        record = RECORD + ABSOLUTES * self.absgrad
+        most_slots = min(RECORD_MEMORY // (4 * record), MOST)
         most_views = MOST // max(self.slot_count.shape[1], self.tiles)
         return _split_views(slots, most_slots, most_views)
 
@@ -204,11 +215,14 @@ class _Frame(Frame):
 
     def blend_backward(
         self, parameters: list[Tensor], background: Tensor, images: list[Tensor | None]
-    ) -> list[Tensor]:
+    ) -> list[Tensor | None]:
         """See :meth:`Frame.blend_backward`."""
         means, *_, sh = parameters
         v, n = self.views, means.shape[0]
-        records = means.new_empty(max((group.slots.shape[0] for group in self.groups), default=0), RECORD)
+        slots = max((group.slots.shape[0] for group in self.groups), default=0)
+        records = means.new_empty(slots, RECORD)
+        absolutes = means.new_empty(slots, ABSOLUTES) if self.absgrad else None
+        absgrad = means.new_empty(v, n, 2) if self.absgrad else None
         grad_axes = means.new_empty(n, 9) if len(self.groups) > 1 else None
         grads = [means.new_empty(v, n, 2), *(torch.empty_like(tensor) for tensor in parameters)]
         alpha, depth, *grad_images = images
@@ -217,12 +231,19 @@ class _Frame(Frame):
             for group in self.groups:
                 threads = (group.tiles + 1) * WARP  # one warp more for slots without a tile
                 blend = (*self._blend_inputs(group, background), *_of(group.views, seen), records)
-                _launch_each(launch, "blend_backward", threads, BLEND_BLOCK, *blend)
+                if absolutes is None:
+                    _launch_each(launch, "blend_backward", threads, BLEND_BLOCK, *blend)
+                else:
+                    _launch_each(launch, "blend_backward_absolute", threads, BLEND_BLOCK, *blend, absolutes)
+                    pairs = (group.views.stop - group.views.start) * n
+                    which = _of(group.views, (self.splats, self.first_slot, self.slot_count, absgrad))
+                    _launch_each(launch, "sum_absolutes", pairs, BLOCK, pairs, absolutes, *which)
                 span = (v, group.views.start, group.views.stop)
                 sums = (self.first_slot, self.slot_count, records, grad_axes)
                 inputs = (*parameters, self.cameras, n, *span, *sums)
                 _launch_each(launch, f"project_backward_{sh.shape[1]}", n, PROJECT_BLOCK, *inputs, *grads)
-        return grads
+        grad_means2d, *others = grads
+        return [grad_means2d, absgrad, *others]
 
     def centre_backward(self, parameters: list[Tensor], radii: Tensor, grad_means2d: Tensor) -> Tensor:
         """See :meth:`Frame.centre_backward`."""

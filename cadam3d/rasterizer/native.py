@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
+from cadam3d.rasterizer.base import absgrad_probe
 
 SH_SIZES = (1, 4, 9, 16)  # coefficients of degree 0 to 3
 
@@ -25,8 +26,9 @@ class Frame(ABC):
     :meth:`Gaussians.tensors`, in that order.
     """
 
-    def __init__(self, cameras: Cameras, device: torch.device) -> None:
+    def __init__(self, cameras: Cameras, device: torch.device, absgrad: bool = False) -> None:
         self.height, self.width, self.device = cameras.height, cameras.width, device
+        self.absgrad = absgrad  # whether the backward brings that, too
         self.matrices = plain(cameras.world_to_camera.detach(), device)
         self.intrinsics = plain(cameras.intrinsics.detach(), device)
 
@@ -48,10 +50,11 @@ class Frame(ABC):
     @abstractmethod
     def blend_backward(
         self, parameters: list[Tensor], background: Tensor, images: list[Tensor | None]
-    ) -> list[Tensor]:
-        """Gradients of means2d and the parameters, but for the path through means2d.
+    ) -> list[Tensor | None]:
+        """Gradients of means2d, absgrad (``None`` unless wanted) and the parameters.
 
-        ``images``: alpha, depth, and the gradients of rgb, alpha and depth, each of which may be ``None``.
+        Those of the parameters lack the path through means2d. ``images``: alpha, depth, and the gradients of
+        rgb, alpha and depth, each of which may be ``None``.
         """
 
     @abstractmethod
@@ -69,10 +72,13 @@ def render_frame(frame: Frame, gaussians: Gaussians, background: Float[Tensor, "
         keeps = torch.is_grad_enabled()
         if keeps:
             means2d.requires_grad_().retain_grad()
+        probe = absgrad_probe(means2d, frame.absgrad)
         tensors = (means, *others, plain(background, device))
-        images = _Blend.apply(frame, keeps, plain(means2d, device), *tensors)
+        probed = None if probe is None else plain(probe, device)
+        images = _Blend.apply(frame, keeps, plain(means2d, device), probed, *tensors)
         rgb, alpha, depth = (image.to(dtype) for image in images)
-    return RenderOutput(rgb=rgb, alpha=alpha, depth=depth, means2d=means2d, radii=radii.to(dtype))
+    radii = radii.to(dtype)
+    return RenderOutput(rgb=rgb, alpha=alpha, depth=depth, means2d=means2d, radii=radii, absgrad=probe)
 
 
 class _Project(torch.autograd.Function):
@@ -95,10 +101,12 @@ class _Project(torch.autograd.Function):
 
 
 class _Blend(torch.autograd.Function):
-    """``means2d``, the raw parameters and the backgrounds to images."""
+    """``means2d``, the probe for ``absgrad``, the raw parameters and the backgrounds to images."""
 
     @staticmethod
-    def forward(ctx, frame: Frame, keeps: bool, means2d: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx, frame: Frame, keeps: bool, means2d: Tensor, probe: Tensor | None, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
         *parameters, background = tensors
         rgb, alpha, depth = frame.blend(parameters, background, keeps)
         ctx.frame = frame

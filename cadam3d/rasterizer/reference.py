@@ -37,6 +37,7 @@ from cadam3d.rasterizer.base import (
     NEAR,
     TRANSMITTANCE_MIN,
     Rasterizer,
+    absgrad_probe,
 )
 
 TILE = 8  # pixels along the edge of a tile
@@ -53,7 +54,11 @@ class ReferenceRasterizer(Rasterizer):
     """
 
     def render(
-        self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        background: Float[Tensor, "v 3"],
+        absgrad: bool = False,
     ) -> RenderOutput:
         """See :meth:`Rasterizer.render`."""
         assert background.shape == (len(cameras), 3), "one background colour per view"
@@ -64,7 +69,9 @@ class ReferenceRasterizer(Rasterizer):
             means2d = torch.stack([s.on_rows(s.projection.means2d) for s in splats])
             if torch.is_grad_enabled():
                 means2d.requires_grad_().retain_grad()
-            sums = [_composite(*each) for each in zip(means2d, splats, views, strict=True)]
+            probe = absgrad_probe(means2d, absgrad)
+            probes = [None] * len(views) if probe is None else list(probe)
+            sums = [_composite(*each) for each in zip(means2d, probes, splats, views, strict=True)]
             color, depth, alpha = torch.stack(sums).split([3, 1, 1], dim=-1)
             return RenderOutput(
                 rgb=color + (1 - alpha) * background.to(like)[:, None, None],
@@ -73,6 +80,7 @@ class ReferenceRasterizer(Rasterizer):
                 depth=(depth / alpha.clamp_min(ALPHA_MIN / 2))[..., 0],
                 means2d=means2d,
                 radii=torch.stack([s.on_rows(s.half_sizes.amax(dim=1)) for s in splats]),
+                absgrad=probe,
             )
 
 
@@ -188,14 +196,17 @@ def _project(gaussians: Gaussians, view: _View) -> _Projection:
     )
 
 
-def _composite(means2d: Float[Tensor, "n 2"], splats: _Splats, view: _View) -> Float[Tensor, "h w 5"]:
+def _composite(
+    means2d: Float[Tensor, "n 2"], probe: Float[Tensor, "n 2"] | None, splats: _Splats, view: _View
+) -> Float[Tensor, "h w 5"]:
     """Weighted sums over the splats of each pixel: of red, green, blue, camera z and 1."""
     tiles_x, tiles_y = -(-view.width // TILE), -(-view.height // TILE)
     means2d = means2d.index_select(0, splats.rows)
     blocks = list(_blocks(means2d.detach(), splats.half_sizes, tiles_x, tiles_y))
     columns = (splats.opacities[:, None], splats.colors, splats.projection.depths[:, None])
     table = torch.cat([means2d, splats.projection.whitening, *columns], dim=1)
-    sums = _Blend.apply(table, blocks, tiles_x, tiles_y)
+    probe = None if probe is None else probe.index_select(0, splats.rows)
+    sums = _Blend.apply(table, probe, blocks, tiles_x, tiles_y)
     image = sums.view(tiles_y, tiles_x, 5, TILE, TILE).permute(0, 3, 1, 4, 2)
     return image.reshape(tiles_y * TILE, tiles_x * TILE, 5)[: view.height, : view.width]
 
@@ -246,10 +257,15 @@ def _bin(
 
 
 class _Blend(torch.autograd.Function):
-    """From a table of splats (mean 2, whitening 3, opacity, features 4) to weighted sums at every pixel."""
+    """From a table of splats (mean 2, whitening 3, opacity, features 4) to weighted sums at every pixel.
+
+    ``probe`` adds nothing; where there is one, its gradient is that of the means with nothing cancelled.
+    """
 
     @staticmethod
-    def forward(ctx, table: Tensor, blocks: list[_Block], tiles_x: int, tiles_y: int) -> Tensor:
+    def forward(
+        ctx, table: Tensor, probe: Tensor | None, blocks: list[_Block], tiles_x: int, tiles_y: int
+    ) -> Tensor:
         ctx.save_for_backward(table)
         ctx.blocks, ctx.tiles_x = blocks, tiles_x
         sums = table.new_zeros(tiles_x * tiles_y, 5, TILE**2)
@@ -262,12 +278,16 @@ class _Blend(torch.autograd.Function):
     def backward(ctx, *grads: Tensor) -> tuple[Tensor | None, ...]:
         (table,) = ctx.saved_tensors
         rows, width = table.shape
+        wants_absolute = ctx.needs_input_grad[1]
+        width += 2 * wants_absolute
         total = table.new_zeros((rows + 1) * width)  # the last row belongs to nobody: see _Block.splats
         for block in ctx.blocks:
-            partial = _Shading(table, block, ctx.tiles_x).backward(grads[0][block.tiles])
+            partial = _Shading(table, block, ctx.tiles_x).backward(grads[0][block.tiles], wants_absolute)
             slots = block.splats[..., None] * width + torch.arange(width, device=table.device)
             total.index_add_(0, slots.flatten(), partial.flatten())  # one-dimensional: in order on a CPU
-        return total.view(rows + 1, width)[:-1], None, None, None
+        total = total.view(rows + 1, width)[:-1]
+        absolute = total[:, table.shape[1] :] if wants_absolute else None
+        return total[:, : table.shape[1]], absolute, None, None, None
 
 
 class _Shading:
@@ -302,8 +322,10 @@ class _Shading:
         weighted = [(self.weight * feature).sum(dim=1) for feature in self.features]
         return torch.stack([*weighted, self.weight.sum(dim=1)], dim=1)
 
-    def backward(self, grad: Float[Tensor, "b 5 p"]) -> Float[Tensor, "b l 10"]:
+    def backward(self, grad: Float[Tensor, "b 5 p"], wants_absolute: bool) -> Float[Tensor, "b l c"]:
         """Turn the gradient of the sums into that of the table, summed over the pixels of a tile.
+
+        With ``wants_absolute``, two columns follow: what pixels add to the first two, in absolute value.
 
         With ``value_i = grad . (feature_i, 1)`` the sums give
         ``dL/dalpha_i = T_i value_i - sum(w_j value_j for j > i) / (1 - alpha_i)``.
@@ -319,6 +341,10 @@ class _Shading:
         pull = grad_raw * self.alpha  # -dL/d(|W d|^2 / 2)
         pull_x, pull_y = pull * self.x, pull * self.y
         sum_x, sum_y = pull_x.sum(dim=-1), pull_y.sum(dim=-1)
+        absolute = ()
+        if wants_absolute:
+            along_x, along_y = pull_x * self.w_xx, (pull_x * self.w_xy).addcmul_(pull_y, self.w_yy)
+            absolute = (along_x.abs_().sum(dim=-1), along_y.abs_().sum(dim=-1))
         return torch.stack(
             [
                 sum_x * self.w_xx[..., 0],
@@ -328,6 +354,7 @@ class _Shading:
                 -(pull_y * self.dy).sum(dim=-1),
                 (grad_raw * self.falloff).sum(dim=-1),
                 *((self.weight * grad_feature).sum(dim=-1) for grad_feature in grad_features),
+                *absolute,
             ],
             dim=-1,
         )

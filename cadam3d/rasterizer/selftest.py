@@ -39,7 +39,7 @@ class Agreement:
     images: Mapping[
         str, float
     ]  # rgb, alpha, depth, means2d, radii: deviation, relative to the largest number
-    gradients: Mapping[str, float]  # of the five tensors and means2d, likewise
+    gradients: Mapping[str, float]  # of the five tensors and means2d, and absgrad, likewise
     repeats: bool  # whether a second run gave the same bits
 
     @property
@@ -75,22 +75,26 @@ class Scene:
 
 
 def self_test(rasterizer: Rasterizer, device: torch.device) -> Agreement:
-    """Render the scene twice on ``device``, and once with the reference on the CPU in float64.
+    """Render the scene three times on ``device``, and once with the reference on the CPU in float64.
 
     Takes about a tenth of a second, nearly all of it for the reference. Raises what the rasterizer raises.
     """
     scene = make_scene()
     images, gradients = _render(rasterizer, scene, device, torch.float32)
     again = _render(rasterizer, scene, device, torch.float32)
-    want_images, want_gradients = _render(ReferenceRasterizer(), scene, torch.device("cpu"), torch.float64)
+    truth = ReferenceRasterizer(), scene, torch.device("cpu"), torch.float64
+    want_images, want_gradients = _render(*truth, absgrad=True)
+    repeats = all(
+        torch.equal(first[name], second[name])
+        for first, second in zip((images, gradients), again, strict=True)
+        for name in first
+    )
+    # By kernels of its own, which nobody else calls.
+    gradients["absgrad"] = _render(rasterizer, scene, device, torch.float32, absgrad=True)[1]["absgrad"]
     return Agreement(
         images={name: _deviation(images[name], want) for name, want in want_images.items()},
         gradients={name: _deviation(gradients[name], want) for name, want in want_gradients.items()},
-        repeats=all(
-            torch.equal(first[name], second[name])
-            for first, second in zip((images, gradients), again, strict=True)
-            for name in first
-        ),
+        repeats=repeats,
     )
 
 
@@ -125,13 +129,13 @@ def make_scene() -> Scene:
 
 
 def _render(
-    rasterizer: Rasterizer, scene: Scene, device: torch.device, dtype: torch.dtype
+    rasterizer: Rasterizer, scene: Scene, device: torch.device, dtype: torch.dtype, absgrad: bool = False
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """What is seen, and the gradients of the weighted sum of the images and ``means2d``; on the CPU."""
     leaves = scene.gaussians.map(lambda tensor: tensor.to(device, dtype, copy=True).requires_grad_())
     background = scene.background.to(device, dtype)
     with torch.enable_grad():
-        output = rasterizer.render(leaves, scene.cameras.to(device), background)
+        output = rasterizer.render(leaves, scene.cameras.to(device), background, absgrad)
         loss = sum(
             (getattr(output, name) * weight.to(device, dtype)).sum() for name, weight in scene.weights.items()
         )
@@ -139,6 +143,8 @@ def _render(
         loss.backward()
     gradients = {name: tensor.grad for name, tensor in leaves.tensors().items()}
     gradients["means2d"] = output.means2d.grad
+    if absgrad:
+        gradients["absgrad"] = None if output.absgrad is None else output.absgrad.grad
     return _on_cpu(_seen(output)), _on_cpu(gradients)
 
 

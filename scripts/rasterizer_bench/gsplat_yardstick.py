@@ -31,11 +31,16 @@ class GsplatRasterizer(Rasterizer):
     """gsplat with the settings nearest to our image formation: classic, expected depth, unpacked."""
 
     def render(
-        self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        background: Float[Tensor, "v 3"],
+        absgrad: bool = False,
     ) -> RenderOutput:
         """See :meth:`Rasterizer.render`; activations are timed along, for ours are part of the kernels."""
         from gsplat import rasterization
 
+        assert not absgrad, "nobody times it"
         images, alphas, extra = rasterization(
             gaussians.means,
             gaussians.quats,

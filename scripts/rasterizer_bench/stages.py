@@ -32,7 +32,7 @@ STAGES = {  # in order, and how the names of their kernels begin; sorts and pref
     "tile sort": ("tile_ranges",),
     "blend forward": ("blend_forward",),
     "blend backward": ("blend_backward",),
-    "project backward": ("project_backward", "centre_backward"),
+    "project backward": ("project_backward", "sum_absolutes", "centre_backward"),
 }
 REST = "rest"  # what no launch of ours explains: allocation, autograd, the host, one wait for the device
 WORD = 4  # bytes of a float and of an index
@@ -46,10 +46,14 @@ class KernelRasterizer(Rasterizer):
     launcher: Launcher
 
     def render(
-        self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "v 3"]
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        background: Float[Tensor, "v 3"],
+        absgrad: bool = False,
     ) -> RenderOutput:
         """See :meth:`Rasterizer.render`."""
-        return rasterize(self.launcher, gaussians, cameras, background)
+        return rasterize(self.launcher, gaussians, cameras, background, absgrad)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import torch
 from cadam3d.camera.orbit import Orbit
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import UserError
+from cadam3d.core.schedule import Steps
 
 RANGES = {
     "size": 40,
@@ -73,6 +74,39 @@ def test_the_elevation_law_sets_how_often_the_top_is_seen(law, power):
     assert above_30 == pytest.approx([2 / 3, 1 / 2][power], abs=0.01)  # by angle, or by area: 1 - sin 30
 
 
+def test_the_mixture_is_uniform_in_degrees_in_half_of_the_steps_and_threestudios_law_in_the_others():
+    steps = [sample(64, seed, elevation_law="mixture").elevation_deg for seed in range(300)]
+    is_wide = [bool(views.max() > 45) for views in steps]  # of 64 uniform views some are above 45
+    assert sum(is_wide) / 300 == pytest.approx(0.5, abs=0.1)
+    wide = torch.cat([views for views, yes in zip(steps, is_wide, strict=True) if yes])
+    other = torch.cat([views for views, yes in zip(steps, is_wide, strict=True) if not yes])
+    assert (float(wide.min()), float(wide.max())) == pytest.approx((-10, 60), abs=0.1)
+    assert float(wide.mean()) == pytest.approx(25, abs=1)
+    assert (float(other.min()), float(other.max())) == pytest.approx((-6.38, 41.81), abs=0.1)  # asin(e / 90)
+    assert float(torch.deg2rad(other).sin().mean()) == pytest.approx(25 / 90, abs=0.01)
+
+
+def test_the_mixture_draws_the_same_amount_whatever_the_toss():
+    states = {}
+    for seed in range(10):
+        generator = torch.Generator().manual_seed(seed)
+        orbit(elevation_law="mixture").sample(0, 3, generator)
+        after = torch.rand(1, generator=generator)
+        generator.manual_seed(seed)
+        torch.rand(3 + 1 + 3 + 3 + 3, generator=generator)  # azimuth, toss, elevation, distance, lens
+        states[seed] = torch.equal(after, torch.rand(1, generator=generator))
+    assert all(states.values())
+
+
+def test_the_size_may_follow_the_step():
+    growing = Steps(values=[128, 256, 512], milestones=[150, 300])
+    sizes = {step: sample(1, step=step, size=growing) for step in (0, 149, 150, 299, 300, 499)}
+    assert [cameras.height for cameras in sizes.values()] == [128, 128, 256, 256, 512, 512]
+    assert all(cameras.width == cameras.height for cameras in sizes.values())
+    lenses = torch.stack([fov_y_deg(cameras) for cameras in sizes.values()])
+    torch.testing.assert_close(lenses, lenses[:1].expand_as(lenses), atol=1e-3, rtol=0)
+
+
 def test_a_range_may_be_one_point():
     cameras = sample(3, elevation_deg=[20.0, 20.0], distance=[3.0, 3.0], fov_y_deg=[45.0, 45.0])
     torch.testing.assert_close(cameras.elevation_deg, torch.full((3,), 20.0))
@@ -88,6 +122,7 @@ def test_the_generator_decides_and_the_step_does_not():
     ("key", "value"),
     [
         ("size", 0),
+        ("size", Steps(values=[0, 128], milestones=[10])),
         ("azimuth_deg", [90.0, -90.0]),
         ("azimuth_deg", [0.0]),
         ("elevation_deg", [-100.0, 0.0]),

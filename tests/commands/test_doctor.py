@@ -11,6 +11,8 @@ import pytest
 from cadam3d import cli
 from cadam3d.commands import doctor
 from cadam3d.commands.finding import Finding, Verdict
+from cadam3d.prior.latent import PRIORS
+from cadam3d.settings import compose
 
 REPOSITORY = Path(__file__).parent.parent.parent
 
@@ -104,6 +106,34 @@ def test_models_on_disk_are_listed_by_name(monkeypatch, tmp_path):
     (tmp_path / "models--someone--some-model").mkdir()
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
     assert doctor._models().found == "someone/some-model"
+
+
+def test_models_on_disk_say_what_reads_them(monkeypatch, tmp_path):
+    """From the index in the cache; one that is damaged or of another kind stays a name."""
+    for name, index in {
+        "one--sdxl": '{"_class_name": "StableDiffusionXLPipeline"}',
+        "two--shap": '{"_class_name": "ShapEPipeline"}',
+        "three--other": '{"_class_name": "KandinskyPipeline"}',
+        "four--cut": '{"_class_na',
+        "five--strange": "[1]",
+    }.items():
+        snapshot = tmp_path / f"models--{name}" / "snapshots" / "0123abcd"
+        snapshot.mkdir(parents=True)
+        (snapshot / "model_index.json").write_text(index)
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    listed = doctor._models().found.split(", ")
+    assert listed == [
+        "five/strange",
+        "four/cut",
+        "one/sdxl (prior=sdxl)",
+        "three/other",
+        "two/shap (initializer=shap_e)",
+    ]
+
+
+def test_what_a_model_is_for_can_be_typed():
+    for line in PRIORS.values():
+        assert compose(["prompt=x", line]).prior._target_.startswith("cadam3d.prior.")
 
 
 def test_a_program_that_does_not_answer_is_not_waited_for(monkeypatch):

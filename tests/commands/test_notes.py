@@ -101,3 +101,30 @@ def test_a_rasterizer_that_cannot_be_had_is_refused_before_anything_is_touched(
     assert (code, err) == (1, f"cadam3d: {NEEDED}\n")
     assert (tmp_path / "outputs/latest").resolve() == latest
     assert sorted(tmp_path.rglob("*")) == before
+
+
+SHAP_E = ["rasterizer=reference", "initializer=shap_e", "initializer.path=nowhere"]
+
+
+def test_an_initializer_that_cannot_be_had_is_refused_before_anything_is_touched(type_line, tmp_path):
+    code, err = type_line("train", *SMALL, *SHAP_E)
+    assert code == 1
+    assert err.startswith("cadam3d: initializer.path: wanted a folder with a model_index.json")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_stands_in_for_an_initializer_is_said_and_written_down(type_line, tmp_path):
+    stand_in = ["initializer/fallback=ball", "initializer.fallback.count=9"]
+    code, err = type_line("train", *SMALL, *SHAP_E, *stand_in, "hydra.run.dir=fallen")
+    assert code == 0
+    [line] = [line for line in err.splitlines() if "Shap-E" in line]
+    assert line.startswith("Note: Ball stands in for Shap-E. initializer.path: wanted a folder")
+    summary = json.loads((tmp_path / "fallen/summary.json").read_text(encoding="utf-8"))
+    assert summary["initializer"] == "shap_e"
+    assert f"Note: {summary['initializer_note']}" == line
+    assert "Ball stands in for Shap-E" in (tmp_path / "fallen/report.html").read_text(encoding="utf-8")
+
+    assert type_line("train", *SMALL, "rasterizer=reference", "hydra.run.dir=asked")[0] == 0
+    fallen, asked = ((tmp_path / run / "asset.ply").read_bytes() for run in ("fallen", "asked"))
+    assert fallen == asked
+    assert "initializer_note" not in (tmp_path / "asked/summary.json").read_text(encoding="utf-8")

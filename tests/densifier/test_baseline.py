@@ -8,11 +8,13 @@ import torch
 from cadam3d.core.checks import UserError
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.schedule import Linear, as_schedule
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.baseline import VIEWS, Baseline
 
 CPU = torch.device("cpu")
 STEP = 100  # of a call; no matter, unless a schedule asks
+LOTS = torch.Generator()  # nobody here draws any
 
 
 def baseline(**changes) -> Baseline:
@@ -55,7 +57,7 @@ def test_noise_that_cancels_still_counts_in_full():
     state = baseline().init_state(1, CPU)
     for one in there_and_back:
         state = baseline().observe(state, one)
-    assert baseline().select(state, STEP).all()  # the dilemma of paper sec. 4.1
+    assert baseline().select(state, STEP, LOTS).all()  # the dilemma of paper sec. 4.1
 
 
 def test_steps_that_do_not_see_a_gaussian_do_not_dilute_its_mean():
@@ -68,7 +70,7 @@ def test_steps_that_do_not_see_a_gaussian_do_not_dilute_its_mean():
 def test_a_gaussian_never_seen_is_never_selected():
     hidden = signal(torch.ones(1, 2, 2), torch.tensor([[True, False]]))
     state = baseline().observe(baseline().init_state(2, CPU), hidden)
-    assert baseline().select(state, STEP).tolist() == [True, False]
+    assert baseline().select(state, STEP, LOTS).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("views", VIEWS)
@@ -121,7 +123,18 @@ def test_reaching_the_threshold_is_enough():
     norms = torch.tensor([[[0.5, 0.0], [0.25, 0.0], [0.1875, 0.0]]])
     densifier = baseline(tau_pos=0.25)
     state = densifier.observe(densifier.init_state(3, CPU), signal(norms))
-    assert densifier.select(state, STEP).tolist() == [True, True, False]
+    assert densifier.select(state, STEP, LOTS).tolist() == [True, True, False]
+
+
+def test_a_schedule_of_the_threshold_is_followed():
+    norms = torch.tensor([[[0.5, 0.0], [0.25, 0.0], [0.125, 0.0]]])
+    densifier = baseline(tau_pos=Linear(start=0.125, end=0.5, begin=100, steps=150))
+    state = densifier.observe(densifier.init_state(3, CPU), signal(norms))
+    for step, selected in ((1, 3), (100, 3), (150, 2), (250, 1), (10_000, 1)):
+        assert int(densifier.select(state, step, LOTS).sum()) == selected
+        told = densifier.statistics(state, step)
+        assert told["share_above_tau_pos"] == pytest.approx(selected / 3)
+        assert told["tau_pos"] == as_schedule(densifier.tau_pos)(step)
 
 
 def test_the_multiplier_undoes_a_loss_scale():
@@ -211,7 +224,7 @@ def test_the_score_is_what_the_threshold_is_compared_with():
     state = baseline().observe(baseline().init_state(50, CPU), signal(gradients(2, 50)))
     norms = baseline().scores(state)["mean_norm"]
     median = float(norms.median())
-    assert torch.equal(baseline(tau_pos=median).select(state, STEP), norms >= median)
+    assert torch.equal(baseline(tau_pos=median).select(state, STEP, LOTS), norms >= median)
 
 
 def test_everybody_is_reset():
@@ -233,12 +246,19 @@ def test_statistics_say_what_the_densifier_saw():
 
 def test_an_empty_scene_is_no_problem():
     state = baseline().observe(baseline().init_state(0, CPU), signal(torch.zeros(2, 0, 2)))
-    assert baseline().select(state, STEP).shape == (0,)
+    assert baseline().select(state, STEP, LOTS).shape == (0,)
     assert baseline().statistics(state, STEP) == {}
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("tau_pos", 0.0), ("views", "first"), ("grad_multiplier", 0.0), ("screen_px", 0.0)]
+    ("key", "value"),
+    [
+        ("tau_pos", 0.0),
+        ("tau_pos", Linear(start=1e-4, end=0.0, steps=9)),
+        ("views", "first"),
+        ("grad_multiplier", 0.0),
+        ("screen_px", 0.0),
+    ],
 )
 def test_an_impossible_value_is_refused_by_name(key, value):
     with pytest.raises(UserError, match=rf"densifier\.{key}"):

@@ -128,18 +128,48 @@ class Asynchronous(TorchDispatchMode):
         "cadam densifier.nonfinite=skip_row",
         "cadam_strict",
         "cadam_calibrated",
+        "random",
+        "mcmc",
+        "absgrad",
     ],
 )
 def test_observing_never_waits_for_the_device(choice):
     densifier = component(compose(["prompt=a red cube", *f"densifier={choice}".split()]).densifier)
     evidence = GradientSignal(
-        means=torch.ones(5, 3), means2d=torch.ones(2, 5, 2), radii=torch.ones(2, 5), height=8, width=8
+        means=torch.ones(5, 3),
+        means2d=torch.ones(2, 5, 2),
+        radii=torch.ones(2, 5),
+        height=8,
+        width=8,
+        absgrad=torch.ones(2, 5, 2),
     )
     state = densifier.init_state(5, CPU)
     with Asynchronous():
         densifier.observe(state, evidence)
     with pytest.raises(AssertionError, match="waits"), Asynchronous():
         bool(evidence.means.sum())
+
+
+@pytest.mark.parametrize(("choice", "wants"), [("absgrad", True), ("baseline", False), ("cadam", False)])
+def test_absolute_gradients_are_summed_for_who_needs_them_and_for_nobody_else(
+    choice, wants, tmp_path, monkeypatch
+):
+    seen: list[GradientSignal] = []
+    densifier = type(component(compose([*SMALL, f"densifier={choice}"]).densifier))
+    observe = densifier.observe
+    monkeypatch.setattr(
+        densifier,
+        "observe",
+        lambda self, state, signal: (seen.append(signal), observe(self, state, signal))[1],
+    )
+    run([f"densifier={choice}", "steps=2"], tmp_path)
+    assert len(seen) == 2
+    for signal in seen:
+        assert (signal.absgrad is not None) == wants
+        if wants:
+            slack = 1e-5 * float(signal.absgrad.max())
+            assert (signal.absgrad >= signal.means2d.abs() - slack).all()
+            assert (signal.absgrad > 1.01 * signal.means2d.abs() + slack).any()
 
 
 # The report, for pictures.
@@ -190,6 +220,20 @@ def test_the_reset_is_for_whom_the_densifier_says(choice, everybody, tmp_path):
     at_reset = witness.reports[1]
     assert at_reset.step == 4
     assert at_reset.reset == (at_reset.after if everybody else 0)
+
+
+def test_the_means_tremble_after_the_step_of_the_optimizer_and_nothing_else_does(tmp_path):
+    still, _, _ = run(["densifier=mcmc", "densifier.noise_lr=0", "steps=1"], tmp_path)
+    moved, _, _ = run(["densifier=mcmc", "densifier.noise_lr=1e5", "steps=1"], tmp_path)
+    cfg = compose([*SMALL, "densifier=mcmc", "densifier.noise_lr=1e5"])
+    trainer = build_trainer(cfg, CPU)
+    draws = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU).generators["densifier"]
+    lr = trainer.optimizer.learning_rates(0)["means"]
+    wanted = trainer.densifier.perturb(still.gaussians.detach(), lr, draws)
+    torch.testing.assert_close(moved.gaussians.means - still.gaussians.means, wanted, rtol=1e-3, atol=1e-6)
+    assert wanted.abs().max() > 1e-3
+    for name in set(FIELDS) - {"means"}:
+        assert torch.equal(getattr(moved.gaussians, name), getattr(still.gaussians, name))
 
 
 @pytest.mark.parametrize("clears", ["false", "true"])

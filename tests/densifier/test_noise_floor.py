@@ -18,6 +18,7 @@ from cadam3d.settings import component, compose
 
 CPU = torch.device("cpu")
 STEP = 100  # of a call; no matter, unless a schedule asks
+LOTS = torch.Generator()  # nobody here draws any
 N = 4000
 ALPHA = 0.05
 ERROR = 0.015  # above four standard errors of a share near ALPHA of N
@@ -215,7 +216,7 @@ def test_select_uses_the_threshold_of_each_age():
     threshold = snr_threshold(ALPHA, 0.9, 0.81, state.age)
     assert len(threshold.unique()) == 2
     expected = (drift > threshold * noise) & (drift > drift.quantile(0.9))
-    assert torch.equal(densifier.select(state, STEP), expected)
+    assert torch.equal(densifier.select(state, STEP, LOTS), expected)
     assert densifier.statistics(state, STEP)["share_above_tau_SNR"] == pytest.approx(
         float((drift > threshold * noise).float().mean())
     )

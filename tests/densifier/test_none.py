@@ -9,6 +9,7 @@ from cadam3d.densifier.none import NoGrowth
 
 CPU = torch.device("cpu")
 STEP = 100  # of a call; no matter, unless a schedule asks
+LOTS = torch.Generator()  # nobody here draws any
 
 
 def children(n: int) -> Gaussians:
@@ -30,14 +31,14 @@ def test_nobody_grows_and_nobody_is_reset_whatever_the_gradients():
         width=8,
     )
     state = NoGrowth().observe(NoGrowth().init_state(4, CPU), loud)
-    assert NoGrowth().select(state, STEP).tolist() == [False] * 4
+    assert NoGrowth().select(state, STEP, LOTS).tolist() == [False] * 4
     assert NoGrowth().unreliable(state).tolist() == [False] * 4
 
 
 def test_the_masks_follow_the_count_when_pruning_removes_rows():
     edit = RowEdit(keep=torch.tensor([0, 2]), children=children(0), parents=torch.arange(0))
     state = NoGrowth().init_state(4, CPU).carry(edit)
-    assert NoGrowth().select(state, STEP).tolist() == [False] * 2
+    assert NoGrowth().select(state, STEP, LOTS).tolist() == [False] * 2
 
 
 def test_there_is_nothing_to_report():

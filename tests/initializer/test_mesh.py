@@ -19,6 +19,7 @@ def build(path, seed: int = 0, **changes) -> Gaussians:
     usual = {
         "path": str(path),
         "up": "z",
+        "turn_deg": 0,
         "radius": 0.9,
         "count": 2000,
         "scale": 0.02,
@@ -78,6 +79,23 @@ def test_a_file_with_y_up_stands_upright_and_faces_the_front(tmp_path):
     assert top[0] < 0  # where the file has z = 0, the back
 
 
+def test_a_turn_brings_one_side_to_the_front(tmp_path):
+    corners = np.array(
+        [[0, 0, 0], [0, -3.0, 0], [0, 0, 1]]
+    )  # long towards -y, the front of Blender's objects
+    path = save(trimesh.Trimesh(corners, [[0, 1, 2]], process=False), tmp_path / "mark.ply")
+    means = build(path, turn_deg=90).means
+    torch.testing.assert_close(means[:, 1], torch.zeros(2000), atol=1e-5, rtol=0)
+    assert means[means[:, 2].argmax(), 0] < means[:, 0].mean()  # the tip stands where the long side begins
+
+
+def test_without_a_radius_it_stays_as_it_is(tmp_path):
+    mesh = trimesh.creation.box(extents=(0.2, 0.2, 0.2)).apply_translation([0.1, 0.5, 0])
+    means = build(save(mesh, tmp_path / "box.ply"), radius=None).means
+    torch.testing.assert_close(means.amin(dim=0), torch.tensor([0.0, 0.4, -0.1]), atol=0.01, rtol=0)
+    torch.testing.assert_close(means.amax(dim=0), torch.tensor([0.2, 0.6, 0.1]), atol=0.01, rtol=0)
+
+
 def test_vertex_colors_are_interpolated(tmp_path):
     box = trimesh.creation.box(extents=(2, 2, 2))
     colors = np.full((8, 4), 255, dtype=np.uint8)
@@ -113,6 +131,73 @@ def test_textures_are_read_at_each_point(tmp_path):
     assert torch.equal(is_blue[inner], made.means[inner, 0] > 0)
     assert is_blue.any()
     assert not is_blue.all()
+
+
+QUAD = "v 0 0 0{0}\nv 1 0 0{0}\nv 1 1 0{0}\nv 0 1 0{0}\n"
+
+
+def test_an_obj_brings_its_colors_at_vertices_in_materials_and_in_textures(tmp_path):
+    Image.new("RGB", (4, 4), (0, 0, 255)).save(tmp_path / "blue.png")
+    (tmp_path / "all.mtl").write_text("newmtl plain\nKd 0 1 0\nnewmtl image\nKd 1 1 1\nmap_Kd blue.png\n")
+    files = {
+        "vertices": QUAD.format(" 1 0 0") + "f 1 2 3 4\n",
+        "material": "mtllib all.mtl\nusemtl plain\n" + QUAD.format("") + "f 1 2 3 4\n",
+        "texture": "mtllib all.mtl\nusemtl image\n" + QUAD.format("") + "vt 0.5 0.5\nf 1/1 2/1 3/1 4/1\n",
+    }
+    for (name, text), color in zip(files.items(), torch.eye(3), strict=True):
+        (tmp_path / f"{name}.obj").write_text(text)
+        made = rgb(build(tmp_path / f"{name}.obj", count=50))
+        torch.testing.assert_close(made, color.expand(50, 3), msg=name)
+
+
+def test_a_material_without_a_texture_colors_a_glb(tmp_path):
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[0, 255, 0, 255])
+    visual = trimesh.visual.TextureVisuals(material=material)
+    box = trimesh.creation.box()
+    mesh = trimesh.Trimesh(box.vertices, box.faces, visual=visual, process=False)
+    made = build(save(mesh, tmp_path / "green.glb"), count=50)
+    torch.testing.assert_close(rgb(made), torch.tensor([[0.0, 1.0, 0.0]]).expand(50, 3))
+
+
+def test_every_part_of_a_scene_keeps_its_own_kind_of_colors(tmp_path):
+    red, plain = trimesh.creation.box(), trimesh.creation.box()
+    red.visual.vertex_colors = [255, 0, 0, 255]
+    textured = []
+    for color in ((0, 0, 255), (0, 255, 0)):
+        box = trimesh.creation.box()
+        visual = trimesh.visual.TextureVisuals(uv=np.full((8, 2), 0.5), image=Image.new("RGB", (4, 4), color))
+        textured.append(trimesh.Trimesh(box.vertices, box.faces, visual=visual, process=False))
+    parts = [red, plain, *textured]
+    for place, part in enumerate(parts):
+        part.apply_translation([3 * place, 0, 0])
+    trimesh.Scene(parts).export(tmp_path / "mixed.glb")
+    made = build(tmp_path / "mixed.glb", color=[0.2, 0.4, 0.6], radius=None)
+    column = (made.means[:, 0] / 3).round().long()
+    wanted = torch.tensor([[1.0, 0, 0], [0.2, 0.4, 0.6], [0, 0, 1], [0, 1, 0]])
+    torch.testing.assert_close(rgb(made), wanted[column])
+    assert column.bincount().min() > 400
+
+
+def test_parts_stand_where_the_scene_puts_them(tmp_path):
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.box())
+    scene.add_geometry(
+        trimesh.creation.box(), transform=trimesh.transformations.translation_matrix([0, 0, 9])
+    )
+    scene.export(tmp_path / "tower.glb")
+    height = build(tmp_path / "tower.glb", radius=None).means[:, 2]
+    assert float(height.min()) == pytest.approx(-0.5, abs=0.01)
+    assert float(height.max()) == pytest.approx(9.5, abs=0.01)
+    assert float((height > 5).float().mean()) == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_body_of_seven_thousand_vertices_becomes_fifty_thousand_gaussians(tmp_path):
+    """GaussianDreamer's start from SMPL, with the scales from the neighbours."""
+    body = trimesh.creation.capsule(height=1.2, radius=0.3, count=[84, 84])
+    made = build(save(body, tmp_path / "body.obj"), up="z", count=50_000, scale=None)
+    assert len(made) == 50_000
+    spacing = (body.area / 50_000) ** 0.5  # it is 1.8 tall, so nothing is scaled
+    assert 0.4 * spacing < float(made.scales.mean()) < 1.2 * spacing
 
 
 def test_a_file_without_colors_gets_the_given_one(tmp_path):
@@ -163,7 +248,8 @@ def test_a_file_without_a_surface_is_said_so(tmp_path, kind):
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("up", "x"), ("radius", 2.0), ("count", 0), ("opacity", 0.0), ("color", [1.0])]
+    ("key", "value"),
+    [("up", "x"), ("turn_deg", 45), ("radius", 2.0), ("count", 0), ("opacity", 0.0), ("color", [1.0])],
 )
 def test_an_impossible_value_is_refused_by_name(tmp_path, key, value):
     with pytest.raises(UserError, match=rf"initializer\.{key}"):

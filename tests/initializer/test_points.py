@@ -3,12 +3,31 @@
 import pytest
 import torch
 
+from cadam3d.core.errors import UserError
 from cadam3d.core.sh import evaluate_sh
-from cadam3d.initializer.points import BLOCK, gaussians_at, neighbour_distance
+from cadam3d.initializer.points import (
+    PointCloud,
+    fit,
+    found_file,
+    gaussians_at,
+    neighbour_distance,
+    points_in_ball,
+    points_on_surface,
+    replicated,
+    rows_of,
+)
 
 
 def cloud(n: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def colored(n: int, seed: int = 0) -> PointCloud:
+    return PointCloud(cloud(n, seed), torch.rand(n, 3, generator=seeded(seed)))
 
 
 def by_hand(points: torch.Tensor) -> torch.Tensor:
@@ -16,27 +35,27 @@ def by_hand(points: torch.Tensor) -> torch.Tensor:
     return distances.sort(dim=1).values[:, 1:4].mean(dim=1)
 
 
-@pytest.mark.parametrize("n", [2, 3, 4, 5, BLOCK, BLOCK + 1, 3 * BLOCK + 7])
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 256, 1000])
 def test_neighbour_distances_are_those_of_an_exhaustive_search(n):
     torch.testing.assert_close(neighbour_distance(cloud(n)), by_hand(cloud(n)))
 
 
 def test_an_outlier_far_from_everybody_is_measured_right():
-    points = cloud(2 * BLOCK) * 0.01
+    points = cloud(512) * 0.01
     points[17] = torch.tensor([50.0, -3.0, 8.0])
     torch.testing.assert_close(neighbour_distance(points), by_hand(points))
 
 
 def test_points_on_a_line_and_on_a_grid_are_measured_right():
-    line = torch.zeros(2 * BLOCK, 3)
-    line[:, 1] = torch.arange(2 * BLOCK)
-    assert neighbour_distance(line)[5:-5].tolist() == pytest.approx([4 / 3] * (2 * BLOCK - 10))
+    line = torch.zeros(512, 3)
+    line[:, 1] = torch.arange(512)
+    assert neighbour_distance(line)[5:-5].tolist() == pytest.approx([4 / 3] * 502)
     grid = torch.cartesian_prod(*[torch.arange(9.0)] * 3)
     assert neighbour_distance(grid).tolist() == [1.0] * 729
 
 
 def test_coincident_points_keep_a_size():
-    assert (neighbour_distance(torch.zeros(2 * BLOCK, 3)) > 0).all()
+    assert (neighbour_distance(torch.zeros(512, 3)) > 0).all()
 
 
 def test_a_lonely_point_and_an_empty_cloud_are_no_problem():
@@ -46,16 +65,15 @@ def test_a_lonely_point_and_an_empty_cloud_are_no_problem():
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_gaussians_show_their_color_from_every_side(degree):
-    rgb = torch.rand(9, 3, generator=torch.Generator().manual_seed(0))
-    made = gaussians_at(cloud(9), rgb, scale=None, opacity=0.1, sh_degree=degree)
+    made = gaussians_at(colored(9), scale=None, opacity=0.1, sh_degree=degree)
     assert made.sh_degree == degree
     directions = torch.nn.functional.normalize(cloud(9, seed=1), dim=-1)
-    torch.testing.assert_close(evaluate_sh(made.sh, directions), rgb)
+    torch.testing.assert_close(evaluate_sh(made.sh, directions), colored(9).rgb)
 
 
 def test_gaussians_are_round_and_as_opaque_as_asked():
     points = cloud(9)
-    made = gaussians_at(points, torch.rand(9, 3), scale=None, opacity=0.1, sh_degree=0)
+    made = gaussians_at(colored(9), scale=None, opacity=0.1, sh_degree=0)
     assert torch.equal(made.means, points)
     torch.testing.assert_close(made.opacities, torch.full((9,), 0.1))
     torch.testing.assert_close(made.scales, neighbour_distance(points)[:, None].expand(9, 3))
@@ -63,5 +81,74 @@ def test_gaussians_are_round_and_as_opaque_as_asked():
 
 
 def test_a_given_scale_is_everybodys():
-    made = gaussians_at(cloud(9), torch.rand(9, 3), scale=0.03, opacity=0.1, sh_degree=0)
+    made = gaussians_at(colored(9), scale=0.03, opacity=0.1, sh_degree=0)
     torch.testing.assert_close(made.scales, torch.full((9, 3), 0.03))
+
+
+def test_every_point_is_replicated_at_the_same_offsets():
+    original = colored(50)
+    made = replicated(original, 20, 0.05, seeded())
+    assert len(made) == 1000
+    offsets = made.points.view(50, 20, 3) - original.points[:, None]
+    torch.testing.assert_close(offsets, offsets[:1].expand(50, 20, 3), atol=1e-6, rtol=0)
+    assert offsets.norm(dim=-1).min() > 0
+    assert offsets.norm(dim=-1).max() <= 0.05 + 1e-6
+    assert torch.equal(made.rgb.view(50, 20, 3), original.rgb[:, None].expand(50, 20, 3))
+
+
+def test_one_of_each_is_the_cloud_itself_and_draws_nothing():
+    generator = seeded()
+    before = generator.get_state()
+    original = colored(5)
+    assert replicated(original, 1, 0.05, generator) is original
+    assert torch.equal(generator.get_state(), before)
+
+
+def test_a_ball_is_full():
+    radii = points_in_ball(20_000, 0.5, seeded()).norm(dim=-1)
+    assert radii.max() <= 0.5 + 1e-6
+    assert float((radii < 0.25).float().mean()) == pytest.approx(1 / 8, abs=0.01)
+
+
+def test_rows_are_a_random_choice_in_order():
+    rows = rows_of(1000, 300, seeded())
+    assert len(rows) == 300
+    assert (rows.diff() > 0).all()
+    assert rows.float().mean() == pytest.approx(500, abs=50)
+    assert not torch.equal(rows, rows_of(1000, 300, seeded(1)))
+
+
+@pytest.mark.parametrize("count", [None, 10, 11])
+def test_no_cap_below_the_count_leaves_all_rows(count):
+    assert rows_of(10, count, seeded()).tolist() == list(range(10))
+
+
+def test_what_fits_is_centred_and_its_farthest_point_at_the_radius():
+    points = cloud(500) * torch.tensor([1.0, 2.0, 0.5]) + 7
+    center, factor = fit(points, 0.9)
+    placed = (points - center) * factor
+    assert float(placed.norm(dim=-1).max()) == pytest.approx(0.9)
+    torch.testing.assert_close(placed.amin(dim=0), -placed.amax(dim=0), atol=1e-5, rtol=0)
+
+
+def test_without_a_radius_everything_stays_as_it_is():
+    center, factor = fit(cloud(5), None)
+    assert torch.equal((cloud(5) - center) * factor, cloud(5))
+
+
+def test_a_single_point_fits_anywhere():
+    center, factor = fit(cloud(1), 0.5)
+    assert ((cloud(1) - center) * factor).tolist() == [[0, 0, 0]]
+
+
+def test_a_surface_is_covered_in_proportion_to_its_area():
+    small = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
+    faces, weights = points_on_surface(torch.cat([small, 3 * small]), 20_000, seeded())
+    assert float(faces.float().mean()) == pytest.approx(0.9, abs=0.01)
+    torch.testing.assert_close(weights.sum(dim=1), torch.ones(20_000))
+    torch.testing.assert_close(weights.mean(dim=0), torch.full((3,), 1 / 3), atol=0.01, rtol=0)
+
+
+def test_a_file_that_is_not_there_is_said_so(tmp_path):
+    with pytest.raises(UserError, match=r"^initializer\.path: no file .* Try: initializer\.path=a\.ply$"):
+        found_file(str(tmp_path / "nothing.ply"), "a.ply")

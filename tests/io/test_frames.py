@@ -6,7 +6,16 @@ import torch
 from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import sh_basis
-from cadam3d.io.frames import FRAMES, UPS, band_matrix, file_to_world, world_to_file
+from cadam3d.io.frames import (
+    FRAMES,
+    UPS,
+    band_matrix,
+    file_to_world,
+    points_to_world,
+    turned,
+    turned_points,
+    world_to_file,
+)
 
 
 def random_gaussians(n: int = 40, degree: int = 3, seed: int = 0, dtype=torch.float64) -> Gaussians:
@@ -99,3 +108,28 @@ def test_the_vector_rule_of_band_one_is_the_fitted_matrix():
 def test_an_unknown_frame_is_refused_with_the_choices():
     with pytest.raises(UserError, match=r"-y\|\+y\|\+z"):
         world_to_file(random_gaussians(), "up")
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_points_take_the_way_of_gaussians(up):
+    world = random_gaussians(dtype=torch.float32)
+    assert torch.equal(points_to_world(world_to_file(world, up).means, up), world.means)
+
+
+def test_a_quarter_turn_brings_the_front_to_the_left():
+    front = torch.tensor([[1.0, 0.0, 0.5]])
+    assert turned_points(front, 90).tolist() == [[0.0, 1.0, 0.5]]
+
+
+@pytest.mark.parametrize(("turn_deg", "back"), [(0, 0), (90, 270), (180, 180), (270, 90)])
+def test_turns_add_up_to_a_whole_one(turn_deg, back):
+    world = random_gaussians(degree=1, dtype=torch.float32)
+    made = turned(turned(world, turn_deg), back)
+    for name, tensor in world.tensors().items():
+        assert torch.equal(made.tensors()[name], tensor), name
+    assert torch.equal(turned_points(world.means, turn_deg), turned(world, turn_deg).means)
+
+
+def test_an_eighth_of_a_turn_is_refused():
+    with pytest.raises(UserError, match=r"turn_deg: wanted one of 0\|90\|180\|270, got 45"):
+        turned(random_gaussians(), 45)

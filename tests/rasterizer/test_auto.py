@@ -23,8 +23,8 @@ CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
 class Flat(ReferenceRasterizer):
     """Shows that it was chosen: everything is transparent."""
 
-    def render(self, gaussians, cameras, background):
-        return super().render(gaussians.index(slice(0, 0)), cameras, background)
+    def render(self, gaussians, cameras, background, absgrad=False):
+        return super().render(gaussians.index(slice(0, 0)), cameras, background, absgrad)
 
 
 @pytest.fixture(autouse=True)

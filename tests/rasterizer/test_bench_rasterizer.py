@@ -43,8 +43,8 @@ class Wrong(Rasterizer):
 
     mistake: Callable[[Gaussians], Gaussians]
 
-    def render(self, gaussians, cameras, background):
-        return ReferenceRasterizer().render(self.mistake(gaussians), cameras, background)
+    def render(self, gaussians, cameras, background, absgrad=False):
+        return ReferenceRasterizer().render(self.mistake(gaussians), cameras, background, absgrad)
 
 
 def changed(gaussians: Gaussians, **tensors: torch.Tensor) -> Gaussians:
@@ -223,7 +223,7 @@ def test_gsplat_is_asked_for_what_we_render(monkeypatch):
 
 @dataclass(frozen=True)
 class Greedy(Rasterizer):
-    def render(self, gaussians, cameras, background):
+    def render(self, gaussians, cameras, background, absgrad=False):
         raise torch.OutOfMemoryError
 
 

@@ -1,5 +1,7 @@
 """The native CPU rasterizer: threads and instruction sets; its laws are in test_backends.py."""
 
+from functools import partial
+
 import pytest
 import torch
 from splats import (
@@ -41,9 +43,9 @@ def test_narrower_vectors_and_groups_of_one_view_agree(kernel_build, tmp_path, f
     if flag.startswith("-march") and instruction_set(load(kernel_build)) != "avx512":
         pytest.skip("the machine's own vectors are not wider")
     kernels = load(build(tmp_path, machine_flags=((flag,),)))
-    assert_agrees(
-        lambda *scene: rasterize(kernels, *scene), make_gaussians(150, degree=1), make_cameras(3, 40, 50)
-    )
+    scene = make_gaussians(150, degree=1), make_cameras(3, 40, 50)
+    for absgrad in (False, True):
+        assert_agrees(partial(rasterize, kernels), *scene, absgrad=absgrad)
 
 
 def test_off_the_cpu_it_says_what_to_type(cpu):

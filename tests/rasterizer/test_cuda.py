@@ -1,14 +1,10 @@
 """The CUDA rasterizer: its very kernels, on fibers everywhere, and on a GPU where there is one."""
 
-import faulthandler
-import os
 import shutil
-from collections.abc import Callable
-from multiprocessing import get_context
 
 import pytest
 import torch
-from emulation import Emulator, compile_emulator
+from emulation import Emulator, compile_emulator, is_acquitted
 from splats import (
     assert_agrees,
     assert_same_bits,
@@ -181,6 +177,7 @@ def test_constants_mirror_those_of_the_kernels():
         f"WARP = {cuda.WARP};",
         f"TILE = {cuda.TILE};",
         f"RECORD = {cuda.RECORD};",
+        f"ABSOLUTES = {cuda.ABSOLUTES};",
         f"RADIX_BITS = {cuda.RADIX_BITS};",
         f"sizeof(Camera) == {cuda.CAMERA} * sizeof(float)",
     ):
@@ -243,28 +240,8 @@ MUTANTS = {
 }
 
 
-def is_acquitted(emulator: Emulator, judge: Callable[[Emulator], None] = judge) -> bool:
-    """In a process of its own: a mutant may write anywhere."""
-
-    def trial() -> None:
-        torch.set_num_threads(1)  # threads do not survive a fork
-        faulthandler.disable()  # to crash is one way to be found guilty
-        try:
-            judge(emulator)
-        except (AssertionError, UserError):
-            os._exit(1)
-        os._exit(0)
-
-    process = get_context("fork").Process(target=trial)
-    process.start()
-    process.join(60)
-    process.kill()  # no more than a mutant that never ends is left
-    process.join()
-    return process.exitcode == 0
-
-
 def test_the_judge_acquits_the_innocent(emulator):
-    assert is_acquitted(emulator)
+    assert is_acquitted(emulator, judge)
 
 
 @pytest.mark.parametrize("mutant", MUTANTS)
@@ -275,7 +252,7 @@ def test_a_mutant_is_caught(tmp_path, mutant):
     source = path.read_text()
     assert source.count(original) == 1
     path.write_text(source.replace(original, changed))
-    assert not is_acquitted(compile_emulator(tmp_path, tmp_path / "kernels", "-O0"))
+    assert not is_acquitted(compile_emulator(tmp_path, tmp_path / "kernels", "-O0"), judge)
 
 
 def judge_slots(emulator: Emulator) -> None:

@@ -19,6 +19,7 @@ ARCHITECTURES = (75, 80, 86, 87, 88, 89, 90, 100, 101, 103, 107, 110, 120, 121)
 # of an SM is in use at 64; the backward of degree 3, 48 coefficients at hand, less than a fifth.
 REGISTERS = {
     "blend_backward": 64,
+    "blend_backward_absolute": 71,
     "blend_forward": 64,
     "centre_backward": 42,
     "prepare_cameras": 48,
@@ -35,6 +36,7 @@ REGISTERS = {
     "scan_short": 51,
     "sort_count": 36,
     "sort_scatter": 43,
+    "sum_absolutes": 61,
     "tile_list": 60,
     "tile_ranges": 12,
 }

@@ -33,8 +33,9 @@ class Bent(Rasterizer):
     before: object = staticmethod(lambda gaussians, cameras, background: (gaussians, cameras, background))
     after: object = staticmethod(lambda output: output)
 
-    def render(self, gaussians, cameras, background):
-        return self.after(ReferenceRasterizer().render(*self.before(gaussians, cameras, background)))
+    def render(self, gaussians, cameras, background, absgrad=False):
+        scene = self.before(gaussians, cameras, background)
+        return self.after(ReferenceRasterizer().render(*scene, absgrad))
 
 
 class _Bend(torch.autograd.Function):
@@ -64,7 +65,7 @@ def test_float32_agrees_with_float64_far_inside_the_limits():
     assert agreement.repeats
     assert agreement.worst_image < MOST_IMAGES / 5
     assert agreement.worst_gradient < MOST_GRADIENTS / 20
-    assert set(agreement.gradients) == {*FIELDS, "means2d"}
+    assert set(agreement.gradients) == {*FIELDS, "means2d", "absgrad"}
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
@@ -77,8 +78,8 @@ def test_the_native_kernels_pass(kernel_build):
 def test_the_cuda_kernels_pass_in_the_emulator(emulator):
     @dataclass(frozen=True)
     class Emulated(Rasterizer):
-        def render(self, gaussians, cameras, background):
-            return emulator.render(gaussians, cameras, background)
+        def render(self, gaussians, cameras, background, absgrad=False):
+            return emulator.render(gaussians, cameras, background, absgrad)
 
     agreement = self_test(Emulated(), CPU)
     assert agreement.holds, agreement
@@ -151,6 +152,21 @@ def test_a_gradient_that_is_none_is_noticed(bend):
     agreement = self_test(bent_gradient("opacity_logits", bend), CPU)
     assert not agreement.holds
     assert agreement.worst_gradient >= 1
+
+
+@pytest.mark.parametrize("bend", [lambda grad: grad * 1.001, torch.zeros_like, None])
+def test_an_absgrad_that_is_wrong_or_missing_is_noticed(bend):
+    def after(output):
+        if output.absgrad is None:
+            return output
+        if bend is None:
+            return replace(output, absgrad=None)
+        output.absgrad.register_hook(bend)
+        return output
+
+    agreement = self_test(Bent(after=after), CPU)
+    assert not agreement.holds
+    assert max(agreement.gradients, key=agreement.gradients.get) == "absgrad"
 
 
 def test_one_gaussian_less_is_noticed():

@@ -146,7 +146,14 @@ struct Sums {
   float g, gu, gt, guu, gut, gtt, red, green, blue, depth;
 };
 
-SPLAT_FN void shade_backward(PixelBackward& pixel, const Splat& s, const Falloff& f, Sums& sums) {
+// Two more, if absgrad is wanted: what pixels add to the gradient of the centre, in absolute value.
+struct Absolutes {
+  float u, y;  // of |g u| and |g (l12 u + l22 t)|: see splat::mean2d_absolute
+};
+
+template <bool ABSOLUTE>
+SPLAT_FN void shade_backward(PixelBackward& pixel, const Splat& s, const Falloff& f, Sums& sums,
+                             Absolutes& absolutes) {
   const float free = s.opacity * __expf(-f.exponent), alpha = fminf(free, float(SPLAT_ALPHA_MAX));
   const float inverse = __fdividef(1.0f, 1.0f - alpha), before = pixel.transmittance * inverse;
   const float w = alpha * before;
@@ -169,6 +176,9 @@ SPLAT_FN void shade_backward(PixelBackward& pixel, const Splat& s, const Falloff
   sums.green = __fmaf_rn(w, pixel.green, sums.green);
   sums.blue = __fmaf_rn(w, pixel.blue, sums.blue);
   sums.depth = __fmaf_rn(w, pixel.far, sums.depth);
+  if (!ABSOLUTE) return;
+  absolutes.u += fabsf(gu);
+  absolutes.y += fabsf(__fmaf_rn(s.l12, gu, s.l22 * gt));
 }
 
 // Half of the lanes go on with ``low``, the other half with ``high``, and each gives away what it drops.
@@ -191,18 +201,27 @@ SPLAT_FN float fold_sums(const Sums& s) {
   return sum + __shfl_xor_sync(ALL, sum, 1);
 }
 
+// The first half of the lanes get the sum of u, the others that of y.
+SPLAT_FN float fold_absolutes(const Absolutes& absolutes) {
+  float sum = fold(lane_index() & 16, absolutes.u, absolutes.y, 16);
+  for (int reach = 8; reach > 0; reach /= 2) sum += __shfl_xor_sync(ALL, sum, reach);
+  return sum;
+}
+
 // Which sum a lane holds after fold_sums; -1 if none, or if its neighbour holds the same.
 SPLAT_FN int component_of(int lane) {
   const int b4 = lane / 16, b3 = lane / 8 % 2, in_half = 3 * b3 + lane / 2 % 4;
   return lane % 2 == 0 && in_half < (b3 ? 5 : 3) ? 5 * b4 + in_half : -1;
 }
 
-// records [slots 10]. One list more than there are tiles: slots that no tile took get a record of zeros too.
-KERNEL(BLEND_BLOCK)
-blend_backward(const float4* splats, const u32* slots, const u32* pair_of_slot, const u32* ranges, i64 tiles,
-               const float* background, i64 height, i64 width, const float* alpha, const float* depth,
-               const float* transmittance, const u32* last, const float* grad_rgb, const float* grad_alpha,
-               const float* grad_depth, float* records) {
+// records [slots 10], absolutes [slots 2]. One list more than there are tiles: slots that no tile took get
+// zeros too.
+template <bool ABSOLUTE>
+SPLAT_FN void blend_tile_backward(const float4* splats, const u32* slots, const u32* pair_of_slot,
+                                  const u32* ranges, i64 tiles, const float* background, i64 height, i64 width,
+                                  const float* alpha, const float* depth, const float* transmittance,
+                                  const u32* last, const float* grad_rgb, const float* grad_alpha,
+                                  const float* grad_depth, float* records, float* absolutes) {
   __shared__ float4 staged[BLEND_WARPS][3][WARP];
   __shared__ u32 staged_slots[BLEND_WARPS][WARP];
   const i64 tile = thread_index() / WARP;
@@ -225,8 +244,11 @@ blend_backward(const float4* splats, const u32* slots, const u32* pair_of_slot, 
   }
 
   const i64 begin = ranges[2 * tile], end = ranges[2 * tile + 1];
-  for (i64 e = begin + used + lane; e < end; e += WARP)
+  for (i64 e = begin + used + lane; e < end; e += WARP) {
     for (int j = 0; j < RECORD; ++j) records[RECORD * i64(slots[e]) + j] = 0;
+    if (ABSOLUTE)
+      for (int j = 0; j < ABSOLUTES; ++j) absolutes[ABSOLUTES * i64(slots[e]) + j] = 0;
+  }
 
   for (i64 top = begin + used; top > begin; top -= WARP) {
     const i64 base = top - begin < WARP ? begin : top - WARP;
@@ -245,14 +267,36 @@ blend_backward(const float4* splats, const u32* slots, const u32* pair_of_slot, 
       const Falloff f0 = falloff(s, dx, place.y[0] - s.y), f1 = falloff(s, dx, place.y[1] - s.y);
       const bool hit0 = rank < pixels[0].last && f0.exponent <= s.cut;
       const bool hit1 = rank < pixels[1].last && f1.exponent <= s.cut;
-      float sum = 0;
+      float sum = 0, absolute = 0;
       if (__any_sync(ALL, hit0 || hit1)) {
         Sums sums = {};
-        if (hit0) shade_backward(pixels[0], s, f0, sums);
-        if (hit1) shade_backward(pixels[1], s, f1, sums);
+        Absolutes apart = {};
+        if (hit0) shade_backward<ABSOLUTE>(pixels[0], s, f0, sums, apart);
+        if (hit1) shade_backward<ABSOLUTE>(pixels[1], s, f1, sums, apart);
         sum = fold_sums(sums);
+        if (ABSOLUTE) absolute = fold_absolutes(apart);
       }
       if (component >= 0) records[RECORD * i64(stage_slots[j]) + component] = sum;
+      if (ABSOLUTE && lane % 16 == 0) absolutes[ABSOLUTES * i64(stage_slots[j]) + lane / 16] = absolute;
     }
   }
+}
+
+KERNEL(BLEND_BLOCK)
+blend_backward(const float4* splats, const u32* slots, const u32* pair_of_slot, const u32* ranges, i64 tiles,
+               const float* background, i64 height, i64 width, const float* alpha, const float* depth,
+               const float* transmittance, const u32* last, const float* grad_rgb, const float* grad_alpha,
+               const float* grad_depth, float* records) {
+  blend_tile_backward<false>(splats, slots, pair_of_slot, ranges, tiles, background, height, width, alpha,
+                             depth, transmittance, last, grad_rgb, grad_alpha, grad_depth, records, nullptr);
+}
+
+KERNEL(BLEND_BLOCK)
+blend_backward_absolute(const float4* splats, const u32* slots, const u32* pair_of_slot, const u32* ranges,
+                        i64 tiles, const float* background, i64 height, i64 width, const float* alpha,
+                        const float* depth, const float* transmittance, const u32* last,
+                        const float* grad_rgb, const float* grad_alpha, const float* grad_depth,
+                        float* records, float* absolutes) {
+  blend_tile_backward<true>(splats, slots, pair_of_slot, ranges, tiles, background, height, width, alpha,
+                            depth, transmittance, last, grad_rgb, grad_alpha, grad_depth, records, absolutes);
 }

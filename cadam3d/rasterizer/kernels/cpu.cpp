@@ -53,6 +53,7 @@ constexpr int PARTS = CELL * CELL / LANES;  // vectors per cell
 constexpr int64_t BLOCK = 256;              // Gaussians per piece of work; a whole number of vectors
 constexpr int RECORD = 16;   // floats left by the backward per (Gaussian, tile): one cache line
 constexpr int MOMENTS = 10;  // of them in use
+constexpr int ABSOLUTES = 2;  // the next ones, if absgrad is wanted
 static_assert(CELLS == CELL * CELL && BLOCK % LANES == 0, "a vector of cells is as long as one of pixels");
 
 // Bytes of records in flight, unless one view needs more; tests set a small one.
@@ -607,6 +608,7 @@ void load_gradients(const Scene& scene, const View& view, int64_t tile, const Pl
 // Back to front. With w = alpha T the loss sees a pixel through sum w v, where v = rgb . g_rgb +
 // (z - D) g_depth / A, and through its final transmittance. ``suffix`` is what lies behind a splat:
 // dLoss/dalpha = T v - suffix / (1 - alpha).
+template <bool ABSOLUTE>
 void blend_tile_backward(const Scene& scene, const Frame& frame, const View& view, const Splat* splats,
                          int64_t tile, const float* background, const Images& images, Record* records) {
   const int64_t begin = view.first_entry[tile], end = view.first_entry[tile + 1];
@@ -631,9 +633,10 @@ void blend_tile_backward(const Scene& scene, const Frame& frame, const View& vie
     take_aim(s, s.x - float(place.x), s.y - float(place.y), aim);
     const Floats cut = spread(s.cut), opacity = spread(s.opacity);
     const Floats r = spread(s.rgb[0]), g = spread(s.rgb[1]), b = spread(s.rgb[2]), z = spread(s.depth);
+    const Floats l12 = spread(s.l12), l22 = spread(s.l22);
     const Ints index = spread(int(rank));
     Floats sum_g{}, sum_gu{}, sum_gt{}, sum_guu{}, sum_gut{}, sum_gtt{};
-    Floats sum_red{}, sum_green{}, sum_blue{}, sum_z{};
+    Floats sum_red{}, sum_green{}, sum_blue{}, sum_z{}, absolute_u{}, absolute_y{};
     for (uint32_t left = reached; left != 0; left &= left - 1) {
       const int cell = __builtin_ctz(left);
       for (int part = 0; part < PARTS; ++part) {
@@ -665,22 +668,32 @@ void blend_tile_backward(const Scene& scene, const Frame& frame, const View& vie
         sum_green = simd::fma(w, p.green, sum_green);
         sum_blue = simd::fma(w, p.blue, sum_blue);
         sum_z = simd::fma(w, p.far, sum_z);
+        if constexpr (ABSOLUTE) {
+          absolute_u += simd::absolute(gu);
+          absolute_y += simd::absolute(simd::fma(l12, gu, l22 * gt));
+        }
       }
     }
-    simd::store_sums(records[entry.slot].sums,
-                     {sum_g, sum_gu, sum_gt, sum_guu, sum_gut, sum_gtt, sum_red, sum_green, sum_blue, sum_z});
+    float* const sums = records[entry.slot].sums;
+    if constexpr (ABSOLUTE) {
+      simd::store_sums(sums, {sum_g, sum_gu, sum_gt, sum_guu, sum_gut, sum_gtt, sum_red, sum_green, sum_blue,
+                              sum_z, absolute_u, absolute_y});
+    } else {
+      simd::store_sums(sums, {sum_g, sum_gu, sum_gt, sum_guu, sum_gut, sum_gtt, sum_red, sum_green, sum_blue,
+                              sum_z});
+    }
   }
 }
 
 // ---------------------------------------------------------------------------------------------- gather
 
 struct ParameterGradients {
-  float *means2d, *means, *log_scales, *quats, *opacity_logits, *sh;
+  float *means2d, *absgrad, *means, *log_scales, *quats, *opacity_logits, *sh;  // absgrad may be null
 };
 
 // The sums over the tiles of one view; false if no Gaussian of the batch is on the screen.
 bool gather_moments(const View& view, const Batch& batch, const Record* records,
-                    splat::Moments<Wide>& moments) {
+                    splat::Moments<Wide>& moments, Wide (&absolutes)[ABSOLUTES]) {
   if (view.first_slot[batch.first] == view.first_slot[batch.first + batch.count]) return false;
   float sums[RECORD][LANES] = {};
   for (int lane = 0; lane < batch.count; ++lane) {
@@ -689,11 +702,12 @@ bool gather_moments(const View& view, const Batch& batch, const Record* records,
     for (uint32_t slot = view.first_slot[i]; slot < view.first_slot[i + 1]; ++slot)
       for (int j = 0; j < RECORD; j += LANES)
         simd::store(sum.sums + j, simd::load(sum.sums + j) + simd::load(records[slot].sums + j));
-    for (int j = 0; j < MOMENTS; ++j) sums[j][lane] = sum.sums[j];
+    for (int j = 0; j < MOMENTS + ABSOLUTES; ++j) sums[j][lane] = sum.sums[j];
   }
   Wide of[MOMENTS];
   for (int j = 0; j < MOMENTS; ++j) of[j] = simd::load(sums[j]);
   moments = {of[0], of[1], of[2], of[3], of[4], of[5], {of[6], of[7], of[8]}, of[9]};
+  for (int j = 0; j < ABSOLUTES; ++j) absolutes[j] = simd::load(sums[MOMENTS + j]);
   return true;
 }
 
@@ -719,7 +733,8 @@ void batch_backward(const Scene& scene, const Frame& frame, int64_t view_begin, 
   for (int64_t v = view_begin; v < view_end; ++v) {
     const View& view = frame.views[size_t(v)];
     splat::Moments<Wide> moments;
-    if (!gather_moments(view, batch, records[v], moments)) continue;
+    Wide absolutes[ABSOLUTES];
+    if (!gather_moments(view, batch, records[v], moments, absolutes)) continue;
     splat::Footprint<Wide> footprint;
     const Truths is_seen = is_sound & splat::project(batch.gaussian, shape, view.camera, footprint);
     has_any = has_any | is_seen;
@@ -727,6 +742,11 @@ void batch_backward(const Scene& scene, const Frame& frame, int64_t view_begin, 
     splat::mean2d_gradient(footprint, moments, centre);
     float* const means2d = out.means2d + 2 * v * scene.gaussians;
     for (int j = 0; j < 2; ++j) batch.add(means2d + j, 2, select(is_seen, centre[j], 0));
+    if (out.absgrad) {
+      splat::mean2d_absolute(footprint.l11, absolutes, centre);
+      float* const absgrad = out.absgrad + 2 * v * scene.gaussians;
+      for (int j = 0; j < 2; ++j) batch.add(absgrad + j, 2, select(is_seen, centre[j], 0));
+    }
     splat::clear(of_view, int(scene.coefficients));
     splat::project_backward(batch.gaussian, shape, view.camera, footprint, moments, of_view);
     add_where(is_seen, of_view, scene.coefficients, total);
@@ -812,16 +832,19 @@ EXPORT int cadam3d_blend(const Scene* scene, void* handle, float* rgb, float* al
   });
 }
 
-// Adds to gradients that come zeroed; each image gradient may be null. The path through means2d is left to
-// cadam3d_centre_backward: here it only arrives in grad_means2d.
+// Adds to gradients that come zeroed; each image gradient may be null, and so may absgrad: then nobody sums
+// absolute values. The path through means2d is left to cadam3d_centre_backward: here it only arrives in
+// grad_means2d.
 EXPORT int cadam3d_blend_backward(const Scene* scene, void* handle, const float* alpha, const float* depth,
                                   const float* grad_rgb, const float* grad_alpha, const float* grad_depth,
-                                  float* grad_means2d, float* grad_means, float* grad_log_scales,
-                                  float* grad_quats, float* grad_opacity_logits, float* grad_sh) {
+                                  float* grad_means2d, float* absgrad, float* grad_means,
+                                  float* grad_log_scales, float* grad_quats, float* grad_opacity_logits,
+                                  float* grad_sh) {
   return guarded([&] {
     Frame& frame = *static_cast<Frame*>(handle);
-    const ParameterGradients out{grad_means2d, grad_means,          grad_log_scales,
+    const ParameterGradients out{grad_means2d, absgrad,             grad_means, grad_log_scales,
                                  grad_quats,   grad_opacity_logits, grad_sh};
+    const auto blend_tile = absgrad ? blend_tile_backward<true> : blend_tile_backward<false>;
     const int64_t pixels = scene->height * scene->width, tiles = frame.tiles();
     Buffer<Record> records;
     std::vector<Record*> of_view(size_t(scene->views));
@@ -838,8 +861,8 @@ EXPORT int cadam3d_blend_backward(const Scene* scene, void* handle, const float*
         const Images images{
             alpha + v * pixels, depth + v * pixels, grad_rgb ? grad_rgb + 3 * v * pixels : nullptr,
             grad_alpha ? grad_alpha + v * pixels : nullptr, grad_depth ? grad_depth + v * pixels : nullptr};
-        blend_tile_backward(*scene, frame, frame.views[size_t(v)], frame.splats.data() + v * scene->gaussians,
-                            item % tiles, scene->background + 3 * v, images, of_view[size_t(v)]);
+        blend_tile(*scene, frame, frame.views[size_t(v)], frame.splats.data() + v * scene->gaussians,
+                   item % tiles, scene->background + 3 * v, images, of_view[size_t(v)]);
       });
       each_batch(*scene, [&](int64_t first) {
         batch_backward(*scene, frame, begin, end, first, of_view.data(), out);
@@ -889,8 +912,8 @@ EXPORT int cadam3d_self_test() {
   int status = cadam3d_blend(&scene, frame, rgb.data(), alpha.data(), depth.data(), 1);
   if (status == OK)
     status = cadam3d_blend_backward(&scene, frame, alpha.data(), depth.data(), ones.data(), nullptr, nullptr,
-                                    gradients, gradients + 2, gradients + 5, gradients + 8, gradients + 12,
-                                    gradients + 13);
+                                    gradients, nullptr, gradients + 2, gradients + 5, gradients + 8,
+                                    gradients + 12, gradients + 13);
   cadam3d_free(frame);
   return status == OK && alpha[210] > 0.5f && std::fabs(depth[210] - 2) < 1e-3f && gradients[13] > 0 ? 0 : 1;
 }

@@ -18,6 +18,7 @@ constexpr u32 ALL = 0xffffffffu;  // every lane of a warp
 constexpr int BLOCK = 256;        // threads of most kernels; mirrored in ../cuda.py
 constexpr int TILE = 8;           // pixels along the edge of a tile; mirrored in ../cuda.py
 constexpr int RECORD = 10;        // floats that the blend leaves per (splat, tile); mirrored in ../cuda.py
+constexpr int ABSOLUTES = 2;      // and besides, if absgrad is wanted; mirrored in ../cuda.py
 constexpr u32 CULLED = ALL;       // depth key of who is not seen: behind every other
 
 SPLAT_FN i64 thread_index() { return i64(blockIdx.x) * blockDim.x + threadIdx.x; }

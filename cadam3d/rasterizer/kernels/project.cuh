@@ -68,13 +68,15 @@ SPLAT_FN void project_gaussian(const float* means, const float* log_scales, cons
 
 constexpr i64 LONG_RUN = 64;  // records; a longer run is summed by the whole warp
 
-// The sum of ``count`` records from ``first`` on, for every lane its own. All lanes of a warp must call it.
+// The sum of ``count`` records of so many floats from ``first`` on, for every lane its own. All lanes of a warp
+// must call it.
+template <int WIDTH>
 SPLAT_FN void sum_records(const float* records, i64 first, i64 count, float* sum) {
-  for (int j = 0; j < RECORD; ++j) sum[j] = 0;
+  for (int j = 0; j < WIDTH; ++j) sum[j] = 0;
   if (count <= LONG_RUN)
     for (i64 slot = first; slot < first + count; ++slot)
 #pragma unroll
-      for (int j = 0; j < RECORD; ++j) sum[j] += records[RECORD * slot + j];
+      for (int j = 0; j < WIDTH; ++j) sum[j] += records[WIDTH * slot + j];
   const int lane = lane_index();
   u32 waiting = __ballot_sync(ALL, count > LONG_RUN);
   while (waiting) {
@@ -82,12 +84,12 @@ SPLAT_FN void sum_records(const float* records, i64 first, i64 count, float* sum
     waiting &= waiting - 1;
     const i64 from = i64(__shfl_sync(ALL, u64(first), owner)),
               many = i64(__shfl_sync(ALL, u64(count), owner));
-    float part[RECORD] = {};
+    float part[WIDTH] = {};
     for (i64 slot = from + lane; slot < from + many; slot += WARP)
 #pragma unroll
-      for (int j = 0; j < RECORD; ++j) part[j] += records[RECORD * slot + j];
+      for (int j = 0; j < WIDTH; ++j) part[j] += records[WIDTH * slot + j];
 #pragma unroll
-    for (int j = 0; j < RECORD; ++j) {
+    for (int j = 0; j < WIDTH; ++j) {
 #pragma unroll
       for (int reach = WARP / 2; reach > 0; reach /= 2) part[j] += __shfl_xor_sync(ALL, part[j], reach);
       if (lane == owner) sum[j] = part[j];
@@ -143,7 +145,7 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
     const i64 pair = v * n + i;
     const bool is_visible = is_mine && slot_count[pair] > 0;
     float sum[RECORD];
-    sum_records(records, is_visible ? first_slot[pair] : 0, is_visible ? slot_count[pair] : 0, sum);
+    sum_records<RECORD>(records, is_visible ? first_slot[pair] : 0, is_visible ? slot_count[pair] : 0, sum);
     float centre[2] = {0, 0};
     if (is_visible) {
       splat::Footprint<float> footprint;
@@ -162,6 +164,19 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
   if (is_seen) splat::shape_backward(shape, gaussian, total, log_scale, quat);
   for (int j = 0; j < 3; ++j) grad_log_scales[3 * i + j] = log_scale[j];
   for (int j = 0; j < 4; ++j) grad_quats[4 * i + j] = quat[j];
+}
+
+// absgrad [pairs 2]: over the pixels, the sum of what each adds to the gradient of a centre, in absolute value.
+KERNEL(BLOCK)
+sum_absolutes(i64 pairs, const float* absolutes, const float4* splats, const u32* first_slot,
+              const u32* slot_count, float* absgrad) {
+  const i64 pair = thread_index();
+  const bool is_visible = pair < pairs && slot_count[pair] > 0;  // the others stay to help with long runs
+  float sum[ABSOLUTES], absolute[2] = {0, 0};
+  sum_records<ABSOLUTES>(absolutes, is_visible ? first_slot[pair] : 0, is_visible ? slot_count[pair] : 0, sum);
+  if (is_visible) splat::mean2d_absolute(splats[3 * pair].z, sum, absolute);  // z: l11
+  if (pair >= pairs) return;
+  for (int j = 0; j < 2; ++j) absgrad[2 * pair + j] = absolute[j];
 }
 
 // dLoss/dmeans [n 3] through the projected centres, from dLoss/dmeans2d [v n 2]; who is culled gets none.

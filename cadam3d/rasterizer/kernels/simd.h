@@ -228,6 +228,14 @@ inline void store_sums(float* to, const Floats (&x)[10]) {
   const __m512i home = _mm512_setr_epi32(0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 0, 0, 0, 0, 0, 0);
   _mm512_store_ps(to, _mm512_permutexvar_ps(home, (__m512)all));
 }
+inline void store_sums(float* to, const Floats (&x)[12]) {
+  const Floats a = fold<4>(fold<8>(x[0], x[1]), fold<8>(x[2], x[3]));
+  const Floats b = fold<4>(fold<8>(x[4], x[5]), fold<8>(x[6], x[7]));
+  const Floats c = fold<4>(fold<8>(x[8], x[9]), fold<8>(x[10], x[11]));
+  const Floats all = fold<1>(fold<2>(a, b), fold<2>(c, c));
+  const __m512i home = _mm512_setr_epi32(0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 5, 13, 0, 0, 0, 0);
+  _mm512_store_ps(to, _mm512_permutexvar_ps(home, (__m512)all));
+}
 #else
 // The four lanes of the result are the sums of a, b, c and d.
 #if defined(SIMD_AVX2) || defined(SIMD_SSE2)
@@ -250,6 +258,11 @@ inline Quad sums(Floats a, Floats b, Floats c, Floats d) { return Quad{sum(a), s
 inline void store_sums(float* to, const Floats (&x)[10]) {
   const Quad all[4] = {sums(x[0], x[1], x[2], x[3]), sums(x[4], x[5], x[6], x[7]),
                        sums(x[8], x[9], x[9], x[9]), Quad{}};
+  __builtin_memcpy(to, all, sizeof all);
+}
+inline void store_sums(float* to, const Floats (&x)[12]) {
+  const Quad all[4] = {sums(x[0], x[1], x[2], x[3]), sums(x[4], x[5], x[6], x[7]),
+                       sums(x[8], x[9], x[10], x[11]), Quad{}};
   __builtin_memcpy(to, all, sizeof all);
 }
 #endif

@@ -332,6 +332,13 @@ SPLAT_FN void mean2d_gradient(const Footprint<Real>& footprint, const Moments<Re
   gradient[1] = -2 * (footprint.l12 * moments.gu + footprint.l22 * moments.gt);
 }
 
+// What pixels add to that in absolute value, from their sums of |g u| and of |g (l12 u + l22 t)|.
+template <class Real>
+SPLAT_FN void mean2d_absolute(const Real& l11, const Real* sums, Real* absolute) {
+  absolute[0] = 2 * l11 * sums[0];
+  absolute[1] = 2 * sums[1];
+}
+
 // Adds one view to ``total``; the path through mean2d is left out, see centre_backward.
 template <class Real, class Count>
 SPLAT_FN void project_backward(const Gaussian<Real, Count>& gaussian, const Shape<Real>& shape,

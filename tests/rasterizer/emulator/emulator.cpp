@@ -22,7 +22,8 @@ static const struct {
     ENTRY(centre_backward),     ENTRY(scan_short),         ENTRY(scan_reduce),
     ENTRY(scan_apply),          ENTRY(sort_count),         ENTRY(sort_scatter),
     ENTRY(tile_list),           ENTRY(tile_ranges),        ENTRY(blend_forward),
-    ENTRY(blend_backward),
+    ENTRY(blend_backward),      ENTRY(blend_backward_absolute),
+    ENTRY(sum_absolutes),
 };
 
 enum Status : int { OK = 0, NOT_FOUND = 500, LAUNCH_FAILED = 719 };

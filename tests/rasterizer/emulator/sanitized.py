@@ -29,9 +29,13 @@ def main(folder: Path, kernels: Path, flags: tuple[str, ...]) -> None:
         cuda.RECORD_MEMORY = 0 if degree == 1 else 256 * 2**20  # one group per view, or one for all
         size = (9 + degree, 17)
         gaussians, cameras = make_gaussians(33, degree=degree, log_scale=-1.0), make_cameras(2, *size)
-        render_and_differentiate(emulator.render, gaussians, cameras, backgrounds(2), make_weights(2, *size))
+        scene = gaussians, cameras, backgrounds(2), make_weights(2, *size)
+        render_and_differentiate(emulator.render, *scene, absgrad=degree > 0)
     wide = make_gaussians(3, log_scale=1.5), make_cameras(1, 75, 70), backgrounds(1), make_weights(1, 75, 70)
-    render_and_differentiate(emulator.render, *wide)  # more tiles than a thread lists, or sums, alone
+    for absgrad in (False, True):
+        render_and_differentiate(
+            emulator.render, *wide, absgrad=absgrad
+        )  # more than a thread lists, or sums, alone
     print("all done")
 
 

@@ -1,0 +1,84 @@
+"""Multiview: groups of four views at right angles, for priors that judge four views together (MVDream)."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from cadam3d.camera.base import CameraSampler
+from cadam3d.camera.ranges import (
+    elevations,
+    image_size,
+    require_elevations,
+    require_interval,
+    require_size,
+    uniform,
+)
+from cadam3d.core.cameras import Cameras, orbit
+from cadam3d.core.checks import require
+from cadam3d.core.schedule import Schedule
+
+GROUP = 4  # what multi-view networks were trained on
+OUTSIDE = 1.0  # world units: cameras stay outside the unit ball, which the object may fill
+
+
+@dataclass(frozen=True, kw_only=True)
+class Multiview(CameraSampler):
+    """Upright cameras that look at the origin, in groups of four; every range is ``[low, high]``.
+
+    The views of a group share elevation, distance and field of view; their azimuths lie 90 degrees apart,
+    from a random start in the first quarter. Consecutive views form a group: 0 to 3, 4 to 7, and so on.
+    """
+
+    size: int | Schedule  # pixels; images are square
+    elevation_deg: Sequence[float]  # 0 = horizon, 90 = from above
+    elevation_law: str  # uniform, sphere or mixture: see camera/ranges.py
+    relative_distance: Sequence[float]  # times 1 / tan(fov / 2): half the image's height at the origin
+    fov_y_deg: Sequence[float]  # vertical field of view
+
+    def __post_init__(self) -> None:
+        require_size(self.size)
+        require_elevations(self.elevation_law, self.elevation_deg)
+        require_interval(
+            "camera.relative_distance", self.relative_distance, low=0, high=100, example="[0.8,1]"
+        )
+        require_interval("camera.fov_y_deg", self.fov_y_deg, low=1, high=170, example="[15,60]")
+        least = OUTSIDE * math.tan(math.radians(self.fov_y_deg[1]) / 2)
+        require(
+            self.relative_distance[0] >= least,
+            "camera.relative_distance",
+            wanted=f"cameras outside the unit ball: from {least:.3g} on, at {self.fov_y_deg[1]:g} degrees",
+            got=self.relative_distance,
+            example="'camera.relative_distance=[0.8,1]' 'camera.fov_y_deg=[15,60]'",
+        )
+
+    def check_views(self, views: int) -> None:
+        """Raise ``UserError`` unless the views make whole groups."""
+        require(
+            views % GROUP == 0,
+            "views",
+            wanted=f"a multiple of {GROUP}, the views of a group of camera=multiview",
+            got=views,
+            example=f"views={GROUP * max(round(views / GROUP), 1)}",
+        )
+
+    def sample(self, step: int, views: int, generator: torch.Generator) -> Cameras:
+        """``views`` / 4 groups; raises ``UserError`` if that is no whole number."""
+        self.check_views(views)
+        groups = views // GROUP
+        starts = torch.rand(groups, 1, generator=generator)
+        turns = (starts + torch.arange(GROUP)) / GROUP  # [groups 4], in [0, 1)
+        fov_y_deg = uniform(self.fov_y_deg, groups, generator)
+        half_height = uniform(self.relative_distance, groups, generator)  # of the image, at the origin
+        distance = half_height / torch.tan(torch.deg2rad(fov_y_deg) / 2)
+        elevation_deg = elevations(self.elevation_law, self.elevation_deg, groups, generator)
+        size = image_size(self.size, step)
+        return orbit(
+            azimuth_deg=360 * turns.flatten() - 180,
+            elevation_deg=elevation_deg.repeat_interleave(GROUP),
+            distance=distance.repeat_interleave(GROUP),
+            fov_y_deg=fov_y_deg.repeat_interleave(GROUP),
+            height=size,
+            width=size,
+        )

@@ -1,0 +1,149 @@
+"""Progressive: cameras that come closer, zoom in and see more sides as training goes on (LucidDreamer)."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.camera.base import CameraSampler
+from cadam3d.camera.ranges import image_size, require_interval, require_lens, require_size, uniform
+from cadam3d.core.cameras import Cameras, around, look_at, pinhole, wrapped
+from cadam3d.core.checks import are_numbers, require, require_range, require_whole
+from cadam3d.core.schedule import Schedule
+
+LARGEST_LOG = 500.0  # growth is cut off here, before it leaves floating point: every end has come to rest
+
+
+@dataclass(frozen=True, kw_only=True)
+class Widening:
+    """A range whose two ends move by a constant factor at every widening, until they come to rest."""
+
+    start: Sequence[float]  # [low, high] before the first widening
+    end: Sequence[float]  # [low, high] where they rest
+    factor: Sequence[float]  # of low and of high, at every widening; > 0
+    about: float = 0.0  # the point whose distance the factors multiply
+
+    def at(self, widenings: int) -> tuple[float, float]:
+        """The range after so many widenings."""
+        low, high = (self._end(side, widenings) for side in (0, 1))
+        return low, high
+
+    def moves_as_meant(self) -> bool:
+        """Whether each factor leads from its start to its end, or both are the same."""
+        return all(
+            start == end or (start - self.about) * (factor - 1) * (end - start) > 0
+            for start, end, factor in zip(self.start, self.end, self.factor, strict=True)
+        )
+
+    def _end(self, side: int, widenings: int) -> float:
+        start, rest = self.start[side], self.end[side]
+        growth = math.exp(min(widenings * math.log(self.factor[side]), LARGEST_LOG)) if widenings else 1.0
+        return min(max(self.about + (start - self.about) * growth, min(start, rest)), max(start, rest))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progressive(CameraSampler):
+    """Slightly shaken cameras around the origin, whose ranges widen at multiples of ``every``.
+
+    Elevation and azimuth are ``middle +- u^gamma * half range`` with uniform u, so gamma > 1 prefers the
+    middle; the distance is uniform. All views of a step share one field of view. A widening is a closed form
+    of the step, so that a resumed run needs no memory of it.
+
+    LucidDreamer draws a pool of ten poses with one field of view, and takes views from it at random until it
+    is empty. Its poses are independent, so the order says nothing; what differs here is that a field of view
+    lasts for one step (four views there) instead of ten views. Its shaken up vector also shears the image
+    slightly; our cameras stay rigid.
+    """
+
+    size: int | Schedule  # pixels; images are square
+    azimuth_deg: Widening  # 0 = front (+x), 90 = the +y side
+    elevation_deg: Widening  # 0 = horizon, 90 = from above
+    distance: Widening  # world units from the origin; the object fits in the unit ball
+    fov_y_deg: Widening  # vertical field of view
+    begin: int  # the first step that may widen
+    every: int  # steps; widenings are at its multiples
+    gamma: float  # of elevation and azimuth; 1 = uniform
+    position_jitter: float  # world units; half-width of a uniform deviation along each axis
+    target_jitter: float  # world units; standard deviation of the point looked at, along each axis
+    up_jitter: float  # standard deviation along each axis of a unit vector
+
+    def __post_init__(self) -> None:
+        require_size(self.size)
+        for name in ("azimuth_deg", "elevation_deg", "distance", "fov_y_deg"):
+            _require_widening(f"camera.{name}", getattr(self, name))
+        for side in ("start", "end"):
+            turn, rise = getattr(self.azimuth_deg, side), getattr(self.elevation_deg, side)
+            require_interval(f"camera.azimuth_deg.{side}", turn, low=-360, high=360, example="[-180,180]")
+            require_interval(f"camera.elevation_deg.{side}", rise, low=-90, high=90, example="[-15,45]")
+            require_lens(getattr(self.distance, side), getattr(self.fov_y_deg, side), f".{side}")
+        for name in ("azimuth_deg", "elevation_deg", "distance", "fov_y_deg"):
+            _require_motion(f"camera.{name}", getattr(self, name))
+        require_whole("camera.begin", self.begin, low=0, example=500)
+        require_whole("camera.every", self.every, low=1, example=500)
+        require_range("camera.gamma", self.gamma, above=0, example=1.0)
+        require_range("camera.position_jitter", self.position_jitter, low=0, high=0.5, example=0.05)
+        require_range("camera.target_jitter", self.target_jitter, low=0, high=1, example=0.1)
+        require_range("camera.up_jitter", self.up_jitter, low=0, high=1, example=0.01)
+
+    def widenings(self, step: int) -> int:
+        """How often the ranges have widened at ``step`` (0 is the first): multiples of ``every`` passed."""
+        earlier = math.ceil(max(self.begin, 1) / self.every) - 1  # multiples before ``begin`` do not count
+        return max(step // self.every - earlier, 0)
+
+    def sample(self, step: int, views: int, generator: torch.Generator) -> Cameras:
+        """``views`` cameras of the ranges of ``step``; all but the field of view is drawn apart."""
+        count = self.widenings(step)
+        azimuth_deg = self._biased(self.azimuth_deg.at(count), views, generator)
+        elevation_deg = self._biased(self.elevation_deg.at(count), views, generator)
+        distance = uniform(self.distance.at(count), views, generator)
+        fov_y_deg = uniform(self.fov_y_deg.at(count), 1, generator).expand(views)
+        outward, up = around(azimuth_deg, elevation_deg)
+        shake = uniform((-self.position_jitter, self.position_jitter), 3 * views, generator).view(views, 3)
+        target = self.target_jitter * torch.randn(views, 3, generator=generator)
+        tilt = self.up_jitter * torch.randn(views, 3, generator=generator)
+        size = image_size(self.size, step)
+        return Cameras(
+            world_to_camera=look_at(distance[:, None] * outward + shake, target, up + tilt),
+            intrinsics=pinhole(fov_y_deg, size, size),
+            height=size,
+            width=size,
+            azimuth_deg=wrapped(azimuth_deg),
+            elevation_deg=elevation_deg,
+        )
+
+    def _biased(
+        self, interval: tuple[float, float], views: int, generator: torch.Generator
+    ) -> Float[Tensor, "v"]:
+        low, high = interval
+        side = 2 * torch.rand(views, generator=generator) - 1
+        return (low + high) / 2 + (high - low) / 2 * side.sign() * side.abs() ** self.gamma
+
+
+def _require_widening(key: str, value: object) -> None:
+    is_one = isinstance(value, Widening)
+    example = (
+        f"'{key}={{_target_: {Widening.__module__}.Widening, start: [10,20], end: [5,20], factor: [0.9,1]}}'"
+    )
+    require(is_one, key, wanted="start, end and factor", got=value, example=example)
+    assert isinstance(value, Widening)
+    require(
+        are_numbers(value.factor, low=1e-3, high=1e3) and len(value.factor) == 2,
+        f"{key}.factor",
+        wanted="two numbers > 0, of the low and of the high end",
+        got=value.factor,
+        example=f"'{key}.factor=[0.75,1.1]'",
+    )
+    require_range(f"{key}.about", value.about, example=0.0)
+
+
+def _require_motion(key: str, value: Widening) -> None:
+    require(
+        value.moves_as_meant(),
+        f"{key}.factor",
+        wanted=f"factors that lead from {value.start} to {value.end}",
+        got=value.factor,
+        example=f"'{key}.end=[{value.start[0]:g},{value.start[1]:g}]' to stay, or other factors",
+    )

@@ -1,0 +1,80 @@
+"""Ranges: how every sampler draws from ``[low, high]``, and what it refuses as one."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.core.checks import are_numbers, require, require_choice, require_whole
+from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+
+ELEVATION_LAWS = ("uniform", "sphere", "mixture")
+
+
+def uniform(interval: Sequence[float], views: int, generator: torch.Generator) -> Float[Tensor, "v"]:
+    """``views`` independent uniform draws from ``[low, high]``."""
+    low, high = interval
+    return low + (high - low) * torch.rand(views, generator=generator)
+
+
+def elevations(
+    law: str, interval: Sequence[float], views: int, generator: torch.Generator
+) -> Float[Tensor, "v"]:
+    """``views`` elevations in degrees, within ``interval``, by one of ``ELEVATION_LAWS``.
+
+    ``uniform``: in degrees. ``sphere``: equal areas between the two latitudes are equally likely. ``mixture``
+    is threestudio's law, which GaussianDreamer and MVDream keep: one toss per call makes all views uniform in
+    degrees, or their sines uniform in [low / 90, high / 90]. That second half was meant to be ``sphere`` but
+    reaches asin(high / 90) only: [-10, 60] becomes [-6.4, 41.8].
+    """
+    if law == "uniform":
+        return uniform(interval, views, generator)
+    if law == "sphere":
+        heights = torch.deg2rad(torch.tensor([float(angle) for angle in interval])).sin()
+        return torch.rad2deg(uniform(heights.tolist(), views, generator).asin())
+    in_degrees = torch.rand(1, generator=generator) < 0.5
+    degrees = uniform(interval, views, generator)
+    return torch.where(in_degrees, degrees, torch.rad2deg((degrees / 90).asin()))
+
+
+def image_size(size: int | Schedule, step: int) -> int:
+    """Height and width in pixels at ``step`` (0 is the first)."""
+    return round(as_schedule(size)(step))
+
+
+def require_size(size: object) -> None:
+    """Raise ``UserError`` unless ``size`` is a whole number of pixels or a schedule of it."""
+    if isinstance(size, Schedule):
+        require_scheduled("camera.size", size, low=1, example=128)
+    else:
+        require_whole("camera.size", size, low=1, example=128)
+
+
+def require_interval(key: str, interval: object, *, low: float, high: float, example: str) -> None:
+    """Raise ``UserError`` unless ``interval`` is two ascending numbers in ``[low, high]``."""
+    is_interval = (
+        are_numbers(interval, low=low, high=high) and len(interval) == 2 and interval[0] <= interval[1]
+    )
+    require(
+        is_interval,
+        key,
+        wanted=f"[low, high] in ascending order between {low:g} and {high:g}",
+        got=interval,
+        example=f"'{key}={example}'",
+    )
+
+
+def require_elevations(law: object, interval: object) -> None:
+    """Raise ``UserError`` unless ``law`` is known and ``interval`` two ascending elevations."""
+    require_choice("camera.elevation_law", law, ELEVATION_LAWS)
+    require_interval("camera.elevation_deg", interval, low=-90, high=90, example="[-10,60]")
+
+
+def require_lens(distance: object, fov_y_deg: object, suffix: str = "") -> None:
+    """Raise ``UserError`` unless distances lie outside the unit ball and fields of view are possible.
+
+    ``suffix`` continues the names of the keys, such as ``.start``.
+    """
+    require_interval(f"camera.distance{suffix}", distance, low=1, high=1000, example="[3.0,3.6]")
+    require_interval(f"camera.fov_y_deg{suffix}", fov_y_deg, low=1, high=170, example="[40,45]")

@@ -1,0 +1,79 @@
+"""Exposure: dims the colours of Gaussians that distillation has driven too bright."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.core.checks import require, require_range, require_whole
+from cadam3d.core.render import RenderOutput
+
+
+class Exposure(ABC):
+    """Judges the renders of a step. Frozen hyper-parameters; draws nothing."""
+
+    @abstractmethod
+    def dimming(self, output: RenderOutput, background: Float[Tensor, "v 3"], step: int) -> float | None:
+        """What to multiply all colour coefficients by after the ``step``-th step (1 is the first).
+
+        None leaves them alone. ``output`` was rendered over ``background`` before the step.
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoExposure(Exposure):
+    """Any brightness will do."""
+
+    def dimming(self, output: RenderOutput, background: Float[Tensor, "v 3"], step: int) -> float | None:
+        """None."""
+        return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class BrightnessGuard(Exposure):
+    """Dim when the bright parts of most views are too bright (GCS-BEG's over-exposure guard).
+
+    The brightness of a pixel is the mean of its channels without what the background contributes, so it is
+    that of the published code over black. There, views over another colour count their background as object.
+    """
+
+    begin: int  # judged are steps strictly between `begin` and `end`, counted from 1
+    end: int
+    quantile: float  # of the object's pixels in a view, and again of the views
+    threshold: float  # of that brightness; white is 1
+    rate: float  # what colours are multiplied by, in (0, 1)
+
+    def __post_init__(self) -> None:
+        require_whole("exposure.begin", self.begin, low=0, example=1000)
+        require_whole("exposure.end", self.end, low=0, example=4500)
+        require(
+            self.end > self.begin,
+            "exposure.end",
+            wanted=f"a step after exposure.begin={self.begin}",
+            got=self.end,
+            example=f"exposure.end={self.begin + 3500}",
+        )
+        require_range("exposure.quantile", self.quantile, low=0, high=1, example=0.85)
+        require_range("exposure.threshold", self.threshold, low=0, example=0.9)
+        require_range("exposure.rate", self.rate, above=0, below=1, example=0.8)
+
+    def dimming(self, output: RenderOutput, background: Float[Tensor, "v 3"], step: int) -> float | None:
+        """``rate`` if the quantile over views of :meth:`brightness` exceeds the threshold. One wait."""
+        if not self.begin < step < self.end:
+            return None
+        views = self.brightness(output, background)
+        return self.rate if bool(views.quantile(self.quantile) > self.threshold) else None
+
+    @torch.no_grad()
+    def brightness(self, output: RenderOutput, background: Float[Tensor, "v 3"]) -> Float[Tensor, "v"]:
+        """The quantile over the object's pixels (alpha > 0) of each view; 0 for a view without any."""
+        behind = (1 - output.alpha)[..., None] * background[:, None, None]
+        pixels = (output.rgb - behind).mean(dim=-1)
+        return torch.stack(
+            [
+                seen.quantile(self.quantile) if len(seen := view[alpha > 0]) else view.new_zeros(())
+                for view, alpha in zip(pixels, output.alpha, strict=True)
+            ]
+        )

@@ -1,0 +1,135 @@
+"""Ply: from a PLY file, be it an asset of Gaussians or a cloud of coloured points."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from cadam3d.core.checks import UserError, require, require_choice, require_color
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.initializer.base import Initializer
+from cadam3d.initializer.points import (
+    PointCloud,
+    fit,
+    found_file,
+    gaussians_at,
+    one_color,
+    replicated,
+    require_copies,
+    require_place,
+    require_points,
+    rows_of,
+)
+from cadam3d.io.frames import UPS, points_to_world, turned, turned_points
+from cadam3d.io.ply import holds_gaussians, read_ply
+
+UP_OF_GAUSSIANS = "-y"  # 3DGS, and whatever it was trained on with COLMAP
+UP_OF_POINTS = "+z"  # Point-E, most scans
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ply(Initializer):
+    """What a PLY file holds; the prompt plays no part.
+
+    Gaussians (3DGS layout, any SH degree, ours or anybody's) keep their shapes, colours and opacities. Points
+    (ASCII or binary; of Point-E, a scan) become round Gaussians with their colours.
+    """
+
+    path: str  # of the file
+    up: str | None  # up axis of the file, unless it says so itself: -y, +y or +z; null = -y or, of points, +z
+    turn_deg: int  # then turned about the up axis, counterclockwise from above: 0, 90, 180 or 270
+    radius: float | None  # world units from the centre of the bounding box to the farthest; null = as it is
+    count: int | None  # at most so many rows of the file, drawn at random; null = all
+    sh_degree: int | None  # of the colours, 0 to 3; null = that of the file
+    replicate: int  # Gaussians for each point
+    replicate_radius: float  # world units; of the ball that holds them
+    scale: float | None  # of points: world units; null = mean distance to the three nearest neighbours
+    opacity: float  # of points: in (0, 1)
+    color: Sequence[float]  # of points, where the file has no colours: RGB in [0, 1]
+
+    def __post_init__(self) -> None:
+        count = 1 if self.count is None else self.count
+        require_points(count, self.scale, self.opacity, self.sh_degree or 0)
+        if self.up is not None:
+            require_choice("initializer.up", self.up, UPS)
+        require_place(self.turn_deg, self.radius)
+        require_copies(self.replicate, self.replicate_radius)
+        require_color("initializer.color", self.color)
+
+    def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
+        """The Gaussians of the file, or Gaussians at its points.
+
+        Raises ``UserError`` if the file is missing, cannot be read or holds neither.
+        """
+        path = found_file(self.path, "/path/to/asset.ply")
+        if holds_gaussians(path):
+            return self._asset(path, generator).to(device)
+        return self._cloud(path, generator, device)
+
+    def _asset(self, path: Path, generator: torch.Generator) -> Gaussians:
+        require(
+            self.replicate == 1,
+            "initializer.replicate",
+            wanted="1, since this file holds Gaussians",
+            got=self.replicate,
+            example="initializer.replicate=1",
+        )
+        asset = turned(read_ply(path, up=self.up or UP_OF_GAUSSIANS), self.turn_deg)
+        for name, tensor in asset.tensors().items():
+            _require_finite(path, name, tensor)
+        asset = asset.index(rows_of(len(asset), self.count, generator))
+        center, factor = fit(asset.means, self.radius)
+        return replace(
+            asset,
+            means=(asset.means - center) * factor,
+            log_scales=asset.log_scales + math.log(factor),
+            sh=asset.sh if self.sh_degree is None else _with_degree(asset.sh, self.sh_degree),
+        )
+
+    def _cloud(self, path: Path, generator: torch.Generator, device: torch.device) -> Gaussians:
+        points, rgb = self._read_points(path)
+        points = turned_points(points_to_world(points, self.up or UP_OF_POINTS), self.turn_deg)
+        rows = rows_of(len(points), self.count, generator)
+        center, factor = fit(points[rows], self.radius)
+        cloud = PointCloud((points[rows] - center) * factor, rgb[rows])
+        cloud = replicated(cloud, self.replicate, self.replicate_radius, generator).to(device)
+        degree = self.sh_degree or 0
+        return gaussians_at(cloud, scale=self.scale, opacity=self.opacity, sh_degree=degree)
+
+    def _read_points(self, path: Path) -> tuple[Tensor, Tensor]:
+        """Positions in the frame of the file, and colours."""
+        try:
+            loaded = trimesh.load(path)
+        except Exception as error:  # the parser has no exceptions of its own
+            reason = str(error) or type(error).__name__
+            raise UserError(
+                f"initializer.path: {self.path!r} cannot be read ({reason}). Try: another PLY file"
+            ) from error
+        if not isinstance(loaded, trimesh.PointCloud):
+            raise UserError(
+                f"initializer.path: {self.path!r} holds a surface. Try: initializer=mesh, with up and count"
+            )
+        points = torch.as_tensor(np.asarray(loaded.vertices), dtype=torch.float32)
+        _require_finite(path, "points", points)
+        colors = np.asarray(loaded.colors)
+        if len(colors) == 0:
+            return points, one_color(self.color, len(points))
+        return points, torch.as_tensor(colors[:, :3] / 255.0, dtype=torch.float32)
+
+
+def _require_finite(path: Path, name: str, rows: Tensor) -> None:
+    bad = int((~rows.isfinite()).reshape(len(rows), -1).any(dim=1).sum()) if len(rows) else 0
+    if bad or len(rows) == 0:
+        what = f"{name} that are not finite ({bad} of {len(rows)})" if bad else "nothing"
+        raise UserError(f"initializer.path: {path} holds {what}. Try: another PLY file")
+
+
+def _with_degree(sh: Tensor, degree: int) -> Tensor:
+    """The coefficients up to ``degree``: those of the file, and zeros beyond."""
+    wanted = (degree + 1) ** 2
+    return torch.nn.functional.pad(sh[:, :wanted], (0, 0, 0, max(wanted - sh.shape[1], 0)))

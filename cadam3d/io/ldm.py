@@ -1,0 +1,316 @@
+"""Networks under the names of the latent diffusion code (Rombach et al. 2022), read into diffusers' classes.
+
+Files of this kind hold tensors and no configuration. It is read off the shapes of the tensors; what shapes
+cannot tell is constant in the family of Stable Diffusion 2, the only one that is known here.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from cadam3d.core.checks import UserError
+from cadam3d.io.pretrained import LIBRARIES, Pretrained, Source, require_extra
+
+HEAD = 64  # channels of one attention head, in the UNet and in the text encoder
+SCALING = 0.18215  # of latents
+SAFE = ".safetensors"
+PARTS = {  # part -> its class, and what the names of its tensors begin with in a file of a whole model
+    "unet": (("diffusers", "UNet2DConditionModel"), "model.diffusion_model."),
+    "vae": (("diffusers", "AutoencoderKL"), "first_stage_model."),
+    "text_encoder": (("transformers", "CLIPTextModel"), "cond_stage_model.model."),
+}
+
+
+@dataclass(frozen=True)
+class LatentDiffusion(Pretrained):
+    """A model of which some parts come under those names, and the others as in any model."""
+
+    files: Mapping[str, tuple[Path, str]]  # part -> the file of its tensors, and what their names begin with
+
+    def part(self, name: str, dtype: torch.dtype | None = None) -> Any:
+        """Load one part, frozen, on the CPU. Raises ``UserError`` if it is missing or damaged."""
+        if name not in self.files:
+            return super().part(name, dtype)
+        tensors = self._tensors(name)
+        network = self._empty(name)
+        try:
+            converted = CONVERSIONS[name](tensors, network)
+            cast = {k: tensor if dtype is None else tensor.to(dtype) for k, tensor in converted.items()}
+            network.load_state_dict(cast, assign=True)
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise self._unlike(name, error) from error
+        return network.requires_grad_(False).eval()
+
+    def config(self, name: str) -> dict[str, Any]:
+        """The configuration of one part."""
+        if name not in self.files:
+            return super().config(name)
+        try:
+            return CONFIGURATIONS[name](self._tensors(name))
+        except (KeyError, IndexError) as error:
+            raise self._unlike(name, error) from error
+
+    def _empty(self, name: str) -> nn.Module:
+        """The network, without memory for its numbers."""
+        from accelerate import init_empty_weights
+
+        kind, config = self._kind(name), self.config(name)
+        with init_empty_weights(include_buffers=False):
+            if hasattr(kind, "from_config"):
+                return kind.from_config(config)
+            return kind(kind.config_class.from_dict(config))
+
+    def _tensors(self, name: str) -> dict[str, Tensor]:
+        file, prefix = self.files[name]
+        tensors = read_tensors(self.source.key, file)
+        return {k.removeprefix(prefix): tensor for k, tensor in tensors.items() if k.startswith(prefix)}
+
+    def _unlike(self, name: str, error: Exception) -> UserError:
+        reason = " ".join(str(error).split())[:200]
+        return UserError(
+            f"{self.source.key}: {self.files[name][0]} holds no {name} of the family of Stable Diffusion 2 "
+            f"({reason}). Try: another {self.source.key}.path"
+        )
+
+
+@dataclass(frozen=True)
+class SingleFile(LatentDiffusion):
+    """A whole model in one file. It has no tokenizer, and no words about its noise: both are told."""
+
+    scheduler: Mapping[str, Any]  # its configuration
+    tokenizer: str  # a folder or a name on the hub, with CLIP's vocabulary
+    tokenizer_key: str  # the configuration key that says so
+
+    @staticmethod
+    def open(
+        source: Source, scheduler: Mapping[str, Any], tokenizer: str, tokenizer_key: str
+    ) -> "SingleFile":
+        """The model in ``source.path``, whose tensors are read when a part is asked for."""
+        require_extra(source.key)
+        file = Path(str(source.path)).expanduser()
+        return SingleFile(
+            source=source,
+            where=str(file),
+            revision=None,
+            file=file,
+            index={name: list(kind) for name, (kind, _) in PARTS.items()},
+            files={name: (file, prefix) for name, (_, prefix) in PARTS.items()},
+            scheduler=scheduler,
+            tokenizer=tokenizer,
+            tokenizer_key=tokenizer_key,
+        )
+
+    def part(self, name: str, dtype: torch.dtype | None = None) -> Any:
+        """As of any model; the tokenizer pads with zeros, as OpenCLIP does."""
+        return self._load_tokenizer() if name == "tokenizer" else super().part(name, dtype)
+
+    def config(self, name: str) -> dict[str, Any]:
+        """As of any model."""
+        return dict(self.scheduler) if name == "scheduler" else super().config(name)
+
+    @property
+    def identity(self) -> str:
+        """Name, size and time of the file, and where words become numbers."""
+        facts = self.file.stat()
+        return json.dumps([str(self.file.resolve()), facts.st_size, facts.st_mtime_ns, self.tokenizer])
+
+    def _load_tokenizer(self) -> Any:
+        from transformers import CLIPTokenizer
+
+        config = self.config("text_encoder")
+        loaded: Any = ()
+        reason = "its vocabulary is another one"
+        length = config["max_position_embeddings"]
+        try:
+            loaded = CLIPTokenizer.from_pretrained(self.tokenizer, model_max_length=length)
+        except (OSError, ValueError) as error:
+            reason = " ".join(str(error).split())[:200]
+        if len(loaded) != config["vocab_size"]:  # without files, transformers makes one that knows no word
+            raise UserError(
+                f"{self.tokenizer_key}: wanted the {config['vocab_size']} pieces that the text encoder of "
+                f"{self.file} reads, got {self.tokenizer!r} ({reason}). Try: {self.tokenizer_key}=DIR, "
+                f"a folder with CLIP's vocab.json and merges.txt"
+            )
+        loaded.pad_token_id = 0
+        return loaded
+
+
+def with_ldm_unet(found: Pretrained) -> Pretrained:
+    """``found`` itself, or how to read its UNet if that is of a stranger's class under these names."""
+    library = str((found.index.get("unet") or [None])[0])
+    if library in LIBRARIES:
+        return found
+    index = found.index | {"unet": list(PARTS["unet"][0])}
+    file = _weights_file(found, "unet")
+    return LatentDiffusion(found.source, found.where, found.revision, found.file, index, {"unet": (file, "")})
+
+
+def read_tensors(key: str, file: Path) -> Mapping[str, Tensor]:
+    """The tensors of a file, by name; mapped, where possible, so that only what is used is read.
+
+    Nothing in the file is executed. Raises ``UserError`` if it cannot be read; ``key`` is the configuration
+    node of the model, for the message.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        if file.suffix == SAFE:
+            return load_file(file)
+        content = _unpickle(file)
+        tensors = content.get("state_dict", content)
+        return {name: tensor for name, tensor in tensors.items() if torch.is_tensor(tensor)}
+    except (OSError, EOFError, AttributeError, RuntimeError, UnpicklingError, SafetensorError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise UserError(
+            f"{key}: {file} is no file of tensors ({reason}). Try: download it again, or another {key}.path"
+        ) from error
+
+
+def _unpickle(file: Path) -> Any:
+    try:
+        return torch.load(file, map_location="cpu", weights_only=True, mmap=True)
+    except RuntimeError:  # written before torch could map
+        return torch.load(file, map_location="cpu", weights_only=True)
+
+
+def _weights_file(found: Pretrained, part: str) -> Path:
+    """The file of the tensors of one part of a model in the layout of diffusers."""
+    stems = [f"{part}/diffusion_pytorch_model{v}" for v in (f".{found.source.variant}", "")]
+    names = [stem + suffix for suffix in (SAFE, ".bin") for stem in stems[found.source.variant is None :]]
+    for name in names:
+        file = Path(found.where) / name if Path(found.where).is_dir() else _download(found, name)
+        if file is not None and file.is_file():
+            return file
+    raise UserError(
+        f"{found.source.key}: {found.where} has none of {', '.join(names)}. "
+        f"Try: download it again, or another {found.source.key}.path"
+    )
+
+
+def _download(found: Pretrained, name: str) -> Path | None:
+    from huggingface_hub import hf_hub_download
+    from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError
+
+    try:
+        return Path(hf_hub_download(found.where, name, revision=found.revision))
+    except EntryNotFoundError:
+        return None
+    except (HfHubHTTPError, OSError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise UserError(
+            f"{found.source.key}: {name} of {found.where} cannot be had ({reason}). "
+            f"Try, where there is a connection: hf download {found.where}"
+        ) from error
+
+
+# --- the configurations behind the shapes -------------------------------------------------------------------
+
+
+def _unet_config(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+    shrinks = _numbers(tensors, "input_blocks.", ".0.op.weight")  # each level but the last ends with one
+    layers = min(shrinks) - 1
+    starts = [1 + level * (layers + 1) for level in range(len(shrinks) + 1)]
+    channels = [tensors[f"input_blocks.{i}.0.out_layers.3.weight"].shape[0] for i in starts]
+    attends = [f"input_blocks.{i}.1.norm.weight" in tensors for i in starts]
+    attention = "middle_block.1.transformer_blocks.0.attn2.to_k.weight"
+    config = {
+        "in_channels": tensors["input_blocks.0.0.weight"].shape[1],
+        "out_channels": tensors["out.2.weight"].shape[0],
+        "block_out_channels": channels,
+        "layers_per_block": layers,
+        "down_block_types": ["CrossAttnDownBlock2D" if each else "DownBlock2D" for each in attends],
+        "up_block_types": ["CrossAttnUpBlock2D" if each else "UpBlock2D" for each in reversed(attends)],
+        "cross_attention_dim": tensors[attention].shape[1],
+        "attention_head_dim": [max(width // HEAD, 1) for width in channels],  # diffusers means their number
+        "use_linear_projection": tensors["middle_block.1.proj_in.weight"].ndim == 2,
+    }
+    if "camera_embed.0.weight" in tensors:
+        dim = tensors["camera_embed.0.weight"].shape[1]
+        config |= {"class_embed_type": "projection", "projection_class_embeddings_input_dim": dim}
+    return config
+
+
+def _vae_config(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+    levels = 1 + max(_numbers(tensors, "encoder.down.", ".block.0.conv2.weight"))
+    widths = [tensors[f"encoder.down.{i}.block.0.conv2.weight"].shape[0] for i in range(levels)]
+    return {
+        "block_out_channels": widths,
+        "down_block_types": ["DownEncoderBlock2D"] * levels,
+        "up_block_types": ["UpDecoderBlock2D"] * levels,
+        "layers_per_block": 1 + max(_numbers(tensors, "encoder.down.0.block.", ".conv2.weight")),
+        "latent_channels": tensors["quant_conv.weight"].shape[0] // 2,
+        "scaling_factor": SCALING,
+    }
+
+
+def _text_config(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+    """One layer less than there are: the model reads the states before the last one (then normalized)."""
+    width, pieces = tensors["ln_final.weight"].shape[0], tensors["token_embedding.weight"].shape[0]
+    return {
+        "vocab_size": pieces,
+        "max_position_embeddings": tensors["positional_embedding"].shape[0],
+        "hidden_size": width,
+        "intermediate_size": tensors["transformer.resblocks.0.mlp.c_fc.weight"].shape[0],
+        "num_hidden_layers": max(_numbers(tensors, "transformer.resblocks.", ".ln_1.weight")),
+        "num_attention_heads": max(width // HEAD, 1),
+        "hidden_act": "gelu",
+        "bos_token_id": pieces - 2,
+        "eos_token_id": pieces - 1,
+    }
+
+
+def _numbers(tensors: Mapping[str, Tensor], before: str, after: str) -> list[int]:
+    """The numbers between two pieces of names."""
+    found = [k.removeprefix(before).removesuffix(after) for k in tensors if k.startswith(before)]
+    numbers = [int(number) for number in found if number.isdigit()]
+    if not numbers:
+        raise KeyError(f"{before}0{after} is missing")
+    return numbers
+
+
+# --- their names in diffusers -------------------------------------------------------------------------------
+
+
+def _convert_unet(tensors: Mapping[str, Tensor], network: Any) -> dict[str, Tensor]:
+    from diffusers.loaders.single_file_utils import convert_ldm_unet_checkpoint
+
+    prefix = PARTS["unet"][1]
+    named = {prefix + k.replace("camera_embed.", "label_emb.0."): tensor for k, tensor in tensors.items()}
+    return convert_ldm_unet_checkpoint(named, network.config)
+
+
+def _convert_vae(tensors: Mapping[str, Tensor], network: Any) -> dict[str, Tensor]:
+    from diffusers.loaders.single_file_utils import convert_ldm_vae_checkpoint
+
+    prefix = PARTS["vae"][1]
+    return convert_ldm_vae_checkpoint({prefix + k: tensor for k, tensor in tensors.items()}, network.config)
+
+
+def _convert_text_encoder(tensors: Mapping[str, Tensor], network: Any) -> dict[str, Tensor]:
+    from diffusers.loaders.single_file_utils import convert_open_clip_checkpoint
+
+    unused = f"transformer.resblocks.{network.config.num_hidden_layers}."
+    ignored = (unused, "text_projection")
+    wanted = {name: tensor for name, tensor in tensors.items() if not name.startswith(ignored)}
+    converted = convert_open_clip_checkpoint(network, wanted, prefix="")
+    is_wrapped = hasattr(network, "text_model")  # in older versions of transformers
+    return converted if is_wrapped else {k.removeprefix("text_model."): t for k, t in converted.items()}
+
+
+CONFIGURATIONS: dict[str, Callable[[Mapping[str, Tensor]], dict[str, Any]]] = {
+    "unet": _unet_config,
+    "vae": _vae_config,
+    "text_encoder": _text_config,
+}
+CONVERSIONS: dict[str, Callable[[Mapping[str, Tensor], Any], dict[str, Tensor]]] = {
+    "unet": _convert_unet,
+    "vae": _convert_vae,
+    "text_encoder": _convert_text_encoder,
+}

@@ -1,0 +1,511 @@
+"""LatentPrior: what the pretrained latent models share; they differ in how they read text and call a network.
+
+Text is embedded once per prompt and model, kept on disk, and its encoders are freed before the denoiser is
+loaded. Networks compute in ``dtype``; everything that leaves them is float32.
+"""
+
+import gc
+import hashlib
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812  (the name everybody knows)
+from torch.utils.checkpoint import checkpoint
+
+from cadam3d.core.cameras import Cameras, orbit
+from cadam3d.core.checks import UserError, require, require_choice, require_whole
+from cadam3d.io.atomic import replacing
+from cadam3d.io.cache import default_cache_dir
+from cadam3d.io.pretrained import DTYPES, Pretrained, Source
+from cadam3d.prior.base import Condition, DiffusionPrior, MemoryEstimate, PromptEmbedding
+from cadam3d.prior.memory import working_bytes
+from cadam3d.prior.path import DDPM, NoisePath, Prediction
+from cadam3d.prior.prompting import Mix, Prompting, guide
+
+PRIORS = {  # what to type for a model of this class
+    "StableDiffusionPipeline": "prior=stable_diffusion",
+    "StableDiffusionXLPipeline": "prior=sdxl",
+    "StableDiffusion3Pipeline": "prior=stable_diffusion_3",
+    "MVDreamPipeline": "prior=mvdream",
+}
+TOKENS, T5_TOKENS = 77, 256  # of CLIP and of T5, per text
+FACTOR = 8  # pixels per latent, per side, in every model of this family
+
+
+@dataclass(frozen=True)
+class Texts:
+    """Embedded texts, one per row."""
+
+    tokens: Float[Tensor, "k n d"]
+    pooled: Float[Tensor, "k p"] | None  # where the network wants one vector per text as well
+
+    def mixed(self, weights: Float[Tensor, "b k"]) -> "Texts":
+        """Weighted sums of rows."""
+        tokens = torch.einsum("bk,knd->bnd", weights.to(self.tokens), self.tokens)
+        return Texts(tokens, None if self.pooled is None else weights.to(self.pooled) @ self.pooled)
+
+    def to(self, device: torch.device) -> "Texts":
+        """The same rows on ``device``."""
+        return Texts(self.tokens.to(device), None if self.pooled is None else self.pooled.to(device))
+
+
+@dataclass(frozen=True)
+class TextCondition(Condition):
+    """Weights over embedded texts, per view; the last text is empty."""
+
+    texts: Texts
+    mix: Mix  # over all of ``texts``
+    negative: Float[Tensor, "v k"]
+    cameras: Cameras  # for models that are told where a view stands
+
+    def unprompted(self) -> "TextCondition":
+        """The same views under the empty text, positive and negative."""
+        empty = torch.zeros_like(self.negative)
+        empty[:, -1] = 1
+        mix = Mix(positive=empty, repelled=empty[:, None][:, :0], strengths=empty[:, :0])
+        return TextCondition(texts=self.texts, mix=mix, negative=empty, cameras=self.cameras)
+
+
+@dataclass(frozen=True)
+class LatentEmbedding(PromptEmbedding):
+    """The texts of a prompting, then the negative prompt, then the empty text."""
+
+    texts: Texts
+    prompting: Prompting
+
+    def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> TextCondition:
+        """The condition of these views; the backdrop plays no part."""
+        cameras = cameras.to(self.texts.tokens.device)
+        mix = self.prompting.mix(cameras)
+        v = len(cameras)
+        negative = mix.positive.new_zeros(v, mix.positive.shape[1] + 2)
+        negative[:, -2] = 1
+        padded = Mix(F.pad(mix.positive, (0, 2)), F.pad(mix.repelled, (0, 2)), mix.strengths)
+        return TextCondition(texts=self.texts, mix=padded, negative=negative, cameras=cameras)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LatentPrior(DiffusionPrior):
+    """A pretrained model that denoises what an autoencoder makes of images.
+
+    Renders of any size are resized to ``size``. Latents are the mean of the autoencoder's posterior, where
+    the released codes draw from it. ``micro_batch`` bounds how many images are in a network at once: the
+    autoencoder is then run again in the backward pass, part by part, so that memory no longer grows with the
+    number of views, and the gradient stays what it is.
+    """
+
+    path: str | None  # a folder in the layout of diffusers; wins over ids
+    ids: Sequence[str]  # names on the hub, tried in order
+    revision: str | None  # on the hub
+    variant: str | None  # of weight files
+    prompting: Prompting
+    size: int | None  # pixels per side that renders are resized to; None = as they are
+    dtype: str  # of the networks: one of DTYPES, or "auto": `half` on CUDA, float32 elsewhere
+    micro_batch: int | None  # images in a network at a time; None = all
+    tiling: bool  # decode and encode large images in tiles
+    compile: bool  # torch.compile for the denoiser
+    text_device: str  # where prompts are embedded: "auto" (with the rest) or "cpu"
+    cache_dir: str | None  # of embedded texts; None = the user's cache folder
+
+    kinds: ClassVar[tuple[str, ...]]  # pipeline classes that this prior can use
+    encoders: ClassVar[tuple[str, ...]]  # parts that embed text
+    network_part: ClassVar[str]  # the denoiser
+    half: ClassVar[str]  # the 16-bit type that the model is safe in
+    upcasts: ClassVar[bool]  # whether the autoencoder overflows in float16
+
+    def __post_init__(self) -> None:
+        self.source  # noqa: B018  (checks path, ids, revision and variant)
+        require(
+            isinstance(self.prompting, Prompting),
+            "prior.prompting",
+            wanted="a way to word prompts",
+            got=self.prompting,
+            example="prompting=discrete",
+        )
+        if self.size is not None:
+            require_whole("prior.size", self.size, low=FACTOR, example=512)
+            is_multiple = self.size % (2 * FACTOR) == 0
+            require(
+                is_multiple, "prior.size", wanted="a multiple of 16", got=self.size, example="prior.size=512"
+            )
+        require_choice("prior.dtype", self.dtype, ("auto", *DTYPES))
+        if self.micro_batch is not None:
+            require_whole("prior.micro_batch", self.micro_batch, low=1, example=1)
+        require_choice("prior.text_device", self.text_device, ("auto", "cpu"))
+        require_choice("prior.tiling", self.tiling, (False, True))
+        require_choice("prior.compile", self.compile, (False, True))
+
+    # --- what a family of models fills in ------------------------------------------------------------------
+
+    @abstractmethod
+    def embed_texts(self, found: Pretrained, texts: Sequence[str], device: torch.device) -> Texts:
+        """Load the text encoders, embed, and let go of them."""
+
+    @abstractmethod
+    def denoise(
+        self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
+    ) -> Float[Tensor, "b c h w"]:
+        """The raw output of :attr:`network`, in its dtype."""
+
+    @abstractmethod
+    def complete(
+        self, noisy: Float[Tensor, "v c h w"], output: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
+    ) -> Prediction:
+        """What the (guided) output of the network means."""
+
+    def tempered(
+        self,
+        noisy: Float[Tensor, "v c h w"],
+        guided: Prediction,
+        output: Float[Tensor, "v c h w"],
+        t: Float[Tensor, "v"],
+    ) -> Prediction:
+        """``guided`` itself; a family may weaken it where it is far from ``output``, the prompt's alone."""
+        return guided
+
+    # --- the interface of a prior --------------------------------------------------------------------------
+
+    def embed(self, prompt: str, negative: str) -> LatentEmbedding:
+        """Embed the prompt's texts, the negative prompt and the empty text, from the cache where they are."""
+        texts = self._embedded(self._listed(prompt, negative))
+        return LatentEmbedding(texts=texts.to(self.device), prompting=self.prompting)
+
+    def encode(self, rgb: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v c lh lw"]:
+        """Images in [0, 1] to scaled latents; differentiable."""
+        images = self._resized(rgb.permute(0, 3, 1, 2))
+        if self.micro_batch is None:
+            return self._to_latents(images)
+        parts = [
+            checkpoint(self._to_latents, part, use_reentrant=False, preserve_rng_state=False)
+            for part in images.split(self.micro_batch)
+        ]
+        return torch.cat(parts)
+
+    @torch.no_grad()
+    def decode(
+        self, latents: Float[Tensor, "v c lh lw"], height: int, width: int
+    ) -> Float[Tensor, "v h w 3"]:
+        """Scaled latents to images in [0, 1] of the size that renders have; without gradient."""
+        config = self.vae.config
+        raw = latents / config.scaling_factor + (config.shift_factor or 0)
+        parts = [self.vae.decode(part.to(self.vae.dtype)).sample.float() for part in self._parts(raw)]
+        images = F.interpolate(torch.cat(parts), size=(height, width), mode="bilinear", antialias=True)
+        return (images.permute(0, 2, 3, 1) / 2 + 0.5).clamp(0, 1)
+
+    @torch.no_grad()
+    def predict(
+        self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: TextCondition, scale: float
+    ) -> Prediction:
+        """One guess, without gradient; all branches of guidance in one batch, or by ``micro_batch``."""
+        mix = condition.mix
+        repelled = list(mix.repelled.unbind(dim=1))
+        branches = [condition.negative, mix.positive, *repelled]
+        if scale == 0:
+            branches = [condition.negative]
+        elif scale == 1 and not repelled:
+            branches = [mix.positive]
+        outputs = self._outputs(noisy.float(), t, condition, torch.cat(branches)).chunk(len(branches))
+        guess = outputs[0]
+        if len(branches) == 1:
+            return self.complete(noisy, guess.to(noisy.dtype), t)
+        guess = guide(
+            outputs[0],
+            outputs[1],
+            torch.stack([*outputs[2:]]) if repelled else guess[None][:0],
+            mix.strengths,
+            scale,
+        )
+        guided = self.complete(noisy, guess.to(noisy.dtype), t)
+        return self.tempered(noisy, guided, outputs[1].to(noisy.dtype), t)
+
+    def memory(self, prompt: str, negative: str, views: int, size: int | None) -> MemoryEstimate:
+        """Weights, the larger of what denoiser and autoencoder need at once, and the text encoders.
+
+        From the model's configurations alone. Renders have ``size`` (or 512) where the prior has none.
+        """
+        pixels = self.size or size or 512
+        branches = 2 + self.prompting.mix(_views(1)).repelled.shape[1]
+        vae = self.found.skeleton("vae", self._vae_dtype)
+        network = self.found.skeleton(self.network_part, self.torch_dtype)
+        working = max(
+            self._denoising(network, self._at_once(views * branches), vae.config.latent_channels, pixels),
+            _encoding(vae, self._at_once(views), pixels),
+        )
+        is_known = all(self._cache_file(text).is_file() for text in self._listed(prompt, negative))
+        is_elsewhere = self.text_device == "cpu" and self.device.type != "cpu"
+        encoders = (
+            [] if is_known or is_elsewhere else [part for part in self.encoders if self.found.has(part)]
+        )
+        texts = sum(_weights(self.found.skeleton(part, self.torch_dtype)) for part in encoders)
+        return MemoryEstimate(weights=_weights(vae) + _weights(network), working=working, texts=texts)
+
+    def load(self) -> None:
+        """Load the autoencoder and the denoiser."""
+        _ = self.vae, self.network
+
+    def to(self, device: torch.device) -> "LatentPrior":
+        """Networks loaded from now on go to ``device``; those that are loaded move."""
+        self._place["device"] = device
+        for part in ("vae", "network"):
+            if part in self.__dict__:
+                self.__dict__[part].to(device)
+        return self
+
+    # --- parts ---------------------------------------------------------------------------------------------
+
+    @property
+    def device(self) -> torch.device:
+        """Where the networks are, or will be."""
+        return self._place["device"]
+
+    @property
+    def torch_dtype(self) -> torch.dtype:
+        """What the networks compute in."""
+        if self.dtype != "auto":
+            return DTYPES[self.dtype]
+        return DTYPES[self.half] if self.device.type == "cuda" else torch.float32
+
+    @cached_property
+    def source(self) -> Source:
+        """Where the model may be found."""
+        return Source("prior", self.path, self.ids, self.revision, self.variant)
+
+    @cached_property
+    def found(self) -> Pretrained:
+        """The model, found but not loaded."""
+        return self.source.find(self.kinds, PRIORS)
+
+    @cached_property
+    def scheduler(self) -> Mapping[str, Any]:
+        """The configuration of the model's noise schedule."""
+        return self.found.config("scheduler")
+
+    @cached_property
+    def vae(self) -> Any:
+        """The autoencoder, frozen, on the device."""
+        vae = self.found.part("vae", self._vae_dtype)
+        if self.tiling:
+            vae.enable_tiling()
+        return vae.to(self.device)
+
+    @cached_property
+    def network(self) -> Any:
+        """The denoiser, frozen, on the device."""
+        network = self.found.part(self.network_part, self.torch_dtype).to(self.device)
+        if self.device.type == "cuda":
+            network = network.to(memory_format=torch.channels_last)
+        return torch.compile(network) if self.compile else network
+
+    @cached_property
+    def _place(self) -> dict[str, torch.device]:
+        return {"device": torch.device("cpu")}
+
+    @property
+    def _vae_dtype(self) -> torch.dtype:
+        overflows = self.upcasts and self.torch_dtype == torch.float16
+        return torch.float32 if overflows else self.torch_dtype
+
+    # --- work ----------------------------------------------------------------------------------------------
+
+    def _resized(self, images: Float[Tensor, "v 3 h w"]) -> Float[Tensor, "v 3 s s2"]:
+        size = (self.size, self.size) if self.size is not None else images.shape[2:]
+        require(
+            all(side % FACTOR == 0 and side >= FACTOR for side in size),
+            "camera.size",
+            wanted=f"a multiple of {FACTOR} pixels, since prior.size is null",
+            got=size[0],
+            example="prior.size=512",
+        )
+        return (
+            images if tuple(images.shape[2:]) == tuple(size) else F.interpolate(images, size, mode="bilinear")
+        )
+
+    def _to_latents(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c lh lw"]:
+        config = self.vae.config
+        mean = self.vae.encode((2 * images - 1).to(self.vae.dtype)).latent_dist.mode().float()
+        return (mean - (config.shift_factor or 0)) * config.scaling_factor
+
+    def _outputs(
+        self,
+        noisy: Float[Tensor, "v c h w"],
+        t: Float[Tensor, "v"],
+        condition: TextCondition,
+        weights: Tensor,
+    ) -> Float[Tensor, "b c h w"]:
+        """The network on every row of ``weights``: the views, once per branch of guidance."""
+        copies = len(weights) // len(noisy)
+        many = noisy.to(self.torch_dtype).repeat(copies, 1, 1, 1)
+        timestep = self.noise_path.timestep(t.float()).repeat(copies)
+        which = torch.arange(len(noisy), device=noisy.device).repeat(copies)
+        outputs = []
+        for rows in self._parts(torch.arange(len(many), device=noisy.device)):
+            texts = condition.texts.mixed(weights[rows])
+            cameras = condition.cameras.index(which[rows])
+            outputs.append(self.denoise(many[rows], timestep[rows], texts, cameras).float())
+        return torch.cat(outputs)
+
+    def _parts(self, rows: Tensor) -> Sequence[Tensor]:
+        return rows.split(self._at_once(len(rows)))
+
+    def _at_once(self, images: int) -> int:
+        return min(images, self.micro_batch or images)
+
+    def _listed(self, prompt: str, negative: str) -> list[str]:
+        return [*self.prompting.texts(prompt), negative, ""]
+
+    def _denoising(self, network: Any, count: int, channels: int, pixels: int) -> int:
+        """Scratch bytes of one pass of a skeleton of the denoiser over ``count`` images."""
+        ghost = replace(self)  # this prior, with a network that has no numbers
+        object.__setattr__(ghost, "network", network)
+        side = pixels // FACTOR
+        with torch.device("meta"):
+            noisy = torch.empty(count, channels, side, side, dtype=self.torch_dtype)
+            timestep = torch.empty(count)
+            texts = blank_texts(count, network.config, self.torch_dtype)
+        cameras = _views(count).to("meta")
+        with torch.no_grad():
+            return working_bytes(lambda: ghost.denoise(noisy, timestep, texts, cameras), network.parameters())
+
+    def _embedded(self, listed: Sequence[str]) -> Texts:
+        """Rows for ``listed``, in order; only texts that are not in the cache cost anything."""
+        rows = {text: self._cached(text) for text in dict.fromkeys(listed)}
+        missing = [text for text, row in rows.items() if row is None]
+        if missing:
+            device = torch.device("cpu") if self.text_device == "cpu" else self.device
+            made = self.embed_texts(self.found, missing, device)
+            free()
+            for i, text in enumerate(missing):
+                row = Texts(made.tokens[i : i + 1], None if made.pooled is None else made.pooled[i : i + 1])
+                self._remember(text, row)
+                rows[text] = row
+        chosen = [row for text in listed if (row := rows[text]) is not None]
+        pooled = [row.pooled for row in chosen if row.pooled is not None]
+        return Texts(
+            torch.cat([row.tokens.to(self.device) for row in chosen]),
+            torch.cat([row.to(self.device) for row in pooled]) if pooled else None,
+        )
+
+    def _cached(self, text: str) -> Texts | None:
+        from safetensors import SafetensorError
+        from safetensors.torch import load_file
+
+        file = self._cache_file(text)
+        if not file.is_file():
+            return None
+        try:
+            kept = load_file(file)
+        except (OSError, SafetensorError):
+            return None  # cut short by a crash; made again
+        return Texts(kept["tokens"], kept.get("pooled"))
+
+    def _remember(self, text: str, row: Texts) -> None:
+        from safetensors.torch import save_file
+
+        kept = {"tokens": row.tokens} | ({} if row.pooled is None else {"pooled": row.pooled})
+        try:
+            with replacing(self._cache_file(text)) as temporary:
+                save_file({name: value.contiguous().cpu() for name, value in kept.items()}, temporary)
+        except UserError:
+            pass  # a cache that cannot be written only costs time
+
+    def _cache_file(self, text: str) -> Path:
+        folder = Path(self.cache_dir).expanduser() if self.cache_dir else default_cache_dir()
+        facts = (*self._identity, text)
+        return folder / "texts" / f"{hashlib.sha256(repr(facts).encode()).hexdigest()[:32]}.safetensors"
+
+    @property
+    def _identity(self) -> tuple[str, ...]:
+        """Whatever changes an embedded text."""
+        return (type(self).__name__, self.found.identity, str(self.torch_dtype), *self.encoders)
+
+
+def ddpm_path(scheduler: Mapping[str, Any]) -> NoisePath:
+    """The noise path that a scheduler's configuration describes. Raises ``UserError`` for unknown kinds."""
+    kind = scheduler.get("beta_schedule")
+    is_known = kind == "scaled_linear" and not scheduler.get("rescale_betas_zero_snr")
+    require(
+        is_known and scheduler.get("trained_betas") is None,
+        "prior.path",
+        wanted="a model whose noise schedule is scaled_linear",
+        got=kind if kind != "scaled_linear" else "one rescaled to zero terminal SNR",
+        example="another model",
+    )
+    return DDPM(
+        train_steps=scheduler["num_train_timesteps"],
+        beta_start=scheduler["beta_start"],
+        beta_end=scheduler["beta_end"],
+    )
+
+
+def blank_texts(count: int, config: Any, dtype: torch.dtype) -> Texts:
+    """Texts of the shapes that a denoiser with this configuration reads, without meaning."""
+    joint = getattr(config, "joint_attention_dim", None)
+    tokens = torch.empty(count, TOKENS + (T5_TOKENS if joint else 0), joint or config.cross_attention_dim)
+    width = getattr(config, "pooled_projection_dim", None)
+    if (
+        getattr(config, "addition_embed_type", None) == "text_time"
+    ):  # SDXL: the rest are six numbers about sizes
+        width = config.projection_class_embeddings_input_dim - 6 * config.addition_time_embed_dim
+    return Texts(tokens.to(dtype), None if width is None else torch.empty(count, width).to(dtype))
+
+
+def tokenize(tokenizer: Any, texts: Sequence[str], length: int | None = None) -> Tensor:
+    """Token numbers, cut or padded to ``length`` (None: the tokenizer's own)."""
+    return tokenizer(
+        list(texts),
+        padding="max_length",
+        max_length=length or tokenizer.model_max_length,
+        truncation=True,
+        return_tensors="pt",
+    ).input_ids
+
+
+def free() -> None:
+    """Give memory of dropped networks back."""
+    gc.collect()
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+
+
+Complete = Callable[[Tensor, Tensor, Tensor], Prediction]
+
+
+def completion(path: NoisePath, scheduler: Mapping[str, Any]) -> Complete:
+    """How the outputs of a network become predictions. Raises ``UserError`` for unknown kinds."""
+    kind = scheduler.get("prediction_type", "epsilon")
+    ways: dict[str, Complete] = {
+        "epsilon": path.from_noise,
+        "v_prediction": path.from_velocity,
+        "sample": path.from_clean,
+    }
+    require(
+        kind in ways,
+        "prior.path",
+        wanted=f"a model that predicts {' or '.join(ways)}",
+        got=kind,
+        example="another model",
+    )
+    return ways[kind]
+
+
+def _encoding(vae: Any, count: int, pixels: int) -> int:
+    """Bytes that a skeleton of the autoencoder keeps for the backward pass through ``count`` images."""
+    with torch.device("meta"):
+        images = torch.empty(count, 3, pixels, pixels, dtype=vae.dtype, requires_grad=True)
+    return working_bytes(lambda: vae.encode(images).latent_dist.mode(), vae.parameters())  # noqa: PLW0108
+
+
+def _weights(network: Any) -> int:
+    return sum(parameter.numel() * parameter.element_size() for parameter in network.parameters())
+
+
+def _views(count: int) -> Cameras:
+    zeros = torch.zeros(count)
+    return orbit(zeros, zeros, zeros + 3, zeros + 45, FACTOR, FACTOR)

@@ -1,0 +1,213 @@
+"""MVDream: four views at a time, each told where it stands, in a UNet whose attention spans all four."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.core.cameras import Cameras
+from cadam3d.core.checks import UserError, require, require_range
+from cadam3d.io.ldm import SingleFile, with_ldm_unet
+from cadam3d.io.pretrained import Pretrained
+from cadam3d.prior.base import MemoryEstimate
+from cadam3d.prior.latent import PRIORS, LatentEmbedding, TextCondition, Texts
+from cadam3d.prior.path import Prediction, per_view
+from cadam3d.prior.stable_diffusion import StableDiffusion
+
+VIEWS = 4  # of one group
+CAMERA = 16  # numbers that the network is told about a view
+TOLERANCE_DEG = 1.0  # within which the views of a group stand a quarter turn apart
+SCHEDULER = {  # of the published files, which do not say
+    "beta_schedule": "scaled_linear",
+    "beta_start": 0.00085,
+    "beta_end": 0.012,
+    "num_train_timesteps": 1000,
+    "prediction_type": "epsilon",
+}
+
+
+@dataclass(frozen=True)
+class MultiviewEmbedding(LatentEmbedding):
+    """Embedded texts for views that come in groups of four."""
+
+    def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> TextCondition:
+        """The condition of these views. Raises ``UserError`` unless they are groups as in training."""
+        require_groups(cameras)
+        return super().at(cameras, background)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MVDream(StableDiffusion):
+    """Shi et al. 2024, on Stable Diffusion 2.1: views that agree, since they are denoised together.
+
+    Consecutive views form a group of four, a quarter turn apart, at one elevation and one ``t``, as
+    ``camera=multiview`` makes them. ``path`` may also be the published file (``sd-v2.1-base-4view.pt``).
+    """
+
+    rescale: float  # share of the guided guess that gets back the spread it had without guidance
+    tokenizer: str  # of a single file, which has none: a folder or a name on the hub with CLIP's vocabulary
+
+    kinds: ClassVar = ("MVDreamPipeline", "StableDiffusionPipeline")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_range("prior.rescale", self.rescale, low=0, high=1, example=0.5)
+        is_name = isinstance(self.tokenizer, str) and self.tokenizer != ""
+        require(
+            is_name,
+            "prior.tokenizer",
+            wanted="a folder or a name on the hub",
+            got=self.tokenizer,
+            example="prior.tokenizer=openai/clip-vit-large-patch14",
+        )
+        require(
+            self.micro_batch is None or self.micro_batch % VIEWS == 0,
+            "prior.micro_batch",
+            wanted=f"null or a multiple of {VIEWS}, the views that are denoised together",
+            got=self.micro_batch,
+            example=f"prior.micro_batch={VIEWS}",
+        )
+
+    @cached_property
+    def found(self) -> Pretrained:
+        """The model: a folder, one file, or on the hub. Raises ``UserError`` if it knows of no cameras."""
+        if self.path is not None and Path(self.path).expanduser().is_file():
+            found = SingleFile.open(self.source, SCHEDULER, self.tokenizer, "prior.tokenizer")
+        else:
+            found = with_ldm_unet(self.source.find(self.kinds, PRIORS))
+        if found.config("unet").get("projection_class_embeddings_input_dim") != CAMERA:
+            raise UserError(
+                f"prior: {found.where} is not MVDream: its UNet is not told where a view stands. "
+                f"Try: prior=stable_diffusion, or another prior.path"
+            )
+        return found
+
+    @cached_property
+    def network(self) -> Any:
+        """The denoiser, frozen, on the device, with attention across the views of a group."""
+        return across_views(super().network)
+
+    def embed(self, prompt: str, negative: str) -> MultiviewEmbedding:
+        """Embed the prompt's texts, the negative prompt and the empty text."""
+        embedding = super().embed(prompt, negative)
+        return MultiviewEmbedding(texts=embedding.texts, prompting=embedding.prompting)
+
+    def denoise(
+        self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
+    ) -> Float[Tensor, "b c h w"]:
+        """The UNet under text cross-attention; where the views stand is added to the time."""
+        told = camera_numbers(cameras).to(noisy)
+        return self.network(noisy, timestep, encoder_hidden_states=texts.tokens, class_labels=told).sample
+
+    @torch.no_grad()
+    def predict(
+        self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: TextCondition, scale: float
+    ) -> Prediction:
+        """One guess per view, without gradient. Raises ``UserError`` if ``t`` differs within a group."""
+        levels = t.view(-1, VIEWS)
+        require(
+            bool((levels == levels[:, :1]).all()),
+            "guidance.shared_t",
+            wanted="true, since prior=mvdream denoises four views of one noise level together",
+            got=False,
+            example="guidance.shared_t=true",
+        )
+        return super().predict(noisy, t, condition, scale)
+
+    def tempered(
+        self,
+        noisy: Float[Tensor, "v c h w"],
+        guided: Prediction,
+        output: Float[Tensor, "v c h w"],
+        t: Float[Tensor, "v"],
+    ) -> Prediction:
+        """Pull the clean guess to the spread that it has for the prompt alone (MVDream, sec. 3.2)."""
+        if self.rescale == 0:
+            return guided
+        alone = self.complete(noisy, output, t).clean
+        ratio = _spread(alone) / _spread(guided.clean)
+        factor = torch.lerp(torch.ones_like(ratio), ratio, self.rescale)
+        return self.noise_path.from_clean(noisy, guided.clean * per_view(factor), t)
+
+    def memory(self, prompt: str, negative: str, views: int, size: int | None) -> MemoryEstimate:
+        """As of any latent model. Raises ``UserError`` unless ``views`` make groups of four."""
+        require_whole_groups(views)
+        return super().memory(prompt, negative, views, size)
+
+
+def camera_numbers(cameras: Cameras) -> Float[Tensor, "v 16"]:
+    """Camera-to-world matrices, row by row, as the network was trained on them.
+
+    World axes are ours: +z up, and the front at +x, where the published code has it too. Camera axes are
+    OpenGL's: +x right, +y up, +z backward. Camera centres are moved to the unit sphere.
+    """
+    to_world = cameras.world_to_camera[:, :3, :3].transpose(1, 2)
+    axes = to_world * to_world.new_tensor([1.0, -1.0, -1.0])
+    centres = torch.nn.functional.normalize(cameras.positions, dim=-1)
+    last = to_world.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(cameras), 1, 4)
+    return torch.cat([torch.cat([axes, centres[..., None]], dim=2), last], dim=1).flatten(1)
+
+
+def require_whole_groups(views: int) -> None:
+    """Raise ``UserError`` unless ``views`` make groups of four."""
+    require(
+        views % VIEWS == 0,
+        "views",
+        wanted=f"a multiple of {VIEWS}, since prior=mvdream denoises {VIEWS} views together",
+        got=views,
+        example=f"camera=multiview views={VIEWS}",
+    )
+
+
+def require_groups(cameras: Cameras) -> None:
+    """Raise ``UserError`` unless consecutive views are groups of four, a quarter turn apart, on one level."""
+    require_whole_groups(len(cameras))
+    azimuth, elevation = (a.view(-1, VIEWS) for a in (cameras.azimuth_deg, cameras.elevation_deg))
+    turns = (azimuth - azimuth[:, :1]) % 360
+    quarters = 90.0 * torch.arange(VIEWS, device=turns.device)
+    off = torch.maximum((turns.sort(dim=1).values - quarters).abs(), (elevation - elevation[:, :1]).abs())
+    require(
+        bool((off < TOLERANCE_DEG).all()),
+        "camera",
+        wanted="groups of four views, a quarter turn apart at one elevation, for prior=mvdream",
+        got=f"azimuths {_listed(azimuth[0])} and elevations {_listed(elevation[0])} degrees",
+        example="camera=multiview",
+    )
+
+
+class AcrossViews:
+    """What computes an attention layer, over the pixels of a group as if they were those of one image."""
+
+    def __init__(self, processor: Any) -> None:
+        self.processor = processor
+
+    def __call__(self, attention: Any, states: Float[Tensor, "b n c"], *args: Any, **kwargs: Any) -> Tensor:
+        """The layer's output for every view."""
+        b, n, c = states.shape
+        together = states.reshape(b // VIEWS, VIEWS * n, c)
+        return self.processor(attention, together, *args, **kwargs).reshape(b, n, c)
+
+
+def across_views(network: Any) -> Any:
+    """Let the self-attention of ``network`` span the views of a group; changes and returns it."""
+    processors = {
+        name: AcrossViews(each) if name.endswith("attn1.processor") else each
+        for name, each in network.attn_processors.items()
+    }
+    network.set_attn_processor(processors)
+    return network
+
+
+def _spread(clean: Float[Tensor, "v c h w"]) -> Float[Tensor, "v"]:
+    """Standard deviation over a whole group, for each of its views."""
+    groups = clean.reshape(len(clean) // VIEWS, -1)
+    return groups.std(dim=1).clamp_min(1e-8).repeat_interleave(VIEWS)
+
+
+def _listed(values: Sequence[float] | Tensor) -> str:
+    return ", ".join(f"{float(value):.0f}" for value in values)

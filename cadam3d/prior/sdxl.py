@@ -1,0 +1,64 @@
+"""Stable Diffusion XL: a larger UNet that reads two text encoders, a pooled text and the image's size."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.core.cameras import Cameras
+from cadam3d.io.pretrained import Pretrained
+from cadam3d.prior.latent import FACTOR, LatentPrior, Texts, completion, ddpm_path
+from cadam3d.prior.path import NoisePath, Prediction
+from cadam3d.prior.text import penultimate
+
+
+@dataclass(frozen=True, kw_only=True)
+class StableDiffusionXL(LatentPrior):
+    """Podell et al. 2023. Every image is presented as uncropped and of its own size (sec. 2.2 there).
+
+    The empty text is all zeros where the model says so, as it was in training.
+    """
+
+    kinds: ClassVar = ("StableDiffusionXLPipeline",)
+    encoders: ClassVar = ("text_encoder", "text_encoder_2")
+    network_part: ClassVar = "unet"
+    half: ClassVar = "float16"
+    upcasts: ClassVar = True
+
+    @cached_property
+    def noise_path(self) -> NoisePath:
+        """The model's own noise schedule."""
+        return ddpm_path(self.scheduler)
+
+    def complete(
+        self, noisy: Float[Tensor, "v c h w"], output: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
+    ) -> Prediction:
+        """Noise or velocity, as the model's scheduler says."""
+        return completion(self.noise_path, self.scheduler)(noisy, output, t)
+
+    def embed_texts(self, found: Pretrained, texts: Sequence[str], device: torch.device) -> Texts:
+        """Both encoders' penultimate states side by side; the second one's projected text as the vector."""
+        first, second = (penultimate(found, part, texts, self.torch_dtype, device) for part in self.encoders)
+        both = Texts(torch.cat([first.tokens, second.tokens], dim=-1), second.pooled)
+        if not found.index.get("force_zeros_for_empty_prompt"):
+            return both
+        empty = torch.tensor(
+            [i for i, text in enumerate(texts) if text == ""], dtype=torch.int64, device=device
+        )
+        pooled = None if both.pooled is None else both.pooled.index_fill(0, empty, 0)
+        return Texts(both.tokens.index_fill(0, empty, 0), pooled)
+
+    def denoise(
+        self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
+    ) -> Float[Tensor, "b c h w"]:
+        """The UNet under text cross-attention; pooled text and sizes go in beside the time."""
+        height, width = (FACTOR * side for side in noisy.shape[2:])
+        sizes = noisy.new_tensor([[height, width, 0, 0, height, width]])  # original, top left corner, target
+        added = {"text_embeds": texts.pooled, "time_ids": sizes.expand(len(noisy), -1)}
+        return self.network(
+            noisy, timestep, encoder_hidden_states=texts.tokens, added_cond_kwargs=added
+        ).sample

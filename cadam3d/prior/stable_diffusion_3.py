@@ -1,0 +1,93 @@
+"""Stable Diffusion 3 and 3.5: a transformer on the straight path, which reads up to three text encoders."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812  (the name everybody knows)
+
+from cadam3d.core.cameras import Cameras
+from cadam3d.core.checks import require, require_choice
+from cadam3d.io.pretrained import Pretrained
+from cadam3d.prior.latent import T5_TOKENS, LatentPrior, Texts, free, tokenize
+from cadam3d.prior.path import NoisePath, Prediction, RectifiedFlow
+from cadam3d.prior.text import penultimate
+
+T5 = "text_encoder_3"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StableDiffusion3(LatentPrior):
+    """Esser et al. 2024; the paper's VFDS experiments use 3.5. It predicts the velocity, noise - clean.
+
+    ``t`` is bent towards noise by the model's own ``shift``, once, in its noise path: a uniform ``t`` is a
+    uniform row of the table of sigmas that the model's scheduler comes with.
+    """
+
+    t5: bool  # read T5 too, if the model has it; else it is neither loaded nor downloaded
+
+    kinds: ClassVar = ("StableDiffusion3Pipeline",)
+    network_part: ClassVar = "transformer"
+    half: ClassVar = "bfloat16"
+    upcasts: ClassVar = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_choice("prior.t5", self.t5, (True, False))
+
+    @property
+    def encoders(self) -> tuple[str, ...]:
+        """The parts that embed text: T5 only where it is wanted and there."""
+        third = (T5,) if self.t5 and self.found.has(T5) else ()
+        return ("text_encoder", "text_encoder_2", *third)
+
+    @cached_property
+    def noise_path(self) -> NoisePath:
+        """The straight path, with the model's shift."""
+        is_shifted = not self.scheduler.get("use_dynamic_shifting")
+        require(
+            is_shifted,
+            "prior.path",
+            wanted="a model with one shift for every size of image",
+            got="dynamic shifting",
+            example="another model",
+        )
+        return RectifiedFlow(shift=float(self.scheduler.get("shift", 1.0)))
+
+    def complete(
+        self, noisy: Float[Tensor, "v c h w"], output: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
+    ) -> Prediction:
+        """The velocity."""
+        return self.noise_path.from_velocity(noisy, output, t)
+
+    @torch.no_grad()
+    def embed_texts(self, found: Pretrained, texts: Sequence[str], device: torch.device) -> Texts:
+        """CLIP's penultimate states side by side, padded to T5's width; then T5's tokens, or zeros."""
+        dtype = self.torch_dtype
+        clip = [penultimate(found, part, texts, dtype, device) for part in ("text_encoder", "text_encoder_2")]
+        both = torch.cat([each.tokens for each in clip], dim=-1)
+        width = found.config(self.network_part)["joint_attention_dim"]
+        long = both.new_zeros(len(texts), T5_TOKENS, width)
+        if T5 in self.encoders:
+            numbers = tokenize(found.part("tokenizer_3"), texts, T5_TOKENS).to(device)
+            encoder = found.part(T5, dtype).to(device)
+            long = encoder(numbers)[0].to(dtype)
+            del encoder
+            free()
+        tokens = torch.cat([F.pad(both, (0, width - both.shape[-1])), long], dim=1)
+        return Texts(tokens, torch.cat([each.pooled for each in clip if each.pooled is not None], dim=-1))
+
+    def denoise(
+        self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
+    ) -> Float[Tensor, "b c h w"]:
+        """The transformer over image and text tokens together."""
+        return self.network(
+            hidden_states=noisy,
+            timestep=timestep,
+            encoder_hidden_states=texts.tokens,
+            pooled_projections=texts.pooled,
+        ).sample

@@ -1,0 +1,265 @@
+"""Time and memory of whole recipes on networks of the published sizes with random weights, made on the spot.
+
+    python scripts/bench_recipes.py --device cuda --steps 50 --vram low --json recipes.json
+    python scripts/bench_recipes.py --estimates     # what each would need, without a GPU or weights
+
+What an object looks like means nothing here; what a step costs does. Weights are drawn once and saved as a
+real model is, so that loading is timed too (Stable Diffusion 2.1: 1.9 GB, 3.5-medium: 4.7 GB in 16 bit).
+"""
+
+import argparse
+import json
+import subprocess
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cadam3d.commands.train import build_trainer
+from cadam3d.prior.base import amount
+from cadam3d.settings import component, compose
+from cadam3d.state import RunContext
+from cadam3d.trainer import Trainer, resolve_device
+
+RECIPES = {"luciddreamer": "stable_diffusion", "flowdreamer": "stable_diffusion_3"}
+SD_VAE = {
+    "block_out_channels": (128, 256, 512, 512),
+    "down_block_types": ("DownEncoderBlock2D",) * 4,
+    "up_block_types": ("UpDecoderBlock2D",) * 4,
+    "layers_per_block": 2,
+}
+
+
+def stable_diffusion(folder: Path, tiny: bool, weights: bool) -> None:
+    """Stable Diffusion 2.1's UNet and autoencoder; texts are read by a small encoder."""
+    from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
+
+    unet = {"block_out_channels": (320, 640, 1280, 1280), "attention_head_dim": (5, 10, 20, 20)}
+    vae = dict(SD_VAE)
+    if tiny:
+        unet = {"block_out_channels": (32, 32, 32, 32), "attention_head_dim": 8}
+        vae |= {"block_out_channels": (32, 32, 32, 32)}
+    parts = {
+        "unet": lambda: UNet2DConditionModel(
+            sample_size=64, cross_attention_dim=1024, use_linear_projection=True, **unet
+        ),
+        "vae": lambda: AutoencoderKL(latent_channels=4, scaling_factor=0.18215, **vae),
+    }
+    scheduler = DDIMScheduler(
+        beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", prediction_type="epsilon"
+    )
+    save(folder, "StableDiffusionPipeline", parts, scheduler, torch.float16 if weights else None)
+
+
+def stable_diffusion_3(folder: Path, tiny: bool, weights: bool) -> None:
+    """Stable Diffusion 3.5-medium's transformer and autoencoder."""
+    from diffusers import AutoencoderKL, FlowMatchEulerDiscreteScheduler, SD3Transformer2DModel
+
+    layers, heads = (2, 2) if tiny else (24, 24)
+    vae = dict(SD_VAE) | ({"block_out_channels": (32, 32, 32, 32)} if tiny else {})
+    parts = {
+        "transformer": lambda: SD3Transformer2DModel(
+            sample_size=128,
+            patch_size=2,
+            in_channels=16,
+            out_channels=16,
+            num_layers=layers,
+            num_attention_heads=heads,
+            attention_head_dim=64,
+            caption_projection_dim=64 * heads,
+            joint_attention_dim=4096,
+            pooled_projection_dim=2048,
+            pos_embed_max_size=384,
+            qk_norm="rms_norm",
+            dual_attention_layers=tuple(range(min(13, layers))),
+        ),
+        "vae": lambda: AutoencoderKL(
+            latent_channels=16,
+            scaling_factor=1.5305,
+            shift_factor=0.0609,
+            use_quant_conv=False,
+            use_post_quant_conv=False,
+            **vae,
+        ),
+    }
+    scheduler = FlowMatchEulerDiscreteScheduler(shift=3.0)
+    save(folder, "StableDiffusion3Pipeline", parts, scheduler, torch.bfloat16 if weights else None)
+
+
+def save(
+    folder: Path, kind: str, parts: dict[str, Callable[[], Any]], scheduler: Any, dtype: torch.dtype | None
+) -> None:
+    """Write a folder in the layout of diffusers, one part at a time; without a dtype, without weights."""
+    index: dict[str, Any] = {"_class_name": kind, "scheduler": ["diffusers", type(scheduler).__name__]}
+    torch.manual_seed(0)
+    torch.set_default_dtype(dtype or torch.float32)
+    try:
+        for name, make in parts.items():
+            with torch.device("cpu" if dtype else "meta"):
+                part = make()
+            (part.save_pretrained if dtype else part.save_config)(folder / name)
+            index[name] = ["diffusers", type(part).__name__]
+            del part
+    finally:
+        torch.set_default_dtype(torch.float32)
+    scheduler.save_pretrained(folder / "scheduler")
+    (folder / "model_index.json").write_text(json.dumps(index))
+
+
+class Stopwatch:
+    """Seconds per stage; a GPU is waited for at both ends of each, which slows the whole a little."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device, self.seconds, self.calls = (
+            device,
+            defaultdict[str, float](float),
+            defaultdict[str, int](int),
+        )
+
+    def __call__(self, stage: str, work: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            started = self.now()
+            result = work(*args, **kwargs)
+            self.seconds[stage] += self.now() - started
+            self.calls[stage] += 1
+            return result
+
+        return timed
+
+    def now(self) -> float:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        return time.perf_counter()
+
+
+def random_texts(prior: Any) -> None:
+    """Stand in for text encoders, which run once per prompt and are not what a step costs."""
+    from cadam3d.prior.latent import Texts, blank_texts
+
+    def embed_texts(found: Any, texts: list[str], device: torch.device) -> Texts:
+        config = found.skeleton(prior.network_part, prior.torch_dtype).config
+        blank = blank_texts(len(texts), config, prior.torch_dtype)
+        generator = torch.Generator().manual_seed(0)
+
+        def drawn(like: torch.Tensor) -> torch.Tensor:
+            return torch.randn(like.shape, generator=generator).to(device, like.dtype)
+
+        return Texts(drawn(blank.tokens), None if blank.pooled is None else drawn(blank.pooled))
+
+    object.__setattr__(prior, "embed_texts", embed_texts)
+
+
+def measure(recipe: str, model: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """Train for a while; seconds per step and stage, and the peak of memory."""
+    device = resolve_device(args.device)
+    lines = [f"experiment={recipe}", "prompt=a corgi", f"prior.path={model}", "initializer=ball"]
+    lines += [f"initializer.count={args.count}", f"steps={args.steps}", f"prior.cache_dir={model / 'texts'}"]
+    lines += ["callback=[]", *([f"vram={args.vram}"] if args.vram else []), *args.settings]
+    cfg = compose(lines)
+    trainer = build_trainer(cfg, device)
+    random_texts(trainer.prior)
+    backend = trainer.rasterizer.prepare(device)
+    estimate = trainer.prior.memory(cfg.prompt, cfg.negative_prompt, trainer.views, None)
+    started = time.perf_counter()
+    embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
+    trainer.prior.load()
+    loading = time.perf_counter() - started
+    watch = Stopwatch(device)
+    for name in ("encode", "decode", "predict"):
+        object.__setattr__(trainer.prior, name, watch(name, getattr(trainer.prior, name)))
+    object.__setattr__(trainer.rasterizer, "render", watch("render", trainer.rasterizer.render))
+    state = trainer.start(cfg.prompt, component(cfg.initializer), 0, device)
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    with tempfile.TemporaryDirectory() as folder:
+        context = RunContext(Path(folder), cfg.prompt, cfg.steps, trainer.renderer(state), trainer.rasterizer)
+        warm: Trainer = replace(trainer, steps=args.warmup)
+        warm.train(state, embedding, context)
+        watch.seconds.clear()
+        watch.calls.clear()
+        before = watch.now()
+        trainer.train(state, embedding, context)
+        total = watch.now() - before
+    steps = args.steps - args.warmup
+    stages = {name: seconds / steps for name, seconds in watch.seconds.items()}
+    stages["everything else, backward included"] = total / steps - sum(stages.values())
+    peak = torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None
+    return {
+        "recipe": recipe,
+        "vram": args.vram,
+        "backend": backend.name,
+        "loading_seconds": loading,
+        "seconds_per_step": total / steps,
+        "stages": stages,
+        "predictions_per_step": watch.calls["predict"] / steps,
+        "num_gaussians": len(state.gaussians),
+        "estimate_bytes": estimate.total,
+        "peak_bytes": peak,
+    }
+
+
+def estimate(recipe: str, model: Path) -> None:
+    """Print what training would hold under each choice of ``vram``, in 16 bit, texts being known."""
+    for vram in ("low", "medium", "full"):
+        lines = [f"experiment={recipe}", "initializer=ball", "prompt=x", f"prior.path={model}"]
+        lines += [f"vram={vram}"]
+        prior = component(compose([*lines, "prior.dtype=float16"]).prior)
+        object.__setattr__(prior, "_cache_file", lambda text: model / "model_index.json")
+        needed = prior.memory("x", "", 4, None)
+        print(
+            f"{recipe:<14}{vram:<8}{amount(needed.weights):>10} weights, "
+            f"{amount(needed.working):>10} working, {amount(needed.total):>10} in all"
+        )
+
+
+def machine(device: torch.device) -> dict[str, Any]:
+    """What was measured on, and at which commit."""
+    told = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
+    return {
+        "device": name,
+        "torch": torch.__version__,
+        "cuda": torch.version.cuda,
+        "commit": told.stdout.strip(),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--recipes", nargs="+", default=list(RECIPES), choices=list(RECIPES))
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--steps", type=int, default=50)
+    parser.add_argument("--warmup", type=int, default=3, help="steps that are not timed")
+    parser.add_argument("--count", type=int, default=81920, help="initial Gaussians")
+    parser.add_argument("--vram", choices=("low", "medium", "full"))
+    parser.add_argument("--tiny", action="store_true", help="small networks, to try the script itself")
+    parser.add_argument("--estimates", action="store_true", help="only say what each would need")
+    parser.add_argument("--models", type=Path, help="folder to keep the models in, for the next time")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("settings", nargs="*", help="further settings of cadam3d train")
+    args = parser.parse_args()
+    results = []
+    with tempfile.TemporaryDirectory() as temporary:
+        for recipe in args.recipes:
+            model = (args.models or Path(temporary)) / RECIPES[recipe]
+            if not (model / "model_index.json").is_file():
+                globals()[RECIPES[recipe]](model, args.tiny, weights=not args.estimates)
+            if args.estimates:
+                estimate(recipe, model)
+                continue
+            results.append(measure(recipe, model, args))
+            print(json.dumps(results[-1], indent=2))
+    if args.json and results:
+        facts = machine(resolve_device(args.device))
+        args.json.write_text(json.dumps({"machine": facts, "results": results}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""What the previews callback draws, and that it changes nothing."""
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+
+from cadam3d.callback.previews import Previews
+from cadam3d.commands.train import build_trainer
+from cadam3d.core.checks import UserError
+from cadam3d.settings import component, compose
+from cadam3d.state import Outcome, RunContext, TrainState
+
+CPU = torch.device("cpu")
+LINE = (
+    *("prompt=a red cube", "prior=tiny", "rasterizer=reference", "steps=7", "camera.size=12"),
+    *("initializer.count=30", "refine.start=0", "refine.end=100", "refine.interval=2"),
+    *("densifier.min_age=0", "callback=[previews]", "callback.previews.size=16"),
+)
+SETTINGS = {
+    "every": 3,
+    "views": 4,
+    "elevation_deg": 15.0,
+    "distance": 3.0,
+    "fov_y_deg": 40.0,
+    "size": 16,
+    "background": [1.0, 1.0, 1.0],
+}
+
+
+def train(folder, *lines: str) -> TrainState:
+    cfg = compose([*LINE, *lines])
+    trainer = build_trainer(cfg, CPU)
+    state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
+    context = RunContext(folder, cfg.prompt, trainer.steps, trainer.renderer(state), trainer.rasterizer)
+    assert trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context) is Outcome.FINISHED
+    return state
+
+
+def names(folder) -> list[str]:
+    return sorted(path.name for path in (folder / "previews").glob("*"))
+
+
+def test_there_are_none_until_somebody_asks(tmp_path):
+    train(tmp_path)
+    assert not (tmp_path / "previews").exists()
+
+
+def test_one_key_switches_them_on_in_every_run(tmp_path):
+    assert "previews" in compose(["prompt=a red cube"]).callback
+    train(tmp_path, "callback.previews.every=3")
+    assert names(tmp_path) == ["step_000003.png", "step_000006.png"]
+
+
+def test_a_sheet_shows_the_object_from_all_sides_in_one_row(tmp_path):
+    state = train(tmp_path, "callback.previews.every=7", "callback.previews.views=4")
+    sheet = imageio.imread(tmp_path / "previews/step_000007.png")
+    assert sheet.shape == (16, 4 * 16, 3)
+    assert len(state.gaussians) > 0
+    views = sheet.reshape(16, 4, 16, 3).swapaxes(0, 1)
+    assert all((view[4:12, 4:12] < 250).any() for view in views)
+    assert not np.array_equal(views[0], views[2])
+
+
+def test_a_run_that_is_drawn_equals_one_that_is_not(tmp_path):
+    drawn, alone = train(tmp_path, "callback.previews.every=1"), train(tmp_path / "other")
+    assert len(drawn.gaussians) != 30, "nothing grew: the test would say little"
+    for name, tensor in alone.gaussians.tensors().items():
+        assert torch.equal(drawn.gaussians.tensors()[name], tensor), name
+    for name, generator in alone.generators.items():
+        assert torch.equal(drawn.generators[name].get_state(), generator.get_state()), name
+
+
+def test_what_a_killed_run_had_drawn_is_dropped(tmp_path):
+    (tmp_path / "previews").mkdir()
+    (tmp_path / "previews/step_000099.png").write_bytes(b"old")
+    train(tmp_path, "callback.previews.every=5")
+    assert names(tmp_path) == ["step_000005.png"]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("every", 0),
+        ("views", 0),
+        ("elevation_deg", 100.0),
+        ("distance", 0.0),
+        ("fov_y_deg", 180.0),
+        ("size", 0),
+        ("background", [2.0, 0.0, 0.0]),
+    ],
+)
+def test_settings_that_cannot_be_are_refused_by_name(key, value):
+    with pytest.raises(UserError, match=rf"callback\.previews\.{key}"):
+        Previews(**{**SETTINGS, key: value})

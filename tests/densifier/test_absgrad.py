@@ -1,0 +1,67 @@
+"""Laws of AbsGS: the pulls of pixels that disagree count in full. The rest is in test_baseline.py."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from cadam3d.core.checks import UserError
+from cadam3d.core.schedule import Linear
+from cadam3d.densifier.absgrad import AbsGrad
+from cadam3d.densifier.base import GradientSignal
+from cadam3d.densifier.baseline import VIEWS, Baseline
+
+CPU = torch.device("cpu")
+STEP = 100  # of a call; no matter, unless a schedule asks
+LOTS = torch.Generator()  # nobody here draws any
+SETTINGS = {"tau_pos": 0.25, "views": "sum_norm", "grad_multiplier": 1.0, "screen_px": None}
+
+
+def signal(means2d: torch.Tensor, absgrad: torch.Tensor | None, height=2, width=2) -> GradientSignal:
+    """At 2 x 2 pixels one pixel is one NDC unit."""
+    return GradientSignal(
+        means=torch.zeros(means2d.shape[1], 3),
+        means2d=means2d,
+        radii=torch.ones(means2d.shape[:2]),
+        height=height,
+        width=width,
+        absgrad=absgrad,
+    )
+
+
+def test_pulls_that_cancel_count():
+    cancelled, pulls = torch.zeros(1, 2, 2), torch.tensor([[[0.3, 0.0], [0.1, 0.1]]])
+    torn = signal(cancelled, pulls)
+    state = AbsGrad(**SETTINGS).observe(AbsGrad(**SETTINGS).init_state(2, CPU), torn)
+    assert AbsGrad(**SETTINGS).select(state, STEP, LOTS).tolist() == [True, False]
+    state = Baseline(**SETTINGS).observe(Baseline(**SETTINGS).init_state(2, CPU), torn)
+    assert not Baseline(**SETTINGS).select(state, STEP, LOTS).any()
+
+
+@pytest.mark.parametrize("views", VIEWS)
+def test_it_is_the_baseline_on_other_evidence(views):
+    pulls = torch.rand(3, 9, 2, generator=torch.Generator().manual_seed(0))
+    settings = SETTINGS | {"views": views, "grad_multiplier": 2.0}
+    ours, theirs = AbsGrad(**settings), Baseline(**settings)
+    one = ours.observe(ours.init_state(9, CPU), signal(torch.zeros(3, 9, 2), pulls, height=10, width=60))
+    two = theirs.observe(theirs.init_state(9, CPU), signal(pulls, None, height=10, width=60))
+    assert all(torch.equal(rows, two.to_dict()[name]) for name, rows in one.to_dict().items())
+    assert torch.equal(ours.unreliable(one), theirs.unreliable(two))
+
+
+def test_it_says_what_it_needs_and_the_baseline_needs_nothing():
+    assert AbsGrad(**SETTINGS).needs_absgrad
+    assert not Baseline(**SETTINGS).needs_absgrad
+
+
+def test_its_threshold_may_be_a_schedule():
+    densifier = replace(AbsGrad(**SETTINGS), tau_pos=Linear(start=0.1, end=1.0, steps=10))
+    state = densifier.observe(
+        densifier.init_state(1, CPU), signal(torch.zeros(1, 1, 2), torch.full((1, 1, 2), 0.4))
+    )
+    assert [bool(densifier.select(state, step, LOTS)) for step in (0, 10)] == [True, False]
+
+
+def test_an_impossible_threshold_is_refused_by_name():
+    with pytest.raises(UserError, match=r"densifier\.tau_pos"):
+        AbsGrad(**SETTINGS | {"tau_pos": 0.0})

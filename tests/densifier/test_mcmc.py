@@ -1,0 +1,273 @@
+"""Laws of 3DGS-MCMC: who dies is born again elsewhere, what is shared looks as before, and all tremble."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+from scipy.integrate import quad
+
+from cadam3d.core.checks import UserError
+from cadam3d.core.gaussians import FIELDS, Gaussians
+from cadam3d.densifier.base import GradientSignal
+from cadam3d.densifier.mcmc import MCMC, draw, share
+from cadam3d.densifier.refine import Refine
+from cadam3d.settings import component, compose
+
+CPU = torch.device("cpu")
+LATE = 10_000  # a step at which nothing is scheduled
+
+
+def lots(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def mcmc(**changes) -> MCMC:
+    return MCMC(**{"cap": 10**6, "growth": 0.05, "noise_lr": 8000.0, **changes})
+
+
+@cache
+def refine() -> Refine:
+    usual = component(compose(["prompt=a red cube"]).refine)
+    return replace(usual, max_scale=None, reset_interval=None)
+
+
+def gaussians(n: int, seed: int = 0, low: float = 0.1) -> Gaussians:
+    noise = lots(seed)
+    return Gaussians(
+        means=torch.randn(n, 3, generator=noise),
+        log_scales=torch.randn(n, 3, generator=noise) - 3,
+        quats=torch.randn(n, 4, generator=noise),
+        opacity_logits=(low + (0.9 - low) * torch.rand(n, generator=noise)).logit(),
+        sh=torch.randn(n, 4, 3, generator=noise),
+    )
+
+
+def plan(densifier: MCMC, scene: Gaussians, how: Refine | None = None, seed: int = 0, step: int = LATE):
+    state = densifier.init_state(len(scene), CPU)
+    return densifier.plan(state, scene, step, how or refine(), lots(seed))
+
+
+# What N coincident Gaussians show (equation 9).
+
+
+@pytest.mark.parametrize("opacity", [0.001, 0.1, 0.5, 0.9, 0.999, 0.999999])
+@pytest.mark.parametrize("among", [1, 2, 3, 10, 60, 1000])
+def test_coincident_gaussians_show_what_the_one_showed(opacity, among):
+    logits = torch.tensor([opacity], dtype=torch.float64).logit()
+    new, log_shrink = share(logits, torch.tensor([among]))
+    each, width = float(new.sigmoid()), math.exp(float(log_shrink))
+    assert 1 - (1 - each) ** among == pytest.approx(opacity, rel=1e-6)
+
+    def together(x: float) -> float:
+        return -math.expm1(among * math.log1p(-each * math.exp(-0.5 * (x / width) ** 2)))
+
+    line = 2 * quad(together, 0, 12 * width, points=[width], limit=200)[0]
+    assert line == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-5)
+
+
+def test_one_for_one_is_no_change():
+    logits = torch.linspace(-6, 13, 20, dtype=torch.float64)
+    new, log_shrink = share(logits, torch.ones(20, dtype=torch.long))
+    torch.testing.assert_close(new, logits)
+    torch.testing.assert_close(log_shrink, torch.zeros_like(logits), atol=1e-9, rtol=0)
+
+
+def test_shares_of_a_batch_are_those_of_each_alone():
+    logits, among = torch.tensor([-2.0, 0.5, 3.0]).double(), torch.tensor([7, 1, 40])
+    together = torch.stack(share(logits, among))
+    alone = torch.cat([torch.stack(share(logits[i : i + 1], among[i : i + 1])) for i in range(3)], dim=1)
+    torch.testing.assert_close(together, alone)
+
+
+def test_the_utterly_opaque_share_without_a_nan():
+    new, log_shrink = share(torch.tensor([20.0, 90.0]).double(), torch.tensor([2, 500]))
+    assert new.isfinite().all()
+    assert log_shrink.isfinite().all()
+
+
+# Whom the lot falls on.
+
+
+def test_lots_fall_in_proportion_to_the_weights():
+    weights = torch.tensor([0.0, 1.0, 3.0, 0.0, 6.0]).double()
+    hits = draw(weights, 100_000, lots()).bincount(minlength=5)
+    expected = 100_000 * weights / 10
+    assert hits[0] == hits[3] == 0
+    assert ((hits - expected).abs() <= 4.5 * expected.sqrt()).all()
+
+
+def test_nothing_to_draw_draws_nothing():
+    assert draw(torch.ones(3).double(), 0, lots()).shape == (0,)
+
+
+# The plan.
+
+
+def test_the_dead_are_replaced_by_copies_of_the_living():
+    scene = gaussians(40)
+    scene.opacity_logits[5:15] = math.log(0.004 / 0.996)
+    decided = plan(mcmc(growth=0.0), scene)
+    dead = set(range(5, 15))
+    assert decided.edit.rows_after == 40
+    assert (decided.cloned, decided.split, decided.pruned) == (10, 0, 10)
+    assert not dead & set(decided.edit.keep.tolist())
+    assert not dead & set(decided.edit.parents.tolist())
+    assert set(range(40)) == dead | set(decided.edit.keep.tolist()) | set(decided.edit.parents.tolist())
+    chosen = decided.is_selected.nonzero()[:, 0]
+    assert set(chosen.tolist()) == set(decided.edit.parents.tolist())
+    assert decided.edit.keep.tolist() == sorted(decided.edit.keep.tolist())
+
+
+def test_copies_stand_where_the_copied_stood_and_share_its_opacity_and_size():
+    scene = gaussians(30)
+    scene.opacity_logits[:20] = -9.0
+    edit = plan(mcmc(growth=0.0), scene).edit
+    assert edit.parents.bincount().max() > 2, "someone was drawn twice: shares are not of two only"
+    for parent in edit.parents.unique():
+        mine = edit.parents == parent
+        wanted_logit, log_shrink = share(scene.opacity_logits[parent][None].double(), mine.sum()[None])
+        for field in ("means", "quats", "sh"):
+            original = getattr(scene, field)[parent]
+            assert torch.equal(
+                getattr(edit.children, field)[mine], original.expand(int(mine.sum()), *original.shape)
+            )
+        torch.testing.assert_close(
+            edit.children.opacity_logits[mine].double(), wanted_logit.expand(int(mine.sum()))
+        )
+        torch.testing.assert_close(
+            edit.children.log_scales[mine].double(),
+            (scene.log_scales[parent].double() + log_shrink).expand(int(mine.sum()), 3),
+        )
+
+
+def test_whoever_is_copied_loses_its_moments_and_nobody_else_does():
+    scene = gaussians(30)
+    edit = plan(mcmc(), scene).edit
+    carried = edit.carry(torch.ones(30))
+    assert carried.tolist() == [1.0] * len(edit.keep) + [0.0] * len(edit.parents)
+    kept = edit.apply(scene).index(slice(0, len(edit.keep)))
+    for field in FIELDS:
+        assert torch.equal(getattr(kept, field), getattr(scene, field)[edit.keep])
+
+
+@pytest.mark.parametrize("growth", [0.05, 0.1])
+def test_the_population_grows_by_its_share_up_to_the_cap_and_stays(growth):
+    scene, counts = gaussians(100, low=0.5), [100]
+    for call in range(20):
+        scene = plan(mcmc(growth=growth, cap=180), scene, seed=call).edit.apply(scene)
+        counts.append(len(scene))
+        assert counts[-1] == min(180, int((1 + growth) * counts[-2]))
+    assert counts[-1] == counts[-2] == 180
+
+
+def test_more_than_the_cap_neither_grow_nor_shrink():
+    scene = gaussians(50)
+    scene.opacity_logits[:10] = -9.0
+    assert plan(mcmc(cap=20), scene).edit.rows_after == 50
+
+
+def test_who_is_relocated_shares_again_with_who_is_added():
+    scene = gaussians(40)
+    scene.opacity_logits[1:] = -9.0
+    edit = plan(mcmc(growth=0.05), scene).edit  # one alive: all 42 share what it was
+    assert edit.rows_after == 42
+    assert set(edit.parents.tolist()) == {0}
+    clear = torch.log1p(-edit.children.opacities.double()).sum()
+    before = torch.log1p(-scene.opacities[:1].double()).sum()
+    torch.testing.assert_close(clear, before, rtol=1e-4, atol=0)
+
+
+def test_nobody_is_born_dead():
+    scene = gaussians(60, low=0.006)
+    scene.opacity_logits[:50] = -9.0
+    scene.opacity_logits[50:] = math.log(0.0051 / 0.9949)
+    how = refine()
+    after = plan(mcmc(), scene, how).edit.apply(scene)
+    assert how.keeps(after, LATE).all()
+
+
+def test_whom_refinement_would_prune_for_another_reason_is_dead_too():
+    scene = gaussians(20)
+    scene.means[3] = math.nan
+    scene.log_scales[7, 1] = 2.0
+    how = replace(refine(), max_scale=0.9, prune_from=100)
+    decided = plan(mcmc(growth=0.0), scene, how, step=101)
+    assert decided.pruned == 2
+    assert not {3, 7} & (set(decided.edit.keep.tolist()) | set(decided.edit.parents.tolist()))
+    assert plan(mcmc(growth=0.0), scene, how, step=100).pruned == 1
+
+
+@pytest.mark.parametrize("n", [0, 5])
+def test_where_nobody_lives_nobody_is_born(n):
+    scene = gaussians(n)
+    scene.opacity_logits -= 20
+    decided = plan(mcmc(), scene)
+    assert decided.edit.rows_after == 0
+    assert (decided.cloned, decided.pruned, decided.selected) == (0, n, 0)
+
+
+def test_a_plan_follows_from_its_generator_and_changes_nothing():
+    scene = gaussians(50, low=0.001)
+    before = scene.map(torch.clone)
+    first, again, other = (plan(mcmc(), scene, seed=seed).edit for seed in (0, 0, 1))
+    assert torch.equal(first.parents, again.parents)
+    assert not torch.equal(first.parents, other.parents)
+    assert all(torch.equal(getattr(scene, field), getattr(before, field)) for field in FIELDS)
+
+
+def test_gradients_change_nothing_and_nobody_is_reset_or_split():
+    state = mcmc().init_state(4, CPU)
+    loud = GradientSignal(
+        means=torch.full((4, 3), 1e6),
+        means2d=torch.full((2, 4, 2), 1e6),
+        radii=torch.ones(2, 4),
+        height=8,
+        width=8,
+    )
+    observed = mcmc().observe(state, loud)
+    assert torch.equal(observed.nobody, state.nobody)
+    assert not mcmc().unreliable(observed).any()
+    assert not mcmc().select(observed, LATE, lots()).any()
+
+
+# The noise.
+
+
+def test_the_noise_has_the_squared_covariance_of_each_gaussian():
+    one = gaussians(1)
+    one.opacity_logits[:] = math.log(0.005 / 0.995)  # where half of the noise is left
+    many = one.index(torch.zeros(200_000, dtype=torch.long))
+    moved = mcmc(noise_lr=6.0).perturb(many, 0.5, lots()).double()
+    spread = one.rotations[0] * one.scales[0].square() @ one.rotations[0].T
+    wanted = (0.5 * 6.0 * 0.5) ** 2 * spread.double() @ spread.double()
+    error = (moved.T @ moved / len(moved) - wanted).abs().max()
+    assert error < 0.01 * wanted.diagonal().max()
+
+
+def test_the_opaque_hold_still_and_the_faint_tremble():
+    scene = gaussians(4000)
+    scene.log_scales[:] = math.log(0.1)
+    levels = torch.tensor([0.0, 0.005, 0.03, 0.2]).clamp_min(1e-6).logit().repeat_interleave(1000)
+    moved = mcmc().perturb(replace(scene, opacity_logits=levels), 0.01, lots())
+    strengths = moved.norm(dim=-1).view(4, 1000).mean(dim=1)
+    relative = (strengths / strengths[1]).tolist()
+    for opacity, found in zip((0.0, 0.005, 0.03, 0.2), relative, strict=True):
+        assert found == pytest.approx(2 / (1 + math.exp(100 * (opacity - 0.005))), rel=0.1)
+
+
+def test_the_noise_scales_with_the_rate_and_comes_from_the_generator():
+    scene = gaussians(20, low=0.001)
+    once, twice = (mcmc().perturb(scene, lr, lots()) for lr in (0.01, 0.02))
+    torch.testing.assert_close(2 * once, twice)
+    assert not torch.equal(once, mcmc().perturb(scene, 0.01, lots(1)))
+    assert not mcmc(noise_lr=0.0).perturb(scene, 0.01, lots()).any()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("cap", 0), ("growth", -0.1), ("growth", 1.5), ("noise_lr", -1.0)]
+)
+def test_an_impossible_value_is_refused_by_name(key, value):
+    with pytest.raises(UserError, match=rf"densifier\.{key}"):
+        mcmc(**{key: value})

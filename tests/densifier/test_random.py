@@ -1,0 +1,107 @@
+"""Laws of growth by lot, the control of the experiments."""
+
+import pytest
+import torch
+
+from cadam3d.core.checks import UserError
+from cadam3d.core.edit import RowEdit
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.schedule import Linear
+from cadam3d.densifier.base import GradientSignal
+from cadam3d.densifier.cadam import quantile
+from cadam3d.densifier.random import RandomGrowth
+from cadam3d.settings import component, compose
+
+CPU = torch.device("cpu")
+STEP = 100  # of a call; no matter, unless a schedule asks
+
+
+def lots(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def select(densifier: RandomGrowth, n: int, *, seed: int = 0, step: int = STEP) -> torch.Tensor:
+    return densifier.select(densifier.init_state(n, CPU), step, lots(seed))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.1, 0.3, 0.5, 0.999])
+def test_as_many_are_drawn_as_a_quantile_gate_lets_through(share):
+    for n in (0, 1, 2, 10, 11, 300, 331, 1000):
+        drift = torch.randperm(n, generator=lots(n)).double()
+        passing = int((drift > quantile(drift, 1 - share)).sum()) if n else 0
+        assert int(select(RandomGrowth(share=share), n).sum()) == passing
+
+
+def test_everybody_has_the_same_chance():
+    densifier, generator, calls = RandomGrowth(share=0.2), lots(), 4000
+    state = densifier.init_state(51, CPU)
+    hits = sum(densifier.select(state, STEP, generator).int() for _ in range(calls))
+    expected = calls * 10 / 51
+    assert (hits - expected).abs().max() < 4.5 * (expected * (1 - 10 / 51)) ** 0.5
+
+
+def test_the_lots_come_from_the_generator_and_from_nowhere_else():
+    densifier = RandomGrowth(share=0.1)
+    assert torch.equal(select(densifier, 500, seed=3), select(densifier, 500, seed=3))
+    assert not torch.equal(select(densifier, 500, seed=3), select(densifier, 500, seed=4))
+    before = torch.random.get_rng_state()
+    select(densifier, 500)
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_gradients_change_nothing_and_nobody_is_reset():
+    densifier = RandomGrowth(share=0.5)
+    state = densifier.init_state(8, CPU)
+    loud = GradientSignal(
+        means=torch.full((8, 3), 1e6),
+        means2d=torch.full((2, 8, 2), 1e6),
+        radii=torch.ones(2, 8),
+        height=8,
+        width=8,
+    )
+    observed = densifier.observe(state, loud)
+    assert torch.equal(densifier.select(observed, STEP, lots()), densifier.select(state, STEP, lots()))
+    assert not densifier.unreliable(observed).any()
+
+
+def test_selecting_leaves_the_state_alone():
+    densifier = RandomGrowth(share=0.5)
+    state = densifier.init_state(8, CPU)
+    assert densifier.select(state, STEP, lots()).any()
+    assert not state.nobody.any()
+
+
+def test_a_schedule_of_the_share_is_followed():
+    densifier = RandomGrowth(share=Linear(start=0.5, end=0.02, begin=100, steps=150))
+    drawn = [int(select(densifier, 1001, step=step).sum()) for step in (1, 100, 175, 250, 10_000)]
+    assert drawn == [500, 500, 260, 20, 20]
+    assert densifier.statistics(densifier.init_state(3, CPU), 175)["share"] == pytest.approx(0.26)
+
+
+def test_the_annealed_control_draws_as_many_as_its_original_at_every_call():
+    cadam, control = (
+        component(compose(["prompt=a red cube", f"densifier={name}"]).densifier)
+        for name in ("cadam_annealed", "random_annealed")
+    )
+    for step in range(0, 601, 10):
+        assert control.share(step) == pytest.approx(1 - cadam.tau_Q(step))
+
+
+def test_rows_follow_an_edit():
+    densifier = RandomGrowth(share=0.5)
+    children = Gaussians(
+        means=torch.zeros(3, 3),
+        log_scales=torch.zeros(3, 3),
+        quats=torch.ones(3, 4),
+        opacity_logits=torch.zeros(3),
+        sh=torch.zeros(3, 1, 3),
+    )
+    edit = RowEdit(keep=torch.tensor([0, 2]), children=children, parents=torch.tensor([1, 1, 0]))
+    state = densifier.init_state(4, CPU).carry(edit)
+    assert densifier.select(state, STEP, lots()).shape == (5,)
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.0, Linear(start=0.5, end=1.0, steps=10)])
+def test_an_impossible_share_is_refused_by_name(share):
+    with pytest.raises(UserError, match=r"densifier\.share"):
+        RandomGrowth(share=share)

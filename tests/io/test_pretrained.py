@@ -1,0 +1,233 @@
+"""Models are found in a folder or on the hub, and everything that can go wrong is one line that helps."""
+
+import json
+import shutil
+
+import pytest
+import torch
+
+from cadam3d.core.checks import UserError
+from cadam3d.io import pretrained
+from cadam3d.io.pretrained import Source
+
+huggingface_hub = pytest.importorskip("huggingface_hub")
+pytest.importorskip("diffusers")
+
+KINDS = ("StableDiffusionPipeline",)
+OTHERS = {"StableDiffusion3Pipeline": "prior=stable_diffusion_3"}
+
+
+def source(**changes):
+    keys = {"key": "prior", "path": None, "ids": ["one/model"], "revision": None, "variant": None}
+    return Source(**keys | changes)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    import pipelines
+
+    return pipelines.stable_diffusion(tmp_path_factory.mktemp("model"))
+
+
+@pytest.fixture
+def hub(monkeypatch):
+    """A hub on which every id fails as told, and a record of who was asked and how."""
+    answers, asked = {}, []
+
+    def download(name, file, *, revision, local_files_only):
+        asked.append((name, revision, local_files_only))
+        answer = answers[name]
+        if isinstance(answer, Exception):
+            raise answer
+        return str(answer)
+
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", download)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
+    answers["asked"] = asked
+    return answers
+
+
+def refusal(kind):
+    import httpx2 as client  # what the hub's errors carry
+
+    return kind("no", response=client.Response(404, request=client.Request("GET", "hub")))
+
+
+def test_a_folder_wins_over_ids_and_needs_no_hub(model, hub):
+    found = source(path=str(model)).find(KINDS, OTHERS)
+    assert found.where == str(model)
+    assert hub["asked"] == []
+    assert found.has("unet")
+    assert not found.has("safety_checker")
+    assert not found.has("text_encoder_3")
+
+
+@pytest.mark.parametrize("lost", ["tokenizer", "tokenizer/*"])
+def test_a_tokenizer_without_files_is_no_tokenizer(model, tmp_path, lost):
+    """Transformers makes one that knows no word; every prompt would read the same."""
+    folder = tmp_path / "model"
+    shutil.copytree(model, folder)
+    if lost == "tokenizer":
+        shutil.rmtree(folder / lost)
+    else:
+        for file in folder.glob(lost):
+            file.unlink()
+    found = source(path=str(folder)).find(KINDS, OTHERS)
+    with pytest.raises(UserError, match=r"^prior: tokenizer of .* knows 2 of the 519 pieces"):
+        found.part("tokenizer")
+
+
+def test_parts_are_frozen_and_have_the_type_asked_for(model):
+    found = source(path=str(model)).find(KINDS, OTHERS)
+    for name in ("unet", "vae", "text_encoder"):
+        network = found.part(name, torch.bfloat16)
+        assert not network.training
+        assert all(p.dtype == torch.bfloat16 and not p.requires_grad for p in network.parameters())
+
+
+def test_a_skeleton_is_the_network_without_numbers(model):
+    found = source(path=str(model)).find(KINDS, OTHERS)
+    for name in ("unet", "vae", "text_encoder"):
+        skeleton, network = found.skeleton(name, torch.float16), found.part(name, torch.float16)
+        assert {p.device.type for p in skeleton.parameters()} == {"meta"}
+        shapes = [(n, p.shape, p.dtype) for n, p in skeleton.named_parameters()]
+        assert shapes == [(n, p.shape, p.dtype) for n, p in network.named_parameters()]
+    assert torch.get_default_dtype() == torch.float32
+
+
+def test_the_identity_changes_with_the_files(model, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(model, copy)
+    before = source(path=str(copy)).find(KINDS, OTHERS).identity
+    assert before == source(path=str(copy)).find(KINDS, OTHERS).identity
+    (copy / "text_encoder" / "config.json").touch()
+    assert before != source(path=str(copy)).find(KINDS, OTHERS).identity
+
+
+def test_a_wrong_folder_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("x")
+    for path, what in (
+        ("/nowhere", "nothing there"),
+        (tmp_path, "no model_index.json in it"),
+        (tmp_path / "file", "a file"),
+    ):
+        with pytest.raises(UserError, match=what) as caught:
+            source(path=str(path)).find(KINDS, OTHERS)
+        assert "\n" not in str(caught.value)
+        assert "Try: prior.path=DIR" in str(caught.value)
+
+
+def test_a_model_of_another_kind_names_the_prior_to_use(model, tmp_path):
+    with pytest.raises(UserError, match=r"not a StableDiffusion3Pipeline\. Try: another prior\.path"):
+        source(path=str(model)).find(("StableDiffusion3Pipeline",), OTHERS)
+    index = {"_class_name": "StableDiffusion3Pipeline"}
+    (tmp_path / "model_index.json").write_text(json.dumps(index))
+    with pytest.raises(UserError, match="Try: prior=stable_diffusion_3"):
+        source(path=str(tmp_path)).find(KINDS, OTHERS)
+
+
+@pytest.mark.parametrize("text", ["", "no json", "[1]"])
+def test_a_damaged_index_is_one_line(tmp_path, text):
+    (tmp_path / "model_index.json").write_text(text)
+    with pytest.raises(UserError, match=r"model_index\.json"):
+        source(path=str(tmp_path)).find(KINDS, OTHERS)
+
+
+def test_a_damaged_part_is_one_line(model, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(model, copy)
+    found = source(path=str(copy)).find(KINDS, OTHERS)
+    (copy / "unet" / "diffusion_pytorch_model.safetensors").write_bytes(b"cut")
+    with pytest.raises(UserError, match=r"unet of .* cannot be loaded"):
+        found.part("unet", torch.float32)
+    shutil.rmtree(copy / "vae")
+    for ask in (found.part, found.config):
+        with pytest.raises(UserError, match="vae"):
+            ask("vae")
+
+
+@pytest.mark.parametrize("entry", [("os", "system"), ("shap_e", "Nothing"), ("shap_e.os", "system")])
+def test_code_of_strangers_is_not_run(model, tmp_path, entry):
+    index = json.loads((model / "model_index.json").read_text()) | {"unet": list(entry)}
+    (tmp_path / "model_index.json").write_text(json.dumps(index))
+    with pytest.raises(UserError, match=r"\.".join(entry)):
+        source(path=str(tmp_path)).find(KINDS, OTHERS).part("unet", torch.float32)
+
+
+def test_a_part_that_only_one_pipeline_of_diffusers_has_is_found(tmp_path):
+    import pipelines
+    from diffusers.pipelines.shap_e import ShapERenderer
+
+    found = source(path=str(pipelines.shap_e(tmp_path))).find(("ShapEPipeline",), {})
+    assert isinstance(found.part("shap_e_renderer", torch.float32), ShapERenderer)
+
+
+def test_ids_are_tried_in_order_and_the_first_that_answers_is_taken(model, hub):
+    hub["a/gone"] = refusal(huggingface_hub.errors.RepositoryNotFoundError)
+    hub["b/gated"] = refusal(huggingface_hub.errors.GatedRepoError)
+    hub["c/there"] = model / "model_index.json"
+    hub["d/unasked"] = model / "model_index.json"
+    found = source(ids=["a/gone", "b/gated", "c/there", "d/unasked"], revision="v1").find(KINDS, OTHERS)
+    assert (found.where, found.revision) == ("c/there", "v1")
+    assert hub["asked"] == [(name, "v1", False) for name in ("a/gone", "b/gated", "c/there")]
+
+
+def test_when_none_answers_each_has_its_reason_and_there_is_a_way_out(hub):
+    hub["a/gone"] = refusal(huggingface_hub.errors.RepositoryNotFoundError)
+    hub["b/gated"] = refusal(huggingface_hub.errors.GatedRepoError)
+    hub["c/revision"] = refusal(huggingface_hub.errors.RevisionNotFoundError)
+    hub["d/layout"] = refusal(huggingface_hub.errors.RemoteEntryNotFoundError)
+    with pytest.raises(UserError) as caught:
+        source(ids=["a/gone", "b/gated", "c/revision", "d/layout"], revision="v1").find(KINDS, OTHERS)
+    for piece in (
+        "a/gone: not on the hub",
+        "b/gated: gated",
+        "hf auth login",
+        "c/revision: has no revision 'v1'",
+        "d/layout: has no model_index.json",
+        "hf download a/gone --local-dir models/gone",
+        "prior.path=models/gone",
+    ):
+        assert piece in str(caught.value)
+
+
+def test_an_unreachable_hub_is_asked_once(hub):
+    """Every question takes half a minute of retries; what is on this disk is still found."""
+    for name in ("a/one", "b/two"):
+        hub[name] = huggingface_hub.errors.LocalEntryNotFoundError("no")
+    with pytest.raises(UserError, match=r"a/one: not on this disk, and the hub cannot be reached"):
+        source(ids=["a/one", "b/two"]).find(KINDS, OTHERS)
+    assert [local for _, _, local in hub["asked"]] == [False, True]
+
+
+def test_offline_is_obeyed_and_said(hub, monkeypatch):
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    hub["a/one"] = huggingface_hub.errors.LocalEntryNotFoundError("no")
+    with pytest.raises(UserError, match="HF_HUB_OFFLINE is set"):
+        source(ids=["a/one"]).find(KINDS, OTHERS)
+    assert hub["asked"] == [("a/one", None, True)]
+
+
+def test_without_the_extra_the_command_that_installs_it(monkeypatch):
+    monkeypatch.setattr(pretrained, "find_spec", lambda name: None if name == "diffusers" else object())
+    with pytest.raises(UserError, match=r"prior: needs diffusers. Try: pip install 'cadam3d\[diffusers\]'"):
+        source().find(KINDS, OTHERS)
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"path": ""}, "prior.path"),
+        ({"ids": "one/model"}, "prior.ids"),
+        ({"ids": ["one"]}, "prior.ids"),
+        ({"variant": ""}, "prior.variant"),
+    ],
+)
+def test_wrong_values_are_named(changes, key):
+    with pytest.raises(UserError, match=key):
+        source(**changes)
+
+
+def test_neither_folder_nor_ids():
+    with pytest.raises(UserError, match=r"prior.path: wanted the folder of a model"):
+        source(ids=[]).find(KINDS, OTHERS)

@@ -1,0 +1,75 @@
+"""What the tests of pretrained priors share: views, numbers, and what every one of them must do."""
+
+from dataclasses import replace
+
+import torch
+
+from cadam3d.core.cameras import turntable
+from cadam3d.prior.latent import LatentPrior, TextCondition
+from cadam3d.prior.prompting import Discrete
+
+KEYS = {  # of every pretrained prior; path and cache_dir are the test's
+    "ids": [],
+    "revision": None,
+    "variant": None,
+    "prompting": Discrete(front_deg=45.0, back_deg=45.0, overhead_deg=60.0),
+    "size": 64,
+    "dtype": "float32",
+    "micro_batch": None,
+    "tiling": False,
+    "compile": False,
+    "text_device": "auto",
+}
+
+
+def normal(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def condition_of(prior: LatentPrior, prompt="a red cube", negative="ugly", views=2) -> TextCondition:
+    """The condition of views around the object; with four, Discrete calls them front, side, back, side."""
+    cameras = turntable(views, elevation_deg=15.0, distance=3.0, fov_y_deg=40.0, size=64)
+    return prior.embed(prompt, negative).at(cameras, torch.zeros(views, 3))
+
+
+def encodes_what_the_autoencoder_says(prior: LatentPrior, vae) -> None:
+    """Images of another size are resized; latents are the posterior's mean, shifted and scaled."""
+    rgb = torch.rand(2, 48, 48, 3, generator=torch.Generator().manual_seed(1))
+    images = torch.nn.functional.interpolate(rgb.permute(0, 3, 1, 2), (64, 64), mode="bilinear")
+    mean = vae.encode(2 * images - 1).latent_dist.mean
+    expected = (mean - (vae.config.shift_factor or 0)) * vae.config.scaling_factor
+    torch.testing.assert_close(prior.encode(rgb), expected, rtol=1e-4, atol=1e-5)
+
+
+def memory_is_foreseen(prior: LatentPrior, views: int = 2) -> None:
+    """From configurations alone: the weights exactly, and something for the work and the texts."""
+    unloaded = replace(prior)
+    estimate = unloaded.memory("a prompt that nobody has embedded", "", views, None)
+    assert not {"vae", "network"} & set(unloaded.__dict__)
+    parameters = [*prior.network.parameters(), *prior.vae.parameters()]
+    assert estimate.weights == sum(each.numel() * each.element_size() for each in parameters)
+    assert estimate.working > 0
+    assert estimate.texts > 0
+
+
+def micro_batch_changes_nothing(
+    prior: LatentPrior, size: int, condition: TextCondition, channels: int
+) -> None:
+    """Neither a prediction, nor latents, nor the gradient that reaches the pixels."""
+    few, views = replace(prior, micro_batch=size), len(condition.cameras)
+    noisy, t = normal(views, channels, 8, 8), torch.full((views,), 0.4)
+    guesses = [each.predict(noisy, t, condition, 7.5).clean for each in (prior, few)]
+    are_close(*guesses)
+    gradients = []
+    for each in (prior, few):
+        rgb = torch.rand(views, 64, 64, 3, generator=torch.Generator().manual_seed(2)).requires_grad_()
+        latents = each.encode(rgb)
+        (latents * normal(*latents.shape)).sum().backward()
+        gradients.append(rgb.grad)
+    assert (gradients[0].flatten(1).norm(dim=1) > 0).all()
+    are_close(*gradients)
+
+
+def are_close(one: torch.Tensor, other: torch.Tensor) -> None:
+    """To 1e-5 of the largest: batches of other sizes are summed in another order."""
+    torch.testing.assert_close(one, other, rtol=0, atol=1e-5 * float(one.abs().max()))

@@ -1,0 +1,298 @@
+"""Tiny pipelines of the real classes with random weights, saved as real ones are: nothing is downloaded."""
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+
+WORDS = "a corgi red cube blue sphere front side back overhead view ugly blurry of the on table small big cat"
+WIDTH = 32  # of every text encoder
+
+
+def clip_tokenizer(folder: Path, **options):
+    """CLIP's tokenizer with the byte alphabet and five merges, read from files as the real one is."""
+    from tokenizers.pre_tokenizers import ByteLevel
+    from transformers import CLIPTokenizer
+
+    folder.mkdir(parents=True, exist_ok=True)
+    symbols = sorted(ByteLevel.alphabet())
+    merges = ["c o", "r g", "co rg", "v i", "e w</w>"]
+    pieces = [*symbols, *(symbol + "</w>" for symbol in symbols), *(m.replace(" ", "") for m in merges)]
+    pieces += ["<|startoftext|>", "<|endoftext|>"]
+    (folder / "vocab.json").write_text(json.dumps({piece: i for i, piece in enumerate(pieces)}))
+    (folder / "merges.txt").write_text("#version: 0.2\n" + "\n".join(merges) + "\n")
+    return CLIPTokenizer.from_pretrained(folder, model_max_length=77, **options)
+
+
+def t5_tokenizer():
+    """A unigram tokenizer, trained on a dozen words."""
+    from tokenizers import Tokenizer, models, pre_tokenizers, trainers
+    from transformers import T5TokenizerFast
+
+    tokenizer = Tokenizer(models.Unigram())
+    tokenizer.pre_tokenizer = pre_tokenizers.Metaspace()
+    special = ["<pad>", "</s>", "<unk>"]
+    trainer = trainers.UnigramTrainer(vocab_size=80, special_tokens=special, unk_token="<unk>")
+    tokenizer.train_from_iterator([WORDS] * 10, trainer)
+    return T5TokenizerFast(tokenizer_object=tokenizer, extra_ids=0)
+
+
+def clip_text(tokenizer, *, projected: bool = False, layers: int = 2, **options):
+    """A CLIP text encoder, with or without the projection of its pooled output."""
+    from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection
+
+    last = len(tokenizer) - 1
+    usual = {
+        "vocab_size": len(tokenizer),
+        "hidden_size": WIDTH,
+        "intermediate_size": 48,
+        "num_hidden_layers": layers,
+        "num_attention_heads": 2,
+        "projection_dim": WIDTH,
+        "bos_token_id": last - 1,
+        "eos_token_id": last,
+        "pad_token_id": last,
+    }
+    return (CLIPTextModelWithProjection if projected else CLIPTextModel)(CLIPTextConfig(**usual | options))
+
+
+def vae(channels: int, scaling: float, shift: float | None = None, *, width: int = 8, groups: int = 4):
+    """An image autoencoder: four blocks, so that it keeps the real factor of eight."""
+    from diffusers import AutoencoderKL
+
+    return AutoencoderKL(
+        block_out_channels=(width,) * 4,
+        down_block_types=("DownEncoderBlock2D",) * 4,
+        up_block_types=("UpDecoderBlock2D",) * 4,
+        latent_channels=channels,
+        layers_per_block=1,
+        norm_num_groups=groups,
+        scaling_factor=scaling,
+        shift_factor=shift,
+        use_quant_conv=shift is None,
+        use_post_quant_conv=shift is None,
+        sample_size=64,
+    )
+
+
+def unet(cross: int, **options):
+    """A UNet of two blocks, with text cross-attention."""
+    from diffusers import UNet2DConditionModel
+
+    usual = {
+        "sample_size": 8,
+        "in_channels": 4,
+        "out_channels": 4,
+        "block_out_channels": (16, 32),
+        "layers_per_block": 1,
+        "norm_num_groups": 8,
+        "down_block_types": ("CrossAttnDownBlock2D", "DownBlock2D"),
+        "up_block_types": ("UpBlock2D", "CrossAttnUpBlock2D"),
+        "cross_attention_dim": cross,
+        "attention_head_dim": 8,
+        "use_linear_projection": True,
+    }
+    return UNet2DConditionModel(**usual | options)
+
+
+def ddim(prediction: str = "epsilon"):
+    """Stable Diffusion's noise schedule."""
+    from diffusers import DDIMScheduler
+
+    return DDIMScheduler(
+        beta_start=0.00085,
+        beta_end=0.012,
+        beta_schedule="scaled_linear",
+        clip_sample=False,
+        set_alpha_to_one=False,
+        steps_offset=1,
+        prediction_type=prediction,
+    )
+
+
+def stable_diffusion(folder: Path, prediction: str = "epsilon") -> Path:
+    """Stable Diffusion 1.5 and 2.1 in small."""
+    from diffusers import StableDiffusionPipeline
+
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        tokenizer = clip_tokenizer(folder / "tokens")
+        StableDiffusionPipeline(
+            vae=vae(4, 0.18215),
+            text_encoder=clip_text(tokenizer),
+            tokenizer=tokenizer,
+            unet=unet(WIDTH),
+            scheduler=ddim(prediction),
+            safety_checker=None,
+            feature_extractor=None,
+            requires_safety_checker=False,
+        ).save_pretrained(folder)
+    return folder
+
+
+def stable_diffusion_xl(folder: Path) -> Path:
+    """SDXL in small: two encoders, pooled text and six numbers about sizes beside the time."""
+    from diffusers import StableDiffusionXLPipeline
+
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        tokenizer = clip_tokenizer(folder / "tokens")
+        StableDiffusionXLPipeline(
+            vae=vae(4, 0.13025),
+            text_encoder=clip_text(tokenizer),
+            text_encoder_2=clip_text(tokenizer, projected=True),
+            tokenizer=tokenizer,
+            tokenizer_2=tokenizer,
+            unet=unet(
+                2 * WIDTH,
+                addition_embed_type="text_time",
+                addition_time_embed_dim=8,
+                projection_class_embeddings_input_dim=6 * 8 + WIDTH,
+            ),
+            scheduler=ddim(),
+            force_zeros_for_empty_prompt=True,
+        ).save_pretrained(folder)
+    return folder
+
+
+def stable_diffusion_3(folder: Path, t5: bool = True) -> Path:
+    """Stable Diffusion 3 and 3.5 in small, with or without T5."""
+    from diffusers import FlowMatchEulerDiscreteScheduler, SD3Transformer2DModel, StableDiffusion3Pipeline
+    from transformers import T5Config, T5EncoderModel
+
+    joint = 2 * WIDTH
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        tokenizer = clip_tokenizer(folder / "tokens")
+        words = t5_tokenizer() if t5 else None
+        third = None
+        if words is not None:
+            third = T5EncoderModel(
+                T5Config(
+                    vocab_size=len(words),
+                    d_model=joint,
+                    d_kv=8,
+                    d_ff=48,
+                    num_layers=2,
+                    num_heads=2,
+                    decoder_start_token_id=0,
+                )
+            )
+        StableDiffusion3Pipeline(
+            transformer=SD3Transformer2DModel(
+                sample_size=16,
+                patch_size=2,
+                in_channels=16,
+                num_layers=2,
+                attention_head_dim=8,
+                num_attention_heads=4,
+                joint_attention_dim=joint,
+                caption_projection_dim=32,
+                pooled_projection_dim=2 * WIDTH,
+                out_channels=16,
+                pos_embed_max_size=96,
+                qk_norm="rms_norm",
+                dual_attention_layers=(0,),
+            ),
+            scheduler=FlowMatchEulerDiscreteScheduler(shift=3.0),
+            vae=vae(16, 1.5305, 0.0609),
+            text_encoder=clip_text(tokenizer, projected=True),
+            tokenizer=tokenizer,
+            text_encoder_2=clip_text(tokenizer, projected=True),
+            tokenizer_2=tokenizer,
+            text_encoder_3=third,
+            tokenizer_3=words,
+        ).save_pretrained(folder)
+    return folder
+
+
+def mvdream(folder: Path) -> Path:
+    """MVDream in small: what its published file does not say (groups, heads of 64 channels) is as there."""
+    from diffusers import StableDiffusionPipeline
+
+    width = 64
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        tokenizer = clip_tokenizer(folder / "tokens", pad_token="!")
+        StableDiffusionPipeline(
+            vae=vae(4, 0.18215, width=32, groups=32),
+            text_encoder=clip_text(tokenizer, hidden_size=width, num_attention_heads=1, hidden_act="gelu"),
+            tokenizer=tokenizer,
+            unet=unet(
+                width,
+                block_out_channels=(width, 2 * width),
+                norm_num_groups=32,
+                attention_head_dim=(1, 2),
+                class_embed_type="projection",
+                projection_class_embeddings_input_dim=16,
+            ),
+            scheduler=ddim(),
+            safety_checker=None,
+            feature_extractor=None,
+            requires_safety_checker=False,
+        ).save_pretrained(folder)
+    return folder
+
+
+def shap_e(folder: Path, surface: bool = True) -> Path:
+    """Shap-E in small. Without a surface, its table of triangles is empty, as in a model made anew."""
+    from diffusers import HeunDiscreteScheduler, PriorTransformer, ShapEPipeline
+    from diffusers.pipelines.shap_e import ShapERenderer
+
+    width, layers = 8, 4  # of the renderer's network; each row of its weights is one token of the latent
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        tokenizer = clip_tokenizer(folder / "tokens")
+        renderer = ShapERenderer(
+            param_shapes=((width, 93), *((width, width),) * (layers - 1)), d_latent=16, d_hidden=width
+        )
+        if surface:
+            renderer.mesh_decoder.cases, renderer.mesh_decoder.masks = triangles_of_cubes()
+        ShapEPipeline(
+            prior=PriorTransformer(
+                num_attention_heads=2,
+                attention_head_dim=8,
+                num_layers=2,
+                embedding_dim=16,
+                num_embeddings=width * layers,
+                additional_embeddings=0,
+                time_embed_act_fn="gelu",
+                norm_in_type="layer",
+                encoder_hid_proj_type=None,
+                added_emb_type=None,
+                time_embed_dim=16,
+                embedding_proj_dim=WIDTH,
+                clip_embed_dim=32,
+            ),
+            text_encoder=clip_text(tokenizer, projected=True),
+            tokenizer=tokenizer,
+            scheduler=HeunDiscreteScheduler(
+                beta_schedule="exp",
+                num_train_timesteps=1024,
+                prediction_type="sample",
+                use_karras_sigmas=True,
+                clip_sample=True,
+            ),
+            shap_e_renderer=renderer,
+        ).save_pretrained(folder)
+    return folder
+
+
+def triangles_of_cubes() -> tuple[torch.Tensor, torch.Tensor]:
+    """A table for marching cubes: a fan over the cut edges of each cube: a surface, if a crumpled one.
+
+    Bit x + 2 y + 4 z of a case says whether that corner is inside. Edges along x come first, then y, then z.
+    """
+    corners = [(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]
+    edges = []
+    for axis in range(3):
+        for low in (corner for corner in corners if corner[axis] == 0):
+            high = tuple(1 if i == axis else value for i, value in enumerate(low))
+            edges.append((corners.index(low), corners.index(high)))
+    cases, masks = torch.zeros(256, 5, 3, dtype=torch.long), torch.zeros(256, 5, dtype=torch.bool)
+    for case in range(256):
+        cut = [i for i, (low, high) in enumerate(edges) if (case >> low & 1) != (case >> high & 1)]
+        for row, (second, third) in enumerate(list(pairwise(cut[1:]))[:5]):
+            cases[case, row], masks[case, row] = torch.tensor([cut[0], second, third]), True
+    return cases, masks

@@ -1,0 +1,156 @@
+"""Which words stand for which view: rules at the angles where they change, and the arithmetic of guidance."""
+
+import math
+
+import pytest
+import torch
+
+from cadam3d.core.cameras import orbit
+from cadam3d.core.checks import UserError
+from cadam3d.prior.prompting import (
+    BACK,
+    FRONT,
+    OVERHEAD,
+    SIDE,
+    Discrete,
+    Interpolated,
+    PerpNeg,
+    Plain,
+    guide,
+)
+
+DISCRETE = Discrete(front_deg=45, back_deg=45, overhead_deg=60)
+LUCID = PerpNeg(curve="lucid", overhead_deg=None)
+THREESTUDIO = PerpNeg(curve="threestudio", overhead_deg=60)
+EVERY = [Plain(), DISCRETE, Interpolated(), LUCID, THREESTUDIO]
+
+
+def views(azimuth, elevation=0.0):
+    azimuth = torch.as_tensor(azimuth, dtype=torch.float32).reshape(-1)
+    ones = torch.ones_like(azimuth)
+    return orbit(azimuth, ones * elevation, ones * 3, ones * 45, 8, 8)
+
+
+@pytest.mark.parametrize("prompting", EVERY, ids=lambda each: type(each).__name__)
+def test_laws(prompting):
+    mix = prompting.mix(views(torch.linspace(-180, 180, 73), elevation=30))
+    k = len(prompting.texts("a corgi"))
+    for rows in (mix.positive, mix.repelled):
+        assert rows.shape[-1] == k
+        torch.testing.assert_close(rows.sum(dim=-1), torch.ones(rows.shape[:-1]))
+        assert (rows >= 0).all()
+    assert mix.repelled.shape[1] == mix.strengths.shape[1]
+    assert (mix.strengths <= 1e-3).all()
+    mirrored = prompting.mix(views(torch.linspace(180, -180, 73), elevation=30))
+    torch.testing.assert_close(mix.positive, mirrored.positive)  # left and right are alike
+    torch.testing.assert_close(mix.strengths, mirrored.strengths)
+    assert all(text.startswith("a corgi") for text in prompting.texts("a corgi"))
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "text"),
+    [
+        (0, 0, FRONT),
+        (-44.9, 0, FRONT),
+        (45, 0, SIDE),
+        (-90, 0, SIDE),
+        (135, 0, SIDE),
+        (135.1, 0, BACK),
+        (-180, 0, BACK),
+        (0, 60, FRONT),
+        (0, 60.1, OVERHEAD),
+        (180, 80, OVERHEAD),
+    ],
+)
+def test_discrete_rules_and_overhead_wins(azimuth, elevation, text):
+    assert DISCRETE.mix(views(azimuth, elevation)).positive.argmax() == text
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "weights"),
+    [(0, [1, 0, 0]), (30, [2 / 3, 1 / 3, 0]), (-90, [0, 1, 0]), (135, [0, 0.5, 0.5]), (180, [0, 0, 1])],
+)
+def test_interpolation_is_linear_in_azimuth(azimuth, weights):
+    torch.testing.assert_close(Interpolated().mix(views(azimuth)).positive, torch.tensor([weights]).float())
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "names", "strengths"),
+    [
+        (0, (FRONT, SIDE), (0, -2)),
+        (9, (FRONT, SIDE), (0, -2 * math.exp(-1))),
+        (45, (FRONT, SIDE), (-2 * math.exp(-1), -2 * math.exp(-5))),
+        (81, (FRONT, SIDE), (-2 * math.exp(-0.2), 0)),
+        (90, (SIDE, FRONT), (0, -2)),
+        (135, (SIDE, FRONT), (-math.exp(-5), -2)),
+        (180, (SIDE, FRONT), (-1, -2)),
+    ],
+)
+def test_the_curves_of_lucid_dreamer(azimuth, names, strengths):
+    mix = LUCID.mix(views(azimuth))
+    assert tuple(mix.repelled[0].argmax(dim=-1).tolist()) == names
+    torch.testing.assert_close(mix.strengths[0], torch.tensor(strengths).float())
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "strengths"),
+    [
+        (0, (-(4 * math.exp(-0.5) - 2.426), -(4 - 2.426))),
+        (45, (-(4 * math.exp(-0.25) - 2.426), -(4 * math.exp(-0.25) - 2.426))),
+        (90, (-(math.exp(-0.5) - 0.606), -(math.exp(-0.5) + 0.967))),
+        (180, (-(1 - 0.606), -(1 + 0.967))),
+    ],
+)
+def test_the_curves_of_threestudio(azimuth, strengths):
+    torch.testing.assert_close(THREESTUDIO.mix(views(azimuth)).strengths[0], torch.tensor(strengths))
+
+
+def test_overhead_repels_nothing():
+    mix = THREESTUDIO.mix(views([0, 120], elevation=70))
+    assert (mix.positive.argmax(dim=-1) == OVERHEAD).all()
+    assert (mix.strengths == 0).all()
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_without_repulsion_guidance_has_the_conventional_form():
+    negative, positive = random(2, 3, 4, 4), random(2, 3, 4, 4, seed=1)
+    guided = guide(negative, positive, negative[None][:0], negative.new_zeros(2, 0), 7.5)
+    torch.testing.assert_close(guided, negative + 7.5 * (positive - negative))
+
+
+def test_repulsion_acts_across_the_prompt_only():
+    negative, positive = random(2, 3, 4, 4), random(2, 3, 4, 4, seed=1)
+    others, strengths = random(2, 2, 3, 4, 4, seed=2), -random(2, 2, seed=3).abs()
+    guided = guide(negative, positive, others, strengths, 1.0)
+    direction = (positive - negative).flatten(1)
+    extra = (guided - positive).flatten(1)
+    torch.testing.assert_close((extra * direction).sum(dim=1), torch.zeros(2).double(), atol=1e-10, rtol=0)
+    for view in range(2):  # by projection matrices, one view at a time
+        d = direction[view]
+        across = torch.eye(len(d)).double() - torch.outer(d, d) / d.square().sum()
+        wanted = sum(strengths[view, i] * across @ (others[i] - negative)[view].flatten() for i in range(2))
+        torch.testing.assert_close(extra[view], wanted)
+
+
+def test_what_lies_along_the_prompt_is_not_repelled():
+    negative, positive = random(1, 3, 4, 4), random(1, 3, 4, 4, seed=1)
+    along = negative + 3 * (positive - negative)
+    guided = guide(negative, positive, along[None], -torch.ones(1, 1).double(), 5.0)
+    torch.testing.assert_close(guided, negative + 5 * (positive - negative))
+
+
+@pytest.mark.parametrize(
+    ("make", "key"),
+    [
+        (lambda: Discrete(front_deg=100, back_deg=100, overhead_deg=60), "prompting.back_deg"),
+        (lambda: Discrete(front_deg=-1, back_deg=45, overhead_deg=60), "prompting.front_deg"),
+        (lambda: PerpNeg(curve="other", overhead_deg=None), "prompting.curve"),
+        (lambda: PerpNeg(curve="lucid", overhead_deg=100), "prompting.overhead_deg"),
+    ],
+)
+def test_what_cannot_be(make, key):
+    with pytest.raises(UserError, match=key):
+        make()

@@ -1,0 +1,113 @@
+"""Laws of SDXL as a prior, against the pipeline of diffusers on the same folder."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from latents import (
+    KEYS,
+    condition_of,
+    encodes_what_the_autoencoder_says,
+    memory_is_foreseen,
+    micro_batch_changes_nothing,
+    normal,
+)
+
+from cadam3d.prior.sdxl import StableDiffusionXL
+
+diffusers = pytest.importorskip("diffusers")
+
+
+@pytest.fixture(scope="module")
+def folder(pipelines):
+    return pipelines("stable_diffusion_xl")
+
+
+@pytest.fixture(scope="module")
+def pipe(folder):
+    return diffusers.StableDiffusionXLPipeline.from_pretrained(folder, local_files_only=True)
+
+
+@pytest.fixture(scope="module")
+def prior(folder, tmp_path_factory):
+    cache = str(tmp_path_factory.mktemp("cache"))
+    return StableDiffusionXL(path=str(folder), cache_dir=cache, **KEYS)
+
+
+@pytest.mark.parametrize("negative", ["ugly", ""])
+def test_texts_are_embedded_as_the_pipeline_embeds_them(prior, pipe, negative):
+    """Its empty negative prompt, None, is zeros: the index of the model says so."""
+    texts = prior.embed("a red cube", negative).texts
+    positive, other, pooled, other_pooled = pipe.encode_prompt(
+        "a red cube, side view", negative_prompt=negative or None
+    )
+    torch.testing.assert_close(texts.tokens[1:2], positive)
+    torch.testing.assert_close(texts.pooled[1:2], pooled)
+    torch.testing.assert_close(texts.tokens[-2:-1], other)
+    torch.testing.assert_close(texts.pooled[-2:-1], other_pooled)
+    assert bool(texts.tokens[-1].any()) is False
+
+
+def test_a_model_that_does_not_ask_for_zeros_reads_the_empty_text(prior, pipe):
+    found = replace(prior.found, index=prior.found.index | {"force_zeros_for_empty_prompt": False})
+    texts = prior.embed_texts(found, [""], torch.device("cpu"))
+    tokens, _, pooled, _ = pipe.encode_prompt("", do_classifier_free_guidance=False)
+    torch.testing.assert_close(texts.tokens, tokens)
+    torch.testing.assert_close(texts.pooled, pooled)
+    assert texts.tokens.any()
+
+
+@torch.no_grad()
+def test_a_prediction_is_what_the_pipelines_parts_say(prior, pipe):
+    """Latents that are not square, since the network is told height and width."""
+    clean, noise, k, scale = normal(2, 4, 8, 12), normal(2, 4, 8, 12, seed=1), 400, 7.5
+    noisy = pipe.scheduler.add_noise(clean, noise, torch.tensor([k - 1, k - 1]))
+    sizes = pipe._get_add_time_ids((64, 96), (0, 0), (64, 96), torch.float32, 32).repeat(2, 1)
+
+    def network(*prompts):
+        tokens, _, pooled, _ = pipe.encode_prompt(list(prompts), do_classifier_free_guidance=False)
+        added = {"text_embeds": pooled, "time_ids": sizes}
+        return pipe.unet(noisy, k - 1, encoder_hidden_states=tokens, added_cond_kwargs=added).sample
+
+    ugly = network("ugly", "ugly")
+    expected = ugly + scale * (network("a red cube, front view", "a red cube, back view") - ugly)
+    a = pipe.scheduler.alphas_cumprod[k - 1] ** 0.5
+
+    t = torch.full((2,), k / 1000)
+    torch.testing.assert_close(prior.noise_path.mix(clean, noise, t), noisy)
+    guess = prior.predict(noisy, t, condition_of(prior), scale)
+    torch.testing.assert_close(guess.noise, expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(guess.clean, (noisy - (1 - a**2) ** 0.5 * expected) / a, rtol=1e-4, atol=1e-4)
+
+
+def test_the_network_is_told_the_size(prior):
+    """The same latents as a part of larger ones would not be the same image."""
+    texts = prior.embed("a red cube", "").texts
+    one = replace(texts, tokens=texts.tokens[:1], pooled=texts.pooled[:1])
+    cameras = condition_of(prior, views=1).cameras
+    told = []
+    hook = prior.network.add_embedding.register_forward_pre_hook(lambda _, inputs: told.append(inputs[0]))
+    for height, width in ((8, 8), (8, 16)):
+        prior.denoise(normal(1, 4, height, width), torch.tensor([500.0]), one, cameras)
+    hook.remove()
+    assert not torch.equal(told[0], told[1])
+
+
+def test_latents_are_those_of_the_pipelines_autoencoder(prior, pipe):
+    encodes_what_the_autoencoder_says(prior, pipe.vae)
+
+
+def test_memory_is_foreseen(prior):
+    memory_is_foreseen(prior)
+
+
+def test_micro_batch_changes_nothing(prior):
+    micro_batch_changes_nothing(prior, size=1, condition=condition_of(prior), channels=4)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "expected"),
+    [("float16", torch.float32), ("bfloat16", torch.bfloat16), ("float32", torch.float32)],
+)
+def test_the_autoencoder_overflows_in_float16_and_stays_out_of_it(prior, dtype, expected):
+    assert replace(prior, dtype=dtype).vae.dtype == expected

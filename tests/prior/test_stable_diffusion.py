@@ -1,0 +1,315 @@
+"""Stable Diffusion as a prior, against the pipeline's own pieces, on tiny models from files."""
+
+import pytest
+import torch
+
+from cadam3d.core.cameras import orbit
+from cadam3d.core.checks import UserError
+from cadam3d.prior.prompting import Discrete, Interpolated, PerpNeg, Plain
+from cadam3d.prior.stable_diffusion import StableDiffusion
+
+diffusers = pytest.importorskip("diffusers")
+
+PIXELS = 64
+PERP_NEG = PerpNeg(curve="lucid", overhead_deg=None)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def make(pipelines, cache):
+    def make(prediction="epsilon", **changes):
+        keys = {
+            "path": str(pipelines("stable_diffusion", prediction=prediction)),
+            "ids": [],
+            "revision": None,
+            "variant": None,
+            "prompting": Plain(),
+            "size": PIXELS,
+            "dtype": "auto",
+            "micro_batch": None,
+            "tiling": False,
+            "compile": False,
+            "text_device": "auto",
+            "cache_dir": str(cache),
+        }
+        return StableDiffusion(**keys | changes)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def pipeline_of(pipelines):
+    def load(prediction="epsilon"):
+        pipeline = diffusers.StableDiffusionPipeline.from_pretrained(
+            pipelines("stable_diffusion", prediction=prediction)
+        )
+        pipeline.scheduler.set_timesteps(1000)
+        return pipeline
+
+    return load
+
+
+@pytest.fixture(scope="module")
+def pipeline(pipeline_of):
+    return pipeline_of()
+
+
+def views(*azimuth):
+    azimuth = torch.tensor(azimuth, dtype=torch.float32)
+    ones = torch.ones_like(azimuth)
+    return orbit(azimuth, 10 * ones, 3 * ones, 45 * ones, PIXELS, PIXELS)
+
+
+def condition_of(prior, *azimuth, prompt="a corgi", negative="ugly"):
+    cameras = views(*azimuth)
+    return prior.embed(prompt, negative).at(cameras, torch.ones(len(cameras), 3))
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+LEVELS = torch.tensor([0.3, 0.8])
+
+
+@pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
+def test_a_guess_equals_the_pipelines_own(prediction, make, pipeline_of):
+    """Text encoder, UNet, guidance and scheduler of diffusers against ours, at levels of its own table."""
+    pipeline = pipeline_of(prediction)
+    prior, clean, noise = make(prediction), random(2, 4, 8, 8), random(2, 4, 8, 8, seed=1)
+    steps = torch.tensor([299, 799])  # rows of the table: t = (row + 1) / 1000
+    noisy = pipeline.scheduler.add_noise(clean, noise, steps)
+    torch.testing.assert_close(prior.noise_path.mix(clean, noise, LEVELS), noisy, rtol=1e-5, atol=1e-5)
+    positive, negative = pipeline.encode_prompt("a corgi", "cpu", 1, True, negative_prompt="ugly")
+    with torch.no_grad():
+        empty, full = (
+            pipeline.unet(noisy, steps, encoder_hidden_states=text.repeat(2, 1, 1)).sample
+            for text in (negative, positive)
+        )
+    output = empty + 7.5 * (full - empty)
+    guess = prior.predict(noisy, LEVELS, condition_of(prior, 0, 90), 7.5)
+    asked = guess.noise if prediction == "epsilon" else guess.velocity
+    torch.testing.assert_close(asked, output, rtol=1e-4, atol=1e-4)
+    for view, step in enumerate(steps):
+        clean_guess = pipeline.scheduler.step(output[view], step, noisy[view]).pred_original_sample
+        torch.testing.assert_close(guess.clean[view], clean_guess, rtol=1e-3, atol=1e-3)
+
+
+def test_scale_zero_is_the_negative_prompt_alone_and_unprompted_knows_neither(make):
+    prior, noisy = make(), random(2, 4, 8, 8)
+    condition = condition_of(prior, 0, 90)
+    swapped = condition_of(prior, 0, 90, prompt="ugly", negative="a corgi")
+    zero = prior.predict(noisy, LEVELS, condition, 0.0)
+    torch.testing.assert_close(zero.noise, prior.predict(noisy, LEVELS, swapped, 1.0).noise)
+    nobody = condition_of(prior, 0, 90, prompt="", negative="")
+    for scale in (1.0, 7.5):
+        torch.testing.assert_close(
+            prior.predict(noisy, LEVELS, condition.unprompted(), scale).noise,
+            prior.predict(noisy, LEVELS, nobody, 1.0).noise,
+            rtol=1e-4,
+            atol=1e-4,
+        )
+
+
+def test_encoding_is_the_mean_of_the_autoencoder_and_can_be_differentiated(make, pipeline):
+    prior = make()
+    rgb = torch.rand(2, PIXELS, PIXELS, 3, generator=torch.Generator().manual_seed(2)).requires_grad_()
+    latents = prior.encode(rgb)
+    with torch.no_grad():
+        mean = pipeline.vae.encode(2 * rgb.permute(0, 3, 1, 2) - 1).latent_dist.mean
+    torch.testing.assert_close(latents, 0.18215 * mean, rtol=1e-4, atol=1e-5)
+    latents.square().sum().backward()
+    assert rgb.grad.abs().sum() > 0
+
+
+def test_renders_of_any_size_are_resized_and_gradients_find_back(make):
+    prior, rgb = make(), torch.rand(1, 50, 70, 3).requires_grad_()
+    assert prior.encode(rgb).shape == (1, 4, 8, 8)
+    prior.encode(rgb).sum().backward()
+    assert rgb.grad.shape == rgb.shape
+    with pytest.raises(UserError, match=r"camera\.size"):
+        make(size=None).encode(rgb)
+    assert make(size=None).encode(torch.rand(1, 32, 48, 3)).shape == (1, 4, 4, 6)
+
+
+def test_decoding_gives_images_of_the_size_asked_for(make, pipeline):
+    prior, latents = make(), random(2, 4, 8, 8)
+    images = prior.decode(latents, PIXELS, PIXELS)
+    with torch.no_grad():
+        raw = pipeline.vae.decode(latents / 0.18215).sample
+    torch.testing.assert_close(images, (raw.permute(0, 2, 3, 1) / 2 + 0.5).clamp(0, 1), rtol=1e-4, atol=1e-4)
+    assert prior.decode(latents, 48, 40).shape == (2, 48, 40, 3)
+
+
+@pytest.mark.parametrize("micro_batch", [1, 2])
+def test_parts_leave_guess_and_gradient_as_they_are(make, micro_batch):
+    whole, parts = make(prompting=PERP_NEG), make(prompting=PERP_NEG, micro_batch=micro_batch)
+    noisy, levels = random(3, 4, 8, 8), torch.tensor([0.2, 0.5, 0.9])
+    guesses = [p.predict(noisy, levels, condition_of(p, 0, 100, -45), 7.5).clean for p in (whole, parts)]
+    torch.testing.assert_close(*guesses, rtol=1e-4, atol=1e-4)
+    gradients = []
+    for prior in (whole, parts):
+        rgb = torch.rand(3, PIXELS, PIXELS, 3, generator=torch.Generator().manual_seed(2)).requires_grad_()
+        (prior.encode(rgb) * noisy).sum().backward()
+        gradients.append(rgb.grad)
+    torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-5)
+
+
+def test_views_get_their_own_words(make):
+    prior = make(prompting=Discrete(front_deg=45, back_deg=45, overhead_deg=60))
+    noisy, levels = random(1, 4, 8, 8).repeat(3, 1, 1, 1), torch.full((3,), 0.5)
+    front, back, again = prior.predict(noisy, levels, condition_of(prior, 0, 180, 10), 1.0).noise
+    plain = make()
+    worded = plain.predict(noisy[:1], levels[:1], condition_of(plain, 0, prompt="a corgi, back view"), 1.0)
+    assert not torch.allclose(front, back, atol=1e-4)
+    torch.testing.assert_close(front, again, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(back, worded.noise[0], rtol=1e-4, atol=1e-4)
+
+
+def test_interpolated_embeddings_are_weighted_sums(make):
+    prior = make(prompting=Interpolated())
+    embedding = prior.embed("a corgi", "ugly")
+    condition = embedding.at(views(30), torch.ones(1, 3))
+    mixed = condition.texts.mixed(condition.mix.positive).tokens[0]
+    front, side = embedding.texts.tokens[:2]
+    torch.testing.assert_close(mixed, 2 / 3 * front + 1 / 3 * side, rtol=1e-5, atol=1e-5)
+
+
+def test_perp_neg_changes_what_a_side_view_wants(make):
+    plain, repelled = make(prompting=Interpolated()), make(prompting=PERP_NEG)
+    noisy, level = random(1, 4, 8, 8), torch.tensor([0.5])
+    guesses = [p.predict(noisy, level, condition_of(p, 100), 7.5).noise for p in (plain, repelled)]
+    assert not torch.allclose(*guesses, atol=1e-4)
+
+
+# --- embedded texts on disk -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """How many texts went through an encoder."""
+    seen = []
+    real = StableDiffusion.embed_texts
+
+    def embed_texts(self, found, texts, device):
+        seen.extend(texts)
+        return real(self, found, texts, device)
+
+    monkeypatch.setattr(StableDiffusion, "embed_texts", embed_texts)
+    return seen
+
+
+def test_a_text_is_embedded_once_per_model(make, counted, tmp_path):
+    first = make(cache_dir=str(tmp_path)).embed("a corgi", "ugly").texts.tokens
+    assert counted == ["a corgi", "ugly", ""]
+    second = make(cache_dir=str(tmp_path)).embed("a corgi", "blurry").texts.tokens
+    assert counted == ["a corgi", "ugly", "", "blurry"]
+    torch.testing.assert_close(first[[0, 2]], second[[0, 2]], rtol=0, atol=0)
+    make(cache_dir=str(tmp_path), dtype="bfloat16").embed("a corgi", "ugly")
+    assert counted[4:] == ["a corgi", "ugly", ""]  # other numbers, another entry
+
+
+def test_a_damaged_entry_is_made_again_and_an_unwritable_cache_only_costs_time(make, counted, tmp_path):
+    make(cache_dir=str(tmp_path)).embed("a corgi", "")
+    for file in (tmp_path / "texts").iterdir():
+        file.write_bytes(b"cut")
+    make(cache_dir=str(tmp_path)).embed("a corgi", "")
+    assert counted == ["a corgi", "", "a corgi", ""]
+    (tmp_path / "file").write_text("x")
+    make(cache_dir=str(tmp_path / "file")).embed("a corgi", "")
+    assert len(counted) == 6
+
+
+def test_the_encoder_is_gone_before_the_denoiser_comes(make, tmp_path, monkeypatch):
+    import weakref
+
+    from cadam3d.io.pretrained import Pretrained
+
+    kept, real = {}, Pretrained.part
+
+    def part(self, name, dtype=None):
+        loaded = real(self, name, dtype)
+        if name == "unet":
+            assert kept["text_encoder"]() is None
+        elif name == "text_encoder":
+            kept[name] = weakref.ref(loaded)
+        return loaded
+
+    monkeypatch.setattr(Pretrained, "part", part)
+    prior = make(cache_dir=str(tmp_path))
+    prior.embed("a corgi", "")
+    prior.load()
+    assert set(kept) == {"text_encoder"}
+
+
+# --- memory -----------------------------------------------------------------------------------------------
+
+
+def test_the_estimate_counts_weights_exactly_and_grows_with_what_is_at_once(make, tmp_path):
+    prior = make(cache_dir=str(tmp_path))
+    estimate = prior.memory("a corgi", "", 2, None)
+    assert "vae" not in prior.__dict__  # nothing was loaded
+    assert "network" not in prior.__dict__
+    networks = (prior.network, prior.vae)
+    assert estimate.weights == sum(p.numel() * 4 for n in networks for p in n.parameters())
+    four, parts = (make(**c).memory("a corgi", "", 4, None) for c in ({}, {"micro_batch": 2}))
+    assert four.working == pytest.approx(2 * estimate.working, rel=0.02)
+    assert parts.working == pytest.approx(estimate.working, rel=0.02)
+    assert make(dtype="bfloat16").memory("a corgi", "", 2, None).working < 0.7 * estimate.working
+    assert estimate.texts > 0
+    prior.embed("a corgi", "")
+    assert prior.memory("a corgi", "", 2, None).texts == 0  # known: no encoder will be loaded
+
+
+def test_the_estimate_of_the_autoencoder_is_what_autograd_keeps(make):
+    prior = make()
+    kept = {}
+    rgb = torch.rand(2, PIXELS, PIXELS, 3).requires_grad_()
+
+    def pack(tensor):
+        storage = tensor.untyped_storage()
+        kept[storage.data_ptr()] = storage.nbytes()
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+        prior.encode(rgb)
+    weights = {p.untyped_storage().data_ptr() for p in prior.vae.parameters()}
+    saved = sum(size for pointer, size in kept.items() if pointer not in weights)
+    assert 0.8 * saved < prior.memory("a corgi", "", 2, None).working < 2 * saved
+
+
+# --- what cannot be ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"size": 100}, "prior.size"),
+        ({"size": 0}, "prior.size"),
+        ({"dtype": "int8"}, "prior.dtype"),
+        ({"micro_batch": 0}, "prior.micro_batch"),
+        ({"text_device": "moon"}, "prior.text_device"),
+    ],
+)
+def test_wrong_values_are_named(make, changes, key):
+    with pytest.raises(UserError, match=key):
+        make(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"beta_schedule": "squaredcos_cap_v2"}, "scaled_linear"),
+        ({"rescale_betas_zero_snr": True}, "zero terminal SNR"),
+        ({"prediction_type": "flow"}, "epsilon"),
+    ],
+)
+def test_a_schedule_that_we_do_not_know_is_refused(make, changes, word):
+    prior = make()
+    object.__setattr__(prior, "scheduler", dict(prior.scheduler) | changes)
+    with pytest.raises(UserError, match=word):
+        prior.predict(random(2, 4, 8, 8), LEVELS, condition_of(prior, 0, 0), 1.0)

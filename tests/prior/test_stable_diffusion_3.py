@@ -1,0 +1,153 @@
+"""Laws of Stable Diffusion 3 as a prior, against the pipeline of diffusers on the same folder."""
+
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+from latents import (
+    KEYS,
+    condition_of,
+    encodes_what_the_autoencoder_says,
+    memory_is_foreseen,
+    micro_batch_changes_nothing,
+    normal,
+)
+
+from cadam3d.core.checks import UserError
+from cadam3d.io.jsonl import read_json, write_json
+from cadam3d.prior.path import RectifiedFlow
+from cadam3d.prior.stable_diffusion_3 import StableDiffusion3
+
+diffusers = pytest.importorskip("diffusers")
+
+
+@pytest.fixture(scope="module")
+def folder(pipelines):
+    return pipelines("stable_diffusion_3")
+
+
+@pytest.fixture(scope="module")
+def pipe(folder):
+    return diffusers.StableDiffusion3Pipeline.from_pretrained(folder, local_files_only=True)
+
+
+@pytest.fixture(scope="module")
+def prior(folder, tmp_path_factory):
+    cache = str(tmp_path_factory.mktemp("cache"))
+    return StableDiffusion3(path=str(folder), t5=True, cache_dir=cache, **KEYS)
+
+
+def embeds_as_the_pipeline(prior, pipe):
+    texts = prior.embed("a red cube", "ugly").texts
+    prompt = "a red cube, side view"
+    positive, negative, pooled, other_pooled = pipe.encode_prompt(
+        prompt, prompt, prompt, negative_prompt="ugly"
+    )
+    torch.testing.assert_close(texts.tokens[1:2], positive)
+    torch.testing.assert_close(texts.pooled[1:2], pooled)
+    torch.testing.assert_close(texts.tokens[-2:-1], negative)
+    torch.testing.assert_close(texts.pooled[-2:-1], other_pooled)
+    _, empty, _, empty_pooled = pipe.encode_prompt(prompt, prompt, prompt)
+    torch.testing.assert_close(texts.tokens[-1:], empty)
+    torch.testing.assert_close(texts.pooled[-1:], empty_pooled)
+
+
+def test_texts_are_embedded_as_the_pipeline_embeds_them(prior, pipe):
+    embeds_as_the_pipeline(prior, pipe)
+
+
+def test_without_t5_too(prior, folder):
+    pipe = diffusers.StableDiffusion3Pipeline.from_pretrained(folder, text_encoder_3=None, tokenizer_3=None)
+    embeds_as_the_pipeline(replace(prior, t5=False), pipe)
+
+
+def test_a_model_that_comes_without_t5_needs_no_key(prior, pipelines):
+    folder = pipelines("stable_diffusion_3", t5=False)
+    other = replace(prior, path=str(folder))
+    assert other.encoders == ("text_encoder", "text_encoder_2")
+    none = {"text_encoder_3": None, "tokenizer_3": None}  # diffusers insists on hearing it
+    embeds_as_the_pipeline(other, diffusers.StableDiffusion3Pipeline.from_pretrained(folder, **none))
+
+
+def test_t5_that_is_not_wanted_need_not_be_there(prior, folder, tmp_path):
+    """Nor its tokenizer: neither is looked for, so on the hub neither is downloaded."""
+    unwanted = ("text_encoder_3", "tokenizer_3", "tokens")
+    shutil.copytree(folder, tmp_path / "model", ignore=shutil.ignore_patterns(*unwanted))
+    there = replace(prior, path=str(tmp_path / "model"), t5=False)
+    assert there.found.has("text_encoder_3")
+    expected = replace(prior, t5=False).embed("a red cube", "").texts.tokens
+    torch.testing.assert_close(there.embed("a red cube", "").texts.tokens, expected)
+    with pytest.raises(UserError, match=r"^prior: .*text_encoder_3"):
+        replace(there, t5=True).embed("a red cube", "")
+
+
+def test_embeddings_with_and_without_t5_are_kept_apart(prior):
+    with_t5, without = (replace(prior, t5=t5).embed("a red cube", "").texts.tokens for t5 in (True, False))
+    torch.testing.assert_close(with_t5[:, :77], without[:, :77])
+    assert with_t5[:, 77:].any()
+    assert not without[:, 77:].any()
+
+
+@torch.no_grad()
+def test_a_prediction_is_what_the_pipelines_parts_say(prior, pipe):
+    """The scheduler's table of sigmas has the shift in it: row i is t = 1 - i / 1000."""
+    clean, noise, row, scale = normal(2, 16, 8, 8), normal(2, 16, 8, 8, seed=1), 600, 7.5
+    sigma, timestep = pipe.scheduler.sigmas[row], pipe.scheduler.timesteps[row]
+    noisy = pipe.scheduler.scale_noise(clean, timestep[None], noise)
+
+    def network(*prompts):
+        listed = list(prompts)
+        tokens, _, pooled, _ = pipe.encode_prompt(listed, listed, listed, do_classifier_free_guidance=False)
+        return pipe.transformer(
+            noisy, timestep=timestep.expand(2), encoder_hidden_states=tokens, pooled_projections=pooled
+        ).sample
+
+    ugly = network("ugly", "ugly")
+    expected = ugly + scale * (network("a red cube, front view", "a red cube, back view") - ugly)
+
+    t = torch.full((2,), 1 - row / 1000)
+    torch.testing.assert_close(prior.noise_path.timestep(t), timestep.expand(2))
+    torch.testing.assert_close(prior.noise_path.mix(clean, noise, t), noisy)
+    guess = prior.predict(noisy, t, condition_of(prior), scale)
+    torch.testing.assert_close(guess.velocity, expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(guess.clean, noisy - sigma * expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(guess.noise, noisy + (1 - sigma) * expected, rtol=1e-4, atol=1e-4)
+
+
+def test_a_step_of_the_pipelines_sampler_is_a_mixture_of_the_prediction(prior, pipe):
+    """From one noise level of its schedule to the next: Euler there, NoisePath.mix here."""
+    scheduler = type(pipe.scheduler).from_config(pipe.scheduler.config)
+    scheduler.set_timesteps(4)
+    noisy, velocity = normal(1, 16, 8, 8), normal(1, 16, 8, 8, seed=1)
+    stepped = scheduler.step(velocity, scheduler.timesteps[1], noisy).prev_sample
+    path = prior.noise_path
+    start, end = (s / (3 - 2 * s) for s in scheduler.sigmas[1:3, None])  # t of a sigma, the shift being 3
+    guess = path.from_velocity(noisy, velocity, start)
+    torch.testing.assert_close(path.mix(guess.clean, guess.noise, end), stepped, rtol=1e-4, atol=1e-4)
+
+
+def test_the_shift_is_the_models_own(prior, folder, tmp_path):
+    assert prior.noise_path == RectifiedFlow(shift=3.0)
+    shutil.copytree(folder / "scheduler", tmp_path / "scheduler")
+    shutil.copy(folder / "model_index.json", tmp_path)
+    file = tmp_path / "scheduler" / "scheduler_config.json"
+    settings = read_json(file)
+    write_json(file, settings | {"shift": 1.5})
+    assert replace(prior, path=str(tmp_path)).noise_path == RectifiedFlow(shift=1.5)
+    write_json(file, settings | {"use_dynamic_shifting": True})
+    with pytest.raises(UserError, match=r"^prior\.path: wanted a model with one shift"):
+        replace(prior, path=str(tmp_path)).noise_path  # noqa: B018
+
+
+def test_latents_are_those_of_the_pipelines_autoencoder(prior, pipe):
+    assert pipe.vae.config.shift_factor
+    encodes_what_the_autoencoder_says(prior, pipe.vae)
+
+
+def test_memory_is_foreseen(prior):
+    memory_is_foreseen(prior)
+
+
+def test_micro_batch_changes_nothing(prior):
+    micro_batch_changes_nothing(prior, size=1, condition=condition_of(prior), channels=16)

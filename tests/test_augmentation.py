@@ -1,0 +1,144 @@
+"""Laws of the augmentations: what they change, what they leave alone, and what they draw."""
+
+import pytest
+import torch
+from splats import make_gaussians
+
+from cadam3d.augmentation import LEAST, LucidAugmentation, NoAugmentation
+from cadam3d.core.checks import UserError
+from cadam3d.core.render import RenderOutput
+
+
+def draw(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def lucid(scale_noise: float = 0.0, disparity: float = 0.0, flip: float = 0.0) -> LucidAugmentation:
+    return LucidAugmentation(scale_noise=scale_noise, disparity=disparity, flip=flip)
+
+
+def output(size: int = 6) -> RenderOutput:
+    noise = torch.rand(3, size, size, 5, generator=draw())
+    return RenderOutput(
+        rgb=noise[..., :3],
+        alpha=0.9 + 0.1 * noise[..., 3],
+        depth=2 + noise[..., 4],
+        means2d=torch.zeros(3, 0, 2),
+        radii=torch.zeros(3, 0),
+    )
+
+
+def test_none_is_the_identity_and_draws_nothing():
+    gaussians, seen, generator = make_gaussians(5), output(), draw()
+    before = generator.get_state()
+    assert NoAugmentation().perturb(gaussians, generator) is gaussians
+    assert NoAugmentation().show(seen, generator) is seen.rgb
+    assert torch.equal(generator.get_state(), before)
+
+
+def test_without_noise_and_tosses_lucid_changes_nothing():
+    gaussians, seen = make_gaussians(5), output()
+    assert torch.equal(lucid().perturb(gaussians, draw()).log_scales, gaussians.log_scales)
+    assert torch.equal(lucid().show(seen, draw()), seen.rgb)
+
+
+@pytest.mark.parametrize("noise", [0.1118, 0.02])
+def test_scales_are_multiplied_by_a_factor_around_one(noise):
+    gaussians = make_gaussians(20_000)
+    factor = lucid(noise).perturb(gaussians, draw()).scales / gaussians.scales
+    assert float(factor.mean()) == pytest.approx(1, abs=0.01 * noise)
+    assert float(factor.std()) == pytest.approx(noise, rel=0.02)
+    apart = torch.corrcoef(factor.T) - torch.eye(3)  # the three axes are drawn apart
+    assert apart.abs().max() < 0.03
+
+
+def test_no_scale_becomes_nothing_or_less():
+    gaussians = make_gaussians(20_000)
+    factor = lucid(1.0).perturb(gaussians, draw()).scales / gaussians.scales
+    assert float(factor.min()) == pytest.approx(LEAST, rel=1e-3)
+
+
+def test_only_scales_change_and_means_stay_the_very_tensor():
+    gaussians = make_gaussians(10)
+    perturbed = lucid(0.1).perturb(gaussians, draw())
+    for name in ("means", "quats", "opacity_logits", "sh"):
+        assert perturbed.tensors()[name] is gaussians.tensors()[name]
+    assert not torch.equal(perturbed.log_scales, gaussians.log_scales)
+
+
+def test_the_gradient_of_a_perturbed_scale_reaches_the_scale():
+    gaussians = make_gaussians(10).map(lambda tensor: tensor.requires_grad_())
+    weights = torch.rand(10, 3, generator=draw(1))
+    perturbed = lucid(0.1).perturb(gaussians, draw())
+    (weights * perturbed.scales).sum().backward()
+    torch.testing.assert_close(gaussians.log_scales.grad, (weights * perturbed.scales).detach())
+
+
+def test_a_flip_mirrors_every_view_left_to_right():
+    seen = output()
+    shown = lucid(flip=1.0).show(seen, draw())
+    assert torch.equal(shown, seen.rgb[:, :, torch.arange(5, -1, -1)])
+
+
+def test_disparity_is_shown_in_grey_for_all_views():
+    seen = output()
+    shown = lucid(disparity=1.0).show(seen, draw())
+    assert torch.equal(shown, seen.disparity()[..., None].repeat(1, 1, 1, 3))
+
+
+def test_tosses_come_as_often_as_they_should_and_apart():
+    seen, generator, augmentation = output(), draw(), lucid(disparity=0.2, flip=0.5)
+    grey, mirrored = [], []
+    mirror = seen.rgb.flip(dims=(2,)), seen.disparity().flip(dims=(2,))
+    for _ in range(4000):
+        shown = augmentation.show(seen, generator)
+        grey.append(torch.equal(shown[..., 0], shown[..., 1]))
+        mirrored.append(torch.equal(shown, mirror[0]) or torch.equal(shown[..., 0], mirror[1]))
+    assert sum(grey) / 4000 == pytest.approx(0.2, abs=0.02)
+    assert sum(mirrored) / 4000 == pytest.approx(0.5, abs=0.03)
+    both = sum(a and b for a, b in zip(grey, mirrored, strict=True)) / 4000
+    assert both == pytest.approx(0.1, abs=0.02)
+
+
+def test_gradients_flow_through_what_is_shown():
+    for augmentation in (lucid(flip=1.0), lucid(disparity=1.0, flip=1.0)):
+        seen = output()
+        for image in (seen.rgb, seen.alpha, seen.depth):
+            image.requires_grad_()
+        shown = augmentation.show(seen, draw())
+        (shown * torch.arange(6.0)[:, None]).sum().backward()
+        moved = [image.grad is not None and bool(image.grad.any()) for image in (seen.rgb, seen.depth)]
+        assert moved == ([True, False] if augmentation.disparity == 0 else [False, True])
+    assert seen.depth.grad.isfinite().all()
+
+
+def test_the_generator_decides():
+    gaussians = make_gaussians(5)
+    same = [lucid(0.1).perturb(gaussians, draw(1)).log_scales for _ in range(2)]
+    assert torch.equal(*same)
+    assert not torch.equal(same[0], lucid(0.1).perturb(gaussians, draw(2)).log_scales)
+
+
+def test_consecutive_steps_have_noise_of_their_own():
+    gaussians, generator = make_gaussians(5), draw()
+    first, second = (lucid(0.1).perturb(gaussians, generator).log_scales for _ in range(2))
+    assert not torch.equal(first, second)
+
+
+def test_later_draws_do_not_depend_on_the_number_of_gaussians_or_on_the_tosses():
+    """So that densifiers with one seed are shown the same, however many Gaussians each has."""
+    states = []
+    for n, augmentation in ((5, lucid(0.1)), (50, lucid(0.1)), (5, lucid(0.1, 1.0, 1.0))):
+        generator = draw()
+        augmentation.perturb(make_gaussians(n), generator)
+        augmentation.show(output(), generator)
+        states.append(generator.get_state())
+    assert torch.equal(states[0], states[1])
+    assert torch.equal(states[0], states[2])
+
+
+@pytest.mark.parametrize("key", ["scale_noise", "disparity", "flip"])
+@pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])
+def test_an_impossible_value_is_refused_by_name(key, value):
+    with pytest.raises(UserError, match=rf"augmentation\.{key}: wanted .* Try: augmentation\.{key}="):
+        LucidAugmentation(**{"scale_noise": 0.1, "disparity": 0.2, "flip": 0.5, key: value})

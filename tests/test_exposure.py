@@ -1,0 +1,119 @@
+"""Laws of the exposure guard: when it dims, and what it takes for bright."""
+
+import pytest
+import torch
+from splats import make_gaussians
+
+from cadam3d.core.cameras import turntable
+from cadam3d.core.checks import UserError
+from cadam3d.core.render import RenderOutput
+from cadam3d.exposure import BrightnessGuard, NoExposure
+from cadam3d.rasterizer.reference import ReferenceRasterizer
+
+PUBLISHED = {"begin": 1000, "end": 4500, "quantile": 0.85, "threshold": 0.9, "rate": 0.8}
+
+
+def guard(**changes) -> BrightnessGuard:
+    return BrightnessGuard(**{**PUBLISHED, **changes})
+
+
+def over(background: torch.Tensor, color: torch.Tensor, alpha: torch.Tensor) -> RenderOutput:
+    """``color`` with coverage ``alpha`` over ``background``."""
+    rgb = alpha[..., None] * color + (1 - alpha)[..., None] * background[:, None, None]
+    views = len(alpha)
+    return RenderOutput(
+        rgb=rgb, alpha=alpha, depth=alpha, means2d=torch.zeros(views, 0, 2), radii=torch.zeros(views, 0)
+    )
+
+
+def scene(*levels: float) -> tuple[RenderOutput, torch.Tensor]:
+    """A grey object of each level in a view of its own, over white."""
+    alpha = torch.zeros(len(levels), 8, 8)
+    alpha[:, 2:6, 2:6] = 1.0
+    white = torch.ones(len(levels), 3)
+    return over(white, torch.tensor(levels)[:, None, None, None].expand(-1, 8, 8, 3), alpha), white
+
+
+def test_none_never_dims():
+    output, background = scene(5.0, 5.0)
+    assert all(NoExposure().dimming(output, background, step) is None for step in (1, 2000, 10**6))
+
+
+@pytest.mark.parametrize(
+    ("step", "dims"), [(1, False), (1000, False), (1001, True), (4499, True), (4500, False), (5000, False)]
+)
+def test_only_steps_strictly_between_begin_and_end_are_judged(step, dims):
+    assert guard().dimming(*scene(1.0, 1.0), step) == (0.8 if dims else None)
+
+
+@pytest.mark.parametrize(("level", "dims"), [(0.0, False), (0.89, False), (0.91, True), (3.0, True)])
+def test_what_is_brighter_than_the_threshold_is_dimmed(level, dims):
+    assert (guard().dimming(*scene(level, level), 2000) is not None) == dims
+
+
+def test_it_takes_a_quantile_of_the_views():
+    """Of four views 0.85 lies between the third and the fourth: 0.45 of the third, 0.55 of the fourth."""
+    assert guard().dimming(*scene(0.0, 0.0, 0.8, 1.0), 2000) == 0.8  # 0.91
+    assert guard().dimming(*scene(0.0, 0.0, 0.7, 1.0), 2000) is None  # 0.865
+
+
+def test_it_takes_a_quantile_of_the_pixels_and_the_background_is_none_of_them():
+    alpha = torch.zeros(1, 10, 11)
+    alpha[:, :, :10] = 1.0
+    alpha[:, :, 10] = 0.0
+    shades = torch.linspace(0, 1, 100).view(1, 10, 10)
+    color = torch.cat([shades, torch.zeros(1, 10, 1)], dim=2)[..., None].expand(-1, -1, -1, 3)
+    for backdrop in (torch.zeros(1, 3), torch.ones(1, 3), torch.tensor([[0.2, 0.9, 0.4]])):
+        seen = guard().brightness(over(backdrop, color, alpha), backdrop)
+        assert float(seen) == pytest.approx(0.85, abs=1e-5)
+
+
+def test_brightness_is_that_of_the_picture_over_black():
+    gaussians = make_gaussians(40, spread=0.3)
+    camera = turntable(2, elevation_deg=20.0, distance=3.0, fov_y_deg=40.0, size=24)
+    seen = []
+    for backdrop in (torch.zeros(2, 3), torch.tensor([[1.0, 1.0, 1.0], [0.1, 0.7, 0.3]])):
+        output = ReferenceRasterizer().render(gaussians, camera, backdrop)
+        seen.append(guard().brightness(output, backdrop))
+    torch.testing.assert_close(*seen, atol=1e-5, rtol=0)
+    rgb = ReferenceRasterizer().render(gaussians, camera, torch.zeros(2, 3)).rgb.mean(dim=-1)
+    published = torch.stack([view[view > 0].quantile(0.85) for view in rgb])
+    torch.testing.assert_close(seen[0], published, atol=1e-5, rtol=0)
+
+
+def test_a_brightness_is_the_mean_of_the_channels():
+    alpha = torch.ones(1, 4, 4)
+    red = torch.tensor([1.0, 0.0, 0.0]).expand(1, 4, 4, 3)
+    assert float(guard().brightness(over(torch.zeros(1, 3), red, alpha), torch.zeros(1, 3))) == pytest.approx(
+        1 / 3
+    )
+
+
+def test_an_empty_view_is_dark():
+    nothing = torch.zeros(2, 4, 4)
+    white = torch.ones(2, 3)
+    output = over(white, torch.ones(2, 4, 4, 3), nothing)
+    assert guard().brightness(output, white).tolist() == [0.0, 0.0]
+    assert guard().dimming(output, white, 2000) is None
+
+
+def test_judging_leaves_no_trace_in_the_graph():
+    output, background = scene(1.0)
+    output.rgb.requires_grad_()
+    assert not guard().brightness(output, background).requires_grad
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("begin", -1),
+        ("end", 1000),
+        ("quantile", 1.1),
+        ("threshold", -0.1),
+        ("rate", 0.0),
+        ("rate", 1.0),
+    ],
+)
+def test_an_impossible_value_is_refused_by_name(key, value):
+    with pytest.raises(UserError, match=rf"^exposure\.{key}: wanted .* Try: exposure\.{key}="):
+        guard(**{key: value})
