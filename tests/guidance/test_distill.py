@@ -257,18 +257,33 @@ def test_the_residual_is_measured_against_the_last_guess(make, ask, gaussian, on
     assert output.log["residual_rms"] == pytest.approx(float(offset.square().mean().sqrt()))
 
 
+def judge_by_network(guidance, predicts, noise_path, device="cpu"):
+    """The gradient on a render of odd size, and the output."""
+    prior = Tiny(predicts=predicts, noise_path=noise_path, width=16, downscale=2, seed=0)
+    prior = prior.to(torch.device(device))
+    cameras = turntable(2, elevation_deg=15.0, distance=3.0, fov_y_deg=40.0, size=17)
+    condition = prior.embed("a red cube", "blurry").at(cameras.to(torch.device(device)), torch.zeros(2, 3))
+    render = torch.rand(2, 17, 17, 3, generator=torch.Generator().manual_seed(0)).to(device).requires_grad_()
+    output = guidance(render, condition, prior, 0, torch.Generator().manual_seed(0))
+    output.loss.backward()
+    return render.grad, output
+
+
 @pytest.mark.parametrize(
     ("predicts", "noise_path"), [("noise", DDPM()), ("velocity", RectifiedFlow(shift=3.0))]
 )
 def test_it_runs_on_a_network(predicts, noise_path, objective, make):
-    prior = Tiny(predicts=predicts, noise_path=noise_path, width=16, downscale=2, seed=0)
-    cameras = turntable(2, elevation_deg=15.0, distance=3.0, fov_y_deg=40.0, size=17)
-    condition = prior.embed("a red cube", "blurry").at(cameras, torch.zeros(2, 3))
-    render = torch.rand(2, 17, 17, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    output = make(objective)(render, condition, prior, 0, torch.Generator().manual_seed(0))
-    output.loss.backward()
+    gradient, output = judge_by_network(make(objective), predicts, noise_path)
     assert output.log["guidance_nonfinite"] == 0
-    assert (render.grad != 0).any(dim=-1).all()
+    assert (gradient != 0).any(dim=-1).all()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cuda_agrees_with_the_cpu(objective, make):
+    """The same draws on either; the network computes a little differently."""
+    near, far = (judge_by_network(make(objective), "noise", DDPM(), device)[0] for device in ("cpu", "cuda"))
+    assert (far.cpu() - near).norm() < 0.05 * near.norm()
 
 
 @pytest.mark.parametrize(
