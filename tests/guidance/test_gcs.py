@@ -95,7 +95,7 @@ def test_the_terms_add_up_and_are_logged_with_their_weights(make, ask, prior, me
 def test_the_noise_averages_out_to_a_pull_towards_the_image(make, ask, gaussian, one_among_many, rgb):
     """If the prompt names one image and nearly anything else goes, GC's difference is x0 + gamma n - m."""
     guidance = make("gcs", t_min=0.5, t_max=0.5, **weights_of(*ALONE["gc"]))
-    prior, count = gaussian(DDPM(), spread=0.0), 60
+    prior, count = gaussian(DDPM(), spread=0.0), 40
     offset = rgb.detach().permute(0, 3, 1, 2) - one_among_many.positive
     draws = torch.stack([ask(guidance, rgb, one_among_many, prior, seed=seed)[0] for seed in range(count)])
     z = (draws.mean(dim=0) - 2 * offset) / (draws.std(dim=0) / count**0.5)
@@ -107,8 +107,8 @@ def test_descent_arrives_at_the_image(path, make, ask, gaussian, one_among_many,
     prior, render = gaussian(path, spread=0.02), rgb.detach()
     target = one_among_many.positive.permute(0, 2, 3, 1)
     before = (render - target).square().mean().sqrt()
-    for step in range(40):
-        t = 0.05 + 0.9 * 0.85**step
+    for step in range(20):
+        t = 0.05 + 0.9 * 0.7**step
         guidance = make("gcs", t_min=t, t_max=t, delta=0.03)
         gradient, _ = ask(guidance, render, one_among_many, prior, step=step, seed=step)
         render = render - 0.2 * gradient.permute(0, 2, 3, 1)
