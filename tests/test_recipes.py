@@ -93,6 +93,8 @@ def test_a_recipe_has_the_published_numbers(recipe):
             assert as_schedule(getattr(guidance, name))(step) == pytest.approx(value)
     if "disparity" in wanted:
         assert component(cfg.augmentation).disparity == wanted["disparity"]
+        weights = {name: node.weight for name, node in cfg.regularizer.items()}
+        assert weights == {"squared_variation": 1, "disparity_variation": 1, "mean_scale": 0.5}
     calls = [step for step in range(1, cfg.steps + 1) if refine.refines_at(step)]
     assert (calls[0], calls[-1]) == wanted["calls"]
     assert (densifier.tau_pos, densifier.views) == (wanted["tau_pos"], wanted["stats"])
