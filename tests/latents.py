@@ -1,5 +1,6 @@
 """What the tests of pretrained priors share: views, numbers, and what every one of them must do."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -68,6 +69,20 @@ def micro_batch_changes_nothing(
         gradients.append(rgb.grad)
     assert (gradients[0].flatten(1).norm(dim=1) > 0).all()
     are_close(*gradients)
+
+
+def computes_in_sixteen_bits(
+    prior: LatentPrior, condition_of: Callable[[LatentPrior], TextCondition]
+) -> None:
+    """Networks in bfloat16, numbers out of them in float32, and near those of float32."""
+    half = replace(prior, dtype="bfloat16")
+    rgb = torch.rand(len(condition_of(prior).cameras), 64, 64, 3, generator=torch.Generator().manual_seed(3))
+    latents = [each.encode(rgb) for each in (prior, half)]
+    t = torch.full((len(rgb),), 0.4)
+    guesses = [each.predict(latents[0], t, condition_of(each), 1.0).noise for each in (prior, half)]
+    for exact, rough in (latents, guesses):
+        assert rough.dtype == torch.float32
+        assert 0 < (rough - exact).norm() < 0.05 * exact.norm()
 
 
 def are_close(one: torch.Tensor, other: torch.Tensor) -> None:

@@ -203,9 +203,8 @@ def _model(folder: Path) -> str:
     name = folder.name.removeprefix("models--").replace("--", "/")
     uses = set[str]()
     for index in folder.glob(f"snapshots/*/{INDEX}"):
-        with suppress(OSError, ValueError, LookupError, TypeError):  # whatever a lost connection left there
-            kind = str(json.loads(index.read_text(encoding="utf-8"))["_class_name"])
-            uses |= {readers[kind]} if kind in readers else set()
+        with suppress(OSError, ValueError, LookupError, TypeError):  # of another kind, or cut short
+            uses.add(readers[json.loads(index.read_text(encoding="utf-8"))["_class_name"]])
     return f"{name} ({', '.join(sorted(uses))})" if uses else name
 
 

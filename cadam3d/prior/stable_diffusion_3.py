@@ -13,7 +13,7 @@ from torch.nn import functional as F  # noqa: N812  (the name everybody knows)
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require, require_choice
 from cadam3d.io.pretrained import Pretrained
-from cadam3d.prior.latent import T5_TOKENS, LatentPrior, Texts, free, tokenize
+from cadam3d.prior.latent import T5_TOKENS, LatentPrior, Texts, tokenize
 from cadam3d.prior.path import NoisePath, Prediction, RectifiedFlow
 from cadam3d.prior.text import penultimate
 
@@ -74,10 +74,7 @@ class StableDiffusion3(LatentPrior):
         long = both.new_zeros(len(texts), T5_TOKENS, width)
         if T5 in self.encoders:
             numbers = tokenize(found.part("tokenizer_3"), texts, T5_TOKENS).to(device)
-            encoder = found.part(T5, dtype).to(device)
-            long = encoder(numbers)[0].to(dtype)
-            del encoder
-            free()
+            long = found.part(T5, dtype).to(device)(numbers)[0].to(dtype)
         tokens = torch.cat([F.pad(both, (0, width - both.shape[-1])), long], dim=1)
         return Texts(tokens, torch.cat([each.pooled for each in clip if each.pooled is not None], dim=-1))
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 
 from cadam3d.io.pretrained import Pretrained
-from cadam3d.prior.latent import Texts, free, tokenize
+from cadam3d.prior.latent import Texts, tokenize
 
 
 @torch.no_grad()
@@ -20,7 +20,4 @@ def penultimate(
     numbers = tokenize(found.part(encoder.replace("text_encoder", "tokenizer")), texts).to(device)
     network = found.part(encoder, dtype).to(device)
     output = network(numbers, output_hidden_states=True)
-    embedded = Texts(output.hidden_states[-2], getattr(output, "text_embeds", None))
-    del network, output
-    free()
-    return embedded
+    return Texts(output.hidden_states[-2], getattr(output, "text_embeds", None))

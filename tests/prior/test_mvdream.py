@@ -8,6 +8,7 @@ import pytest
 import torch
 from latents import (
     KEYS,
+    computes_in_sixteen_bits,
     encodes_what_the_autoencoder_says,
     memory_is_foreseen,
     micro_batch_changes_nothing,
@@ -156,6 +157,10 @@ def test_latents_are_those_of_the_autoencoder(prior, pipe):
 
 def test_micro_batch_changes_nothing(prior):
     micro_batch_changes_nothing(prior, size=4, condition=condition_of(prior, views(8)), channels=4)
+
+
+def test_it_computes_in_sixteen_bits(prior):
+    computes_in_sixteen_bits(prior, lambda each: condition_of(each, views()))
 
 
 def test_memory_is_foreseen(prior):

@@ -6,6 +6,7 @@ import pytest
 import torch
 from latents import (
     KEYS,
+    computes_in_sixteen_bits,
     condition_of,
     encodes_what_the_autoencoder_says,
     memory_is_foreseen,
@@ -95,6 +96,10 @@ def test_the_network_is_told_the_size(prior):
 
 def test_latents_are_those_of_the_pipelines_autoencoder(prior, pipe):
     encodes_what_the_autoencoder_says(prior, pipe.vae)
+
+
+def test_it_computes_in_sixteen_bits(prior):
+    computes_in_sixteen_bits(prior, condition_of)
 
 
 def test_memory_is_foreseen(prior):

@@ -7,6 +7,7 @@ import pytest
 import torch
 from latents import (
     KEYS,
+    computes_in_sixteen_bits,
     condition_of,
     encodes_what_the_autoencoder_says,
     memory_is_foreseen,
@@ -143,6 +144,10 @@ def test_the_shift_is_the_models_own(prior, folder, tmp_path):
 def test_latents_are_those_of_the_pipelines_autoencoder(prior, pipe):
     assert pipe.vae.config.shift_factor
     encodes_what_the_autoencoder_says(prior, pipe.vae)
+
+
+def test_it_computes_in_sixteen_bits(prior):
+    computes_in_sixteen_bits(prior, condition_of)
 
 
 def test_memory_is_foreseen(prior):
