@@ -1,9 +1,19 @@
-"""Tiny real pipelines, each built at most once per process."""
+"""Tiny real pipelines, each built at most once per process; and the order of the files."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+# Whole runs, a file per process: first, so that no process is left alone with one at the end.
+LONG = ("test_end_to_end", "test_configs", "test_cuda", "test_recipes", "test_cuda_sanitizer", "test_cpu")
+
+
+def pytest_collection_modifyitems(items):
+    def place(item):
+        return LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG)
+
+    items.sort(key=place)
 
 
 @pytest.fixture(scope="session")

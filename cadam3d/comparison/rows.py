@@ -281,7 +281,7 @@ def _shipped(arm: str) -> Mapping[str, Any]:
     if not arm or not (config_dir() / ARM / f"{arm}.yaml").is_file():
         return {}
     node = compose([f"{ARM}={arm}", "prompt=any"])[ARM]
-    plain = OmegaConf.to_container(node, resolve=False)
+    plain = OmegaConf.to_container(node, resolve=True)
     assert isinstance(plain, dict)
     return {str(key): value for key, value in plain.items()}
 
