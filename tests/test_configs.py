@@ -197,7 +197,7 @@ def test_a_launcher_fills_in_a_launcher_of_hydra(path):
 def test_every_experiment_runs_two_steps_on_the_tiny_prior(experiment, tmp_path, monkeypatch):
     raw = read(CONFIGS / "experiment" / f"{experiment}.yaml")
     lines = [PROMPT, f"experiment={experiment}", "prior=tiny", "rasterizer=reference", "steps=2"]
-    lines += ["camera.size=16", "initializer.count=20", f"hydra.run.dir={tmp_path}"]
+    lines += ["camera.size=16", "initializer=ball", "initializer.count=20", f"hydra.run.dir={tmp_path}"]
     lines += [line for line in ("exporter=[ply]", "metric=[size]") if line.partition("=")[0] not in raw]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["cadam3d", "train", *lines])

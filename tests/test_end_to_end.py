@@ -133,9 +133,10 @@ def test_a_signal_saves_everything_and_says_how_to_go_on(finished, tmp_path, num
     assert (victim / "asset.ply").read_bytes() == (whole / "asset.ply").read_bytes()
 
 
-@pytest.mark.parametrize("guidance", ["ism", "vfds"])
-@pytest.mark.parametrize("densifier", ["baseline", "none"])
-def test_every_objective_and_densifier_trains(tmp_path, guidance, densifier):
+@pytest.mark.parametrize(
+    ("guidance", "densifier"), [("ism", "baseline"), ("vfds", "none"), ("gcs", "mcmc"), ("ucm", "absgrad")]
+)
+def test_objectives_and_densifiers_train(tmp_path, guidance, densifier):
     words = [*SMALL, f"guidance={guidance}", f"densifier={densifier}", "steps=12", "exporter=[ply]"]
     out, _ = run(tmp_path, "train", *words)
     summary = json.loads((tmp_path / "outputs" / "latest" / "summary.json").read_text())
