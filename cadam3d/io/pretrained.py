@@ -15,7 +15,6 @@ from typing import Any
 import torch
 
 from cadam3d.core.checks import UserError, require
-from cadam3d.io.jsonl import read_json
 
 INDEX = "model_index.json"
 LIBRARIES = ("diffusers", "transformers")  # the only ones that a part may come from: no code of strangers
@@ -151,7 +150,7 @@ class Pretrained:
             path = Path(self.where) / name / file
             if not path.is_file():
                 raise UserError(f"{self.source.key}: {path} is missing. Try: download {self.where} again")
-            return read_json(path)
+            return _read_index(self.source.key, path)
         if hasattr(kind, "load_config"):
             return dict(kind.load_config(self.where, subfolder=name, revision=self.revision))
         return kind.config_class.from_pretrained(self.where, subfolder=name, revision=self.revision).to_dict()
