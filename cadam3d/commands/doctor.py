@@ -171,6 +171,8 @@ def _priors() -> Iterator[Finding]:
 
 def _prior(topic: str) -> Finding:
     prior = component(compose(["prompt=test", topic]).prior)
+    if (lack := prior.lacks()) is not None:
+        return Finding(topic, Verdict.NOTE, lack)
     return Finding(topic, Verdict.OK, (prior.notice() or "ready").splitlines()[0])
 
 

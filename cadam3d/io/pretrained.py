@@ -51,14 +51,15 @@ class Source:
                 is_name, f"{key}.{name}", wanted="a name or null", got=value, example=f"{key}.{name}=null"
             )
 
-    def find(self, kinds: Sequence[str], others: Mapping[str, str]) -> "Pretrained":
+    def find(self, kinds: Sequence[str], others: Mapping[str, str], ask_hub: bool = True) -> "Pretrained":
         """The model, of which only the index has been read; on the hub, the first id that can be had.
 
         ``kinds`` are the pipeline classes that will do, ``others`` what to type for those that will not.
+        Unless ``ask_hub``, only what is on this disk counts.
         Raises ``UserError`` if the extra is not installed, or with a reason for everything that was tried.
         """
         require_extra(self.key)
-        found = self._local() if self.path is not None else self._remote()
+        found = self._local() if self.path is not None else self._remote(ask_hub)
         kind = str(found.index.get("_class_name"))
         if kind not in kinds:
             advice = others.get(kind, f"another {self.key}.path")
@@ -80,7 +81,7 @@ class Source:
             )
         return Pretrained(self, str(folder), None, folder / INDEX, _read_index(self.key, folder / INDEX))
 
-    def _remote(self) -> "Pretrained":
+    def _remote(self, can_ask: bool) -> "Pretrained":
         require(
             len(self.ids) > 0,
             f"{self.key}.path",
@@ -89,7 +90,6 @@ class Source:
             example=f"{self.key}.path=DIR",
         )
         reasons: list[str] = []
-        can_ask = True
         for name in self.ids:
             index, reason, can_ask = _fetch_index(name, self.revision, can_ask)
             if index is not None:

@@ -93,6 +93,10 @@ class DiffusionPrior(ABC):
         """What training on ``views`` renders of ``size`` pixels a side will hold; None if next to nothing."""
         return None
 
+    def lacks(self) -> str | None:
+        """What must be had before this prior can be used here, such as weights; None if it is ready."""
+        return None
+
     def load(self) -> None:
         """Load what training needs, so that a missing file shows before the first step; may take minutes."""
         return

@@ -246,6 +246,19 @@ class LatentPrior(DiffusionPrior):
         texts = sum(_weights(self.found.skeleton(part, self.torch_dtype)) for part in encoders)
         return MemoryEstimate(weights=_weights(vae) + _weights(network), working=working, texts=texts)
 
+    def lacks(self) -> str | None:
+        """The libraries of the extra, or a model on this disk."""
+        try:
+            if self.path is not None:
+                _ = self.found
+            else:
+                self.source.find(self.kinds, PRIORS, ask_hub=False)
+        except UserError as error:
+            if self.path is not None or "pip install" in str(error):
+                return str(error)
+            return f"no model on this disk; it would be had from the hub: {', '.join(self.ids)}"
+        return None
+
     def load(self) -> None:
         """Load the autoencoder and the denoiser."""
         _ = self.vae, self.network

@@ -9,6 +9,7 @@ from cadam3d.prior.prompting import Discrete, Interpolated, PerpNeg, Plain
 from cadam3d.prior.stable_diffusion import StableDiffusion
 
 diffusers = pytest.importorskip("diffusers")
+huggingface_hub = pytest.importorskip("huggingface_hub")
 
 PIXELS = 64
 PERP_NEG = PerpNeg(curve="lucid", overhead_deg=None)
@@ -280,6 +281,20 @@ def test_the_estimate_of_the_autoencoder_is_what_autograd_keeps(make):
     weights = {p.untyped_storage().data_ptr() for p in prior.vae.parameters()}
     saved = sum(size for pointer, size in kept.items() if pointer not in weights)
     assert 0.8 * saved < prior.memory("a corgi", "", 2, None).working < 2 * saved
+
+
+def test_what_is_not_on_this_disk_is_lacking_and_the_hub_is_not_asked(make, monkeypatch):
+    assert make().lacks() is None
+    asked = []
+
+    def download(name, file, *, revision, local_files_only):
+        asked.append(local_files_only)
+        raise huggingface_hub.errors.LocalEntryNotFoundError("no")
+
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", download)
+    assert "a/one, b/two" in make(path=None, ids=["a/one", "b/two"]).lacks()
+    assert asked == [True, True]
+    assert "nothing there" in make(path="/nowhere").lacks()
 
 
 # --- what cannot be ---------------------------------------------------------------------------------------
