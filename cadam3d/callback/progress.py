@@ -17,9 +17,9 @@ GIB = 2**30
 class Progress(Callback):
     """A tqdm bar on standard error; plain lines where that is not a terminal.
 
-    ``done`` is the time of day at which the last step will be over if steps go on taking as long as they did
-    in this session on average. ``VRAM``, on a CUDA device only, is the most that tensors have needed at once;
-    torch's cache and the driver hold more.
+    ``done`` is the time of day at which the last step will be over if steps go on taking as long as they have
+    since this process started training, on average. ``VRAM``, on a CUDA device only, is the most that tensors
+    have needed at once; torch's cache and the driver hold more.
     """
 
     refresh_seconds: float  # at most one redraw in this time
