@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -11,34 +10,21 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.io.pretrained import Pretrained
-from cadam3d.prior.latent import FACTOR, LatentPrior, Texts, completion, ddpm_path
-from cadam3d.prior.path import NoisePath, Prediction
+from cadam3d.prior.latent import FACTOR, Texts
+from cadam3d.prior.stable_diffusion import StableDiffusion
 from cadam3d.prior.text import penultimate
 
 
 @dataclass(frozen=True, kw_only=True)
-class StableDiffusionXL(LatentPrior):
-    """Podell et al. 2023. Every image is presented as uncropped and of its own size (sec. 2.2 there).
+class StableDiffusionXL(StableDiffusion):
+    """Podell et al. 2023: Stable Diffusion, but for what its network reads.
 
-    The empty text is all zeros where the model says so, as it was in training.
+    Every image is presented as uncropped and of its own size (sec. 2.2 there). The empty text is all zeros where the model says so, as it was in training.
     """
 
     kinds: ClassVar = ("StableDiffusionXLPipeline",)
     encoders: ClassVar = ("text_encoder", "text_encoder_2")
-    network_part: ClassVar = "unet"
-    half: ClassVar = "float16"
     upcasts: ClassVar = True
-
-    @cached_property
-    def noise_path(self) -> NoisePath:
-        """The model's own noise schedule."""
-        return ddpm_path(self.scheduler)
-
-    def complete(
-        self, noisy: Float[Tensor, "v c h w"], output: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
-    ) -> Prediction:
-        """Noise or velocity, as the model's scheduler says."""
-        return completion(self.noise_path, self.scheduler)(noisy, output, t)
 
     def embed_texts(self, found: Pretrained, texts: Sequence[str], device: torch.device) -> Texts:
         """Both encoders' penultimate states side by side; the second one's projected text as the vector."""
