@@ -19,7 +19,8 @@ from cadam3d.prior.text import penultimate
 class StableDiffusionXL(StableDiffusion):
     """Podell et al. 2023: Stable Diffusion, but for what its network reads.
 
-    Every image is presented as uncropped and of its own size (sec. 2.2 there). The empty text is all zeros where the model says so, as it was in training.
+    Every image is presented as uncropped and of its own size (sec. 2.2 there). The empty text is all zeros
+    where the model says so, as it was in training.
     """
 
     kinds: ClassVar = ("StableDiffusionXLPipeline",)
