@@ -172,5 +172,6 @@ def finite(gradient: Tensor) -> tuple[Tensor, int]:
 
 def rms(values: Tensor) -> float:
     """Root mean square over the finite elements; 0 if there are none."""
-    finite_ones = values[values.isfinite()]
-    return float(finite_ones.square().mean().sqrt()) if finite_ones.numel() else 0.0
+    is_finite = values.isfinite()
+    squares = torch.where(is_finite, values, 0).square().sum()
+    return float((squares / is_finite.sum().clamp_min(1)).sqrt())

@@ -1,7 +1,9 @@
-"""The one folder outside of runs that is written to: what is dear to make and can be made again."""
+"""Where what is dear to make and can be made again is kept, outside of runs."""
 
 import os
 from pathlib import Path
+
+TRACES = "CADAM3D_TRACES"  # the variable that names a folder for what the jobs of a sweep share
 
 
 def default_cache_dir() -> Path:

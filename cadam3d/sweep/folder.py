@@ -15,6 +15,7 @@ from cadam3d.io.jsonl import read_json, write_json
 JOBS = "jobs.json"  # the mark of a sweep
 STOP = ".stop"  # while this is there, running jobs save and end, and no further one starts
 LOCK = ".lock"  # held while a sweep runs
+TRACED = "traces"  # what jobs that look at the same scene from the same places share, while the sweep runs
 ENDED = "job.json"  # in the folder of a job whose process has ended
 SUMMARY = "summary.json"  # of a run
 CONSOLE = "console.txt"  # what the process of a job said

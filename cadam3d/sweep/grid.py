@@ -227,7 +227,8 @@ def _foreign(
 def _told(grid: Grid, line: Axes) -> set[str]:
     """The keys that the name of a folder tells: those that may vary, whether the line narrows them or not."""
     varied = {key for axes in grid.arms.values() for key, axis in axes.items() if len(axis) > 1}
-    fixed = {key for axes in grid.arms.values() for key in axes} - varied
+    varied |= {key for key, axis in grid.each.items() if len(axis) > 1}
+    fixed = {key for axes in (*grid.arms.values(), grid.each) for key in axes} - varied
     return {key for key in swept_keys(grid, line) if key not in fixed or len(line.get(key, ())) > 1}
 
 

@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from cadam3d.core.outcome import Outcome
+from cadam3d.io.cache import TRACES
 from cadam3d.io.jsonl import write_json
 from cadam3d.settings import quote
 from cadam3d.sweep.folder import (
@@ -23,6 +24,7 @@ from cadam3d.sweep.folder import (
     ENDED,
     STOP,
     SUMMARY,
+    TRACED,
     Plan,
     Row,
     is_complete,
@@ -69,6 +71,7 @@ def _wait(plan: Plan, row: Row, stop: Path) -> int:
     environment.pop(
         "HYDRA_FULL_ERROR", None
     )  # set while Hydra is at work here: a mistake is one message there
+    environment.setdefault(TRACES, str(stop.with_name(TRACED)))
     if plan.threads is not None:
         environment["OMP_NUM_THREADS"] = str(plan.threads)
     with (row.folder / CONSOLE).open("ab") as console, _signals() as signals:

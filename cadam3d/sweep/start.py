@@ -5,6 +5,7 @@ The folder has the same name whenever the line is the same, so typing the line a
 
 import fcntl
 import os
+import shutil
 import signal
 import sys
 from argparse import Namespace
@@ -25,7 +26,7 @@ from cadam3d.commands.paths import shown
 from cadam3d.core.errors import UserError
 from cadam3d.launch import RUN_MARKS, Task, claim, key_of, run_hydra
 from cadam3d.settings import flatten, quote
-from cadam3d.sweep.folder import LOCK, STOP, Plan, PlannedJob, Row, outcomes, rows_of, write_plan
+from cadam3d.sweep.folder import LOCK, STOP, TRACED, Plan, PlannedJob, Row, outcomes, rows_of, write_plan
 from cadam3d.sweep.grid import sweep_name
 from cadam3d.sweep.plan import FOLDER, Composed, Sweep, compose_all, read_sweep, told_keys
 from cadam3d.sweep.table import TABLE, as_text, write_table
@@ -68,6 +69,7 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
                 with Watch(rows, pending):
                     problem = _launch(folder, sweep, pending, flags)
         finally:
+            shutil.rmtree(folder / TRACED, ignore_errors=True)
             code = _tell(folder, write_table(folder), problem)
     if stop.received is not None:
         return 128 + stop.received

@@ -13,6 +13,9 @@ import json, os, pathlib, signal, sys, time
 given = dict(word.lstrip("+~").partition("=")[::2] for word in sys.argv[5:] if "=" in word)
 folder = pathlib.Path(given["hydra.run.dir"].strip("'"))
 note = {{"folder": folder.name, "words": sys.argv[4:], "threads": os.environ.get("OMP_NUM_THREADS")}}
+note["traces"] = os.environ.get("CADAM3D_TRACES")
+if note["traces"]:
+    os.makedirs(note["traces"], exist_ok=True)
 note["files"] = sorted(path.name for path in folder.iterdir())
 with (folder.parent / "calls.jsonl").open("a") as file:
     file.write(json.dumps(note) + "\n")

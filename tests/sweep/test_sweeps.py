@@ -129,6 +129,20 @@ def test_a_sweep_leaves_one_row_per_job(command, flags, hydra_sweep):
     assert all((only_sweep() / row["folder"] / "summary.json").is_file() for row in rows)
 
 
+def test_jobs_share_a_folder_for_their_traces_that_goes_with_the_sweep(sweep, calls):
+    sweep("prompt=a cube", "seed=0,1")
+    folder = only_sweep()
+    assert {call["traces"] for call in calls(folder)} == {str(folder.resolve() / "traces")}
+    assert not (folder / "traces").exists()
+
+
+def test_a_folder_for_traces_of_the_user_is_kept(sweep, calls, monkeypatch, tmp_path):
+    monkeypatch.setenv("CADAM3D_TRACES", str(tmp_path / "mine"))
+    sweep("prompt=a cube", "seed=0,1")
+    assert {call["traces"] for call in calls(only_sweep())} == {str(tmp_path / "mine")}
+    assert (tmp_path / "mine").is_dir()
+
+
 def test_each_job_is_told_as_it_ends(sweep):
     lines = sweep("prompt=a cube", "seed=0,1,2").out.splitlines()
     assert lines[0].startswith("3 jobs in multirun/")

@@ -18,6 +18,7 @@ from cadam3d.prior.shapes.mixture import Mixture
 from cadam3d.prior.shapes.objects import known_objects, known_primitives
 from cadam3d.prior.shapes.scene import Scene, build
 from cadam3d.prior.shapes.tracer import Layers, trace
+from cadam3d.prior.shapes.traces import shared_trace
 
 CENSUS_VIEWS = 4  # of every object, around its equator
 CENSUS_ELEVATION_DEG = 15.0
@@ -176,7 +177,7 @@ class ShapesPrior(DiffusionPrior):
 
     def _layers(self, scene: Scene, cameras: Cameras) -> tuple[Layers, Scene]:
         scene = scene.to(cameras.intrinsics.device, cameras.intrinsics.dtype)
-        return trace(scene, cameras, self.samples_per_pixel), scene
+        return shared_trace(scene, cameras, self.samples_per_pixel), scene
 
     def _guess(self, noisy: Tensor, t: Tensor, mixture: Mixture, branch: int) -> tuple[Tensor, Tensor]:
         a, b = self.noise_path.a(t), self.noise_path.b(t)
@@ -196,26 +197,37 @@ def error_field(image: Float[Tensor, "v c h w"], seed: int) -> Float[Tensor, "v 
     variance), and the sine of that is upsampled bicubically: another noise, another field.
     """
     _, channels, height, width = image.shape
-    generator = torch.Generator().manual_seed(seed)
-    signs = torch.randint(0, 2, (channels, channels, height, width), generator=generator).to(image) * 2 - 1
-    phase = 2 * math.pi * torch.rand(channels, ERROR_GRID, ERROR_GRID, generator=generator).to(image)
-    rows, columns = _cells(height, image), _cells(width, image)
+    signs, phase = _draws(channels, height, width, seed, image.dtype, image.device)
+    like = (image.dtype, image.device)
     signed = torch.einsum("vchw,dchw->vdhw", image, signs) / math.sqrt(channels)
-    projected = torch.einsum("gh,vdhw,kw->vdgk", rows, signed, columns)
+    projected = torch.einsum("gh,vdhw,kw->vdgk", _cells(height, *like), signed, _cells(width, *like))
     coarse = math.sqrt(2) * torch.sin(ERROR_FREQUENCY * projected + phase)
-    return torch.einsum("hg,vdgk,wk->vdhw", _bicubic(height, image), coarse, _bicubic(width, image))
+    return torch.einsum("hg,vdgk,wk->vdhw", _bicubic(height, *like), coarse, _bicubic(width, *like))
 
 
-def _cells(size: int, like: Tensor) -> Float[Tensor, "g s"]:
+@lru_cache(maxsize=8)
+def _draws(
+    channels: int, height: int, width: int, seed: int, dtype: torch.dtype, device: torch.device
+) -> tuple[Float[Tensor, "c c h w"], Float[Tensor, "c g g"]]:
+    """Random signs and phases, the same for the same seed."""
+    generator = torch.Generator().manual_seed(seed)
+    signs = torch.randint(0, 2, (channels, channels, height, width), generator=generator) * 2 - 1
+    phase = 2 * math.pi * torch.rand(channels, ERROR_GRID, ERROR_GRID, generator=generator)
+    return signs.to(device, dtype), phase.to(device, dtype)
+
+
+@lru_cache(maxsize=8)
+def _cells(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "g s"]:
     """Sums over the cells of the error grid, scaled so that white noise keeps its variance."""
-    cell = torch.arange(size, device=like.device) * ERROR_GRID // size
-    member = (cell[None] == torch.arange(ERROR_GRID, device=like.device)[:, None]).to(like)
+    cell = torch.arange(size, device=device) * ERROR_GRID // size
+    member = (cell[None] == torch.arange(ERROR_GRID, device=device)[:, None]).to(dtype)
     return member / member.sum(1, keepdim=True).sqrt().clamp_min(1)
 
 
-def _bicubic(size: int, like: Tensor) -> Float[Tensor, "s g"]:
+@lru_cache(maxsize=8)
+def _bicubic(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "s g"]:
     """Interpolation from the error grid to ``size`` pixels; independent cells of unit variance keep it."""
-    grid = torch.eye(ERROR_GRID, device=like.device, dtype=like.dtype)[None, None]
+    grid = torch.eye(ERROR_GRID, device=device, dtype=dtype)[None, None]
     rows = torch.nn.functional.interpolate(grid, (size, ERROR_GRID), mode="bicubic", align_corners=False)[
         0, 0
     ]

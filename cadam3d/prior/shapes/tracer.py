@@ -108,9 +108,11 @@ def _candidates(scene: Scene, rays: _Rays) -> tuple[Int[Tensor, "n"], Int[Tensor
     """Pairs (part, ray) where the ray meets the part's bounding ball, sorted by part."""
     masks = []
     for origin, direction in zip(rays.origins, rays.directions.split(rays.per_view, dim=1), strict=True):
-        towards = (scene.centres - origin) @ direction
-        apart = (scene.centres - origin).square().sum(1, keepdim=True) - towards.clamp_min(0).square()
-        masks.append(apart <= scene.radii[:, None].square())
+        away = scene.centres - origin
+        # |away|^2 - towards^2 <= radius^2, solved for what differs between rays.
+        beyond = away.square().sum(1, keepdim=True) - scene.radii[:, None].square()
+        least = torch.where(beyond > 0, beyond.clamp_min(0).sqrt(), -torch.inf)
+        masks.append(away @ direction >= least)
     part, ray = torch.cat(masks, dim=1).nonzero(as_tuple=True)
     return part, ray
 

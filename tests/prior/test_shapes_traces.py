@@ -1,0 +1,114 @@
+"""Shared traces: the same pictures to the bit, made once, and never in the way."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from cadam3d.core.cameras import Cameras, turntable
+from cadam3d.io.cache import TRACES
+from cadam3d.prior.shapes import traces
+from cadam3d.prior.shapes.scene import Scene, build
+from cadam3d.prior.shapes.tracer import Layers, trace
+
+FLOATS = {"device": torch.device("cpu"), "dtype": torch.float32}
+
+
+def scene_of(prompt: str) -> Scene:
+    return build(prompt).to(**FLOATS)
+
+
+def cameras(size: int = 24, elevation_deg: float = 15.0) -> Cameras:
+    return turntable(2, elevation_deg=elevation_deg, distance=3.0, fov_y_deg=45.0, size=size)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch) -> Path:
+    monkeypatch.setenv(TRACES, str(tmp_path / "traces"))
+    return tmp_path / "traces"
+
+
+@pytest.fixture
+def traced(monkeypatch) -> list[int]:
+    """One entry for each time that something is really traced."""
+    calls: list[int] = []
+
+    def count(scene: Scene, cameras: Cameras, samples: int) -> Layers:
+        calls.append(samples)
+        return trace(scene, cameras, samples)
+
+    monkeypatch.setattr(traces, "trace", count)
+    return calls
+
+
+def same(one: Layers, other: Layers) -> bool:
+    return torch.equal(one.alpha, other.alpha) and torch.equal(one.paints, other.paints)
+
+
+@pytest.mark.parametrize("samples", [1, 2, 3])
+@pytest.mark.parametrize("prompt", ["a robot", "a cube", "three red and white spotted balls under a tree"])
+def test_what_was_kept_is_what_would_be_traced_to_the_bit(prompt, samples, folder, traced) -> None:
+    expected = trace(scene_of(prompt), cameras(), samples)
+    first = traces.shared_trace(scene_of(prompt), cameras(), samples)
+    second = traces.shared_trace(scene_of(prompt), cameras(), samples)
+    assert len(traced) == 1
+    assert same(first, expected)
+    assert same(second, expected)
+    assert second.paints.dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda scene, views, samples: (scene_of("a snowman"), views, samples),
+        lambda scene, views, samples: (scene_of("a red and white striped cube"), views, samples),  # a pattern
+        lambda scene, views, samples: (scene, cameras(elevation_deg=15.001), samples),
+        lambda scene, views, samples: (scene, cameras(size=26), samples),
+        lambda scene, views, samples: (scene, replace(views, width=26), samples),
+        lambda scene, views, samples: (scene, views.index(slice(0, 1)), samples),
+        lambda scene, views, samples: (scene, views, 2),
+    ],
+    ids=["object", "pattern", "place", "size", "width", "views", "samples"],
+)
+def test_whatever_changes_the_picture_is_traced_anew(other, folder, traced) -> None:
+    first = (scene_of("a red and white checkered cube"), cameras(), 1)
+    traces.shared_trace(*first)
+    assert same(traces.shared_trace(*other(*first)), trace(*other(*first)))
+    assert len(traced) == 2
+
+
+def test_colours_are_put_on_afterwards_and_share_a_trace(folder, traced) -> None:
+    for prompt in ("a red cube", "a blue cube"):
+        traces.shared_trace(scene_of(prompt), cameras(), 1)
+    assert len(traced) == 1
+
+
+@pytest.mark.parametrize("damage", [b"", b"\x93NUMPY", b"no array at all"], ids=["empty", "cut", "other"])
+def test_a_damaged_file_is_traced_anew(damage, folder, traced) -> None:
+    given = (scene_of("a cube"), cameras(), 1)
+    expected = traces.shared_trace(*given)
+    [file] = folder.iterdir()
+    file.write_bytes(damage or file.read_bytes()[:-9])
+    assert same(traces.shared_trace(*given), expected)
+    assert same(traces.shared_trace(*given), expected)
+    assert len(traced) == 2
+
+
+@pytest.mark.parametrize("trouble", ["a file in its place", "a full disk"])
+def test_a_folder_that_takes_nothing_does_no_harm(trouble, folder, monkeypatch) -> None:
+    if trouble == "a full disk":
+        monkeypatch.setattr(traces, "SPARE", 2**62)
+    else:
+        folder.write_text("")
+    given = (scene_of("a cube"), cameras(), 1)
+    for _ in range(2):
+        assert same(traces.shared_trace(*given), trace(*given))
+    assert folder.is_file() or list(folder.iterdir()) == []
+
+
+def test_without_the_variable_nothing_is_written(tmp_path, monkeypatch) -> None:
+    monkeypatch.delenv(TRACES, raising=False)
+    monkeypatch.chdir(tmp_path)
+    traces.shared_trace(scene_of("a cube"), cameras(), 1)
+    assert list(tmp_path.iterdir()) == []
