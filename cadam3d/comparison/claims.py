@@ -109,6 +109,10 @@ class Comparison:
         """How many cells were compared."""
         return len(self.pairs)
 
+    def comparable(self, loss: float) -> int:
+        """In how many cells ours has lost no more than ``loss``, dB of PSNR."""
+        return sum(pair.psnr >= -loss for pair in self.pairs)
+
 
 def compare(rows: Sequence[Row], ours: Setting, theirs: Setting) -> Comparison | None:
     """How ``ours`` stands against ``theirs``; ``None`` if no cell has both."""

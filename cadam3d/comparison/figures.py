@@ -21,6 +21,7 @@ from cadam3d.comparison.claims import (
     standard,
 )
 from cadam3d.comparison.rows import (
+    NO_NOISE,
     NOISE,
     Row,
     Setting,
@@ -34,7 +35,6 @@ from cadam3d.comparison.rows import (
 from cadam3d.comparison.style import INK, PAPER, SOFT, Look, looks, new_figure, spread_labels
 from cadam3d.io.plot import log_ticks, short
 
-NO_NOISE = ("photometric", "none")  # the levels whose gradients have no noise
 MAX_HEAT_ROWS = 4  # arms in one heat map figure
 EARLY = "\u2020"  # a dagger: some of its jobs ended before their last step
 ROOM = 0.07  # between labels, in shares of the axis

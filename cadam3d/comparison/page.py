@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from cadam3d import __version__
 from cadam3d.comparison import figures, pictures, tables, words
 from cadam3d.comparison.claims import compare, standard
-from cadam3d.comparison.rows import COMPLETE, NOISE, PLAN, PROMPT, SEED, UNFINISHED, Row, read
+from cadam3d.comparison.rows import COMPLETE, NOISE, PLAN, PROMPT, SEED, UNFINISHED, Row, read, with_noise
 from cadam3d.comparison.style import css, inline, styled, write_figure
 from cadam3d.core.checks import UserError, fail
 from cadam3d.io.atomic import replacing
@@ -145,7 +145,8 @@ def _verdict(rows: Sequence[Row]) -> str:
 
 
 def _tiles(rows: Sequence[Row]) -> str:
-    """The paper's claim over all noise levels together."""
+    """The paper's claim over all levels of noise together."""
+    rows = with_noise(rows)
     ours, theirs = standard(rows, words.OURS), standard(rows, words.THEIRS)
     whole = compare(rows, ours, theirs) if ours and theirs else None
     if whole is None:
@@ -203,10 +204,12 @@ def _style() -> str:
 
 
 def _commands(sweep_folder: Path) -> str:
-    """What to type for the same jobs again: the line of the sweep, or each job's own where that is kept."""
+    """What to type for the same jobs again: the line of the sweep, and each job's own where that is kept."""
     plan, multirun = sweep_folder / PLAN, sweep_folder / "multirun.yaml"
     if plan.is_file():
-        lines = [["train", *job["overrides"]] for job in read_json(plan)["jobs"]]
+        told = read_json(plan)
+        lines = [["sweep", *told["line"]]] if told.get("line") else []
+        lines += [["train", *job["overrides"]] for job in told["jobs"]]
     elif multirun.is_file():
         told = yaml.safe_load(multirun.read_text(encoding="utf-8")) or {}
         lines = [["sweep", *(((told.get("hydra") or {}).get("overrides") or {}).get("task") or [])]]

@@ -26,7 +26,8 @@ WITH_ASSET = (COMPLETE, "max_gaussians", "out_of_memory")  # the others left not
 PLAN, LINES = "jobs.json", ".hydra/overrides.yaml"  # how sweeps remember their jobs, and what a job was told
 ARM, PREFIX = "densifier", "densifier."
 SEED, PROMPT, NOISE, GUIDANCE = "seed", "prompt", "noise", "guidance"
-NOISE_ORDER = ("none", "photometric", "weak", "medium", "strong")  # other levels follow, by name
+NO_NOISE = ("none", "photometric")  # the levels whose gradients have no noise
+NOISE_ORDER = (*NO_NOISE, "weak", "medium", "strong")  # other levels follow, by name
 
 
 @dataclass(frozen=True)
@@ -268,6 +269,11 @@ def in_noise_order(levels: Iterable[str]) -> list[str]:
 def at_noise(rows: Iterable[Row], level: str) -> list[Row]:
     """The rows of one noise level."""
     return [row for row in rows if row.cell[NOISE] == level]
+
+
+def with_noise(rows: Sequence[Row]) -> Sequence[Row]:
+    """The rows with noise in their gradients, of which the paper speaks; all rows where none has any."""
+    return [row for row in rows if row.cell[NOISE] not in NO_NOISE] or rows
 
 
 def measured(rows: Iterable[Row]) -> list[Row]:

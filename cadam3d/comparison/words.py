@@ -4,22 +4,29 @@ import math
 from collections.abc import Sequence
 
 from cadam3d.comparison.claims import Comparison, Standing, compare, stand, standard
-from cadam3d.comparison.figures import level_title, levels_of
-from cadam3d.comparison.rows import Row, at_noise
+from cadam3d.comparison.figures import arms_of, level_title, levels_of
+from cadam3d.comparison.rows import Row, at_noise, with_noise
 
 OURS, THEIRS = "cadam", "baseline"
+COMPARABLE = 0.3  # dB of PSNR; a smaller loss is hardly seen
 
 
 def headline(rows: Sequence[Row]) -> list[str]:
-    """The paper's claim over everything, then, by noise level, where the tuned baseline stands."""
+    """The paper's claim over all noise; by its level, where the tuned baseline stands; then the variants."""
     sentences = []
+    noisy = with_noise(rows)
     ours, theirs = standard(rows, OURS), standard(rows, THEIRS)
-    if ours and theirs and (comparison := compare(rows, ours, theirs)):
+    if ours and theirs and (comparison := compare(noisy, ours, theirs)):
         sentences.append(reduction_sentence(comparison))
     for level in levels_of(rows):
         here = at_noise(rows, level)
         if ours and (standing := stand(here, ours, THEIRS)) and standing.settings > 1:
-            sentences.append(standing_sentence(standing, level))
+            sentences.append(standing_sentence(standing, _where(level)))
+    where = "At all levels of noise: " if len(levels_of(noisy)) > 1 else ""
+    for arm in (arm for arm in arms_of(noisy) if arm.startswith(OURS) and arm != OURS):
+        variant = standard(noisy, arm)
+        if variant and (standing := stand(noisy, variant, THEIRS)) and standing.settings > 1:
+            sentences.append(standing_sentence(standing, where))
     return sentences
 
 
@@ -30,7 +37,8 @@ def reduction_sentence(comparison: Comparison) -> str:
     sentence = (
         f"{comparison.ours.name} ends with {abs(fewer.median):.1%} {many} Gaussians than "
         f"{comparison.theirs.name} (median of {_cells(comparison.cells)}; quartiles {fewer.low:.1%} to "
-        f"{fewer.high:.1%} fewer), at {psnr.median:+.2f} dB PSNR ({psnr.low:+.2f} to {psnr.high:+.2f})"
+        f"{fewer.high:.1%} fewer), at {psnr.median:+.2f} dB PSNR ({psnr.low:+.2f} to {psnr.high:+.2f}), "
+        f"no more than {COMPARABLE} dB lower in {comparison.comparable(COMPARABLE)} of them"
     )
     if comparison.psnr_over_seeds is not None:
         sentence += f", {comparison.psnr_over_seeds:.2f} dB spread over seeds"
@@ -43,18 +51,18 @@ def reduction_sentence(comparison: Comparison) -> str:
     return sentence + "."
 
 
-def standing_sentence(standing: Standing, level: str = "") -> str:
-    """Where a setting lies against the whole frontier of another arm."""
+def standing_sentence(standing: Standing, where: str = "") -> str:
+    """Where a setting lies against the whole frontier of another arm; ``where`` begins the sentence."""
     who, whom = standing.setting.name, standing.arm
     outside = _outside(standing)
     if standing.psnr is None:
-        return f"{_where(level)}{who} has no equal count on {whom}'s frontier: {outside}."
+        return f"{where}{who} has no equal count on {whom}'s frontier: {outside}."
     estimate = standing.psnr
     side = "above" if estimate.median >= 0 else "below"
     share = f"{standing.above} of {_cells(estimate.cells)}"
     interval = "" if estimate.low is None else f" [{estimate.low:+.2f}, {estimate.high:+.2f}]"
     sentence = (
-        f"{_where(level)}{who} lies {abs(estimate.median):.2f} dB{interval} {side} the best of {whom}'s "
+        f"{where}{who} lies {abs(estimate.median):.2f} dB{interval} {side} the best of {whom}'s "
         f"{standing.settings} thresholds at equal count, above it in {share}"
     )
     if not is_certain(standing):

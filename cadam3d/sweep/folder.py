@@ -42,6 +42,7 @@ class Plan:
     threads: int | None  # OpenMP threads of a job; None: whatever its machine finds right
     jobs: list[PlannedJob]
     figures: list[str] | None = None  # of the report; None: whatever the jobs have data for
+    line: list[str] = field(default_factory=list)  # what was typed after ``cadam3d sweep``
 
 
 @dataclass(frozen=True)

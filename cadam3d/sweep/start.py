@@ -59,6 +59,7 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
             threads=threads,
             jobs=jobs,
             figures=sweep.grid.figures,
+            line=[*_flags_of_jobs(flags), *overrides],
         )
         write_plan(folder, plan)
         done = len(rows) - len(pending)

@@ -1,6 +1,7 @@
 """The report of a sweep stands alone, says what failed, and believes nothing that a user typed."""
 
 import csv
+import html
 import json
 import re
 import shlex
@@ -22,8 +23,8 @@ def whole(bench):
     return comparison.write(bench).read_text(encoding="utf-8")
 
 
-def text_of(html: str) -> str:
-    return " ".join(re.sub(r"<[^>]*>", " ", html).split())
+def text_of(content: str) -> str:
+    return " ".join(re.sub(r"<[^>]*>", " ", content).split())
 
 
 def test_a_whole_comparison_has_verdict_figures_tables_failures_and_command(whole, bench):
@@ -39,6 +40,16 @@ def test_a_whole_comparison_has_verdict_figures_tables_failures_and_command(whol
     ):
         assert expected in said, expected
     assert "cadam3d sweep grid=pareto" in said
+
+
+def test_the_line_of_the_sweep_comes_before_those_of_its_jobs(jobs):
+    folder = jobs.add("cadam", n=100, psnr=20.0)
+    job = {"arm": "cadam", "folder": folder.name, "overrides": ["densifier=cadam", "prompt=a cube"]}
+    plan = {"jobs": [job], "line": ["grid=mine", "prompt=a cube"]}
+    (jobs.folder / "jobs.json").write_text(json.dumps(plan))
+    said = comparison.write(jobs.folder).read_text(encoding="utf-8")
+    expected = 'cadam3d sweep grid=mine "prompt=a cube"\ncadam3d train densifier=cadam "prompt=a cube"'
+    assert html.escape(expected) in said
 
 
 def test_figures_and_tables_lie_beside_it(whole, bench):

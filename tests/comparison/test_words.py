@@ -67,6 +67,35 @@ def test_a_range_that_does_not_overlap_is_told(jobs):
     assert "in 3 cells it has fewer Gaussians than any of baseline's settings" in sentence
 
 
+def test_a_level_without_noise_is_no_witness_for_the_paper_s_claim(jobs):
+    cells(jobs, (1000, 10.0), {0.0002: (2000, 20.0)}, noise="none")
+    cells(jobs, (1000, 19.8), {0.0002: (10000, 20.0)}, noise="weak")
+    [sentence] = headline(read(jobs.folder))
+    assert sentence.startswith("cadam ends with 90.0% fewer Gaussians than baseline (median of 3 cells")
+
+
+def test_without_any_noise_the_claim_is_about_what_there_is(jobs):
+    cells(jobs, (1000, 20.0), {0.0002: (2000, 20.0)}, noise="none")
+    [sentence] = headline(read(jobs.folder))
+    assert sentence.startswith("cadam ends with 50.0% fewer")
+
+
+def test_cells_of_comparable_quality_are_counted_with_the_limit_among_them(jobs):
+    for prompt, psnr in (("a cube", 19.71), ("a torus", 19.69), ("a tower", 25.0)):
+        cells(jobs, (1000, psnr), {0.0002: (10000, 20.0)}, prompts=[prompt])
+    assert "no more than 0.3 dB lower in 2 of them" in headline(read(jobs.folder))[0]
+
+
+def test_variants_are_told_over_all_noise_together(jobs):
+    for noise, psnr in (("none", 10.0), ("weak", 17.0), ("strong", 17.0)):
+        cells(jobs, (1000, 15.0), {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, noise=noise)
+        for prompt in ("a cube", "a torus", "a tower"):
+            jobs.add("cadam_annealed", f"prompt={prompt}", f"noise={noise}", n=1000, psnr=psnr)
+    *_, last = headline(read(jobs.folder))
+    assert last.startswith("At all levels of noise: cadam_annealed lies 2.00 dB [+2.00, +2.00] above")
+    assert "above it in 6 of 6 cells" in last
+
+
 def test_without_a_baseline_nothing_is_claimed(jobs):
     jobs.add("cadam", n=100, psnr=20.0)
     assert headline(read(jobs.folder)) == []

@@ -561,11 +561,14 @@ def test_what_the_plan_remembers(sweep, tmp_path):
     own = tmp_path / "own/densifier"
     own.mkdir(parents=True)
     (own / "mine.yaml").write_text("_target_: mypackage.Mine\n", encoding="utf-8")
-    result = sweep("--config-dir", "own", "prompt=a cube", "densifier=mine,none", "hydra.sweep.dir=x")
+    result = sweep("--config-dir", "own", "prompt='a cube'", "densifier=mine,none", "hydra.sweep.dir=x")
     assert result.code == 0, result.err
     remembered = read_plan(Path("x"))
     assert remembered.cwd == str(tmp_path)
     assert remembered.flags == ["--config-dir", "own"]
+    assert remembered.line == [
+        *("--config-dir", "own", "prompt='a cube'", "densifier=mine,none", "hydra.sweep.dir=x")
+    ]
     assert [job.swept["densifier"] for job in remembered.jobs] == ["mine", "none"]
 
 
