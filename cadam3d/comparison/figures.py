@@ -4,13 +4,16 @@ Small multiples run over noise levels, arms are named beside their curves, and c
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from matplotlib.transforms import Bbox, BboxBase
 
 from cadam3d.comparison.claims import (
     FrontierPoint,
@@ -38,6 +41,14 @@ from cadam3d.io.plot import log_ticks, short
 MAX_HEAT_ROWS = 4  # arms in one heat map figure
 EARLY = "\u2020"  # a dagger: some of its jobs ended before their last step
 ROOM = 0.07  # between labels, in shares of the axis
+MARK = 6.0  # half the side of the square that a mark takes, in pixels
+SPOTS = (  # where the name of an arm may stand, the best first: alignment, and offset in points
+    ("center", 0, 8),
+    ("center", 0, -16),
+    *((ha, x, y) for y in (8, -16, 19, -27, 30, -38) for ha, x in (("left", -6), ("right", 6))),
+    ("left", 9, -3),
+    ("right", -9, -3),
+)
 
 
 def arms_of(rows: Sequence[Row]) -> list[str]:
@@ -66,13 +77,15 @@ def frontier_figure(rows: Sequence[Row]) -> Figure | None:
     figure, style = new_figure(len(levels), height=3.5), looks(arms)
     panels = figure.subplots(1, len(levels), squeeze=False, sharey=True)[0]
     gains = all(has_no_growth(at_noise(rows, level)) for level in levels)
+    named: dict[str, dict[str, tuple[float, float]]] = {}
     for axes, level in zip(panels, levels, strict=True):
         here = at_noise(rows, level)
         axes.set_xscale("log")
-        for arm in arms:
-            points = frontier(here, arm, here if gains else ())
-            if points:
-                _frontier_curve(axes, arm, points, style[arm])
+        named[level] = {
+            arm: _frontier_curve(axes, points, style[arm])
+            for arm in arms
+            if (points := frontier(here, arm, here if gains else ()))
+        }
         axes.set_title(level_title(level))
         axes.set_xlabel("Gaussians at the end")
         _plain_log(axes.xaxis, room=1.25)
@@ -87,11 +100,16 @@ def frontier_figure(rows: Sequence[Row]) -> Figure | None:
     panels[0].text(
         0.98, 0.03, "\n".join(legend), transform=panels[0].transAxes, ha="right", fontsize=7, color=SOFT
     )
+    for axes, level in zip(panels, levels, strict=True):
+        _name_arms(axes, named[level], style)
     return figure
 
 
-def _frontier_curve(axes: Axes, arm: str, points: Sequence[FrontierPoint], look: Look) -> None:
-    """One arm: with one threshold a line through all settings, with more the hull of what they reach."""
+def _frontier_curve(axes: Axes, points: Sequence[FrontierPoint], look: Look) -> tuple[float, float]:
+    """One arm: with one threshold a line through all settings, with more the hull of what they reach.
+
+    Returns the place of the setting that its name belongs to.
+    """
     places = [(point.count.median, point.gain.median) for point in points]
     is_line = len(points[0].setting.thresholds) == 1
     curve = places if is_line else [(10**x, y) for x, y in Hull(places).corners]
@@ -116,12 +134,33 @@ def _frontier_curve(axes: Axes, arm: str, points: Sequence[FrontierPoint], look:
     if len(points) > 1 and not is_line:  # too many to name each: the ends, and by its ring the standard one
         _annotate(axes, points[0].setting.values, places[0], (-6, -2), ha="right")
         _annotate(axes, points[-1].setting.values, places[-1], (6, -2), ha="left")
-    named = next((at for point, at in zip(points, places, strict=True) if point.is_standard), places[-1])
-    is_last = len(points) > 1 and named == places[-1]
-    if len(points) == 1:
-        _annotate(axes, arm, named, (0, 9), look=look)
-    else:
-        _annotate(axes, arm, named, (8 if is_last else -7, 8), ha="right", look=look)
+    return next((at for point, at in zip(points, places, strict=True) if point.is_standard), places[-1])
+
+
+def _name_arms(axes: Axes, places: Mapping[str, tuple[float, float]], style: Mapping[str, Look]) -> None:
+    """The name of each arm beside its place: at the first spot where it covers no mark and no other words."""
+    figure = axes.get_figure()
+    assert isinstance(figure, Figure)
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    figure.draw_without_rendering()  # fixes where everything is
+    taken = [text.get_window_extent(renderer) for text in axes.texts if text.get_text()]
+    for line in axes.lines:
+        if line.get_marker() not in ("", "None", None):
+            marks = axes.transData.transform(np.column_stack(line.get_data()))
+            taken += [Bbox.from_bounds(x - MARK, y - MARK, 2 * MARK, 2 * MARK) for x, y in marks]
+    frame = axes.get_window_extent(renderer)
+    for arm, place in places.items():
+        texts = [_annotate(axes, arm, place, (x, y), ha=ha, look=style[arm]) for ha, x, y in SPOTS]
+        boxes = [text.get_window_extent(renderer) for text in texts]
+        covered = [box.count_overlaps(taken) + 9 * (not _contains(frame, box)) for box in boxes]
+        best = covered.index(min(covered))
+        for text in texts[:best] + texts[best + 1 :]:
+            text.remove()
+        taken.append(boxes[best])
+
+
+def _contains(outer: BboxBase, inner: BboxBase) -> bool:
+    return all(outer.contains(*corner) for corner in inner.corners())
 
 
 def _annotate(
@@ -132,11 +171,21 @@ def _annotate(
     *,
     ha: str = "center",
     look: Look | None = None,
-) -> None:
+) -> Annotation:
     """Words beside a mark: small and grey, or in the look of an arm."""
     style = {"fontsize": 6.5, "color": SOFT} if look is None else {"fontsize": 8.5, "color": look.color}
     weight = "normal" if look is None else "bold"
-    axes.annotate(text, place, offset, textcoords="offset points", ha=ha, weight=weight, zorder=6, **style)
+    return axes.annotate(
+        text,
+        place,
+        offset,
+        textcoords="offset points",
+        ha=ha,
+        weight=weight,
+        zorder=6,
+        in_layout=False,
+        **style,
+    )
 
 
 def _bars(axes: Axes, point: FrontierPoint, look: Look) -> None:
