@@ -17,7 +17,7 @@ from cadam3d.prior.shapes.grammar import TRY
 from cadam3d.prior.shapes.mixture import Mixture
 from cadam3d.prior.shapes.objects import known_objects, known_primitives
 from cadam3d.prior.shapes.scene import Scene, build
-from cadam3d.prior.shapes.tracer import Layers, trace
+from cadam3d.prior.shapes.tracer import Layers
 from cadam3d.prior.shapes.traces import shared_trace
 
 CENSUS_VIEWS = 4  # of every object, around its equator
@@ -250,7 +250,7 @@ def take_census(size: int) -> Census:
     names = (*known_primitives(), *known_objects())
     for name in names:
         scene = build(name).to(torch.device("cpu"), torch.float32)
-        layers = trace(scene, cameras, samples=1)
+        layers = shared_trace(scene, cameras, samples=1)
         images = layers.images(scene.albedo, black).double()
         alpha = layers.alpha.double()
         rgb_sum += images.mean(dim=(0, 1))
