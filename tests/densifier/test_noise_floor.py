@@ -136,10 +136,24 @@ def test_under_a_weight_common_to_all_the_gate_opens_and_shuts_for_everybody():
     assert [passes(strict, state) for state in states.values()] == pytest.approx([90] * 5, abs=3)
 
 
-def test_cadam_strict_passes_a_sixth_of_the_noise():
-    densifier = cadam(grad_norm="per_step_rms")
+@pytest.mark.parametrize("name", ["cadam_strict", "cadam_selective"])
+def test_gates_above_the_floor_pass_a_sixth_of_the_noise(name):
+    densifier = component(compose(["prompt=noise", f"densifier={name}"]).densifier)
     state = simulate(densifier, [1.0] * 300, looks=(300,))[300]
-    assert passes(densifier, state, tau=0.3) == pytest.approx(16, abs=3)
+    assert passes(densifier, state, tau=densifier.tau_SNR) == pytest.approx(16, abs=3)
+
+
+@pytest.mark.parametrize(("name", "noise", "signal"), [("cadam", 10, 10), ("cadam_selective", 16, 30)])
+def test_what_a_call_takes_without_and_with_a_drift(name, noise, signal):
+    """The published gates take their tenth of whatever there is; the selective ones take less of mere noise."""
+    densifier = component(compose(["prompt=noise", f"densifier={name}"]).densifier)
+    for offset, percent in ((0.0, noise), (1.0, signal)):
+        shifted = simulate(
+            densifier, [1.0] * 300, noise=lambda draw, d=offset: isotropic(draw) + d, looks=(300,)
+        )
+        assert 100 * float(densifier.select(shifted[300], STEP, LOTS).float().mean()) == pytest.approx(
+            percent, abs=3
+        )
 
 
 # The calibrated gate.
