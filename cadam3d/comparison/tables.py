@@ -1,6 +1,7 @@
 """Tables of a sweep: lists of plain rows, written as CSV and as HTML."""
 
 import csv
+import math
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -15,6 +16,7 @@ from cadam3d.io.atomic import replacing
 from cadam3d.io.page import show
 
 Line = dict[str, Any]
+NO_RATIO: dict[float | None, str] = {math.inf: "never", 0.0: "always"}  # reaches the quality; exceeds it
 
 
 def objectives_table(rows: Sequence[Row]) -> list[Line]:
@@ -44,6 +46,7 @@ def objectives_table(rows: Sequence[Row]) -> list[Line]:
                         "seconds": _median([row.seconds for row in members], 1),
                         f"fewer than {THEIRS}": f"{pair.reduction.median:.1%}" if pair else None,
                         "ended early": sum(row.ended_early for row in members),
+                        "unpaired": (pair.unpaired or None) if pair else None,
                     }
                 )
     return _without_empty(lines)
@@ -89,13 +92,16 @@ def standings_table(rows: Sequence[Row]) -> list[Line]:
                         "low (95 %)": _rounded(estimate.low if estimate else None, 2),
                         "high": _rounded(estimate.high if estimate else None, 2),
                         "sign test p": _rounded(estimate.p_value if estimate else None, 3),
+                        "over seeds (dB)": _rounded(each.psnr_over_seeds, 2),
                         "above in": f"{each.above} of {estimate.cells if estimate else 0}",
                         "fewer than any": each.fewer,
                         "more than any": each.more,
-                        f"{THEIRS} needs times": "never"
-                        if each.count_ratio == float("inf")
-                        else _rounded(each.count_ratio, 2),
+                        f"{THEIRS} needs times": NO_RATIO.get(
+                            each.count_ratio, _rounded(each.count_ratio, 2)
+                        ),
                         "never reaches": each.never,
+                        "always exceeds": each.always,
+                        "unpaired": each.unpaired or None,
                     }
                 )
     return _without_empty(lines) if any(line["dB above at equal count"] is not None for line in lines) else []

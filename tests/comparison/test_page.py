@@ -141,6 +141,26 @@ def test_light_and_dark_define_the_same_arms():
 # Tables.
 
 
+def test_standings_tell_the_luck_of_seeds_and_what_is_out_of_reach(jobs):
+    for seed, psnr in enumerate((9.0, 9.2)):
+        for tau, n, best in ((0.001, 100, 10.0), (0.0002, 10000, 20.0)):
+            jobs.add("baseline", f"densifier.tau_pos={tau}", f"seed={seed}", n=n, psnr=best)
+        jobs.add("cadam", f"seed={seed}", n=1000, psnr=psnr)
+    jobs.add("cadam", "seed=2", n=1000, psnr=9.0)
+    [line] = tables.standings_table(read(jobs.folder))
+    assert line["over seeds (dB)"] == 0.14
+    assert (line["baseline needs times"], line["always exceeds"], line["never reaches"]) == ("always", 2, 0)
+    assert line["unpaired"] == 1
+
+
+def test_the_key_table_tells_cells_that_only_one_of_two_has(jobs):
+    for seed in (0, 1):
+        jobs.add("baseline", f"seed={seed}", n=1000, psnr=20.0)
+    jobs.add("cadam", "seed=0", n=100, psnr=20.0)
+    jobs.add("cadam", "seed=1", n=100, psnr=None, outcome="failed")
+    assert [line["unpaired"] for line in tables.objectives_table(read(jobs.folder))] == [None, 1]
+
+
 def test_the_key_table_has_a_line_per_objective_level_and_arm(jobs):
     for guidance in ("sds", "ism"):
         for arm, n in (("baseline", 1000), ("cadam", 100)):
