@@ -26,6 +26,34 @@ SIGNIFICANT = 1 - CONFIDENCE  # of the sign test
 
 
 @dataclass(frozen=True)
+class Quality:
+    """A number by which assets are judged: more is better."""
+
+    name: str
+    unit: str  # empty: none
+    digits: int  # after the point, in tables
+    of: Callable[[Row], float | None]
+
+    @property
+    def axis(self) -> str:
+        """Its name with its unit."""
+        return self.with_unit(self.name)
+
+    @property
+    def gain(self) -> str:
+        """What its difference to the job without growth is called, with its unit."""
+        return self.with_unit(f"{self.name} gained by growth")
+
+    def with_unit(self, words: str) -> str:
+        """``words`` and the unit, if there is one."""
+        return f"{words} ({self.unit})" if self.unit else words
+
+
+PSNR = Quality("PSNR", "dB", 2, lambda row: row.psnr)
+SSIM = Quality("SSIM", "", 4, lambda row: row.ssim)
+
+
+@dataclass(frozen=True)
 class Spread:
     """Median and quartiles of numbers, one per cell."""
 
@@ -164,35 +192,41 @@ class FrontierPoint:
     cells: int
     early: int  # of them, stopped before the last step
     count: Spread
-    gain: Spread  # PSNR over the cell's job without growth, dB; plain PSNR where the sweep has none
+    left_out: int  # cells that have no job without growth, or whose quality nobody measured
+    gain: Spread  # quality over the cell's job without growth; plain quality where the sweep has none
     count_over_seeds: float | None  # standard deviation of log10 count
-    gain_over_seeds: float | None  # dB
+    gain_over_seeds: float | None
 
 
-def frontier(rows: Sequence[Row], arm: str, zero: Sequence[Row] | None = None) -> list[FrontierPoint]:
+def frontier(
+    rows: Sequence[Row], arm: str, zero: Sequence[Row] | None = None, quality: Quality = PSNR
+) -> list[FrontierPoint]:
     """The settings of ``arm``, those with fewest Gaussians first.
 
     ``rows`` are those of one noise level. Gains are counted from the jobs without growth among ``zero``
-    (``rows`` itself, or another level); cells that have no such job are left out. Without any: plain PSNR.
+    (``rows`` itself, or another level); cells that have no such job are left out, and counted. Without any:
+    plain quality.
     """
-    gain = gain_over(rows if zero is None else zero)
+    gain = gain_over(rows if zero is None else zero, quality)
     points = []
     for setting in settings_of(rows, arm):
-        cells = {cell: row for cell, row in by_cell(rows, setting).items() if math.isfinite(gain(row))}
+        members = by_cell(rows, setting)
+        cells = {cell: row for cell, row in members.items() if math.isfinite(gain(row))}
         if not cells:
             continue
         counts = {cell: _count(row) for cell, row in cells.items()}
-        quality = {cell: gain(row) for cell, row in cells.items()}
+        gains = {cell: gain(row) for cell, row in cells.items()}
         points.append(
             FrontierPoint(
                 setting=setting,
                 is_standard=any(row.is_standard for row in cells.values()),
                 cells=len(cells),
                 early=sum(row.ended_early for row in cells.values()),
+                left_out=len(members) - len(cells),
                 count=Spread.of(counts.values()),
-                gain=Spread.of(quality.values()),
+                gain=Spread.of(gains.values()),
                 count_over_seeds=over_seeds({cell: math.log10(n) for cell, n in counts.items()}),
-                gain_over_seeds=over_seeds(quality),
+                gain_over_seeds=over_seeds(gains),
             )
         )
     return sorted(points, key=lambda point: point.count.median)
@@ -203,15 +237,20 @@ def has_no_growth(rows: Sequence[Row]) -> bool:
     return any(row.arm == NO_GROWTH for row in measured(rows))
 
 
-def gain_over(zero: Sequence[Row]) -> Callable[[Row], float]:
-    """PSNR over that of the same prompt and seed without growth in ``zero``, dB; NaN where it has none.
+def gain_over(zero: Sequence[Row], quality: Quality = PSNR) -> Callable[[Row], float]:
+    """Quality over that of the same prompt and seed without growth in ``zero``; NaN where it has none.
 
-    Plain PSNR if ``zero`` has no job without growth at all.
+    Plain quality if ``zero`` has no job without growth at all; NaN where nobody measured it.
     """
+
+    def measured_of(row: Row) -> float:
+        value = quality.of(row)
+        return math.nan if value is None else value
+
     if not has_no_growth(zero):
-        return _psnr
-    levels = {row.cell.without(NOISE): _psnr(row) for row in measured(zero) if row.arm == NO_GROWTH}
-    return lambda row: _psnr(row) - levels.get(row.cell.without(NOISE), math.nan)
+        return measured_of
+    levels = {row.cell.without(NOISE): measured_of(row) for row in measured(zero) if row.arm == NO_GROWTH}
+    return lambda row: measured_of(row) - levels.get(row.cell.without(NOISE), math.nan)
 
 
 class Hull:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from cadam3d.comparison.claims import by_cell, compare, frontier, has_no_growth, standard, standings
+from cadam3d.comparison.claims import SSIM, by_cell, compare, frontier, has_no_growth, standard, standings
 from cadam3d.comparison.figures import arms_of, levels_of
 from cadam3d.comparison.rows import GUIDANCE, Row, at_noise, measured
 from cadam3d.comparison.words import OURS, THEIRS
@@ -57,9 +57,12 @@ def frontier_table(rows: Sequence[Row]) -> list[Line]:
     lines = []
     for level in levels_of(rows):
         here = at_noise(rows, level)
-        quality = "gain" if has_no_growth(here) else "PSNR"
+        gains = has_no_growth(here)
+        quality, ssim_title = ("gain", "SSIM gain") if gains else ("PSNR", "SSIM")
         for arm in arms_of(here):
+            ssims = {point.setting: point.gain for point in frontier(here, arm, quality=SSIM)}
             for point in frontier(here, arm):
+                ssim = ssims.get(point.setting)
                 lines.append(
                     {
                         "noise": level,
@@ -71,6 +74,8 @@ def frontier_table(rows: Sequence[Row]) -> list[Line]:
                         f"{quality} (dB)": round(point.gain.median, 2),
                         f"{quality} quartiles": f"{point.gain.low:.2f} to {point.gain.high:.2f}",
                         "over seeds (dB)": _rounded(point.gain_over_seeds, 2),
+                        ssim_title: _rounded(ssim.median if ssim else None, SSIM.digits),
+                        "left out": point.left_out or None,
                     }
                 )
     return _without_empty(lines)

@@ -63,7 +63,7 @@ def standing_sentence(standing: Standing, where: str = "") -> str:
     who, whom = standing.setting.name, standing.arm
     outside = _outside(standing)
     if standing.psnr is None:
-        return f"{where}{who} has no equal count on {whom}'s frontier: {outside}."
+        return f"{where}{who} has no equal count on {whom}'s frontier: {outside}{needed_clause(standing)}."
     estimate = standing.psnr
     side = "above" if estimate.median >= 0 else "below"
     share = f"{standing.above} of {_cells(estimate.cells)}"
