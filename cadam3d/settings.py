@@ -93,8 +93,19 @@ def flatten(node: object, prefix: str = "", *, with_nodes: bool = False) -> Iter
 
 
 def register_resolvers() -> None:
-    """Make ``${slug:...}`` known to OmegaConf; calling it again does nothing new."""
+    """Make ``${slug:...}`` and ``${span:...}`` known to OmegaConf; calling it again does nothing new."""
     OmegaConf.register_new_resolver("slug", slug, replace=True)
+    OmegaConf.register_new_resolver("span", span, replace=True)
+
+
+def span(share: float, start: object, *ends: object) -> int:
+    """A part of the steps from ``start`` to the first of ``ends``, at least 1.
+
+    Also 1 where they are no whole numbers: whoever owns the wrong key says so.
+    """
+    if not all(type(step) is int for step in (start, *ends)):
+        return 1
+    return max(1, round(share * (min(ends) - start)))  # pyright: ignore[reportOperatorIssue, reportArgumentType]
 
 
 def slug(*parts: object) -> str:

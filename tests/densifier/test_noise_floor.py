@@ -145,7 +145,7 @@ def test_gates_above_the_floor_pass_a_sixth_of_the_noise(name):
 
 @pytest.mark.parametrize(("name", "noise", "signal"), [("cadam", 10, 10), ("cadam_selective", 16, 30)])
 def test_what_a_call_takes_without_and_with_a_drift(name, noise, signal):
-    """The published gates take their tenth of whatever there is; the selective ones take less of mere noise."""
+    """The published gates take their tenth of whatever there is, the selective ones less of mere noise."""
     densifier = component(compose(["prompt=noise", f"densifier={name}"]).densifier)
     for offset, percent in ((0.0, noise), (1.0, signal)):
         shifted = simulate(

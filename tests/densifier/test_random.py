@@ -1,5 +1,7 @@
 """Laws of growth by lot, the control of the experiments."""
 
+import math
+
 import pytest
 import torch
 
@@ -85,6 +87,18 @@ def test_the_annealed_control_draws_as_many_as_its_original_at_every_call():
     )
     for step in range(0, 601, 10):
         assert control.share(step) == pytest.approx(1 - cadam.tau_Q(step))
+
+
+@pytest.mark.parametrize("recipe", [None, "bench", "luciddreamer", "gaussiandreamer", "dreamgaussian"])
+def test_the_annealed_quantile_follows_the_schedule_and_bounds_growth_as_the_paper_s_does(recipe):
+    words = ["prompt=a red cube", "densifier=cadam_annealed", *([f"experiment={recipe}"] if recipe else [])]
+    cfg = compose(words)
+    tau_Q, refine = component(cfg.densifier).tau_Q, cfg.refine
+    calls = [at for at in range(0, cfg.steps + 1, refine.interval) if refine.start < at < refine.end]
+    assert tau_Q(refine.start) == 0.5
+    assert tau_Q(calls[-1]) == pytest.approx(0.98)
+    bound, paper = math.prod(2 - tau_Q(at) for at in calls), 1.1 ** len(calls)
+    assert 0.9 * paper < bound < 1.35 * paper
 
 
 def test_rows_follow_an_edit():
