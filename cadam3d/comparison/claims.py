@@ -1,25 +1,56 @@
 """Claims: what rows say about settings, within cells first, then over cells. Pure functions of rows.
 
-Medians run over cells. An interval comes from a bootstrap that draws prompts (cells without their seed) with
-all their seeds, because the seeds of one prompt are no independent witnesses; a sign test counts prompts.
+Medians run over cells. An interval comes from a bootstrap that draws prompts with all their cells, because
+the seeds, noise levels and objectives of one prompt are no independent witnesses; a sign test counts prompts.
 """
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from scipy.stats import binomtest
 
-from cadam3d.comparison.rows import NOISE, SEED, Cell, Row, Setting, measured
+from cadam3d.comparison.rows import NOISE, PROMPT, SEED, Cell, Row, Setting, measured
 
 NO_GROWTH = "none"  # the arm that gains are counted from
 RESAMPLES = 2000
 CONFIDENCE = 0.95
 BOOTSTRAP_SEED = 0  # same rows, same interval
-LEAST_FOR_INTERVAL = 3  # prompts; with fewer a bootstrap says nothing
+LEAST_FOR_INTERVAL = (
+    6  # prompts; with 4 a bootstrap of the median covers 85 % only, and 5 prove nothing by signs
+)
+SIGNIFICANT = 1 - CONFIDENCE  # of the sign test
+
+
+@dataclass(frozen=True)
+class Quality:
+    """A number by which assets are judged: more is better."""
+
+    name: str
+    unit: str  # empty: none
+    digits: int  # after the point, in tables
+    of: Callable[[Row], float | None]
+
+    @property
+    def axis(self) -> str:
+        """Its name with its unit."""
+        return self.with_unit(self.name)
+
+    @property
+    def gain(self) -> str:
+        """What its difference to the job without growth is called, with its unit."""
+        return self.with_unit(f"{self.name} gained by growth")
+
+    def with_unit(self, words: str) -> str:
+        """``words`` and the unit, if there is one."""
+        return f"{words} ({self.unit})" if self.unit else words
+
+
+PSNR = Quality("PSNR", "dB", 2, lambda row: row.psnr)
+SSIM = Quality("SSIM", "", 4, lambda row: row.ssim)
 
 
 @dataclass(frozen=True)
@@ -42,20 +73,28 @@ class Estimate:
     """A median over cells and how sure it is."""
 
     median: float
-    low: float | None  # ends of the 95 % bootstrap interval; None with fewer than 3 prompts
+    low: float | None  # ends of the 95 % bootstrap interval; None with fewer than LEAST_FOR_INTERVAL prompts
     high: float | None
     p_value: float | None  # two-sided sign test of "the median is 0" over prompts; None if all are 0
     cells: int
+    prompts: int
 
     @classmethod
     def of(cls, values: Mapping[Cell, float]) -> "Estimate":
         """Of one value per cell, at least one."""
-        groups = list(_by_prompt(values).values())
+        groups = list(_grouped(values, lambda cell: cell[PROMPT]).values())
         low, high = _bootstrap(groups) if len(groups) >= LEAST_FOR_INTERVAL else (None, None)
         middles = [float(np.median(group)) for group in groups]
         ups, downs = sum(middle > 0 for middle in middles), sum(middle < 0 for middle in middles)
         p_value = float(binomtest(ups, ups + downs).pvalue) if ups + downs else None
-        return cls(float(np.median(list(values.values()))), low, high, p_value, len(values))
+        return cls(float(np.median(list(values.values()))), low, high, p_value, len(values), len(groups))
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the interval excludes 0 and the sign test agrees; without either nothing is certain."""
+        if self.low is None or self.high is None or self.p_value is None:
+            return False
+        return (self.low > 0 or self.high < 0) and self.p_value < SIGNIFICANT
 
 
 @dataclass(frozen=True)
@@ -95,11 +134,12 @@ class Comparison:
     ours: Setting
     theirs: Setting
     pairs: list[Pair]
-    unpaired: int  # cells in which only one of the two left something to measure
+    only_ours: int  # cells in which theirs left nothing to measure: failed, vanished, not done, never planned
+    only_theirs: int
     reduction: Spread
     psnr: Spread
     ssim: Spread | None
-    reduction_over_seeds: float | None  # mean over prompts of the standard deviation over seeds
+    reduction_over_seeds: float | None  # standard deviation over seeds, averaged; None without two seeds
     psnr_over_seeds: float | None
     early: int  # cells in which ours stopped before its last step
     theirs_early: int
@@ -108,6 +148,11 @@ class Comparison:
     def cells(self) -> int:
         """How many cells were compared."""
         return len(self.pairs)
+
+    @property
+    def unpaired(self) -> int:
+        """Cells in which only one of the two left something to measure."""
+        return self.only_ours + self.only_theirs
 
     def comparable(self, loss: float) -> int:
         """In how many cells ours has lost no more than ``loss``, dB of PSNR."""
@@ -126,7 +171,8 @@ def compare(rows: Sequence[Row], ours: Setting, theirs: Setting) -> Comparison |
         ours=ours,
         theirs=theirs,
         pairs=pairs,
-        unpaired=len(of_ours.keys() ^ of_theirs.keys()),
+        only_ours=len(of_ours.keys() - of_theirs.keys()),
+        only_theirs=len(of_theirs.keys() - of_ours.keys()),
         reduction=Spread.of(pair.reduction for pair in pairs),
         psnr=Spread.of(pair.psnr for pair in pairs),
         ssim=Spread.of(ssims) if ssims else None,
@@ -146,35 +192,41 @@ class FrontierPoint:
     cells: int
     early: int  # of them, stopped before the last step
     count: Spread
-    gain: Spread  # PSNR over the cell's job without growth, dB; plain PSNR where the sweep has none
+    left_out: int  # cells that have no job without growth, or whose quality nobody measured
+    gain: Spread  # quality over the cell's job without growth; plain quality where the sweep has none
     count_over_seeds: float | None  # standard deviation of log10 count
-    gain_over_seeds: float | None  # dB
+    gain_over_seeds: float | None
 
 
-def frontier(rows: Sequence[Row], arm: str, zero: Sequence[Row] | None = None) -> list[FrontierPoint]:
+def frontier(
+    rows: Sequence[Row], arm: str, zero: Sequence[Row] | None = None, quality: Quality = PSNR
+) -> list[FrontierPoint]:
     """The settings of ``arm``, those with fewest Gaussians first.
 
     ``rows`` are those of one noise level. Gains are counted from the jobs without growth among ``zero``
-    (``rows`` itself, or another level); cells that have no such job are left out. Without any: plain PSNR.
+    (``rows`` itself, or another level); cells that have no such job are left out, and counted. Without any:
+    plain quality.
     """
-    gain = gain_over(rows if zero is None else zero)
+    gain = gain_over(rows if zero is None else zero, quality)
     points = []
     for setting in settings_of(rows, arm):
-        cells = {cell: row for cell, row in by_cell(rows, setting).items() if math.isfinite(gain(row))}
+        members = by_cell(rows, setting)
+        cells = {cell: row for cell, row in members.items() if math.isfinite(gain(row))}
         if not cells:
             continue
         counts = {cell: _count(row) for cell, row in cells.items()}
-        quality = {cell: gain(row) for cell, row in cells.items()}
+        gains = {cell: gain(row) for cell, row in cells.items()}
         points.append(
             FrontierPoint(
                 setting=setting,
                 is_standard=any(row.is_standard for row in cells.values()),
                 cells=len(cells),
                 early=sum(row.ended_early for row in cells.values()),
+                left_out=len(members) - len(cells),
                 count=Spread.of(counts.values()),
-                gain=Spread.of(quality.values()),
+                gain=Spread.of(gains.values()),
                 count_over_seeds=over_seeds({cell: math.log10(n) for cell, n in counts.items()}),
-                gain_over_seeds=over_seeds(quality),
+                gain_over_seeds=over_seeds(gains),
             )
         )
     return sorted(points, key=lambda point: point.count.median)
@@ -185,15 +237,20 @@ def has_no_growth(rows: Sequence[Row]) -> bool:
     return any(row.arm == NO_GROWTH for row in measured(rows))
 
 
-def gain_over(zero: Sequence[Row]) -> Callable[[Row], float]:
-    """PSNR over that of the same prompt and seed without growth in ``zero``, dB; NaN where it has none.
+def gain_over(zero: Sequence[Row], quality: Quality = PSNR) -> Callable[[Row], float]:
+    """Quality over that of the same prompt and seed without growth in ``zero``; NaN where it has none.
 
-    Plain PSNR if ``zero`` has no job without growth at all.
+    Plain quality if ``zero`` has no job without growth at all; NaN where nobody measured it.
     """
+
+    def measured_of(row: Row) -> float:
+        value = quality.of(row)
+        return math.nan if value is None else value
+
     if not has_no_growth(zero):
-        return _psnr
-    levels = {row.cell.without(NOISE): _psnr(row) for row in measured(zero) if row.arm == NO_GROWTH}
-    return lambda row: _psnr(row) - levels.get(row.cell.without(NOISE), math.nan)
+        return measured_of
+    levels = {row.cell.without(NOISE): measured_of(row) for row in measured(zero) if row.arm == NO_GROWTH}
+    return lambda row: measured_of(row) - levels.get(row.cell.without(NOISE), math.nan)
 
 
 class Hull:
@@ -255,19 +312,22 @@ class Standing:
     setting: Setting
     arm: str  # whose frontier
     settings: int  # on that frontier, at most, in one cell
+    unpaired: int  # cells in which only the setting or only the arm left something to measure
     psnr: Estimate | None  # dB above the frontier at equal count; None if no cell has an equal count
+    psnr_over_seeds: float | None  # its standard deviation over seeds, averaged; None without two seeds
     above: int  # cells, of those in psnr, in which the setting lies above
     fewer: int  # cells with fewer Gaussians than any setting of the arm
     more: int  # cells with more
     count_ratio: float | None  # median of (count the arm needs for the same PSNR) / (count of the setting)
     never: int  # cells in which no setting of the arm reaches that PSNR; they count as an infinite ratio
-    always: int  # cells in which every setting of the arm exceeds it; left out of the ratio
+    always: int  # cells in which every setting of the arm exceeds it; they count as a ratio of 0
 
 
 def stand(rows: Sequence[Row], setting: Setting, arm: str) -> Standing | None:
     """Where ``setting`` lies against the best of ``arm`` in the same cells; ``None`` if no cell has both."""
     hulls = {cell: (Hull(points), len(points)) for cell, points in _points_by_cell(rows, arm).items()}
-    shared = {cell: row for cell, row in by_cell(rows, setting).items() if cell in hulls}
+    ours = by_cell(rows, setting)
+    shared = {cell: row for cell, row in ours.items() if cell in hulls}
     if not shared:
         return None
     differences: dict[Cell, float] = {}
@@ -285,17 +345,18 @@ def stand(rows: Sequence[Row], setting: Setting, arm: str) -> Standing | None:
         needed = hull.count_for(psnr)
         if needed is None:
             always += 1
-        else:
-            ratios.append(needed / count)
+        ratios.append(0.0 if needed is None else needed / count)
     return Standing(
         setting=setting,
         arm=arm,
         settings=max(size for _, size in hulls.values()),
+        unpaired=len(ours.keys() ^ hulls.keys()),
         psnr=Estimate.of(differences) if differences else None,
+        psnr_over_seeds=over_seeds(differences),
         above=sum(difference > 0 for difference in differences.values()),
         fewer=fewer,
         more=more,
-        count_ratio=_median(ratios),
+        count_ratio=_middle_ratio(ratios),
         never=sum(math.isinf(ratio) for ratio in ratios),
         always=always,
     )
@@ -326,16 +387,18 @@ def by_cell(rows: Iterable[Row], setting: Setting) -> dict[Cell, Row]:
 
 
 def over_seeds(values: Mapping[Cell, float]) -> float | None:
-    """Standard deviation over the seeds of a prompt, averaged over prompts; ``None`` without two seeds."""
-    groups = [group for group in _by_prompt(values).values() if len(group) > 1]
+    """Standard deviation over the seeds of cells that are one otherwise, averaged; ``None`` without two."""
+    groups = [group for group in _grouped(values, lambda cell: cell.without(SEED)).values() if len(group) > 1]
     return float(np.mean([np.std(group, ddof=1) for group in groups])) if groups else None
 
 
-def _by_prompt(values: Mapping[Cell, float]) -> dict[Cell, list[float]]:
-    """The values of each cell without its seed."""
-    groups: dict[Cell, list[float]] = defaultdict(list)
+def _grouped(
+    values: Mapping[Cell, float], group_of: Callable[[Cell], Hashable]
+) -> dict[Hashable, list[float]]:
+    """The values of the cells of each group."""
+    groups: dict[Hashable, list[float]] = defaultdict(list)
     for cell, value in sorted(values.items()):  # in an order of their own: same rows, same bootstrap
-        groups[cell.without(SEED)].append(value)
+        groups[group_of(cell)].append(value)
     return dict(groups)
 
 
@@ -358,9 +421,16 @@ def _points_by_cell(rows: Iterable[Row], arm: str) -> dict[Cell, list[tuple[floa
     return dict(points)
 
 
-def _median(values: Sequence[float]) -> float | None:
-    """The lower median: of numbers and infinities alike, without averaging the two."""
-    return sorted(values)[(len(values) - 1) // 2] if values else None
+def _middle_ratio(ratios: Sequence[float]) -> float | None:
+    """The median of ratios of which 0 and infinity stand for "less" and "more than there are settings for".
+
+    The mean of the two in the middle if both are known, else the lower of them: in doubt for the other arm.
+    """
+    if not ratios:
+        return None
+    ordered = sorted(ratios)
+    low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
+    return (low + high) / 2 if low > 0 and high < math.inf else low
 
 
 def _count(row: Row) -> float:

@@ -16,8 +16,11 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from matplotlib.transforms import Bbox, BboxBase
 
 from cadam3d.comparison.claims import (
+    PSNR,
+    SSIM,
     FrontierPoint,
     Hull,
+    Quality,
     by_cell,
     frontier,
     has_no_growth,
@@ -38,7 +41,7 @@ from cadam3d.comparison.rows import (
 from cadam3d.comparison.style import INK, PAPER, SOFT, Look, looks, new_figure, spread_labels
 from cadam3d.io.plot import log_ticks, short
 
-MAX_HEAT_ROWS = 4  # arms in one heat map figure
+MAX_HEAT_COLUMNS = 3  # heat maps beside one another, where there are not more noise levels
 EARLY = "\u2020"  # a dagger: some of its jobs ended before their last step
 ROOM = 0.07  # between labels, in shares of the axis
 MARK = 6.0  # half the side of the square that a mark takes, in pixels
@@ -69,12 +72,19 @@ def level_title(level: str) -> str:
     return f"{level} noise" if level else ""
 
 
-def frontier_figure(rows: Sequence[Row]) -> Figure | None:
+def frontier_ssim_figure(rows: Sequence[Row]) -> Figure | None:
+    """:func:`frontier_figure` of SSIM, which sees structure where PSNR sees brightness."""
+    return frontier_figure(rows, SSIM)
+
+
+def frontier_figure(rows: Sequence[Row], quality: Quality = PSNR) -> Figure | None:
     """Quality over count, a panel per noise level: every setting, each arm's curve, spreads as bars."""
+    style = looks(arms_of(rows))
+    rows = [row for row in rows if quality.of(row) is not None]
     levels, arms = levels_of(rows), arms_of(rows)
     if not any(len({row.setting for row in measured(at_noise(rows, level))}) > 1 for level in levels):
         return None
-    figure, style = new_figure(len(levels), height=3.5), looks(arms)
+    figure = new_figure(len(levels), height=3.5)
     panels = figure.subplots(1, len(levels), squeeze=False, sharey=True)[0]
     gains = all(has_no_growth(at_noise(rows, level)) for level in levels)
     named: dict[str, dict[str, tuple[float, float]]] = {}
@@ -84,7 +94,7 @@ def frontier_figure(rows: Sequence[Row]) -> Figure | None:
         named[level] = {
             arm: _frontier_curve(axes, points, style[arm])
             for arm in arms
-            if (points := frontier(here, arm, here if gains else ()))
+            if (points := frontier(here, arm, here if gains else (), quality))
         }
         axes.set_title(level_title(level))
         axes.set_xlabel("Gaussians at the end")
@@ -93,8 +103,8 @@ def frontier_figure(rows: Sequence[Row]) -> Figure | None:
     low, high = panels[0].get_ylim()
     panels[0].set_ylim(low - 0.06 * (high - low), high + 0.1 * (high - low))
     for axes, level in zip(panels, levels, strict=True):
-        _upper_curve(axes, rows, level, at_noise(rows, level) if gains else ())
-    panels[0].set_ylabel("PSNR gained by growth (dB)" if gains else "PSNR (dB)")
+        _upper_curve(axes, rows, level, at_noise(rows, level) if gains else (), quality)
+    panels[0].set_ylabel(quality.gain if gains else quality.axis)
     keys = {row.arm: ", ".join(key for key, _ in row.setting.thresholds) for row in measured(rows)}
     legend = [f"{arm}: {keys[arm]}" for arm in arms if keys[arm]]
     panels[0].text(
@@ -202,13 +212,13 @@ def _bars(axes: Axes, point: FrontierPoint, look: Look) -> None:
         axes.plot([x / factor, x * factor], [y, y], **thick)
 
 
-def _upper_curve(axes: Axes, rows: Sequence[Row], level: str, zero: Sequence[Row]) -> None:
+def _upper_curve(axes: Axes, rows: Sequence[Row], level: str, zero: Sequence[Row], quality: Quality) -> None:
     """What the same Gaussians reach without noise, whatever the arm: how much growth could help at all."""
     clean = next((each for each in levels_of(rows) if each in NO_NOISE), None)
     if clean is None or clean == level:
         return
     there = at_noise(rows, clean)
-    points = [point for arm in arms_of(there) for point in frontier(there, arm, zero)]
+    points = [point for arm in arms_of(there) for point in frontier(there, arm, zero, quality)]
     if len(points) < 2:
         return
     corners = Hull((point.count.median, point.gain.median) for point in points).corners
@@ -217,7 +227,8 @@ def _upper_curve(axes: Axes, rows: Sequence[Row], level: str, zero: Sequence[Row
     line = {"color": SOFT, "lw": 1.1, "ls": (0, (4, 3)), "zorder": 1}
     if min(y) < top:
         axes.plot(x, y, scaley=False, **line)
-    says = "without noise" if y[-1] < top else f"without noise: {y[0]:.1f} to {y[-1]:.1f} dB"
+    ends = [f"{value:.{quality.digits - 1}f}" for value in (y[0], y[-1])]
+    says = "without noise" if y[-1] < top else f"without noise: {' to '.join(ends)} {quality.unit}".strip()
     place = (0.98, min((y[-1] - axes.get_ylim()[0]) / (top - axes.get_ylim()[0]), 0.92))
     axes.annotate(
         says,
@@ -300,29 +311,43 @@ def _label_ends(axes: Axes, ends: dict[str, tuple[float, float]], style: dict[st
 
 
 def snr_figure(rows: Sequence[Row]) -> Figure | None:
-    """Histograms of the SNR over time, a row per arm that has one, a column per noise level."""
+    """Histograms of the SNR over time: every arm that has one, at every noise level.
+
+    A column per level and a row per arm; where there is room, several arms share a row.
+    """
     levels = levels_of(rows)
-    arms = [arm for arm in arms_of(rows) if standard(rows, arm) is not None]
+    chosen = {arm: setting for arm in arms_of(rows) if (setting := standard(rows, arm)) is not None}
     maps = {
         (arm, level): heat
-        for arm in arms
+        for arm, setting in chosen.items()
         for level in levels
-        if (heat := _snr_map(list(by_cell(at_noise(rows, level), standard(rows, arm)).values())))  # pyright: ignore[reportArgumentType]
+        if (heat := _snr_map(list(by_cell(at_noise(rows, level), setting).values())))
     }
-    arms = [arm for arm in arms if any(key[0] == arm for key in maps)][:MAX_HEAT_ROWS]
+    arms = [arm for arm in chosen if any(key[0] == arm for key in maps)]
     if not maps:
         return None
-    figure = new_figure(len(levels), len(arms), height=2.7)
-    panels = figure.subplots(len(arms), len(levels), squeeze=False, sharex=True, sharey=True)
-    for row, arm in zip(panels, arms, strict=True):
-        for axes, level in zip(row, levels, strict=True):
-            axes.set_title(f"{arm}, {level_title(level)}".removesuffix(", "))
-            axes.set_yscale("log")
-            if heat := maps.get((arm, level)):
-                _draw_snr(axes, heat)
-        row[0].set_ylabel("SNR of the gradient")
-    for axes in panels[-1]:
+    in_a_row = min(max(MAX_HEAT_COLUMNS // len(levels), 1), len(arms))
+    columns, lines = in_a_row * len(levels), math.ceil(len(arms) / in_a_row)
+    figure = new_figure(columns, lines, height=2.7 if lines < 4 else 2.1)
+    panels = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
+    places = [(arm, level) for arm in arms for level in levels]
+    for axes, (arm, level) in zip(panels.flat, places, strict=False):
+        axes.set_title(f"{arm}, {level_title(level)}".removesuffix(", "))
+        axes.set_yscale("log")
+        if heat := maps.get((arm, level)):
+            _draw_snr(axes, heat)
+    shown = [heat.shown for heat in maps.values()]
+    panels[0, 0].set_ylim(min(low for low, _ in shown) / 1.5, max(high for _, high in shown) * 2)
+    _plain_log(panels[0, 0].yaxis)
+    sides = [heat.sides for heat in maps.values()]
+    panels[0, 0].set_xlim(min(low for low, _ in sides), max(high for _, high in sides))
+    for axes in panels[:, 0]:
+        axes.set_ylabel("SNR of the gradient")
+    for axes in panels.flat[len(places) :]:
+        axes.set_visible(False)
+    for axes in panels.flat[len(places) - columns : len(places)]:  # the lowest of each column
         axes.set_xlabel("step")
+        axes.tick_params(labelbottom=True)
     return figure
 
 
@@ -348,6 +373,28 @@ class SnrMap:
         self.tau = settings.get("tau_SNR")
         self.floor = noise_floor(settings.get("beta1"), settings.get("beta2"))
 
+    @property
+    def edges(self) -> np.ndarray:
+        """Of the bins, one more than there are."""
+        return 10 ** (np.arange(self.first, self.first + len(self.shares) + 1) / self.per_decade)
+
+    @property
+    def half(self) -> float:
+        """Half the width of a column, in steps."""
+        return float(np.diff(self.steps).min() if len(self.steps) > 1 else 10.0) / 2
+
+    @property
+    def sides(self) -> tuple[float, float]:
+        """Where the first column begins and the last ends, in steps."""
+        return self.steps[0] - self.half, self.steps[-1] + self.half
+
+    @property
+    def shown(self) -> tuple[float, float]:
+        """The least and the largest SNR worth showing: bins that hold something, and the two lines."""
+        held = self.edges[:-1][self.shares.max(axis=1) > 0.002]
+        all_of_it = [*held, *(line for line in (self.tau, self.floor) if line)] or list(self.edges)
+        return float(min(all_of_it)), float(max(all_of_it))
+
 
 def _snr_map(rows: Sequence[Row]) -> SnrMap | None:
     heat = SnrMap(rows)
@@ -362,33 +409,29 @@ def noise_floor(beta1: float | None, beta2: float | None) -> float | None:
 
 
 def _draw_snr(axes: Axes, heat: SnrMap) -> None:
-    edges = 10 ** (np.arange(heat.first, heat.first + len(heat.shares) + 1) / heat.per_decade)
-    steps = np.array(heat.steps, dtype=float)
-    half = (np.diff(steps).min() if len(steps) > 1 else 10.0) / 2
-    for column, step in enumerate(steps):
+    for column, step in enumerate(heat.steps):
         axes.pcolormesh(
-            [step - half, step + half],
-            edges,
+            [step - heat.half, step + heat.half],
+            heat.edges,
             np.ma.masked_less_equal(heat.shares[:, column : column + 1], 0),
             cmap="Blues",
             vmin=-0.02,
             vmax=max(heat.shares.max(), 1e-9),
             rasterized=True,
         )
-    shown = [*edges[:-1][heat.shares.max(axis=1) > 0.002], *(each for each in (heat.tau, heat.floor) if each)]
-    axes.set_ylim(min(shown) / 1.5, max(shown) * 2)
-    _plain_log(axes.yaxis)
-    axes.set_xlim(steps.min() - half, steps.max() + half)
+    upper = max(heat.tau or 0, heat.floor or 0)
     for value, text, color in ((heat.tau, "tau_SNR", "#d55e00"), (heat.floor, "white noise", INK)):
         if value:
+            side = 1 if value == upper else -1  # of two lines that lie close, the words keep apart
             axes.axhline(value, color=color, lw=1.1, ls="--")
             axes.annotate(
                 f"{text} {value:.3g}",
                 (1, value),
                 xycoords=("axes fraction", "data"),
-                xytext=(-3, 3),
+                xytext=(-3, 3 * side),
                 textcoords="offset points",
                 ha="right",
+                va="bottom" if side > 0 else "top",
                 fontsize=7.5,
                 color=color,
                 bbox={"facecolor": PAPER, "alpha": 0.6, "lw": 0, "pad": 0.5},
@@ -409,7 +452,7 @@ def thresholds_figure(rows: Sequence[Row]) -> Figure | None:
     for pair, level in zip(panels, levels, strict=True):
         here = at_noise(rows, level)
         points = frontier(here, arm)
-        quality = "PSNR gained by growth (dB)" if has_no_growth(here) else "PSNR (dB)"
+        quality = PSNR.gain if has_no_growth(here) else PSNR.axis
         kinds: tuple[tuple[str, Callable[[FrontierPoint], float], Callable[[float], str]], ...] = (
             (
                 "Gaussians",

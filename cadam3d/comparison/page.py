@@ -33,6 +33,11 @@ FIGURES: dict[str, tuple[Draw, str, str]] = {  # name -> how, title, what to see
         "ones quartiles over cells. Hollow: cells are missing; dagger: jobs ended early. Dashed: the best "
         "that any arm reaches with the same seeds without noise.",
     ),
+    "frontier_ssim": (
+        figures.frontier_ssim_figure,
+        "Structure against count",
+        "The same in SSIM: up and to the left is better.",
+    ),
     "growth": (
         figures.growth_figure,
         "Gaussians over time",
@@ -96,6 +101,7 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None) -> Path:
         _verdict(rows),
         _tiles(rows),
         _section("Medians of every arm at its standard setting", key_table),
+        _without_standard(rows),
         *(_figure(rows, name, folder) for name in wanted),
         _section(f"Against the whole frontier of {words.THEIRS}", standings),
         details("Every setting", tables.as_html(frontiers)) if frontiers else "",
@@ -181,6 +187,15 @@ def _figure(rows: Sequence[Row], name: str, folder: Path) -> str:
 
 def _section(title: str, lines: Sequence[tables.Line]) -> str:
     return f'<h2>{escape(title)}</h2><div class="card">{tables.as_html(lines)}</div>' if lines else ""
+
+
+def _without_standard(rows: Sequence[Row]) -> str:
+    """Whom the key table leaves out: arms of which the sweep has several settings, none of them shipped."""
+    arms = [arm for arm in figures.arms_of(rows) if standard(rows, arm) is None]
+    if not arms:
+        return ""
+    verb = "has no standard setting and is" if len(arms) == 1 else "have no standard setting and are"
+    return f"<p>{escape(', '.join(arms))} {verb} under Every setting only.</p>"
 
 
 def _failures(rows: Sequence[Row]) -> str:

@@ -28,6 +28,7 @@ def masks_figure(rows: Sequence[Row]) -> Figure | None:
     steps = sorted({step for row in members for step in candidate_pictures(row)})
     steps = [steps[i] for i in _evenly(len(steps), MAX_COLUMNS)]
     figure, panels = _grid(len(members), len(steps))
+    style = looks(arms_of(rows))
     for line, row in zip(panels, members, strict=True):
         found = candidate_pictures(row)
         chosen = {each.step: (sum(each.selected), sum(each.counts)) for each in histograms(row)}
@@ -36,7 +37,7 @@ def masks_figure(rows: Sequence[Row]) -> Figure | None:
                 axes.imshow(mask_of(imageio.imread(found[step])), interpolation="antialiased")
             if step in chosen:
                 _caption(axes, "{:,} of {:,}".format(*chosen[step]))
-        _row_title(line[0], row.arm, looks([row.arm])[row.arm].color)
+        _row_title(line[0], row.arm, style[row.arm].color)
     for axes, step in zip(panels[0], steps, strict=True):
         axes.set_title(f"step {step}", fontsize=8.5, fontweight="normal", loc="center")
     _say_cell(figure, shown)
@@ -54,10 +55,11 @@ def ablation_figure(rows: Sequence[Row]) -> Figure | None:
     strips = {row.folder: views(row)[:MAX_VIEWS] for row in members}
     columns = max(len(strip) for strip in strips.values())
     figure, panels = _grid(len(members), columns, more_width=1.9)
+    style = looks(arms_of(rows))
     for line, row in zip(panels, members, strict=True):
         for axes, picture in zip(line, strips[row.folder], strict=False):
             axes.imshow(picture, interpolation="antialiased")
-        _row_title(line[0], row.arm, looks([row.arm])[row.arm].color)
+        _row_title(line[0], row.arm, style[row.arm].color)
         line[-1].annotate(
             f"{row.count:,.0f} Gaussians\n{row.psnr:.2f} dB\n{row.outcome.replace('_', ' ')}",
             (1.06, 0.5),
@@ -72,6 +74,7 @@ def ablation_figure(rows: Sequence[Row]) -> Figure | None:
 
 def objectives_figure(rows: Sequence[Row]) -> Figure | None:
     """Rows are objectives, columns arms, in one cell (paper fig. 4)."""
+    style = looks(arms_of(rows))
     rows = [row for row in measured(rows) if row.cell[GUIDANCE]]
     objectives = sorted({row.cell[GUIDANCE] for row in rows})
     shown = showcase([row for row in rows if has_views(row)])
@@ -89,7 +92,7 @@ def objectives_figure(rows: Sequence[Row]) -> Figure | None:
                 _caption(axes, f"{row.count:,.0f}, {row.psnr:.2f} dB")
         _row_title(line[0], objective.upper())
     for axes, arm in zip(panels[0], arms, strict=True):
-        axes.set_title(arm, color=looks([arm])[arm].color, fontsize=9, loc="center")
+        axes.set_title(arm, color=style[arm].color, fontsize=9, loc="center")
     _say_cell(figure, shown.without(GUIDANCE))
     return figure
 

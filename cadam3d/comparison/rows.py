@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 
 from cadam3d.io.jsonl import read_json, read_jsonl
 from cadam3d.io.page import number
-from cadam3d.settings import compose, config_dir
+from cadam3d.settings import compose, config_dir, flatten
 
 UNFINISHED = "unfinished"  # the outcome of a job that is running, or that was killed
 COMPLETE = "finished"
@@ -283,13 +283,16 @@ def measured(rows: Iterable[Row]) -> list[Row]:
 
 @cache
 def _shipped(arm: str) -> Mapping[str, Any]:
-    """The settings of ``configs/densifier/<arm>.yaml``; empty for an arm from elsewhere."""
+    """The settings of ``configs/densifier/<arm>.yaml`` by dotted key; empty for an arm from elsewhere.
+
+    What has keys of its own, such as a schedule, is there as a whole too: a line may replace it by a number.
+    """
     if not arm or not (config_dir() / ARM / f"{arm}.yaml").is_file():
         return {}
     node = compose([f"{ARM}={arm}", "prompt=any"])[ARM]
     plain = OmegaConf.to_container(node, resolve=True)
     assert isinstance(plain, dict)
-    return {str(key): value for key, value in plain.items()}
+    return dict(flatten(plain, with_nodes=True))
 
 
 def _order(folder: Path) -> tuple[float, str]:

@@ -23,12 +23,17 @@ KNOWN = {  # arm -> light, marker
     "baseline": ("#d55e00", "o"),
     "cadam": ("#0072b2", "s"),
     "cadam_calibrated": ("#009e73", "D"),
+    "cadam_annealed": ("#cc79a7", "^"),
+    "cadam_selective": ("#8c1c46", "P"),
+    "random": ("#8a5a44", "v"),
 }
-SPARE = (("#cc79a7", "^"), ("#b07d00", "v"), ("#56b4e9", "P"), ("#8a5a44", "<"), ("#6a5acd", ">"))
+SPARE_COLORS = ("#56b4e9", "#b07d00", "#6a5acd", "#5c7a00", "#00838f", "#1f2d6b", "#b5179e", "#5b2c6f")
+SPARE_MARKERS = ("<", ">", "p", "*", "d", "h")  # beside eight colours: a pair comes again after 24 arms
 DARK = {
     **{"#767676": "#a3a7ad", "#d55e00": "#ff9150", "#0072b2": "#62b3f0", "#009e73": "#3fcfa4"},
-    **{"#cc79a7": "#e5a0c8", "#b07d00": "#e3b04b", "#56b4e9": "#8fd0f7", "#8a5a44": "#c99a84"},
-    "#6a5acd": "#a99ff0",
+    **{"#cc79a7": "#e5a0c8", "#8c1c46": "#e2607f", "#8a5a44": "#c99a84"},
+    **{"#56b4e9": "#8fd0f7", "#b07d00": "#e3b04b", "#6a5acd": "#a99ff0", "#5c7a00": "#a9c94f"},
+    **{"#00838f": "#4fc3cd", "#1f2d6b": "#8ea0e8", "#b5179e": "#ee6fd8", "#5b2c6f": "#c9a0dc"},
 }
 INCH = 2.9  # height of a panel
 RC: Any = {  # Any: matplotlib has a type for the names of its settings
@@ -65,10 +70,17 @@ class Look:
 
 
 def looks(arms: Iterable[str]) -> dict[str, Look]:
-    """The look of each arm: fixed for the common ones, in the order of names for others."""
+    """The look of each arm: fixed for the common ones, in the order of names for others.
+
+    Give all arms of a sweep at once, or those without a fixed look get that of another.
+    """
+    arms = list(arms)
     others = sorted(set(arms) - set(KNOWN))
-    spare = {arm: SPARE[i % len(SPARE)] for i, arm in enumerate(others)}
-    return {arm: Look(*KNOWN.get(arm, spare.get(arm, ()))) for arm in arms}
+    spare = {
+        arm: (SPARE_COLORS[i % len(SPARE_COLORS)], SPARE_MARKERS[i % len(SPARE_MARKERS)])
+        for i, arm in enumerate(others)
+    }
+    return {arm: Look(*(KNOWN.get(arm) or spare[arm])) for arm in arms}
 
 
 def new_figure(columns: int, rows: int = 1, *, width: float = 0.0, height: float = INCH) -> Figure:

@@ -1,13 +1,14 @@
 """Tables of a sweep: lists of plain rows, written as CSV and as HTML."""
 
 import csv
+import math
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from cadam3d.comparison.claims import by_cell, compare, frontier, has_no_growth, standard, standings
+from cadam3d.comparison.claims import SSIM, by_cell, compare, frontier, has_no_growth, standard, standings
 from cadam3d.comparison.figures import arms_of, levels_of
 from cadam3d.comparison.rows import GUIDANCE, Row, at_noise, measured
 from cadam3d.comparison.words import OURS, THEIRS
@@ -15,6 +16,7 @@ from cadam3d.io.atomic import replacing
 from cadam3d.io.page import show
 
 Line = dict[str, Any]
+NO_RATIO: dict[float | None, str] = {math.inf: "never", 0.0: "always"}  # reaches the quality; exceeds it
 
 
 def objectives_table(rows: Sequence[Row]) -> list[Line]:
@@ -44,6 +46,7 @@ def objectives_table(rows: Sequence[Row]) -> list[Line]:
                         "seconds": _median([row.seconds for row in members], 1),
                         f"fewer than {THEIRS}": f"{pair.reduction.median:.1%}" if pair else None,
                         "ended early": sum(row.ended_early for row in members),
+                        "unpaired": (pair.unpaired or None) if pair else None,
                     }
                 )
     return _without_empty(lines)
@@ -54,9 +57,12 @@ def frontier_table(rows: Sequence[Row]) -> list[Line]:
     lines = []
     for level in levels_of(rows):
         here = at_noise(rows, level)
-        quality = "gain" if has_no_growth(here) else "PSNR"
+        gains = has_no_growth(here)
+        quality, ssim_title = ("gain", "SSIM gain") if gains else ("PSNR", "SSIM")
         for arm in arms_of(here):
+            ssims = {point.setting: point.gain for point in frontier(here, arm, quality=SSIM)}
             for point in frontier(here, arm):
+                ssim = ssims.get(point.setting)
                 lines.append(
                     {
                         "noise": level,
@@ -68,6 +74,8 @@ def frontier_table(rows: Sequence[Row]) -> list[Line]:
                         f"{quality} (dB)": round(point.gain.median, 2),
                         f"{quality} quartiles": f"{point.gain.low:.2f} to {point.gain.high:.2f}",
                         "over seeds (dB)": _rounded(point.gain_over_seeds, 2),
+                        ssim_title: _rounded(ssim.median if ssim else None, SSIM.digits),
+                        "left out": point.left_out or None,
                     }
                 )
     return _without_empty(lines)
@@ -89,13 +97,16 @@ def standings_table(rows: Sequence[Row]) -> list[Line]:
                         "low (95 %)": _rounded(estimate.low if estimate else None, 2),
                         "high": _rounded(estimate.high if estimate else None, 2),
                         "sign test p": _rounded(estimate.p_value if estimate else None, 3),
+                        "over seeds (dB)": _rounded(each.psnr_over_seeds, 2),
                         "above in": f"{each.above} of {estimate.cells if estimate else 0}",
                         "fewer than any": each.fewer,
                         "more than any": each.more,
-                        f"{THEIRS} needs times": "never"
-                        if each.count_ratio == float("inf")
-                        else _rounded(each.count_ratio, 2),
+                        f"{THEIRS} needs times": NO_RATIO.get(
+                            each.count_ratio, _rounded(each.count_ratio, 2)
+                        ),
                         "never reaches": each.never,
+                        "always exceeds": each.always,
+                        "unpaired": each.unpaired or None,
                     }
                 )
     return _without_empty(lines) if any(line["dB above at equal count"] is not None for line in lines) else []

@@ -48,6 +48,13 @@ def reduction_sentence(comparison: Comparison) -> str:
     ):
         if early:
             sentence += f"; {name} ended early in {_cells(early)}"
+    for name, lacking in (
+        (comparison.ours.arm, comparison.only_theirs),
+        (comparison.theirs.arm, comparison.only_ours),
+    ):
+        if lacking:
+            further = "1 further cell" if lacking == 1 else f"{lacking} further cells"
+            sentence += f"; {name} left nothing to measure in {further}"
     return sentence + "."
 
 
@@ -56,7 +63,7 @@ def standing_sentence(standing: Standing, where: str = "") -> str:
     who, whom = standing.setting.name, standing.arm
     outside = _outside(standing)
     if standing.psnr is None:
-        return f"{where}{who} has no equal count on {whom}'s frontier: {outside}."
+        return f"{where}{who} has no equal count on {whom}'s frontier: {outside}{needed_clause(standing)}."
     estimate = standing.psnr
     side = "above" if estimate.median >= 0 else "below"
     share = f"{standing.above} of {_cells(estimate.cells)}"
@@ -65,8 +72,11 @@ def standing_sentence(standing: Standing, where: str = "") -> str:
         f"{where}{who} lies {abs(estimate.median):.2f} dB{interval} {side} the best of {whom}'s "
         f"{standing.settings} thresholds at equal count, above it in {share}"
     )
+    if standing.psnr_over_seeds is not None:
+        sentence += f", {standing.psnr_over_seeds:.2f} dB spread over seeds"
     if not is_certain(standing):
-        sentence += ", which is no certain difference"
+        prompts = f"{estimate.prompts} prompt{'s' if estimate.prompts > 1 else ''}"
+        sentence += f", which is no certain difference ({prompts})"
     if outside:
         sentence += f"; {outside}"
     return sentence + needed_clause(standing) + "."
@@ -74,21 +84,22 @@ def standing_sentence(standing: Standing, where: str = "") -> str:
 
 def needed_clause(standing: Standing) -> str:
     """How many Gaussians the other arm would need for the same quality; empty where that is unknown."""
-    ratio = standing.count_ratio
+    ratio, whom = standing.count_ratio, standing.arm
     if ratio is None:
         return ""
-    if math.isinf(ratio):
-        return f"; {standing.arm} reaches that PSNR at no threshold in {_cells(standing.never)}"
-    never = f", and never gets there in {_cells(standing.never)}" if standing.never else ""
-    return f"; for the same PSNR {standing.arm} needs {ratio:.2g} times as many{never}"
+    never = f"{whom} reaches that PSNR at no threshold in {_cells(standing.never)}" if standing.never else ""
+    always = (
+        f"{whom} exceeds that PSNR at every threshold in {_cells(standing.always)}" if standing.always else ""
+    )
+    known = f"for the same PSNR {whom} needs {ratio:.2g} times as many" if 0 < ratio < math.inf else ""
+    return "".join(
+        f"; {part}" for part in (known, *((always, never) if ratio == 0 else (never, always))) if part
+    )
 
 
 def is_certain(standing: Standing) -> bool:
-    """Whether the bootstrap interval excludes zero; without an interval nothing is certain."""
-    estimate = standing.psnr
-    if estimate is None or estimate.low is None or estimate.high is None:
-        return False
-    return estimate.low > 0 or estimate.high < 0
+    """Whether the interval excludes 0 and the sign test agrees; without either nothing is certain."""
+    return standing.psnr is not None and standing.psnr.is_certain
 
 
 def _outside(standing: Standing) -> str:

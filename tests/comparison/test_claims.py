@@ -53,7 +53,7 @@ def test_a_cell_without_its_partner_is_counted_not_compared(jobs):
     jobs.add("baseline", "seed=1", n=100, psnr=20.0, outcome="failed")
     found = compare(read(jobs.folder), OURS, THEIRS)
     assert found is not None
-    assert (found.cells, found.unpaired) == (1, 1)
+    assert (found.cells, found.unpaired, found.only_ours, found.only_theirs) == (1, 1, 1, 0)
 
 
 def test_an_early_end_is_compared_and_told(jobs):
@@ -143,7 +143,7 @@ def baseline_frontier(jobs, settings, **where):
 
 
 def test_a_setting_stands_against_the_best_of_the_other_at_its_count(jobs):
-    for prompt, shift in (("a cube", 0.0), ("a torus", 5.0), ("a tower", -5.0)):
+    for prompt, shift in zip("abcdef", (0.0, 5.0, -5.0, 1.0, 2.0, 3.0), strict=True):
         where = {"prompt": prompt, "seed": 0}
         baseline_frontier(jobs, {0.001: (100, 10.0 + shift), 0.0002: (10000, 20.0 + shift)}, **where)
         jobs.add("cadam", f"prompt={prompt}", "seed=0", n=1000, psnr=17.5 + shift)
@@ -152,7 +152,7 @@ def test_a_setting_stands_against_the_best_of_the_other_at_its_count(jobs):
     assert found.psnr is not None
     assert found.psnr.median == pytest.approx(2.5)
     assert found.psnr.low == found.psnr.high == pytest.approx(2.5)
-    assert (found.above, found.fewer, found.more, found.never) == (3, 0, 0, 0)
+    assert (found.above, found.fewer, found.more, found.never) == (6, 0, 0, 0)
     assert found.count_ratio == pytest.approx(10**0.5)
 
 
@@ -187,13 +187,53 @@ def test_a_ratio_of_counts_is_free_of_their_scale(jobs):
     assert found.psnr.median == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(
+    ("qualities", "ratio"),
+    [
+        ((9.0, 25.0, 15.0), 1.0),  # one always exceeded, one never reached: the two sides weigh the same
+        ((9.0, 9.0, 15.0), 0.0),
+        ((25.0, 25.0, 15.0), math.inf),
+        ((10.0, 20.0), (0.1 + 10) / 2),  # both in the middle are known: their mean
+        ((9.0, 15.0), 0.0),  # one of the two is not: the lower
+        ((15.0, 25.0), 1.0),
+    ],
+)
+def test_qualities_out_of_reach_count_on_both_sides(jobs, qualities, ratio):
+    for seed, psnr in enumerate(qualities):
+        baseline_frontier(jobs, {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, seed=seed)
+        jobs.add("cadam", f"seed={seed}", n=1000, psnr=psnr)
+    found = stand(read(jobs.folder), OURS, "baseline")
+    assert found is not None
+    assert found.count_ratio == pytest.approx(ratio)
+    assert (found.always, found.never) == (qualities.count(9.0), qualities.count(25.0))
+
+
+def test_the_luck_of_seeds_is_that_of_the_difference(jobs):
+    for seed, psnr in enumerate((16.0, 18.0)):
+        baseline_frontier(jobs, {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, seed=seed)
+        jobs.add("cadam", f"seed={seed}", n=1000, psnr=psnr)
+    found = stand(read(jobs.folder), OURS, "baseline")
+    assert found is not None
+    assert found.psnr_over_seeds == pytest.approx(math.sqrt(2))
+
+
+def test_cells_without_a_frontier_and_frontiers_without_the_setting_are_counted(jobs):
+    for seed in (0, 1):
+        baseline_frontier(jobs, {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, seed=seed)
+    for seed in (1, 2, 3):
+        jobs.add("cadam", f"seed={seed}", n=1000, psnr=15.0)
+    found = stand(read(jobs.folder), OURS, "baseline")
+    assert found is not None
+    assert found.unpaired == 3
+
+
 # How sure.
 
 
 def test_a_constant_has_an_interval_of_no_width():
-    found = Estimate.of({cell(prompt, 0): 1.0 for prompt in "abcd"})
+    found = Estimate.of({cell(prompt, 0): 1.0 for prompt in "abcdef"})
     assert (found.median, found.low, found.high) == (1.0, 1.0, 1.0)
-    assert found.p_value == pytest.approx(2 * 0.5**4)
+    assert found.p_value == pytest.approx(2 * 0.5**6)
 
 
 def test_seeds_are_no_prompts():
@@ -203,16 +243,64 @@ def test_seeds_are_no_prompts():
     assert found.p_value == pytest.approx(0.5)
 
 
-def test_an_interval_covers_the_truth_as_often_as_it_says():
+def test_noise_levels_and_objectives_are_no_prompts():
+    """They share the object: three levels of two prompts witness for two."""
+    axes = [(noise, guidance) for noise in ("weak", "medium", "strong") for guidance in ("ism", "sds")]
+    values = {
+        Cell((("guidance", guidance), ("noise", noise), ("prompt", prompt), ("seed", "0"))): 1.0
+        for prompt in "ab"
+        for noise, guidance in axes
+    }
+    found = Estimate.of(values)
+    assert (found.cells, found.prompts, found.low) == (12, 2, None)
+    assert found.p_value == pytest.approx(0.5)
+
+
+def test_levels_are_no_seeds():
+    values = {
+        Cell((("noise", noise), ("prompt", "a"), ("seed", str(seed)))): level + seed
+        for noise, level in (("weak", 0.0), ("strong", 100.0))
+        for seed in (0, 1)
+    }
+    assert over_seeds(values) == pytest.approx(math.sqrt(0.5))
+
+
+@pytest.mark.parametrize("prompts", [3, 4, 5])
+def test_few_prompts_have_no_interval(prompts):
+    found = Estimate.of({cell(str(prompt), 0): 1.0 + prompt for prompt in range(prompts)})
+    assert found.low is found.high is None
+    assert not found.is_certain
+
+
+@pytest.mark.parametrize(
+    ("prompts", "seeds", "least"), [(6, 1, 0.91), (6, 3, 0.87), (12, 1, 0.92), (12, 3, 0.9)]
+)
+def test_an_interval_covers_the_truth_as_often_as_the_documentation_says(prompts, seeds, least):
+    """The truth is 0; half a standard deviation of luck beside that of the prompts."""
     rng = np.random.default_rng(0)
-    hits = 0
-    for _ in range(60):
-        values = {cell(str(prompt), 0): float(rng.standard_normal()) for prompt in range(12)}
+    hits = mistakes = 0
+    for _ in range(400):
+        values = {}
+        for prompt in range(prompts):
+            middle = rng.standard_normal()
+            for seed in range(seeds):
+                values[cell(str(prompt), seed)] = float(middle + 0.5 * (seeds > 1) * rng.standard_normal())
         found = Estimate.of(values)
         assert found.low is not None
         assert found.high is not None
         hits += found.low <= 0 <= found.high
-    assert 50 <= hits <= 60
+        mistakes += found.is_certain
+    assert hits >= least * 400
+    assert mistakes <= 0.05 * 400
+
+
+def test_certain_is_what_interval_and_sign_test_agree_on():
+    far = {cell(prompt, 0): 1.0 for prompt in "abcdefgh"}
+    assert Estimate.of(far).is_certain
+    one_against = Estimate.of({**far, cell("h", 0): -1.0})  # seven against one: p = 0.07
+    assert one_against.low == 1.0
+    assert not one_against.is_certain
+    assert not Estimate.of(dict.fromkeys(far, 0.0)).is_certain
 
 
 def test_same_rows_same_interval():

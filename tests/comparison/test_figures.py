@@ -9,7 +9,7 @@ import pytest
 from cadam3d.comparison import figures, pictures
 from cadam3d.comparison.page import FIGURES
 from cadam3d.comparison.rows import at_noise, read
-from cadam3d.comparison.style import DARK, css, inline, looks, spread_labels, styled, write_figure
+from cadam3d.comparison.style import DARK, KNOWN, css, inline, looks, spread_labels, styled, write_figure
 
 
 def texts(figure) -> str:
@@ -64,6 +64,48 @@ def test_a_frontier_puts_each_setting_where_its_median_is(jobs):
         if line.get_marker() not in (None, "None", "")
     ]
     assert marks == [(100.0, 0.0), (2000.0, 3.0)]
+
+
+def test_a_frontier_of_ssim_is_one_of_ssim(jobs):
+    for seed, ssim in enumerate((0.8, 0.85, 0.95)):
+        jobs.add("cadam", f"seed={seed}", n=1000, psnr=20.0, ssim=ssim)
+        jobs.add("none", f"seed={seed}", n=100, psnr=18.0, ssim=0.7)
+    jobs.add("cadam", "seed=3", n=1000, psnr=20.0, ssim=None)
+    figure = draw("frontier_ssim", read(jobs.folder))
+    marks = [
+        tuple(round(float(x), 9) for x in (*line.get_xdata(), *line.get_ydata()))
+        for line in figure.axes[0].lines
+        if line.get_marker() not in (None, "None", "")
+    ]
+    assert marks == [(100.0, 0.0), (1000.0, 0.15)]
+    assert figure.axes[0].get_ylabel() == "SSIM gained by growth"
+    assert "PSNR" not in texts(figure)
+
+
+def test_without_ssim_there_is_no_figure_of_it(jobs):
+    for arm, n in (("cadam", 100), ("baseline", 1000)):
+        jobs.add(arm, n=n, psnr=20.0, ssim=None)
+    assert draw("frontier", read(jobs.folder)) is not None
+    assert draw("frontier_ssim", read(jobs.folder)) is None
+
+
+@pytest.mark.parametrize(("levels", "shape"), [(1, (3, 3)), (2, (7, 2)), (4, (7, 4))])
+def test_every_arm_with_an_snr_is_shown(jobs, levels, shape):
+    arms = ["cadam", *(f"cadam_{letter}" for letter in "abcdef")]
+    noises = ["none", "weak", "medium", "strong"][-levels:]
+    for i, arm in enumerate(arms):
+        for noise in noises:
+            jobs.files(jobs.add(arm, f"noise={noise}", n=500, psnr=20.0), 500, snr=10.0**-i)
+    figure = draw("snr", read(jobs.folder))
+    panels = [axes for axes in figure.axes if axes.get_visible()]
+    assert len(panels) == len(arms) * levels
+    assert figure.axes[0].get_gridspec().get_geometry() == shape
+    for arm in arms:
+        assert f"{arm}, strong noise" in texts(figure)
+    low, high = panels[0].get_ylim()
+    assert low < 1e-6  # whatever arm was drawn last
+    assert high > 1
+    assert sum(axes.get_xlabel() == "step" for axes in panels) == shape[1]
 
 
 def test_a_setting_that_lacks_cells_is_hollow_and_an_early_end_has_a_dagger(jobs):
@@ -175,6 +217,31 @@ def test_an_arm_looks_the_same_in_every_figure_and_arms_look_different():
     few, many = looks(["cadam", "baseline"]), looks(["none", "cadam", "baseline", "cadam_calibrated", "mcmc"])
     assert few["cadam"] == many["cadam"]
     assert len({look.color for look in many.values()}) == len({look.marker for look in many.values()}) == 5
+
+
+def test_a_dozen_unknown_arms_look_different_from_one_another_and_from_the_known():
+    arms = [*KNOWN, *(f"mine_{i}" for i in range(12))]
+    found = looks(iter(arms))
+    assert len({(look.color, look.marker) for look in found.values()}) == len(arms)
+    assert {look.color for look in found.values()} <= set(DARK)
+    assert len(set(DARK.values())) == len(DARK)
+
+
+def test_the_arms_of_the_grids_that_are_compared_look_the_same_in_all_sweeps():
+    for arm in ("none", "baseline", "cadam", "cadam_annealed", "cadam_selective", "random"):
+        assert looks([arm])[arm] == looks([arm, "aaa"])[arm]
+
+
+@pytest.mark.parametrize("name", ["masks", "ablation", "objectives"])
+def test_unknown_arms_differ_in_pictures_too(jobs, name):
+    for arm in ("aaa", "bbb", "ccc"):
+        for guidance in ("sds", "ism"):
+            jobs.files(jobs.add(arm, f"guidance={guidance}", n=500, psnr=20.0), 500)
+    figure = draw(name, read(jobs.folder))
+    words = figure.findobj(
+        match=lambda each: hasattr(each, "get_text") and each.get_text() in ("aaa", "bbb", "ccc")
+    )
+    assert len({text.get_color() for text in words}) == 3
 
 
 def test_labels_keep_their_distance_and_their_order():

@@ -54,7 +54,7 @@ def test_the_line_of_the_sweep_comes_before_those_of_its_jobs(jobs):
 
 def test_figures_and_tables_lie_beside_it(whole, bench):
     names = {path.name for path in (bench / "figures").iterdir()}
-    drawn = {"frontier", "growth", "snr", "masks", "thresholds", "regimes", "ablation"}
+    drawn = {"frontier", "frontier_ssim", "growth", "snr", "masks", "thresholds", "regimes", "ablation"}
     assert {f"{name}.{kind}" for name in drawn for kind in ("svg", "png")} <= names
     assert {"objectives.csv", "frontiers.csv", "standings.csv"} <= names
     with (bench / "figures/frontiers.csv").open(newline="") as file:
@@ -139,6 +139,53 @@ def test_light_and_dark_define_the_same_arms():
 
 
 # Tables.
+
+
+def test_standings_tell_the_luck_of_seeds_and_what_is_out_of_reach(jobs):
+    for seed, psnr in enumerate((9.0, 9.2)):
+        for tau, n, best in ((0.001, 100, 10.0), (0.0002, 10000, 20.0)):
+            jobs.add("baseline", f"densifier.tau_pos={tau}", f"seed={seed}", n=n, psnr=best)
+        jobs.add("cadam", f"seed={seed}", n=1000, psnr=psnr)
+    jobs.add("cadam", "seed=2", n=1000, psnr=9.0)
+    [line] = tables.standings_table(read(jobs.folder))
+    assert line["over seeds (dB)"] == 0.14
+    assert (line["baseline needs times"], line["always exceeds"], line["never reaches"]) == ("always", 2, 0)
+    assert line["unpaired"] == 1
+
+
+def test_an_arm_without_a_standard_setting_is_named_below_the_key_table(jobs):
+    jobs.add("cadam", n=100, psnr=20.0)
+    for growth in (0.1, 0.2):
+        jobs.add("mcmc", f"densifier.growth={growth}", n=100, psnr=20.0)
+    said = text_of(comparison.write(jobs.folder).read_text(encoding="utf-8"))
+    assert "mcmc has no standard setting and is under Every setting only." in said
+
+
+@pytest.mark.parametrize(("zero", "title", "expected"), [(True, "SSIM gain", 0.15), (False, "SSIM", 0.85)])
+def test_the_table_of_frontiers_has_ssim(jobs, zero, title, expected):
+    for seed, ssim in enumerate((0.8, 0.85, 0.95)):
+        jobs.add("cadam", f"seed={seed}", n=100, psnr=20.0, ssim=ssim)
+        if zero:
+            jobs.add("none", f"seed={seed}", n=10, psnr=10.0, ssim=0.7)
+    line = next(line for line in tables.frontier_table(read(jobs.folder)) if line["setting"] == "cadam")
+    assert line[title] == pytest.approx(expected)
+
+
+def test_the_table_of_frontiers_counts_cells_that_it_left_out(jobs):
+    jobs.add("none", "seed=0", n=10, psnr=10.0)
+    for seed in (0, 1):
+        jobs.add("cadam", f"seed={seed}", n=100, psnr=20.0)
+    lines = {line["setting"]: line for line in tables.frontier_table(read(jobs.folder))}
+    assert (lines["cadam"]["cells"], lines["cadam"]["left out"]) == (1, 1)
+    assert lines["none"]["left out"] is None
+
+
+def test_the_key_table_tells_cells_that_only_one_of_two_has(jobs):
+    for seed in (0, 1):
+        jobs.add("baseline", f"seed={seed}", n=1000, psnr=20.0)
+    jobs.add("cadam", "seed=0", n=100, psnr=20.0)
+    jobs.add("cadam", "seed=1", n=100, psnr=None, outcome="failed")
+    assert [line["unpaired"] for line in tables.objectives_table(read(jobs.folder))] == [None, 1]
 
 
 def test_the_key_table_has_a_line_per_objective_level_and_arm(jobs):

@@ -33,6 +33,26 @@ def test_a_changed_threshold_is_no_standard_even_if_it_never_varies(jobs):
     assert not read(jobs.folder)[0].is_standard
 
 
+def test_the_key_of_a_schedule_has_its_shipped_value_too(jobs):
+    for start in (0.35, 0.5, 0.65):
+        jobs.add("cadam_annealed", f"densifier.tau_Q.start={start}", n=100, psnr=20.0)
+    jobs.add("cadam_annealed", n=100, psnr=20.0)
+    rows = read(jobs.folder)
+    assert [row.is_standard for row in rows] == [False, True, False, True]
+    assert rows[1].setting == rows[3].setting == Setting("cadam_annealed", (("tau_Q.start", 0.5),))
+
+
+def test_a_number_in_place_of_a_schedule_is_not_the_shipped_one(jobs):
+    jobs.add("cadam_annealed", "densifier.tau_Q=0.9", n=100, psnr=20.0)
+    assert not read(jobs.folder)[0].is_standard
+
+
+def test_where_no_threshold_is_the_shipped_one_nothing_is_standard(jobs):
+    for growth in (0.05, 0.1):
+        jobs.add("mcmc", "densifier.cap=1500", f"densifier.growth={growth}", n=100, psnr=20.0)
+    assert not any(row.is_standard for row in read(jobs.folder))
+
+
 def test_thresholds_may_be_words(jobs):
     for views in ("sum_norm", "last"):
         jobs.add("baseline", f"densifier.views={views}", n=100, psnr=20.0)

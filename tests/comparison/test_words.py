@@ -3,8 +3,10 @@
 from cadam3d.comparison.rows import read
 from cadam3d.comparison.words import headline
 
+PROMPTS = ("a cube", "a torus", "a tower", "a castle", "a tree", "a ball")
 
-def cells(jobs, ours, baseline, prompts=("a cube", "a torus", "a tower"), noise="medium"):
+
+def cells(jobs, ours, baseline, prompts=PROMPTS, noise="medium"):
     for prompt in prompts:
         for tau, (n, psnr) in baseline.items():
             jobs.add(
@@ -17,13 +19,13 @@ def test_the_paper_s_claim_comes_first_then_the_tuned_baseline(jobs):
     cells(jobs, (1000, 17.5), {0.001: (100, 10.0), 0.0002: (10000, 20.0)})
     first, second = headline(read(jobs.folder))
     assert first.startswith(
-        "cadam ends with 90.0% fewer Gaussians than baseline (tau_pos 0.0002) (median of 3"
+        "cadam ends with 90.0% fewer Gaussians than baseline (tau_pos 0.0002) (median of 6"
     )
     assert "at -2.50 dB PSNR" in first
     assert second.startswith(
         "At medium noise: cadam lies 2.50 dB [+2.50, +2.50] above the best of baseline's 2"
     )
-    assert "above it in 3 of 3 cells; for the same PSNR baseline needs 3.2 times as many" in second
+    assert "above it in 6 of 6 cells; for the same PSNR baseline needs 3.2 times as many" in second
 
 
 def test_more_gaussians_are_called_more(jobs):
@@ -37,16 +39,63 @@ def test_a_worse_setting_is_called_worse(jobs):
 
 
 def test_a_difference_that_chance_explains_is_not_claimed(jobs):
-    for prompt, psnr in (("a cube", 14.0), ("a torus", 15.1), ("a tower", 16.0)):
+    for prompt, psnr in zip(PROMPTS, (14.0, 15.1, 16.0, 14.5, 15.5, 15.2), strict=True):
         cells(jobs, (1000, psnr), {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, prompts=[prompt])
     assert "no certain difference" in headline(read(jobs.folder))[1]
 
 
-def test_two_prompts_are_too_few_to_be_certain(jobs):
-    cells(jobs, (1000, 19.0), {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, prompts=("a cube", "a torus"))
+def test_a_difference_in_five_of_six_prompts_is_not_claimed(jobs):
+    """The interval excludes 0, the sign test does not."""
+    for prompt, psnr in zip(PROMPTS, (14.9, *(5 * [19.0])), strict=True):
+        cells(jobs, (1000, psnr), {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, prompts=[prompt])
+    assert "no certain difference (6 prompts)" in headline(read(jobs.folder))[1]
+
+
+def test_five_prompts_are_too_few_to_be_certain_at_however_many_levels(jobs):
+    for noise in ("weak", "medium", "strong"):
+        cells(jobs, (1000, 19.0), {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, PROMPTS[:5], noise)
+        for prompt in PROMPTS[:5]:
+            jobs.add("cadam_strict", f"prompt={prompt}", f"noise={noise}", n=1000, psnr=19.0)
+    for sentence in headline(read(jobs.folder))[1:]:
+        assert "no certain difference (5 prompts)" in sentence
+        assert "[" not in sentence
+
+
+def test_the_spread_over_seeds_stands_beside_a_difference(jobs):
+    for seed, psnr in enumerate((16.0, 16.2)):
+        for tau, n, best in ((0.001, 100, 10.0), (0.0002, 10000, 20.0)):
+            jobs.add("baseline", f"densifier.tau_pos={tau}", f"seed={seed}", n=n, psnr=best)
+        jobs.add("cadam", f"seed={seed}", n=1000, psnr=psnr)
+    assert "in 2 of 2 cells, 0.14 dB spread over seeds" in headline(read(jobs.folder))[1]
+
+
+def test_a_cell_without_a_partner_is_told_and_whose_it_is(jobs):
+    cells(jobs, (1000, 20.0), {0.0002: (2000, 20.0)})
+    jobs.add("baseline", "noise=medium", "prompt=a seventh", n=2000, psnr=20.0)
+    jobs.add("cadam", "noise=medium", "prompt=a seventh", n=10, psnr=None, outcome="vanished")
+    for prompt in ("an eighth", "a ninth"):
+        jobs.add("cadam", "noise=medium", f"prompt={prompt}", n=1000, psnr=20.0)
+    assert headline(read(jobs.folder))[0].endswith(
+        "; cadam left nothing to measure in 1 further cell; "
+        "baseline left nothing to measure in 2 further cells."
+    )
+
+
+def test_a_quality_that_is_always_exceeded_is_told(jobs):
+    cells(jobs, (1000, 9.0), {0.001: (100, 10.0), 0.0002: (10000, 20.0)})
     sentence = headline(read(jobs.folder))[1]
-    assert "no certain difference" in sentence
-    assert "[" not in sentence
+    assert "; baseline exceeds that PSNR at every threshold in 6 cells" in sentence
+    assert "times as many" not in sentence
+
+
+def test_qualities_out_of_reach_are_told_beside_the_median_on_both_sides(jobs):
+    for prompt, psnr in zip(PROMPTS, (9.0, 25.0, 15.0, 15.0, 15.0, 15.0), strict=True):
+        cells(jobs, (1000, psnr), {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, prompts=[prompt])
+    assert headline(read(jobs.folder))[1].endswith(
+        "; for the same PSNR baseline needs 1 times as many; "
+        "baseline reaches that PSNR at no threshold in 1 cell; "
+        "baseline exceeds that PSNR at every threshold in 1 cell."
+    )
 
 
 def test_an_early_end_is_told(jobs):
@@ -57,21 +106,24 @@ def test_an_early_end_is_told(jobs):
 
 def test_an_unreached_quality_is_told(jobs):
     cells(jobs, (1000, 25.0), {0.001: (100, 10.0), 0.0002: (10000, 20.0)})
-    assert "baseline reaches that PSNR at no threshold in 3 cells" in headline(read(jobs.folder))[1]
+    assert "baseline reaches that PSNR at no threshold in 6 cells" in headline(read(jobs.folder))[1]
 
 
 def test_a_range_that_does_not_overlap_is_told(jobs):
     cells(jobs, (50, 25.0), {0.001: (100, 10.0), 0.0002: (10000, 20.0)})
     sentence = headline(read(jobs.folder))[1]
     assert "no equal count" in sentence
-    assert "in 3 cells it has fewer Gaussians than any of baseline's settings" in sentence
+    assert sentence.endswith(
+        ": in 6 cells it has fewer Gaussians than any of baseline's settings; "
+        "baseline reaches that PSNR at no threshold in 6 cells."
+    )
 
 
 def test_a_level_without_noise_is_no_witness_for_the_paper_s_claim(jobs):
     cells(jobs, (1000, 10.0), {0.0002: (2000, 20.0)}, noise="none")
     cells(jobs, (1000, 19.8), {0.0002: (10000, 20.0)}, noise="weak")
     [sentence] = headline(read(jobs.folder))
-    assert sentence.startswith("cadam ends with 90.0% fewer Gaussians than baseline (median of 3 cells")
+    assert sentence.startswith("cadam ends with 90.0% fewer Gaussians than baseline (median of 6 cells")
 
 
 def test_without_any_noise_the_claim_is_about_what_there_is(jobs):
@@ -89,11 +141,11 @@ def test_cells_of_comparable_quality_are_counted_with_the_limit_among_them(jobs)
 def test_variants_are_told_over_all_noise_together(jobs):
     for noise, psnr in (("none", 10.0), ("weak", 17.0), ("strong", 17.0)):
         cells(jobs, (1000, 15.0), {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, noise=noise)
-        for prompt in ("a cube", "a torus", "a tower"):
+        for prompt in PROMPTS:
             jobs.add("cadam_annealed", f"prompt={prompt}", f"noise={noise}", n=1000, psnr=psnr)
     *_, last = headline(read(jobs.folder))
     assert last.startswith("At all levels of noise: cadam_annealed lies 2.00 dB [+2.00, +2.00] above")
-    assert "above it in 6 of 6 cells" in last
+    assert "above it in 12 of 12 cells" in last
 
 
 def test_without_a_baseline_nothing_is_claimed(jobs):
