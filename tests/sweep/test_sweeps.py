@@ -366,9 +366,14 @@ def start_sweep(tmp_path, small_configs, stand_in):
         )
         environment = {**os.environ, "PYTHONPATH": f"{site}:{REPOSITORY}", "OMP_NUM_THREADS": "1"}
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        return subprocess.Popen([PYTHON, "-c", code], cwd=tmp_path, env=environment, **pipes)
+        started.append(subprocess.Popen([PYTHON, "-c", code], cwd=tmp_path, env=environment, **pipes))
+        return started[-1]
 
-    return run
+    started: list[subprocess.Popen] = []
+    yield run
+    for process in started:  # of a test that failed; workers and jobs end with it
+        process.kill()
+        process.wait()
 
 
 @pytest.mark.parametrize(("launcher", "running"), [((), 1), (("launcher=joblib", "launcher.n_jobs=2"), 2)])
