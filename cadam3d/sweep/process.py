@@ -4,6 +4,8 @@ This side waits for it, passes on the wish to stop, and writes down how it ended
 ``cadam3d train``, started through this module's last lines, which make it end with the sweep.
 """
 
+import fcntl
+import multiprocessing
 import os
 import shutil
 import signal
@@ -13,7 +15,9 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
+from typing import IO
 
 from cadam3d.core.outcome import Outcome
 from cadam3d.io.cache import TRACES
@@ -22,15 +26,16 @@ from cadam3d.settings import quote
 from cadam3d.sweep.folder import (
     CONSOLE,
     ENDED,
+    LOCK,
     STOP,
     SUMMARY,
     TRACED,
     Plan,
     Row,
     is_complete,
-    load,
     read_plan,
     read_summary,
+    rows_of,
 )
 
 POLL_SECONDS = 0.2
@@ -43,26 +48,68 @@ TAIL = 20_000  # bytes of the console in which the reason of a failure is looked
 def run_job(sweep: Path, number: int) -> None:
     """Run job ``number`` of the sweep to its end, from its checkpoint if it has one.
 
-    Nothing happens if the sweep is being stopped or the job has a result.
+    Nothing happens if the sweep is being stopped or the job has a result. If another process is at work on
+    the job, such as one that a killed sweep has left behind, this waits until that has ended.
     """
-    plan, row = read_plan(sweep), load(sweep)[number]
-    stop = sweep / STOP
-    if stop.exists() or row.has_result:
+    plan, stop = read_plan(sweep), sweep / STOP
+    _end_with_sweep()
+    if stop.exists():
         return
-    started = time.monotonic()
-    row.folder.mkdir(parents=True, exist_ok=True)
-    if not row.has_checkpoint:  # half-made files of an earlier attempt would be taken for this one's
-        shutil.rmtree(row.folder)
-        row.folder.mkdir()
-    for name in (SUMMARY, ENDED):
-        (row.folder / name).unlink(missing_ok=True)
-    code = _wait(plan, row, stop)
-    row.folder.mkdir(exist_ok=True)  # a run that was refused may have tidied up after itself
-    _note_outcome(row.folder, code)
-    write_json(row.folder / ENDED, {"exit_code": code, "seconds": round(time.monotonic() - started, 2)})
+    folder = sweep / plan.jobs[number].folder
+    folder.mkdir(parents=True, exist_ok=True)
+    with _locked(folder, stop) as lock:
+        row = rows_of(sweep, plan.jobs)[number]  # not before: who held the lock may have brought it further
+        if lock is None or stop.exists() or row.has_result:
+            return
+        started = time.monotonic()
+        if not row.has_checkpoint:  # half-made files of an earlier attempt would be taken for this one's
+            _empty(folder)
+        for name in (SUMMARY, ENDED):
+            (folder / name).unlink(missing_ok=True)
+        code = _wait(plan, row, stop, lock)
+        folder.mkdir(exist_ok=True)  # a run that was refused may have tidied up after itself
+        _note_outcome(folder, code)
+        write_json(folder / ENDED, {"exit_code": code, "seconds": round(time.monotonic() - started, 2)})
 
 
-def _wait(plan: Plan, row: Row, stop: Path) -> int:
+@contextmanager
+def _locked(folder: Path, stop: Path) -> Iterator[int | None]:
+    """Keep all others off a job, once they have left it; None if this one is to stop before that.
+
+    The process of the job inherits the lock, which so lasts as long as that one, even if this one is killed.
+    """
+    with (folder / LOCK).open("w") as file:
+        with _signals() as signals:
+            while not (is_ours := _try_lock(file)) and not signals and not stop.exists():
+                time.sleep(POLL_SECONDS)
+        try:
+            yield file.fileno() if is_ours and not signals else None
+        finally:
+            if is_ours:  # closing is not enough if the job has left somebody behind who inherited it too
+                with suppress(OSError):
+                    fcntl.flock(file, fcntl.LOCK_UN)
+
+
+def _try_lock(file: IO[str]) -> bool:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        pass
+    return True
+
+
+def _empty(folder: Path) -> None:
+    """Remove all but the lock, which would be no lock if others met another file by its name."""
+    for path in folder.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        elif path.name != LOCK:
+            path.unlink()
+
+
+def _wait(plan: Plan, row: Row, stop: Path, lock: int) -> int:
     """Start the process, wait for it and return its exit code; minus the signal if one killed it."""
     words = [f"resume={quote(str(row.folder))}"] if row.has_checkpoint else row.overrides
     command = [sys.executable, "-m", __name__, str(os.getpid()), "train", *words]
@@ -83,6 +130,7 @@ def _wait(plan: Plan, row: Row, stop: Path) -> int:
             stdout=console,
             stderr=subprocess.STDOUT,
             start_new_session=True,  # Ctrl-C reaches it through us only: twice would mean at once
+            pass_fds=(lock,),
         )
         is_told = False
         try:
@@ -160,6 +208,23 @@ def _last_words(console: Path) -> str:
     return said[-1] if said else ""
 
 
+def _end_with_sweep() -> None:
+    """In a worker that the sweep itself has made, as joblib does: end at once when the sweep is gone.
+
+    Otherwise it would go on with the jobs it has been given. Workers on Slurm and Ray are not made by the
+    sweep, and may outlive it.
+    """
+    sweep = multiprocessing.parent_process()
+    if sweep is None or sweep.pid is None:
+        return
+    _end_with(os.getppid())
+    try:
+        os.kill(sweep.pid, 0)
+    except ProcessLookupError:  # before the first job, so that nobody will see it go
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+@cache  # one thread, however many jobs come
 def _end_with(parent: int) -> None:
     """End this process at once when ``parent`` is gone: the sweep, run again, must find nobody at work."""
 

@@ -7,17 +7,30 @@ from pathlib import Path
 import pytest
 
 # Called as: PROGRAM -m cadam3d.sweep.process PARENT train key=value ...
-# It does what prompt= says, after noting how it was called in calls.jsonl beside the job folders.
+# It does what prompt= says, after noting how it was called in calls.jsonl beside the job folders: "meets" are
+# the earlier calls for the same job that are still at work.
 STAND_IN = r"""#!{python} -S
 import json, os, pathlib, signal, sys, time
 given = dict(word.lstrip("+~").partition("=")[::2] for word in sys.argv[5:] if "=" in word)
 folder = pathlib.Path(given["hydra.run.dir"].strip("'"))
+beside, parent = folder.parent, int(sys.argv[3])
+log = beside / "calls.jsonl"
+earlier = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+
+def is_at_work(pid):
+    try:
+        return pathlib.Path(f"/proc/{{pid}}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
 note = {{"folder": folder.name, "words": sys.argv[4:], "threads": os.environ.get("OMP_NUM_THREADS")}}
+note["pid"] = os.getpid()
+note["meets"] = [call["pid"] for call in earlier if call["folder"] == folder.name and is_at_work(call["pid"])]
 note["traces"] = os.environ.get("CADAM3D_TRACES")
 if note["traces"]:
     os.makedirs(note["traces"], exist_ok=True)
 note["files"] = sorted(path.name for path in folder.iterdir())
-with (folder.parent / "calls.jsonl").open("a") as file:
+with log.open("a") as file:
     file.write(json.dumps(note) + "\n")
 prompt = given.get("prompt", "'a cube'").strip("'")
 steps, seed = int(given.get("steps", 5)), int(given.get("seed", 0))
@@ -52,6 +65,13 @@ if prompt == "a deaf one":
 if prompt in ("a wait", "a deaf one"):
     (folder / "waiting").touch()
     time.sleep(60)
+if prompt == "a long one":  # its end, with its parent's or its own, is up to the test
+    (folder / "waiting").touch()
+    deadline = time.monotonic() + 60
+    while not (beside / "go").exists() and time.monotonic() < deadline:
+        if os.getppid() != parent and (beside / "end").exists():
+            sys.exit(1)
+        time.sleep(0.02)
 if prompt == "a crowd":
     write("out_of_memory", warnings=[])
     sys.exit(0)

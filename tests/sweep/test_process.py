@@ -1,5 +1,6 @@
 """One job as a process of its own: how it is started, stopped, and what is written down when it ends."""
 
+import errno
 import json
 import os
 import signal
@@ -7,7 +8,9 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -110,8 +113,11 @@ def test_a_job_without_a_checkpoint_starts_in_an_empty_folder(sweep, calls):
     folder = sweep("a bug")
     run_job(folder, 0)
     (folder / "job_1/metrics.jsonl").write_text("of the first attempt")
+    (folder / "job_1/frames").mkdir()
+    lock = (folder / "job_1/.lock").stat().st_ino
     run_job(folder, 0)
-    assert [call["files"] for call in calls(folder)] == [["console.txt"]] * 2
+    assert [call["files"] for call in calls(folder)] == [[".lock", "console.txt"]] * 2
+    assert (folder / "job_1/.lock").stat().st_ino == lock  # or whoever waits for it would wait for nothing
 
 
 def test_a_job_with_a_result_is_left_alone(sweep, calls):
@@ -139,6 +145,108 @@ def test_a_running_job_is_asked_to_save_when_the_sweep_is_stopped(sweep):
     assert not thread.is_alive()
     row, end = ended(folder)
     assert (row.outcome, row.has_result, end["exit_code"]) == ("interrupted", False, 130)
+
+
+# --- two at the same job ----------------------------------------------------------------------------------
+
+
+def start_waiting(folder: Path) -> threading.Thread:
+    """Somebody else who is to run job 0, and finds it taken."""
+    thread = threading.Thread(target=run_job, args=(folder, 0), daemon=True)
+    thread.start()
+    thread.join(3 * process.POLL_SECONDS)
+    assert thread.is_alive()
+    return thread
+
+
+def join(thread: threading.Thread) -> None:
+    thread.join(timeout=30)
+    assert not thread.is_alive()
+
+
+def test_two_workers_at_the_same_job_run_it_once(sweep, calls):
+    folder = sweep("a long one")
+    worker = start_worker(folder)
+    waiting = start_waiting(folder)
+    (folder / "go").touch()
+    assert worker.wait(30) == 0
+    join(waiting)
+    assert len(calls(folder)) == 1
+    assert load(folder)[0].outcome == "finished"
+
+
+@pytest.mark.parametrize("has_checkpoint", [False, True])
+def test_a_job_whose_worker_was_killed_is_taken_up_when_it_too_has_ended(has_checkpoint, sweep, calls):
+    folder = sweep("a long one")
+    worker = start_worker(folder)
+    waiting = start_waiting(folder)
+    worker.kill()
+    worker.wait()
+    if has_checkpoint:  # after the other one had begun to wait
+        (folder / "job_1/checkpoints").mkdir()
+        (folder / "job_1/checkpoints/step_0000002.pt").touch()
+    time.sleep(3 * process.POLL_SECONDS)
+    [first] = calls(folder)  # its process is still there, and so is what it has made
+    assert (folder / "job_1/waiting").exists()
+    (folder / "end").touch()
+    wait_until(lambda: len(calls(folder)) == 2)
+    (folder / "go").touch()
+    join(waiting)
+    _, second = calls(folder)
+    assert second["words"][1].partition("=")[0] == ("resume" if has_checkpoint else "prompt")
+    assert not second["meets"], first
+
+
+def test_who_waits_for_a_job_leaves_when_the_sweep_is_stopped(sweep, calls):
+    folder = sweep("a cube")
+    (folder / "job_1").mkdir()
+    with process._locked(folder / "job_1", folder / STOP):
+        waiting = start_waiting(folder)
+        (folder / STOP).touch()
+        join(waiting)
+    assert not calls(folder)
+
+
+def test_a_lock_ends_with_the_job_whoever_has_inherited_it(tmp_path):
+    with process._locked(tmp_path, tmp_path / STOP) as lock:
+        left_behind = subprocess.Popen(["sleep", "60"], pass_fds=(lock,))
+    try:
+        with (tmp_path / ".lock").open("w") as file:
+            assert process._try_lock(file)
+    finally:
+        left_behind.kill()
+        left_behind.wait()
+
+
+def test_a_file_system_without_locks_runs_jobs_too(sweep, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    folder = sweep("a cube")
+    run_job(folder, 0)
+    assert load(folder)[0].outcome == "finished"
+
+
+def test_a_worker_ends_with_its_sweep_only_if_that_has_made_it(monkeypatch):
+    """As with joblib. Those of Slurm and Ray are started by others, and go on."""
+    done = []
+    monkeypatch.setattr(process, "_end_with", lambda parent: done.append(("watch", parent)))
+    process._end_with_sweep()
+    assert not done
+    monkeypatch.setattr("multiprocessing.parent_process", lambda: SimpleNamespace(pid=os.getppid()))
+    process._end_with_sweep()
+    assert done.pop() == ("watch", os.getppid())
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    monkeypatch.setattr("multiprocessing.parent_process", lambda: gone)
+    kill = os.kill
+    monkeypatch.setattr(os, "kill", lambda pid, number: done.append(number) if number else kill(pid, number))
+    process._end_with_sweep()
+    assert done == [("watch", os.getppid()), signal.SIGKILL]
+
+
+# --- ends from outside ------------------------------------------------------------------------------------
 
 
 def start_worker(folder: Path, before: str = "") -> subprocess.Popen:
@@ -220,7 +328,11 @@ def is_alive(pid: int) -> bool:
 
 
 def wait_for(path: Path) -> None:
-    deadline = time.monotonic() + 30
-    while not path.exists():
-        assert time.monotonic() < deadline, f"{path.name} never came"
+    wait_until(path.exists)
+
+
+def wait_until(is_so: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 60
+    while not is_so():
+        assert time.monotonic() < deadline
         time.sleep(0.02)

@@ -8,6 +8,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -364,19 +366,20 @@ def start_sweep(tmp_path, small_configs, stand_in):
         )
         environment = {**os.environ, "PYTHONPATH": f"{site}:{REPOSITORY}", "OMP_NUM_THREADS": "1"}
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        return subprocess.Popen([PYTHON, "-c", code], cwd=tmp_path, env=environment, **pipes)
+        started.append(subprocess.Popen([PYTHON, "-c", code], cwd=tmp_path, env=environment, **pipes))
+        return started[-1]
 
-    return run
+    started: list[subprocess.Popen] = []
+    yield run
+    for process in started:  # of a test that failed; workers and jobs end with it
+        process.kill()
+        process.wait()
 
 
 @pytest.mark.parametrize(("launcher", "running"), [((), 1), (("launcher=joblib", "launcher.n_jobs=2"), 2)])
 def test_sigint_stops_all_running_jobs_and_leaves_the_table_true(launcher, running, start_sweep, tmp_path):
     process = start_sweep("prompt=a wait", "seed=0,1,2,3,4,5", "hydra.sweep.dir=x", *launcher)
-    deadline = time.monotonic() + 90
-    while len(list(tmp_path.glob("x/*/waiting"))) < running:  # side by side, or it will never be
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    wait_for(tmp_path, "x/*/waiting", process, running)  # side by side, or it will never be
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
@@ -401,11 +404,39 @@ def test_a_second_sigint_ends_at_once(start_sweep, tmp_path):
     assert [row["outcome"] for row in read_table(tmp_path / "x")] == ["unfinished"] * 2
 
 
-def wait_for(folder: Path, pattern: str, process: subprocess.Popen) -> None:
+@pytest.mark.parametrize(("launcher", "running"), [((), 1), (("launcher=joblib", "launcher.n_jobs=2"), 2)])
+def test_a_killed_sweep_typed_again_has_no_job_twice_at_work(launcher, running, start_sweep, calls, tmp_path):
+    line = ("prompt=a long one", "seed=0,1,2,3", "hydra.sweep.dir=x")
+    folder = tmp_path / "x"
+    first = start_sweep(*line, *launcher)
+    wait_for(folder, "*/waiting", first, running)
+    first.kill()
+    held = [call["folder"] for call in calls(folder)]
+    opened = {lock: lock.stat().st_mtime_ns for lock in folder.glob("*/.lock")}
+    second = start_sweep(*line, *launcher)
+    first.communicate(timeout=30)  # the pipes close when its workers have ended too; its jobs are still there
+    wait_until(lambda: all(lock.stat().st_mtime_ns > time for lock, time in opened.items()), second)
+    time.sleep(1)
+    assert len(calls(folder)) == running
+    (folder / "end").touch()
+    wait_until(lambda: len(calls(folder)) == 2 * running, second)
+    (folder / "go").touch()
+    _, err = second.communicate(timeout=60)
+    assert second.returncode == 0, err
+    times = Counter(call["folder"] for call in calls(folder))
+    assert times == {row.folder.name: 1 + (row.folder.name in held) for row in load(folder)}
+    assert not any(call["meets"] for call in calls(folder))
+
+
+def wait_for(folder: Path, pattern: str, process: subprocess.Popen, count: int = 1) -> None:
+    wait_until(lambda: len(list(folder.glob(pattern))) >= count, process)
+
+
+def wait_until(is_so: Callable[[], bool], process: subprocess.Popen) -> None:
     deadline = time.monotonic() + 90
-    while not list(folder.glob(pattern)):
+    while not is_so():
         assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline, f"{pattern} never came"
+        assert time.monotonic() < deadline
         time.sleep(0.05)
 
 
