@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.optim.adam import adam
 
 from cadam3d.core.checks import UserError, require_range
 from cadam3d.core.edit import RowEdit
@@ -80,11 +81,8 @@ class GaussianOptimizer:
         gradients = self._gaussians.map(
             lambda tensor: torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
         )
-        for group, gradient in zip(self._adam.param_groups, _parts(gradients).values(), strict=True):
-            group["lr"] = rates[group["name"]]
-            group["params"][0].grad = gradient if bound is None else _clipped(gradient, bound)
-        self._adam.step()
-        self._adam.zero_grad(set_to_none=True)
+        for name, gradient in _parts(gradients).items():
+            self._move(name, gradient if bound is None else _clipped(gradient, bound), rates[name])
         self.zero_grad()
 
     def zero_grad(self) -> None:
@@ -120,9 +118,8 @@ class GaussianOptimizer:
         ceiling = math.log(value / (1 - value))
         lowered = rows & (logits > ceiling)
         logits.masked_fill_(lowered, ceiling)
-        moments = self._moments("opacity")
         for kind in MOMENTS:
-            moments[kind].masked_fill_(rows, 0.0)
+            self._moments[kind]["opacity"].masked_fill_(rows, 0.0)
         return int(lowered.sum())
 
     @torch.no_grad()
@@ -135,13 +132,13 @@ class GaussianOptimizer:
         self._gaussians.sh.mul_(factor)
         for part in COLOR_PARTS:
             for kind in MOMENTS:
-                self._moments(part)[kind].zero_()
+                self._moments[kind][part].zero_()
 
     def state_dict(self) -> dict[str, Any]:
         """Steps done and both moments by part: plain numbers and tensors. The Gaussians are saved apart."""
         return {
-            "steps": int(self._moments("means")["step"]),
-            **{kind: {name: self._moments(name)[kind] for name in PARTS} for kind in MOMENTS},
+            "steps": int(self._steps["means"]),
+            **{kind: dict(self._moments[kind]) for kind in MOMENTS},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -161,23 +158,34 @@ class GaussianOptimizer:
             moments[kind] = {name: state[kind][name].to(part, copy=True) for name, part in parts.items()}
         self._install(self._gaussians.detach(), moments)
 
-    def _moments(self, part: str) -> dict[str, Tensor]:
-        return self._adam.state[self._adam.param_groups[PARTS.index(part)]["params"][0]]
+    @torch.no_grad()
+    def _move(self, part: str, gradient: Tensor, rate: float) -> None:
+        """One step of torch's Adam on one part.
+
+        As a function: the class would load torch's compiler with its first object, more than a second.
+        """
+        adam(
+            [self._parts[part]],
+            [gradient],
+            [self._moments["exp_avg"][part]],
+            [self._moments["exp_avg_sq"][part]],
+            [],
+            [self._steps[part]],
+            amsgrad=False,
+            beta1=float(self.settings.beta1),
+            beta2=float(self.settings.beta2),
+            lr=rate,
+            weight_decay=0.0,
+            eps=float(self.settings.eps),
+            maximize=False,
+        )
 
     def _install(self, gaussians: Gaussians, moments: Mapping[str, Any]) -> None:
-        """Make ``gaussians`` the leaves and hand Adam views into them, so that one step moves both."""
+        """Make ``gaussians`` the leaves and give Adam views into them, so that one step moves both."""
         self._gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
-        parts = _parts(self._gaussians.detach())
-        self._adam = torch.optim.Adam(
-            [{"params": [part], "name": name} for name, part in parts.items()],
-            betas=(float(self.settings.beta1), float(self.settings.beta2)),  # torch refuses the integer 0
-            eps=float(self.settings.eps),
-        )
-        for name, part in parts.items():
-            self._adam.state[part] = {
-                "step": torch.tensor(float(moments["steps"])),
-                **{kind: moments[kind][name].contiguous() for kind in MOMENTS},
-            }
+        self._parts = _parts(self._gaussians.detach())
+        self._steps = {name: torch.tensor(float(moments["steps"])) for name in PARTS}
+        self._moments = {kind: {name: moments[kind][name].contiguous() for name in PARTS} for kind in MOMENTS}
 
 
 def _parts(gaussians: Gaussians) -> dict[str, Tensor]:

@@ -76,7 +76,8 @@ def run(cfg: DictConfig) -> float | None:
     for key, least in (("seed", 0), ("steps", 1), ("views", 1)):
         require_whole(key, cfg[key], low=least, example=3)
     # Same seed, same bytes: on the CPU every operation we use has a deterministic form.
-    torch.use_deterministic_algorithms(device.type == "cpu")
+    # The same as use_deterministic_algorithms, which would load torch's compiler first: more than a second.
+    torch.set_deterministic_debug_mode("error" if device.type == "cpu" else "default")
     trainer = build_trainer(cfg, device)
     backend = trainer.rasterizer.prepare(device)
     exporters: dict[str, Exporter] = components(cfg.exporter)

@@ -546,7 +546,7 @@ def test_a_folder_that_holds_a_run_is_refused(sweep):
 
 
 def test_cfg_job_shows_the_first_job(sweep):
-    result = sweep("prompt=a cube", "grid=objectives", "seed=3,4", "~grid.each.guidance", "--cfg", "job")
+    result = sweep("prompt=a cube", "grid=objectives", "seed=3,4", "~grid.each", "--cfg", "job")
     assert result.code == 0, result.err
     assert "seed: 3" in result.out
     assert "densifier.baseline" in result.out
