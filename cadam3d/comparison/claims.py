@@ -19,9 +19,8 @@ NO_GROWTH = "none"  # the arm that gains are counted from
 RESAMPLES = 2000
 CONFIDENCE = 0.95
 BOOTSTRAP_SEED = 0  # same rows, same interval
-LEAST_FOR_INTERVAL = (
-    6  # prompts; with 4 a bootstrap of the median covers 85 % only, and 5 prove nothing by signs
-)
+# Prompts: with 4 a bootstrap of the median covers 85 % only, and 5 prove nothing by signs.
+LEAST_FOR_INTERVAL = 6
 SIGNIFICANT = 1 - CONFIDENCE  # of the sign test
 
 
