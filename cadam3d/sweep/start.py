@@ -34,6 +34,7 @@ from cadam3d.sweep.watch import Watch
 
 PLACE = Path("multirun")
 COMPARISON = "cadam3d.comparison"  # makes figures and a report of the rows of a sweep
+LONGEST = 40  # jobs that a table in the terminal has at most
 FOR_JOBS = ("--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn")  # flags that they need too
 
 
@@ -194,8 +195,10 @@ def _launch(folder: Path, sweep: Sweep, pending: Sequence[Row], flags: Sequence[
 
 
 def _tell(folder: Path, rows: Sequence[Row], problem: str) -> int:
-    """Print the table and what is left to do; the exit code."""
-    print(f"\n{as_text(rows)}\n\n{_jobs(len(rows))}: {shown(folder / TABLE)}", flush=True)
+    """Print the table and what is left to do; the exit code. Of a long table only what has no result."""
+    told = rows if len(rows) <= LONGEST else [row for row in rows if not row.has_result][:LONGEST]
+    table = f"\n{as_text(told)}\n" if told else ""
+    print(f"{table}\n{_jobs(len(rows))}: {shown(folder / TABLE)}", flush=True)
     if problem:
         print(f"cadam3d: {problem}", file=sys.stderr)
     left = outcomes(rows)
@@ -211,11 +214,14 @@ def _tell(folder: Path, rows: Sequence[Row], problem: str) -> int:
 
 
 def _compare(folder: Path) -> None:
-    """Figures and a report, where there is a module that makes them."""
+    """Figures, a report and its verdict, where there is a module that makes them."""
     if find_spec(COMPARISON) is None:
         return
+    comparison = import_module(COMPARISON)
     try:
-        import_module(COMPARISON).write(folder)
+        page = comparison.write(folder)
+        print("".join(f"\n{sentence}\n" for sentence in comparison.verdict(folder)))
+        print(f"report: {shown(page)}", flush=True)
     except UserError as error:
         print(f"cadam3d: {error}", file=sys.stderr)
 

@@ -629,12 +629,23 @@ def test_a_plan_that_is_none_is_named(tmp_path):
 def test_the_comparison_is_made_of_a_sweep_where_there_is_one(sweep, monkeypatch):
     made = []
     module = type(sys)("comparison_of_mine")
-    module.write = made.append
+    module.write = lambda folder: (made.append(folder), folder / "report.html")[1]
+    module.verdict = lambda folder: ["Ours is better."]
     monkeypatch.setitem(sys.modules, "comparison_of_mine", module)
     module.__spec__ = importlib.machinery.ModuleSpec("comparison_of_mine", None)
     monkeypatch.setattr(start, "COMPARISON", "comparison_of_mine")
-    sweep("prompt=a cube", "grid=densifiers")
+    said = sweep("prompt=a cube", "grid=densifiers").out
     assert made == [Path("multirun/densifiers").resolve()]
+    assert said.endswith("sweep.csv\n\nOurs is better.\n\nreport: multirun/densifiers/report.html\n")
+
+
+def test_of_a_long_table_the_terminal_sees_what_has_no_result(sweep, monkeypatch):
+    monkeypatch.setattr(start, "LONGEST", 2)
+    said = sweep("prompt=a cube,a bug", "seed=0,1").out
+    table = said[said.index("\njob ") :]
+    assert table.count("failed") > 1  # also counted below it
+    assert "finished" not in table
+    assert "\njob " not in sweep("prompt=a cube", "seed=0,1,2").out
 
 
 def test_preparing_a_sweep_needs_no_torch(start_sweep, tmp_path):
