@@ -150,7 +150,8 @@ def test_each_job_is_told_as_it_ends(sweep):
     assert lines[0].startswith("3 jobs in multirun/")
     assert lines[1].startswith("[1/3] seed=0: 5 Gaussians, 20.25 dB, 2 s; about ")
     assert lines[3] == "[3/3] seed=2: 5 Gaussians, 20.25 dB, 2 s"
-    assert lines[-1] == f"3 jobs: {only_sweep()}/sweep.csv"
+    assert f"3 jobs: {only_sweep()}/sweep.csv" in lines
+    assert lines[-1] == f"report: {only_sweep()}/report.html"
 
 
 def test_a_grid_gives_its_name_and_its_arms(sweep):
