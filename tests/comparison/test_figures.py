@@ -2,9 +2,11 @@
 
 import math
 import re
+from itertools import combinations
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from cadam3d.comparison import figures, pictures
 from cadam3d.comparison.page import FIGURES
@@ -275,3 +277,21 @@ def test_numbers_on_a_log_axis_are_plain(bench_rows):
     assert "1k" in labels
     assert not any("10^" in label for label in labels)
     assert all(math.isfinite(value) for value in figure.axes[0].get_ylim())
+
+
+def test_names_of_arms_that_end_in_one_place_do_not_cover_each_other(jobs):
+    for prompt in ("a cube", "a torus"):
+        for arm, n, psnr in (("none", 300, 18.0), ("cadam", 1000, 20.0), ("cadam_annealed", 990, 20.0)):
+            jobs.add(arm, f"prompt={prompt}", "noise=weak", n=n, psnr=psnr)
+        for tau, n, psnr in ((2e-4, 20000, 20.5), (1.0, 1100, 19.9)):
+            words = (f"densifier.tau_pos={tau}", f"prompt={prompt}", "noise=weak")
+            jobs.add("baseline", *words, n=n, psnr=psnr)
+    figure = draw("frontier", read(jobs.folder))
+    [axes] = figure.axes
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    names = [
+        text for text in axes.texts if text.get_text() in ("none", "cadam", "cadam_annealed", "baseline")
+    ]
+    assert len(names) == 4
+    boxes = [name.get_window_extent(renderer) for name in names]
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))

@@ -9,7 +9,7 @@ import torch
 from cadam3d.core.cameras import turntable
 from cadam3d.core.checks import UserError
 from cadam3d.core.schedule import Linear, Steps
-from cadam3d.guidance.distill import surrogate
+from cadam3d.guidance.distill import rms, surrogate
 from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
 from cadam3d.prior.tiny import Tiny
 
@@ -335,3 +335,8 @@ def test_a_window_that_closes_in_between_is_refused_when_it_does(make, ask, gaus
     ask(guidance, rgb, means, gaussian(DDPM()), step=4)
     with pytest.raises(UserError, match=r"t_min 0\.99 and t_max 0\.98"):
         ask(guidance, rgb, means, gaussian(DDPM()), step=5)
+
+
+def test_the_root_mean_square_is_of_what_is_finite():
+    assert rms(torch.tensor([3.0, torch.nan, 4.0, torch.inf])) == pytest.approx(12.5**0.5)
+    assert rms(torch.tensor([torch.nan, -torch.inf])) == 0
