@@ -81,7 +81,7 @@ def help_text() -> str:
 
 def unknown_command(words: Sequence[str]) -> UserError:
     """The message for a first word that is no command; a sentence or an override gets the line it wanted."""
-    from cadam3d.advice import did_you_mean
+    from cadam3d.settings.advice import did_you_mean
 
     first = words[0]
     listed = "|".join(COMMANDS)
@@ -94,7 +94,7 @@ def unknown_command(words: Sequence[str]) -> UserError:
         return UserError(f"{first!r} is no command. Did you mean {near[0]}? Try: {line}")
     else:
         line = "cadam3d --help"
-    return UserError(f"{first!r} is no command: wanted one of {listed}. Try: {line}")
+    return UserError(f"{first!r} is no command: expected one of {listed}. Try: {line}")
 
 
 def complete(words: Sequence[str]) -> int:
@@ -105,7 +105,7 @@ def complete(words: Sequence[str]) -> int:
     """
     action, _, shell = words[1].partition("=") if len(words) > 1 else ("", "", "")
     if action not in ("install", "uninstall", "query") or shell not in ("bash", "zsh", "fish"):
-        raise UserError('-sc: wanted install=bash|zsh|fish. Try: eval "$(cadam3d -sc install=bash)"')
+        raise UserError('-sc: expected install=bash|zsh|fish. Try: eval "$(cadam3d -sc install=bash)"')
     if action == "query":
         line = os.environ.get("COMP_LINE", "")
         typed = _words(line)[1:]

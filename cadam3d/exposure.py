@@ -51,7 +51,7 @@ class BrightnessGuard(Exposure):
         require(
             self.end > self.begin,
             "exposure.end",
-            wanted=f"a step after exposure.begin={self.begin}",
+            expected=f"a step after exposure.begin={self.begin}",
             got=self.end,
             example=f"exposure.end={self.begin + 3500}",
         )

@@ -19,9 +19,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 
-from cadam3d.advice import ask_for, explain, missing_values
 from cadam3d.core.errors import UserError
-from cadam3d.settings import TEXT_KEYS, VERSION_BASE, compose, config_dir, quote, register_resolvers
+from cadam3d.settings.advice import ask_for, explain, missing_values
+from cadam3d.settings.compose import TEXT_KEYS, VERSION_BASE, compose, config_dir, quote, register_resolvers
 
 TRAINING = ("train", "sweep")  # the commands that own a run folder
 OVERRIDES = ".hydra/overrides.yaml"  # in a run folder: what its line said
@@ -126,7 +126,7 @@ def resumed(overrides: Sequence[str], *, is_sweep: bool) -> list[str]:
     folder = holders[0] if path.exists() and holders else None
     if folder is None or (path.is_dir() and path != folder):
         raise UserError(
-            f"resume: wanted the folder of a run (it holds {OVERRIDES}), got {text!r}. "
+            f"resume: expected the folder of a run (it holds {OVERRIDES}), got {text!r}. "
             "Try: cadam3d train resume=outputs/latest"
         )
     if "hydra.run.dir" in given and Path(_text(given["hydra.run.dir"])).expanduser().resolve() != folder:
@@ -181,7 +181,7 @@ def _run(command: str, overrides: list[str], flags: list[str], options: Namespac
     except InterpolationResolutionError as error:
         raise explain(error, command, overrides) or error from error
     if not place:
-        raise UserError(f"{key}: wanted a folder, got nothing. Try: {key}=outputs/mine, or without it")
+        raise UserError(f"{key}: expected a folder, got nothing. Try: {key}=outputs/mine, or without it")
     wanted = Path(str(place)).expanduser()
     stood = _standing(wanted if is_chosen else wanted.parent)
     folder = claim(wanted, key, is_chosen=is_chosen)
@@ -318,7 +318,7 @@ def _refuse_bare_words(command: str, overrides: Sequence[str]) -> None:
         key, _, start = before[-1].partition("=") if before else ("prompt", "", "")
         whole = " ".join([start, *bare]).strip()
         example = f"cadam3d {command} {key}={shlex.quote(whole)}" if command in TRAINING else f"run={bare[0]}"
-        raise UserError(f"{bare[0]!r}: wanted key=value. Try: {example}")
+        raise UserError(f"{bare[0]!r}: expected key=value. Try: {example}")
 
 
 def _refuse_flags(message: str) -> NoReturn:

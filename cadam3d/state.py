@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -16,6 +17,18 @@ from cadam3d.optimizer import GaussianOptimizer
 from cadam3d.rasterizer.base import Rasterizer
 
 __all__ = ["Outcome", "Population", "RefineReport", "RunContext", "StepReport", "TrainState"]
+
+# Each source of randomness has its own generator: two densifiers with one seed see the same views and noise.
+# New names go to the end: a seed gives each the stream of its place.
+GENERATORS = (
+    "initializer",
+    "camera",
+    "background",
+    "guidance",
+    "refine",
+    "densifier",
+    "augmentation",
+)
 
 
 @dataclass
@@ -106,3 +119,12 @@ class RunContext:
     total_steps: int
     render: RenderFn  # the Gaussians as they stand, without gradient
     rasterizer: Rasterizer  # for other Gaussians, such as those before a refinement
+
+
+def start_generators(seed: int) -> dict[str, torch.Generator]:
+    """Every source of randomness as it is before the first draw."""
+    children = np.random.SeedSequence(seed).spawn(len(GENERATORS))
+    return {
+        name: torch.Generator().manual_seed(int(child.generate_state(1, np.uint64)[0] >> 1))
+        for name, child in zip(GENERATORS, children, strict=True)
+    }

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,7 +12,7 @@ from cadam3d.augmentation import Augmentation
 from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
-from cadam3d.core.checks import UserError, require, require_range
+from cadam3d.core.checks import require, require_range
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.densifier.base import Densifier, GradientSignal
@@ -23,20 +22,16 @@ from cadam3d.guidance.base import Guidance
 from cadam3d.initializer.base import Initializer
 from cadam3d.optimizer import AdamSettings
 from cadam3d.prior.base import DiffusionPrior, PromptEmbedding
-from cadam3d.rasterizer.base import Rasterizer
+from cadam3d.rasterizer.base import Rasterizer, render_fn
 from cadam3d.regularizer import Regularizer
-from cadam3d.state import Outcome, Population, RefineReport, RunContext, StepReport, TrainState
-
-# Each source of randomness has its own generator: two densifiers with one seed see the same views and noise.
-# New names go to the end: a seed gives each the stream of its place.
-GENERATORS = (
-    "initializer",
-    "camera",
-    "background",
-    "guidance",
-    "refine",
-    "densifier",
-    "augmentation",
+from cadam3d.state import (
+    Outcome,
+    Population,
+    RefineReport,
+    RunContext,
+    StepReport,
+    TrainState,
+    start_generators,
 )
 
 
@@ -101,14 +96,14 @@ class Trainer:
         require(
             expected == set(payload["densifier"]),
             "densifier",
-            wanted=f"the one of the checkpoint (state: {sorted(payload['densifier'])})",
+            expected=f"the one of the checkpoint (state: {sorted(payload['densifier'])})",
             got=sorted(expected),
             example="resume without densifier=...",
         )
         require(
             all(len(rows) == len(gaussians) for rows in payload["densifier"].values()),
             "resume",
-            wanted="a checkpoint whose densifier state has one row per Gaussian",
+            expected="a checkpoint whose densifier state has one row per Gaussian",
             got=f"{len(gaussians)} Gaussians and another number of rows",
             example="resume=RUN/checkpoints/<an earlier one>",
         )
@@ -300,42 +295,6 @@ class Trainer:
         state.densifier = carried  # only now: memory may run out above, and owners must agree even then
         after = len(state.gaussians)
         return replace(report, after=after, cloned=plan.cloned, split=plan.split, pruned=plan.pruned)
-
-
-def start_generators(seed: int) -> dict[str, torch.Generator]:
-    """Every source of randomness as it is before the first draw."""
-    children = np.random.SeedSequence(seed).spawn(len(GENERATORS))
-    return {
-        name: torch.Generator().manual_seed(int(child.generate_state(1, np.uint64)[0] >> 1))
-        for name, child in zip(GENERATORS, children, strict=True)
-    }
-
-
-def render_fn(rasterizer: Rasterizer, gaussians: Callable[[], Gaussians]) -> RenderFn:
-    """A :data:`RenderFn` of whatever Gaussians ``gaussians()`` returns when it is called."""
-
-    def render(cameras, background) -> RenderOutput:
-        now = gaussians().detach()
-        with torch.no_grad():
-            return rasterizer.render(now, cameras.to(now.device), background.to(now.device))
-
-    return render
-
-
-def resolve_device(name: str) -> torch.device:
-    """``auto`` is CUDA where there is one, else the CPU; other names are torch's.
-
-    Raises ``UserError`` for a name that torch does not know, or a device that this machine does not have.
-    """
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).strip().splitlines()[0]
-        raise UserError(f"device={name}: not usable here ({reason}). Try: device=cpu") from error
-    return device
 
 
 def _signal(gaussians: Gaussians, output: RenderOutput) -> GradientSignal:

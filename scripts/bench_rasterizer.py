@@ -27,7 +27,7 @@ from rasterizer_bench.timing import OUT_OF_MEMORY, take_turns
 from cadam3d.core.checks import UserError
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cuda import Launcher, load_kernels
-from cadam3d.settings import component, config_dir
+from cadam3d.settings.compose import component, config_dir
 
 DEFAULTS = {
     "cpu": {

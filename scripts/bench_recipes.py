@@ -21,10 +21,11 @@ from typing import Any
 import torch
 
 from cadam3d.commands.train import build_trainer
+from cadam3d.core.device import resolve_device
 from cadam3d.prior.base import amount
-from cadam3d.settings import component, compose
+from cadam3d.settings.compose import component, compose
 from cadam3d.state import RunContext
-from cadam3d.trainer import Trainer, resolve_device
+from cadam3d.trainer import Trainer
 
 RECIPES = {"luciddreamer": "stable_diffusion", "flowdreamer": "stable_diffusion_3"}
 SD_VAE = {

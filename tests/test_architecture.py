@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parent.parent / "cadam3d"
-TOP = ("cli", "launch", "advice", "settings", "sweep", "commands", "comparison", "__main__")
+TOP = ("cli", "launch", "settings", "sweep", "commands", "report", "__main__")
 FLOORS = {  # part of cadam3d -> floor; parts of one floor may meet only as MAY_MEET says
     **dict.fromkeys(("core",), 0.0),
     **dict.fromkeys(("io",), 0.5),  # core, then io

@@ -103,11 +103,11 @@ def test_what_is_drawn_later_does_not_depend_on_the_probabilities():
 
 @pytest.mark.parametrize("color", [[0.0, 0.0], [0.0, 0.0, 1.5], [-0.1, 0.0, 0.0], [float("nan"), 0.0, 0.0]])
 def test_what_is_no_color_is_refused(color):
-    with pytest.raises(UserError, match=r"background\.color: wanted three numbers"):
+    with pytest.raises(UserError, match=r"background\.color: expected three numbers"):
         ConstantBackground(color=color)
-    with pytest.raises(UserError, match=r"background\.color: wanted three numbers"):
+    with pytest.raises(UserError, match=r"background\.color: expected three numbers"):
         RandomBackground(probability=0.5, color=color)
-    with pytest.raises(UserError, match=r"background\.color: wanted three numbers"):
+    with pytest.raises(UserError, match=r"background\.color: expected three numbers"):
         LucidBackground(probability=0.5, black=0.5, color=color)
 
 

@@ -17,8 +17,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from cadam3d import advice, cli, launch, settings
+from cadam3d import cli, launch
 from cadam3d.core.errors import UserError
+from cadam3d.settings import advice
+from cadam3d.settings import compose as settings
 
 REPOSITORY = Path(__file__).parent.parent
 DENSIFIERS = sorted(path.stem for path in (settings.config_dir() / "densifier").glob("*.yaml"))
@@ -233,7 +235,7 @@ def test_a_prompt_that_is_quoted_already_is_left_alone(quoted, type_line, jobs):
 
 def test_a_prompt_torn_apart_by_the_shell_is_given_back_whole(type_line):
     assert type_line("train", "prompt=a", "red", "cube").message == (
-        "'red': wanted key=value. Try: cadam3d train prompt='a red cube'"
+        "'red': expected key=value. Try: cadam3d train prompt='a red cube'"
     )
 
 
@@ -325,19 +327,19 @@ def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, 
         ("densifier.max_gaussians=9", "Did you mean refine.max_gaussians? Try: refine.max_gaussians=9"),
         ("step=5", "Did you mean steps"),
         ("qqqq.zzzz=5", "no such setting. Try: cadam3d train --cfg job"),
-        ("densifier=cadm", f"wanted one of {'|'.join(DENSIFIERS)}, got 'cadm'. Try: densifier=cadam"),
+        ("densifier=cadm", f"expected one of {'|'.join(DENSIFIERS)}, got 'cadm'. Try: densifier=cadam"),
         ("prior=shape", "Try: prior=shapes"),
         ("callback=[metrics,progres]", "got 'progres'. Try: callback=progress"),
         ("experiment=smok", "Try: experiment=smoke"),
         ("steps=1,2", "steps: several values make a sweep. Try: cadam3d sweep steps=1,2"),
         ("~steps", "~steps: a setting can be changed, not taken away. Try: "),
         ("~densifier", "~densifier: a setting can be changed"),
-        ("densifier=null", f"wanted one of {'|'.join(DENSIFIERS)}, got null. Try: densifier=none"),
-        ("camera=null", "camera: wanted one of "),
-        ("exporter=null", "exporter: wanted one of "),
+        ("densifier=null", f"expected one of {'|'.join(DENSIFIERS)}, got null. Try: densifier=none"),
+        ("camera=null", "camera: expected one of "),
+        ("exporter=null", "exporter: expected one of "),
         ("steps=${nope}", "cadam3d: steps: Interpolation key 'nope' not found. Try: "),
         ("hydra.run.dir=o_${seedd}", "hydra.run.dir: Interpolation key 'seedd' not found. Try: "),
-        ("hydra.run.dir=", "hydra.run.dir: wanted a folder, got nothing. Try: "),
+        ("hydra.run.dir=", "hydra.run.dir: expected a folder, got nothing. Try: "),
         ("promt=a b", "Try: 'prompt=a b'"),
         ("seed=1,2 3", "Try: cadam3d sweep 'seed=1,2 3' ... (a list is 'seed=[1,2 3]')"),
         ("grid=densifiers", "grids belong to sweeps. Try: cadam3d sweep grid=densifiers ..."),
@@ -497,7 +499,7 @@ def test_resume_follows_a_link_and_takes_a_checkpoint_file(run_folder, type_line
 @pytest.mark.parametrize("place", ["nowhere", "."])
 def test_resume_from_what_is_no_run_is_refused(place, type_line, jobs):
     message = type_line("train", f"resume={place}").message
-    assert "wanted the folder of a run" in message
+    assert "expected the folder of a run" in message
     assert not jobs
 
 

@@ -14,11 +14,12 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from cadam3d import advice, cli, regularizer
+from cadam3d import cli, regularizer
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json, read_jsonl
 from cadam3d.launch import _read_flags
-from cadam3d.settings import component, components, compose, config_dir, flatten, quote
+from cadam3d.settings import advice
+from cadam3d.settings.compose import component, components, compose, config_dir, flatten, quote
 from cadam3d.sweep.plan import compose_all, read_sweep
 
 CONFIGS = config_dir()
@@ -232,7 +233,7 @@ def node(target: str, **values: Any):
 
 def test_a_mistake_found_in_a_constructor_comes_out_as_it_is():
     with pytest.raises(
-        UserError, match=r"^schedule.steps: wanted a whole number >= 1, got 0. Try: schedule.steps=600$"
+        UserError, match=r"^schedule.steps: expected a whole number >= 1, got 0. Try: schedule.steps=600$"
     ):
         component(node("cadam3d.core.schedule.Linear", start=1.0, end=0.0, steps=0))
 

@@ -112,7 +112,7 @@ def test_another_run_does_not_move_into_a_folder_that_holds_one(finished):
     _, err = run(finished, "train", *SMALL, f"hydra.run.dir={latest}", "seed=1", code=1)
     assert "holds a run already" in err
     _, err = run(finished, "train", f"resume={latest}", "seed=1", code=1)
-    assert "seed: wanted 0" in err
+    assert "seed: expected 0" in err
     assert (latest / "asset.ply").read_bytes() == before
 
 

@@ -115,5 +115,5 @@ def test_judging_leaves_no_trace_in_the_graph():
     ],
 )
 def test_an_impossible_value_is_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"^exposure\.{key}: wanted .* Try: exposure\.{key}="):
+    with pytest.raises(UserError, match=rf"^exposure\.{key}: expected .* Try: exposure\.{key}="):
         guard(**{key: value})

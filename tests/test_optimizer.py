@@ -355,5 +355,5 @@ def test_an_impossible_number_is_refused_by_name(key):
 
 @pytest.mark.parametrize("key", RATES)
 def test_a_rate_that_falls_below_zero_is_refused_by_name(key):
-    with pytest.raises(UserError, match=rf"optimizer\.{key}: wanted a number >= 0, got -0\.1"):
+    with pytest.raises(UserError, match=rf"optimizer\.{key}: expected a number >= 0, got -0\.1"):
         settings(**{key: Linear(start=0.1, end=-0.1, steps=10)})

@@ -3,7 +3,7 @@
 import pytest
 
 from cadam3d.core.schedule import as_schedule
-from cadam3d.settings import component, compose
+from cadam3d.settings.compose import component, compose
 
 UNITS = {"gaussiandreamer": 1.5, "lucid": 0.5, "dreamgaussian": 1.0}  # of theirs in one of ours
 EXTENT = {"gaussiandreamer": 4.0, "lucid": 3.5, "dreamgaussian": 4.0}  # theirs

@@ -7,7 +7,7 @@ import pytest
 from cadam3d import cli
 from cadam3d.core.schedule import as_schedule
 from cadam3d.io.jsonl import read_json
-from cadam3d.settings import component, compose
+from cadam3d.settings.compose import component, compose
 
 LUCID = {"views": 4, "tau_pos": 7.5e-4, "stats": "last", "calls": (200, 2900)}
 FLOW = LUCID | {"steps": 5000, "calls": (200, 1400), "scale": 40, "weight": 0.1, "reduction": "sum"}

@@ -9,7 +9,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.core.errors import UserError
-from cadam3d.settings import component, compose
+from cadam3d.settings.compose import component, compose
 
 WHOLE = {  # what to choose, and the keys that count something
     "camera=orbit": ["camera.size"],
@@ -135,7 +135,7 @@ def refuses(choice: str, line: str) -> None:
     with pytest.raises(UserError) as raised:
         build(choice, line)
     message = str(raised.value)
-    assert message.startswith(f"{key}: wanted ")
+    assert message.startswith(f"{key}: expected ")
     assert f"{key}=" in message.partition("Try: ")[2]
     assert "\n" not in message
 
@@ -168,7 +168,9 @@ def test_a_range_that_widens_has_a_start_an_end_and_a_factor(value):
 
 
 def test_a_name_is_no_initializer_to_fall_back_on():
-    with pytest.raises(UserError, match=r"^initializer\.fallback: wanted .* Try: initializer/fallback=ball$"):
+    with pytest.raises(
+        UserError, match=r"^initializer\.fallback: expected .* Try: initializer/fallback=ball$"
+    ):
         build("initializer=shap_e", "initializer.fallback=ball")
 
 
@@ -185,7 +187,7 @@ def test_a_parent_has_a_bounded_number_of_children():
 @pytest.mark.parametrize("key", ["steps", "begin"])
 @pytest.mark.parametrize("value", ["2.5", "true", "null", "abc"])
 def test_a_schedule_counts_whole_steps(key, value):
-    with pytest.raises(UserError, match=rf"^schedule\.{key}: wanted a whole number"):
+    with pytest.raises(UserError, match=rf"^schedule\.{key}: expected a whole number"):
         build("optimizer=adam", f"optimizer.means_lr.{key}={value}")
 
 
@@ -193,7 +195,7 @@ def test_a_schedule_counts_whole_steps(key, value):
 @pytest.mark.parametrize("kind", ["Linear", "LogLinear"])
 @pytest.mark.parametrize("value", ["true", "null", "abc"])
 def test_a_schedule_goes_from_number_to_number(key, kind, value):
-    with pytest.raises(UserError, match=rf"^schedule\.{key}: wanted a"):
+    with pytest.raises(UserError, match=rf"^schedule\.{key}: expected a"):
         build(
             "optimizer=adam",
             f"optimizer.means_lr._target_=cadam3d.core.schedule.{kind}",

@@ -49,7 +49,7 @@ class Candidates(Callback):
         require(
             are_numbers(self.azimuths_deg, low=-360, high=360) and len(self.azimuths_deg) > 0,
             "callback.candidates.azimuths_deg",
-            wanted="at least one angle, each in [-360, 360]",
+            expected="at least one angle, each in [-360, 360]",
             got=self.azimuths_deg,
             example="'callback.candidates.azimuths_deg=[30]'",
         )

@@ -48,7 +48,7 @@ class Multiview(CameraSampler):
         require(
             self.relative_distance[0] >= least,
             "camera.relative_distance",
-            wanted=f"cameras outside the unit ball: from {least:.3g} on, at {self.fov_y_deg[1]:g} degrees",
+            expected=f"cameras outside the unit ball: from {least:.3g} on, at {self.fov_y_deg[1]:g} degrees",
             got=self.relative_distance,
             example="'camera.relative_distance=[0.8,1]' 'camera.fov_y_deg=[15,60]'",
         )
@@ -58,7 +58,7 @@ class Multiview(CameraSampler):
         require(
             views % GROUP == 0,
             "views",
-            wanted=f"a multiple of {GROUP}, the views of a group of camera=multiview",
+            expected=f"a multiple of {GROUP}, the views of a group of camera=multiview",
             got=views,
             example=f"views={GROUP * max(round(views / GROUP), 1)}",
         )

@@ -127,12 +127,12 @@ def _require_widening(key: str, value: object) -> None:
     example = (
         f"'{key}={{_target_: {Widening.__module__}.Widening, start: [10,20], end: [5,20], factor: [0.9,1]}}'"
     )
-    require(is_one, key, wanted="start, end and factor", got=value, example=example)
+    require(is_one, key, expected="start, end and factor", got=value, example=example)
     assert isinstance(value, Widening)
     require(
         are_numbers(value.factor, low=1e-3, high=1e3) and len(value.factor) == 2,
         f"{key}.factor",
-        wanted="two numbers > 0, of the low and of the high end",
+        expected="two numbers > 0, of the low and of the high end",
         got=value.factor,
         example=f"'{key}.factor=[0.75,1.1]'",
     )
@@ -143,7 +143,7 @@ def _require_motion(key: str, value: Widening) -> None:
     require(
         value.moves_as_meant(),
         f"{key}.factor",
-        wanted=f"factors that lead from {value.start} to {value.end}",
+        expected=f"factors that lead from {value.start} to {value.end}",
         got=value.factor,
         example=f"'{key}.end=[{value.start[0]:g},{value.start[1]:g}]' to stay, or other factors",
     )

@@ -59,7 +59,7 @@ def require_interval(key: str, interval: object, *, low: float, high: float, exa
     require(
         is_interval,
         key,
-        wanted=f"[low, high] in ascending order between {low:g} and {high:g}",
+        expected=f"[low, high] in ascending order between {low:g} and {high:g}",
         got=interval,
         example=f"'{key}={example}'",
     )

@@ -12,14 +12,14 @@ from cadam3d.commands.notes import note_backend
 from cadam3d.commands.paths import shown
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import UserError
+from cadam3d.core.device import resolve_device
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.ply import read_ply
-from cadam3d.rasterizer.base import Rasterizer
-from cadam3d.settings import component, components, load
+from cadam3d.rasterizer.base import Rasterizer, render_fn
+from cadam3d.settings.compose import component, components, load
 from cadam3d.sweep.folder import is_sweep
-from cadam3d.trainer import render_fn, resolve_device
 
 ASSET = "asset.ply"
 CONFIG = "config.yaml"
@@ -38,7 +38,7 @@ def open_asset(cfg: DictConfig) -> Asset:
     """The asset that ``run=`` or ``ply=`` names, exactly one of which must be given."""
     if (cfg.run is None) == (cfg.ply is None):
         got = "neither" if cfg.run is None else "both"
-        raise UserError(f"run, ply: wanted one of them, got {got}. Try: run=outputs/latest")
+        raise UserError(f"run, ply: expected one of them, got {got}. Try: run=outputs/latest")
     if cfg.run is not None:
         return open_run(find_run(cfg.run), cfg.device)
     ply = Path(cfg.ply).expanduser()
@@ -65,7 +65,7 @@ def find_run(text: str) -> Path:
         reason = f"a sweep, which holds many runs; one of them is {_any_job(folder)}"
     else:
         reason = f"it holds no {CONFIG}"
-    raise UserError(f"run: wanted the folder of a run, got {text!r} ({reason}). Try: run=outputs/latest")
+    raise UserError(f"run: expected the folder of a run, got {text!r} ({reason}). Try: run=outputs/latest")
 
 
 def run_config(folder: Path) -> DictConfig:
@@ -89,7 +89,7 @@ def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
     """Let every exporter of ``cfg`` write ``asset`` into ``folder``; returns what they wrote."""
     exporters: Sequence[Exporter] = list(components(cfg.exporter).values())
     if not exporters:
-        raise UserError("exporter: wanted at least one, got none. Try: exporter=[images,turntable]")
+        raise UserError("exporter: expected at least one, got none. Try: exporter=[images,turntable]")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 
 from cadam3d import __version__
 from cadam3d.commands.finding import Finding, Verdict, attempt
-from cadam3d.settings import component, compose, config_dir
+from cadam3d.settings.compose import component, compose, config_dir
 
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "imageio", "imageio-ffmpeg", "jaxtyping", "kornia")
 PACKAGES += ("matplotlib", "pillow", "pyyaml", "scipy", "tqdm", "trimesh")

@@ -6,12 +6,12 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from cadam3d import comparison
+from cadam3d import report
 from cadam3d.commands.asset import find_run, open_run, renderer, run_config
 from cadam3d.commands.paths import shown
 from cadam3d.core.checks import UserError
 from cadam3d.io.jsonl import write_json
-from cadam3d.settings import component, components
+from cadam3d.settings.compose import component, components
 from cadam3d.sweep.folder import is_sweep, load
 
 RESULT = "eval.json"
@@ -20,7 +20,7 @@ RESULT = "eval.json"
 def run(cfg: DictConfig) -> None:
     """Measure ``run=`` and write its ``eval.json``; for a sweep every job, one file of all and its report."""
     if cfg.run is None:
-        raise UserError("run: wanted a finished run or a sweep. Try: cadam3d eval run=outputs/latest")
+        raise UserError("run: expected a finished run or a sweep. Try: cadam3d eval run=outputs/latest")
     folder = Path(cfg.run).expanduser().resolve()
     if is_sweep(folder):
         _evaluate_sweep(cfg, folder)
@@ -68,4 +68,4 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
     if failures == len(results):
         raise UserError(f"run={cfg.run}: no job of this sweep could be measured. Try: cadam3d sweep again")
     write_json(folder / RESULT, results)
-    print(f"\n{len(results)} jobs: {shown(folder / RESULT)}\nreport: {shown(comparison.write(folder))}")
+    print(f"\n{len(results)} jobs: {shown(folder / RESULT)}\nreport: {shown(report.write_sweep(folder))}")

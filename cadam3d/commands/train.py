@@ -18,16 +18,17 @@ from cadam3d import __version__
 from cadam3d.commands.notes import note, note_backend
 from cadam3d.commands.paths import shown
 from cadam3d.core.checks import UserError, require, require_whole
+from cadam3d.core.device import resolve_device
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.atomic import remove_leftovers
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import read_jsonl, write_json
-from cadam3d.io.report import write_report
 from cadam3d.metric.base import Metric
 from cadam3d.prior.base import MemoryEstimate
-from cadam3d.settings import component, components, flatten, load
+from cadam3d.report.run import write_report
+from cadam3d.settings.compose import component, components, flatten, load
 from cadam3d.state import Outcome, RunContext, TrainState
-from cadam3d.trainer import Trainer, resolve_device
+from cadam3d.trainer import Trainer
 
 log = logging.getLogger(__name__)
 
@@ -201,7 +202,7 @@ def _start_or_resume(cfg: DictConfig, trainer: Trainer, device: torch.device, fo
     require(
         cfg.seed == state.seed,
         "seed",
-        wanted=f"{state.seed}, which this run was started with",
+        expected=f"{state.seed}, which this run was started with",
         got=cfg.seed,
         example="resume without seed=..., or start another run",
     )

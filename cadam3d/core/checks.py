@@ -18,18 +18,18 @@ __all__ = [
 ]
 
 
-def fail(key: str, *, wanted: str, got: object, example: str) -> UserError:
+def fail(key: str, *, expected: str, got: object, example: str) -> UserError:
     """Build the error for one configuration key; the caller raises it.
 
     ``example`` is a whole argument to paste, such as ``"densifier.tau_Q=0.9"``.
     """
-    return UserError(f"{key}: wanted {wanted}, got {got!r}. Try: {example}")
+    return UserError(f"{key}: expected {expected}, got {got!r}. Try: {example}")
 
 
-def require(claim: bool, key: str, *, wanted: str, got: object, example: str) -> None:
+def require(claim: bool, key: str, *, expected: str, got: object, example: str) -> None:
     """Raise :class:`UserError` unless ``claim`` holds."""
     if not claim:
-        raise fail(key, wanted=wanted, got=got, example=example)
+        raise fail(key, expected=expected, got=got, example=example)
 
 
 def require_range(
@@ -53,8 +53,8 @@ def require_range(
     ]
     number = value if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
     if not (low <= number <= high and above < number < below):
-        wanted = "a number " + " and ".join(bounds) if bounds else "a finite number"
-        raise fail(key, wanted=wanted, got=value, example=f"{key}={example}")
+        expected = "a number " + " and ".join(bounds) if bounds else "a finite number"
+        raise fail(key, expected=expected, got=value, example=f"{key}={example}")
 
 
 def require_whole(
@@ -66,22 +66,22 @@ def require_whole(
     """
     if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
         bounds = [f"{sign} {bound}" for sign, bound in ((">=", low), ("<=", high)) if math.isfinite(bound)]
-        wanted = " ".join(["a whole number", " and ".join(bounds)]).rstrip()
-        raise fail(key, wanted=wanted, got=value, example=f"{key}={example}")
+        expected = " ".join(["a whole number", " and ".join(bounds)]).rstrip()
+        raise fail(key, expected=expected, got=value, example=f"{key}={example}")
 
 
 def require_choice(key: str, value: object, choices: Sequence[object]) -> None:
     """Raise unless ``value`` is one of ``choices``, of the same type; the message lists them."""
     if not any(type(value) is type(choice) and value == choice for choice in choices):  # True == 1 == 1.0
         listed = "|".join(str(choice) for choice in choices)
-        raise fail(key, wanted=f"one of {listed}", got=value, example=f"{key}={choices[0]}")
+        raise fail(key, expected=f"one of {listed}", got=value, example=f"{key}={choices[0]}")
 
 
 def require_color(key: str, value: object) -> None:
     """Raise unless ``value`` is an RGB colour: three numbers in [0, 1]."""
     is_color = are_numbers(value, low=0, high=1) and len(value) == 3
     example = f"'{key}=[0.5,0.5,0.5]'"
-    require(is_color, key, wanted="three numbers in [0, 1]", got=value, example=example)
+    require(is_color, key, expected="three numbers in [0, 1]", got=value, example=example)
 
 
 def are_numbers(value: object, *, low: float, high: float) -> TypeGuard[Sequence[float]]:

@@ -91,7 +91,7 @@ class Steps(Schedule):
             and len(self.values) == len(self.milestones) + 1
             and list(self.milestones) == sorted(self.milestones),
             "schedule.values",
-            wanted="one value more than milestones, all numbers, milestones ascending",
+            expected="one value more than milestones, all numbers, milestones ascending",
             got=(self.values, self.milestones),
             example="{values: [0.98, 0.5], milestones: [500]}",
         )
@@ -113,7 +113,7 @@ def require_scheduled(key: str, value: object, *, example: object, **bounds: flo
     ``above``.
     """
     is_one = isinstance(value, int | float | Schedule)
-    require(is_one, key, wanted="a number or a schedule", got=value, example=f"{key}={example}")
+    require(is_one, key, expected="a number or a schedule", got=value, example=f"{key}={example}")
     for step in (0, FAR_STEP):  # most mistakes show at an end
         number = value(step) if isinstance(value, Schedule) else value
         require_range(key, number, example=example, **bounds)

@@ -18,7 +18,7 @@ def require_elevations(key: str, elevations_deg: object) -> None:
     require(
         are_numbers(elevations_deg, low=-90, high=90) and len(elevations_deg) > 0,
         f"{key}.elevations_deg",
-        wanted="at least one angle, each in [-90, 90]",
+        expected="at least one angle, each in [-90, 90]",
         got=elevations_deg,
         example=f"'{key}.elevations_deg=[15]'",
     )

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from cadam3d.core.chart import Chart
 from cadam3d.core.edit import RowEdit, RowState
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.densifier.refine import Refine, RefinePlan
@@ -128,3 +129,7 @@ class Densifier(ABC, Generic[State]):
     def statistics(self, state: State, step: int) -> dict[str, float]:
         """Numbers about the state for logs and plots; never read back."""
         return {}
+
+    def charts(self) -> tuple[Chart, ...]:
+        """Declare the charts that the report draws of :meth:`statistics`; none by default."""
+        return ()

@@ -102,14 +102,14 @@ class CAdam(Densifier[CAdamState]):
         require(
             self.tau_reset is None or self.reset == "unreliable",
             "densifier.tau_reset",
-            wanted=f"null, for densifier.reset={self.reset} asks nobody's SNR",
+            expected=f"null, for densifier.reset={self.reset} asks nobody's SNR",
             got=self.tau_reset,
             example="densifier.tau_reset=null",
         )
         require(
             self.reset != "unreliable" or self.tau_reset is not None or self.tau_SNR is not None,
             "densifier.tau_reset",
-            wanted="a number, for densifier.tau_SNR is null: whose opacity would a reset lower?",
+            expected="a number, for densifier.tau_SNR is null: whose opacity would a reset lower?",
             got=self.tau_reset,
             example="densifier.tau_reset=0.1",
         )
@@ -121,14 +121,14 @@ class CAdam(Densifier[CAdamState]):
         require(
             self.tau_SNR is None,
             "densifier.tau_SNR",
-            wanted=f"null, for densifier.alpha={self.alpha:g} sets the SNR that candidates exceed",
+            expected=f"null, for densifier.alpha={self.alpha:g} sets the SNR that candidates exceed",
             got=self.tau_SNR,
             example="densifier.tau_SNR=null densifier.tau_reset=0.1",
         )
         require(
             self.beta2 >= self.beta1**2 - 1e-6,  # so that 0.81 may be written for 0.9**2
             "densifier.beta2",
-            wanted=f"at least beta1^2 = {self.beta1**2:g}, up to which densifier.alpha is calibrated",
+            expected=f"at least beta1^2 = {self.beta1**2:g}, up to which densifier.alpha is calibrated",
             got=self.beta2,
             example=f"densifier.beta2={max(self.beta1**2, 0.99):g}",
         )

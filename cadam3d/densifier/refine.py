@@ -77,7 +77,7 @@ class Refine:
         require(
             self.min_opacity < self.reset_value or self.prune_grace > 0,
             "refine.min_opacity",
-            wanted=f"a number below refine.reset_value={self.reset_value:g}, or a grace period: "
+            expected=f"a number below refine.reset_value={self.reset_value:g}, or a grace period: "
             "a reset would delete at the next refinement",
             got=self.min_opacity,
             example="refine.prune_grace=100",
@@ -85,7 +85,7 @@ class Refine:
         require(
             self.prune_grace < self.reset_interval,
             "refine.prune_grace",
-            wanted=f"less than refine.reset_interval={self.reset_interval}, or opacity never prunes again",
+            expected=f"less than refine.reset_interval={self.reset_interval}, or opacity never prunes again",
             got=self.prune_grace,
             example=f"refine.prune_grace={self.reset_interval // 2}",
         )

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cadam3d.core.chart import Chart
 from cadam3d.prior.base import Condition, DiffusionPrior
 
 
@@ -31,3 +32,7 @@ class Guidance(ABC):
         generator: torch.Generator,
     ) -> GuidanceOutput:
         """Judge the render ``rgb`` (in [0, 1], with gradient); all draws come from the CPU ``generator``."""
+
+    def charts(self) -> tuple[Chart, ...]:
+        """Declare the charts that the report draws of :attr:`GuidanceOutput.log`; none by default."""
+        return ()

@@ -88,7 +88,7 @@ class GCS(WindowedGuidance):
         for key, value in (("w_cc", self.w_cc), ("w_gc", self.w_gc), ("w_cp", self.w_cp)):
             require_range(f"guidance.{key}", value, low=0, example=0.5)
         is_any = max(self.w_cc, self.w_gc, self.w_cp) > 0
-        require(is_any, "guidance.w_gc", wanted="a term with a weight", got=0, example="guidance.w_gc=0.5")
+        require(is_any, "guidance.w_gc", expected="a term with a weight", got=0, example="guidance.w_gc=0.5")
         require_scheduled("guidance.delta", self.delta, above=GAP, high=0.5, example=0.08)
         require_choice("guidance.fixed_noise", self.fixed_noise, (True, False))
         require_choice("guidance.reduction", self.reduction, list(DIVISORS))

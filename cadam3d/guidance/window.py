@@ -35,7 +35,7 @@ class WindowedGuidance(Guidance):
         require(
             0 <= low <= high <= 1,
             "guidance.t_max",
-            wanted="0 <= t_min <= t_max <= 1 at every step",
+            expected="0 <= t_min <= t_max <= 1 at every step",
             got=f"t_min {low:g} and t_max {high:g}",
             example="guidance.t_min=0.02 guidance.t_max=0.98",
         )

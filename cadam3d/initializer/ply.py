@@ -75,7 +75,7 @@ class Ply(Initializer):
         require(
             self.replicate == 1,
             "initializer.replicate",
-            wanted="1, since this file holds Gaussians",
+            expected="1, since this file holds Gaussians",
             got=self.replicate,
             example="initializer.replicate=1",
         )

@@ -75,7 +75,7 @@ class ShapE(Initializer):
         require_choice("initializer.dtype", self.dtype, ("auto", *DTYPES))
         is_text = self.prompt is None or (isinstance(self.prompt, str) and self.prompt.strip() != "")
         example = "initializer.prompt=null"
-        require(is_text, "initializer.prompt", wanted="a text or null", got=self.prompt, example=example)
+        require(is_text, "initializer.prompt", expected="a text or null", got=self.prompt, example=example)
         require_whole("initializer.steps", self.steps, low=1, high=1024, example=64)
         require_range("initializer.guidance_scale", self.guidance_scale, low=1, example=15)
         require_whole("initializer.grid_size", self.grid_size, low=2, example=128)
@@ -88,7 +88,7 @@ class ShapE(Initializer):
         require(
             self.fallback is None or hasattr(self.fallback, "begin"),
             "initializer.fallback",
-            wanted="an initializer or null",
+            expected="an initializer or null",
             got=self.fallback,
             example="initializer/fallback=ball",
         )

@@ -133,7 +133,7 @@ class SingleFile(LatentDiffusion):
             reason = " ".join(str(error).split())[:200]
         if len(loaded) != config["vocab_size"]:  # without files, transformers makes one that knows no word
             raise UserError(
-                f"{self.tokenizer_key}: wanted the {config['vocab_size']} pieces that the text encoder of "
+                f"{self.tokenizer_key}: expected the {config['vocab_size']} pieces that the text encoder of "
                 f"{self.file} reads, got {self.tokenizer!r} ({reason}). Try: {self.tokenizer_key}=DIR, "
                 f"a folder with CLIP's vocab.json and merges.txt"
             )

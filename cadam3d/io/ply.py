@@ -196,7 +196,7 @@ def _require_format(path: Path, version: str) -> None:
     )
     if version != FORMAT:
         raise UserError(
-            f"{path}: wanted format {FORMAT}, got {version}. "
+            f"{path}: expected format {FORMAT}, got {version}. "
             f'Try: pip install plyfile && python -c "{convert}"'
         )
 
@@ -240,7 +240,7 @@ def _vertex_header(
     rest_size = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
     if rest_size not in REST_SIZES or any(f"f_rest_{i}" not in names for i in range(rest_size)):
         raise UserError(
-            f"{path}: not a Gaussian ply: wanted f_rest_0.. for SH degree 0 to {MAX_DEGREE} "
+            f"{path}: not a Gaussian ply: expected f_rest_0.. for SH degree 0 to {MAX_DEGREE} "
             f"({', '.join(map(str, REST_SIZES))} of them), got {rest_size}"
         )
     return _Header(skip_bytes, count, np.dtype(properties), rest_size, up)

@@ -35,12 +35,12 @@ class Source:
     def __post_init__(self) -> None:
         key = self.key
         is_path = self.path is None or (isinstance(self.path, str) and self.path != "")
-        require(is_path, f"{key}.path", wanted="a folder or null", got=self.path, example=f"{key}.path=DIR")
+        require(is_path, f"{key}.path", expected="a folder or null", got=self.path, example=f"{key}.path=DIR")
         listed = isinstance(self.ids, Sequence) and not isinstance(self.ids, str)
         require(
             listed and all(isinstance(name, str) and name.count("/") == 1 for name in self.ids),
             f"{key}.ids",
-            wanted="a list of hub ids, each OWNER/NAME",
+            expected="a list of hub ids, each OWNER/NAME",
             got=self.ids,
             example=f"'{key}.ids=[stabilityai/stable-diffusion-3.5-medium]'",
         )
@@ -48,7 +48,7 @@ class Source:
             value = getattr(self, name)
             is_name = value is None or (isinstance(value, str) and value != "")
             require(
-                is_name, f"{key}.{name}", wanted="a name or null", got=value, example=f"{key}.{name}=null"
+                is_name, f"{key}.{name}", expected="a name or null", got=value, example=f"{key}.{name}=null"
             )
 
     def find(self, kinds: Sequence[str], others: Mapping[str, str], ask_hub: bool = True) -> "Pretrained":
@@ -75,8 +75,8 @@ class Source:
             if folder.exists():
                 what = f"no {INDEX} in it" if folder.is_dir() else "that is a file"
             raise UserError(
-                f"{self.key}.path: wanted a folder with a {INDEX} (a model in the layout of diffusers), got "
-                f"{str(self.path)!r}: {what}. Try: {self.key}.path=DIR, "
+                f"{self.key}.path: expected a folder with a {INDEX} (a model in the layout of diffusers), "
+                f"got {str(self.path)!r}: {what}. Try: {self.key}.path=DIR, "
                 f"or {self.key}.path=null for {' or '.join(self.ids) or 'the ids (there are none)'}"
             )
         return Pretrained(self, str(folder), None, folder / INDEX, _read_index(self.key, folder / INDEX))
@@ -85,7 +85,7 @@ class Source:
         require(
             len(self.ids) > 0,
             f"{self.key}.path",
-            wanted=f"the folder of a model, since {self.key}.ids is empty",
+            expected=f"the folder of a model, since {self.key}.ids is empty",
             got=self.path,
             example=f"{self.key}.path=DIR",
         )

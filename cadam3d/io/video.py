@@ -29,7 +29,7 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], *, fps
         finally:
             if writer is not None:
                 writer.close()
-        require(writer is not None, str(path), wanted="at least one frame", got=0, example="views=60")
+        require(writer is not None, str(path), expected="at least one frame", got=0, example="views=60")
         if not temporary.is_file() or temporary.stat().st_size == 0:
             raise _ffmpeg_error("it wrote nothing")
 

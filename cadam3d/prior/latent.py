@@ -125,7 +125,7 @@ class LatentPrior(DiffusionPrior):
         require(
             isinstance(self.prompting, Prompting),
             "prior.prompting",
-            wanted="a way to word prompts",
+            expected="a way to word prompts",
             got=self.prompting,
             example="prompting=discrete",
         )
@@ -133,7 +133,11 @@ class LatentPrior(DiffusionPrior):
             require_whole("prior.size", self.size, low=FACTOR, example=512)
             is_multiple = self.size % (2 * FACTOR) == 0
             require(
-                is_multiple, "prior.size", wanted="a multiple of 16", got=self.size, example="prior.size=512"
+                is_multiple,
+                "prior.size",
+                expected="a multiple of 16",
+                got=self.size,
+                example="prior.size=512",
             )
         require_choice("prior.dtype", self.dtype, ("auto", *DTYPES))
         if self.micro_batch is not None:
@@ -332,7 +336,7 @@ class LatentPrior(DiffusionPrior):
         require(
             all(side % FACTOR == 0 and side >= FACTOR for side in size),
             "camera.size",
-            wanted=f"a multiple of {FACTOR} pixels, since prior.size is null",
+            expected=f"a multiple of {FACTOR} pixels, since prior.size is null",
             got=size[0],
             example="prior.size=512",
         )
@@ -446,7 +450,7 @@ def ddpm_path(scheduler: Mapping[str, Any]) -> NoisePath:
     require(
         is_known and scheduler.get("trained_betas") is None,
         "prior.path",
-        wanted="a model whose noise schedule is scaled_linear",
+        expected="a model whose noise schedule is scaled_linear",
         got=kind if kind != "scaled_linear" else "one rescaled to zero terminal SNR",
         example="another model",
     )
@@ -501,7 +505,7 @@ def completion(path: NoisePath, scheduler: Mapping[str, Any]) -> Complete:
     require(
         kind in ways,
         "prior.path",
-        wanted=f"a model that predicts {' or '.join(ways)}",
+        expected=f"a model that predicts {' or '.join(ways)}",
         got=kind,
         example="another model",
     )

@@ -61,14 +61,14 @@ class MVDream(StableDiffusion):
         require(
             is_name,
             "prior.tokenizer",
-            wanted="a folder or a name on the hub",
+            expected="a folder or a name on the hub",
             got=self.tokenizer,
             example="prior.tokenizer=openai/clip-vit-large-patch14",
         )
         require(
             self.micro_batch is None or self.micro_batch % VIEWS == 0,
             "prior.micro_batch",
-            wanted=f"null or a multiple of {VIEWS}, the views that are denoised together",
+            expected=f"null or a multiple of {VIEWS}, the views that are denoised together",
             got=self.micro_batch,
             example=f"prior.micro_batch={VIEWS}",
         )
@@ -113,7 +113,7 @@ class MVDream(StableDiffusion):
         require(
             bool((levels == levels[:, :1]).all()),
             "guidance.shared_t",
-            wanted="true, since prior=mvdream denoises four views of one noise level together",
+            expected="true, since prior=mvdream denoises four views of one noise level together",
             got=False,
             example="guidance.shared_t=true",
         )
@@ -158,7 +158,7 @@ def require_whole_groups(views: int) -> None:
     require(
         views % VIEWS == 0,
         "views",
-        wanted=f"a multiple of {VIEWS}, since prior=mvdream denoises {VIEWS} views together",
+        expected=f"a multiple of {VIEWS}, since prior=mvdream denoises {VIEWS} views together",
         got=views,
         example=f"camera=multiview views={VIEWS}",
     )
@@ -174,7 +174,7 @@ def require_groups(cameras: Cameras) -> None:
     require(
         bool((off < TOLERANCE_DEG).all()),
         "camera",
-        wanted="groups of four views, a quarter turn apart at one elevation, for prior=mvdream",
+        expected="groups of four views, a quarter turn apart at one elevation, for prior=mvdream",
         got=f"azimuths {_listed(azimuth[0])} and elevations {_listed(elevation[0])} degrees",
         example="camera=multiview",
     )

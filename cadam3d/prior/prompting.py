@@ -68,7 +68,7 @@ class Discrete(Prompting):
         require(
             self.front_deg + self.back_deg <= 180,
             "prompting.back_deg",
-            wanted="front_deg + back_deg <= 180",
+            expected="front_deg + back_deg <= 180",
             got=(self.front_deg, self.back_deg),
             example="prompting.back_deg=45",
         )

@@ -52,7 +52,7 @@ class StableDiffusion3(LatentPrior):
         require(
             is_shifted,
             "prior.path",
-            wanted="a model with one shift for every size of image",
+            expected="a model with one shift for every size of image",
             got="dynamic shifting",
             example="another model",
         )

@@ -1,6 +1,7 @@
 """Rasterizer: Gaussians and cameras in, images and their gradients out."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.render import RenderFn, RenderOutput
 
 # Constants of the image formation model, shared by every backend (gsplat-compatible).
 BLUR = 0.3  # pixels^2 added to the diagonal of each projected covariance
@@ -58,6 +59,17 @@ class Rasterizer(ABC):
         Raises :class:`UserError` if it cannot be had. Without this call, the first render does it.
         """
         return Backend(type(self).__name__.removesuffix("Rasterizer").lower())
+
+
+def render_fn(rasterizer: Rasterizer, gaussians: Callable[[], Gaussians]) -> RenderFn:
+    """A :data:`RenderFn` of whatever Gaussians ``gaussians()`` returns when it is called."""
+
+    def render(cameras, background) -> RenderOutput:
+        now = gaussians().detach()
+        with torch.no_grad():
+            return rasterizer.render(now, cameras.to(now.device), background.to(now.device))
+
+    return render
 
 
 def absgrad_probe(means2d: Float[Tensor, "v n 2"], wanted: bool) -> Float[Tensor, "v n 2"] | None:

@@ -137,7 +137,7 @@ def require_shapes(gaussians: Gaussians, cameras: Cameras, background: Tensor) -
     wanted = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "opacity_logits": (n,), "sh": (n, k, 3)}
     shapes = {name: tuple(tensor.shape) for name, tensor in gaussians.tensors().items()}
     if shapes != wanted or k not in SH_SIZES:
-        raise ValueError(f"Gaussians: wanted {wanted} with k in {SH_SIZES}, got {shapes}")
+        raise ValueError(f"Gaussians: expected {wanted} with k in {SH_SIZES}, got {shapes}")
     views = [tuple(each.shape) for each in (cameras.world_to_camera, cameras.intrinsics, background)]
     if views != [(v, 4, 4), (v, 3, 3), (v, 3)] or min(cameras.height, cameras.width) < 1:
-        raise ValueError(f"cameras and background: wanted (v, 4, 4), (v, 3, 3), (v, 3), got {views}")
+        raise ValueError(f"cameras and background: expected (v, 4, 4), (v, 3, 3), (v, 3), got {views}")

@@ -17,7 +17,7 @@ from hydra.core.override_parser.types import Override
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import to_json
-from cadam3d.settings import TEXT_KEYS, quote, slug
+from cadam3d.settings.compose import TEXT_KEYS, quote, slug
 
 IDENTIFIER = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)  # the same text to Hydra, quoted or not
 RESERVED = ("null", "true", "false", "nan", "inf")
@@ -78,14 +78,14 @@ def read_grid(node: Any) -> Grid:
         return Grid(each={}, arms={"": {}})
     if not isinstance(node, dict) or not node or not node.keys() <= {"each", "arms", "figures"}:
         got = "|".join(map(str, node)) if isinstance(node, dict) else node
-        raise UserError(f"grid: wanted each, arms and figures, got {got}. Try: a file that says {EXAMPLE}")
+        raise UserError(f"grid: expected each, arms and figures, got {got}. Try: a file that says {EXAMPLE}")
     arms = node.get("arms")
     arms = {"": {}} if arms is None else arms
     if not isinstance(arms, dict) or not arms:
-        raise UserError(f"grid.arms: wanted named arms, got {arms}. Try: a file that says {EXAMPLE}")
+        raise UserError(f"grid.arms: expected named arms, got {arms}. Try: a file that says {EXAMPLE}")
     figures = node.get("figures")
     if figures is not None and not (isinstance(figures, list) and all(isinstance(f, str) for f in figures)):
-        raise UserError(f"grid.figures: wanted a list of names, got {figures}. Try: figures: [frontier]")
+        raise UserError(f"grid.figures: expected a list of names, got {figures}. Try: figures: [frontier]")
     return Grid(
         each=_axes(node.get("each"), "grid.each"),
         arms={str(name): _axes(axes, f"grid.arms.{name}") for name, axes in arms.items()},
@@ -164,7 +164,7 @@ def _axes(node: Any, where: str) -> Axes:
     if node is None:
         return {}
     if not isinstance(node, dict):
-        raise UserError(f"{where}: wanted keys with values, got {node!r}. Try: {where}={{seed: [0, 1]}}")
+        raise UserError(f"{where}: expected keys with values, got {node!r}. Try: {where}={{seed: [0, 1]}}")
     return {str(key).lstrip("+"): _axis(str(key), value, where) for key, value in node.items()}
 
 
@@ -195,7 +195,7 @@ def _alternatives(line: str) -> list[str]:
         return [line]
     key = override.get_key_element()
     if not override.is_discrete_sweep():
-        raise UserError(f"{key}: wanted values one by one, got an interval. Try: {key}=range(0,1,0.25)")
+        raise UserError(f"{key}: expected values one by one, got an interval. Try: {key}=range(0,1,0.25)")
     return [f"{key}={value}" for value in override.sweep_string_iterator()]
 
 

@@ -12,10 +12,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
-from cadam3d.advice import ask_for, explain, missing_values
 from cadam3d.core.errors import UserError
 from cadam3d.launch import compose_line, key_of, refuse_holes
-from cadam3d.settings import flatten
+from cadam3d.settings.advice import ask_for, explain, missing_values
+from cadam3d.settings.compose import flatten
 from cadam3d.sweep.grid import ALWAYS_TOLD, Axes, Grid, Job, expand, read_grid, read_line, swept_keys
 
 FOLDER = "hydra.sweep.dir"

@@ -22,7 +22,7 @@ from typing import IO
 from cadam3d.core.outcome import Outcome
 from cadam3d.io.cache import TRACES
 from cadam3d.io.jsonl import write_json
-from cadam3d.settings import quote
+from cadam3d.settings.compose import quote
 from cadam3d.sweep.folder import (
     CONSOLE,
     ENDED,

@@ -21,11 +21,11 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
-from cadam3d.advice import explain
 from cadam3d.commands.paths import shown
 from cadam3d.core.errors import UserError
 from cadam3d.launch import RUN_MARKS, Task, claim, key_of, run_hydra
-from cadam3d.settings import flatten, quote
+from cadam3d.settings.advice import explain
+from cadam3d.settings.compose import flatten, quote
 from cadam3d.sweep.folder import LOCK, STOP, TRACED, Plan, PlannedJob, Row, outcomes, rows_of, write_plan
 from cadam3d.sweep.grid import sweep_name
 from cadam3d.sweep.plan import FOLDER, Composed, Sweep, compose_all, read_sweep, told_keys
@@ -33,7 +33,7 @@ from cadam3d.sweep.table import TABLE, as_text, write_table
 from cadam3d.sweep.watch import Watch
 
 PLACE = Path("multirun")
-COMPARISON = "cadam3d.comparison"  # makes figures and a report of the rows of a sweep
+COMPARISON = "cadam3d.report"  # makes figures and a report of the rows of a sweep
 LONGEST = 40  # jobs that a table in the terminal has at most
 FOR_JOBS = ("--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn")  # flags that they need too
 
@@ -106,7 +106,7 @@ def _folder(sweep: Sweep, command: str) -> Path:
         except InterpolationResolutionError as error:
             raise explain(error, command, sweep.line.folder) or error from error
         if not text:
-            raise UserError(f"{FOLDER}: wanted a folder, got nothing. Try: {FOLDER}={place}, or without it")
+            raise UserError(f"{FOLDER}: expected a folder, got nothing. Try: {FOLDER}={place}, or without it")
         place = Path(str(text)).expanduser()
     if any((place / name).exists() for name in RUN_MARKS):
         raise UserError(f"{FOLDER}: {place} holds a run. Try: {FOLDER}=multirun/mine, or without it")
@@ -217,10 +217,10 @@ def _compare(folder: Path) -> None:
     """Figures, a report and its verdict, where there is a module that makes them."""
     if find_spec(COMPARISON) is None:
         return
-    comparison = import_module(COMPARISON)
+    report = import_module(COMPARISON)
     try:
-        page = comparison.write(folder)
-        print("".join(f"\n{sentence}\n" for sentence in comparison.verdict(folder)))
+        page = report.write_sweep(folder)
+        print("".join(f"\n{sentence}\n" for sentence in report.verdict(folder)))
         print(f"report: {shown(page)}", flush=True)
     except UserError as error:
         print(f"cadam3d: {error}", file=sys.stderr)

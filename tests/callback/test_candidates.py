@@ -14,7 +14,7 @@ from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.jsonl import append_jsonl, read_jsonl
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.settings import component, compose
+from cadam3d.settings.compose import component, compose
 from cadam3d.state import Outcome, RunContext
 
 CPU = torch.device("cpu")

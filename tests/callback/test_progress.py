@@ -10,7 +10,7 @@ import torch
 from cadam3d.callback import progress
 from cadam3d.callback.progress import Progress, clock, peak_memory
 from cadam3d.commands.train import build_trainer
-from cadam3d.settings import component, compose
+from cadam3d.settings.compose import component, compose
 from cadam3d.state import RunContext, StepReport
 
 CPU = torch.device("cpu")

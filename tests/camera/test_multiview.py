@@ -72,7 +72,7 @@ def test_opposite_views_look_at_each_other():
 def test_a_broken_group_is_refused_with_a_number_that_works(views, hint):
     for ask in (lambda: sample(views), lambda: Multiview(**PUBLISHED).check_views(views)):
         with pytest.raises(
-            UserError, match=rf"^views: wanted a multiple of 4.*got {views}\. Try: views={hint}$"
+            UserError, match=rf"^views: expected a multiple of 4.*got {views}\. Try: views={hint}$"
         ):
             ask()
 

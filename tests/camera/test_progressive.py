@@ -9,7 +9,7 @@ import torch
 from cadam3d.camera.progressive import Progressive, Widening
 from cadam3d.core.cameras import Cameras, around
 from cadam3d.core.checks import UserError
-from cadam3d.settings import component, compose
+from cadam3d.settings.compose import component, compose
 
 STILL = {"position_jitter": 0.0, "target_jitter": 0.0, "up_jitter": 0.0}
 
@@ -208,6 +208,6 @@ def test_later_draws_do_not_depend_on_the_step():
     ],
 )
 def test_an_impossible_value_is_refused_by_name(line, key):
-    with pytest.raises(UserError, match=rf"^{key}: wanted ".replace(".", r"\.")) as raised:
+    with pytest.raises(UserError, match=rf"^{key}: expected ".replace(".", r"\.")) as raised:
         published(line)
     assert f"{key.rpartition('.')[0]}." in str(raised.value).partition("Try: ")[2]

@@ -12,7 +12,7 @@ from cadam3d import cli
 from cadam3d.commands import doctor
 from cadam3d.commands.finding import Finding, Verdict
 from cadam3d.prior.latent import PRIORS
-from cadam3d.settings import compose
+from cadam3d.settings.compose import compose
 
 REPOSITORY = Path(__file__).parent.parent.parent
 

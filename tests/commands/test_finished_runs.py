@@ -13,7 +13,7 @@ from cadam3d.commands import view
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.jsonl import read_json
 from cadam3d.io.ply import read_ply, write_ply
-from cadam3d.settings import compose
+from cadam3d.settings.compose import compose
 from cadam3d.sweep.folder import Plan, PlannedJob, write_plan
 
 SMALL = ("metric.fidelity.views=2", "metric.fidelity.elevations_deg=[0]", "metric.fidelity.size=24")
@@ -62,7 +62,10 @@ def run_folder(tmp_path, gaussians) -> Path:
 @pytest.mark.parametrize(("words", "got"), [((), "neither"), (("run=a", "ply=b"), "both")])
 def test_exactly_one_asset_must_be_named(command, words, got, type_line):
     code, _, err = type_line(command, *words)
-    assert (code, err) == (1, f"cadam3d: run, ply: wanted one of them, got {got}. Try: run=outputs/latest\n")
+    assert (code, err) == (
+        1,
+        f"cadam3d: run, ply: expected one of them, got {got}. Try: run=outputs/latest\n",
+    )
 
 
 @pytest.mark.parametrize("command", ["render", "export", "view", "eval"])
@@ -71,7 +74,7 @@ def test_a_folder_that_is_no_run_is_named(command, type_line, tmp_path):
     for place, reason in (("nowhere", "no such folder"), ("empty", "it holds no config.yaml")):
         code, _, err = type_line(command, f"run={place}")
         assert code == 1
-        assert err.startswith(f"cadam3d: run: wanted the folder of a run, got {place!r} ({reason}). Try: ")
+        assert err.startswith(f"cadam3d: run: expected the folder of a run, got {place!r} ({reason}). Try: ")
 
 
 def test_a_run_without_an_asset_is_told_to_finish(run_folder, type_line):

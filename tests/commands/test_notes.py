@@ -109,7 +109,7 @@ SHAP_E = ["rasterizer=reference", "initializer=shap_e", "initializer.path=nowher
 def test_an_initializer_that_cannot_be_had_is_refused_before_anything_is_touched(type_line, tmp_path):
     code, err = type_line("train", *SMALL, *SHAP_E)
     assert code == 1
-    assert err.startswith("cadam3d: initializer.path: wanted a folder with a model_index.json")
+    assert err.startswith("cadam3d: initializer.path: expected a folder with a model_index.json")
     assert not list(tmp_path.iterdir())
 
 
@@ -118,7 +118,7 @@ def test_what_stands_in_for_an_initializer_is_said_and_written_down(type_line, t
     code, err = type_line("train", *SMALL, *SHAP_E, *stand_in, "hydra.run.dir=fallen")
     assert code == 0
     [line] = [line for line in err.splitlines() if "Shap-E" in line]
-    assert line.startswith("Note: Ball stands in for Shap-E. initializer.path: wanted a folder")
+    assert line.startswith("Note: Ball stands in for Shap-E. initializer.path: expected a folder")
     summary = json.loads((tmp_path / "fallen/summary.json").read_text(encoding="utf-8"))
     assert summary["initializer"] == "shap_e"
     assert f"Note: {summary['initializer_note']}" == line

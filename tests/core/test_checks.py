@@ -16,14 +16,14 @@ from cadam3d.core.checks import (
 
 
 def test_a_message_says_key_wanted_got_and_what_to_type():
-    message = str(fail("densifier.tau_Q", wanted="a number >= 0", got=-1, example="densifier.tau_Q=0.9"))
-    assert message == "densifier.tau_Q: wanted a number >= 0, got -1. Try: densifier.tau_Q=0.9"
+    message = str(fail("densifier.tau_Q", expected="a number >= 0", got=-1, example="densifier.tau_Q=0.9"))
+    assert message == "densifier.tau_Q: expected a number >= 0, got -1. Try: densifier.tau_Q=0.9"
 
 
 def test_a_true_claim_passes_and_a_false_one_is_a_user_error():
-    require(True, "key", wanted="x", got="y", example="key=x")
-    with pytest.raises(UserError, match=r"key: wanted x, got 'y'\. Try: key=x"):
-        require(False, "key", wanted="x", got="y", example="key=x")
+    require(True, "key", expected="x", got="y", example="key=x")
+    with pytest.raises(UserError, match=r"key: expected x, got 'y'\. Try: key=x"):
+        require(False, "key", expected="x", got="y", example="key=x")
 
 
 @pytest.mark.parametrize("value", [0, 0.0, 0.5, 0.999])
@@ -33,7 +33,7 @@ def test_numbers_inside_pass(value):
 
 @pytest.mark.parametrize("value", [-1e-9, 1, 1.0, math.nan, math.inf, -math.inf, None, "0.5", True, [0.5]])
 def test_numbers_outside_and_things_that_are_no_numbers_do_not(value):
-    with pytest.raises(UserError, match=r"key: wanted a number >= 0 and < 1, got .*\. Try: key=0.5"):
+    with pytest.raises(UserError, match=r"key: expected a number >= 0 and < 1, got .*\. Try: key=0.5"):
         require_range("key", value, low=0, below=1, example=0.5)
 
 
@@ -73,15 +73,17 @@ def test_whole_numbers_inside_pass(value):
 
 @pytest.mark.parametrize("value", [1, 17, 2.0, 2.5, True, False, None, "3", [3], math.nan, math.inf])
 def test_everything_but_whole_numbers_inside_is_refused(value):
-    with pytest.raises(UserError, match=r"^key: wanted a whole number >= 2 and <= 16, got .*\. Try: key=2$"):
+    with pytest.raises(
+        UserError, match=r"^key: expected a whole number >= 2 and <= 16, got .*\. Try: key=2$"
+    ):
         require_whole("key", value, low=2, high=16, example=2)
 
 
 def test_bounds_of_whole_numbers_are_optional():
     require_whole("key", -(10**400), example=0)
-    with pytest.raises(UserError, match=r"^key: wanted a whole number, got 0\.5\. Try: key=0$"):
+    with pytest.raises(UserError, match=r"^key: expected a whole number, got 0\.5\. Try: key=0$"):
         require_whole("key", 0.5, example=0)
-    with pytest.raises(UserError, match=r"^key: wanted a whole number >= 1, got True\. Try: key=5$"):
+    with pytest.raises(UserError, match=r"^key: expected a whole number >= 1, got True\. Try: key=5$"):
         require_whole("key", True, low=1, example=5)
 
 
@@ -90,13 +92,13 @@ def test_bounds_of_whole_numbers_are_optional():
     [(0, (True, False)), (True, range(4)), (1.0, range(4)), ([], range(4)), (None, "ab")],
 )
 def test_a_choice_has_the_type_of_what_it_equals(value, choices):
-    with pytest.raises(UserError, match="key: wanted one of"):
+    with pytest.raises(UserError, match="key: expected one of"):
         require_choice("key", value, choices)
 
 
 def test_a_choice_lists_what_there_is():
     require_choice("prior", "tiny", ["shapes", "tiny"])
-    with pytest.raises(UserError, match=r"prior: wanted one of shapes\|tiny, got 'tin'. Try: prior=shapes"):
+    with pytest.raises(UserError, match=r"prior: expected one of shapes\|tiny, got 'tin'. Try: prior=shapes"):
         require_choice("prior", "tin", ["shapes", "tiny"])
 
 
@@ -112,5 +114,5 @@ def test_a_colour_is_three_numbers_between_zero_and_one():
         "abc",
         [True] * 3,
     ):
-        with pytest.raises(UserError, match=r"background\.color: wanted three numbers in \[0, 1\]"):
+        with pytest.raises(UserError, match=r"background\.color: expected three numbers in \[0, 1\]"):
             require_color("background.color", wrong)

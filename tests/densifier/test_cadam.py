@@ -622,5 +622,5 @@ def test_an_impossible_value_is_refused_by_name(key, value):
     ],
 )
 def test_a_key_that_would_do_nothing_or_mislead_is_refused(changes, key):
-    with pytest.raises(UserError, match=rf"densifier\.{key}: wanted .* Try: densifier\."):
+    with pytest.raises(UserError, match=rf"densifier\.{key}: expected .* Try: densifier\."):
         cadam(**changes)

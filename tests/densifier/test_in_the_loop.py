@@ -12,7 +12,7 @@ from cadam3d.callback.base import Callback
 from cadam3d.commands.train import build_trainer
 from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.densifier.base import GradientSignal
-from cadam3d.settings import component, compose
+from cadam3d.settings.compose import component, compose
 from cadam3d.state import Outcome, RefineReport, RunContext, TrainState
 
 CPU = torch.device("cpu")

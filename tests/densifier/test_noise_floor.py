@@ -14,7 +14,7 @@ from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.cadam import CAdam, CAdamState
 from cadam3d.densifier.noise_floor import snr_threshold, squared_weights
 from cadam3d.prior.path import DDPM
-from cadam3d.settings import component, compose
+from cadam3d.settings.compose import component, compose
 
 CPU = torch.device("cpu")
 STEP = 100  # of a call; no matter, unless a schedule asks

@@ -12,7 +12,7 @@ from cadam3d.core.schedule import Linear
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.cadam import quantile
 from cadam3d.densifier.random import RandomGrowth
-from cadam3d.settings import component, compose
+from cadam3d.settings.compose import component, compose
 
 CPU = torch.device("cpu")
 STEP = 100  # of a call; no matter, unless a schedule asks

@@ -36,5 +36,5 @@ def test_padding_reaches_the_file(tmp_path):
 def test_wrong_values_name_their_key():
     with pytest.raises(UserError, match=r"exporter\.ply\.up=-y"):
         PlyExporter(up="z", pad_sh=0)
-    with pytest.raises(UserError, match=r"exporter\.ply\.pad_sh: wanted one of 0\|1\|2\|3"):
+    with pytest.raises(UserError, match=r"exporter\.ply\.pad_sh: expected one of 0\|1\|2\|3"):
         PlyExporter(up="-y", pad_sh=4)

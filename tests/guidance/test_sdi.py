@@ -108,7 +108,7 @@ def test_eta_adds_noise_in_proportion_to_b(path, make, gaussian, means, rgb):
 
 def test_only_the_inversion_may_be_guided_backwards(make):
     assert make("sdi", inversion_scale=-7.5).inversion_scale == -7.5
-    with pytest.raises(UserError, match=r"guidance.scale: wanted a number >= 0"):
+    with pytest.raises(UserError, match=r"guidance.scale: expected a number >= 0"):
         make("sdi", scale=-7.5)
 
 

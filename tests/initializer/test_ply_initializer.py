@@ -140,7 +140,7 @@ def test_the_degree_of_the_colors_can_be_chosen(tmp_path, degree):
 
 
 def test_gaussians_are_not_replicated(tmp_path):
-    with pytest.raises(UserError, match=r"initializer\.replicate: wanted 1, since .* got 20"):
+    with pytest.raises(UserError, match=r"initializer\.replicate: expected 1, since .* got 20"):
         build(saved(tmp_path, some_gaussians()), replicate=20)
 
 
@@ -288,5 +288,5 @@ def test_a_missing_file_is_said_so(tmp_path):
     ],
 )
 def test_an_impossible_value_is_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"initializer\.{key}: wanted"):
+    with pytest.raises(UserError, match=rf"initializer\.{key}: expected"):
         ply("a.ply", **{key: value})

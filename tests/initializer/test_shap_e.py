@@ -255,10 +255,10 @@ def test_what_can_be_had_comes_without_a_note(models):
 
 
 def test_a_missing_model_is_an_error_or_the_fallback_with_a_note():
-    with pytest.raises(UserError, match=r"initializer\.path: wanted a folder with a model_index\.json"):
+    with pytest.raises(UserError, match=r"initializer\.path: expected a folder with a model_index\.json"):
         begin()
     made = begin(fallback=BALL)
-    assert made.note.startswith("Ball stands in for Shap-E. initializer.path: wanted a folder")
+    assert made.note.startswith("Ball stands in for Shap-E. initializer.path: expected a folder")
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -277,7 +277,7 @@ def test_stand_ins_of_stand_ins_are_all_named():
 
 
 def test_a_mistake_in_the_fallback_is_an_error():
-    with pytest.raises(UserError, match=r"initializer\.path: wanted a folder .*'elsewhere'"):
+    with pytest.raises(UserError, match=r"initializer\.path: expected a folder .*'elsewhere'"):
         begin(fallback=shap_e("elsewhere"))
 
 
@@ -306,5 +306,5 @@ def test_a_mistake_in_the_fallback_is_an_error():
     ],
 )
 def test_an_impossible_value_is_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"^initializer\.{key}: wanted"):
+    with pytest.raises(UserError, match=rf"^initializer\.{key}: expected"):
         shap_e(**{key: value})

@@ -131,5 +131,5 @@ def test_turns_add_up_to_a_whole_one(turn_deg, back):
 
 
 def test_an_eighth_of_a_turn_is_refused():
-    with pytest.raises(UserError, match=r"turn_deg: wanted one of 0\|90\|180\|270, got 45"):
+    with pytest.raises(UserError, match=r"turn_deg: expected one of 0\|90\|180\|270, got 45"):
         turned(random_gaussians(), 45)

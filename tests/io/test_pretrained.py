@@ -229,5 +229,5 @@ def test_wrong_values_are_named(changes, key):
 
 
 def test_neither_folder_nor_ids():
-    with pytest.raises(UserError, match=r"prior.path: wanted the folder of a model"):
+    with pytest.raises(UserError, match=r"prior.path: expected the folder of a model"):
         source(ids=[]).find(KINDS, OTHERS)

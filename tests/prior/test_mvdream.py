@@ -165,7 +165,7 @@ def test_it_computes_in_sixteen_bits(prior):
 
 def test_memory_is_foreseen(prior):
     memory_is_foreseen(prior, views=4)
-    with pytest.raises(UserError, match=r"^views: wanted a multiple of 4"):
+    with pytest.raises(UserError, match=r"^views: expected a multiple of 4"):
         prior.memory("a corgi", "", 2, None)
 
 
@@ -249,7 +249,7 @@ def test_a_tokenizer_that_does_not_fit_is_refused(prior, file, tmp_path, where):
     if where == "other":
         (tmp_path / "vocab.json").write_text(json.dumps({"a": 0, "<|startoftext|>": 1, "<|endoftext|>": 2}))
         (tmp_path / "merges.txt").write_text("#version: 0.2\n")
-    with pytest.raises(UserError, match=r"^prior\.tokenizer: wanted the 519 pieces"):
+    with pytest.raises(UserError, match=r"^prior\.tokenizer: expected the 519 pieces"):
         replace(prior, path=str(file), tokenizer=str(tmp_path)).embed("a corgi", "")
 
 
@@ -315,13 +315,13 @@ def test_nothing_in_a_file_is_executed(prior, tmp_path):
 
 @pytest.mark.parametrize(("count", "key"), [(3, "views"), (6, "views")])
 def test_views_come_in_fours(prior, count, key):
-    with pytest.raises(UserError, match=rf"^{key}: wanted a multiple of 4.*Try: camera=multiview views=4"):
+    with pytest.raises(UserError, match=rf"^{key}: expected a multiple of 4.*Try: camera=multiview views=4"):
         condition_of(prior, turntable(count, elevation_deg=0.0, distance=3.0, fov_y_deg=40.0, size=64))
 
 
 def test_views_of_a_group_stand_a_quarter_turn_apart(prior):
     cameras = turntable(8, elevation_deg=0.0, distance=3.0, fov_y_deg=40.0, size=64)
-    with pytest.raises(UserError, match=r"^camera: wanted groups of four views.*azimuths 0, 45, 90, 135"):
+    with pytest.raises(UserError, match=r"^camera: expected groups of four views.*azimuths 0, 45, 90, 135"):
         condition_of(prior, cameras)
     regrouped = cameras.index(torch.tensor([6, 0, 2, 4, 7, 1, 3, 5]))
     assert len(condition_of(prior, regrouped).cameras) == 8
@@ -329,13 +329,13 @@ def test_views_of_a_group_stand_a_quarter_turn_apart(prior):
 
 def test_views_of_a_group_stand_on_one_level(prior):
     cameras = level_with(elevation=torch.tensor([0.0, 0.0, 0.0, 20.0]))
-    with pytest.raises(UserError, match=r"^camera: wanted groups of four views.*elevations 0, 0, 0, 20"):
+    with pytest.raises(UserError, match=r"^camera: expected groups of four views.*elevations 0, 0, 0, 20"):
         condition_of(prior, cameras)
 
 
 def test_a_group_has_one_noise_level(prior):
     t = torch.tensor([0.4, 0.4, 0.5, 0.4])
-    with pytest.raises(UserError, match=r"^guidance\.shared_t: wanted true"):
+    with pytest.raises(UserError, match=r"^guidance\.shared_t: expected true"):
         prior.predict(normal(4, 4, 8, 8), t, condition_of(prior, views()), 7.5)
 
 
@@ -344,5 +344,5 @@ def test_a_group_has_one_noise_level(prior):
     [("micro_batch", 1), ("micro_batch", 6), ("rescale", 1.5), ("rescale", -0.1), ("tokenizer", "")],
 )
 def test_wrong_values_are_refused_by_key(prior, key, value):
-    with pytest.raises(UserError, match=rf"^prior\.{key}: wanted "):
+    with pytest.raises(UserError, match=rf"^prior\.{key}: expected "):
         replace(prior, **{key: value})

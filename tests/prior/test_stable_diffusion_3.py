@@ -137,7 +137,7 @@ def test_the_shift_is_the_models_own(prior, folder, tmp_path):
     write_json(file, settings | {"shift": 1.5})
     assert replace(prior, path=str(tmp_path)).noise_path == RectifiedFlow(shift=1.5)
     write_json(file, settings | {"use_dynamic_shifting": True})
-    with pytest.raises(UserError, match=r"^prior\.path: wanted a model with one shift"):
+    with pytest.raises(UserError, match=r"^prior\.path: expected a model with one shift"):
         replace(prior, path=str(tmp_path)).noise_path  # noqa: B018
 
 

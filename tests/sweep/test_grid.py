@@ -191,11 +191,11 @@ def test_all_keys_in_which_jobs_may_differ_are_told(pareto):
 @pytest.mark.parametrize(
     ("node", "said"),
     [
-        ({"densifier": "baseline,cadam"}, "grid: wanted each, arms and figures, got densifier"),
-        ([1], "grid: wanted each, arms and figures"),
-        ({"arms": {}}, "grid.arms: wanted named arms"),
-        ({"arms": ["a"]}, "grid.arms: wanted named arms"),
-        ({"arms": {"a": 1}}, "grid.arms.a: wanted keys with values, got 1"),
+        ({"densifier": "baseline,cadam"}, "grid: expected each, arms and figures, got densifier"),
+        ([1], "grid: expected each, arms and figures"),
+        ({"arms": {}}, "grid.arms: expected named arms"),
+        ({"arms": ["a"]}, "grid.arms: expected named arms"),
+        ({"arms": {"a": 1}}, "grid.arms.a: expected keys with values, got 1"),
         ({"each": {"seed": []}}, "grid.each: seed has no values"),
     ],
 )

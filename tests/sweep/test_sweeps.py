@@ -17,8 +17,10 @@ import pytest
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from cadam3d import advice, cli, launch, settings
+from cadam3d import cli, launch
 from cadam3d.core.errors import UserError
+from cadam3d.settings import advice
+from cadam3d.settings import compose as settings
 from cadam3d.sweep import plan, start
 from cadam3d.sweep.folder import JOBS, Row, load, read_plan
 from cadam3d.sweep.process import run_job
@@ -359,7 +361,8 @@ def start_sweep(tmp_path, small_configs, stand_in):
 
     def run(*words: str) -> subprocess.Popen:
         code = (
-            "import sys; from pathlib import Path; from cadam3d import advice, cli, launch, settings\n"
+            "import sys; from pathlib import Path; from cadam3d import cli, launch\n"
+            "from cadam3d.settings import advice, compose as settings\n"
             "for module in (settings, launch, advice):\n"
             f"    module.config_dir = lambda: Path({str(small_configs)!r})\n"
             f"sys.argv = {['cadam3d', 'sweep', *words]!r}\n"
@@ -523,7 +526,7 @@ def test_a_launcher_that_breaks_down_leaves_the_table_true(sweep, monkeypatch):
             "hydra.run.dir: not for sweeps. Try: hydra.sweep.dir=multirun/mine",
         ),
         (("seed=0,1", "hydra/sweeper=optuna"), "hydra/sweeper: not for sweeps"),
-        (("seed=0,1", "hydra.sweep.dir="), "hydra.sweep.dir: wanted a folder, got nothing"),
+        (("seed=0,1", "hydra.sweep.dir="), "hydra.sweep.dir: expected a folder, got nothing"),
         (("seed=0,1", "hydra.sweep.dir=x_${seedd}"), "hydra.sweep.dir: Interpolation key 'seedd' not found"),
         (("seed=interval(0,1)",), "one by one, got an interval"),
         (("seed=0,1", "steps=[1"), "steps: cannot read the value"),
@@ -630,7 +633,7 @@ def test_a_plan_that_is_none_is_named(tmp_path):
 def test_the_comparison_is_made_of_a_sweep_where_there_is_one(sweep, monkeypatch):
     made = []
     module = type(sys)("comparison_of_mine")
-    module.write = lambda folder: (made.append(folder), folder / "report.html")[1]
+    module.write_sweep = lambda folder: (made.append(folder), folder / "report.html")[1]
     module.verdict = lambda folder: ["Ours is better."]
     monkeypatch.setitem(sys.modules, "comparison_of_mine", module)
     module.__spec__ = importlib.machinery.ModuleSpec("comparison_of_mine", None)

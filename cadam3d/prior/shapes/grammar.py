@@ -149,7 +149,7 @@ class _Reader:
             if self.take(*words):
                 return name
         if self.peek() is not None:
-            raise self.fail(f"wanted a relation such as 'on' or 'next to' before {self.peek()!r}")
+            raise self.fail(f"expected a relation such as 'on' or 'next to' before {self.peek()!r}")
         return None
 
     def take(self, *words: str) -> bool:

@@ -113,7 +113,7 @@ class ShapesPrior(DiffusionPrior):
         Raises ``UserError`` for an empty prompt and for words that the grammar does not know.
         """
         if not prompt.strip():
-            raise UserError(f"prompt: wanted an object, got {prompt!r}. {TRY}")
+            raise UserError(f"prompt: expected an object, got {prompt!r}. {TRY}")
         positive = build(prompt)
         return ShapesEmbedding(
             prior=self,

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import binomtest
 
-from cadam3d.comparison.rows import NOISE, PROMPT, SEED, Cell, Row, Setting, measured
+from cadam3d.report.rows import NOISE, PROMPT, SEED, Cell, Row, Setting, measured
 
 NO_GROWTH = "none"  # the arm that gains are counted from
 RESAMPLES = 2000

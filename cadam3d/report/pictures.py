@@ -7,10 +7,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cadam3d.comparison.claims import by_cell, standard
-from cadam3d.comparison.figures import arm_of_two_thresholds, arms_of, level_title
-from cadam3d.comparison.rows import GUIDANCE, NOISE, Cell, Row, config, histograms, measured
-from cadam3d.comparison.style import SOFT, looks, new_figure, pictures_only
+from cadam3d.report.claims import by_cell, standard
+from cadam3d.report.figures import arm_of_two_thresholds, arms_of, level_title
+from cadam3d.report.rows import GUIDANCE, NOISE, Cell, Row, config, histograms, measured
+from cadam3d.report.style import SOFT, looks, new_figure, pictures_only
 
 PREVIEW = "preview.png"
 MAX_COLUMNS = 7  # pictures beside one another

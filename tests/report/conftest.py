@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from cadam3d.comparison.rows import Row, read
+from cadam3d.report.rows import Row, read
 
 SIZE = 12  # pixels of a picture
 STEPS = (40, 80, 120)

@@ -15,7 +15,7 @@ from matplotlib.text import Annotation
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from matplotlib.transforms import Bbox, BboxBase
 
-from cadam3d.comparison.claims import (
+from cadam3d.report.claims import (
     PSNR,
     SSIM,
     FrontierPoint,
@@ -26,7 +26,8 @@ from cadam3d.comparison.claims import (
     has_no_growth,
     standard,
 )
-from cadam3d.comparison.rows import (
+from cadam3d.report.plot import log_ticks, short
+from cadam3d.report.rows import (
     NO_NOISE,
     NOISE,
     Row,
@@ -38,8 +39,7 @@ from cadam3d.comparison.rows import (
     in_noise_order,
     measured,
 )
-from cadam3d.comparison.style import INK, PAPER, SOFT, Look, looks, new_figure, spread_labels
-from cadam3d.io.plot import log_ticks, short
+from cadam3d.report.style import INK, PAPER, SOFT, Look, looks, new_figure, spread_labels
 
 MAX_HEAT_COLUMNS = 3  # heat maps beside one another, where there are not more noise levels
 EARLY = "\u2020"  # a dagger: some of its jobs ended before their last step

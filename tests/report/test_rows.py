@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from cadam3d.comparison.rows import Setting, at_noise, counts, histograms, in_noise_order, measured, read
+from cadam3d.report.rows import Setting, at_noise, counts, histograms, in_noise_order, measured, read
 
 
 def test_a_threshold_that_varies_within_an_arm_makes_settings(jobs):

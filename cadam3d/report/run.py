@@ -7,7 +7,7 @@ from typing import Any
 
 from cadam3d import __version__
 from cadam3d.io.atomic import replacing
-from cadam3d.io.page import (
+from cadam3d.report.page import (
     data_url,
     details,
     duration,
@@ -19,7 +19,7 @@ from cadam3d.io.page import (
     shown_bytes,
     tile,
 )
-from cadam3d.io.plot import Band, Bar, Chart, Curve, Point, smooth
+from cadam3d.report.plot import Band, Bar, Chart, Curve, Point, smooth
 
 FILE_NAME = "report.html"
 EMBED_BYTES = 8 << 20  # a larger video is linked, not embedded

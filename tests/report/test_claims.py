@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from cadam3d.comparison.claims import (
+from cadam3d.report.claims import (
     Estimate,
     Hull,
     Spread,
@@ -18,7 +18,7 @@ from cadam3d.comparison.claims import (
     standard,
     standings,
 )
-from cadam3d.comparison.rows import Cell, Setting, at_noise, read
+from cadam3d.report.rows import Cell, Setting, at_noise, read
 
 OURS, THEIRS = Setting("cadam"), Setting("baseline")
 

@@ -8,8 +8,8 @@ from importlib import resources
 import pytest
 
 from cadam3d.core.checks import UserError
-from cadam3d.io import report
-from cadam3d.io.report import write_report
+from cadam3d.report import run as report
+from cadam3d.report.run import write_report
 
 SUMMARY = {
     "prompt": "a red torus",
@@ -241,7 +241,7 @@ def test_warnings_are_shown(tmp_path):
 
 
 def test_light_and_dark_define_the_same_colours():
-    css = (resources.files("cadam3d.io") / "report.css").read_text(encoding="utf-8")
+    css = (resources.files("cadam3d.report") / "page.css").read_text(encoding="utf-8")
     light, dark = css.split("@media (prefers-color-scheme: dark)")
     dark = dark[: dark.index("}")]
     assert set(re.findall(r"(--[\w-]+):", light)) == set(re.findall(r"(--[\w-]+):", dark))

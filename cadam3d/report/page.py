@@ -12,7 +12,7 @@ GOOD, SERIOUS = ("finished",), ("failed", "vanished")  # outcomes; the others st
 
 def page(title: str, body: Iterable[str], more_style: str = "") -> str:
     """A whole page around the parts of ``body``; empty parts are left out. ``title`` is escaped here."""
-    style = resources.files("cadam3d.io").joinpath("report.css").read_text(encoding="utf-8")
+    style = resources.files("cadam3d.report").joinpath("page.css").read_text(encoding="utf-8")
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'

@@ -17,8 +17,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cadam3d.io.jsonl import read_json, read_jsonl
-from cadam3d.io.page import number
-from cadam3d.settings import compose, config_dir, flatten
+from cadam3d.report.page import number
+from cadam3d.settings.compose import compose, config_dir, flatten
 
 UNFINISHED = "unfinished"  # the outcome of a job that is running, or that was killed
 COMPLETE = "finished"

@@ -1,7 +1,7 @@
 """Sentences say what the numbers say, no more."""
 
-from cadam3d.comparison.rows import read
-from cadam3d.comparison.words import headline
+from cadam3d.report.rows import read
+from cadam3d.report.words import headline
 
 PROMPTS = ("a cube", "a torus", "a tower", "a castle", "a tree", "a ball")
 

@@ -25,7 +25,7 @@ SLUG_LENGTH = 60  # characters; even of three bytes each they fit a file name
 
 def config_dir() -> Path:
     """The folder of YAML files: inside the installed package, or ``configs/`` of a checkout."""
-    package = Path(__file__).parent
+    package = Path(__file__).parent.parent
     packaged = package / "configs"
     return packaged if packaged.is_dir() else package.parent / "configs"
 
@@ -41,7 +41,7 @@ def compose(
     """The configuration that ``cadam3d <config_name> <overrides>`` would run with.
 
     ``folder`` replaces :func:`config_dir`, ``search_path`` is one more folder of YAML files, ``with_hydra``
-    keeps Hydra's own node. Raises Hydra's exceptions; ``cadam3d.advice`` puts them into words.
+    keeps Hydra's own node. Raises Hydra's exceptions; ``cadam3d.settings.advice`` puts them into words.
     """
     register_resolvers()
     extra = [] if search_path is None else [f"hydra.searchpath=[{quote('file://' + str(search_path))}]"]

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
 from cadam3d.core.errors import UserError
-from cadam3d.settings import compose, config_dir, flatten, quote
+from cadam3d.settings.compose import compose, config_dir, flatten, quote
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
 NO_NAME_COMPLAINT = "Config group override must be a string or a list"
@@ -86,7 +86,7 @@ def _unknown_option(error: MissingConfigException, config_name: str, overrides: 
     if not group or not options:
         return UserError(f"{path}: no such configuration in {config_dir()}. Try: cadam3d doctor")
     best = (did_you_mean(option, options) or options)[0]
-    return UserError(f"{group}: wanted one of {'|'.join(options)}, got {option!r}. Try: {group}={best}")
+    return UserError(f"{group}: expected one of {'|'.join(options)}, got {option!r}. Try: {group}={best}")
 
 
 def _no_name(reason: str, overrides: Sequence[str]) -> UserError:
@@ -96,7 +96,7 @@ def _no_name(reason: str, overrides: Sequence[str]) -> UserError:
         options = sorted(file.stem for file in (config_dir() / key).glob("*.yaml")) if key else []
         if options and value not in options and not value.startswith("["):
             best = "none" if "none" in options else options[0]
-            return UserError(f"{key}: wanted one of {'|'.join(options)}, got {value}. Try: {key}={best}")
+            return UserError(f"{key}: expected one of {'|'.join(options)}, got {value}. Try: {key}={best}")
     return UserError(f"{reason}. Try: the name of an option instead of null")
 
 

@@ -9,10 +9,11 @@ import shlex
 import pytest
 import yaml
 
-from cadam3d import comparison
-from cadam3d.comparison import page, tables
-from cadam3d.comparison.rows import read
+from cadam3d import report
 from cadam3d.core.checks import UserError
+from cadam3d.report import sweep as page
+from cadam3d.report import tables
+from cadam3d.report.rows import read
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +21,7 @@ def whole(bench):
     (bench / "multirun.yaml").write_text(
         yaml.safe_dump({"hydra": {"overrides": {"task": ["grid=pareto", "prompt='a <b>cube</b>'"]}}})
     )
-    return comparison.write(bench).read_text(encoding="utf-8")
+    return report.write_sweep(bench).read_text(encoding="utf-8")
 
 
 def text_of(content: str) -> str:
@@ -47,7 +48,7 @@ def test_the_line_of_the_sweep_comes_before_those_of_its_jobs(jobs):
     job = {"arm": "cadam", "folder": folder.name, "overrides": ["densifier=cadam", "prompt=a cube"]}
     plan = {"jobs": [job], "line": ["grid=mine", "prompt=a cube"]}
     (jobs.folder / "jobs.json").write_text(json.dumps(plan))
-    said = comparison.write(jobs.folder).read_text(encoding="utf-8")
+    said = report.write_sweep(jobs.folder).read_text(encoding="utf-8")
     expected = 'cadam3d sweep grid=mine "prompt=a cube"\ncadam3d train densifier=cadam "prompt=a cube"'
     assert html.escape(expected) in said
 
@@ -83,14 +84,14 @@ def test_half_a_sweep_has_a_page_too(jobs):
     folder = jobs.add("cadam", n=100, psnr=20.0)
     jobs.add("baseline", n=1000, psnr=20.5)
     (folder / "summary.json").unlink()
-    said = text_of(comparison.write(jobs.folder).read_text(encoding="utf-8"))
+    said = text_of(report.write_sweep(jobs.folder).read_text(encoding="utf-8"))
     assert "1 jobs are not done" in said
     assert "baseline" in said
 
 
 def test_a_sweep_whose_jobs_all_failed_has_a_page_too(jobs):
     jobs.add("cadam", n=0, psnr=None, outcome="failed", message="out of luck")
-    assert "failed (out of luck)" in text_of(comparison.write(jobs.folder).read_text(encoding="utf-8"))
+    assert "failed (out of luck)" in text_of(report.write_sweep(jobs.folder).read_text(encoding="utf-8"))
 
 
 def test_nothing_that_a_user_typed_becomes_markup(jobs):
@@ -98,12 +99,12 @@ def test_nothing_that_a_user_typed_becomes_markup(jobs):
     folder = jobs.add("cadam", n=100, psnr=20.0, outcome="failed", message=nasty)
     (folder / ".hydra/overrides.yaml").write_text(json.dumps(["densifier=cadam", f"prompt='{nasty}'"]))
     jobs.add("cadam", "seed=1", n=100, psnr=20.0)
-    assert nasty not in comparison.write(jobs.folder).read_text(encoding="utf-8")
+    assert nasty not in report.write_sweep(jobs.folder).read_text(encoding="utf-8")
 
 
 def test_a_folder_without_jobs_is_refused(tmp_path):
     with pytest.raises(UserError, match="without jobs"):
-        comparison.write(tmp_path)
+        report.write_sweep(tmp_path)
 
 
 def test_the_plan_of_a_sweep_may_name_its_figures(jobs):
@@ -112,13 +113,13 @@ def test_the_plan_of_a_sweep_may_name_its_figures(jobs):
     planned = {"folder": folder.name, "arm": "paper", "overrides": ["densifier=cadam", "seed=0"]}
     plan = jobs.folder / "jobs.json"
     plan.write_text(json.dumps({"jobs": [planned], "figures": ["growth"]}))
-    said = text_of(comparison.write(jobs.folder).read_text(encoding="utf-8"))
+    said = text_of(report.write_sweep(jobs.folder).read_text(encoding="utf-8"))
     assert "Gaussians over time" in said
     assert "Signal to noise" not in said
     assert "cadam3d train densifier=cadam seed=0" in said
     plan.write_text(json.dumps({"jobs": [planned], "figures": ["pie"]}))
     with pytest.raises(UserError, match="pie"):
-        comparison.write(jobs.folder)
+        report.write_sweep(jobs.folder)
 
 
 def test_commands_can_be_pasted():
@@ -157,7 +158,7 @@ def test_an_arm_without_a_standard_setting_is_named_below_the_key_table(jobs):
     jobs.add("cadam", n=100, psnr=20.0)
     for growth in (0.1, 0.2):
         jobs.add("mcmc", f"densifier.growth={growth}", n=100, psnr=20.0)
-    said = text_of(comparison.write(jobs.folder).read_text(encoding="utf-8"))
+    said = text_of(report.write_sweep(jobs.folder).read_text(encoding="utf-8"))
     assert "mcmc has no standard setting and is under Every setting only." in said
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from cadam3d.comparison import figures, pictures
-from cadam3d.comparison.page import FIGURES
-from cadam3d.comparison.rows import at_noise, read
-from cadam3d.comparison.style import DARK, KNOWN, css, inline, looks, spread_labels, styled, write_figure
+from cadam3d.report import figures, pictures
+from cadam3d.report.rows import at_noise, read
+from cadam3d.report.style import DARK, KNOWN, css, inline, looks, spread_labels, styled, write_figure
+from cadam3d.report.sweep import FIGURES
 
 
 def texts(figure) -> str:

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from cadam3d.comparison.claims import SSIM, by_cell, compare, frontier, has_no_growth, standard, standings
-from cadam3d.comparison.figures import arms_of, levels_of
-from cadam3d.comparison.rows import GUIDANCE, Row, at_noise, measured
-from cadam3d.comparison.words import OURS, THEIRS
 from cadam3d.io.atomic import replacing
-from cadam3d.io.page import show
+from cadam3d.report.claims import SSIM, by_cell, compare, frontier, has_no_growth, standard, standings
+from cadam3d.report.figures import arms_of, levels_of
+from cadam3d.report.page import show
+from cadam3d.report.rows import GUIDANCE, Row, at_noise, measured
+from cadam3d.report.words import OURS, THEIRS
 
 Line = dict[str, Any]
 NO_RATIO: dict[float | None, str] = {math.inf: "never", 0.0: "always"}  # reaches the quality; exceeds it

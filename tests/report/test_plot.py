@@ -6,7 +6,20 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from cadam3d.io.plot import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Band, Bar, Chart, Curve, short, smooth
+from cadam3d.report.plot import (
+    BOTTOM,
+    HEIGHT,
+    LEFT,
+    RIGHT,
+    TOP,
+    WIDTH,
+    Band,
+    Bar,
+    Chart,
+    Curve,
+    short,
+    smooth,
+)
 
 
 def chart(points, **settings) -> Chart:

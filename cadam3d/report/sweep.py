@@ -12,14 +12,14 @@ import yaml
 from matplotlib.figure import Figure
 
 from cadam3d import __version__
-from cadam3d.comparison import figures, pictures, tables, words
-from cadam3d.comparison.claims import compare, standard
-from cadam3d.comparison.rows import COMPLETE, NOISE, PLAN, PROMPT, SEED, UNFINISHED, Row, read, with_noise
-from cadam3d.comparison.style import css, inline, styled, write_figure
 from cadam3d.core.checks import UserError, fail
 from cadam3d.io.atomic import replacing
 from cadam3d.io.jsonl import read_json
-from cadam3d.io.page import details, outcome_chip, page, tile
+from cadam3d.report import figures, pictures, tables, words
+from cadam3d.report.claims import compare, standard
+from cadam3d.report.page import details, outcome_chip, page, tile
+from cadam3d.report.rows import COMPLETE, NOISE, PLAN, PROMPT, SEED, UNFINISHED, Row, read, with_noise
+from cadam3d.report.style import css, inline, styled, write_figure
 
 FILE_NAME = "report.html"
 FOLDER_NAME = "figures"  # of the sweep: every figure as SVG and PNG, every table as CSV
@@ -88,7 +88,7 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None) -> Path:
     rows = read(sweep_folder)
     if not rows:
         raise UserError(
-            f"{sweep_folder}: wanted the folder of a sweep, got one without jobs. Try: cadam3d sweep"
+            f"{sweep_folder}: expected the folder of a sweep, got one without jobs. Try: cadam3d sweep"
         )
     wanted = _wanted(sweep_folder, names)
     folder = sweep_folder / FOLDER_NAME
@@ -123,7 +123,7 @@ def _wanted(sweep_folder: Path, names: Sequence[str] | None) -> list[str]:
     for name in names or ():
         if name not in FIGURES:
             raise fail(
-                "figures", wanted=f"some of {'|'.join(FIGURES)}", got=name, example="figures=[frontier]"
+                "figures", expected=f"some of {'|'.join(FIGURES)}", got=name, example="figures=[frontier]"
             )
     return list(FIGURES if names is None else names)
 
@@ -215,7 +215,7 @@ def _failures(rows: Sequence[Row]) -> str:
 
 
 def _style() -> str:
-    return css() + resources.files("cadam3d.comparison").joinpath("page.css").read_text(encoding="utf-8")
+    return css() + resources.files("cadam3d.report").joinpath("sweep.css").read_text(encoding="utf-8")
 
 
 def _commands(sweep_folder: Path) -> str:

@@ -3,9 +3,9 @@
 import math
 from collections.abc import Sequence
 
-from cadam3d.comparison.claims import Comparison, Standing, compare, stand, standard
-from cadam3d.comparison.figures import arms_of, level_title, levels_of
-from cadam3d.comparison.rows import Row, at_noise, with_noise
+from cadam3d.report.claims import Comparison, Standing, compare, stand, standard
+from cadam3d.report.figures import arms_of, level_title, levels_of
+from cadam3d.report.rows import Row, at_noise, with_noise
 
 OURS, THEIRS = "cadam", "baseline"
 COMPARABLE = 0.3  # dB of PSNR; a smaller loss is hardly seen
