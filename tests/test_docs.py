@@ -1,0 +1,237 @@
+"""Every example in the documentation works: command lines in real shells, settings, YAML and Python."""
+
+import os
+import re
+import runpy
+import shlex
+import shutil
+import stat
+import subprocess
+import sys
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import yaml
+
+from cadam3d import cli
+from cadam3d.io.jsonl import write_json
+
+REPOSITORY = Path(__file__).parent.parent
+PAGES = [
+    REPOSITORY / "README.md",
+    REPOSITORY / "CHANGELOG.md",
+    REPOSITORY / "CONTRIBUTING.md",
+    *sorted((REPOSITORY / "docs").glob("*.md")),
+]
+SHELLS = {"bash": ("bash", "--noprofile", "--norc", "-c"), "zsh": ("zsh", "-f", "-c")}
+PROGRAMS = (
+    "cadam3d",
+    "pip",
+    "make",
+    "python",
+    "python3",
+    "git",
+    "hf",
+    "ruff",
+    "pyright",
+    "compute-sanitizer",
+)
+CALL = rf"(?:\w+=\S* )*(?:\.venv/bin/)?(?:{'|'.join(PROGRAMS)}) "
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+NAMED_BLOCK = re.compile(
+    r"`([\w./]+\.(?:py|yaml|toml))`[^`\n]*:\n\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL
+)
+
+# Writes the words that it was called with to the file RECORD, instead of doing anything.
+STAND_IN = """#!/bin/sh
+{ for word in "${0##*/}" "$@"; do printf '%s\\0' "$word"; done; printf '\\036\\0'; } >> "$RECORD"
+"""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A command line that a page shows."""
+
+    page: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.page}: {self.text}"
+
+
+def lines_of(page: Path) -> list[Line]:
+    """Return the command lines in the blocks (fenced or indented) and in the prose of a page."""
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    blocks = [body for language, body in FENCE.findall(text) if language in ("", "sh", "bash")]
+    prose = FENCE.sub("", text)
+    blocks += re.findall(r"^ {4}\S.*$", prose, re.MULTILINE)
+    candidates = [line.strip() for block in blocks for line in block.splitlines()]
+    for paragraph in re.split(r"\n\s*\n", re.sub(r"^ {4}\S.*$", "", prose, flags=re.MULTILINE)):
+        candidates += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", paragraph)]
+    return [Line(page.name, line) for line in candidates if re.match(CALL, f"{line} ")]
+
+
+def help_lines() -> list[Line]:
+    """Return the command lines that the program's own help and the comments of its settings show."""
+    found = [Line("cadam3d --help", example) for _, example in cli.COMMANDS.values()]
+    for file in sorted((REPOSITORY / "configs").rglob("*.yaml")):
+        text = file.read_text(encoding="utf-8")
+        shown = re.findall(rf"^[\s#]*(cadam3d (?:{'|'.join(cli.COMMANDS)})\b.*)$", text, re.MULTILINE)
+        found += [Line(file.name, line) for line in shown]
+    return found
+
+
+LINES = list(dict.fromkeys([line for page in PAGES for line in lines_of(page)] + help_lines()))
+DISTINCT = list({line.text: line for line in LINES}.values())
+
+
+def named_blocks(page: Path) -> dict[str, str]:
+    """Return the files that a page asks the reader to write: name to content."""
+    return dict(NAMED_BLOCK.findall(page.read_text(encoding="utf-8")))
+
+
+@cache
+def split_by(shell: str, line: str, place: Path) -> list[list[str]]:
+    """Run ``line`` in a real shell, with stand-ins for every program, and return the words that each got."""
+    record = place / f"{shell}.record"
+    record.unlink(missing_ok=True)
+    environment = {"PATH": str(place / "bin"), "HOME": str(place), "RECORD": str(record)}
+    program = shutil.which(SHELLS[shell][0])
+    if program is None:
+        pytest.skip(f"{shell} is not installed")
+    done = subprocess.run(
+        [program, *SHELLS[shell][1:], line],
+        cwd=place,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, f"{line}\n{done.stderr}"
+    calls = record.read_text(encoding="utf-8").split("\036\0")[:-1] if record.is_file() else []
+    return [call.split("\0")[:-1] for call in calls]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """A folder as the pages assume it: a run, a sweep, and the files that the pages ask the reader to write."""
+    place = tmp_path_factory.mktemp("place")
+    for folder in ("bin", ".venv/bin"):
+        (place / folder).mkdir(parents=True)
+        for program in PROGRAMS:
+            stand_in = place / folder / program
+            stand_in.write_text(STAND_IN, encoding="utf-8")
+            stand_in.chmod(stand_in.stat().st_mode | stat.S_IXUSR)
+    (place / ".venv/bin/activate").touch()
+    (place / "cadam3d").mkdir()
+    run = place / "outputs" / "latest"
+    (run / ".hydra").mkdir(parents=True)
+    (run / ".hydra/overrides.yaml").write_text("- prompt='a cube'\n", encoding="utf-8")
+    (run / "config.yaml").touch()
+    write_sweep(place / "multirun" / "mine")
+    for page in PAGES:
+        for name, content in named_blocks(page).items():
+            (place / name).parent.mkdir(parents=True, exist_ok=True)
+            (place / name).write_text(content, encoding="utf-8")
+    return place
+
+
+def write_sweep(folder: Path) -> None:
+    """Write what a sweep of two densifiers over three prompts leaves, as far as tables are made of it."""
+    jobs = []
+    for prompt in ("a cube", "a torus", "a cone"):
+        for arm, count, psnr in (("baseline", 20000, 22.0), ("cadam", 1000, 22.5)):
+            job = folder / f"{arm}_{prompt.split()[1]}"
+            overrides = [f"densifier={arm}", f"prompt='{prompt}'", "seed=0"]
+            swept = {"densifier": arm, "prompt": prompt, "seed": 0}
+            jobs.append({"arm": arm, "folder": job.name, "overrides": overrides, "swept": swept})
+            facts = {"prompt": prompt, "seed": 0, "outcome": "finished", "warnings": [], "steps": 600}
+            counts = {"num_gaussians": count, "num_gaussians_initial": 300, "asset_bytes": 68 * count}
+            write_json(job / "summary.json", {**facts, **counts, "psnr": psnr, "ssim": 0.9, "seconds": 1.0})
+            (job / ".hydra").mkdir()
+            (job / ".hydra/overrides.yaml").write_text(yaml.safe_dump(overrides), encoding="utf-8")
+    write_json(folder / "jobs.json", {"cwd": str(folder), "flags": [], "threads": None, "jobs": jobs})
+
+
+def without_missing_launcher(words: list[str]) -> list[str]:
+    """Leave out a launcher whose plugin is not installed (only joblib's is sure to be), and its settings."""
+    name = next((word.partition("=")[2] for word in words if word.startswith("launcher=")), "joblib")
+    if name == "joblib" or find_spec(f"hydra_plugins.hydra_{name}_launcher"):
+        return words
+    return [word for word in words if not word.startswith("launcher")]
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+@pytest.mark.parametrize("line", DISTINCT, ids=str)
+def test_a_documented_line_means_the_same_in_every_shell(line, shell, place):
+    assert split_by(shell, line.text, place), "no program was called"
+    assert split_by(shell, line.text, place) == split_by("bash", line.text, place)
+
+
+@pytest.mark.parametrize("line", DISTINCT, ids=str)
+def test_a_documented_line_can_be_pasted(line):
+    """A shell that is typed into expands ``!``, and zsh takes a comment behind a command for its words."""
+    assert "!" not in line.text
+    assert shlex.split(line.text, comments=True) == shlex.split(line.text)
+
+
+@pytest.mark.parametrize("line", DISTINCT, ids=str)
+def test_a_documented_line_composes(line, place, monkeypatch, capsys):
+    for words in split_by("bash", line.text, place):
+        if words[0] != "cadam3d" or (len(words) == 2 and words[1] != "doctor"):
+            continue  # another program, or only the name of a command
+        words = without_missing_launcher(words)
+        if words[1:2] and words[1] in cli.COMMANDS and "--help" not in words and "--cfg" not in words:
+            words = [*words, "--cfg", "job"]
+        monkeypatch.chdir(place)
+        monkeypatch.setattr(sys, "argv", words)
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert not ended.value.code, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_python_of_a_page_runs(page, place, monkeypatch):
+    """Scripts run; blocks that belong into a file of the reader's are run by test_extending."""
+    text = NAMED_BLOCK.sub("", page.read_text(encoding="utf-8"))
+    monkeypatch.chdir(place)
+    for number, (language, body) in enumerate(FENCE.findall(text)):
+        if language == "python":
+            script = place / f"{page.stem}_{number}.py"
+            script.write_text(body, encoding="utf-8")
+            runpy.run_path(str(script))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_yaml_of_a_page_names_its_file(page):
+    """So that it is written where the command lines of the page look for it, and composes with them."""
+    text = NAMED_BLOCK.sub("", page.read_text(encoding="utf-8"))
+    assert not [body for language, body in FENCE.findall(text) if language == "yaml"]
+
+
+def test_the_readme_is_short_and_shows_the_two_commands():
+    text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 65
+    assert re.search(r"^ *make demo$", text, re.MULTILINE)
+    assert re.search(r"^ *make test$", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_to_files_lead_somewhere(page):
+    text = page.read_text(encoding="utf-8")
+    targets = re.findall(r"\]\((?!https?://|#|mailto:)([^)#]+)(?:#[^)]*)?\)", text)
+    assert not [target for target in targets if not (page.parent / target).exists()]
+
+
+def test_documented_files_exist():
+    """Paths in backticks that look like ours are real: documentation must not outlive what it describes."""
+    missing = []
+    for page in PAGES:
+        text = FENCE.sub("", page.read_text(encoding="utf-8"))
+        for path in re.findall(r"`((?:cadam3d|configs|docs|scripts|tests)/[\w./-]+\.\w+)`", text):
+            if "mine" not in path and not (REPOSITORY / path).exists():
+                missing.append(f"{page.name}: {path}")
+    assert not missing
