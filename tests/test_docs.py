@@ -38,6 +38,7 @@ PROGRAMS = (
     "pyright",
     "compute-sanitizer",
 )
+SETTINGS = r"'?~?[a-z][\w./]*=[^|]*[\[({*?]"  # what a shell may read in its own way
 CALL = rf"(?:\w+=\S* )*(?:\.venv/bin/)?(?:{'|'.join(PROGRAMS)}) "
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NAMED_BLOCK = re.compile(
@@ -67,10 +68,11 @@ def lines_of(page: Path) -> list[Line]:
     blocks = [body for language, body in FENCE.findall(text) if language in ("", "sh", "bash")]
     prose = FENCE.sub("", text)
     blocks += re.findall(r"^ {4}\S.*$", prose, re.MULTILINE)
-    candidates = [line.strip() for block in blocks for line in block.splitlines()]
+    lines = [line.strip() for block in blocks for line in block.splitlines()]
     for paragraph in re.split(r"\n\s*\n", re.sub(r"^ {4}\S.*$", "", prose, flags=re.MULTILINE)):
-        candidates += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", paragraph)]
-    return [Line(page.name, line) for line in candidates if re.match(CALL, line)]
+        spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", paragraph)]
+        lines += [f"cadam3d train {span}" if re.match(SETTINGS, span) else span for span in spans]
+    return [Line(page.name, line) for line in lines if re.match(CALL, line)]
 
 
 def help_lines() -> list[Line]:
@@ -191,6 +193,14 @@ def test_a_documented_line_composes(line, place, monkeypatch, capsys):
         assert not ended.value.code, capsys.readouterr().err
 
 
+@pytest.mark.parametrize("line", DISTINCT, ids=str)
+def test_a_documented_script_or_test_exists(line, place):
+    for program, *words in split_by("bash", line.text, place):
+        if program == "python":
+            files = [word for word in words if word.endswith(".py") or word.startswith("tests/")]
+            assert all((REPOSITORY / file).exists() for file in files)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_the_python_of_a_page_runs(page, place, monkeypatch):
     """Scripts run; blocks that belong into a file of the reader's are run by test_extending."""
@@ -218,10 +228,27 @@ def test_the_readme_is_short_and_shows_the_two_commands():
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_to_files_lead_somewhere(page):
-    text = page.read_text(encoding="utf-8")
-    targets = re.findall(r"\]\((?!https?://|#|mailto:)([^)#]+)(?:#[^)]*)?\)", text)
-    assert not [target for target in targets if not (page.parent / target).exists()]
+def test_links_to_files_and_headings_lead_somewhere(page):
+    links = re.findall(r"\]\((?!https?://|mailto:)([^)#]*)#?([^)]*)\)", page.read_text(encoding="utf-8"))
+    for file, heading in links:
+        target = page.parent / file if file else page
+        assert target.exists(), file
+        assert not heading or heading in headings_of(target), f"{file}#{heading}"
+
+
+def headings_of(page: Path) -> list[str]:
+    """Return the headings of a page in the form in which links name them."""
+    headings = re.findall(r"^#+ (.*)$", FENCE.sub("", page.read_text(encoding="utf-8")), re.MULTILINE)
+    return [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
+
+
+def test_quoted_messages_are_messages_of_ours():
+    """Headings of the page on troubles that are quotes: each piece between dots is in the source."""
+    page = (REPOSITORY / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    source = "".join(file.read_text(encoding="utf-8") for file in (REPOSITORY / "cadam3d").rglob("*.py"))
+    quotes = re.findall(r'^\*\*"(.+?)"\.\*\*', page, re.MULTILINE)
+    assert quotes
+    assert not [quote for quote in quotes if any(piece.strip() not in source for piece in quote.split("..."))]
 
 
 def test_documented_files_exist():
