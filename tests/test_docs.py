@@ -175,7 +175,7 @@ def test_a_documented_line_means_the_same_in_every_shell(line, shell, place):
 @pytest.mark.parametrize("line", DISTINCT, ids=str)
 def test_a_documented_line_can_be_pasted(line):
     """A shell that is typed into expands ``!``, and zsh takes a comment behind a command for its words."""
-    assert "!" not in line.text
+    assert "!" not in re.sub(r"'[^']*'", "", line.text)
     assert shlex.split(line.text, comments=True) == shlex.split(line.text)
 
 
