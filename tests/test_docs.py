@@ -38,9 +38,10 @@ PROGRAMS = (
     "pyright",
     "compute-sanitizer",
 )
-SETTINGS = r"'?~?[a-z][\w./]*=[^|]*[\[({*?]"  # what a shell may read in its own way
+SETTING = r"'?~?[a-z][\w./]*=[^|]*[\[({*?]"  # with characters that a shell may read in its own way
 CALL = rf"(?:\w+=\S* )*(?:\.venv/bin/)?(?:{'|'.join(PROGRAMS)}) "
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+INDENTED = re.compile(r"^ {4}\S.*$", re.MULTILINE)
 NAMED_BLOCK = re.compile(
     r"`([\w./]+\.(?:py|yaml|toml))`[^`\n]*:\n\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL
 )
@@ -66,13 +67,21 @@ def lines_of(page: Path) -> list[Line]:
     """Return the command lines in the blocks (fenced or indented) and in the prose of a page."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
     blocks = [body for language, body in FENCE.findall(text) if language in ("", "sh", "bash")]
-    prose = FENCE.sub("", text)
-    blocks += re.findall(r"^ {4}\S.*$", prose, re.MULTILINE)
+    blocks += INDENTED.findall(FENCE.sub("", text))
     lines = [line.strip() for block in blocks for line in block.splitlines()]
-    for paragraph in re.split(r"\n\s*\n", re.sub(r"^ {4}\S.*$", "", prose, flags=re.MULTILINE)):
-        spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", paragraph)]
-        lines += [f"cadam3d train {span}" if re.match(SETTINGS, span) else span for span in spans]
-    return [Line(page.name, line) for line in lines if re.match(CALL, line)]
+    return [Line(page.name, line) for line in [*lines, *spans_of(page)] if re.match(CALL, line)]
+
+
+def settings_of(page: Path) -> list[Line]:
+    """Return the settings in the prose of a page that a shell may misread, as part of a line."""
+    return [Line(page.name, f"cadam3d {span}") for span in spans_of(page) if re.match(SETTING, span)]
+
+
+def spans_of(page: Path) -> list[str]:
+    """Return what the prose of a page shows as code."""
+    prose = INDENTED.sub("", FENCE.sub("", page.read_text(encoding="utf-8")))
+    paragraphs = re.split(r"\n\s*\n", prose)
+    return [" ".join(span.split()) for text in paragraphs for span in re.findall(r"`([^`]+)`", text)]
 
 
 def help_lines() -> list[Line]:
@@ -87,6 +96,7 @@ def help_lines() -> list[Line]:
 
 LINES = list(dict.fromkeys([line for page in PAGES for line in lines_of(page)] + help_lines()))
 DISTINCT = list({line.text: line for line in LINES}.values())
+SETTINGS = list(dict.fromkeys(line for page in PAGES for line in settings_of(page)))
 
 
 def named_blocks(page: Path) -> dict[str, str]:
@@ -166,7 +176,7 @@ def without_missing_launcher(words: list[str]) -> list[str]:
 
 
 @pytest.mark.parametrize("shell", SHELLS)
-@pytest.mark.parametrize("line", DISTINCT, ids=str)
+@pytest.mark.parametrize("line", [*DISTINCT, *SETTINGS], ids=str)
 def test_a_documented_line_means_the_same_in_every_shell(line, shell, place):
     assert split_by(shell, line.text, place), "no program was called"
     assert split_by(shell, line.text, place) == split_by("bash", line.text, place)
