@@ -168,7 +168,7 @@ def write_sweep(folder: Path) -> None:
 
 
 def without_missing_launcher(words: list[str]) -> list[str]:
-    """Leave out a launcher whose plugin is not installed (only joblib's is sure to be), and its settings."""
+    """Leave out a launcher that is not installed (only joblib is sure to be), and its settings."""
     name = next((word.partition("=")[2] for word in words if word.startswith("launcher=")), "joblib")
     if name == "joblib" or find_spec(f"hydra_plugins.hydra_{name}_launcher"):
         return words

@@ -31,7 +31,7 @@ main()
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory) -> Path:
-    """The folder of a reader who has written down every file of the page."""
+    """Return a folder with every file that the page shows."""
     place = tmp_path_factory.mktemp("stranger")
     for name, content in BLOCK.findall(PAGE):
         (place / name).parent.mkdir(parents=True, exist_ok=True)
