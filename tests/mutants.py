@@ -22,8 +22,8 @@ RENDERING = {
     ),
     "a barrier that not all threads reach": (
         "sort.cuh",
-        "  __syncthreads();  // the",
-        "  if (t || !MUTANT) __syncthreads();  // the",
+        "  __syncthreads();  // after this",
+        "  if (t || !MUTANT) __syncthreads();  // after this",
     ),
     "no wait before a bin moves on": (
         "sort.cuh",
