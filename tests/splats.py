@@ -2,8 +2,8 @@
 
 The image formation model has steps: a contribution below ALPHA_MIN is skipped, one above ALPHA_MAX is capped,
 and a pixel stops before TRANSMITTANCE_MIN. If a number is within rounding of a step, float32 and float64 may
-decide differently, and both are right. ``undecided`` finds such pixels. Comparisons leave them out and require
-that there are few of them.
+decide differently, and both are right. ``undecided`` finds such pixels. Comparisons leave them out and
+require that there are few of them.
 """
 
 import math
@@ -68,7 +68,7 @@ class Ellipses:
     depths: torch.Tensor  # [n]; camera z, world units
 
     def exponents(self, height: int, width: int) -> torch.Tensor:
-        """Return half the squared distance of every pixel from the centres, in standard deviations [n h w]."""
+        """Return half the squared distance of all pixels from the centres, in standard deviations [n h w]."""
         y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         offset = torch.stack([x, y], dim=-1)[None] + 0.5 - self.centres[:, None, None]
         return 0.5 * torch.einsum("nhwi,nij,nhwj->nhw", offset, torch.linalg.inv(self.covariances), offset)
@@ -96,7 +96,7 @@ def ellipses(gaussians: Gaussians, cameras: Cameras, view: int) -> Ellipses:
 
 
 def undecided(gaussians: Gaussians, cameras: Cameras, within: float = 1e-3) -> torch.Tensor:
-    """Return the mask [v h w] of the pixels where a number is within a share of a step, densely in float64."""
+    """Return the mask [v h w] of pixels where a number is within a share of a step, densely in float64."""
     pixels = []
     for view in range(len(cameras)):
         depths = ellipses(gaussians, cameras, view).depths

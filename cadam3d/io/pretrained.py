@@ -174,7 +174,7 @@ class Pretrained:
 
     @property
     def identity(self) -> str:
-        """Return a text that changes with the model: names, sizes and times of files, or a commit of the hub."""
+        """Return a text that changes with the model: names, sizes and times of files, or the hub's commit."""
         if not Path(self.where).is_dir():
             # The name of a snapshot folder is its commit.
             return f"{self.where}@{self.file.resolve().parent.name}"

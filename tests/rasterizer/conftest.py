@@ -1,4 +1,4 @@
-"""The rasterizers under test. All test processes share their compiled files, but not with the user's cache."""
+"""The rasterizers under test. Test processes share compiled files, apart from the cache of the user."""
 
 from pathlib import Path
 

@@ -20,7 +20,7 @@ RASTERIZER = ReferenceRasterizer()
 
 
 def scene(n: int = 80, degree: int = 1, seed: int = 0, dtype: torch.dtype = torch.float64) -> Gaussians:
-    """Return splats of all sizes, faint to nearly opaque, some with colours below zero; the first is hidden."""
+    """Return splats of all sizes, faint to nearly opaque, some with negative colours; the first is hidden."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
