@@ -113,7 +113,7 @@ def save(
 
 
 class Stopwatch:
-    """Measures seconds per stage. It waits for a GPU at both ends of a stage, which slows the run a little."""
+    """Measures seconds per stage. It waits for a GPU at both ends of a stage, which slows the run down."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device

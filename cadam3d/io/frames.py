@@ -36,7 +36,7 @@ TURNS = (0, 90, 180, 270)  # degrees; only quarter turns permute axes
 
 
 def world_to_file(gaussians: Gaussians, up: str) -> Gaussians:
-    """Return the object in the axes of a file whose up axis is ``up``: ``-y``, ``+y`` or ``+z``."""
+    """Return the object in the axes of a file with the up axis ``up``: ``-y``, ``+y`` or ``+z``."""
     return _rotate(gaussians, _axes(up))
 
 

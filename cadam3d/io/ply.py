@@ -54,7 +54,7 @@ NUMPY_TYPES = {
 
 
 def write_ply(path: Path, gaussians: Gaussians, *, up: str, pad_sh: int) -> None:
-    """Write ``gaussians`` as float32, atomically, in the axes whose up axis is ``up`` (see ``frames.py``).
+    """Write ``gaussians`` as float32, atomically, in the axes with up axis ``up`` (see ``frames.py``).
 
     ``pad_sh`` is the smallest SH degree of the file (0 to 3). Missing coefficients are written as zeros,
     which changes no colour but satisfies importers that require degree 3. Raises ``UserError`` if the file

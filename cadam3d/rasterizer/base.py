@@ -55,8 +55,8 @@ class Rasterizer(ABC):
         its own gradient, so ``backward()`` fills ``output.means2d.grad``.
 
         Gaussians that are behind a camera, ``FAR`` or farther in front of it, off screen, too faint or not
-        finite are culled, and so are those whose quaternion has a squared length below 1e-12 and therefore
-        no direction. A culled Gaussian has radius 0, contributes nothing, and gets a gradient of zero, never
+        finite are culled. So are Gaussians with a quaternion of a squared length below 1e-12, which has no
+        direction. A culled Gaussian has radius 0, contributes nothing, and gets a gradient of zero, never
         NaN.
 
         With ``absgrad``, ``backward()`` fills ``output.absgrad.grad`` too. It is the sum over the pixels of

@@ -93,7 +93,7 @@ def test_a_missing_driver_is_reported_with_a_hint(monkeypatch):
 
 
 class FakeCuda:
-    """Stands in for ``torch.cuda`` with two devices; number 0 is current, and each has a side stream."""
+    """A replacement of ``torch.cuda`` with two devices; number 0 is current, and each has a side stream."""
 
     def __init__(self) -> None:
         self.index = 0

@@ -1,7 +1,7 @@
 // The CPU rasterizer: projection, tile lists, blending and their gradients, behind a C interface.
 //
 // The forward pass projects every Gaussian into every view, sorts the visible ones of each view by depth, lists
-// for each 16x16 tile the Gaussians whose boxes touch it, front to back, and blends the tiles. The backward pass
+// for each 16x16 tile the Gaussians with boxes that touch it, front to back, and blends the tiles. The backward pass
 // processes each tile back to front, writes one record per (Gaussian, tile), sums the records of each Gaussian in
 // a fixed order and applies the chain rule. No two threads ever add to the same number, and the pieces of work do
 // not depend on the number of threads. Therefore any number of threads gives the same bits.
@@ -766,7 +766,7 @@ void batch_backward(const Scene& scene, const Frame& frame, int64_t view_begin, 
   for (int64_t j = 0; j < stride; ++j) batch.add(out.sh + j, stride, total.sh[j]);
 }
 
-// Returns the end of a group of views whose records fit the budget. A group has at least one view.
+// Returns the end of a group of views with records that fit the budget. A group has at least one view.
 int64_t group_end(const Scene& scene, const Frame& frame, int64_t begin, int64_t& records) {
   records = 0;
   int64_t v = begin;

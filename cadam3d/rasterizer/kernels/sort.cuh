@@ -1,4 +1,4 @@
-// Prefix sums, whose total must fit into 32 bits, and a stable radix sort.
+// Prefix sums with totals that fit into 32 bits, and a stable radix sort.
 //
 // The sort handles eight bits per pass, least significant first. A pass counts the digits of each chunk, converts
 // the counts (digit after digit, chunk after chunk) to positions with one prefix sum, and scatters the items.

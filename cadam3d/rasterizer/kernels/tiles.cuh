@@ -18,7 +18,7 @@ struct Range {
   int first, last;  // both included; empty if last < first
 };
 
-// The pixels whose centres are in [low, high], extended by more than the rounding error of either bound.
+// The pixels with centres in [low, high], extended by more than the rounding error of either bound.
 SPLAT_FN Range pixels_between(float low, float high, int size) {
   const float slack = 2e-3f + 2e-6f * (fabsf(low) + fabsf(high));
   const float first = ceilf(low - slack - 0.5f), last = floorf(high + slack - 0.5f);
