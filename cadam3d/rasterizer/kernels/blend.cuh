@@ -1,8 +1,9 @@
 // Blending and its gradient: one warp per 8x8 tile, two pixels per lane, four rows apart.
 //
-// A warp loads 32 splats at once, one per lane, and then all lanes loop over them. Lanes never wait for another
-// warp. The backward pass goes back to front with one running sum per pixel. It writes ten sums over the pixels
-// of the tile into the slot of the splat, so a warp never adds to a number that another warp wrote.
+// A warp loads 32 splats at once, one per lane, and then all lanes loop over them. Lanes never wait for
+// another warp. The backward pass goes back to front with one running sum per pixel. It writes ten sums over
+// the pixels of the tile into the slot of the splat, so a warp never adds to a number that another warp
+// wrote.
 #pragma once
 
 #include "device.cuh"
@@ -117,9 +118,9 @@ blend_forward(const float4* splats, const u32* slots, const u32* pair_of_slot, c
   }
 }
 
-// A pixel in the backward pass. With w = alpha T, the loss depends on it through sum w v, where v = rgb . g_rgb +
-// (z - D) g_depth / A, and through its final transmittance. ``suffix`` is the sum over everything behind a
-// splat: dLoss/dalpha = T v - suffix / (1 - alpha).
+// A pixel in the backward pass. With w = alpha T, the loss depends on it through sum w v, where v = rgb .
+// g_rgb + (z - D) g_depth / A, and through its final transmittance. ``suffix`` is the sum over everything
+// behind a splat: dLoss/dalpha = T v - suffix / (1 - alpha).
 struct PixelBackward {
   // red to far: gradients of the weighted sums.
   float transmittance, suffix, red, green, blue, far, depth;
@@ -189,9 +190,9 @@ SPLAT_FN float fold(bool is_high, float low, float high, int reach) {
   return (is_high ? high : low) + __shfl_xor_sync(ALL, is_high ? low : high, reach);
 }
 
-// Ten sums over the warp in twelve shuffles: each fold halves the number of sums that a lane is responsible for.
-// Lane (b4 b3 b2 b1 b0) ends with sum 5 b4 + 3 b3 + 2 b2 + b1, if that exists: see component_of. The sums are
-// separate variables because an array would be placed in slow memory.
+// Ten sums over the warp in twelve shuffles: each fold halves the number of sums that a lane is responsible
+// for. Lane (b4 b3 b2 b1 b0) ends with sum 5 b4 + 3 b3 + 2 b2 + b1, if that exists: see component_of. The
+// sums are separate variables because an array would be placed in slow memory.
 SPLAT_FN float fold_sums(const Sums& s) {
   const int lane = lane_index();
   const bool b4 = lane & 16, b3 = lane & 8, b2 = lane & 4, b1 = lane & 2;
@@ -217,8 +218,8 @@ SPLAT_FN int component_of(int lane) {
   return lane % 2 == 0 && in_half < (b3 ? 5 : 3) ? 5 * b4 + in_half : -1;
 }
 
-// records [slots 10], absolutes [slots 2]. There is one more list than tiles: it holds the slots that belong to
-// no tile, and they get zeros too.
+// records [slots 10], absolutes [slots 2]. There is one more list than tiles: it holds the slots that belong
+// to no tile, and they get zeros too.
 template <bool ABSOLUTE>
 SPLAT_FN void blend_tile_backward(const float4* splats, const u32* slots, const u32* pair_of_slot,
                                   const u32* ranges, i64 tiles, const float* background, i64 height, i64 width,

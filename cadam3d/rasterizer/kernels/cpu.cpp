@@ -1,10 +1,11 @@
 // The CPU rasterizer: projection, tile lists, blending and their gradients, behind a C interface.
 //
-// The forward pass projects every Gaussian into every view, sorts the visible ones of each view by depth, lists
-// for each 16x16 tile the Gaussians with boxes that touch it, front to back, and blends the tiles. The backward pass
-// processes each tile back to front, writes one record per (Gaussian, tile), sums the records of each Gaussian in
-// a fixed order and applies the chain rule. No two threads ever add to the same number, and the pieces of work do
-// not depend on the number of threads. Therefore any number of threads gives the same bits.
+// The forward pass projects every Gaussian into every view, sorts the visible ones of each view by depth,
+// lists for each 16x16 tile the Gaussians with boxes that touch it, front to back, and blends the tiles. The
+// backward pass processes each tile back to front, writes one record per (Gaussian, tile), sums the records
+// of each Gaussian in a fixed order and applies the chain rule. No two threads ever add to the same number,
+// and the pieces of work do not depend on the number of threads. Therefore any number of threads gives the
+// same bits.
 //
 // In the projection a vector holds LANES Gaussians. In the blending it holds LANES pixels of a cell of 4x4
 // pixels: splats are small, and on a square they leave fewer lanes unused than on a row.
@@ -56,7 +57,8 @@ constexpr int MOMENTS = 10;  // the first floats of a record
 constexpr int ABSOLUTES = 2;  // the next floats, used for absgrad
 static_assert(CELLS == CELL * CELL && BLOCK % LANES == 0, "a vector of cells is as long as one of pixels");
 
-// Bytes of the records that exist at the same time, unless a single view needs more. Tests set a small number.
+// Bytes of the records that exist at the same time, unless a single view needs more. Tests set a small
+// number.
 #if !defined(SPLAT_RECORD_BUDGET)
 #define SPLAT_RECORD_BUDGET (256 << 20)
 #endif
@@ -338,7 +340,8 @@ inline void prefetch(const void* address) {
   asm volatile("" : : "r"(address));  // GCC would remove a function that only prefetches
 }
 
-// Writes the lists of the tile rows [row_begin, row_end). Near splats come first, so lists are in depth order.
+// Writes the lists of the tile rows [row_begin, row_end). Near splats come first, so lists are in depth
+// order.
 void fill_entries(const Frame& frame, View& view, const Splat* splats, int64_t row_begin, int64_t row_end) {
   std::vector<uint32_t> next(size_t((row_end - row_begin) * frame.tiles_x));
   const int64_t first_tile = row_begin * frame.tiles_x;
@@ -397,7 +400,8 @@ Place place_of(const Scene& scene, const Frame& frame, int64_t tile) {
           int(std::min<int64_t>(TILE, scene.height - y))};
 }
 
-// The offsets of the pixels of a cell from its middle, and of the middles of the cells from the tile's corner.
+// The offsets of the pixels of a cell from its middle, and of the middles of the cells from the tile's
+// corner.
 struct Grid {
   float offset_x[CELL * CELL], offset_y[CELL * CELL], middle_x[CELLS], middle_y[CELLS];
 };
@@ -432,8 +436,8 @@ inline void take_aim(const Splat& s, float x, float y, Aim& aim) {
   }
 }
 
-// Returns a bit for each cell that |L d|^2 <= cut can reach. Within a cell, u and t differ from their value in
-// the middle by at most a known margin.
+// Returns a bit for each cell that |L d|^2 <= cut can reach. Within a cell, u and t differ from their value
+// in the middle by at most a known margin.
 inline uint32_t reachable_cells(const Splat& s, const Aim& aim) {
   const Floats margin_u = spread(1.5f * (s.l11 + std::fabs(s.l12))), margin_t = spread(1.5f * s.l22);
   const Floats cut = spread(s.cut + 1e-3f);  // includes more than the rounding error
@@ -793,7 +797,8 @@ int guarded(const Body& body) {
 }  // namespace
 
 // ---------------------------------------------------------------------------------------------- C interface
-// Every tensor is contiguous float32, with the shape that the Python code gives it. Functions return a Status.
+// Every tensor is contiguous float32, with the shape that the Python code gives it. Functions return a
+// Status.
 
 EXPORT const char* cadam3d_instruction_set() { return SIMD_NAME; }
 
@@ -835,8 +840,9 @@ EXPORT int cadam3d_blend(const Scene* scene, void* handle, float* rgb, float* al
   });
 }
 
-// Adds to gradients that the caller has set to zero. Each image gradient may be null, and so may absgrad: then no
-// absolute values are summed. The path through means2d ends in grad_means2d; cadam3d_centre_backward continues it.
+// Adds to gradients that the caller has set to zero. Each image gradient may be null, and so may absgrad:
+// then no absolute values are summed. The path through means2d ends in grad_means2d; cadam3d_centre_backward
+// continues it.
 EXPORT int cadam3d_blend_backward(const Scene* scene, void* handle, const float* alpha, const float* depth,
                                   const float* grad_rgb, const float* grad_alpha, const float* grad_depth,
                                   float* grad_means2d, float* absgrad, float* grad_means,

@@ -1,8 +1,9 @@
 // Definitions that all CUDA kernels share: short names, sizes, and the indices of a thread.
 //
-// No header of the toolkit is included, because a run-time compiler has none. Every kernel parameter has eight
-// bytes, a pointer or an i64, so that a launch is a list of numbers (see ``Launch`` in ../launcher.py). Grids
-// have one dimension. No kernel adds floats atomically, so the input determines every bit of every result.
+// No header of the toolkit is included, because a run-time compiler has none. Every kernel parameter has
+// eight bytes, a pointer or an i64, so that a launch is a list of numbers (see ``Launch`` in
+// ../launcher.py). Grids have one dimension. No kernel adds floats atomically, so the input determines every
+// bit of every result.
 #pragma once
 
 #include "splat_math.h"

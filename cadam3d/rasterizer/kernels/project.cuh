@@ -1,4 +1,5 @@
-// Projection of Gaussians to splats, and its gradient from records: one thread per Gaussian loops over the views.
+// Projection of Gaussians to splats, and its gradient from records: one thread per Gaussian loops over the
+// views.
 #pragma once
 
 #include "tiles.cuh"
@@ -33,7 +34,8 @@ SPLAT_FN Gaussian<COEFFICIENTS> load_gaussian(const float* means, const float* l
   return gaussian;
 }
 
-// splats [v n 3 float4], means2d [v n 2], radii [v n], depth_keys [v n], and the numbers of tiles: counts [v n]
+// splats [v n 3 float4], means2d [v n 2], radii [v n], depth_keys [v n], and the numbers of tiles: counts [v
+// n]
 template <int COEFFICIENTS>
 SPLAT_FN void project_gaussian(const float* means, const float* log_scales, const float* quats,
                                const float* opacity_logits, const float* sh, const Camera* cameras, i64 n,
@@ -68,8 +70,8 @@ SPLAT_FN void project_gaussian(const float* means, const float* log_scales, cons
 
 constexpr i64 LONG_RUN = 64;  // records; a longer run is summed by the whole warp
 
-// Sums ``count`` records of WIDTH floats from ``first`` on; each lane has its own run. All lanes of a warp must
-// call this function.
+// Sums ``count`` records of WIDTH floats from ``first`` on; each lane has its own run. All lanes of a warp
+// must call this function.
 template <int WIDTH>
 SPLAT_FN void sum_records(const float* records, i64 first, i64 count, float* sum) {
   for (int j = 0; j < WIDTH; ++j) sum[j] = 0;
@@ -97,8 +99,9 @@ SPLAT_FN void sum_records(const float* records, i64 first, i64 count, float* sum
   }
 }
 
-// The totals over the views. A launch processes some consecutive views and the next launch continues, so numbers
-// are added in the same order as in a single launch. ``axes`` [n 9] may be null if one launch processes all views.
+// The totals over the views. A launch processes some consecutive views and the next launch continues, so
+// numbers are added in the same order as in a single launch. ``axes`` [n 9] may be null if one launch
+// processes all views.
 template <int COEFFICIENTS>
 struct Totals {
   float *means, *axes, *opacity_logits, *sh;
@@ -120,9 +123,9 @@ struct Totals {
   }
 };
 
-// All gradients of one Gaussian except the path through means2d, which ends in grad_means2d [v n 2]. Processes
-// the views first_view .. end_view - 1, for which there are records. The launch with the last view also computes
-// the gradients of log-scales and quaternions.
+// All gradients of one Gaussian except the path through means2d, which ends in grad_means2d [v n 2].
+// Processes the views first_view .. end_view - 1, for which there are records. The launch with the last view
+// also computes the gradients of log-scales and quaternions.
 template <int COEFFICIENTS>
 SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, const float* quats,
                                 const float* opacity_logits, const float* sh, const Camera* cameras, i64 n,
@@ -168,7 +171,8 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
   for (int j = 0; j < 4; ++j) grad_quats[4 * i + j] = quat[j];
 }
 
-// absgrad [pairs 2]: the sum over the pixels of the absolute value of what each adds to the gradient of a centre.
+// absgrad [pairs 2]: the sum over the pixels of the absolute value of what each adds to the gradient of a
+// centre.
 KERNEL(BLOCK)
 sum_absolutes(i64 pairs, const float* absolutes, const float4* splats, const u32* first_slot,
               const u32* slot_count, float* absgrad) {

@@ -1,8 +1,9 @@
 // Vectors of many pixels or Gaussians, with the width of this machine, and the operations on them.
 //
-// A compiler lowers vectors that are wider than those of the machine to scalar code. Therefore the width depends
-// on the instruction set: 16 lanes for AVX-512, 8 for AVX2, 4 for everything else (SSE2, NEON, ...). A product and
-// a sum are fused only where the code says fma(), so that the forward and the backward pass compute the same bits.
+// A compiler lowers vectors that are wider than those of the machine to scalar code. Therefore the width
+// depends on the instruction set: 16 lanes for AVX-512, 8 for AVX2, 4 for everything else (SSE2, NEON, ...).
+// A product and a sum are fused only where the code says fma(), so that the forward and the backward pass
+// compute the same bits.
 #pragma once
 
 #if defined(__x86_64__) || defined(_M_X64)
@@ -158,9 +159,9 @@ inline bool any(Mask a) { return bits(a) != 0; }
 
 // ------------------------------------------------------------------------------------- exp and sums
 
-// exp(-x) for 0 <= x < 80, with a relative error below 3e-7. For other x the result is arbitrary, and the caller
-// masks the lane. exp(-x) = 2^n 2^f, where n is the nearest integer; the polynomial is the minimax approximation
-// of 2^f on [-1/2, 1/2] (Lawson).
+// exp(-x) for 0 <= x < 80, with a relative error below 3e-7. For other x the result is arbitrary, and the
+// caller masks the lane. exp(-x) = 2^n 2^f, where n is the nearest integer; the polynomial is the minimax
+// approximation of 2^f on [-1/2, 1/2] (Lawson).
 inline Floats exp_minus(Floats x) {
   const Floats scaled = x * spread(-1.44269504f);
   const Floats magic = spread(12582912.0f);  // 1.5 * 2^23; adding it rounds, and n is in the low bits
@@ -204,8 +205,8 @@ inline Floats log(Floats x) {
   return fma(n, spread(0.693147181f), fma(p * square, s, s + s));
 }
 
-// Writes the sums over the lanes of each of the N vectors to ``to[0] .. to[15]``, always added in the same order.
-// Numbers after the N-th are arbitrary. ``to`` is the start of a cache line.
+// Writes the sums over the lanes of each of the N vectors to ``to[0] .. to[15]``, always added in the same
+// order. Numbers after the N-th are arbitrary. ``to`` is the start of a cache line.
 #if defined(SIMD_AVX512)
 // Lanes with the bit DISTANCE set hold sums of b, the others of a; each adds its partner DISTANCE lanes away.
 template <int DISTANCE>

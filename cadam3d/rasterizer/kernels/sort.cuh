@@ -1,8 +1,9 @@
 // Prefix sums with totals that fit into 32 bits, and a stable radix sort.
 //
-// The sort handles eight bits per pass, least significant first. A pass counts the digits of each chunk, converts
-// the counts (digit after digit, chunk after chunk) to positions with one prefix sum, and scatters the items.
-// Within a chunk a warp owns consecutive items and ranks them by votes, so equal keys keep their order.
+// The sort handles eight bits per pass, least significant first. A pass counts the digits of each chunk,
+// converts the counts (digit after digit, chunk after chunk) to positions with one prefix sum, and scatters
+// the items. Within a chunk a warp owns consecutive items and ranks them by votes, so equal keys keep their
+// order.
 #pragma once
 
 #include "device.cuh"
@@ -16,8 +17,8 @@ constexpr int SORT_ROUNDS = 16;                  // items of one thread
 constexpr int SORT_CHUNK = BLOCK * SORT_ROUNDS;  // of one block; mirrored in ../cuda.py
 static_assert(BINS == BLOCK, "a thread per bin");
 
-// Returns the sum over the threads before this one; ``total`` is the sum over all threads of the block. ``sums``
-// is shared memory for BLOCK numbers.
+// Returns the sum over the threads before this one; ``total`` is the sum over all threads of the block.
+// ``sums`` is shared memory for BLOCK numbers.
 SPLAT_FN u32 block_scan(u32 value, u32* sums, u32* total) {
   const int t = int(threadIdx.x);
   u32 inclusive = value;
@@ -35,8 +36,8 @@ SPLAT_FN u32 block_scan(u32 value, u32* sums, u32* total) {
   return inclusive - value;
 }
 
-// Exclusive prefix sums of one chunk, all increased by ``carry``; returns the sum of the chunk. ``out`` may be
-// ``in``, because each thread reads and writes only its own items.
+// Exclusive prefix sums of one chunk, all increased by ``carry``; returns the sum of the chunk. ``out`` may
+// be ``in``, because each thread reads and writes only its own items.
 SPLAT_FN u32 scan_chunk(const u32* in, i64 begin, i64 n, u32 carry, u32* out, u32* sums) {
   const i64 first = begin + i64(threadIdx.x) * SCAN_ITEMS;
   const i64 end = first + SCAN_ITEMS < n ? first + SCAN_ITEMS : n;

@@ -1,17 +1,17 @@
 // One splat, from world to screen and back: the maths that all native backends share.
 //
-// This file includes no header, because a run-time CUDA compiler has none. It is templated on the scalar and has
-// neither allocations nor branches, so that a scalar may also stand for many Gaussians (``simd::Wide``). The
-// formulas are those of EWA splatting (Zwicker et al. 2002; Kerbl et al. 2023, sec. 4), in a form that costs
-// nothing more and keeps long thin splats accurate in float32:
+// This file includes no header, because a run-time CUDA compiler has none. It is templated on the scalar and
+// has neither allocations nor branches, so that a scalar may also stand for many Gaussians (``simd::Wide``).
+// The formulas are those of EWA splatting (Zwicker et al. 2002; Kerbl et al. 2023, sec. 4), in a form that
+// costs nothing more and keeps long thin splats accurate in float32:
 //
 //   screen covariance  C = B B^T + blur I,  B = J W R diag(s): two rows of three
 //   its determinant    |B0 x B1|^2 + blur (|B0|^2 + |B1|^2) + blur^2: a sum of squares, no cancellation
 //   its whitening      L^T L = C^-1 / 2,  L = [[l11, l12], [0, l22]]: closed form in C and det C
 //   falloff at d       exp(-|L d|^2): never above 1, by construction
 //
-// The blend gathers moments of y = L d, not of d. With Y = sum g y y^T and s = sum g y (g = dLoss/d|y|^2), the
-// gradients are  dLoss/dC = -2 L^T Y L,  dLoss/dB = -4 L^T Y (L B),  dLoss/dmean2d = -2 L^T s.
+// The blend gathers moments of y = L d, not of d. With Y = sum g y y^T and s = sum g y (g = dLoss/d|y|^2),
+// the gradients are  dLoss/dC = -2 L^T Y L,  dLoss/dB = -4 L^T Y (L B),  dLoss/dmean2d = -2 L^T s.
 //
 // The build defines the constants of image formation (SPLAT_BLUR, SPLAT_ALPHA_MIN, SPLAT_NEAR, SPLAT_FAR,
 // SPLAT_FRUSTUM_MARGIN) from cadam3d/rasterizer/base.py, which is the only place that contains their values.

@@ -1,7 +1,8 @@
 // Counts and lists the tiles that each splat touches, and splits the slots into one list per tile.
 //
-// A splat gets one slot per tile it touches. Slots are numbered in depth order, so a stable sort by tile leaves
-// every list in depth order. The slots of a splat are consecutive; the backward pass writes its records there.
+// A splat gets one slot per tile it touches. Slots are numbered in depth order, so a stable sort by tile
+// leaves every list in depth order. The slots of a splat are consecutive; the backward pass writes its
+// records there.
 #pragma once
 
 #include "device.cuh"
@@ -25,8 +26,8 @@ SPLAT_FN Range pixels_between(float low, float high, int size) {
   return {int(fminf(fmaxf(first, 0.0f), float(size))), int(fmaxf(fminf(last, float(size - 1)), -1.0f))};
 }
 
-// Calls visit(tile row, first column, last column) for each row of tiles that the ellipse |L d|^2 <= cut meets,
-// from top to bottom. Counting and listing both use this function, so they agree on every tile.
+// Calls visit(tile row, first column, last column) for each row of tiles that the ellipse |L d|^2 <= cut
+// meets, from top to bottom. Counting and listing both use this function, so they agree on every tile.
 template <class Visit>
 SPLAT_FN void each_tile_row(const Splat& s, const Grid& grid, const Visit& visit) {
   const float reach_x = s.reach_x, reach_y = sqrtf(s.cut) / s.l22;
@@ -55,7 +56,8 @@ SPLAT_FN u32 count_tiles(const Splat& s, const Grid& grid) {
   return count;
 }
 
-// Fills the slots [slot, end) of one pair. Lane ``first_lane`` of ``lanes`` handles every lanes-th tile of a row.
+// Fills the slots [slot, end) of one pair. Lane ``first_lane`` of ``lanes`` handles every lanes-th tile of a
+// row.
 SPLAT_FN void fill_slots(const Splat& s, const Grid& grid, u32 pair, u32 first_key, u32 sentinel, u32 slot,
                          u32 end, int first_lane, int lanes, u32* tile_keys, u32* pair_of_slot) {
   const auto write = [&](u32 at, u32 key) {
@@ -71,8 +73,8 @@ SPLAT_FN void fill_slots(const Splat& s, const Grid& grid, u32 pair, u32 first_k
 
 constexpr u32 MANY_TILES = 32;  // a splat with more is listed by the whole warp
 
-// order, offsets [pairs]: the pairs, nearest first, and the prefix sums of their counts. tile_keys, pair_of_slot
-// [slots]. counts, first_slot [v n]: the number of slots of each pair, and the first of them.
+// order, offsets [pairs]: the pairs, nearest first, and the prefix sums of their counts. tile_keys,
+// pair_of_slot [slots]. counts, first_slot [v n]: the number of slots of each pair, and the first of them.
 KERNEL(BLOCK)
 tile_list(const u32* order, const u32* counts, const u32* offsets, i64 pairs, i64 n, const float4* splats,
           i64 views, i64 height, i64 width, u32* tile_keys, u32* pair_of_slot, u32* first_slot) {
@@ -100,8 +102,8 @@ tile_list(const u32* order, const u32* counts, const u32* offsets, i64 pairs, i6
   }
 }
 
-// ranges [v tiles + 1, 2]: begin and end of each list among the sorted keys; the caller fills it with zeros. The
-// last list holds the slots that belong to no tile. It is empty as long as listing agrees with counting.
+// ranges [v tiles + 1, 2]: begin and end of each list among the sorted keys; the caller fills it with zeros.
+// The last list holds the slots that belong to no tile. It is empty as long as listing agrees with counting.
 KERNEL(BLOCK) tile_ranges(const u32* tile_keys, i64 slots, u32* ranges) {
   const i64 e = thread_index();
   if (e >= slots) return;

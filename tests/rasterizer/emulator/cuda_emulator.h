@@ -1,9 +1,9 @@
 // Runs CUDA kernels on a CPU, one fiber per thread, so that tests can check the same source that a GPU runs.
 //
-// A thread runs until it reaches a barrier or a warp operation. Then another thread of its block continues, in an
-// order shuffled by a seed. So a result that depends on the schedule changes with the seed. If a barrier is
-// missing, a thread reads memory before it is written; shared memory starts with garbage in each block. A barrier
-// that some threads do not reach is reported as a deadlock.
+// A thread runs until it reaches a barrier or a warp operation. Then another thread of its block continues,
+// in an order shuffled by a seed. So a result that depends on the schedule changes with the seed. If a
+// barrier is missing, a thread reads memory before it is written; shared memory starts with garbage in each
+// block. A barrier that some threads do not reach is reported as a deadlock.
 //
 // The emulator cannot show the order in which a real memory system makes stores visible to other threads, nor
 // the rounding of a real GPU's exponential.

@@ -1,6 +1,6 @@
-// The part of the CUDA driver that the rasterizer calls, on top of the emulator: same functions, same arguments.
-// A module contains every kernel below. The handle of a stream is the seed of the schedule; seed 0 runs blocks
-// and threads in order.
+// The part of the CUDA driver that the rasterizer calls, on top of the emulator: same functions, same
+// arguments. A module contains every kernel below. The handle of a stream is the seed of the schedule; seed
+// 0 runs blocks and threads in order.
 #include "cuda_emulator.h"
 
 // The number of the planted mistake that is switched on. Only altered copies of the kernels read it.
