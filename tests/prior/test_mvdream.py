@@ -289,10 +289,10 @@ def test_a_damaged_or_foreign_file_is_one_line(prior, file, folder, tmp_path):
     torch.save({"other": torch.zeros(3)}, tmp_path / "other.pt")
     (tmp_path / "text.safetensors").write_text("hello")
     for name, words in (
-        ("broken.pt", "is no file of tensors"),
-        ("text.safetensors", "is no file of tensors"),
-        ("other.pt", "holds no unet"),
-        ("lacking.pt", "holds no unet"),
+        ("broken.pt", "is not a file of tensors"),
+        ("text.safetensors", "is not a file of tensors"),
+        ("other.pt", "contains no unet"),
+        ("lacking.pt", "contains no unet"),
     ):
         there = replace(prior, path=str(tmp_path / name), tokenizer=str(folder / "tokenizer"))
         with pytest.raises(UserError, match=words) as raised:
@@ -306,7 +306,7 @@ def test_nothing_in_a_file_is_executed(prior, tmp_path):
             return (exec, ("raise SystemExit('executed')",))
 
     torch.save({"weight": torch.zeros(1), "code": Stranger()}, tmp_path / "evil.pt")
-    with pytest.raises(UserError, match="is no file of tensors"):
+    with pytest.raises(UserError, match="is not a file of tensors"):
         replace(prior, path=str(tmp_path / "evil.pt")).found  # noqa: B018
 
 
