@@ -325,6 +325,13 @@ def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, 
         ("densifier.tau_q=0.5", "Did you mean densifier.tau_Q? Try: densifier.tau_Q=0.5"),
         ("tau_SNR=0.2", "Did you mean densifier.tau_SNR? Try: densifier.tau_SNR=0.2"),
         ("densifier.max_gaussians=9", "Did you mean refine.max_gaussians? Try: refine.max_gaussians=9"),
+        (
+            "densifier.child_state=inherit",
+            "a setting of densifier=cadam_open, not of the chosen option. "
+            "Try: densifier=cadam_open densifier.child_state=inherit",
+        ),
+        ("densifier.screen_px=20", "Try: densifier=absgrad densifier.screen_px=20"),
+        ("exporter.views=20", "exporter.views: no such setting. Did you mean "),
         ("step=5", "Did you mean steps"),
         ("qqqq.zzzz=5", "no such setting. Try: cadam3d train --cfg job"),
         ("densifier=cadm", f"expected one of {'|'.join(DENSIFIERS)}, got 'cadm'. Try: densifier=cadam"),
