@@ -561,10 +561,7 @@ def complete(line: str, type_line, monkeypatch, shell: str = "bash") -> list[str
         ("cadam3d ", list(cli.COMMANDS)),
         ("cadam3d e", ["export", "eval"]),
         ("cadam3d train densifier=", [f"densifier={name}" for name in DENSIFIERS]),
-        (
-            "cadam3d train densifier.tau_",
-            ["densifier.tau_Q=", "densifier.tau_SNR=", "densifier.tau_m=", "densifier.tau_reset="],
-        ),
+        ("cadam3d train densifier.tau_", ["densifier.tau_Q=", "densifier.tau_SNR="]),
         ('cadam3d train prompt="a car, (red)" densifier=cadam_c', ["densifier=cadam_calibrated"]),
         ("cadam3d train 'prompt=a car' densifier=cadam_c", ["densifier=cadam_calibrated"]),
         ("cadam3d sweep grid=th", ["grid=thresholds"]),

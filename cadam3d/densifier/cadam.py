@@ -45,12 +45,10 @@ class CAdam(Densifier[CAdamState]):
     tau_Q: float | Schedule | None  # in [0, 1): quantile of the drift that candidates exceed; null = off
     tau_SNR: (
         float | None
-    )  # >= 0: SNR that candidates exceed, and that unreliable Gaussians stay below; null = off
-    beta1: float  # decay of m
-    beta2: float  # decay of v
-    eps: (
-        float  # added to the noise, in loss per world unit; gives a Gaussian without any gradient an SNR of 0
-    )
+    )  # >= 0: SNR that candidates exceed and unreliable Gaussians do not reach; null = off
+    beta1: float  # in [0, 1): decay of m
+    beta2: float  # in [0, 1): decay of v
+    eps: float  # > 0: added to the noise, in loss per world unit; without any gradient the SNR is 0
     min_age: int  # updates before a Gaussian may grow
     reset: str  # which opacities a reset lowers: unreliable (paper), all (3DGS) or none
     reset_min_age: int  # updates before a Gaussian may be called unreliable
@@ -103,7 +101,7 @@ class CAdam(Densifier[CAdamState]):
         return drift, noise
 
     def select(self, state: CAdamState, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
-        """Return the mask of Gaussians to grow: large drift (eq. 9) that stands above its noise (eq. 11)."""
+        """Return the mask of Gaussians to grow, by their drift (eq. 9) and their SNR (eq. 11)."""
         drift, noise = self.strengths(state)
         is_strong = drift > self._drift_threshold(state, drift, step)
         # Compare with a product, because a quotient would divide by a noise close to zero.
@@ -118,7 +116,7 @@ class CAdam(Densifier[CAdamState]):
         is_noisy = drift < self._reset_threshold() * (noise + self._eps(noise))
         return is_noisy & (state.age >= self.reset_min_age)
 
-    # The terms of the equations above. ``cadam_open.py`` replaces them.
+    # Terms of the equations above, which the open choices in ``cadam_open.py`` replace.
 
     def _drift_threshold(self, state: CAdamState, drift: Float[Tensor, "n"], step: int) -> Float[Tensor, ""]:
         """Return the drift that candidates exceed at ``step`` (right-hand side of eq. 9)."""

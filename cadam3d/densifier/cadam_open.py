@@ -31,26 +31,18 @@ class CAdamOpen(CAdam):
     """CAdam with other evidence, other gates, another inheritance or another reset."""
 
     # Evidence: which gradients the moments average.
-    grad_source: str  # total: gradient of the whole loss; guidance: without the regularizers
-    grad_norm: (
-        str  # none; per_step_rms: divide each step's gradients by their root mean square over Gaussians
-    )
-    invisible: (
-        str  # zero: a Gaussian that no view sees has gradient 0; skip: it is not updated and does not age
-    )
+    grad_source: str  # gradient of the total loss, or of the guidance without the regularizers
+    grad_norm: str  # none, or per_step_rms: gradients over their root mean square over all Gaussians
+    invisible: str  # Gaussians that no view sees: zero (gradient 0) or skip (no update and no ageing)
     nonfinite: str  # a NaN or infinite gradient: skip_step for all Gaussians, or skip_row for its own
     # Gates: which Gaussians are candidates.
     quantile_over: str  # population of tau_Q: all, mature (age >= min_age) or seen (v > 0)
     tau_m: float | None  # >= 0: absolute drift that candidates exceed, in loss per world unit; null = off
-    alpha: (
-        float | None
-    )  # in (0, 1): how often pure noise may pass the SNR gate, instead of tau_SNR; null = tau_SNR
+    alpha: float | None  # in (0, 1): share of pure noise that may pass the SNR gate; null = use tau_SNR
     eps_mode: str  # unit of eps: abs (loss per world unit) or rel_median (shares of the median noise)
-    # Histories: what newborns and their parents remember.
-    child_state: (
-        str  # newborns: zero, or the parent's moments and age (inherit), or those of half its gradients
-    )
-    parent_state: str  # a cloned parent: keep its moments and age, or reset them to zero
+    # Histories: moments and ages after a refinement.
+    child_state: str  # of newborns: zero, inherit (the parent's) or inherit_half (of half its gradients)
+    parent_state: str  # of a cloned parent: keep, or reset to zero
     # Resets.
     tau_reset: float | None  # >= 0: SNR below which a Gaussian is unreliable; null = tau_SNR
     reset_moments: bool  # whether an opacity reset also zeroes the moments and ages of its Gaussians

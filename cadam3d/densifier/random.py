@@ -19,9 +19,7 @@ class RandomGrowth(Densifier[RowCount]):
     What a densifier gains over this one at the same share is what its evidence is worth.
     """
 
-    share: (
-        float | Schedule
-    )  # in [0, 1): of the Gaussians, at each refinement; the control of tau_Q = 1 - share
+    share: float | Schedule  # in [0, 1): of the Gaussians, at each refinement; matches tau_Q = 1 - share
 
     def __post_init__(self) -> None:
         require_scheduled("densifier.share", self.share, low=0, below=1, example=0.1)
