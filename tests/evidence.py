@@ -39,12 +39,12 @@ OPEN = {
 
 
 def cadam(**changes) -> CAdam:
-    """The paper's densifier, apart from ``changes`` and without minimum ages."""
+    """Return the paper's densifier with ``changes``, and without minimum ages."""
     return CAdam(**{**PAPER, **changes})
 
 
 def open_cadam(**changes) -> CAdamOpen:
-    """The same densifier with its open choices as settings."""
+    """Return the same densifier with its open choices as settings."""
     return CAdamOpen(**{**PAPER, **OPEN, **changes})
 
 

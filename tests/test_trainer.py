@@ -73,7 +73,7 @@ def restore(trainer: Trainer, payload: dict) -> TrainState:
 
 
 def same(left: dict, right: dict) -> bool:
-    """Bitwise equality of two payloads, wall-clock time aside."""
+    """Return whether two payloads are equal to the bit, apart from wall-clock time."""
     assert left.keys() == right.keys()
     for key, value in left.items():
         other = right[key]
@@ -321,6 +321,26 @@ def test_a_resumed_run_with_a_larger_cap_equals_one_that_never_met_it(tmp_path, 
     resumed = restored()
     assert go(free, resumed, tmp_path) is Outcome.FINISHED
     assert same(whole.to_payload(), resumed.to_payload())
+
+
+def test_a_refused_refinement_that_a_new_schedule_leaves_out_does_not_end_the_resumed_run(tmp_path):
+    capped, state = make(["refine.max_gaussians=30"])
+    assert go(capped, state, tmp_path) is Outcome.MAX_GAUSSIANS
+    without_growth, _ = make(["refine.max_gaussians=30", "refine.end=0", "refine.reset_interval=null"])
+    assert go(without_growth, state, tmp_path) is Outcome.FINISHED
+    assert not state.refused
+
+
+def test_memory_that_runs_out_while_a_refused_refinement_is_repeated_is_an_outcome(tmp_path, monkeypatch):
+    capped, state = make(["refine.max_gaussians=30"])
+    assert go(capped, state, tmp_path) is Outcome.MAX_GAUSSIANS
+
+    def exhausted(*_args):
+        raise MemoryError
+
+    monkeypatch.setattr("cadam3d.core.edit.RowEdit.apply", exhausted)
+    free, _ = make()
+    assert go(free, state, tmp_path) is Outcome.OUT_OF_MEMORY
 
 
 def test_losing_every_gaussian_is_an_outcome(tmp_path):

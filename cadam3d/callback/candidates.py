@@ -19,7 +19,7 @@ from cadam3d.io.jsonl import append_jsonl, truncate_after
 from cadam3d.io.run_folder import CANDIDATES, HISTOGRAMS
 from cadam3d.state import RefineReport, RunContext, TrainState
 
-# Vermilion of Okabe and Ito, which people with any colour vision distinguish from grey, also in print.
+# Vermilion of Okabe and Ito, which differs from grey with any colour vision, and in print.
 SELECTED = (0.84, 0.37, 0.0)
 OTHERS = (0.72, 0.72, 0.72)
 # Powers of ten at which histograms end; values beyond are counted in the outermost bins.

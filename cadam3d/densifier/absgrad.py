@@ -11,7 +11,7 @@ from cadam3d.densifier.baseline import Baseline
 
 @dataclass(frozen=True, kw_only=True)
 class AbsGrad(Baseline):
-    """Select Gaussians whose mean homodirectional gradient norm reaches a fixed threshold.
+    """Select Gaussians whose mean norm of absolute gradients reaches a fixed threshold.
 
     The baseline takes the view-space gradient, a sum over pixels that pull in many directions. This class
     takes the sums over pixels of the absolute values, along x and along y separately. A large Gaussian over

@@ -65,8 +65,8 @@ class MCMC(Densifier[RowCount]):
     ) -> RefinePlan:
         """Replace dead Gaussians by copies of live ones, then grow; both drawn in proportion to opacity.
 
-        A Gaussian that is copied becomes newborn like its copies: its opacity and scales change with theirs,
-        and its old moments describe what it was. Where none is alive, the dead ones are removed without
+        A Gaussian that is copied becomes newborn like its copies, because its opacity and scales change with
+        theirs and its old moments no longer describe it. If none is alive, the dead ones are removed without
         replacement.
         """
         gaussians = gaussians.detach()
@@ -97,7 +97,8 @@ class MCMC(Densifier[RowCount]):
         """Return Langevin noise, stretched by each covariance and almost zero for opaque Gaussians."""
         means = gaussians.means
         normal = torch.randn(means.shape, generator=generator, dtype=means.dtype).to(means.device)
-        # Isotropic noise is isotropic along the own axes of each Gaussian too.
+        # Isotropic noise has the same distribution along the axes of each Gaussian, so it needs no rotation
+        # first.
         along_axes = gaussians.scales.square() * normal
         strength = self.noise_lr * lr * (SHARPNESS * (FAINT - gaussians.opacities)).sigmoid()
         return strength[:, None] * (gaussians.rotations @ along_axes[..., None])[..., 0]
@@ -105,7 +106,7 @@ class MCMC(Densifier[RowCount]):
 
 @dataclass(frozen=True)
 class _Population:
-    """The population under construction: which row each member copies, and how it differs from that row."""
+    """A population under construction: which row each member copies, and how it differs from that row."""
 
     rows: Int[Tensor, "m"]  # row numbers before the edit; ascending among members that are not new
     logits: Float[Tensor, "m"]  # of opacity, in double precision
@@ -121,8 +122,8 @@ class _Population:
     def multiply(self, births: int, min_opacity: float, generator: torch.Generator) -> "_Population":
         """Return the population with ``births`` more copies, drawn with replacement in proportion to opacity.
 
-        No copy and no copied Gaussian is fainter than ``min_opacity``, because the next refinement would
-        remove it.
+        Copies and copied Gaussians have at least the opacity ``min_opacity``; otherwise the next refinement
+        would remove them.
         """
         floor = math.log(min_opacity / (1 - min_opacity)) + ABOVE if min_opacity > 0 else -math.inf
         chosen = draw(self.logits.sigmoid(), births, generator)
@@ -159,8 +160,8 @@ def share(
 
         sum over k < N of  C(N, k + 1) (-1)^k o'^(k + 1) / sqrt(k + 1)
 
-    (the double sum of the paper with its inner binomials added up), up to a factor that it shares with ``o
-    s``. The sum alternates, but loses no more digits than 1 - o has leading zeros.
+    up to a factor that it shares with ``o s``. This is the double sum of the paper with its inner binomials
+    added up. It alternates, but loses no more digits than 1 - o has leading zeros.
     """
     clear = softplus(logits.clamp_max(LOGIT_MAX)) / among  # -log(1 - o')
     opacity = -torch.expm1(-clear)

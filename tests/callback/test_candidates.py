@@ -120,7 +120,7 @@ def test_bins_contain_the_values_between_their_edges():
 
 
 def test_bins_do_not_depend_on_the_data():
-    """So that histograms of two runs, or of two steps, can be added."""
+    """Histograms of two runs, or of two steps, can therefore be added."""
     generator = torch.Generator().manual_seed(0)
     values = torch.rand(500, generator=generator).double().exp()
     no_rows = torch.zeros(500, dtype=torch.bool)

@@ -18,7 +18,7 @@ SETTINGS = {"tau_pos": 0.25, "views": "sum_norm", "grad_multiplier": 1.0, "scree
 
 
 def signal(means2d: torch.Tensor, absgrad: torch.Tensor | None, height=2, width=2) -> GradientSignal:
-    """At 2 x 2 pixels one pixel is one NDC unit."""
+    """Return a signal; at 2 x 2 pixels one pixel is one NDC unit."""
     return GradientSignal(
         means=torch.zeros(means2d.shape[1], 3),
         means2d=means2d,

@@ -24,7 +24,7 @@ def baseline(**changes) -> Baseline:
 
 
 def signal(means2d: torch.Tensor, visible: torch.Tensor | None = None, height=2, width=2) -> GradientSignal:
-    """At 2 x 2 pixels one pixel is one NDC unit."""
+    """Return a signal; at 2 x 2 pixels one pixel is one NDC unit."""
     visible = torch.ones(means2d.shape[:2], dtype=torch.bool) if visible is None else visible
     return GradientSignal(
         means=torch.zeros(means2d.shape[1], 3),

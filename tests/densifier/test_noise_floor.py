@@ -50,7 +50,7 @@ def one_plane(draw: torch.Generator) -> torch.Tensor:
 
 
 def heavy(draw: torch.Generator) -> torch.Tensor:
-    """Student's t with 3 degrees of freedom: no fourth moment."""
+    """Return noise of Student's t with 3 degrees of freedom, which has no fourth moment."""
     return isotropic(draw) / isotropic(draw).square().mean(dim=-1, keepdim=True).sqrt()
 
 

@@ -42,7 +42,7 @@ def refine(**changes) -> Refine:
 
 
 def gaussians(n: int, seed: int = 0) -> Gaussians:
-    """Half of them smaller than tau_scale, half larger; all well visible."""
+    """Return Gaussians of which half are smaller than tau_scale, and half larger; all are clearly visible."""
     draw = torch.Generator().manual_seed(seed)
     scales = torch.empty(n, 3).uniform_(0.01, 0.02, generator=draw)
     scales[n // 2 :, 1] *= 10
