@@ -42,12 +42,10 @@ class TrainState:
     step: int  # steps done
     seconds: float  # wall-clock time spent on them
     num_initial: int  # Gaussians at step 0
-    initial_note: str | None  # why a fallback replaced the chosen initializer, if one did
+    initial_note: str | None  # which fallback replaced the chosen initializer, and why; None if none did
     skipped: int  # steps without an update, because a gradient was not finite
     dimmed: int  # steps after which the exposure guard dimmed all colours
-    refused: (
-        bool  # whether the refinement after the last step was refused, because it would exceed max_gaussians
-    )
+    refused: bool  # whether the refinement after the last step was refused, for exceeding max_gaussians
     seed: int  # from which all generators descend
     optimizer: GaussianOptimizer  # owns the Gaussians
     densifier: RowState
