@@ -43,9 +43,7 @@ class CAdam(Densifier[CAdamState]):
     """
 
     tau_Q: float | Schedule | None  # in [0, 1): quantile of the drift that candidates exceed; null = off
-    tau_SNR: (
-        float | None
-    )  # >= 0: SNR that candidates exceed and unreliable Gaussians do not reach; null = off
+    tau_SNR: float | None  # >= 0: SNR above which a Gaussian is reliable (eq. 11 and 13); null = off
     beta1: float  # in [0, 1): decay of m
     beta2: float  # in [0, 1): decay of v
     eps: float  # > 0: added to the noise, in loss per world unit; without any gradient the SNR is 0
