@@ -198,7 +198,7 @@ def _start_or_resume(cfg: DictConfig, trainer: Trainer, device: torch.device, fo
     path = _checkpoint(cfg, folder)
     if path is None:
         return trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, device)
-    state = trainer.restore(load_checkpoint(path), device)
+    state = TrainState.restore(load_checkpoint(path), trainer.optimizer, trainer.densifier, device)
     require(
         cfg.seed == state.seed,
         "seed",
