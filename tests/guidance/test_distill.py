@@ -340,3 +340,12 @@ def test_a_window_that_closes_in_between_is_refused_when_it_does(make, ask, gaus
 def test_the_root_mean_square_is_of_what_is_finite():
     assert rms(torch.tensor([3.0, torch.nan, 4.0, torch.inf])) == pytest.approx(12.5**0.5)
     assert rms(torch.tensor([torch.nan, -torch.inf])) == 0
+
+
+def test_every_number_of_a_chart_is_logged(objective, make, ask, gaussian, means, rgb):
+    guidance = make(objective)
+    _, output = ask(guidance, rgb, means, gaussian(DDPM()))
+    keys = [curve.key for chart in guidance.charts() for curve in chart.curves]
+    assert "residual_rms" in keys
+    assert len(keys) == len(set(keys))
+    assert set(keys) <= set(output.log)

@@ -288,5 +288,5 @@ def test_wrong_values_are_refused_by_key(key, value, make, monkeypatch):
 
 
 def test_without_any_term_there_is_nothing_to_descend(make):
-    with pytest.raises(UserError, match=r"guidance.w_gc: expected a term with a weight"):
+    with pytest.raises(UserError, match=r"guidance.w_gc: expected a number > 0, since w_cc and w_cp are 0"):
         make("gcs", **weights_of(0.0, 0.0, 0.0))

@@ -145,15 +145,15 @@ def test_gaussians_are_not_replicated(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["means", "opacity_logits"])
-def test_an_asset_with_numbers_that_are_none_is_refused(tmp_path, name):
+def test_an_asset_with_numbers_that_are_not_finite_is_refused(tmp_path, name):
     asset = some_gaussians()
     asset.tensors()[name][3] = float("nan")
-    with pytest.raises(UserError, match=rf"holds {name} that are not finite \(1 of 60\)"):
+    with pytest.raises(UserError, match=rf"which has {name} that are not finite \(1 of 60\)"):
         build(saved(tmp_path, asset))
 
 
 def test_an_empty_asset_is_refused(tmp_path):
-    with pytest.raises(UserError, match="holds nothing"):
+    with pytest.raises(UserError, match=r"which is empty\. Try: initializer\.path="):
         build(saved(tmp_path, some_gaussians(n=0)))
 
 
@@ -240,16 +240,16 @@ def test_the_generator_decides(tmp_path):
     assert not torch.equal(first, other)
 
 
-def test_points_that_are_nowhere_are_refused(tmp_path):
+def test_points_that_are_not_finite_are_refused(tmp_path):
     path = point_cloud(tmp_path, "ascii")
     path.write_text(path.read_text().replace(str(POINTS.tolist()[0][0]), "nan"))
-    with pytest.raises(UserError, match=r"holds points that are not finite \(1 of 40\)"):
+    with pytest.raises(UserError, match=r"which has points that are not finite \(1 of 40\)"):
         build(path)
 
 
-def test_a_surface_is_for_the_mesh_initializer(tmp_path):
+def test_a_mesh_is_refused_with_the_initializer_to_use(tmp_path):
     trimesh.creation.box().export(tmp_path / "box.ply")
-    with pytest.raises(UserError, match=r"holds a surface\. Try: initializer=mesh"):
+    with pytest.raises(UserError, match=r"which is a mesh\. Try: initializer=mesh 'initializer\.path=.*box"):
         build(tmp_path / "box.ply")
 
 
@@ -261,14 +261,14 @@ def test_a_surface_is_for_the_mesh_initializer(tmp_path):
         (b"ply\nformat ascii 1.0\n", "the header has no end"),
     ],
 )
-def test_a_file_that_is_no_cloud_is_refused(tmp_path, content, message):
+def test_a_file_that_is_not_a_point_cloud_is_refused(tmp_path, content, message):
     (tmp_path / "a.ply").write_bytes(content)
     with pytest.raises(UserError, match=message):
         build(tmp_path / "a.ply")
 
 
-def test_a_missing_file_is_said_so(tmp_path):
-    with pytest.raises(UserError, match=r"initializer\.path: no file .*nothing\.ply"):
+def test_a_missing_file_is_reported(tmp_path):
+    with pytest.raises(UserError, match=r"initializer\.path: expected a file, got .*nothing\.ply', which"):
         build(tmp_path / "nothing.ply")
 
 

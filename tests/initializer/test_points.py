@@ -149,6 +149,8 @@ def test_a_surface_is_covered_in_proportion_to_its_area():
     torch.testing.assert_close(weights.mean(dim=0), torch.full((3,), 1 / 3), atol=0.01, rtol=0)
 
 
-def test_a_file_that_is_not_there_is_said_so(tmp_path):
-    with pytest.raises(UserError, match=r"^initializer\.path: no file .* Try: initializer\.path=a\.ply$"):
-        found_file(str(tmp_path / "nothing.ply"), "a.ply")
+def test_a_missing_file_and_a_folder_are_refused_with_the_line_to_type(tmp_path):
+    for path, what in ((tmp_path / "nothing.ply", "does not exist"), (tmp_path, "is a folder")):
+        pattern = rf"^initializer\.path: expected a file, got '.*', which {what}\. Try: initializer\.path=a"
+        with pytest.raises(UserError, match=pattern):
+            found_file(str(path), "a.ply")
