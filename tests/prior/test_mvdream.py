@@ -271,12 +271,12 @@ def test_a_folder_whose_unet_keeps_its_old_names_is_the_same_model(prior, pipe, 
 def test_a_file_without_cameras_is_refused(prior, file, tmp_path):
     tensors = {k: v for k, v in torch.load(file).items() if "camera_embed" not in k}
     torch.save(tensors, tmp_path / "sd.pt")
-    with pytest.raises(UserError, match=r"is not MVDream: .* Try: prior=stable_diffusion"):
+    with pytest.raises(UserError, match=r"expected an MVDream model, .* Try: prior=stable_diffusion"):
         replace(prior, path=str(tmp_path / "sd.pt")).embed("a corgi", "")
 
 
 def test_a_folder_without_cameras_is_refused(prior, pipelines):
-    with pytest.raises(UserError, match=r"is not MVDream: .* Try: prior=stable_diffusion"):
+    with pytest.raises(UserError, match=r"expected an MVDream model, .* Try: prior=stable_diffusion"):
         replace(prior, path=str(pipelines("stable_diffusion"))).embed("a corgi", "")
 
 
