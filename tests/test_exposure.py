@@ -42,12 +42,12 @@ def test_none_never_dims():
 @pytest.mark.parametrize(
     ("step", "dims"), [(1, False), (1000, False), (1001, True), (4499, True), (4500, False), (5000, False)]
 )
-def test_only_steps_strictly_between_begin_and_end_are_judged(step, dims):
+def test_only_steps_strictly_between_begin_and_end_are_checked(step, dims):
     assert guard().dimming(*scene(1.0, 1.0), step) == (0.8 if dims else None)
 
 
 @pytest.mark.parametrize(("level", "dims"), [(0.0, False), (0.89, False), (0.91, True), (3.0, True)])
-def test_what_is_brighter_than_the_threshold_is_dimmed(level, dims):
+def test_colours_are_dimmed_above_the_threshold(level, dims):
     assert (guard().dimming(*scene(level, level), 2000) is not None) == dims
 
 
@@ -57,7 +57,7 @@ def test_it_takes_a_quantile_of_the_views():
     assert guard().dimming(*scene(0.0, 0.0, 0.7, 1.0), 2000) is None  # 0.865
 
 
-def test_it_takes_a_quantile_of_the_pixels_and_the_background_is_none_of_them():
+def test_it_takes_a_quantile_of_the_pixels_without_the_background():
     alpha = torch.zeros(1, 10, 11)
     alpha[:, :, :10] = 1.0
     alpha[:, :, 10] = 0.0
@@ -97,7 +97,7 @@ def test_an_empty_view_is_dark():
     assert guard().dimming(output, white, 2000) is None
 
 
-def test_judging_leaves_no_trace_in_the_graph():
+def test_the_check_adds_nothing_to_the_graph():
     output, background = scene(1.0)
     output.rgb.requires_grad_()
     assert not guard().brightness(output, background).requires_grad

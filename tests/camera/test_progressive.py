@@ -127,7 +127,7 @@ def test_gamma_says_how_close_to_the_middle_most_views_are(gamma):
         assert float(within_half) == pytest.approx(0.5 ** (1 / gamma), abs=0.01)
 
 
-def test_without_jitter_cameras_look_at_the_origin_and_stand_upright():
+def test_without_jitter_cameras_look_at_the_origin_and_are_upright():
     cameras = draw(changed(published(), **STILL, size=40), views=50)
     origin, above = torch.zeros(3), torch.tensor([0.0, 0.0, 0.1])
     for point, is_above in ((origin, False), (above, True)):
@@ -138,7 +138,7 @@ def test_without_jitter_cameras_look_at_the_origin_and_stand_upright():
         assert ((pixels[:, 1] < 19.99) == is_above).all()
 
 
-def test_the_named_angles_are_where_the_cameras_stand():
+def test_the_recorded_angles_are_those_of_the_positions():
     cameras = draw(changed(published(), **STILL), views=50)
     outward, _ = around(cameras.azimuth_deg, cameras.elevation_deg)
     position = cameras.positions
@@ -163,7 +163,7 @@ def test_each_jitter_has_its_published_size():
     assert float(roll.std()) == pytest.approx(0.01, abs=1e-3)
 
 
-def test_cameras_stay_rigid_whatever_shakes_them():
+def test_jittered_cameras_stay_rigid():
     rotation = draw(published("camera.up_jitter=0.5"), views=200).world_to_camera[:, :3, :3]
     torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(200, 3, 3), atol=1e-5, rtol=0)
     torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(200), atol=1e-5, rtol=0)

@@ -72,7 +72,7 @@ def test_descent_arrives_at_the_image_where_the_negative_prompt_allows_anything(
     assert (render - target).square().mean().sqrt() < 0.02 * before
 
 
-def test_each_prompt_is_asked_once_and_alone(make, ask, prior, means, rgb):
+def test_each_prompt_costs_one_prediction_of_a_single_branch(make, ask, prior, means, rgb):
     ask(make("csd"), rgb, means, prior)
     assert [(call.scale, call.condition) for call in prior.calls] == [(1.0, means), (0.0, means)]
     assert torch.equal(prior.calls[0].t, prior.calls[1].t)
@@ -86,7 +86,7 @@ def test_the_empty_prompt_takes_its_share(make, ask, prior, means, rgb):
     torch.testing.assert_close(empty, ask(make("csd"), rgb, same, prior)[0], rtol=1e-9, atol=1e-10)
 
 
-def test_the_share_may_be_a_schedule_and_nobody_is_asked_in_vain(make, ask, gaussian, means, rgb):
+def test_the_share_may_be_a_schedule_and_makes_no_unused_predictions(make, ask, gaussian, means, rgb):
     guidance = make("csd", empty_share=Linear(start=1.0, end=0.0, steps=10))
     for step, asked in ((0, [means.empty]), (5, [means.empty, means]), (10, [means])):
         prior = gaussian(DDPM())

@@ -222,7 +222,7 @@ def test_ucm(grid, sigmas, make, still, clean, flow):
     close(gradient, 0.1 * (guided(noisy, timestep) - (noise - clean)))
 
 
-def test_the_network_tells_its_arguments_apart(clean):
+def test_the_network_depends_on_all_its_arguments(clean):
     """Otherwise this file would prove less than it seems to."""
     base = network(clean, rows(10), PROMPT)
     others = [network(*args) for args in ((clean, rows(200), PROMPT), (clean, rows(10), EMPTY))]

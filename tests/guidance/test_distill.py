@@ -21,7 +21,7 @@ FORMULAS = {
 }
 
 
-def test_a_perfect_guess_has_zero_gradient(objective, path, make, ask, gaussian, one_image):
+def test_a_perfect_prediction_has_zero_gradient(objective, path, make, ask, gaussian, one_image):
     """The render is the only image of the prompt, and the prior knows it."""
     render = one_image.positive.permute(0, 2, 3, 1)
     for seed in range(5):
@@ -87,7 +87,7 @@ def test_the_sum_does_not_overflow_in_half_precision():
 
 
 @pytest.mark.parametrize("form", ["noise", "velocity"])
-def test_what_the_prior_predicts_does_not_matter(form, objective, make, ask, prior, means, rgb):
+def test_the_form_that_the_prior_predicts_does_not_matter(form, objective, make, ask, prior, means, rgb):
     expected, _ = ask(make(objective), rgb, means, prior)
     got, _ = ask(make(objective), rgb, means, replace(prior, form=form))
     torch.testing.assert_close(got, expected, rtol=1e-7, atol=1e-9)
@@ -251,7 +251,7 @@ def test_numbers_that_are_not_finite_become_zero_and_are_counted(distillation, m
     assert all(torch.tensor(value).isfinite() for value in after.log.values())
 
 
-def test_the_residual_is_measured_against_the_last_guess(make, ask, gaussian, one_image, rgb):
+def test_the_residual_is_measured_against_the_last_prediction(make, ask, gaussian, one_image, rgb):
     _, output = ask(make("sds", scale=1.0), rgb, one_image, gaussian(DDPM(), spread=0.0))
     offset = rgb.detach().permute(0, 3, 1, 2) - one_image.positive
     assert output.log["residual_rms"] == pytest.approx(float(offset.square().mean().sqrt()))
@@ -337,7 +337,7 @@ def test_a_window_that_closes_in_between_is_refused_when_it_does(make, ask, gaus
         ask(guidance, rgb, means, gaussian(DDPM()), step=5)
 
 
-def test_the_root_mean_square_is_of_what_is_finite():
+def test_the_root_mean_square_is_over_finite_elements():
     assert rms(torch.tensor([3.0, torch.nan, 4.0, torch.inf])) == pytest.approx(12.5**0.5)
     assert rms(torch.tensor([torch.nan, -torch.inf])) == 0
 

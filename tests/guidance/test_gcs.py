@@ -190,7 +190,7 @@ def test_with_fixed_noise_only_the_levels_are_drawn(make, means, gaussian, rgb):
 # --- cost
 
 
-def test_the_prior_is_asked_as_the_method_says(make, ask, gaussian, means, rgb):
+def test_predictions_are_made_as_the_method_says(make, ask, gaussian, means, rgb):
     prior = gaussian(DDPM())
     ask(make("gcs", t_min=0.5, t_max=0.5, delta=0.05), rgb, means, prior)
     asked = [(round(float(call.t[0]), 6), call.condition is means, call.scale) for call in prior.calls]
@@ -210,7 +210,7 @@ def test_the_prior_is_asked_as_the_method_says(make, ask, gaussian, means, rgb):
 
 
 @pytest.mark.parametrize("cost", [("cc", 5, 0), ("gc", 4, 0), ("cp", 4, 2)], ids=ALONE)
-def test_a_term_without_weight_costs_nothing(cost, make, ask, gaussian, means, rgb, monkeypatch):
+def test_a_term_of_weight_zero_makes_no_predictions(cost, make, ask, gaussian, means, rgb, monkeypatch):
     decoded, decode = [], gaussian.decode
     monkeypatch.setattr(gaussian, "decode", lambda *given: decoded.append(given) or decode(*given))
     prior, (term, calls, decodings) = gaussian(DDPM()), cost
@@ -221,7 +221,7 @@ def test_a_term_without_weight_costs_nothing(cost, make, ask, gaussian, means, r
 # --- pixels
 
 
-def test_the_pixel_term_goes_past_the_encoder(make):
+def test_the_pixel_term_does_not_pass_through_the_encoder(make):
     """Each latent of this prior is the mean of four pixels and decodes to four alike; D is the views."""
     prior = Tiny(predicts="noise", noise_path=DDPM(), width=16, downscale=2, seed=0)
     cameras = turntable(2, elevation_deg=15.0, distance=3.0, fov_y_deg=40.0, size=16)
@@ -287,6 +287,6 @@ def test_wrong_values_are_refused_by_key(key, value, make, monkeypatch):
         make("gcs", **{key: value})
 
 
-def test_without_any_term_there_is_nothing_to_descend(make):
+def test_all_weights_zero_are_refused(make):
     with pytest.raises(UserError, match=r"guidance.w_gc: expected a number > 0, since w_cc and w_cp are 0"):
         make("gcs", **weights_of(0.0, 0.0, 0.0))

@@ -43,7 +43,7 @@ def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means
     torch.testing.assert_close(gradient, b / a * (noise_at_t - noise_at_s), rtol=1e-8, atol=1e-9)
 
 
-def test_the_prior_is_asked_as_the_method_says(make, ask, prior, means, rgb):
+def test_predictions_are_made_as_the_method_says(make, ask, prior, means, rgb):
     """Unprompted at 0, 0.2, 0.4 and s; prompted, with guidance, at t."""
     keys = {"t_min": 0.6, "t_max": 0.6, "delta": 0.1, "inversion_stride": 0.2}
     ask(make("ism", scale=7.5, **keys), rgb, means, prior)
@@ -79,7 +79,7 @@ def test_without_initial_noise_it_is_deterministic_given_t(make, ask, prior, mea
     assert (first - again).abs().max() > 1e-4
 
 
-def test_initial_noise_lies_on_the_path(path, make, ask, gaussian, means, rgb):
+def test_initial_noise_is_on_the_path(path, make, ask, gaussian, means, rgb):
     """The inversion starts at t = initial_noise on a x0 + b n; with s below that, at s."""
     guidance = make("ism", initial_noise=0.2, t_min=0.051, t_max=0.5, delta=0.05, inversion_stride=1.0)
     prior = gaussian(path, spread=SPREAD)

@@ -53,7 +53,7 @@ def test_gradient_equals_the_closed_form(scales, path, make, ask, gaussian, mean
     torch.testing.assert_close(gradient, expected, rtol=1e-8, atol=1e-8)
 
 
-def test_the_published_weight_leaves_the_distance_to_the_clean_guess(make, ask, prior, means, rgb):
+def test_with_the_published_weight_g_is_the_difference_to_the_clean_prediction(make, ask, prior, means, rgb):
     """G = x0 - x0_hat: a mean squared error against the image that the prior makes of the render."""
     gradient, output = ask(make("sdi", weighting="gamma", **STILL), rgb, means, prior)
     clean = rgb.detach().permute(0, 3, 1, 2)
@@ -64,7 +64,7 @@ def test_the_published_weight_leaves_the_distance_to_the_clean_guess(make, ask, 
     assert output.log["guidance_rms"] == pytest.approx(output.log["residual_rms"], rel=1e-8)
 
 
-def test_the_prior_is_asked_as_the_method_says(make, ask, prior, means, rgb):
+def test_predictions_are_made_as_the_method_says(make, ask, prior, means, rgb):
     """Ten steps for t = 1, fewer for a smaller t, under the prompt and the inversion's own scale."""
     keys = {"inversion_stride": 0.1, "overshoot": 0.0, "t_min": 0.35, "t_max": 0.35}
     ask(make("sdi", scale=7.5, inversion_scale=-7.5, **keys), rgb, means, prior)

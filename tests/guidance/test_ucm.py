@@ -46,7 +46,7 @@ def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means
     torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_on_a_flow_the_noise_is_the_end_of_eulers_walk(make, ask, gaussian, means, rgb):
+def test_on_a_flow_the_noise_is_the_end_of_the_euler_steps(make, ask, gaussian, means, rgb):
     """As FlowDreamer writes it: three steps of a third each, the first from sigma = 0."""
     prior = gaussian(RectifiedFlow(shift=3.0))
     guidance = make("ucm", scale=40.0, inversion_grid="sigma", t_min=0.6, t_max=0.6)
@@ -75,7 +75,7 @@ def test_the_published_grids(grid, sigmas, make, ask, gaussian, means, rgb):
 
 
 @pytest.mark.parametrize("steps", [1, 5])
-def test_the_prior_is_asked_as_the_method_says(steps, path, make, ask, gaussian, means, rgb):
+def test_predictions_are_made_as_the_method_says(steps, path, make, ask, gaussian, means, rgb):
     """Unprompted along the grid, even in b on any path; then once, prompted and guided."""
     prior = gaussian(path)
     ask(make("ucm", scale=40.0, inversion_steps=steps, inversion_grid="sigma"), rgb, means, prior)

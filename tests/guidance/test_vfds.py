@@ -49,7 +49,7 @@ def test_times_a_it_is_sds(path, make, ask, prior, means, rgb):
     torch.testing.assert_close(velocity * per_view(path.a(prior.calls[-1].t)), noise, rtol=1e-8, atol=1e-9)
 
 
-def test_paths_agree_at_equal_b_and_an_equal_clean_guess(make, ask, gaussian, one_image, rgb):
+def test_paths_agree_at_equal_b_and_an_equal_clean_prediction(make, ask, gaussian, one_image, rgb):
     """Without spread the clean guess is the image itself, on any path."""
     gradients = []
     for path, t in (

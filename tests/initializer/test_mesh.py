@@ -40,7 +40,7 @@ def save(mesh: trimesh.Trimesh, path):
 
 
 @pytest.mark.parametrize("suffix", ["ply", "obj", "stl", "glb", "off"])
-def test_points_lie_on_the_surface_scaled_to_the_radius(tmp_path, suffix):
+def test_points_are_on_the_surface_scaled_to_the_radius(tmp_path, suffix):
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=7.0).apply_translation([3, 4, 5])
     made = build(save(sphere, tmp_path / f"sphere.{suffix}"))
     assert len(made) == 2000
@@ -67,7 +67,7 @@ def test_the_bounding_box_is_centred(tmp_path):
     torch.testing.assert_close(middle, torch.zeros(3), atol=0.03, rtol=0)
 
 
-def test_a_file_with_y_up_stands_upright_and_faces_the_front(tmp_path):
+def test_a_file_with_y_up_is_upright_and_faces_the_front(tmp_path):
     corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 3.0, 0], [0, 0, 2.0]])  # tall in y, its front towards +z
     mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 1, 3], [0, 2, 3]], process=False)
     path = save(mesh, tmp_path / "mark.ply")
@@ -159,7 +159,7 @@ def test_a_material_without_a_texture_colors_a_glb(tmp_path):
     torch.testing.assert_close(rgb(made), torch.tensor([[0.0, 1.0, 0.0]]).expand(50, 3))
 
 
-def test_every_part_of_a_scene_keeps_its_own_kind_of_colors(tmp_path):
+def test_every_part_of_a_scene_keeps_its_kind_of_colors(tmp_path):
     red, plain = trimesh.creation.box(), trimesh.creation.box()
     red.visual.vertex_colors = [255, 0, 0, 255]
     textured = []
@@ -178,7 +178,7 @@ def test_every_part_of_a_scene_keeps_its_own_kind_of_colors(tmp_path):
     assert column.bincount().min() > 400
 
 
-def test_parts_stand_where_the_scene_puts_them(tmp_path):
+def test_parts_are_placed_as_in_the_scene(tmp_path):
     scene = trimesh.Scene()
     scene.add_geometry(trimesh.creation.box())
     scene.add_geometry(
@@ -212,7 +212,7 @@ def test_all_parts_of_a_scene_are_used(tmp_path):
     assert float((means[:, 0] > 0).float().mean()) == pytest.approx(0.5, abs=0.05)
 
 
-def test_the_generator_decides(tmp_path):
+def test_results_depend_on_the_generator_alone(tmp_path):
     path = save(trimesh.creation.box(), tmp_path / "box.ply")
     assert torch.equal(build(path, seed=1).means, build(path, seed=1).means)
     assert not torch.equal(build(path, seed=1).means, build(path, seed=2).means)

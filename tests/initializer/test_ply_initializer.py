@@ -76,19 +76,19 @@ def assert_equal(made: Gaussians, wanted: Gaussians) -> None:
 
 @pytest.mark.parametrize("up", ["-y", "+y", "+z"])
 @pytest.mark.parametrize("degree", [0, 1])
-def test_our_assets_come_back_as_they_were_whatever_their_frame(tmp_path, up, degree):
+def test_our_assets_are_read_back_unchanged_with_any_up_axis(tmp_path, up, degree):
     asset = some_gaussians(degree=degree)
     assert_equal(build(saved(tmp_path, asset, up), up="+z"), asset)
 
 
 @pytest.mark.parametrize("degree", [2, 3])
-def test_assets_of_any_degree_come_back_to_rounding(tmp_path, degree):
+def test_assets_of_any_degree_are_read_back_up_to_rounding(tmp_path, degree):
     asset = some_gaussians(degree=degree)
     torch.testing.assert_close(build(saved(tmp_path, asset)).sh, asset.sh)
 
 
 @pytest.mark.parametrize(("written", "asked"), [("-y", None), ("+z", "+z"), ("+y", "+y")])
-def test_an_asset_of_others_stands_as_the_line_says(tmp_path, written, asked):
+def test_the_up_axis_of_other_programs_assets_can_be_given(tmp_path, written, asked):
     asset = some_gaussians()
     assert_equal(build(from_strangers(saved(tmp_path, asset, written)), up=asked), asset)
 
@@ -157,7 +157,7 @@ def test_an_empty_asset_is_refused(tmp_path):
         build(saved(tmp_path, some_gaussians(n=0)))
 
 
-def test_half_of_an_asset_is_no_point_cloud(tmp_path):
+def test_a_truncated_asset_is_not_a_point_cloud(tmp_path):
     path = saved(tmp_path, some_gaussians())
     path.write_bytes(path.read_bytes().replace(b"property float opacity\n", b""))
     with pytest.raises(UserError, match="properties missing: opacity"):
@@ -209,7 +209,7 @@ def test_points_without_colors_get_the_given_one(tmp_path):
 @pytest.mark.parametrize(
     ("up", "world"), [("+z", (0, 1, 2)), ("+y", (2, 0, 1)), (None, (0, 1, 2))], ids=["+z", "+y", "unsaid"]
 )
-def test_points_stand_upright(tmp_path, up, world):
+def test_points_are_upright(tmp_path, up, world):
     torch.testing.assert_close(build(point_cloud(tmp_path), up=up).means, POINTS[:, world])
 
 
@@ -233,7 +233,7 @@ def test_a_cap_counts_points_not_their_copies(tmp_path):
     assert len(build(point_cloud(tmp_path), count=10, replicate=20)) == 200
 
 
-def test_the_generator_decides(tmp_path):
+def test_results_depend_on_the_generator_alone(tmp_path):
     path = point_cloud(tmp_path)
     first, again, other = (build(path, count=10, replicate=3, seed=seed).means for seed in (1, 1, 2))
     assert torch.equal(first, again)

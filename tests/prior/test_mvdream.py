@@ -96,7 +96,7 @@ class FromScratch:
 
 
 @torch.no_grad()
-def test_a_prediction_is_what_the_parts_say_written_out(prior, pipe):
+def test_a_prediction_equals_the_parts_written_out(prior, pipe):
     """Cameras as threestudio builds them: right, up and backward of a camera that looks at the origin."""
     cameras, clean, noise, k = views(8), normal(8, 4, 8, 8), normal(8, 4, 8, 8, seed=1), 400
     azimuth, elevation = (torch.deg2rad(a) for a in (cameras.azimuth_deg, cameras.elevation_deg))
@@ -121,7 +121,7 @@ def test_a_prediction_is_what_the_parts_say_written_out(prior, pipe):
     torch.testing.assert_close(guess.noise, ugly + 7.5 * (full - ugly), rtol=1e-4, atol=1e-4)
 
 
-def test_the_views_of_a_group_know_each_other_and_no_other_group(prior):
+def test_views_depend_on_their_own_group_and_on_no_other_group(prior):
     cameras, noisy = views(8), normal(8, 4, 8, 8)
     before = guess_of(prior, noisy, cameras).noise
     changed = noisy.clone()
@@ -131,19 +131,19 @@ def test_the_views_of_a_group_know_each_other_and_no_other_group(prior):
     assert (difference[4:] < 1e-5).all()
 
 
-def test_where_a_view_stands_changes_what_is_seen(prior):
+def test_the_camera_of_a_view_changes_its_prediction(prior):
     noisy = normal(4, 4, 8, 8)
     front, turned = level_with(), level_with(start=30.0)
     one, other = (guess_of(prior, noisy, cameras).noise for cameras in (front, turned))
     assert (one - other).abs().max() > 1e-3
 
 
-def test_neither_distance_nor_lens_is_told():
+def test_the_network_reads_neither_distance_nor_field_of_view():
     near, far = level_with(distance=2.0, fov=60.0), level_with(distance=9.0, fov=15.0)
     torch.testing.assert_close(camera_numbers(near), camera_numbers(far))
 
 
-def test_the_front_is_told_as_published():
+def test_the_front_is_encoded_as_published():
     """The first of the published samples: on Blender's +x, 15 degrees up."""
     s, c = torch.sin(torch.deg2rad(torch.tensor(15.0))), torch.cos(torch.deg2rad(torch.tensor(15.0)))
     front = level_with(elevation=15.0).index(slice(0, 1))
@@ -155,15 +155,15 @@ def test_latents_are_those_of_the_autoencoder(prior, pipe):
     encodes_what_the_autoencoder_says(prior, pipe.vae)
 
 
-def test_micro_batch_changes_nothing(prior):
+def test_micro_batch_does_not_change_results(prior):
     micro_batch_changes_nothing(prior, size=4, condition=condition_of(prior, views(8)), channels=4)
 
 
-def test_it_computes_in_sixteen_bits(prior):
+def test_networks_compute_in_16_bits_and_return_float32(prior):
     computes_in_sixteen_bits(prior, lambda each: condition_of(each, views()))
 
 
-def test_memory_is_foreseen(prior):
+def test_memory_is_estimated(prior):
     memory_is_foreseen(prior, views=4)
     with pytest.raises(UserError, match=r"^views: expected a multiple of 4"):
         prior.memory("a corgi", "", 2, None)
@@ -176,7 +176,7 @@ def spreads(clean):
     return clean.unflatten(0, (-1, 4)).flatten(1).std(dim=1)
 
 
-def test_rescaling_gives_a_group_the_spread_of_its_unguided_guess(prior):
+def test_rescaling_gives_a_group_the_spread_of_its_unguided_prediction(prior):
     cameras, noisy = views(8), normal(8, 4, 8, 8)
     noisy[4:] *= 0.5  # so that groups differ
     guided, unguided = (guess_of(prior, noisy, cameras, scale).clean for scale in (50.0, 1.0))
@@ -187,7 +187,7 @@ def test_rescaling_gives_a_group_the_spread_of_its_unguided_guess(prior):
     torch.testing.assert_close(half.clean, (guided + whole.clean) / 2, rtol=1e-4, atol=1e-4)
 
 
-def test_a_rescaled_guess_is_still_one_guess_in_three_forms(prior):
+def test_the_three_forms_of_a_rescaled_prediction_agree(prior):
     noisy = normal(4, 4, 8, 8)
     guess = guess_of(replace(prior, rescale=0.5), noisy, views(), 50.0)
     t = torch.full((4,), 0.4)
@@ -229,7 +229,7 @@ def test_one_published_file_is_the_same_model(prior, pipe, folder, file, tmp_pat
     assert {p.dtype for p in replace(one, dtype="bfloat16").network.parameters()} == {torch.bfloat16}
 
 
-def test_memory_of_one_file_is_foreseen(prior, file, folder):
+def test_memory_of_one_file_is_estimated(prior, file, folder):
     one = replace(prior, path=str(file), tokenizer=str(folder / "tokenizer"))
     assert one.memory("a dog", "", 4, None) == prior.memory("a dog", "", 4, None)
 
@@ -280,7 +280,7 @@ def test_a_folder_without_cameras_is_refused(prior, pipelines):
         replace(prior, path=str(pipelines("stable_diffusion"))).embed("a corgi", "")
 
 
-def test_a_damaged_or_foreign_file_is_one_line(prior, file, folder, tmp_path):
+def test_a_damaged_or_unsupported_file_gives_a_message_of_one_line(prior, file, folder, tmp_path):
     broken = tmp_path / "broken.pt"
     broken.write_bytes(file.read_bytes()[:1000])
     tensors = torch.load(file)
@@ -314,12 +314,12 @@ def test_nothing_in_a_file_is_executed(prior, tmp_path):
 
 
 @pytest.mark.parametrize(("count", "key"), [(3, "views"), (6, "views")])
-def test_views_come_in_fours(prior, count, key):
+def test_views_must_come_in_groups_of_four(prior, count, key):
     with pytest.raises(UserError, match=rf"^{key}: expected a multiple of 4.*Try: camera=multiview views=4"):
         condition_of(prior, turntable(count, elevation_deg=0.0, distance=3.0, fov_y_deg=40.0, size=64))
 
 
-def test_views_of_a_group_stand_a_quarter_turn_apart(prior):
+def test_views_of_a_group_must_be_a_quarter_turn_apart(prior):
     cameras = turntable(8, elevation_deg=0.0, distance=3.0, fov_y_deg=40.0, size=64)
     with pytest.raises(UserError, match=r"^camera: expected groups of four views.*azimuths 0, 45, 90, 135"):
         condition_of(prior, cameras)
@@ -327,13 +327,13 @@ def test_views_of_a_group_stand_a_quarter_turn_apart(prior):
     assert len(condition_of(prior, regrouped).cameras) == 8
 
 
-def test_views_of_a_group_stand_on_one_level(prior):
+def test_views_of_a_group_must_have_one_elevation(prior):
     cameras = level_with(elevation=torch.tensor([0.0, 0.0, 0.0, 20.0]))
     with pytest.raises(UserError, match=r"^camera: expected groups of four views.*elevations 0, 0, 0, 20"):
         condition_of(prior, cameras)
 
 
-def test_a_group_has_one_noise_level(prior):
+def test_a_group_must_have_one_noise_level(prior):
     t = torch.tensor([0.4, 0.4, 0.5, 0.4])
     with pytest.raises(UserError, match=r"^guidance\.shared_t: expected true"):
         prior.predict(normal(4, 4, 8, 8), t, condition_of(prior, views()), 7.5)

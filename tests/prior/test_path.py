@@ -154,7 +154,7 @@ def test_three_forms_of_the_truth_all_return_it(path):
 
 
 @every_path
-def test_three_forms_of_a_wrong_guess_agree(path):
+def test_three_forms_of_a_wrong_prediction_agree(path):
     """What a network says need not fit the true pair; its three forms must still be one guess."""
     t = inner_levels(50)
     noisy, wrong = pairs(50, seed=1)
@@ -165,7 +165,7 @@ def test_three_forms_of_a_wrong_guess_agree(path):
 
 
 @every_path
-def test_a_guess_mixes_back_to_the_noisy_image(path):
+def test_a_prediction_mixes_back_to_the_noisy_image(path):
     t = inner_levels(50)
     noisy, wrong = pairs(50, seed=2)
     for complete in (path.from_clean, path.from_noise, path.from_velocity):

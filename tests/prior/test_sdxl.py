@@ -59,7 +59,7 @@ def test_a_model_that_does_not_ask_for_zeros_reads_the_empty_text(prior, pipe):
 
 
 @torch.no_grad()
-def test_a_prediction_is_what_the_pipelines_parts_say(prior, pipe):
+def test_a_prediction_equals_that_of_the_pipelines_parts(prior, pipe):
     """Latents that are not square, since the network is told height and width."""
     clean, noise, k, scale = normal(2, 4, 8, 12), normal(2, 4, 8, 12, seed=1), 400, 7.5
     noisy = pipe.scheduler.add_noise(clean, noise, torch.tensor([k - 1, k - 1]))
@@ -81,7 +81,7 @@ def test_a_prediction_is_what_the_pipelines_parts_say(prior, pipe):
     torch.testing.assert_close(guess.clean, (noisy - (1 - a**2) ** 0.5 * expected) / a, rtol=1e-4, atol=1e-4)
 
 
-def test_the_network_is_told_the_size(prior):
+def test_the_network_reads_the_image_size(prior):
     """The same latents as a part of larger ones would not be the same image."""
     texts = prior.embed("a red cube", "").texts
     one = replace(texts, tokens=texts.tokens[:1], pooled=texts.pooled[:1])
@@ -98,15 +98,15 @@ def test_latents_are_those_of_the_pipelines_autoencoder(prior, pipe):
     encodes_what_the_autoencoder_says(prior, pipe.vae)
 
 
-def test_it_computes_in_sixteen_bits(prior):
+def test_networks_compute_in_16_bits_and_return_float32(prior):
     computes_in_sixteen_bits(prior, condition_of)
 
 
-def test_memory_is_foreseen(prior):
+def test_memory_is_estimated(prior):
     memory_is_foreseen(prior)
 
 
-def test_micro_batch_changes_nothing(prior):
+def test_micro_batch_does_not_change_results(prior):
     micro_batch_changes_nothing(prior, size=1, condition=condition_of(prior), channels=4)
 
 

@@ -120,7 +120,7 @@ def test_pure_noise_gives_the_mean_of_the_mixture() -> None:
     torch.testing.assert_close(noise, noisy)
 
 
-def test_certain_modes_answer_with_the_nearest() -> None:
+def test_without_spread_and_noise_the_nearest_mode_is_returned() -> None:
     _, a, b = at(DDPM(), 0.0)
     noisy = (MEANS[1] + 0.05).reshape(1, 1, 1, 2)
     clean, noise = small(1, torch.zeros(2, dtype=torch.float64)).denoise(noisy, a, b)

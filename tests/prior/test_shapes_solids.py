@@ -55,7 +55,7 @@ def unit_vectors(count: int, seed: int = 1) -> torch.Tensor:
     return torch.nn.functional.normalize(random_points(count, seed), dim=0)
 
 
-def test_every_kind_is_tried_here() -> None:
+def test_every_kind_is_tested_in_this_file() -> None:
     assert {solid.kind for solid, _ in VOLUMES.values()} == set(KINDS)
 
 
@@ -84,14 +84,14 @@ def test_distance_grows_on_the_way_out(solid: Solid) -> None:
 
 
 @pytest.mark.parametrize("solid", SOLIDS)
-def test_no_inner_point_reaches_beyond_the_support(solid: Solid) -> None:
+def test_no_inner_point_is_beyond_the_support(solid: Solid) -> None:
     points, directions = random_points(40_000), unit_vectors(40)
     inner = points[:, solid.distance(points) < 0]
     assert bool((directions.T @ inner <= solid.support(directions)[:, None] + 1e-12).all())
 
 
 @pytest.mark.parametrize("solid", SOLIDS)
-def test_support_is_touched_by_the_surface(solid: Solid) -> None:
+def test_the_surface_touches_every_supporting_plane(solid: Solid) -> None:
     """The gradient of a support function is the point that touches the supporting plane."""
     moved = solid.turned("x", 20).turned("z", 50).at(0.1, -0.2, 0.3)
     directions = unit_vectors(60).requires_grad_(True)

@@ -48,7 +48,7 @@ def same(one: Layers, other: Layers) -> bool:
 
 @pytest.mark.parametrize("samples", [1, 2, 3])
 @pytest.mark.parametrize("prompt", ["a robot", "a cube", "three red and white spotted balls under a tree"])
-def test_what_was_kept_is_what_would_be_traced_to_the_bit(prompt, samples, folder, traced) -> None:
+def test_a_cached_trace_is_bit_identical(prompt, samples, folder, traced) -> None:
     expected = trace(scene_of(prompt), cameras(), samples)
     first = trace_cache.shared_trace(scene_of(prompt), cameras(), samples)
     second = trace_cache.shared_trace(scene_of(prompt), cameras(), samples)
@@ -71,21 +71,21 @@ def test_what_was_kept_is_what_would_be_traced_to_the_bit(prompt, samples, folde
     ],
     ids=["object", "pattern", "place", "size", "width", "views", "samples"],
 )
-def test_whatever_changes_the_picture_is_traced_anew(other, folder, traced) -> None:
+def test_a_trace_is_repeated_if_anything_changes_the_image(other, folder, traced) -> None:
     first = (scene_of("a red and white checkered cube"), cameras(), 1)
     trace_cache.shared_trace(*first)
     assert same(trace_cache.shared_trace(*other(*first)), trace(*other(*first)))
     assert len(traced) == 2
 
 
-def test_colours_are_put_on_afterwards_and_share_a_trace(folder, traced) -> None:
+def test_scenes_that_differ_in_colour_share_a_trace(folder, traced) -> None:
     for prompt in ("a red cube", "a blue cube"):
         trace_cache.shared_trace(scene_of(prompt), cameras(), 1)
     assert len(traced) == 1
 
 
 @pytest.mark.parametrize("damage", [b"", b"\x93NUMPY", b"no array at all"], ids=["empty", "cut", "other"])
-def test_a_damaged_file_is_traced_anew(damage, folder, traced) -> None:
+def test_a_damaged_file_is_replaced_by_a_new_trace(damage, folder, traced) -> None:
     given = (scene_of("a cube"), cameras(), 1)
     expected = trace_cache.shared_trace(*given)
     [file] = folder.iterdir()
@@ -96,7 +96,7 @@ def test_a_damaged_file_is_traced_anew(damage, folder, traced) -> None:
 
 
 @pytest.mark.parametrize("trouble", ["a file in its place", "a full disk"])
-def test_a_folder_that_takes_nothing_does_no_harm(trouble, folder, monkeypatch) -> None:
+def test_tracing_works_if_nothing_can_be_stored(trouble, folder, monkeypatch) -> None:
     if trouble == "a full disk":
         monkeypatch.setattr(trace_cache, "SPARE", 2**62)
     else:

@@ -136,7 +136,7 @@ def test_turning_scene_and_camera_together_changes_no_silhouette() -> None:
 
 
 @pytest.mark.parametrize("prompt", ["sphere", "cube", "cone", "disc"])
-def test_what_is_symmetric_looks_the_same_from_every_quarter(prompt: str) -> None:
+def test_a_symmetric_object_looks_the_same_from_every_quarter(prompt: str) -> None:
     _, layers = look(prompt, samples=2)
     assert float((layers.alpha - layers.alpha[:1]).abs().mean()) < 2e-3
 
@@ -162,7 +162,7 @@ def test_finer_sampling_makes_soft_edges_of_the_same_shape() -> None:
     )
 
 
-def test_images_stay_in_range_and_show_the_background_through() -> None:
+def test_images_are_in_range_and_show_the_background_where_they_are_transparent() -> None:
     scene, layers = look("a striped cube", samples=2)
     background = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.2, 0.4, 0.6], [1.0, 0.0, 1.0]])
     images = layers.images(scene.albedo, background)
@@ -195,7 +195,7 @@ def test_on_and_under_are_above_and_below(prompt: str, above: bool) -> None:
     assert bool(mean_red < mean_blue) is above
 
 
-def test_between_stands_in_the_middle_as_seen_from_the_front() -> None:
+def test_between_is_in_the_middle_as_seen_from_the_front() -> None:
     scene, layers = look("a green sphere between a red cube and a blue cube")
     image = layers.images(scene.albedo, torch.zeros(4, 3))[0, 0]
     columns = torch.arange(40.0)
