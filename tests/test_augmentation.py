@@ -1,4 +1,4 @@
-"""Laws of the augmentations: what they change, what they leave alone, and what they draw."""
+"""Laws of the augmentations: the tensors that they change, and the random numbers that they draw."""
 
 import pytest
 import torch
@@ -126,7 +126,7 @@ def test_consecutive_steps_have_different_noise():
 
 
 def test_later_draws_do_not_depend_on_the_number_of_gaussians_or_on_earlier_outcomes():
-    """So that densifiers with one seed are shown the same, however many Gaussians each has."""
+    """Densifiers with the same seed must see the same images, however many Gaussians each has."""
     states = []
     for n, augmentation in ((5, lucid(0.1)), (50, lucid(0.1)), (5, lucid(0.1, 1.0, 1.0))):
         generator = draw()

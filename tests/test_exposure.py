@@ -1,4 +1,4 @@
-"""Laws of the exposure guard: when it dims, and what it takes for bright."""
+"""Laws of the exposure guard: when it dims colours, and how it measures brightness."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ def guard(**changes) -> BrightnessGuard:
 
 
 def over(background: torch.Tensor, color: torch.Tensor, alpha: torch.Tensor) -> RenderOutput:
-    """``color`` with coverage ``alpha`` over ``background``."""
+    """Composite ``color`` with coverage ``alpha`` over ``background``."""
     rgb = alpha[..., None] * color + (1 - alpha)[..., None] * background[:, None, None]
     views = len(alpha)
     return RenderOutput(
@@ -27,7 +27,7 @@ def over(background: torch.Tensor, color: torch.Tensor, alpha: torch.Tensor) -> 
 
 
 def scene(*levels: float) -> tuple[RenderOutput, torch.Tensor]:
-    """A grey object of each level in a view of its own, over white."""
+    """Render one view with a grey object for each level, over white."""
     alpha = torch.zeros(len(levels), 8, 8)
     alpha[:, 2:6, 2:6] = 1.0
     white = torch.ones(len(levels), 3)
@@ -52,7 +52,7 @@ def test_colours_are_dimmed_above_the_threshold(level, dims):
 
 
 def test_it_takes_a_quantile_of_the_views():
-    """Of four views 0.85 lies between the third and the fourth: 0.45 of the third, 0.55 of the fourth."""
+    """The 0.85 quantile of four views is 0.45 times the third plus 0.55 times the fourth."""
     assert guard().dimming(*scene(0.0, 0.0, 0.8, 1.0), 2000) == 0.8  # 0.91
     assert guard().dimming(*scene(0.0, 0.0, 0.7, 1.0), 2000) is None  # 0.865
 

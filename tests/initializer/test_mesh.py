@@ -86,7 +86,7 @@ def test_a_turn_brings_one_side_to_the_front(tmp_path):
     path = save(trimesh.Trimesh(corners, [[0, 1, 2]], process=False), tmp_path / "mark.ply")
     means = build(path, turn_deg=90).means
     torch.testing.assert_close(means[:, 1], torch.zeros(2000), atol=1e-5, rtol=0)
-    assert means[means[:, 2].argmax(), 0] < means[:, 0].mean()  # the tip stands where the long side begins
+    assert means[means[:, 2].argmax(), 0] < means[:, 0].mean()  # the tip is where the long side begins
 
 
 def test_without_a_radius_it_stays_as_it_is(tmp_path):
@@ -192,7 +192,7 @@ def test_parts_are_placed_as_in_the_scene(tmp_path):
 
 
 def test_a_body_of_seven_thousand_vertices_becomes_fifty_thousand_gaussians(tmp_path):
-    """GaussianDreamer's start from SMPL, with the scales from the neighbours."""
+    """GaussianDreamer starts from SMPL like this, with scales from the neighbours."""
     body = trimesh.creation.capsule(height=1.2, radius=0.3, count=[84, 84])
     made = build(save(body, tmp_path / "body.obj"), up="z", count=50_000, scale=None)
     assert len(made) == 50_000

@@ -1,4 +1,4 @@
-"""Laws of the ply initializer: assets come back as they were, points become Gaussians."""
+"""Laws of the ply initializer: assets are read back unchanged, and points become Gaussians."""
 
 import struct
 
@@ -63,7 +63,7 @@ def saved(tmp_path, gaussians: Gaussians, up: str = "-y"):
 
 
 def from_strangers(path):
-    """The same file without the comments that say who wrote it and which axis is up."""
+    """Remove the comments that name the program and the up axis."""
     lines = path.read_bytes().split(b"\n")
     path.write_bytes(b"\n".join(line for line in lines if not line.startswith(b"comment cadam3d")))
     return path
@@ -172,7 +172,7 @@ COLORS = torch.randint(256, (40, 3), generator=seeded(3))
 
 
 def point_cloud(folder, layout: str = "binary_little_endian", kind: str = "uchar", names="red green blue"):
-    """A file as other programs write it, made without the code under test; no colours without names."""
+    """Write a file as other programs do, without the code under test; without names it has no colours."""
     header = f"ply\nformat {layout} 1.0\nelement vertex 40\n"
     header += "".join(f"property float {axis}\n" for axis in "xyz")
     header += "".join(f"property {kind} {name}\n" for name in names.split()) + "end_header\n"

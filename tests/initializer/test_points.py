@@ -1,4 +1,4 @@
-"""Laws of what initializers share: neighbour distances, and Gaussians at coloured points."""
+"""Laws of the functions that initializers share: neighbour distances, and Gaussians at coloured points."""
 
 import pytest
 import torch

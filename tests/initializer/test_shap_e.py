@@ -1,4 +1,4 @@
-"""Laws of the Shap-E initializer, on a tiny real pipeline and on meshes made by hand."""
+"""Laws of the Shap-E initializer, on a tiny pipeline of the real classes and on handmade meshes."""
 
 import gc
 
@@ -49,7 +49,7 @@ def rgb_of(gaussians) -> torch.Tensor:
     return 0.5 + SH_C0 * gaussians.sh[:, 0]
 
 
-# --- what becomes of a mesh
+# --- from a mesh to Gaussians
 
 
 def a_mesh() -> ColoredMesh:
@@ -207,7 +207,7 @@ def test_the_prompt_becomes_gaussians(models):
 
 
 def test_colors_are_those_that_the_model_paints_with(models):
-    """The decoder converts its own colours to linear light; pictures, and so we, want them back."""
+    """The decoder converts its colours to linear light; the initializer must convert them back."""
     asked = shap_e(models[True])
     found = asked._source().find((KIND,), OTHERS)
     described = asked.sample(found, "a corgi", seeded(), CPU)
@@ -241,7 +241,7 @@ def test_the_model_is_freed_completely(models):
     assert not [each for each in gc.get_objects() if type(each) is ShapERenderer]
 
 
-# --- what stands in for it
+# --- the fallback
 
 
 def begin(seed: int = 0, **changes):

@@ -24,7 +24,7 @@ from cadam3d.prior.mvdream import MVDream, camera_numbers
 from cadam3d.prior.prompting import Plain
 
 diffusers = pytest.importorskip("diffusers")
-OWN = {"prompting": Plain(), "rescale": 0.0, "tokenizer": "nobody/nothing"}
+OWN = {"prompting": Plain(), "rescale": 0.0, "tokenizer": "owner/missing"}
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def prior(folder, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def file(pipe, tmp_path_factory):
-    """Everything in one file, as published."""
+    """The path of a single file that holds the whole model, as published."""
     file = tmp_path_factory.mktemp("published") / "sd-v2.1-base-4view.pt"
     torch.save(single_file(pipe.unet, pipe.vae, pipe.text_encoder), file)
     return file
@@ -76,11 +76,11 @@ def guess_of(prior, noisy, cameras, scale=7.5, t=0.4):
     return prior.predict(noisy, torch.full((len(noisy),), t), condition_of(prior, cameras), scale)
 
 
-# --- what it predicts -------------------------------------------------------------------------------------
+# --- predictions ------------------------------------------------------------------------------------------
 
 
 class FromScratch:
-    """Attention written out, across four views where it is self-attention."""
+    """Attention written out; self-attention spans four views."""
 
     def __call__(self, attention, states, encoder_hidden_states=None, **_):
         own = encoder_hidden_states is None
@@ -97,7 +97,7 @@ class FromScratch:
 
 @torch.no_grad()
 def test_a_prediction_equals_the_parts_written_out(prior, pipe):
-    """Cameras as threestudio builds them: right, up and backward of a camera that looks at the origin."""
+    """Build cameras as threestudio does, from right, up and backward of a camera that faces the origin."""
     cameras, clean, noise, k = views(8), normal(8, 4, 8, 8), normal(8, 4, 8, 8, seed=1), 400
     azimuth, elevation = (torch.deg2rad(a) for a in (cameras.azimuth_deg, cameras.elevation_deg))
     centre = torch.stack(
@@ -105,8 +105,8 @@ def test_a_prediction_equals_the_parts_written_out(prior, pipe):
     )
     right = normalize(torch.linalg.cross(-centre, torch.tensor([[0.0, 0.0, 1.0]]).expand(8, 3)), dim=-1)
     up = torch.linalg.cross(right, -centre)
-    told = torch.eye(4).repeat(8, 1, 1)
-    told[:, :3] = torch.stack([right, up, centre, centre], dim=-1)
+    encoded = torch.eye(4).repeat(8, 1, 1)
+    encoded[:, :3] = torch.stack([right, up, centre, centre], dim=-1)
 
     unet = type(pipe.unet).from_config(pipe.unet.config)
     unet.load_state_dict(pipe.unet.state_dict())
@@ -114,7 +114,7 @@ def test_a_prediction_equals_the_parts_written_out(prior, pipe):
     noisy = pipe.scheduler.add_noise(clean, noise, torch.full((8,), k - 1))
     positive, negative = pipe.encode_prompt("a corgi", "cpu", 1, True, negative_prompt="ugly")
     full, ugly = (
-        unet(noisy, k - 1, encoder_hidden_states=text.repeat(8, 1, 1), class_labels=told.flatten(1)).sample
+        unet(noisy, k - 1, encoder_hidden_states=text.repeat(8, 1, 1), class_labels=encoded.flatten(1)).sample
         for text in (positive, negative)
     )
     guess = guess_of(prior, noisy, cameras, t=k / 1000)
@@ -144,7 +144,7 @@ def test_the_network_reads_neither_distance_nor_field_of_view():
 
 
 def test_the_front_is_encoded_as_published():
-    """The first of the published samples: on Blender's +x, 15 degrees up."""
+    """The first view of the published samples is on Blender's +x, 15 degrees up."""
     s, c = torch.sin(torch.deg2rad(torch.tensor(15.0))), torch.cos(torch.deg2rad(torch.tensor(15.0)))
     front = level_with(elevation=15.0).index(slice(0, 1))
     expected = [0, -s, c, c, 1, 0, 0, 0, 0, c, s, s, 0, 0, 0, 1]
@@ -235,7 +235,7 @@ def test_memory_of_one_file_is_estimated(prior, file, folder):
 
 
 def test_the_tokenizer_of_one_file_pads_as_it_was_trained(prior, file, folder):
-    """With zeros; an exclamation mark in the prompt, whose number that is, stays what it is."""
+    """Padding is token 0, which is also the exclamation mark; the mark must survive in a prompt."""
     one = replace(prior, path=str(file), tokenizer=str(folder / "tokens"))
     tokenizer = one.found.part("tokenizer")
     numbers = tokenizer(["a!"], padding="max_length", max_length=77).input_ids[0]
@@ -245,7 +245,7 @@ def test_the_tokenizer_of_one_file_pads_as_it_was_trained(prior, file, folder):
 
 @pytest.mark.parametrize("where", ["empty", "other"])
 def test_a_tokenizer_that_does_not_fit_is_refused(prior, file, tmp_path, where):
-    """Where transformers finds no files, it makes a tokenizer that knows no word, and says nothing."""
+    """If transformers finds no files, it silently builds a tokenizer that knows no words."""
     if where == "other":
         (tmp_path / "vocab.json").write_text(json.dumps({"a": 0, "<|startoftext|>": 1, "<|endoftext|>": 2}))
         (tmp_path / "merges.txt").write_text("#version: 0.2\n")
@@ -254,7 +254,7 @@ def test_a_tokenizer_that_does_not_fit_is_refused(prior, file, tmp_path, where):
 
 
 def test_a_folder_whose_unet_keeps_its_old_names_is_the_same_model(prior, pipe, folder, tmp_path):
-    """As on the hub: its class is a stranger's, whose code is never run."""
+    """On the hub the UNet has a class of another package, of which no code is run."""
     model = tmp_path / "model"
     shutil.copytree(folder, model, ignore=shutil.ignore_patterns("unet", "tokens"))
     index = json.loads((model / "model_index.json").read_text())
@@ -301,16 +301,16 @@ def test_a_damaged_or_unsupported_file_gives_a_message_of_one_line(prior, file, 
 
 
 def test_nothing_in_a_file_is_executed(prior, tmp_path):
-    class Stranger:
+    class Malicious:
         def __reduce__(self):
             return (exec, ("raise SystemExit('executed')",))
 
-    torch.save({"weight": torch.zeros(1), "code": Stranger()}, tmp_path / "evil.pt")
+    torch.save({"weight": torch.zeros(1), "code": Malicious()}, tmp_path / "evil.pt")
     with pytest.raises(UserError, match="is no file of tensors"):
         replace(prior, path=str(tmp_path / "evil.pt")).found  # noqa: B018
 
 
-# --- what it asks for -------------------------------------------------------------------------------------
+# --- requirements -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("count", "key"), [(3, "views"), (6, "views")])

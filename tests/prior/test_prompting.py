@@ -1,4 +1,4 @@
-"""Which words stand for which view: rules at the angles where they change, and the arithmetic of guidance."""
+"""Prompting: the text of each view around the angles where it changes, and the arithmetic of guidance."""
 
 import math
 

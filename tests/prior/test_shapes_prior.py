@@ -1,4 +1,4 @@
-"""ShapesPrior as guidance sees it: scales, the unconditional branch, the prediction error, the truth."""
+"""ShapesPrior as guidance uses it: scales, the unconditional branch, the prediction error and the truth."""
 
 from dataclasses import replace
 
@@ -158,7 +158,7 @@ def test_spread_is_wider_at_silhouettes() -> None:
 
 
 def test_empty_prompt_has_the_moments_of_the_world() -> None:
-    """Against pictures composited one by one, without the algebra of the census."""
+    """Compare with images that are composited one by one, without the algebra of the census."""
     model = prior(spread=1e-4, edge_spread=0.0, samples_per_pixel=1)
     cameras = turntable(
         CENSUS_VIEWS,
@@ -206,7 +206,7 @@ def test_error_has_unit_rms_and_no_mean() -> None:
 
 
 def test_error_is_smooth() -> None:
-    """Of the energy of a field on 32 pixels, next to nothing lies above the frequency of its 8 cells."""
+    """A field on 32 pixels has almost no energy above the frequency of its 8 cells."""
     spectrum = torch.fft.fft2(fields()).abs().square().mean(dim=(0, 1))
     frequency = torch.fft.fftfreq(32, 1 / 32).abs()
     is_high = torch.maximum(frequency[:, None], frequency[None]) > 8
@@ -264,7 +264,7 @@ def test_clean_images_have_no_error_and_branches_have_different_errors() -> None
     assert abs(float(correlation)) < 0.3
 
 
-# --- what a user can get wrong
+# --- user errors
 
 
 @pytest.mark.parametrize("prompt", ["", "   "])

@@ -70,7 +70,7 @@ def test_inside_has_the_volume_of_the_textbook(name: str) -> None:
 
 @pytest.mark.parametrize("solid", SOLIDS)
 def test_distance_never_overshoots_the_surface(solid: Solid) -> None:
-    """1-Lipschitz with the right sign: no point of the surface is nearer than the distance says."""
+    """The function is 1-Lipschitz with the right sign: no point of the surface is nearer than its value."""
     first, step = random_points(20_000), 0.3 * random_points(20_000, seed=2)
     difference = (solid.distance(first + step) - solid.distance(first)).abs()
     assert bool((difference <= step.norm(dim=0) * (1 + 1e-9)).all())
@@ -78,7 +78,7 @@ def test_distance_never_overshoots_the_surface(solid: Solid) -> None:
 
 @pytest.mark.parametrize("solid", SOLIDS)
 def test_distance_grows_on_the_way_out(solid: Solid) -> None:
-    """Far away the bound stays useful: a ray that marches by it gets on."""
+    """The bound stays useful far away, so that a ray that advances by it makes progress."""
     away = unit_vectors(500) * 6
     assert bool((solid.distance(away) > 0.3).all())
 

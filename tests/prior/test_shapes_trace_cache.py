@@ -1,4 +1,4 @@
-"""Shared traces: the same pictures to the bit, made once, and never in the way."""
+"""The trace cache: bit-identical images, traced once, and no errors if the cache cannot be used."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +31,7 @@ def folder(tmp_path: Path, monkeypatch) -> Path:
 
 @pytest.fixture
 def traced(monkeypatch) -> list[int]:
-    """One entry for each time that something is really traced."""
+    """A list with one entry for each call of the tracer."""
     calls: list[int] = []
 
     def count(scene: Scene, cameras: Cameras, samples: int) -> Layers:

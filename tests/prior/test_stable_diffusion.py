@@ -1,4 +1,4 @@
-"""Stable Diffusion as a prior, against the pipeline's own pieces, on tiny models from files."""
+"""Stable Diffusion as a prior, compared with the parts of the pipeline, on tiny models from files."""
 
 import pytest
 import torch
@@ -79,7 +79,7 @@ LEVELS = torch.tensor([0.3, 0.8])
 
 @pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
 def test_a_prediction_equals_that_of_the_pipeline(prediction, make, pipeline_of):
-    """Text encoder, UNet, guidance and scheduler of diffusers against ours, at levels of its own table."""
+    """Compare with text encoder, UNet, guidance and scheduler of diffusers, at levels of its table."""
     pipeline = pipeline_of(prediction)
     prior, clean, noise = make(prediction), random(2, 4, 8, 8), random(2, 4, 8, 8, seed=1)
     steps = torch.tensor([299, 799])  # rows of the table: t = (row + 1) / 1000
@@ -106,11 +106,11 @@ def test_scale_zero_is_the_negative_prompt_alone_and_unprompted_uses_neither(mak
     swapped = condition_of(prior, 0, 90, prompt="ugly", negative="a corgi")
     zero = prior.predict(noisy, LEVELS, condition, 0.0)
     torch.testing.assert_close(zero.noise, prior.predict(noisy, LEVELS, swapped, 1.0).noise)
-    nobody = condition_of(prior, 0, 90, prompt="", negative="")
+    empty = condition_of(prior, 0, 90, prompt="", negative="")
     for scale in (1.0, 7.5):
         torch.testing.assert_close(
             prior.predict(noisy, LEVELS, condition.unprompted(), scale).noise,
-            prior.predict(noisy, LEVELS, nobody, 1.0).noise,
+            prior.predict(noisy, LEVELS, empty, 1.0).noise,
             rtol=1e-4,
             atol=1e-4,
         )
@@ -192,7 +192,7 @@ def test_perp_neg_changes_the_prediction_of_a_side_view(make):
 
 @pytest.fixture
 def counted(monkeypatch):
-    """How many texts went through an encoder."""
+    """The texts that went through an encoder."""
     seen = []
     real = StableDiffusion.embed_texts
 
@@ -297,7 +297,7 @@ def test_a_model_that_is_not_on_disk_is_lacking_and_the_hub_is_not_queried(make,
     assert "nothing there" in make(path="/nowhere").lacks()
 
 
-# --- what cannot be ---------------------------------------------------------------------------------------
+# --- impossible values ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

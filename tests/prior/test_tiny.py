@@ -1,4 +1,4 @@
-"""Laws of the tiny prior: everything a real one has, except knowledge."""
+"""Laws of the tiny prior, which has the interface of a real prior and random weights."""
 
 import pytest
 import torch
@@ -178,7 +178,7 @@ def test_views_do_not_influence_each_other(prior):
 
 @pytest.mark.parametrize("path", [DDPM(), RectifiedFlow(shift=3.0)], ids=["ddpm", "flow"])
 def test_predicts_decides_what_the_output_is(path):
-    """The same network, read as noise and as velocity."""
+    """Read the output of the same network as noise and as velocity."""
     as_noise, as_velocity = (
         Tiny(**KEYS | {"noise_path": path, "predicts": p}) for p in ("noise", "velocity")
     )
