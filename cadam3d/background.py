@@ -45,7 +45,7 @@ class RandomBackground(Background):
         require_color("background.color", self.color)
 
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
-        """One colour per view; the number of draws does not depend on their outcome."""
+        """Return one colour per view; the number of random draws does not depend on their outcome."""
         is_random = torch.rand(views, 1, generator=generator) < self.probability
         colors = torch.rand(views, 3, generator=generator)
         return torch.where(is_random, colors, torch.tensor([float(channel) for channel in self.color]))
@@ -65,7 +65,7 @@ class LucidBackground(Background):
         require_color("background.color", self.color)
 
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
-        """One colour per view; the number of draws does not depend on their outcome."""
+        """Return one colour per view; the number of random draws does not depend on their outcome."""
         is_other = torch.rand(views, 1, generator=generator) < self.probability
         is_black = torch.rand(views, 1, generator=generator) < self.black
         colors = torch.where(is_black, 0.0, torch.rand(views, 3, generator=generator))

@@ -21,7 +21,7 @@ LARGEST_LOG = 500.0
 
 @dataclass(frozen=True, kw_only=True)
 class Widening:
-    """A range whose bounds move by a constant factor at every widening until they reach their end values."""
+    """A range with bounds that move by a constant factor at every widening until they reach their ends."""
 
     start: Sequence[float]  # [low, high] before the first widening
     end: Sequence[float]  # [low, high] after the last widening
@@ -48,7 +48,7 @@ class Widening:
 
 @dataclass(frozen=True, kw_only=True)
 class Progressive(CameraSampler):
-    """Slightly shaken cameras around the origin, whose ranges widen at multiples of ``every``.
+    """Slightly shaken cameras around the origin, with ranges that widen at multiples of ``every``.
 
     Elevation and azimuth are ``middle +- u^gamma * half range`` with uniform u, so gamma > 1 prefers the
     middle; the distance is uniform. All views of a step share one field of view. The ranges are a closed

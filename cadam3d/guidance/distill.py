@@ -172,7 +172,7 @@ class GuidedDistillation(Distillation):
 def surrogate(
     clean: Float[Tensor, "v c h w"], gradient: Float[Tensor, "v c h w"], divisor: int
 ) -> Float[Tensor, ""]:
-    """Return ||x0 - stopgrad(x0 - G)||^2 / (2 * divisor), whose gradient with respect to x0 is G / divisor.
+    """Return ||x0 - stopgrad(x0 - G)||^2 / (2 * divisor), which has the gradient G / divisor.
 
     The difference is computed as (x0 - stopgrad(x0)) + G: the first part is exactly 0, whereas x0 - (x0 - G)
     would round a small G away. The sum is never in half precision, where it would overflow.

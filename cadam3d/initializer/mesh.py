@@ -36,8 +36,8 @@ class Mesh(Initializer):
     Reads all formats of trimesh (PLY, OBJ, STL, GLB, OFF, ...), with vertex, face or texture colours. The
     mesh is moved and scaled so that its bounding box is centred at the origin and its farthest point is at
     ``radius``; None keeps position and size as in the file. ``up`` is the axis of the file that points up:
-    "z", or "y" as in glTF and most OBJ files, whose front is then +z. ``scale`` is the standard deviation of
-    the Gaussians; None takes the mean distance to the three nearest neighbours.
+    "z", or "y" as in glTF and most OBJ files, where the front is then +z. ``scale`` is the standard deviation
+    of the Gaussians; None takes the mean distance to the three nearest neighbours.
     """
 
     path: str  # of the file

@@ -35,7 +35,7 @@ class PointCloud:
 
 
 def gaussians_at(cloud: PointCloud, *, scale: float | None, opacity: float, sh_degree: int) -> Gaussians:
-    """Return round Gaussians at the points (world units) whose colour is the same from every side.
+    """Return round Gaussians at the points (world units) that have the same colour from every side.
 
     ``scale`` is their standard deviation in world units. None gives each Gaussian the mean distance to its
     three nearest neighbours, so that neighbours just overlap.

@@ -385,7 +385,7 @@ class LatentPrior(DiffusionPrior):
 
     def _denoising(self, network: Any, count: int, channels: int, pixels: int) -> int:
         """Return the scratch bytes of one pass of a skeleton of the denoiser over ``count`` images."""
-        # A copy of this prior whose network has shapes and no numbers.
+        # A copy of this prior with a network that has shapes and no numbers.
         ghost = replace(self)
         object.__setattr__(ghost, "network", network)
         side = pixels // FACTOR
@@ -457,7 +457,7 @@ def ddpm_path(scheduler: Mapping[str, Any]) -> NoisePath:
     require(
         is_known and scheduler.get("trained_betas") is None,
         "prior.path",
-        expected="a model whose noise schedule is scaled_linear",
+        expected="a model with a scaled_linear noise schedule",
         got=kind if kind != "scaled_linear" else "scaled_linear, rescaled to zero terminal SNR",
         example="prior.path=DIR with another model",
     )

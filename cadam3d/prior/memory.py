@@ -64,5 +64,5 @@ class _EfficientAttention(TorchFunctionMode):
             return func(*args, **kwargs)
         names = ("query", "key", "value")
         query, _, value = (args[i] if i < len(args) else kwargs[name] for i, name in enumerate(names))
-        # A product of the same size as the output, whose graph keeps the inputs alive.
+        # A product of the same size as the output; its graph keeps the inputs alive.
         return query * value.new_ones(*query.shape[:-1], value.shape[-1])

@@ -87,8 +87,8 @@ class MVDream(StableDiffusion):
             found = with_ldm_unet(self.source.find(self.kinds, PRIORS))
         if found.config("unet").get("projection_class_embeddings_input_dim") != CAMERA:
             raise UserError(
-                f"prior.path: expected an MVDream model, got {found.where!r}, whose UNet has no camera "
-                "input. Try: prior=stable_diffusion, or prior.path=/path/to/sd-v2.1-base-4view.pt"
+                f"prior.path: expected an MVDream model, got {found.where!r}, which has no camera input "
+                "in its UNet. Try: prior=stable_diffusion, or prior.path=/path/to/sd-v2.1-base-4view.pt"
             )
         return found
 

@@ -17,7 +17,7 @@ from cadam3d.core.checks import require, require_choice, require_range
 
 FRONT, SIDE, BACK, OVERHEAD = range(4)
 SUFFIXES = (", front view", ", side view", ", back view", ", overhead view")
-QUARTER = 90.0  # degrees between neighbouring views whose embeddings are interpolated
+QUARTER = 90.0  # degrees between front, side and back, between which embeddings are interpolated
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Discrete(Prompting):
         )
 
     def texts(self, prompt: str) -> list[str]:
-        """The prompt with each of the four suffixes."""
+        """Return the prompt with each of the four suffixes."""
         return [prompt + suffix for suffix in SUFFIXES]
 
     def mix(self, cameras: Cameras) -> Mix:
@@ -136,7 +136,7 @@ class PerpNeg(Prompting):
             require_range("prompting.overhead_deg", self.overhead_deg, low=-90, high=90, example=60)
 
     def texts(self, prompt: str) -> list[str]:
-        """The prompt with each of the four suffixes."""
+        """Return the prompt with each of the four suffixes."""
         return [prompt + suffix for suffix in SUFFIXES]
 
     def mix(self, cameras: Cameras) -> Mix:

@@ -17,7 +17,7 @@ from cadam3d.prior.stable_diffusion import StableDiffusion
 
 @dataclass(frozen=True, kw_only=True)
 class StableDiffusionXL(StableDiffusion):
-    """Podell et al. 2023: Stable Diffusion whose network reads more inputs.
+    """Podell et al. 2023: Stable Diffusion with a network that reads more inputs.
 
     Every image is presented as uncropped and with its own size (their sec. 2.2). The empty text is embedded
     as zeros if the configuration of the model says so, as in training.

@@ -239,11 +239,11 @@ def _rocket() -> Thing:
 def _house() -> Thing:
     def window(x: float, y: float, z: float, *, sideways: bool) -> list[Part]:
         turn = 90.0 if sideways else 0.0
-        frame = box(0.05, 0.34, 0.34).turned("z", turn).at(x, y, z)
+        border = box(0.05, 0.34, 0.34).turned("z", turn).at(x, y, z)
         pane = box(0.07, 0.27, 0.27).turned("z", turn).at(x, y, z)
         bars = [box(0.085, 0.27, 0.03), box(0.085, 0.03, 0.27)]
         return [
-            _p(frame, "white"),
+            _p(border, "white"),
             _p(pane, "navy"),
             *(_p(bar.turned("z", turn).at(x, y, z), "white") for bar in bars),
         ]

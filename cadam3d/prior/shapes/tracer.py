@@ -225,7 +225,7 @@ def _shade(scene: Scene, hits: _Hits) -> tuple[Float[Tensor, "n"], Int[Tensor, "
 
 
 def _unit(vectors: Tensor) -> Tensor:
-    """Normalize vectors, whose components are along the first axis."""
+    """Normalize vectors that have their components along the first axis."""
     return vectors * vectors.square().sum(0).clamp_min(1e-30).rsqrt()
 
 

@@ -31,7 +31,7 @@ COLOURS: dict[str, tuple[float, float, float]] = {
 }
 COLOUR_ALIASES = {"gray": "grey", "golden": "gold", "tan": "beige", "crimson": "maroon", "aqua": "cyan"}
 
-# The equally likely colours of an object whose colour is open; each gives one mode of the mixture.
+# The equally likely colours of an object without a given colour; each gives one mode of the mixture.
 OPEN_PALETTE = ("red", "orange", "yellow", "green", "cyan", "blue", "purple", "pink")
 
 PLAIN = "plain"
