@@ -99,7 +99,7 @@ def small_configs(tmp_path_factory) -> Path:
         shutil.copytree(REPOSITORY / "configs" / name, folder / name)
     shutil.copy(REPOSITORY / "configs/sweep.yaml", folder)
     train = "defaults: [{densifier: cadam}, {hydra: default}, _self_]\n"
-    train += "backbone: {tau_pos: 0.0002, views: sum_norm, grad_multiplier: 1.0}\n"
+    train += "published_baseline: {tau_pos: 0.0002, views: sum_norm, grad_multiplier: 1.0}\n"
     train += "refine: {interval: 50}\nprompt: ???\nnegative_prompt: ''\nsteps: 600\nseed: 0\nresume: null\n"
     (folder / "train.yaml").write_text(train, encoding="utf-8")
     return folder
