@@ -201,7 +201,7 @@ class Library:
                 Setting(
                     key=group.name,
                     value=_spelled(list(group.chosen) if group.is_list else "".join(group.chosen)),
-                    words=group.words or "; ".join(self.summary(group.name, name) for name in group.chosen),
+                    words=group.words or " ".join(self.summary(group.name, name) for name in group.chosen),
                     is_object=False,
                 )
                 for group in groups
@@ -395,10 +395,11 @@ def _flat(values: dict[str, Value], prefix: str = "") -> Iterator[tuple[str, Val
 
 
 def _keys_by_class(values: dict[str, Value]) -> Iterator[tuple[str, str]]:
-    """Yield the dotted keys of every object in ``values``, each with the class of the object."""
+    """Yield the dotted keys of every object but schedules, each with the class of the object."""
     for path, _, parent in _flat(values):
-        if "_target_" in parent:
-            yield path, parent["_target_"]
+        target = parent.get("_target_", SCHEDULES)
+        if not target.startswith(SCHEDULES):
+            yield path, target
 
 
 def _spelled(value: Value) -> str:

@@ -24,8 +24,8 @@ def help_text(command: str, overrides: Sequence[str], options: Namespace) -> str
     """Return the help of a command, or of what the overrides choose, such as ``camera=orbit``.
 
     A word without ``=`` that names a group lists its options; overrides of single settings are ignored.
-    ``options`` are the flags of the line, of which ``--config-path`` and ``--config-dir`` name folders of YAML
-    files. Raises ``UserError`` for a group or an option that does not exist.
+    ``options`` are the flags of the line, of which ``--config-path`` and ``--config-dir`` name folders of
+    YAML files. Raises ``UserError`` for a group or an option that does not exist.
     """
     folders = [Path(options.config_path) if options.config_path else config_dir()]
     folders += [Path(options.config_dir)] if options.config_dir else []
@@ -52,8 +52,9 @@ def _groups(library: Library, command: str) -> Iterator[Group]:
         for name in library.options:
             outer, _, inner = name.rpartition("/")
             if outer == group.name:
-                pages = (library.page(f"{outer}/{option}") for option in library.options[outer])
-                words = next((page.words[inner] for page in pages if inner in page.words), "")
+                pages = [library.page(f"{outer}/{option}") for option in library.options[outer]]
+                owners = [page for page in pages if inner in [each.name for each in page.groups]]
+                words = " ".join(page.words.get(inner, "") for page in owners)
                 yield Group(name=name, chosen=(), is_list=False, words=words)
 
 
@@ -64,7 +65,9 @@ def _overview(library: Library, command: str, groups: dict[str, Group], width: i
     if about.settings:
         parts.append("Settings (key=value):\n" + _settings(about.settings, width))
     if groups:
-        parts.append("Parts (group=option); * marks the options that are chosen if the line does not say:")
+        parts.append(
+            _paragraphs("Parts (group=option); * marks the options that are chosen by default:", width)
+        )
     parts += [_group(library, group, width) for group in groups.values()]
     if groups:
         parts.append(_hint(command, groups.get("densifier") or next(iter(groups.values())), width))
