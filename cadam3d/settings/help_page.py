@@ -99,12 +99,10 @@ def _option(library: Library, command: str, group: str, name: str, width: int) -
     title = f"{group}={name}" + (f" ({option.target})" if option.target else "")
     lines = [title, _paragraphs(option.about, width)]
     if option.base:
-        changed = [
-            each.key.removeprefix(f"{group}.") for each in option.settings if each.key in option.own_keys
-        ]
-        lines.append(
-            textwrap.fill(f"Builds on {group}={option.base} and changes {', '.join(changed)}.", width)
-        )
+        changed = [each.key for each in option.settings if each.key in option.own_keys]
+        whole = [key for key in changed if key.rpartition(".")[0] not in changed]
+        names = ", ".join(key.removeprefix(f"{group}.") for key in whole)
+        lines.append(textwrap.fill(f"Builds on {group}={option.base} and changes {names}.", width))
     return "\n".join([*lines, _settings(option.settings, width) or "  There are no settings."])
 
 
