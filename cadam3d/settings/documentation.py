@@ -12,7 +12,7 @@ elsewhere in its group, in a component of the same class.
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,7 @@ class Option:
     """What ``group=name`` chooses, or a command with the settings that are in no group."""
 
     name: str
-    about: str  # paragraphs, one per line; a line that begins with a blank is an example
+    about: str  # paragraphs between empty lines; a line that begins with a blank is an example
     target: str  # the class, such as "cadam3d.camera.orbit.Orbit", or ""
     base: str  # the option of the same group that this one builds on, or ""
     settings: tuple[Setting, ...]
@@ -88,7 +88,7 @@ class Library:
         for folder in self.folders:
             for path in folder.glob("*/**/*.yaml"):
                 names.setdefault(path.parent.relative_to(folder).as_posix(), set()).add(path.stem)
-        return {group: sorted(names[group]) for group in sorted(names) if group.split("/")[0] != "hydra"}
+        return {group: sorted(names[group]) for group in sorted(names) if _head(group, "/") != "hydra"}
 
     def page(self, name: str) -> Page:
         """Return the file ``name``, such as ``train`` or ``camera/orbit``."""
@@ -173,7 +173,7 @@ class Library:
         """Return the words of keys by class and key: those of this option first, then those of its group."""
         pages = [(values, words)]
         for place, names in self.options.items():
-            if place.partition("/")[0] == group.partition("/")[0]:
+            if _head(place, "/") == _head(group, "/"):
                 others = [self.page(f"{place}/{name}") for name in names]
                 pages += [(page.values, page.words) for page in others if not page.bases]
         known: dict[tuple[str, str], str] = {}
@@ -185,37 +185,25 @@ class Library:
 
     def _recipe(self, page: Page, settings: Sequence[Setting], command: str) -> list[Setting]:
         """Return what a recipe chooses and changes, each with the words of what it changes."""
-        groups = [group for group in page.groups if group.name.split("/")[0] != "hydra"]
+        groups = [group for group in page.groups if _head(group.name, "/") != "hydra"]
         chosen = {group.name: group.chosen for group in [*self.groups(command), *groups]}
         known = {each.key: each.words for each in self.command(command).settings}
         for group in {_head(each.key) for each in settings} & set(self.options):
-            names = [
-                *chosen.get(group, ()),
-                *(name for each in settings for name in each.key.split(".")[1:2]),
-            ]
-            for name in dict.fromkeys(name for name in names if name in self.options[group]):
-                for each in self.option(group, name).settings:
-                    known.setdefault(each.key, each.words)
-        return [
-            *(
-                Setting(
-                    key=group.name,
-                    value=_spelled(list(group.chosen) if group.is_list else "".join(group.chosen)),
-                    words=group.words or " ".join(self.summary(group.name, name) for name in group.chosen),
-                    is_object=False,
-                )
-                for group in groups
-            ),
-            *(
-                Setting(
-                    key=each.key,
-                    value=each.value,
-                    words=_with_note(known.get(each.key, ""), each.words),
-                    is_object=each.is_object,
-                )
-                for each in settings
-            ),
+            for name in dict.fromkeys([*chosen.get(group, ()), *self.options[group]]):
+                if self.page(f"{group}/{name}").package != "_global_":
+                    for each in self.option(group, name).settings:
+                        known.setdefault(each.key, each.words)
+        choices = [
+            Setting(
+                key=group.name,
+                value=_spelled(list(group.chosen) if group.is_list else "".join(group.chosen)),
+                words=group.words or " ".join(self.summary(group.name, name) for name in group.chosen),
+                is_object=False,
+            )
+            for group in groups
         ]
+        changes = [replace(each, words=_with_note(known.get(each.key, ""), each.words)) for each in settings]
+        return choices + changes
 
 
 def read_page(text: str) -> Page:
@@ -280,14 +268,14 @@ def _header(lines: Sequence[str]) -> tuple[str, str]:
 
 
 def _flowing(lines: Iterable[str]) -> str:
-    """Join lines to paragraphs. An empty line ends one; a line that begins with a blank is an example."""
-    text = ""
+    """Join the lines of each paragraph. Lines that begin with a blank are examples and stay as they are."""
+    flowing = [""]
     for line in lines:
-        is_joined = line and text and not line.startswith(" ") and not text.endswith("\n")
-        text += " " + line if is_joined else line if line else "\n"
-        if line.startswith(" "):
-            text = text.removesuffix(line).rstrip("\n") + "\n" + line + "\n"
-    return text.strip("\n")
+        if line and flowing[-1] and not line.startswith(" ") and not flowing[-1].startswith(" "):
+            flowing[-1] += " " + line
+        else:
+            flowing.append(line)
+    return "\n".join(flowing).strip("\n")
 
 
 def _entries(node: yaml.Node | None, prefix: str = "") -> Iterator[tuple[str, yaml.Node, yaml.Node]]:
@@ -340,7 +328,9 @@ def _words_of(key: yaml.Node, comments: Mapping[int, _Comment]) -> str:
                 break
             beside.append(further.text)
     parts = [" ".join(part) for part in (above, beside) if part]
-    return (" " if parts and parts[0].endswith(".") else "; ").join(parts)
+    if len(parts) == 2 and parts[0].endswith("."):
+        return f"{parts[0]} {parts[1][0].upper()}{parts[1][1:]}"
+    return "; ".join(parts)
 
 
 def _group(item: yaml.MappingNode, comments: Mapping[int, _Comment]) -> Group:
@@ -417,5 +407,5 @@ def _spelled(value: Value) -> str:
     return f"{name}({', '.join(inner)})" if name else f"{{{', '.join(inner)}}}"
 
 
-def _head(key: str) -> str:
-    return key.partition(".")[0]
+def _head(name: str, separator: str = ".") -> str:
+    return name.partition(separator)[0]
