@@ -80,6 +80,7 @@ class Library:
     def __init__(self, folders: Sequence[Path]) -> None:
         self.folders = folders
         self._pages: dict[str, Page] = {}
+        self._words: dict[str, dict[tuple[str, str], str]] = {}  # see _group_words
 
     @cached_property
     def options(self) -> dict[str, list[str]]:
@@ -160,28 +161,23 @@ class Library:
             values = _merged(base_values, values)
             notes = {key: _with_note(base_words.get(key, ""), note) for key, note in words.items()}
             words = base_words | notes
-        known = self._words_by_class(group, values, words)
+        known = self._group_words(_head(group, "/")) | _words_by_class(values, words)
         for key, target in _keys_by_class(values):
             meaning = known.get((target, key.rpartition(".")[2]))
             if key not in words and meaning:
                 words = words | {key: meaning}
         return values, words
 
-    def _words_by_class(
-        self, group: str, values: dict[str, Value], words: dict[str, str]
-    ) -> dict[tuple[str, str], str]:
-        """Return the words of keys by class and key: those of this option first, then those of its group."""
-        pages = [(values, words)]
-        for place, names in self.options.items():
-            if _head(place, "/") == _head(group, "/"):
-                others = [self.page(f"{place}/{name}") for name in names]
-                pages += [(page.values, page.words) for page in others if not page.bases]
-        known: dict[tuple[str, str], str] = {}
-        for some_values, some_words in pages:
-            for key, target in _keys_by_class(some_values):
-                if key in some_words:
-                    known.setdefault((target, key.rpartition(".")[2]), some_words[key])
-        return known
+    def _group_words(self, group: str) -> dict[tuple[str, str], str]:
+        """Return the words of the keys of objects in a group, by class and key; the first file counts."""
+        if group not in self._words:
+            places = [place for place in self.options if _head(place, "/") == group]
+            pages = [self.page(f"{place}/{name}") for place in places for name in self.options[place]]
+            self._words[group] = {}
+            for page in pages:
+                if not page.bases:
+                    self._words[group] = _words_by_class(page.values, page.words) | self._words[group]
+        return self._words[group]
 
     def _recipe(self, page: Page, settings: Sequence[Setting], command: str) -> list[Setting]:
         """Return what a recipe chooses and changes, each with the words of what it changes."""
@@ -189,10 +185,11 @@ class Library:
         chosen = {group.name: group.chosen for group in [*self.groups(command), *groups]}
         known = {each.key: each.words for each in self.command(command).settings}
         for group in {_head(each.key) for each in settings} & set(self.options):
+            wanted = {each.key for each in settings if _head(each.key) == group}
             for name in dict.fromkeys([*chosen.get(group, ()), *self.options[group]]):
-                if self.page(f"{group}/{name}").package != "_global_":
-                    for each in self.option(group, name).settings:
-                        known.setdefault(each.key, each.words)
+                if wanted <= set(known) or self.page(f"{group}/{name}").package == "_global_":
+                    break
+                known = {each.key: each.words for each in self.option(group, name).settings} | known
         choices = [
             Setting(
                 key=group.name,
@@ -390,6 +387,15 @@ def _keys_by_class(values: dict[str, Value]) -> Iterator[tuple[str, str]]:
         target = parent.get("_target_", SCHEDULES)
         if not target.startswith(SCHEDULES):
             yield path, target
+
+
+def _words_by_class(values: dict[str, Value], words: Mapping[str, str]) -> dict[tuple[str, str], str]:
+    """Return the words of the keys of objects, by class and key; the first key with words counts."""
+    known: dict[tuple[str, str], str] = {}
+    for key, target in _keys_by_class(values):
+        if key in words:
+            known.setdefault((target, key.rpartition(".")[2]), words[key])
+    return known
 
 
 def _spelled(value: Value) -> str:

@@ -152,7 +152,8 @@ def test_a_key_without_words_has_those_of_the_same_class(tmp_path):
 
 
 def test_a_schedule_is_one_value(tmp_path):
-    text = "# It.\n_target_: a.B\nrate: # per step\n  _target_: cadam3d.core.schedule.Linear\n  start: 1\n  end: 0\n"
+    schedule = "  _target_: cadam3d.core.schedule.Linear\n  start: 1\n  end: 0\n"
+    text = f"# It.\n_target_: a.B\nrate: # per step\n{schedule}"
     [rate] = library(tmp_path, thing__it=text).option("thing", "it", "none").settings
     assert (rate.key, rate.value) == ("thing.rate", "Linear(start=1, end=0)")
 
