@@ -158,10 +158,9 @@ def test_help_is_instant_and_imports_nothing_heavy():
 
 
 @pytest.mark.parametrize("command", list(cli.COMMANDS))
-def test_every_command_has_a_module_and_says_in_its_yaml_what_it_is_for(command):
+def test_every_command_has_a_module_and_a_file_of_settings(command):
     assert (REPOSITORY / f"cadam3d/commands/{command}.py").is_file()
-    config = yaml.safe_load((settings.config_dir() / f"{command}.yaml").read_text(encoding="utf-8"))
-    assert f"\n  cadam3d {command}" in config["hydra"]["help"]["header"]
+    assert (settings.config_dir() / f"{command}.yaml").is_file()
 
 
 @pytest.mark.parametrize("command", ["train", "doctor"])

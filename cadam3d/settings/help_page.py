@@ -103,7 +103,7 @@ def _option(library: Library, command: str, group: str, name: str, width: int) -
         whole = [key for key in changed if key.rpartition(".")[0] not in changed]
         names = ", ".join(key.removeprefix(f"{group}.") for key in whole)
         lines.append(textwrap.fill(f"Builds on {group}={option.base} and changes {names}.", width))
-    return "\n".join([*lines, _settings(option.settings, width) or "  There are no settings."])
+    return "\n".join([*lines, _settings(option.settings, width) or "  It has no settings."])
 
 
 def _settings(settings: Iterable[Setting], width: int) -> str:
