@@ -227,14 +227,14 @@ def read_page(text: str) -> Page:
 def settings_of(values: dict[str, Value], words: Mapping[str, str], prefix: str = "") -> Iterator[Setting]:
     """Yield the settings in ``values`` in their order, with ``prefix`` before their keys.
 
-    The numbers of a schedule are shown with the schedule; only those with words of their own are yielded too.
+    The numbers of a schedule are part of its value. A group of keys is yielded if it has words.
     """
     for path, value, parent in _flat(values):
         is_class = isinstance(value, dict) and "_target_" in value
         is_whole_option = parent is values and "_target_" not in values  # such as regularizer.sparsity
         is_branch = isinstance(value, dict) and (is_whole_option or not is_class)
         is_number = str(parent.get("_target_", "")).startswith(SCHEDULES)
-        if not path.endswith("_target_") and (path in words or not (is_number or is_branch)):
+        if not (path.endswith("_target_") or is_number or (is_branch and path not in words)):
             yield Setting(
                 key=f"{prefix}.{path}" if prefix else path,
                 value="" if is_branch else _spelled(value),

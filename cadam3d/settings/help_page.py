@@ -65,9 +65,12 @@ def _overview(library: Library, command: str, groups: dict[str, Group], width: i
     if about.settings:
         parts.append("Settings (key=value):\n" + _settings(about.settings, width))
     if groups:
-        parts.append(
-            _paragraphs("Parts (group=option); * marks the options that are chosen by default:", width)
+        lists = [group for group in groups.values() if group.is_list]
+        example = (
+            f"; a list needs quotes, as in '{lists[0].name}=[{','.join(lists[0].chosen)}]'" if lists else ""
         )
+        title = f"Parts (group=option{example}). * marks what is chosen by default."
+        parts.append(textwrap.fill(title, width))
     parts += [_group(library, group, width) for group in groups.values()]
     if groups:
         parts.append(_hint(command, groups.get("densifier") or next(iter(groups.values())), width))
