@@ -37,7 +37,7 @@ class Setting:
         str  # as YAML spells it, or what builds an object, such as "Linear(start=0.98, end=0.5, steps=500)"
     )
     words: str
-    is_object: bool  # the value is an object, whose own settings have longer keys
+    is_object: bool  # the value is an object or a group of keys, with settings of its own
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +149,11 @@ class Library:
         )
 
     def _find(self, name: str) -> Path:
-        return next(path for folder in self.folders if (path := folder / f"{name}.yaml").is_file())
+        for folder in self.folders:
+            if (path := folder / f"{name}.yaml").is_file():
+                return path
+        places = " or ".join(map(str, self.folders))
+        raise UserError(f"{name}.yaml: expected this file in {places}, got none. Try: cadam3d doctor")
 
     def _resolved(self, group: str, name: str) -> tuple[dict[str, Value], dict[str, str]]:
         """Return values and words of an option, merged with those of the file that it builds on."""
@@ -212,7 +216,8 @@ def read_page(text: str) -> Page:
     words = {key: words for key, node, _ in entries if (words := _words_of(node, comments))}
     groups, bases = [], []
     for key, _, value in entries:
-        for item in value.value if key == "defaults" else []:
+        is_list = key == "defaults" and isinstance(value, yaml.SequenceNode)
+        for item in value.value if is_list else []:
             if isinstance(item, yaml.MappingNode):
                 groups.append(_group(item, comments))
             elif item.value != "_self_":
@@ -332,7 +337,7 @@ def _words_of(key: yaml.Node, comments: Mapping[int, _Comment]) -> str:
 
 def _group(item: yaml.MappingNode, comments: Mapping[int, _Comment]) -> Group:
     """Return the group that an entry in a list of defaults is about."""
-    [(key, value)] = item.value
+    key, value = item.value[0]
     plain = _plain(value)
     chosen = plain if isinstance(plain, list) else [] if plain == "null" else [plain]
     comment = comments.get(key.start_mark.line)
@@ -345,8 +350,8 @@ def _group(item: yaml.MappingNode, comments: Mapping[int, _Comment]) -> Group:
 
 
 def _reference(text: str) -> str:
-    """Return the group or file that a list of defaults refers to, without ``override`` and package."""
-    return text.removeprefix("override ").partition("@")[0].lstrip("/")
+    """Return the group or file that a list of defaults refers to, without its prefix and package."""
+    return text.removeprefix("override ").removeprefix("optional ").partition("@")[0].lstrip("/")
 
 
 def _plain(node: yaml.Node) -> Value:

@@ -30,7 +30,8 @@ def help_text(command: str, overrides: Sequence[str], options: Namespace) -> str
     folders = [Path(options.config_path) if options.config_path else config_dir()]
     folders += [Path(options.config_dir)] if options.config_dir else []
     library = Library(folders)
-    groups = {group.name: group for group in _groups(library, options.config_name or command)}
+    config_name = options.config_name or command
+    groups = {group.name: group for group in _groups(library, config_name)}
     width = min(max(shutil.get_terminal_size((100, 24)).columns, NARROWEST), WIDEST)
     parts = []
     for word in overrides:
@@ -42,13 +43,14 @@ def help_text(command: str, overrides: Sequence[str], options: Namespace) -> str
             parts += [_group(library, groups[name], width), _hint(command, groups[name], width)]
         elif name in library.options or not equals:
             raise _no_group(command, word, groups)
-    return "\n\n".join(parts) if parts else _overview(library, command, groups, width)
+    return "\n\n".join(parts) if parts else _overview(library, command, config_name, groups, width)
 
 
 def _groups(library: Library, command: str) -> Iterator[Group]:
-    """Yield the groups of a command, each followed by the groups inside of it."""
+    """Yield the groups of a command that have options, each followed by the groups inside of it."""
     for group in library.groups(command):
-        yield group
+        if group.name in library.options:
+            yield group
         for name in library.options:
             outer, _, inner = name.rpartition("/")
             if outer == group.name:
@@ -58,18 +60,16 @@ def _groups(library: Library, command: str) -> Iterator[Group]:
                 yield Group(name=name, chosen=(), is_list=False, words=words)
 
 
-def _overview(library: Library, command: str, groups: dict[str, Group], width: int) -> str:
+def _overview(library: Library, command: str, config_name: str, groups: dict[str, Group], width: int) -> str:
     """Return what a command is for, its settings, and its groups with their options."""
-    about = library.command(command)
+    about = library.command(config_name)
     parts = [_paragraphs(about.about, width)]
     if about.settings:
         parts.append("Settings (key=value):\n" + _settings(about.settings, width))
     if groups:
-        lists = [group for group in groups.values() if group.is_list]
-        example = (
-            f"; a list needs quotes, as in '{lists[0].name}=[{','.join(lists[0].chosen)}]'" if lists else ""
-        )
-        title = f"Parts (group=option{example}). * marks what is chosen by default."
+        lists = [f"'{group.name}=[{','.join(group.chosen)}]'" for group in groups.values() if group.is_list]
+        note = f"; a list needs quotes, as in {lists[0]}" if lists else ""
+        title = f"Parts (group=option{note}). * marks what is chosen by default."
         parts.append(textwrap.fill(title, width))
     parts += [_group(library, group, width) for group in groups.values()]
     if groups:
@@ -90,7 +90,7 @@ def _group(library: Library, group: Group, width: int) -> str:
 
 
 def _option(library: Library, command: str, group: str, name: str, width: int) -> str:
-    """Return an option with all its settings."""
+    """Return an option with all its settings. Raises ``UserError`` if there is no such option."""
     if name not in library.options[group]:
         names = library.options[group]
         best = (did_you_mean(name, names) or names)[0]
@@ -110,6 +110,7 @@ def _option(library: Library, command: str, group: str, name: str, width: int) -
 
 
 def _settings(settings: Iterable[Setting], width: int) -> str:
+    """Return one row for each setting, as a command line names it."""
     rows = []
     for each in settings:
         sign = ": " if each.is_object and each.value else "" if each.is_object else "="
@@ -136,6 +137,7 @@ def _paragraphs(text: str, width: int) -> str:
 
 
 def _hint(command: str, group: Group, width: int) -> str:
+    """Return where to read on."""
     example = group.chosen[0] if group.chosen else "NAME"
     text = (
         f"cadam3d {command} --help {group.name}={example} lists the settings of an option. "

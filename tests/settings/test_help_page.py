@@ -107,6 +107,12 @@ def test_a_name_that_does_not_exist_is_answered_with_the_near_one(words, message
         page(*words)
 
 
+def test_a_config_that_does_not_exist_is_named():
+    flags = Namespace(config_dir=None, config_path=None, config_name="mine")
+    with pytest.raises(UserError, match=r"^mine\.yaml: expected this file in "):
+        page(flags=flags)
+
+
 def test_a_command_without_groups_says_so():
     with pytest.raises(UserError, match=r"has no groups\. Try: cadam3d doctor --help"):
         page("camera", command="doctor")
