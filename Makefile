@@ -1,36 +1,49 @@
-# make demo   install into .venv and make a first object       make test   everything that must hold before a merge
-# make clean  remove .venv and caches (outputs stay)
-# PYTHON=python3.12 chooses the interpreter; JOBS=2 the number of test processes.
+# make demo   install into .venv and train a first object
+# make test   ruff, pyright and the whole test suite: everything that must hold before a merge
+# make check  ruff, pyright and the tests of what has changed since the last commit on main; less than a minute
+# make clean  remove .venv and caches; outputs stay
+# PYTHON=python3.12 chooses the interpreter; JOBS=2 sets the number of test processes.
 
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 CANDIDATES := python3 python3.13 python3.12 python3.11
 PYTHON ?= $(firstword $(foreach name,$(CANDIDATES),$(shell $(name) -c '$(SUPPORTED)' 2>/dev/null && echo $(name))))
 JOBS ?= auto
+BASE ?= main
 BIN := .venv/bin
+INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test clean
+.PHONY: demo test check clean
 
 demo: .venv/.installed
 	$(BIN)/cadam3d train prompt="a red and yellow checkered torus"
-	@echo "The run: outputs/latest (asset.ply, turntable.mp4, preview.png, report.html)"
+	@echo "Output folder: outputs/latest (asset.ply, turntable.mp4, preview.png, report.html)"
 
 test: .venv/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+	$(PYTEST)
+
+check: .venv/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	@tests="$$($(BIN)/python scripts/changed_tests.py $(BASE))"; \
+	if [ -z "$$tests" ]; then echo "No tests belong to what has changed since $(BASE)."; \
+	else echo "Tests of what has changed since $(BASE): $$tests"; $(PYTEST) -m "not slow" $$tests; fi
 
 clean:
 	rm -rf .venv build dist .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The installs are editable: a changed source needs no second one, only a changed pyproject.toml does.
-.venv/.installed: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --editable .
+# The installs are editable: a changed source needs no new install; changed dependencies do.
+.venv/.installed: pyproject.toml constraints.txt | $(BIN)/python
+	$(INSTALL) .
 	@touch $@
 
-.venv/.installed-dev: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+.venv/.installed-dev: pyproject.toml constraints.txt | $(BIN)/python
+	$(INSTALL) ".[dev]"
 	@touch $@ .venv/.installed
 
 $(BIN)/python:

@@ -73,7 +73,7 @@ def test_the_source_archive_carries_what_its_own_tests_read(tmp_path):
     everything = [*find("cadam3d", "*.py"), *find("configs", "*.yaml"), *find("docs", "*.md")]
     everything += [*find("tests", "*.py"), *REPOSITORY.glob("*.md")]
     names = {str(path.relative_to(REPOSITORY)) for path in everything}
-    assert names | {"Makefile", "LICENSE", "pyproject.toml", ".ci/run"} <= set(modes)
+    assert names | {"Makefile", "LICENSE", "pyproject.toml", "constraints.txt", ".ci/run"} <= set(modes)
     assert modes[".ci/run"] & 0o100
 
 
@@ -140,6 +140,34 @@ def test_no_dependency_pulls_torchvision():
     assert not [line for line in everything if "torchvision" in line]
 
 
+def test_the_package_forbids_no_newer_version():
+    """An upper bound in the package would make it refuse the environments of its users."""
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    for_users = [
+        *project["dependencies"],
+        *(line for name in extras if name != "dev" for line in extras[name]),
+    ]
+    assert not [line for line in [project["requires-python"], *for_users] if re.search(r"<|==|~=|!=", line)]
+
+
+def test_the_projects_own_commands_use_the_tested_versions():
+    """Every constraint names a dependency, and ``make`` installs under the constraints."""
+    text = (REPOSITORY / "pyproject.toml").read_text(encoding="utf-8")
+    constraints = (REPOSITORY / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    names = [re.split("[<=>]", line)[0] for line in constraints if line and not line.startswith("#")]
+    assert "torch" in names
+    assert not [name for name in names if f'"{name}>=' not in text]
+    done = subprocess.run(
+        ["make", "-n", "-W", "pyproject.toml", "test"],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "--constraint constraints.txt" in done.stdout
+
+
 def test_the_ci_runs_make_test_and_nothing_beside_it():
     script = REPOSITORY / ".ci" / "run"
     assert os.access(script, os.X_OK)
@@ -148,7 +176,12 @@ def test_the_ci_runs_make_test_and_nothing_beside_it():
 
 
 @pytest.mark.parametrize(
-    ("goal", "expected"), [("demo", 'train prompt="a red and yellow checkered torus"'), ("test", "-m pytest")]
+    ("goal", "expected"),
+    [
+        ("demo", 'train prompt="a red and yellow checkered torus"'),
+        ("test", "-m pytest"),
+        ("check", '-m "not slow"'),
+    ],
 )
 def test_make_says_what_it_would_do(goal, expected):
     done = subprocess.run(["make", "-n", goal], cwd=REPOSITORY, capture_output=True, text=True, check=True)
@@ -157,7 +190,8 @@ def test_make_says_what_it_would_do(goal, expected):
 
 def test_make_refuses_a_python_that_is_too_old_or_too_new(tmp_path):
     (tmp_path / "Makefile").symlink_to(REPOSITORY / "Makefile")
-    (tmp_path / "pyproject.toml").touch()
+    for name in ("pyproject.toml", "constraints.txt"):
+        (tmp_path / name).touch()
     old = tmp_path / "python3.8"
     old.write_text("#!/bin/sh\nexit 1\n", encoding="utf-8")
     old.chmod(0o755)

@@ -1,0 +1,129 @@
+"""docs/extending.md, followed word by word from a folder outside the package."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
+import torch
+
+from cadam3d.densifier.base import GradientSignal
+
+REPOSITORY = Path(__file__).parent.parent
+PAGE = (REPOSITORY / "docs" / "extending.md").read_text(encoding="utf-8")
+BLOCK = re.compile(r"^`([\w./]+)`:\n\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+COMMAND = re.findall(r"^```sh\n(.* train .*)\n```$", PAGE, re.MULTILINE)[0]
+ENOUGH = "experiment=smoke prior=tiny"  # a few steps with small images: the law is that the parts are used
+
+# The installed command for the sources of this repository; the current folder is not on its path.
+PROGRAM = f"""#!{sys.executable}
+import sys
+sys.path.insert(0, {str(REPOSITORY)!r})
+from cadam3d.cli import main
+main()
+"""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """Return a folder with every file that the page shows."""
+    place = tmp_path_factory.mktemp("stranger")
+    for name, content in BLOCK.findall(PAGE):
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / name).write_text(content, encoding="utf-8")
+    return place
+
+
+@pytest.fixture(scope="module")
+def run(place) -> Path:
+    """The run folder after the command of the page."""
+    program = place / "bin" / "cadam3d"
+    program.parent.mkdir()
+    program.write_text(PROGRAM, encoding="utf-8")
+    program.chmod(0o755)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    environment |= {"PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        ["bash", "-c", f"{COMMAND} {ENOUGH}"],
+        cwd=place,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return place / "outputs" / "latest"
+
+
+@pytest.fixture
+def energy(place, monkeypatch):
+    """The densifier of the page, with the values of its YAML file."""
+    monkeypatch.syspath_prepend(str(place))
+    from cadam3d.settings.compose import component, load
+
+    yield component(load(place / "myconfigs/densifier/energy.yaml"))
+    for name in [name for name in sys.modules if name.partition(".")[0] == "mypackage"]:
+        del sys.modules[name]
+
+
+def signal(means: torch.Tensor) -> GradientSignal:
+    n = len(means)
+    return GradientSignal(
+        means=means, means2d=torch.zeros(1, n, 2), radii=torch.ones(1, n), height=8, width=8
+    )
+
+
+@pytest.mark.parametrize("command", [["check"], ["format", "--check", "--diff"]], ids=lambda words: words[0])
+def test_the_code_of_the_page_passes_our_linter(command, place):
+    ruff = shutil.which("ruff", path=sysconfig.get_path("scripts"))
+    if ruff is None:
+        pytest.skip("ruff is not installed")
+    settings = ["--no-cache", "--config", str(REPOSITORY / "pyproject.toml")]
+    done = subprocess.run(
+        [ruff, *command, *settings, "mypackage"], cwd=place, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_exporter_writes_its_file(run):
+    rows = [line.split() for line in (run / "asset.xyz").read_text(encoding="utf-8").splitlines()]
+    assert rows
+    assert all(len(row) == 6 and all(0 <= int(channel) <= 255 for channel in row[3:]) for row in rows)
+
+
+def test_the_metric_is_in_the_summary(run):
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    assert 0 <= summary["outliers"] <= 1
+    assert summary["densifier"] == "energy"
+
+
+def test_the_statistic_is_logged_at_each_refinement(run):
+    lines = map(json.loads, (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines())
+    refinements = [line["statistics"] for line in lines if line["kind"] == "refine"]
+    assert refinements
+    assert all(numbers["energy_threshold"] >= numbers["energy_median"] >= 0 for numbers in refinements)
+
+
+def test_the_chart_is_in_the_report(run):
+    assert "Gradient energy" in (run / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_densifier_grows_the_share_that_its_settings_name(energy):
+    state = energy.observe(energy.init_state(100, torch.device("cpu")), signal(torch.rand(100, 3)))
+    assert energy.select(state, 1, torch.Generator()).sum() == 5
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e30])
+def test_a_gradient_that_is_not_finite_leaves_the_state_finite(bad, energy):
+    means = torch.ones(4, 3)
+    means[1, 2] = bad
+    before = energy.observe(energy.init_state(4, torch.device("cpu")), signal(torch.ones(4, 3)))
+    after = energy.observe(before, signal(means))
+    assert after.energy.isfinite().all()
+    assert after.energy[1] == before.energy[1]
+    assert (after.energy[[0, 2, 3]] > before.energy[[0, 2, 3]]).all()
