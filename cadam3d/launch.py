@@ -22,6 +22,7 @@ from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 from cadam3d.core.errors import UserError
 from cadam3d.settings.advice import ask_for, explain, missing_values
 from cadam3d.settings.compose import TEXT_KEYS, VERSION_BASE, compose, config_dir, quote, register_resolvers
+from cadam3d.settings.help_page import help_text
 
 TRAINING = ("train", "sweep")  # the commands that own a run folder
 OVERRIDES = ".hydra/overrides.yaml"  # in a run folder: what its line said
@@ -66,15 +67,18 @@ def launch(command: str, words: Sequence[str]) -> int:
     if command == "doctor":
         words = ["json=true" if word == "--json" else word for word in words]
     overrides, flags = split(words)
-    _refuse_bare_words(command, overrides)
     options = _read_flags(flags)
+    if options.help:
+        print(help_text(command, overrides, options))
+        return 0
+    _refuse_bare_words(command, overrides)
     is_sweep = command == "sweep" or options.multirun or "hydra.mode=MULTIRUN" in overrides
     overrides = [quoted(line, is_sweep=is_sweep) for line in overrides]
     if command in TRAINING:
         overrides = resumed(overrides, is_sweep=is_sweep)
     elif is_sweep:
         raise UserError(f"{command}: only training can be swept. Try: cadam3d {command} once for each asset")
-    if options.help or options.hydra_help or options.info or options.shell_completion:
+    if options.hydra_help or options.info or options.shell_completion:
         return run_hydra(command, [*overrides, *flags])
     if is_sweep:
         return _sweep(command, overrides, flags, options)

@@ -31,7 +31,7 @@ REPOSITORY = Path(__file__).parents[2]
 PYTHON = sys.executable
 TRAIN = """
 defaults: [{densifier: cadam}, {hydra: default}, _self_]
-backbone: {tau_pos: 0.0002, views: sum_norm, grad_multiplier: 1.0}
+published_baseline: {tau_pos: 0.0002, views: sum_norm, grad_multiplier: 1.0}
 refine: {interval: 50}
 optimizer: {steps: "${steps}"}
 prompt: ???

@@ -1,0 +1,88 @@
+"""Write the generated parts of docs/components.md: python scripts/write_components.py
+
+They are made from the comments in configs/. A generated part is between two lines, ``<!-- begin generated:
+NAME -->`` and ``<!-- end generated -->``. NAME is a group of options, or a command, which stands for its
+settings. Everything around these parts is written by hand.
+"""
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from cadam3d.settings.compose import config_dir
+from cadam3d.settings.documentation import Library, Option, Setting
+
+PAGE = Path(__file__).parent.parent / "docs" / "components.md"
+PART = re.compile(r"(<!-- begin generated: (\S+) -->\n).*?(<!-- end generated -->)", re.DOTALL)
+LISTED_ONLY = ("grid",)  # lists of runs, which have no settings
+RECIPES = ("experiment", "noise", "vram")  # change settings of other groups, which are documented there
+
+
+def main() -> None:
+    PAGE.write_text(written(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+def written(text: str) -> str:
+    """Return the page with all generated parts made anew."""
+    library = Library([config_dir()])
+    chosen = {group.name: group.chosen for group in library.groups("sweep")}
+
+    def part(match: re.Match[str]) -> str:
+        name = match.group(2)
+        is_group = name in library.options
+        body = (
+            group(library, name, chosen.get(name, ())) if is_group else table(library.command(name).settings)
+        )
+        return f"{match.group(1)}\n{body}\n\n{match.group(3)}"
+
+    return PART.sub(part, text)
+
+
+def group(library: Library, name: str, chosen: tuple[str, ...]) -> str:
+    """Return the table of the options of a group, and under it the settings of each option."""
+    options = [library.option(name, each) for each in library.options[name]]
+    lines = [f"| `{name}=` | |", "|---|---|"]
+    for option in options:
+        mark = " (default)" if option.name in chosen else ""
+        lines.append(f"| `{option.name}`{mark} | {cell(option.about)} |")
+    blocks = ["\n".join(lines)]
+    if name not in LISTED_ONLY:
+        blocks += [block for option in options if (block := settings(name, option))]
+    return "\n\n".join(blocks)
+
+
+def settings(name: str, option: Option) -> str:
+    """Return the settings of an option, folded away. If it builds on another option, only what it changes."""
+    own = [each for each in option.settings if not option.base or each.key in option.own_keys]
+    if not own:
+        return ""
+    title = f"<code>{name}={option.name}</code>"
+    if option.base:
+        title += f", otherwise as <code>{option.base}</code>"
+    prefix = name.replace("/", ".") + "."
+    body = table(own, prefix) if name not in RECIPES else changes(own)
+    return f"<details><summary>{title}</summary>\n\n{body}\n\n</details>"
+
+
+def table(settings: Iterable[Setting], prefix: str = "") -> str:
+    """Return a table of settings; ``prefix`` is left out of the keys."""
+    lines = ["| setting | value | meaning |", "|---|---|---|"]
+    for each in settings:
+        value = f"`{cell(each.value)}`" if each.value else ""
+        lines.append(f"| `{each.key.removeprefix(prefix)}` | {value} | {cell(each.words)} |")
+    return "\n".join(lines)
+
+
+def changes(settings: Iterable[Setting]) -> str:
+    """Return what a recipe chooses and changes."""
+    lines = [f"    {each.key}={each.value}" for each in settings if each.value]
+    return "\n".join(lines)
+
+
+def cell(text: str) -> str:
+    """Return text for a cell of a table."""
+    return " ".join(text.split()).replace("|", r"\|").replace("<", "&lt;")
+
+
+if __name__ == "__main__":
+    main()
