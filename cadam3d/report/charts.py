@@ -101,7 +101,7 @@ def _growth_plots(steps: Lines, refinements: Lines, x_range: Point) -> list[Plot
     return [
         Plot(
             title="Gaussians",
-            caption="The number of Gaussians; marks on the axis are refinements",
+            caption="The number of Gaussians; marks on the axis are refinements.",
             series=[Series(label="", points=_counts(steps, refinements), color=1)],
             marks=[step for step, _ in _points(refinements, "after")],
             x_range=x_range,
@@ -109,7 +109,7 @@ def _growth_plots(steps: Lines, refinements: Lines, x_range: Point) -> list[Plot
         ),
         Plot(
             title="Loss",
-            caption="Half the squared norm of the guidance gradient plus regularizers; logarithmic",
+            caption="Half the squared norm of the guidance gradient plus regularizers.",
             series=[
                 Series(label="logged", points=loss, color=1, is_faint=True),
                 Series(label="running median", points=smooth(loss, max(len(loss) // SMOOTHING, 1)), color=1),
@@ -119,7 +119,7 @@ def _growth_plots(steps: Lines, refinements: Lines, x_range: Point) -> list[Plot
         ),
         Plot(
             title="Refinements",
-            caption="Gaussians cloned and split (up) and pruned (down) by each refinement",
+            caption="Gaussians that each refinement cloned and split (up) and pruned (down).",
             bars=_refinement_bars(refinements),
             bar_labels=[("cloned", 1), ("split", 2), ("pruned", 4)],
             x_range=x_range,
@@ -127,7 +127,7 @@ def _growth_plots(steps: Lines, refinements: Lines, x_range: Point) -> list[Plot
         ),
         Plot(
             title="Opacity resets",
-            caption="Gaussians whose opacity was lowered by each reset",
+            caption="Gaussians whose opacity each reset lowered.",
             bars=[
                 Bar(x=step, start=0, stop=count, color=3, hint=f"{count:,.0f} reset at step {step:g}")
                 for step, count in resets
@@ -147,7 +147,7 @@ def _selected_plot(refinements: Lines, x_range: Point) -> Plot:
     ]
     return Plot(
         title="Selected Gaussians",
-        caption="Percentage of all Gaussians that each refinement selects for growth",
+        caption="Percentage of all Gaussians that each refinement selected for growth.",
         series=[Series(label="", points=shares, color=2)],
         x_range=x_range,
         from_zero=True,

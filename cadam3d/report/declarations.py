@@ -37,7 +37,9 @@ def read_declarations(folder: Path) -> tuple[Chart, ...]:
 
 def _chart(entry: Mapping[str, Any]) -> Chart:
     """Return the chart that plain data describe. Raises some built-in exception if they do not."""
-    band = entry.get("band")
+    band, score = entry.get("band"), _text(entry.get("score", ""))
+    if score and not score.isidentifier():  # it names the files of a figure
+        raise ValueError(f"expected the name of a score, got {score!r}")
     return Chart(
         title=_text(entry["title"]),
         caption=_text(entry["caption"]),
@@ -53,7 +55,7 @@ def _chart(entry: Mapping[str, Any]) -> Chart:
         band_label=_text(entry.get("band_label", "")),
         log_y=bool(entry.get("log_y")),
         percent=bool(entry.get("percent")),
-        score=_text(entry.get("score", "")),
+        score=score,
         levels=tuple(
             Level(label=_text(level["label"]), value=float(level["value"]))
             for level in entry.get("levels", ())

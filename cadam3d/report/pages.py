@@ -58,7 +58,7 @@ def table(lines: Sequence[Mapping[str, Any]], *, link: str = "", align_decimals:
     keys = list(dict.fromkeys(key for line in lines for key in line))
     digits = {key: max((_decimals(line.get(key)) for line in lines), default=0) for key in keys}
     columns = [
-        Column(title=key, is_text=any(isinstance(line.get(key), str) for line in lines), is_link=key == link)
+        Column(title=key, is_text=any(_is_text(line.get(key)) for line in lines), is_link=key == link)
         for key in keys
     ]
     cells = [
@@ -92,6 +92,10 @@ def mood(outcome: str) -> str:
 def _cell(value: Any, digits: int) -> str:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return f"{value:,.{digits}f}" if is_number else show(value)
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and not value.endswith("%")
 
 
 def _decimals(value: Any) -> int:
