@@ -1,6 +1,7 @@
 """HTML pages made from the templates beside this module. No scripts, and nothing is fetched.
 
-Autoescape is always on: whatever a user typed reaches a page as text, never as markup.
+Autoescape is always on: whatever a user typed reaches a page as text, never as markup. Only drawings and the
+colours of the page are marked as safe, in the templates.
 """
 
 import base64
@@ -12,7 +13,6 @@ from typing import Any
 from urllib.parse import quote
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
 
 from cadam3d import __version__
 from cadam3d.io.atomic import replacing
@@ -114,5 +114,5 @@ def _environment() -> Environment:
     )
     environment.filters |= {"show": show, "mood": mood, "link": lambda path: quote(str(path))}
     environment.globals["zip"] = zip
-    environment.globals["color_variables"] = Markup(css())
+    environment.globals["color_variables"] = css()
     return environment

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
-from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
@@ -82,7 +81,7 @@ class Hint:
 class Drawing:
     """A plot as parts of a page. The picture lacks its closing tag, so that the hints fit in."""
 
-    svg: Markup
+    svg: str
     hints: list[Hint]
 
 
@@ -137,7 +136,7 @@ class Plot:
                 _draw_series(axes, each)
             _draw_marks(axes, self.marks)
             svg = inline(svg_of(figure, self.title, DPI)).removesuffix("</svg>")
-            return Drawing(Markup(svg), self._hints(axes))
+            return Drawing(svg, self._hints(axes))
 
     def _points(self) -> list[Point]:
         points = [point for each in self.series for point in each.points]

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -178,7 +177,7 @@ def svg_of(figure: Figure, name: str, dpi: float) -> str:
     return buffer.getvalue()
 
 
-def inline(svg: str) -> Markup:
+def inline(svg: str) -> str:
     """Return an SVG file as a part of an HTML page.
 
     Left out is what a page does not need: the prolog, metadata, namespaces, names of groups, fonts (those of
@@ -197,7 +196,7 @@ def inline(svg: str) -> Markup:
     text = re.sub(r">\s+<", "><", text)
     for color, variable in VARIABLES.items():
         text = text.replace(color, f"var(--{variable}, {color})")
-    return Markup(text.strip())
+    return text.strip()
 
 
 def _compact(path: str) -> str:

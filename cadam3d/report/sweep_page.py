@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from cadam3d.core.errors import UserError
@@ -37,7 +36,7 @@ class ShownFigure:
 
     title: str
     caption: str
-    svg: Markup
+    svg: str
 
 
 KINDS = {  # the figures that need nothing but results; those of declared scores come after "growth"

@@ -143,7 +143,7 @@ def test_the_picture_is_well_formed_and_escapes_names():
         bands=[Band(label=nasty, low=[(0, 1)], high=[(0, 2)], color=1)],
         marks=[0.5],
     )
-    svg = str(made.draw().svg).replace("xlink:href", "href") + "</svg>"
+    svg = made.draw().svg.replace("xlink:href", "href") + "</svg>"
     ET.fromstring(svg)
     assert "<b>" not in svg
 
