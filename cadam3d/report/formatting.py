@@ -48,7 +48,7 @@ def shown_bytes(count: float) -> str:
     return f"{count:.0f} B"
 
 
-def duration(seconds: float) -> str:
+def elapsed(seconds: float) -> str:
     """Return a time span: seconds with one decimal below a minute, else minutes, else hours and minutes."""
     if seconds < 60:
         return f"{seconds:.1f} s"

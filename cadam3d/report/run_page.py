@@ -8,7 +8,7 @@ from cadam3d.core.chart import Chart
 from cadam3d.io.run_folder import ASSET, CONFIG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE
 from cadam3d.report.charts import other_plots, sections
 from cadam3d.report.declarations import write_declarations
-from cadam3d.report.formatting import duration, number, shown_bytes
+from cadam3d.report.formatting import elapsed, number, shown_bytes
 from cadam3d.report.pages import Tile, data_url, table, write_page
 
 EMBED_BYTES = 8 << 20  # a larger video is linked, not embedded
@@ -99,7 +99,7 @@ def _tiles(summary: Mapping[str, Any]) -> list[Tile]:
         tiles.append(Tile(ASSET, shown_bytes(size), remark))
     if seconds is not None:
         rate = f"{done / seconds:.1f} steps per second" if done and seconds else ""
-        tiles.append(Tile("Time", duration(seconds), rate))
+        tiles.append(Tile("Time", elapsed(seconds), rate))
     if done is not None and len(tiles) < 4:
         tiles.append(Tile("Steps", f"{done:,.0f}", f"of {asked:,.0f}" if asked is not None else ""))
     return tiles

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from cadam3d.report.formatting import duration, number, plural, short, show, shown_bytes
+from cadam3d.report.formatting import elapsed, number, plural, short, show, shown_bytes
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ def test_any_value_has_a_text(value, text):
     [(1.54, "1.5 s"), (59.9, "59.9 s"), (75, "1 min 15 s"), (3599.6, "1 h 0 min"), (7260, "2 h 1 min")],
 )
 def test_durations_have_suitable_units(seconds, text):
-    assert duration(seconds) == text
+    assert elapsed(seconds) == text
 
 
 def test_bytes_have_suitable_units():
