@@ -41,7 +41,7 @@ from cadam3d.report.style import Look, label_log_axis, looks, new_figure, spread
 
 EARLY = "\u2020"  # a dagger: some jobs of the setting ended before their last step
 ROOM = 0.07  # between labels, as a share of the axis
-MARK = 6.0  # half the side of the square that a mark takes, in pixels
+MARK = 6.0  # half the side of the square that a mark covers, in pixels
 SPOTS = (  # possible places for the name of an arm, the best first: alignment, and offset in points
     ("center", 0, 8),
     ("center", 0, -16),
@@ -247,8 +247,8 @@ def growth_figure(results: Sequence[JobResult]) -> Figure | None:
         for arm in chosen:
             if paths := histories.get((level, arm)):
                 steps, low, middle, high = over_time(paths)
-                axes.fill_between(steps, low, high, color=style[arm].color, alpha=0.16, lw=0)
-                axes.plot(steps, middle, color=style[arm].color, lw=1.8)
+                axes.fill_between(steps, low, high, step="post", color=style[arm].color, alpha=0.16, lw=0)
+                axes.step(steps, middle, where="post", color=style[arm].color, lw=1.8)
                 ends[arm] = (steps[-1], middle[-1])
         _label_ends(axes, ends, style)
         axes.set_title(level_title(level))
