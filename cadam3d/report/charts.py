@@ -66,10 +66,11 @@ def plot_of(chart: Chart, lines: Lines, x_range: Point) -> Plot:
     def points(key: str) -> list[Point]:
         return [(step, factor * value) for step, value in _points(lines, key)]
 
+    is_alone = len(chart.curves) == 1 and chart.band is None
     colors = iter(CURVE_COLORS * len(chart.curves))
     series = [
         Series(
-            label=curve.label or ("threshold" if curve.is_threshold else "value"),
+            label=curve.label or ("" if is_alone else curve.key),
             points=points(curve.key),
             color=THRESHOLD_COLOR if curve.is_threshold else next(colors),
             is_dashed=curve.is_threshold,
@@ -88,6 +89,7 @@ def plot_of(chart: Chart, lines: Lines, x_range: Point) -> Plot:
         x_range=x_range,
         log_y=chart.log_y,
         from_zero=not chart.log_y,
+        unit="%" if chart.percent else "",
     )
 
 
@@ -147,10 +149,11 @@ def _selected_plot(refinements: Lines, x_range: Point) -> Plot:
     ]
     return Plot(
         title="Selected Gaussians",
-        caption="Percentage of all Gaussians that each refinement selected for growth.",
+        caption="Share of all Gaussians that each refinement selected for growth.",
         series=[Series(label="", points=shares, color=2)],
         x_range=x_range,
         from_zero=True,
+        unit="%",
     )
 
 

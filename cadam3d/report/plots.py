@@ -99,6 +99,7 @@ class Plot:
     log_y: bool = False
     x_range: Point | None = None  # None: the range of the points
     from_zero: bool = False  # the y axis includes 0
+    unit: str = ""  # behind the numbers of the y axis
 
     def __post_init__(self) -> None:
         if self.log_y:  # a logarithmic axis shows positive numbers only
@@ -130,13 +131,14 @@ class Plot:
             self._draw_axes(axes)
             for band in self.bands:
                 _draw_band(axes, band)
+            boxes = self._boxes(axes)
             for color in sorted({bar.color for bar in self.bars}):
-                _draw_bars(axes, [self._box(axes, bar) for bar in self.bars if bar.color == color], color)
+                _draw_bars(axes, [box for box in boxes if box.color == color], color)
             for each in self.series:
                 _draw_series(axes, each)
             _draw_marks(axes, self.marks)
             svg = inline(svg_of(figure, self.title, DPI)).removesuffix("</svg>")
-            return Drawing(svg, self._hints(axes))
+            return Drawing(svg, [*boxes, *self._hints(axes)])
 
     def _points(self) -> list[Point]:
         points = [point for each in self.series for point in each.points]
@@ -154,29 +156,31 @@ class Plot:
         values += [0.0] if self.from_zero and not self.log_y else []
         low, high, ticks = (_log_range if self.log_y else _range)(min(values), max(values))
         axes.set_ylim(low, high)
-        label_ticks(axes.yaxis, ticks)
+        label_ticks(axes.yaxis, ticks, self.unit)
         axes.tick_params(length=0, pad=6)
         axes.grid(visible=False, axis="x")
         axes.spines["left"].set_visible(False)
-        axes.text(1, 3 / HEIGHT, "step", transform=axes.figure.transFigure, ha="right", color=SOFT)
-        axes.texts[-1].set_x(1 - RIGHT / WIDTH)
+        place = 1 - RIGHT / WIDTH, 3 / HEIGHT
+        axes.text(*place, "step", transform=axes.figure.transFigure, ha="right", color=SOFT)
         if low < 0 < high:
             axes.axhline(0, color=SOFT, lw=0.8)
 
-    def _box(self, axes: Axes, bar: Bar) -> tuple[float, float, float, float]:
-        """Return left, bottom, width and height of a bar in units from the lower left of the picture."""
-        distances = sorted({each.x for each in self.bars})
-        gap = min((b - a for a, b in pairwise(distances)), default=math.inf)
+    def _boxes(self, axes: Axes) -> list[Hint]:
+        """Return the bars as shapes with tooltips; all have the same width."""
+        steps = sorted({bar.x for bar in self.bars})
+        gap = min((b - a for a, b in pairwise(steps)), default=math.inf)
         (left, _), (right, _) = axes.transData.transform([(0, 1), (1, 1)])
         width = max(min(0.6 * gap * (right - left), BAR_WIDTHS[1]), BAR_WIDTHS[0])
-        (x, start), (_, stop) = axes.transData.transform([(bar.x, bar.start), (bar.x, bar.stop)])
-        return x - width / 2, min(start, stop), width, abs(stop - start)
+        boxes = []
+        for bar in self.bars:
+            (x, start), (_, stop) = axes.transData.transform([(bar.x, bar.start), (bar.x, bar.stop)])
+            top, height = HEIGHT - max(start, stop), abs(stop - start)
+            boxes.append(Hint(bar.hint, bar.color, x - width / 2, top, width, height))
+        return boxes
 
     def _hints(self, axes: Axes) -> list[Hint]:
+        """Return a shape with a tooltip for every point of a curve, or for some points of a long one."""
         hints = []
-        for bar in self.bars:
-            left, bottom, width, height = self._box(axes, bar)
-            hints.append(Hint(bar.hint, bar.color, left, HEIGHT - bottom - height, width, height))
         for each in self.series:
             if each.is_faint:
                 continue
@@ -184,7 +188,7 @@ class Plot:
             name = f"{each.label}: " if each.label else ""
             for x, y in each.points[::every]:
                 left, bottom = axes.transData.transform((x, y))
-                text = f"{name}{short(y)} at step {x:g}"
+                text = f"{name}{short(y)}{self.unit} at step {x:g}"
                 hints.append(Hint(text, each.color, float(left), float(HEIGHT - bottom)))
         return hints
 
@@ -261,13 +265,15 @@ def _draw_band(axes: Axes, band: Band) -> None:
         axes.fill(*zip(*corners, strict=True), color=SERIES_COLORS[band.color - 1], alpha=0.18, lw=0)
 
 
-def _draw_bars(axes: Axes, boxes: Sequence[tuple[float, float, float, float]], color: int) -> None:
+def _draw_bars(axes: Axes, boxes: Sequence[Hint], color: int) -> None:
     """Draw all bars of one colour as one outline, which keeps the page small."""
-    outlines = [
-        Outline([(x, y), (x + w, y), (x + w, y + h), (x, y + h), (x, y)], closed=True)
-        for x, y, w, h in boxes
-        if h > 0
-    ]
+    outlines = []
+    for box in boxes:
+        left, right = box.x, box.x + box.width
+        top, bottom = HEIGHT - box.y, HEIGHT - box.y - box.height
+        if box.height > 0:
+            corners = [(left, bottom), (right, bottom), (right, top), (left, top), (left, bottom)]
+            outlines.append(Outline(corners, closed=True))
     if outlines:
         outline = Outline.make_compound_path(*outlines)
         fill = SERIES_COLORS[color - 1]

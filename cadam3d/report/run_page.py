@@ -38,6 +38,20 @@ LABELS = {
     "skipped_steps": "Steps skipped (gradient not finite)",
     "dimmed_steps": "Steps that dimmed all colours",
     "seed": "Seed",
+    "densifier": "Densifier",
+    "guidance": "Guidance",
+    "prior": "Prior",
+    "rasterizer": "Rasterizer",
+    "initializer": "Initializer",
+    "camera": "Camera",
+    "refine": "Refinement",
+    "optimizer": "Optimizer",
+    "device": "Device",
+    "memory_estimate_gib": "Memory, estimated (GiB)",
+    "memory_peak_gib": "Memory of the GPU at its peak (GiB)",
+    "cadam3d": "Version of cadam3d",
+    "torch": "Version of torch",
+    "finished_at": "Finished at",
 }
 
 

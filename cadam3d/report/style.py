@@ -137,10 +137,10 @@ def log_ticks(low: float, high: float) -> list[float]:
     return [tick for tick in ticks if low - 1e-9 <= math.log10(tick) <= high + 1e-9]
 
 
-def label_ticks(axis: Axis, ticks: Sequence[float]) -> None:
-    """Put ticks on an axis, labelled with short numbers such as 500, 1k or 20k."""
+def label_ticks(axis: Axis, ticks: Sequence[float], unit: str = "") -> None:
+    """Put ticks on an axis, labelled with short numbers such as 500, 1k or 20k, and the unit."""
     axis.set_major_locator(FixedLocator(list(ticks)))
-    axis.set_major_formatter(FixedFormatter([short(tick) for tick in ticks]))
+    axis.set_major_formatter(FixedFormatter([short(tick) + unit for tick in ticks]))
     axis.set_minor_locator(NullLocator())
 
 

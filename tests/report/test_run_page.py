@@ -208,10 +208,10 @@ def test_a_declared_chart_is_drawn_from_nested_or_flat_statistics(tmp_path, nest
 
 
 def test_a_declared_chart_of_the_objective_is_drawn_from_its_log(tmp_path):
-    page = make(tmp_path, metrics=[step(1, heat=3.0), step(2, heat=4.0)], charts=[WOBBLE, HEAT])
+    make(tmp_path, metrics=[step(1, heat=3.0), step(2, heat=4.0)], charts=[WOBBLE, HEAT])
     assert chart_titles(tmp_path) == ["Gaussians", "Loss", "Heat of the objective"]
-    assert "Objective" in page.text
-    assert "Densifier" not in page.text
+    assert "<h2>Objective</h2>" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<h2>Densifier</h2>" not in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_a_declared_chart_without_numbers_leaves_no_trace_in_the_page(tmp_path):
@@ -220,6 +220,12 @@ def test_a_declared_chart_without_numbers_leaves_no_trace_in_the_page(tmp_path):
     without = (tmp_path / "report.html").read_bytes()
     make(tmp_path, metrics=metrics, charts=[WOBBLE, HEAT])
     assert (tmp_path / "report.html").read_bytes() == without
+
+
+def test_a_declared_share_is_shown_in_percent(tmp_path):
+    chart = Chart(title="Share", caption="", curves=(Curve(key="share"),), percent=True)
+    page = make(tmp_path, metrics=[refine(100, share=0.25), refine(150, share=0.5)], charts=[chart])
+    assert "25% at step 100" in page.text
 
 
 def test_an_undeclared_statistic_is_among_the_other_numbers(tmp_path):
