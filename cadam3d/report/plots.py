@@ -171,12 +171,12 @@ class Plot:
         gap = min((b - a for a, b in pairwise(steps)), default=math.inf)
         (left, _), (right, _) = axes.transData.transform([(0, 1), (1, 1)])
         width = max(min(0.6 * gap * (right - left), BAR_WIDTHS[1]), BAR_WIDTHS[0])
-        boxes = []
-        for bar in self.bars:
-            (x, start), (_, stop) = axes.transData.transform([(bar.x, bar.start), (bar.x, bar.stop)])
-            top, height = HEIGHT - max(start, stop), abs(stop - start)
-            boxes.append(Hint(bar.hint, bar.color, x - width / 2, top, width, height))
-        return boxes
+        starts = _places(axes, [(bar.x, bar.start) for bar in self.bars])
+        stops = _places(axes, [(bar.x, bar.stop) for bar in self.bars])
+        return [
+            Hint(bar.hint, bar.color, x - width / 2, min(start, stop), width, abs(stop - start))
+            for bar, (x, start), (_, stop) in zip(self.bars, starts, stops, strict=True)
+        ]
 
     def _hints(self, axes: Axes) -> list[Hint]:
         """Return a shape with a tooltip for every point of a curve, or for some points of a long one."""
@@ -186,10 +186,9 @@ class Plot:
                 continue
             every = max(1, math.ceil(len(each.points) / HINTS))
             name = f"{each.label}: " if each.label else ""
-            for x, y in each.points[::every]:
-                left, bottom = axes.transData.transform((x, y))
-                text = f"{name}{short(y)}{self.unit} at step {x:g}"
-                hints.append(Hint(text, each.color, float(left), float(HEIGHT - bottom)))
+            points = each.points[::every]
+            for (step, value), place in zip(points, _places(axes, points), strict=True):
+                hints.append(Hint(f"{name}{short(value)}{self.unit} at step {step:g}", each.color, *place))
         return hints
 
 
@@ -240,6 +239,13 @@ def _log_range(low: float, high: float) -> tuple[float, float, list[float]]:
         low, high = low - 0.5, high + 0.5
     room = 0.04 * (high - low)
     return 10 ** (low - room), 10 ** (high + room), log_ticks(low, high)
+
+
+def _places(axes: Axes, points: Sequence[Point]) -> list[Point]:
+    """Return where points are in the picture: units from the left and from the top."""
+    if not points:
+        return []
+    return [(x, HEIGHT - y) for x, y in axes.transData.transform(points).tolist()]
 
 
 def _draw_series(axes: Axes, series: Series) -> None:
