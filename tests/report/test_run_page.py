@@ -1,17 +1,22 @@
 """The page of a run is self-contained, complete, and safe against whatever a user typed."""
 
+import ast
 import base64
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
+import torch
 
+from cadam3d import report
 from cadam3d.core.chart import Chart, Curve
 from cadam3d.core.errors import UserError
 from cadam3d.report import run_page, write_report
 from cadam3d.report.declarations import read_declarations
 from cadam3d.report.pages import TEMPLATES
 from cadam3d.report.palette import css
+from cadam3d.settings.compose import component, compose
 
 SUMMARY = {
     "prompt": "a red torus",
@@ -232,6 +237,22 @@ def test_an_undeclared_statistic_is_among_the_other_numbers(tmp_path):
     page = make(tmp_path, metrics=[refine(n, statistics=STATISTICS) for n in (100, 150)])
     assert "Other numbers that were logged" in page.text
     assert chart_titles(tmp_path)[-4:] == list(STATISTICS)
+
+
+@pytest.mark.parametrize("densifier", ["cadam", "baseline"])
+def test_the_reports_know_no_statistic_and_no_score_by_name(densifier):
+    made = component(compose([f"densifier={densifier}", "prompt=any"]).densifier)
+    state = made.init_state(3, torch.device("cpu"))
+    # The level of noise is a setting of sweeps that has the same name as a score.
+    names = {*made.statistics(state, 1), *made.scores(state)} - {"noise"}
+    assert len(names) > 3
+    texts = {
+        node.value
+        for path in Path(report.__file__).parent.glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant)
+    }
+    assert not names & texts
 
 
 def test_the_declarations_are_kept_with_the_run(tmp_path):
