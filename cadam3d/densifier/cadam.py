@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cadam3d.core.chart import Chart, Curve
+from cadam3d.core.chart import Chart, Curve, Level
 from cadam3d.core.checks import require, require_choice, require_range, require_whole
 from cadam3d.core.edit import RowState
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
@@ -187,6 +187,8 @@ class CAdam(Densifier[CAdamState]):
                 ),
                 band=("snr_p10", "snr_p90"),
                 band_label="10 to 90 %",
+                score="snr",
+                levels=self._snr_levels(),
             ),
             Chart(
                 title="Gaussians above the SNR gate",
@@ -209,6 +211,19 @@ class CAdam(Densifier[CAdamState]):
                 curves=(Curve(key="age_median"),),
             ),
         )
+
+    def _snr_levels(self) -> tuple[Level, ...]:
+        """Return the SNR values that the distribution of the SNR is compared with."""
+        values = {"tau_SNR": self.tau_SNR, "white noise": white_noise_snr(self.beta1, self.beta2)}
+        return tuple(Level(label=label, value=value) for label, value in values.items() if value)
+
+
+def white_noise_snr(beta1: float, beta2: float) -> float | None:
+    """Return the root mean square SNR of stationary white noise: ``sqrt((1 - beta1) / (1 + beta1))``.
+
+    ``None`` for a ``beta2`` below 0.99: with so short a second moment the SNR of noise has no fixed level.
+    """
+    return math.sqrt((1 - beta1) / (1 + beta1)) if beta2 >= 0.99 else None
 
 
 def quantile(values: Float[Tensor, "n"], share: float) -> Float[Tensor, ""]:
