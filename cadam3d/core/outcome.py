@@ -4,7 +4,7 @@ from enum import StrEnum
 
 
 class Outcome(StrEnum):
-    """How a run ended. Running out of memory is an outcome that is recorded, not a crash."""
+    """The way in which a run ended. Running out of memory is an outcome that is recorded, not a crash."""
 
     FINISHED = "finished"
     INTERRUPTED = "interrupted"

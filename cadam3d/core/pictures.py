@@ -14,7 +14,7 @@ from cadam3d.core.checks import are_numbers, require, require_color, require_ran
 
 @dataclass(frozen=True, kw_only=True)
 class PictureSettings:
-    """How square pictures are taken: from which distance, how large, and in front of which colour.
+    """Distance, field of view, size and background of square pictures of an asset.
 
     Exporters, callbacks and metrics that render inherit these four settings and add their own angles.
     """

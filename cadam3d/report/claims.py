@@ -91,7 +91,7 @@ class Estimate:
 
     @property
     def is_certain(self) -> bool:
-        """Whether the interval excludes 0 and the sign test agrees; False if either is missing."""
+        """Return whether the interval excludes 0 and the sign test agrees; False if either is missing."""
         if self.low is None or self.high is None or self.p_value is None:
             return False
         return (self.low > 0 or self.high < 0) and self.p_value < SIGNIFICANT
@@ -235,7 +235,7 @@ def frontier(
 
 
 def has_no_growth(results: Sequence[JobResult]) -> bool:
-    """Whether there is a job without growth, from which gains can be measured."""
+    """Return whether there is a job without growth, from which gains can be measured."""
     return any(result.arm == NO_GROWTH for result in measured(results))
 
 
@@ -303,12 +303,12 @@ class Hull:
         return 10 ** self.corners[-1][0]
 
     def reaches_below(self, count: float) -> bool:
-        """Whether the arm has a setting with fewer than ``count`` Gaussians."""
+        """Return whether the arm has a setting with fewer than ``count`` Gaussians."""
         return self.corners[0][0] < math.log10(count)
 
 
 def _turns_left(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
-    """Whether ``b`` is on or below the line from ``a`` to ``c``."""
+    """Return whether ``b`` is on or below the line from ``a`` to ``c``."""
     return (b[0] - a[0]) * (c[1] - a[1]) >= (c[0] - a[0]) * (b[1] - a[1])
 
 

@@ -162,7 +162,7 @@ def candidate_pictures(result: JobResult) -> dict[int, str]:
 
 
 def has_views(result: JobResult) -> bool:
-    """Whether the job left pictures of its asset."""
+    """Return whether the job left pictures of its asset."""
     return (result.folder / PREVIEW).is_file()
 
 

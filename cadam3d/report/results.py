@@ -95,17 +95,17 @@ class JobResult:
 
     @property
     def is_measured(self) -> bool:
-        """Whether the job left an asset whose count and quality may be compared."""
+        """Return whether the job left an asset whose count and quality may be compared."""
         return self.outcome in WITH_ASSET and bool(self.count) and self.psnr is not None
 
     @property
     def is_unfinished(self) -> bool:
-        """Whether the job waits, runs, or was killed before it could report an outcome."""
+        """Return whether the job waits, runs, or was killed before it could report an outcome."""
         return self.outcome == UNFINISHED
 
     @property
     def ended_early(self) -> bool:
-        """Whether the job stopped before its last step: its numbers are those of an unfinished asset."""
+        """Return whether the job stopped before its last step: its numbers are those of an unfinished asset."""
         return self.outcome != Outcome.FINISHED
 
 

@@ -59,7 +59,7 @@ RC: Any = {  # Any: matplotlib has a type for the names of its settings
 
 @dataclass(frozen=True)
 class Look:
-    """How an arm is drawn."""
+    """Colour, marker and line of an arm in every figure."""
 
     color: str
     marker: str

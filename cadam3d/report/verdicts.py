@@ -105,7 +105,7 @@ def needed_clause(standing: Standing) -> str:
 
 
 def is_certain(standing: Standing) -> bool:
-    """Whether the interval excludes 0 and the sign test agrees; False if either is missing."""
+    """Return whether the interval excludes 0 and the sign test agrees; False if either is missing."""
     return standing.psnr is not None and standing.psnr.is_certain
 
 

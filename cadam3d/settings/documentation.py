@@ -33,16 +33,15 @@ class Setting:
     """A key with its value and its meaning."""
 
     key: str  # as in a command line, such as "camera.fov_y_deg"
-    value: (
-        str  # as YAML spells it, or what builds an object, such as "Linear(start=0.98, end=0.5, steps=500)"
-    )
+    # As YAML spells it, or the call that builds an object, such as "Linear(start=0.98, end=0.5, steps=500)".
+    value: str
     words: str
     is_object: bool  # the value is an object or a group of keys, with settings of its own
 
 
 @dataclass(frozen=True, kw_only=True)
 class Option:
-    """What ``group=name`` chooses, or a command with the settings that are in no group."""
+    """An option that ``group=name`` chooses, or a command with the settings that are in no group."""
 
     name: str
     about: str  # paragraphs between empty lines; a line that begins with a blank is an example

@@ -12,7 +12,7 @@ from cadam3d.exporter.images import ImagesExporter
 
 VALUES = {"views": 4, "elevations_deg": [0.0, 30.0], "distance": 3.0, "fov_y_deg": 40.0, "size": 6}
 VALUES |= {"background": [1.0, 0.5, 0.0]}
-NOBODY = Gaussians(
+EMPTY = Gaussians(
     means=torch.zeros(0, 3),
     log_scales=torch.zeros(0, 3),
     quats=torch.zeros(0, 4),
@@ -33,7 +33,7 @@ def render_angles(cameras, background):
 
 
 def test_each_file_shows_the_view_in_its_name(tmp_path):
-    paths = ImagesExporter(**VALUES).export(NOBODY, render_angles, tmp_path)
+    paths = ImagesExporter(**VALUES).export(EMPTY, render_angles, tmp_path)
     assert [path.name for path in paths[:2]] == ["000_az000_el+00.png", "001_az090_el+00.png"]
     assert len(paths) == 8
     for path in paths:
@@ -44,7 +44,7 @@ def test_each_file_shows_the_view_in_its_name(tmp_path):
 
 
 def test_names_sort_in_the_order_of_the_views(tmp_path):
-    paths = ImagesExporter(**VALUES).export(NOBODY, render_angles, tmp_path)
+    paths = ImagesExporter(**VALUES).export(EMPTY, render_angles, tmp_path)
     assert sorted(paths) == paths
 
 

@@ -1,6 +1,6 @@
 """The objectives, computed a second time with the schedulers of diffusers and a small function as network.
 
-Times lie on the thousand rows of the schedulers: row k of a DDPM table is t = (k + 1) / 1000.
+Times are those of the thousand rows of the schedulers: row k of a DDPM table is t = (k + 1) / 1000.
 """
 
 from dataclasses import dataclass
