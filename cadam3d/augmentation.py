@@ -1,4 +1,4 @@
-"""Augmentation: what is done to the Gaussians before they are rendered, and to the images before guidance."""
+"""Augmentation: changes to the Gaussians before they are rendered, and to the images before guidance."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -11,45 +11,48 @@ from cadam3d.core.checks import require_range
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 
-LEAST = 1e-3  # of a scale that noise leaves over: a logarithm needs something
+LEAST = 1e-3  # smallest factor that noise multiplies a scale by; its logarithm must be finite
 LARGEST_SEED = 2**63 - 1
 
 
 class Augmentation(ABC):
-    """Two differentiable disguises of a training step. Frozen hyper-parameters; randomness is handed in."""
+    """Two differentiable changes to what a training step renders and shows.
+
+    Holds frozen hyper-parameters; all randomness comes from the generator.
+    """
 
     @abstractmethod
     def perturb(self, gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
-        """What is rendered, and penalised, in place of ``gaussians``: as many rows, in the same order.
+        """Return the Gaussians to render and regularize instead of ``gaussians``, with the same rows.
 
-        ``means`` must stay the very tensor it is: densifiers read its gradient.
+        ``means`` must be the same tensor object, since densifiers read its gradient.
         """
 
     @abstractmethod
     def show(self, output: RenderOutput, generator: torch.Generator) -> Float[Tensor, "v h w 3"]:
-        """What guidance judges, in [0, 1]; called once per step, after :meth:`perturb`."""
+        """Return the images for guidance, in [0, 1]; called once per step, after :meth:`perturb`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoAugmentation(Augmentation):
-    """Renders what there is and shows what was rendered. Draws nothing."""
+    """Changes neither the Gaussians nor the images, and draws no random numbers."""
 
     def perturb(self, gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
-        """The Gaussians themselves."""
+        """Return the Gaussians themselves."""
         return gaussians
 
     def show(self, output: RenderOutput, generator: torch.Generator) -> Float[Tensor, "v h w 3"]:
-        """The colours."""
+        """Return the rendered colours."""
         return output.rgb
 
 
 @dataclass(frozen=True, kw_only=True)
 class LucidAugmentation(Augmentation):
-    """Noise on the scales, at times disparity instead of colour, and mirror images (LucidDreamer).
+    """Noise on the scales, sometimes disparity instead of colour, and mirrored images (LucidDreamer).
 
-    The noise is drawn once per step for all views, where LucidDreamer renders view by view with noise of its
-    own for each. For priors that take any image: one that knows the camera, or left from right, would be
-    shown something false.
+    The noise is drawn once per step for all views; LucidDreamer renders view by view and draws new noise for
+    each. Use it only with priors that accept any image: for a prior that knows the camera or distinguishes
+    left from right, a mirrored image is wrong.
     """
 
     scale_noise: float  # standard deviation of the factor by which each scale is multiplied
@@ -62,8 +65,8 @@ class LucidAugmentation(Augmentation):
         require_range("augmentation.flip", self.flip, low=0, high=1, example=0.5)
 
     def perturb(self, gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
-        """The same Gaussians with ``scales * max(1 + scale_noise * N(0, 1), 0.001)``."""
-        # A generator of the step's own: later draws must not depend on how many Gaussians there are.
+        """Return the same Gaussians with ``scales * max(1 + scale_noise * N(0, 1), 0.001)``."""
+        # Each step has its own generator, so that later draws do not depend on the number of Gaussians.
         seed = int(torch.randint(LARGEST_SEED, (1,), generator=generator))
         log_scales = gaussians.log_scales
         noise = torch.randn(log_scales.shape, generator=torch.Generator().manual_seed(seed))
@@ -77,7 +80,7 @@ class LucidAugmentation(Augmentation):
         )
 
     def show(self, output: RenderOutput, generator: torch.Generator) -> Float[Tensor, "v h w 3"]:
-        """Colours or disparities, perhaps mirrored; two tosses decide for all views together."""
+        """Return colours or disparities, possibly mirrored; the same two choices hold for all views."""
         as_disparity, flipped = (torch.rand(2, generator=generator) < torch.tensor(self._odds)).tolist()
         images = output.disparity()[..., None].expand_as(output.rgb) if as_disparity else output.rgb
         return images.flip(dims=(2,)) if flipped else images

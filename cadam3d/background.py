@@ -1,4 +1,4 @@
-"""The colour behind the Gaussians. A random one keeps them from painting the background themselves."""
+"""Background: the colour behind the Gaussians. A random colour keeps them from imitating the background."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -12,11 +12,11 @@ from cadam3d.core.checks import require_color, require_range
 
 
 class Background(ABC):
-    """Draws one colour per training view. Frozen hyper-parameters; randomness comes from the generator."""
+    """Draws one colour per training view. Holds frozen hyper-parameters."""
 
     @abstractmethod
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
-        """RGB in [0, 1] for each of ``views`` views, on the CPU."""
+        """Return RGB in [0, 1] for each of ``views`` views, on the CPU, drawn from ``generator`` alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,13 +29,13 @@ class ConstantBackground(Background):
         require_color("background.color", self.color)
 
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
-        """The colour, for every view."""
+        """Return the colour, repeated for every view."""
         return torch.tensor([float(channel) for channel in self.color]).repeat(views, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomBackground(Background):
-    """For each view by itself: with ``probability`` a uniformly random colour, else the constant one."""
+    """Independently for each view: a uniformly random colour with ``probability``, else the constant one."""
 
     probability: float  # in [0, 1]
     color: Sequence[float]  # RGB in [0, 1]
@@ -45,7 +45,7 @@ class RandomBackground(Background):
         require_color("background.color", self.color)
 
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
-        """One colour per view; the number of draws does not depend on their outcome."""
+        """Return one colour per view; the number of random draws does not depend on their outcome."""
         is_random = torch.rand(views, 1, generator=generator) < self.probability
         colors = torch.rand(views, 3, generator=generator)
         return torch.where(is_random, colors, torch.tensor([float(channel) for channel in self.color]))
@@ -53,10 +53,10 @@ class RandomBackground(Background):
 
 @dataclass(frozen=True, kw_only=True)
 class LucidBackground(Background):
-    """For each view by itself: usually a random colour or black, else the constant one (LucidDreamer)."""
+    """Independently for each view: often black or a random colour, else the constant one (LucidDreamer)."""
 
-    probability: float  # in [0, 1]; of a colour other than the constant one
-    black: float  # in [0, 1]; how many of those are black, the others being uniformly random
+    probability: float  # in [0, 1]; of black or a random colour instead of the constant one
+    black: float  # in [0, 1]; share of black among those; the others are uniformly random
     color: Sequence[float]  # RGB in [0, 1]
 
     def __post_init__(self) -> None:
@@ -65,7 +65,7 @@ class LucidBackground(Background):
         require_color("background.color", self.color)
 
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
-        """One colour per view; the number of draws does not depend on their outcome."""
+        """Return one colour per view; the number of random draws does not depend on their outcome."""
         is_other = torch.rand(views, 1, generator=generator) < self.probability
         is_black = torch.rand(views, 1, generator=generator) < self.black
         colors = torch.where(is_black, 0.0, torch.rand(views, 3, generator=generator))
@@ -74,7 +74,7 @@ class LucidBackground(Background):
 
 @dataclass(frozen=True, kw_only=True)
 class BlackOrWhite(Background):
-    """For each view by itself: white with probability ``white``, else black (DreamGaussian)."""
+    """Independently for each view: white with probability ``white``, else black (DreamGaussian)."""
 
     white: float  # in [0, 1]
 
@@ -82,5 +82,5 @@ class BlackOrWhite(Background):
         require_range("background.white", self.white, low=0, high=1, example=0.5)
 
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
-        """One shade per view."""
+        """Return black or white for each view."""
         return (torch.rand(views, 1, generator=generator) < self.white).float().repeat(1, 3)

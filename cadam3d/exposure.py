@@ -12,38 +12,38 @@ from cadam3d.core.render import RenderOutput
 
 
 class Exposure(ABC):
-    """Judges the renders of a step. Frozen hyper-parameters; draws nothing."""
+    """Checks the brightness of a step's renders. Holds frozen hyper-parameters; uses no random numbers."""
 
     @abstractmethod
     def dimming(self, output: RenderOutput, background: Float[Tensor, "v 3"], step: int) -> float | None:
-        """What to multiply all colour coefficients by after the ``step``-th step (1 is the first).
+        """Return the factor for all colour coefficients after the ``step``-th step (1 is the first).
 
-        None leaves them alone. ``output`` was rendered over ``background`` before the step.
+        None leaves them unchanged. ``output`` was rendered over ``background`` before the step.
         """
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoExposure(Exposure):
-    """Any brightness will do."""
+    """Accepts any brightness."""
 
     def dimming(self, output: RenderOutput, background: Float[Tensor, "v 3"], step: int) -> float | None:
-        """None."""
+        """Return None."""
         return None
 
 
 @dataclass(frozen=True, kw_only=True)
 class BrightnessGuard(Exposure):
-    """Dim when the bright parts of most views are too bright (GCS-BEG's over-exposure guard).
+    """Dims colours when the bright parts of most views are too bright (GCS-BEG's over-exposure guard).
 
-    The brightness of a pixel is the mean of its channels without what the background contributes, so it is
-    that of the published code over black. There, views over another colour count their background as object.
+    The brightness of a pixel is the mean of its channels without the contribution of the background. Over
+    black this equals the published code, which counts a background of any other colour as part of the object.
     """
 
-    begin: int  # judged are steps strictly between `begin` and `end`, counted from 1
+    begin: int  # the guard acts at steps strictly between `begin` and `end`, counted from 1
     end: int
-    quantile: float  # of the object's pixels in a view, and again of the views
+    quantile: float  # of the object's pixels in a view, and then of the views
     threshold: float  # of that brightness; white is 1
-    rate: float  # what colours are multiplied by, in (0, 1)
+    rate: float  # factor for the colours, in (0, 1)
 
     def __post_init__(self) -> None:
         require_whole("exposure.begin", self.begin, low=0, example=1000)
@@ -60,7 +60,10 @@ class BrightnessGuard(Exposure):
         require_range("exposure.rate", self.rate, above=0, below=1, example=0.8)
 
     def dimming(self, output: RenderOutput, background: Float[Tensor, "v 3"], step: int) -> float | None:
-        """``rate`` if the quantile over views of :meth:`brightness` exceeds the threshold. One wait."""
+        """Return ``rate`` if the quantile over views of :meth:`brightness` exceeds the threshold.
+
+        Costs one synchronization with the device.
+        """
         if not self.begin < step < self.end:
             return None
         views = self.brightness(output, background)
@@ -68,7 +71,7 @@ class BrightnessGuard(Exposure):
 
     @torch.no_grad()
     def brightness(self, output: RenderOutput, background: Float[Tensor, "v 3"]) -> Float[Tensor, "v"]:
-        """The quantile over the object's pixels (alpha > 0) of each view; 0 for a view without any."""
+        """Return the quantile over the object's pixels (alpha > 0) of each view, or 0 if it has none."""
         behind = (1 - output.alpha)[..., None] * background[:, None, None]
         pixels = (output.rgb - behind).mean(dim=-1)
         return torch.stack(

@@ -1,4 +1,4 @@
-"""Adam over the five raw tensors, following row edits: survivors keep their moments, newborns have zeros."""
+"""Adam over the five raw tensors. Moments follow row edits: survivors keep theirs, newborns get zeros."""
 
 import math
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 
-# What Adam sees: the five tensors, with the view-dependent colours apart because they learn more slowly.
+# The tensors as Adam groups them: view-dependent colours are separate, because they learn more slowly.
 PARTS = ("means", "sh_dc", "sh_rest", "opacity", "scale", "quat")
 COLOR_PARTS = ("sh_dc", "sh_rest")
 MOMENTS = ("exp_avg", "exp_avg_sq")  # as torch names them
@@ -25,16 +25,16 @@ MOMENTS = ("exp_avg", "exp_avg_sq")  # as torch names them
 class AdamSettings:
     """Learning rates (a number, or a schedule of the step) and constants of Adam (Kingma and Ba 2015)."""
 
-    means_lr: float | Schedule  # world units per step
+    means_lr: float | Schedule  # >= 0, like all rates; world units per step
     sh_dc_lr: float | Schedule  # of the view-independent colour coefficient
-    sh_rest_lr: float | Schedule  # of all other coefficients; unused at SH degree 0
+    sh_rest_lr: float | Schedule  # of all other colour coefficients; unused at SH degree 0
     opacity_lr: float | Schedule  # logits per step
     scale_lr: float | Schedule  # natural logs per step
-    quat_lr: float | Schedule
-    beta1: float
-    beta2: float
-    eps: float  # far below any gradient: world gradients can be tiny
-    clip_norm: float | Schedule | None  # largest Euclidean norm of each part's whole gradient; None = off
+    quat_lr: float | Schedule  # of the quaternions
+    beta1: float  # in [0, 1): decay of the first moment
+    beta2: float  # in [0, 1): decay of the second moment
+    eps: float  # > 0: far below any gradient, because world gradients can be tiny
+    clip_norm: float | Schedule | None  # > 0: largest Euclidean norm of each part's gradient; None = off
 
     def __post_init__(self) -> None:
         for part in PARTS:
@@ -46,20 +46,20 @@ class AdamSettings:
             require_scheduled("optimizer.clip_norm", self.clip_norm, above=0, example="null")
 
     def start(self, gaussians: Gaussians) -> "GaussianOptimizer":
-        """An optimizer that owns a copy of ``gaussians``, with zero moments."""
+        """Return an optimizer that owns a copy of ``gaussians``, with zero moments."""
         return GaussianOptimizer(self, gaussians)
 
     def learning_rates(self, step: int) -> dict[str, float]:
-        """The rate of each part at ``step`` (0 is the first)."""
+        """Return the rate of each part at ``step`` (0 is the first)."""
         return {part: float(as_schedule(getattr(self, f"{part}_lr"))(step)) for part in PARTS}
 
     def largest_norm(self, step: int) -> float | None:
-        """What :attr:`clip_norm` allows at ``step`` (0 is the first); None: anything."""
+        """Return :attr:`clip_norm` at ``step`` (0 is the first); None if gradients are not clipped."""
         return None if self.clip_norm is None else float(as_schedule(self.clip_norm)(step))
 
 
 class GaussianOptimizer:
-    """Mutable: owns the leaf tensors, moves them, and replaces them when rows change."""
+    """Mutable owner of the leaf tensors: moves them, and replaces them when rows change."""
 
     def __init__(self, settings: AdamSettings, gaussians: Gaussians) -> None:
         self.settings = settings
@@ -68,14 +68,14 @@ class GaussianOptimizer:
 
     @property
     def gaussians(self) -> Gaussians:
-        """The leaf tensors; ``backward()`` fills their ``grad``. Ask again after :meth:`apply`."""
+        """Return the leaf tensors, whose ``grad`` ``backward()`` fills. :meth:`apply` replaces them."""
         return self._gaussians
 
     def step(self, step: int) -> None:
-        """One Adam step at the learning rates of ``step`` (0 is the first), then forget the gradients.
+        """Do one Adam step at the learning rates of ``step`` (0 is the first), then clear the gradients.
 
-        A tensor without a gradient has the gradient zero: its moments decay like everybody's. With a
-        ``clip_norm``, only Adam sees clipped gradients: densifiers have looked before.
+        A tensor without a gradient has the gradient zero, so its moments decay like all others. With a
+        ``clip_norm``, only Adam sees clipped gradients, because densifiers observe them before this step.
         """
         rates, bound = self.settings.learning_rates(step), self.settings.largest_norm(step)
         gradients = self._gaussians.map(
@@ -86,17 +86,17 @@ class GaussianOptimizer:
         self.zero_grad()
 
     def zero_grad(self) -> None:
-        """Forget the gradients, without a step."""
+        """Clear the gradients without a step."""
         for tensor in self._gaussians.tensors().values():
             tensor.grad = None
 
     def finite_gradients(self) -> bool:
-        """Whether every gradient at hand is free of NaN and infinity. One wait for the device."""
+        """Return whether no gradient contains NaN or infinity. Waits for the device once."""
         gradients = [tensor.grad for tensor in self._gaussians.tensors().values() if tensor.grad is not None]
         return not gradients or bool(torch.stack([grad.isfinite().all() for grad in gradients]).all())
 
     def apply(self, edit: RowEdit) -> None:
-        """Replace the rows as ``edit`` says; pending gradients are dropped."""
+        """Replace the rows as ``edit`` says; gradients are dropped."""
         moments = self.state_dict()
         for kind in MOMENTS:
             moments[kind] = {name: edit.carry(rows) for name, rows in moments[kind].items()}
@@ -104,15 +104,15 @@ class GaussianOptimizer:
 
     @torch.no_grad()
     def displace(self, offsets: Float[Tensor, "n 3"]) -> None:
-        """Add ``offsets`` (world units) to the means; all moments stay as they are."""
+        """Add ``offsets`` (world units) to the means; no moment changes."""
         self._gaussians.means.add_(offsets)
 
     @torch.no_grad()
     def reset_opacity(self, rows: Bool[Tensor, "n"], value: float) -> int:
-        """Lower the opacity of ``rows`` to at most ``value`` (paper sec. 4.4); nobody's is ever raised.
+        """Lower the opacity of ``rows`` to at most ``value`` (paper sec. 4.4), without raising any.
 
         The opacity moments of exactly these rows become zero, so that old momentum does not undo the reset;
-        all other moments stay. Returns how many opacities were lowered.
+        all other moments stay. Returns the number of lowered opacities.
         """
         logits = self._gaussians.opacity_logits
         ceiling = math.log(value / (1 - value))
@@ -124,7 +124,7 @@ class GaussianOptimizer:
 
     @torch.no_grad()
     def scale_colors(self, factor: float) -> None:
-        """Multiply every colour coefficient, the view-independent one too, and forget the colours' momentum.
+        """Multiply every colour coefficient, the view-independent one too, and zero the moments of colours.
 
         Coefficients are zero at mid grey, so a factor below 1 draws bright and dark colours towards it
         (GCS-BEG). All other tensors and moments stay.
@@ -135,14 +135,14 @@ class GaussianOptimizer:
                 self._moments[kind][part].zero_()
 
     def state_dict(self) -> dict[str, Any]:
-        """Steps done and both moments by part: plain numbers and tensors. The Gaussians are saved apart."""
+        """Return steps done and both moments by part, as numbers and tensors, without the Gaussians."""
         return {
             "steps": int(self._steps["means"]),
             **{kind: dict(self._moments[kind]) for kind in MOMENTS},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over what :meth:`state_dict` described, for the same Gaussians; goes on bit for bit.
+        """Continue, bit for bit, from the state that :meth:`state_dict` returned for the same Gaussians.
 
         Raises ``UserError`` if the moments are of other Gaussians.
         """
@@ -153,16 +153,17 @@ class GaussianOptimizer:
                 if state[kind][name].shape != part.shape:
                     raise UserError(
                         f"checkpoint: {kind} of {name} has shape {tuple(state[kind][name].shape)}, but the "
-                        f"Gaussians have {tuple(part.shape)}. Resume from another checkpoint of this run"
+                        f"Gaussians have {tuple(part.shape)}. Try: another checkpoint of this run"
                     )
             moments[kind] = {name: state[kind][name].to(part, copy=True) for name, part in parts.items()}
         self._install(self._gaussians.detach(), moments)
 
     @torch.no_grad()
     def _move(self, part: str, gradient: Tensor, rate: float) -> None:
-        """One step of torch's Adam on one part.
+        """Do one step of torch's Adam on one part.
 
-        As a function: the class would load torch's compiler with its first object, more than a second.
+        This uses the function, because the class loads torch's compiler with its first object, which takes
+        more than a second.
         """
         adam(
             [self._parts[part]],
@@ -181,7 +182,7 @@ class GaussianOptimizer:
         )
 
     def _install(self, gaussians: Gaussians, moments: Mapping[str, Any]) -> None:
-        """Make ``gaussians`` the leaves and give Adam views into them, so that one step moves both."""
+        """Make ``gaussians`` the leaf tensors, and give Adam views into them, so that a step moves both."""
         self._gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
         self._parts = _parts(self._gaussians.detach())
         self._steps = {name: torch.tensor(float(moments["steps"])) for name in PARTS}
@@ -189,7 +190,7 @@ class GaussianOptimizer:
 
 
 def _parts(gaussians: Gaussians) -> dict[str, Tensor]:
-    """The tensors as Adam groups them, in the order of ``PARTS``; views, no copies."""
+    """Return the tensors as Adam groups them, in the order of ``PARTS``, as views without copies."""
     tensors = (
         gaussians.means,
         gaussians.sh[:, :1],
@@ -202,6 +203,6 @@ def _parts(gaussians: Gaussians) -> dict[str, Tensor]:
 
 
 def _clipped(gradient: Tensor, bound: float) -> Tensor:
-    """``gradient``, shortened to the Euclidean norm ``bound`` if it is longer; all elements together."""
+    """Return ``gradient``, scaled to the Euclidean norm ``bound`` over all elements if it is longer."""
     norm = torch.linalg.vector_norm(gradient)
     return gradient * (bound / norm.clamp_min(bound))

@@ -12,15 +12,15 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 
-CLEAR = 1e-5  # keeps logarithms finite where a pixel is wholly empty or wholly covered
+CLEAR = 1e-5  # keeps logarithms finite where a pixel is fully transparent or fully opaque
 
 
 class Regularizer(ABC):
-    """A wish that the prior does not express. Frozen hyper-parameters."""
+    """A penalty on properties that the prior does not control. Holds frozen hyper-parameters."""
 
     @abstractmethod
     def __call__(self, gaussians: Gaussians, output: RenderOutput, step: int) -> Float[Tensor, ""]:
-        """The weighted penalty at ``step`` (0 is the first), >= 0, with gradient."""
+        """Return the weighted penalty at ``step`` (0 is the first), >= 0, with gradient."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,38 +33,41 @@ class Weighted(Regularizer):
         require_scheduled("regularizer.*.weight", self.weight, low=0, example=1.0)
 
     def __call__(self, gaussians: Gaussians, output: RenderOutput, step: int) -> Float[Tensor, ""]:
-        """``weight(step)`` times :meth:`penalty`."""
+        """Return ``weight(step)`` times :meth:`penalty`."""
         return as_schedule(self.weight)(step) * self.penalty(gaussians, output)
 
     @abstractmethod
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
-        """The penalty at weight 1."""
+        """Return the penalty at weight 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeanScale(Weighted):
     """Mean standard deviation in world units: keeps Gaussians small (LucidDreamer, weight 1).
 
-    3DGS-MCMC gives it a weight of 0.01.
+    3DGS-MCMC uses a weight of 0.01.
     """
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
-        """Mean over Gaussians and axes."""
+        """Return the mean over Gaussians and axes."""
         return _mean(gaussians.scales)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeanOpacity(Weighted):
-    """Mean opacity: whoever is not needed fades away (3DGS-MCMC, Kheradmand et al. 2024, weight 0.01)."""
+    """Mean opacity: fades out Gaussians that are not needed.
+
+    3DGS-MCMC (Kheradmand et al. 2024) uses a weight of 0.01.
+    """
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
-        """Mean over Gaussians, in (0, 1)."""
+        """Return the mean over Gaussians, in (0, 1)."""
         return _mean(gaussians.opacities)
 
 
 @dataclass(frozen=True, kw_only=True)
 class OutsideBall(Weighted):
-    """Mean squared distance of the centres to the ball that the object has to fit in; zero inside it."""
+    """Mean squared distance of the centres to the ball that must hold the object; zero inside it."""
 
     radius: float  # world units
 
@@ -73,26 +76,26 @@ class OutsideBall(Weighted):
         require_range("regularizer.*.radius", self.radius, above=0, example=1.0)
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
-        """Mean over Gaussians of ``max(|mean| - radius, 0)^2``, in world units squared."""
+        """Return the mean over Gaussians of ``max(|mean| - radius, 0)^2``, in world units squared."""
         return _mean((gaussians.means.norm(dim=-1) - self.radius).clamp_min(0).square())
 
 
 @dataclass(frozen=True, kw_only=True)
 class AlphaEntropy(Weighted):
-    """Mean binary entropy of the rendered alpha: a pixel should be object or background, not fog."""
+    """Mean binary entropy of the rendered alpha: makes every pixel either object or background, not fog."""
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
-        """Mean over pixels, in nats: 0 for a clean silhouette, log 2 at most."""
+        """Return the mean over pixels, in nats: 0 for a clean silhouette, log 2 at most."""
         alpha = output.alpha.clamp(CLEAR, 1 - CLEAR)
         return _mean(-alpha * alpha.log() - (1 - alpha) * (1 - alpha).log())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sparsity(Weighted):
-    """Mean of ``sqrt(alpha^2 + 0.01)`` over pixels: empty space should stay empty (as in DreamFusion)."""
+    """Mean of ``sqrt(alpha^2 + 0.01)`` over pixels: keeps empty space empty (as in DreamFusion)."""
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
-        """Mean over pixels, in (0.1, 1.005)."""
+        """Return the mean over pixels, in (0.1, 1.005)."""
         return _mean((output.alpha.square() + 0.01).sqrt())
 
 
@@ -101,7 +104,7 @@ class TotalVariation(Weighted):
     """Mean absolute difference of neighbouring pixels of the render: suppresses speckle."""
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
-        """Mean over views, channels and directions, per pixel."""
+        """Return the mean over views, channels and directions, per pixel."""
         images = output.rgb.permute(0, 3, 1, 2)
         return total_variation(images, reduction="mean").mean()
 
@@ -111,16 +114,16 @@ class SquaredVariation(Weighted):
     """Mean squared difference of neighbouring pixels: LucidDreamer's total variation, weight 1."""
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
-        """Twice the sum, over the two directions, of the mean over views, channels and pixels."""
+        """Return twice the sum, over the two directions, of the mean over views, channels and pixels."""
         return _squared_variation(output.rgb.permute(0, 3, 1, 2))
 
 
 @dataclass(frozen=True, kw_only=True)
 class DisparityVariation(Weighted):
-    """As :class:`SquaredVariation`, of the disparity: suppresses floaters (LucidDreamer, weight 1)."""
+    """:class:`SquaredVariation` of the disparity: suppresses floaters (LucidDreamer, weight 1)."""
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
-        """Of the grey image in [0, 1] that ``output.disparity()`` is."""
+        """Return the squared variation of ``output.disparity()``, a grey image in [0, 1]."""
         return _squared_variation(output.disparity()[:, None])
 
 
@@ -129,5 +132,5 @@ def _squared_variation(images: Float[Tensor, "v c h w"]) -> Float[Tensor, ""]:
 
 
 def _mean(values: Tensor) -> Float[Tensor, ""]:
-    """The mean; zero of nothing, so that an empty scene is no NaN."""
+    """Return the mean, or 0 if there are no values, so that an empty scene does not give NaN."""
     return values.sum() / max(values.numel(), 1)

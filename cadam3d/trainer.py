@@ -1,20 +1,20 @@
-"""The loop: sample views, render, ask the prior, step, and at times refine. It sees interfaces only."""
+"""Trainer: one training step from top to bottom, the refinement that may end it, and the loop around both.
+
+It sees interfaces only, never a concrete component. ``docs/architecture.md`` has the same step as a picture.
+"""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from cadam3d.augmentation import Augmentation
 from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
-from cadam3d.core.checks import require, require_range
-from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderFn, RenderOutput
+from cadam3d.core.checks import require_range
+from cadam3d.core.render import RenderFn
 from cadam3d.densifier.base import Densifier, GradientSignal
 from cadam3d.densifier.refine import Refine
 from cadam3d.exposure import Exposure
@@ -35,17 +35,12 @@ from cadam3d.state import (
 )
 
 
-def never() -> bool:
-    """The stop signal of a run that nobody interrupts."""
-    return False
-
-
 @dataclass(frozen=True, kw_only=True)
 class Trainer:
     """Everything about a run that does not change while it runs."""
 
-    steps: int
-    views: int  # per step
+    steps: int  # >= 1
+    views: int  # >= 1: per step
     camera: CameraSampler
     background: Background
     augmentation: Augmentation
@@ -64,8 +59,108 @@ class Trainer:
         require_range("views", self.views, low=1, example=2)
         self.camera.check_views(self.views)
 
+    def _step(self, state: TrainState, embedding: PromptEmbedding) -> tuple[StepReport, RefineReport | None]:
+        """Advance ``state`` in place by one step, and by a refinement or opacity reset where one is due."""
+        gaussians, draw = state.gaussians, state.generators
+
+        # Render the Gaussians from a few cameras.
+        cameras = self.camera.sample(state.step, self.views, draw["camera"]).to(gaussians.device)
+        background = self.background.sample(self.views, draw["background"]).to(gaussians.device)
+        rendered = self.augmentation.perturb(gaussians, draw["augmentation"])
+        output = self.rasterizer.render(rendered, cameras, background, self.densifier.needs_absgrad)
+        images = self.augmentation.show(output, draw["augmentation"])
+
+        # Compare the images with what the prior expects to see, and add the penalties.
+        condition = embedding.at(cameras, background)
+        guided = self.guidance(images, condition, self.prior, state.step, draw["guidance"])
+        penalties = {name: fn(rendered, output, state.step) for name, fn in self.regularizers.items()}
+        loss = sum(penalties.values(), start=guided.loss)
+
+        # Differentiate. A densifier that ignores the penalties reads the gradients before these are added.
+        if penalties and self.densifier.guidance_only:
+            guided.loss.backward(retain_graph=True)
+            signal = GradientSignal.read(gaussians, output)
+            torch.stack(list(penalties.values())).sum().backward()
+        else:
+            loss.backward()
+            signal = GradientSignal.read(gaussians, output)
+
+        # Let the densifier observe the gradients before the optimizer moves anything. A step with a NaN or
+        # infinite gradient moves nothing.
+        state.densifier = self.densifier.observe(state.densifier, signal)
+        if state.optimizer.finite_gradients():
+            state.optimizer.step(state.step)
+            lr = self.optimizer.learning_rates(state.step)["means"]
+            offsets = self.densifier.perturb(state.gaussians.detach(), lr, draw["densifier"])
+            if offsets is not None:
+                state.optimizer.displace(offsets)
+        else:
+            state.optimizer.zero_grad()
+            state.skipped += 1
+        factor = self.exposure.dimming(output, background, state.step + 1)
+        if factor is not None:
+            state.optimizer.scale_colors(factor)
+            state.dimmed += 1
+
+        refined = self._refine(state, state.step + 1)
+        state.step += 1
+        log = {**guided.log, **{name: float(penalty.detach()) for name, penalty in penalties.items()}}
+        if state.dimmed:
+            log["dimmed"] = float(state.dimmed)
+        report = StepReport(step=state.step, loss=float(loss.detach()), log=log, num_gaussians=len(gaussians))
+        return report, refined
+
+    def _refine(self, state: TrainState, step: int) -> RefineReport | None:
+        """Grow, prune and reset opacities if the schedule says so after step number ``step`` (from 1).
+
+        A refinement is decided first and then applied to all three owners of rows: Gaussians, optimizer
+        moments and densifier state. One that would exceed ``max_gaussians`` changes nothing except
+        ``state.refused``.
+        """
+        refines, resets = self.refine.refines_at(step), self.refine.resets_at(step)
+        state.refused = False
+        if not (refines or resets):
+            return None
+        before, seen = state.gaussians.detach(), state.densifier
+        statistics, scores = self.densifier.statistics(seen, step), self.densifier.scores(seen)
+        is_selected = torch.zeros(len(before), dtype=torch.bool, device=before.device)
+        cloned = split = pruned = reset = 0
+
+        if refines:
+            generator = state.generators["refine"]
+            draws_before = generator.get_state()
+            plan = self.densifier.plan(state.densifier, state.gaussians, step, self.refine, generator)
+            is_selected = plan.is_selected
+            state.refused = self.refine.exceeds(plan)
+            if state.refused:
+                generator.set_state(draws_before)
+            else:
+                # The state changes last: if memory runs out before, all owners still have the old rows.
+                carried = self.densifier.carry(state.densifier, plan.edit)
+                state.optimizer.apply(plan.edit)
+                state.densifier = carried
+                cloned, split, pruned = plan.cloned, plan.split, plan.pruned
+
+        if resets and not state.refused:
+            unreliable = self.densifier.unreliable(state.densifier)
+            reset = state.optimizer.reset_opacity(unreliable, self.refine.reset_value)
+            state.densifier = self.densifier.after_reset(state.densifier, unreliable)
+
+        return RefineReport(
+            step=step,
+            before=len(before),
+            after=len(state.gaussians),
+            selected=int(is_selected.sum()),
+            cloned=cloned,
+            split=split,
+            pruned=pruned,
+            reset=reset,
+            statistics=statistics,
+            population=Population(gaussians=before, is_selected=is_selected, scores=scores),
+        )
+
     def start(self, prompt: str, initializer: Initializer, seed: int, device: torch.device) -> TrainState:
-        """The state before the first step; every later draw descends from ``seed``."""
+        """Return the state before the first step; every later random draw descends from ``seed``."""
         generators = start_generators(seed)
         beginning = initializer.begin(prompt, generators["initializer"], device)
         gaussians = beginning.gaussians
@@ -83,68 +178,28 @@ class Trainer:
             generators=generators,
         )
 
-    def restore(self, payload: Mapping[str, Any], device: torch.device) -> TrainState:
-        """The state that ``TrainState.to_payload`` described, on ``device``.
-
-        Raises ``UserError`` if the checkpoint belongs to another kind of densifier.
-        """
-        gaussians = Gaussians(**payload["gaussians"]).to(device)
-        optimizer = self.optimizer.start(gaussians)
-        optimizer.load_state_dict(payload["optimizer"])
-        blank = self.densifier.init_state(len(gaussians), device)
-        expected = {field.name for field in fields(blank)}
-        require(
-            expected == set(payload["densifier"]),
-            "densifier",
-            expected=f"the one of the checkpoint (state: {sorted(payload['densifier'])})",
-            got=sorted(expected),
-            example="resume without densifier=...",
-        )
-        require(
-            all(len(rows) == len(gaussians) for rows in payload["densifier"].values()),
-            "resume",
-            expected="a checkpoint whose densifier state has one row per Gaussian",
-            got=f"{len(gaussians)} Gaussians and another number of rows",
-            example="resume=RUN/checkpoints/<an earlier one>",
-        )
-        generators = start_generators(payload["seed"])
-        for name, generator in generators.items():
-            if name in payload["generators"]:  # a checkpoint from before the name was: nothing was drawn yet
-                generator.set_state(payload["generators"][name])
-        return TrainState(
-            step=payload["step"],
-            seconds=payload["seconds"],
-            num_initial=payload["num_initial"],
-            initial_note=payload.get("initial_note"),  # older checkpoints have none
-            skipped=payload["skipped"],
-            dimmed=payload.get("dimmed", 0),  # a checkpoint from before there was a guard
-            refused=payload["refused"],
-            seed=payload["seed"],
-            optimizer=optimizer,
-            densifier=type(blank)(**{k: v.to(device) for k, v in payload["densifier"].items()}),
-            generators=generators,
-        )
-
-    def renderer(self, state: TrainState) -> RenderFn:
-        """Renders the Gaussians as they stand, without gradient."""
-        return render_fn(self.rasterizer, lambda: state.gaussians)
-
     def train(
         self,
         state: TrainState,
         embedding: PromptEmbedding,
         context: RunContext,
-        stop: Callable[[], bool] = never,
+        stop: Callable[[], bool] = lambda: False,
     ) -> Outcome:
-        """Advance ``state`` (in place) to ``steps`` or to another outcome; every step asks ``stop()``."""
+        """Advance ``state`` in place until ``steps`` are done or another outcome ends the run.
+
+        ``stop()`` is called after every step and interrupts the run if it returns True. Running out of memory
+        is an outcome; any other exception ends the callbacks' work and is raised.
+        """
         for callback in self.callbacks:
             callback.on_start(context, state)
         try:
             outcome = self._loop(state, embedding, context, stop)
-        except BaseException:
-            for callback in self.callbacks:
-                callback.on_abort(context)
-            raise
+        except BaseException as error:
+            if not _is_out_of_memory(error):
+                for callback in self.callbacks:
+                    callback.on_abort(context)
+                raise
+            outcome = Outcome.OUT_OF_MEMORY
         for callback in self.callbacks:
             callback.on_end(context, state, outcome)
         return outcome
@@ -152,163 +207,49 @@ class Trainer:
     def _loop(
         self, state: TrainState, embedding: PromptEmbedding, context: RunContext, stop: Callable[[], bool]
     ) -> Outcome:
-        outcome = self._take_up(state, context)
-        while outcome is None and state.step < self.steps:
-            try:
-                outcome = self._advance(state, embedding, context)
-            except (torch.OutOfMemoryError, MemoryError):
-                return Outcome.OUT_OF_MEMORY
-            except RuntimeError as error:
-                if "can't allocate memory" in str(error):  # what torch's CPU allocator says
-                    return Outcome.OUT_OF_MEMORY
-                raise
-            if outcome is None and state.step < self.steps and stop():
-                outcome = Outcome.INTERRUPTED
-        return outcome or Outcome.FINISHED
-
-    def _take_up(self, state: TrainState, context: RunContext) -> Outcome | None:
-        """Begin where a resumed run ended: a refused refinement comes first, perhaps under a larger cap."""
+        # A resumed run first repeats the refinement that ended it, because max_gaussians may be larger now.
         if state.refused:
-            refined, outcome = self._refine(state, state.step)
-            self._tell(context, state, refined, None)
-            return outcome
-        return Outcome.VANISHED if len(state.gaussians) == 0 else None
-
-    def _advance(self, state: TrainState, embedding: PromptEmbedding, context: RunContext) -> Outcome | None:
-        """One step with its refinement, and the callbacks' look at it."""
-        started = time.perf_counter()
-        report = self._step(state, embedding)
-        refined, outcome = self._refine(state, state.step + 1)
-        state.step += 1
-        state.seconds += time.perf_counter() - started
-        self._tell(context, state, refined, report)
+            self._report(context, state, self._refine(state, state.step), None)
+        outcome = self._outcome(state)
+        while outcome is None:
+            started = time.perf_counter()
+            report, refined = self._step(state, embedding)
+            state.seconds += time.perf_counter() - started
+            self._report(context, state, refined, report)
+            outcome = self._outcome(state)
+            if outcome is None and stop():
+                outcome = Outcome.INTERRUPTED
         return outcome
 
-    def _tell(
+    def _outcome(self, state: TrainState) -> Outcome | None:
+        """Return how the run has ended, or ``None`` if it goes on."""
+        if state.refused:
+            return Outcome.MAX_GAUSSIANS
+        if len(state.gaussians) == 0:
+            return Outcome.VANISHED
+        return Outcome.FINISHED if state.step >= self.steps else None
+
+    def _report(
         self,
         context: RunContext,
         state: TrainState,
         refined: RefineReport | None,
         report: StepReport | None,
     ) -> None:
+        """Show the callbacks what was done; they may look but not change anything."""
         for callback in self.callbacks:
             if refined is not None:
                 callback.on_refine(context, state, refined)
             if report is not None:
                 callback.on_step(context, state, report)
 
-    def _step(self, state: TrainState, embedding: PromptEmbedding) -> StepReport:
-        """Render, judge, differentiate, observe and step."""
-        gaussians, draw = state.gaussians, state.generators
-        cameras = self.camera.sample(state.step, self.views, draw["camera"]).to(gaussians.device)
-        background = self.background.sample(self.views, draw["background"]).to(gaussians.device)
-        rendered = self.augmentation.perturb(gaussians, draw["augmentation"])
-        output = self.rasterizer.render(rendered, cameras, background, self.densifier.needs_absgrad)
-        images = self.augmentation.show(output, draw["augmentation"])
-        condition = embedding.at(cameras, background)
-        judged = self.guidance(images, condition, self.prior, state.step, draw["guidance"])
-        penalties = {name: fn(rendered, output, state.step) for name, fn in self.regularizers.items()}
-        loss = sum(penalties.values(), start=judged.loss)
-        if penalties and self.densifier.guidance_only:
-            judged.loss.backward(retain_graph=True)
-            signal = _signal(gaussians, output)
-            torch.stack(list(penalties.values())).sum().backward()
-        else:
-            loss.backward()
-            signal = _signal(gaussians, output)
-
-        state.densifier = self.densifier.observe(state.densifier, signal)
-        if state.optimizer.finite_gradients():
-            state.optimizer.step(state.step)
-            self._perturb(state)
-        else:
-            state.skipped += 1
-            state.optimizer.zero_grad()
-        log = {**judged.log, **{name: float(value.detach()) for name, value in penalties.items()}}
-        if (factor := self.exposure.dimming(output, background, state.step + 1)) is not None:
-            state.optimizer.scale_colors(factor)
-            state.dimmed += 1
-        if state.dimmed:
-            log["dimmed"] = float(state.dimmed)
-        return StepReport(
-            step=state.step + 1, loss=float(loss.detach()), log=log, num_gaussians=len(gaussians)
-        )
-
-    def _perturb(self, state: TrainState) -> None:
-        """Move the means at random, if the densifier wants it."""
-        lr = self.optimizer.learning_rates(state.step)["means"]
-        offsets = self.densifier.perturb(state.gaussians.detach(), lr, state.generators["densifier"])
-        if offsets is not None:
-            state.optimizer.displace(offsets)
-
-    def _refine(self, state: TrainState, step: int) -> tuple[RefineReport | None, Outcome | None]:
-        """Grow, prune and reset where the schedule says so: a pure plan, then one edit for everybody."""
-        refines, resets = self.refine.refines_at(step), self.refine.resets_at(step)
-        if not (refines or resets):
-            return None, None
-        report = self._look(state, step)
-        if refines:
-            report = self._grow(state, report)
-            if state.refused:
-                return report, Outcome.MAX_GAUSSIANS
-        if resets:
-            unreliable = self.densifier.unreliable(state.densifier)
-            lowered = state.optimizer.reset_opacity(unreliable, self.refine.reset_value)
-            state.densifier = self.densifier.after_reset(state.densifier, unreliable)
-            report = replace(report, reset=lowered)
-        return report, (Outcome.VANISHED if report.after == 0 else None)
-
-    def _look(self, state: TrainState, step: int) -> RefineReport:
-        """What the densifier sees, before anything is decided."""
-        gaussians, seen = state.gaussians.detach(), state.densifier
-        n = len(gaussians)
-        return RefineReport(
-            step=step,
-            before=n,
-            after=n,
-            selected=0,
-            cloned=0,
-            split=0,
-            pruned=0,
-            reset=0,
-            statistics=self.densifier.statistics(seen, step),
-            population=Population(
-                gaussians=gaussians,
-                is_selected=torch.zeros(n, dtype=torch.bool, device=gaussians.device),
-                scores=self.densifier.scores(seen),
-            ),
-        )
-
-    def _grow(self, state: TrainState, report: RefineReport) -> RefineReport:
-        """Apply one refinement to all owners of rows, or refuse it whole; ``state.refused`` says which."""
-        generator = state.generators["refine"]
-        draws_before = generator.get_state()
-        plan = self.densifier.plan(state.densifier, state.gaussians, report.step, self.refine, generator)
-        population = replace(report.population, is_selected=plan.is_selected)
-        report = replace(report, selected=plan.selected, population=population)
-        state.refused = self.refine.exceeds(plan)
-        if state.refused:
-            generator.set_state(draws_before)
-            return report
-        carried = self.densifier.carry(state.densifier, plan.edit)
-        state.optimizer.apply(plan.edit)
-        state.densifier = carried  # only now: memory may run out above, and owners must agree even then
-        after = len(state.gaussians)
-        return replace(report, after=after, cloned=plan.cloned, split=plan.split, pruned=plan.pruned)
+    def renderer(self, state: TrainState) -> RenderFn:
+        """Return a function that renders the current Gaussians of ``state``, without gradient."""
+        return render_fn(self.rasterizer, lambda: state.gaussians)
 
 
-def _signal(gaussians: Gaussians, output: RenderOutput) -> GradientSignal:
-    """What the last backward pass left: copies, for another pass would add to it in place."""
-    return GradientSignal(
-        means=_gradient_of(gaussians.means),
-        means2d=_gradient_of(output.means2d),
-        radii=output.radii.detach(),
-        height=output.rgb.shape[1],
-        width=output.rgb.shape[2],
-        absgrad=None if output.absgrad is None else _gradient_of(output.absgrad),
-    )
-
-
-def _gradient_of(tensor: Tensor) -> Tensor:
-    """A copy of what backward left there; zeros if that was nothing."""
-    return torch.zeros_like(tensor) if tensor.grad is None else tensor.grad.detach().clone()
+def _is_out_of_memory(error: BaseException) -> bool:
+    """Return whether memory ran out; torch's CPU allocator raises a plain ``RuntimeError``."""
+    if isinstance(error, RuntimeError) and "can't allocate memory" in str(error):
+        return True
+    return isinstance(error, torch.OutOfMemoryError | MemoryError)

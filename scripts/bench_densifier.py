@@ -1,12 +1,11 @@
-"""What watching costs: a densifier's observe() against the whole training step that it watches.
+"""Measures the cost of a densifier: observe() beside the whole training step that it observes.
 
     python scripts/bench_densifier.py --densifiers cadam baseline --count 1000000 --size 512 --threads 1
 
-A step here is render, loss, backward and Adam on a shell of Gaussians, without a prior: the cheapest step
-there is, so the printed share is an upper bound. Also printed: the time of select(), which happens at
-refinements only, and the most bytes per Gaussian that observe() holds beyond the state and the signal it was
-given; the new state is among them. One thread on the CPU is timed by its own clock, so that whatever else the
-machine does is left out.
+A step here is render, loss, backward and Adam on a shell of Gaussians, without a prior. No training step is
+cheaper, so the printed share is an upper bound. The other columns are the time of select(), which is called
+at refinements only, and the largest number of bytes per Gaussian that observe() allocates, including the new
+state. One CPU thread is timed by its own clock, which excludes other processes.
 """
 
 import argparse
@@ -31,7 +30,7 @@ RADIUS = 0.6  # world units, of the shell
 
 
 def shell(count: int) -> Gaussians:
-    """Splats on a sphere, about as large as the distance to the next one."""
+    """Return Gaussians on a sphere, about as large as the distance between neighbours."""
     draw = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=draw), dim=-1)
     spacing = math.sqrt(4 * math.pi * RADIUS**2 / count)
@@ -47,7 +46,7 @@ def shell(count: int) -> Gaussians:
 def train_step(
     optimizer: GaussianOptimizer, rasterizer: Rasterizer, size: int, views: int, step: int
 ) -> GradientSignal:
-    """One optimization step, and what a densifier would be told about it."""
+    """Do one optimization step and return the signal that a densifier would observe."""
     gaussians = optimizer.gaussians
     cameras = turntable(views, elevation_deg=20.0, distance=3.0, fov_y_deg=40.0, size=size)
     background = torch.ones(views, 3, device=gaussians.device)
@@ -73,7 +72,7 @@ def milliseconds(work: Callable[[], object], device: torch.device) -> float:
 
 
 class Held(TorchDispatchMode):
-    """Counts the bytes of all tensors that were made inside and are still alive, and their peak."""
+    """Counts the bytes of all tensors that were created inside and are still alive, and their peak."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,11 +1,12 @@
-"""Check rasterizers against the reference, then time them against one another, in one process.
+"""Check rasterizers against the reference and then compare their speed, in one process.
 
     python scripts/bench_rasterizer.py                  # this CPU: reference and cpu
     python scripts/bench_rasterizer.py --device cuda    # this GPU: cuda, stage by stage, beside gsplat
 
-A backend that disagrees with the reference, or with itself from run to run, is not timed: the script says
-where it differs, times the others, and ends with exit code 1. Times are medians of milliseconds (`best`: the
-least); the ratio is the time of the first backend over this one's. docs/performance.md says what is measured.
+A backend that disagrees with the reference, or with itself from run to run, is not timed. The script prints
+the differences, times the other backends, and ends with exit code 1. Times are medians in milliseconds, and
+`best` is the shortest time. The ratio is the time of the first backend divided by that of the row's backend.
+docs/performance.md describes the measurement.
 """
 
 import argparse
@@ -26,7 +27,8 @@ from rasterizer_bench.timing import OUT_OF_MEMORY, take_turns
 
 from cadam3d.core.checks import UserError
 from cadam3d.rasterizer.base import Rasterizer
-from cadam3d.rasterizer.cuda import Launcher, load_kernels
+from cadam3d.rasterizer.cuda import load_kernels
+from cadam3d.rasterizer.launcher import Launcher
 from cadam3d.settings.compose import component, config_dir
 
 DEFAULTS = {
@@ -37,7 +39,7 @@ DEFAULTS = {
         "views": [1],
         "degrees": [0],
     },
-    "cuda": {  # the table of targets
+    "cuda": {  # the scenes of the table of targets
         "backends": ["gsplat", "cuda"],
         "counts": [20_000, 100_000, 500_000, 1_000_000, 3_400_000],
         "sizes": [512, 1024],
@@ -45,21 +47,21 @@ DEFAULTS = {
         "degrees": [0, 3],
     },
 }
-GSPLAT = "gsplat"  # the one backend that has no file in configs/rasterizer
-COPY_BYTES = {"cuda": 2**31, "cpu": 2**25}  # of the copy that gives the floor
-LONG_SORT = 2**27 + 1  # keys: one more than a counter of 27 bits takes
+GSPLAT = "gsplat"  # the only backend without a file in configs/rasterizer
+COPY_BYTES = {"cuda": 2**31, "cpu": 2**25}  # size of the copy that determines the floor
+LONG_SORT = 2**27 + 1  # keys; one more than a counter of 27 bits can count
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
+    """Reports errors in one line."""
 
     def error(self, message: str) -> NoReturn:
-        """End the program."""
+        """Print the message and end the program."""
         self.exit(2, f"{self.prog}: {message}\n")
 
 
 def whole(low: int):
-    """A parser of whole numbers that are at least ``low``."""
+    """Return a parser of whole numbers that are at least ``low``."""
 
     def parse_whole(word: str) -> int:
         number = int(word)
@@ -67,7 +69,7 @@ def whole(low: int):
             raise ValueError
         return number
 
-    parse_whole.__name__ = f"whole number >= {low}"  # what argparse calls it when it complains
+    parse_whole.__name__ = f"whole number >= {low}"  # argparse prints this name in its messages
     return parse_whole
 
 
@@ -78,36 +80,43 @@ def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
     several = {"nargs": "+", "metavar": "N"}
     known = sorted(path.stem for path in (config_dir() / "rasterizer").glob("*.yaml"))
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument("--backends", nargs="+", choices=[*known, GSPLAT], help="the first is compared with")
-    parser.add_argument("--counts", type=whole(1), **several, help="of Gaussians")
-    parser.add_argument("--sizes", type=whole(1), **several, help="of the square images, in pixels")
-    parser.add_argument("--views", type=whole(1), **several, help="rendered at once")
-    parser.add_argument("--degrees", type=int, choices=range(4), **several, help="of spherical harmonics")
+    parser.add_argument(
+        "--backends", nargs="+", choices=[*known, GSPLAT], help="ratios are relative to the first one"
+    )
+    parser.add_argument("--counts", type=whole(1), **several, help="numbers of Gaussians")
+    parser.add_argument("--sizes", type=whole(1), **several, help="sizes of the square images, in pixels")
+    parser.add_argument("--views", type=whole(1), **several, help="numbers of views rendered at once")
+    parser.add_argument(
+        "--degrees", type=int, choices=range(4), **several, help="spherical harmonics degrees"
+    )
     parser.add_argument("--repeats", type=whole(1), default=10, metavar="N")
-    # One by default: with more, what else the machine does shows in every number.
+    # With more threads, other load on the machine affects every number.
     parser.add_argument("--threads", type=whole(1), default=1, metavar="N")
     parser.add_argument("--check", action=argparse.BooleanOptionalAction, default=True)
-    parser.add_argument("--check-only", action="store_true", help="time nothing")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write everything there")
+    parser.add_argument("--check-only", action="store_true", help="check the backends without timing them")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write all results to this file")
     args = parser.parse_args(words)
     for name, value in DEFAULTS[args.device].items():
         if getattr(args, name) is None:
             setattr(args, name, value)
     if args.check_only and not args.check:
-        parser.error("--check-only and --no-check leave nothing to do. Leave one of them out")
+        parser.error("--check-only and --no-check leave nothing to do. Remove one of them")
     if args.json and not args.json.absolute().parent.is_dir():
-        parser.error(f"--json: there is no folder {args.json.parent}. Try: mkdir -p {args.json.parent}")
+        parser.error(f"--json: the folder {args.json.parent} is missing. Try: mkdir -p {args.json.parent}")
     return args
 
 
 def make_backends(names: Sequence[str], device: torch.device) -> dict[str, Rasterizer]:
-    """By name, without gsplat where it cannot run. Raises :class:`UserError` if none is left."""
+    """Return the backends by name, without gsplat if it cannot run.
+
+    Raises :class:`UserError` if none is left.
+    """
     backends: dict[str, Rasterizer] = {}
     for name in names:
         if name != GSPLAT:
             backends[name] = component(OmegaConf.load(config_dir() / "rasterizer" / f"{name}.yaml"))
         elif reason := why_absent(device):
-            print(f"gsplat is left out: {reason}", flush=True)
+            print(f"gsplat is skipped: {reason}", flush=True)
         else:
             backends[name] = GsplatRasterizer()
     if not backends:
@@ -118,7 +127,7 @@ def make_backends(names: Sequence[str], device: torch.device) -> dict[str, Raste
 def check_all(
     backends: dict[str, Rasterizer], launcher: Launcher | None, device: torch.device
 ) -> dict[str, Rasterizer]:
-    """The backends that agree with the reference; says of each whether it does."""
+    """Return the backends that agree with the reference, and print the verdict for each."""
     agreeing: dict[str, Rasterizer] = {}
     for name, rasterizer in backends.items():
         troubles = check(name, rasterizer, device)
@@ -126,10 +135,10 @@ def check_all(
             try:
                 troubles += check_long_sort(launcher, device, LONG_SORT)
             except OUT_OF_MEMORY:
-                print(f"no memory to check a sort of {LONG_SORT} keys")
+                print(f"not enough memory to check a sort of {LONG_SORT} keys")
         if not troubles:
             agreeing[name] = rasterizer
-        verdict = "agrees with the reference" if not troubles else "REFUSED, and not timed"
+        verdict = "agrees with the reference" if not troubles else "FAILED, not timed"
         print(f"check {name}: {verdict}", *troubles, sep="\n  ", flush=True)
     return agreeing
 
@@ -153,15 +162,18 @@ def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher
                 stages = time_stages(launcher, scene, args.repeats, report.copy_bytes_per_ms)
                 report.stages.append(SceneStages(*at, stages))
                 print(show_stages(stages), flush=True)
-            if args.json:  # now, for a later scene may be one too many
+            if args.json:  # after every scene, because a later one may be too large
                 report.write(args.json)
     verdicts = [row.is_met for row in report.rows if row.is_met is not None]
     if verdicts:
-        print(f"{sum(verdicts)} of {len(verdicts)} demands met")
+        print(f"{sum(verdicts)} of {len(verdicts)} targets met")
 
 
 def run(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher: Launcher | None) -> int:
-    """The exit code; ``launcher`` is that of the backend ``cuda``, if its stages are to be timed."""
+    """Check and time the backends, and return the exit code.
+
+    ``launcher`` is that of the backend ``cuda``; with it, the stages of that backend are timed too.
+    """
     torch.set_num_threads(args.threads)
     good = check_all(backends, launcher, torch.device(args.device)) if args.check else backends
     if good and not args.check_only:

@@ -1,10 +1,10 @@
-"""Time and memory of whole recipes on networks of the published sizes with random weights, made on the spot.
+"""Measure time and memory of whole recipes, on networks of the published sizes with random weights.
 
     python scripts/bench_recipes.py --device cuda --steps 50 --vram low --json recipes.json
-    python scripts/bench_recipes.py --estimates     # what each would need, without a GPU or weights
+    python scripts/bench_recipes.py --estimates     # print estimates of memory, without a GPU or weights
 
-What an object looks like means nothing here; what a step costs does. Weights are drawn once and saved as a
-real model is, so that loading is timed too (Stable Diffusion 2.1: 1.9 GB, 3.5-medium: 4.7 GB in 16 bit).
+The resulting objects are meaningless, but a step costs as much as with real weights. Random weights are saved
+like a real model, so that loading is timed too (Stable Diffusion 2.1: 1.9 GB, 3.5-medium: 4.7 GB in 16 bit).
 """
 
 import argparse
@@ -37,7 +37,7 @@ SD_VAE = {
 
 
 def stable_diffusion(folder: Path, tiny: bool, weights: bool) -> None:
-    """Stable Diffusion 2.1's UNet and autoencoder; texts are read by a small encoder."""
+    """Save the UNet and the autoencoder of Stable Diffusion 2.1 with random weights."""
     from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
 
     unet = {"block_out_channels": (320, 640, 1280, 1280), "attention_head_dim": (5, 10, 20, 20)}
@@ -58,7 +58,7 @@ def stable_diffusion(folder: Path, tiny: bool, weights: bool) -> None:
 
 
 def stable_diffusion_3(folder: Path, tiny: bool, weights: bool) -> None:
-    """Stable Diffusion 3.5-medium's transformer and autoencoder."""
+    """Save the transformer and the autoencoder of Stable Diffusion 3.5-medium with random weights."""
     from diffusers import AutoencoderKL, FlowMatchEulerDiscreteScheduler, SD3Transformer2DModel
 
     layers, heads = (2, 2) if tiny else (24, 24)
@@ -95,7 +95,7 @@ def stable_diffusion_3(folder: Path, tiny: bool, weights: bool) -> None:
 def save(
     folder: Path, kind: str, parts: dict[str, Callable[[], Any]], scheduler: Any, dtype: torch.dtype | None
 ) -> None:
-    """Write a folder in the layout of diffusers, one part at a time; without a dtype, without weights."""
+    """Write a model in the layout of diffusers, one part at a time; without a dtype there are no weights."""
     index: dict[str, Any] = {"_class_name": kind, "scheduler": ["diffusers", type(scheduler).__name__]}
     torch.manual_seed(0)
     torch.set_default_dtype(dtype or torch.float32)
@@ -113,14 +113,12 @@ def save(
 
 
 class Stopwatch:
-    """Seconds per stage; a GPU is waited for at both ends of each, which slows the whole a little."""
+    """Measures seconds per stage. It waits for a GPU at both ends of a stage, which slows the run down."""
 
     def __init__(self, device: torch.device) -> None:
-        self.device, self.seconds, self.calls = (
-            device,
-            defaultdict[str, float](float),
-            defaultdict[str, int](int),
-        )
+        self.device = device
+        self.seconds = defaultdict[str, float](float)
+        self.calls = defaultdict[str, int](int)
 
     def __call__(self, stage: str, work: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*args: Any, **kwargs: Any) -> Any:
@@ -139,7 +137,7 @@ class Stopwatch:
 
 
 def random_texts(prior: Any) -> None:
-    """Stand in for text encoders, which run once per prompt and are not what a step costs."""
+    """Replace the text encoders, which run once per prompt and are not part of a step."""
     from cadam3d.prior.latent import Texts, blank_texts
 
     def embed_texts(found: Any, texts: list[str], device: torch.device) -> Texts:
@@ -156,7 +154,7 @@ def random_texts(prior: Any) -> None:
 
 
 def measure(recipe: str, model: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """Train for a while; seconds per step and stage, and the peak of memory."""
+    """Train for some steps, and return seconds per step and stage and the peak of memory."""
     device = resolve_device(args.device)
     lines = [f"experiment={recipe}", "prompt=a corgi", f"prior.path={model}", "initializer=ball"]
     lines += [f"initializer.count={args.count}", f"steps={args.steps}", f"prior.cache_dir={model / 'texts'}"]
@@ -205,7 +203,7 @@ def measure(recipe: str, model: Path, args: argparse.Namespace) -> dict[str, Any
 
 
 def estimate(recipe: str, model: Path) -> None:
-    """Print what training would hold under each choice of ``vram``, in 16 bit, texts being known."""
+    """Print the estimated memory of training for each choice of ``vram``, in 16 bit, with cached texts."""
     for vram in ("low", "medium", "full"):
         lines = [f"experiment={recipe}", "initializer=ball", "prompt=x", f"prior.path={model}"]
         lines += [f"vram={vram}"]
@@ -219,14 +217,14 @@ def estimate(recipe: str, model: Path) -> None:
 
 
 def machine(device: torch.device) -> dict[str, Any]:
-    """What was measured on, and at which commit."""
-    told = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    """Return the device, the versions and the commit of the measurement."""
+    head = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
     return {
         "device": name,
         "torch": torch.__version__,
         "cuda": torch.version.cuda,
-        "commit": told.stdout.strip(),
+        "commit": head.stdout.strip(),
     }
 
 
@@ -240,11 +238,11 @@ def main() -> None:
     parser.add_argument("--warmup", type=int, default=3, help="steps that are not timed")
     parser.add_argument("--count", type=int, default=81920, help="initial Gaussians")
     parser.add_argument("--vram", choices=("low", "medium", "full"))
-    parser.add_argument("--tiny", action="store_true", help="small networks, to try the script itself")
-    parser.add_argument("--estimates", action="store_true", help="only say what each would need")
-    parser.add_argument("--models", type=Path, help="folder to keep the models in, for the next time")
+    parser.add_argument("--tiny", action="store_true", help="small networks, to test the script itself")
+    parser.add_argument("--estimates", action="store_true", help="only print estimates of memory")
+    parser.add_argument("--models", type=Path, help="folder that keeps the models for the next run")
     parser.add_argument("--json", type=Path)
-    parser.add_argument("settings", nargs="*", help="further settings of cadam3d train")
+    parser.add_argument("settings", nargs="*", help="more settings of cadam3d train")
     args = parser.parse_args()
     results = []
     with tempfile.TemporaryDirectory() as temporary:

@@ -1,11 +1,11 @@
-"""Tiny real pipelines, each built at most once per process; and the order of the files."""
+"""Tiny real pipelines, each built at most once per process, and the order of the test files."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-# Whole runs, a file per process: first, so that no process is left alone with one at the end.
+# Files with whole runs come first, because each is run by one process and should not be the last to end.
 LONG = ("test_end_to_end", "test_configs", "test_cuda", "test_recipes", "test_cuda_sanitizer", "test_cpu")
 
 
@@ -18,7 +18,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session")
 def pipelines(tmp_path_factory) -> Callable[..., Path]:
-    """``pipelines("stable_diffusion")``: the folder that the function of that name in pipelines.py saves."""
+    """Return a function from the name of a builder in pipelines.py to the folder with its pipeline."""
     for name in ("diffusers", "transformers"):
         pytest.importorskip(name)
     import pipelines as builders

@@ -1,4 +1,4 @@
-"""What the tests of pretrained priors share: views, numbers, and what every one of them must do."""
+"""Helpers of the tests of pretrained priors, and the checks that every such prior must pass."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,7 +9,7 @@ from cadam3d.core.cameras import turntable
 from cadam3d.prior.latent import LatentPrior, TextCondition
 from cadam3d.prior.prompting import Discrete
 
-KEYS = {  # of every pretrained prior; path and cache_dir are the test's
+KEYS = {  # of every pretrained prior; tests add path and cache_dir
     "ids": [],
     "revision": None,
     "variant": None,
@@ -28,13 +28,13 @@ def normal(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def condition_of(prior: LatentPrior, prompt="a red cube", negative="ugly", views=2) -> TextCondition:
-    """The condition of views around the object; with four, Discrete calls them front, side, back, side."""
+    """Return the condition of views around the object; four of them are front, side, back and side."""
     cameras = turntable(views, elevation_deg=15.0, distance=3.0, fov_y_deg=40.0, size=64)
     return prior.embed(prompt, negative).at(cameras, torch.zeros(views, 3))
 
 
 def encodes_what_the_autoencoder_says(prior: LatentPrior, vae) -> None:
-    """Images of another size are resized; latents are the posterior's mean, shifted and scaled."""
+    """Check that images are resized and that latents are the posterior's mean, shifted and scaled."""
     rgb = torch.rand(2, 48, 48, 3, generator=torch.Generator().manual_seed(1))
     images = torch.nn.functional.interpolate(rgb.permute(0, 3, 1, 2), (64, 64), mode="bilinear")
     mean = vae.encode(2 * images - 1).latent_dist.mean
@@ -43,9 +43,9 @@ def encodes_what_the_autoencoder_says(prior: LatentPrior, vae) -> None:
 
 
 def memory_is_foreseen(prior: LatentPrior, views: int = 2) -> None:
-    """From configurations alone: the weights exactly, and something for the work and the texts."""
+    """Check that the estimate, from configurations alone, has exact weights and counts work and texts."""
     unloaded = replace(prior)
-    estimate = unloaded.memory("a prompt that nobody has embedded", "", views, None)
+    estimate = unloaded.memory("a prompt that is not cached", "", views, None)
     assert not {"vae", "network"} & set(unloaded.__dict__)
     parameters = [*prior.network.parameters(), *prior.vae.parameters()]
     assert estimate.weights == sum(each.numel() * each.element_size() for each in parameters)
@@ -56,7 +56,7 @@ def memory_is_foreseen(prior: LatentPrior, views: int = 2) -> None:
 def micro_batch_changes_nothing(
     prior: LatentPrior, size: int, condition: TextCondition, channels: int
 ) -> None:
-    """Neither a prediction, nor latents, nor the gradient that reaches the pixels."""
+    """Check that micro-batches change neither predictions, nor latents, nor the gradient on pixels."""
     few, views = replace(prior, micro_batch=size), len(condition.cameras)
     noisy, t = normal(views, channels, 8, 8), torch.full((views,), 0.4)
     guesses = [each.predict(noisy, t, condition, 7.5).clean for each in (prior, few)]
@@ -74,7 +74,7 @@ def micro_batch_changes_nothing(
 def computes_in_sixteen_bits(
     prior: LatentPrior, condition_of: Callable[[LatentPrior], TextCondition]
 ) -> None:
-    """Networks in bfloat16, numbers out of them in float32, and near those of float32."""
+    """Check that networks in bfloat16 return float32 numbers close to those of networks in float32."""
     half = replace(prior, dtype="bfloat16")
     rgb = torch.rand(len(condition_of(prior).cameras), 64, 64, 3, generator=torch.Generator().manual_seed(3))
     latents = [each.encode(rgb) for each in (prior, half)]
@@ -86,5 +86,5 @@ def computes_in_sixteen_bits(
 
 
 def are_close(one: torch.Tensor, other: torch.Tensor) -> None:
-    """To 1e-5 of the largest: batches of other sizes are summed in another order."""
+    """Compare up to 1e-5 of the largest number, since the order of sums depends on the batch size."""
     torch.testing.assert_close(one, other, rtol=0, atol=1e-5 * float(one.abs().max()))

@@ -1,4 +1,4 @@
-"""The names of the latent diffusion code for what diffusers names otherwise, as published files have them."""
+"""Renames tensors from the names of diffusers to those of latent diffusion, as in published files."""
 
 import re
 
@@ -17,7 +17,7 @@ IN_TEXT = {"layer_norm1": "ln_1", "layer_norm2": "ln_2", "mlp.fc1": "mlp.c_fc", 
 
 
 def single_file(unet, vae, text_encoder) -> dict[str, torch.Tensor]:
-    """All tensors of the three networks as one published file holds them."""
+    """Return all tensors of the three networks, as one published file contains them."""
     parts = {
         "model.diffusion_model.": unet_names(unet),
         "first_stage_model.": vae_names(vae),
@@ -83,14 +83,15 @@ def vae_names(vae) -> dict[str, torch.Tensor]:
         placed = place(name)
         if ".attn_1." in placed:
             placed = inside(placed, IN_ATTENTION)
-            named[placed] = tensor[:, :, None, None] if tensor.ndim == 2 else tensor  # 1 x 1 convolutions
+            # Published files store these matrices as 1 x 1 convolutions.
+            named[placed] = tensor[:, :, None, None] if tensor.ndim == 2 else tensor
         else:
             named[placed] = tensor
     return named
 
 
 def text_names(text_encoder) -> dict[str, torch.Tensor]:
-    """With one more layer at the end, which the model does not use."""
+    """Return the tensors of the text encoder with one more layer at the end, which the model does not use."""
     own = {name.removeprefix("text_model."): t for name, t in text_encoder.state_dict().items()}
     layers = text_encoder.config.num_hidden_layers
     named = {
@@ -119,7 +120,7 @@ def text_names(text_encoder) -> dict[str, torch.Tensor]:
 
 
 def inside(name: str, names: dict[str, str]) -> str:
-    """Rename the second to last piece of a name, where ``names`` has it."""
+    """Rename the second to last piece of a name if ``names`` contains it."""
     for old, new in names.items():
         name = re.sub(rf"\.{re.escape(old)}\.(weight|bias)$", rf".{new}.\1", name)
     return name

@@ -1,4 +1,4 @@
-"""Tiny pipelines of the real classes with random weights, saved as real ones are: nothing is downloaded."""
+"""Tiny pipelines of the real classes with random weights, saved like real ones, without any download."""
 
 import json
 from itertools import pairwise
@@ -11,7 +11,7 @@ WIDTH = 32  # of every text encoder
 
 
 def clip_tokenizer(folder: Path, **options):
-    """CLIP's tokenizer with the byte alphabet and five merges, read from files as the real one is."""
+    """Return CLIP's tokenizer with the byte alphabet and five merges, read from files like the real one."""
     from tokenizers.pre_tokenizers import ByteLevel
     from transformers import CLIPTokenizer
 
@@ -26,7 +26,7 @@ def clip_tokenizer(folder: Path, **options):
 
 
 def t5_tokenizer():
-    """A unigram tokenizer, trained on a dozen words."""
+    """Return a unigram tokenizer, trained on a dozen words."""
     from tokenizers import Tokenizer, models, pre_tokenizers, trainers
     from transformers import T5TokenizerFast
 
@@ -39,7 +39,7 @@ def t5_tokenizer():
 
 
 def clip_text(tokenizer, *, projected: bool = False, layers: int = 2, **options):
-    """A CLIP text encoder, with or without the projection of its pooled output."""
+    """Return a CLIP text encoder, with or without the projection of its pooled output."""
     from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection
 
     last = len(tokenizer) - 1
@@ -58,7 +58,7 @@ def clip_text(tokenizer, *, projected: bool = False, layers: int = 2, **options)
 
 
 def vae(channels: int, scaling: float, shift: float | None = None, *, width: int = 8, groups: int = 4):
-    """An image autoencoder: four blocks, so that it keeps the real factor of eight."""
+    """Return an image autoencoder with four blocks, which gives the real factor of eight."""
     from diffusers import AutoencoderKL
 
     return AutoencoderKL(
@@ -77,7 +77,7 @@ def vae(channels: int, scaling: float, shift: float | None = None, *, width: int
 
 
 def unet(cross: int, **options):
-    """A UNet of two blocks, with text cross-attention."""
+    """Return a UNet of two blocks with text cross-attention."""
     from diffusers import UNet2DConditionModel
 
     usual = {
@@ -97,7 +97,7 @@ def unet(cross: int, **options):
 
 
 def ddim(prediction: str = "epsilon"):
-    """Stable Diffusion's noise schedule."""
+    """Return the noise schedule of Stable Diffusion."""
     from diffusers import DDIMScheduler
 
     return DDIMScheduler(
@@ -112,7 +112,7 @@ def ddim(prediction: str = "epsilon"):
 
 
 def stable_diffusion(folder: Path, prediction: str = "epsilon") -> Path:
-    """Stable Diffusion 1.5 and 2.1 in small."""
+    """Save a small Stable Diffusion 1.5 or 2.1."""
     from diffusers import StableDiffusionPipeline
 
     with torch.random.fork_rng():
@@ -132,7 +132,7 @@ def stable_diffusion(folder: Path, prediction: str = "epsilon") -> Path:
 
 
 def stable_diffusion_xl(folder: Path) -> Path:
-    """SDXL in small: two encoders, pooled text and six numbers about sizes beside the time."""
+    """Save a small SDXL with two encoders, pooled text and six numbers about sizes beside the time."""
     from diffusers import StableDiffusionXLPipeline
 
     with torch.random.fork_rng():
@@ -157,7 +157,7 @@ def stable_diffusion_xl(folder: Path) -> Path:
 
 
 def stable_diffusion_3(folder: Path, t5: bool = True) -> Path:
-    """Stable Diffusion 3 and 3.5 in small, with or without T5."""
+    """Save a small Stable Diffusion 3 or 3.5, with or without T5."""
     from diffusers import FlowMatchEulerDiscreteScheduler, SD3Transformer2DModel, StableDiffusion3Pipeline
     from transformers import T5Config, T5EncoderModel
 
@@ -208,7 +208,7 @@ def stable_diffusion_3(folder: Path, t5: bool = True) -> Path:
 
 
 def mvdream(folder: Path) -> Path:
-    """MVDream in small: what its published file does not say (groups, heads of 64 channels) is as there."""
+    """Save a small MVDream; values that its published file omits (groups, heads of 64) are as real."""
     from diffusers import StableDiffusionPipeline
 
     width = 64
@@ -236,7 +236,7 @@ def mvdream(folder: Path) -> Path:
 
 
 def shap_e(folder: Path, surface: bool = True) -> Path:
-    """Shap-E in small. Without a surface, its table of triangles is empty, as in a model made anew."""
+    """Save a small Shap-E; without a surface, its table of triangles is empty, as in a new model."""
     from diffusers import HeunDiscreteScheduler, PriorTransformer, ShapEPipeline
     from diffusers.pipelines.shap_e import ShapERenderer
 
@@ -280,7 +280,7 @@ def shap_e(folder: Path, surface: bool = True) -> Path:
 
 
 def triangles_of_cubes() -> tuple[torch.Tensor, torch.Tensor]:
-    """A table for marching cubes: a fan over the cut edges of each cube: a surface, if a crumpled one.
+    """Return a table for marching cubes with a fan over the cut edges of each cube, a crumpled surface.
 
     Bit x + 2 y + 4 z of a case says whether that corner is inside. Edges along x come first, then y, then z.
     """

@@ -1,9 +1,9 @@
-"""Scenes for the native rasterizers, and how one is compared with the reference.
+"""Scenes for the native rasterizers, and comparisons with the reference.
 
 The image formation model has steps: a contribution below ALPHA_MIN is skipped, one above ALPHA_MAX is capped,
-and a pixel stops before TRANSMITTANCE_MIN. Where a number lies within rounding of a step, float32 and float64
-may decide differently, and both are right. ``undecided`` finds those pixels; comparisons leave them out, and
-demand that they are few.
+and a pixel stops before TRANSMITTANCE_MIN. If a number is within rounding of a step, float32 and float64 may
+decide differently, and both are right. ``undecided`` finds such pixels. Comparisons leave them out and
+require that there are few of them.
 """
 
 import math
@@ -47,7 +47,7 @@ def make_cameras(v, height, width, *, distance=3.0, seed=0) -> Cameras:
         height,
         width,
     )
-    # No symmetry to hide behind: another focal length along y, a principal point off the centre.
+    # Symmetry could hide mistakes, so the focal lengths differ and the principal point is not at the centre.
     off = torch.tensor([[1.1, 0.0, 0.04 * width], [0.0, 0.9, -0.03 * height], [0.0, 0.0, 0.0]])
     cameras.intrinsics.mul_(torch.where(off.eq(1.1) | off.eq(0.9), off, 1.0)).add_(
         torch.where(off.eq(1.1) | off.eq(0.9), 0.0, off)
@@ -61,14 +61,14 @@ def backgrounds(v):
 
 @dataclass(frozen=True)
 class Ellipses:
-    """What each Gaussian looks like in one view, in float64, from matrices and nothing clever."""
+    """The projected Gaussians of one view, in float64, computed with plain matrices."""
 
     centres: torch.Tensor  # [n 2]; pixels
     covariances: torch.Tensor  # [n 2 2]; pixels^2, blurred
     depths: torch.Tensor  # [n]; camera z, world units
 
     def exponents(self, height: int, width: int) -> torch.Tensor:
-        """[n h w]: half the squared distance of every pixel from the centres, in standard deviations."""
+        """Return half the squared distance of all pixels from the centres, in standard deviations [n h w]."""
         y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         offset = torch.stack([x, y], dim=-1)[None] + 0.5 - self.centres[:, None, None]
         return 0.5 * torch.einsum("nhwi,nij,nhwj->nhw", offset, torch.linalg.inv(self.covariances), offset)
@@ -96,7 +96,7 @@ def ellipses(gaussians: Gaussians, cameras: Cameras, view: int) -> Ellipses:
 
 
 def undecided(gaussians: Gaussians, cameras: Cameras, within: float = 1e-3) -> torch.Tensor:
-    """[v h w]: pixels where some number is ``within`` so much of a step. A dense twin, in float64."""
+    """Return the mask [v h w] of pixels where a number is within a share of a step, densely in float64."""
     pixels = []
     for view in range(len(cameras)):
         depths = ellipses(gaussians, cameras, view).depths
@@ -122,10 +122,10 @@ def make_weights(v, height, width, seed=3):
 def render_and_differentiate(
     render, gaussians, cameras, background, weights, dtype=torch.float32, device="cpu", *, absgrad=False
 ):
-    """The output, and the gradient of ``sum(weights * images)`` in every tensor and means2d, on the CPU.
+    """Return the output and the gradients of ``sum(weights * images)``, on the CPU.
 
-    An image whose weight is ``None`` is no part of the loss: no gradient comes back for it, not even zeros.
-    ``absgrad`` comes last, where it is asked for.
+    There is a gradient for every tensor and for means2d, and at the end for absgrad if that is requested. An
+    image with the weight ``None`` is not part of the loss: it gets no gradient, not even zeros.
     """
     leaves = gaussians.map(lambda tensor: tensor.detach().to(device, dtype, copy=True).requires_grad_())
     output = render(leaves, cameras, background.to(device, dtype), *([True] if absgrad else []))
@@ -172,10 +172,10 @@ def assert_agrees(
     device="cpu",
     absgrad=False,
 ):
-    """``render`` shows what the reference shows in float64, in value and in every gradient."""
+    """Check that ``render`` agrees with the reference in float64, in all images and gradients."""
     v, height, width = len(cameras), cameras.height, cameras.width
     decided = ~undecided(gaussians, cameras)
-    assert decided.double().mean() > most, "too many pixels lie on a step: the test would say little"
+    assert decided.double().mean() > most, "too many pixels are on a step: the test would prove little"
     weights = [
         weight * decided.view(*decided.shape, *[1] * (weight.ndim - 3)) if name in images else None
         for name, weight in zip(IMAGES, make_weights(v, height, width), strict=True)
@@ -201,21 +201,21 @@ def assert_agrees(
 
 @dataclass(frozen=True)
 class Backend:
-    """A rasterizer, and where and in what its tests render."""
+    """A rasterizer, with the device and the dtype of its tests."""
 
     name: str
     render: Callable[[Gaussians, Cameras, torch.Tensor], RenderOutput]
     device: str = "cpu"
     dtype: torch.dtype = torch.float32
-    rounding: float = 2e-5  # of the largest: how far from exact on scenes that are made to be hard
-    order_of_sums: float = 0.0  # ... and how far two sums of the same numbers in another order
+    rounding: float = 2e-5  # error on hard scenes, relative to the largest number
+    order_of_sums: float = 0.0  # deviation of a sum in another order, likewise
 
     def agrees(self, gaussians, cameras, **kwargs):
         """See :func:`assert_agrees`."""
         return assert_agrees(self.render, gaussians, cameras, device=self.device, **kwargs)
 
     def differentiate(self, gaussians, cameras, weights=None, background=None, absgrad=False):
-        """See :func:`render_and_differentiate`; without ``weights`` every number of every image counts."""
+        """See :func:`render_and_differentiate`; without ``weights``, all numbers of all images have one."""
         v, size = len(cameras), (cameras.height, cameras.width)
         return render_and_differentiate(
             self.render,
@@ -229,7 +229,7 @@ class Backend:
         )
 
     def show(self, gaussians, cameras):
-        """The output without gradients, on the CPU."""
+        """Return the output without gradients, on the CPU."""
         with torch.no_grad():
             output = self.render(self.put(gaussians), cameras, self.put(backgrounds(len(cameras))))
         return replace(
@@ -237,7 +237,7 @@ class Backend:
         )
 
     def put(self, tensors):
-        """A tensor, or Gaussians, where and in what this backend renders."""
+        """Return a tensor or Gaussians on the device and in the dtype of this backend."""
         return tensors.to(self.device).to(self.dtype)
 
 
@@ -264,7 +264,7 @@ def duplicated(n):
 
 
 def facing_camera(height, width) -> Cameras:
-    """One camera at the origin that looks along +z, its principal point at the image centre."""
+    """Return one camera at the origin that looks along +z, with its principal point at the image centre."""
     return replace(
         make_cameras(1, height, width),
         world_to_camera=torch.eye(4)[None],
@@ -273,7 +273,7 @@ def facing_camera(height, width) -> Cameras:
 
 
 def stack(*opacity_logits, first=2.0) -> Gaussians:
-    """Grey balls right before ``facing_camera``, nearest first; each fills a small image."""
+    """Return grey balls in front of ``facing_camera``, nearest first; each fills a small image."""
     n = len(opacity_logits)
     return Gaussians(
         means=torch.stack([torch.tensor([0.0, 0.0, first + i / 10]) for i in range(n)]),
@@ -285,10 +285,11 @@ def stack(*opacity_logits, first=2.0) -> Gaussians:
 
 
 def at_tile_corners(log_scales, margin=1e-3) -> tuple[Gaussians, Cameras]:
-    """One Gaussian, and views in which its ellipse ends ``margin`` pixels behind or before a pixel centre.
+    """Return one Gaussian, and views in which its ellipse ends ``margin`` pixels from a pixel centre.
 
-    The pixel is the first one across the borders of 16x16, and so of 8x8, tiles; the ellipse comes to it from
-    every side, with a rightmost, leftmost, topmost and lowest point too. Views with odd numbers fall short.
+    The pixel is the first one across the borders of 16x16 tiles, and therefore of 8x8 tiles. The ellipse
+    reaches it from every side, also with its rightmost, leftmost, topmost and lowest point. In views with odd
+    numbers it ends just before the pixel centre, in the others just behind it.
     """
     gaussians = make_gaussians(1, seed=3, spread=0.1)
     gaussians.log_scales[0], gaussians.opacity_logits[0] = torch.tensor(log_scales), 0.5

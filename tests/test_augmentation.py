@@ -1,4 +1,4 @@
-"""Laws of the augmentations: what they change, what they leave alone, and what they draw."""
+"""Laws of the augmentations: the tensors that they change, and the random numbers that they draw."""
 
 import pytest
 import torch
@@ -36,7 +36,7 @@ def test_none_is_the_identity_and_draws_nothing():
     assert torch.equal(generator.get_state(), before)
 
 
-def test_without_noise_and_tosses_lucid_changes_nothing():
+def test_lucid_with_all_probabilities_zero_changes_nothing():
     gaussians, seen = make_gaussians(5), output()
     assert torch.equal(lucid().perturb(gaussians, draw()).log_scales, gaussians.log_scales)
     assert torch.equal(lucid().show(seen, draw()), seen.rgb)
@@ -52,13 +52,13 @@ def test_scales_are_multiplied_by_a_factor_around_one(noise):
     assert apart.abs().max() < 0.03
 
 
-def test_no_scale_becomes_nothing_or_less():
+def test_all_scales_stay_positive():
     gaussians = make_gaussians(20_000)
     factor = lucid(1.0).perturb(gaussians, draw()).scales / gaussians.scales
     assert float(factor.min()) == pytest.approx(LEAST, rel=1e-3)
 
 
-def test_only_scales_change_and_means_stay_the_very_tensor():
+def test_only_scales_change_and_means_are_the_same_tensor():
     gaussians = make_gaussians(10)
     perturbed = lucid(0.1).perturb(gaussians, draw())
     for name in ("means", "quats", "opacity_logits", "sh"):
@@ -86,7 +86,7 @@ def test_disparity_is_shown_in_grey_for_all_views():
     assert torch.equal(shown, seen.disparity()[..., None].repeat(1, 1, 1, 3))
 
 
-def test_tosses_come_as_often_as_they_should_and_apart():
+def test_disparity_and_flips_are_independent_with_their_probabilities():
     seen, generator, augmentation = output(), draw(), lucid(disparity=0.2, flip=0.5)
     grey, mirrored = [], []
     mirror = seen.rgb.flip(dims=(2,)), seen.disparity().flip(dims=(2,))
@@ -100,7 +100,7 @@ def test_tosses_come_as_often_as_they_should_and_apart():
     assert both == pytest.approx(0.1, abs=0.02)
 
 
-def test_gradients_flow_through_what_is_shown():
+def test_gradients_flow_through_the_shown_images():
     for augmentation in (lucid(flip=1.0), lucid(disparity=1.0, flip=1.0)):
         seen = output()
         for image in (seen.rgb, seen.alpha, seen.depth):
@@ -112,21 +112,21 @@ def test_gradients_flow_through_what_is_shown():
     assert seen.depth.grad.isfinite().all()
 
 
-def test_the_generator_decides():
+def test_results_depend_on_the_generator_alone():
     gaussians = make_gaussians(5)
     same = [lucid(0.1).perturb(gaussians, draw(1)).log_scales for _ in range(2)]
     assert torch.equal(*same)
     assert not torch.equal(same[0], lucid(0.1).perturb(gaussians, draw(2)).log_scales)
 
 
-def test_consecutive_steps_have_noise_of_their_own():
+def test_consecutive_steps_have_different_noise():
     gaussians, generator = make_gaussians(5), draw()
     first, second = (lucid(0.1).perturb(gaussians, generator).log_scales for _ in range(2))
     assert not torch.equal(first, second)
 
 
-def test_later_draws_do_not_depend_on_the_number_of_gaussians_or_on_the_tosses():
-    """So that densifiers with one seed are shown the same, however many Gaussians each has."""
+def test_later_draws_do_not_depend_on_the_number_of_gaussians_or_on_earlier_outcomes():
+    """Densifiers with the same seed must see the same images, however many Gaussians each has."""
     states = []
     for n, augmentation in ((5, lucid(0.1)), (50, lucid(0.1)), (5, lucid(0.1, 1.0, 1.0))):
         generator = draw()

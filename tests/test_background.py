@@ -62,7 +62,7 @@ def test_black_or_white_is_nothing_else_and_white_with_its_probability(white):
     assert float(colors.mean()) == pytest.approx(white, abs=0.01)
 
 
-def test_views_are_drawn_apart():
+def test_views_are_drawn_independently():
     colors = RandomBackground(probability=1.0, color=[0.0, 0.0, 0.0]).sample(5, draw())
     assert len(colors.unique(dim=0)) == 5
     lucid = LucidBackground(probability=1.0, black=0.0, color=[0.0, 0.0, 0.0])
@@ -78,7 +78,7 @@ CHANGING = [
 
 
 @pytest.mark.parametrize("background", CHANGING, ids=lambda background: type(background).__name__)
-def test_the_generator_decides(background):
+def test_results_depend_on_the_generator_alone(background):
     assert torch.equal(background.sample(9, draw(1)), background.sample(9, draw(1)))
     assert not torch.equal(background.sample(9, draw(1)), background.sample(9, draw(2)))
 
@@ -90,7 +90,7 @@ def after(background) -> torch.Tensor:
     return generator.get_state()
 
 
-def test_what_is_drawn_later_does_not_depend_on_the_probabilities():
+def test_later_draws_do_not_depend_on_the_probabilities():
     black = [0.0, 0.0, 0.0]
     for family in (
         [RandomBackground(probability=p, color=black) for p in (0.0, 0.5, 1.0)],
@@ -102,7 +102,7 @@ def test_what_is_drawn_later_does_not_depend_on_the_probabilities():
 
 
 @pytest.mark.parametrize("color", [[0.0, 0.0], [0.0, 0.0, 1.5], [-0.1, 0.0, 0.0], [float("nan"), 0.0, 0.0]])
-def test_what_is_no_color_is_refused(color):
+def test_invalid_colors_are_refused(color):
     with pytest.raises(UserError, match=r"background\.color: expected three numbers"):
         ConstantBackground(color=color)
     with pytest.raises(UserError, match=r"background\.color: expected three numbers"):

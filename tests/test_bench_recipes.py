@@ -1,4 +1,4 @@
-"""The benchmark of whole recipes: what it makes loads as a model does, and stages add up to the step."""
+"""The benchmark of whole recipes: its models load, and the times of the stages add up to that of the step."""
 
 import argparse
 import importlib.util

@@ -1,4 +1,4 @@
-"""Laws of the exposure guard: when it dims, and what it takes for bright."""
+"""Laws of the exposure guard: when it dims colours, and how it measures brightness."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ def guard(**changes) -> BrightnessGuard:
 
 
 def over(background: torch.Tensor, color: torch.Tensor, alpha: torch.Tensor) -> RenderOutput:
-    """``color`` with coverage ``alpha`` over ``background``."""
+    """Composite ``color`` with coverage ``alpha`` over ``background``."""
     rgb = alpha[..., None] * color + (1 - alpha)[..., None] * background[:, None, None]
     views = len(alpha)
     return RenderOutput(
@@ -27,7 +27,7 @@ def over(background: torch.Tensor, color: torch.Tensor, alpha: torch.Tensor) -> 
 
 
 def scene(*levels: float) -> tuple[RenderOutput, torch.Tensor]:
-    """A grey object of each level in a view of its own, over white."""
+    """Render one view with a grey object for each level, over white."""
     alpha = torch.zeros(len(levels), 8, 8)
     alpha[:, 2:6, 2:6] = 1.0
     white = torch.ones(len(levels), 3)
@@ -42,22 +42,22 @@ def test_none_never_dims():
 @pytest.mark.parametrize(
     ("step", "dims"), [(1, False), (1000, False), (1001, True), (4499, True), (4500, False), (5000, False)]
 )
-def test_only_steps_strictly_between_begin_and_end_are_judged(step, dims):
+def test_only_steps_strictly_between_begin_and_end_are_checked(step, dims):
     assert guard().dimming(*scene(1.0, 1.0), step) == (0.8 if dims else None)
 
 
 @pytest.mark.parametrize(("level", "dims"), [(0.0, False), (0.89, False), (0.91, True), (3.0, True)])
-def test_what_is_brighter_than_the_threshold_is_dimmed(level, dims):
+def test_colours_are_dimmed_above_the_threshold(level, dims):
     assert (guard().dimming(*scene(level, level), 2000) is not None) == dims
 
 
 def test_it_takes_a_quantile_of_the_views():
-    """Of four views 0.85 lies between the third and the fourth: 0.45 of the third, 0.55 of the fourth."""
+    """The 0.85 quantile of four views is 0.45 times the third plus 0.55 times the fourth."""
     assert guard().dimming(*scene(0.0, 0.0, 0.8, 1.0), 2000) == 0.8  # 0.91
     assert guard().dimming(*scene(0.0, 0.0, 0.7, 1.0), 2000) is None  # 0.865
 
 
-def test_it_takes_a_quantile_of_the_pixels_and_the_background_is_none_of_them():
+def test_it_takes_a_quantile_of_the_pixels_without_the_background():
     alpha = torch.zeros(1, 10, 11)
     alpha[:, :, :10] = 1.0
     alpha[:, :, 10] = 0.0
@@ -97,7 +97,7 @@ def test_an_empty_view_is_dark():
     assert guard().dimming(output, white, 2000) is None
 
 
-def test_judging_leaves_no_trace_in_the_graph():
+def test_the_check_adds_nothing_to_the_graph():
     output, background = scene(1.0)
     output.rgb.requires_grad_()
     assert not guard().brightness(output, background).requires_grad

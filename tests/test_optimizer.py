@@ -1,4 +1,4 @@
-"""Laws of GaussianOptimizer: it is Adam, it follows row edits, and it goes on bit for bit."""
+"""Laws of GaussianOptimizer: it is Adam, it follows row edits, and it resumes bit for bit."""
 
 import math
 
@@ -33,7 +33,7 @@ def gaussians(n: int, seed: int = 0, k: int = 4) -> Gaussians:
 
 
 def push(optimizer: GaussianOptimizer, seed: int) -> None:
-    """Random gradients for every tensor, as a backward pass would leave them."""
+    """Set random gradients on every tensor, as a backward pass would."""
     noise = gaussians(len(optimizer.gaussians), seed=seed, k=optimizer.gaussians.sh.shape[1])
     for name, tensor in optimizer.gaussians.tensors().items():
         tensor.grad = getattr(noise, name)
@@ -91,14 +91,14 @@ def test_leaves_collect_gradients_through_a_render_like_graph():
     torch.testing.assert_close(before - leaves.means.detach(), torch.full((4, 3), 0.01))
 
 
-def test_a_step_forgets_the_gradients():
+def test_a_step_clears_the_gradients():
     optimizer = settings().start(gaussians(4))
     push(optimizer, seed=0)
     optimizer.step(0)
     assert all(tensor.grad is None for tensor in optimizer.gaussians.tensors().values())
 
 
-def test_zero_grad_forgets_without_moving():
+def test_zero_grad_clears_without_moving():
     optimizer = settings().start(gaussians(4))
     before = optimizer.gaussians.means.detach().clone()
     push(optimizer, seed=0)
@@ -130,7 +130,7 @@ def test_rates_follow_their_schedule():
 
 
 def norms(optimizer: GaussianOptimizer) -> dict[str, float]:
-    """The norm of the gradient that Adam saw at its first step, by part."""
+    """Return the norm of the gradient that Adam saw at its first step, by part."""
     moments = optimizer.state_dict()["exp_avg"]
     return {name: float(moments[name].norm()) / (1 - 0.9) for name in PARTS}
 
@@ -159,7 +159,7 @@ def test_the_bound_follows_its_schedule_as_published():
     assert norms(optimizer)["means"] == pytest.approx(5.0, rel=1e-5)
 
 
-def test_a_bound_that_nobody_reaches_changes_no_bit():
+def test_a_bound_that_no_gradient_reaches_changes_no_bit():
     plain, bounded = settings().start(gaussians(6)), settings(clip_norm=1e6).start(gaussians(6))
     train(plain, range(5))
     train(bounded, range(5))
@@ -221,7 +221,7 @@ def test_an_edit_leaves_fresh_leaves_that_train():
     assert (optimizer.gaussians.sh != before).all()
 
 
-def test_everybody_may_vanish():
+def test_all_gaussians_may_vanish():
     optimizer = settings().start(gaussians(3))
     train(optimizer, range(2))
     optimizer.apply(RowEdit(keep=torch.arange(0), children=gaussians(0), parents=torch.arange(0)))
@@ -282,7 +282,7 @@ def test_a_reset_moves_what_is_rendered_next():
     assert float(leaf.detach().sigmoid().max()) < 0.02
 
 
-def test_dimming_multiplies_every_colour_coefficient_and_forgets_their_momentum_only():
+def test_dimming_multiplies_every_colour_coefficient_and_zeroes_their_moments_only():
     optimizer = settings().start(gaussians(10))
     train(optimizer, range(5))
     leaf = optimizer.gaussians.sh
@@ -332,7 +332,7 @@ def test_resuming_from_disk_is_bit_exact(tmp_path):
         assert torch.equal(moment, as_named(resumed.state_dict())[name])
 
 
-def test_resuming_takes_a_copy_of_the_moments():
+def test_resuming_copies_the_moments():
     first = settings().start(gaussians(4))
     train(first, range(2))
     second = settings().start(first.gaussians)

@@ -64,6 +64,13 @@ def test_kernel_sources_travel_too(wheel):
     assert {str(path.relative_to(REPOSITORY)) for path in sources} <= names
 
 
+def test_report_templates_travel_too(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
+    templates = find("cadam3d/report/templates", "*.*")
+    assert templates
+    assert {str(path.relative_to(REPOSITORY)) for path in templates} <= names
+
+
 def test_the_source_archive_carries_what_its_own_tests_read(tmp_path):
     command = [sys.executable, "-m", "build", "--sdist", "--no-isolation", "--outdir", str(tmp_path)]
     subprocess.run([*command, str(REPOSITORY)], check=True, capture_output=True)

@@ -1,4 +1,4 @@
-"""The published numbers of each family, in our world: one factor for all lengths, the published steps."""
+"""The published numbers of each family: one factor converts all lengths, and steps are as published."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The published recipes: their numbers, and that each trains through a real pipeline of its family."""
+"""The published recipes: each has the published numbers and trains with a pipeline of its real classes."""
 
 import sys
 
@@ -102,7 +102,7 @@ def test_a_recipe_has_the_published_numbers(recipe):
 
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_a_recipe_leaves_every_group_to_the_line(recipe):
-    """The densifier first of all: nothing that it says depends on an option that the line may replace."""
+    """No value of a recipe remains in a group that the command line replaces, such as the densifier."""
     others = ["prior=shapes", "guidance=sds", "camera=orbit", "initializer=ball", "densifier=none"]
     others += ["optimizer=adam", "refine=default", "augmentation=none", "background=white", "exposure=none"]
     cfg = compose(["prompt=x", f"experiment={recipe}", *others])

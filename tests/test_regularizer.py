@@ -101,7 +101,7 @@ def test_mean_opacity_is_the_mean_opacity():
     assert float(MeanOpacity(weight=0.5)(scene, output(), 0)) == pytest.approx(0.5 * 0.35)
 
 
-def test_the_ball_is_free_inside_and_costs_the_squared_distance_outside():
+def test_the_penalty_is_zero_in_the_ball_and_the_squared_distance_outside():
     ball = OutsideBall(weight=1.0, radius=0.5)
     assert at(ball, means=torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.2, 0.0]])) == 0
     assert at(ball, means=torch.tensor([[0.0, 0.0, 1.5], [0.0, 0.0, 0.0]])) == pytest.approx(0.5)
@@ -113,7 +113,7 @@ def test_the_ball_pulls_straight_inwards():
     torch.testing.assert_close(scene.means.grad, 2 * 4 * torch.tensor([[0.0, 0.6, 0.8]]))
 
 
-def test_fog_costs_most_entropy_and_a_clean_silhouette_none():
+def test_fog_has_the_largest_entropy_and_a_clean_silhouette_has_none():
     entropy = AlphaEntropy(weight=1.0)
     silhouette = (noise(1, 8, 8) > 0.5).float()
     assert at(entropy, alpha=silhouette) == pytest.approx(0.0, abs=1e-3)
@@ -121,7 +121,7 @@ def test_fog_costs_most_entropy_and_a_clean_silhouette_none():
     assert at(entropy, alpha=torch.full((1, 8, 8), 0.2)) < math.log(2)
 
 
-def test_sparsity_grows_with_what_is_covered():
+def test_sparsity_grows_with_the_covered_area():
     sparsity = Sparsity(weight=1.0)
     costs = [at(sparsity, alpha=torch.full((1, 8, 8), alpha)) for alpha in (0.0, 0.3, 1.0)]
     assert costs == pytest.approx([0.1, 0.1**0.5, 1.01**0.5])

@@ -1,4 +1,4 @@
-"""Laws of the training loop: same seed same bytes, resume is no event, outcomes are recorded."""
+"""Laws of the training loop: the same seed gives the same bytes, resuming too, and outcomes are recorded."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -38,7 +38,7 @@ SMALL = [
 
 @dataclass
 class Witness(Callback):
-    """Remembers what it was shown."""
+    """Records its calls."""
 
     steps: list[StepReport] = field(default_factory=list)
     refinements: list[RefineReport] = field(default_factory=list)
@@ -68,8 +68,12 @@ def go(trainer: Trainer, state: TrainState, tmp_path: Path, **kwargs) -> Outcome
     return trainer.train(state, embedding, context, **kwargs)
 
 
+def restore(trainer: Trainer, payload: dict) -> TrainState:
+    return TrainState.restore(payload, trainer.optimizer, trainer.densifier, CPU)
+
+
 def same(left: dict, right: dict) -> bool:
-    """Bitwise equality of two payloads, wall-clock time aside."""
+    """Return whether two payloads are equal to the bit, apart from wall-clock time."""
     assert left.keys() == right.keys()
     for key, value in left.items():
         other = right[key]
@@ -94,14 +98,12 @@ def test_same_seed_same_bytes(tmp_path, densifier):
     assert same(*payloads)
 
 
-def test_what_stood_in_for_the_initializer_is_remembered_by_checkpoints():
+def test_the_fallback_of_an_initializer_is_recorded_in_checkpoints():
     lines = ["initializer=shap_e", "initializer.path=nowhere", "initializer/fallback=ball"]
     trainer, state = make(lines)
     assert state.initial_note.startswith("Ball stands in for Shap-E")
     assert len(state.gaussians) == state.num_initial == 4000
-    assert trainer.restore(state.to_payload(), CPU).initial_note == state.initial_note
-    before_there_were_notes = {k: v for k, v in state.to_payload().items() if k != "initial_note"}
-    assert trainer.restore(before_there_were_notes, CPU).initial_note is None
+    assert restore(trainer, state.to_payload()).initial_note == state.initial_note
 
 
 def test_another_seed_gives_another_result(tmp_path):
@@ -123,7 +125,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, densifie
     _, state = make([f"densifier={densifier}"])
     go(replace(trainer, steps=cut), state, tmp_path)  # stopped early, with the schedules of the whole run
     torch.save(state.to_payload(), tmp_path / "half.pt")
-    resumed = trainer.restore(torch.load(tmp_path / "half.pt", weights_only=True), CPU)
+    resumed = restore(trainer, torch.load(tmp_path / "half.pt", weights_only=True))
     assert go(trainer, resumed, tmp_path) is Outcome.FINISHED
     assert same(whole.to_payload(), resumed.to_payload())
 
@@ -138,21 +140,9 @@ def test_densifiers_with_one_seed_see_the_same_views_and_noise(tmp_path):
         assert torch.equal(ends["cadam"][source], ends["none"][source])
 
 
-@pytest.mark.parametrize("densifier", ["cadam", "mcmc"])
-def test_a_checkpoint_older_than_a_source_of_randomness_goes_on_as_if_it_had_been_there(tmp_path, densifier):
-    trainer, whole = make([f"densifier={densifier}"])
-    payload = whole.to_payload()
-    del payload["generators"]["densifier"]
-    torch.save(payload, tmp_path / "old.pt")
-    resumed = trainer.restore(torch.load(tmp_path / "old.pt", weights_only=True), CPU)
-    go(trainer, whole, tmp_path)
-    go(trainer, resumed, tmp_path)
-    assert same(whole.to_payload(), resumed.to_payload())
-
-
 def test_a_stream_depends_on_its_place_and_on_no_later_name():
-    """So that a new source of randomness moves no other, and old results can be had again."""
-    children = np.random.SeedSequence(7).spawn(5)  # as before there was an augmentation
+    """A new source of randomness then moves no other, and old results stay reproducible."""
+    children = np.random.SeedSequence(7).spawn(5)
     old = [
         torch.Generator().manual_seed(int(child.generate_state(1, np.uint64)[0] >> 1)) for child in children
     ]
@@ -179,7 +169,7 @@ def test_an_augmented_run_is_another_run_in_which_all_other_streams_are_the_same
     assert not torch.equal(ends[2]["generators"]["augmentation"], fresh)
 
 
-def test_guidance_judges_what_is_shown_and_regularizers_what_is_rendered(tmp_path):
+def test_guidance_gets_the_shown_images_and_regularizers_the_rendered_ones(tmp_path):
     seen = {}
 
     class Eye(LucidAugmentation):
@@ -219,19 +209,7 @@ def test_an_augmented_run_resumes_to_the_bit(tmp_path):
     _, state = make(AUGMENTED)
     go(replace(trainer, steps=3), state, tmp_path)
     torch.save(state.to_payload(), tmp_path / "half.pt")
-    resumed = trainer.restore(torch.load(tmp_path / "half.pt", weights_only=True), CPU)
-    go(trainer, resumed, tmp_path)
-    assert same(whole.to_payload(), resumed.to_payload())
-
-
-def test_a_checkpoint_from_before_there_were_augmentations_goes_on_as_if_it_had_one_of_today(tmp_path):
-    trainer, whole = make()
-    go(trainer, whole, tmp_path)
-    _, state = make()
-    go(replace(trainer, steps=3), state, tmp_path)
-    old = state.to_payload()
-    del old["generators"]["augmentation"]
-    resumed = trainer.restore(old, CPU)
+    resumed = restore(trainer, torch.load(tmp_path / "half.pt", weights_only=True))
     go(trainer, resumed, tmp_path)
     assert same(whole.to_payload(), resumed.to_payload())
 
@@ -239,7 +217,7 @@ def test_a_checkpoint_from_before_there_were_augmentations_goes_on_as_if_it_had_
 ALWAYS = ["exposure=beg", "exposure.begin=2", "exposure.end=6", "exposure.threshold=0", "exposure.rate=0.5"]
 
 
-def test_colours_are_dimmed_after_the_steps_that_were_judged_too_bright_and_counted(tmp_path):
+def test_colours_are_dimmed_after_steps_that_are_too_bright_and_the_steps_are_counted(tmp_path):
     trainer, state = make(["densifier=none", *ALWAYS])
     witness = Witness()
     go(replace(trainer, callbacks=[witness]), state, tmp_path)
@@ -267,17 +245,10 @@ def test_a_dimmed_run_resumes_to_the_bit_and_keeps_its_count(tmp_path):
     _, state = make(ALWAYS)
     go(replace(trainer, steps=4), state, tmp_path)
     torch.save(state.to_payload(), tmp_path / "half.pt")
-    resumed = trainer.restore(torch.load(tmp_path / "half.pt", weights_only=True), CPU)
+    resumed = restore(trainer, torch.load(tmp_path / "half.pt", weights_only=True))
     assert resumed.dimmed == 2
     go(trainer, resumed, tmp_path)
     assert same(whole.to_payload(), resumed.to_payload())
-
-
-def test_a_checkpoint_from_before_there_was_a_guard_has_dimmed_nothing():
-    trainer, state = make()
-    old = state.to_payload()
-    del old["dimmed"]
-    assert trainer.restore(old, CPU).dimmed == 0
 
 
 def test_the_densifier_observes_gradients_that_are_not_clipped(tmp_path):
@@ -315,7 +286,7 @@ def test_callbacks_see_every_step_once_and_the_end(tmp_path):
     assert witness.ends == [Outcome.FINISHED]
 
 
-def test_a_stop_signal_ends_the_run_after_the_step_at_hand(tmp_path):
+def test_a_stop_signal_ends_the_run_after_the_current_step(tmp_path):
     trainer, state = make()
     asked = iter([False, False, True])
     assert go(trainer, state, tmp_path, stop=lambda: next(asked)) is Outcome.INTERRUPTED
@@ -342,7 +313,7 @@ def test_a_resumed_run_with_a_larger_cap_equals_one_that_never_met_it(tmp_path, 
     torch.save(state.to_payload(), tmp_path / "capped.pt")
 
     def restored() -> TrainState:
-        return free.restore(torch.load(tmp_path / "capped.pt", weights_only=True), CPU)
+        return restore(free, torch.load(tmp_path / "capped.pt", weights_only=True))
 
     again = restored()
     assert go(capped, again, tmp_path) is Outcome.MAX_GAUSSIANS  # the same cap refuses the same refinement
@@ -352,11 +323,31 @@ def test_a_resumed_run_with_a_larger_cap_equals_one_that_never_met_it(tmp_path, 
     assert same(whole.to_payload(), resumed.to_payload())
 
 
+def test_a_refused_refinement_that_a_new_schedule_leaves_out_does_not_end_the_resumed_run(tmp_path):
+    capped, state = make(["refine.max_gaussians=30"])
+    assert go(capped, state, tmp_path) is Outcome.MAX_GAUSSIANS
+    without_growth, _ = make(["refine.max_gaussians=30", "refine.end=0", "refine.reset_interval=null"])
+    assert go(without_growth, state, tmp_path) is Outcome.FINISHED
+    assert not state.refused
+
+
+def test_memory_that_runs_out_while_a_refused_refinement_is_repeated_is_an_outcome(tmp_path, monkeypatch):
+    capped, state = make(["refine.max_gaussians=30"])
+    assert go(capped, state, tmp_path) is Outcome.MAX_GAUSSIANS
+
+    def exhausted(*_args):
+        raise MemoryError
+
+    monkeypatch.setattr("cadam3d.core.edit.RowEdit.apply", exhausted)
+    free, _ = make()
+    assert go(free, state, tmp_path) is Outcome.OUT_OF_MEMORY
+
+
 def test_losing_every_gaussian_is_an_outcome(tmp_path):
     trainer, state = make(["refine.min_opacity=0.999999", "refine.reset_interval=null"])
     assert go(trainer, state, tmp_path) is Outcome.VANISHED
     assert len(state.gaussians) == 0
-    assert go(trainer, state, tmp_path) is Outcome.VANISHED  # and so it stays
+    assert go(trainer, state, tmp_path) is Outcome.VANISHED  # and stays the outcome
     camera = component(compose(SMALL).camera).sample(0, 1, torch.Generator())
     image = trainer.renderer(state)(camera, torch.ones(1, 3))
     assert torch.equal(image.rgb, torch.ones_like(image.rgb))
@@ -416,7 +407,7 @@ def test_a_step_with_a_non_finite_gradient_changes_nothing_but_is_counted(tmp_pa
     go(replace(trainer, guidance=poisoned), state, tmp_path)
     after = state.to_payload()
     assert after["skipped"] == 1
-    for owner in ("gaussians", "optimizer", "densifier"):  # nor do means that tremble by themselves
+    for owner in ("gaussians", "optimizer", "densifier"):  # nor does the noise of MCMC
         assert same({owner: before[owner]}, {owner: after[owner]})
 
 
@@ -424,7 +415,7 @@ def test_a_checkpoint_of_another_densifier_is_refused():
     _, state = make(["densifier=baseline"])
     other, _ = make(["densifier=cadam"])
     with pytest.raises(UserError, match="densifier"):
-        other.restore(state.to_payload(), CPU)
+        restore(other, state.to_payload())
 
 
 def test_a_number_of_views_that_the_cameras_cannot_give_is_refused_before_the_start():
@@ -439,16 +430,16 @@ def test_an_unknown_or_absent_device_says_what_to_type():
     assert resolve_device("cpu") == CPU
 
 
-def test_a_loop_that_breaks_tells_its_callbacks_to_let_go(tmp_path, monkeypatch):
+def test_a_loop_that_raises_calls_on_abort(tmp_path, monkeypatch):
     class Holder(Callback):
-        let_go = False
+        was_called = False
 
         def on_abort(self, context: RunContext) -> None:
-            self.let_go = True
+            self.was_called = True
 
     trainer, state = make()
     holder = Holder()
     monkeypatch.setattr(type(trainer.rasterizer), "render", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         go(replace(trainer, callbacks=[holder]), state, tmp_path)
-    assert holder.let_go
+    assert holder.was_called

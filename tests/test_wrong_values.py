@@ -84,7 +84,7 @@ LISTS = {
     "metric=[fidelity]": ["metric.fidelity.elevations_deg", "metric.fidelity.background"],
 }
 TRUTHS = {
-    "densifier=cadam": ["densifier.reset_moments"],
+    "densifier=cadam_open": ["densifier.reset_moments"],
     "guidance=sds": ["guidance.shared_t"],
     "guidance=ism": ["guidance.shared_t"],
     "guidance=gcs": ["guidance.shared_t", "guidance.fixed_noise"],

@@ -1,4 +1,4 @@
-"""The run-time type checker of the test suite: beartype, with an int where a float is wanted (PEP 484)."""
+"""The run-time type checker of the test suite: beartype, which accepts an int as a float (PEP 484)."""
 
 from beartype import BeartypeConf, beartype
 

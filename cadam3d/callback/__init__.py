@@ -1,1 +1,1 @@
-"""Who watches the loop: may look, may write files, may never change training."""
+"""Callbacks: watch the training loop; they may write files but never change training."""

@@ -1,27 +1,28 @@
-"""Checkpoints: written atomically every so many steps and at the end; no kill loses more than that."""
+"""Checkpoint: writes the state every so many steps and at the end, so that a killed run can be resumed."""
 
 from dataclasses import dataclass
 
 from cadam3d.callback.base import Callback
 from cadam3d.core.checks import require_whole
 from cadam3d.io.checkpoint import checkpoint_name, drop_after, prune_checkpoints, save_checkpoint
+from cadam3d.io.run_folder import CHECKPOINTS
 from cadam3d.state import Outcome, RunContext, StepReport, TrainState
 
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoint(Callback):
-    """Saves the whole :class:`TrainState` into ``checkpoints/`` of the run folder."""
+    """Save the whole :class:`TrainState`, atomically, into ``checkpoints/`` of the run folder."""
 
     every: int  # steps between checkpoints
-    keep: int  # newest files to keep
+    keep: int  # number of newest files that are kept
 
     def __post_init__(self) -> None:
         require_whole("callback.checkpoint.every", self.every, low=1, example=100)
         require_whole("callback.checkpoint.keep", self.keep, low=1, example=2)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
-        """Delete checkpoints of later steps: they belong to a future that this run will not have."""
-        drop_after(context.folder / "checkpoints", state.step)
+        """Delete checkpoints of later steps, because this run will write its own."""
+        drop_after(context.folder / CHECKPOINTS, state.step)
 
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
         """Save at every multiple of ``every``."""
@@ -29,14 +30,15 @@ class Checkpoint(Callback):
             self._save(context, state)
 
     def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
-        """Save where the run ended, unless that step is saved already.
+        """Save the last step, unless it is saved already.
 
-        Out of memory, a step was left half done that no resumed run could repeat: the last file stands.
+        After running out of memory nothing is saved: the step was left half done, and the last file stays
+        valid.
         """
         if state.step % self.every != 0 and outcome is not Outcome.OUT_OF_MEMORY:
             self._save(context, state)
 
     def _save(self, context: RunContext, state: TrainState) -> None:
-        folder = context.folder / "checkpoints"
+        folder = context.folder / CHECKPOINTS
         save_checkpoint(folder / checkpoint_name(state.step), state.to_payload())
         prune_checkpoints(folder, keep=self.keep)

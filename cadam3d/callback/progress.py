@@ -1,4 +1,4 @@
-"""The progress bar: step, Gaussians, loss scale, speed, when it will be done, and peak memory of the GPU."""
+"""Progress: a bar with step, number of Gaussians, loss, speed, time of the end and peak GPU memory."""
 
 import time
 from dataclasses import dataclass, field
@@ -15,19 +15,19 @@ GIB = 2**30
 
 @dataclass(kw_only=True)
 class Progress(Callback):
-    """A tqdm bar on standard error; plain lines where that is not a terminal.
+    """A tqdm bar on standard error; plain lines if that is not a terminal.
 
-    ``done`` is the time of day at which the last step will be over if steps go on taking as long as they have
-    since this process started training, on average. ``VRAM``, on a CUDA device only, is the most that tensors
-    have needed at once; torch's cache and the driver hold more.
+    ``done`` is the time of day at which the last step will end if steps keep the average duration that they
+    have had since this process started training. ``VRAM``, on a CUDA device only, is the largest amount of
+    memory that tensors have used at once; torch's cache and the driver use more.
     """
 
-    refresh_seconds: float  # at most one redraw in this time
+    refresh_seconds: float  # between redraws, at least
     _bar: tqdm | None = field(default=None, init=False, repr=False)
     _begun: tuple[int, float] = field(default=(0, 0.0), init=False, repr=False)  # step and time of day
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
-        """Open the bar where the run stands."""
+        """Open the bar at the current step."""
         self._begun = state.step, time.time()
         self._bar = tqdm(
             total=context.total_steps,
@@ -39,7 +39,7 @@ class Progress(Callback):
         )
 
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
-        """Advance by one."""
+        """Advance the bar by one step."""
         if self._bar is None:
             return
         shown = {"N": report.num_gaussians, "loss": f"{report.loss:.3g}"}
@@ -54,21 +54,21 @@ class Progress(Callback):
         self._bar.update(1)
 
     def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
-        """Close the bar, leaving its last line."""
+        """Close the bar and leave its last line on the screen."""
         self.on_abort(context)
 
     def on_abort(self, context: RunContext) -> None:
-        """Close the bar, so that what follows starts on a line of its own."""
+        """Close the bar, so that the next message starts on a new line."""
         if self._bar is not None:
             self._bar.close()
 
 
 def clock(now: float, seconds: float) -> str:
-    """The local time of day ``seconds`` after ``now`` (since the epoch), with the weekday from a day on."""
-    wanted = "%H:%M" if seconds < DAY else "%a %H:%M"
-    return time.strftime(wanted, time.localtime(now + seconds))
+    """Return the local time ``seconds`` after ``now`` (since the epoch), with the weekday if a day away."""
+    pattern = "%H:%M" if seconds < DAY else "%a %H:%M"
+    return time.strftime(pattern, time.localtime(now + seconds))
 
 
 def peak_memory(device: torch.device) -> int | None:
-    """The most bytes that tensors on ``device`` have taken at once in this process; None without CUDA."""
+    """Return the largest number of bytes that tensors on ``device`` have used at once; None without CUDA."""
     return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None

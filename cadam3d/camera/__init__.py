@@ -1,1 +1,1 @@
-"""Where we look: samplers of training cameras."""
+"""Samplers of training cameras."""

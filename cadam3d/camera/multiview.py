@@ -1,4 +1,4 @@
-"""Multiview: groups of four views at right angles, for priors that judge four views together (MVDream)."""
+"""Multiview: groups of four views at right angles, for priors that denoise four views together (MVDream)."""
 
 import math
 from collections.abc import Sequence
@@ -19,16 +19,16 @@ from cadam3d.core.cameras import Cameras, orbit
 from cadam3d.core.checks import require
 from cadam3d.core.schedule import Schedule
 
-GROUP = 4  # what multi-view networks were trained on
-OUTSIDE = 1.0  # world units: cameras stay outside the unit ball, which the object may fill
+GROUP = 4  # views; multi-view networks were trained on groups of this size
+OUTSIDE = 1.0  # world units; cameras stay outside the unit ball, which the object may fill
 
 
 @dataclass(frozen=True, kw_only=True)
 class Multiview(CameraSampler):
     """Upright cameras that look at the origin, in groups of four; every range is ``[low, high]``.
 
-    The views of a group share elevation, distance and field of view; their azimuths lie 90 degrees apart,
-    from a random start in the first quarter. Consecutive views form a group: 0 to 3, 4 to 7, and so on.
+    The views of a group share elevation, distance and field of view. Their azimuths are 90 degrees apart,
+    starting at a random angle in the first quarter. Consecutive views form a group: 0 to 3, 4 to 7, etc.
     """
 
     size: int | Schedule  # pixels; images are square
@@ -48,23 +48,23 @@ class Multiview(CameraSampler):
         require(
             self.relative_distance[0] >= least,
             "camera.relative_distance",
-            expected=f"cameras outside the unit ball: from {least:.3g} on, at {self.fov_y_deg[1]:g} degrees",
+            expected=f"at least {least:.3g} at {self.fov_y_deg[1]:g} degrees, outside the unit ball",
             got=self.relative_distance,
             example="'camera.relative_distance=[0.8,1]' 'camera.fov_y_deg=[15,60]'",
         )
 
     def check_views(self, views: int) -> None:
-        """Raise ``UserError`` unless the views make whole groups."""
+        """Raise ``UserError`` unless ``views`` is a multiple of four."""
         require(
             views % GROUP == 0,
             "views",
-            expected=f"a multiple of {GROUP}, the views of a group of camera=multiview",
+            expected=f"a multiple of {GROUP}, since camera=multiview draws groups of {GROUP} views",
             got=views,
             example=f"views={GROUP * max(round(views / GROUP), 1)}",
         )
 
     def sample(self, step: int, views: int, generator: torch.Generator) -> Cameras:
-        """``views`` / 4 groups; raises ``UserError`` if that is no whole number."""
+        """Draw ``views`` / 4 groups. Raises ``UserError`` if that is not a whole number."""
         self.check_views(views)
         groups = views // GROUP
         starts = torch.rand(groups, 1, generator=generator)

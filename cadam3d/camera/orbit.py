@@ -1,4 +1,4 @@
-"""Cameras around the object within chosen ranges, spread evenly in azimuth over the views of a step."""
+"""Orbit: cameras around the object within chosen ranges, spread evenly in azimuth over a step's views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,14 +23,14 @@ from cadam3d.core.schedule import Schedule
 class Orbit(CameraSampler):
     """Upright cameras that look at the origin; every range is ``[low, high]``.
 
-    The azimuth range is cut into as many equal strata as there are views, one view in each, so that a
-    step never sees the object from one side only.
+    The azimuth range is divided into as many equal strata as there are views, with one view in each, so that
+    a step never shows the object from one side only.
     """
 
     size: int | Schedule  # pixels; images are square
     azimuth_deg: Sequence[float]  # 0 = front (+x), 90 = the +y side
     elevation_deg: Sequence[float]  # 0 = horizon, 90 = from above
-    elevation_law: str  # uniform, sphere or mixture: see camera/ranges.py
+    elevation_law: str  # uniform, sphere or mixture; see camera/ranges.py
     distance: Sequence[float]  # world units from the origin; the object fits in the unit ball
     fov_y_deg: Sequence[float]  # vertical field of view
 
@@ -41,7 +41,10 @@ class Orbit(CameraSampler):
         require_lens(self.distance, self.fov_y_deg)
 
     def sample(self, step: int, views: int, generator: torch.Generator) -> Cameras:
-        """One camera per stratum of azimuth; all else is drawn apart. Only the size may follow ``step``."""
+        """Draw one camera per stratum of azimuth, and everything else independently for each camera.
+
+        Only the image size may depend on ``step``.
+        """
         low, high = self.azimuth_deg
         strata = torch.arange(views) + torch.rand(views, generator=generator)
         size = image_size(self.size, step)

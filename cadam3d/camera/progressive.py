@@ -14,25 +14,27 @@ from cadam3d.core.cameras import Cameras, around, look_at, pinhole, wrapped
 from cadam3d.core.checks import are_numbers, require, require_range, require_whole
 from cadam3d.core.schedule import Schedule
 
-LARGEST_LOG = 500.0  # growth is cut off here, before it leaves floating point: every end has come to rest
+# Logarithm of the largest growth of a range. It stays within floating point, and every range has reached
+# its end long before.
+LARGEST_LOG = 500.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Widening:
-    """A range whose two ends move by a constant factor at every widening, until they come to rest."""
+    """A range with bounds that move by a constant factor at every widening until they reach their ends."""
 
     start: Sequence[float]  # [low, high] before the first widening
-    end: Sequence[float]  # [low, high] where they rest
+    end: Sequence[float]  # [low, high] after the last widening
     factor: Sequence[float]  # of low and of high, at every widening; > 0
-    about: float = 0.0  # the point whose distance the factors multiply
+    about: float = 0.0  # the factors multiply the distance to this point
 
     def at(self, widenings: int) -> tuple[float, float]:
-        """The range after so many widenings."""
+        """Return the range after ``widenings`` widenings."""
         low, high = (self._end(side, widenings) for side in (0, 1))
         return low, high
 
     def moves_as_meant(self) -> bool:
-        """Whether each factor leads from its start to its end, or both are the same."""
+        """Return whether each factor leads from its start to its end, or start and end are equal."""
         return all(
             start == end or (start - self.about) * (factor - 1) * (end - start) > 0
             for start, end, factor in zip(self.start, self.end, self.factor, strict=True)
@@ -46,16 +48,16 @@ class Widening:
 
 @dataclass(frozen=True, kw_only=True)
 class Progressive(CameraSampler):
-    """Slightly shaken cameras around the origin, whose ranges widen at multiples of ``every``.
+    """Slightly shaken cameras around the origin, with ranges that widen at multiples of ``every``.
 
     Elevation and azimuth are ``middle +- u^gamma * half range`` with uniform u, so gamma > 1 prefers the
-    middle; the distance is uniform. All views of a step share one field of view. A widening is a closed form
-    of the step, so that a resumed run needs no memory of it.
+    middle; the distance is uniform. All views of a step share one field of view. The ranges are a closed
+    form of the step, so that a checkpoint does not have to store them.
 
     LucidDreamer draws a pool of ten poses with one field of view, and takes views from it at random until it
-    is empty. Its poses are independent, so the order says nothing; what differs here is that a field of view
-    lasts for one step (four views there) instead of ten views. Its shaken up vector also shears the image
-    slightly; our cameras stay rigid.
+    is empty. Its poses are independent, so the order does not matter. The difference is that a field of view
+    here lasts for one step (four views in LucidDreamer) instead of ten views. LucidDreamer's shaken up vector
+    also shears the image slightly; the cameras here stay rigid.
     """
 
     size: int | Schedule  # pixels; images are square
@@ -67,8 +69,8 @@ class Progressive(CameraSampler):
     every: int  # steps; widenings are at its multiples
     gamma: float  # of elevation and azimuth; 1 = uniform
     position_jitter: float  # world units; half-width of a uniform deviation along each axis
-    target_jitter: float  # world units; standard deviation of the point looked at, along each axis
-    up_jitter: float  # standard deviation along each axis of a unit vector
+    target_jitter: float  # world units; standard deviation of the target point along each axis
+    up_jitter: float  # standard deviation added to each axis of the unit up vector
 
     def __post_init__(self) -> None:
         require_size(self.size)
@@ -89,12 +91,13 @@ class Progressive(CameraSampler):
         require_range("camera.up_jitter", self.up_jitter, low=0, high=1, example=0.01)
 
     def widenings(self, step: int) -> int:
-        """How often the ranges have widened at ``step`` (0 is the first): multiples of ``every`` passed."""
-        earlier = math.ceil(max(self.begin, 1) / self.every) - 1  # multiples before ``begin`` do not count
+        """Return how often the ranges have widened at ``step``, where 0 is the first step."""
+        # Multiples of ``every`` before ``begin`` do not count.
+        earlier = math.ceil(max(self.begin, 1) / self.every) - 1
         return max(step // self.every - earlier, 0)
 
     def sample(self, step: int, views: int, generator: torch.Generator) -> Cameras:
-        """``views`` cameras of the ranges of ``step``; all but the field of view is drawn apart."""
+        """Draw ``views`` cameras from the ranges of ``step``; they share only the field of view."""
         count = self.widenings(step)
         azimuth_deg = self._biased(self.azimuth_deg.at(count), views, generator)
         elevation_deg = self._biased(self.elevation_deg.at(count), views, generator)
@@ -127,12 +130,12 @@ def _require_widening(key: str, value: object) -> None:
     example = (
         f"'{key}={{_target_: {Widening.__module__}.Widening, start: [10,20], end: [5,20], factor: [0.9,1]}}'"
     )
-    require(is_one, key, expected="start, end and factor", got=value, example=example)
+    require(is_one, key, expected="a range with start, end and factor", got=value, example=example)
     assert isinstance(value, Widening)
     require(
         are_numbers(value.factor, low=1e-3, high=1e3) and len(value.factor) == 2,
         f"{key}.factor",
-        expected="two numbers > 0, of the low and of the high end",
+        expected="two numbers > 0, for the low and the high end",
         got=value.factor,
         example=f"'{key}.factor=[0.75,1.1]'",
     )
@@ -145,5 +148,5 @@ def _require_motion(key: str, value: Widening) -> None:
         f"{key}.factor",
         expected=f"factors that lead from {value.start} to {value.end}",
         got=value.factor,
-        example=f"'{key}.end=[{value.start[0]:g},{value.start[1]:g}]' to stay, or other factors",
+        example=f"'{key}.end=[{value.start[0]:g},{value.start[1]:g}]' for a fixed range, or other factors",
     )

@@ -1,4 +1,4 @@
-"""Ranges: how every sampler draws from ``[low, high]``, and what it refuses as one."""
+"""Ranges: how every sampler draws from ``[low, high]``, and the checks of such ranges."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ ELEVATION_LAWS = ("uniform", "sphere", "mixture")
 
 
 def uniform(interval: Sequence[float], views: int, generator: torch.Generator) -> Float[Tensor, "v"]:
-    """``views`` independent uniform draws from ``[low, high]``."""
+    """Draw ``views`` independent, uniformly distributed numbers from ``[low, high]``."""
     low, high = interval
     return low + (high - low) * torch.rand(views, generator=generator)
 
@@ -21,12 +21,13 @@ def uniform(interval: Sequence[float], views: int, generator: torch.Generator) -
 def elevations(
     law: str, interval: Sequence[float], views: int, generator: torch.Generator
 ) -> Float[Tensor, "v"]:
-    """``views`` elevations in degrees, within ``interval``, by one of ``ELEVATION_LAWS``.
+    """Draw ``views`` elevations in degrees, within ``interval``, by one of ``ELEVATION_LAWS``.
 
-    ``uniform``: in degrees. ``sphere``: equal areas between the two latitudes are equally likely. ``mixture``
-    is threestudio's law, which GaussianDreamer and MVDream keep: one toss per call makes all views uniform in
-    degrees, or their sines uniform in [low / 90, high / 90]. That second half was meant to be ``sphere`` but
-    reaches asin(high / 90) only: [-10, 60] becomes [-6.4, 41.8].
+    - ``uniform``: uniform in degrees.
+    - ``sphere``: equal areas between the two latitudes are equally likely.
+    - ``mixture``: threestudio's law, which GaussianDreamer and MVDream keep. With even odds per call, all
+      views are uniform in degrees, or their sines are uniform in [low / 90, high / 90]. The second case was
+      meant to be ``sphere``, but it reaches only asin(high / 90): [-10, 60] becomes [-6.4, 41.8].
     """
     if law == "uniform":
         return uniform(interval, views, generator)
@@ -39,12 +40,12 @@ def elevations(
 
 
 def image_size(size: int | Schedule, step: int) -> int:
-    """Height and width in pixels at ``step`` (0 is the first)."""
+    """Return the height and width of the square image at ``step`` (0 is the first), in pixels."""
     return round(as_schedule(size)(step))
 
 
 def require_size(size: object) -> None:
-    """Raise ``UserError`` unless ``size`` is a whole number of pixels or a schedule of it."""
+    """Raise ``UserError`` unless ``size`` is a whole number of pixels or a schedule."""
     if isinstance(size, Schedule):
         require_scheduled("camera.size", size, low=1, example=128)
     else:
@@ -66,15 +67,15 @@ def require_interval(key: str, interval: object, *, low: float, high: float, exa
 
 
 def require_elevations(law: object, interval: object) -> None:
-    """Raise ``UserError`` unless ``law`` is known and ``interval`` two ascending elevations."""
+    """Raise ``UserError`` unless ``law`` is known and ``interval`` is two ascending elevations in degrees."""
     require_choice("camera.elevation_law", law, ELEVATION_LAWS)
     require_interval("camera.elevation_deg", interval, low=-90, high=90, example="[-10,60]")
 
 
 def require_lens(distance: object, fov_y_deg: object, suffix: str = "") -> None:
-    """Raise ``UserError`` unless distances lie outside the unit ball and fields of view are possible.
+    """Raise ``UserError`` unless distances are outside the unit ball and fields of view are in [1, 170].
 
-    ``suffix`` continues the names of the keys, such as ``.start``.
+    ``suffix`` is appended to the names of the keys in the message, such as ``.start``.
     """
     require_interval(f"camera.distance{suffix}", distance, low=1, high=1000, example="[3.0,3.6]")
     require_interval(f"camera.fov_y_deg{suffix}", fov_y_deg, low=1, high=170, example="[40,45]")

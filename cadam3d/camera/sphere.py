@@ -1,4 +1,4 @@
-"""Sphere: cameras from everywhere, above and below alike."""
+"""Sphere: cameras from all directions, above and below alike."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,8 @@ from cadam3d.core.schedule import Schedule
 class Sphere(CameraSampler):
     """Upright cameras that look at the origin from independent, uniformly random directions.
 
-    For objects that must look right from below too; most text-to-3D recipes stay above (see :class:`Orbit`).
+    Use it for objects that must look right from below too; most text-to-3D recipes stay above the horizon
+    (see :class:`~cadam3d.camera.orbit.Orbit`).
     """
 
     size: int | Schedule  # pixels; images are square
@@ -27,7 +28,10 @@ class Sphere(CameraSampler):
         require_lens(self.distance, self.fov_y_deg)
 
     def sample(self, step: int, views: int, generator: torch.Generator) -> Cameras:
-        """Equal areas are equally likely: azimuth and height (sine of elevation) are uniform."""
+        """Draw directions such that equal areas are equally likely.
+
+        Azimuth and height (the sine of the elevation) are uniform.
+        """
         size = image_size(self.size, step)
         return orbit(
             azimuth_deg=uniform((-180.0, 180.0), views, generator),

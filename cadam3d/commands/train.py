@@ -25,7 +25,7 @@ from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import read_jsonl, write_json
 from cadam3d.metric.base import Metric
 from cadam3d.prior.base import MemoryEstimate
-from cadam3d.report.run import write_report
+from cadam3d.report import write_report
 from cadam3d.settings.compose import component, components, flatten, load
 from cadam3d.state import Outcome, RunContext, TrainState
 from cadam3d.trainer import Trainer
@@ -126,7 +126,8 @@ def run(cfg: DictConfig) -> float | None:
         log.info("%s after %d steps: %d Gaussians", outcome, state.step, len(gaussians))
         write_json(folder / "summary.json", summary)
         lines = read_jsonl(folder / "metrics.jsonl")
-        report = write_report(folder, summary=summary, metrics=lines, config_text=config_text)
+        charts = (*trainer.densifier.charts(), *trainer.guidance.charts())
+        report = write_report(folder, summary=summary, metrics=lines, config_text=config_text, charts=charts)
     _say(folder, summary, report)
     if stop.received is not None:  # also where training was done already: a sweep must not go on
         sys.exit(128 + stop.received)
@@ -198,7 +199,7 @@ def _start_or_resume(cfg: DictConfig, trainer: Trainer, device: torch.device, fo
     path = _checkpoint(cfg, folder)
     if path is None:
         return trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, device)
-    state = trainer.restore(load_checkpoint(path), device)
+    state = TrainState.restore(load_checkpoint(path), trainer.optimizer, trainer.densifier, device)
     require(
         cfg.seed == state.seed,
         "seed",

@@ -1,1 +1,1 @@
-"""Floor 0: the data everybody shares. Torch only; knows nobody."""
+"""Floor 0: the data types that all other packages share. Imports torch and nothing of ours."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Cameras:
-    """``v`` pinhole views that share one image size. Pixel centres lie at +0.5."""
+    """``v`` pinhole views that share one image size. Pixel centres are at +0.5."""
 
     world_to_camera: Float[Tensor, "v 4 4"]  # rigid; OpenCV axes
     intrinsics: Float[Tensor, "v 3 3"]  # pixels
@@ -24,12 +24,12 @@ class Cameras:
 
     @property
     def positions(self) -> Float[Tensor, "v 3"]:
-        """Camera centres in world units."""
+        """Return the camera centres in world units."""
         rotation, translation = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3]
         return -(rotation.transpose(1, 2) @ translation[..., None])[..., 0]
 
     def index(self, views: Int[Tensor, "views"] | slice) -> "Cameras":
-        """The chosen views, in the given order."""
+        """Return the chosen views, in the given order."""
         return Cameras(
             world_to_camera=self.world_to_camera[views],
             intrinsics=self.intrinsics[views],
@@ -40,7 +40,7 @@ class Cameras:
         )
 
     def to(self, target: torch.device | torch.dtype | str) -> "Cameras":
-        """The same cameras on another device or in another dtype."""
+        """Return the same cameras on another device or in another dtype."""
         return Cameras(
             world_to_camera=self.world_to_camera.to(target),
             intrinsics=self.intrinsics.to(target),
@@ -51,7 +51,7 @@ class Cameras:
         )
 
     def resize(self, height: int, width: int) -> "Cameras":
-        """The same views at another image size (intrinsics scaled per axis)."""
+        """Return the same views at another image size, with intrinsics scaled per axis."""
         scale = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
         return Cameras(
             world_to_camera=self.world_to_camera,
@@ -63,7 +63,7 @@ class Cameras:
         )
 
     def rays(self) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "v h w 3"]]:
-        """World-space ray origins and unit directions through every pixel centre."""
+        """Return world-space ray origins, and unit directions through every pixel centre."""
         kwargs = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
         y, x = torch.meshgrid(
             torch.arange(self.height, **kwargs) + 0.5, torch.arange(self.width, **kwargs) + 0.5, indexing="ij"
@@ -77,9 +77,9 @@ class Cameras:
 def look_at(
     position: Float[Tensor, "v 3"], target: Float[Tensor, "v 3"], up: Float[Tensor, "v 3"]
 ) -> Float[Tensor, "v 4 4"]:
-    """World-to-camera matrices of cameras at ``position`` that look at ``target``, image top towards ``up``.
+    """Return world-to-camera matrices at ``position``, looking at ``target``, image top towards ``up``.
 
-    Looking along ``up`` itself is allowed: then the axis farthest from it stands in (world +x for +z).
+    Looking along ``up`` itself is allowed: then the axis farthest from it replaces it (world +x for +z).
     """
     forward = torch.nn.functional.normalize(target - position, dim=-1)
     right = torch.linalg.cross(forward, up, dim=-1)
@@ -96,7 +96,7 @@ def look_at(
 
 
 def pinhole(fov_y_deg: Float[Tensor, "v"], height: int, width: int) -> Float[Tensor, "v 3 3"]:
-    """Intrinsics with square pixels, a centred principal point and the given vertical field of view."""
+    """Return intrinsics with square pixels, a centred principal point and this vertical field of view."""
     focal = 0.5 * height / torch.tan(torch.deg2rad(fov_y_deg) / 2)
     matrix = torch.zeros(fov_y_deg.shape[0], 3, 3, dtype=fov_y_deg.dtype, device=fov_y_deg.device)
     matrix[:, 0, 0] = matrix[:, 1, 1] = focal
@@ -107,9 +107,10 @@ def pinhole(fov_y_deg: Float[Tensor, "v"], height: int, width: int) -> Float[Ten
 def around(
     azimuth_deg: Float[Tensor, "v"], elevation_deg: Float[Tensor, "v"]
 ) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "v 3"]]:
-    """Unit vectors from the origin towards a viewer, and the image's up there.
+    """Return unit vectors from the origin towards a viewer, and the up direction of its image.
 
-    Up is the direction of growing elevation: +z as the image sees it, and well defined at the poles too.
+    Up is the direction of growing elevation. It appears as +z in the image and is well defined at the poles
+    too.
     """
     azimuth, elevation = torch.deg2rad(azimuth_deg), torch.deg2rad(elevation_deg)
     outward = torch.stack(
@@ -122,7 +123,7 @@ def around(
 
 
 def wrapped(azimuth_deg: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-    """The same azimuths in [-180, 180)."""
+    """Return the same azimuths in [-180, 180)."""
     return (azimuth_deg + 180) % 360 - 180
 
 
@@ -134,7 +135,7 @@ def orbit(
     height: int,
     width: int,
 ) -> Cameras:
-    """Cameras on spheres around the origin, looking at it, upright (+z up in the image).
+    """Return upright cameras on spheres around the origin that look at it (+z is up in the image).
 
     ``distance`` is in world units, angles in degrees; azimuth 0 sees the front (camera on +x).
     """
@@ -151,12 +152,12 @@ def orbit(
 
 
 def turntable(views: int, *, elevation_deg: float, distance: float, fov_y_deg: float, size: int) -> Cameras:
-    """``views`` square cameras evenly spaced over one full turn, starting at the front."""
+    """Return ``views`` square cameras evenly spaced over one full turn, starting at the front."""
     azimuth = torch.arange(views, dtype=torch.float32) * (360.0 / views)
     full = torch.ones_like(azimuth)
     return orbit(azimuth, full * elevation_deg, full * distance, full * fov_y_deg, size, size)
 
 
 def fitting_distance(fov_y_deg: float, radius: float = 1.0) -> float:
-    """Distance at which a ball of ``radius`` just touches the image border."""
+    """Return the distance at which a ball of ``radius`` just touches the image border."""
     return radius / math.sin(math.radians(fov_y_deg) / 2)

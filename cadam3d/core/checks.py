@@ -1,4 +1,4 @@
-"""Errors a user can cause, said so that the next line typed is the right one."""
+"""Checks of settings; their errors name the key, what was expected, what came, and what to type."""
 
 import math
 from collections.abc import Sequence
@@ -60,7 +60,7 @@ def require_range(
 def require_whole(
     key: str, value: object, *, low: float = -math.inf, high: float = math.inf, example: object
 ) -> None:
-    """Raise unless ``value`` is an ``int`` in ``[low, high]``; 2.0 and ``True`` are none.
+    """Raise unless ``value`` is an ``int`` in ``[low, high]``; 2.0 and ``True`` are refused.
 
     Example: ``require_whole("refine.interval", interval, low=1, example=50)``.
     """
@@ -72,20 +72,21 @@ def require_whole(
 
 def require_choice(key: str, value: object, choices: Sequence[object]) -> None:
     """Raise unless ``value`` is one of ``choices``, of the same type; the message lists them."""
-    if not any(type(value) is type(choice) and value == choice for choice in choices):  # True == 1 == 1.0
+    # The types are compared too, because True == 1 == 1.0.
+    if not any(type(value) is type(choice) and value == choice for choice in choices):
         listed = "|".join(str(choice) for choice in choices)
         raise fail(key, expected=f"one of {listed}", got=value, example=f"{key}={choices[0]}")
 
 
 def require_color(key: str, value: object) -> None:
-    """Raise unless ``value`` is an RGB colour: three numbers in [0, 1]."""
+    """Raise :class:`UserError` unless ``value`` is an RGB colour: three numbers in [0, 1]."""
     is_color = are_numbers(value, low=0, high=1) and len(value) == 3
     example = f"'{key}=[0.5,0.5,0.5]'"
     require(is_color, key, expected="three numbers in [0, 1]", got=value, example=example)
 
 
 def are_numbers(value: object, *, low: float, high: float) -> TypeGuard[Sequence[float]]:
-    """Whether ``value`` is a sequence of numbers in ``[low, high]``; text and truth values are none."""
+    """Return whether ``value`` is a sequence of numbers in ``[low, high]``, without text or truth values."""
     return isinstance(value, Sequence) and all(
         isinstance(item, int | float) and not isinstance(item, bool) and low <= item <= high for item in value
     )

@@ -1,4 +1,4 @@
-"""Device: from the name that a user types to a device that works here."""
+"""Device: turns the name that a user types into a device that works on this machine."""
 
 import torch
 
@@ -6,7 +6,7 @@ from cadam3d.core.errors import UserError
 
 
 def resolve_device(name: str) -> torch.device:
-    """``auto`` is CUDA where there is one, else the CPU; other names are torch's.
+    """Return the device ``name``: ``auto`` is CUDA if available, else the CPU; other names are torch's.
 
     Raises ``UserError`` for a name that torch does not know, or a device that this machine does not have.
     """

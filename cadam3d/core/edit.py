@@ -1,6 +1,7 @@
-"""RowEdit: the only way rows change. RowState: per-row tensors that follow one.
+"""RowEdit: the only way in which rows change. RowState: per-row tensors that follow an edit.
 
-Three owners of rows (Gaussians, optimizer moments, densifier state) follow one edit: they cannot disagree.
+The three owners of rows (Gaussians, optimizer moments, densifier state) follow the same edit, so they cannot
+disagree.
 """
 
 from dataclasses import dataclass, fields
@@ -12,12 +13,13 @@ from torch import Tensor
 
 from cadam3d.core.gaussians import Gaussians, concatenate
 
-State = TypeVar("State", bound="RowState")  # not Self: run-time type checkers refuse it on plain methods
+# Not typing.Self, because run-time type checkers refuse it on plain methods.
+State = TypeVar("State", bound="RowState")
 
 
 @dataclass(frozen=True)
 class RowEdit:
-    """Which rows survive, and who is appended after them."""
+    """The rows that survive, and the rows that are appended after them."""
 
     keep: Int[Tensor, "kept"]  # old row numbers of the survivors, ascending
     children: Gaussians  # appended after the survivors
@@ -28,15 +30,15 @@ class RowEdit:
 
     @property
     def rows_after(self) -> int:
-        """Number of rows once the edit is applied."""
+        """Return the number of rows after the edit."""
         return self.keep.shape[0] + len(self.children)
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
-        """Survivors, then children; a new object without autograd history."""
+        """Return the survivors, then the children, as a new object without autograd history."""
         return concatenate([gaussians.detach().index(self.keep), self.children.detach()])
 
     def carry(self, rows: Tensor) -> Tensor:
-        """Carry a per-row tensor through the edit: survivors keep their values, newborns start at zero."""
+        """Return a per-row tensor after the edit: survivors keep their values, newborns start at zero."""
         newborn = rows.new_zeros((len(self.children), *rows.shape[1:]))
         return torch.cat([rows[self.keep], newborn])
 
@@ -49,7 +51,7 @@ class RowState:
     """
 
     def carry(self: State, edit: RowEdit) -> State:
-        """The state after ``edit``."""
+        """Return the state after ``edit``."""
         return type(self)(**{field.name: edit.carry(getattr(self, field.name)) for field in fields(self)})
 
     def to_dict(self) -> dict[str, Tensor]:

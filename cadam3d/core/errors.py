@@ -1,5 +1,5 @@
-"""UserError lives apart from the checks that raise it, so that the command line can name it without torch."""
+"""UserError: separate from the checks that raise it, so that the command line imports it without torch."""
 
 
 class UserError(Exception):
-    """A mistake the user can mend: shown as one message, without a traceback, with exit code 1."""
+    """A mistake that the user can correct: shown as one message, without a traceback, with exit code 1."""

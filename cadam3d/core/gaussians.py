@@ -1,4 +1,4 @@
-"""Gaussians: five raw tensors and their activations. What the optimizer moves, nothing more."""
+"""Gaussians: the five raw tensors that the optimizer moves, and their activations."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class Gaussians:
 
     means: Float[Tensor, "n 3"]  # world units
     log_scales: Float[Tensor, "n 3"]  # natural log of standard deviations in world units
-    quats: Float[Tensor, "n 4"]  # wxyz, any length but (nearly) zero
+    quats: Float[Tensor, "n 4"]  # wxyz, of any length that is not nearly zero
     opacity_logits: Float[Tensor, "n"]
     sh: Float[Tensor, "n k 3"]  # k = (degree + 1)**2; coefficient 0 is the view-independent one
 
@@ -29,52 +29,53 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the spherical harmonics, 0 to 3."""
+        """Return the degree of the spherical harmonics, 0 to 3."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
     @property
     def scales(self) -> Float[Tensor, "n 3"]:
-        """Standard deviations along the three own axes, in world units, > 0."""
+        """Return standard deviations along the three own axes, in world units, > 0."""
         return self.log_scales.exp()
 
     @property
     def opacities(self) -> Float[Tensor, "n"]:
-        """Opacities in (0, 1)."""
+        """Return opacities in (0, 1)."""
         return self.opacity_logits.sigmoid()
 
     @property
     def rotations(self) -> Float[Tensor, "n 3 3"]:
-        """Rotation matrices from own axes to world axes; a zero quaternion gives the identity."""
-        largest = self.quats.detach().abs().amax(dim=-1, keepdim=True)  # its square might leave float32
+        """Return rotation matrices from own axes to world axes; a zero quaternion gives the identity."""
+        # Divide by the largest component first, because squares might leave the range of float32.
+        largest = self.quats.detach().abs().amax(dim=-1, keepdim=True)
         return quaternion_to_rotation_matrix(self.quats / largest.clamp_min(torch.finfo(largest.dtype).tiny))
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors live."""
+        """Return the device of the tensors."""
         return self.means.device
 
     def tensors(self) -> dict[str, Tensor]:
-        """The five tensors by field name, in the fixed order of ``FIELDS``; no copies."""
+        """Return the five tensors by field name, in the fixed order of ``FIELDS``, without copying."""
         return {name: getattr(self, name) for name in FIELDS}
 
     def map(self, change: Callable[[Tensor], Tensor]) -> "Gaussians":
-        """New Gaussians whose every tensor is ``change(tensor)``."""
+        """Return new Gaussians, each tensor replaced by ``change(tensor)``."""
         return Gaussians(**{name: change(tensor) for name, tensor in self.tensors().items()})
 
     def index(self, rows: Int[Tensor, "rows"] | Bool[Tensor, "n"] | slice) -> "Gaussians":
-        """The chosen rows, in the given order."""
+        """Return the chosen rows, in the given order."""
         return self.map(lambda tensor: tensor[rows])
 
     def detach(self) -> "Gaussians":
-        """The same numbers, cut from the autograd graph."""
+        """Return the same numbers, cut from the autograd graph."""
         return self.map(lambda tensor: tensor.detach())
 
     def to(self, target: torch.device | torch.dtype | str) -> "Gaussians":
-        """The same Gaussians on another device or in another dtype."""
+        """Return the same Gaussians on another device or in another dtype."""
         return self.map(lambda tensor: tensor.to(target))
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-    """All rows of ``parts``, one after the other; they must share their SH degree."""
+    """Return all rows of ``parts``, one after the other; they must share their SH degree."""
     columns = {name: [getattr(part, name) for part in parts] for name in FIELDS}
     return Gaussians(**{name: torch.cat(tensors) for name, tensors in columns.items()})

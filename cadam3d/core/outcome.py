@@ -1,10 +1,10 @@
-"""How a run ends. Apart from ``cadam3d.state``, because a sweep reads outcomes and never needs torch."""
+"""Outcome: how a run ended. Separate from ``cadam3d.state``, because sweeps read outcomes without torch."""
 
 from enum import StrEnum
 
 
 class Outcome(StrEnum):
-    """How a run ended. Running out of memory is an outcome, written down, not a crash."""
+    """How a run ended. Running out of memory is an outcome that is recorded, not a crash."""
 
     FINISHED = "finished"
     INTERRUPTED = "interrupted"
@@ -12,4 +12,5 @@ class Outcome(StrEnum):
     OUT_OF_MEMORY = "out_of_memory"
     VANISHED = "vanished"  # every Gaussian was pruned
     FAILED = "failed"
-    KILLED = "killed"  # by a signal, such as that of the system when memory is out; written by the sweep
+    # By a signal, such as the one that the system sends when memory is short; recorded by the sweep.
+    KILLED = "killed"

@@ -1,6 +1,6 @@
-"""Schedules are values: pure, printable, callable on a step.
+"""Schedules: numbers that depend on the training step. They are pure, printable values.
 
-``Linear(start=1e-3, end=1e-5, steps=600)(300)`` is a number; nothing is mutated while training runs.
+``Linear(start=1e-3, end=1e-5, steps=600)(300)`` is a number; a schedule has no state that training changes.
 """
 
 import math
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from cadam3d.core.checks import are_numbers, require, require_range, require_whole
 
-FAR_STEP = 10**9  # every schedule has come to rest by then
+FAR_STEP = 10**9  # by then every schedule has its final value
 
 
 class Schedule(ABC):
@@ -19,7 +19,7 @@ class Schedule(ABC):
 
     @abstractmethod
     def __call__(self, step: int) -> float:
-        """The value at ``step``."""
+        """Return the value at ``step``."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Constant(Schedule):
         require_range("schedule.value", self.value, example=0.001)
 
     def __call__(self, step: int) -> float:
-        """The value, whatever the step."""
+        """Return the value, whatever the step."""
         return self.value
 
 
@@ -52,13 +52,13 @@ class Linear(Schedule):
         require_range("schedule.end", self.end, example=1e-5)
 
     def __call__(self, step: int) -> float:
-        """The value at ``step``."""
+        """Return the value at ``step``."""
         return self.start + (self.end - self.start) * _progress(step, self.begin, self.steps)
 
 
 @dataclass(frozen=True)
 class LogLinear(Schedule):
-    """As :class:`Linear`, in the logarithm: equal factors over equal times. 3DGS decays its rates so."""
+    """Like :class:`Linear`, but in the logarithm: equal factors over equal times, as for 3DGS' rates."""
 
     start: float
     end: float
@@ -72,7 +72,7 @@ class LogLinear(Schedule):
         require_range("schedule.end", self.end, above=0, example=1e-5)
 
     def __call__(self, step: int) -> float:
-        """The value at ``step``."""
+        """Return the value at ``step``."""
         progress = _progress(step, self.begin, self.steps)
         return math.exp(math.log(self.start) * (1 - progress) + math.log(self.end) * progress)
 
@@ -97,24 +97,25 @@ class Steps(Schedule):
         )
 
     def __call__(self, step: int) -> float:
-        """The value at ``step``."""
+        """Return the value at ``step``."""
         return self.values[sum(step >= milestone for milestone in self.milestones)]
 
 
 def as_schedule(value: float | Schedule) -> Schedule:
-    """A plain number is a constant schedule."""
+    """Return ``value`` as a schedule; a plain number becomes a constant one."""
     return value if isinstance(value, Schedule) else Constant(float(value))
 
 
 def require_scheduled(key: str, value: object, *, example: object, **bounds: float) -> None:
-    """Raise unless ``value`` is a number in range, or a schedule that starts and comes to rest in range.
+    """Raise unless ``value`` is a number in range, or a schedule whose first and final values are in range.
 
     ``bounds`` are those of :func:`~cadam3d.core.checks.require_range`: ``low``, ``high``, ``below`` and
     ``above``.
     """
     is_one = isinstance(value, int | float | Schedule)
     require(is_one, key, expected="a number or a schedule", got=value, example=f"{key}={example}")
-    for step in (0, FAR_STEP):  # most mistakes show at an end
+    # Most mistakes are visible at one of the two ends.
+    for step in (0, FAR_STEP):
         number = value(step) if isinstance(value, Schedule) else value
         require_range(key, number, example=example, **bounds)
 

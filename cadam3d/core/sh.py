@@ -29,7 +29,7 @@ MAX_DEGREE = 3
 
 
 def sh_basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch k"]:
-    """The ``k = (degree + 1)**2`` basis functions at unit ``directions`` (from camera to Gaussian)."""
+    """Return the ``k = (degree + 1)**2`` basis functions at unit ``directions`` (from camera to Gaussian)."""
     assert 0 <= degree <= MAX_DEGREE
     x, y, z = directions.unbind(-1)
     basis = [torch.full_like(x, SH_C0)]
@@ -60,12 +60,12 @@ def sh_basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor
 def evaluate_sh(
     sh: Float[Tensor, "*batch k 3"], directions: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """RGB seen along unit ``directions``: ``max(basis . sh + 0.5, 0)``, as 3DGS defines it."""
+    """Return the RGB seen along unit ``directions``: ``max(basis . sh + 0.5, 0)``, as 3DGS defines it."""
     degree = round(sh.shape[-2] ** 0.5) - 1
     raw = (sh_basis(directions, degree)[..., None] * sh).sum(dim=-2)
     return (raw + 0.5).clamp_min(0.0)
 
 
 def rgb_to_sh0(rgb: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """The view-independent coefficient that shows ``rgb`` (in [0, 1])."""
+    """Return the view-independent coefficient that shows ``rgb`` (in [0, 1])."""
     return (rgb - 0.5) / SH_C0

@@ -1,1 +1,1 @@
-"""When and where to grow."""
+"""Densifiers: when Gaussians are added, and which; how they are added and removed is in ``refine.py``."""

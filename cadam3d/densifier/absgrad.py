@@ -1,4 +1,4 @@
-"""AbsGS: the baseline, but the pulls of the pixels on a Gaussian do not cancel (Ye et al. 2024)."""
+"""AbsGS: the baseline with absolute gradients, so that opposite pixels do not cancel (Ye et al. 2024)."""
 
 from dataclasses import dataclass
 
@@ -11,17 +11,17 @@ from cadam3d.densifier.baseline import Baseline
 
 @dataclass(frozen=True, kw_only=True)
 class AbsGrad(Baseline):
-    """Select whoever's mean homodirectional gradient norm reaches a fixed threshold.
+    """Select Gaussians whose mean norm of absolute gradients reaches a fixed threshold.
 
-    Where the baseline takes the view-space gradient, a sum over pixels that pull in many directions, this
-    takes the sums over pixels of their absolute values, along x and y by themselves. A large Gaussian over
+    The baseline takes the view-space gradient, a sum over pixels that pull in many directions. This class
+    takes the sums over pixels of the absolute values, along x and along y separately. A large Gaussian over
     fine detail, whose pixels disagree, then stands out. Everything else is the baseline's. Absolute values
-    are larger, and those of noise do not cancel either: the threshold must be higher.
+    are larger, and those of noise do not cancel either, so the threshold must be higher.
     """
 
     @property
     def needs_absgrad(self) -> bool:
-        """Always: it is the evidence."""
+        """Return True: absolute gradients are the evidence."""
         return True
 
     def _pulls(self, signal: GradientSignal) -> Float[Tensor, "v n 2"]:

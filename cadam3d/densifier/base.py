@@ -1,4 +1,4 @@
-"""Densifier: WHEN a Gaussian may grow. HOW (clone, split, prune) is shared: see refine.py (sec. 4.4)."""
+"""Densifier: decides WHEN a Gaussian grows. HOW (clone, split, prune) is shared, see refine.py (sec. 4.4)."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from torch import Tensor
 from cadam3d.core.chart import Chart
 from cadam3d.core.edit import RowEdit, RowState
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.render import RenderOutput
 from cadam3d.densifier.refine import Refine, RefinePlan
 
 State = TypeVar("State", bound=RowState)
@@ -18,7 +19,7 @@ State = TypeVar("State", bound=RowState)
 
 @dataclass(frozen=True)
 class GradientSignal:
-    """What one backward pass told us about each Gaussian, before the optimizer step."""
+    """The gradients that one backward pass left on each Gaussian, before the optimizer step."""
 
     means: Float[Tensor, "n 3"]  # dLoss/dmeans, loss per world unit: CAdam's evidence
     means2d: Float[Tensor, "v n 2"]  # dLoss/dmeans2d, loss per pixel, every view: the baseline's evidence
@@ -28,26 +29,38 @@ class GradientSignal:
     # Sums over pixels of |dLoss/dmeans2d|, for a densifier that needs them.
     absgrad: Float[Tensor, "v n 2"] | None = None
 
+    @classmethod
+    def read(cls, gaussians: Gaussians, output: RenderOutput) -> "GradientSignal":
+        """Copy the gradients of the last backward pass, because another pass would add to them in place."""
+        return cls(
+            means=_gradient_of(gaussians.means),
+            means2d=_gradient_of(output.means2d),
+            radii=output.radii.detach(),
+            height=output.rgb.shape[1],
+            width=output.rgb.shape[2],
+            absgrad=None if output.absgrad is None else _gradient_of(output.absgrad),
+        )
+
     @property
     def visible(self) -> Bool[Tensor, "v n"]:
-        """Which Gaussians touched which view."""
+        """Return the mask of Gaussians that touched each view."""
         return self.radii > 0
 
 
 @dataclass
-class Headcount(RowState):
-    """The state of a densifier that remembers nothing but how many Gaussians there are."""
+class RowCount(RowState):
+    """State of a densifier that remembers nothing except the number of Gaussians."""
 
-    nobody: Bool[Tensor, "n"]  # all False
+    no_rows: Bool[Tensor, "n"]  # all False: the mask that marks no Gaussian
 
     @classmethod
-    def of(cls, n: int, device: torch.device) -> "Headcount":
-        """The count of ``n``."""
-        return cls(nobody=torch.zeros(n, dtype=torch.bool, device=device))
+    def of(cls, n: int, device: torch.device) -> "RowCount":
+        """Return the state of ``n`` Gaussians."""
+        return cls(no_rows=torch.zeros(n, dtype=torch.bool, device=device))
 
 
 class Densifier(ABC, Generic[State]):
-    """Frozen hyper-parameters; the per-Gaussian tensors live in a state that the trainer holds.
+    """Frozen hyper-parameters; the per-Gaussian tensors are in a state that the trainer holds.
 
     Every method is pure: it returns a new state and leaves its arguments alone, so a step that fails half way
     has changed nothing. Working in place would save CAdam about a third of 11 ms per million Gaussians on one
@@ -56,80 +69,87 @@ class Densifier(ABC, Generic[State]):
 
     @property
     def guidance_only(self) -> bool:
-        """Whether signals leave the regularizers out: where there are some, another backward pass."""
+        """Return whether signals leave the regularizers out, which may take a second backward pass."""
         return False
 
     @property
     def needs_absgrad(self) -> bool:
-        """Whether signals bring ``absgrad``, which rasterizers do not sum unless somebody wants it."""
+        """Return whether signals must contain ``absgrad``; rasterizers compute it on request only."""
         return False
 
     @abstractmethod
     def init_state(self, n: int, device: torch.device) -> State:
-        """The state of ``n`` newborn Gaussians."""
+        """Return the state of ``n`` newborn Gaussians."""
 
     @abstractmethod
     def observe(self, state: State, signal: GradientSignal) -> State:
-        """The state after one more step; ``state`` itself is left alone. Called at every step.
+        """Return the state after one more step, without modifying ``state``. Called at every step.
 
-        A gradient may hold NaN or infinities (the loop then skips the optimizer step); the state never may.
+        A gradient may contain NaN or infinities (the loop then skips the optimizer step); the state never
+        may.
         """
 
     @abstractmethod
     def select(self, state: State, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
-        """Whom to grow. Called at refinement steps only; the one real difference between densifiers.
+        """Return the mask of Gaussians to grow: the one real difference between densifiers.
 
-        ``step`` (1 after the first step) is for schedules; the evidence is in the state. ``generator`` (on
-        the CPU) is for those who draw lots.
+        Called at refinements only. ``step`` (1 after the first step) is for schedules, because the evidence
+        is in the state. ``generator`` (on the CPU) is for random choices.
         """
 
     @abstractmethod
     def unreliable(self, state: State) -> Bool[Tensor, "n"]:
-        """Whose opacity an opacity reset lowers (the baseline: everybody's)."""
+        """Return the mask of Gaussians whose opacity an opacity reset lowers; the baseline marks all."""
 
     def unwanted(self, state: State) -> Bool[Tensor, "n"] | None:
-        """Whom a refinement prunes besides the faint and the large, once ``refine.prune_from`` is over.
+        """Return the mask of Gaussians that a refinement prunes besides faint and large ones.
 
-        Nobody by default (``None``). Asked before the edit: newborns are not meant.
+        ``None``, the default, marks none. The mask has the rows before the edit, so it never includes
+        newborns, and it applies only after ``refine.prune_from``.
         """
         return None
 
     def plan(
         self, state: State, gaussians: Gaussians, step: int, refine: Refine, generator: torch.Generator
     ) -> RefinePlan:
-        """One refinement, decided, not applied: whom by :meth:`select`, how by ``refine``.
+        """Decide one refinement without applying it: :meth:`select` decides which rows grow, ``refine`` how.
 
-        A densifier with a "how" of its own overrides it. Nothing is changed but ``generator``, on the CPU.
+        A densifier with its own "how" overrides this. Only ``generator`` (on the CPU) is changed.
         """
         selected = self.select(state, step, generator)
         return refine.plan(gaussians, selected, step, generator, self.unwanted(state))
 
     def after_reset(self, state: State, rows: Bool[Tensor, "n"]) -> State:
-        """The state after an opacity reset of ``rows``; by default the statistics do not notice."""
+        """Return the state after an opacity reset of ``rows``; by default the same state."""
         return state
 
     def perturb(
         self, gaussians: Gaussians, lr: float, generator: torch.Generator
     ) -> Float[Tensor, "n 3"] | None:
-        """What an optimizer step is followed by: displacements of the means, in world units.
+        """Return displacements of the means, in world units, to add after an optimizer step.
 
-        None by default (``None``). ``lr`` is the learning rate of the means at that step; ``generator`` is on
-        the CPU, and nobody else draws from it.
+        ``None``, the default, moves nothing. ``lr`` is the learning rate of the means at that step;
+        ``generator`` is on the CPU, and nothing else draws from it.
         """
         return None
 
     def carry(self, state: State, edit: RowEdit) -> State:
-        """The state after a refinement; by default survivors keep their rows and newborns start at zero."""
+        """Return the state after a refinement; by default survivors keep it and newborns get zeros."""
         return state.carry(edit)
 
     def scores(self, state: State) -> dict[str, Float[Tensor, "n"]]:
-        """Numbers per Gaussian for pictures and histograms, such as the SNR; never read back."""
+        """Return numbers per Gaussian, such as the SNR, for pictures and histograms only."""
         return {}
 
     def statistics(self, state: State, step: int) -> dict[str, float]:
-        """Numbers about the state for logs and plots; never read back."""
+        """Return numbers about the state, for logs and plots only."""
         return {}
 
     def charts(self) -> tuple[Chart, ...]:
         """Declare the charts that the report draws of :meth:`statistics`; none by default."""
         return ()
+
+
+def _gradient_of(tensor: Tensor) -> Tensor:
+    """Return a copy of the gradient that backward left on ``tensor``; zeros if it left none."""
+    return torch.zeros_like(tensor) if tensor.grad is None else tensor.grad.detach().clone()

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from cadam3d.core.chart import Chart, Curve
 from cadam3d.core.checks import require_choice, require_range
 from cadam3d.core.edit import RowEdit, RowState
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
@@ -19,11 +20,11 @@ class BaselineState(RowState):
     """Gradient norms and sizes since the last refinement: 12 bytes per Gaussian."""
 
     norm_sum: Float[Tensor, "n"]  # of view-space gradients; loss per NDC unit
-    sightings: Int[Tensor, "n"]  # how many norms were added
+    sightings: Int[Tensor, "n"]  # number of norms added
     radius: Float[Tensor, "n"]  # the largest on screen, in pixels
 
     def carry(self, edit: RowEdit) -> "BaselineState":
-        """All zero after every refinement, survivors included: 3DGS averages over one interval at a time."""
+        """Return zeros for survivors too, because 3DGS averages over one refinement interval at a time."""
         return BaselineState(
             **{name: rows.new_zeros(edit.rows_after) for name, rows in self.to_dict().items()}
         )
@@ -31,19 +32,19 @@ class BaselineState(RowState):
 
 @dataclass(frozen=True, kw_only=True)
 class Baseline(Densifier[BaselineState]):
-    """Select whoever's mean gradient norm reaches a fixed threshold; a reset lowers everybody's opacity.
+    """Select Gaussians whose mean gradient norm reaches a fixed threshold; a reset lowers every opacity.
 
-    The mean runs over the sightings of the Gaussian since the last refinement: over single views with
-    ``views=sum_norm``, else over steps. Gradients are taken in normalised device coordinates (image
-    half-widths), as 3DGS and gsplat do. With a loss that is a mean over pixels (``guidance.reduction=mean``)
-    the threshold then does not depend on the image size; the other reductions sum over pixels, and there it
+    The mean is over the sightings of the Gaussian since the last refinement: over single views with
+    ``views=sum_norm``, otherwise over steps. Gradients are in normalised device coordinates (image
+    half-widths), as in 3DGS and gsplat. With a loss that is a mean over pixels (``guidance.reduction=mean``)
+    the threshold then does not depend on the image size; with the other reductions, which sum over pixels, it
     does. It always depends on the scale of the loss and of its noise (paper sec. 4.1: the dilemma).
     """
 
-    tau_pos: float | Schedule  # loss per NDC unit
+    tau_pos: float | Schedule  # > 0: loss per NDC unit
     views: str  # how the views of one batch are combined, see `_norms`
-    grad_multiplier: float  # applied to gradients first, for recipes that threshold scaled losses
-    screen_px: float | None  # larger ones on screen since the last refinement are pruned; null = never
+    grad_multiplier: float  # > 0: applied to gradients first, for recipes that threshold scaled losses
+    screen_px: float | None  # > 0: Gaussians that were larger on screen, in pixels, are pruned; null = never
 
     def __post_init__(self) -> None:
         require_scheduled("densifier.tau_pos", self.tau_pos, above=0, example=2e-4)
@@ -53,7 +54,7 @@ class Baseline(Densifier[BaselineState]):
             require_range("densifier.screen_px", self.screen_px, above=0, example=20)
 
     def init_state(self, n: int, device: torch.device) -> BaselineState:
-        """Nothing accumulated."""
+        """Return sums and sizes of zero."""
         return BaselineState(
             norm_sum=torch.zeros(n, device=device),
             sightings=torch.zeros(n, dtype=torch.int32, device=device),
@@ -61,9 +62,11 @@ class Baseline(Densifier[BaselineState]):
         )
 
     def observe(self, state: BaselineState, signal: GradientSignal) -> BaselineState:
-        """Add the norms of one batch. A gradient that is not finite counts as not seen."""
-        x, y = self._pulls(signal).unbind(dim=-1)  # a row of two broadcasts slowly
-        x = x * (self.grad_multiplier * signal.width / 2)  # pixels per NDC unit: half the size
+        """Return the sums after one more batch. A gradient that is not finite counts as not seen."""
+        # Both axes by themselves, because broadcasting over rows of two is slow.
+        x, y = self._pulls(signal).unbind(dim=-1)
+        # An NDC unit is half the image size.
+        x = x * (self.grad_multiplier * signal.width / 2)
         y = y * (self.grad_multiplier * signal.height / 2)
         norms, sightings = self._norms(x, y, signal.visible)
         return BaselineState(
@@ -73,27 +76,27 @@ class Baseline(Densifier[BaselineState]):
         )
 
     def select(self, state: BaselineState, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
-        """Mark the Gaussians to grow: A_i >= tau_pos (paper eq. 1; ``>=`` as in 3DGS)."""
+        """Return the mask of Gaussians to grow: A_i >= tau_pos (paper eq. 1; ``>=`` as in 3DGS)."""
         return self._mean_norms(state) >= as_schedule(self.tau_pos)(step)
 
     def unreliable(self, state: BaselineState) -> Bool[Tensor, "n"]:
-        """Everybody: the global opacity reset of 3DGS."""
+        """Return the mask of all Gaussians: the global opacity reset of 3DGS."""
         return torch.ones_like(state.sightings, dtype=torch.bool)
 
     def unwanted(self, state: BaselineState) -> Bool[Tensor, "n"] | None:
-        """Who was larger on screen than ``screen_px`` in any view since the last refinement.
+        """Return the mask of Gaussians larger than ``screen_px`` in any view since the last refinement.
 
-        3DGS wants this (20 pixels) but clears its radii before it looks, so as shipped nobody is pruned:
-        ``null``.
+        3DGS intends this (20 pixels) but clears its radii before it compares them, so as shipped it prunes
+        none: ``null``.
         """
         return None if self.screen_px is None else state.radius > self.screen_px
 
     def scores(self, state: BaselineState) -> dict[str, Float[Tensor, "n"]]:
-        """The mean gradient norm, in loss per NDC unit, which ``tau_pos`` is compared with."""
+        """Return the mean gradient norm, in loss per NDC unit, which is compared with ``tau_pos``."""
         return {"mean_norm": self._mean_norms(state)}
 
     def statistics(self, state: BaselineState, step: int) -> dict[str, float]:
-        """Quantiles of the mean gradient norm, and the share of Gaussians that reach the threshold."""
+        """Return the threshold, quantiles of the mean gradient norm, and the share that reaches it."""
         norms = self._mean_norms(state)
         if len(norms) == 0:
             return {}
@@ -105,14 +108,36 @@ class Baseline(Densifier[BaselineState]):
             "share_above_tau_pos": float((norms >= tau_pos).float().mean()),
         }
 
+    def charts(self) -> tuple[Chart, ...]:
+        """Declare the charts of :meth:`statistics`."""
+        return (
+            Chart(
+                title="Screen-space gradients",
+                caption="Mean gradient norm of each Gaussian, in loss per NDC unit, before each refinement.",
+                curves=(
+                    Curve(key="gradient_p50", label="median"),
+                    Curve(key="tau_pos", label="tau_pos", is_threshold=True),
+                ),
+                band=("gradient_p10", "gradient_p90"),
+                band_label="10 to 90 %",
+                log_y=True,
+            ),
+            Chart(
+                title="Gaussians that reach the gradient threshold",
+                caption="Share of all Gaussians whose mean gradient norm is at least tau_pos.",
+                curves=(Curve(key="share_above_tau_pos"),),
+                percent=True,
+            ),
+        )
+
     def _pulls(self, signal: GradientSignal) -> Float[Tensor, "v n 2"]:
-        """The evidence, in loss per pixel."""
+        """Return the evidence, in loss per pixel."""
         return signal.means2d
 
     def _norms(
         self, x: Float[Tensor, "v n"], y: Float[Tensor, "v n"], visible: Bool[Tensor, "v n"]
     ) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
-        """What a batch adds to the sum and to the count; the released codes disagree about it.
+        """Return what a batch adds to the sum of norms and to their number; released codes disagree about it.
 
         ``sum_norm``: every view by itself (gsplat, gsgen). ``sum_vector``: the norm of the sum, one count per
         batch (GaussianDreamer). ``last``: only the last view (LucidDreamer, FlowDreamer, GCS-BEG).

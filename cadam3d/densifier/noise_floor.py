@@ -1,4 +1,4 @@
-"""How large the SNR of pure noise is, and how rarely it is larger: what a threshold on the SNR means.
+"""Distribution of the SNR of pure noise, and the threshold that noise exceeds with a given probability.
 
 Let the gradients of a Gaussian be zero-mean noise, independent from step to step, equally strong along the
 three axes. Then the bias-corrected first moment is a weighted mean with
@@ -8,14 +8,14 @@ three axes. Then the bias-corrected first moment is a weighted mean with
 after ``a`` updates, so E[SNR^2] is about s(beta1, a): 1 at age 1, and (1 - beta1) / (1 + beta1) in the end.
 
 For its distribution, stack the gradients of ``n`` equally weighted steps into one vector of 3n numbers. Its
-direction is uniform, and the share of its energy that lies in a fixed subspace of 3 dimensions (the weights
-of the first moment, once per axis) follows Beta(3/2, 3 (n - 1)/2). The second moment weighs not quite
-equally; n = 1 / s(beta2, a) is its effective number of steps. Hence
+direction is uniform, and the share of its energy that is in a fixed subspace of 3 dimensions (the weights of
+the first moment, once per axis) follows Beta(3/2, 3 (n - 1)/2). The weights of the second moment are not
+quite equal; n = 1 / s(beta2, a) is its effective number of steps. Hence
 
-    SNR^2 ~ s(beta1, a) n Beta(3/2, 3 (n - 1)/2),
+    SNR^2 ~ s(beta1, a) n Beta(3/2, 3 (n - 1)/2).
 
-exact for an infinite memory of v and, by ``tests/densifier/test_noise_floor.py``, close for any that is at
-least as long as beta2 = beta1^2; for large n it becomes s(beta1, a) chi^2_3 / 3.
+This is exact if v has an infinite memory. ``tests/densifier/test_noise_floor.py`` shows that it is close for
+any memory at least as long as that of beta2 = beta1^2. For large n it becomes s(beta1, a) chi^2_3 / 3.
 """
 
 import numpy as np
@@ -24,13 +24,14 @@ from jaxtyping import Float, Int
 from scipy.special import betaincinv
 from torch import Tensor
 
-AXES = 3  # along which the noise is taken to be equally strong
+AXES = 3  # along which the noise is assumed to be equally strong
 
 
 def snr_threshold(alpha: float, beta1: float, beta2: float, age: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """The SNR that pure noise of this ``age`` (in updates) exceeds with probability ``alpha``.
+    """Return the SNR that pure noise of this ``age`` (in updates) exceeds with probability ``alpha``.
 
-    Infinite below age 2: of one gradient nobody can say whether it is consistent. Waits for the device.
+    Infinite below age 2, because a single gradient cannot show whether it is consistent. Waits for the
+    device.
     """
     ages, rows = age.unique(return_inverse=True)
     grown = np.maximum(ages.cpu().numpy().astype(np.float64), 2)
@@ -41,6 +42,6 @@ def snr_threshold(alpha: float, beta1: float, beta2: float, age: Int[Tensor, "n"
 
 
 def squared_weights(beta: float, age: np.ndarray) -> np.ndarray:
-    """Sum of the squared weights of a bias-corrected moving average: 1 / its effective number of steps."""
+    """Return the sum of squared weights of a bias-corrected moving average: 1 / its effective steps."""
     fading = beta**age
     return (1 - beta) * (1 + fading) / ((1 + beta) * (1 - fading))

@@ -1,4 +1,4 @@
-"""No densification: the initial Gaussians are all there will be. Pruning (refine.py) still happens."""
+"""No densification: no Gaussian is ever added. Pruning (refine.py) still happens."""
 
 from dataclasses import dataclass
 
@@ -6,25 +6,25 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from cadam3d.densifier.base import Densifier, GradientSignal, Headcount
+from cadam3d.densifier.base import Densifier, GradientSignal, RowCount
 
 
 @dataclass(frozen=True, kw_only=True)
-class NoGrowth(Densifier[Headcount]):
-    """Selects nobody and distrusts nobody."""
+class NoGrowth(Densifier[RowCount]):
+    """Select no Gaussian for growth and none for an opacity reset."""
 
-    def init_state(self, n: int, device: torch.device) -> Headcount:
-        """Nothing to remember."""
-        return Headcount.of(n, device)
+    def init_state(self, n: int, device: torch.device) -> RowCount:
+        """Return a state without statistics."""
+        return RowCount.of(n, device)
 
-    def observe(self, state: Headcount, signal: GradientSignal) -> Headcount:
-        """The same state: gradients change nothing here."""
+    def observe(self, state: RowCount, signal: GradientSignal) -> RowCount:
+        """Return the same state, because gradients decide nothing."""
         return state
 
-    def select(self, state: Headcount, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
-        """Nobody grows."""
-        return state.nobody
+    def select(self, state: RowCount, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
+        """Return the empty mask."""
+        return state.no_rows
 
-    def unreliable(self, state: Headcount) -> Bool[Tensor, "n"]:
-        """Nobody's opacity is reset."""
-        return state.nobody
+    def unreliable(self, state: RowCount) -> Bool[Tensor, "n"]:
+        """Return the empty mask: no opacity is reset."""
+        return state.no_rows

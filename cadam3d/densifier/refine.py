@@ -1,4 +1,4 @@
-"""HOW Gaussians grow and vanish, and at which steps: shared by every densifier (paper sec. 3.1 and 4.4)."""
+"""HOW Gaussians are added and removed, and when; shared by all densifiers (paper sec. 3.1 and 4.4)."""
 
 from dataclasses import dataclass
 
@@ -13,41 +13,41 @@ from cadam3d.core.gaussians import Gaussians, concatenate
 
 @dataclass(frozen=True)
 class RefinePlan:
-    """One refinement, decided, not applied: rows after = before + cloned + (children - 1) split - pruned.
+    """One refinement, decided but not applied: rows after = before + cloned + (children - 1) split - pruned.
 
-    Of :meth:`Refine.plan`, whose ``selected = cloned + split``; a densifier with its own "how" may give one
-    parent many copies.
+    In a plan of :meth:`Refine.plan`, the number of selected Gaussians is ``cloned + split``. A densifier with
+    its own "how" may give one parent many copies.
     """
 
     edit: RowEdit
-    is_selected: Bool[Tensor, "n"]  # of those before the edit, who was chosen to have children
-    cloned: int  # newborns besides whom they are copies of; each selected parent has one, if it is not split
+    is_selected: Bool[Tensor, "n"]  # rows before the edit that get children
+    cloned: int  # children that are added beside their parent; one for each selected parent that is not split
     split: int  # parents that are replaced by their children
     pruned: int  # survivors and newborns removed
 
     @property
     def selected(self) -> int:
-        """How many were chosen."""
+        """Return the number of Gaussians that get children."""
         return int(self.is_selected.sum())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Refine:
-    """Clone, split, prune and opacity reset: when, and how. Steps count from 1, lengths in world units."""
+    """When and how Gaussians are cloned, split, pruned and reset. Steps count from 1, in world units."""
 
     start: int  # refinements happen at multiples of `interval` strictly between `start` and `end`
-    end: int
-    interval: int  # the paper's K
-    tau_scale: float  # longest standard deviation above which a selected Gaussian splits, else it is cloned
-    split_children: int
-    split_shrink: float  # children's standard deviations are the parent's divided by this
-    min_opacity: float  # fainter Gaussians are pruned at every refinement
+    end: int  # see `start`
+    interval: int  # steps; the paper's K
+    tau_scale: float  # a selected Gaussian with a longer standard deviation splits; others are cloned
+    split_children: int  # number of Gaussians that replace a split one, 2 to 16
+    split_shrink: float  # >= 1: standard deviations of children are those of the parent divided by this
+    min_opacity: float  # in [0, 1): fainter Gaussians are pruned at every refinement
     max_scale: float | None  # Gaussians with a longer standard deviation are pruned; null = never
-    prune_from: int  # `max_scale`, and the densifier's own pruning, only after this step
+    prune_from: int  # `max_scale`, and the densifier's own pruning, apply only after this step
     reset_interval: int | None  # opacity resets at its multiples in [reset_from, reset_until); null = never
-    reset_from: int
-    reset_until: int
-    reset_value: float  # opacity that a reset lowers to
+    reset_from: int  # see `reset_interval`
+    reset_until: int  # see `reset_interval`
+    reset_value: float  # in (0, 1): opacity to which a reset lowers
     prune_grace: int  # steps after a reset in which no Gaussian is pruned for its opacity
     max_gaussians: int | None  # growth beyond this ends the run; null = no limit
 
@@ -77,28 +77,29 @@ class Refine:
         require(
             self.min_opacity < self.reset_value or self.prune_grace > 0,
             "refine.min_opacity",
-            expected=f"a number below refine.reset_value={self.reset_value:g}, or a grace period: "
-            "a reset would delete at the next refinement",
+            expected=f"a number below refine.reset_value={self.reset_value:g}, or refine.prune_grace > 0, "
+            "because otherwise the next refinement deletes every Gaussian that a reset has lowered",
             got=self.min_opacity,
             example="refine.prune_grace=100",
         )
         require(
             self.prune_grace < self.reset_interval,
             "refine.prune_grace",
-            expected=f"less than refine.reset_interval={self.reset_interval}, or opacity never prunes again",
+            expected=f"less than refine.reset_interval={self.reset_interval}, because otherwise "
+            "opacity never prunes after the first reset",
             got=self.prune_grace,
             example=f"refine.prune_grace={self.reset_interval // 2}",
         )
 
     def refines_at(self, step: int) -> bool:
-        """Whether the ``step``-th step (1 is the first) ends with a refinement.
+        """Return whether step number ``step`` (from 1) ends with a refinement.
 
         300/900/100 (GaussianDreamer) means 400, 500, ..., 800; 100/3000/100 (LucidDreamer) 200, ..., 2900.
         """
         return self.start < step < self.end and step % self.interval == 0
 
     def resets_at(self, step: int) -> bool:
-        """Whether the ``step``-th step (1 is the first) ends with an opacity reset, after any refinement."""
+        """Return whether step number ``step`` (from 1) ends with an opacity reset, after any refinement."""
         if self.reset_interval is None:
             return False
         return self.reset_from <= step < self.reset_until and step % self.reset_interval == 0
@@ -111,11 +112,11 @@ class Refine:
         generator: torch.Generator,
         unwanted: Bool[Tensor, "n"] | None = None,
     ) -> RefinePlan:
-        """Decide one refinement; nothing is changed but ``generator`` (on the CPU; one draw per split child).
+        """Decide one refinement; only ``generator`` is changed (on the CPU; one draw per split child).
 
         Clones and splits come from the one mask ``selected`` of the population before the edit, so they are
-        disjoint. Pruning then judges the grown population, newborns included; ``unwanted`` (none if ``None``)
-        names rows of the population before the edit that are pruned too, at the times of ``max_scale``.
+        disjoint. Pruning then judges the grown population, newborns included. ``unwanted`` marks rows before
+        the edit that are pruned too, after the same step as by ``max_scale``; ``None`` marks no row.
         """
         gaussians = gaussians.detach()
         is_split = selected & (gaussians.scales.amax(dim=-1) > self.tau_scale)
@@ -141,7 +142,10 @@ class Refine:
         )
 
     def keeps(self, gaussians: Gaussians, step: int) -> Bool[Tensor, "n"]:
-        """Who is not pruned. The comparisons ask for health, so a row with NaN is pruned too."""
+        """Return the mask of Gaussians that are not pruned.
+
+        Every comparison is true for healthy rows only, so a row with NaN is pruned too.
+        """
         keeps = gaussians.means.isfinite().all(dim=-1)
         if not self._spares_faint_at(step):
             keeps &= gaussians.opacities >= self.min_opacity
@@ -150,15 +154,15 @@ class Refine:
         return keeps
 
     def exceeds(self, plan: RefinePlan) -> bool:
-        """Whether ``plan`` would leave more than ``max_gaussians``.
+        """Return whether ``plan`` would leave more than ``max_gaussians``.
 
         Such a plan must not be applied: the run ends there, with the outcome ``max_gaussians`` and the
-        Gaussians it had. Trimming the growth instead would hide that a densifier runs away.
+        Gaussians it had. Limiting the growth instead would hide that a densifier grows without bound.
         """
         return self.max_gaussians is not None and plan.edit.rows_after > self.max_gaussians
 
     def _split(self, parents: Gaussians, generator: torch.Generator) -> Gaussians:
-        """``split_children`` smaller Gaussians per parent, at positions drawn from the parent itself."""
+        """Return ``split_children`` smaller Gaussians per parent, at positions drawn from the parent."""
         each = parents.map(lambda tensor: tensor.repeat_interleave(self.split_children, dim=0))
         normal = torch.randn(each.means.shape, generator=generator, dtype=each.means.dtype).to(each.device)
         return Gaussians(
@@ -170,5 +174,5 @@ class Refine:
         )
 
     def _spares_faint_at(self, step: int) -> bool:
-        """Whether a reset lies at most ``prune_grace`` steps back."""
+        """Return whether the last reset was at most ``prune_grace`` steps ago."""
         return any(self.resets_at(earlier) for earlier in range(max(step - self.prune_grace, 1), step))

@@ -1,1 +1,1 @@
-"""What leaves the house: assets, videos, pictures."""
+"""Exporters: write the finished asset, and pictures and videos of it, into the run folder."""

@@ -8,8 +8,11 @@ from cadam3d.core.render import RenderFn
 
 
 class Exporter(ABC):
-    """Frozen hyper-parameters."""
+    """Write one kind of file; a subclass is a frozen dataclass of settings."""
 
     @abstractmethod
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
-        """Write into ``folder`` (which exists) and return the paths written."""
+        """Write into ``folder``, which exists, and return the paths of the files.
+
+        ``render`` shows the same ``gaussians``. Raises ``UserError`` if a file cannot be written.
+        """

@@ -1,4 +1,4 @@
-"""PlyExporter: the asset itself, as splat viewers and engines read it."""
+"""PlyExporter: the asset itself, in the format that splat viewers and engines read."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,23 +10,22 @@ from cadam3d.core.sh import MAX_DEGREE
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.frames import UPS
 from cadam3d.io.ply import write_ply
-
-FILE_NAME = "asset.ply"
+from cadam3d.io.run_folder import ASSET
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlyExporter(Exporter):
-    """Writes ``asset.ply`` in the de-facto 3DGS layout; ``io/ply.py`` says what reads back bit for bit."""
+    """Write ``asset.ply`` in the de-facto 3DGS layout; ``io/ply.py`` lists what reads back bit for bit."""
 
-    up: str  # -y, +y or +z
-    pad_sh: int  # least SH degree of the file, 0 to 3
+    up: str  # -y, +y or +z: up axis of the file
+    pad_sh: int  # smallest SH degree of the file, 0 to 3
 
     def __post_init__(self) -> None:
         require_choice("exporter.ply.up", self.up, UPS)
         require_choice("exporter.ply.pad_sh", self.pad_sh, range(MAX_DEGREE + 1))
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
-        """Write the file; nothing is rendered."""
-        path = folder / FILE_NAME
+        """Write the file without rendering anything."""
+        path = folder / ASSET
         write_ply(path, gaussians, up=self.up, pad_sh=self.pad_sh)
         return [path]

@@ -1,69 +1,56 @@
 """TurntableExporter: one full turn around the object, colour beside depth or alpha."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from cadam3d.core.cameras import Cameras, turntable
+from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require_choice, require_range, require_whole
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.pictures import PictureSettings
 from cadam3d.core.render import RenderFn, RenderOutput
-from cadam3d.core.viewing import require_viewing
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.image import closeness, to_uint8
+from cadam3d.io.run_folder import TURNTABLE
 from cadam3d.io.video import write_video
 
-FILE_NAME = "turntable.mp4"
-VIEWS_AT_ONCE = 4  # bounds the memory of a render, whatever the length of the video
+VIEWS_AT_ONCE = 4  # bounds the memory of rendering for a video of any length
 
 
 @dataclass(frozen=True, kw_only=True)
-class TurntableExporter(Exporter):
-    """Writes ``turntable.mp4``: the camera circles the object once, starting at its front."""
+class TurntableExporter(PictureSettings, Exporter):
+    """Write ``turntable.mp4``: the camera circles the object once, starting at its front."""
 
-    views: int  # frames
-    elevation_deg: float
-    distance: float  # of the camera from the origin, world units
-    fov_y_deg: float
-    size: int  # pixels, height and width of each picture
-    fps: int
-    background: Sequence[float]  # RGB in [0, 1]
-    beside: str  # depth, alpha or none: the second picture of each frame
+    node: ClassVar[str] = "exporter.turntable"
+
+    views: int  # frames of one full turn
+    elevation_deg: float  # in [-90, 90]
+    fps: int  # frames per second
+    beside: str  # second picture of each frame: depth, alpha or none
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require_whole("exporter.turntable.views", self.views, low=1, example=60)
         require_range("exporter.turntable.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
         require_whole("exporter.turntable.fps", self.fps, low=1, example=30)
-        require_viewing(
-            "exporter.turntable",
-            distance=self.distance,
-            fov_y_deg=self.fov_y_deg,
-            size=self.size,
-            background=self.background,
-        )
         require_choice("exporter.turntable.beside", self.beside, ("depth", "alpha", "none"))
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
         """Render and encode frame by frame."""
-        path = folder / FILE_NAME
-        cameras = turntable(
-            self.views,
-            elevation_deg=self.elevation_deg,
-            distance=self.distance,
-            fov_y_deg=self.fov_y_deg,
-            size=self.size,
-        )
+        path = folder / TURNTABLE
+        cameras = self.ring(self.views, self.elevation_deg)
         write_video(path, self._frames(cameras, render), fps=self.fps)
         return [path]
 
     def _frames(self, cameras: Cameras, render: RenderFn) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
         for first in range(0, self.views, VIEWS_AT_ONCE):
             some = cameras.index(slice(first, first + VIEWS_AT_ONCE))
-            output = render(some, torch.tensor([list(self.background)] * len(some)))
+            output = render(some, self.backgrounds(len(some)))
             yield from to_uint8(self._pictures(output))
 
     def _pictures(self, output: RenderOutput) -> torch.Tensor:

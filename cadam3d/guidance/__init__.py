@@ -1,1 +1,1 @@
-"""How the opinion of a prior becomes a gradient."""
+"""Objectives: how the prediction of a prior becomes a gradient."""

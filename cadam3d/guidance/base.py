@@ -1,4 +1,4 @@
-"""Guidance: how the prior's opinion about a render becomes a gradient."""
+"""Guidance: the interface that turns a prior's prediction about a render into a gradient."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from cadam3d.prior.base import Condition, DiffusionPrior
 
 @dataclass(frozen=True)
 class GuidanceOutput:
-    """A surrogate loss and what the eye wants to follow."""
+    """A surrogate loss, and numbers to follow during training."""
 
     loss: Float[Tensor, ""]  # its gradient IS the distillation gradient
-    log: dict[str, float]  # for eyes only; never read back
+    log: dict[str, float]  # for people to read; training never reads it
 
 
 class Guidance(ABC):
-    """A distillation objective (paper eq. 4). Frozen hyper-parameters; stateless."""
+    """A distillation objective (paper eq. 4). Holds frozen hyper-parameters and no state."""
 
     @abstractmethod
     def __call__(
@@ -31,7 +31,10 @@ class Guidance(ABC):
         step: int,
         generator: torch.Generator,
     ) -> GuidanceOutput:
-        """Judge the render ``rgb`` (in [0, 1], with gradient); all draws come from the CPU ``generator``."""
+        """Return the loss of the render ``rgb``, which is in [0, 1] and has a gradient.
+
+        All random numbers come from the CPU ``generator``.
+        """
 
     def charts(self) -> tuple[Chart, ...]:
         """Declare the charts that the report draws of :attr:`GuidanceOutput.log`; none by default."""

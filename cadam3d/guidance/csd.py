@@ -10,7 +10,8 @@ from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.guidance.distill import Case, Comparison, Distillation
 from cadam3d.guidance.trajectory import UNGUIDED
 
-PROMPT, NEGATIVE = 1.0, 0.0  # the scales at which one half of a condition speaks alone
+# Guidance scales at which a prediction depends on the prompt alone, or on the negative prompt alone.
+PROMPT, NEGATIVE = 1.0, 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,25 +22,26 @@ class CSD(Distillation):
 
         G = weight * w(t) * (eps(x_t, t, prompt) - (1 - r) eps(x_t, t, n) - r eps(x_t, t, no prompt)),
 
-    the part of SDS that grows with the guidance scale: at r = 0 it is SDS at scale s + 1 less SDS at scale 1,
-    divided by s. A scale would only be another weight. r anneals the negative prompt, as their recipes do.
+    the part of SDS that grows with the guidance scale: at r = 0 it is SDS at scale s + 1 minus SDS at scale
+    1, divided by s. CSD has no guidance scale, since that would only be another weight. A schedule for r
+    anneals the negative prompt, as the authors' recipes do.
 
-    Two predictions of a single branch each; a third where r lies strictly between 0 and 1.
+    Each step makes two predictions of a single branch, and a third if 0 < r < 1.
     """
 
-    empty_share: float | Schedule  # of the empty prompt in what the prompt is held against; in [0, 1]
+    empty_share: float | Schedule  # of the empty prompt in the reference prediction; in [0, 1]
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_scheduled("guidance.empty_share", self.empty_share, low=0, high=1, example=0.0)
 
     def compare(self, case: Case) -> Comparison:
-        """Noise predicted under the prompt minus noise predicted under what it is held against."""
+        """Subtract the noise of the reference prediction from the noise predicted under the prompt."""
         noise = case.draw_noise()
         guess = case.guess(noise, PROMPT)
-        return Comparison(difference=guess.noise - self._against(case, noise), clean=guess.clean)
+        return Comparison(difference=guess.noise - self._reference(case, noise), clean=guess.clean)
 
-    def _against(self, case: Case, noise: Float[Tensor, "v c h w"]) -> Float[Tensor, "v c h w"]:
+    def _reference(self, case: Case, noise: Float[Tensor, "v c h w"]) -> Float[Tensor, "v c h w"]:
         share = as_schedule(self.empty_share)(case.step)
         require_range("guidance.empty_share", share, low=0, high=1, example=0.0)
         if share == 0:

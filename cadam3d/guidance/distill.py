@@ -1,4 +1,4 @@
-"""Distillation: what the objectives share that differ only in the guesses they subtract (paper sec. 3.2)."""
+"""Distillation: the part shared by all objectives that subtract two predictions (paper sec. 3.2)."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cadam3d.core.chart import Chart, Curve
 from cadam3d.core.checks import require_choice, require_range
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.guidance.base import GuidanceOutput
@@ -23,17 +24,30 @@ WEIGHTINGS: dict[str, Callable[[NoisePath, Tensor], Tensor]] = {
     "sqrt_abar_one_minus_abar": lambda path, t: path.a(t) * path.b(t) ** 2,
     "gamma": lambda path, t: path.gamma(t),
 }
-# What the sum over all elements is divided by, given the shape (v, c, h, w) of what the prior denoises.
+# Divisor of the sum over all elements, given the shape (v, c, h, w) of the encoded renders.
 DIVISORS: dict[str, Callable[[torch.Size], int]] = {
     "mean": lambda shape: shape.numel(),
     "sum_per_view": lambda shape: shape[0],
     "sum": lambda shape: 1,
 }
+STRENGTH = Chart(
+    title="Strength of the guidance",
+    caption="Root mean square of the gradient that the objective applies to the encoded renders, before it "
+    "is divided by the number of elements. It varies with the noise level that each step draws.",
+    curves=(Curve(key="guidance_rms"),),
+    log_y=True,
+)
+RESIDUAL = Chart(
+    title="Distance to the prior's clean prediction",
+    caption="Root mean square difference between the encoded renders and the clean images that the prior "
+    "predicts for them; small if the prior would change little.",
+    curves=(Curve(key="residual_rms"),),
+)
 
 
 @dataclass(frozen=True)
 class Case:
-    """What an objective has to judge: encoded renders at their noise levels, and the prior to ask."""
+    """The input of an objective: encoded renders, their noise levels, and the prior."""
 
     clean: Float[Tensor, "v c h w"]  # the encoded renders, without gradient
     t: Float[Tensor, "v"]
@@ -43,41 +57,45 @@ class Case:
     generator: torch.Generator
 
     def draw_noise(self) -> Float[Tensor, "v c h w"]:
-        """Fresh noise for every view."""
+        """Draw new noise for every view."""
         return standard_normal(self.clean, self.generator)
 
     def guess(self, noise: Float[Tensor, "v c h w"], scale: float) -> Prediction:
-        """The prior's guess about the renders under ``noise``, at their levels."""
+        """Mix the renders with ``noise`` at their levels and return the prior's prediction."""
         noisy = self.prior.noise_path.mix(self.clean, noise, self.t)
         return self.prior.predict(noisy, self.t, self.condition, scale)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two guesses, subtracted."""
+    """The difference of two predictions, and the clean image that one of them leads to."""
 
-    difference: Float[Tensor, "v c h w"]  # descending along it moves the render towards `clean`
-    clean: Float[Tensor, "v c h w"]  # the pseudo-target: the prior's guess of the clean image
+    difference: Float[Tensor, "v c h w"]  # a descent step along it moves the render towards `clean`
+    clean: Float[Tensor, "v c h w"]  # the pseudo-target: the prior's prediction of the clean image
 
 
 @dataclass(frozen=True, kw_only=True)
 class Distillation(WindowedGuidance):
-    """Turn the difference of two guesses into a loss (paper eq. 4).
+    """Turns the difference of two predictions into a loss (paper eq. 4).
 
     Per element of the encoded render x0,
 
         G = weight * w(t) * difference,    clamped to +-clip,    loss = ||x0 - stopgrad(x0 - G)||^2 / (2 D),
 
-    so that d loss / d x0 = G / D exactly, and the value of the loss is half the squared norm of the guidance:
-    a size to follow, not a distance to the prompt. Descent subtracts G: it moves x0 towards the clean guess.
-    No network is differentiated. Elements of G that are not finite become 0 and are counted in the log.
+    so that d loss / d x0 = G / D exactly. The value of the loss is half the squared norm of the guidance
+    (divided by D); it is not a distance to the prompt. Gradient descent subtracts G, which moves x0 towards
+    the predicted clean image. No network is differentiated. Elements of G that are not finite become 0 and
+    are counted in the log.
 
-    D depends on ``reduction``. ``mean``: all elements, v * c * h * w, the scale of a photometric mean squared
-    error, for which 3DGS's densification threshold of 2e-4 was made. ``sum_per_view``: v (GaussianDreamer).
-    ``sum``: 1 (LucidDreamer, FlowDreamer).
+    D depends on ``reduction``:
 
-    Log: ``t`` (mean), ``guidance_rms`` (of G, clamped, before D), ``residual_rms`` (of x0 minus the clean
-    guess), ``guidance_nonfinite`` (elements replaced by 0).
+    - ``mean``: v * c * h * w, the number of elements. This is the scale of a photometric mean squared error,
+      for which 3DGS chose its densification threshold of 2e-4.
+    - ``sum_per_view``: v (GaussianDreamer).
+    - ``sum``: 1 (LucidDreamer, FlowDreamer).
+
+    The log holds ``t`` (mean over views), ``guidance_rms`` (of G, clamped, before D), ``residual_rms`` (of x0
+    minus the predicted clean image) and ``guidance_nonfinite`` (elements replaced by 0).
     """
 
     weight: float  # of the objective; the repositories call it lambda_guidance
@@ -95,7 +113,7 @@ class Distillation(WindowedGuidance):
 
     @abstractmethod
     def compare(self, case: Case) -> Comparison:
-        """The objective itself; called without gradient."""
+        """Return the two predictions, subtracted; this defines the objective. Called without gradient."""
 
     def __call__(
         self,
@@ -105,9 +123,10 @@ class Distillation(WindowedGuidance):
         step: int,
         generator: torch.Generator,
     ) -> GuidanceOutput:
-        """Judge the render ``rgb`` (in [0, 1], with gradient); all draws come from the CPU ``generator``.
+        """Return the loss of the render ``rgb``, which is in [0, 1] and has a gradient.
 
-        Raises ``UserError`` if a schedule leaves its range at ``step``.
+        All random numbers come from the CPU ``generator``. Raises ``UserError`` if a schedule leaves its
+        range at ``step``.
         """
         clean = prior.encode(rgb)
         with torch.no_grad():
@@ -127,6 +146,10 @@ class Distillation(WindowedGuidance):
             },
         )
 
+    def charts(self) -> tuple[Chart, ...]:
+        """Declare charts of ``guidance_rms`` and ``residual_rms``."""
+        return (STRENGTH, RESIDUAL)
+
     def _bound(self, step: int) -> float | None:
         if self.clip is None:
             return None
@@ -137,7 +160,7 @@ class Distillation(WindowedGuidance):
 
 @dataclass(frozen=True, kw_only=True)
 class GuidedDistillation(Distillation):
-    """A distillation whose guess of the clean image is under classifier-free guidance."""
+    """A distillation that predicts the clean image under classifier-free guidance."""
 
     scale: float  # conventional: negative + scale * (positive - negative)
 
@@ -149,29 +172,29 @@ class GuidedDistillation(Distillation):
 def surrogate(
     clean: Float[Tensor, "v c h w"], gradient: Float[Tensor, "v c h w"], divisor: int
 ) -> Float[Tensor, ""]:
-    """||x0 - stopgrad(x0 - G)||^2 / (2 * divisor), whose gradient with respect to x0 is G / divisor.
+    """Return ||x0 - stopgrad(x0 - G)||^2 / (2 * divisor), which has the gradient G / divisor.
 
-    The inner bracket is opened: x0 - stopgrad(x0) is exactly 0; x0 - (x0 - G) would round a small G away. The
-    sum is never in half precision, where it would overflow.
+    The difference is computed as (x0 - stopgrad(x0)) + G: the first part is exactly 0, whereas x0 - (x0 - G)
+    would round a small G away. The sum is never in half precision, where it would overflow.
     """
     wide = clean.to(torch.promote_types(clean.dtype, torch.float32))
     return 0.5 * (wide - wide.detach() + gradient).square().sum() / divisor
 
 
 def standard_normal(like: Float[Tensor, "v c h w"], generator: torch.Generator) -> Float[Tensor, "v c h w"]:
-    """Noise in the shape, dtype and device of ``like``; the same numbers on any device, in any dtype."""
+    """Draw noise with the shape, dtype and device of ``like``; the draws do not depend on device or dtype."""
     noise = torch.randn(like.shape, generator=generator, dtype=torch.float32, device=generator.device)
     return noise.to(like)
 
 
 def finite(gradient: Tensor) -> tuple[Tensor, int]:
-    """``gradient`` with 0 for what is not finite, and how many elements that were."""
+    """Replace elements of ``gradient`` that are not finite by 0; return the result and their number."""
     is_finite = gradient.isfinite()
     return torch.where(is_finite, gradient, 0), int((~is_finite).sum())
 
 
 def rms(values: Tensor) -> float:
-    """Root mean square over the finite elements; 0 if there are none."""
+    """Return the root mean square of the finite elements, or 0 if there are none."""
     is_finite = values.isfinite()
     squares = torch.where(is_finite, values, 0).square().sum()
     return float((squares / is_finite.sum().clamp_min(1)).sqrt())

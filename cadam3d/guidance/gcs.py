@@ -1,4 +1,4 @@
-"""GCS: the prior's trajectory through the render, held against the one that the prompt would take."""
+"""GCS: compares the prior's trajectory through the render with the trajectory that the prompt would take."""
 
 from dataclasses import dataclass
 
@@ -6,17 +6,29 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cadam3d.core.chart import Chart, Curve
 from cadam3d.core.checks import require, require_choice, require_range
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.guidance.base import GuidanceOutput
-from cadam3d.guidance.distill import DIVISORS, Case, finite, rms, standard_normal, surrogate
+from cadam3d.guidance.distill import DIVISORS, RESIDUAL, Case, finite, rms, standard_normal, surrogate
 from cadam3d.guidance.trajectory import UNGUIDED
 from cadam3d.guidance.window import WindowedGuidance
 from cadam3d.prior.base import Condition, DiffusionPrior
 from cadam3d.prior.path import Prediction, per_view
 
-ROW = 0.001  # one of the thousand of Stable Diffusion's noise table, in t: the least e
-GAP = 10 * ROW  # least distance between e and s
+# One of the thousand rows of Stable Diffusion's noise table, in units of t; the smallest e.
+ROW = 0.001
+GAP = 10 * ROW  # smallest distance between e and s
+TERMS = Chart(
+    title="Terms of GCS",
+    caption="Root mean square of the gradient that each term applies, with its weight, before it is divided "
+    "by the number of elements; the pixel constraint acts on pixels, the others on the encoded renders.",
+    curves=(
+        Curve(key="cc_rms", label="compact consistency"),
+        Curve(key="gc_rms", label="conditional guidance"),
+        Curve(key="cp_rms", label="pixel constraint"),
+    ),
+)
 
 
 @dataclass(frozen=True)
@@ -30,46 +42,48 @@ class Levels:
 
 @dataclass(frozen=True)
 class Terms:
-    """What the three terms ask of the encoded renders and of the renders, before their weights."""
+    """The differences inside the three terms, before their weights."""
 
     consistency: Float[Tensor, "v c lh lw"]  # CC
     guidance: Float[Tensor, "v c lh lw"]  # GC
     pixels: Float[Tensor, "v h w 3"]  # CP
-    clean: Float[Tensor, "v c lh lw"]  # the prior's guess of the clean image
+    clean: Float[Tensor, "v c lh lw"]  # the prior's prediction of the clean image
 
 
 @dataclass(frozen=True, kw_only=True)
 class GCS(WindowedGuidance):
     """Guided consistency sampling (Li et al. 2024, GCS-BEG), without its brightness rule.
 
-    With t from the window, s = t - ``delta`` and a random e in [t - 2 delta, s - 0.01), the render x0 is
-    noised to x_e = a x0 + b n and follows the prior without a prompt to x_s and x_t. From x_t the prompt
-    leads back to y_s and y_e. Phi(x, p -> q) is one DDIM step (DPM-Solver++ of order 1) without a prompt,
-    x0_hat a clean guess without and x0_bar with it, under classifier-free guidance as the way back:
+    The objective draws t from the window, takes s = t - ``delta`` and draws e from [t - 2 delta, s - 0.01).
+    It mixes the render x0 with noise n to x_e = a x0 + b n and follows the prior without a prompt to x_s and
+    x_t. From x_t it goes back under the prompt, with classifier-free guidance, to y_s and y_e. Phi(x, p -> q)
+    is one DDIM step (DPM-Solver++ of order 1) without a prompt. x0_hat is the predicted clean image without
+    the prompt, x0_bar the one under the prompt and guidance:
 
         CC = || Phi(x_t, t -> e) - Phi(y_s, s -> e) ||^2                 compact consistency
         GC = || x0_hat(x_e, e) - x0_bar(y_e, e) ||^2                     conditional guidance
         CP = || decode(x0_hat(x_e, e)) - decode(x0_bar(y_e, e)) ||^2     pixel constraint
         loss = weight (w_cc CC + w_gc GC + w_cp CP) / D
 
-    Second arguments and networks are constants. The chain of DDIM steps that carries x0 into a first argument
-    has a slope that telescopes, to a(e) for CC and 1 for GC. CP hands its difference to the pixels of the
-    render themselves, past the encoder. The gradients, before D, are
+    The second term of each difference and the networks are constants. The slope of the chain of DDIM steps
+    that carries x0 into the first term telescopes to a(e) for CC and to 1 for GC. CP applies its difference
+    to the pixels of the render directly, without the encoder. The gradients, before D, are
 
         2 weight (a(e) w_cc [CC's difference] + w_gc [GC's])  on x0,    2 weight w_cp [CP's]  on the render.
 
-    There is no w(t), and no factor 1/2 as elsewhere. D follows ``reduction``; ``mean`` divides each part by
-    its own number of elements, latents or pixels. The value of the loss that is returned is half the squared
-    norm of the gradients.
+    There is no w(t), and no factor 1/2 as in the other objectives. D follows ``reduction``; ``mean`` divides
+    each part by its own number of elements, latents or pixels. The value of the returned loss is half the
+    squared norm of the gradients.
 
-    ``fixed_noise`` takes the same n at every step. It follows the seed of the guidance's generator, which a
-    checkpoint keeps, so a resumed run goes on with it; another number of views has other noise.
+    With ``fixed_noise`` every step uses the same n. It is derived from the seed of the guidance's generator,
+    which a checkpoint keeps, so a resumed run continues with the same noise. A different number of views
+    gives different noise.
 
-    The prior is asked six times, four of them without guidance; less for a weight of 0. CP decodes twice.
+    A step makes six predictions, four of them without guidance, and fewer if a weight is 0. CP decodes twice.
 
-    Log: ``t`` (mean), ``guidance_rms`` (of the gradient on x0 before D), ``cc_rms``, ``gc_rms``, ``cp_rms``
-    (of each term's part, with its weights), ``residual_rms`` (of x0 minus the last clean guess),
-    ``guidance_nonfinite`` (elements replaced by 0).
+    The log holds ``t`` (mean over views), ``guidance_rms`` (of the gradient on x0 before D), ``cc_rms``,
+    ``gc_rms``, ``cp_rms`` (of each term's gradient, with its weights), ``residual_rms`` (of x0 minus the last
+    predicted clean image) and ``guidance_nonfinite`` (elements replaced by 0).
     """
 
     scale: float  # classifier-free guidance, conventional: negative + scale * (positive - negative)
@@ -88,7 +102,13 @@ class GCS(WindowedGuidance):
         for key, value in (("w_cc", self.w_cc), ("w_gc", self.w_gc), ("w_cp", self.w_cp)):
             require_range(f"guidance.{key}", value, low=0, example=0.5)
         is_any = max(self.w_cc, self.w_gc, self.w_cp) > 0
-        require(is_any, "guidance.w_gc", expected="a term with a weight", got=0, example="guidance.w_gc=0.5")
+        require(
+            is_any,
+            "guidance.w_gc",
+            expected="a number > 0, since w_cc and w_cp are 0 as well",
+            got=self.w_gc,
+            example="guidance.w_gc=0.5",
+        )
         require_scheduled("guidance.delta", self.delta, above=GAP, high=0.5, example=0.08)
         require_choice("guidance.fixed_noise", self.fixed_noise, (True, False))
         require_choice("guidance.reduction", self.reduction, list(DIVISORS))
@@ -101,9 +121,10 @@ class GCS(WindowedGuidance):
         step: int,
         generator: torch.Generator,
     ) -> GuidanceOutput:
-        """Judge the render ``rgb`` (in [0, 1], with gradient); all draws come from the CPU ``generator``.
+        """Return the loss of the render ``rgb``, which is in [0, 1] and has a gradient.
 
-        Raises ``UserError`` if a schedule leaves its range at ``step``.
+        All random numbers come from the CPU ``generator``. Raises ``UserError`` if a schedule leaves its
+        range at ``step``.
         """
         clean = prior.encode(rgb)
         with torch.no_grad():
@@ -131,8 +152,12 @@ class GCS(WindowedGuidance):
             },
         )
 
+    def charts(self) -> tuple[Chart, ...]:
+        """Declare charts of the three terms and of ``residual_rms``."""
+        return (TERMS, RESIDUAL)
+
     def draw_levels(self, clean: Float[Tensor, "v c h w"], step: int, generator: torch.Generator) -> Levels:
-        """t from the window, but at least delta + 0.001; s and e below it."""
+        """Draw t from the window, raised to at least delta + 0.001, and s and e below it."""
         delta = as_schedule(self.delta)(step)
         require_range("guidance.delta", delta, above=GAP, high=0.5, example=0.08)
         t = self.draw_t(clean, step, generator).clamp_min(delta + ROW)
@@ -142,14 +167,15 @@ class GCS(WindowedGuidance):
         return Levels(e=e, s=s, t=t)
 
     def draw_noise(self, case: Case) -> Float[Tensor, "v c h w"]:
-        """n: the run's own, or new."""
+        """Return the noise n: the same at every step with ``fixed_noise``, otherwise drawn anew."""
         if not self.fixed_noise:
             return case.draw_noise()
-        seed = (case.generator.initial_seed() + 1) % 2**63  # another stream than that of t
+        # Add 1, so that the noise does not repeat the random numbers from which t is drawn.
+        seed = (case.generator.initial_seed() + 1) % 2**63
         return standard_normal(case.clean, torch.Generator().manual_seed(seed))
 
     def terms(self, case: Case, levels: Levels, rgb: Float[Tensor, "v h w 3"]) -> Terms:
-        """There without a prompt, back with it, and what lies between the two."""
+        """Follow the prior to t without the prompt and back with it, and return the differences."""
         path, unprompted = case.prior.noise_path, case.condition.unprompted()
         height, width = rgb.shape[1:3]
 

@@ -1,4 +1,4 @@
-"""ISM: noise the render along the prior's own trajectory instead of at random; compare neighbours on it."""
+"""ISM: adds noise along the prior's own trajectory instead of at random, and compares two points of it."""
 
 from dataclasses import dataclass
 
@@ -12,21 +12,21 @@ from cadam3d.guidance.trajectory import UNGUIDED, ddim, strides
 class ISM(GuidedDistillation):
     """Interval score matching (Liang et al. 2024, LucidDreamer).
 
-    DDIM inversion without a prompt takes x0 to x_s, s = max(t - delta, 0), and one step more to x_t. Then
+    DDIM inversion without a prompt takes x0 to x_s, s = max(t - delta, 0), and one more step to x_t. Then
 
         G = weight * w(t) * (eps_hat(x_t, t, prompt) - eps(x_s, s, no prompt))
 
     with eps_hat under classifier-free guidance in the conventional form. The published w(t) is
     gamma(t) = b / a: 0.13 at t = 0.02 and 13 at 0.98 on the DDPM path, and infinite on a flow path at t = 1.
 
-    The prior is asked ceil(s / inversion_stride) + 1 times without guidance and once with it; without
-    ``shared_t`` the longest inversion of the batch sets the number. ``initial_noise`` noises the render
-    before it is inverted, which LucidDreamer's code does and its paper does not.
+    A step makes ceil(s / inversion_stride) + 1 predictions without guidance and one with it; without
+    ``shared_t`` the longest inversion of the batch sets the number. ``initial_noise`` adds noise to the
+    render before it is inverted, as LucidDreamer's code does; the paper does not.
     """
 
     delta: float | Schedule  # length of the interval, in t units; in (0, 1]
     inversion_stride: float  # largest DDIM step on the way to s, in t units; in (0, 1]
-    initial_noise: float  # t of the freshly noised image to invert; in [0, 1); 0 = none, as in the paper
+    initial_noise: float  # t of the noised image where the inversion starts; in [0, 1); 0 as in the paper
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -35,7 +35,7 @@ class ISM(GuidedDistillation):
         require_scheduled("guidance.delta", self.delta, above=0, high=1, example=0.05)
 
     def compare(self, case: Case) -> Comparison:
-        """Guided noise at t minus unprompted noise at s, both on one trajectory."""
+        """Subtract the noise at s without a prompt from the guided noise at t, on one trajectory."""
         prior, path, unprompted = case.prior, case.prior.noise_path, case.condition.unprompted()
         s = (case.t - self._interval(case.step)).clamp_min(0)
         start = s.clamp_max(self.initial_noise)

@@ -1,4 +1,4 @@
-"""SDI: the noise that would have led to the render, found by inverting the prior under its prompt."""
+"""SDI: finds the noise that would have led to the render by inverting the prior under its prompt."""
 
 from dataclasses import dataclass
 
@@ -17,28 +17,29 @@ class SDI(GuidedDistillation):
     """Score distillation via inversion (Lukoianov et al. 2024, "Score distillation via reparametrized DDIM").
 
     DDIM inversion from 0 to t' = min(t + tau, 1), tau ~ U(0, ``overshoot``), under the prompt and its own
-    guidance scale, carries the render x0 to x_t'. The noise between the two, a little more noise added,
+    guidance scale, carries the render x0 to x_t'. The noise between the two, plus a little new noise,
 
         kappa = (x_t' - a(t') x0) / b(t') + eta b(t') eps,    eps ~ N(0, I),
 
-    takes the place of SDS's random one (their algorithm 2 and equation 11):
+    replaces the random noise of SDS (algorithm 2 and equation 11 of the SDI paper):
 
         G = weight * w(t) * (eps_hat(x_t, t, prompt) - kappa),    x_t = a(t) x0 + b(t) kappa.
 
-    With the published w(t) = gamma(t) this is x0 - x0_hat: the distance to the clean guess, without a weight.
-    The published inversion scale is the guidance scale negated; the paper finds that to invert best.
+    With the published w(t) = gamma(t) this is x0 - x0_hat: the difference to the predicted clean image,
+    without a weight. The published inversion scale is the negative guidance scale, which the paper finds to
+    invert best.
 
     The released code differs in two places. It adds its noise at every step of the inversion; over its ten
-    steps that sums up to eta b(t')^2 in x_t' to within 7 %, as here. And it hands x_t' itself to the last
-    guess, as though it lay at t, where the paper goes back to t.
+    steps the sum in x_t' agrees with the eta b(t')^2 used here to within 7 %. It also passes x_t' itself to
+    the last prediction as if its level were t, where the paper goes back to t.
 
-    The prior is asked ceil(t' / inversion_stride) + 1 times, always under guidance.
+    A step makes ceil(t' / inversion_stride) + 1 predictions, all under guidance.
     """
 
     inversion_scale: float  # guidance scale of the inversion, conventional; may be negative
     inversion_stride: float  # largest DDIM step of the inversion, in t units; in (0, 1]
-    overshoot: float  # largest distance that the inversion goes beyond t; in [0, 1)
-    eta: float  # share of fresh noise on top of the inverted one, at full noise; >= 0
+    overshoot: float  # largest distance by which the inversion goes beyond t; in [0, 1)
+    eta: float  # share of new noise added to the inverted noise, at full noise; >= 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -48,13 +49,13 @@ class SDI(GuidedDistillation):
         require_range("guidance.eta", self.eta, low=0, example=0.3)
 
     def compare(self, case: Case) -> Comparison:
-        """Guided noise minus the noise that the inversion found."""
+        """Subtract the noise that the inversion found from the guided noise."""
         noise = self.invert(case)
         guess = case.guess(noise, self.scale)
         return Comparison(difference=guess.noise - noise, clean=guess.clean)
 
     def invert(self, case: Case) -> Float[Tensor, "v c h w"]:
-        """The noise kappa of every render."""
+        """Return the noise kappa of every render."""
         path, tau = case.prior.noise_path, self.overshoot * self.uniform(case.clean, case.generator)
         beyond = (case.t + tau).clamp_max(1)
         levels = strides(torch.zeros_like(beyond), beyond, self.inversion_stride)

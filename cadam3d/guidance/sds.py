@@ -1,4 +1,4 @@
-"""SDS: would the prior have removed the noise that we know we added?"""
+"""SDS: compares the noise that the prior predicts with the noise that was added."""
 
 from dataclasses import dataclass
 
@@ -14,12 +14,12 @@ class SDS(GuidedDistillation):
         G = weight * w(t) * (eps_hat(x_t, t, prompt) - eps)
           = weight * w(t) / gamma(t) * (x0 - x0_hat)                 (paper eq. 4)
 
-    where eps_hat is under classifier-free guidance in the conventional form. GaussianDreamer's own scale of
-    100 counts from the prompt, eps_y + 100 (eps_y - eps_n), which is 101 here.
+    where eps_hat is under classifier-free guidance in the conventional form. GaussianDreamer defines its
+    scale of 100 by eps_y + 100 (eps_y - eps_n), which corresponds to ``scale=101`` here.
     """
 
     def compare(self, case: Case) -> Comparison:
-        """Predicted noise minus added noise. One guided prediction per view."""
+        """Subtract the added noise from the predicted noise; one guided prediction per view."""
         noise = case.draw_noise()
         guess = case.guess(noise, self.scale)
         return Comparison(difference=guess.noise - noise, clean=guess.clean)

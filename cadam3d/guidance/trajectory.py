@@ -1,4 +1,4 @@
-"""The prior's own trajectory between noise levels: inversion upwards in t, sampling downwards."""
+"""Trajectories of a prior between noise levels: inversion towards larger t, sampling towards smaller t."""
 
 import math
 from collections.abc import Sequence
@@ -11,8 +11,10 @@ from torch import Tensor
 from cadam3d.prior.base import Condition, DiffusionPrior
 from cadam3d.prior.path import per_view
 
-UNGUIDED = 1.0  # both halves of an unprompted condition are empty; at 1 a prior needs only one of them
-TIE = 1e-4  # of a stride: 0.6 / 0.2 is three steps, whatever the rounding says
+# Both halves of an unprompted condition are empty. At scale 1 a prior needs to evaluate only one of them.
+UNGUIDED = 1.0
+# Tolerance in strides, so that 0.6 / 0.2 gives three steps in spite of rounding.
+TIE = 1e-4
 
 
 def ddim(
@@ -24,8 +26,8 @@ def ddim(
 ) -> Float[Tensor, "v c h w"]:
     """Follow the prior's deterministic trajectory (DDIM, eta = 0) from the first of ``levels`` to the last.
 
-    ``noisy`` lies at the first, the answer at the last; every level but the last costs one prediction. On a
-    flow path a step is one of Euler's. A view whose level does not change keeps its image.
+    ``noisy`` is at the first level, the returned image at the last. Every level except the last costs one
+    prediction. On a flow path each step is an Euler step. A view keeps its image while its level stays equal.
     """
     for now, then in pairwise(levels):
         guess = prior.predict(noisy, now, condition, scale)
@@ -35,9 +37,10 @@ def ddim(
 
 
 def strides(start: Float[Tensor, "v"], end: Float[Tensor, "v"], stride: float) -> list[Float[Tensor, "v"]]:
-    """Levels from ``start`` to ``end``, ``stride`` apart in t; the last step is shorter.
+    """Return levels from ``start`` to ``end``, ``stride`` apart in t; the last step may be shorter.
 
-    A view that has arrived waits for the others. Without any distance to go, ``start`` alone.
+    A view that has arrived repeats its last level until all views have. If no view has any distance to go,
+    the list holds ``start`` alone.
     """
     length, way = (end - start).abs(), (end - start).sign()
     steps = math.ceil(float(length.max()) / stride - TIE)

@@ -1,4 +1,4 @@
-"""UCM: find the noise that the prior itself couples with the render, instead of drawing one."""
+"""UCM: uses the noise that the prior itself couples with the render, instead of random noise."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from cadam3d.guidance.distill import Case, Comparison, GuidedDistillation
 from cadam3d.guidance.trajectory import ddim
 from cadam3d.prior.path import NoisePath, per_view
 
-# Where the steps of the inversion lie, by name: shares of the way from 0 to 1 -> levels in t.
+# Positions of the inversion steps, by name: a function from shares of the way, 0 to 1, to levels in t.
 GRIDS: dict[str, Callable[[NoisePath, Tensor], Tensor]] = {
     "sigma": lambda path, shares: path.t_at(shares * path.b(torch.ones_like(shares))),
     "t": lambda path, shares: shares,
@@ -24,21 +24,21 @@ class UCM(GuidedDistillation):
     """Unique coupling matching by push-backward (FlowDreamer).
 
     The prior's own trajectory without a prompt, ``inversion_steps`` Euler steps from t = 0 to t = 1, carries
-    the render x0 to x_1. The noise eps* that mixes with x0 to x_1 is coupled with x0, and
+    the render x0 to x_1. The noise eps* that, mixed with x0, gives x_1 is coupled with x0, and
 
         G = weight * w(t) * (v_hat(x_t, t, prompt) - v(x0, eps*)),    x_t = a x0 + b eps*,
 
     with the coupling treated as a constant. On a rectified flow eps* = x_1; on a DDPM path some of x0 is left
-    at t = 1, and eps* = (x_1 - a(1) x0) / b(1). Given t and the render nothing is random, unless
-    ``fresh_noise`` puts some back, as FlowDreamer does where it uses Perp-Neg:
+    at t = 1, and eps* = (x_1 - a(1) x0) / b(1). Given t and the render, nothing is random unless
+    ``fresh_noise`` adds new noise, as FlowDreamer does in combination with Perp-Neg:
 
         eps* <- (1 - r) eps* + r eps',    r = fresh_noise * b(t),    eps' ~ N(0, I).
 
-    The prior is asked ``inversion_steps`` times without guidance, first at t = 0 exactly, and once with it.
+    A step makes ``inversion_steps`` predictions without guidance, the first at t = 0, and one with guidance.
     """
 
     inversion_steps: int  # >= 1
-    inversion_grid: str  # where they lie, one of GRIDS: even in sigma (b on any path) or in t
+    inversion_grid: str  # spacing of the steps, one of GRIDS: even in sigma (b on any path) or in t
     fresh_noise: float  # in [0, 1]; 0 = off
 
     def __post_init__(self) -> None:
@@ -48,14 +48,14 @@ class UCM(GuidedDistillation):
         require_range("guidance.fresh_noise", self.fresh_noise, low=0, high=1, example=0.0)
 
     def compare(self, case: Case) -> Comparison:
-        """Guided velocity minus the velocity of the coupled pair."""
+        """Subtract the velocity of the coupled pair from the guided velocity."""
         noise = self.couple(case)
         guess = case.guess(noise, self.scale)
         velocity = case.prior.noise_path.velocity(case.clean, noise, case.t)
         return Comparison(difference=guess.velocity - velocity, clean=guess.clean)
 
     def couple(self, case: Case) -> Float[Tensor, "v c h w"]:
-        """The noise eps* of every render."""
+        """Return the noise eps* of every render."""
         path, ends = case.prior.noise_path, torch.ones_like(case.t)
         shares = torch.linspace(0, 1, self.inversion_steps + 1, dtype=torch.float64)
         grid = GRIDS[self.inversion_grid](path, shares).tolist()

@@ -1,4 +1,4 @@
-"""VFDS: would the prior's flow have led back to where we came from?"""
+"""VFDS: compares the velocity that the prior predicts with the velocity of the path itself."""
 
 from dataclasses import dataclass
 
@@ -17,11 +17,12 @@ class VFDS(GuidedDistillation):
 
         v_hat - v = (x0 - x0_hat) / b,
 
-    so that at equal b and an equal clean guess the two paths give the same G, and G is SDS's divided by a.
+    so that at equal b and an equal predicted clean image the two paths give the same G, which is the G of SDS
+    divided by a.
     """
 
     def compare(self, case: Case) -> Comparison:
-        """Predicted velocity minus the velocity of the pair. One guided prediction per view."""
+        """Subtract the velocity of the pair from the predicted velocity; one guided prediction per view."""
         noise = case.draw_noise()
         guess = case.guess(noise, self.scale)
         velocity = case.prior.noise_path.velocity(case.clean, noise, case.t)

@@ -1,4 +1,4 @@
-"""The window of noise levels that a guidance draws from; it may slide while training runs."""
+"""The window of noise levels that an objective draws from; schedules may move it during training."""
 
 from dataclasses import dataclass
 
@@ -15,22 +15,23 @@ from cadam3d.guidance.base import Guidance
 class WindowedGuidance(Guidance):
     """Guidance at noise levels drawn uniformly from [t_min, t_max).
 
-    With t_min = t_max nothing is left to chance: one schedule for both is DreamGaussian's annealing of t.
+    With t_min = t_max the level is not random: the same schedule for both is DreamGaussian's annealing of t.
     """
 
     t_min: float | Schedule  # in [0, t_max]
     t_max: float | Schedule  # in [t_min, 1]
-    shared_t: bool  # one t for all views of a step, or one each
+    shared_t: bool  # one t for all views of a step, or one for each
 
     def __post_init__(self) -> None:
         require_choice("guidance.shared_t", self.shared_t, (True, False))
         require_scheduled("guidance.t_min", self.t_min, example=0.02)
         require_scheduled("guidance.t_max", self.t_max, example=0.98)
-        for step in (0, FAR_STEP):  # the steps between are checked as they come
+        # The steps in between are checked when training reaches them.
+        for step in (0, FAR_STEP):
             self.window(step)
 
     def window(self, step: int) -> tuple[float, float]:
-        """t_min and t_max at ``step``. Raises ``UserError`` if a schedule leaves its range there."""
+        """Return t_min and t_max at ``step``. Raises ``UserError`` if a schedule leaves its range there."""
         low, high = as_schedule(self.t_min)(step), as_schedule(self.t_max)(step)
         require(
             0 <= low <= high <= 1,
@@ -44,15 +45,15 @@ class WindowedGuidance(Guidance):
     def draw_t(
         self, clean: Float[Tensor, "v c h w"], step: int, generator: torch.Generator
     ) -> Float[Tensor, "v"]:
-        """Noise levels for the encoded renders ``clean``; see :meth:`uniform`."""
+        """Draw noise levels for the encoded renders ``clean``, as :meth:`uniform` does."""
         low, high = self.window(step)
         uniform = self.uniform(clean, generator)
         return torch.lerp(torch.full_like(uniform, low), torch.full_like(uniform, high), uniform)
 
     def uniform(self, clean: Float[Tensor, "v c h w"], generator: torch.Generator) -> Float[Tensor, "v"]:
-        """Draws from [0, 1), shared or not as ``shared_t`` says.
+        """Draw uniformly from [0, 1): one number for all views with ``shared_t``, otherwise one for each.
 
-        On the device of ``clean``, and never in half precision: noise levels must stay precise.
+        The result is on the device of ``clean``, and in float32 or wider, since noise levels need precision.
         """
         views = clean.shape[0]
         drawn = torch.rand(1 if self.shared_t else views, generator=generator, dtype=torch.float32)

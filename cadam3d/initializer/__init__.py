@@ -1,1 +1,1 @@
-"""What we start from: initial Gaussians."""
+"""Initializers: the Gaussians that training starts from."""

@@ -1,4 +1,4 @@
-"""Ball: a cloud of near-grey Gaussians around the origin. Needs nothing but a count."""
+"""Ball: a cloud of nearly grey Gaussians around the origin, which needs no model and no file."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,13 +13,15 @@ from cadam3d.initializer.points import PointCloud, gaussians_at, one_color, poin
 
 @dataclass(frozen=True, kw_only=True)
 class Ball(Initializer):
-    """``count`` Gaussians at uniformly random points of a ball; the prompt plays no part."""
+    """``count`` Gaussians at uniformly random points of a ball; the prompt is not used.
+
+    ``scale`` is their standard deviation in world units; None takes the mean distance to the three nearest
+    neighbours.
+    """
 
     count: int
-    radius: float  # world units, at most 1: the object fits in the unit ball
-    scale: (
-        float | None
-    )  # standard deviation in world units; null = mean distance to the three nearest neighbours
+    radius: float  # world units; at most 1, since the object fits in the unit ball
+    scale: float | None  # world units
     opacity: float  # in (0, 1)
     sh_degree: int  # of the colours, 0 to 3
     color: Sequence[float]  # mean RGB, in [0, 1]
@@ -32,7 +34,7 @@ class Ball(Initializer):
         require_color("initializer.color", self.color)
 
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
-        """Gaussians with equal density everywhere in the ball."""
+        """Return Gaussians on ``device`` that fill the ball with equal density."""
         points = points_in_ball(self.count, self.radius, generator)
         deviation = self.color_noise * (2 * torch.rand(self.count, 3, generator=generator) - 1)
         rgb = (one_color(self.color, self.count) + deviation).clamp(0, 1)

@@ -1,4 +1,4 @@
-"""Initializer: the Gaussians that training starts from."""
+"""Initializer: the interface that builds the Gaussians that training starts from."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -10,19 +10,25 @@ from cadam3d.core.gaussians import Gaussians
 
 @dataclass(frozen=True)
 class Beginning:
-    """What a run starts from."""
+    """The initial Gaussians of a run, with a note if they are not the requested ones.
+
+    The note names the fallback and the reason; the user reads it on the console and in the summary.
+    """
 
     gaussians: Gaussians
-    note: str | None = None  # for the user and the summary, where it is not what was asked for: why, and what
+    note: str | None = None
 
 
 class Initializer(ABC):
-    """Builds the initial Gaussians. Frozen hyper-parameters."""
+    """Builds the initial Gaussians. Holds frozen hyper-parameters."""
 
     @abstractmethod
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
-        """Initial Gaussians on ``device``; every random draw comes from the (CPU) ``generator``."""
+        """Return initial Gaussians on ``device``; all random numbers come from the CPU ``generator``."""
 
     def begin(self, prompt: str, generator: torch.Generator, device: torch.device) -> Beginning:
-        """What :meth:`build` builds, or what stands in for it, with a note. By default nothing stands in."""
+        """Return the result of :meth:`build`, or that of a fallback with a note.
+
+        This implementation has no fallback: errors of :meth:`build` are raised.
+        """
         return Beginning(self.build(prompt, generator, device))

@@ -26,27 +26,29 @@ from cadam3d.initializer.points import (
 from cadam3d.io.frames import points_to_world, turned_points
 
 UPS = ("z", "y")
+EXAMPLE = "/path/to/mesh.glb"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mesh(Initializer):
-    """``count`` Gaussians at uniformly random points of a surface; the prompt plays no part.
+    """``count`` Gaussians at uniformly random points of a surface; the prompt is not used.
 
-    Reads whatever trimesh reads (PLY, OBJ, STL, GLB, OFF, ...), with vertex, face or texture colours. It is
-    moved and scaled so that its bounding box is centred at the origin, its farthest point at ``radius``.
+    Reads all formats of trimesh (PLY, OBJ, STL, GLB, OFF, ...), with vertex, face or texture colours. The
+    mesh is moved and scaled so that its bounding box is centred at the origin and its farthest point is at
+    ``radius``; None keeps position and size as in the file. ``up`` is the axis of the file that points up:
+    "z", or "y" as in glTF and most OBJ files, where the front is then +z. ``scale`` is the standard deviation
+    of the Gaussians; None takes the mean distance to the three nearest neighbours.
     """
 
     path: str  # of the file
-    up: str  # which axis of the file points up: "z", or "y" (glTF and most OBJ files, whose front is then +z)
-    turn_deg: int  # then turned about the up axis, counterclockwise from above: 0, 90, 180 or 270
-    radius: float | None  # world units, at most 1: the object fits in the unit ball; null = as it is
+    up: str  # z or y
+    turn_deg: int  # about the up axis, counterclockwise from above; 0, 90, 180 or 270
+    radius: float | None  # world units; at most 1, since the object fits in the unit ball
     count: int
-    scale: (
-        float | None
-    )  # standard deviation in world units; null = mean distance to the three nearest neighbours
+    scale: float | None  # world units
     opacity: float  # in (0, 1)
     sh_degree: int  # of the colours, 0 to 3
-    color: Sequence[float]  # RGB in [0, 1], where the file has no colours
+    color: Sequence[float]  # RGB in [0, 1], used if the file has no colours
 
     def __post_init__(self) -> None:
         require_points(self.count, self.scale, self.opacity, self.sh_degree)
@@ -55,9 +57,9 @@ class Mesh(Initializer):
         require_color("initializer.color", self.color)
 
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
-        """Gaussians with equal density everywhere on the surface.
+        """Return Gaussians on ``device`` that cover the surface with equal density.
 
-        Raises ``UserError`` if the file is missing, cannot be read or holds no surface.
+        Raises ``UserError`` if the file is missing, cannot be read or has no surface.
         """
         parts = self._load()
         corners = torch.cat([_corners(part) for part in parts])
@@ -68,26 +70,28 @@ class Mesh(Initializer):
         return gaussians_at(cloud, scale=self.scale, opacity=self.opacity, sh_degree=self.sh_degree)
 
     def _load(self) -> list[trimesh.Trimesh]:
-        """The surfaces of the file, each where it stands and with its own colours."""
-        path = found_file(self.path, "/path/to/mesh.glb")
+        """Return the surfaces of the file, each at its place in the scene and with its own colours."""
+        path = found_file(self.path, EXAMPLE)
         try:
             parts = [part for part in trimesh.load_scene(path).dump() if isinstance(part, trimesh.Trimesh)]
         except Exception as error:  # every format has its own parser, with its own exceptions
             reason = str(error) or type(error).__name__
             raise UserError(
-                f"initializer.path: {self.path!r} cannot be read ({reason}). Try: a PLY, OBJ, STL or GLB file"
+                f"initializer.path: expected a PLY, OBJ, STL, GLB or OFF file, got {self.path!r}, which "
+                f"cannot be read ({reason}). Try: initializer.path={EXAMPLE}"
             ) from error
         is_finite = all(np.isfinite(part.vertices).all() for part in parts)
         if not is_finite or sum(float(part.area) for part in parts) <= 0:
             vertices, faces = (sum(len(getattr(part, of)) for part in parts) for of in ("vertices", "faces"))
             raise UserError(
-                f"initializer.path: {self.path!r} holds no surface ({vertices} vertices, {faces} faces). "
-                "Try: a file with triangles"
+                f"initializer.path: expected a mesh with triangles, got {self.path!r}, which has no surface "
+                f"({vertices} vertices, {faces} faces). Try: initializer.path={EXAMPLE}, or initializer=ply "
+                "for a cloud of points"
             )
         return parts
 
     def _place(self, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
-        """World positions of the file's points."""
+        """Return the world positions of points of the file."""
         upright = turned_points(points_to_world(points, f"+{self.up}"), self.turn_deg)
         center, factor = fit(upright, self.radius)
         return (upright - center) * factor
@@ -95,7 +99,7 @@ class Mesh(Initializer):
     def _colors(
         self, parts: Sequence[trimesh.Trimesh], faces: Int[Tensor, "n"], weights: Float[Tensor, "n 3"]
     ) -> Float[Tensor, "n 3"]:
-        """RGB of the sampled points, in [0, 1]; ``faces`` count through all parts."""
+        """Return RGB of the sampled points, in [0, 1]; ``faces`` are numbered through all parts."""
         rgb = one_color(self.color, len(faces))
         first = 0
         for part in parts:
@@ -112,7 +116,7 @@ def _corners(part: trimesh.Trimesh) -> Float[Tensor, "f 3 3"]:
 
 
 def _colors_of(part: trimesh.Trimesh, faces: np.ndarray, barycentric: np.ndarray) -> np.ndarray | None:
-    """RGBA at points of ``faces``, 0 to 255; None where the part has no colours."""
+    """Return RGBA at points of ``faces``, 0 to 255, or None if the part has no colours."""
     visual: Any = part.visual
     rows = np.asarray(part.faces)[faces]
     if visual.kind == "vertex":

@@ -1,4 +1,4 @@
-"""Ply: from a PLY file, be it an asset of Gaussians or a cloud of coloured points."""
+"""Ply: starts from a PLY file that holds Gaussians or a cloud of coloured points."""
 
 import math
 from collections.abc import Sequence
@@ -28,29 +28,31 @@ from cadam3d.initializer.points import (
 from cadam3d.io.frames import UPS, points_to_world, turned, turned_points
 from cadam3d.io.ply import holds_gaussians, read_ply
 
-UP_OF_GAUSSIANS = "-y"  # 3DGS, and whatever it was trained on with COLMAP
-UP_OF_POINTS = "+z"  # Point-E, most scans
+UP_OF_GAUSSIANS = "-y"  # as in 3DGS, which takes its axes from COLMAP
+UP_OF_POINTS = "+z"  # as in Point-E and most scans
+EXAMPLE = "/path/to/asset.ply"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ply(Initializer):
-    """What a PLY file holds; the prompt plays no part.
+    """The Gaussians or points of a PLY file; the prompt is not used.
 
-    Gaussians (3DGS layout, any SH degree, ours or anybody's) keep their shapes, colours and opacities. Points
-    (ASCII or binary; of Point-E, a scan) become round Gaussians with their colours.
+    Gaussians (3DGS layout, any SH degree, written by any program) keep their shapes, colours and opacities.
+    Points (ASCII or binary, such as those of Point-E or a scan) become round Gaussians with their colours;
+    ``scale``, ``opacity``, ``color``, ``replicate`` and ``replicate_radius`` apply to points only.
     """
 
     path: str  # of the file
-    up: str | None  # up axis of the file, unless it says so itself: -y, +y or +z; null = -y or, of points, +z
-    turn_deg: int  # then turned about the up axis, counterclockwise from above: 0, 90, 180 or 270
-    radius: float | None  # world units from the centre of the bounding box to the farthest; null = as it is
-    count: int | None  # at most so many rows of the file, drawn at random; null = all
+    up: str | None  # -y, +y or +z, unless the file names its up axis; null = -y for Gaussians, +z for points
+    turn_deg: int  # about the up axis, counterclockwise from above; 0, 90, 180 or 270
+    radius: float | None  # world units from the centre of the bounding box to the farthest; null = unscaled
+    count: int | None  # at most this many rows of the file, drawn at random; null = all
     sh_degree: int | None  # of the colours, 0 to 3; null = that of the file
     replicate: int  # Gaussians for each point
     replicate_radius: float  # world units; of the ball that holds them
-    scale: float | None  # of points: world units; null = mean distance to the three nearest neighbours
-    opacity: float  # of points: in (0, 1)
-    color: Sequence[float]  # of points, where the file has no colours: RGB in [0, 1]
+    scale: float | None  # world units; null = mean distance to the three nearest neighbours
+    opacity: float  # in (0, 1)
+    color: Sequence[float]  # RGB in [0, 1], used if the file has no colours
 
     def __post_init__(self) -> None:
         count = 1 if self.count is None else self.count
@@ -62,11 +64,11 @@ class Ply(Initializer):
         require_color("initializer.color", self.color)
 
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
-        """The Gaussians of the file, or Gaussians at its points.
+        """Return the Gaussians of the file, or Gaussians at its points, on ``device``.
 
         Raises ``UserError`` if the file is missing, cannot be read or holds neither.
         """
-        path = found_file(self.path, "/path/to/asset.ply")
+        path = found_file(self.path, EXAMPLE)
         if holds_gaussians(path):
             return self._asset(path, generator).to(device)
         return self._cloud(path, generator, device)
@@ -102,17 +104,19 @@ class Ply(Initializer):
         return gaussians_at(cloud, scale=self.scale, opacity=self.opacity, sh_degree=degree)
 
     def _read_points(self, path: Path) -> tuple[Tensor, Tensor]:
-        """Positions in the frame of the file, and colours."""
+        """Return positions in the axes of the file, and RGB in [0, 1]."""
         try:
             loaded = trimesh.load(path)
         except Exception as error:  # the parser has no exceptions of its own
             reason = str(error) or type(error).__name__
             raise UserError(
-                f"initializer.path: {self.path!r} cannot be read ({reason}). Try: another PLY file"
+                f"initializer.path: expected a PLY file of Gaussians or points, got {self.path!r}, which "
+                f"cannot be read ({reason}). Try: initializer.path={EXAMPLE}"
             ) from error
         if not isinstance(loaded, trimesh.PointCloud):
             raise UserError(
-                f"initializer.path: {self.path!r} holds a surface. Try: initializer=mesh, with up and count"
+                f"initializer.path: expected a PLY file of Gaussians or points, got {self.path!r}, which is "
+                f"a mesh. Try: initializer=mesh 'initializer.path={self.path}'"
             )
         points = torch.as_tensor(np.asarray(loaded.vertices), dtype=torch.float32)
         _require_finite(path, "points", points)
@@ -125,11 +129,14 @@ class Ply(Initializer):
 def _require_finite(path: Path, name: str, rows: Tensor) -> None:
     bad = int((~rows.isfinite()).reshape(len(rows), -1).any(dim=1).sum()) if len(rows) else 0
     if bad or len(rows) == 0:
-        what = f"{name} that are not finite ({bad} of {len(rows)})" if bad else "nothing"
-        raise UserError(f"initializer.path: {path} holds {what}. Try: another PLY file")
+        what = f"has {name} that are not finite ({bad} of {len(rows)})" if bad else "is empty"
+        raise UserError(
+            f"initializer.path: expected a PLY file of Gaussians or points, got {str(path)!r}, which {what}. "
+            f"Try: initializer.path={EXAMPLE}"
+        )
 
 
 def _with_degree(sh: Tensor, degree: int) -> Tensor:
-    """The coefficients up to ``degree``: those of the file, and zeros beyond."""
+    """Return the coefficients up to ``degree``, with zeros where the file has none."""
     wanted = (degree + 1) ** 2
     return torch.nn.functional.pad(sh[:, :wanted], (0, 0, 0, max(wanted - sh.shape[1], 0)))

@@ -1,4 +1,4 @@
-"""From coloured points to Gaussians: what every initializer that starts from a point cloud shares."""
+"""From coloured points to Gaussians: functions shared by the initializers that start from a point cloud."""
 
 import math
 from collections.abc import Sequence
@@ -15,13 +15,13 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE, rgb_to_sh0
 from cadam3d.io.frames import TURNS
 
-NEIGHBOURS = 3  # as 3DGS (Kerbl et al. 2023, sec. 5.1)
-SMALLEST = 1e-4  # world units; coincident points would have no size at all
+NEIGHBOURS = 3  # as in 3DGS (Kerbl et al. 2023, sec. 5.1)
+SMALLEST = 1e-4  # world units; keeps the size of coincident points above zero
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Coloured points."""
+    """Coloured points in space."""
 
     points: Float[Tensor, "n 3"]
     rgb: Float[Tensor, "n 3"]  # in [0, 1]
@@ -30,15 +30,15 @@ class PointCloud:
         return self.points.shape[0]
 
     def to(self, device: torch.device) -> "PointCloud":
-        """The same cloud on ``device``."""
+        """Return the same cloud on ``device``."""
         return PointCloud(self.points.to(device), self.rgb.to(device))
 
 
 def gaussians_at(cloud: PointCloud, *, scale: float | None, opacity: float, sh_degree: int) -> Gaussians:
-    """Round Gaussians at the points (world units) that show their colours from every side.
+    """Return round Gaussians at the points (world units) that have the same colour from every side.
 
-    ``scale`` is their standard deviation in world units; None gives each the mean distance to its three
-    nearest neighbours, so that they just overlap.
+    ``scale`` is their standard deviation in world units. None gives each Gaussian the mean distance to its
+    three nearest neighbours, so that neighbours just overlap.
     """
     points, n = cloud.points, len(cloud)
     scales = neighbour_distance(points) if scale is None else points.new_full((n,), scale)
@@ -54,9 +54,9 @@ def gaussians_at(cloud: PointCloud, *, scale: float | None, opacity: float, sh_d
 
 
 def neighbour_distance(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Mean distance of each point to its three nearest others (to all others, if they are fewer).
+    """Return the mean distance of each point to its three nearest neighbours, or to all if there are fewer.
 
-    Exact. A point without neighbours gets 1; none gets less than 1e-4.
+    The neighbours are exact. A single point gets 1, and no point gets less than 1e-4.
     """
     count = min(NEIGHBOURS, len(points) - 1)
     if count < 1:
@@ -67,12 +67,12 @@ def neighbour_distance(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
 
 
 def one_color(color: Sequence[float], count: int) -> Float[Tensor, "count 3"]:
-    """The same RGB for everybody."""
+    """Return the same RGB for ``count`` points."""
     return torch.tensor([float(channel) for channel in color]).repeat(count, 1)
 
 
 def points_in_ball(count: int, radius: float, generator: torch.Generator) -> Float[Tensor, "count 3"]:
-    """Random points with equal density everywhere in a ball around the origin."""
+    """Draw random points with equal density everywhere in a ball around the origin."""
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     radii = radius * torch.rand(count, 1, generator=generator) ** (1 / 3)  # volume grows as r^3
     return directions * radii
@@ -81,7 +81,10 @@ def points_in_ball(count: int, radius: float, generator: torch.Generator) -> Flo
 def points_on_surface(
     corners: Float[Tensor, "f 3 3"], count: int, generator: torch.Generator
 ) -> tuple[Int[Tensor, "count"], Float[Tensor, "count 3"]]:
-    """Random triangles, in proportion to their areas, and uniform barycentric weights within each."""
+    """Draw points that are uniform over the area of a surface.
+
+    Returns the number of the triangle of each point and its barycentric weights within the triangle.
+    """
     edges = corners[:, 1:] - corners[:, :1]
     areas = torch.linalg.cross(edges[:, 0], edges[:, 1], dim=-1).norm(dim=-1).double().cumsum(dim=0)
     drawn = torch.rand(count, generator=generator, dtype=torch.float64) * areas[-1]
@@ -92,16 +95,16 @@ def points_on_surface(
 
 
 def rows_of(n: int, count: int | None, generator: torch.Generator) -> Int[Tensor, "rows"]:
-    """At most ``count`` of ``n`` rows, drawn at random, in their order; all of them if ``count`` is None."""
+    """Draw at most ``count`` of ``n`` rows, in ascending order; all rows if ``count`` is None."""
     if count is None or count >= n:
         return torch.arange(n)
     return torch.randperm(n, generator=generator)[:count].sort().values
 
 
 def replicated(cloud: PointCloud, times: int, radius: float, generator: torch.Generator) -> PointCloud:
-    """Each point ``times`` times, all displaced by the same random offsets of a ball (LucidDreamer).
+    """Repeat each point ``times`` times, with the same random offsets within a ball (LucidDreamer).
 
-    With ``times`` 1 nothing is displaced, and nothing drawn.
+    With ``times`` 1 the cloud is returned unchanged, without any random draw.
     """
     if times == 1:
         return cloud
@@ -113,24 +116,24 @@ def replicated(cloud: PointCloud, times: int, radius: float, generator: torch.Ge
 def grown(
     cloud: PointCloud, candidates: int, distance: float, noise: float, generator: torch.Generator
 ) -> PointCloud:
-    """Noisy point growing (GaussianDreamer): the cloud, and random points of its bounding box.
+    """Add random points of the bounding box that are close to the cloud (GaussianDreamer's point growing).
 
-    Of ``candidates`` points those stay that are nearer than ``distance`` to a point of the cloud; to each
-    channel of its colour up to ``noise`` is added.
+    Of ``candidates`` points, those nearer than ``distance`` to a point of the cloud are added. Each takes the
+    colour of its nearest point, plus a random amount of up to ``noise`` per channel.
     """
     low, high = cloud.points.amin(dim=0), cloud.points.amax(dim=0)
     drawn = low + (high - low) * torch.rand(candidates, 3, generator=generator)
     _, nearest = KDTree(cloud.points.numpy()).query(drawn.numpy(), distance_upper_bound=distance)
     neighbour = torch.from_numpy(nearest)
-    is_near = neighbour < len(cloud)  # equal means: nobody is
+    is_near = neighbour < len(cloud)  # the tree returns len(cloud) if no point is within `distance`
     rgb = cloud.rgb[neighbour[is_near]] + noise * torch.rand(int(is_near.sum()), 3, generator=generator)
     return PointCloud(torch.cat([cloud.points, drawn[is_near]]), torch.cat([cloud.rgb, rgb.clamp_max(1)]))
 
 
 def fit(points: Float[Tensor, "n 3"], radius: float | None) -> tuple[Float[Tensor, "3"], float]:
-    """The centre of the bounding box, and the factor that then brings the farthest point to ``radius``.
+    """Return the centre of the bounding box, and the factor that then moves the farthest point to ``radius``.
 
-    The origin and 1 if ``radius`` is None: everything stays as it is.
+    Returns the origin and 1 if ``radius`` is None, so that position and size do not change.
     """
     if radius is None:
         return torch.zeros_like(points[0]), 1.0
@@ -140,15 +143,18 @@ def fit(points: Float[Tensor, "n 3"], radius: float | None) -> tuple[Float[Tenso
 
 
 def found_file(path: str, example: str) -> Path:
-    """The file that ``initializer.path`` names. Raises ``UserError`` if there is none."""
+    """Return the path of the file that ``initializer.path`` names. Raises ``UserError`` if it is no file."""
     found = Path(path).expanduser()
     if not found.is_file():
-        raise UserError(f"initializer.path: no file {path!r}. Try: initializer.path={example}")
+        what = "is a folder" if found.is_dir() else "does not exist"
+        raise UserError(
+            f"initializer.path: expected a file, got {path!r}, which {what}. Try: initializer.path={example}"
+        )
     return found
 
 
 def require_points(count: object, scale: object, opacity: object, sh_degree: object) -> None:
-    """Raise ``UserError`` unless these keys of an initializer make sense."""
+    """Raise ``UserError`` unless these keys of an initializer are in their ranges."""
     require_whole("initializer.count", count, low=1, example=2000)
     if scale is not None:
         require_range("initializer.scale", scale, above=0, example=0.03)
@@ -157,13 +163,13 @@ def require_points(count: object, scale: object, opacity: object, sh_degree: obj
 
 
 def require_place(turn_deg: object, radius: object) -> None:
-    """Raise ``UserError`` unless an object can be turned and sized like this; no radius means as it is."""
+    """Raise ``UserError`` unless the turn is a multiple of 90 degrees and the radius is None or in (0, 1]."""
     require_choice("initializer.turn_deg", turn_deg, TURNS)
     if radius is not None:
         require_range("initializer.radius", radius, above=0, high=1, example=0.9)
 
 
 def require_copies(replicate: object, replicate_radius: object) -> None:
-    """Raise ``UserError`` unless points can be replicated like this."""
+    """Raise ``UserError`` unless ``replicate`` is at least 1 and ``replicate_radius`` is in (0, 1]."""
     require_whole("initializer.replicate", replicate, low=1, example=20)
     require_range("initializer.replicate_radius", replicate_radius, above=0, high=1, example=0.05)

@@ -1,4 +1,4 @@
-"""Shap-E: a first guess of the shape from the prompt (Jun and Nichol 2023), through diffusers."""
+"""Shap-E: an initial shape generated from the prompt (Jun and Nichol 2023), through diffusers."""
 
 import gc
 from collections.abc import Sequence
@@ -28,12 +28,13 @@ from cadam3d.io.frames import turned_points
 from cadam3d.io.pretrained import DTYPES, Pretrained, Source
 
 KIND = "ShapEPipeline"
-OTHERS = {"ShapEImg2ImgPipeline": "initializer.ids=[openai/shap-e], which reads text; this one reads images"}
+# What to type instead of a pipeline that cannot be used.
+OTHERS = {"ShapEImg2ImgPipeline": "'initializer.ids=[openai/shap-e]', which reads text instead of images"}
 
 
 @dataclass(frozen=True)
 class ColoredMesh:
-    """Triangles in Shap-E's frame: z up, inside the cube from -1 to 1, most of it within half of that."""
+    """Triangles in Shap-E's coordinates: z up, inside the cube from -1 to 1, mostly in its inner half."""
 
     vertices: Float[Tensor, "m 3"]
     faces: Int[Tensor, "f 3"]
@@ -42,27 +43,29 @@ class ColoredMesh:
 
 @dataclass(frozen=True, kw_only=True)
 class ShapE(Initializer):
-    """The mesh that Shap-E makes of the prompt: its vertices or random points of it, grown or replicated.
+    """Gaussians at the vertices, or at random points, of the mesh that Shap-E generates from the prompt.
 
-    Its parts are loaded one after the other and freed before training. Where the model cannot be had, or
-    finds no surface, ``fallback`` builds instead and the run says so; without one that is an error.
+    The points can be grown or replicated. The parts of the model are loaded one after the other and freed
+    before training. If the model is not available or finds no surface, ``fallback`` builds the Gaussians
+    and the run reports it; without a fallback that is an error. With ``dtype`` "auto", the text encoder and
+    the denoiser use float16 on CUDA and float32 elsewhere.
     """
 
-    path: str | None  # a folder in the layout of diffusers; wins over ids
+    path: str | None  # a folder in the layout of diffusers; takes precedence over ids
     ids: Sequence[str]  # names on the hub, tried in order
     revision: str | None  # on the hub
     variant: str | None  # of weight files
-    dtype: str  # of text encoder and denoiser: one of DTYPES, or "auto": float16 on CUDA, float32 elsewhere
-    prompt: str | None  # Shap-E's own; None = that of the run
+    dtype: str  # auto, or one of DTYPES
+    prompt: str | None  # for Shap-E only; None = that of the run
     steps: int  # of denoising
     guidance_scale: float  # 1 = no guidance
-    grid_size: int  # cells per side of the grid on which the surface is sought
-    turn_deg: int  # about the up axis, counterclockwise from above: 0, 90, 180 or 270
-    radius: float | None  # world units from the centre of the bounding box to the farthest; null = as it is
+    grid_size: int  # cells per side of the grid on which the surface is extracted
+    turn_deg: int  # about the up axis, counterclockwise from above; 0, 90, 180 or 270
+    radius: float | None  # world units from the centre of the bounding box to the farthest; null = unscaled
     count: int | None  # random points of the surface; null = the vertices
-    grow_points: int  # candidates in the bounding box; 0 = nothing grows
-    grow_distance: float  # Shap-E's units: candidates this near to a point of the surface stay
-    grow_noise: float  # at most so much is added to each channel of their colours
+    grow_points: int  # candidates in the bounding box; 0 = off
+    grow_distance: float  # Shap-E's units; candidates this close to a point of the surface are added
+    grow_noise: float  # in [0, 1]; largest amount added to each channel of their colours
     replicate: int  # Gaussians for each point
     replicate_radius: float  # world units; of the ball that holds them
     scale: float | None  # world units; null = mean distance to the three nearest neighbours
@@ -75,7 +78,7 @@ class ShapE(Initializer):
         require_choice("initializer.dtype", self.dtype, ("auto", *DTYPES))
         is_text = self.prompt is None or (isinstance(self.prompt, str) and self.prompt.strip() != "")
         example = "initializer.prompt=null"
-        require(is_text, "initializer.prompt", expected="a text or null", got=self.prompt, example=example)
+        require(is_text, "initializer.prompt", expected="text or null", got=self.prompt, example=example)
         require_whole("initializer.steps", self.steps, low=1, high=1024, example=64)
         require_range("initializer.guidance_scale", self.guidance_scale, low=1, example=15)
         require_whole("initializer.grid_size", self.grid_size, low=2, example=128)
@@ -94,22 +97,26 @@ class ShapE(Initializer):
         )
 
     def begin(self, prompt: str, generator: torch.Generator, device: torch.device) -> Beginning:
-        """What Shap-E makes of the prompt, or else what ``fallback`` builds, as if it had been asked for."""
+        """Return the Gaussians of Shap-E, or those of ``fallback`` with a note if Shap-E fails.
+
+        Raises ``UserError`` if Shap-E fails and there is no fallback.
+        """
         before = generator.get_state()
         try:
             return Beginning(self.build(prompt, generator, device))
         except UserError as error:
             if self.fallback is None:
                 raise
-            generator.set_state(before)  # so the run equals one that was started with the fallback
+            # Rewind, so that the run equals one that was started with the fallback.
+            generator.set_state(before)
             instead = self.fallback.begin(prompt, generator, device)
             note = f"{type(self.fallback).__name__} stands in for Shap-E. {error}"
             return Beginning(instead.gaussians, f"{note} {instead.note}" if instead.note else note)
 
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
-        """Gaussians at points of the mesh.
+        """Return Gaussians on ``device`` at points of the generated mesh.
 
-        Raises ``UserError`` if the model cannot be had, does not fit into memory or finds no surface.
+        Raises ``UserError`` if the model is not available, does not fit into memory or finds no surface.
         """
         found = self._source().find((KIND,), OTHERS)
         try:
@@ -118,7 +125,7 @@ class ShapE(Initializer):
         except torch.OutOfMemoryError as error:
             raise UserError(
                 f"initializer: Shap-E does not fit into the memory of {device}. "
-                "Try: initializer.dtype=float16, or a smaller initializer.grid_size"
+                f"Try: initializer.dtype=float16, or initializer.grid_size={max(self.grid_size // 2, 2)}"
             ) from error
         finally:
             _free()
@@ -127,7 +134,7 @@ class ShapE(Initializer):
     def sample(
         self, found: Pretrained, prompt: str, generator: torch.Generator, device: torch.device
     ) -> Float[Tensor, "1 k d"]:
-        """Draw and denoise the latent that describes an object for the prompt, on ``device``."""
+        """Draw and denoise the latent that describes an object of the prompt, on ``device``."""
         from diffusers import ShapEPipeline
 
         half = torch.float16 if device.type == "cuda" else torch.float32
@@ -144,7 +151,7 @@ class ShapE(Initializer):
         pipeline.set_progress_bar_config(desc="Shap-E", leave=False, disable=None)
         numbers = denoiser.config.num_embeddings * denoiser.config.embedding_dim
         noise = torch.randn(1, numbers, generator=generator).to(device)
-        # The latent itself stays float32: beside its noise at the start, half precision loses the object.
+        # The latent itself stays float32: its initial noise is so large that half precision loses the object.
         with torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
             output: Any = pipeline(
                 self.prompt or prompt,
@@ -156,17 +163,17 @@ class ShapE(Initializer):
         return output.images.float()
 
     def decode(self, found: Pretrained, latent: Float[Tensor, "1 k d"]) -> ColoredMesh:
-        """The surface that a latent describes, on the CPU. Raises ``UserError`` if there is none."""
-        # Always float32: positions are encoded in frequencies up to 2^14, of which half precision sees few.
+        """Return the surface that a latent describes, on the CPU. Raises ``UserError`` if there is none."""
+        # Always float32: positions are encoded with frequencies up to 2^14, too high for half precision.
         renderer = found.part("shap_e_renderer", torch.float32).to(latent.device)
         renderer.mesh_decoder.register_forward_hook(_refuse_nothing)
         mesh = renderer.decode_to_mesh(latent, latent.device, grid_size=self.grid_size)
         linear = torch.stack([mesh.vertex_channels[channel] for channel in "RGB"])
-        rgb = linear_rgb_to_rgb(linear[..., None])[..., 0].T  # the decoder says what a light would meet
+        rgb = linear_rgb_to_rgb(linear[..., None])[..., 0].T  # the decoder's colours are linear
         return ColoredMesh(mesh.verts.cpu(), mesh.faces.cpu(), rgb.clamp(0, 1).cpu())
 
     def settle(self, mesh: ColoredMesh, generator: torch.Generator, device: torch.device) -> Gaussians:
-        """Gaussians at points of a mesh that Shap-E decoded."""
+        """Return Gaussians on ``device`` at points of a mesh that Shap-E decoded."""
         cloud = self._points(mesh, generator)
         if self.grow_points > 0:
             cloud = grown(cloud, self.grow_points, self.grow_distance, self.grow_noise, generator)
@@ -189,11 +196,14 @@ class ShapE(Initializer):
 
 
 def _refuse_nothing(_decoder: object, _inputs: object, mesh: Any) -> None:
-    """A hook behind the marching cubes, for what follows in diffusers breaks on a mesh of nothing."""
+    """Raise ``UserError`` for an empty mesh; runs after the marching cubes.
+
+    The code of diffusers that follows fails on an empty mesh.
+    """
     if len(mesh.faces) == 0:
         raise UserError(
-            "initializer: Shap-E found no surface for this prompt. Try: another seed, or initializer.prompt="
-            "'a simpler description'"
+            "initializer: Shap-E found no surface for this prompt. Try: another seed, or "
+            "initializer.prompt='a simpler description'"
         )
 
 

@@ -1,12 +1,14 @@
-"""Frames of files: our world is +z up with its front at +x; viewers of 3DGS files expect -y up.
+"""Converts between the axes of the world and those of files.
 
-Every frame here is a signed permutation of axes that carries our front (+x) to the file's +z, where viewers
-put their first camera. Two facts keep the change exact in floating point:
+The world is +z up with the front at +x, but viewers of 3DGS files expect -y up. Every choice of axes here is
+a signed permutation that moves the front (+x) to +z of the file, where viewers put their first camera. Two
+facts keep the conversion exact in floating point:
 
-* positions, and the degree-1 part of a colour (a vector too), only change places and signs;
-* a Gaussian's *own* axes may be renamed together with the world's. Its covariance ``R diag(s^2) R^T``
-  becomes ``(A R A^T) (A diag(s^2) A^T) (A R A^T)^T``: the quaternion of ``A R A^T`` is the old one with its
-  vector part permuted, and ``A diag(s^2) A^T`` permutes the scales. Multiplying quaternions instead would
+* In positions, and in the degree-1 part of a colour, which is a vector too, numbers only change places and
+  signs.
+* The axes of each Gaussian may be renamed together with those of the world. The covariance ``R diag(s^2)
+  R^T`` becomes ``(A R A^T) (A diag(s^2) A^T) (A R A^T)^T``. The quaternion of ``A R A^T`` is the old one with
+  its vector part permuted, and ``A diag(s^2) A^T`` permutes the scales. Multiplying quaternions instead would
   round.
 
 Only SH bands 2 and 3 mix their coefficients (by factors such as sqrt(3)/2), which rounds once per direction.
@@ -22,44 +24,51 @@ from cadam3d.core.checks import require_choice
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import sh_basis
 
-# Rows: the file's x, y, z axes in world coordinates. Rotations (determinant +1), so nothing is mirrored.
-FRAMES: dict[str, tuple[tuple[int, int, int], ...]] = {
-    "-y": ((0, -1, 0), (0, 0, -1), (1, 0, 0)),  # 3DGS, COLMAP: x right, y down, z forward
+# The rows are the x, y and z axes of a file in world coordinates. All are rotations (determinant +1), so
+# nothing is mirrored.
+AXES: dict[str, tuple[tuple[int, int, int], ...]] = {
+    "-y": ((0, -1, 0), (0, 0, -1), (1, 0, 0)),  # 3DGS and COLMAP: x right, y down, z forward
     "+y": ((0, 1, 0), (0, 0, 1), (1, 0, 0)),  # glTF, most engines and editors
-    "+z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),  # ours, Blender
+    "+z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),  # the world, Blender
 }
-UPS = tuple(FRAMES)
+UPS = tuple(AXES)
 TURNS = (0, 90, 180, 270)  # degrees; only quarter turns permute axes
 
 
 def world_to_file(gaussians: Gaussians, up: str) -> Gaussians:
-    """The same object in the frame whose ``up`` axis is one of ``-y``, ``+y``, ``+z``."""
+    """Return the object in the axes of a file with the up axis ``up``: ``-y``, ``+y`` or ``+z``."""
     return _rotate(gaussians, _axes(up))
 
 
 def file_to_world(gaussians: Gaussians, up: str) -> Gaussians:
-    """Undo :func:`world_to_file`: bit for bit for SH degree 0 and 1, and for any degree with ``+z``."""
+    """Undo :func:`world_to_file`.
+
+    This is exact to the bit for SH degrees 0 and 1, and for any degree with ``+z``.
+    """
     return _rotate(gaussians, _axes(up).T)
 
 
 def points_to_world(points: Float[Tensor, "n 3"], up: str) -> Float[Tensor, "n 3"]:
-    """Positions of a file in the world, bit for bit; ``up`` is the file's up axis as above."""
+    """Return positions of a file in world axes, exact to the bit; ``up`` is the up axis of the file."""
     return _permute(points, _axes(up).T)
 
 
 def turned(gaussians: Gaussians, turn_deg: int) -> Gaussians:
-    """The same object, turned about the world's +z; counterclockwise from above, one of ``TURNS``."""
+    """Return the object turned about the world's +z axis, counterclockwise seen from above.
+
+    ``turn_deg`` is one of ``TURNS``.
+    """
     return _rotate(gaussians, _turn(turn_deg))
 
 
 def turned_points(points: Float[Tensor, "n 3"], turn_deg: int) -> Float[Tensor, "n 3"]:
-    """The same positions, turned likewise."""
+    """Return positions turned as in :func:`turned`."""
     return _permute(points, _turn(turn_deg))
 
 
 def _axes(up: str) -> Float[Tensor, "3 3"]:
     require_choice("up", up, UPS)
-    return torch.tensor(FRAMES[up], dtype=torch.float64)
+    return torch.tensor(AXES[up], dtype=torch.float64)
 
 
 def _turn(turn_deg: int) -> Float[Tensor, "3 3"]:
@@ -109,17 +118,19 @@ def _rotate_band(band: Float[Tensor, "n b 3"], permute, axes: Float[Tensor, "3 3
 
 @lru_cache(maxsize=16)
 def band_matrix(degree: int, rotation: tuple[float, ...]) -> Float[Tensor, "b b"]:
-    """How the ``b = 2 degree + 1`` coefficients of an SH band change under a rotation (9 numbers by rows).
+    """Return the matrix by which a rotation (9 numbers, row by row) changes the coefficients of an SH band.
 
-    A function of directions turns with the object: ``new(R d) = old(d)`` for all d. Solved in float64 from
-    more sampled directions than unknowns; the fit is exact, because rotations do not mix bands.
+    A band has ``b = 2 degree + 1`` coefficients. A function of directions turns with the object, so
+    ``new(R d) = old(d)`` for all d. This is solved in float64 from more sampled directions than unknowns. The
+    fit is exact, because rotations do not mix bands.
     """
     matrix = torch.tensor(rotation, dtype=torch.float64).reshape(3, 3)
-    generator = torch.Generator().manual_seed(0)  # any directions do; these are always the same
+    generator = torch.Generator().manual_seed(0)  # any directions work; these are always the same
     directions = torch.randn(64, 3, dtype=torch.float64, generator=generator)
     directions = torch.nn.functional.normalize(directions, dim=1)
     band = slice(degree**2, (degree + 1) ** 2)
     old = sh_basis(directions, degree)[:, band]
     new = sh_basis(directions @ matrix.T, degree)[:, band]
     solution = torch.linalg.lstsq(new, old).solution
-    return torch.where(solution.abs() < 1e-12, 0.0, solution)  # a true zero must not spread noise
+    # Entries that are zero up to rounding become exactly zero, so that they add no noise.
+    return torch.where(solution.abs() < 1e-12, 0.0, solution)

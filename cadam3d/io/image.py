@@ -1,4 +1,4 @@
-"""Pictures: float images to PNG, colour maps for depth and alpha, contact sheets."""
+"""Images: writing PNG files, colour maps for depth and alpha, and contact sheets."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from cadam3d.io.atomic import replacing
 
-# Viridis (van der Walt and Smith, CC0) at ten equal distances: dark is low, and it stays readable in grey.
+# Viridis (van der Walt and Smith, CC0) at ten equal distances. Dark is low, and it stays readable in grey.
 VIRIDIS = (
     (68, 1, 84), (72, 40, 120), (62, 74, 137), (49, 104, 142), (38, 130, 142),
     (31, 158, 137), (53, 183, 121), (110, 206, 88), (181, 222, 43), (253, 231, 37),
@@ -22,7 +22,7 @@ LABEL_MARGIN = 4  # pixels
 
 
 def to_uint8(rgb: Float[Tensor, "*batch h w 3"]) -> UInt8[np.ndarray, "*batch h w 3"]:
-    """Images in [0, 1] to bytes, rounded to the nearest; outside values are clamped, NaN is black."""
+    """Return images in [0, 1] as bytes, rounded to the nearest; values outside are clamped, NaN is black."""
     return (rgb.detach().nan_to_num(nan=0.0).clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
@@ -33,17 +33,17 @@ def write_png(path: Path, rgb: Float[Tensor, "h w 3"]) -> None:
 
 
 def step_picture(folder: Path, step: int) -> Path:
-    """Where the picture of ``step`` belongs in ``folder``; names sort as steps do."""
+    """Return the path of the image of ``step`` in ``folder``; the names sort in the order of the steps."""
     return folder / f"step_{step:06d}.png"
 
 
 def step_pictures(folder: Path) -> list[tuple[int, Path]]:
-    """Step and path of every such picture in ``folder``, in order; none if there is no such folder."""
+    """Return the step and the path of every such image in ``folder``, in order; none if it does not exist."""
     return sorted((int(path.stem.removeprefix("step_")), path) for path in folder.glob("step_*.png"))
 
 
 def colorize(values: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch h w 3"]:
-    """Viridis colours of values in [0, 1]; outside values are clamped, NaN counts as 0."""
+    """Return the Viridis colours of values in [0, 1]; values outside are clamped, and NaN counts as 0."""
     table = torch.tensor(VIRIDIS, dtype=values.dtype, device=values.device) / 255
     position = values.nan_to_num(nan=0.0).clamp(0, 1) * (len(VIRIDIS) - 1)
     low = position.floor().clamp_max(len(VIRIDIS) - 2)
@@ -53,10 +53,10 @@ def colorize(values: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch h w 3
 def closeness(
     depth: Float[Tensor, "*batch h w"], alpha: Float[Tensor, "*batch h w"], distance: float
 ) -> Float[Tensor, "*batch h w 3"]:
-    """Depth as colours: yellow is near, dark far, black where there is nothing.
+    """Return depth as colours: yellow is near, dark is far, and black is background.
 
-    The range is that of the unit ball, which objects fit in, seen from ``distance``: the same in every
-    view, so that colours can be compared between frames.
+    The range is that of the unit ball, in which objects fit, seen from ``distance``. It is the same in every
+    view, so that colours can be compared between images.
     """
     return colorize((distance + 1.0 - depth) / 2.0) * alpha[..., None]
 
@@ -64,7 +64,10 @@ def closeness(
 def contact_sheet(
     images: Float[Tensor, "v h w 3"], columns: int, labels: Sequence[str] = ()
 ) -> Float[Tensor, "sheet_h sheet_w 3"]:
-    """All images in rows of ``columns``, the last row filled with white; labels go into the corners."""
+    """Return one image with all images in rows of ``columns``, and with labels in their corners.
+
+    White fills the rest of the last row.
+    """
     views, height, width, _ = images.shape
     rows = math.ceil(views / columns)
     cells = images.new_ones(rows * columns, height, width, 3)
@@ -79,7 +82,7 @@ def contact_sheet(
 
 
 def _write_label(cell: Float[Tensor, "h w 3"], label: str) -> None:
-    """Draw ``label`` into ``cell`` (in place), dark on light or light on dark as the corner asks."""
+    """Draw ``label`` into ``cell`` (in place), in dark or light ink depending on the corner."""
     height, width, _ = cell.shape
     mask = Image.new("L", (width, height))
     ImageDraw.Draw(mask).text((LABEL_MARGIN, LABEL_MARGIN), label, fill=255, font=ImageFont.load_default())

@@ -1,7 +1,7 @@
-"""Networks under the names of the latent diffusion code (Rombach et al. 2022), read into diffusers' classes.
+"""Reads networks with the names of the latent diffusion code (Rombach et al. 2022) into classes of diffusers.
 
-Files of this kind hold tensors and no configuration. It is read off the shapes of the tensors; what shapes
-cannot tell is constant in the family of Stable Diffusion 2, the only one that is known here.
+Files of this kind contain tensors but no configuration. The configuration follows from the shapes of the
+tensors. Everything else is constant in the family of Stable Diffusion 2, the only one that is supported.
 """
 
 import json
@@ -18,9 +18,10 @@ from cadam3d.core.checks import UserError
 from cadam3d.io.pretrained import LIBRARIES, Pretrained, Source, require_extra
 
 HEAD = 64  # channels of one attention head, in the UNet and in the text encoder
-SCALING = 0.18215  # of latents
+SCALING = 0.18215  # factor of the latents
 SAFE = ".safetensors"
-PARTS = {  # part -> its class, and what the names of its tensors begin with in a file of a whole model
+# For each part its class, and the prefix of its tensors' names in a file with a whole model.
+PARTS = {
     "unet": (("diffusers", "UNet2DConditionModel"), "model.diffusion_model."),
     "vae": (("diffusers", "AutoencoderKL"), "first_stage_model."),
     "text_encoder": (("transformers", "CLIPTextModel"), "cond_stage_model.model."),
@@ -29,9 +30,10 @@ PARTS = {  # part -> its class, and what the names of its tensors begin with in 
 
 @dataclass(frozen=True)
 class LatentDiffusion(Pretrained):
-    """A model of which some parts come under those names, and the others as in any model."""
+    """A model in which some parts have the names of latent diffusion, and the others those of diffusers."""
 
-    files: Mapping[str, tuple[Path, str]]  # part -> the file of its tensors, and what their names begin with
+    # For each such part, the file of its tensors and the prefix of their names.
+    files: Mapping[str, tuple[Path, str]]
 
     def part(self, name: str, dtype: torch.dtype | None = None) -> Any:
         """Load one part, frozen, on the CPU. Raises ``UserError`` if it is missing or damaged."""
@@ -48,7 +50,7 @@ class LatentDiffusion(Pretrained):
         return network.requires_grad_(False).eval()
 
     def config(self, name: str) -> dict[str, Any]:
-        """The configuration of one part."""
+        """Return the configuration of one part."""
         if name not in self.files:
             return super().config(name)
         try:
@@ -57,7 +59,7 @@ class LatentDiffusion(Pretrained):
             raise self._unlike(name, error) from error
 
     def _empty(self, name: str) -> nn.Module:
-        """The network, without memory for its numbers."""
+        """Return the network without memory for its parameters."""
         from accelerate import init_empty_weights
 
         kind, config = self._kind(name), self.config(name)
@@ -74,24 +76,24 @@ class LatentDiffusion(Pretrained):
     def _unlike(self, name: str, error: Exception) -> UserError:
         reason = " ".join(str(error).split())[:200]
         return UserError(
-            f"{self.source.key}: {self.files[name][0]} holds no {name} of the family of Stable Diffusion 2 "
+            f"{self.source.key}: {self.files[name][0]} contains no {name} of the Stable Diffusion 2 family "
             f"({reason}). Try: another {self.source.key}.path"
         )
 
 
 @dataclass(frozen=True)
 class SingleFile(LatentDiffusion):
-    """A whole model in one file. It has no tokenizer, and no words about its noise: both are told."""
+    """A whole model in one file. The file has neither a tokenizer nor a noise schedule; both are given."""
 
-    scheduler: Mapping[str, Any]  # its configuration
-    tokenizer: str  # a folder or a name on the hub, with CLIP's vocabulary
-    tokenizer_key: str  # the configuration key that says so
+    scheduler: Mapping[str, Any]  # configuration of the noise schedule
+    tokenizer: str  # folder or name on the hub, with CLIP's vocabulary
+    tokenizer_key: str  # configuration key of the tokenizer, for messages
 
     @staticmethod
     def open(
         source: Source, scheduler: Mapping[str, Any], tokenizer: str, tokenizer_key: str
     ) -> "SingleFile":
-        """The model in ``source.path``, whose tensors are read when a part is asked for."""
+        """Return the model in ``source.path``. Its tensors are read when a part is loaded."""
         require_extra(source.key)
         file = Path(str(source.path)).expanduser()
         return SingleFile(
@@ -107,16 +109,16 @@ class SingleFile(LatentDiffusion):
         )
 
     def part(self, name: str, dtype: torch.dtype | None = None) -> Any:
-        """As of any model; the tokenizer pads with zeros, as OpenCLIP does."""
+        """Load one part; see :meth:`Pretrained.part`. The tokenizer pads with zeros, as OpenCLIP does."""
         return self._load_tokenizer() if name == "tokenizer" else super().part(name, dtype)
 
     def config(self, name: str) -> dict[str, Any]:
-        """As of any model."""
+        """Return the configuration of one part; see :meth:`Pretrained.config`."""
         return dict(self.scheduler) if name == "scheduler" else super().config(name)
 
     @property
     def identity(self) -> str:
-        """Name, size and time of the file, and where words become numbers."""
+        """Return a text that changes with the name, size or time of the file, or with the tokenizer."""
         facts = self.file.stat()
         return json.dumps([str(self.file.resolve()), facts.st_size, facts.st_mtime_ns, self.tokenizer])
 
@@ -125,13 +127,14 @@ class SingleFile(LatentDiffusion):
 
         config = self.config("text_encoder")
         loaded: Any = ()
-        reason = "its vocabulary is another one"
+        reason = "its vocabulary is different"
         length = config["max_position_embeddings"]
         try:
             loaded = CLIPTokenizer.from_pretrained(self.tokenizer, model_max_length=length)
         except (OSError, ValueError) as error:
             reason = " ".join(str(error).split())[:200]
-        if len(loaded) != config["vocab_size"]:  # without files, transformers makes one that knows no word
+        # If the files are missing, transformers silently makes a tokenizer that knows no word.
+        if len(loaded) != config["vocab_size"]:
             raise UserError(
                 f"{self.tokenizer_key}: expected the {config['vocab_size']} pieces that the text encoder of "
                 f"{self.file} reads, got {self.tokenizer!r} ({reason}). Try: {self.tokenizer_key}=DIR, "
@@ -142,7 +145,7 @@ class SingleFile(LatentDiffusion):
 
 
 def with_ldm_unet(found: Pretrained) -> Pretrained:
-    """``found`` itself, or how to read its UNet if that is of a stranger's class under these names."""
+    """Return ``found``, or a model that reads its UNet by these names if the UNet has a foreign class."""
     library = str((found.index.get("unet") or [None])[0])
     if library in LIBRARIES:
         return found
@@ -152,7 +155,7 @@ def with_ldm_unet(found: Pretrained) -> Pretrained:
 
 
 def read_tensors(key: str, file: Path) -> Mapping[str, Tensor]:
-    """The tensors of a file, by name; mapped, where possible, so that only what is used is read.
+    """Return the tensors of a file by name. If possible the file is mapped, so that only used data is read.
 
     Nothing in the file is executed. Raises ``UserError`` if it cannot be read; ``key`` is the configuration
     node of the model, for the message.
@@ -169,19 +172,20 @@ def read_tensors(key: str, file: Path) -> Mapping[str, Tensor]:
     except (OSError, EOFError, AttributeError, RuntimeError, UnpicklingError, SafetensorError) as error:
         reason = " ".join(str(error).split())[:120]
         raise UserError(
-            f"{key}: {file} is no file of tensors ({reason}). Try: download it again, or another {key}.path"
+            f"{key}: {file} is not a file of tensors ({reason}). Try: download it again, or use another "
+            f"{key}.path"
         ) from error
 
 
 def _unpickle(file: Path) -> Any:
     try:
         return torch.load(file, map_location="cpu", weights_only=True, mmap=True)
-    except RuntimeError:  # written before torch could map
+    except RuntimeError:  # an old format that torch cannot map
         return torch.load(file, map_location="cpu", weights_only=True)
 
 
 def _weights_file(found: Pretrained, part: str) -> Path:
-    """The file of the tensors of one part of a model in the layout of diffusers."""
+    """Return the file with the tensors of one part of a model in the layout of diffusers."""
     stems = [f"{part}/diffusion_pytorch_model{v}" for v in (f".{found.source.variant}", "")]
     names = [stem + suffix for suffix in (SAFE, ".bin") for stem in stems[found.source.variant is None :]]
     for name in names:
@@ -205,16 +209,17 @@ def _download(found: Pretrained, name: str) -> Path | None:
     except (HfHubHTTPError, OSError) as error:
         reason = " ".join(str(error).split())[:120]
         raise UserError(
-            f"{found.source.key}: {name} of {found.where} cannot be had ({reason}). "
-            f"Try, where there is a connection: hf download {found.where}"
+            f"{found.source.key}: {name} of {found.where} is not available ({reason}). "
+            f"Try, with a network connection: hf download {found.where}"
         ) from error
 
 
-# --- the configurations behind the shapes -------------------------------------------------------------------
+# --- configurations from shapes -----------------------------------------------------------------------------
 
 
 def _unet_config(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-    shrinks = _numbers(tensors, "input_blocks.", ".0.op.weight")  # each level but the last ends with one
+    # Every level except the last ends with a downsampling block.
+    shrinks = _numbers(tensors, "input_blocks.", ".0.op.weight")
     layers = min(shrinks) - 1
     starts = [1 + level * (layers + 1) for level in range(len(shrinks) + 1)]
     channels = [tensors[f"input_blocks.{i}.0.out_layers.3.weight"].shape[0] for i in starts]
@@ -228,7 +233,8 @@ def _unet_config(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
         "down_block_types": ["CrossAttnDownBlock2D" if each else "DownBlock2D" for each in attends],
         "up_block_types": ["CrossAttnUpBlock2D" if each else "UpBlock2D" for each in reversed(attends)],
         "cross_attention_dim": tensors[attention].shape[1],
-        "attention_head_dim": [max(width // HEAD, 1) for width in channels],  # diffusers means their number
+        # In diffusers, this key is the number of heads.
+        "attention_head_dim": [max(width // HEAD, 1) for width in channels],
         "use_linear_projection": tensors["middle_block.1.proj_in.weight"].ndim == 2,
     }
     if "camera_embed.0.weight" in tensors:
@@ -251,7 +257,7 @@ def _vae_config(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
 
 
 def _text_config(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-    """One layer less than there are: the model reads the states before the last one (then normalized)."""
+    """Return the configuration without the last layer, because the model uses the states before it."""
     width, pieces = tensors["ln_final.weight"].shape[0], tensors["token_embedding.weight"].shape[0]
     return {
         "vocab_size": pieces,
@@ -267,7 +273,7 @@ def _text_config(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
 
 
 def _numbers(tensors: Mapping[str, Tensor], before: str, after: str) -> list[int]:
-    """The numbers between two pieces of names."""
+    """Return the numbers between ``before`` and ``after`` in the names of tensors."""
     found = [k.removeprefix(before).removesuffix(after) for k in tensors if k.startswith(before)]
     numbers = [int(number) for number in found if number.isdigit()]
     if not numbers:
@@ -275,7 +281,7 @@ def _numbers(tensors: Mapping[str, Tensor], before: str, after: str) -> list[int
     return numbers
 
 
-# --- their names in diffusers -------------------------------------------------------------------------------
+# --- names in diffusers -------------------------------------------------------------------------------------
 
 
 def _convert_unet(tensors: Mapping[str, Tensor], network: Any) -> dict[str, Tensor]:

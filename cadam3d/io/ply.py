@@ -1,13 +1,13 @@
-"""PLY in the de-facto layout of 3D Gaussian Splatting: what every splat viewer opens.
+"""PLY files in the de-facto layout of 3D Gaussian Splatting, which every splat viewer opens.
 
-``binary_little_endian 1.0``, float32 properties ``x y z nx ny nz f_dc_0..2 f_rest_0..(3r-1) opacity
-scale_0..2 rot_0..3``: raw numbers (logit opacity, natural-log scales, quaternion wxyz of any length),
-``r = (degree + 1)^2 - 1`` rest coefficients per channel, stored channel-major (all of red, then green, then
-blue); normals are zeros.
+The format is ``binary_little_endian 1.0`` with float32 properties ``x y z nx ny nz f_dc_0..2
+f_rest_0..(3r-1) opacity scale_0..2 rot_0..3``. The numbers are raw: logits of opacity, natural logarithms of
+scales, and quaternions wxyz of any length. There are ``r = (degree + 1)^2 - 1`` rest coefficients per
+channel, stored channel-major (all of red, then green, then blue). Normals are zeros.
 
-A comment line records the frame, so that our own files come back into our world frame by themselves.
-Reading back what was written gives the same bits, except SH bands 2 and 3 in a frame other than ``+z`` (see
-``frames.py``), which are rounded to float32 once on the way out and once on the way back.
+A comment line records the axes, so that files of this project are read back into world axes automatically.
+Reading a file that was written here gives the same bits. The exception are SH bands 2 and 3 in axes other
+than ``+z`` (see ``frames.py``), which are rounded to float32 once when writing and once when reading.
 """
 
 import re
@@ -27,15 +27,18 @@ from cadam3d.io.atomic import replacing
 from cadam3d.io.frames import UPS, file_to_world, world_to_file
 
 FORMAT = "binary_little_endian 1.0"
-COLUMNS = {  # of each tensor that is stored as it is
+# The columns of each tensor that is stored without a change of layout.
+COLUMNS = {
     "means": ["x", "y", "z"],
     "opacity_logits": ["opacity"],
     "log_scales": ["scale_0", "scale_1", "scale_2"],
     "quats": ["rot_0", "rot_1", "rot_2", "rot_3"],
 }
-NORMALS = ["nx", "ny", "nz"]  # unread by anybody, but readers with a fixed record size count on them
+# No reader uses the normals, but readers with a fixed record size expect them.
+NORMALS = ["nx", "ny", "nz"]
 SH0 = ["f_dc_0", "f_dc_1", "f_dc_2"]
-SIGNS = {"f_dc_0", "scale_0", "rot_0", "packed_position"}  # of Gaussians; points have none of them
+# Properties that only Gaussians have, never mere points.
+SIGNS = {"f_dc_0", "scale_0", "rot_0", "packed_position"}
 REST_SIZES = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_DEGREE + 1)]
 MAX_HEADER_BYTES = 1 << 16
 NUMPY_TYPES = {
@@ -51,11 +54,11 @@ NUMPY_TYPES = {
 
 
 def write_ply(path: Path, gaussians: Gaussians, *, up: str, pad_sh: int) -> None:
-    """Write ``gaussians`` as float32, atomically, in the frame whose up axis is ``up`` (see ``frames.py``).
+    """Write ``gaussians`` as float32, atomically, in the axes with up axis ``up`` (see ``frames.py``).
 
-    ``pad_sh`` is the least SH degree of the file (0 to 3): missing coefficients are zeros, which changes no
-    colour but satisfies importers that insist on degree 3. Raises ``UserError`` if the file cannot be
-    written.
+    ``pad_sh`` is the smallest SH degree of the file (0 to 3). Missing coefficients are written as zeros,
+    which changes no colour but satisfies importers that require degree 3. Raises ``UserError`` if the file
+    cannot be written.
     """
     require_choice("pad_sh", pad_sh, range(MAX_DEGREE + 1))
     local = world_to_file(gaussians.detach().to("cpu").to(torch.float32), up)
@@ -80,11 +83,11 @@ def write_ply(path: Path, gaussians: Gaussians, *, up: str, pad_sh: int) -> None
 
 
 def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
-    """Read Gaussians into our world frame, on the CPU, as float32.
+    """Read Gaussians into world axes, on the CPU, as float32.
 
-    Properties are found by name, so their order, extra ones and missing normals do not matter. ``up`` is
-    the up axis of files that do not say it themselves (ours do). Raises ``UserError`` if ``path`` is not
-    such a file, naming what is wrong or missing.
+    Properties are found by name, so their order, additional ones and missing normals do not matter. ``up`` is
+    the up axis of files that do not record it; files of this project do. Raises ``UserError``, which names
+    the problem, if ``path`` is not such a file.
     """
     require_choice("up", up, UPS)
     try:
@@ -115,9 +118,9 @@ def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
 
 
 def holds_gaussians(path: Path) -> bool:
-    """Whether the properties of a PLY file are those of Gaussians, whole or not, rather than of mere points.
+    """Return whether a PLY file has properties of Gaussians, complete or not, rather than of mere points.
 
-    Raises ``UserError`` if ``path`` is no PLY file.
+    Raises ``UserError`` if ``path`` is not a PLY file.
     """
     try:
         with path.open("rb") as file:
@@ -128,7 +131,7 @@ def holds_gaussians(path: Path) -> bool:
 
 
 def ply_bytes(num_gaussians: int, sh_degree: int) -> int:
-    """Size of the file that :func:`write_ply` writes: header and ``4 (17 + rest)`` bytes per Gaussian."""
+    """Return the size of a file of :func:`write_ply`: its header and ``4 (17 + rest)`` bytes per Gaussian."""
     rest_size = REST_SIZES[sh_degree]
     return len(_header(num_gaussians, rest_size, UPS[0])) + num_gaussians * 4 * len(_names(rest_size))
 
@@ -154,13 +157,13 @@ def _header(num_gaussians: int, rest_size: int, up: str) -> str:
 
 @dataclass(frozen=True)
 class _Header:
-    """What a file says about itself."""
+    """The header of a file."""
 
-    skip_bytes: int  # of elements before the vertices
+    skip_bytes: int  # size of the elements before the vertices
     count: int
     record: np.dtype  # one vertex
     rest_size: int
-    up: str | None  # the frame, where cadam3d wrote it
+    up: str | None  # up axis; None unless cadam3d wrote the file
 
 
 def _parse_header(path: Path, file: BinaryIO) -> _Header:
@@ -171,13 +174,13 @@ def _parse_header(path: Path, file: BinaryIO) -> _Header:
             case ["format", *version]:
                 _require_format(path, " ".join(version))
             case ["comment", "cadam3d", claim] if claim.startswith("up="):
-                up = _frame(path, claim.removeprefix("up="))
+                up = _require_up(path, claim.removeprefix("up="))
             case ["element", name, count] if count.isdecimal():
                 elements.append((name, int(count), []))
             case ["property", kind, name] if elements and kind in NUMPY_TYPES:
                 elements[-1][2].append((name, NUMPY_TYPES[kind]))
             case ["property", "list", *_] if elements and any(e[0] == "vertex" for e in elements[:-1]):
-                pass  # faces and such, after the vertices: never read
+                pass  # faces and the like after the vertices are never read
             case ["comment" | "obj_info", *_]:
                 pass
             case _:
@@ -201,14 +204,14 @@ def _require_format(path: Path, version: str) -> None:
         )
 
 
-def _frame(path: Path, up: str) -> str:
+def _require_up(path: Path, up: str) -> str:
     if up not in UPS:
-        raise UserError(f"{path}: unknown frame up={up}; known are {', '.join(UPS)}")
+        raise UserError(f"{path}: expected up={'|'.join(UPS)} in the header, got up={up}")
     return up
 
 
 def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:
-    """The words of each line between ``ply`` and ``end_header``."""
+    """Yield the words of each line between ``ply`` and ``end_header``."""
     line = file.readline(MAX_HEADER_BYTES)
     if line.strip() != b"ply":
         raise UserError(f"{path}: not a ply file: it begins with {line[:16]!r}")

@@ -1,7 +1,7 @@
-"""Pretrained models in the layout of diffusers: found in a folder or on the hub, loaded part by part.
+"""Pretrained models in the layout of diffusers, in a folder or on the hub, loaded part by part.
 
-A model is a folder with a ``model_index.json``, which names a class for each of its parts; a part (the UNet,
-a text encoder, a tokenizer) is loaded when it is needed and alone: what nobody needs is never downloaded.
+A model is a folder with a ``model_index.json``, which names a class for each of its parts. A part (the UNet,
+a text encoder, a tokenizer) is loaded separately and when it is needed. Unused parts are never downloaded.
 """
 
 import json
@@ -17,19 +17,20 @@ import torch
 from cadam3d.core.checks import UserError, require
 
 INDEX = "model_index.json"
-LIBRARIES = ("diffusers", "transformers")  # the only ones that a part may come from: no code of strangers
+# Parts may only have classes of these libraries, so that no foreign code runs.
+LIBRARIES = ("diffusers", "transformers")
 EXTRA = ("diffusers", "transformers", "safetensors")
 DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where a model may be found. ``key`` is the node of the configuration that says so, for messages."""
+    """The places to search for a model. ``key`` is their node in the configuration, for messages."""
 
     key: str  # such as "prior"
-    path: str | None  # a folder on this machine; it wins over ``ids``
-    ids: Sequence[str]  # names on the hub of Hugging Face, tried in order
-    revision: str | None  # branch, tag or commit on the hub; None = the newest
+    path: str | None  # folder on this machine; takes precedence over ``ids``
+    ids: Sequence[str]  # names on the Hugging Face hub, tried in order
+    revision: str | None  # branch, tag or commit on the hub; None: the newest
     variant: str | None  # of the weight files, such as "fp16"
 
     def __post_init__(self) -> None:
@@ -52,11 +53,11 @@ class Source:
             )
 
     def find(self, kinds: Sequence[str], others: Mapping[str, str], ask_hub: bool = True) -> "Pretrained":
-        """The model, of which only the index has been read; on the hub, the first id that can be had.
+        """Find the model and read its index; on the hub, the first available id is used.
 
-        ``kinds`` are the pipeline classes that will do, ``others`` what to type for those that will not.
-        Unless ``ask_hub``, only what is on this disk counts.
-        Raises ``UserError`` if the extra is not installed, or with a reason for everything that was tried.
+        ``kinds`` are the accepted pipeline classes; ``others`` maps other classes to what the user should
+        type instead. Without ``ask_hub``, only files on this disk count. Raises ``UserError`` if the extra is
+        not installed, or with a reason for everything that was tried.
         """
         require_extra(self.key)
         found = self._local() if self.path is not None else self._remote(ask_hub)
@@ -97,14 +98,14 @@ class Source:
             reasons.append(f"{name}: {reason}")
         folder = f"models/{self.ids[0].split('/')[1]}"
         raise UserError(
-            f"{self.key}.ids: no model could be had. {'; '.join(reasons)}. Try, where there is a connection: "
+            f"{self.key}.ids: no model is available. {'; '.join(reasons)}. Try, with a network connection: "
             f"hf download {self.ids[0]} --local-dir {folder}. Then: {self.key}.path={folder}"
         )
 
 
 @dataclass(frozen=True)
 class Pretrained:
-    """A model that was found. Its parts are loaded by :meth:`part`."""
+    """A model that was found. :meth:`part` loads its parts."""
 
     source: Source
     where: str  # the folder, or the id on the hub
@@ -113,14 +114,14 @@ class Pretrained:
     index: dict[str, Any]
 
     def has(self, part: str) -> bool:
-        """Whether the model comes with ``part``, such as ``"text_encoder_3"``."""
+        """Return whether the model has ``part``, such as ``"text_encoder_3"``."""
         library, kind = (self.index.get(part) or (None, None))[:2]
         return library is not None and kind is not None
 
     def part(self, name: str, dtype: torch.dtype | None = None) -> Any:
-        """Load one part, in evaluation mode and frozen if it is a network, on the CPU.
+        """Load one part on the CPU; a network is frozen and in evaluation mode.
 
-        Raises ``UserError`` if the part is missing, damaged or of a class that the installed libraries lack.
+        Raises ``UserError`` if the part is missing or damaged, or the installed libraries lack its class.
         """
         options: dict[str, Any] = {"subfolder": name, "revision": self.revision}
         if dtype is not None:
@@ -143,7 +144,7 @@ class Pretrained:
         return loaded
 
     def config(self, name: str) -> dict[str, Any]:
-        """The configuration of one part, without its weights."""
+        """Return the configuration of one part, without loading its weights."""
         kind = self._kind(name)
         file = "scheduler_config.json" if name == "scheduler" else "config.json"
         if Path(self.where).is_dir():
@@ -156,7 +157,7 @@ class Pretrained:
         return kind.config_class.from_pretrained(self.where, subfolder=name, revision=self.revision).to_dict()
 
     def skeleton(self, name: str, dtype: torch.dtype) -> Any:
-        """A network without numbers, on the meta device, from its configuration alone: nothing is loaded."""
+        """Return a network on the meta device, built from its configuration without loading any weights."""
         kind, config = self._kind(name), self.config(name)
         usual = torch.get_default_dtype()
         torch.set_default_dtype(dtype)
@@ -173,18 +174,23 @@ class Pretrained:
 
     @property
     def identity(self) -> str:
-        """A text that changes when the model does: file names, sizes and times, or the commit on the hub."""
+        """Return a text that changes with the model: names, sizes and times of files, or the hub's commit."""
         if not Path(self.where).is_dir():
-            return f"{self.where}@{self.file.resolve().parent.name}"  # the folder of a snapshot is its commit
+            # The name of a snapshot folder is its commit.
+            return f"{self.where}@{self.file.resolve().parent.name}"
         files = sorted(path for path in Path(self.where).rglob("*") if path.is_file())
         facts = [(str(f.relative_to(self.where)), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
         return json.dumps([str(Path(self.where).resolve()), facts])
 
     def _check_vocabulary(self, name: str, size: int) -> None:
-        """Where a tokenizer has no files, transformers makes one up that knows no word, and says nothing."""
+        """Raise ``UserError`` if a tokenizer has far fewer pieces of text than its encoder.
+
+        If the files of a tokenizer are missing, transformers silently makes one that knows no word.
+        """
         encoder = name.replace("tokenizer", "text_encoder")
         wanted = self._kind(encoder).config_class.from_dict(self.config(encoder)).vocab_size
-        if size < wanted / 2:  # T5's encoder has room for a few more pieces than there are
+        # The encoder of T5 has room for a few more pieces than its tokenizer has.
+        if size < wanted / 2:
             raise UserError(
                 f"{self.source.key}: {name} of {self.where} knows {size} of the {wanted} pieces of text that "
                 f"{encoder} reads: files are missing. Try: download it again"
@@ -195,24 +201,25 @@ class Pretrained:
         module = _module(library)
         if module is None or not hasattr(module, kind):
             raise UserError(
-                f"{self.source.key}: {self.where} says that its {name} is a {library}.{kind}, which the "
-                f"installed libraries do not have. Try: pip install -U 'cadam3d[diffusers]', or another model"
+                f"{self.source.key}: the {name} of {self.where} is a {library}.{kind}, which the installed "
+                f"libraries do not have. Try: pip install -U 'cadam3d[diffusers]', or another model"
             )
         return getattr(module, kind)
 
 
 def require_extra(key: str) -> None:
-    """Raise ``UserError`` unless the libraries of pretrained models are installed."""
+    """Raise ``UserError`` unless the libraries for pretrained models are installed."""
     missing = [name for name in EXTRA if find_spec(name) is None]
     if missing:
         raise UserError(f"{key}: needs {', '.join(missing)}. Try: pip install 'cadam3d[diffusers]'")
 
 
 def _module(library: str) -> Any:
-    """Where an index says that a class lives: a library, or a pipeline of diffusers; None for all else."""
+    """Return the module that an index names: a library or a pipeline of diffusers; ``None`` for others."""
     if library in LIBRARIES:
         return import_module(library)
-    own = f"diffusers.pipelines.{library}"  # parts that only one pipeline has, such as Shap-E's renderer
+    # Some parts belong to a single pipeline, such as the renderer of Shap-E.
+    own = f"diffusers.pipelines.{library}"
     return import_module(own) if library.isidentifier() and find_spec(own) is not None else None
 
 
@@ -222,12 +229,12 @@ def _read_index(key: str, file: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise UserError(f"{key}: {file} cannot be read ({error}). Try: download the model again") from error
     if not isinstance(index, dict):
-        raise UserError(f"{key}: {file} is no index of a model. Try: download the model again")
+        raise UserError(f"{key}: {file} is not the index of a model. Try: download the model again")
     return index
 
 
 def _fetch_index(name: str, revision: str | None, can_ask: bool) -> tuple[Path | None, str, bool]:
-    """The index of a model on the hub, or why there is none; and whether asking the hub is worth the wait."""
+    """Return the index of a model on the hub, or why there is none, and whether to ask the hub again."""
     from huggingface_hub import constants, hf_hub_download, utils
     from huggingface_hub.errors import (
         EntryNotFoundError,
@@ -240,7 +247,8 @@ def _fetch_index(name: str, revision: str | None, can_ask: bool) -> tuple[Path |
 
     offline = constants.HF_HUB_OFFLINE
     verbosity = utils.logging.get_verbosity()
-    utils.logging.set_verbosity_error()  # its retries would be all that the user sees
+    # Otherwise the messages about retries would hide ours.
+    utils.logging.set_verbosity_error()
     try:
         file = hf_hub_download(name, INDEX, revision=revision, local_files_only=offline or not can_ask)
         return Path(file), "", can_ask
@@ -254,7 +262,7 @@ def _fetch_index(name: str, revision: str | None, can_ask: bool) -> tuple[Path |
         reason = (
             f"not on this disk, and {'HF_HUB_OFFLINE is set' if offline else 'the hub cannot be reached'}"
         )
-        can_ask = False  # every further question would take as long
+        can_ask = False  # every further request would take as long
     except EntryNotFoundError:
         reason = f"has no {INDEX}: not in the layout of diffusers"
     except (HfHubHTTPError, OSError) as error:
@@ -265,7 +273,7 @@ def _fetch_index(name: str, revision: str | None, can_ask: bool) -> tuple[Path |
 
 
 def _silence() -> None:
-    """No progress bars of other libraries between ours."""
+    """Switch off the progress bars of other libraries."""
     import diffusers
     import transformers
 

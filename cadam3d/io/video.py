@@ -1,4 +1,4 @@
-"""Videos: H.264 in MP4 with yuv420p, which every browser and player shows."""
+"""Videos: H.264 in MP4 with yuv420p, which every browser and player supports."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,15 +10,15 @@ from jaxtyping import UInt8
 from cadam3d.core.checks import UserError, require
 from cadam3d.io.atomic import replacing
 
-CRF = 18  # visually lossless; larger is smaller and worse
+# 18 is visually lossless; larger numbers give smaller and worse files.
+CRF = 18
 
 
 def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], *, fps: int) -> None:
-    """Write ``frames`` atomically, one at a time, so that a generator never holds more than one in memory.
+    """Write video frames atomically, one at a time, so that a generator needs memory for one frame only.
 
-    Odd sizes are padded by repeating the last row or column: yuv420p needs even ones. Raises ``UserError``
-    if there is no frame, if the file cannot be written, or if ffmpeg is missing or fails, with what to
-    type.
+    yuv420p needs even sizes, so odd sizes are padded by repeating the last row or column. Raises
+    ``UserError`` if there is no frame, if the file cannot be written, or if ffmpeg is missing or fails.
     """
     with replacing(path) as temporary:
         writer = None
@@ -48,8 +48,10 @@ def _open(path: Path, fps: int):
             fps=fps,
             codec="libx264",
             pixelformat="yuv420p",
-            macro_block_size=1,  # we pad to even sizes ourselves; the default of 16 would rescale the picture
-            output_params=["-crf", str(CRF), "-movflags", "+faststart"],  # faststart: plays while it loads
+            # The frames already have even sizes. The default of 16 would rescale them.
+            macro_block_size=1,
+            # With faststart, a browser plays the video while it loads.
+            output_params=["-crf", str(CRF), "-movflags", "+faststart"],
         )
     except (RuntimeError, OSError, ImportError) as error:
         raise _ffmpeg_error(error) from error
@@ -58,7 +60,8 @@ def _open(path: Path, fps: int):
 def _append(writer, frame: UInt8[np.ndarray, "h w 3"]) -> None:
     try:
         writer.append_data(frame)
-    except (RuntimeError, OSError) as error:  # ffmpeg starts with the first frame, and breaks there too
+    # ffmpeg starts with the first video frame, so a broken one fails here.
+    except (RuntimeError, OSError) as error:
         raise _ffmpeg_error(error) from error
 
 

@@ -2,17 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
-from cadam3d.core.cameras import Cameras, orbit
+from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require_whole
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.pictures import PictureSettings
 from cadam3d.core.render import RenderFn, TruthFn
-from cadam3d.core.viewing import require_elevations, require_viewing
 from cadam3d.metric.base import Metric
 
 SSIM_WINDOW = 11  # pixels (Wang et al. 2004)
@@ -21,7 +22,7 @@ VIEWS_AT_ONCE = 4  # bounds memory: the truth holds one image per mode and view
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fidelity(Metric):
+class Fidelity(PictureSettings, Metric):
     """PSNR and SSIM of held-out views against the true images.
     Each view's PSNR comes from the mean squared error over all its pixels and channels, renders clamped to
     [0, 1]; views are then averaged in dB. If the prompt leaves something open, the truth is a mixture: the
@@ -29,23 +30,15 @@ class Fidelity(Metric):
     for the whole object.
     """
 
+    node: ClassVar[str] = "metric.fidelity"
+
     views: int  # azimuths per elevation
     elevations_deg: Sequence[float]
-    distance: float  # of the camera from the origin, world units
-    fov_y_deg: float
-    size: int  # pixels, height and width
-    background: Sequence[float]  # RGB in [0, 1]; render and truth stand before the same one
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require_whole("metric.fidelity.views", self.views, low=1, example=12)
-        require_elevations("metric.fidelity", self.elevations_deg)
-        require_viewing(
-            "metric.fidelity",
-            distance=self.distance,
-            fov_y_deg=self.fov_y_deg,
-            size=self.size,
-            background=self.background,
-        )
+        self.require_angles("elevations_deg", self.elevations_deg, limit=90, example=15)
         require_whole("metric.fidelity.size", self.size, low=SSIM_WINDOW, example=128)
 
     def cameras(self) -> Cameras:
@@ -60,8 +53,7 @@ class Fidelity(Metric):
         elevation = torch.tensor([float(angle) for angle in self.elevations_deg]).repeat_interleave(
             self.views
         )
-        full = torch.ones_like(azimuth)
-        return orbit(azimuth, elevation, full * self.distance, full * self.fov_y_deg, self.size, self.size)
+        return self.cameras_at(azimuth, elevation)
 
     def measure(self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None) -> dict[str, float]:
         """``psnr`` (dB, mean over views), ``psnr_min`` (dB, the worst view), ``ssim`` (mean over views) and
@@ -73,7 +65,7 @@ class Fidelity(Metric):
         psnrs, ssims = [], []
         for first in range(0, len(cameras), VIEWS_AT_ONCE):
             some = cameras.index(slice(first, first + VIEWS_AT_ONCE))
-            background = torch.tensor([[float(channel) for channel in self.background]] * len(some))
+            background = self.backgrounds(len(some))
             images = render(some, background).rgb.detach().float().cpu().clamp(0, 1)
             modes = truth(some, background).detach().float().cpu()
             psnrs.append(_psnr(images, modes))

@@ -1,1 +1,1 @@
-"""What knows images: diffusion and flow models behind one interface."""
+"""Priors: diffusion and flow models of images behind one interface."""

@@ -1,4 +1,4 @@
-"""DiffusionPrior: what knows images, behind one interface for networks and for exact models."""
+"""DiffusionPrior: one interface for image models, whether networks or exact models."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -13,11 +13,14 @@ from cadam3d.prior.path import NoisePath, Prediction
 
 
 class Condition(ABC):
-    """What a prediction is conditioned on: the prompt, seen from particular views. Opaque to guidance."""
+    """The input that a prediction is conditioned on: the prompt for particular views.
+
+    Guidance passes it to the prior and does not look inside.
+    """
 
     @abstractmethod
     def unprompted(self) -> "Condition":
-        """The same views under the empty prompt and the empty negative prompt (for inversion)."""
+        """Return the same views under the empty prompt and the empty negative prompt (for inversion)."""
 
 
 class PromptEmbedding(ABC):
@@ -25,52 +28,56 @@ class PromptEmbedding(ABC):
 
     @abstractmethod
     def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> Condition:
-        """The condition of these views: view-dependent wording, and the backdrop behind the render."""
+        """Return the condition of these views over these background colours, RGB in [0, 1]."""
 
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """What a prior will hold while it trains, in bytes, guessed before anything is loaded."""
+    """The memory that training with a prior needs, in bytes, estimated before anything is loaded."""
 
-    weights: int  # of the networks that stay
-    working: int  # the most that one of them needs beside its weights
-    texts: int  # the most while prompts are embedded, before the rest is loaded; 0 if they are known
+    weights: int  # of the networks that stay loaded
+    working: int  # largest scratch memory of one of them, in addition to the weights
+    texts: int  # peak while prompts are embedded, before the rest is loaded; 0 if they are cached
 
     @property
     def total(self) -> int:
-        """The peak, in bytes."""
+        """Return the peak, in bytes."""
         return max(self.weights + self.working, self.texts)
 
     def __str__(self) -> str:
         return (
-            f"{amount(self.total)}: weights {amount(self.weights)}, working memory {amount(self.working)}, "
-            f"and {amount(self.texts)} before them for the encoders of text"
+            f"{amount(self.total)}: weights {amount(self.weights)}, working memory {amount(self.working)}; "
+            f"before that, the text encoders need {amount(self.texts)}"
         )
 
 
 def amount(count: int) -> str:
-    """Bytes in words: ``"5.2 GiB"``, ``"310 MiB"``."""
+    """Return a number of bytes as text, such as ``"5.2 GiB"`` or ``"310 MiB"``."""
     return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"
 
 
 class DiffusionPrior(ABC):
-    """A denoiser of images. ``t`` in [0, 1]: 0 is clean, 1 is noise, for diffusion and flow models alike."""
+    """A denoiser of images. ``t`` is in [0, 1]: 0 is clean and 1 is noise, for diffusion and flow models.
 
-    noise_path: NoisePath  # how this model mixes images with noise; not a property, so that it can be a field
+    ``noise_path`` is how the model mixes images with noise. It is declared as an attribute and not as a
+    property, so that subclasses can make it a dataclass field.
+    """
+
+    noise_path: NoisePath
 
     @abstractmethod
     def embed(self, prompt: str, negative: str) -> PromptEmbedding:
-        """Embed both prompts; called once. Raises ``UserError`` if the model cannot understand them."""
+        """Embed both prompts, once per run. Raises ``UserError`` for a prompt that the model cannot read."""
 
     @abstractmethod
     def encode(self, rgb: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v c lh lw"]:
-        """Images in [0, 1] to the space that the model denoises in; differentiable."""
+        """Convert images in [0, 1] to the space that the model denoises in; differentiable."""
 
     @abstractmethod
     def decode(
         self, latents: Float[Tensor, "v c lh lw"], height: int, width: int
     ) -> Float[Tensor, "v h w 3"]:
-        """The way back from :meth:`encode`: images in [0, 1], without gradient.
+        """Invert :meth:`encode`: return images in [0, 1], without gradient.
 
         ``height`` and ``width`` are those of the images that were encoded, in pixels.
         """
@@ -79,32 +86,38 @@ class DiffusionPrior(ABC):
     def predict(
         self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: Condition, scale: float
     ) -> Prediction:
-        """One guess, without gradient, under guidance: negative + scale * (positive - negative).
+        """Predict under guidance, negative + scale * (positive - negative), without gradient.
 
-        ``scale`` 1 is the prompt alone, 0 the negative prompt alone (the empty one unless the user gave one);
-        below 0 it leads away from the prompt (SDI inverts so).
+        ``scale`` 1 uses the prompt alone, 0 the negative prompt alone (the empty one unless the user gave
+        one). A scale below 0 leads away from the prompt, as in the inversion of SDI.
         """
 
     def truth(self, prompt: str) -> TruthFn | None:
-        """The true images of ``prompt``, for a prior that knows them; None for one that does not."""
+        """Return the function that renders the true images of ``prompt``, or None if they are not known."""
         return None
 
     def memory(self, prompt: str, negative: str, views: int, size: int | None) -> MemoryEstimate | None:
-        """What training on ``views`` renders of ``size`` pixels a side will hold; None if next to nothing."""
+        """Estimate the memory of training on ``views`` square renders of ``size`` pixels per side.
+
+        Returns None if it is negligible.
+        """
         return None
 
     def lacks(self) -> str | None:
-        """What must be had before this prior can be used here, such as weights; None if it is ready."""
+        """Return what is missing before this prior can be used, such as weights; None if it is ready."""
         return None
 
     def load(self) -> None:
-        """Load what training needs, so that a missing file shows before the first step; may take minutes."""
+        """Load everything that training needs, which may take minutes.
+
+        The trainer calls it first, so that a missing file is reported before the first step.
+        """
         return
 
     def notice(self) -> str | None:
-        """A sentence the user must read before training with this prior, if any."""
+        """Return a sentence that the user must read before training with this prior, or None."""
         return None
 
     def to(self, device: torch.device) -> "DiffusionPrior":
-        """Move whatever the prior holds to ``device``; returns the prior."""
+        """Move everything that the prior holds to ``device``, and return the prior."""
         return self

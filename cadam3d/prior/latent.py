@@ -1,7 +1,7 @@
-"""LatentPrior: what the pretrained latent models share; they differ in how they read text and call a network.
+"""LatentPrior: the base class of the pretrained latent models, which differ in text encoders and denoisers.
 
-Text is embedded once per prompt and model, kept on disk, and its encoders are freed before the denoiser is
-loaded. Networks compute in ``dtype``; everything that leaves them is float32.
+Text is embedded once per prompt and model and cached on disk. The text encoders are freed before the denoiser
+is loaded. Networks compute in ``dtype``; all their outputs are converted to float32.
 """
 
 import gc
@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional as F  # noqa: N812  (the name everybody knows)
+from torch.nn import functional as F  # noqa: N812  (the usual name)
 from torch.utils.checkpoint import checkpoint
 
 from cadam3d.core.cameras import Cameras, orbit
@@ -29,14 +29,15 @@ from cadam3d.prior.memory import working_bytes
 from cadam3d.prior.path import DDPM, NoisePath, Prediction
 from cadam3d.prior.prompting import Mix, Prompting, guide
 
-PRIORS = {  # what to type for a model of this class
+# What to type for a model of each pipeline class.
+PRIORS = {
     "StableDiffusionPipeline": "prior=stable_diffusion",
     "StableDiffusionXLPipeline": "prior=sdxl",
     "StableDiffusion3Pipeline": "prior=stable_diffusion_3",
     "MVDreamPipeline": "prior=mvdream",
 }
-TOKENS, T5_TOKENS = 77, 256  # of CLIP and of T5, per text
-FACTOR = 8  # pixels per latent, per side, in every model of this family
+TOKENS, T5_TOKENS = 77, 256  # per text; of CLIP and of T5
+FACTOR = 8  # pixels per latent and side, in every model of this family
 
 
 @dataclass(frozen=True)
@@ -44,29 +45,29 @@ class Texts:
     """Embedded texts, one per row."""
 
     tokens: Float[Tensor, "k n d"]
-    pooled: Float[Tensor, "k p"] | None  # where the network wants one vector per text as well
+    pooled: Float[Tensor, "k p"] | None  # one vector per text, for networks that read it
 
     def mixed(self, weights: Float[Tensor, "b k"]) -> "Texts":
-        """Weighted sums of rows."""
+        """Return weighted sums of the rows, one for each row of ``weights``."""
         tokens = torch.einsum("bk,knd->bnd", weights.to(self.tokens), self.tokens)
         return Texts(tokens, None if self.pooled is None else weights.to(self.pooled) @ self.pooled)
 
     def to(self, device: torch.device) -> "Texts":
-        """The same rows on ``device``."""
+        """Return the same rows on ``device``."""
         return Texts(self.tokens.to(device), None if self.pooled is None else self.pooled.to(device))
 
 
 @dataclass(frozen=True)
 class TextCondition(Condition):
-    """Weights over embedded texts, per view; the last text is empty."""
+    """Weights over embedded texts for each view; the last text is empty."""
 
     texts: Texts
-    mix: Mix  # over all of ``texts``
+    mix: Mix  # over all of `texts`
     negative: Float[Tensor, "v k"]
-    cameras: Cameras  # for models that are told where a view stands
+    cameras: Cameras  # for models that read the cameras
 
     def unprompted(self) -> "TextCondition":
-        """The same views under the empty text, positive and negative."""
+        """Return the same views with the empty text as both prompt and negative prompt."""
         empty = torch.zeros_like(self.negative)
         empty[:, -1] = 1
         mix = Mix(positive=empty, repelled=empty[:, None][:, :0], strengths=empty[:, :0])
@@ -81,7 +82,7 @@ class LatentEmbedding(PromptEmbedding):
     prompting: Prompting
 
     def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> TextCondition:
-        """The condition of these views; the backdrop plays no part."""
+        """Return the condition of these views; the background is not used."""
         cameras = cameras.to(self.texts.tokens.device)
         mix = self.prompting.mix(cameras)
         v = len(cameras)
@@ -93,31 +94,32 @@ class LatentEmbedding(PromptEmbedding):
 
 @dataclass(frozen=True, kw_only=True)
 class LatentPrior(DiffusionPrior):
-    """A pretrained model that denoises what an autoencoder makes of images.
+    """A pretrained model that denoises the latents of an autoencoder.
 
     Renders of any size are resized to ``size``. Latents are the mean of the autoencoder's posterior, where
-    the released codes draw from it. ``micro_batch`` bounds how many images are in a network at once: the
-    autoencoder is then run again in the backward pass, part by part, so that memory no longer grows with the
-    number of views, and the gradient stays what it is.
+    the released code draws from it. ``micro_batch`` limits the number of images in a network at a time: the
+    autoencoder then runs again in the backward pass, part by part, so that memory does not grow with the
+    number of views. The gradient does not change. With ``dtype`` "auto" the networks use ``half`` on CUDA and
+    float32 elsewhere.
     """
 
-    path: str | None  # a folder in the layout of diffusers; wins over ids
+    path: str | None  # a folder in the layout of diffusers; takes precedence over ids
     ids: Sequence[str]  # names on the hub, tried in order
     revision: str | None  # on the hub
     variant: str | None  # of weight files
     prompting: Prompting
-    size: int | None  # pixels per side that renders are resized to; None = as they are
-    dtype: str  # of the networks: one of DTYPES, or "auto": `half` on CUDA, float32 elsewhere
+    size: int | None  # pixels per side that renders are resized to; None = not resized
+    dtype: str  # of the networks: auto, or one of DTYPES
     micro_batch: int | None  # images in a network at a time; None = all
     tiling: bool  # decode and encode large images in tiles
     compile: bool  # torch.compile for the denoiser
-    text_device: str  # where prompts are embedded: "auto" (with the rest) or "cpu"
+    text_device: str  # where prompts are embedded: auto (the device of the run) or cpu
     cache_dir: str | None  # of embedded texts; None = the user's cache folder
 
     kinds: ClassVar[tuple[str, ...]]  # pipeline classes that this prior can use
     encoders: ClassVar[tuple[str, ...]]  # parts that embed text
     network_part: ClassVar[str]  # the denoiser
-    half: ClassVar[str]  # the 16-bit type that the model is safe in
+    half: ClassVar[str]  # the 16-bit type that is safe for the model
     upcasts: ClassVar[bool]  # whether the autoencoder overflows in float16
 
     def __post_init__(self) -> None:
@@ -125,7 +127,7 @@ class LatentPrior(DiffusionPrior):
         require(
             isinstance(self.prompting, Prompting),
             "prior.prompting",
-            expected="a way to word prompts",
+            expected="one of the prompting options",
             got=self.prompting,
             example="prompting=discrete",
         )
@@ -146,23 +148,23 @@ class LatentPrior(DiffusionPrior):
         require_choice("prior.tiling", self.tiling, (False, True))
         require_choice("prior.compile", self.compile, (False, True))
 
-    # --- what a family of models fills in ------------------------------------------------------------------
+    # --- methods that a family of models implements ---------------------------------------------------------
 
     @abstractmethod
     def embed_texts(self, found: Pretrained, texts: Sequence[str], device: torch.device) -> Texts:
-        """Load the text encoders, embed, and let go of them."""
+        """Load the text encoders, embed ``texts``, and free the encoders."""
 
     @abstractmethod
     def denoise(
         self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
     ) -> Float[Tensor, "b c h w"]:
-        """The raw output of :attr:`network`, in its dtype."""
+        """Return the raw output of :attr:`network`, in its dtype."""
 
     @abstractmethod
     def complete(
         self, noisy: Float[Tensor, "v c h w"], output: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
     ) -> Prediction:
-        """What the (guided) output of the network means."""
+        """Convert the (guided) output of the network to a prediction in all three forms."""
 
     def tempered(
         self,
@@ -171,18 +173,18 @@ class LatentPrior(DiffusionPrior):
         output: Float[Tensor, "v c h w"],
         t: Float[Tensor, "v"],
     ) -> Prediction:
-        """``guided`` itself; a family may weaken it where it is far from ``output``, the prompt's alone."""
+        """Return ``guided``; a subclass may move it towards ``output``, the prediction without guidance."""
         return guided
 
     # --- the interface of a prior --------------------------------------------------------------------------
 
     def embed(self, prompt: str, negative: str) -> LatentEmbedding:
-        """Embed the prompt's texts, the negative prompt and the empty text, from the cache where they are."""
+        """Embed the texts of the prompt, the negative prompt and the empty text, using the cache."""
         texts = self._embedded(self._listed(prompt, negative))
         return LatentEmbedding(texts=texts.to(self.device), prompting=self.prompting)
 
     def encode(self, rgb: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v c lh lw"]:
-        """Images in [0, 1] to scaled latents; differentiable."""
+        """Convert images in [0, 1] to scaled latents; differentiable."""
         images = self._resized(rgb.permute(0, 3, 1, 2))
         if self.micro_batch is None:
             return self._to_latents(images)
@@ -196,7 +198,7 @@ class LatentPrior(DiffusionPrior):
     def decode(
         self, latents: Float[Tensor, "v c lh lw"], height: int, width: int
     ) -> Float[Tensor, "v h w 3"]:
-        """Scaled latents to images in [0, 1] of the size that renders have; without gradient."""
+        """Convert scaled latents to images in [0, 1] of ``height`` x ``width`` pixels, without gradient."""
         config = self.vae.config
         raw = latents / config.scaling_factor + (config.shift_factor or 0)
         parts = [self.vae.decode(part.to(self.vae.dtype)).sample.float() for part in self._parts(raw)]
@@ -207,7 +209,10 @@ class LatentPrior(DiffusionPrior):
     def predict(
         self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: TextCondition, scale: float
     ) -> Prediction:
-        """One guess, without gradient; all branches of guidance in one batch, or by ``micro_batch``."""
+        """Predict under guidance, without gradient.
+
+        All branches of guidance are in one batch, which ``micro_batch`` splits.
+        """
         mix = condition.mix
         repelled = list(mix.repelled.unbind(dim=1))
         branches = [condition.negative, mix.positive, *repelled]
@@ -230,9 +235,10 @@ class LatentPrior(DiffusionPrior):
         return self.tempered(noisy, guided, outputs[1].to(noisy.dtype), t)
 
     def memory(self, prompt: str, negative: str, views: int, size: int | None) -> MemoryEstimate:
-        """Weights, the larger of what denoiser and autoencoder need at once, and the text encoders.
+        """Estimate the memory of training from the configuration of the model alone.
 
-        From the model's configurations alone. Renders have ``size`` (or 512) where the prior has none.
+        The working memory is that of the denoiser or of the autoencoder, whichever is larger. Renders have
+        ``size`` pixels per side (512 if that is None too) unless the prior resizes them.
         """
         pixels = self.size or size or 512
         branches = 2 + self.prompting.mix(_views(1)).repelled.shape[1]
@@ -244,14 +250,14 @@ class LatentPrior(DiffusionPrior):
         )
         is_known = all(self._cache_file(text).is_file() for text in self._listed(prompt, negative))
         is_elsewhere = self.text_device == "cpu" and self.device.type != "cpu"
-        encoders = (
-            [] if is_known or is_elsewhere else [part for part in self.encoders if self.found.has(part)]
-        )
+        encoders = [part for part in self.encoders if self.found.has(part)]
+        if is_known or is_elsewhere:
+            encoders = []
         texts = sum(_weights(self.found.skeleton(part, self.torch_dtype)) for part in encoders)
         return MemoryEstimate(weights=_weights(vae) + _weights(network), working=working, texts=texts)
 
     def lacks(self) -> str | None:
-        """The libraries of the extra, or a model on this disk."""
+        """Return why the model cannot be used yet: libraries, ``path`` or weights; None if it is ready."""
         try:
             if self.path is not None:
                 _ = self.found
@@ -260,7 +266,7 @@ class LatentPrior(DiffusionPrior):
         except UserError as error:
             if self.path is not None or "pip install" in str(error):
                 return str(error)
-            return f"no model on this disk; it would be had from the hub: {', '.join(self.ids)}"
+            return f"no model on this disk; the first run would download one of {', '.join(self.ids)}"
         return None
 
     def load(self) -> None:
@@ -268,7 +274,7 @@ class LatentPrior(DiffusionPrior):
         _ = self.vae, self.network
 
     def to(self, device: torch.device) -> "LatentPrior":
-        """Networks loaded from now on go to ``device``; those that are loaded move."""
+        """Move loaded networks to ``device``, load others there later, and return the prior."""
         self._place["device"] = device
         for part in ("vae", "network"):
             if part in self.__dict__:
@@ -279,34 +285,34 @@ class LatentPrior(DiffusionPrior):
 
     @property
     def device(self) -> torch.device:
-        """Where the networks are, or will be."""
+        """Return the device of the networks, loaded or not."""
         return self._place["device"]
 
     @property
     def torch_dtype(self) -> torch.dtype:
-        """What the networks compute in."""
+        """Return the dtype that the networks compute in."""
         if self.dtype != "auto":
             return DTYPES[self.dtype]
         return DTYPES[self.half] if self.device.type == "cuda" else torch.float32
 
     @cached_property
     def source(self) -> Source:
-        """Where the model may be found."""
+        """Return the folder or the hub names where the model is searched."""
         return Source("prior", self.path, self.ids, self.revision, self.variant)
 
     @cached_property
     def found(self) -> Pretrained:
-        """The model, found but not loaded."""
+        """Return the model, found but not loaded. Raises ``UserError`` if there is none."""
         return self.source.find(self.kinds, PRIORS)
 
     @cached_property
     def scheduler(self) -> Mapping[str, Any]:
-        """The configuration of the model's noise schedule."""
+        """Return the configuration of the model's noise schedule."""
         return self.found.config("scheduler")
 
     @cached_property
     def vae(self) -> Any:
-        """The autoencoder, frozen, on the device."""
+        """Return the autoencoder, frozen and on the device."""
         vae = self.found.part("vae", self._vae_dtype)
         if self.tiling:
             vae.enable_tiling()
@@ -314,7 +320,7 @@ class LatentPrior(DiffusionPrior):
 
     @cached_property
     def network(self) -> Any:
-        """The denoiser, frozen, on the device."""
+        """Return the denoiser, frozen and on the device."""
         network = self.found.part(self.network_part, self.torch_dtype).to(self.device)
         if self.device.type == "cuda":
             network = network.to(memory_format=torch.channels_last)
@@ -340,9 +346,9 @@ class LatentPrior(DiffusionPrior):
             got=size[0],
             example="prior.size=512",
         )
-        return (
-            images if tuple(images.shape[2:]) == tuple(size) else F.interpolate(images, size, mode="bilinear")
-        )
+        if tuple(images.shape[2:]) == tuple(size):
+            return images
+        return F.interpolate(images, size, mode="bilinear")
 
     def _to_latents(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c lh lw"]:
         config = self.vae.config
@@ -356,7 +362,7 @@ class LatentPrior(DiffusionPrior):
         condition: TextCondition,
         weights: Tensor,
     ) -> Float[Tensor, "b c h w"]:
-        """The network on every row of ``weights``: the views, once per branch of guidance."""
+        """Run the network on every row of ``weights``: all views, once for each branch of guidance."""
         copies = len(weights) // len(noisy)
         many = noisy.to(self.torch_dtype).repeat(copies, 1, 1, 1)
         timestep = self.noise_path.timestep(t.float()).repeat(copies)
@@ -378,8 +384,9 @@ class LatentPrior(DiffusionPrior):
         return [*self.prompting.texts(prompt), negative, ""]
 
     def _denoising(self, network: Any, count: int, channels: int, pixels: int) -> int:
-        """Scratch bytes of one pass of a skeleton of the denoiser over ``count`` images."""
-        ghost = replace(self)  # this prior, with a network that has no numbers
+        """Return the scratch bytes of one pass of a skeleton of the denoiser over ``count`` images."""
+        # A copy of this prior with a network that has shapes and no numbers.
+        ghost = replace(self)
         object.__setattr__(ghost, "network", network)
         side = pixels // FACTOR
         with torch.device("meta"):
@@ -391,7 +398,7 @@ class LatentPrior(DiffusionPrior):
             return working_bytes(lambda: ghost.denoise(noisy, timestep, texts, cameras), network.parameters())
 
     def _embedded(self, listed: Sequence[str]) -> Texts:
-        """Rows for ``listed``, in order; only texts that are not in the cache cost anything."""
+        """Return the rows of ``listed``, in order; only texts that are not cached are embedded."""
         rows = {text: self._cached(text) for text in dict.fromkeys(listed)}
         missing = [text for text, row in rows.items() if row is None]
         if missing:
@@ -419,7 +426,7 @@ class LatentPrior(DiffusionPrior):
         try:
             kept = load_file(file)
         except (OSError, SafetensorError):
-            return None  # cut short by a crash; made again
+            return None  # truncated by a crash; the text is embedded again
         return Texts(kept["tokens"], kept.get("pooled"))
 
     def _remember(self, text: str, row: Texts) -> None:
@@ -439,20 +446,20 @@ class LatentPrior(DiffusionPrior):
 
     @property
     def _identity(self) -> tuple[str, ...]:
-        """Whatever changes an embedded text."""
+        """Return everything that an embedded text depends on, except the text."""
         return (type(self).__name__, self.found.identity, str(self.torch_dtype), *self.encoders)
 
 
 def ddpm_path(scheduler: Mapping[str, Any]) -> NoisePath:
-    """The noise path that a scheduler's configuration describes. Raises ``UserError`` for unknown kinds."""
+    """Return the noise path of a scheduler's configuration. Raises ``UserError`` for unknown kinds."""
     kind = scheduler.get("beta_schedule")
     is_known = kind == "scaled_linear" and not scheduler.get("rescale_betas_zero_snr")
     require(
         is_known and scheduler.get("trained_betas") is None,
         "prior.path",
-        expected="a model whose noise schedule is scaled_linear",
-        got=kind if kind != "scaled_linear" else "one rescaled to zero terminal SNR",
-        example="another model",
+        expected="a model with a scaled_linear noise schedule",
+        got=kind if kind != "scaled_linear" else "scaled_linear, rescaled to zero terminal SNR",
+        example="prior.path=DIR with another model",
     )
     return DDPM(
         train_steps=scheduler["num_train_timesteps"],
@@ -462,19 +469,18 @@ def ddpm_path(scheduler: Mapping[str, Any]) -> NoisePath:
 
 
 def blank_texts(count: int, config: Any, dtype: torch.dtype) -> Texts:
-    """Texts of the shapes that a denoiser with this configuration reads, without meaning."""
+    """Return texts without content, in the shapes that a denoiser with this configuration reads."""
     joint = getattr(config, "joint_attention_dim", None)
     tokens = torch.empty(count, TOKENS + (T5_TOKENS if joint else 0), joint or config.cross_attention_dim)
     width = getattr(config, "pooled_projection_dim", None)
-    if (
-        getattr(config, "addition_embed_type", None) == "text_time"
-    ):  # SDXL: the rest are six numbers about sizes
+    # SDXL: the pooled text is followed by the embeddings of six numbers about image sizes.
+    if getattr(config, "addition_embed_type", None) == "text_time":
         width = config.projection_class_embeddings_input_dim - 6 * config.addition_time_embed_dim
     return Texts(tokens.to(dtype), None if width is None else torch.empty(count, width).to(dtype))
 
 
 def tokenize(tokenizer: Any, texts: Sequence[str], length: int | None = None) -> Tensor:
-    """Token numbers, cut or padded to ``length`` (None: the tokenizer's own)."""
+    """Return token numbers, cut or padded to ``length`` (None = the length that the tokenizer defines)."""
     return tokenizer(
         list(texts),
         padding="max_length",
@@ -485,7 +491,7 @@ def tokenize(tokenizer: Any, texts: Sequence[str], length: int | None = None) ->
 
 
 def free() -> None:
-    """Give memory of dropped networks back."""
+    """Free the memory of networks that are no longer referenced."""
     gc.collect()
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
@@ -495,7 +501,7 @@ Complete = Callable[[Tensor, Tensor, Tensor], Prediction]
 
 
 def completion(path: NoisePath, scheduler: Mapping[str, Any]) -> Complete:
-    """How the outputs of a network become predictions. Raises ``UserError`` for unknown kinds."""
+    """Return the function that converts outputs to predictions. Raises ``UserError`` for unknown kinds."""
     kind = scheduler.get("prediction_type", "epsilon")
     ways: dict[str, Complete] = {
         "epsilon": path.from_noise,
@@ -505,15 +511,15 @@ def completion(path: NoisePath, scheduler: Mapping[str, Any]) -> Complete:
     require(
         kind in ways,
         "prior.path",
-        expected=f"a model that predicts {' or '.join(ways)}",
+        expected=f"a model with the prediction type {' or '.join(ways)}",
         got=kind,
-        example="another model",
+        example="prior.path=DIR with another model",
     )
     return ways[kind]
 
 
 def _encoding(vae: Any, count: int, pixels: int) -> int:
-    """Bytes that a skeleton of the autoencoder keeps for the backward pass through ``count`` images."""
+    """Return the bytes that a skeleton of the autoencoder keeps for a backward pass over ``count`` images."""
     with torch.device("meta"):
         images = torch.empty(count, 3, pixels, pixels, dtype=vae.dtype, requires_grad=True)
     return working_bytes(lambda: vae.encode(images).latent_dist.mode(), vae.parameters())  # noqa: PLW0108

@@ -1,7 +1,8 @@
-"""How much memory a network will hold, before it exists: it is built and run without data, and counted.
+"""Memory estimates of networks before they are loaded: a network is run without data and its tensors counted.
 
-Everything happens on torch's ``meta`` device: shapes only. What is counted is what the network's operations
-make and keep alive, the activations; attention counts as the memory-efficient kernels that GPUs use.
+Everything happens on torch's ``meta`` device, which has shapes and no numbers. Counted are the tensors that
+the operations of the network create and keep alive, its activations. Attention counts as it is computed by
+the memory-efficient kernels of GPUs.
 """
 
 import weakref
@@ -10,28 +11,28 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F  # noqa: N812  (the name everybody knows)
+from torch.nn import functional as F  # noqa: N812  (the usual name)
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 
 def working_bytes(call: Callable[[], object], existing: Iterable[Tensor]) -> int:
-    """The most bytes alive at once of what ``call`` makes on the meta device, beside ``existing`` tensors.
+    """Return the peak number of bytes that ``call`` allocates on the meta device.
 
-    Run under ``torch.no_grad()`` this is the scratch space of a network; with gradients it includes what the
-    backward pass will need.
+    The ``existing`` tensors are not counted. Under ``torch.no_grad()`` the result is the scratch memory of a
+    network; with gradients it includes everything that the backward pass will need.
     """
     kept = [tensor.untyped_storage() for tensor in existing]
     counter = _Counter({storage._cdata for storage in kept})
     with torch.device("meta"), counter, _EfficientAttention():
-        result = call()  # held, for the graph behind it is what is measured
+        result = call()  # kept alive together with its graph, which is part of the measurement
     del result
     return counter.peak
 
 
 class _Counter(TorchDispatchMode):
-    """Adds up storages as operations make them, and subtracts them as they die."""
+    """Adds up storages when operations create them, and subtracts them when they are freed."""
 
     def __init__(self, ignored: set[int]) -> None:
         super().__init__()
@@ -55,7 +56,7 @@ class _Counter(TorchDispatchMode):
 
 
 class _EfficientAttention(TorchFunctionMode):
-    """On the meta device attention falls back to whole score matrices, which no GPU kernel makes."""
+    """Replaces attention, which on the meta device allocates score matrices that no GPU kernel allocates."""
 
     def __torch_function__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         kwargs = kwargs or {}
@@ -63,4 +64,5 @@ class _EfficientAttention(TorchFunctionMode):
             return func(*args, **kwargs)
         names = ("query", "key", "value")
         query, _, value = (args[i] if i < len(args) else kwargs[name] for i, name in enumerate(names))
-        return query * value.new_ones(*query.shape[:-1], value.shape[-1])  # as large, and keeps its inputs
+        # A product of the same size as the output; its graph keeps the inputs alive.
+        return query * value.new_ones(*query.shape[:-1], value.shape[-1])

@@ -1,4 +1,4 @@
-"""MVDream: four views at a time, each told where it stands, in a UNet whose attention spans all four."""
+"""MVDream: denoises four views together in a UNet that reads their cameras and attends across them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,10 +19,11 @@ from cadam3d.prior.latent import PRIORS, LatentEmbedding, TextCondition, Texts
 from cadam3d.prior.path import Prediction, per_view
 from cadam3d.prior.stable_diffusion import StableDiffusion
 
-VIEWS = 4  # of one group
-CAMERA = 16  # numbers that the network is told about a view
-TOLERANCE_DEG = 1.0  # within which the views of a group stand a quarter turn apart
-SCHEDULER = {  # of the published files, which do not say
+VIEWS = 4  # per group
+CAMERA = 16  # numbers that describe the camera of a view to the network
+TOLERANCE_DEG = 1.0  # largest deviation from a quarter turn between the views of a group
+# The noise schedule of the published files, which do not contain it.
+SCHEDULER = {
     "beta_schedule": "scaled_linear",
     "beta_start": 0.00085,
     "beta_end": 0.012,
@@ -36,7 +37,7 @@ class MultiviewEmbedding(LatentEmbedding):
     """Embedded texts for views that come in groups of four."""
 
     def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> TextCondition:
-        """The condition of these views. Raises ``UserError`` unless they are groups as in training."""
+        """Return the condition of these views. Raises ``UserError`` unless they form groups of four."""
         require_groups(cameras)
         return super().at(cameras, background)
 
@@ -45,12 +46,13 @@ class MultiviewEmbedding(LatentEmbedding):
 class MVDream(StableDiffusion):
     """Shi et al. 2024, on Stable Diffusion 2.1: views that agree, since they are denoised together.
 
-    Consecutive views form a group of four, a quarter turn apart, at one elevation and one ``t``, as
-    ``camera=multiview`` makes them. ``path`` may also be the published file (``sd-v2.1-base-4view.pt``).
+    Consecutive views form a group of four, a quarter turn apart, at one elevation and one ``t``, as drawn by
+    ``camera=multiview``. ``path`` may also be the published file (``sd-v2.1-base-4view.pt``), which has no
+    tokenizer; ``tokenizer`` is then a folder, or a name on the hub, with CLIP's vocabulary.
     """
 
-    rescale: float  # share of the guided guess that gets back the spread it had without guidance
-    tokenizer: str  # of a single file, which has none: a folder or a name on the hub with CLIP's vocabulary
+    rescale: float  # in [0, 1]; how far the spread of the guided prediction returns to that without guidance
+    tokenizer: str  # a folder or a name on the hub
 
     kinds: ClassVar = ("MVDreamPipeline", "StableDiffusionPipeline")
 
@@ -68,52 +70,55 @@ class MVDream(StableDiffusion):
         require(
             self.micro_batch is None or self.micro_batch % VIEWS == 0,
             "prior.micro_batch",
-            expected=f"null or a multiple of {VIEWS}, the views that are denoised together",
+            expected=f"null or a multiple of {VIEWS}, since {VIEWS} views are denoised together",
             got=self.micro_batch,
             example=f"prior.micro_batch={VIEWS}",
         )
 
     @cached_property
     def found(self) -> Pretrained:
-        """The model: a folder, one file, or on the hub. Raises ``UserError`` if it knows of no cameras."""
+        """Return the model in a folder, in one file or on the hub.
+
+        Raises ``UserError`` if its network does not read cameras.
+        """
         if self.path is not None and Path(self.path).expanduser().is_file():
             found = SingleFile.open(self.source, SCHEDULER, self.tokenizer, "prior.tokenizer")
         else:
             found = with_ldm_unet(self.source.find(self.kinds, PRIORS))
         if found.config("unet").get("projection_class_embeddings_input_dim") != CAMERA:
             raise UserError(
-                f"prior: {found.where} is not MVDream: its UNet is not told where a view stands. "
-                f"Try: prior=stable_diffusion, or another prior.path"
+                f"prior.path: expected an MVDream model, got {found.where!r}, which has no camera input "
+                "in its UNet. Try: prior=stable_diffusion, or prior.path=/path/to/sd-v2.1-base-4view.pt"
             )
         return found
 
     @cached_property
     def network(self) -> Any:
-        """The denoiser, frozen, on the device, with attention across the views of a group."""
+        """Return the denoiser, frozen and on the device, with attention across the views of a group."""
         return across_views(super().network)
 
     def embed(self, prompt: str, negative: str) -> MultiviewEmbedding:
-        """Embed the prompt's texts, the negative prompt and the empty text."""
+        """Embed the texts of the prompt, the negative prompt and the empty text."""
         embedding = super().embed(prompt, negative)
         return MultiviewEmbedding(texts=embedding.texts, prompting=embedding.prompting)
 
     def denoise(
         self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
     ) -> Float[Tensor, "b c h w"]:
-        """The UNet under text cross-attention; where the views stand is added to the time."""
-        told = camera_numbers(cameras).to(noisy)
-        return self.network(noisy, timestep, encoder_hidden_states=texts.tokens, class_labels=told).sample
+        """Run the UNet with text cross-attention; the cameras are added to the time input."""
+        matrices = camera_numbers(cameras).to(noisy)
+        return self.network(noisy, timestep, encoder_hidden_states=texts.tokens, class_labels=matrices).sample
 
     @torch.no_grad()
     def predict(
         self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: TextCondition, scale: float
     ) -> Prediction:
-        """One guess per view, without gradient. Raises ``UserError`` if ``t`` differs within a group."""
+        """Predict every view, without gradient. Raises ``UserError`` if ``t`` differs within a group."""
         levels = t.view(-1, VIEWS)
         require(
             bool((levels == levels[:, :1]).all()),
             "guidance.shared_t",
-            expected="true, since prior=mvdream denoises four views of one noise level together",
+            expected="true, since prior=mvdream denoises four views together at one noise level",
             got=False,
             example="guidance.shared_t=true",
         )
@@ -126,7 +131,7 @@ class MVDream(StableDiffusion):
         output: Float[Tensor, "v c h w"],
         t: Float[Tensor, "v"],
     ) -> Prediction:
-        """Pull the clean guess to the spread that it has for the prompt alone (MVDream, sec. 3.2)."""
+        """Rescale the clean prediction towards its spread without guidance (MVDream, sec. 3.2)."""
         if self.rescale == 0:
             return guided
         alone = self.complete(noisy, output, t).clean
@@ -135,16 +140,16 @@ class MVDream(StableDiffusion):
         return self.noise_path.from_clean(noisy, guided.clean * per_view(factor), t)
 
     def memory(self, prompt: str, negative: str, views: int, size: int | None) -> MemoryEstimate:
-        """As of any latent model. Raises ``UserError`` unless ``views`` make groups of four."""
+        """Estimate the memory of training. Raises ``UserError`` unless ``views`` is a multiple of four."""
         require_whole_groups(views)
         return super().memory(prompt, negative, views, size)
 
 
 def camera_numbers(cameras: Cameras) -> Float[Tensor, "v 16"]:
-    """Camera-to-world matrices, row by row, as the network was trained on them.
+    """Return camera-to-world matrices, flattened row by row, as the network reads them.
 
-    World axes are ours: +z up, and the front at +x, where the published code has it too. Camera axes are
-    OpenGL's: +x right, +y up, +z backward. Camera centres are moved to the unit sphere.
+    World axes are the same as ours: +z up and the front at +x, as in the published code. Camera axes are
+    those of OpenGL: +x right, +y up, +z backward. Camera centres are moved to the unit sphere.
     """
     to_world = cameras.world_to_camera[:, :3, :3].transpose(1, 2)
     axes = to_world * to_world.new_tensor([1.0, -1.0, -1.0])
@@ -154,7 +159,7 @@ def camera_numbers(cameras: Cameras) -> Float[Tensor, "v 16"]:
 
 
 def require_whole_groups(views: int) -> None:
-    """Raise ``UserError`` unless ``views`` make groups of four."""
+    """Raise ``UserError`` unless ``views`` is a multiple of four."""
     require(
         views % VIEWS == 0,
         "views",
@@ -165,7 +170,10 @@ def require_whole_groups(views: int) -> None:
 
 
 def require_groups(cameras: Cameras) -> None:
-    """Raise ``UserError`` unless consecutive views are groups of four, a quarter turn apart, on one level."""
+    """Raise ``UserError`` unless consecutive views form groups of four at one elevation.
+
+    The views of a group must be a quarter turn apart, within ``TOLERANCE_DEG``.
+    """
     require_whole_groups(len(cameras))
     azimuth, elevation = (a.view(-1, VIEWS) for a in (cameras.azimuth_deg, cameras.elevation_deg))
     turns = (azimuth - azimuth[:, :1]) % 360
@@ -181,20 +189,20 @@ def require_groups(cameras: Cameras) -> None:
 
 
 class AcrossViews:
-    """What computes an attention layer, over the pixels of a group as if they were those of one image."""
+    """An attention processor that treats the pixels of a group of views as the pixels of one image."""
 
     def __init__(self, processor: Any) -> None:
         self.processor = processor
 
     def __call__(self, attention: Any, states: Float[Tensor, "b n c"], *args: Any, **kwargs: Any) -> Tensor:
-        """The layer's output for every view."""
+        """Return the output of the layer for every view."""
         b, n, c = states.shape
         together = states.reshape(b // VIEWS, VIEWS * n, c)
         return self.processor(attention, together, *args, **kwargs).reshape(b, n, c)
 
 
 def across_views(network: Any) -> Any:
-    """Let the self-attention of ``network`` span the views of a group; changes and returns it."""
+    """Make the self-attention of ``network`` span the views of a group; changes and returns ``network``."""
     processors = {
         name: AcrossViews(each) if name.endswith("attn1.processor") else each
         for name, each in network.attn_processors.items()
@@ -204,7 +212,7 @@ def across_views(network: Any) -> Any:
 
 
 def _spread(clean: Float[Tensor, "v c h w"]) -> Float[Tensor, "v"]:
-    """Standard deviation over a whole group, for each of its views."""
+    """Return the standard deviation over a whole group, repeated for each of its views."""
     groups = clean.reshape(len(clean) // VIEWS, -1)
     return groups.std(dim=1).clamp_min(1e-8).repeat_interleave(VIEWS)
 

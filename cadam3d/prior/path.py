@@ -1,8 +1,8 @@
 """NoisePath: noisy = a(t) * clean + b(t) * noise, for diffusion and flow models alike.
 
-``t`` runs from 0 (clean) to 1 (noise) on every path. One prediction has three equivalent forms, clean, noise
-and velocity (paper eq. 5); a path turns any of them into the other two. Noising, a DDIM step and DDIM
-inversion are one call: ``mix(prediction.clean, prediction.noise, t)``.
+``t`` runs from 0 (clean) to 1 (noise) on every path. A prediction has three equivalent forms, clean, noise
+and velocity (paper eq. 5), and a path computes the other two from any of them. Adding noise, a DDIM step and
+DDIM inversion are the same call: ``mix(prediction.clean, prediction.noise, t)``.
 """
 
 from abc import ABC, abstractmethod
@@ -16,12 +16,12 @@ from torch import Tensor
 
 from cadam3d.core.checks import require_range, require_whole
 
-HALVINGS = 53  # until an interval of length 1 is as short as double precision can tell
+HALVINGS = 53  # bisections until an interval of length 1 reaches the resolution of double precision
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """One guess of a model about a noisy image, in its three equivalent forms."""
+    """A model's prediction for a noisy image, in its three equivalent forms."""
 
     clean: Float[Tensor, "v c h w"]  # E[clean | noisy]
     noise: Float[Tensor, "v c h w"]
@@ -33,50 +33,50 @@ class NoisePath(ABC):
 
     @abstractmethod
     def a(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """Share of the clean image, 1 at t = 0."""
+        """Return the share of the clean image, which is 1 at t = 0."""
 
     @abstractmethod
     def b(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """Share of the noise, 0 at t = 0."""
+        """Return the share of the noise, which is 0 at t = 0."""
 
     @abstractmethod
     def velocity(
         self, clean: Float[Tensor, "v c h w"], noise: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
     ) -> Float[Tensor, "v c h w"]:
-        """The velocity form of a pair: what a velocity-predicting network of this path is trained on."""
+        """Return the velocity of a pair, the training target of networks that predict it on this path."""
 
     @abstractmethod
     def from_velocity(
         self, noisy: Float[Tensor, "v c h w"], velocity: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
     ) -> Prediction:
-        """Complete a guess of the velocity; exact at both ends of the path."""
+        """Complete a prediction of the velocity; exact at both ends of the path."""
 
     @abstractmethod
     def timestep(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """What a network of this path is told about ``t``: the number it was trained on, not rounded."""
+        """Return the input that a network of this path was trained on for ``t``, not rounded."""
 
     def from_clean(
         self, noisy: Float[Tensor, "v c h w"], clean: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
     ) -> Prediction:
-        """Complete a guess of the clean image. Where b is 0 the noise is out of sight and 0 stands in."""
+        """Complete a prediction of the clean image. If b is 0, the noise is undetermined and is set to 0."""
         noise = (noisy - per_view(self.a(t)) * clean) * per_view(_reciprocal_or_zero(self.b(t)))
         return Prediction(clean=clean, noise=noise, velocity=self.velocity(clean, noise, t))
 
     def from_noise(
         self, noisy: Float[Tensor, "v c h w"], noise: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
     ) -> Prediction:
-        """Complete a guess of the noise. Where a is 0 the image is out of sight and 0 stands in."""
+        """Complete a prediction of the noise. If a is 0, the image is undetermined and is set to 0."""
         clean = (noisy - per_view(self.b(t)) * noise) * per_view(_reciprocal_or_zero(self.a(t)))
         return Prediction(clean=clean, noise=noise, velocity=self.velocity(clean, noise, t))
 
     def gamma(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """Noise-to-signal ratio b / a (paper sec. 3.2); infinite where a is 0."""
+        """Return the noise-to-signal ratio b / a (paper sec. 3.2), which is infinite if a is 0."""
         return self.b(t) / self.a(t)
 
     def t_at(self, b: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """The ``t`` at which the share of noise is ``b``: by bisection, since b rises with t.
+        """Return the ``t`` at which the share of noise is ``b``, by bisection, since b increases with t.
 
-        Exactly 0 and 1 at the ends of the path, and for a ``b`` that lies beyond them.
+        The result is exactly 0 or 1 at the ends of the path, and for values of ``b`` beyond them.
         """
         low, high = torch.zeros_like(b, dtype=torch.float64), torch.ones_like(b, dtype=torch.float64)
         wanted, most = b.double(), self.b(high)
@@ -90,12 +90,12 @@ class NoisePath(ABC):
     def mix(
         self, clean: Float[Tensor, "v c h w"], noise: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
     ) -> Float[Tensor, "v c h w"]:
-        """The point of the path at ``t``: a(t) * clean + b(t) * noise."""
+        """Return the point of the path at ``t``: a(t) * clean + b(t) * noise."""
         return per_view(self.a(t)) * clean + per_view(self.b(t)) * noise
 
 
 def per_view(values: Float[Tensor, "v"]) -> Float[Tensor, "v 1 1 1"]:
-    """Reshape one number per view so that it multiplies images."""
+    """Reshape one number per view so that it can multiply images."""
     return torch.reshape(values, (-1, 1, 1, 1))
 
 
@@ -104,9 +104,9 @@ class DDPM(NoisePath):
     """The variance-preserving path of Stable Diffusion: a**2 + b**2 = 1, velocity = a * noise - b * clean.
 
     Betas are linear in their square root ("scaled linear", Rombach et al. 2022). Step k >= 1 of the published
-    table lies at t = k / ``train_steps`` with a**2 = prod(1 - beta_i, i <= k); t = 0 is exactly clean, and in
-    between log(a**2) is linear. At t = 1 some signal remains (a = 0.068), as the models were trained. The
-    defaults are constants of those models, not settings.
+    table is at t = k / ``train_steps`` with a**2 = prod(1 - beta_i, i <= k). At t = 0 the image is exactly
+    clean, and between the steps log(a**2) is linear. At t = 1 some signal remains (a = 0.068), as in the
+    training of these models. The defaults are constants of the models, not settings.
     """
 
     train_steps: int = 1000
@@ -119,28 +119,28 @@ class DDPM(NoisePath):
         require_range("prior.noise_path.beta_end", self.beta_end, low=self.beta_start, below=1, example=0.012)
 
     def a(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """sqrt(alpha_bar), 1 at t = 0."""
+        """Return sqrt(alpha_bar), which is 1 at t = 0."""
         return torch.exp(0.5 * self._log_alpha_bar(t))
 
     def b(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """sqrt(1 - alpha_bar), 0 at t = 0."""
-        return torch.expm1(self._log_alpha_bar(t)).abs().sqrt()  # expm1 keeps its digits where b is small
+        """Return sqrt(1 - alpha_bar), which is 0 at t = 0."""
+        return torch.expm1(self._log_alpha_bar(t)).abs().sqrt()  # expm1 is accurate for small b
 
     def velocity(
         self, clean: Float[Tensor, "v c h w"], noise: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
     ) -> Float[Tensor, "v c h w"]:
-        """a * noise - b * clean (v-prediction; Salimans and Ho 2022)."""
+        """Return a * noise - b * clean (v-prediction; Salimans and Ho 2022)."""
         return per_view(self.a(t)) * noise - per_view(self.b(t)) * clean
 
     def from_velocity(
         self, noisy: Float[Tensor, "v c h w"], velocity: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
     ) -> Prediction:
-        """clean = a * noisy - b * velocity; noise = b * noisy + a * velocity."""
+        """Return clean = a * noisy - b * velocity and noise = b * noisy + a * velocity."""
         a, b = per_view(self.a(t)), per_view(self.b(t))
         return Prediction(clean=a * noisy - b * velocity, noise=b * noisy + a * velocity, velocity=velocity)
 
     def timestep(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """The row of the table, from 0: k - 1 at t = k / ``train_steps``; 0 for anything cleaner."""
+        """Return the row of the table, counted from 0: k - 1 at t = k / ``train_steps``, and at least 0."""
         return (t * self.train_steps - 1).clamp_min(0)
 
     def _log_alpha_bar(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
@@ -154,8 +154,8 @@ class DDPM(NoisePath):
 class RectifiedFlow(NoisePath):
     """The straight path: noisy = (1 - sigma) * clean + sigma * noise, velocity = noise - clean.
 
-    ``shift`` bends t towards noise: sigma = shift * t / (1 + (shift - 1) * t), as Stable Diffusion 3 does
-    with shift 3 (Esser et al. 2024, sec. 5.3.2); 1 leaves t alone.
+    ``shift`` moves t towards noise: sigma = shift * t / (1 + (shift - 1) * t), as in Stable Diffusion 3 with
+    shift 3 (Esser et al. 2024, sec. 5.3.2). A shift of 1 does not change t.
     """
 
     shift: float = 1.0
@@ -164,34 +164,38 @@ class RectifiedFlow(NoisePath):
         require_range("prior.noise_path.shift", self.shift, above=0, example=1.0)
 
     def a(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """1 - sigma."""
-        return (1 - t) / (self.shift * t + (1 - t))  # not 1 - b: exactly 0 at t = 1, all digits near it
+        """Return 1 - sigma."""
+        # Not computed as 1 - b, so that it is exactly 0 at t = 1 and accurate close to it.
+        return (1 - t) / (self.shift * t + (1 - t))
 
     def b(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """Sigma."""
+        """Return sigma."""
         return self.shift * t / (self.shift * t + (1 - t))
 
     def velocity(
         self, clean: Float[Tensor, "v c h w"], noise: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
     ) -> Float[Tensor, "v c h w"]:
-        """Noise - clean, at every ``t``."""
+        """Return noise - clean, which does not depend on ``t``."""
         return noise - clean
 
     def from_velocity(
         self, noisy: Float[Tensor, "v c h w"], velocity: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
     ) -> Prediction:
-        """clean = noisy - sigma * velocity; noise = noisy + (1 - sigma) * velocity."""
+        """Return clean = noisy - sigma * velocity and noise = noisy + (1 - sigma) * velocity."""
         a, b = per_view(self.a(t)), per_view(self.b(t))
         return Prediction(clean=noisy - b * velocity, noise=noisy + a * velocity, velocity=velocity)
 
     def timestep(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """1000 * sigma, in [0, 1000]."""
+        """Return 1000 * sigma, in [0, 1000]."""
         return 1000 * self.b(t)
 
 
 @lru_cache(maxsize=8)
 def _log_alpha_bars(train_steps: int, beta_start: float, beta_end: float) -> np.ndarray:
-    """log(alpha_bar) at k = 0 ... train_steps; NumPy, so that no torch mode leaks into the cache."""
+    """Return log(alpha_bar) at k = 0 ... train_steps.
+
+    The array is NumPy's, so that the cache does not depend on torch's modes and devices.
+    """
     betas = np.linspace(beta_start**0.5, beta_end**0.5, train_steps) ** 2
     return np.concatenate([[0.0], np.cumsum(np.log1p(-betas))])
 

@@ -1,7 +1,8 @@
-"""Prompting: which words stand for which view, and how their embeddings are mixed and opposed.
+"""Prompting: the texts that describe each view, and how their embeddings are mixed or repelled.
 
-A prompting turns a prompt into a few texts, embedded once, and every view into weights over them. Azimuth 0
-is the front. Nothing here knows a network: :class:`Mix` is numbers, :func:`guide` arithmetic on predictions.
+A prompting turns a prompt into a few texts, which are embedded once, and every view into weights over these
+texts. Azimuth 0 is the front. This module is independent of networks: a :class:`Mix` holds weights, and
+:func:`guide` combines predictions.
 """
 
 from abc import ABC, abstractmethod
@@ -16,12 +17,12 @@ from cadam3d.core.checks import require, require_choice, require_range
 
 FRONT, SIDE, BACK, OVERHEAD = range(4)
 SUFFIXES = (", front view", ", side view", ", back view", ", overhead view")
-QUARTER = 90.0  # degrees between the views that embeddings are interpolated between
+QUARTER = 90.0  # degrees between front, side and back, between which embeddings are interpolated
 
 
 @dataclass(frozen=True)
 class Mix:
-    """Per view: the text to approach, and texts to stay away from (Perp-Neg), as weights over ``k`` texts."""
+    """The text to approach and the texts to avoid (Perp-Neg) for each view, as weights over ``k`` texts."""
 
     positive: Float[Tensor, "v k"]  # rows sum to 1
     repelled: Float[Tensor, "v m k"]  # rows sum to 1; m may be 0
@@ -29,37 +30,40 @@ class Mix:
 
 
 class Prompting(ABC):
-    """How a prompt speaks of views. Frozen hyper-parameters."""
+    """Decides how a prompt describes views. Holds frozen hyper-parameters."""
 
     @abstractmethod
     def texts(self, prompt: str) -> list[str]:
-        """The ``k`` texts to embed."""
+        """Return the ``k`` texts to embed."""
 
     @abstractmethod
     def mix(self, cameras: Cameras) -> Mix:
-        """The weights of the texts for each view, on the device of the cameras."""
+        """Return the weights of the texts for each view, on the device of the cameras."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plain(Prompting):
-    """The prompt, whatever the view."""
+    """The same prompt for every view."""
 
     def texts(self, prompt: str) -> list[str]:
-        """The prompt alone."""
+        """Return the prompt alone."""
         return [prompt]
 
     def mix(self, cameras: Cameras) -> Mix:
-        """Weight 1 everywhere."""
+        """Return weight 1 for every view."""
         return _attract(torch.ones_like(cameras.azimuth_deg)[:, None])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Discrete(Prompting):
-    """One of four texts per view: front, side, back, and overhead, which wins (threestudio's rule)."""
+    """One of four texts per view, by threestudio's rule: front, side, back or overhead.
 
-    front_deg: float  # |azimuth| below this is the front
-    back_deg: float  # |azimuth| above 180 minus this is the back
-    overhead_deg: float  # elevations above this are overhead
+    A view above ``overhead_deg`` is overhead, whatever its azimuth.
+    """
+
+    front_deg: float  # a view with |azimuth| below this is a front view
+    back_deg: float  # a view with |azimuth| above 180 minus this is a back view
+    overhead_deg: float  # a view with an elevation above this is an overhead view
 
     def __post_init__(self) -> None:
         require_range("prompting.front_deg", self.front_deg, low=0, high=180, example=45)
@@ -68,17 +72,17 @@ class Discrete(Prompting):
         require(
             self.front_deg + self.back_deg <= 180,
             "prompting.back_deg",
-            expected="front_deg + back_deg <= 180",
-            got=(self.front_deg, self.back_deg),
+            expected=f"at most {180 - self.front_deg:g}, since front_deg + back_deg <= 180",
+            got=self.back_deg,
             example="prompting.back_deg=45",
         )
 
     def texts(self, prompt: str) -> list[str]:
-        """The prompt with each of the four suffixes."""
+        """Return the prompt with each of the four suffixes."""
         return [prompt + suffix for suffix in SUFFIXES]
 
     def mix(self, cameras: Cameras) -> Mix:
-        """One-hot rows; of the rules that fit a view, the last one wins."""
+        """Return one-hot rows; if several rules fit a view, the last one applies."""
         turned = cameras.azimuth_deg.abs()
         which = torch.full_like(turned, SIDE, dtype=torch.int64)
         which[turned < self.front_deg] = FRONT
@@ -89,24 +93,24 @@ class Discrete(Prompting):
 
 @dataclass(frozen=True, kw_only=True)
 class Interpolated(Prompting):
-    """Embeddings change linearly with azimuth: front, side at 90 degrees, back (LucidDreamer's rule)."""
+    """Embeddings that change linearly with azimuth: front, side at 90 degrees, back (LucidDreamer's rule)."""
 
     def texts(self, prompt: str) -> list[str]:
-        """The prompt with the suffixes of front, side and back."""
+        """Return the prompt with the suffixes of front, side and back."""
         return [prompt + suffix for suffix in SUFFIXES[:OVERHEAD]]
 
     def mix(self, cameras: Cameras) -> Mix:
-        """Rows with at most two weights."""
+        """Return rows with at most two weights that are not 0."""
         return _attract(_around(cameras.azimuth_deg, OVERHEAD))
 
 
 @dataclass(frozen=True, kw_only=True)
 class PerpNeg(Prompting):
-    """Interpolated, and pushed away from the views beside it, across the prompt only (Perp-Neg).
+    """Interpolated, and repelled from neighbouring views perpendicular to the prompt (Perp-Neg).
 
-    Armandpour et al. 2023, against the Janus problem: a side view must not look like a front view. With rho
-    = 1 at the first view of a quarter (front, then side) and 0 at its second (side, then back), the strengths
-    are those of the released codes:
+    Armandpour et al. 2023 propose it against the Janus problem: a side view must not look like a front view.
+    Let rho be 1 at the first view of a quarter (front, or side) and 0 at its second (side, or back). The
+    strengths are those of the released code:
 
     ==============  =======================  =====================================================
     quarter         repelled                 ``lucid`` (LucidDreamer, GCS-BEG)
@@ -117,9 +121,10 @@ class PerpNeg(Prompting):
     side to back    front                    -2
     ==============  =======================  =====================================================
 
-    ``threestudio`` uses -(a exp(-b r) + c): front (r = rho) and side (r = 1 - rho) in the first quarter with
-    (4, 0.5, -2.426); in the second, side with (1, 0.5, -0.606) and front with (1, 0.5, 0.967), both r = rho.
-    There, views above ``overhead_deg`` are overhead views, and nothing is repelled.
+    ``threestudio`` uses -(a exp(-b r) + c). In the first quarter (a, b, c) is (4, 0.5, -2.426) for the front
+    with r = rho and for the side with r = 1 - rho. In the second quarter, it is (1, 0.5, -0.606) for the side
+    and (1, 0.5, 0.967) for the front, both with r = rho. Views above ``overhead_deg`` are overhead views;
+    nothing is repelled from them.
     """
 
     curve: str  # "lucid" or "threestudio"
@@ -131,11 +136,11 @@ class PerpNeg(Prompting):
             require_range("prompting.overhead_deg", self.overhead_deg, low=-90, high=90, example=60)
 
     def texts(self, prompt: str) -> list[str]:
-        """The prompt with each of the four suffixes."""
+        """Return the prompt with each of the four suffixes."""
         return [prompt + suffix for suffix in SUFFIXES]
 
     def mix(self, cameras: Cameras) -> Mix:
-        """Two repelled texts per view: the first is the nearer one of its quarter's rule above."""
+        """Return weights with two repelled texts per view, in the order of the table above."""
         k = len(SUFFIXES)
         azimuth = cameras.azimuth_deg
         turned = azimuth.abs()
@@ -161,10 +166,11 @@ def guide(
     strengths: Float[Tensor, "v m"],
     scale: float,
 ) -> Float[Tensor, "v *rest"]:
-    """Classifier-free guidance with Perp-Neg: negative + scale * (d + sum_i w_i perp(d_i, d)).
+    """Return the prediction under guidance with Perp-Neg: negative + scale * (d + sum_i w_i perp(d_i, d)).
 
-    d = positive - negative, d_i = repelled_i - negative, and perp(a, d) is the part of a across d, per view
-    over all elements. Without repelled predictions this is the conventional form.
+    Here d = positive - negative, d_i = repelled_i - negative, and perp(a, d) is the component of a
+    perpendicular to d, for each view over all elements. Without repelled predictions this is conventional
+    classifier-free guidance.
     """
     direction = positive - negative
     flat = direction.flatten(1)
@@ -196,7 +202,7 @@ def _threestudio_strengths(rho: Float[Tensor, "v"], first: bool) -> Float[Tensor
 
 
 def _around(azimuth_deg: Float[Tensor, "v"], k: int) -> Float[Tensor, "v k"]:
-    """Linear between the front at 0, the side at 90 and the back at 180 degrees, either way round."""
+    """Interpolate between the front at 0, the side at 90 and the back at 180 degrees, on either side."""
     position = azimuth_deg.abs() / QUARTER
     weights = azimuth_deg.new_zeros(len(azimuth_deg), k)
     for text in (FRONT, SIDE, BACK):

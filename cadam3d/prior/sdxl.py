@@ -1,4 +1,4 @@
-"""Stable Diffusion XL: a larger UNet that reads two text encoders, a pooled text and the image's size."""
+"""Stable Diffusion XL: a larger UNet that reads two text encoders, a pooled text and the image size."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,17 +10,17 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.io.pretrained import Pretrained
+from cadam3d.prior.clip import penultimate
 from cadam3d.prior.latent import FACTOR, Texts
 from cadam3d.prior.stable_diffusion import StableDiffusion
-from cadam3d.prior.text import penultimate
 
 
 @dataclass(frozen=True, kw_only=True)
 class StableDiffusionXL(StableDiffusion):
-    """Podell et al. 2023: Stable Diffusion, but for what its network reads.
+    """Podell et al. 2023: Stable Diffusion with a network that reads more inputs.
 
-    Every image is presented as uncropped and of its own size (sec. 2.2 there). The empty text is all zeros
-    where the model says so, as it was in training.
+    Every image is presented as uncropped and with its own size (their sec. 2.2). The empty text is embedded
+    as zeros if the configuration of the model says so, as in training.
     """
 
     kinds: ClassVar = ("StableDiffusionXLPipeline",)
@@ -28,7 +28,7 @@ class StableDiffusionXL(StableDiffusion):
     upcasts: ClassVar = True
 
     def embed_texts(self, found: Pretrained, texts: Sequence[str], device: torch.device) -> Texts:
-        """Both encoders' penultimate states side by side; the second one's projected text as the vector."""
+        """Concatenate the penultimate states of both encoders; the pooled text is that of the second."""
         first, second = (penultimate(found, part, texts, self.torch_dtype, device) for part in self.encoders)
         both = Texts(torch.cat([first.tokens, second.tokens], dim=-1), second.pooled)
         if not found.index.get("force_zeros_for_empty_prompt"):
@@ -42,7 +42,7 @@ class StableDiffusionXL(StableDiffusion):
     def denoise(
         self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
     ) -> Float[Tensor, "b c h w"]:
-        """The UNet under text cross-attention; pooled text and sizes go in beside the time."""
+        """Run the UNet with text cross-attention; pooled text and image sizes are added to the time input."""
         height, width = (FACTOR * side for side in noisy.shape[2:])
         sizes = noisy.new_tensor([[height, width, 0, 0, height, width]])  # original, top left corner, target
         added = {"text_embeds": texts.pooled, "time_ids": sizes.expand(len(noisy), -1)}

@@ -1,4 +1,4 @@
-"""Stable Diffusion 1.5, 2.1-base (both predict noise) and 2.1 (predicts velocity)."""
+"""Stable Diffusion 1.5 and 2.1-base, which predict the noise, and 2.1, which predicts the velocity."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from cadam3d.prior.path import NoisePath, Prediction
 class StableDiffusion(LatentPrior):
     """A UNet over four latent channels that reads one CLIP text encoder (Rombach et al. 2022).
 
-    What the network predicts, and the noise it was trained on, are read from the model's scheduler.
+    The prediction type and the noise schedule are read from the configuration of the model's scheduler.
     """
 
     kinds: ClassVar = ("StableDiffusionPipeline",)
@@ -30,18 +30,18 @@ class StableDiffusion(LatentPrior):
 
     @cached_property
     def noise_path(self) -> NoisePath:
-        """The model's own noise schedule."""
+        """Return the noise path of the model's scheduler."""
         return ddpm_path(self.scheduler)
 
     def complete(
         self, noisy: Float[Tensor, "v c h w"], output: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
     ) -> Prediction:
-        """Noise or velocity, as the model's scheduler says."""
+        """Complete the network's output, which is the noise or the velocity, as the scheduler says."""
         return completion(self.noise_path, self.scheduler)(noisy, output, t)
 
     @torch.no_grad()
     def embed_texts(self, found: Pretrained, texts: Sequence[str], device: torch.device) -> Texts:
-        """The encoder's last hidden state, 77 tokens a text."""
+        """Return the last hidden state of the encoder, 77 tokens per text."""
         tokens = tokenize(found.part("tokenizer"), texts).to(device)
         encoder = found.part("text_encoder", self.torch_dtype).to(device)
         return Texts(encoder(tokens)[0], None)
@@ -49,5 +49,5 @@ class StableDiffusion(LatentPrior):
     def denoise(
         self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
     ) -> Float[Tensor, "b c h w"]:
-        """The UNet under text cross-attention."""
+        """Run the UNet with text cross-attention."""
         return self.network(noisy, timestep, encoder_hidden_states=texts.tokens).sample

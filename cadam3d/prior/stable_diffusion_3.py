@@ -8,27 +8,27 @@ from typing import ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional as F  # noqa: N812  (the name everybody knows)
+from torch.nn import functional as F  # noqa: N812  (the usual name)
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require, require_choice
 from cadam3d.io.pretrained import Pretrained
+from cadam3d.prior.clip import penultimate
 from cadam3d.prior.latent import T5_TOKENS, LatentPrior, Texts, tokenize
 from cadam3d.prior.path import NoisePath, Prediction, RectifiedFlow
-from cadam3d.prior.text import penultimate
 
 T5 = "text_encoder_3"
 
 
 @dataclass(frozen=True, kw_only=True)
 class StableDiffusion3(LatentPrior):
-    """Esser et al. 2024; the paper's VFDS experiments use 3.5. It predicts the velocity, noise - clean.
+    """Esser et al. 2024. The model predicts the velocity, noise - clean; the CAdam paper uses 3.5 for VFDS.
 
-    ``t`` is bent towards noise by the model's own ``shift``, once, in its noise path: a uniform ``t`` is a
-    uniform row of the table of sigmas that the model's scheduler comes with.
+    The noise path applies the model's own ``shift`` to ``t``, so that a uniform ``t`` is a uniform row of the
+    table of sigmas in the model's scheduler. With ``t5`` false, T5 is neither downloaded nor loaded.
     """
 
-    t5: bool  # read T5 too, if the model has it; else it is neither loaded nor downloaded
+    t5: bool  # whether to use the T5 text encoder, if the model has one
 
     kinds: ClassVar = ("StableDiffusion3Pipeline",)
     network_part: ClassVar = "transformer"
@@ -41,32 +41,32 @@ class StableDiffusion3(LatentPrior):
 
     @property
     def encoders(self) -> tuple[str, ...]:
-        """The parts that embed text: T5 only where it is wanted and there."""
+        """Return the parts that embed text, with T5 if it is requested and available."""
         third = (T5,) if self.t5 and self.found.has(T5) else ()
         return ("text_encoder", "text_encoder_2", *third)
 
     @cached_property
     def noise_path(self) -> NoisePath:
-        """The straight path, with the model's shift."""
+        """Return the straight path with the model's shift. Raises ``UserError`` for a dynamic shift."""
         is_shifted = not self.scheduler.get("use_dynamic_shifting")
         require(
             is_shifted,
             "prior.path",
-            expected="a model with one shift for every size of image",
+            expected="a model with one shift for all image sizes",
             got="dynamic shifting",
-            example="another model",
+            example="prior.path=DIR with another model",
         )
         return RectifiedFlow(shift=float(self.scheduler.get("shift", 1.0)))
 
     def complete(
         self, noisy: Float[Tensor, "v c h w"], output: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
     ) -> Prediction:
-        """The velocity."""
+        """Complete the network's output, which is the velocity."""
         return self.noise_path.from_velocity(noisy, output, t)
 
     @torch.no_grad()
     def embed_texts(self, found: Pretrained, texts: Sequence[str], device: torch.device) -> Texts:
-        """CLIP's penultimate states side by side, padded to T5's width; then T5's tokens, or zeros."""
+        """Concatenate both CLIP encoders' states, padded to T5's width, and append T5's tokens or zeros."""
         dtype = self.torch_dtype
         clip = [penultimate(found, part, texts, dtype, device) for part in ("text_encoder", "text_encoder_2")]
         both = torch.cat([each.tokens for each in clip], dim=-1)
@@ -81,7 +81,7 @@ class StableDiffusion3(LatentPrior):
     def denoise(
         self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
     ) -> Float[Tensor, "b c h w"]:
-        """The transformer over image and text tokens together."""
+        """Run the transformer over image and text tokens together."""
         return self.network(
             hidden_states=noisy,
             timestep=timestep,

@@ -1,4 +1,4 @@
-"""prior=tiny: a small random network with everything a real prior has, except knowledge."""
+"""prior=tiny: a small random network with the interface of a real prior, for tests and dry runs."""
 
 import math
 from dataclasses import dataclass
@@ -7,14 +7,14 @@ from functools import cached_property
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.nn import functional as F  # noqa: N812  (the name everybody knows)
+from torch.nn import functional as F  # noqa: N812  (the usual name)
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require_choice, require_whole
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import NoisePath, Prediction
 
-START, PADDING = 256, 257  # tokens 0 to 255 are the bytes of the prompt
+START, PADDING = 256, 257  # special tokens; 0 to 255 are the bytes of the prompt
 MAX_TOKENS = 96  # longer prompts are cut
 GROUPS = 8  # of every normalization
 FREQUENCIES = 32  # of the time embedding
@@ -22,14 +22,14 @@ FREQUENCIES = 32  # of the time embedding
 
 @dataclass(frozen=True)
 class TinyCondition(Condition):
-    """Two prompts as tokens, and where the views stand."""
+    """Two prompts as tokens, and the directions of the views."""
 
     positive: Int[Tensor, "tokens"]
     negative: Int[Tensor, "tokens"]
     directions: Float[Tensor, "v 4"]  # cosine and sine of azimuth and of elevation
 
     def unprompted(self) -> "TinyCondition":
-        """The same views under two empty prompts."""
+        """Return the same views under two empty prompts."""
         empty = tokenize("").to(self.positive.device)
         return TinyCondition(positive=empty, negative=empty, directions=self.directions)
 
@@ -42,7 +42,7 @@ class TinyEmbedding(PromptEmbedding):
     negative: Int[Tensor, "tokens"]
 
     def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> TinyCondition:
-        """The condition of these views; the backdrop plays no part."""
+        """Return the condition of these views; the background is not used."""
         angles = torch.deg2rad(torch.stack([cameras.azimuth_deg, cameras.elevation_deg], dim=-1))
         directions = torch.cat([angles.cos(), angles.sin()], dim=-1)
         return TinyCondition(positive=self.positive, negative=self.negative, directions=directions)
@@ -50,13 +50,13 @@ class TinyEmbedding(PromptEmbedding):
 
 @dataclass(frozen=True, kw_only=True)
 class Tiny(DiffusionPrior):
-    """A random UNet, conditioned on text and view: for tests and dry runs of everything around it.
+    """A random UNet that is conditioned on text and view, for tests and dry runs of the rest of the program.
 
-    Its weights depend on ``seed`` and ``width`` alone; making them leaves the global random state untouched.
-    Images of any size from 8 x 8 pixels up, odd ones too, become three channels in [-1, 1], averaged down.
+    Its weights depend on ``seed`` and ``width`` alone; creating them does not change the global random state.
+    Images of 8 x 8 pixels or more, with even or odd sides, are averaged down to three channels in [-1, 1].
     """
 
-    predicts: str  # noise | velocity
+    predicts: str  # noise or velocity
     noise_path: NoisePath
     width: int  # channels at full size
     downscale: int  # pixels per latent, per side
@@ -70,18 +70,18 @@ class Tiny(DiffusionPrior):
 
     @cached_property
     def network(self) -> "TinyUNet":
-        """The network, frozen; made when first asked for."""
+        """Return the frozen network, which is created on first use."""
         with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(self.seed)  # torch.manual_seed would reseed every GPU as well
+            torch.default_generator.manual_seed(self.seed)  # torch.manual_seed would also reseed all GPUs
             network = TinyUNet(self.width)
         return network.requires_grad_(False).eval()
 
     def embed(self, prompt: str, negative: str) -> TinyEmbedding:
-        """Any text will do, cut after 95 bytes."""
+        """Embed any two texts; each is cut after 95 bytes."""
         return TinyEmbedding(positive=tokenize(prompt), negative=tokenize(negative))
 
     def encode(self, rgb: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v c lh lw"]:
-        """Images in [0, 1] to three channels in [-1, 1]; sizes shrink by ``downscale``, rounded up."""
+        """Convert images in [0, 1] to three channels in [-1, 1], smaller by ``downscale``, rounded up."""
         pixels = rgb.permute(0, 3, 1, 2)
         return 2 * F.avg_pool2d(pixels, self.downscale, ceil_mode=True) - 1
 
@@ -89,7 +89,10 @@ class Tiny(DiffusionPrior):
     def decode(
         self, latents: Float[Tensor, "v c lh lw"], height: int, width: int
     ) -> Float[Tensor, "v h w 3"]:
-        """Three channels in [-1, 1] to images in [0, 1], clamped; a latent fills the pixels it averaged."""
+        """Convert three channels in [-1, 1] to images in [0, 1], clamped.
+
+        Every latent fills the pixels that it is the average of.
+        """
         rows = latents.repeat_interleave(self.downscale, dim=2)[:, :, :height]
         pixels = rows.repeat_interleave(self.downscale, dim=3)[..., :width]
         return ((pixels.permute(0, 2, 3, 1) + 1) / 2).clamp(0, 1)
@@ -98,7 +101,7 @@ class Tiny(DiffusionPrior):
     def predict(
         self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: TinyCondition, scale: float
     ) -> Prediction:
-        """One guess, without gradient: negative + scale * (positive - negative), both halves in one batch."""
+        """Predict negative + scale * (positive - negative), without gradient, both halves in one batch."""
         prompts = [condition.positive] if scale == 1 else [condition.negative, condition.positive]
         copies = len(prompts)
         output = self.network(
@@ -113,20 +116,23 @@ class Tiny(DiffusionPrior):
         return complete(noisy, guess, t)
 
     def notice(self) -> str:
-        """What a user of this prior must know."""
+        """Return the warning that this prior cannot generate objects."""
         return (
-            "prior=tiny is a random network for tests and dry runs: it makes no meaningful object. "
-            "For one, use prior=shapes."
+            "prior=tiny is a random network for tests and dry runs: it cannot generate a meaningful object. "
+            "Use prior=shapes instead."
         )
 
     def to(self, device: torch.device) -> "Tiny":
-        """Move the network to ``device``, in place; returns the prior."""
+        """Move the network to ``device``, in place, and return the prior."""
         self.network.to(device)
         return self
 
 
 class TinyUNet(nn.Module):
-    """Three scales, two skips, one cross-attention to the prompt at the coarsest; under 2M parameters."""
+    """A UNet with three scales, two skips and one cross-attention to the prompt at the coarsest scale.
+
+    It has fewer than 2 million parameters.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -156,7 +162,7 @@ class TinyUNet(nn.Module):
         tokens: Int[Tensor, "b tokens"],
         directions: Float[Tensor, "b 4"],
     ) -> Float[Tensor, "b 3 h w"]:
-        """The prediction; what it means is the prior's affair."""
+        """Return the raw prediction; the prior decides whether it is the noise or the velocity."""
         is_padding = tokens == PADDING
         text = self.token(tokens) + self.position.weight
         context = self.mixture(self.time(sinusoids(timestep)) + self.view(directions))
@@ -171,7 +177,7 @@ class TinyUNet(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions; the context scales and shifts between them (FiLM)."""
+    """Two convolutions, with a scale and a shift from the context between them (FiLM)."""
 
     def __init__(self, channels_in: int, channels: int, context: int) -> None:
         super().__init__()
@@ -184,14 +190,14 @@ class ResidualBlock(nn.Module):
         self.skip = nn.Conv2d(channels_in, channels, 1)
 
     def forward(self, x: Float[Tensor, "b i h w"], context: Float[Tensor, "b k"]) -> Float[Tensor, "b o h w"]:
-        """The block's output, on top of what came in."""
+        """Return the input plus the output of the block."""
         factor, offset = self.film(context)[..., None, None].chunk(2, dim=1)
         changed = self.after(self.norm(self.before(x)) * (1 + factor) + offset)
         return self.skip(x) + changed
 
 
 class PromptAttention(nn.Module):
-    """Every pixel asks the prompt's tokens."""
+    """Cross-attention from every pixel to the tokens of the prompt."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -203,7 +209,7 @@ class PromptAttention(nn.Module):
     def forward(
         self, x: Float[Tensor, "b c h w"], text: Float[Tensor, "b t c"], is_padding: Tensor
     ) -> Float[Tensor, "b c h w"]:
-        """The answers, on top of what came in; padding is not heard."""
+        """Return the input plus the attended tokens; padding is masked."""
         pixels = self.norm(x).flatten(2).transpose(1, 2)
         answers = F.scaled_dot_product_attention(
             self.query(pixels), self.key(text), self.value(text), attn_mask=~is_padding[:, None, :]
@@ -212,18 +218,18 @@ class PromptAttention(nn.Module):
 
 
 def tokenize(text: str) -> Int[Tensor, "tokens"]:
-    """A start token and the UTF-8 bytes of ``text``, cut or padded to ``MAX_TOKENS``."""
+    """Return a start token and the UTF-8 bytes of ``text``, cut or padded to ``MAX_TOKENS``."""
     tokens = [START, *text.encode("utf-8")][:MAX_TOKENS]
     return torch.tensor(tokens + [PADDING] * (MAX_TOKENS - len(tokens)))
 
 
 def sinusoids(timestep: Float[Tensor, "b"]) -> Float[Tensor, "b k"]:
-    """Cosines and sines of ``timestep`` at geometrically spaced frequencies from 1 to 1e-4."""
+    """Return cosines and sines of ``timestep`` at geometrically spaced frequencies from 1 to 1e-4."""
     exponents = torch.arange(FREQUENCIES, device=timestep.device) / (FREQUENCIES - 1)
     phases = timestep[:, None] * torch.exp(-math.log(10_000) * exponents)
     return torch.cat([phases.cos(), phases.sin()], dim=-1)
 
 
 def _join(coarse: Float[Tensor, "b i h w"], skip: Float[Tensor, "b o lh lw"]) -> Tensor:
-    """Enlarge ``coarse`` to the size of ``skip``, odd or even, and stack both."""
+    """Enlarge ``coarse`` to the size of ``skip``, odd or even, and concatenate both."""
     return torch.cat([F.interpolate(coarse, size=skip.shape[2:], mode="nearest"), skip], dim=1)

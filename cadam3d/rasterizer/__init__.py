@@ -1,1 +1,1 @@
-"""How we see: differentiable rasterizers."""
+"""Differentiable rasterizers, which render Gaussians."""

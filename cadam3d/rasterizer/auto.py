@@ -1,4 +1,4 @@
-"""The best rasterizer for the device the Gaussians live on: what a user who does not care gets."""
+"""The automatic choice of a rasterizer: the fastest that works on the device of the Gaussians."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -18,16 +18,14 @@ from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import self_test
 
-REPORT = (
-    "Please report this with the output of `cadam3d doctor`. Until mended, settle for: rasterizer=reference"
-)
+REPORT = "Please report this with the output of `cadam3d doctor`, and for now try: rasterizer=reference"
 
 
 @dataclass(frozen=True, kw_only=True)
 class AutoRasterizer(Rasterizer):
     """Renders with the compiled kernels for the device of the Gaussians, or else with the reference.
 
-    The question is asked once per device; the answer holds as long as the process lives.
+    The choice is made once per device and process.
     """
 
     def render(
@@ -41,20 +39,20 @@ class AutoRasterizer(Rasterizer):
         return choose(gaussians.device).rasterizer.render(gaussians, cameras, background, absgrad)
 
     def prepare(self, device: torch.device) -> Backend:
-        """See :meth:`Rasterizer.prepare`. Where the reference stands in, the reason is there."""
+        """See :meth:`Rasterizer.prepare`. If the reference was chosen as a fallback, the reason is given."""
         return choose(device).backend
 
 
 @dataclass(frozen=True)
 class Choice:
-    """A rasterizer that works on a device, and how it is called."""
+    """A rasterizer that works on a device, and its name."""
 
     rasterizer: Rasterizer
     backend: Backend
 
 
 def choose(device: torch.device) -> Choice:
-    """What ``rasterizer=auto`` takes on ``device``."""
+    """Return the rasterizer that ``rasterizer=auto`` uses on ``device``."""
     if device.type == "cuda" and device.index is None and torch.cuda.is_available():
         device = torch.device("cuda", torch.cuda.current_device())
     return _choose(device)
@@ -74,14 +72,14 @@ def _choose(device: torch.device) -> Choice:
 
 
 def native(device: torch.device) -> Rasterizer:
-    """The native rasterizer; its kernels have proved themselves when they were built."""
+    """Return the native CPU rasterizer; its kernels were tested when they were built."""
     rasterizer = CpuRasterizer(cache_dir=None)
     rasterizer.prepare(device)
     return rasterizer
 
 
 def proven_cuda(device: torch.device) -> Rasterizer:
-    """The CUDA rasterizer, if it passes the self-test on this very device; else :class:`UserError`."""
+    """Return the CUDA rasterizer. Raises :class:`UserError` unless it passes the self-test on ``device``."""
     rasterizer = CudaRasterizer(cache_dir=None)
     rasterizer.prepare(device)
     name = torch.cuda.get_device_name(device)
@@ -97,12 +95,16 @@ def proven_cuda(device: torch.device) -> Rasterizer:
     return rasterizer
 
 
-# By type of device; each returns a rasterizer that works there, or raises UserError.
+# For each type of device, a function that returns a rasterizer that works there or raises UserError.
 FASTEST: Mapping[str, Callable[[torch.device], Rasterizer]] = {"cpu": native, "cuda": proven_cuda}
 
 
 def _refuse_broken(device: torch.device) -> None:
-    """A kernel that touches what it must not takes the whole device from this process, the reference too."""
+    """Raise :class:`UserError` if a failed kernel has made the device unusable.
+
+    A kernel that accesses invalid memory makes the device unusable for the whole process, so the reference
+    could not render there either.
+    """
     if device.type == "cuda" and torch.cuda.is_available():
         try:
             torch.cuda.synchronize(device)

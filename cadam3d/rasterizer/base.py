@@ -1,4 +1,4 @@
-"""Rasterizer: Gaussians and cameras in, images and their gradients out."""
+"""Rasterizer: the interface that renders Gaussians into images, differentiably."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -12,26 +12,34 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, RenderOutput
 
-# Constants of the image formation model, shared by every backend (gsplat-compatible).
-BLUR = 0.3  # pixels^2 added to the diagonal of each projected covariance
-ALPHA_MIN = 1 / 255  # a fainter contribution to a pixel is skipped
-ALPHA_MAX = 0.99  # a stronger one is capped, with zero gradient to what is capped
-TRANSMITTANCE_MIN = 1e-4  # a pixel stops before the splat that would bring it to this or below
-NEAR = 0.01  # world units; this near or nearer, centres are culled
-FAR = 1e15  # world units; this far or farther too, before gradients of depth leave float32
-FRUSTUM_MARGIN = 0.15  # the Jacobian is evaluated at most this share of the image size outside the border
+# Constants of the image formation model, shared by every backend and compatible with gsplat.
+
+# Added to the diagonal of each projected covariance.
+BLUR = 0.3  # pixels^2
+# A fainter contribution to a pixel is skipped.
+ALPHA_MIN = 1 / 255
+# A stronger contribution is capped, with zero gradient to whatever was capped.
+ALPHA_MAX = 0.99
+# A pixel stops before the splat that would bring its transmittance to this value or below.
+TRANSMITTANCE_MIN = 1e-4
+# Centres at this distance or nearer are culled.
+NEAR = 0.01  # world units
+# Centres at this distance or farther are culled, before the gradient of depth exceeds float32.
+FAR = 1e15  # world units
+# Outside the image the Jacobian is evaluated at most this share of the image size beyond the border.
+FRUSTUM_MARGIN = 0.15
 
 
 @dataclass(frozen=True)
 class Backend:
-    """What renders on a device."""
+    """The rasterizer that renders on a device."""
 
     name: str  # as in rasterizer=<name>
-    reason: str | None = None  # why nothing faster does, and what to type; None if nothing faster exists
+    reason: str | None = None  # why nothing faster renders, and what to type; None if nothing faster exists
 
 
 class Rasterizer(ABC):
-    """How we see. A component is its hyper-parameters; it holds no tensors."""
+    """Renders Gaussians. A component is its hyper-parameters, so it holds no tensors."""
 
     @abstractmethod
     def render(
@@ -44,34 +52,44 @@ class Rasterizer(ABC):
         """Render every view, differentiably in all five tensors of ``gaussians`` and in ``means2d``.
 
         ``background`` is one RGB colour per view, in [0, 1]. Whenever gradients are on, ``means2d`` retains
-        its own gradient, so ``output.means2d.grad`` is filled by ``backward()``. Gaussians that are behind a
-        camera, ``FAR`` or farther in front of it, off screen, too faint or not finite, and those whose
-        quaternion has a squared length below 1e-12 and so no direction, are culled: radius 0, no
-        contribution, zero gradient, never a NaN.
+        its own gradient, so ``backward()`` fills ``output.means2d.grad``.
 
-        With ``absgrad``, ``output.absgrad.grad`` is filled too: what each pixel adds to ``means2d.grad``, in
-        absolute value and summed, so that opposite pulls do not cancel. It changes nothing else.
+        Gaussians that are behind a camera, ``FAR`` or farther in front of it, off screen, too faint or not
+        finite are culled. So are Gaussians with a quaternion of a squared length below 1e-12, which has no
+        direction. A culled Gaussian has radius 0, contributes nothing, and gets a gradient of zero, never
+        NaN.
+
+        With ``absgrad``, ``backward()`` fills ``output.absgrad.grad`` too. It is the sum over the pixels of
+        the absolute value of what each pixel adds to ``means2d.grad``, so opposite contributions do not
+        cancel. It changes no other result.
         """
 
     def prepare(self, device: torch.device) -> Backend:
-        """Compile and load now what rendering on ``device`` needs, and say what will render there.
+        """Compile and load everything that rendering on ``device`` needs, and return what will render there.
 
-        Raises :class:`UserError` if it cannot be had. Without this call, the first render does it.
+        Raises :class:`UserError` if that fails. Without this call, the first render does the same.
         """
         return Backend(type(self).__name__.removesuffix("Rasterizer").lower())
 
 
 def render_fn(rasterizer: Rasterizer, gaussians: Callable[[], Gaussians]) -> RenderFn:
-    """A :data:`RenderFn` of whatever Gaussians ``gaussians()`` returns when it is called."""
+    """Return a function that renders the Gaussians that ``gaussians()`` returns at the time of the call.
 
-    def render(cameras, background) -> RenderOutput:
-        now = gaussians().detach()
+    Cameras and backgrounds may be on any device; they are moved to the device of the Gaussians. The images
+    carry no gradient.
+    """
+
+    def render(cameras: Cameras, background: Float[Tensor, "v 3"]) -> RenderOutput:
+        current = gaussians().detach()
         with torch.no_grad():
-            return rasterizer.render(now, cameras.to(now.device), background.to(now.device))
+            return rasterizer.render(current, cameras.to(current.device), background.to(current.device))
 
     return render
 
 
 def absgrad_probe(means2d: Float[Tensor, "v n 2"], wanted: bool) -> Float[Tensor, "v n 2"] | None:
-    """What a backend hands out as ``absgrad``; ``None`` where it is not wanted, or gradients are off."""
+    """Return the ``absgrad`` of a :class:`RenderOutput`: zeros that collect a gradient.
+
+    Returns ``None`` if it is not wanted or gradients are off.
+    """
     return torch.zeros_like(means2d, requires_grad=True) if wanted and torch.is_grad_enabled() else None

@@ -1,8 +1,9 @@
-"""The native CPU kernels: compiled once by this machine's compiler, kept in the user's cache folder.
+"""Builds the native CPU kernels with a compiler of this machine, and keeps them in the user's cache folder.
 
-A cached file carries three hashes in its name: of the sources, flags and the machine; of the compiler; of its
-own bytes. So a copied home folder, a new release, another compiler or a damaged file each lead to a fresh
-build, and no lock is needed: who finishes renames the file into place, and any that fits its name will do.
+The name of a cached file contains three hashes: of the sources, flags and machine; of the compiler; and of
+the bytes of the file. So a copied home folder, a new release, another compiler or a damaged file each lead to
+a fresh build. No lock is needed: every process renames its finished file into place, and any file that
+matches its name is usable.
 """
 
 import ctypes
@@ -32,27 +33,33 @@ FLAGS = (
     "-fPIC",
     "-pthread",
     "-fvisibility=hidden",
-    "-ffp-contract=off",  # fused only where written: forward and backward must see the same bits
-    "-fno-math-errno",  # so that sqrt is one instruction; values stay IEEE
+    # Multiplications and additions are fused only where the source says so, because the forward and the
+    # backward pass must compute the same bits.
+    "-ffp-contract=off",
+    # Makes sqrt a single instruction; the values stay IEEE.
+    "-fno-math-errno",
     "-fno-trapping-math",
-    "-fno-tree-vectorize",  # what is worth it is written as vectors; the rest only gets slower
+    # Code that profits from vectors is written with vectors; automatic vectorization slows down the rest.
+    "-fno-tree-vectorize",
     "-Wno-psabi",
 )
-STATIC = ("-static-libstdc++", "-static-libgcc")  # another libstdc++ may already be loaded, an older one
-# Tried in turn until one compiles and runs: not every compiler knows every flag.
+# The process may already have loaded another, older libstdc++.
+STATIC = ("-static-libstdc++", "-static-libgcc")
+# Tried in turn until one compiles and runs, because not every compiler knows every flag.
 MACHINE_FLAGS = (("-march=native", *STATIC), ("-march=native",), ("-mcpu=native",), ())
 CONSTANTS = ("BLUR", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN", "NEAR", "FAR", "FRUSTUM_MARGIN")
 SUFFIX = ".dll" if sys.platform == "win32" else ".so"
 SELF_TEST = "import ctypes, sys; sys.exit(ctypes.CDLL(sys.argv[1]).cadam3d_self_test())"
-TIMEOUT = 900  # seconds for one run of the compiler; most need three, a first `zig c++` minutes
+# Most compilers need three seconds; the first run of `zig c++` needs minutes.
+TIMEOUT = 900  # seconds
 
 
 @dataclass(frozen=True)
 class Compiler:
-    """A C++ compiler that answers."""
+    """A C++ compiler that works."""
 
-    command: tuple[str, ...]  # how it is called
-    version: str  # first line of what it says about itself
+    command: tuple[str, ...]
+    version: str  # first line of its --version
 
 
 @dataclass(frozen=True)
@@ -60,11 +67,11 @@ class Build:
     """A compiled library, ready to load."""
 
     path: Path
-    seconds: float  # spent compiling; 0 if it came from the cache
+    seconds: float  # time spent compiling; 0 for a library from the cache
 
 
 def find_compiler() -> Compiler | None:
-    """The first that answers of ``$CXX``, ``c++``, ``g++``, ``clang++`` and Python's ``ziglang``."""
+    """Return the first that works of ``$CXX``, ``c++``, ``g++``, ``clang++`` and Python's ``ziglang``."""
     commands = [tuple(os.environ.get("CXX", "").split()), ("c++",), ("g++",), ("clang++",)]
     if find_spec("ziglang"):
         commands.append((sys.executable, "-m", "ziglang", "c++"))
@@ -77,7 +84,10 @@ def find_compiler() -> Compiler | None:
 
 
 def find_cached(cache_dir: Path, compiler: Compiler | None) -> Path | None:
-    """An intact library for these sources and this machine, from ``compiler`` (``None``: from any)."""
+    """Return an intact library for these sources and this machine, or ``None`` if there is none.
+
+    Only libraries built by ``compiler`` count, or by any compiler if that is ``None``.
+    """
     by = _short_hash(compiler.version) if compiler else "*"
     for path in sorted(cache_dir.glob(f"rasterizer-{_key()}-{by}-*{SUFFIX}")):
         if path.stem.endswith(_short_hash(path.read_bytes())):
@@ -86,7 +96,7 @@ def find_cached(cache_dir: Path, compiler: Compiler | None) -> Path | None:
 
 
 def build(cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAGS) -> Build:
-    """The library in ``cache_dir``, compiled now if it is not there.
+    """Return the library in ``cache_dir``, and compile it if it is missing.
 
     ``machine_flags`` are alternatives, tried in turn. Raises :class:`UserError` if there is neither a cached
     library nor a compiler, if the compiler fails, or if the folder cannot be written.
@@ -99,7 +109,7 @@ def build(cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAG
         raise UserError(
             "rasterizer=cpu needs a C++ compiler once, and found none ($CXX, c++, g++, clang++). "
             "Install one: `apt install g++`, `xcode-select --install` or `pip install 'cadam3d[compiler]'`. "
-            "Or settle for: rasterizer=reference"
+            "Or try: rasterizer=reference"
         )
     start = time.perf_counter()
     try:
@@ -124,14 +134,14 @@ def _compile(compiler: Compiler, target: Path, machine_flags: Sequence[Sequence[
     for flags in machine_flags:
         answer = _run([*compiler.command, *FLAGS, *flags, *defines, source, "-o", str(target)])
         if answer.returncode == 0:
-            # In a process of its own: an instruction this machine lacks would end the process.
+            # The test runs in another process, which an instruction unknown to this machine would end.
             answer = _run([sys.executable, "-I", "-S", "-c", SELF_TEST, str(target)])
             if answer.returncode == 0:
                 return target
         complaint = answer.stderr.strip()[-2000:] or f"exit code {answer.returncode}"
     raise UserError(
         f"rasterizer=cpu: {' '.join(compiler.command)} ({compiler.version}) could not build the kernels:\n"
-        f"{complaint}\nName another compiler in CXX, or try: rasterizer=reference"
+        f"{complaint}\nSet CXX to another compiler, or try: rasterizer=reference"
     )
 
 
@@ -149,13 +159,14 @@ def _key() -> str:
 
 
 def _machine() -> str:
-    """What ``-march=native`` depends on."""
+    """Return the facts about this machine that ``-march=native`` depends on."""
     facts = [platform.machine(), sysconfig.get_platform(), platform.processor()]
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         wanted = ("model name", "flags", "Features", "CPU part")
         lines = [line for line in cpuinfo.read_text().splitlines() if line.startswith(wanted)]
-        facts += sorted(set(lines))  # every core says the same, or nearly
+        # The lines of the cores are the same, or nearly the same.
+        facts += sorted(set(lines))
     elif sys.platform == "darwin":
         facts.append(_run(["sysctl", "-n", "machdep.cpu.brand_string"]).stdout)
     return "\n".join(facts)
@@ -166,5 +177,5 @@ def _short_hash(content: str | bytes) -> str:
 
 
 def load(build: Build) -> ctypes.CDLL:
-    """The library as ctypes sees it."""
+    """Load the library with ctypes."""
     return ctypes.CDLL(str(build.path))

@@ -1,4 +1,4 @@
-"""The native CPU rasterizer: vectorised, threaded C++ (``kernels/cpu.cpp``), compiled at first use."""
+"""The native CPU rasterizer: vectorised and threaded C++ (``kernels/cpu.cpp``), compiled at its first use."""
 
 import ctypes
 import weakref
@@ -17,17 +17,17 @@ from cadam3d.core.render import RenderOutput
 from cadam3d.io.cache import default_cache_dir
 from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.rasterizer.build import build, load
-from cadam3d.rasterizer.native import Frame, render_frame, require_shapes
+from cadam3d.rasterizer.native import RenderPass, require_shapes, run_pass
 
 
 @dataclass(frozen=True, kw_only=True)
 class CpuRasterizer(Rasterizer):
-    """Renders in float32 on ``torch.get_num_threads()`` threads; the bits do not depend on how many.
+    """Renders in float32 on ``torch.get_num_threads()`` threads; the bits do not depend on their number.
 
     Other dtypes are converted on the way in and out. The kernels are compiled at the first use on a machine.
     """
 
-    cache_dir: str | None  # where compiled kernels are kept; None: the user's cache folder
+    cache_dir: str | None  # folder of the compiled kernels; None: the user's cache folder
 
     def render(
         self,
@@ -36,7 +36,10 @@ class CpuRasterizer(Rasterizer):
         background: Float[Tensor, "v 3"],
         absgrad: bool = False,
     ) -> RenderOutput:
-        """See :meth:`Rasterizer.render`. Raises :class:`UserError` off the CPU or without a compiler."""
+        """See :meth:`Rasterizer.render`.
+
+        Raises :class:`UserError` if the Gaussians are not on the CPU or the kernels cannot be compiled.
+        """
         self.prepare(gaussians.device)
         return rasterize(load_kernels(self.cache_dir), gaussians, cameras, background, absgrad)
 
@@ -50,12 +53,12 @@ class CpuRasterizer(Rasterizer):
 
 @cache
 def load_kernels(cache_dir: str | None) -> ctypes.CDLL:
-    """The compiled kernels; compiles them if they are not in ``cache_dir`` yet. Once per process."""
+    """Return the compiled kernels, and compile them if ``cache_dir`` lacks them. Runs once per process."""
     return load(build(Path(cache_dir).expanduser() if cache_dir else default_cache_dir()))
 
 
 def instruction_set(kernels: ctypes.CDLL) -> str:
-    """What the kernels were compiled for: ``avx512``, ``avx2``, ``sse2``, ``neon`` or ``generic``."""
+    """Return the instruction set of the kernels: ``avx512``, ``avx2``, ``sse2``, ``neon`` or ``generic``."""
     kernels.cadam3d_instruction_set.restype = ctypes.c_char_p
     return kernels.cadam3d_instruction_set().decode()
 
@@ -67,13 +70,13 @@ def rasterize(
     background: Float[Tensor, "v 3"],
     absgrad: bool = False,
 ) -> RenderOutput:
-    """Render with the kernels at hand; see :meth:`Rasterizer.render`."""
+    """Render with the given kernels; see :meth:`Rasterizer.render`."""
     require_shapes(gaussians, cameras, background)
-    return render_frame(_Frame(kernels, cameras, absgrad), gaussians, background)
+    return run_pass(_CpuPass(kernels, cameras, absgrad), gaussians, background)
 
 
 class _Scene(ctypes.Structure):
-    """``struct Scene`` of kernels/cpu.cpp: same order, same types."""
+    """Mirror of ``struct Scene`` in kernels/cpu.cpp: same order, same types."""
 
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("n", "v", "k", "height", "width", "threads")),
@@ -85,15 +88,15 @@ class _Scene(ctypes.Structure):
     )
 
 
-class _Frame(Frame):
-    """See :class:`Frame`."""
+class _CpuPass(RenderPass):
+    """One call of the CPU rasterizer; see :class:`RenderPass`."""
 
     def __init__(self, kernels: ctypes.CDLL, cameras: Cameras, absgrad: bool) -> None:
         super().__init__(cameras, torch.device("cpu"), absgrad)
         self.kernels, self.handle = kernels, ctypes.c_void_p()
 
     def project(self, parameters: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """See :meth:`Frame.project`; creates the kernels' memory of this frame."""
+        """See :meth:`RenderPass.project`; also creates the memory that the kernels keep for this pass."""
         v, n = self.views, parameters[0].shape[0]
         means2d, radii = parameters[0].new_empty(v, n, 2), parameters[0].new_empty(v, n)
         scene = self.scene(parameters, None)
@@ -104,7 +107,7 @@ class _Frame(Frame):
     def blend(
         self, parameters: list[Tensor], background: Tensor, keeps: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """See :meth:`Frame.blend`."""
+        """See :meth:`RenderPass.blend`."""
         size = (self.views, self.height, self.width)
         rgb, alpha, depth = (background.new_empty(*size, *channels) for channels in ((3,), (), ()))
         scene = self.scene(parameters, background)
@@ -114,7 +117,7 @@ class _Frame(Frame):
     def blend_backward(
         self, parameters: list[Tensor], background: Tensor, images: list[Tensor | None]
     ) -> list[Tensor | None]:
-        """See :meth:`Frame.blend_backward`."""
+        """See :meth:`RenderPass.blend_backward`."""
         on_screen = (self.views, parameters[0].shape[0], 2)
         grads = [torch.zeros(on_screen), torch.zeros(on_screen) if self.absgrad else None]
         grads += [torch.zeros_like(tensor) for tensor in parameters]
@@ -123,13 +126,13 @@ class _Frame(Frame):
         return grads
 
     def centre_backward(self, parameters: list[Tensor], radii: Tensor, grad_means2d: Tensor) -> Tensor:
-        """See :meth:`Frame.centre_backward`."""
+        """See :meth:`RenderPass.centre_backward`."""
         grad_means, scene = torch.zeros_like(parameters[0]), self.scene(parameters, None)
         self.call("cadam3d_centre_backward", ctypes.byref(scene), radii, grad_means2d, grad_means)
         return grad_means
 
     def scene(self, parameters: list[Tensor], background: Tensor | None) -> _Scene:
-        """The arguments all kernels share; valid as long as the tensors live."""
+        """Return the arguments that all kernels share; they are valid as long as the tensors live."""
         means, *_, sh = parameters
         sizes = (means.shape[0], self.views, sh.shape[1], self.height, self.width)
         tensors = (*parameters, self.matrices, self.intrinsics)
@@ -141,7 +144,7 @@ class _Frame(Frame):
         )
 
     def call(self, name: str, *arguments: object) -> None:
-        """Call a kernel; a tensor is passed as its address, ``None`` as a null pointer."""
+        """Call a kernel. A tensor is passed as its address, and ``None`` as a null pointer."""
         plain = (ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else a for a in arguments)
         if getattr(self.kernels, name)(*plain) != 0:
             raise MemoryError(f"rasterizer=cpu: not enough memory for {self.width} x {self.height} pixels")

@@ -1,25 +1,23 @@
-"""The CUDA rasterizer: kernels of our own, compiled at run time.
+"""The CUDA rasterizer: the project's own kernels, compiled at run time.
 
-A frame goes through these kernels (``kernels/*.cuh``):
+A forward pass runs these kernels (``kernels/*.cuh``):
 
-* ``project_forward``: splats, how many tiles each touches, and a depth key per (view, Gaussian) pair; who is
-  culled has the largest key;
-* a stable radix sort of the pairs by depth, which also moves the culled ones out of the way;
-* a prefix sum, ``tile_list``: a slot per (splat, tile), numbered in depth order;
-* a stable radix sort of the slots by tile, ``tile_ranges``: a list per tile, nearest splat first;
-* ``blend_forward``: a warp per tile.
+* ``project_forward`` writes the splats, the number of tiles that each splat touches, and a depth key for each
+  (view, Gaussian) pair; a culled pair gets the largest key;
+* a stable radix sort orders the pairs by depth, which also moves the culled pairs to the end;
+* a prefix sum and ``tile_list`` number one slot per (splat, tile) pair, in depth order;
+* a stable radix sort of the slots by tile and ``tile_ranges`` produce one list per tile, nearest splat first;
+* ``blend_forward`` blends each tile with one warp.
 
-Backward is ``blend_backward``, which leaves a record in each slot, and ``project_backward``, which sums the
-slots of each Gaussian in order. There are no float atomics: the same input gives the same bits. The host
-waits for the device once, to learn how many slots there are.
+The backward pass runs ``blend_backward``, which writes one record into each slot, and ``project_backward``,
+which sums the slots of each Gaussian in order. No kernel adds floats atomically, so the same input gives the
+same bits. The host waits for the device once, to read the number of slots.
 
-All views go at once, but where their records would fill more than ``RECORD_MEMORY``: then, all but projection
-goes group of views by group of views, and the bits stay the same.
+All views are processed together unless their records would fill more than ``RECORD_MEMORY``. In that case
+everything except the projection runs on one group of views after another, with the same bits.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -34,40 +32,34 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.io.cache import default_cache_dir
 from cadam3d.rasterizer.base import Backend, Rasterizer
-from cadam3d.rasterizer.native import Frame, render_frame, require_shapes
+from cadam3d.rasterizer.driver import Driver
+from cadam3d.rasterizer.launcher import Launch, Launcher
+from cadam3d.rasterizer.native import RenderPass, require_shapes, run_pass
 
-# Mirrors of kernels/*.cuh
+# The kernels define the same constants (kernels/*.cuh).
 BLOCK, PROJECT_BLOCK, BLEND_BLOCK, WARP = 256, 128, 128, 32  # threads
 TILE = 8  # pixels along the edge of a tile
 SPLAT, RECORD, ABSOLUTES, CAMERA = 12, 10, 2, 25  # floats
 SCAN_CHUNK, SORT_CHUNK, RADIX_BITS = 2048, 4096, 8
 
 DEPTH_BITS = 32
-SCAN_SHORT = 8 * SCAN_CHUNK  # up to here one block scans it all, faster than three launches
-MOST = 2**31 - 1  # pairs, slots or tiles of a group, pixels of a view: their numbers have 32 bits
-RECORD_MEMORY = 256 * 2**20  # bytes; a group has one view at least, whatever that needs
-
-# A kernel, how many blocks of how many threads, and its arguments: a tensor is its address, None is null.
-Launch = Callable[..., None]
-
-
-class Launcher(ABC):
-    """Where kernels run: on a GPU, or in the emulator of the tests."""
-
-    @abstractmethod
-    def on(self, device: torch.device) -> AbstractContextManager[Launch]:
-        """Yield ``launch(kernel, blocks, threads, *arguments)`` for ``device`` and its current stream."""
+# One block scans up to this many numbers by itself, which is faster than three launches.
+SCAN_SHORT = 8 * SCAN_CHUNK
+# The kernels count the pairs, slots and tiles of a group and the pixels of a view with 32 bits.
+MOST = 2**31 - 1
+# Bytes of the records of one group of views. A group has at least one view, whatever that view needs.
+RECORD_MEMORY = 256 * 2**20
 
 
 @dataclass(frozen=True, kw_only=True)
 class CudaRasterizer(Rasterizer):
-    """Renders in float32 on a CUDA device; the bits are the same on every run.
+    """Renders in float32 on a CUDA device, with the same bits on every run.
 
-    Other dtypes are converted on the way in and out, and autocast is off inside. The kernels are compiled by
-    the NVRTC that comes with torch, at the first use of a kind of device.
+    Other dtypes are converted on the way in and out, and autocast is off inside. The NVRTC that comes with
+    torch compiles the kernels when a device of a new compute capability is first used.
     """
 
-    cache_dir: str | None  # where compiled kernels are kept; None: the user's cache folder
+    cache_dir: str | None  # folder of the compiled kernels; None: the user's cache folder
 
     def render(
         self,
@@ -76,7 +68,10 @@ class CudaRasterizer(Rasterizer):
         background: Float[Tensor, "v 3"],
         absgrad: bool = False,
     ) -> RenderOutput:
-        """See :meth:`Rasterizer.render`. Raises :class:`UserError` off CUDA, or if nothing can compile."""
+        """See :meth:`Rasterizer.render`.
+
+        Raises :class:`UserError` if the Gaussians are not on a CUDA device or the kernels do not compile.
+        """
         _refuse_others(gaussians.device)
         return rasterize(load_kernels(self.cache_dir), gaussians, cameras, background, absgrad)
 
@@ -96,9 +91,7 @@ def _refuse_others(device: torch.device) -> None:
 
 @cache
 def load_kernels(cache_dir: str | None) -> Launcher:
-    """The kernels on every CUDA device; compiled for a kind of device when one of them is first used."""
-    from cadam3d.rasterizer.driver import Driver
-
+    """Return the kernels for all CUDA devices; the first use of a device compiles and loads them."""
     return Driver(Path(cache_dir).expanduser() if cache_dir else default_cache_dir())
 
 
@@ -109,23 +102,23 @@ def rasterize(
     background: Float[Tensor, "v 3"],
     absgrad: bool = False,
 ) -> RenderOutput:
-    """Render with the kernels at hand; see :meth:`Rasterizer.render`."""
+    """Render with the kernels of ``launcher``; see :meth:`Rasterizer.render`."""
     require_shapes(gaussians, cameras, background)
     if max(len(gaussians), cameras.height * cameras.width) > MOST:
         raise UserError(
             f"rasterizer=cuda: more than {MOST} Gaussians or pixels in a view are too many. Try: fewer"
         )
-    return render_frame(_Frame(launcher, cameras, gaussians.device, absgrad), gaussians, background)
+    return run_pass(_CudaPass(launcher, cameras, gaussians.device, absgrad), gaussians, background)
 
 
-class _Frame(Frame):
-    """See :class:`Frame`."""
+class _CudaPass(RenderPass):
+    """One call of the CUDA rasterizer; see :class:`RenderPass`."""
 
     cameras: Tensor  # [v CAMERA]
     splats: Tensor  # [v n SPLAT]
     depth_keys: Tensor  # [v n]
     slot_count: Tensor  # [v n]
-    first_slot: Tensor  # [v n]; among those of the group
+    first_slot: Tensor  # [v n]; counted from the first slot of the group
     groups: list["_Group"]
     transmittance: Tensor  # [v h w]; after the last splat
     last: Tensor  # [v h w]; 1 + rank of the last splat that reached the pixel
@@ -138,11 +131,11 @@ class _Frame(Frame):
 
     @property
     def tiles(self) -> int:
-        """Of one view."""
+        """Return the number of tiles of one view."""
         return _pieces(self.height, TILE) * _pieces(self.width, TILE)
 
     def project(self, parameters: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """See :meth:`Frame.project`; fills the frame's splats."""
+        """See :meth:`RenderPass.project`; also fills ``splats``, ``depth_keys`` and ``slot_count``."""
         means, *_, sh = parameters
         v, n = self.views, means.shape[0]
         self.cameras = means.new_empty(v, CAMERA)
@@ -163,7 +156,7 @@ class _Frame(Frame):
     def blend(
         self, parameters: list[Tensor], background: Tensor, keeps: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """See :meth:`Frame.blend`."""
+        """See :meth:`RenderPass.blend`."""
         size = (self.views, self.height, self.width)
         rgb, alpha, depth = (background.new_empty(*size, *channels) for channels in ((3,), (), ()))
         self.transmittance, self.last = torch.empty_like(alpha), torch.empty_like(alpha, dtype=torch.int32)
@@ -181,8 +174,9 @@ class _Frame(Frame):
         return rgb, alpha, depth
 
     def _split(self) -> list[tuple[slice, int]]:
-        """Groups of views that go together, and how many slots each has."""
-        slots = self.slot_count.sum(dim=1, dtype=torch.int64).tolist()  # the one time the host waits
+        """Return the groups of views that are processed together, each with its number of slots."""
+        # This is the only time that the host waits for the device.
+        slots = self.slot_count.sum(dim=1, dtype=torch.int64).tolist()
         largest = max(slots, default=0)
         if largest > MOST:
             raise UserError(
@@ -194,7 +188,7 @@ class _Frame(Frame):
         return _split_views(slots, most_slots, most_views)
 
     def _list(self, launch: Launch, views: slice, slots: int) -> "_Group":
-        """For every tile of some views, the slots of the splats that touch it; fills their ``first_slot``."""
+        """Return the tile lists of a group of views, and fill ``first_slot`` for these views."""
         v, n = views.stop - views.start, self.slot_count.shape[1]
         tiles, counts = v * self.tiles, self.slot_count[views].flatten()
         _, order = _sort(launch, self.depth_keys[views].flatten(), DEPTH_BITS)
@@ -216,7 +210,7 @@ class _Frame(Frame):
     def blend_backward(
         self, parameters: list[Tensor], background: Tensor, images: list[Tensor | None]
     ) -> list[Tensor | None]:
-        """See :meth:`Frame.blend_backward`."""
+        """See :meth:`RenderPass.blend_backward`."""
         means, *_, sh = parameters
         v, n = self.views, means.shape[0]
         slots = max((group.slots.shape[0] for group in self.groups), default=0)
@@ -229,7 +223,8 @@ class _Frame(Frame):
         seen = (alpha, depth, self.transmittance, self.last, *grad_images)
         with self.launcher.on(self.device) as launch:
             for group in self.groups:
-                threads = (group.tiles + 1) * WARP  # one warp more for slots without a tile
+                # One more warp clears the slots that belong to no tile.
+                threads = (group.tiles + 1) * WARP
                 blend = (*self._blend_inputs(group, background), *_of(group.views, seen), records)
                 if absolutes is None:
                     _launch_each(launch, "blend_backward", threads, BLEND_BLOCK, *blend)
@@ -246,7 +241,7 @@ class _Frame(Frame):
         return [grad_means2d, absgrad, *others]
 
     def centre_backward(self, parameters: list[Tensor], radii: Tensor, grad_means2d: Tensor) -> Tensor:
-        """See :meth:`Frame.centre_backward`."""
+        """See :meth:`RenderPass.centre_backward`."""
         means, grad_means = parameters[0], torch.empty_like(parameters[0])
         n = means.shape[0]
         with self.launcher.on(self.device) as launch:
@@ -257,17 +252,17 @@ class _Frame(Frame):
 
 @dataclass(frozen=True)
 class _Group:
-    """Views that go together, and their slots: one per (splat, tile), numbered in depth order."""
+    """Views that are processed together and their slots, one per (splat, tile), numbered in depth order."""
 
     views: slice
-    tiles: int  # of all of them
+    tiles: int  # in all of these views together
     slots: Tensor  # tile after tile, nearest first
     pair_of_slot: Tensor  # (view - first view) * n + Gaussian
-    ranges: Tensor  # [tiles + 1, 2]; where in ``slots`` the list of a tile begins and ends
+    ranges: Tensor  # [tiles + 1, 2]; begin and end of each tile's list in ``slots``
 
 
 def _split_views(slots: list[int], most_slots: int, most_views: int) -> list[tuple[slice, int]]:
-    """Groups of views in a row, from the slots of each: as many views as fit, but at least one."""
+    """Return groups of consecutive views and their slots: as many views as fit, but at least one."""
     groups: list[tuple[slice, int]] = []
     for view, count in enumerate(slots):
         if groups:
@@ -280,12 +275,12 @@ def _split_views(slots: list[int], most_slots: int, most_views: int) -> list[tup
 
 
 def _of(views: slice, tensors: Sequence[Tensor | None]) -> list[Tensor | None]:
-    """What of the tensors belongs to the views."""
+    """Return the part of each tensor that belongs to ``views``."""
     return [None if tensor is None else tensor[views] for tensor in tensors]
 
 
 def _scan(launch: Launch, values: Tensor) -> Tensor:
-    """Exclusive prefix sums of numbers whose sum has 32 bits."""
+    """Return exclusive prefix sums; the total must fit into 32 bits."""
     n, sums = values.shape[0], torch.empty_like(values)
     if n <= SCAN_SHORT:
         launch("scan_short", 1, BLOCK, values, n, sums)
@@ -299,7 +294,10 @@ def _scan(launch: Launch, values: Tensor) -> Tensor:
 
 
 def _sort(launch: Launch, keys: Tensor, bits: int) -> tuple[Tensor, Tensor]:
-    """Sorted unsigned keys of so many bits, and where each was; equal keys keep their order."""
+    """Return the sorted unsigned keys and their old positions; equal keys keep their order.
+
+    Only the lowest ``bits`` bits of the keys are compared.
+    """
     n, chunks, order = keys.shape[0], _pieces(keys.shape[0], SORT_CHUNK), None
     if n == 0:
         return keys, keys
@@ -316,7 +314,7 @@ def _sort(launch: Launch, keys: Tensor, bits: int) -> tuple[Tensor, Tensor]:
 
 
 def _launch_each(launch: Launch, kernel: str, count: int, threads: int, *arguments: object) -> None:
-    """At least ``count`` threads, or no launch at all."""
+    """Launch at least ``count`` threads, or nothing if ``count`` is 0."""
     if count > 0:
         launch(kernel, _pieces(count, threads), threads, *arguments)
 
@@ -326,4 +324,5 @@ def _pieces(count: int, size: int) -> int:
 
 
 def _integers(count: int, device: torch.device) -> Tensor:
-    return torch.empty(count, dtype=torch.int32, device=device)  # the kernels take the bits as unsigned
+    # The kernels read the same bits as unsigned integers.
+    return torch.empty(count, dtype=torch.int32, device=device)

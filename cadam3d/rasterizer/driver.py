@@ -1,4 +1,4 @@
-"""Runs compiled kernels through the CUDA driver, on torch's current stream, in torch's own context."""
+"""Runs compiled kernels through the CUDA driver, on torch's current stream and in torch's own context."""
 
 import ctypes
 import sys
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from cadam3d.core.checks import UserError
-from cadam3d.rasterizer.cuda import Launch, Launcher
+from cadam3d.rasterizer.launcher import Launch, Launcher
 from cadam3d.rasterizer.nvrtc import build
 
 LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
@@ -19,7 +19,7 @@ OUT_OF_MEMORY = 2  # CUDA_ERROR_OUT_OF_MEMORY
 
 
 class Driver(Launcher):
-    """The kernels on every CUDA device of this machine, each compiled and loaded when first asked for."""
+    """Launches kernels on every CUDA device; the first use of a device compiles and loads them."""
 
     def __init__(self, cache_dir: Path) -> None:
         self._cache_dir = cache_dir
@@ -27,7 +27,7 @@ class Driver(Launcher):
 
     @contextmanager
     def on(self, device: torch.device) -> Iterator[Launch]:
-        """See :meth:`Launcher.on`. Raises :class:`UserError` if the kernels cannot be had for ``device``."""
+        """See :meth:`Launcher.on`. Raises :class:`UserError` if the kernels do not compile or load."""
         index = torch.cuda.current_device() if device.index is None else device.index
         with torch.cuda.device(index):
             if index not in self._modules:
@@ -38,7 +38,7 @@ class Driver(Launcher):
 
 
 def load_driver() -> ctypes.CDLL:
-    """The CUDA driver's library. Raises :class:`UserError` if there is none."""
+    """Return the library of the CUDA driver. Raises :class:`UserError` if there is none."""
     try:
         return ctypes.CDLL(LIBRARY)
     except OSError as error:
@@ -54,14 +54,14 @@ class Module:
         self._context, self._handle, ordinal = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_int()
         self._call("cuInit", 0)
         self._call("cuDeviceGet", ctypes.byref(ordinal), index)
-        # The context that torch uses too; never released, for it lives as long as the process.
+        # Torch uses this context too. It is never released, because it lives as long as the process.
         self._call("cuDevicePrimaryCtxRetain", ctypes.byref(self._context), ordinal)
         with self._current():
             self._call("cuModuleLoadData", ctypes.byref(self._handle), cubin)
 
     @contextmanager
     def launching(self, stream: int) -> Iterator[Launch]:
-        """Yield ``launch`` (see :meth:`Launcher.on`) for a stream of the device."""
+        """Yield the launch function (see :meth:`Launcher.on`) for a stream of the device."""
         with self._current():
             yield partial(self._launch, ctypes.c_void_p(stream))
 
@@ -81,7 +81,7 @@ class Module:
 
     @contextmanager
     def _current(self) -> Iterator[None]:
-        # Autograd's threads may not have a context yet.
+        # The threads of autograd may not have a context yet.
         self._call("cuCtxPushCurrent_v2", self._context)
         try:
             yield
@@ -100,7 +100,7 @@ class Module:
 
 
 def _as_number(argument: object) -> int:
-    """A kernel's argument in eight bytes: a tensor's address, null for ``None``, or a number."""
+    """Return the eight bytes of a kernel argument: the address of a tensor, 0 for ``None``, or the number."""
     if isinstance(argument, Tensor):
         return argument.data_ptr()
     if argument is None:

@@ -1,9 +1,10 @@
-"""Compiles the CUDA kernels at run time with the NVRTC that torch's wheels bring: no toolkit, no nvcc.
+"""Compiles the CUDA kernels at run time with the NVRTC of torch's wheels, without nvcc or the CUDA toolkit.
 
-Compiled for real architectures only (a cubin), never to PTX, which a driver older than the compiler refuses.
-A cached file's name says the architecture and carries two hashes: of the sources, constants, options and the
-compiler's version; of its own bytes. So a new release, another torch or a damaged file each lead to a fresh
-build, and no lock is needed: who finishes renames the file into place, and any that fits its name will do.
+The result is always a cubin for a real architecture, never PTX, because a driver refuses PTX from a newer
+compiler. The name of a cached file contains the architecture and two hashes: of the sources, constants,
+options and compiler version, and of the file's own bytes. So a new release, another torch or a damaged file
+each lead to a fresh build. No lock is needed: every process renames its finished file into place, and any
+file that matches its name is usable.
 """
 
 import ctypes
@@ -27,23 +28,26 @@ SOURCE = "cuda.cu"
 HEADERS = ("blend.cuh", "device.cuh", "project.cuh", "sort.cuh", "splat_math.h", "tiles.cuh")
 OPTIONS = (
     "--std=c++17",
-    "--fmad=false",  # fused only where written: forward and backward must see the same bits
+    # Multiplications and additions are fused only where the source says so, because the forward and the
+    # backward pass must compute the same bits.
+    "--fmad=false",
 )
 PATTERN = "*nvrtc64_*.dll" if sys.platform == "win32" else "libnvrtc.so*"
 BUILTINS = "*nvrtc-builtins*.dll" if sys.platform == "win32" else "libnvrtc-builtins.so*"
 SYSTEM = ("libnvrtc.so", "libnvrtc.so.13", "libnvrtc.so.12")
-EMBEDDED = (72, 87, 101)  # of boards; no other device runs their code
+# Architectures of embedded boards; no other device runs their code.
+EMBEDDED = (72, 87, 101)
 INSTALL = "It comes with torch built for CUDA; try: pip install nvidia-cuda-nvrtc"
 
 
 @dataclass(frozen=True)
 class Compiler:
-    """An NVRTC library, loaded."""
+    """A loaded NVRTC library."""
 
     library: ctypes.CDLL
     path: str
     version: tuple[int, int]  # of CUDA
-    architectures: tuple[int, ...]  # such as 75 for sm_75, ascending
+    architectures: tuple[int, ...]  # ascending; 75 stands for sm_75
 
 
 @dataclass(frozen=True)
@@ -51,12 +55,12 @@ class Cubin:
     """Compiled kernels, ready for the driver."""
 
     path: Path
-    seconds: float  # spent compiling; 0 if it came from the cache
+    seconds: float  # time spent compiling; 0 for a file from the cache
 
 
 @cache
 def find_compiler() -> Compiler | None:
-    """The first NVRTC that loads: of torch's own CUDA version, then of any, then the system's."""
+    """Return the first NVRTC that loads: of torch's CUDA version, of another one, or of the system."""
     for path in (*sorted(_bundled(), key=_distance_from_torch), *SYSTEM):
         try:
             return _load(str(path))
@@ -66,7 +70,7 @@ def find_compiler() -> Compiler | None:
 
 
 def _bundled() -> Iterator[Path]:
-    """NVRTC libraries in the wheels that are installed here."""
+    """Yield the NVRTC libraries of the installed wheels."""
     namespace = find_spec("nvidia")
     folders = [Path(root) for root in (namespace.submodule_search_locations or [])] if namespace else []
     for root in folders:
@@ -76,14 +80,14 @@ def _bundled() -> Iterator[Path]:
 
 
 def _distance_from_torch(path: Path) -> tuple[bool, bool, str]:
-    # What torch was built for is what the driver is known to load.
+    # The driver is known to load the CUDA version that torch was built for.
     major = (torch.version.cuda or "").split(".")[0]
     fits = bool(major) and (path.name.endswith(f".so.{major}") or f"64_{major}" in path.name)
     return ".alt." in path.name, not fits, path.name
 
 
 def _load(path: str) -> Compiler:
-    # Some releases look for their built-in functions on the loader's path alone: have them there before.
+    # Some releases search for their built-in functions on the loader's path only, so they are loaded first.
     for builtins in sorted(Path(path).parent.glob(BUILTINS)) if Path(path).is_absolute() else ():
         if ".alt." not in builtins.name:
             ctypes.CDLL(str(builtins), mode=ctypes.RTLD_GLOBAL)
@@ -98,7 +102,10 @@ def _load(path: str) -> Compiler:
 
 
 def choose_architecture(capability: tuple[int, int], compiler: Compiler) -> int:
-    """The newest architecture that the compiler knows and a device of this compute capability runs."""
+    """Return the newest architecture that the compiler knows and a device of this compute capability runs.
+
+    Raises :class:`UserError` if there is none.
+    """
     major, minor = capability
     device = 10 * major + minor
     fitting = [
@@ -116,7 +123,7 @@ def choose_architecture(capability: tuple[int, int], compiler: Compiler) -> int:
 
 
 def build(cache_dir: Path, capability: tuple[int, int]) -> Cubin:
-    """The kernels for a device of this compute capability, compiled now if ``cache_dir`` does not hold them.
+    """Return the kernels for a compute capability, and compile them if ``cache_dir`` lacks them.
 
     Raises :class:`UserError` if there is no NVRTC, if it fails, or if the folder cannot be written.
     """
@@ -148,9 +155,9 @@ def build(cache_dir: Path, capability: tuple[int, int]) -> Cubin:
 def compile_kernels(
     compiler: Compiler, architecture: int, show: Callable[[str], object] | None = None
 ) -> bytes:
-    """A cubin of every kernel for ``sm_<architecture>``; ``show`` gets what the compiler said.
+    """Return a cubin with all kernels for ``sm_<architecture>``; ``show`` is called with the compiler's log.
 
-    Raises :class:`UserError`, which quotes it, if that was an error.
+    Raises :class:`UserError`, which quotes the log, if the compilation fails.
     """
     library, program = compiler.library, ctypes.c_void_p()
     headers = [(KERNELS / name).read_bytes() for name in HEADERS]
@@ -191,7 +198,7 @@ def _check(library: ctypes.CDLL, status: int, log: str = "") -> None:
     if status != 0:
         reason = library.nvrtcGetErrorString(status).decode()
         raise UserError(
-            f"rasterizer=cuda: NVRTC says {reason}. {log}\nTry: pip install --force-reinstall torch, "
+            f"rasterizer=cuda: NVRTC reports {reason}. {log}\nTry: pip install --force-reinstall torch, "
             "or: rasterizer=reference"
         )
 

@@ -1,18 +1,19 @@
 """The reference rasterizer: the image formation model in pure torch, for any dtype and any device.
 
-Every other backend is measured against it. It is EWA splatting (Zwicker et al. 2001) as 3DGS uses it (Kerbl
-et al. 2023, sec. 4-5), with the constants of :mod:`cadam3d.rasterizer.base`. At a pixel with offset ``d``
-from a projected mean, with ``W`` whitening the blurred 2D covariance:
+All other backends are compared with it. It is EWA splatting (Zwicker et al. 2001) as 3DGS uses it (Kerbl et
+al. 2023, sec. 4-5), with the constants of :mod:`cadam3d.rasterizer.base`. At a pixel with offset ``d`` from a
+projected mean, where ``W`` whitens the blurred 2D covariance, the model is:
 
 * ``raw = opacity * exp(-|W d|^2 / 2)``; ``alpha = min(raw, ALPHA_MAX)``, or 0 where ``raw < ALPHA_MIN``;
 * front to back ``w = alpha T``, ``T <- T (1 - alpha)``, until ``T`` would fall to ``TRANSMITTANCE_MIN``;
 * ``rgb = sum(w color) + (1 - sum(w)) background``, ``alpha = sum(w)``, ``depth = sum(w z) / sum(w)``.
 
-How it stays quick: splats are binned into square tiles, tiles with about equally many splats are stacked into
-dense blocks ``tiles x splats x pixels``, and a block is composited at once. Nothing of a block is kept for
-backward, which evaluates it again: memory follows the number of (splat, tile) pairs. There is no matrix
-product, whose precision a user may have lowered, and on a CPU no sum in an unspecified order: the bits are
-always the same.
+It is fast because splats are binned into square tiles, tiles with about equally many splats are stacked into
+dense blocks ``tiles x splats x pixels``, and each block is composited at once. No block is kept for the
+backward pass, which evaluates it again, so memory grows with the number of (splat, tile) pairs.
+
+On a CPU the bits are always the same. The code contains no matrix product, because a user may have lowered
+its precision, and no sum in an unspecified order.
 """
 
 import math
@@ -41,16 +42,19 @@ from cadam3d.rasterizer.base import (
 )
 
 TILE = 8  # pixels along the edge of a tile
-BLOCK = 2**17  # (splat, pixel) pairs composited at once: a few arrays of this size fit into the caches
-QUAT_SQUARE_MIN = 1e-12  # a shorter quaternion has no direction: culled
+# This many (splat, pixel) pairs are composited at once: a few arrays of this size fit into the caches.
+BLOCK = 2**17
+# A Gaussian is culled if the squared length of its quaternion is smaller: it has no direction.
+QUAT_SQUARE_MIN = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceRasterizer(Rasterizer):
-    """The definition of what every backend must show. Has no hyper-parameters.
+    """Defines the images and gradients that every backend must reproduce. It has no hyper-parameters.
 
-    Works in the dtype and on the device of the Gaussians; cameras and background follow them. On a CPU the
-    result is the same bit for bit on every run; on CUDA, sums use atomics. There are no second derivatives.
+    It works in the dtype and on the device of the Gaussians, and converts cameras and background. On a CPU
+    every run gives the same bits; on CUDA it does not, because sums use atomics. There are no second
+    derivatives.
     """
 
     def render(
@@ -76,7 +80,7 @@ class ReferenceRasterizer(Rasterizer):
             return RenderOutput(
                 rgb=color + (1 - alpha) * background.to(like)[:, None, None],
                 alpha=alpha[..., 0],
-                # A pixel that anything touched has alpha >= ALPHA_MIN, so the floor only mends 0 / 0.
+                # Wherever a splat contributes, alpha >= ALPHA_MIN, so the lower bound only avoids 0 / 0.
                 depth=(depth / alpha.clamp_min(ALPHA_MIN / 2))[..., 0],
                 means2d=means2d,
                 radii=torch.stack([s.on_rows(s.half_sizes.amax(dim=1)) for s in splats]),
@@ -96,7 +100,7 @@ class _View:
 
 @dataclass(frozen=True)
 class _Projection:
-    """Gaussians on the image plane of one view."""
+    """Gaussians projected onto the image plane of one view."""
 
     means2d: Float[Tensor, "m 2"]  # pixels
     depths: Float[Tensor, "m"]  # camera z, world units
@@ -109,15 +113,15 @@ class _Projection:
 class _Splats:
     """The visible Gaussians of one view, nearest first; ties in row order."""
 
-    n: int  # how many Gaussians there are, seen or not
-    rows: Int[Tensor, "m"]  # which of them these are
+    n: int  # number of all Gaussians, visible or not
+    rows: Int[Tensor, "m"]  # row of each visible Gaussian
     half_sizes: Float[Tensor, "m 2"]  # pixels; of the box around the ellipse of alpha >= ALPHA_MIN
     projection: _Projection
     opacities: Float[Tensor, "m"]
     colors: Float[Tensor, "m 3"]
 
     def on_rows(self, values: Float[Tensor, "m *c"]) -> Float[Tensor, "n *c"]:
-        """One value per Gaussian, 0 for those not seen."""
+        """Return one value per Gaussian, which is 0 for those that are not visible."""
         return values.new_zeros((self.n, *values.shape[1:])).index_copy(0, self.rows, values)
 
 
@@ -145,9 +149,10 @@ def _splat(gaussians: Gaussians, view: _View) -> _Splats:
 
 @torch.no_grad()
 def _see(gaussians: Gaussians, view: _View) -> tuple[Int[Tensor, "m"], Float[Tensor, "m 2"]]:
-    """Rows and half-sizes of the visible Gaussians, nearest first.
+    """Return the rows and half-sizes of the visible Gaussians, nearest first.
 
-    The others never meet autograd: no gradient, hence no NaN in one. Each test is one that a NaN fails.
+    Autograd never sees the other Gaussians, so their gradients are zero and cannot be NaN. Each test is
+    written such that NaN fails it.
     """
     projection = _project(gaussians, view)
     reach = torch.log(gaussians.opacities / ALPHA_MIN).mul(2).sqrt()  # standard deviations; NaN if too faint
@@ -168,12 +173,14 @@ def _see(gaussians: Gaussians, view: _View) -> tuple[Int[Tensor, "m"], Float[Ten
 
 
 def _project(gaussians: Gaussians, view: _View) -> _Projection:
-    """EWA projection of every Gaussian, whether or not that makes sense."""
+    """Return the EWA projection of every Gaussian, including those that are not visible."""
     x, y, z = ((view.rotation * gaussians.means[:, None, :]).sum(dim=-1) + view.translation).unbind(dim=-1)
     x, y = x / z, y / z
     focal, center = view.intrinsics.diagonal()[:2], view.intrinsics[:2, 2]
-    axes = gaussians.rotations * gaussians.scales[:, None, :]  # columns: one deviation along each own axis
-    deviations = []  # J R S: the same three deviations along image x and y, in pixels
+    # The columns are the axes of each Gaussian, scaled by their standard deviations. ``deviations`` holds the
+    # same three vectors along image x and y, in pixels (J R S).
+    axes = gaussians.rotations * gaussians.scales[:, None, :]
+    deviations = []
     for axis, slope, size in ((0, x, view.width), (1, y, view.height)):
         low = (-FRUSTUM_MARGIN * size - center[axis]) / focal[axis]
         high = ((1 + FRUSTUM_MARGIN) * size - center[axis]) / focal[axis]
@@ -183,7 +190,8 @@ def _project(gaussians: Gaussians, view: _View) -> _Projection:
     square_x, square_y = (along_x * along_x).sum(dim=-1), (along_y * along_y).sum(dim=-1)
     variance_x, variance_y = square_x + BLUR, square_y + BLUR
     covariance = (along_x * along_y).sum(dim=-1)
-    # Lagrange's identity: variance_x * variance_y - covariance**2 without its cancellation, hence always > 0.
+    # By Lagrange's identity this is variance_x * variance_y - covariance**2, without its cancellation. It is
+    # always positive.
     cross = torch.linalg.cross(along_x, along_y, dim=-1)
     determinant = (cross * cross).sum(dim=-1) + BLUR * (square_x + square_y) + BLUR**2
     across = (variance_y / determinant).sqrt()  # 1 / the deviation along x at a given y
@@ -199,7 +207,7 @@ def _project(gaussians: Gaussians, view: _View) -> _Projection:
 def _composite(
     means2d: Float[Tensor, "n 2"], probe: Float[Tensor, "n 2"] | None, splats: _Splats, view: _View
 ) -> Float[Tensor, "h w 5"]:
-    """Weighted sums over the splats of each pixel: of red, green, blue, camera z and 1."""
+    """Return the weighted sums over the splats of each pixel: of red, green, blue, camera z and 1."""
     tiles_x, tiles_y = -(-view.width // TILE), -(-view.height // TILE)
     means2d = means2d.index_select(0, splats.rows)
     blocks = list(_blocks(means2d.detach(), splats.half_sizes, tiles_x, tiles_y))
@@ -216,13 +224,14 @@ class _Block:
     """Tiles with about equally many splats, and the splats of each, nearest first."""
 
     tiles: Int[Tensor, "b"]  # row-major tile numbers
-    splats: Int[Tensor, "b l"]  # the number of splats, which is one too many, fills up the shorter lists
+    # Shorter lists are padded with the number of splats, an index that belongs to no splat.
+    splats: Int[Tensor, "b l"]
 
 
 def _blocks(
     means2d: Float[Tensor, "m 2"], half_sizes: Float[Tensor, "m 2"], tiles_x: int, tiles_y: int
 ) -> Iterator[_Block]:
-    """Stack the tiles that any of the depth-ordered splats touches, those with the most splats first."""
+    """Yield the tiles that the depth-ordered splats touch in blocks, those with the most splats first."""
     splats, lengths = _bin(means2d, half_sizes, tiles_x, tiles_y)
     starts = lengths.cumsum(0) - lengths
     by_length = lengths.argsort(descending=True, stable=True)
@@ -241,9 +250,12 @@ def _blocks(
 def _bin(
     means2d: Float[Tensor, "m 2"], half_sizes: Float[Tensor, "m 2"], tiles_x: int, tiles_y: int
 ) -> tuple[Int[Tensor, "e"], Int[Tensor, "t"]]:
-    """The splats whose box meets each tile, tile after tile, nearest first; and how many each tile has."""
+    """Return the splats of each tile, nearest first, one tile after another, and their number per tile.
+
+    A splat belongs to every tile that its box meets.
+    """
     grid = torch.tensor([tiles_x, tiles_y], device=means2d.device)
-    # Closed boxes against whole tiles, whose pixel centres lie half a pixel inside: rounding loses no pixel.
+    # The boxes are closed and the pixel centres are half a pixel inside a tile, so rounding loses no pixel.
     first = ((means2d - half_sizes) / TILE).floor().clamp_min(0).minimum(grid).long()
     last = ((means2d + half_sizes) / TILE).floor().clamp_min(-1).minimum(grid - 1).long()
     span = (last - first + 1).clamp_min(0)
@@ -252,14 +264,15 @@ def _bin(
     nth = torch.arange(splats.shape[0], device=splats.device) - (counts.cumsum(0) - counts)[splats]
     column = first[splats, 0] + nth % span[splats, 0]
     row = first[splats, 1] + nth // span[splats, 0]
-    tiles, order = (row * tiles_x + column).sort(stable=True)  # stable: the nearest stays first
+    # A stable sort keeps the nearest splat of each tile first.
+    tiles, order = (row * tiles_x + column).sort(stable=True)
     return splats[order], torch.bincount(tiles, minlength=tiles_x * tiles_y)
 
 
 class _Blend(torch.autograd.Function):
-    """From a table of splats (mean 2, whitening 3, opacity, features 4) to weighted sums at every pixel.
+    """Maps a table of splats (mean 2, whitening 3, opacity, features 4) to weighted sums at every pixel.
 
-    ``probe`` adds nothing; where there is one, its gradient is that of the means with nothing cancelled.
+    ``probe`` does not change the result. If it is not ``None``, its gradient is ``absgrad``.
     """
 
     @staticmethod
@@ -280,21 +293,23 @@ class _Blend(torch.autograd.Function):
         rows, width = table.shape
         wants_absolute = ctx.needs_input_grad[1]
         width += 2 * wants_absolute
-        total = table.new_zeros((rows + 1) * width)  # the last row belongs to nobody: see _Block.splats
+        # The last row collects the gradients of the padding, which belong to no splat: see _Block.splats.
+        total = table.new_zeros((rows + 1) * width)
         for block in ctx.blocks:
             partial = _Shading(table, block, ctx.tiles_x).backward(grads[0][block.tiles], wants_absolute)
             slots = block.splats[..., None] * width + torch.arange(width, device=table.device)
-            total.index_add_(0, slots.flatten(), partial.flatten())  # one-dimensional: in order on a CPU
+            # On a CPU, a one-dimensional index_add_ adds in order.
+            total.index_add_(0, slots.flatten(), partial.flatten())
         total = total.view(rows + 1, width)[:-1]
         absolute = total[:, table.shape[1] :] if wants_absolute else None
         return total[:, : table.shape[1]], absolute, None, None, None
 
 
 class _Shading:
-    """Every splat of a block at every pixel of its tile; tensors are ``tiles x splats x pixels``."""
+    """Evaluates each splat of a block at each pixel of its tile; tensors are ``tiles x splats x pixels``."""
 
     def __init__(self, table: Tensor, block: _Block, tiles_x: int) -> None:
-        # One more splat, all zero and so transparent, stands where a list is too short.
+        # The padding refers to one more splat, which is all zero and therefore transparent.
         padded = torch.nn.functional.pad(table, (0, 0, 0, 1))
         rows = padded.index_select(0, block.splats.flatten()).view(*block.splats.shape, 1, -1)
         mean_x, mean_y, self.w_xx, self.w_xy, self.w_yy, opacity, *self.features = rows.unbind(dim=-1)
@@ -302,7 +317,8 @@ class _Shading:
         x = block.tiles[:, None] % tiles_x * TILE + pixel % TILE + 0.5
         y = block.tiles[:, None] // tiles_x * TILE + pixel // TILE + 0.5
         self.dx, self.dy = x.to(table)[:, None] - mean_x, y.to(table)[:, None] - mean_y
-        self.x = (self.w_xx * self.dx).addcmul_(self.w_xy, self.dy)  # W d: offset in standard deviations
+        # (x, y) is W d, the offset in standard deviations.
+        self.x = (self.w_xx * self.dx).addcmul_(self.w_xy, self.dy)
         self.y = self.w_yy * self.dy
         self.falloff = (self.x * self.x).addcmul_(self.y, self.y).mul_(-0.5).exp_()
         raw = opacity * self.falloff
@@ -311,26 +327,29 @@ class _Shading:
         self.alpha = raw.clamp_max(ALPHA_MAX) * is_bright
         self.clear = 1 - self.alpha
         after = self.clear.cumprod(dim=1)
-        # T never rises, so "the splat that would bring it too low, and all behind" is one comparison.
+        # T never rises, so one comparison finds the splat that would bring it too low and all behind it.
         is_reached = _as_number(torch.gt, after, TRANSMITTANCE_MIN)
         self.before = after / self.clear
         self.weight = self.alpha * self.before * is_reached
-        self.passes = is_bright.mul_(is_free).mul_(is_reached)  # where alpha depends on raw, and is used
+        # 1 where alpha depends on raw and is used, else 0.
+        self.passes = is_bright.mul_(is_free).mul_(is_reached)
 
     def sums(self) -> Float[Tensor, "b 5 p"]:
-        """Weighted sums of the features and of 1 over the splats."""
+        """Return the weighted sums of the features and of 1 over the splats."""
         weighted = [(self.weight * feature).sum(dim=1) for feature in self.features]
         return torch.stack([*weighted, self.weight.sum(dim=1)], dim=1)
 
     def backward(self, grad: Float[Tensor, "b 5 p"], wants_absolute: bool) -> Float[Tensor, "b l c"]:
-        """Turn the gradient of the sums into that of the table, summed over the pixels of a tile.
+        """Return the gradient of the table from that of the sums, summed over the pixels of a tile.
 
-        With ``wants_absolute``, two columns follow: what pixels add to the first two, in absolute value.
+        With ``wants_absolute``, two more columns contain the sums of the absolute values of what each pixel
+        adds to the first two columns.
 
-        With ``value_i = grad . (feature_i, 1)`` the sums give
+        With ``value_i = grad . (feature_i, 1)`` the gradient is
         ``dL/dalpha_i = T_i value_i - sum(w_j value_j for j > i) / (1 - alpha_i)``.
-        As ``T_i (1 - alpha_i) = T_i - w_i``, that is
-        ``(T_i value_i - sum(w_j value_j for j >= i)) / (1 - alpha_i)``: one running sum from the back.
+        Because ``T_i (1 - alpha_i) = T_i - w_i``, it equals
+        ``(T_i value_i - sum(w_j value_j for j >= i)) / (1 - alpha_i)``, which needs one running sum from the
+        back.
         """
         *grad_features, grad_one = grad[:, :, None].unbind(dim=1)
         value = grad_one.expand_as(self.weight).clone()
@@ -338,7 +357,8 @@ class _Shading:
             value.addcmul_(feature, grad_feature)
         onward = (self.weight * value).flip(1).cumsum(dim=1).flip(1)
         grad_raw = (self.before * value).sub_(onward).div_(self.clear).mul_(self.passes)
-        pull = grad_raw * self.alpha  # -dL/d(|W d|^2 / 2)
+        # ``pull`` is -dL/d(|W d|^2 / 2).
+        pull = grad_raw * self.alpha
         pull_x, pull_y = pull * self.x, pull * self.y
         sum_x, sum_y = pull_x.sum(dim=-1), pull_y.sum(dim=-1)
         absolute = ()
@@ -361,5 +381,5 @@ class _Shading:
 
 
 def _as_number(compare: Callable[..., Tensor], x: Tensor, bound: float) -> Tensor:
-    # 1.0 or 0.0 in the dtype of x: on a CPU ten times faster than a boolean mask and `where`.
+    # 1.0 or 0.0 in the dtype of x, which on a CPU is ten times faster than a boolean mask and `where`.
     return compare(x, bound, out=torch.empty_like(x))

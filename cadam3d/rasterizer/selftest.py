@@ -1,9 +1,9 @@
-"""The self-test of a rasterizer: one small scene, rendered and differentiated, against the reference.
+"""The self-test of a rasterizer: renders and differentiates one small scene and compares with the reference.
 
-The image formation model has steps (a contribution below ``ALPHA_MIN`` is skipped, one above ``ALPHA_MAX`` is
-capped, a pixel stops at ``TRANSMITTANCE_MIN``). A number within rounding of a step may fall on either side of
-it, which no tolerance covers honestly. So the scene is fixed, and chosen such that none of its numbers lies
-within 1e-4 of a step, hundreds of roundings away; and yet every step is taken somewhere.
+The image formation model has steps: a contribution below ``ALPHA_MIN`` is skipped, one above ``ALPHA_MAX`` is
+capped, and a pixel stops at ``TRANSMITTANCE_MIN``. A number that is within rounding of a step may fall on
+either side of it, and no tolerance can cover the difference. So the scene is fixed, and none of its numbers
+is within 1e-4 of a step, which is hundreds of rounding errors. Still, the scene exercises every step.
 """
 
 import math
@@ -21,63 +21,67 @@ from cadam3d.core.render import RenderOutput
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
-# Relative to the largest number of each tensor. Rounding in float32 makes about 1e-6 of images and 2e-6 of
-# gradients, which sum over many pixels; one splat missing in one tile makes more than 1e-3.
+# Largest accepted deviations, relative to the largest number of each tensor. Rounding in float32 causes about
+# 1e-6 in images and 2e-6 in gradients, which are sums over many pixels. One splat that is missing in one tile
+# causes more than 1e-3.
 MOST_IMAGES = 2e-5
 MOST_GRADIENTS = 1e-4
 
 COUNT, SH_COEFFICIENTS = 300, 4  # degree 1
 HEIGHT, WIDTH = 37, 53  # pixels; no multiple of any tile
-SEED = 12  # of the first scene without a number near a step
+# The first seed that gives a scene without a number near a step.
+SEED = 12
 IMAGES = ("rgb", "alpha", "depth")
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far a rasterizer is from the reference, and from itself."""
+    """Deviations of a rasterizer from the reference, and whether it repeats its own results.
 
-    images: Mapping[
-        str, float
-    ]  # rgb, alpha, depth, means2d, radii: deviation, relative to the largest number
-    gradients: Mapping[str, float]  # of the five tensors and means2d, and absgrad, likewise
+    A deviation is relative to the largest number of its tensor.
+    """
+
+    images: Mapping[str, float]  # of rgb, alpha, depth, means2d and radii
+    gradients: Mapping[str, float]  # of the five tensors, means2d and absgrad
     repeats: bool  # whether a second run gave the same bits
 
     @property
     def worst_image(self) -> float:
-        """Largest deviation of what is seen; infinite if something is not finite."""
+        """Return the largest deviation of an image; infinite if a number is not finite."""
         return max(self.images.values())
 
     @property
     def worst_gradient(self) -> float:
-        """Largest deviation of a gradient; infinite if something is not finite."""
+        """Return the largest deviation of a gradient; infinite if a number is not finite."""
         return max(self.gradients.values())
 
     @property
     def holds(self) -> bool:
-        """Whether nothing deviates more than rounding explains."""
+        """Return whether rounding explains all deviations."""
         return self.worst_image <= MOST_IMAGES and self.worst_gradient <= MOST_GRADIENTS
 
     def __str__(self) -> str:
         verb = "agrees" if self.holds else "disagrees"
-        bits = "same bits twice" if self.repeats else "other bits the second time"
+        bits = "same bits twice" if self.repeats else "different bits the second time"
         deviations = f"images {_short(self.worst_image)}, gradients {_short(self.worst_gradient)}"
         return f"{verb} with the reference: {deviations}; {bits}"
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What is rendered, and the weights of the pixels in the loss."""
+    """The scene of the self-test, and the weights of the pixels in the loss."""
 
     gaussians: Gaussians
     cameras: Cameras
     background: Float[Tensor, "v 3"]
-    weights: Mapping[str, Tensor]  # by image, of its size
+    weights: Mapping[str, Tensor]  # one tensor per image, of the size of the image
 
 
 def self_test(rasterizer: Rasterizer, device: torch.device) -> Agreement:
-    """Render the scene three times on ``device``, and once with the reference on the CPU in float64.
+    """Compare three renderings on ``device`` with one of the reference, on the CPU in float64.
 
-    Takes about a tenth of a second, nearly all of it for the reference. Raises what the rasterizer raises.
+    This takes about a tenth of a second, nearly all of it for the reference. Errors of the rasterizer are not
+    caught.
     """
     scene = make_scene()
     images, gradients = _render(rasterizer, scene, device, torch.float32)
@@ -89,7 +93,7 @@ def self_test(rasterizer: Rasterizer, device: torch.device) -> Agreement:
         for first, second in zip((images, gradients), again, strict=True)
         for name in first
     )
-    # By kernels of its own, which nobody else calls.
+    # Separate kernels compute absgrad, so it needs a third rendering.
     gradients["absgrad"] = _render(rasterizer, scene, device, torch.float32, absgrad=True)[1]["absgrad"]
     return Agreement(
         images={name: _deviation(images[name], want) for name, want in want_images.items()},
@@ -99,9 +103,10 @@ def self_test(rasterizer: Rasterizer, device: torch.device) -> Agreement:
 
 
 def make_scene() -> Scene:
-    """The same scene on every machine: Python promises the numbers of its generator, torch does not.
+    """Return a scene that is the same on every machine.
 
-    Thin and thick, faint and opaque, on the screen, across its border, beside it and behind the camera.
+    Python guarantees the numbers of its random generator, torch does not. The Gaussians are thin and thick,
+    faint and opaque, and on the screen, across its border, beside it and behind the camera.
     """
     draw = Random(SEED).random
 
@@ -131,7 +136,7 @@ def make_scene() -> Scene:
 def _render(
     rasterizer: Rasterizer, scene: Scene, device: torch.device, dtype: torch.dtype, absgrad: bool = False
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """What is seen, and the gradients of the weighted sum of the images and ``means2d``; on the CPU."""
+    """Return the rendered tensors and the gradients of the weighted sum of the images, on the CPU."""
     leaves = scene.gaussians.map(lambda tensor: tensor.to(device, dtype, copy=True).requires_grad_())
     background = scene.background.to(device, dtype)
     with torch.enable_grad():
@@ -153,12 +158,13 @@ def _seen(output: RenderOutput) -> dict[str, Tensor]:
 
 
 def _on_cpu(tensors: Mapping[str, Tensor | None]) -> dict[str, Tensor]:
-    missing = torch.tensor(math.nan)  # no gradient at all is as wrong as one that is not a number
+    # A missing gradient counts as a gradient of NaN.
+    missing = torch.tensor(math.nan)
     return {name: (missing if tensor is None else tensor.detach()).cpu() for name, tensor in tensors.items()}
 
 
 def _deviation(got: Tensor, want: Tensor) -> float:
-    """Largest difference, relative to the largest number; infinite if anything is not finite."""
+    """Return the largest difference, relative to the largest number; infinite if a number is not finite."""
     if got.shape != want.shape or not got.isfinite().all():
         return math.inf
     return float((got - want).abs().max() / want.abs().max())

@@ -1,18 +1,44 @@
-"""Report: the page of a run, the page of a sweep, and the charts, tables and verdicts they show."""
+"""Report: the page of a run and the page of a sweep, with their charts, figures, tables and verdicts.
 
+The functions here import what they need when they are called: matplotlib, SciPy and Jinja2 take about a
+second to load, and a command that writes no report should not wait for them.
+"""
+
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
+
+from cadam3d.core.chart import Chart
+
+
+def write_report(
+    folder: Path,
+    *,
+    summary: Mapping[str, Any],
+    metrics: Sequence[Mapping[str, Any]],
+    config_text: str,
+    charts: Sequence[Chart] = (),
+) -> Path:
+    """Write ``report.html`` and ``charts.json`` of the run in ``folder`` and return the path of the page.
+
+    ``summary`` is the content of ``summary.json``, ``metrics`` the lines of ``metrics.jsonl``, and ``charts``
+    the declarations of the run's densifier and objective.
+    """
+    from cadam3d.report.run_page import write
+
+    return write(folder, summary=summary, metrics=metrics, config_text=config_text, charts=charts)
 
 
 def write_sweep(folder: Path) -> Path:
     """Write ``report.html`` and ``figures/`` of the sweep in ``folder`` and return the path of the page."""
-    from cadam3d.report.sweep import write  # loads matplotlib and scipy
+    from cadam3d.report.sweep_page import write
 
     return write(folder)
 
 
 def verdict(folder: Path) -> list[str]:
     """Return the sentences that open the page of the sweep in ``folder``; empty if nothing is comparable."""
-    from cadam3d.report.rows import read
-    from cadam3d.report.words import headline
+    from cadam3d.report.results import read
+    from cadam3d.report.verdicts import headline
 
     return headline(read(folder))

@@ -1,7 +1,8 @@
-"""Claims: what rows say about settings, within cells first, then over cells. Pure functions of rows.
+"""Claims: what the results of a sweep say about settings, first within cells, then over all cells.
 
-Medians run over cells. An interval comes from a bootstrap that draws prompts with all their cells, because
-the seeds, noise levels and objectives of one prompt are no independent witnesses; a sign test counts prompts.
+All functions are pure. Medians run over cells. An interval comes from a bootstrap that draws prompts with
+all their cells, because the seeds, noise levels and objectives of one prompt are not independent samples. The
+sign test counts prompts.
 """
 
 import math
@@ -13,43 +14,43 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import binomtest
 
-from cadam3d.report.rows import NOISE, PROMPT, SEED, Cell, Row, Setting, measured
+from cadam3d.report.results import NOISE, PROMPT, SEED, ArmSetting, Cell, JobResult, measured
 
-NO_GROWTH = "none"  # the arm that gains are counted from
+NO_GROWTH = "none"  # the arm that gains are measured from
 RESAMPLES = 2000
 CONFIDENCE = 0.95
-BOOTSTRAP_SEED = 0  # same rows, same interval
-# Prompts: with 4 a bootstrap of the median covers 85 % only, and 5 prove nothing by signs.
+BOOTSTRAP_SEED = 0  # the same results give the same interval
+# Prompts. With 4 a bootstrap of the median covers the truth in only 85 %, and 5 cannot pass a sign test.
 LEAST_FOR_INTERVAL = 6
 SIGNIFICANT = 1 - CONFIDENCE  # of the sign test
 
 
 @dataclass(frozen=True)
 class Quality:
-    """A number by which assets are judged: more is better."""
+    """A measure of quality; more is better."""
 
     name: str
-    unit: str  # empty: none
+    unit: str  # empty if there is none
     digits: int  # after the point, in tables
-    of: Callable[[Row], float | None]
+    of: Callable[[JobResult], float | None]
 
     @property
     def axis(self) -> str:
-        """Its name with its unit."""
+        """Return the label of an axis: the name with its unit."""
         return self.with_unit(self.name)
 
     @property
     def gain(self) -> str:
-        """What its difference to the job without growth is called, with its unit."""
+        """Return the label of the difference to the job without growth, with its unit."""
         return self.with_unit(f"{self.name} gained by growth")
 
     def with_unit(self, words: str) -> str:
-        """``words`` and the unit, if there is one."""
+        """Return ``words`` followed by the unit, if there is one."""
         return f"{words} ({self.unit})" if self.unit else words
 
 
-PSNR = Quality("PSNR", "dB", 2, lambda row: row.psnr)
-SSIM = Quality("SSIM", "", 4, lambda row: row.ssim)
+PSNR = Quality("PSNR", "dB", 2, lambda result: result.psnr)
+SSIM = Quality("SSIM", "", 4, lambda result: result.ssim)
 
 
 @dataclass(frozen=True)
@@ -62,14 +63,14 @@ class Spread:
 
     @classmethod
     def of(cls, values: Iterable[float]) -> "Spread":
-        """Of at least one value."""
+        """Return the spread of at least one value."""
         low, median, high = np.quantile(np.fromiter(values, dtype=float), (0.25, 0.5, 0.75))
         return cls(float(low), float(median), float(high))
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A median over cells and how sure it is."""
+    """A median over cells and its uncertainty."""
 
     median: float
     low: float | None  # ends of the 95 % bootstrap interval; None with fewer than LEAST_FOR_INTERVAL prompts
@@ -80,7 +81,7 @@ class Estimate:
 
     @classmethod
     def of(cls, values: Mapping[Cell, float]) -> "Estimate":
-        """Of one value per cell, at least one."""
+        """Return the estimate from one value per cell, of which there must be at least one."""
         groups = list(_grouped(values, lambda cell: cell[PROMPT]).values())
         low, high = _bootstrap(groups) if len(groups) >= LEAST_FOR_INTERVAL else (None, None)
         middles = [float(np.median(group)) for group in groups]
@@ -90,7 +91,7 @@ class Estimate:
 
     @property
     def is_certain(self) -> bool:
-        """Whether the interval excludes 0 and the sign test agrees; without either nothing is certain."""
+        """Whether the interval excludes 0 and the sign test agrees; False if either is missing."""
         if self.low is None or self.high is None or self.p_value is None:
             return False
         return (self.low > 0 or self.high < 0) and self.p_value < SIGNIFICANT
@@ -98,75 +99,75 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Pair:
-    """Ours and theirs in one cell."""
+    """The results of two settings in one cell."""
 
     cell: Cell
-    ours: Row
-    theirs: Row
+    ours: JobResult
+    theirs: JobResult
 
     @property
     def reduction(self) -> float:
-        """``1 - N_ours / N_theirs``: 0.9 means that nine in ten Gaussians are gone."""
+        """Return ``1 - N_ours / N_theirs``; 0.9 means that a tenth of the Gaussians remain."""
         assert self.ours.count is not None
         assert self.theirs.count
         return 1 - self.ours.count / self.theirs.count
 
     @property
     def psnr(self) -> float:
-        """PSNR of ours less that of theirs, dB."""
+        """Return our PSNR minus theirs, in dB."""
         assert self.ours.psnr is not None
         assert self.theirs.psnr is not None
         return self.ours.psnr - self.theirs.psnr
 
     @property
     def ssim(self) -> float | None:
-        """SSIM of ours less that of theirs."""
+        """Return our SSIM minus theirs; ``None`` if either is unknown."""
         if self.ours.ssim is None or self.theirs.ssim is None:
             return None
         return self.ours.ssim - self.theirs.ssim
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """Two settings over all cells that have both."""
+class PairedComparison:
+    """Two settings, compared over all cells that have both."""
 
-    ours: Setting
-    theirs: Setting
+    ours: ArmSetting
+    theirs: ArmSetting
     pairs: list[Pair]
-    only_ours: int  # cells in which theirs left nothing to measure: failed, vanished, not done, never planned
+    # Cells in which theirs left nothing to measure: it failed, vanished, is not done or was never planned.
+    only_ours: int
     only_theirs: int
     reduction: Spread
     psnr: Spread
     ssim: Spread | None
-    reduction_over_seeds: float | None  # standard deviation over seeds, averaged; None without two seeds
-    psnr_over_seeds: float | None
+    psnr_over_seeds: float | None  # standard deviation over seeds, averaged; None without two seeds
     early: int  # cells in which ours stopped before its last step
     theirs_early: int
 
     @property
     def cells(self) -> int:
-        """How many cells were compared."""
+        """Return the number of cells that were compared."""
         return len(self.pairs)
 
     @property
     def unpaired(self) -> int:
-        """Cells in which only one of the two left something to measure."""
+        """Return the number of cells in which only one of the two left something to measure."""
         return self.only_ours + self.only_theirs
 
     def comparable(self, loss: float) -> int:
-        """In how many cells ours has lost no more than ``loss``, dB of PSNR."""
+        """Return the number of cells in which ours is at most ``loss`` dB of PSNR below theirs."""
         return sum(pair.psnr >= -loss for pair in self.pairs)
 
 
-def compare(rows: Sequence[Row], ours: Setting, theirs: Setting) -> Comparison | None:
-    """How ``ours`` stands against ``theirs``; ``None`` if no cell has both."""
-    of_ours, of_theirs = by_cell(rows, ours), by_cell(rows, theirs)
+def compare(results: Sequence[JobResult], ours: ArmSetting, theirs: ArmSetting) -> PairedComparison | None:
+    """Compare two settings cell by cell; ``None`` if no cell has both."""
+    of_ours, of_theirs = by_cell(results, ours), by_cell(results, theirs)
     both = sorted(of_ours.keys() & of_theirs.keys())
     pairs = [Pair(cell, of_ours[cell], of_theirs[cell]) for cell in both]
     if not pairs:
         return None
     ssims = [pair.ssim for pair in pairs if pair.ssim is not None]
-    return Comparison(
+    return PairedComparison(
         ours=ours,
         theirs=theirs,
         pairs=pairs,
@@ -175,7 +176,6 @@ def compare(rows: Sequence[Row], ours: Setting, theirs: Setting) -> Comparison |
         reduction=Spread.of(pair.reduction for pair in pairs),
         psnr=Spread.of(pair.psnr for pair in pairs),
         ssim=Spread.of(ssims) if ssims else None,
-        reduction_over_seeds=over_seeds({pair.cell: pair.reduction for pair in pairs}),
         psnr_over_seeds=over_seeds({pair.cell: pair.psnr for pair in pairs}),
         early=sum(pair.ours.ended_early for pair in pairs),
         theirs_early=sum(pair.theirs.ended_early for pair in pairs),
@@ -186,41 +186,44 @@ def compare(rows: Sequence[Row], ours: Setting, theirs: Setting) -> Comparison |
 class FrontierPoint:
     """One setting over all its cells."""
 
-    setting: Setting
+    setting: ArmSetting
     is_standard: bool
     cells: int
-    early: int  # of them, stopped before the last step
+    early: int  # cells whose job stopped before its last step
     count: Spread
-    left_out: int  # cells that have no job without growth, or whose quality nobody measured
-    gain: Spread  # quality over the cell's job without growth; plain quality where the sweep has none
+    left_out: int  # cells without a job without growth, or without a measured quality
+    gain: Spread  # quality minus that of the job without growth; plain quality if the sweep has none
     count_over_seeds: float | None  # standard deviation of log10 count
     gain_over_seeds: float | None
 
 
 def frontier(
-    rows: Sequence[Row], arm: str, zero: Sequence[Row] | None = None, quality: Quality = PSNR
+    results: Sequence[JobResult],
+    arm: str,
+    reference: Sequence[JobResult] | None = None,
+    quality: Quality = PSNR,
 ) -> list[FrontierPoint]:
-    """The settings of ``arm``, those with fewest Gaussians first.
+    """Return the settings of ``arm``, those with fewest Gaussians first.
 
-    ``rows`` are those of one noise level. Gains are counted from the jobs without growth among ``zero``
-    (``rows`` itself, or another level); cells that have no such job are left out, and counted. Without any:
-    plain quality.
+    ``results`` are those of one noise level. Gains are measured from the jobs without growth in
+    ``reference``, which is ``results`` itself by default and may be another level. Cells without such a job
+    are left out and counted. If there is no such job at all, the gain is the plain quality.
     """
-    gain = gain_over(rows if zero is None else zero, quality)
+    gain = gain_over(results if reference is None else reference, quality)
     points = []
-    for setting in settings_of(rows, arm):
-        members = by_cell(rows, setting)
-        cells = {cell: row for cell, row in members.items() if math.isfinite(gain(row))}
+    for setting in settings_of(results, arm):
+        members = by_cell(results, setting)
+        cells = {cell: result for cell, result in members.items() if math.isfinite(gain(result))}
         if not cells:
             continue
-        counts = {cell: _count(row) for cell, row in cells.items()}
-        gains = {cell: gain(row) for cell, row in cells.items()}
+        counts = {cell: _count(result) for cell, result in cells.items()}
+        gains = {cell: gain(result) for cell, result in cells.items()}
         points.append(
             FrontierPoint(
                 setting=setting,
-                is_standard=any(row.is_standard for row in cells.values()),
+                is_standard=any(result.is_standard for result in cells.values()),
                 cells=len(cells),
-                early=sum(row.ended_early for row in cells.values()),
+                early=sum(result.ended_early for result in cells.values()),
                 left_out=len(members) - len(cells),
                 count=Spread.of(counts.values()),
                 gain=Spread.of(gains.values()),
@@ -231,37 +234,42 @@ def frontier(
     return sorted(points, key=lambda point: point.count.median)
 
 
-def has_no_growth(rows: Sequence[Row]) -> bool:
-    """Whether there is a job without growth, so that gains exist."""
-    return any(row.arm == NO_GROWTH for row in measured(rows))
+def has_no_growth(results: Sequence[JobResult]) -> bool:
+    """Whether there is a job without growth, from which gains can be measured."""
+    return any(result.arm == NO_GROWTH for result in measured(results))
 
 
-def gain_over(zero: Sequence[Row], quality: Quality = PSNR) -> Callable[[Row], float]:
-    """Quality over that of the same prompt and seed without growth in ``zero``; NaN where it has none.
+def gain_over(reference: Sequence[JobResult], quality: Quality = PSNR) -> Callable[[JobResult], float]:
+    """Return a function: the quality of a result minus that of its job without growth in ``reference``.
 
-    Plain quality if ``zero`` has no job without growth at all; NaN where nobody measured it.
+    The job without growth has the same prompt and seed. The function returns NaN where that job or the
+    quality is missing, and plain quality if ``reference`` holds no job without growth at all.
     """
 
-    def measured_of(row: Row) -> float:
-        value = quality.of(row)
+    def measured_of(result: JobResult) -> float:
+        value = quality.of(result)
         return math.nan if value is None else value
 
-    if not has_no_growth(zero):
+    if not has_no_growth(reference):
         return measured_of
-    levels = {row.cell.without(NOISE): measured_of(row) for row in measured(zero) if row.arm == NO_GROWTH}
-    return lambda row: measured_of(row) - levels.get(row.cell.without(NOISE), math.nan)
+    levels = {
+        result.cell.without(NOISE): measured_of(result)
+        for result in measured(reference)
+        if result.arm == NO_GROWTH
+    }
+    return lambda result: measured_of(result) - levels.get(result.cell.without(NOISE), math.nan)
 
 
 class Hull:
     """The best that an arm can do in one cell: the upper concave hull of PSNR over log count.
 
-    Straight lines between settings, in log count; where more Gaussians only hurt, the hull stays level, for
-    the arm could stop growing. It ends at the settings with fewest and most Gaussians; nothing is
+    The hull is straight between settings, in log count. Where more Gaussians only hurt it stays level,
+    because the arm could stop growing. It ends at the settings with fewest and most Gaussians; nothing is
     extrapolated.
     """
 
     def __init__(self, points: Iterable[tuple[float, float]]) -> None:
-        """``points``: count (> 0) and PSNR of each setting, at least one."""
+        """Build the hull of ``points``: count (> 0) and PSNR of each setting, at least one."""
         best: dict[float, float] = {}
         for count, psnr in points:
             best[math.log10(count)] = max(psnr, best.get(math.log10(count), -math.inf))
@@ -275,14 +283,14 @@ class Hull:
         self.corners = corners  # log10 count and PSNR, both rising
 
     def psnr_at(self, count: float) -> float | None:
-        """PSNR at ``count`` Gaussians; ``None`` outside the arm's range."""
+        """Return the PSNR at ``count`` Gaussians; ``None`` outside the range of the arm."""
         x = math.log10(count)
         if not self.corners[0][0] - 1e-12 <= x <= self.corners[-1][0] + 1e-12:
             return None
         return float(np.interp(x, [x for x, _ in self.corners], [y for _, y in self.corners]))
 
     def count_for(self, psnr: float) -> float | None:
-        """The fewest Gaussians with this PSNR; infinity: never reached, ``None``: always exceeded."""
+        """Return the fewest Gaussians with this PSNR; infinity: never reached, ``None``: always exceeded."""
         if psnr < self.corners[0][1]:
             return None
         if psnr > self.corners[-1][1]:
@@ -295,45 +303,45 @@ class Hull:
         return 10 ** self.corners[-1][0]
 
     def reaches_below(self, count: float) -> bool:
-        """Whether the arm has a setting with fewer Gaussians than this."""
+        """Whether the arm has a setting with fewer than ``count`` Gaussians."""
         return self.corners[0][0] < math.log10(count)
 
 
 def _turns_left(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
-    """Whether ``b`` lies on or below the line from ``a`` to ``c``."""
+    """Whether ``b`` is on or below the line from ``a`` to ``c``."""
     return (b[0] - a[0]) * (c[1] - a[1]) >= (c[0] - a[0]) * (b[1] - a[1])
 
 
 @dataclass(frozen=True)
 class Standing:
-    """One setting against the whole frontier of another arm, cell by cell."""
+    """One setting compared with the whole frontier of another arm, cell by cell."""
 
-    setting: Setting
-    arm: str  # whose frontier
-    settings: int  # on that frontier, at most, in one cell
+    setting: ArmSetting
+    arm: str  # the arm of the frontier
+    settings: int  # most settings that the arm has in one cell
     unpaired: int  # cells in which only the setting or only the arm left something to measure
     psnr: Estimate | None  # dB above the frontier at equal count; None if no cell has an equal count
     psnr_over_seeds: float | None  # its standard deviation over seeds, averaged; None without two seeds
-    above: int  # cells, of those in psnr, in which the setting lies above
-    fewer: int  # cells with fewer Gaussians than any setting of the arm
-    more: int  # cells with more
+    above: int  # those cells of psnr in which the setting is above the frontier
+    fewer: int  # cells in which it has fewer Gaussians than any setting of the arm
+    more: int  # cells in which it has more than any
     count_ratio: float | None  # median of (count the arm needs for the same PSNR) / (count of the setting)
     never: int  # cells in which no setting of the arm reaches that PSNR; they count as an infinite ratio
     always: int  # cells in which every setting of the arm exceeds it; they count as a ratio of 0
 
 
-def stand(rows: Sequence[Row], setting: Setting, arm: str) -> Standing | None:
-    """Where ``setting`` lies against the best of ``arm`` in the same cells; ``None`` if no cell has both."""
-    hulls = {cell: (Hull(points), len(points)) for cell, points in _points_by_cell(rows, arm).items()}
-    ours = by_cell(rows, setting)
-    shared = {cell: row for cell, row in ours.items() if cell in hulls}
+def standing_of(results: Sequence[JobResult], setting: ArmSetting, arm: str) -> Standing | None:
+    """Compare ``setting`` with the best of ``arm`` in the same cells; ``None`` if no cell has both."""
+    hulls = {cell: (Hull(points), len(points)) for cell, points in _points_by_cell(results, arm).items()}
+    ours = by_cell(results, setting)
+    shared = {cell: result for cell, result in ours.items() if cell in hulls}
     if not shared:
         return None
     differences: dict[Cell, float] = {}
     ratios: list[float] = []
     fewer = more = always = 0
-    for cell, row in shared.items():
-        hull, count, psnr = hulls[cell][0], _count(row), _psnr(row)
+    for cell, result in shared.items():
+        hull, count, psnr = hulls[cell][0], _count(result), _psnr(result)
         at_equal_count = hull.psnr_at(count)
         if at_equal_count is not None:
             differences[cell] = psnr - at_equal_count
@@ -361,32 +369,37 @@ def stand(rows: Sequence[Row], setting: Setting, arm: str) -> Standing | None:
     )
 
 
-def standings(rows: Sequence[Row], arm: str, other: str) -> list[Standing]:
-    """Every setting of ``arm`` against the frontier of ``other``."""
-    found = [stand(rows, setting, other) for setting in settings_of(rows, arm)]
+def standings(results: Sequence[JobResult], arm: str, other: str) -> list[Standing]:
+    """Compare every setting of ``arm`` with the frontier of ``other``."""
+    found = [standing_of(results, setting, other) for setting in settings_of(results, arm)]
     return [standing for standing in found if standing is not None]
 
 
-def settings_of(rows: Iterable[Row], arm: str) -> list[Setting]:
-    """The settings of an arm that left something to measure."""
-    return sorted({row.setting for row in measured(rows) if row.arm == arm}, key=lambda each: each.order)
+def settings_of(results: Iterable[JobResult], arm: str) -> list[ArmSetting]:
+    """Return the settings of an arm that left something to measure."""
+    return sorted(
+        {result.setting for result in measured(results) if result.arm == arm}, key=lambda each: each.order
+    )
 
 
-def standard(rows: Iterable[Row], arm: str) -> Setting | None:
-    """The setting of ``arm`` with the shipped thresholds, else its only one, else ``None``."""
-    rows = [row for row in measured(rows) if row.arm == arm]
-    shipped = {row.setting for row in rows if row.is_standard}
-    candidates = shipped or {row.setting for row in rows}
+def standard_setting(results: Iterable[JobResult], arm: str) -> ArmSetting | None:
+    """Return the setting of ``arm`` with the shipped thresholds, or its only one, or else ``None``."""
+    results = [result for result in measured(results) if result.arm == arm]
+    shipped = {result.setting for result in results if result.is_standard}
+    candidates = shipped or {result.setting for result in results}
     return candidates.pop() if len(candidates) == 1 else None
 
 
-def by_cell(rows: Iterable[Row], setting: Setting) -> dict[Cell, Row]:
-    """The measured row of a setting in each cell; of two, the one that came last."""
-    return {row.cell: row for row in measured(rows) if row.setting == setting}
+def by_cell(results: Iterable[JobResult], setting: ArmSetting) -> dict[Cell, JobResult]:
+    """Return the measured result of a setting in each cell; of two in one cell the later one."""
+    return {result.cell: result for result in measured(results) if result.setting == setting}
 
 
 def over_seeds(values: Mapping[Cell, float]) -> float | None:
-    """Standard deviation over the seeds of cells that are one otherwise, averaged; ``None`` without two."""
+    """Return the standard deviation over seeds, averaged over cells that differ in nothing else.
+
+    ``None`` if no such group has two seeds.
+    """
     groups = [group for group in _grouped(values, lambda cell: cell.without(SEED)).values() if len(group) > 1]
     return float(np.mean([np.std(group, ddof=1) for group in groups])) if groups else None
 
@@ -394,36 +407,37 @@ def over_seeds(values: Mapping[Cell, float]) -> float | None:
 def _grouped(
     values: Mapping[Cell, float], group_of: Callable[[Cell], Hashable]
 ) -> dict[Hashable, list[float]]:
-    """The values of the cells of each group."""
+    """Return the values of the cells of each group."""
     groups: dict[Hashable, list[float]] = defaultdict(list)
-    for cell, value in sorted(values.items()):  # in an order of their own: same rows, same bootstrap
+    for cell, value in sorted(values.items()):  # a fixed order, so that the bootstrap is reproducible
         groups[group_of(cell)].append(value)
     return dict(groups)
 
 
 def _bootstrap(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
-    """The interval of the median of all values when whole groups are drawn."""
+    """Return the interval of the median of all values when whole groups are drawn."""
     padded = np.full((len(groups), max(map(len, groups))), np.nan)
-    for row, group in zip(padded, groups, strict=True):
-        row[: len(group)] = group
+    for line, group in zip(padded, groups, strict=True):
+        line[: len(group)] = group
     draws = np.random.default_rng(BOOTSTRAP_SEED).integers(len(groups), size=(RESAMPLES, len(groups)))
     medians = np.nanmedian(padded[draws].reshape(RESAMPLES, -1), axis=1)
     low, high = np.quantile(medians, ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
     return float(low), float(high)
 
 
-def _points_by_cell(rows: Iterable[Row], arm: str) -> dict[Cell, list[tuple[float, float]]]:
+def _points_by_cell(results: Iterable[JobResult], arm: str) -> dict[Cell, list[tuple[float, float]]]:
     points: dict[Cell, list[tuple[float, float]]] = defaultdict(list)
-    for row in measured(rows):
-        if row.arm == arm:
-            points[row.cell].append((_count(row), _psnr(row)))
+    for result in measured(results):
+        if result.arm == arm:
+            points[result.cell].append((_count(result), _psnr(result)))
     return dict(points)
 
 
 def _middle_ratio(ratios: Sequence[float]) -> float | None:
-    """The median of ratios of which 0 and infinity stand for "less" and "more than there are settings for".
+    """Return the median of ratios; 0 and infinity stand for ratios below and above what the settings cover.
 
-    The mean of the two in the middle if both are known, else the lower of them: in doubt for the other arm.
+    Of an even number it is the mean of the two in the middle if both are known. Otherwise it is the lower
+    one, which is in favour of the other arm.
     """
     if not ratios:
         return None
@@ -432,11 +446,11 @@ def _middle_ratio(ratios: Sequence[float]) -> float | None:
     return (low + high) / 2 if low > 0 and high < math.inf else low
 
 
-def _count(row: Row) -> float:
-    assert row.count
-    return row.count
+def _count(result: JobResult) -> float:
+    assert result.count
+    return result.count
 
 
-def _psnr(row: Row) -> float:
-    assert row.psnr is not None
-    return row.psnr
+def _psnr(result: JobResult) -> float:
+    assert result.psnr is not None
+    return result.psnr

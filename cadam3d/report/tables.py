@@ -1,34 +1,39 @@
-"""Tables of a sweep: lists of plain rows, written as CSV and as HTML."""
+"""Tables of a sweep as lists of plain lines, written as CSV and shown on its page."""
 
 import csv
 import math
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from cadam3d.io.atomic import replacing
-from cadam3d.report.claims import SSIM, by_cell, compare, frontier, has_no_growth, standard, standings
-from cadam3d.report.figures import arms_of, levels_of
-from cadam3d.report.page import show
-from cadam3d.report.rows import GUIDANCE, Row, at_noise, measured
-from cadam3d.report.words import OURS, THEIRS
+from cadam3d.report.claims import (
+    SSIM,
+    by_cell,
+    compare,
+    frontier,
+    has_no_growth,
+    standard_setting,
+    standings,
+)
+from cadam3d.report.results import GUIDANCE, JobResult, arms_of, at_noise, levels_of, measured
+from cadam3d.report.verdicts import OURS, THEIRS
 
 Line = dict[str, Any]
-NO_RATIO: dict[float | None, str] = {math.inf: "never", 0.0: "always"}  # reaches the quality; exceeds it
+# Infinite: the other arm never reaches the quality; 0: it always exceeds it.
+NO_RATIO: dict[float | None, str] = {math.inf: "never", 0.0: "always"}
 
 
-def objectives_table(rows: Sequence[Row]) -> list[Line]:
-    """Each arm's standard setting by objective and noise: the paper's table 1, medians over cells."""
+def objectives_table(results: Sequence[JobResult]) -> list[Line]:
+    """Return the standard setting of each arm by objective and noise, medians over cells (paper table 1)."""
     lines = []
-    for objective in sorted({row.cell[GUIDANCE] for row in measured(rows)}):
-        of_objective = [row for row in rows if row.cell[GUIDANCE] == objective]
+    for objective in sorted({result.cell[GUIDANCE] for result in measured(results)}):
+        of_objective = [result for result in results if result.cell[GUIDANCE] == objective]
         for level in levels_of(of_objective):
             here = at_noise(of_objective, level)
-            theirs = standard(here, THEIRS)
+            theirs = standard_setting(here, THEIRS)
             for arm in arms_of(here):
-                setting = standard(here, arm)
+                setting = standard_setting(here, arm)
                 if setting is None:
                     continue
                 members = list(by_cell(here, setting).values())
@@ -39,24 +44,24 @@ def objectives_table(rows: Sequence[Row]) -> list[Line]:
                         "noise": level,
                         "arm": arm,
                         "cells": len(members),
-                        "PSNR (dB)": _median([row.psnr for row in members], 2),
-                        "SSIM": _median([row.ssim for row in members], 4),
-                        "Gaussians": _median([row.count for row in members], 0),
-                        "MiB": _median([row.mib for row in members], 3),
-                        "seconds": _median([row.seconds for row in members], 1),
+                        "PSNR (dB)": _median([result.psnr for result in members], 2),
+                        "SSIM": _median([result.ssim for result in members], 4),
+                        "Gaussians": _median([result.count for result in members], 0),
+                        "MiB": _median([result.mib for result in members], 3),
+                        "seconds": _median([result.seconds for result in members], 1),
                         f"fewer than {THEIRS}": f"{pair.reduction.median:.1%}" if pair else None,
-                        "ended early": sum(row.ended_early for row in members),
+                        "ended early": sum(result.ended_early for result in members),
                         "unpaired": (pair.unpaired or None) if pair else None,
                     }
                 )
     return _without_empty(lines)
 
 
-def frontier_table(rows: Sequence[Row]) -> list[Line]:
-    """Every setting at every noise level: medians and quartiles over cells, spread over seeds."""
+def frontier_table(results: Sequence[JobResult]) -> list[Line]:
+    """Return every setting at every noise level: medians and quartiles over cells, spread over seeds."""
     lines = []
-    for level in levels_of(rows):
-        here = at_noise(rows, level)
+    for level in levels_of(results):
+        here = at_noise(results, level)
         gains = has_no_growth(here)
         quality, ssim_title = ("gain", "SSIM gain") if gains else ("PSNR", "SSIM")
         for arm in arms_of(here):
@@ -81,11 +86,11 @@ def frontier_table(rows: Sequence[Row]) -> list[Line]:
     return _without_empty(lines)
 
 
-def standings_table(rows: Sequence[Row]) -> list[Line]:
-    """Every setting of our arms against the whole frontier of the baseline, by noise level."""
+def standings_table(results: Sequence[JobResult]) -> list[Line]:
+    """Return every setting of our arms compared with the whole frontier of the baseline, by noise level."""
     lines = []
-    for level in levels_of(rows):
-        here = at_noise(rows, level)
+    for level in levels_of(results):
+        here = at_noise(results, level)
         for arm in (arm for arm in arms_of(here) if arm.startswith(OURS)):
             for each in standings(here, arm, THEIRS):
                 estimate = each.psnr
@@ -112,25 +117,25 @@ def standings_table(rows: Sequence[Row]) -> list[Line]:
     return _without_empty(lines) if any(line["dB above at equal count"] is not None for line in lines) else []
 
 
-def jobs_table(rows: Sequence[Row]) -> list[Line]:
-    """Every job, as it ended."""
+def jobs_table(results: Sequence[JobResult]) -> list[Line]:
+    """Return every job with its outcome."""
     return [
         {
-            "job": row.folder.name,
-            "setting": row.setting.name,
-            **{key: value for key, value in row.cell.axes if value},
-            "outcome": row.outcome,
-            "Gaussians": None if row.count is None else round(row.count),
-            "PSNR (dB)": _rounded(row.psnr, 2),
-            "SSIM": _rounded(row.ssim, 4),
-            "seconds": row.seconds,
+            "job": result.folder.name,
+            "setting": result.setting.name,
+            **{key: value for key, value in result.cell.axes if value},
+            "outcome": result.outcome,
+            "Gaussians": None if result.count is None else round(result.count),
+            "PSNR (dB)": _rounded(result.psnr, 2),
+            "SSIM": _rounded(result.ssim, 4),
+            "seconds": result.seconds,
         }
-        for row in rows
+        for result in results
     ]
 
 
 def write_csv(path: Path, lines: Sequence[Line]) -> None:
-    """Write a table, atomically; an empty one writes nothing."""
+    """Write a table atomically; an empty one writes no file."""
     if not lines:
         return
     columns = list(dict.fromkeys(key for line in lines for key in line))
@@ -138,39 +143,6 @@ def write_csv(path: Path, lines: Sequence[Line]) -> None:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
         writer.writerows(lines)
-
-
-def as_html(lines: Sequence[Line], links: str = "") -> str:
-    """A table; values of the column ``links`` are folders with a report.html in them. All is escaped."""
-    columns = list(dict.fromkeys(key for line in lines for key in line))
-    is_text = {key: any(isinstance(line.get(key), str) for line in lines) for key in columns}
-    digits = {key: max((_digits(line.get(key)) for line in lines), default=0) for key in columns}
-    head = "".join(f"<th{_left(is_text[key])}>{escape(key)}</th>" for key in columns)
-    body = "".join(
-        "<tr>"
-        + "".join(
-            f"<td{_left(is_text[key])}>{_cell(line.get(key), digits[key], key == links)}</td>"
-            for key in columns
-        )
-        + "</tr>"
-        for line in lines
-    )
-    return f'<div class="scroll"><table class="numbers"><tr>{head}</tr>{body}</table></div>'
-
-
-def _cell(value: Any, digits: int, is_link: bool) -> str:
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    text = escape(f"{value:,.{digits}f}" if is_number else show(value))
-    return f'<a href="{quote(str(value))}/report.html">{text}</a>' if is_link else text
-
-
-def _digits(value: Any) -> int:
-    """Decimals of a number: a column shows as many as its longest has."""
-    return len(repr(value).partition(".")[2]) if isinstance(value, float) else 0
-
-
-def _left(is_text: bool) -> str:
-    return ' class="left"' if is_text else ""
 
 
 def _median(values: Sequence[float | None], digits: int) -> float | int | None:
@@ -186,7 +158,7 @@ def _rounded(value: float | None, digits: int) -> float | None:
 
 
 def _without_empty(lines: list[Line]) -> list[Line]:
-    """Columns that say nothing anywhere are left out."""
+    """Return the lines without columns that are empty or at their default everywhere."""
     keys = dict.fromkeys(key for line in lines for key in line)
     kept = [key for key in keys if any(line.get(key) not in (None, "", "default") for line in lines)]
     return [{key: line.get(key) for key in kept} for line in lines]

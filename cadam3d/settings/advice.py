@@ -108,6 +108,9 @@ def _unknown_key(key: str, config_name: str, overrides: Sequence[str]) -> UserEr
             f"grid: grids belong to sweeps. Try: cadam3d sweep {shlex.quote('grid=' + name)} ..."
         )
     value = next((line.split("=", 1)[1] for line in overrides if line.startswith(f"{key}=")), "...")
+    if owners := _options_with(key):
+        line = f"{owners[0]} {shlex.quote(f'{key}={value}')}"
+        return UserError(f"{key}: a setting of {' and '.join(owners)}, not of the chosen option. Try: {line}")
     known = _known_keys(key, config_name, overrides)
     last = key.rpartition(".")[2].lower()
     same_name = [name for name in known if name.rpartition(".")[2].lower() == last]
@@ -120,6 +123,22 @@ def _unknown_key(key: str, config_name: str, overrides: Sequence[str]) -> UserEr
     return UserError(
         f"{key}: no such setting. Did you mean {meant}? Try: {shlex.quote(f'{suggestions[0]}={value}')}"
     )
+
+
+def _options_with(key: str) -> list[str]:
+    """Return the options (such as ``densifier=cadam_open``) of the group of ``key`` that have its setting.
+
+    Left out are options that build on another one, and those that need a value from the user.
+    """
+    group, _, name = key.partition(".")
+    owners = []
+    for file in sorted((config_dir() / group).glob("*.yaml")):
+        content = OmegaConf.to_container(OmegaConf.load(file), resolve=False)
+        if isinstance(content, dict) and "_target_" in content and name in content:
+            is_alone = not file.read_text(encoding="utf-8").startswith("# @package")
+            if is_alone and "???" not in content.values():
+                owners.append(f"{group}={file.stem}")
+    return owners
 
 
 def _known_keys(wrong: str, config_name: str, overrides: Sequence[str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Whether a backend may be timed: it must show what the reference shows, and the same bits every time."""
+"""Checks that a backend may be timed: it must agree with the reference and give the same bits every time."""
 
 from collections.abc import Iterator
 
@@ -9,23 +9,24 @@ from torch import Tensor
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.base import Rasterizer
-from cadam3d.rasterizer.cuda import Launcher
+from cadam3d.rasterizer.launcher import Launcher
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import self_test
 
-PROMISE_BITS = ("cpu", "cuda")  # backends that sum in an order of their own making
+PROMISE_BITS = ("cpu", "cuda")  # backends that promise the same bits on every run
 RUNS = 5
-SPLATS, SIZE, VIEWS = 150, 45, 2  # of the small scenes; no multiple of any tile
-CROWD = {"cpu": (500, 64), "cuda": (100_000, 256)}  # splats and pixels of what is rendered again and again
+SPLATS, SIZE, VIEWS = 150, 45, 2  # of the small scenes; the size is no multiple of a tile
+CROWD = {"cpu": (500, 64), "cuda": (100_000, 256)}  # splats and pixels of the scene for repeated runs
 
-# Relative to the largest number of each tensor. A pixel further off lies on a step of the image formation
-# model (see selftest.py), where float32 may go either way: it is left out of the loss, and there must be few.
+# Relative to the largest number of each tensor. A pixel with a larger deviation is on a step of the image
+# formation model (see selftest.py), where float32 may decide either way. Such pixels are left out of the
+# loss, and there must be few of them.
 MOST_IMAGE, MOST_GRADIENT, MOST_OUTLIERS = 1e-4, 2e-3, 0.03
 
 
 def check(name: str, rasterizer: Rasterizer, device: torch.device) -> list[str]:
-    """What is wrong with the backend, in words."""
-    if name == "gsplat":  # it caps alpha elsewhere: compared where nothing comes near the cap
+    """Return the problems of the backend, in words."""
+    if name == "gsplat":  # it caps alpha at another value, so this scene has no alpha near the cap
         return differences(rasterizer, small_scene(make_shell(SPLATS, 3, device)))
     agreement = self_test(rasterizer, device)
     troubles = [] if agreement.holds else [f"self-test: {agreement}"]
@@ -44,7 +45,7 @@ def small_scene(gaussians: Gaussians) -> Scene:
 
 
 def adversaries(device: torch.device) -> Iterator[tuple[str, Gaussians]]:
-    """Scenes that find mistakes which a benign one forgives."""
+    """Yield scenes that show mistakes which do not show in an ordinary scene."""
 
     def shell(means: float = 1.0, log_scale: Tensor | float = 0.0, opacity: float = 0.0) -> Gaussians:
         plain = make_shell(SPLATS, 3, torch.device("cpu")).detach()
@@ -70,7 +71,7 @@ def adversaries(device: torch.device) -> Iterator[tuple[str, Gaussians]]:
 
 
 def differences(rasterizer: Rasterizer, scene: Scene) -> list[str]:
-    """Where the images, or the gradients of the parameters, are not those of the reference in float64."""
+    """Return how the images and the gradients of the parameters differ from the reference in float64."""
     exact = scene.to(torch.device("cpu"), torch.float64)
     want, got = exact.render(ReferenceRasterizer()), scene.render(rasterizer)
     if not all(image.isfinite().all() for image in got):
@@ -92,18 +93,18 @@ def differences(rasterizer: Rasterizer, scene: Scene) -> list[str]:
             continue
         error = ((ours.cpu() - theirs.grad).abs().max() / theirs.grad.abs().max().clamp_min(1e-20)).item()
         if error > MOST_GRADIENT:
-            troubles.append(f"the gradient of {name} is off by {error:.1e} of its largest")
+            troubles.append(f"the gradient of {name} is wrong by {error:.1e} of its largest number")
     return troubles
 
 
 def _deviation(got: Tensor, want: Tensor) -> Tensor:
-    """[v h w]: of each pixel, relative to the largest number of the image."""
+    """Return the deviation of each pixel, relative to the largest number of the image [v h w]."""
     error = (got - want).abs() / want.abs().max().clamp_min(1e-20)
     return error.amax(dim=-1) if error.ndim == 4 else error
 
 
 def changes(rasterizer: Rasterizer, scene: Scene) -> list[str]:
-    """What is not the same to the last bit in every run."""
+    """Return the results that are not the same to the last bit in every run."""
     first: dict[str, Tensor] = {}
     changed: set[str] = set()
     for _ in range(RUNS):
@@ -118,7 +119,7 @@ def changes(rasterizer: Rasterizer, scene: Scene) -> list[str]:
 
 
 def check_long_sort(launcher: Launcher, device: torch.device, keys: int) -> list[str]:
-    """Whether the kernels sort as many keys as torch does, to the same order."""
+    """Return a problem if the kernels sort ``keys`` random keys differently than torch does."""
     generator = torch.Generator(device).manual_seed(0)
     unsorted = torch.randint(0, 2**31 - 1, (keys,), dtype=torch.int32, device=device, generator=generator)
     with launcher.on(device) as launch:

@@ -1,4 +1,4 @@
-"""gsplat behind our interface, to be timed beside ours; written from its documented ``rasterization``."""
+"""gsplat with the interface of this project, for comparisons; based on its documented ``rasterization``."""
 
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -14,21 +14,21 @@ from cadam3d.rasterizer.base import FAR, NEAR, Rasterizer
 
 
 def why_absent(device: torch.device) -> str | None:
-    """Why gsplat cannot be timed here, in words; ``None`` if it can."""
+    """Return why gsplat cannot be timed here, or ``None`` if it can."""
     if device.type != "cuda":
         return "it renders on CUDA only"
     if find_spec("gsplat") is None:
-        return "not installed. Try: pip install gsplat==1.5.3"
+        return "it is not installed. Try: pip install gsplat==1.5.3"
     try:
-        from gsplat.cuda._backend import _C  # compiled now, if it came without binaries
-    except Exception as error:  # whatever a build by an unknown toolkit raises
-        return f"it does not import here: {error}"
-    return None if _C is not None else "it found no CUDA toolkit to build itself with"
+        from gsplat.cuda._backend import _C  # compiles now if it was installed without binaries
+    except Exception as error:  # a build with an unknown toolkit may raise anything
+        return f"it cannot be imported here: {error}"
+    return None if _C is not None else "it found no CUDA toolkit to compile its kernels"
 
 
 @dataclass(frozen=True)
 class GsplatRasterizer(Rasterizer):
-    """gsplat with the settings nearest to our image formation: classic, expected depth, unpacked."""
+    """gsplat with the settings closest to our image formation: classic, expected depth, unpacked."""
 
     def render(
         self,
@@ -37,10 +37,10 @@ class GsplatRasterizer(Rasterizer):
         background: Float[Tensor, "v 3"],
         absgrad: bool = False,
     ) -> RenderOutput:
-        """See :meth:`Rasterizer.render`; activations are timed along, for ours are part of the kernels."""
+        """See :meth:`Rasterizer.render`. It includes the activations, which our kernels compute too."""
         from gsplat import rasterization
 
-        assert not absgrad, "nobody times it"
+        assert not absgrad, "it is never timed"
         images, alphas, extra = rasterization(
             gaussians.means,
             gaussians.quats,

@@ -1,4 +1,4 @@
-"""What was measured, as rows for people and as JSON for programs."""
+"""The results of the benchmark, as rows for people and as JSON for programs."""
 
 import json
 import platform
@@ -16,13 +16,13 @@ import cadam3d
 REPOSITORY = Path(__file__).parents[2]
 HEADER = (
     f"{'N':>9} {'pixels':>6} {'views':>5} {'SH':>2} {'backend':>10} {'forward':>9} {'backward':>9} "
-    f"{'both':>9} {'best':>9} {'ratio':>7} {'memory':>8}  demand"
+    f"{'both':>9} {'best':>9} {'ratio':>7} {'memory':>8}  target"
 )
 
 
 @dataclass(frozen=True)
 class Row:
-    """One backend on one scene; times in milliseconds, ``None`` if it ran out of memory."""
+    """The times of one backend on one scene, in milliseconds; ``None`` if it ran out of memory."""
 
     count: int
     size: int
@@ -33,11 +33,11 @@ class Row:
     backward_ms: float | None = None
     forward_backward_ms: float | None = None
     forward_backward_min_ms: float | None = None
-    ratio: float | None = None  # time of the first backend over this one's, forward + backward
+    ratio: float | None = None  # time of the first backend divided by this one's, forward + backward
     peak_bytes: int | None = None
     demanded_ms: float | None = None
-    demanded_ratio: float | None = None  # of gsplat's time to this one's
-    is_met: bool | None = None  # both demands; None where there is none, or nothing to hold against it
+    demanded_ratio: float | None = None  # gsplat's time divided by this one's
+    is_met: bool | None = None  # whether both targets are met; None without a target to compare with
 
     def __str__(self) -> str:
         scene = f"{self.count:>9} {self.size:>6} {self.views:>5} {self.degree:>2} {self.backend:>10}"
@@ -60,7 +60,7 @@ class Row:
 def make_rows(
     scene: tuple[int, int, int, int], timings: dict[str, Timing | None], device_name: str
 ) -> list[Row]:
-    """Rows of one scene (count, size, views, degree), in the order of ``timings``."""
+    """Return the rows of one scene (count, size, views, degree), in the order of ``timings``."""
     both = {
         name: timing.median_ms["forward_backward"] if timing else None for name, timing in timings.items()
     }
@@ -80,19 +80,19 @@ def make_rows(
 def judge(
     scene: tuple[int, int, int, int], both: dict[str, float | None], device_name: str
 ) -> tuple[float | None, float | None, bool | None]:
-    """What is demanded of ``cuda`` in ms, what as a ratio to gsplat, and whether it holds."""
+    """Return the targets of ``cuda``, in milliseconds and as a ratio to gsplat, and whether they are met."""
     count, _, views, _ = scene
     most_ms, least_ratio = demanded_ms(device_name, *scene), demanded_ratio(count, views)
     ours, gsplat = both["cuda"], both.get("gsplat")
     if gsplat is None:
-        least_ratio = None  # nobody to compare with
+        least_ratio = None
     verdicts = [ours <= most_ms] if most_ms is not None else []
     verdicts += [gsplat / ours >= least_ratio] if least_ratio is not None else []
     return most_ms, least_ratio, all(verdicts) if verdicts else None
 
 
 def show_stages(stages: list[StageTiming]) -> str:
-    """A table of the stages of one scene."""
+    """Return a table of the stages of one scene."""
     lines = [f"{'':>9} {'stage':>17} {'launches':>8} {'ms':>8} {'MB':>8} {'floor ms':>9} {'of floor':>8}"]
     for stage in stages:
         line = f"{'':>9} {stage.stage:>17} {stage.launches:>8} {stage.median_ms:>8.3f}"
@@ -116,23 +116,23 @@ class SceneStages:
 
 @dataclass
 class Report:
-    """Everything that goes into the file."""
+    """The content of the JSON file."""
 
     device: dict[str, object]
     versions: dict[str, str | None]
     commit: str | None
     settings: dict[str, object]
-    copy_bytes_per_ms: float | None = None  # read and written; what the floors of the stages rest on
+    copy_bytes_per_ms: float | None = None  # read and written; determines the floors of the stages
     rows: list[Row] = field(default_factory=list)
     stages: list[SceneStages] = field(default_factory=list)
 
     def write(self, path: Path) -> None:
-        """As JSON."""
+        """Write the report as JSON."""
         path.write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
 
 
 def start_report(device: torch.device, settings: dict[str, object]) -> Report:
-    """A report that knows where and of what it is."""
+    """Return a report without results, with the device, the versions and the settings."""
     return Report(describe(device), versions(), commit(), settings)
 
 
@@ -150,7 +150,7 @@ def describe(device: torch.device) -> dict[str, object]:
 
 
 def processor() -> str:
-    """The name of the CPU, as well as it can be known."""
+    """Return the name of the CPU, as far as the system reports it."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     found = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -175,7 +175,7 @@ def versions() -> dict[str, str | None]:
 
 
 def commit() -> str | None:
-    """The commit that is checked out, marked if files differ from it; ``None`` outside a checkout."""
+    """Return the current commit, marked if files differ from it; ``None`` outside a checkout."""
     found = _first_line("git", "-C", str(REPOSITORY), "rev-parse", "HEAD")
     changed = _first_line("git", "-C", str(REPOSITORY), "status", "--porcelain", "--untracked-files=no")
     return f"{found} with changes" if found and changed else found

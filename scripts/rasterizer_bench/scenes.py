@@ -1,4 +1,4 @@
-"""What is rendered: a bumpy shell of splats about as large as the distance to the next, seen all around."""
+"""The scene of the benchmark: a bumpy shell of splats about as large as the distance to the next one."""
 
 import math
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ RADIUS = 0.6  # world units, of the shell
 
 @dataclass(frozen=True)
 class Scene:
-    """All a backend is given, and the gradient that comes back to it; the same for every backend."""
+    """The input of a backend and the gradients of its images, which are the same for every backend."""
 
     gaussians: Gaussians  # leaves
     cameras: Cameras
@@ -23,35 +23,35 @@ class Scene:
     gradients: tuple[Tensor, Tensor, Tensor]  # of rgb, alpha and depth
 
     def render(self, rasterizer: Rasterizer) -> tuple[Tensor, Tensor, Tensor]:
-        """The three images."""
+        """Return rgb, alpha and depth."""
         output = rasterizer.render(self.gaussians, self.cameras, self.background)
         return output.rgb, output.alpha, output.depth
 
     def backward(self, images: tuple[Tensor, Tensor, Tensor]) -> None:
-        """From fixed gradients, so that no loss is timed along with the rasterizer."""
+        """Run the backward pass from fixed gradients, so that no loss is part of the time."""
         torch.autograd.backward(images, self.gradients)
 
     def without(self, pixels: Tensor) -> "Scene":
-        """The same, with no gradient from some pixels [v h w]; Gaussians are shared."""
+        """Return the scene with zero gradient at some pixels [v h w]; the Gaussians are shared."""
         keeps = ~pixels.to(self.background.device)
         rgb, alpha, depth = self.gradients
         return replace(self, gradients=(rgb * keeps[..., None], alpha * keeps, depth * keeps))
 
     def to(self, device: torch.device, dtype: torch.dtype) -> "Scene":
-        """A copy elsewhere, with leaves of its own."""
+        """Return a copy with new leaf tensors on another device and in another dtype."""
         gaussians = self.gaussians.map(lambda t: t.detach().to(device, dtype, copy=True).requires_grad_())
         rgb, alpha, depth = (gradient.to(device, dtype) for gradient in self.gradients)
         cameras = self.cameras.to(device)
         return Scene(gaussians, cameras, self.background.to(device, dtype), (rgb, alpha, depth))
 
     def forget(self) -> None:
-        """Drop the gradients, as an optimizer does before each step."""
+        """Remove the gradients, as an optimizer does before each step."""
         for tensor in self.gaussians.tensors().values():
             tensor.grad = None
 
 
 def make_shell(count: int, degree: int, device: torch.device) -> Gaussians:
-    """``count`` splats on a bumpy sphere, with colours up to ``degree``."""
+    """Return ``count`` splats on a bumpy sphere, with colours up to ``degree``."""
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> Tensor:
@@ -70,7 +70,7 @@ def make_shell(count: int, degree: int, device: torch.device) -> Gaussians:
 
 
 def make_scene(gaussians: Gaussians, size: int, views: int) -> Scene:
-    """The splats from ``views`` sides, in squares of ``size`` pixels before white."""
+    """Return a scene of the splats from ``views`` sides, in squares of ``size`` pixels on white."""
     generator, device = torch.Generator().manual_seed(1), gaussians.device
     cameras = turntable(views, elevation_deg=20.0, distance=3.0, fov_y_deg=40.0, size=size)
     gradients = [torch.randn(views, size, size, *more, generator=generator) for more in ((3,), (), ())]

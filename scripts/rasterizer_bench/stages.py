@@ -1,8 +1,8 @@
-"""Where the time of the CUDA rasterizer goes: each launch between two events, next to what its bytes need.
+"""Times the stages of the CUDA rasterizer: each launch is measured by two events and compared with a floor.
 
-The bytes are those that a stage must read and write at least once; divided by the measured speed of a plain
-copy they give a floor. It is a floor of bandwidth alone: a stage that computes much per byte, as both blends
-do, will not come near it. It also supposes that no tile closes before its list ends.
+The floor of a stage is the number of bytes that it must read and write at least once, divided by the measured
+speed of a plain copy. It considers bandwidth alone, so a stage that computes much per byte, as both blends
+do, stays far above it. It also assumes that no tile becomes opaque before the end of its list.
 """
 
 import statistics
@@ -23,9 +23,11 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.base import Rasterizer
-from cadam3d.rasterizer.cuda import Launch, Launcher, rasterize
+from cadam3d.rasterizer.cuda import rasterize
+from cadam3d.rasterizer.launcher import Launch, Launcher
 
-STAGES = {  # in order, and how the names of their kernels begin; sorts and prefix sums serve several
+# The stages in order, with the prefixes of their kernels. Sorts and prefix sums belong to several stages.
+STAGES = {
     "project": ("prepare_cameras", "project_forward"),
     "depth sort": (),
     "tile lists": ("tile_list",),
@@ -34,14 +36,14 @@ STAGES = {  # in order, and how the names of their kernels begin; sorts and pref
     "blend backward": ("blend_backward",),
     "project backward": ("project_backward", "sum_absolutes", "centre_backward"),
 }
-REST = "rest"  # what no launch of ours explains: allocation, autograd, the host, one wait for the device
+REST = "rest"  # time outside of launches: allocation, autograd, the host, one wait for the device
 WORD = 4  # bytes of a float and of an index
 SPLAT, RECORD = WORD * cuda.SPLAT, WORD * cuda.RECORD
 
 
 @dataclass(frozen=True)
 class KernelRasterizer(Rasterizer):
-    """The CUDA rasterizer on a launcher of choice."""
+    """The CUDA rasterizer with a given launcher."""
 
     launcher: Launcher
 
@@ -67,7 +69,7 @@ class Span:
 
 
 class StageClock(Launcher):
-    """Passes every launch on, and notes when it began and ended."""
+    """Passes every launch on and records when it began and ended."""
 
     def __init__(self, inner: Launcher) -> None:
         self._inner = inner
@@ -91,7 +93,7 @@ class StageClock(Launcher):
         self.spans.append(Span(kernel, stage, begin, mark()))
 
     def take(self) -> tuple[dict[str, float], dict[str, int]]:
-        """Milliseconds and launches by stage since the last call; the device must be done."""
+        """Return milliseconds and launches by stage since the last call; the device must be idle."""
         times, launches = dict.fromkeys(STAGES, 0.0), dict.fromkeys(STAGES, 0)
         for span in self.spans:
             times[span.stage] = times.get(span.stage, 0.0) + _milliseconds(span)
@@ -102,11 +104,12 @@ class StageClock(Launcher):
 
 
 def stage_of(kernel: str, before: Span | None) -> str:
-    """The stage of a launch, from the launch before it; a kernel unknown here is a stage of its own."""
+    """Return the stage of a launch, given the previous launch; an unknown kernel is a separate stage."""
     stage = before.stage if before else ""
     if kernel.startswith("sort_"):
         return "tile sort" if stage in ("tile lists", "tile sort") else "depth sort"
-    if kernel.startswith("scan_"):  # within a sort, or after one: where the slots of each splat begin
+    # A prefix sum is part of a sort, or it follows one and computes the first slot of each splat.
+    if kernel.startswith("scan_"):
         return "tile lists" if before and before.kernel == "sort_scatter" else stage
     return next((name for name, prefixes in STAGES.items() if kernel.startswith(prefixes)), kernel)
 
@@ -125,30 +128,34 @@ def _milliseconds(span: Span) -> float:
 
 @dataclass(frozen=True)
 class Load:
-    """How much there is to do in one frame."""
+    """The amount of work in one render."""
 
     gaussians: int
     coefficients: int  # of spherical harmonics
     views: int
-    visible: int  # (view, Gaussian) pairs that are seen
+    visible: int  # visible (view, Gaussian) pairs
     slots: int  # (splat, tile) pairs
     pixels: int  # of all views
     tiles: int  # of all views
 
     @property
     def pairs(self) -> int:
-        """Of a view and a Gaussian."""
+        """Return the number of (view, Gaussian) pairs."""
         return self.views * self.gaussians
 
 
 def sorted_bytes(items: int, bits: int) -> int:
-    """A pass reads keys to count, keys and values to scatter, and writes both; the first has no values."""
+    """Return the bytes of a sort.
+
+    A pass reads keys for counting, reads keys and values for scattering, and writes both. The first pass has
+    no values to read.
+    """
     passes = -(-bits // cuda.RADIX_BITS)
     return items * WORD * (5 * passes - 1)
 
 
 def stage_bytes(load: Load) -> dict[str, int]:
-    """What each stage reads and writes at least, in bytes: each number once per kernel, all views at once."""
+    """Return the least bytes that each stage reads and writes: each number once, for all views together."""
     parameters = load.gaussians * WORD * (11 + 3 * load.coefficients)
     pairs, slots, pixels = load.pairs * WORD, load.slots, load.pixels
     entry = 2 * WORD + SPLAT  # of a tile's list: slot, pair, splat
@@ -159,8 +166,9 @@ def stage_bytes(load: Load) -> dict[str, int]:
         "tile lists": 6 * pairs + load.visible * SPLAT + slots * 2 * WORD,
         "tile sort": sorted_bytes(slots, load.tiles.bit_length()) + slots * WORD + load.tiles * 2 * WORD,
         "blend forward": slots * entry + pixels * 7 * WORD,  # rgb, alpha, depth, transmittance, last
-        "blend backward": slots * (entry + RECORD) + pixels * 9 * WORD,  # those but rgb, and 5 gradients
-        # Where the slots are, and the centre's gradient; radius and the latter again; means in and out again.
+        # Alpha, depth, transmittance, last and five gradients per pixel.
+        "blend backward": slots * (entry + RECORD) + pixels * 9 * WORD,
+        # First slot, count and gradient of the centre; radius and that gradient again; means in and out.
         "project backward": 2 * parameters + slots * RECORD + 7 * pairs + load.gaussians * 6 * WORD,
     }
 
@@ -177,7 +185,7 @@ class StageTiming:
 
 
 def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: float) -> list[StageTiming]:
-    """Stage by stage, forward and backward; the last one is ``REST``."""
+    """Return the times of all stages, forward and backward; the last one is ``REST``."""
     clock, device = StageClock(launcher), scene.gaussians.device
     rasterizer, samples = KernelRasterizer(clock), []
     launches, slots = {}, 0
@@ -194,7 +202,7 @@ def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: fl
         StageTiming(
             stage,
             launches.get(stage, 0),
-            statistics.median(times[stage] for times in samples[1:]),  # the first one warms up
+            statistics.median(times[stage] for times in samples[1:]),  # without the first, which warms up
             needed.get(stage),
             needed[stage] / bytes_per_ms if stage in needed else None,
         )
@@ -218,7 +226,7 @@ def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:
 
 
 def copy_speed(device: torch.device, size: int) -> float:
-    """Bytes per millisecond, read and written together, of the fastest of some copies of ``size`` bytes."""
+    """Return the speed of the fastest of some copies of ``size`` bytes, in bytes per ms read and written."""
     source = torch.zeros(size, dtype=torch.uint8, device=device)
     target = torch.empty_like(source)
     fastest = float("inf")

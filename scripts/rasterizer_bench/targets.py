@@ -1,6 +1,7 @@
-"""What the CUDA rasterizer has to reach, decided before it ran: milliseconds, and the ratio to gsplat."""
+"""Targets of the CUDA rasterizer, set before it ran: milliseconds, and the ratio to gsplat."""
 
-# Part of a device's name, Gaussians, pixels: at most so many ms of forward + backward, 4 views, degree 0.
+# The largest accepted time of forward + backward in ms, for 4 views and degree 0. The keys are a part of the
+# device's name, and then the number of Gaussians and the size in pixels.
 MOST_MS = {
     "H200": {
         (100_000, 512): 2.0,
@@ -23,14 +24,16 @@ MOST_MS = {
         (3_400_000, 1024): 55.0,
     },
 }
-MOST_MS_SMALL = 0.5  # up to SMALL Gaussians, one view, degree 0: here it is all overhead
+# The same in ms for one view and up to SMALL Gaussians and SMALL_SIZE pixels, where overhead dominates.
+MOST_MS_SMALL = 0.5
 SMALL, SMALL_SIZE = 20_000, 512
-LEAST_RATIO = 1.8  # gsplat's time over ours, from MANY Gaussians on, 4 views
+# gsplat's time divided by ours, for 4 views and at least MANY Gaussians.
+LEAST_RATIO = 1.8
 MANY = 100_000
 
 
 def demanded_ms(device: str, count: int, size: int, views: int, degree: int) -> float | None:
-    """At most so many milliseconds of forward + backward; ``None`` where nothing was decided."""
+    """Return the largest accepted time of forward + backward in ms; ``None`` without a target."""
     known = [table for name, table in MOST_MS.items() if name in device]
     if not known or degree != 0:
         return None
@@ -40,5 +43,5 @@ def demanded_ms(device: str, count: int, size: int, views: int, degree: int) -> 
 
 
 def demanded_ratio(count: int, views: int) -> float | None:
-    """At least so many times as fast as gsplat on the same machine; ``None`` where nothing was decided."""
+    """Return the smallest accepted ratio of gsplat's time to ours; ``None`` without a target."""
     return LEAST_RATIO if count >= MANY and views == 4 else None

@@ -1,4 +1,4 @@
-"""How long the phases of a step take, and how much memory they need."""
+"""Measures the time and the memory of the phases of a step."""
 
 import statistics
 import time
@@ -15,18 +15,18 @@ OUT_OF_MEMORY = (torch.OutOfMemoryError, MemoryError)
 
 @dataclass(frozen=True)
 class Timing:
-    """Of one backend and scene, over all repetitions."""
+    """The times of one backend on one scene, over all repetitions."""
 
     median_ms: dict[str, float]  # by phase
     min_ms: dict[str, float]
-    peak_bytes: int | None  # above what the scene itself occupies; None where it cannot be measured
+    peak_bytes: int | None  # without the scene itself; None if it cannot be measured
 
 
 def take_turns(backends: dict[str, Rasterizer], scene: Scene, repeats: int) -> dict[str, Timing | None]:
-    """Time every backend; ``None`` for those that ran out of memory.
+    """Return the timing of every backend, and ``None`` for those that ran out of memory.
 
-    Backends take turns within each repetition, so whatever else the machine does hits them alike. The first,
-    uncounted round warms up, and measures memory.
+    Backends take turns within each repetition, so other load on the machine affects all of them alike. The
+    first round is not counted: it warms up and measures memory.
     """
     samples: dict[str, list[dict[str, float]]] = {name: [] for name in backends}
     peaks: dict[str, int | None] = {}
@@ -56,7 +56,10 @@ def summarize(samples: list[dict[str, float]], peak: int | None) -> Timing:
 
 
 def time_phases(rasterizer: Rasterizer, scene: Scene) -> dict[str, float]:
-    """Milliseconds of each phase; both together are timed anew, with no wait for the device in between."""
+    """Return the milliseconds of each phase.
+
+    Forward and backward together are timed separately, without waiting for the device between them.
+    """
     device = scene.gaussians.device
     scene.forget()
     start = now(device)
@@ -77,17 +80,17 @@ def time_phases(rasterizer: Rasterizer, scene: Scene) -> dict[str, float]:
 
 
 def now(device: torch.device) -> float:
-    """Seconds, once the device has done all it was asked to."""
+    """Return the time in seconds, after waiting for the device."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
 def peak_memory(rasterizer: Rasterizer, scene: Scene) -> int | None:
-    """Bytes that a forward and backward needs at its worst, gradients of the parameters included.
+    """Return the peak of bytes of forward and backward, including the gradients of the parameters.
 
-    Only what torch allocates on a CUDA device is counted to the byte. On a CPU the system sees pages, and an
-    allocator that keeps what was freed before: no honest number comes out, so there is none.
+    Torch counts its allocations on a CUDA device exactly. On a CPU the system counts pages, and the allocator
+    keeps freed memory, so the result would be unreliable and is ``None``.
     """
     device = scene.gaussians.device
     scene.forget()

@@ -1,4 +1,4 @@
-"""What callbacks leave behind in the run folder."""
+"""The files that callbacks write into the run folder."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ def train(tmp_path, callbacks, steps: int = 7, outcome: Outcome = Outcome.FINISH
     return state
 
 
-def test_checkpoints_appear_at_multiples_and_at_the_end_and_old_ones_go(tmp_path):
+def test_checkpoints_appear_at_multiples_and_at_the_end_and_old_ones_are_deleted(tmp_path):
     state = train(tmp_path, [Checkpoint(every=2, keep=2)])
     folder = tmp_path / "checkpoints"
     assert sorted(path.name for path in folder.iterdir()) == ["step_0000006.pt", "step_0000007.pt"]
@@ -59,14 +59,14 @@ def test_a_checkpoint_at_the_last_step_is_not_written_twice(tmp_path, monkeypatc
     assert written == ["step_0000002.pt", "step_0000004.pt"]
 
 
-def test_checkpoints_of_a_future_that_will_not_be_are_dropped(tmp_path):
+def test_checkpoints_of_later_steps_are_deleted(tmp_path):
     train(tmp_path, [Checkpoint(every=2, keep=9)], steps=6)
     train(tmp_path, [Checkpoint(every=3, keep=9)], steps=5)  # another run, from step 0
     names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     assert names == ["step_0000003.pt", "step_0000005.pt"]
 
 
-def test_out_of_memory_the_last_checkpoint_stands(tmp_path, monkeypatch):
+def test_after_running_out_of_memory_the_last_checkpoint_stays(tmp_path, monkeypatch):
     calls = iter(range(100))
 
     def exhausted(self, *args, real=ReferenceRasterizer.render):
@@ -80,7 +80,7 @@ def test_out_of_memory_the_last_checkpoint_stands(tmp_path, monkeypatch):
     assert names == ["step_0000002.pt", "step_0000004.pt"]
 
 
-def test_metrics_hold_one_line_per_logged_step_and_per_refinement(tmp_path):
+def test_metrics_have_one_line_per_logged_step_and_per_refinement(tmp_path):
     train(tmp_path, [Metrics(every=3)])
     lines = read_jsonl(tmp_path / "metrics.jsonl")
     assert [(line["kind"], line["step"]) for line in lines] == [
@@ -105,7 +105,7 @@ def test_metrics_hold_one_line_per_logged_step_and_per_refinement(tmp_path):
     assert {"loss", "num_gaussians", "seconds"} <= lines[0].keys()
 
 
-def test_lines_of_steps_that_will_be_done_again_are_dropped(tmp_path):
+def test_lines_of_steps_that_will_be_repeated_are_deleted(tmp_path):
     for step in (1, 2, 3):
         append_jsonl(tmp_path / "metrics.jsonl", {"kind": "step", "step": step, "old": True})
     train(tmp_path, [Metrics(every=1)], steps=2)

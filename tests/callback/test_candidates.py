@@ -1,4 +1,4 @@
-"""What the candidates callback draws and counts, and that it changes nothing."""
+"""Candidates: its pictures and counts, and that it changes nothing."""
 
 from dataclasses import replace
 
@@ -47,9 +47,9 @@ def train(folder, *, with_callback: bool):
     return state
 
 
-def test_a_run_that_is_looked_at_equals_one_that_is_not(tmp_path):
+def test_a_run_with_the_callback_equals_one_without(tmp_path):
     watched, alone = train(tmp_path, with_callback=True), train(tmp_path, with_callback=False)
-    assert len(watched.gaussians) != 30, "nothing grew: the test would say little"
+    assert len(watched.gaussians) != 30, "nothing grew, so the test would prove little"
     for name, tensor in alone.gaussians.tensors().items():
         assert torch.equal(watched.gaussians.tensors()[name], tensor), name
     for name, rows in alone.densifier.to_dict().items():
@@ -66,13 +66,13 @@ def test_pictures_come_at_multiples_and_histograms_at_every_refinement(tmp_path)
     assert {line["score"] for line in lines} >= {"snr", "drift"}
 
 
-def test_a_picture_is_a_look_and_a_mask_for_each_view(tmp_path):
+def test_a_picture_has_a_render_and_a_selection_for_each_view(tmp_path):
     train(tmp_path, with_callback=True)
     image = imageio.imread(pictures(tmp_path)[0][1])
     assert image.shape == (16, 2 * 16 * 2, 3)
 
 
-def test_the_population_is_counted_whole_in_every_histogram(tmp_path):
+def test_every_histogram_counts_the_whole_population(tmp_path):
     state = train(tmp_path, with_callback=True)
     lines = read_jsonl(tmp_path / "candidates/histograms.jsonl")
     for line in lines:
@@ -81,7 +81,7 @@ def test_the_population_is_counted_whole_in_every_histogram(tmp_path):
     assert {sum(line["counts"]) + line["without_log"] for line in first} == {state.num_initial}
 
 
-def test_what_a_killed_run_had_written_is_dropped(tmp_path):
+def test_files_of_a_killed_run_after_its_checkpoint_are_deleted(tmp_path):
     folder = tmp_path / "candidates"
     folder.mkdir()
     (folder / "step_000099.png").write_bytes(b"old")
@@ -103,11 +103,11 @@ def test_selected_gaussians_are_drawn_in_one_colour_and_the_others_in_another():
     painted = marked(gaussians, torch.tensor([True, False]))
     image = ReferenceRasterizer().render(painted, camera, torch.ones(1, 3)).rgb[0]
     columns = [int(x) for x in (16.5 + 0.5 / 3 * camera.intrinsics[0, 0, 0] * torch.tensor([-1, 1])).tolist()]
-    seen = image[16, columns]  # the camera stands on +x and looks back: +y is at its right
+    seen = image[16, columns]  # the camera is on +x and looks back, so +y is on its right
     assert torch.allclose(seen, torch.tensor([SELECTED, OTHERS]), atol=0.03)
 
 
-def test_bins_hold_what_their_edges_say():
+def test_bins_contain_the_values_between_their_edges():
     values = torch.tensor([0.0, 0.99e-2, 1.01e-2, 0.5, 0.99, 1.01, 9.9, float("inf")])
     line = histogram(values, values > 0.9, bins_per_decade=1)
     assert line == {
@@ -120,12 +120,12 @@ def test_bins_hold_what_their_edges_say():
 
 
 def test_bins_do_not_depend_on_the_data():
-    """So that histograms of two runs, or of two steps, can be added."""
+    """Histograms of two runs, or of two steps, can therefore be added."""
     generator = torch.Generator().manual_seed(0)
     values = torch.rand(500, generator=generator).double().exp()
-    nobody = torch.zeros(500, dtype=torch.bool)
-    whole = histogram(values, nobody, 10)
-    lines = [histogram(part, nobody[:250], 10) for part in values.sort().values.split(250)]
+    no_rows = torch.zeros(500, dtype=torch.bool)
+    whole = histogram(values, no_rows, 10)
+    lines = [histogram(part, no_rows[:250], 10) for part in values.sort().values.split(250)]
     total = np.zeros(60, dtype=int)
     for line in lines:
         at = line["first"] - whole["first"]
@@ -134,14 +134,14 @@ def test_bins_do_not_depend_on_the_data():
     assert total.sum() == 500
 
 
-def test_an_extreme_value_does_not_blow_a_histogram_up():
+def test_an_extreme_value_does_not_lengthen_a_histogram():
     values = torch.tensor([1e-38, 1.0, 1e38])
     line = histogram(values, torch.zeros(3, dtype=torch.bool), bins_per_decade=10)
     assert len(line["counts"]) == 180
     assert sum(line["counts"]) == 3
 
 
-def test_no_gaussian_no_bin():
+def test_without_gaussians_there_are_no_bins():
     line = histogram(torch.empty(0), torch.empty(0, dtype=torch.bool), bins_per_decade=10)
     assert line["counts"] == line["selected"] == []
 
@@ -157,6 +157,6 @@ def test_no_gaussian_no_bin():
         ("bins_per_decade", 0),
     ],
 )
-def test_settings_that_cannot_be_are_refused_by_name(key, value):
+def test_impossible_settings_are_refused_by_name(key, value):
     with pytest.raises(UserError, match=rf"callback\.candidates\.{key}"):
         Candidates(**{**CALLBACK, key: value})

@@ -1,4 +1,4 @@
-"""What the previews callback draws, and that it changes nothing."""
+"""Previews: its pictures, and that it changes nothing."""
 
 import imageio.v3 as imageio
 import numpy as np
@@ -41,7 +41,7 @@ def names(folder) -> list[str]:
     return sorted(path.name for path in (folder / "previews").glob("*"))
 
 
-def test_there_are_none_until_somebody_asks(tmp_path):
+def test_by_default_there_are_none(tmp_path):
     train(tmp_path)
     assert not (tmp_path / "previews").exists()
 
@@ -62,16 +62,16 @@ def test_a_sheet_shows_the_object_from_all_sides_in_one_row(tmp_path):
     assert not np.array_equal(views[0], views[2])
 
 
-def test_a_run_that_is_drawn_equals_one_that_is_not(tmp_path):
+def test_a_run_with_the_callback_equals_one_without(tmp_path):
     drawn, alone = train(tmp_path, "callback.previews.every=1"), train(tmp_path / "other")
-    assert len(drawn.gaussians) != 30, "nothing grew: the test would say little"
+    assert len(drawn.gaussians) != 30, "nothing grew, so the test would prove little"
     for name, tensor in alone.gaussians.tensors().items():
         assert torch.equal(drawn.gaussians.tensors()[name], tensor), name
     for name, generator in alone.generators.items():
         assert torch.equal(drawn.generators[name].get_state(), generator.get_state()), name
 
 
-def test_what_a_killed_run_had_drawn_is_dropped(tmp_path):
+def test_pictures_of_a_killed_run_after_its_checkpoint_are_deleted(tmp_path):
     (tmp_path / "previews").mkdir()
     (tmp_path / "previews/step_000099.png").write_bytes(b"old")
     train(tmp_path, "callback.previews.every=5")
@@ -90,6 +90,6 @@ def test_what_a_killed_run_had_drawn_is_dropped(tmp_path):
         ("background", [2.0, 0.0, 0.0]),
     ],
 )
-def test_settings_that_cannot_be_are_refused_by_name(key, value):
+def test_impossible_settings_are_refused_by_name(key, value):
     with pytest.raises(UserError, match=rf"callback\.previews\.{key}"):
         Previews(**{**SETTINGS, key: value})

@@ -1,4 +1,4 @@
-"""What the progress bar says: where the run is, when it will be done, and what the GPU had to hold."""
+"""The progress bar: current step, time of the end, and peak memory of the GPU."""
 
 import re
 import time
@@ -18,7 +18,7 @@ NOON = time.mktime((2026, 3, 4, 12, 0, 0, 0, 0, -1))  # local time, a Wednesday
 
 
 class Clock:
-    """Stands in for the clock of the bar and of tqdm; every look at it takes no time."""
+    """Replaces the clock of the bar and of tqdm; reading it takes no time."""
 
     def __init__(self) -> None:
         self.now = NOON
@@ -53,7 +53,7 @@ def last_line(capsys) -> str:
     return re.split(r"[\r\n]", capsys.readouterr().err.rstrip())[-1]
 
 
-def test_the_bar_says_where_it_is_and_when_it_will_be_done(at_noon, run, capsys):
+def test_the_bar_shows_the_step_and_the_time_of_the_end(at_noon, run, capsys):
     bar = Progress(refresh_seconds=0.0)
     bar.on_start(*run)
     for number in range(1, 5):
@@ -67,7 +67,7 @@ def test_the_bar_says_where_it_is_and_when_it_will_be_done(at_noon, run, capsys)
     assert "VRAM" not in line  # on a CPU there is no such number
 
 
-def test_a_resumed_run_is_judged_by_its_own_steps(at_noon, run, capsys):
+def test_a_resumed_run_is_timed_by_its_own_steps(at_noon, run, capsys):
     bar = Progress(refresh_seconds=0.0)
     run[1].step = 6
     bar.on_start(*run)
@@ -78,7 +78,7 @@ def test_a_resumed_run_is_judged_by_its_own_steps(at_noon, run, capsys):
     assert "done=12:04" in line
 
 
-def test_a_finished_run_promises_nothing(at_noon, run, capsys):
+def test_a_finished_run_shows_no_time_of_the_end(at_noon, run, capsys):
     bar = Progress(refresh_seconds=0.0)
     bar.on_start(*run)
     for number in range(1, 11):
@@ -90,7 +90,7 @@ def test_a_finished_run_promises_nothing(at_noon, run, capsys):
 
 
 def test_a_bar_that_is_switched_off_is_no_error(run, capsys, monkeypatch):
-    """As users and cluster scripts do with the environment variable TQDM_DISABLE."""
+    """Users and cluster scripts do this with the environment variable TQDM_DISABLE."""
     monkeypatch.setattr(progress, "tqdm", partial(progress.tqdm, disable=True))
     bar = Progress(refresh_seconds=0.0)
     bar.on_start(*run)
@@ -108,7 +108,7 @@ def test_the_bar_shows_the_peak_of_the_gpu(at_noon, run, capsys, monkeypatch):
     assert "VRAM=7.3GiB" in last_line(capsys)
 
 
-def test_the_peak_is_what_torch_says_of_a_cuda_device_and_nothing_of_another(monkeypatch):
+def test_the_peak_is_torch_s_number_on_a_cuda_device_and_none_elsewhere(monkeypatch):
     asked = []
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: asked.append(device) or 123)
     assert peak_memory(torch.device("cuda:1")) == 123
@@ -119,7 +119,7 @@ def test_the_peak_is_what_torch_says_of_a_cuda_device_and_nothing_of_another(mon
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_the_peak_counts_what_is_gone_again():
+def test_the_peak_counts_memory_that_is_free_again():
     device = torch.device("cuda")
     torch.cuda.reset_peak_memory_stats(device)
     block = torch.empty(2**26, dtype=torch.uint8, device=device)

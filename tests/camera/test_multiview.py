@@ -37,7 +37,7 @@ def test_views_of_a_group_share_all_but_the_azimuth():
         assert len(groups(values)[:, 0].unique()) > 90  # and groups differ
 
 
-def test_azimuths_of_a_group_lie_at_right_angles_from_a_random_start():
+def test_azimuths_of_a_group_are_at_right_angles_from_a_random_start():
     azimuth = groups(sample(8000).azimuth_deg)
     torch.testing.assert_close(azimuth - azimuth[:, :1], torch.arange(4.0).mul(90).expand(2000, 4))
     start = azimuth[:, 0]
@@ -69,7 +69,7 @@ def test_opposite_views_look_at_each_other():
 
 
 @pytest.mark.parametrize(("views", "hint"), [(1, 4), (2, 4), (5, 4), (6, 8), (7, 8), (10, 8)])
-def test_a_broken_group_is_refused_with_a_number_that_works(views, hint):
+def test_an_incomplete_group_is_refused_with_a_number_that_works(views, hint):
     for ask in (lambda: sample(views), lambda: Multiview(**PUBLISHED).check_views(views)):
         with pytest.raises(
             UserError, match=rf"^views: expected a multiple of 4.*got {views}\. Try: views={hint}$"
@@ -77,13 +77,13 @@ def test_a_broken_group_is_refused_with_a_number_that_works(views, hint):
             ask()
 
 
-def test_whole_groups_are_welcome():
+def test_whole_groups_are_accepted():
     for views in (4, 8, 12):
         Multiview(**PUBLISHED).check_views(views)
         assert len(sample(views)) == views
 
 
-def test_the_generator_decides():
+def test_results_depend_on_the_generator_alone():
     assert torch.equal(sample(4, seed=1).world_to_camera, sample(4, seed=1).world_to_camera)
     assert not torch.equal(sample(4, seed=1).world_to_camera, sample(4, seed=2).world_to_camera)
 

@@ -51,7 +51,7 @@ def test_each_stratum_of_azimuth_holds_one_view(views, seed):
     assert ((azimuth + 90) / 240 * views).floor().tolist() == list(range(views))
 
 
-def test_cameras_look_at_the_origin_and_stand_upright():
+def test_cameras_look_at_the_origin_and_are_upright():
     cameras = sample(50)
     origin, above = torch.zeros(3), torch.tensor([0.0, 0.0, 0.1])
     for point, is_above in ((origin, False), (above, True)):
@@ -62,7 +62,7 @@ def test_cameras_look_at_the_origin_and_stand_upright():
         assert ((pixels[:, 1] < 19.9) == is_above).all()
 
 
-def test_images_are_square_and_of_the_asked_size():
+def test_images_are_square_and_of_the_requested_size():
     cameras = sample(2, size=33)
     assert (cameras.height, cameras.width, len(cameras)) == (33, 33, 2)
 
@@ -86,7 +86,7 @@ def test_the_mixture_is_uniform_in_degrees_in_half_of_the_steps_and_threestudios
     assert float(torch.deg2rad(other).sin().mean()) == pytest.approx(25 / 90, abs=0.01)
 
 
-def test_the_mixture_draws_the_same_amount_whatever_the_toss():
+def test_the_mixture_draws_equally_many_numbers_in_both_cases():
     states = {}
     for seed in range(10):
         generator = torch.Generator().manual_seed(seed)
@@ -113,7 +113,7 @@ def test_a_range_may_be_one_point():
     torch.testing.assert_close(cameras.positions.norm(dim=-1), torch.full((3,), 3.0))
 
 
-def test_the_generator_decides_and_the_step_does_not():
+def test_results_depend_on_the_generator_and_not_on_the_step():
     assert torch.equal(sample(3, seed=1).world_to_camera, sample(3, seed=1, step=99).world_to_camera)
     assert not torch.equal(sample(3, seed=1).world_to_camera, sample(3, seed=2).world_to_camera)
 

@@ -58,7 +58,7 @@ def test_heads_are_seen_all_around_after_two_widenings():
 
 
 def test_polar_angles_are_what_widens_about_the_pole():
-    """Polar [60, 90] becomes [60 / 1.5, 90 * 1.5], clamped to [45, 105]: at once, as published."""
+    """Polar [60, 90] becomes [60 / 1.5, 90 * 1.5], clamped to [45, 105], in one step as published."""
     sampler = published("camera.elevation_deg.start=[0,30]")
     assert sampler.elevation_deg.at(0) == pytest.approx((0, 30))
     assert sampler.elevation_deg.at(1) == pytest.approx((-15, 45))
@@ -127,7 +127,7 @@ def test_gamma_says_how_close_to_the_middle_most_views_are(gamma):
         assert float(within_half) == pytest.approx(0.5 ** (1 / gamma), abs=0.01)
 
 
-def test_without_jitter_cameras_look_at_the_origin_and_stand_upright():
+def test_without_jitter_cameras_look_at_the_origin_and_are_upright():
     cameras = draw(changed(published(), **STILL, size=40), views=50)
     origin, above = torch.zeros(3), torch.tensor([0.0, 0.0, 0.1])
     for point, is_above in ((origin, False), (above, True)):
@@ -138,7 +138,7 @@ def test_without_jitter_cameras_look_at_the_origin_and_stand_upright():
         assert ((pixels[:, 1] < 19.99) == is_above).all()
 
 
-def test_the_named_angles_are_where_the_cameras_stand():
+def test_the_recorded_angles_are_those_of_the_positions():
     cameras = draw(changed(published(), **STILL), views=50)
     outward, _ = around(cameras.azimuth_deg, cameras.elevation_deg)
     position = cameras.positions
@@ -146,7 +146,7 @@ def test_the_named_angles_are_where_the_cameras_stand():
 
 
 def test_each_jitter_has_its_published_size():
-    """At twice LucidDreamer's numbers, since our units are half of its."""
+    """Measured at twice LucidDreamer's numbers, since our units are half of its."""
     still = draw(changed(published(), **STILL), views=20_000)
     shaken = draw(changed(published(), **{**STILL, "position_jitter": 0.05}), views=20_000)
     moved = shaken.positions - still.positions
@@ -155,7 +155,7 @@ def test_each_jitter_has_its_published_size():
 
     aimed = draw(changed(published(), **{**STILL, "target_jitter": 0.1}), views=20_000)
     forward, distance = aimed.world_to_camera[:, 2, :3], aimed.positions.norm(dim=-1, keepdim=True)
-    missed = aimed.positions + forward * distance  # where the view axis passes the origin, nearly
+    missed = aimed.positions + forward * distance  # about the point of the view axis nearest to the origin
     assert float(missed.square().sum(-1).mean().sqrt()) == pytest.approx(0.1 * 2**0.5, abs=3e-3)
 
     tilted = draw(changed(published(), **{**STILL, "up_jitter": 0.01}), views=20_000)
@@ -163,7 +163,7 @@ def test_each_jitter_has_its_published_size():
     assert float(roll.std()) == pytest.approx(0.01, abs=1e-3)
 
 
-def test_cameras_stay_rigid_whatever_shakes_them():
+def test_jittered_cameras_stay_rigid():
     rotation = draw(published("camera.up_jitter=0.5"), views=200).world_to_camera[:, :3, :3]
     torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(200, 3, 3), atol=1e-5, rtol=0)
     torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(200), atol=1e-5, rtol=0)

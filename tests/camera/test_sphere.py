@@ -40,7 +40,7 @@ def test_angles_agree_with_positions():
     torch.testing.assert_close(torch.rad2deg(torch.atan2(y, x)), cameras.azimuth_deg, atol=0.05, rtol=0)
 
 
-def test_the_generator_decides():
+def test_results_depend_on_the_generator_alone():
     assert torch.equal(sample(3, seed=1).world_to_camera, sample(3, seed=1).world_to_camera)
     assert not torch.equal(sample(3, seed=1).world_to_camera, sample(3, seed=2).world_to_camera)
 

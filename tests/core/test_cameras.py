@@ -1,4 +1,4 @@
-"""Where cameras stand, what they see where, and that every way of copying them keeps that."""
+"""Cameras: their positions, what they see where, and copies that keep both."""
 
 import math
 
@@ -23,7 +23,7 @@ def one(
 
 
 def to_pixels(cameras: Cameras, points: Tensor) -> Tensor:
-    """Pixel coordinates of world ``points`` in the first view."""
+    """Return pixel coordinates of world ``points`` in the first view."""
     in_camera = points @ cameras.world_to_camera[0, :3, :3].T + cameras.world_to_camera[0, :3, 3]
     in_image = in_camera @ cameras.intrinsics[0].T
     return in_image[:, :2] / in_image[:, 2:]
@@ -31,7 +31,7 @@ def to_pixels(cameras: Cameras, points: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("elevation", ELEVATIONS)
 @pytest.mark.parametrize("azimuth", CORNER_AZIMUTHS)
-def test_orbiting_cameras_stand_at_their_angles_and_look_at_the_origin(azimuth, elevation):
+def test_orbiting_cameras_have_their_angles_and_look_at_the_origin(azimuth, elevation):
     cameras = one(azimuth, elevation, distance=3)
     a, e = math.radians(azimuth), math.radians(elevation)
     position = numbers(math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)) * 3

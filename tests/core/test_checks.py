@@ -1,4 +1,4 @@
-"""Messages for users: which key, what was wanted, what came, what to type."""
+"""Messages for users: which key, what was expected, what came, what to type."""
 
 import math
 
@@ -15,7 +15,7 @@ from cadam3d.core.checks import (
 )
 
 
-def test_a_message_says_key_wanted_got_and_what_to_type():
+def test_a_message_has_key_expected_got_and_what_to_type():
     message = str(fail("densifier.tau_Q", expected="a number >= 0", got=-1, example="densifier.tau_Q=0.9"))
     assert message == "densifier.tau_Q: expected a number >= 0, got -1. Try: densifier.tau_Q=0.9"
 
@@ -32,7 +32,7 @@ def test_numbers_inside_pass(value):
 
 
 @pytest.mark.parametrize("value", [-1e-9, 1, 1.0, math.nan, math.inf, -math.inf, None, "0.5", True, [0.5]])
-def test_numbers_outside_and_things_that_are_no_numbers_do_not(value):
+def test_numbers_outside_and_values_that_are_not_numbers_are_refused(value):
     with pytest.raises(UserError, match=r"key: expected a number >= 0 and < 1, got .*\. Try: key=0.5"):
         require_range("key", value, low=0, below=1, example=0.5)
 
@@ -42,7 +42,7 @@ def test_a_truth_value_is_not_a_number():
         require_range("key", True, low=0, high=1, example=1)
 
 
-def test_bounds_are_closed_or_open_as_they_say():
+def test_bounds_are_closed_or_open_as_declared():
     require_range("key", 3, low=3, high=3, example=3)
     with pytest.raises(UserError, match="> 3"):
         require_range("key", 3, above=3, example=4)
@@ -72,7 +72,7 @@ def test_whole_numbers_inside_pass(value):
 
 
 @pytest.mark.parametrize("value", [1, 17, 2.0, 2.5, True, False, None, "3", [3], math.nan, math.inf])
-def test_everything_but_whole_numbers_inside_is_refused(value):
+def test_everything_except_whole_numbers_inside_is_refused(value):
     with pytest.raises(
         UserError, match=r"^key: expected a whole number >= 2 and <= 16, got .*\. Try: key=2$"
     ):
@@ -96,7 +96,7 @@ def test_a_choice_has_the_type_of_what_it_equals(value, choices):
         require_choice("key", value, choices)
 
 
-def test_a_choice_lists_what_there_is():
+def test_a_refused_choice_lists_the_options():
     require_choice("prior", "tiny", ["shapes", "tiny"])
     with pytest.raises(UserError, match=r"prior: expected one of shapes\|tiny, got 'tin'. Try: prior=shapes"):
         require_choice("prior", "tin", ["shapes", "tiny"])

@@ -18,7 +18,7 @@ class Statistics(RowState):
 
 
 def numbered(first: int, n: int) -> Gaussians:
-    """Gaussians whose every number is the row's own."""
+    """Return Gaussians with a different number in every row."""
     rows = torch.arange(first, first + n, dtype=torch.float32)
     return Gaussians(
         means=rows[:, None].repeat(1, 3),
@@ -58,7 +58,7 @@ def test_states_follow_the_same_rows_and_newborns_start_at_zero():
     assert not after.strength[2:].any()
 
 
-def test_an_edit_leaves_what_it_edits_alone():
+def test_an_edit_does_not_modify_its_arguments():
     gaussians, state = (
         numbered(0, 5),
         Statistics(strength=torch.ones(5, 3), age=torch.ones(5, dtype=torch.int64)),

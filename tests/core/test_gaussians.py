@@ -1,4 +1,4 @@
-"""Gaussians: activations, and that rows stay rows whatever is done with them."""
+"""Gaussians: activations, and operations that keep the rows of all tensors together."""
 
 import math
 
@@ -88,7 +88,7 @@ def test_concatenate_undoes_a_split():
     assert_same(concatenate([gaussians.index(slice(0, 2)), gaussians.index(slice(2, 6))]), gaussians)
 
 
-def test_no_gaussians_are_gaussians_too():
+def test_zero_gaussians_are_allowed():
     assert len(make(0)) == 0
     assert make(0).rotations.shape == (0, 3, 3)
     assert_same(concatenate([make(0), make(3)]), make(3))

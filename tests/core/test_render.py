@@ -1,4 +1,4 @@
-"""Laws of what a render output says about itself."""
+"""Laws of the disparity of a render output."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ def output(alpha: torch.Tensor, depth: torch.Tensor) -> RenderOutput:
 
 
 def scene() -> tuple[torch.Tensor, torch.Tensor]:
-    """Two views of something solid at depths 2 to 4, with a faint rim and empty corners."""
+    """Return two views of a solid object at depths 2 to 4, with a faint rim and empty corners."""
     generator = torch.Generator().manual_seed(0)
     depth = 2 + 2 * torch.rand(2, 8, 8, generator=generator)
     alpha = torch.full((2, 8, 8), 0.95)
@@ -27,7 +27,7 @@ def scene() -> tuple[torch.Tensor, torch.Tensor]:
     return alpha, depth
 
 
-def test_disparity_is_one_at_the_nearest_and_nought_at_the_farthest_and_at_the_background():
+def test_disparity_is_one_at_the_nearest_and_zero_at_the_farthest_and_at_the_background():
     alpha, depth = scene()
     seen = output(alpha, depth).disparity()
     assert seen.amin() == 0
@@ -36,7 +36,7 @@ def test_disparity_is_one_at_the_nearest_and_nought_at_the_farthest_and_at_the_b
     for view in range(2):
         solid = alpha[view] >= 0.9
         order = depth[view][solid].argsort()
-        assert (seen[view][solid][order].diff() <= 0).all()  # the nearer the brighter
+        assert (seen[view][solid][order].diff() <= 0).all()  # nearer pixels are brighter
         assert seen[view][solid].min() == 0
 
 
@@ -45,7 +45,7 @@ def test_disparity_does_not_depend_on_the_unit_of_length():
     torch.testing.assert_close(output(alpha, 7 * depth).disparity(), output(alpha, depth).disparity())
 
 
-def test_views_are_stretched_apart():
+def test_each_view_is_stretched_by_itself():
     alpha, depth = scene()
     both = output(alpha, depth).disparity()
     depth[1] *= 3

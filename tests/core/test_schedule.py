@@ -13,7 +13,7 @@ def test_a_constant_never_changes():
 
 
 @pytest.mark.parametrize("kind", [Linear, LogLinear])
-def test_ramps_start_and_end_where_they_say_and_stay_there(kind):
+def test_ramps_have_their_first_and_final_values_and_keep_the_final_one(kind):
     ramp = kind(start=1e-2, end=1e-4, steps=100, begin=20)
     assert [ramp(step) for step in (0, 20, 120, 10**6)] == pytest.approx([1e-2, 1e-2, 1e-4, 1e-4])
     values = [ramp(step) for step in range(20, 121)]
@@ -65,12 +65,12 @@ def test_numbers_and_schedules_in_range_pass(value):
 @pytest.mark.parametrize(
     "value", [-1, 2.0, True, math.nan, Linear(start=1, end=-1, steps=10), Linear(start=2, end=1, steps=10)]
 )
-def test_numbers_and_schedules_that_start_or_end_outside_do_not(value):
+def test_numbers_and_schedules_that_start_or_end_outside_are_refused(value):
     with pytest.raises(UserError, match=r"key: expected a number >= 0 and <= 1, got .*\. Try: key=0\.5"):
         require_scheduled("key", value, low=0, high=1, example=0.5)
 
 
 @pytest.mark.parametrize("value", [None, "0.5", [0.5], {"start": 1.0}])
-def test_what_is_neither_a_number_nor_a_schedule_does_not(value):
+def test_other_values_are_refused(value):
     with pytest.raises(UserError, match="key: expected a number or a schedule, got"):
         require_scheduled("key", value, low=0, example=0.5)

@@ -10,7 +10,7 @@ from cadam3d.core.sh import evaluate_sh, rgb_to_sh0, sh_basis
 
 
 def sphere(n: int = 40) -> tuple[Tensor, Tensor]:
-    """Directions and weights that integrate polynomials up to degree 40 over the sphere exactly."""
+    """Return directions and weights that integrate polynomials up to degree 40 over the sphere exactly."""
     nodes, weights = legendre(n)
     angle = torch.arange(2 * n, dtype=torch.float64) * (math.pi / n)
     z, phi = torch.meshgrid(nodes, angle, indexing="ij")
@@ -20,7 +20,7 @@ def sphere(n: int = 40) -> tuple[Tensor, Tensor]:
 
 
 def legendre(n: int) -> tuple[Tensor, Tensor]:
-    """Gauss-Legendre nodes and weights on [-1, 1] (Golub and Welsch 1969)."""
+    """Return Gauss-Legendre nodes and weights on [-1, 1] (Golub and Welsch 1969)."""
     k = torch.arange(1, n, dtype=torch.float64)
     beta = k / (4 * k * k - 1).sqrt()
     values, vectors = torch.linalg.eigh(torch.diag(beta, 1) + torch.diag(beta, -1))
@@ -114,7 +114,7 @@ def test_a_colour_below_zero_has_no_gradient():
     assert (sh.grad[0, 0] != 0).tolist() == [False, True, True]
 
 
-def test_a_colour_is_seen_as_it_was_given_from_everywhere():
+def test_a_view_independent_colour_is_the_same_from_all_sides():
     rgb = torch.rand(7, 3, dtype=torch.float64)
     directions = torch.nn.functional.normalize(torch.randn(7, 3, dtype=torch.float64), dim=-1)
     torch.testing.assert_close(evaluate_sh(rgb_to_sh0(rgb)[:, None], directions), rgb)

@@ -1,4 +1,4 @@
-"""Laws of AbsGS: the pulls of pixels that disagree count in full. The rest is in test_baseline.py."""
+"""Laws of AbsGS: pixels that pull in opposite directions count in full. The rest is in test_baseline.py."""
 
 from dataclasses import replace
 
@@ -12,13 +12,13 @@ from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.baseline import VIEWS, Baseline
 
 CPU = torch.device("cpu")
-STEP = 100  # of a call; no matter, unless a schedule asks
-LOTS = torch.Generator()  # nobody here draws any
+STEP = 100  # of a refinement; only schedules depend on it
+DRAWS = torch.Generator()  # nothing here draws from it
 SETTINGS = {"tau_pos": 0.25, "views": "sum_norm", "grad_multiplier": 1.0, "screen_px": None}
 
 
 def signal(means2d: torch.Tensor, absgrad: torch.Tensor | None, height=2, width=2) -> GradientSignal:
-    """At 2 x 2 pixels one pixel is one NDC unit."""
+    """Return a signal; at 2 x 2 pixels one pixel is one NDC unit."""
     return GradientSignal(
         means=torch.zeros(means2d.shape[1], 3),
         means2d=means2d,
@@ -33,9 +33,9 @@ def test_pulls_that_cancel_count():
     cancelled, pulls = torch.zeros(1, 2, 2), torch.tensor([[[0.3, 0.0], [0.1, 0.1]]])
     torn = signal(cancelled, pulls)
     state = AbsGrad(**SETTINGS).observe(AbsGrad(**SETTINGS).init_state(2, CPU), torn)
-    assert AbsGrad(**SETTINGS).select(state, STEP, LOTS).tolist() == [True, False]
+    assert AbsGrad(**SETTINGS).select(state, STEP, DRAWS).tolist() == [True, False]
     state = Baseline(**SETTINGS).observe(Baseline(**SETTINGS).init_state(2, CPU), torn)
-    assert not Baseline(**SETTINGS).select(state, STEP, LOTS).any()
+    assert not Baseline(**SETTINGS).select(state, STEP, DRAWS).any()
 
 
 @pytest.mark.parametrize("views", VIEWS)
@@ -49,7 +49,7 @@ def test_it_is_the_baseline_on_other_evidence(views):
     assert torch.equal(ours.unreliable(one), theirs.unreliable(two))
 
 
-def test_it_says_what_it_needs_and_the_baseline_needs_nothing():
+def test_it_needs_absolute_gradients_and_the_baseline_does_not():
     assert AbsGrad(**SETTINGS).needs_absgrad
     assert not Baseline(**SETTINGS).needs_absgrad
 
@@ -59,7 +59,7 @@ def test_its_threshold_may_be_a_schedule():
     state = densifier.observe(
         densifier.init_state(1, CPU), signal(torch.zeros(1, 1, 2), torch.full((1, 1, 2), 0.4))
     )
-    assert [bool(densifier.select(state, step, LOTS)) for step in (0, 10)] == [True, False]
+    assert [bool(densifier.select(state, step, DRAWS)) for step in (0, 10)] == [True, False]
 
 
 def test_an_impossible_threshold_is_refused_by_name():

@@ -13,8 +13,8 @@ from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.baseline import VIEWS, Baseline
 
 CPU = torch.device("cpu")
-STEP = 100  # of a call; no matter, unless a schedule asks
-LOTS = torch.Generator()  # nobody here draws any
+STEP = 100  # of a refinement; only schedules depend on it
+DRAWS = torch.Generator()  # nothing here draws from it
 
 
 def baseline(**changes) -> Baseline:
@@ -24,7 +24,7 @@ def baseline(**changes) -> Baseline:
 
 
 def signal(means2d: torch.Tensor, visible: torch.Tensor | None = None, height=2, width=2) -> GradientSignal:
-    """At 2 x 2 pixels one pixel is one NDC unit."""
+    """Return a signal; at 2 x 2 pixels one pixel is one NDC unit."""
     visible = torch.ones(means2d.shape[:2], dtype=torch.bool) if visible is None else visible
     return GradientSignal(
         means=torch.zeros(means2d.shape[1], 3),
@@ -57,7 +57,7 @@ def test_noise_that_cancels_still_counts_in_full():
     state = baseline().init_state(1, CPU)
     for one in there_and_back:
         state = baseline().observe(state, one)
-    assert baseline().select(state, STEP, LOTS).all()  # the dilemma of paper sec. 4.1
+    assert baseline().select(state, STEP, DRAWS).all()  # the dilemma of paper sec. 4.1
 
 
 def test_steps_that_do_not_see_a_gaussian_do_not_dilute_its_mean():
@@ -70,7 +70,7 @@ def test_steps_that_do_not_see_a_gaussian_do_not_dilute_its_mean():
 def test_a_gaussian_never_seen_is_never_selected():
     hidden = signal(torch.ones(1, 2, 2), torch.tensor([[True, False]]))
     state = baseline().observe(baseline().init_state(2, CPU), hidden)
-    assert baseline().select(state, STEP, LOTS).tolist() == [True, False]
+    assert baseline().select(state, STEP, DRAWS).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("views", VIEWS)
@@ -103,7 +103,7 @@ def test_a_batch_of_views_is_as_good_as_the_same_views_one_by_one():
     )
 
 
-def test_the_views_of_a_batch_combine_as_asked():
+def test_the_views_of_a_batch_combine_as_chosen():
     pixel = torch.tensor([[[3.0, 0.0]], [[0.0, 4.0]], [[-6.0, 0.0]]])
     visible = torch.tensor([[True], [True], [True]])
     expected = {"sum_norm": 13 / 3, "sum_vector": 5.0, "last": 6.0}
@@ -111,7 +111,7 @@ def test_the_views_of_a_batch_combine_as_asked():
         assert float(mean_norms(baseline(views=views), signal(pixel, visible))) == pytest.approx(norm)
 
 
-def test_only_the_last_view_decides_who_was_seen_under_last():
+def test_under_last_only_the_last_view_decides_which_gaussians_are_seen():
     visible = torch.tensor([[True, False], [False, True]])
     state = baseline(views="last").observe(
         baseline().init_state(2, CPU), signal(torch.ones(2, 2, 2), visible)
@@ -123,7 +123,7 @@ def test_reaching_the_threshold_is_enough():
     norms = torch.tensor([[[0.5, 0.0], [0.25, 0.0], [0.1875, 0.0]]])
     densifier = baseline(tau_pos=0.25)
     state = densifier.observe(densifier.init_state(3, CPU), signal(norms))
-    assert densifier.select(state, STEP, LOTS).tolist() == [True, True, False]
+    assert densifier.select(state, STEP, DRAWS).tolist() == [True, True, False]
 
 
 def test_a_schedule_of_the_threshold_is_followed():
@@ -131,10 +131,10 @@ def test_a_schedule_of_the_threshold_is_followed():
     densifier = baseline(tau_pos=Linear(start=0.125, end=0.5, begin=100, steps=150))
     state = densifier.observe(densifier.init_state(3, CPU), signal(norms))
     for step, selected in ((1, 3), (100, 3), (150, 2), (250, 1), (10_000, 1)):
-        assert int(densifier.select(state, step, LOTS).sum()) == selected
-        told = densifier.statistics(state, step)
-        assert told["share_above_tau_pos"] == pytest.approx(selected / 3)
-        assert told["tau_pos"] == as_schedule(densifier.tau_pos)(step)
+        assert int(densifier.select(state, step, DRAWS).sum()) == selected
+        numbers = densifier.statistics(state, step)
+        assert numbers["share_above_tau_pos"] == pytest.approx(selected / 3)
+        assert numbers["tau_pos"] == as_schedule(densifier.tau_pos)(step)
 
 
 def test_the_multiplier_undoes_a_loss_scale():
@@ -224,15 +224,15 @@ def test_the_score_is_what_the_threshold_is_compared_with():
     state = baseline().observe(baseline().init_state(50, CPU), signal(gradients(2, 50)))
     norms = baseline().scores(state)["mean_norm"]
     median = float(norms.median())
-    assert torch.equal(baseline(tau_pos=median).select(state, STEP, LOTS), norms >= median)
+    assert torch.equal(baseline(tau_pos=median).select(state, STEP, DRAWS), norms >= median)
 
 
-def test_everybody_is_reset():
+def test_every_gaussian_is_reset():
     state = baseline().init_state(3, CPU)
     assert baseline().unreliable(state).tolist() == [True] * 3
 
 
-def test_statistics_say_what_the_densifier_saw():
+def test_statistics_are_computed_from_the_mean_norms():
     pixel = torch.zeros(1, 11, 2)
     pixel[0, :, 0] = torch.arange(11) * 1e-4
     numbers = baseline(tau_pos=4.5e-4).statistics(
@@ -244,9 +244,9 @@ def test_statistics_say_what_the_densifier_saw():
     assert numbers["share_above_tau_pos"] == pytest.approx(6 / 11)
 
 
-def test_an_empty_scene_is_no_problem():
+def test_an_empty_scene_has_empty_masks_and_no_statistics():
     state = baseline().observe(baseline().init_state(0, CPU), signal(torch.zeros(2, 0, 2)))
-    assert baseline().select(state, STEP, LOTS).shape == (0,)
+    assert baseline().select(state, STEP, DRAWS).shape == (0,)
     assert baseline().statistics(state, STEP) == {}
 
 

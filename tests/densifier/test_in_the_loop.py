@@ -1,4 +1,4 @@
-"""Laws of densifiers inside the training loop: what they are told, and what follows from their answers."""
+"""Laws of densifiers inside the training loop: what they observe, and what follows from what they return."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -34,12 +34,13 @@ SMALL = [
     "refine.reset_until=100",
     "callback=[]",
 ]
+GUIDANCE = ["densifier=cadam_open", "densifier.grad_source=guidance"]
 REGULARIZED = ["regularizer=[mean_scale,total_variation]", "regularizer.total_variation.weight=50"]
 
 
 @dataclass
 class Witness(Callback):
-    """Remembers what it was shown, and the Gaussians as they were before each step's refinement."""
+    """Records reports, and the densifier state after each refinement."""
 
     reports: list[RefineReport] = field(default_factory=list)
     states: list[dict[str, torch.Tensor]] = field(default_factory=list)
@@ -60,8 +61,8 @@ def run(overrides: Sequence[str], folder: Path) -> tuple[TrainState, Witness, Ou
     return state, witness, outcome
 
 
-def test_the_moments_of_whoever_was_never_densified_are_those_of_the_optimizer_to_the_bit(tmp_path):
-    state, witness, _ = run(["densifier.reset=everybody", *REGULARIZED], tmp_path)
+def test_moments_of_never_densified_gaussians_are_those_of_the_optimizer_to_the_bit(tmp_path):
+    state, witness, _ = run(["densifier.reset=all", *REGULARIZED], tmp_path)
     old = state.densifier.age == state.step
     assert any(report.cloned + report.split for report in witness.reports)
     assert 5 < int(old.sum()) < len(old)
@@ -74,11 +75,11 @@ def test_the_moments_of_whoever_was_never_densified_are_those_of_the_optimizer_t
 # The signal.
 
 
-def test_the_guidance_alone_is_observed_if_asked_while_the_optimizer_follows_the_whole_loss(tmp_path):
+def test_the_guidance_alone_is_observed_on_request_while_the_optimizer_follows_the_whole_loss(tmp_path):
     once = ["steps=1"]
     bare, _, _ = run(once, tmp_path)
     total, _, _ = run([*once, *REGULARIZED], tmp_path)
-    guided, _, _ = run([*once, *REGULARIZED, "densifier.grad_source=guidance"], tmp_path)
+    guided, _, _ = run([*once, *REGULARIZED, *GUIDANCE], tmp_path)
     assert torch.equal(guided.densifier.m, bare.densifier.m)
     assert not torch.allclose(total.densifier.m, bare.densifier.m, rtol=0.01)
     for kind in ("exp_avg", "exp_avg_sq"):
@@ -91,8 +92,8 @@ def test_the_guidance_alone_is_observed_if_asked_while_the_optimizer_follows_the
     [
         ([], 1),
         (REGULARIZED, 1),
-        (["densifier.grad_source=guidance"], 1),
-        (["densifier.grad_source=guidance", *REGULARIZED], 2),
+        (GUIDANCE, 1),
+        ([*GUIDANCE, *REGULARIZED], 2),
     ],
 )
 def test_a_second_backward_pass_happens_only_if_it_is_needed(overrides, passes, tmp_path, monkeypatch):
@@ -124,8 +125,8 @@ class Asynchronous(TorchDispatchMode):
         "baseline",
         "baseline densifier.screen_px=20",
         "cadam",
-        "cadam densifier.invisible=skip",
-        "cadam densifier.nonfinite=skip_row",
+        "cadam_open densifier.invisible=skip",
+        "cadam_open densifier.nonfinite=skip_row",
         "cadam_strict",
         "cadam_calibrated",
         "random",
@@ -151,7 +152,7 @@ def test_observing_never_waits_for_the_device(choice):
 
 
 @pytest.mark.parametrize(("choice", "wants"), [("absgrad", True), ("baseline", False), ("cadam", False)])
-def test_absolute_gradients_are_summed_for_who_needs_them_and_for_nobody_else(
+def test_absolute_gradients_are_summed_only_for_densifiers_that_need_them(
     choice, wants, tmp_path, monkeypatch
 ):
     seen: list[GradientSignal] = []
@@ -172,10 +173,10 @@ def test_absolute_gradients_are_summed_for_who_needs_them_and_for_nobody_else(
             assert (signal.absgrad > 1.01 * signal.means2d.abs() + slack).any()
 
 
-# The report, for pictures.
+# The report that callbacks see.
 
 
-def test_a_report_shows_the_population_before_the_edit_and_who_was_chosen(tmp_path, monkeypatch):
+def test_a_report_has_the_population_before_the_edit_and_the_selected_gaussians(tmp_path, monkeypatch):
     seen: list[Gaussians] = []
     refine = type(component(compose(SMALL).refine))
     plan = refine.plan
@@ -198,14 +199,14 @@ def test_a_report_shows_the_population_before_the_edit_and_who_was_chosen(tmp_pa
         assert (chosen > 0.1).all()
 
 
-def test_a_reset_without_refinement_reports_that_nobody_was_chosen(tmp_path):
+def test_a_reset_without_refinement_reports_an_empty_selection(tmp_path):
     _, witness, _ = run(["refine.end=0"], tmp_path)
     assert [report.step for report in witness.reports] == [4]
     assert not witness.reports[0].population.is_selected.any()
     assert set(witness.reports[0].population.scores) == {"drift", "noise", "snr"}
 
 
-# The answers.
+# What follows.
 
 
 @pytest.mark.parametrize(("screen_px", "outcome"), [("null", Outcome.FINISHED), ("0.01", Outcome.VANISHED)])
@@ -214,15 +215,15 @@ def test_screen_size_prunes_as_intended_or_as_shipped(screen_px, outcome, tmp_pa
     assert run([*quiet, f"densifier.screen_px={screen_px}"], tmp_path)[2] is outcome
 
 
-@pytest.mark.parametrize(("choice", "everybody"), [("cadam_no_reset", False), ("cadam_global_reset", True)])
-def test_the_reset_is_for_whom_the_densifier_says(choice, everybody, tmp_path):
+@pytest.mark.parametrize(("choice", "is_global"), [("cadam_no_reset", False), ("cadam_global_reset", True)])
+def test_the_densifier_decides_which_opacities_are_reset(choice, is_global, tmp_path):
     _, witness, _ = run([f"densifier={choice}"], tmp_path)
     at_reset = witness.reports[1]
     assert at_reset.step == 4
-    assert at_reset.reset == (at_reset.after if everybody else 0)
+    assert at_reset.reset == (at_reset.after if is_global else 0)
 
 
-def test_the_means_tremble_after_the_step_of_the_optimizer_and_nothing_else_does(tmp_path):
+def test_noise_moves_the_means_after_the_optimizer_step_and_nothing_else(tmp_path):
     still, _, _ = run(["densifier=mcmc", "densifier.noise_lr=0", "steps=1"], tmp_path)
     moved, _, _ = run(["densifier=mcmc", "densifier.noise_lr=1e5", "steps=1"], tmp_path)
     cfg = compose([*SMALL, "densifier=mcmc", "densifier.noise_lr=1e5"])
@@ -237,9 +238,11 @@ def test_the_means_tremble_after_the_step_of_the_optimizer_and_nothing_else_does
 
 
 @pytest.mark.parametrize("clears", ["false", "true"])
-def test_a_reset_makes_its_gaussians_young_again_if_asked(clears, tmp_path):
+def test_reset_moments_gives_reset_gaussians_age_zero(clears, tmp_path):
     line = f"densifier.reset_moments={clears}"
-    _, witness, _ = run(["densifier=cadam_global_reset", line, "densifier.tau_m=1e9"], tmp_path)
+    _, witness, _ = run(
+        ["densifier=cadam_open", "densifier.reset=all", line, "densifier.tau_m=1e9"], tmp_path
+    )
     ages, m = witness.states[1]["age"], witness.states[1]["m"]
     assert ages.tolist() == [0 if clears == "true" else 4] * len(ages)
     assert bool(m.any()) == (clears == "false")

@@ -1,4 +1,4 @@
-"""Laws of 3DGS-MCMC: who dies is born again elsewhere, what is shared looks as before, and all tremble."""
+"""Laws of 3DGS-MCMC: relocation of dead Gaussians, copies that look like their original, and noise."""
 
 import math
 from dataclasses import replace
@@ -19,7 +19,7 @@ CPU = torch.device("cpu")
 LATE = 10_000  # a step at which nothing is scheduled
 
 
-def lots(seed: int = 0) -> torch.Generator:
+def draws(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
@@ -34,7 +34,7 @@ def refine() -> Refine:
 
 
 def gaussians(n: int, seed: int = 0, low: float = 0.1) -> Gaussians:
-    noise = lots(seed)
+    noise = draws(seed)
     return Gaussians(
         means=torch.randn(n, 3, generator=noise),
         log_scales=torch.randn(n, 3, generator=noise) - 3,
@@ -46,7 +46,7 @@ def gaussians(n: int, seed: int = 0, low: float = 0.1) -> Gaussians:
 
 def plan(densifier: MCMC, scene: Gaussians, how: Refine | None = None, seed: int = 0, step: int = LATE):
     state = densifier.init_state(len(scene), CPU)
-    return densifier.plan(state, scene, step, how or refine(), lots(seed))
+    return densifier.plan(state, scene, step, how or refine(), draws(seed))
 
 
 # What N coincident Gaussians show (equation 9).
@@ -81,31 +81,31 @@ def test_shares_of_a_batch_are_those_of_each_alone():
     torch.testing.assert_close(together, alone)
 
 
-def test_the_utterly_opaque_share_without_a_nan():
+def test_fully_opaque_gaussians_share_without_nan():
     new, log_shrink = share(torch.tensor([20.0, 90.0]).double(), torch.tensor([2, 500]))
     assert new.isfinite().all()
     assert log_shrink.isfinite().all()
 
 
-# Whom the lot falls on.
+# Random choices.
 
 
-def test_lots_fall_in_proportion_to_the_weights():
+def test_draws_are_in_proportion_to_the_weights():
     weights = torch.tensor([0.0, 1.0, 3.0, 0.0, 6.0]).double()
-    hits = draw(weights, 100_000, lots()).bincount(minlength=5)
+    hits = draw(weights, 100_000, draws()).bincount(minlength=5)
     expected = 100_000 * weights / 10
     assert hits[0] == hits[3] == 0
     assert ((hits - expected).abs() <= 4.5 * expected.sqrt()).all()
 
 
-def test_nothing_to_draw_draws_nothing():
-    assert draw(torch.ones(3).double(), 0, lots()).shape == (0,)
+def test_a_count_of_zero_draws_nothing():
+    assert draw(torch.ones(3).double(), 0, draws()).shape == (0,)
 
 
 # The plan.
 
 
-def test_the_dead_are_replaced_by_copies_of_the_living():
+def test_dead_gaussians_are_replaced_by_copies_of_live_ones():
     scene = gaussians(40)
     scene.opacity_logits[5:15] = math.log(0.004 / 0.996)
     decided = plan(mcmc(growth=0.0), scene)
@@ -120,7 +120,7 @@ def test_the_dead_are_replaced_by_copies_of_the_living():
     assert decided.edit.keep.tolist() == sorted(decided.edit.keep.tolist())
 
 
-def test_copies_stand_where_the_copied_stood_and_share_its_opacity_and_size():
+def test_copies_have_the_position_of_their_original_and_share_its_opacity_and_size():
     scene = gaussians(30)
     scene.opacity_logits[:20] = -9.0
     edit = plan(mcmc(growth=0.0), scene).edit
@@ -142,7 +142,7 @@ def test_copies_stand_where_the_copied_stood_and_share_its_opacity_and_size():
         )
 
 
-def test_whoever_is_copied_loses_its_moments_and_nobody_else_does():
+def test_copied_gaussians_lose_their_moments_and_no_others_do():
     scene = gaussians(30)
     edit = plan(mcmc(), scene).edit
     carried = edit.carry(torch.ones(30))
@@ -168,7 +168,7 @@ def test_more_than_the_cap_neither_grow_nor_shrink():
     assert plan(mcmc(cap=20), scene).edit.rows_after == 50
 
 
-def test_who_is_relocated_shares_again_with_who_is_added():
+def test_relocated_and_added_copies_share_one_original():
     scene = gaussians(40)
     scene.opacity_logits[1:] = -9.0
     edit = plan(mcmc(growth=0.05), scene).edit  # one alive: all 42 share what it was
@@ -179,7 +179,7 @@ def test_who_is_relocated_shares_again_with_who_is_added():
     torch.testing.assert_close(clear, before, rtol=1e-4, atol=0)
 
 
-def test_nobody_is_born_dead():
+def test_no_gaussian_is_born_dead():
     scene = gaussians(60, low=0.006)
     scene.opacity_logits[:50] = -9.0
     scene.opacity_logits[50:] = math.log(0.0051 / 0.9949)
@@ -188,7 +188,7 @@ def test_nobody_is_born_dead():
     assert how.keeps(after, LATE).all()
 
 
-def test_whom_refinement_would_prune_for_another_reason_is_dead_too():
+def test_gaussians_that_refinement_would_prune_for_another_reason_are_dead_too():
     scene = gaussians(20)
     scene.means[3] = math.nan
     scene.log_scales[7, 1] = 2.0
@@ -200,7 +200,7 @@ def test_whom_refinement_would_prune_for_another_reason_is_dead_too():
 
 
 @pytest.mark.parametrize("n", [0, 5])
-def test_where_nobody_lives_nobody_is_born(n):
+def test_without_a_live_gaussian_none_is_born(n):
     scene = gaussians(n)
     scene.opacity_logits -= 20
     decided = plan(mcmc(), scene)
@@ -217,7 +217,7 @@ def test_a_plan_follows_from_its_generator_and_changes_nothing():
     assert all(torch.equal(getattr(scene, field), getattr(before, field)) for field in FIELDS)
 
 
-def test_gradients_change_nothing_and_nobody_is_reset_or_split():
+def test_gradients_change_nothing_and_no_gaussian_is_reset_or_split():
     state = mcmc().init_state(4, CPU)
     loud = GradientSignal(
         means=torch.full((4, 3), 1e6),
@@ -227,9 +227,9 @@ def test_gradients_change_nothing_and_nobody_is_reset_or_split():
         width=8,
     )
     observed = mcmc().observe(state, loud)
-    assert torch.equal(observed.nobody, state.nobody)
+    assert torch.equal(observed.no_rows, state.no_rows)
     assert not mcmc().unreliable(observed).any()
-    assert not mcmc().select(observed, LATE, lots()).any()
+    assert not mcmc().select(observed, LATE, draws()).any()
 
 
 # The noise.
@@ -239,18 +239,18 @@ def test_the_noise_has_the_squared_covariance_of_each_gaussian():
     one = gaussians(1)
     one.opacity_logits[:] = math.log(0.005 / 0.995)  # where half of the noise is left
     many = one.index(torch.zeros(200_000, dtype=torch.long))
-    moved = mcmc(noise_lr=6.0).perturb(many, 0.5, lots()).double()
+    moved = mcmc(noise_lr=6.0).perturb(many, 0.5, draws()).double()
     spread = one.rotations[0] * one.scales[0].square() @ one.rotations[0].T
     wanted = (0.5 * 6.0 * 0.5) ** 2 * spread.double() @ spread.double()
     error = (moved.T @ moved / len(moved) - wanted).abs().max()
     assert error < 0.01 * wanted.diagonal().max()
 
 
-def test_the_opaque_hold_still_and_the_faint_tremble():
+def test_noise_moves_faint_gaussians_and_not_opaque_ones():
     scene = gaussians(4000)
     scene.log_scales[:] = math.log(0.1)
     levels = torch.tensor([0.0, 0.005, 0.03, 0.2]).clamp_min(1e-6).logit().repeat_interleave(1000)
-    moved = mcmc().perturb(replace(scene, opacity_logits=levels), 0.01, lots())
+    moved = mcmc().perturb(replace(scene, opacity_logits=levels), 0.01, draws())
     strengths = moved.norm(dim=-1).view(4, 1000).mean(dim=1)
     relative = (strengths / strengths[1]).tolist()
     for opacity, found in zip((0.0, 0.005, 0.03, 0.2), relative, strict=True):
@@ -259,10 +259,10 @@ def test_the_opaque_hold_still_and_the_faint_tremble():
 
 def test_the_noise_scales_with_the_rate_and_comes_from_the_generator():
     scene = gaussians(20, low=0.001)
-    once, twice = (mcmc().perturb(scene, lr, lots()) for lr in (0.01, 0.02))
+    once, twice = (mcmc().perturb(scene, lr, draws()) for lr in (0.01, 0.02))
     torch.testing.assert_close(2 * once, twice)
-    assert not torch.equal(once, mcmc().perturb(scene, 0.01, lots(1)))
-    assert not mcmc(noise_lr=0.0).perturb(scene, 0.01, lots()).any()
+    assert not torch.equal(once, mcmc().perturb(scene, 0.01, draws(1)))
+    assert not mcmc(noise_lr=0.0).perturb(scene, 0.01, draws()).any()
 
 
 @pytest.mark.parametrize(

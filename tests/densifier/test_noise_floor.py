@@ -1,4 +1,4 @@
-"""What the SNR of pure noise is, when tau_SNR = 0.1 bites, and whether a calibrated gate keeps its promise.
+"""The SNR of pure noise, when tau_SNR = 0.1 rejects it, and which share passes a calibrated gate.
 
 Everything is simulated through ``CAdam.observe``: 4,000 Gaussians whose gradients are zero-mean noise. The
 tables of docs/method.md are these numbers.
@@ -17,8 +17,8 @@ from cadam3d.prior.path import DDPM
 from cadam3d.settings.compose import component, compose
 
 CPU = torch.device("cpu")
-STEP = 100  # of a call; no matter, unless a schedule asks
-LOTS = torch.Generator()  # nobody here draws any
+STEP = 100  # of a refinement; only schedules depend on it
+DRAWS = torch.Generator()  # nothing here draws from it
 N = 4000
 ALPHA = 0.05
 ERROR = 0.015  # above four standard errors of a share near ALPHA of N
@@ -27,7 +27,13 @@ AGES = (5, 10, 20, 50, 100, 300, 1000)
 
 def cadam(**changes) -> CAdam:
     return component(
-        compose(["prompt=noise", *(f"densifier.{key}={value}" for key, value in changes.items())]).densifier
+        compose(
+            [
+                "prompt=noise",
+                "densifier=cadam_open",
+                *(f"densifier.{key}={value}" for key, value in changes.items()),
+            ]
+        ).densifier
     )
 
 
@@ -44,12 +50,12 @@ def one_plane(draw: torch.Generator) -> torch.Tensor:
 
 
 def heavy(draw: torch.Generator) -> torch.Tensor:
-    """Student's t with 3 degrees of freedom: no fourth moment."""
+    """Return noise of Student's t with 3 degrees of freedom, which has no fourth moment."""
     return isotropic(draw) / isotropic(draw).square().mean(dim=-1, keepdim=True).sqrt()
 
 
 def simulate(densifier: CAdam, scales, *, noise=isotropic, visibility=1.0, looks) -> dict[int, CAdamState]:
-    """States at the steps ``looks``, under noise times the ``scales`` of the steps."""
+    """Return the states at the steps ``looks``, under noise times the ``scales`` of the steps."""
     draw, state, states = torch.Generator().manual_seed(0), densifier.init_state(N, CPU), {}
     for step, scale in enumerate(scales, start=1):
         seen = torch.rand(N, generator=draw) < visibility
@@ -64,12 +70,12 @@ def simulate(densifier: CAdam, scales, *, noise=isotropic, visibility=1.0, looks
 
 
 def passes(densifier: CAdam, state: CAdamState, tau: float = 0.1) -> float:
-    """Share above an SNR of ``tau``, in percent."""
+    """Return the share above an SNR of ``tau``, in percent."""
     return 100 * float((densifier.scores(state)["snr"] > tau).float().mean())
 
 
 def alarms(densifier: CAdam, state: CAdamState, alpha: float = ALPHA) -> float:
-    """Share of the noise that the calibrated gate lets pass."""
+    """Return the share of noise that passes the calibrated gate."""
     threshold = snr_threshold(alpha, densifier.beta1, densifier.beta2, state.age)
     return float((densifier.scores(state)["snr"] > threshold).float().mean())
 
@@ -83,14 +89,14 @@ def rising(steps: int) -> list[float]:
 
 
 def gamma_of_ism(steps: int) -> list[float]:
-    """ISM's published weight of each step: t is uniform up to a bound that sinks from 0.98 to 0.5."""
+    """Return ISM's published weight of each step: t is uniform up to a bound that falls from 0.98 to 0.5."""
     draw = torch.Generator().manual_seed(1)
     bound = 0.98 - 0.48 * (torch.arange(steps) / 1500).clamp_max(1)
     t = 0.02 + (bound - 0.02) * torch.rand(steps, generator=draw)
     return DDPM().gamma(t).tolist()
 
 
-# The floor, and when the published gate bites.
+# The noise floor, and when the published gate rejects noise.
 
 
 @pytest.mark.parametrize("beta1", [0.0, 0.9, 0.98])
@@ -119,14 +125,16 @@ def test_the_published_gate_passes_noise_unless_its_scale_falls(case, beta2, sca
 
 
 @pytest.mark.parametrize(("visibility", "zero", "skip"), [(0.3, 84, 90), (0.1, 64, 91), (0.02, 29, 96)])
-def test_the_published_gate_bites_the_rarely_seen_unless_their_pauses_are_skipped(visibility, zero, skip):
+def test_the_published_gate_rejects_rarely_seen_gaussians_unless_their_pauses_are_skipped(
+    visibility, zero, skip
+):
     for choice, percent in (("zero", zero), ("skip", skip)):
         densifier = cadam(invisible=choice)
         state = simulate(densifier, [1.0] * 600, visibility=visibility, looks=(600,))[600]
         assert passes(densifier, state) == pytest.approx(percent, abs=3)
 
 
-def test_under_a_weight_common_to_all_the_gate_opens_and_shuts_for_everybody():
+def test_a_weight_common_to_all_opens_and_shuts_the_gate_for_all_gaussians():
     densifier = cadam()
     states = simulate(densifier, gamma_of_ism(1500), looks=range(200, 1501, 100))
     shares = [passes(densifier, state) for state in states.values()]
@@ -144,14 +152,14 @@ def test_gates_above_the_floor_pass_a_sixth_of_the_noise(name):
 
 
 @pytest.mark.parametrize(("name", "noise", "signal"), [("cadam", 10, 10), ("cadam_selective", 16, 30)])
-def test_what_a_call_takes_without_and_with_a_drift(name, noise, signal):
-    """The published gates take their tenth of whatever there is, the selective ones less of mere noise."""
+def test_shares_selected_without_and_with_a_drift(name, noise, signal):
+    """The published gates select a tenth in both cases, the selective ones less if there is only noise."""
     densifier = component(compose(["prompt=noise", f"densifier={name}"]).densifier)
     for offset, percent in ((0.0, noise), (1.0, signal)):
         shifted = simulate(
             densifier, [1.0] * 300, noise=lambda draw, d=offset: isotropic(draw) + d, looks=(300,)
         )
-        assert 100 * float(densifier.select(shifted[300], STEP, LOTS).float().mean()) == pytest.approx(
+        assert 100 * float(densifier.select(shifted[300], STEP, DRAWS).float().mean()) == pytest.approx(
             percent, abs=3
         )
 
@@ -174,7 +182,7 @@ def test_isotropic_noise_passes_as_often_as_alpha_says_at_every_age(beta1, beta2
 
 
 @pytest.mark.parametrize("visibility", [0.1, 0.3, 1.0])
-def test_skipping_the_pauses_makes_visibility_irrelevant(visibility):
+def test_with_skipped_pauses_visibility_does_not_matter(visibility):
     densifier = cadam(invisible="skip", beta2=0.81)
     for state in simulate(densifier, [1.0] * 300, visibility=visibility, looks=(100, 300)).values():
         grown = densifier.scores(state)["snr"][state.age >= 5]
@@ -199,7 +207,7 @@ def test_with_beta2_of_beta1_squared_no_change_of_scale_lets_more_noise_pass(sca
     rates = [alarms(short, state) for state in simulate(short, scales, looks=looks).values()]
     assert 0.01 < min(rates) <= max(rates) < ALPHA + ERROR
     rates = [alarms(long, state) for state in simulate(long, scales, looks=looks).values()]
-    assert max(rates) > 2 * ALPHA or min(rates) < 0.01  # a long memory holds no such promise
+    assert max(rates) > 2 * ALPHA or min(rates) < 0.01  # a long memory does not keep the rate
 
 
 def test_noise_along_fewer_axes_passes_more_often():
@@ -230,7 +238,7 @@ def test_select_uses_the_threshold_of_each_age():
     threshold = snr_threshold(ALPHA, 0.9, 0.81, state.age)
     assert len(threshold.unique()) == 2
     expected = (drift > threshold * noise) & (drift > drift.quantile(0.9))
-    assert torch.equal(densifier.select(state, STEP, LOTS), expected)
+    assert torch.equal(densifier.select(state, STEP, DRAWS), expected)
     assert densifier.statistics(state, STEP)["share_above_tau_SNR"] == pytest.approx(
         float((drift > threshold * noise).float().mean())
     )
@@ -239,14 +247,14 @@ def test_select_uses_the_threshold_of_each_age():
 # The function.
 
 
-def test_fewer_alarms_take_a_higher_threshold_at_every_age():
+def test_fewer_alarms_need_a_higher_threshold_at_every_age():
     ages = torch.arange(2, 2000)
     strict, usual, lax = (snr_threshold(alpha, 0.9, 0.999, ages) for alpha in (0.01, 0.05, 0.5))
     assert (strict > usual).all()
     assert (usual > lax).all()
 
 
-def test_nobody_passes_on_one_gradient():
+def test_no_gaussian_passes_on_one_gradient():
     assert snr_threshold(0.5, 0.9, 0.999, torch.tensor([0, 1, 2])).isinf().tolist() == [True, True, False]
     assert snr_threshold(0.5, 0.9, 0.999, torch.arange(0)).shape == (0,)
 

@@ -1,4 +1,4 @@
-"""Laws of the densifier that does nothing."""
+"""Laws of the densifier that never grows."""
 
 import torch
 
@@ -8,8 +8,8 @@ from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.none import NoGrowth
 
 CPU = torch.device("cpu")
-STEP = 100  # of a call; no matter, unless a schedule asks
-LOTS = torch.Generator()  # nobody here draws any
+STEP = 100  # of a refinement; only schedules depend on it
+DRAWS = torch.Generator()  # nothing here draws from it
 
 
 def children(n: int) -> Gaussians:
@@ -22,7 +22,7 @@ def children(n: int) -> Gaussians:
     )
 
 
-def test_nobody_grows_and_nobody_is_reset_whatever_the_gradients():
+def test_no_gaussian_grows_or_is_reset_whatever_the_gradients():
     loud = GradientSignal(
         means=torch.full((4, 3), 1e6),
         means2d=torch.full((2, 4, 2), 1e6),
@@ -31,14 +31,14 @@ def test_nobody_grows_and_nobody_is_reset_whatever_the_gradients():
         width=8,
     )
     state = NoGrowth().observe(NoGrowth().init_state(4, CPU), loud)
-    assert NoGrowth().select(state, STEP, LOTS).tolist() == [False] * 4
+    assert NoGrowth().select(state, STEP, DRAWS).tolist() == [False] * 4
     assert NoGrowth().unreliable(state).tolist() == [False] * 4
 
 
 def test_the_masks_follow_the_count_when_pruning_removes_rows():
     edit = RowEdit(keep=torch.tensor([0, 2]), children=children(0), parents=torch.arange(0))
     state = NoGrowth().init_state(4, CPU).carry(edit)
-    assert NoGrowth().select(state, STEP, LOTS).tolist() == [False] * 2
+    assert NoGrowth().select(state, STEP, DRAWS).tolist() == [False] * 2
 
 
 def test_there_is_nothing_to_report():

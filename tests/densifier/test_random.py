@@ -1,4 +1,4 @@
-"""Laws of growth by lot, the control of the experiments."""
+"""Laws of random growth, the control of the experiments."""
 
 import math
 
@@ -15,34 +15,34 @@ from cadam3d.densifier.random import RandomGrowth
 from cadam3d.settings.compose import component, compose
 
 CPU = torch.device("cpu")
-STEP = 100  # of a call; no matter, unless a schedule asks
+STEP = 100  # of a refinement; only schedules depend on it
 
 
-def lots(seed: int = 0) -> torch.Generator:
+def draws(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
 def select(densifier: RandomGrowth, n: int, *, seed: int = 0, step: int = STEP) -> torch.Tensor:
-    return densifier.select(densifier.init_state(n, CPU), step, lots(seed))
+    return densifier.select(densifier.init_state(n, CPU), step, draws(seed))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.1, 0.3, 0.5, 0.999])
-def test_as_many_are_drawn_as_a_quantile_gate_lets_through(share):
+def test_as_many_are_selected_as_pass_a_quantile_gate(share):
     for n in (0, 1, 2, 10, 11, 300, 331, 1000):
-        drift = torch.randperm(n, generator=lots(n)).double()
+        drift = torch.randperm(n, generator=draws(n)).double()
         passing = int((drift > quantile(drift, 1 - share)).sum()) if n else 0
         assert int(select(RandomGrowth(share=share), n).sum()) == passing
 
 
-def test_everybody_has_the_same_chance():
-    densifier, generator, calls = RandomGrowth(share=0.2), lots(), 4000
+def test_every_gaussian_has_the_same_chance():
+    densifier, generator, calls = RandomGrowth(share=0.2), draws(), 4000
     state = densifier.init_state(51, CPU)
     hits = sum(densifier.select(state, STEP, generator).int() for _ in range(calls))
     expected = calls * 10 / 51
     assert (hits - expected).abs().max() < 4.5 * (expected * (1 - 10 / 51)) ** 0.5
 
 
-def test_the_lots_come_from_the_generator_and_from_nowhere_else():
+def test_choices_depend_on_the_given_generator_only():
     densifier = RandomGrowth(share=0.1)
     assert torch.equal(select(densifier, 500, seed=3), select(densifier, 500, seed=3))
     assert not torch.equal(select(densifier, 500, seed=3), select(densifier, 500, seed=4))
@@ -51,7 +51,7 @@ def test_the_lots_come_from_the_generator_and_from_nowhere_else():
     assert torch.equal(torch.random.get_rng_state(), before)
 
 
-def test_gradients_change_nothing_and_nobody_is_reset():
+def test_gradients_change_nothing_and_no_gaussian_is_reset():
     densifier = RandomGrowth(share=0.5)
     state = densifier.init_state(8, CPU)
     loud = GradientSignal(
@@ -62,15 +62,15 @@ def test_gradients_change_nothing_and_nobody_is_reset():
         width=8,
     )
     observed = densifier.observe(state, loud)
-    assert torch.equal(densifier.select(observed, STEP, lots()), densifier.select(state, STEP, lots()))
+    assert torch.equal(densifier.select(observed, STEP, draws()), densifier.select(state, STEP, draws()))
     assert not densifier.unreliable(observed).any()
 
 
 def test_selecting_leaves_the_state_alone():
     densifier = RandomGrowth(share=0.5)
     state = densifier.init_state(8, CPU)
-    assert densifier.select(state, STEP, lots()).any()
-    assert not state.nobody.any()
+    assert densifier.select(state, STEP, draws()).any()
+    assert not state.no_rows.any()
 
 
 def test_a_schedule_of_the_share_is_followed():
@@ -80,7 +80,7 @@ def test_a_schedule_of_the_share_is_followed():
     assert densifier.statistics(densifier.init_state(3, CPU), 175)["share"] == pytest.approx(0.26)
 
 
-def test_the_annealed_control_draws_as_many_as_its_original_at_every_call():
+def test_the_annealed_control_selects_as_many_as_its_original_at_every_refinement():
     cadam, control = (
         component(compose(["prompt=a red cube", f"densifier={name}"]).densifier)
         for name in ("cadam_annealed", "random_annealed")
@@ -112,7 +112,7 @@ def test_rows_follow_an_edit():
     )
     edit = RowEdit(keep=torch.tensor([0, 2]), children=children, parents=torch.tensor([1, 1, 0]))
     state = densifier.init_state(4, CPU).carry(edit)
-    assert densifier.select(state, STEP, lots()).shape == (5,)
+    assert densifier.select(state, STEP, draws()).shape == (5,)
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.0, Linear(start=0.5, end=1.0, steps=10)])

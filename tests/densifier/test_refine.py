@@ -1,22 +1,22 @@
-"""Laws of refinement: when it happens, how Gaussians clone, split and vanish, and that all owners agree."""
+"""Laws of refinement: its steps, cloning, splitting and pruning, and the agreement of all owners of rows."""
 
 from dataclasses import replace
 
 import pytest
 import torch
+from evidence import cadam
 
 from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.baseline import Baseline
-from cadam3d.densifier.cadam import CAdam
 from cadam3d.densifier.none import NoGrowth
 from cadam3d.densifier.refine import Refine
 from cadam3d.optimizer import AdamSettings
 
 CPU = torch.device("cpu")
-STEP = 100  # of a call; no matter, unless a schedule asks
-LOTS = torch.Generator()  # nobody here draws any
+STEP = 100  # of a refinement; only schedules depend on it
+DRAWS = torch.Generator()  # nothing here draws from it
 LATE = 10_000  # a step at which nothing is scheduled
 
 
@@ -42,7 +42,7 @@ def refine(**changes) -> Refine:
 
 
 def gaussians(n: int, seed: int = 0) -> Gaussians:
-    """Half of them smaller than tau_scale, half larger; all well visible."""
+    """Return Gaussians of which half are smaller than tau_scale, and half larger; all are clearly visible."""
     draw = torch.Generator().manual_seed(seed)
     scales = torch.empty(n, 3).uniform_(0.01, 0.02, generator=draw)
     scales[n // 2 :, 1] *= 10
@@ -73,9 +73,9 @@ def with_opacity(scene: Gaussians, opacities: list[float]) -> Gaussians:
 @pytest.mark.parametrize(
     ("start", "end", "expected"),
     [
-        (300, 900, range(400, 801, 100)),  # GaussianDreamer: 5 calls
-        (100, 3000, range(200, 2901, 100)),  # LucidDreamer: 28 calls
-        (100, 1500, range(200, 1401, 100)),  # FlowDreamer: 13 calls
+        (300, 900, range(400, 801, 100)),  # GaussianDreamer: 5 refinements
+        (100, 3000, range(200, 2901, 100)),  # LucidDreamer: 28 refinements
+        (100, 1500, range(200, 1401, 100)),  # FlowDreamer: 13 refinements
     ],
 )
 def test_refinements_happen_at_the_steps_of_the_published_recipes(start, end, expected):
@@ -108,7 +108,7 @@ def test_clones_and_splits_partition_the_selection_by_scale():
     is_large = scene.scales.amax(dim=-1) > 0.05
     stays = torch.zeros(40, dtype=torch.bool)
     stays[plan.edit.keep] = True
-    assert torch.equal(stays, ~(selected & is_large))  # split parents go, clone parents stay
+    assert torch.equal(stays, ~(selected & is_large))  # split parents are removed, cloned parents stay
     births = torch.bincount(plan.edit.parents, minlength=40)
     assert torch.equal(births, selected * torch.where(is_large, 2, 1))
     assert (plan.cloned, plan.split) == (int((selected & ~is_large).sum()), int((selected & is_large).sum()))
@@ -127,14 +127,14 @@ def test_the_counts_add_up(children):
     assert len(plan.edit.apply(scene)) == plan.edit.rows_after
 
 
-def test_nobody_selected_means_nobody_changes():
+def test_an_empty_selection_changes_nothing():
     scene = gaussians(10)
     plan = refine().plan(scene, torch.zeros(10, dtype=torch.bool), LATE, draw())
     after = plan.edit.apply(scene)
     assert all(torch.equal(getattr(after, name), getattr(scene, name)) for name in FIELDS)
 
 
-def test_a_clone_is_its_parent_again():
+def test_a_clone_equals_its_parent():
     scene = gaussians(6)
     scene.log_scales[:] = -5.0
     plan = refine().plan(scene, some(6), LATE, draw())
@@ -153,7 +153,7 @@ def test_split_children_are_smaller_by_the_shrink_and_otherwise_like_their_paren
     assert (children.means != parents.means).any(dim=-1).all()
 
 
-def test_split_children_lie_where_their_parent_has_its_density():
+def test_split_children_are_distributed_like_their_parent():
     n = 4000
     one = gaussians(2).index(torch.tensor([1]))
     scene = one.map(lambda tensor: tensor.repeat(n, *[1] * (tensor.ndim - 1)))
@@ -167,8 +167,8 @@ def test_split_children_lie_where_their_parent_has_its_density():
 
 
 def test_the_plan_is_decided_by_the_generator():
-    scene, everybody = gaussians(10), torch.ones(10, dtype=torch.bool)
-    first, again, other = (refine().plan(scene, everybody, LATE, draw(seed)) for seed in (0, 0, 1))
+    scene, all_rows = gaussians(10), torch.ones(10, dtype=torch.bool)
+    first, again, other = (refine().plan(scene, all_rows, LATE, draw(seed)) for seed in (0, 0, 1))
     assert torch.equal(first.edit.children.means, again.edit.children.means)
     assert not torch.equal(first.edit.children.means, other.edit.children.means)
 
@@ -184,7 +184,7 @@ def test_planning_changes_nothing_and_leaves_no_graph():
 # Pruning.
 
 
-def test_the_faint_are_pruned_whether_old_or_newborn():
+def test_faint_gaussians_are_pruned_whether_old_or_newborn():
     scene = with_opacity(gaussians(4), [0.004, 0.006, 0.004, 0.006])  # two clones, two splits
     plan = refine().plan(scene, torch.tensor([True, False, True, False]), LATE, draw())
     assert plan.edit.keep.tolist() == [1, 3]
@@ -192,12 +192,12 @@ def test_the_faint_are_pruned_whether_old_or_newborn():
     assert plan.pruned == 1 + 1 + 2  # a survivor, its clone, and both children of a split
 
 
-def test_the_large_are_pruned_only_after_prune_from():
+def test_large_gaussians_are_pruned_only_after_prune_from():
     scene = gaussians(4)
     scene.log_scales[3, 0] = 0.0
-    schedule, nobody = refine(max_scale=0.5, prune_from=500), torch.zeros(4, dtype=torch.bool)
-    assert schedule.plan(scene, nobody, 500, draw()).pruned == 0
-    assert schedule.plan(scene, nobody, 501, draw()).edit.keep.tolist() == [0, 1, 2]
+    schedule, no_rows = refine(max_scale=0.5, prune_from=500), torch.zeros(4, dtype=torch.bool)
+    assert schedule.plan(scene, no_rows, 500, draw()).pruned == 0
+    assert schedule.plan(scene, no_rows, 501, draw()).edit.keep.tolist() == [0, 1, 2]
 
 
 def test_the_children_of_a_split_are_judged_by_their_own_scale():
@@ -217,22 +217,22 @@ def test_rows_with_nan_are_pruned(name):
 
 
 def test_opacity_does_not_prune_during_the_grace_after_a_reset():
-    scene, nobody = with_opacity(gaussians(2), [0.01, 0.9]), torch.zeros(2, dtype=torch.bool)
+    scene, no_rows = with_opacity(gaussians(2), [0.01, 0.9]), torch.zeros(2, dtype=torch.bool)
     schedule = refine(reset_interval=300, reset_from=300, prune_grace=100, min_opacity=0.05)
     pruned = {
-        step: schedule.plan(scene, nobody, step, draw()).pruned for step in (200, 300, 301, 400, 401, 700)
+        step: schedule.plan(scene, no_rows, step, draw()).pruned for step in (200, 300, 301, 400, 401, 700)
     }
     assert pruned == {200: 1, 300: 1, 301: 0, 400: 0, 401: 1, 700: 0}
 
 
-def test_everybody_may_vanish():
+def test_all_gaussians_may_be_pruned():
     scene = with_opacity(gaussians(2), [1e-4, 1e-4])
     plan = refine().plan(scene, torch.ones(2, dtype=torch.bool), LATE, draw())
     assert plan.edit.rows_after == 0
     assert len(plan.edit.apply(scene)) == 0
 
 
-def test_an_empty_scene_is_no_problem():
+def test_an_empty_scene_stays_empty():
     plan = refine().plan(gaussians(0), torch.zeros(0, dtype=torch.bool), LATE, draw())
     assert (plan.edit.rows_after, plan.selected, plan.pruned) == (0, 0, 0)
 
@@ -241,15 +241,15 @@ def test_an_empty_scene_is_no_problem():
 
 
 def test_a_plan_exceeds_the_cap_by_its_count_after_the_edit():
-    scene, everybody = gaussians(10), torch.ones(10, dtype=torch.bool)
-    plan = refine().plan(scene, everybody, LATE, draw())
+    scene, all_rows = gaussians(10), torch.ones(10, dtype=torch.bool)
+    plan = refine().plan(scene, all_rows, LATE, draw())
     assert plan.edit.rows_after == 20
     assert refine(max_gaussians=19).exceeds(plan)
     assert not refine(max_gaussians=20).exceeds(plan)
     assert not refine(max_gaussians=None).exceeds(plan)
 
 
-def test_the_unwanted_are_pruned_as_the_large_are_but_their_children_live():
+def test_unwanted_gaussians_are_pruned_when_large_ones_are_but_their_children_are_kept():
     scene = gaussians(6)  # 0..2 are cloned, 3..5 split
     selected = torch.tensor([True, False, False, True, False, False])
     unwanted = torch.tensor([True, True, False, True, True, False])
@@ -270,28 +270,7 @@ def test_the_unwanted_are_pruned_as_the_large_are_but_their_children_live():
     [
         NoGrowth(),
         Baseline(tau_pos=0.1, views="sum_norm", grad_multiplier=1.0, screen_px=None),
-        CAdam(
-            tau_Q=0.7,
-            tau_m=None,
-            tau_SNR=0.1,
-            alpha=None,
-            beta1=0.9,
-            beta2=0.999,
-            eps=1e-15,
-            eps_mode="abs",
-            grad_source="total",
-            grad_norm="none",
-            invisible="zero",
-            nonfinite="skip_step",
-            min_age=0,
-            quantile_over="all",
-            child_state="zero",
-            parent_state="keep",
-            reset="unreliable",
-            tau_reset=None,
-            reset_min_age=0,
-            reset_moments=False,
-        ),
+        cadam(tau_Q=0.7),
     ],
     ids=["none", "baseline", "cadam"],
 )
@@ -314,7 +293,7 @@ def test_gaussians_moments_and_densifier_state_stay_in_step_through_many_edits(d
         state = densifier.observe(state, signal)
         optimizer.step(step)
         if step % 10 == 0:
-            plan = refine().plan(optimizer.gaussians, densifier.select(state, STEP, LOTS), LATE, noise)
+            plan = refine().plan(optimizer.gaussians, densifier.select(state, STEP, DRAWS), LATE, noise)
             optimizer.apply(plan.edit)
             state = state.carry(plan.edit)
         counts = {len(rows) for rows in state.to_dict().values()}

@@ -1,4 +1,4 @@
-"""ImagesExporter: the pictures are the renders, in order, and named after what they show."""
+"""ImagesExporter: the pictures are the renders, in order, and named after their angles."""
 
 import imageio.v3 as imageio
 import numpy as np
@@ -22,7 +22,7 @@ NOBODY = Gaussians(
 
 
 def render_angles(cameras, background):
-    """A picture whose red says the azimuth and whose green says the elevation; blue is the background's."""
+    """Return pictures with the azimuth in red, the elevation in green and the background in blue."""
     views = len(cameras)
     colors = torch.stack(
         [cameras.azimuth_deg % 360 / 360, cameras.elevation_deg / 90, background[:, 2]], dim=1
@@ -32,7 +32,7 @@ def render_angles(cameras, background):
     return RenderOutput(rgb, flat, flat, torch.zeros(views, 0, 2), torch.zeros(views, 0))
 
 
-def test_each_view_is_the_file_that_its_name_says(tmp_path):
+def test_each_file_shows_the_view_in_its_name(tmp_path):
     paths = ImagesExporter(**VALUES).export(NOBODY, render_angles, tmp_path)
     assert [path.name for path in paths[:2]] == ["000_az000_el+00.png", "001_az090_el+00.png"]
     assert len(paths) == 8

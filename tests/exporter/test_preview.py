@@ -28,7 +28,7 @@ def no_gaussians() -> Gaussians:
 
 
 def painted(cameras, background):
-    """Red is the background's, green the azimuth, blue the elevation."""
+    """Return pictures with the background in red, the azimuth in green and the elevation in blue."""
     views, size = len(cameras), cameras.height
     colour = torch.stack(
         [background[:, 0], cameras.azimuth_deg % 360 / 360, cameras.elevation_deg / 90], dim=1
@@ -48,7 +48,7 @@ def test_rows_are_elevations_and_columns_azimuths(tmp_path):
     assert np.abs(cells[..., 2].T - [[0, 0.5, 1]] * 4).max() < 0.01
 
 
-def test_labels_are_written_where_asked(tmp_path):
+def test_labels_are_written_on_request(tmp_path):
     PreviewExporter(**SETTINGS).export(no_gaussians(), painted, tmp_path)
     plain = imageio.imread(tmp_path / "preview.png")
     PreviewExporter(**{**SETTINGS, "labels": True}).export(no_gaussians(), painted, tmp_path)

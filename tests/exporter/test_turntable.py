@@ -1,4 +1,4 @@
-"""TurntableExporter: one turn, every picture where it belongs."""
+"""TurntableExporter: one turn, with every picture in its place."""
 
 import imageio.v3 as imageio
 import numpy as np
@@ -64,7 +64,7 @@ def test_long_videos_are_rendered_a_few_views_at_a_time(tmp_path):
     assert max(len(cameras) for cameras in render.cameras) <= 4
 
 
-def test_depth_stands_beside_colour_black_where_nothing_is(tmp_path):
+def test_depth_is_beside_colour_and_black_where_nothing_is_visible(tmp_path):
     frames, _ = export(tmp_path)
     beside = frames[0, :, 32:]
     assert beside[:4].max() < 0.05
@@ -72,13 +72,13 @@ def test_depth_stands_beside_colour_black_where_nothing_is(tmp_path):
     assert beside[16, 16, 2] < 0.4
 
 
-def test_alpha_stands_beside_colour_where_asked(tmp_path):
+def test_alpha_can_be_beside_colour(tmp_path):
     frames, _ = export(tmp_path, beside="alpha")
     assert frames[0, 16, 48].min() > 0.95
     assert frames[0, 2, 34].max() < 0.05
 
 
-def test_colour_can_stand_alone(tmp_path):
+def test_colour_can_be_alone(tmp_path):
     frames, _ = export(tmp_path, beside="none")
     assert frames.shape == (9, 32, 32, 3)
 

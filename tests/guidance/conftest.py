@@ -1,4 +1,4 @@
-"""An exact prior for the guidance tests: the images of a prompt are Gaussian around one image."""
+"""An exact prior for the tests of objectives: the images of a prompt are Gaussian around one image."""
 
 from dataclasses import dataclass, field, replace
 
@@ -16,14 +16,14 @@ from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
 
 SHARED = {"weight": 1.0, "t_min": 0.02, "t_max": 0.98, "shared_t": False, "reduction": "sum"}
-GUIDED = {  # distillations whose guess is under classifier-free guidance
+GUIDED = {  # distillations that predict under classifier-free guidance
     "sds": (SDS, {}),
     "ism": (ISM, {"delta": 0.05, "inversion_stride": 0.2, "initial_noise": 0.0}),
     "vfds": (VFDS, {}),
     "sdi": (SDI, {"inversion_scale": -2.0, "inversion_stride": 0.25, "overshoot": 0.03, "eta": 0.3}),
     "ucm": (UCM, {"inversion_steps": 3, "inversion_grid": "t", "fresh_noise": 0.0}),
 }
-DISTILLATIONS = GUIDED | {"csd": (CSD, {"empty_share": 0.0})}  # weighted differences of two guesses
+DISTILLATIONS = GUIDED | {"csd": (CSD, {"empty_share": 0.0})}  # weighted differences of two predictions
 OBJECTIVES = DISTILLATIONS | {
     "gcs": (GCS, {"w_cc": 1.0, "w_gc": 0.5, "w_cp": 0.5, "delta": 0.05, "fixed_noise": False})
 }
@@ -55,7 +55,7 @@ class MeansEmbedding(PromptEmbedding):
 
 @dataclass(frozen=True)
 class Call:
-    """What the prior was asked."""
+    """The arguments of one prediction."""
 
     t: torch.Tensor
     scale: float
@@ -65,7 +65,7 @@ class Call:
 
 @dataclass(frozen=True)
 class GaussianPrior(DiffusionPrior):
-    """x0 ~ N(mean, spread**2): the posterior mean is known in closed form. ``form`` is what it predicts."""
+    """A prior x0 ~ N(mean, spread**2) with a closed-form posterior mean; ``form`` is the predicted form."""
 
     noise_path: object
     spread: float = 0.5
@@ -80,7 +80,7 @@ class GaussianPrior(DiffusionPrior):
         return rgb.permute(0, 3, 1, 2)
 
     def decode(self, latents, height, width):
-        """Without the clamp, so that images of any range do."""
+        """Decode without a clamp, so that images may have any range."""
         return latents.permute(0, 2, 3, 1)
 
     def predict(self, noisy, t, condition, scale):
@@ -100,7 +100,7 @@ class GaussianPrior(DiffusionPrior):
 
 
 def posterior_means(noisy, a, b, mean, spread):
-    """Of the clean image and of the noise, given ``noisy``, for images around ``mean``."""
+    """Return the posterior means of the clean image and of the noise for images around ``mean``."""
     variance = a**2 * spread**2 + b**2
     off = (noisy - a * mean) / torch.where(variance > 0, variance, 1)
     return mean + a * spread**2 * off, b * off
@@ -113,7 +113,7 @@ def random_images(count, seed, views=3):
 
 @pytest.fixture
 def gaussian():
-    """The prior's class."""
+    """The class of the prior."""
     return GaussianPrior
 
 
@@ -125,14 +125,14 @@ def means():
 
 @pytest.fixture
 def one_image():
-    """Every prompt means the same image."""
+    """Means such that every prompt has the same image."""
     (image,) = random_images(1, seed=6)
     return Means(image, image, image)
 
 
 @pytest.fixture
 def one_among_many(one_image):
-    """The prompt names one image; without a prompt nearly anything goes."""
+    """Means such that the prompt determines the image and the empty prompt allows nearly any image."""
     return replace(one_image, empty_spread=1e4)
 
 
@@ -145,7 +145,7 @@ def rgb():
 
 @pytest.fixture
 def make():
-    """Objectives by name, with every key set; keywords change some."""
+    """A function that builds an objective by name, with every key set; keywords override keys."""
 
     def build(name, **keys):
         kind, extra = OBJECTIVES[name]
@@ -158,7 +158,7 @@ def make():
 
 @pytest.fixture
 def ask():
-    """The guidance on a render as (G / D, output), computed by autograd; the layout is the encoded one."""
+    """A function that returns G / D, by autograd and in the layout of latents, and the output."""
 
     def evaluate(guidance, rgb, condition, prior, *, step=0, seed=0):
         leaf = rgb.detach().clone().requires_grad_()
@@ -188,11 +188,11 @@ def objective(request):
 
 @pytest.fixture(params=DISTILLATIONS.keys())
 def distillation(request):
-    """An objective that is a weighted difference of two guesses."""
+    """An objective that is a weighted difference of two predictions."""
     return request.param
 
 
 @pytest.fixture(params=GUIDED.keys())
 def guided(request):
-    """A distillation whose guess is under classifier-free guidance."""
+    """A distillation that predicts under classifier-free guidance."""
     return request.param

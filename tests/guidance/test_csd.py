@@ -1,4 +1,4 @@
-"""CSD against its closed form on a Gaussian prior, and against SDS."""
+"""CSD compared with its closed form on a Gaussian prior, and with SDS."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ def drawn_t(views, low, high, seed):
 
 
 def test_between_two_images_of_one_spread_it_is_a_constant_pull(path, make, ask, gaussian, means, rgb):
-    """eps_y - eps_n = a b (n - y) / (a^2 s^2 + b^2), wherever the render is and whatever the noise."""
+    """The difference is eps_y - eps_n = a b (n - y) / (a^2 s^2 + b^2) for every render and every noise."""
     prior, guidance = gaussian(path, spread=SPREAD), make("csd", t_min=0.2, t_max=0.9)
     t = drawn_t(3, 0.2, 0.9, seed=11)
     a, b = per_view(path.a(t)), per_view(path.b(t))
@@ -29,7 +29,7 @@ def test_between_two_images_of_one_spread_it_is_a_constant_pull(path, make, ask,
 
 
 def test_against_a_wider_prompt_it_rests_beyond_the_image(path, make, ask, gaussian, means):
-    """At y + (y - n) (s_y^2 + gamma^2) / (s_n^2 - s_y^2) nothing but the noise pulls."""
+    """At y + (y - n) (s_y^2 + gamma^2) / (s_n^2 - s_y^2) the mean gradient is zero."""
     t, wide = drawn_t(3, 0.2, 0.9, seed=11), 0.8
     a, b = per_view(path.a(t)), per_view(path.b(t))
     ratio = (SPREAD**2 + (b / a) ** 2) / (wide**2 - SPREAD**2)
@@ -59,7 +59,7 @@ def test_exchanged_prompts_pull_the_other_way(make, ask, prior, means, rgb):
 def test_descent_arrives_at_the_image_where_the_negative_prompt_allows_anything(
     path, make, ask, gaussian, one_image, rgb
 ):
-    """Two images of one spread pull without end; against a wide negative prompt there is a place to rest."""
+    """With equal spreads the gradient never vanishes; with a wide negative prompt it does at one image."""
     condition = replace(one_image, negative_spread=1e4)
     prior, render = gaussian(path, spread=0.02), rgb.detach()
     target = one_image.positive.permute(0, 2, 3, 1)
@@ -72,21 +72,21 @@ def test_descent_arrives_at_the_image_where_the_negative_prompt_allows_anything(
     assert (render - target).square().mean().sqrt() < 0.02 * before
 
 
-def test_each_prompt_is_asked_once_and_alone(make, ask, prior, means, rgb):
+def test_each_prompt_costs_one_prediction_of_a_single_branch(make, ask, prior, means, rgb):
     ask(make("csd"), rgb, means, prior)
     assert [(call.scale, call.condition) for call in prior.calls] == [(1.0, means), (0.0, means)]
     assert torch.equal(prior.calls[0].t, prior.calls[1].t)
 
 
 def test_the_empty_prompt_takes_its_share(make, ask, prior, means, rgb):
-    """The negative prompt is annealed: (1 - r) eps_n + r eps_0, from one's place to the other's."""
+    """The reference (1 - r) eps_n + r eps_0 moves from the negative prompt to the empty one."""
     negative, empty, mixed = (ask(make("csd", empty_share=r), rgb, means, prior)[0] for r in (0.0, 1.0, 0.25))
     torch.testing.assert_close(mixed, 0.75 * negative + 0.25 * empty, rtol=1e-9, atol=1e-10)
     same = replace(means, negative=means.empty)
     torch.testing.assert_close(empty, ask(make("csd"), rgb, same, prior)[0], rtol=1e-9, atol=1e-10)
 
 
-def test_the_share_may_be_a_schedule_and_nobody_is_asked_in_vain(make, ask, gaussian, means, rgb):
+def test_the_share_may_be_a_schedule_and_makes_no_unused_predictions(make, ask, gaussian, means, rgb):
     guidance = make("csd", empty_share=Linear(start=1.0, end=0.0, steps=10))
     for step, asked in ((0, [means.empty]), (5, [means.empty, means]), (10, [means])):
         prior = gaussian(DDPM())

@@ -21,7 +21,7 @@ SCALE = 7.5
 
 
 def network(noisy, timestep, word):
-    """Not linear, not the same anywhere in the image, at any two times, for any two words."""
+    """A function that is not linear and differs between pixels, between times and between words."""
     phase = torch.as_tensor(timestep, dtype=noisy.dtype).reshape(-1, 1, 1, 1) / 700 + word
     return torch.tanh(0.6 * noisy.roll(1, -1) + 0.3 * word * noisy.flip(1) + phase.sin()) + 0.2 * noisy
 
@@ -64,7 +64,7 @@ class NetworkPrior(DiffusionPrior):
 
 @pytest.fixture
 def table():
-    """Stable Diffusion's noise table, in diffusers; a step upwards is one of ``inverse``."""
+    """The noise table of Stable Diffusion in diffusers, and the scheduler of its inversion."""
     keys = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear", "clip_sample": False}
     return lambda stride: (
         with_stride(diffusers.DDIMScheduler(**keys), stride),
@@ -78,12 +78,12 @@ def with_stride(scheduler, rows):
 
 
 def up(inverse, noise, row, sample):
-    """One step of DDIM inversion that ends at ``row``."""
+    """Take one step of DDIM inversion that ends at ``row``."""
     return inverse.step(noise, row, sample).prev_sample
 
 
 def down(ddim, noise, row, sample):
-    """One step of DDIM that starts at ``row``."""
+    """Take one step of DDIM that starts at ``row``."""
     return ddim.step(noise, row, sample).prev_sample
 
 
@@ -94,7 +94,7 @@ def gamma(scheduler, row):
 
 @pytest.fixture
 def still(make, ask, rgb):
-    """G of an objective at one fixed t, and what it drew for noise after ``skipped`` draws of levels."""
+    """Return G of an objective at one fixed t, and its noise, drawn after ``skipped`` draws of levels."""
 
     def evaluate(guidance, path, skipped=1):
         generator = torch.Generator().manual_seed(0)
@@ -117,7 +117,7 @@ def at(t):
 
 
 def close(got, expected):
-    """Schedulers keep their tables in single precision."""
+    """Compare with the tolerance of schedulers, which keep their tables in single precision."""
     torch.testing.assert_close(got, expected.to(got), rtol=2e-4, atol=2e-5)
 
 
@@ -139,11 +139,11 @@ def test_csd(make, still, clean, table):
 
 
 def test_ism(make, still, clean, table):
-    """Inverted to row 599 in strides of 200 rows, one more to row 799."""
+    """Invert to row 599 in strides of 200 rows, with one more stride to row 799."""
     guidance = make("ism", **at(0.8), delta=0.2, inversion_stride=0.2, weighting="gamma", weight=0.1)
     gradient, _ = still(guidance, DDPM())
     ddim, inverse = table(200)
-    noisy, row = clean, 0  # the clean image is asked about as row 0
+    noisy, row = clean, 0  # the prediction for the clean image is made at row 0
     for then in (199, 399, 599):
         noisy, row = up(inverse, network(noisy, rows(row), EMPTY), then, noisy), then
     before = network(noisy, rows(599), EMPTY)
@@ -152,7 +152,7 @@ def test_ism(make, still, clean, table):
 
 
 def test_sdi(make, still, clean, table):
-    """Inverted under the negated scale; then the distance to the image that the scheduler predicts."""
+    """Invert under the negated scale, and compare with the image that the scheduler predicts."""
     keys = {"inversion_scale": -SCALE, "inversion_stride": 0.1, "overshoot": 0.0, "eta": 0.0}
     gradient, _ = still(make("sdi", **at(0.3), **keys, weighting="gamma"), DDPM())
     ddim, inverse = table(100)
@@ -200,7 +200,7 @@ def flow():
 
 
 def test_vfds(make, still, clean, flow):
-    """u = 0.4 is the 600th of the descending thousand; the scheduler bends it by the shift."""
+    """u = 0.4 is the 600th of the 1000 descending levels; the scheduler applies the shift to it."""
     gradient, noise = still(make("vfds", **at(0.4)), RectifiedFlow(shift=3.0))
     timestep = flow.timesteps[600].expand(3)
     noisy = flow.scale_noise(clean, timestep, noise)
@@ -209,7 +209,7 @@ def test_vfds(make, still, clean, flow):
 
 @pytest.mark.parametrize(("grid", "sigmas"), [("sigma", [0, 1 / 3, 2 / 3]), ("t", [0, 0.5, 0.75, 0.9])])
 def test_ucm(grid, sigmas, make, still, clean, flow):
-    """The scheduler runs its Euler steps upwards, from the image to the noise."""
+    """The scheduler takes its Euler steps upwards, from the image to the noise."""
     keys = {"inversion_grid": grid, "inversion_steps": len(sigmas), "weight": 0.1}
     gradient, _ = still(make("ucm", **at(0.4), **keys), RectifiedFlow(shift=3.0))
     upwards = diffusers.FlowMatchEulerDiscreteScheduler(shift=1.0, invert_sigmas=True)
@@ -222,8 +222,8 @@ def test_ucm(grid, sigmas, make, still, clean, flow):
     close(gradient, 0.1 * (guided(noisy, timestep) - (noise - clean)))
 
 
-def test_the_network_tells_its_arguments_apart(clean):
-    """Otherwise this file would prove less than it seems to."""
+def test_the_network_depends_on_all_its_arguments(clean):
+    """If the network ignored an argument, the other tests of this file would not notice errors in it."""
     base = network(clean, rows(10), PROMPT)
     others = [network(*args) for args in ((clean, rows(200), PROMPT), (clean, rows(10), EMPTY))]
     assert all((other - base).abs().mean() > 0.05 for other in others)

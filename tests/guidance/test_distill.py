@@ -21,8 +21,8 @@ FORMULAS = {
 }
 
 
-def test_a_perfect_guess_has_zero_gradient(objective, path, make, ask, gaussian, one_image):
-    """The render is the only image of the prompt, and the prior knows it."""
+def test_a_perfect_prediction_has_zero_gradient(objective, path, make, ask, gaussian, one_image):
+    """The render is the only image of the prompt."""
     render = one_image.positive.permute(0, 2, 3, 1)
     for seed in range(5):
         gradient, output = ask(make(objective), render, one_image, gaussian(path, spread=0.0), seed=seed)
@@ -31,14 +31,14 @@ def test_a_perfect_guess_has_zero_gradient(objective, path, make, ask, gaussian,
 
 
 def test_descent_points_at_the_image(guided, path, make, ask, gaussian, one_among_many, rgb):
-    """If the prompt names one image, every element of -G points from the render to it."""
+    """If the prompt determines the image, every element of -G points from the render to it."""
     gradient, _ = ask(make(guided, scale=1.0), rgb, one_among_many, gaussian(path, spread=0.0))
     offset = rgb.detach().permute(0, 3, 1, 2) - one_among_many.positive
     assert (gradient * offset > 0).all()
 
 
 def test_descent_arrives_at_the_image(guided, path, make, ask, gaussian, one_among_many, rgb):
-    """Gradient descent with the x0-residual as gradient, from anywhere, on a prior with little spread."""
+    """Descend along the x0-residual from a random render, on a prior with little spread."""
     weighting = {"vfds": "sigma", "ucm": "sigma"}.get(guided, "gamma")
     guidance = make(guided, scale=1.0, weighting=weighting, t_min=0.3, t_max=0.7)
     prior, render = gaussian(path, spread=0.02), rgb.detach()
@@ -53,7 +53,7 @@ def test_descent_arrives_at_the_image(guided, path, make, ask, gaussian, one_amo
 def test_the_gradient_is_that_of_the_surrogate_with_a_frozen_target(
     distillation, make, ask, gaussian, means, rgb
 ):
-    """Finite differences of ||x0 - target||^2 / (2 D), target = x0 - G held fixed."""
+    """Compare with finite differences of ||x0 - target||^2 / (2 D) for the fixed target x0 - G."""
     divisor = rgb.numel()
     gradient, output = ask(make(distillation, reduction="mean"), rgb, means, gaussian(DDPM()))
     clean = rgb.detach().permute(0, 3, 1, 2)
@@ -78,7 +78,7 @@ def test_a_small_gradient_survives_single_precision():
 
 
 def test_the_sum_does_not_overflow_in_half_precision():
-    """The largest half is 65,504."""
+    """The largest number in half precision is 65,504."""
     clean = torch.ones(1, 1, 2, 2, dtype=torch.float16, requires_grad=True)
     loss = surrogate(clean, torch.full_like(clean, 300), 1)
     loss.backward()
@@ -87,7 +87,7 @@ def test_the_sum_does_not_overflow_in_half_precision():
 
 
 @pytest.mark.parametrize("form", ["noise", "velocity"])
-def test_what_the_prior_predicts_does_not_matter(form, objective, make, ask, prior, means, rgb):
+def test_the_form_that_the_prior_predicts_does_not_matter(form, objective, make, ask, prior, means, rgb):
     expected, _ = ask(make(objective), rgb, means, prior)
     got, _ = ask(make(objective), rgb, means, replace(prior, form=form))
     torch.testing.assert_close(got, expected, rtol=1e-7, atol=1e-9)
@@ -190,7 +190,7 @@ def test_the_window_follows_its_schedules(make, ask, gaussian, means, rgb):
 
 
 def test_a_window_of_no_width_leaves_t_to_its_schedule(distillation, make, ask, prior, means, rgb):
-    """DreamGaussian's annealing: t = 1 - step / 500, for every view and seed."""
+    """DreamGaussian anneals t = 1 - step / 500, for every view and seed."""
     anneal = Linear(start=0.9, end=0.2, steps=7)
     guidance = make(distillation, t_min=anneal, t_max=anneal)
     for step, t in ((0, 0.9), (3, 0.6), (9, 0.2)):
@@ -251,14 +251,14 @@ def test_numbers_that_are_not_finite_become_zero_and_are_counted(distillation, m
     assert all(torch.tensor(value).isfinite() for value in after.log.values())
 
 
-def test_the_residual_is_measured_against_the_last_guess(make, ask, gaussian, one_image, rgb):
+def test_the_residual_is_measured_against_the_last_prediction(make, ask, gaussian, one_image, rgb):
     _, output = ask(make("sds", scale=1.0), rgb, one_image, gaussian(DDPM(), spread=0.0))
     offset = rgb.detach().permute(0, 3, 1, 2) - one_image.positive
     assert output.log["residual_rms"] == pytest.approx(float(offset.square().mean().sqrt()))
 
 
 def judge_by_network(guidance, predicts, noise_path, device="cpu"):
-    """The gradient on a render of odd size, and the output."""
+    """Return the gradient on a render of odd size, and the output."""
     prior = Tiny(predicts=predicts, noise_path=noise_path, width=16, downscale=2, seed=0)
     prior = prior.to(torch.device(device))
     cameras = turntable(2, elevation_deg=15.0, distance=3.0, fov_y_deg=40.0, size=17)
@@ -281,7 +281,7 @@ def test_it_runs_on_a_network(predicts, noise_path, objective, make):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_cuda_agrees_with_the_cpu(objective, make):
-    """The same draws on either; the network computes a little differently."""
+    """The random numbers are the same on both devices; the network's results differ slightly."""
     near, far = (judge_by_network(make(objective), "noise", DDPM(), device)[0] for device in ("cpu", "cuda"))
     assert (far.cpu() - near).norm() < 0.05 * near.norm()
 
@@ -337,6 +337,15 @@ def test_a_window_that_closes_in_between_is_refused_when_it_does(make, ask, gaus
         ask(guidance, rgb, means, gaussian(DDPM()), step=5)
 
 
-def test_the_root_mean_square_is_of_what_is_finite():
+def test_the_root_mean_square_is_over_finite_elements():
     assert rms(torch.tensor([3.0, torch.nan, 4.0, torch.inf])) == pytest.approx(12.5**0.5)
     assert rms(torch.tensor([torch.nan, -torch.inf])) == 0
+
+
+def test_every_number_of_a_chart_is_logged(objective, make, ask, gaussian, means, rgb):
+    guidance = make(objective)
+    _, output = ask(guidance, rgb, means, gaussian(DDPM()))
+    keys = [curve.key for chart in guidance.charts() for curve in chart.curves]
+    assert "residual_rms" in keys
+    assert len(keys) == len(set(keys))
+    assert set(keys) <= set(output.log)

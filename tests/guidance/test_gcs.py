@@ -1,4 +1,4 @@
-"""GCS against the published loss, differentiated by autograd, and the laws of its parts."""
+"""GCS compared with the published loss, differentiated by autograd, and the laws of its parts."""
 
 import jaxtyping
 import pytest
@@ -20,7 +20,7 @@ def weights_of(w_cc, w_gc, w_cp):
 
 
 def redraw(like, low, high, delta, seed):
-    """t, s, e and the noise, in the order in which GCS draws them."""
+    """Return t, s, e and the noise, in the order in which GCS draws them."""
     generator = torch.Generator().manual_seed(seed)
     t, share = (torch.rand(like.shape[0], generator=generator).double() for _ in range(2))
     t = low + (high - low) * t
@@ -30,7 +30,7 @@ def redraw(like, low, high, delta, seed):
 
 
 def published_loss(rgb, path, prior, condition, draws, weights):
-    """As the method is written: constants detached, gradients left to autograd. B = 1, lambda = 1."""
+    """Return the published loss, with constants detached and gradients by autograd; B = 1, lambda = 1."""
     t, s, e, noise = draws
     w_cc, w_gc, w_cp = weights
     empty = condition.unprompted()
@@ -64,7 +64,7 @@ def published_loss(rgb, path, prior, condition, draws, weights):
 
 @pytest.mark.parametrize("weights", [*ALONE.values(), ALL], ids=[*ALONE, "all"])
 def test_gradient_is_that_of_the_published_loss(weights, path, make, ask, gaussian, means, rgb):
-    """Slopes through chains of DDIM steps telescope; autograd is asked whether they do."""
+    """Check with autograd that the slopes through chains of DDIM steps telescope."""
     prior, window = gaussian(path), {"t_min": 0.4, "t_max": 0.9, "delta": 0.1}
     gradient, _ = ask(make("gcs", **window, **weights_of(*weights)), rgb, means, prior, seed=11)
     draws = redraw(rgb.permute(0, 3, 1, 2), 0.4, 0.9, 0.1, seed=11)
@@ -93,7 +93,7 @@ def test_the_terms_add_up_and_are_logged_with_their_weights(make, ask, prior, me
 
 
 def test_the_noise_averages_out_to_a_pull_towards_the_image(make, ask, gaussian, one_among_many, rgb):
-    """If the prompt names one image and nearly anything else goes, GC's difference is x0 + gamma n - m."""
+    """If the prompt determines the image m and the empty prompt allows any, GC is x0 + gamma n - m."""
     guidance = make("gcs", t_min=0.5, t_max=0.5, **weights_of(*ALONE["gc"]))
     prior, count = gaussian(DDPM(), spread=0.0), 40
     offset = rgb.detach().permute(0, 3, 1, 2) - one_among_many.positive
@@ -103,7 +103,7 @@ def test_the_noise_averages_out_to_a_pull_towards_the_image(make, ask, gaussian,
 
 
 def test_descent_arrives_at_the_image(path, make, ask, gaussian, one_among_many, rgb):
-    """As the noise shrinks, so does the distance: what it adds to the render is not told from the render."""
+    """The remaining distance shrinks with the noise, which GC cannot distinguish from the render."""
     prior, render = gaussian(path, spread=0.02), rgb.detach()
     target = one_among_many.positive.permute(0, 2, 3, 1)
     before = (render - target).square().mean().sqrt()
@@ -143,7 +143,7 @@ def test_the_smallest_t_leaves_room_below(make, ask, gaussian, means, rgb):
 
 
 def test_the_window_may_slide_and_the_interval_shrink(make, ask, gaussian, means, rgb):
-    """As published: t from [0.5, 0.98) to [0.02, 0.5), delta from 0.1 to 0.08."""
+    """The published t goes from [0.5, 0.98) to [0.02, 0.5), and delta from 0.1 to 0.08."""
     guidance = make(
         "gcs",
         t_min=Linear(start=0.5, end=0.02, steps=10),
@@ -160,7 +160,7 @@ def test_the_window_may_slide_and_the_interval_shrink(make, ask, gaussian, means
 
 
 def test_fixed_noise_is_the_same_at_every_step_and_after_a_restart(make, ask, gaussian, means, rgb):
-    """A checkpoint keeps the state of the generator; its seed is part of it."""
+    """A checkpoint keeps the state of the generator, which includes its seed."""
     clean, generator = rgb.detach().permute(0, 3, 1, 2), torch.Generator().manual_seed(7)
 
     def noise_of(guidance, source):
@@ -190,7 +190,7 @@ def test_with_fixed_noise_only_the_levels_are_drawn(make, means, gaussian, rgb):
 # --- cost
 
 
-def test_the_prior_is_asked_as_the_method_says(make, ask, gaussian, means, rgb):
+def test_predictions_are_made_as_the_method_says(make, ask, gaussian, means, rgb):
     prior = gaussian(DDPM())
     ask(make("gcs", t_min=0.5, t_max=0.5, delta=0.05), rgb, means, prior)
     asked = [(round(float(call.t[0]), 6), call.condition is means, call.scale) for call in prior.calls]
@@ -210,7 +210,7 @@ def test_the_prior_is_asked_as_the_method_says(make, ask, gaussian, means, rgb):
 
 
 @pytest.mark.parametrize("cost", [("cc", 5, 0), ("gc", 4, 0), ("cp", 4, 2)], ids=ALONE)
-def test_a_term_without_weight_costs_nothing(cost, make, ask, gaussian, means, rgb, monkeypatch):
+def test_a_term_of_weight_zero_makes_no_predictions(cost, make, ask, gaussian, means, rgb, monkeypatch):
     decoded, decode = [], gaussian.decode
     monkeypatch.setattr(gaussian, "decode", lambda *given: decoded.append(given) or decode(*given))
     prior, (term, calls, decodings) = gaussian(DDPM()), cost
@@ -221,8 +221,8 @@ def test_a_term_without_weight_costs_nothing(cost, make, ask, gaussian, means, r
 # --- pixels
 
 
-def test_the_pixel_term_goes_past_the_encoder(make):
-    """Each latent of this prior is the mean of four pixels and decodes to four alike; D is the views."""
+def test_the_pixel_term_does_not_pass_through_the_encoder(make):
+    """Each latent of this prior is the mean of four pixels and decodes to four equal ones; D is the views."""
     prior = Tiny(predicts="noise", noise_path=DDPM(), width=16, downscale=2, seed=0)
     cameras = turntable(2, elevation_deg=15.0, distance=3.0, fov_y_deg=40.0, size=16)
     condition = prior.embed("a red cube", "").at(cameras, torch.zeros(2, 3))
@@ -287,6 +287,6 @@ def test_wrong_values_are_refused_by_key(key, value, make, monkeypatch):
         make("gcs", **{key: value})
 
 
-def test_without_any_term_there_is_nothing_to_descend(make):
-    with pytest.raises(UserError, match=r"guidance.w_gc: expected a term with a weight"):
+def test_all_weights_zero_are_refused(make):
+    with pytest.raises(UserError, match=r"guidance.w_gc: expected a number > 0, since w_cc and w_cp are 0"):
         make("gcs", **weights_of(0.0, 0.0, 0.0))

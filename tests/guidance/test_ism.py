@@ -1,4 +1,4 @@
-"""ISM against its closed form on a Gaussian prior."""
+"""ISM compared with its closed form on a Gaussian prior."""
 
 import pytest
 import torch
@@ -17,14 +17,14 @@ def drawn_t(views, low, high, seed):
 
 
 def step_factor(path, start, end, spread):
-    """What one exact DDIM step multiplies x - a * mean by."""
+    """Return the factor by which one exact DDIM step multiplies x - a * mean."""
     a0, b0, a1, b1 = (per_view(share(t)) for t in (start, end) for share in (path.a, path.b))
     return (a1 * a0 * spread**2 + b1 * b0) / (a0**2 * spread**2 + b0**2)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1.0, 7.5])
 def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means, rgb):
-    """Every step is affine: follow x - a * mean through 0 -> 0.25 -> s -> t by hand."""
+    """Follow x - a * mean through 0 -> 0.25 -> s -> t by hand, since every step is affine."""
     keys = {"t_min": 0.4, "t_max": 0.5, "delta": 0.1, "inversion_stride": 0.25, "weighting": "gamma"}
     gradient, _ = ask(make("ism", scale=scale, **keys), rgb, means, gaussian(path, spread=SPREAD), seed=11)
 
@@ -43,8 +43,8 @@ def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means
     torch.testing.assert_close(gradient, b / a * (noise_at_t - noise_at_s), rtol=1e-8, atol=1e-9)
 
 
-def test_the_prior_is_asked_as_the_method_says(make, ask, prior, means, rgb):
-    """Unprompted at 0, 0.2, 0.4 and s; prompted, with guidance, at t."""
+def test_predictions_are_made_as_the_method_says(make, ask, prior, means, rgb):
+    """Predictions are unprompted at 0, 0.2, 0.4 and s, and prompted with guidance at t."""
     keys = {"t_min": 0.6, "t_max": 0.6, "delta": 0.1, "inversion_stride": 0.2}
     ask(make("ism", scale=7.5, **keys), rgb, means, prior)
     assert [float(call.t[0]) for call in prior.calls] == pytest.approx([0.0, 0.2, 0.4, 0.5, 0.6])
@@ -79,8 +79,8 @@ def test_without_initial_noise_it_is_deterministic_given_t(make, ask, prior, mea
     assert (first - again).abs().max() > 1e-4
 
 
-def test_initial_noise_lies_on_the_path(path, make, ask, gaussian, means, rgb):
-    """The inversion starts at t = initial_noise on a x0 + b n; with s below that, at s."""
+def test_initial_noise_is_on_the_path(path, make, ask, gaussian, means, rgb):
+    """The inversion starts on a x0 + b n at t = initial_noise, or at s if that is smaller."""
     guidance = make("ism", initial_noise=0.2, t_min=0.051, t_max=0.5, delta=0.05, inversion_stride=1.0)
     prior = gaussian(path, spread=SPREAD)
     gradient, _ = ask(guidance, rgb, means, prior, seed=4)

@@ -1,4 +1,4 @@
-"""SDI against its closed form on a Gaussian prior."""
+"""SDI compared with its closed form on a Gaussian prior."""
 
 import pytest
 import torch
@@ -12,14 +12,14 @@ STILL = {"overshoot": 0.0, "eta": 0.0, "t_min": 0.6, "t_max": 0.6}
 
 
 def redraw(like, low, high, seed):
-    """t, tau / overshoot and the added noise, in the order in which SDI draws them."""
+    """Return t, tau / overshoot and the added noise, in the order in which SDI draws them."""
     generator = torch.Generator().manual_seed(seed)
     t, tau = (torch.rand(like.shape[0], generator=generator).double() for _ in range(2))
     return low + (high - low) * t, tau, torch.randn(like.shape, generator=generator).double()
 
 
 def step_factor(path, start, end):
-    """What one exact DDIM step multiplies x - a * mean by."""
+    """Return the factor by which one exact DDIM step multiplies x - a * mean."""
     a0, b0, a1, b1 = (per_view(share(t)) for t in (start, end) for share in (path.a, path.b))
     return (a1 * a0 * SPREAD**2 + b1 * b0) / (a0**2 * SPREAD**2 + b0**2)
 
@@ -30,7 +30,7 @@ def invert(guidance, clean, t, condition, prior, seed=0):
 
 @pytest.mark.parametrize("scales", [(1.0, 1.0), (7.5, -7.5), (7.5, 0.0)])
 def test_gradient_equals_the_closed_form(scales, path, make, ask, gaussian, means, rgb):
-    """Every step is affine around the mean under its guidance: 0 -> 0.25 -> 0.5 -> t', and one guess at t."""
+    """Follow 0 -> 0.25 -> 0.5 -> t' by hand, since every step is affine, with one prediction at t."""
     scale, inversion_scale = scales
     keys = {"scale": scale, "inversion_scale": inversion_scale, "inversion_stride": 0.25}
     guidance = make("sdi", overshoot=0.1, eta=0.3, t_min=0.5, t_max=0.6, **keys)
@@ -53,8 +53,8 @@ def test_gradient_equals_the_closed_form(scales, path, make, ask, gaussian, mean
     torch.testing.assert_close(gradient, expected, rtol=1e-8, atol=1e-8)
 
 
-def test_the_published_weight_leaves_the_distance_to_the_clean_guess(make, ask, prior, means, rgb):
-    """G = x0 - x0_hat: a mean squared error against the image that the prior makes of the render."""
+def test_with_the_published_weight_g_is_the_difference_to_the_clean_prediction(make, ask, prior, means, rgb):
+    """G = x0 - x0_hat, as for a mean squared error to the predicted clean image."""
     gradient, output = ask(make("sdi", weighting="gamma", **STILL), rgb, means, prior)
     clean = rgb.detach().permute(0, 3, 1, 2)
     t = torch.full((3,), 0.6, dtype=torch.float64)
@@ -64,8 +64,8 @@ def test_the_published_weight_leaves_the_distance_to_the_clean_guess(make, ask, 
     assert output.log["guidance_rms"] == pytest.approx(output.log["residual_rms"], rel=1e-8)
 
 
-def test_the_prior_is_asked_as_the_method_says(make, ask, prior, means, rgb):
-    """Ten steps for t = 1, fewer for a smaller t, under the prompt and the inversion's own scale."""
+def test_predictions_are_made_as_the_method_says(make, ask, prior, means, rgb):
+    """There are ten steps for t = 1 and fewer for a smaller t, under the prompt and the inversion's scale."""
     keys = {"inversion_stride": 0.1, "overshoot": 0.0, "t_min": 0.35, "t_max": 0.35}
     ask(make("sdi", scale=7.5, inversion_scale=-7.5, **keys), rgb, means, prior)
     *inversion, last = prior.calls
@@ -76,7 +76,7 @@ def test_the_prior_is_asked_as_the_method_says(make, ask, prior, means, rgb):
 
 
 def test_the_inversion_overshoots_but_never_leaves_the_path(make, ask, gaussian, means, rgb):
-    """With a stride of 1 it is one step from the render; what is asked next lies back at t."""
+    """With a stride of 1 there is one step from the render, and the next prediction is at t again."""
     prior, path = gaussian(RectifiedFlow()), RectifiedFlow()
     clean, t = rgb.detach().permute(0, 3, 1, 2), torch.tensor([0.5, 0.9, 0.99], dtype=torch.float64)
     guidance = make("sdi", overshoot=0.3, eta=0.0, inversion_stride=1.0, inversion_scale=1.0)

@@ -1,4 +1,4 @@
-"""SDS against its closed form on a Gaussian prior."""
+"""SDS compared with its closed form on a Gaussian prior."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ LOW, HIGH, SPREAD = 0.2, 0.9, 0.5
 
 
 def redraw(like, seed, dtype=torch.float64):
-    """The t and the noise that SDS drew: first t, then noise, both in single precision."""
+    """Return the t and the noise that SDS drew: first t, then noise, both in single precision."""
     generator = torch.Generator().manual_seed(seed)
     t = LOW + (HIGH - LOW) * torch.rand(like.shape[0], generator=generator).to(dtype)
     return t, torch.randn(like.shape, generator=generator).to(dtype)

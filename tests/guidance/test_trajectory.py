@@ -1,4 +1,4 @@
-"""Laws of the prior's trajectory: steps, arrival, there and back."""
+"""Laws of the prior's trajectory: number of steps, arrival and inversion."""
 
 import pytest
 import torch
@@ -39,7 +39,7 @@ def test_inversion_and_sampling_undo_each_other(path, gaussian, means):
 
 
 def test_the_round_trip_is_exact_without_spread(path, gaussian, means):
-    """The prior knows the image, so it names the noise exactly: any stride will do."""
+    """The prior predicts the image and the noise exactly, so any stride gives the same result."""
     prior = gaussian(path, spread=0.0)
     start, end = levels(0.1, 0.1, 0.1), levels(0.3, 0.6, 0.9)
     noisy = path.mix(means.positive, means.empty, start)

@@ -1,4 +1,4 @@
-"""UCM against its closed form on a Gaussian prior, and the laws of the coupling."""
+"""UCM compared with its closed form on a Gaussian prior, and the laws of the coupling."""
 
 import jaxtyping
 import pytest
@@ -17,7 +17,7 @@ def drawn_t(views, low, high, seed):
 
 
 def step_factor(path, start, end):
-    """What one exact DDIM step multiplies x - a * mean by."""
+    """Return the factor by which one exact DDIM step multiplies x - a * mean."""
     ends = torch.tensor([start, end], dtype=torch.float64)
     (a0, a1), (b0, b1) = path.a(ends), path.b(ends)
     return (a1 * a0 * SPREAD**2 + b1 * b0) / (a0**2 * SPREAD**2 + b0**2)
@@ -30,7 +30,7 @@ def case_of(clean, prior, condition, t=0.5):
 
 @pytest.mark.parametrize("scale", [0.0, 1.0, 40.0])
 def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means, rgb):
-    """Four affine steps along the empty prompt's trajectory, then one guess under guidance."""
+    """Take four affine steps along the trajectory of the empty prompt, and one prediction under guidance."""
     guidance = make("ucm", scale=scale, inversion_steps=4, t_min=0.2, t_max=0.9)
     gradient, _ = ask(guidance, rgb, means, gaussian(path, spread=SPREAD), seed=11)
 
@@ -46,8 +46,8 @@ def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means
     torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_on_a_flow_the_noise_is_the_end_of_eulers_walk(make, ask, gaussian, means, rgb):
-    """As FlowDreamer writes it: three steps of a third each, the first from sigma = 0."""
+def test_on_a_flow_the_noise_is_the_end_of_the_euler_steps(make, ask, gaussian, means, rgb):
+    """FlowDreamer takes three steps of a third each, the first from sigma = 0."""
     prior = gaussian(RectifiedFlow(shift=3.0))
     guidance = make("ucm", scale=40.0, inversion_grid="sigma", t_min=0.6, t_max=0.6)
     gradient, _ = ask(guidance, rgb, means, prior)
@@ -64,7 +64,7 @@ def test_on_a_flow_the_noise_is_the_end_of_eulers_walk(make, ask, gaussian, mean
 
 @pytest.mark.parametrize(("grid", "sigmas"), [("sigma", [0, 1 / 3, 2 / 3]), ("t", [0, 0.5, 0.75, 0.9])])
 def test_the_published_grids(grid, sigmas, make, ask, gaussian, means, rgb):
-    """The second is even in t, and Stable Diffusion 3 bends t with shift 3."""
+    """The second grid is even in t, to which Stable Diffusion 3 applies the shift 3."""
     path = RectifiedFlow(shift=3.0)
     prior = gaussian(path)
     ask(make("ucm", inversion_grid=grid, inversion_steps=len(sigmas)), rgb, means, prior)
@@ -75,8 +75,8 @@ def test_the_published_grids(grid, sigmas, make, ask, gaussian, means, rgb):
 
 
 @pytest.mark.parametrize("steps", [1, 5])
-def test_the_prior_is_asked_as_the_method_says(steps, path, make, ask, gaussian, means, rgb):
-    """Unprompted along the grid, even in b on any path; then once, prompted and guided."""
+def test_predictions_are_made_as_the_method_says(steps, path, make, ask, gaussian, means, rgb):
+    """Predictions are unprompted along the grid, which is even in b; the last one is prompted and guided."""
     prior = gaussian(path)
     ask(make("ucm", scale=40.0, inversion_steps=steps, inversion_grid="sigma"), rgb, means, prior)
     *unprompted, prompted = prior.calls
@@ -88,7 +88,7 @@ def test_the_prior_is_asked_as_the_method_says(steps, path, make, ask, gaussian,
 
 
 def test_pair_and_trajectory_end_at_the_same_point(path, make, gaussian, means, rgb):
-    """On a DDPM path something of the render is left at t = 1; it must not be counted twice."""
+    """On a DDPM path a part of the render remains at t = 1; it must not be counted twice."""
     clean, prior = rgb.detach().permute(0, 3, 1, 2), gaussian(path)
     noise = make("ucm", inversion_steps=2).couple(case_of(clean, prior, means))
     pushed = clean
@@ -100,7 +100,7 @@ def test_pair_and_trajectory_end_at_the_same_point(path, make, gaussian, means, 
 
 @pytest.mark.parametrize("shift", [1.0, 3.0])
 def test_the_noise_of_an_image_is_its_standard_score(shift, make, gaussian, means, rgb):
-    """The unique coupling of a Gaussian world with pure noise, which fine steps approach."""
+    """Fine steps approach the unique coupling of a Gaussian distribution with pure noise."""
     clean, prior = rgb.detach().permute(0, 3, 1, 2), gaussian(RectifiedFlow(shift=shift), spread=SPREAD)
     errors = []
     for steps in (40, 80):
@@ -136,7 +136,7 @@ def test_gradient_is_the_residual_over_b(make, ask, prior, means, rgb):
 
 
 def test_half_precision_keeps_its_coupling(make, gaussian, one_image):
-    """Levels are never in half precision, and noise drawn in it may be mixed in."""
+    """Levels are never in half precision, and fresh noise in half precision can be added."""
     prior = gaussian(DDPM())
     render = one_image.positive.to(torch.bfloat16).permute(0, 2, 3, 1).requires_grad_()
     guidance = make("ucm", fresh_noise=0.5)

@@ -1,4 +1,4 @@
-"""VFDS against its closed form on a Gaussian prior, and against SDS."""
+"""VFDS compared with its closed form on a Gaussian prior, and with SDS."""
 
 import pytest
 import torch
@@ -49,8 +49,8 @@ def test_times_a_it_is_sds(path, make, ask, prior, means, rgb):
     torch.testing.assert_close(velocity * per_view(path.a(prior.calls[-1].t)), noise, rtol=1e-8, atol=1e-9)
 
 
-def test_paths_agree_at_equal_b_and_an_equal_clean_guess(make, ask, gaussian, one_image, rgb):
-    """Without spread the clean guess is the image itself, on any path."""
+def test_paths_agree_at_equal_b_and_an_equal_clean_prediction(make, ask, gaussian, one_image, rgb):
+    """Without spread the predicted clean image is the image itself, on any path."""
     gradients = []
     for path, t in (
         (DDPM(), 0.4),

@@ -56,7 +56,7 @@ def test_colors_stay_colors():
     assert rgb.max() <= 1 + 1e-6
 
 
-def test_everything_else_is_as_asked():
+def test_scale_opacity_and_degree_are_as_requested():
     made = build()
     assert len(made) == 500
     assert made.sh_degree == 1
@@ -70,7 +70,7 @@ def test_neighbouring_gaussians_just_overlap_by_default():
     assert 0.5 * spacing < scales < 1.5 * spacing
 
 
-def test_the_generator_decides():
+def test_results_depend_on_the_generator_alone():
     assert torch.equal(build(seed=1).means, build(seed=1).means)
     assert not torch.equal(build(seed=1).means, build(seed=2).means)
 

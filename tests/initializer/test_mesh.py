@@ -40,7 +40,7 @@ def save(mesh: trimesh.Trimesh, path):
 
 
 @pytest.mark.parametrize("suffix", ["ply", "obj", "stl", "glb", "off"])
-def test_points_lie_on_the_surface_scaled_to_the_radius(tmp_path, suffix):
+def test_points_are_on_the_surface_scaled_to_the_radius(tmp_path, suffix):
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=7.0).apply_translation([3, 4, 5])
     made = build(save(sphere, tmp_path / f"sphere.{suffix}"))
     assert len(made) == 2000
@@ -67,7 +67,7 @@ def test_the_bounding_box_is_centred(tmp_path):
     torch.testing.assert_close(middle, torch.zeros(3), atol=0.03, rtol=0)
 
 
-def test_a_file_with_y_up_stands_upright_and_faces_the_front(tmp_path):
+def test_a_file_with_y_up_is_upright_and_faces_the_front(tmp_path):
     corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 3.0, 0], [0, 0, 2.0]])  # tall in y, its front towards +z
     mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 1, 3], [0, 2, 3]], process=False)
     path = save(mesh, tmp_path / "mark.ply")
@@ -86,7 +86,7 @@ def test_a_turn_brings_one_side_to_the_front(tmp_path):
     path = save(trimesh.Trimesh(corners, [[0, 1, 2]], process=False), tmp_path / "mark.ply")
     means = build(path, turn_deg=90).means
     torch.testing.assert_close(means[:, 1], torch.zeros(2000), atol=1e-5, rtol=0)
-    assert means[means[:, 2].argmax(), 0] < means[:, 0].mean()  # the tip stands where the long side begins
+    assert means[means[:, 2].argmax(), 0] < means[:, 0].mean()  # the tip is where the long side begins
 
 
 def test_without_a_radius_it_stays_as_it_is(tmp_path):
@@ -159,7 +159,7 @@ def test_a_material_without_a_texture_colors_a_glb(tmp_path):
     torch.testing.assert_close(rgb(made), torch.tensor([[0.0, 1.0, 0.0]]).expand(50, 3))
 
 
-def test_every_part_of_a_scene_keeps_its_own_kind_of_colors(tmp_path):
+def test_every_part_of_a_scene_keeps_its_kind_of_colors(tmp_path):
     red, plain = trimesh.creation.box(), trimesh.creation.box()
     red.visual.vertex_colors = [255, 0, 0, 255]
     textured = []
@@ -178,7 +178,7 @@ def test_every_part_of_a_scene_keeps_its_own_kind_of_colors(tmp_path):
     assert column.bincount().min() > 400
 
 
-def test_parts_stand_where_the_scene_puts_them(tmp_path):
+def test_parts_are_placed_as_in_the_scene(tmp_path):
     scene = trimesh.Scene()
     scene.add_geometry(trimesh.creation.box())
     scene.add_geometry(
@@ -192,7 +192,7 @@ def test_parts_stand_where_the_scene_puts_them(tmp_path):
 
 
 def test_a_body_of_seven_thousand_vertices_becomes_fifty_thousand_gaussians(tmp_path):
-    """GaussianDreamer's start from SMPL, with the scales from the neighbours."""
+    """GaussianDreamer starts from SMPL like this, with scales from the neighbours."""
     body = trimesh.creation.capsule(height=1.2, radius=0.3, count=[84, 84])
     made = build(save(body, tmp_path / "body.obj"), up="z", count=50_000, scale=None)
     assert len(made) == 50_000
@@ -212,7 +212,7 @@ def test_all_parts_of_a_scene_are_used(tmp_path):
     assert float((means[:, 0] > 0).float().mean()) == pytest.approx(0.5, abs=0.05)
 
 
-def test_the_generator_decides(tmp_path):
+def test_results_depend_on_the_generator_alone(tmp_path):
     path = save(trimesh.creation.box(), tmp_path / "box.ply")
     assert torch.equal(build(path, seed=1).means, build(path, seed=1).means)
     assert not torch.equal(build(path, seed=1).means, build(path, seed=2).means)
@@ -224,26 +224,26 @@ def test_a_path_below_the_home_folder_is_found(tmp_path, monkeypatch):
     assert torch.equal(build("~/box.ply").means, build(path).means)
 
 
-def test_a_missing_file_is_said_so(tmp_path):
-    with pytest.raises(UserError, match=r"initializer\.path: no file .*nothing\.glb"):
+def test_a_missing_file_is_reported(tmp_path):
+    with pytest.raises(UserError, match=r"initializer\.path: expected a file, got .*nothing\.glb', which"):
         build(tmp_path / "nothing.glb")
 
 
 @pytest.mark.parametrize("name", ["broken.glb", "unknown.format"])
-def test_a_file_that_cannot_be_read_is_said_so(tmp_path, name):
+def test_a_file_that_cannot_be_read_is_reported(tmp_path, name):
     (tmp_path / name).write_bytes(b"not a mesh")
     with pytest.raises(UserError, match=r"initializer\.path: .* cannot be read \("):
         build(tmp_path / name)
 
 
 @pytest.mark.parametrize("kind", ["points", "flat"])
-def test_a_file_without_a_surface_is_said_so(tmp_path, kind):
+def test_a_file_without_a_surface_is_reported(tmp_path, kind):
     if kind == "points":
         trimesh.PointCloud(np.eye(3)).export(tmp_path / "it.ply")
     else:
         line = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]], dtype=float)
         trimesh.Trimesh(line, [[0, 1, 2]], process=False).export(tmp_path / "it.ply")
-    with pytest.raises(UserError, match="holds no surface"):
+    with pytest.raises(UserError, match=r"expected a mesh with triangles, got .*, which has no surface"):
         build(tmp_path / "it.ply")
 
 

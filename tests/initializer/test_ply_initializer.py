@@ -1,4 +1,4 @@
-"""Laws of the ply initializer: assets come back as they were, points become Gaussians."""
+"""Laws of the ply initializer: assets are read back unchanged, and points become Gaussians."""
 
 import struct
 
@@ -63,7 +63,7 @@ def saved(tmp_path, gaussians: Gaussians, up: str = "-y"):
 
 
 def from_strangers(path):
-    """The same file without the comments that say who wrote it and which axis is up."""
+    """Remove the comments that name the program and the up axis."""
     lines = path.read_bytes().split(b"\n")
     path.write_bytes(b"\n".join(line for line in lines if not line.startswith(b"comment cadam3d")))
     return path
@@ -76,19 +76,19 @@ def assert_equal(made: Gaussians, wanted: Gaussians) -> None:
 
 @pytest.mark.parametrize("up", ["-y", "+y", "+z"])
 @pytest.mark.parametrize("degree", [0, 1])
-def test_our_assets_come_back_as_they_were_whatever_their_frame(tmp_path, up, degree):
+def test_our_assets_are_read_back_unchanged_with_any_up_axis(tmp_path, up, degree):
     asset = some_gaussians(degree=degree)
     assert_equal(build(saved(tmp_path, asset, up), up="+z"), asset)
 
 
 @pytest.mark.parametrize("degree", [2, 3])
-def test_assets_of_any_degree_come_back_to_rounding(tmp_path, degree):
+def test_assets_of_any_degree_are_read_back_up_to_rounding(tmp_path, degree):
     asset = some_gaussians(degree=degree)
     torch.testing.assert_close(build(saved(tmp_path, asset)).sh, asset.sh)
 
 
 @pytest.mark.parametrize(("written", "asked"), [("-y", None), ("+z", "+z"), ("+y", "+y")])
-def test_an_asset_of_others_stands_as_the_line_says(tmp_path, written, asked):
+def test_the_up_axis_of_other_programs_assets_can_be_given(tmp_path, written, asked):
     asset = some_gaussians()
     assert_equal(build(from_strangers(saved(tmp_path, asset, written)), up=asked), asset)
 
@@ -145,19 +145,19 @@ def test_gaussians_are_not_replicated(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["means", "opacity_logits"])
-def test_an_asset_with_numbers_that_are_none_is_refused(tmp_path, name):
+def test_an_asset_with_numbers_that_are_not_finite_is_refused(tmp_path, name):
     asset = some_gaussians()
     asset.tensors()[name][3] = float("nan")
-    with pytest.raises(UserError, match=rf"holds {name} that are not finite \(1 of 60\)"):
+    with pytest.raises(UserError, match=rf"which has {name} that are not finite \(1 of 60\)"):
         build(saved(tmp_path, asset))
 
 
 def test_an_empty_asset_is_refused(tmp_path):
-    with pytest.raises(UserError, match="holds nothing"):
+    with pytest.raises(UserError, match=r"which is empty\. Try: initializer\.path="):
         build(saved(tmp_path, some_gaussians(n=0)))
 
 
-def test_half_of_an_asset_is_no_point_cloud(tmp_path):
+def test_a_truncated_asset_is_not_a_point_cloud(tmp_path):
     path = saved(tmp_path, some_gaussians())
     path.write_bytes(path.read_bytes().replace(b"property float opacity\n", b""))
     with pytest.raises(UserError, match="properties missing: opacity"):
@@ -172,7 +172,7 @@ COLORS = torch.randint(256, (40, 3), generator=seeded(3))
 
 
 def point_cloud(folder, layout: str = "binary_little_endian", kind: str = "uchar", names="red green blue"):
-    """A file as other programs write it, made without the code under test; no colours without names."""
+    """Write a file as other programs do, without the code under test; without names it has no colours."""
     header = f"ply\nformat {layout} 1.0\nelement vertex 40\n"
     header += "".join(f"property float {axis}\n" for axis in "xyz")
     header += "".join(f"property {kind} {name}\n" for name in names.split()) + "end_header\n"
@@ -209,7 +209,7 @@ def test_points_without_colors_get_the_given_one(tmp_path):
 @pytest.mark.parametrize(
     ("up", "world"), [("+z", (0, 1, 2)), ("+y", (2, 0, 1)), (None, (0, 1, 2))], ids=["+z", "+y", "unsaid"]
 )
-def test_points_stand_upright(tmp_path, up, world):
+def test_points_are_upright(tmp_path, up, world):
     torch.testing.assert_close(build(point_cloud(tmp_path), up=up).means, POINTS[:, world])
 
 
@@ -233,23 +233,23 @@ def test_a_cap_counts_points_not_their_copies(tmp_path):
     assert len(build(point_cloud(tmp_path), count=10, replicate=20)) == 200
 
 
-def test_the_generator_decides(tmp_path):
+def test_results_depend_on_the_generator_alone(tmp_path):
     path = point_cloud(tmp_path)
     first, again, other = (build(path, count=10, replicate=3, seed=seed).means for seed in (1, 1, 2))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
 
-def test_points_that_are_nowhere_are_refused(tmp_path):
+def test_points_that_are_not_finite_are_refused(tmp_path):
     path = point_cloud(tmp_path, "ascii")
     path.write_text(path.read_text().replace(str(POINTS.tolist()[0][0]), "nan"))
-    with pytest.raises(UserError, match=r"holds points that are not finite \(1 of 40\)"):
+    with pytest.raises(UserError, match=r"which has points that are not finite \(1 of 40\)"):
         build(path)
 
 
-def test_a_surface_is_for_the_mesh_initializer(tmp_path):
+def test_a_mesh_is_refused_with_the_initializer_to_use(tmp_path):
     trimesh.creation.box().export(tmp_path / "box.ply")
-    with pytest.raises(UserError, match=r"holds a surface\. Try: initializer=mesh"):
+    with pytest.raises(UserError, match=r"which is a mesh\. Try: initializer=mesh 'initializer\.path=.*box"):
         build(tmp_path / "box.ply")
 
 
@@ -261,14 +261,14 @@ def test_a_surface_is_for_the_mesh_initializer(tmp_path):
         (b"ply\nformat ascii 1.0\n", "the header has no end"),
     ],
 )
-def test_a_file_that_is_no_cloud_is_refused(tmp_path, content, message):
+def test_a_file_that_is_not_a_point_cloud_is_refused(tmp_path, content, message):
     (tmp_path / "a.ply").write_bytes(content)
     with pytest.raises(UserError, match=message):
         build(tmp_path / "a.ply")
 
 
-def test_a_missing_file_is_said_so(tmp_path):
-    with pytest.raises(UserError, match=r"initializer\.path: no file .*nothing\.ply"):
+def test_a_missing_file_is_reported(tmp_path):
+    with pytest.raises(UserError, match=r"initializer\.path: expected a file, got .*nothing\.ply', which"):
         build(tmp_path / "nothing.ply")
 
 

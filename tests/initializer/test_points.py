@@ -1,4 +1,4 @@
-"""Laws of what initializers share: neighbour distances, and Gaussians at coloured points."""
+"""Laws of the functions that initializers share: neighbour distances, and Gaussians at coloured points."""
 
 import pytest
 import torch
@@ -40,13 +40,13 @@ def test_neighbour_distances_are_those_of_an_exhaustive_search(n):
     torch.testing.assert_close(neighbour_distance(cloud(n)), by_hand(cloud(n)))
 
 
-def test_an_outlier_far_from_everybody_is_measured_right():
+def test_the_distance_of_an_outlier_is_exact():
     points = cloud(512) * 0.01
     points[17] = torch.tensor([50.0, -3.0, 8.0])
     torch.testing.assert_close(neighbour_distance(points), by_hand(points))
 
 
-def test_points_on_a_line_and_on_a_grid_are_measured_right():
+def test_distances_on_a_line_and_on_a_grid_are_exact():
     line = torch.zeros(512, 3)
     line[:, 1] = torch.arange(512)
     assert neighbour_distance(line)[5:-5].tolist() == pytest.approx([4 / 3] * 502)
@@ -58,7 +58,7 @@ def test_coincident_points_keep_a_size():
     assert (neighbour_distance(torch.zeros(512, 3)) > 0).all()
 
 
-def test_a_lonely_point_and_an_empty_cloud_are_no_problem():
+def test_a_single_point_and_an_empty_cloud_are_accepted():
     assert neighbour_distance(torch.zeros(1, 3)).tolist() == [1.0]
     assert neighbour_distance(torch.zeros(0, 3)).shape == (0,)
 
@@ -71,7 +71,7 @@ def test_gaussians_show_their_color_from_every_side(degree):
     torch.testing.assert_close(evaluate_sh(made.sh, directions), colored(9).rgb)
 
 
-def test_gaussians_are_round_and_as_opaque_as_asked():
+def test_gaussians_are_round_and_have_the_given_opacity():
     points = cloud(9)
     made = gaussians_at(colored(9), scale=None, opacity=0.1, sh_degree=0)
     assert torch.equal(made.means, points)
@@ -80,7 +80,7 @@ def test_gaussians_are_round_and_as_opaque_as_asked():
     torch.testing.assert_close(made.rotations, torch.eye(3).expand(9, 3, 3))
 
 
-def test_a_given_scale_is_everybodys():
+def test_a_given_scale_applies_to_all_gaussians():
     made = gaussians_at(colored(9), scale=0.03, opacity=0.1, sh_degree=0)
     torch.testing.assert_close(made.scales, torch.full((9, 3), 0.03))
 
@@ -149,6 +149,8 @@ def test_a_surface_is_covered_in_proportion_to_its_area():
     torch.testing.assert_close(weights.mean(dim=0), torch.full((3,), 1 / 3), atol=0.01, rtol=0)
 
 
-def test_a_file_that_is_not_there_is_said_so(tmp_path):
-    with pytest.raises(UserError, match=r"^initializer\.path: no file .* Try: initializer\.path=a\.ply$"):
-        found_file(str(tmp_path / "nothing.ply"), "a.ply")
+def test_a_missing_file_and_a_folder_are_refused_with_the_line_to_type(tmp_path):
+    for path, what in ((tmp_path / "nothing.ply", "does not exist"), (tmp_path, "is a folder")):
+        pattern = rf"^initializer\.path: expected a file, got '.*', which {what}\. Try: initializer\.path=a"
+        with pytest.raises(UserError, match=pattern):
+            found_file(str(path), "a.ply")

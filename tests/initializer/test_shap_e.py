@@ -1,4 +1,4 @@
-"""Laws of the Shap-E initializer, on a tiny real pipeline and on meshes made by hand."""
+"""Laws of the Shap-E initializer, on a tiny pipeline of the real classes and on handmade meshes."""
 
 import gc
 
@@ -49,7 +49,7 @@ def rgb_of(gaussians) -> torch.Tensor:
     return 0.5 + SH_C0 * gaussians.sh[:, 0]
 
 
-# --- what becomes of a mesh
+# --- from a mesh to Gaussians
 
 
 def a_mesh() -> ColoredMesh:
@@ -102,7 +102,7 @@ def test_growth_adds_points_near_the_surface_and_keeps_the_surface():
     assert ((grown >= low) & (grown <= high)).all()
 
 
-def test_growth_takes_everybody_who_is_near():
+def test_growth_takes_all_points_that_are_near():
     vertices = torch.tensor([[0.0, 0, 0], [1, 1, 1]])
     mesh = ColoredMesh(vertices, torch.tensor([[0, 1, 1]]), torch.zeros(2, 3))
     made = settle(mesh=mesh, radius=None, grow_points=200_000, grow_distance=0.5)
@@ -167,14 +167,14 @@ def test_the_latent_is_that_of_the_pipeline_itself(models):
     torch.testing.assert_close(latent(models[True]), wanted)
 
 
-def test_the_prompt_decides_and_one_of_its_own_wins(models):
+def test_the_prompt_is_used_unless_shap_e_has_another(models):
     cube = latent(models[True], run_prompt="a red cube")
     assert not torch.equal(cube, latent(models[True]))
     assert torch.equal(cube, latent(models[True], prompt="a red cube"))
 
 
 @pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
-def test_half_precision_is_nearly_the_same_and_leaves_as_float32(models, dtype):
+def test_half_precision_is_nearly_the_same_and_returns_float32(models, dtype):
     half = latent(models[True], dtype=dtype, guidance_scale=1.0)
     assert half.dtype == torch.float32
     whole = latent(models[True], guidance_scale=1.0)
@@ -207,7 +207,7 @@ def test_the_prompt_becomes_gaussians(models):
 
 
 def test_colors_are_those_that_the_model_paints_with(models):
-    """The decoder converts its own colours to linear light; pictures, and so we, want them back."""
+    """The decoder converts its colours to linear light; the initializer must convert them back."""
     asked = shap_e(models[True])
     found = asked._source().find((KIND,), OTHERS)
     described = asked.sample(found, "a corgi", seeded(), CPU)
@@ -220,12 +220,12 @@ def test_colors_are_those_that_the_model_paints_with(models):
     torch.testing.assert_close(mesh.rgb, painted, atol=1e-4, rtol=0)
 
 
-def test_no_surface_is_said_so(models):
+def test_a_missing_surface_is_reported(models):
     with pytest.raises(UserError, match=r"found no surface.*Try: another seed, or initializer\.prompt="):
         shap_e(models[False]).build("a corgi", seeded(), CPU)
 
 
-def test_what_does_not_fit_into_memory_is_said_so(models, monkeypatch):
+def test_running_out_of_memory_is_reported(models, monkeypatch):
     def explode(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory")
 
@@ -234,21 +234,21 @@ def test_what_does_not_fit_into_memory_is_said_so(models, monkeypatch):
         shap_e(models[True]).build("a corgi", seeded(), CPU)
 
 
-def test_nothing_of_the_model_stays(models):
+def test_the_model_is_freed_completely(models):
     from diffusers.pipelines.shap_e import ShapERenderer
 
     shap_e(models[True]).build("a corgi", seeded(), CPU)
     assert not [each for each in gc.get_objects() if type(each) is ShapERenderer]
 
 
-# --- what stands in for it
+# --- the fallback
 
 
 def begin(seed: int = 0, **changes):
     return shap_e(**changes).begin("a corgi", seeded(seed), CPU)
 
 
-def test_what_can_be_had_comes_without_a_note(models):
+def test_an_available_model_gives_no_note(models):
     made = begin(path=models[True], fallback=BALL)
     assert made.note is None
     assert torch.equal(made.gaussians.means, shap_e(models[True]).build("a corgi", seeded(), CPU).means)
@@ -262,7 +262,7 @@ def test_a_missing_model_is_an_error_or_the_fallback_with_a_note():
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_what_stands_in_is_what_it_would_be_by_itself(models, seed):
+def test_the_fallback_gives_the_same_gaussians_as_without_shap_e(models, seed):
     wanted = BALL.build("a corgi", seeded(seed), CPU)
     for path in ("nowhere", models[False]):  # the latter draws, and then finds no surface
         made = begin(path=path, fallback=BALL, seed=seed)
@@ -270,7 +270,7 @@ def test_what_stands_in_is_what_it_would_be_by_itself(models, seed):
         assert torch.equal(made.gaussians.sh, wanted.sh)
 
 
-def test_stand_ins_of_stand_ins_are_all_named():
+def test_nested_fallbacks_are_all_named():
     note = begin(fallback=shap_e("elsewhere", fallback=BALL)).note
     assert note.index("ShapE stands in for Shap-E") < note.index("'nowhere'")
     assert note.index("Ball stands in for Shap-E") < note.index("'elsewhere'")

@@ -1,4 +1,4 @@
-"""Laws of the frames: a change of frame turns the object, and changes nothing that can be seen."""
+"""Laws of the axes of files: a change of axes turns the object and changes nothing visible."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from cadam3d.core.checks import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import sh_basis
 from cadam3d.io.frames import (
-    FRAMES,
+    AXES,
     UPS,
     band_matrix,
     file_to_world,
@@ -33,17 +33,17 @@ def covariances(gaussians: Gaussians) -> torch.Tensor:
 
 
 def axes(up: str) -> torch.Tensor:
-    return torch.tensor(FRAMES[up], dtype=torch.float64)
+    return torch.tensor(AXES[up], dtype=torch.float64)
 
 
 @pytest.mark.parametrize("up", UPS)
-def test_frames_are_rotations_that_mirror_nothing(up):
+def test_axes_are_rotations_that_mirror_nothing(up):
     torch.testing.assert_close(axes(up) @ axes(up).T, torch.eye(3, dtype=torch.float64))
     assert torch.linalg.det(axes(up)).item() == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("up", "file_up"), [("-y", (0, -1, 0)), ("+y", (0, 1, 0)), ("+z", (0, 0, 1))])
-def test_the_name_of_a_frame_is_where_our_up_goes(up, file_up):
+def test_axes_are_named_after_the_direction_of_up(up, file_up):
     assert (axes(up) @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)).tolist() == list(file_up)
 
 
@@ -53,7 +53,7 @@ def test_the_front_faces_the_first_camera_of_viewers(up):
 
 
 @pytest.mark.parametrize("up", UPS)
-def test_means_and_covariances_turn_with_the_frame(up):
+def test_means_and_covariances_turn_with_the_axes(up):
     world, turn = random_gaussians(), axes(up)
     local = world_to_file(world, up)
     torch.testing.assert_close(local.means, world.means @ turn.T)
@@ -62,7 +62,7 @@ def test_means_and_covariances_turn_with_the_frame(up):
 
 @pytest.mark.parametrize("up", UPS)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_colours_seen_along_turned_directions_stay(up, degree):
+def test_colours_along_turned_directions_are_unchanged(up, degree):
     world = random_gaussians(degree=degree)
     directions = torch.nn.functional.normalize(random_gaussians(seed=1).means, dim=1)
     local = world_to_file(world, up)
@@ -75,7 +75,7 @@ def test_colours_seen_along_turned_directions_stay(up, degree):
 
 @pytest.mark.parametrize("up", UPS)
 @pytest.mark.parametrize("degree", [0, 1])
-def test_there_and_back_is_bit_exact_up_to_degree_one(up, degree):
+def test_the_round_trip_is_exact_to_the_bit_up_to_degree_one(up, degree):
     world = random_gaussians(degree=degree, dtype=torch.float32)
     back = file_to_world(world_to_file(world, up), up)
     for name, tensor in world.tensors().items():
@@ -83,7 +83,7 @@ def test_there_and_back_is_bit_exact_up_to_degree_one(up, degree):
 
 
 @pytest.mark.parametrize("up", ["-y", "+y"])
-def test_there_and_back_rounds_higher_bands_by_little(up):
+def test_the_round_trip_rounds_higher_bands_only_slightly(up):
     world = random_gaussians(n=2000, degree=3, dtype=torch.float32)
     back = file_to_world(world_to_file(world, up), up)
     for name in ("means", "log_scales", "quats", "opacity_logits"):
@@ -98,25 +98,25 @@ def test_band_matrices_are_orthogonal_for_any_rotation(degree):
     torch.testing.assert_close(matrix @ matrix.T, torch.eye(2 * degree + 1, dtype=torch.float64))
 
 
-def test_the_vector_rule_of_band_one_is_the_fitted_matrix():
+def test_the_vector_rule_of_band_one_agrees_with_the_fitted_matrix():
     world = random_gaussians(degree=1)
     matrix = band_matrix(1, tuple(axes("-y").flatten().tolist()))
     expected = torch.einsum("ij,njc->nic", matrix, world.sh[:, 1:])
     torch.testing.assert_close(world_to_file(world, "-y").sh[:, 1:], expected)
 
 
-def test_an_unknown_frame_is_refused_with_the_choices():
+def test_an_unknown_up_axis_is_refused_with_the_choices():
     with pytest.raises(UserError, match=r"-y\|\+y\|\+z"):
         world_to_file(random_gaussians(), "up")
 
 
 @pytest.mark.parametrize("up", UPS)
-def test_points_take_the_way_of_gaussians(up):
+def test_points_are_converted_like_gaussians(up):
     world = random_gaussians(dtype=torch.float32)
     assert torch.equal(points_to_world(world_to_file(world, up).means, up), world.means)
 
 
-def test_a_quarter_turn_brings_the_front_to_the_left():
+def test_a_quarter_turn_moves_the_front_to_the_left():
     front = torch.tensor([[1.0, 0.0, 0.5]])
     assert turned_points(front, 90).tolist() == [[0.0, 1.0, 0.5]]
 

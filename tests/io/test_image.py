@@ -1,4 +1,4 @@
-"""Pictures show the numbers they are given."""
+"""Images show the numbers that they are made from."""
 
 import imageio.v3 as imageio
 import numpy as np
@@ -17,7 +17,7 @@ def test_nan_is_black():
     assert to_uint8(torch.full((1, 1, 3), float("nan"))).max() == 0
 
 
-def test_every_byte_survives_the_way_to_a_png_and_back(tmp_path):
+def test_a_png_preserves_every_byte(tmp_path):
     pixels = torch.arange(256 * 3).reshape(16, 16, 3).remainder(256)
     write_png(tmp_path / "a.png", pixels / 255)
     assert np.array_equal(imageio.imread(tmp_path / "a.png"), pixels.numpy())
@@ -29,18 +29,18 @@ def test_the_ends_of_the_colour_map_are_its_first_and_last_colour():
     torch.testing.assert_close(colours[0], torch.tensor(expected, dtype=torch.float32))
 
 
-def test_the_colour_map_gets_brighter_all_the_way():
+def test_the_colour_map_gets_brighter_from_end_to_end():
     luminance = colorize(torch.linspace(0, 1, 200)[None])[0] @ torch.tensor([0.2126, 0.7152, 0.0722])
     assert (luminance.diff() > 0).all()
 
 
-def test_nearer_is_brighter_and_nothing_is_black():
+def test_near_is_bright_and_background_is_black():
     depth = torch.tensor([[2.1, 3.0, 3.9, 0.0]])
     picture = closeness(depth, torch.tensor([[1.0, 1.0, 1.0, 0.0]]), distance=3.0)[0].sum(dim=-1)
     assert picture[0] > picture[1] > picture[2] > picture[3] == 0
 
 
-def test_a_sheet_has_its_images_in_reading_order():
+def test_a_contact_sheet_has_its_images_in_reading_order():
     images = torch.rand(5, 4, 6, 3)
     sheet = contact_sheet(images, columns=3)
     assert sheet.shape == (8, 18, 3)

@@ -1,4 +1,4 @@
-"""The file that leaves the house: same bits back, everybody's layout, clear words for everything else."""
+"""PLY files: the same bits after a round trip, the usual layout, and clear errors for all other files."""
 
 import struct
 
@@ -33,7 +33,7 @@ def property_names(path) -> list[str]:
 
 
 def hand_made(names, rows, kinds=None, version="binary_little_endian 1.0", before="", after="") -> bytes:
-    """A ply built without the code under test."""
+    """Return a PLY file that is built without the code under test."""
     kinds = kinds or ["float"] * len(names)
     declared = "".join(f"property {kind} {name}\n" for kind, name in zip(kinds, names, strict=True))
     header = f"ply\nformat {version}\n{before}element vertex {len(rows)}\n{declared}{after}end_header\n"
@@ -50,7 +50,7 @@ NAMES += ["rot_0", "rot_1", "rot_2", "rot_3"]
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_the_round_trip_in_our_frame_returns_the_same_bits(tmp_path, degree):
+def test_the_round_trip_in_world_axes_returns_the_same_bits(tmp_path, degree):
     gaussians = random_gaussians(degree=degree)
     write_ply(tmp_path / "a.ply", gaussians, up="+z", pad_sh=0)
     assert_same_bits(read_ply(tmp_path / "a.ply"), gaussians)
@@ -58,13 +58,13 @@ def test_the_round_trip_in_our_frame_returns_the_same_bits(tmp_path, degree):
 
 @pytest.mark.parametrize("up", UPS)
 @pytest.mark.parametrize("degree", [0, 1])
-def test_the_round_trip_in_every_frame_returns_the_same_bits_up_to_degree_one(tmp_path, up, degree):
+def test_the_round_trip_in_any_axes_returns_the_same_bits_up_to_degree_one(tmp_path, up, degree):
     gaussians = random_gaussians(degree=degree)
     write_ply(tmp_path / "a.ply", gaussians, up=up, pad_sh=0)
     assert_same_bits(read_ply(tmp_path / "a.ply"), gaussians)
 
 
-def test_extreme_numbers_survive(tmp_path):
+def test_extreme_numbers_are_preserved(tmp_path):
     gaussians = random_gaussians(n=6, degree=0)
     gaussians.means[:, 0] = torch.tensor([0.0, -0.0, 1e-45, 3e38, float("inf"), float("-inf")])
     write_ply(tmp_path / "a.ply", gaussians, up="-y", pad_sh=0)
@@ -72,7 +72,7 @@ def test_extreme_numbers_survive(tmp_path):
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_no_gaussians_are_a_valid_file(tmp_path, degree):
+def test_a_file_without_gaussians_is_valid(tmp_path, degree):
     write_ply(tmp_path / "a.ply", random_gaussians(n=0, degree=degree), up="-y", pad_sh=0)
     back = read_ply(tmp_path / "a.ply")
     assert len(back) == 0
@@ -117,7 +117,7 @@ def test_the_layout_is_the_one_of_3dgs(tmp_path):
     assert property_names(tmp_path / "a.ply") == expected
 
 
-def test_the_file_of_one_gaussian_is_what_a_hand_would_write(tmp_path):
+def test_the_file_of_one_gaussian_equals_one_written_by_hand(tmp_path):
     gaussians = Gaussians(
         means=torch.tensor([[1.0, 2.0, 3.0]]),
         log_scales=torch.tensor([[-1.0, -2.0, -3.0]]),
@@ -139,7 +139,7 @@ def test_the_rest_is_read_channel_major_from_a_hand_made_file(tmp_path):
     assert sh[0, 1:].tolist() == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
 
 
-def test_the_default_frame_puts_up_at_minus_y(tmp_path):
+def test_the_default_axes_have_up_at_minus_y(tmp_path):
     gaussians = random_gaussians(n=1, degree=0)
     gaussians.means[0] = torch.tensor([0.1, 0.2, 0.9])  # front, left, up
     write_ply(tmp_path / "a.ply", gaussians, up="-y", pad_sh=0)
@@ -147,26 +147,26 @@ def test_the_default_frame_puts_up_at_minus_y(tmp_path):
     assert numbers[:3].tolist() == pytest.approx([-0.2, -0.9, 0.1])
 
 
-def test_the_header_says_version_and_frame(tmp_path):
+def test_the_header_contains_the_version_and_the_up_axis(tmp_path):
     write_ply(tmp_path / "a.ply", random_gaussians(), up="+y", pad_sh=0)
     header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode()
     assert f"comment cadam3d {ply.__version__}\n" in header
     assert "comment cadam3d up=+y\n" in header
 
 
-def test_the_frame_of_the_header_wins_over_the_argument(tmp_path):
+def test_the_up_axis_of_the_header_takes_precedence_over_the_argument(tmp_path):
     gaussians = random_gaussians(degree=0)
     write_ply(tmp_path / "a.ply", gaussians, up="+y", pad_sh=0)
     assert_same_bits(read_ply(tmp_path / "a.ply", up="+z"), gaussians)
 
 
 @pytest.mark.parametrize(("up", "world"), [("-y", (3, -1, -2)), ("+y", (3, 1, 2)), ("+z", (1, 2, 3))])
-def test_files_from_elsewhere_are_turned_by_the_argument(tmp_path, up, world):
+def test_the_argument_sets_the_up_axis_of_files_of_other_programs(tmp_path, up, world):
     (tmp_path / "a.ply").write_bytes(hand_made(NAMES, [[1.0, 2.0, 3.0] + [0.0] * 11]))
     assert read_ply(tmp_path / "a.ply", up=up).means[0].tolist() == list(world)
 
 
-# Other people's files
+# Files of other programs
 
 
 def test_order_extra_properties_and_other_types_do_not_matter(tmp_path):
@@ -190,7 +190,7 @@ def test_other_elements_before_and_after_are_skipped(tmp_path):
 
 
 @pytest.mark.parametrize("version", ["ascii 1.0", "binary_big_endian 1.0"])
-def test_other_encodings_are_refused_with_the_way_to_convert(tmp_path, version):
+def test_other_encodings_are_refused_with_a_command_that_converts_them(tmp_path, version):
     (tmp_path / "a.ply").write_bytes(hand_made(NAMES, [], version=version))
     with pytest.raises(UserError, match=f"got {version}.*plyfile"):
         read_ply(tmp_path / "a.ply")
@@ -209,14 +209,14 @@ def test_the_conversion_that_the_message_suggests_works(tmp_path):
     assert_same_bits(read_ply(tmp_path / "binary.ply"), random_gaussians(n=3, degree=0))
 
 
-def test_a_file_without_gaussians_names_what_is_missing(tmp_path):
+def test_missing_properties_are_named(tmp_path):
     (tmp_path / "a.ply").write_bytes(hand_made(["x", "y", "z", "opacity"], []))
     with pytest.raises(UserError, match=r"not a Gaussian ply: properties missing: f_dc_0.*scale_0.*rot_3"):
         read_ply(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("rest", [1, 10, 72])
-def test_a_number_of_rest_coefficients_that_no_degree_has_is_refused(tmp_path, rest):
+def test_a_number_of_rest_coefficients_that_fits_no_degree_is_refused(tmp_path, rest):
     (tmp_path / "a.ply").write_bytes(hand_made([*NAMES, *(f"f_rest_{i}" for i in range(rest))], []))
     with pytest.raises(UserError, match=f"got {rest}$"):
         read_ply(tmp_path / "a.ply")
@@ -255,7 +255,7 @@ def test_every_truncation_of_the_header_is_a_user_error(tmp_path):
         hand_made(NAMES, []).replace(b"vertex 0", b"vertex 999999999999"),
     ],
 )
-def test_what_is_not_a_gaussian_ply_is_a_user_error(tmp_path, content):
+def test_any_other_content_is_a_user_error(tmp_path, content):
     (tmp_path / "a.ply").write_bytes(content)
     with pytest.raises(UserError, match=r"a\.ply"):
         read_ply(tmp_path / "a.ply")

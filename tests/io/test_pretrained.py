@@ -1,4 +1,4 @@
-"""Models are found in a folder or on the hub, and everything that can go wrong is one line that helps."""
+"""Models are found in a folder or on the hub, and every possible failure is a helpful message of one line."""
 
 import json
 import shutil
@@ -31,7 +31,7 @@ def model(tmp_path_factory):
 
 @pytest.fixture
 def hub(monkeypatch):
-    """A hub on which every id fails as told, and a record of who was asked and how."""
+    """Fake a hub that gives a set answer for every id and records the requests."""
     answers, asked = {}, []
 
     def download(name, file, *, revision, local_files_only):
@@ -53,7 +53,7 @@ def refusal(kind):
     return kind("no", response=client.Response(404, request=client.Request("GET", "hub")))
 
 
-def test_a_folder_wins_over_ids_and_needs_no_hub(model, hub):
+def test_a_folder_takes_precedence_over_ids_and_needs_no_hub(model, hub):
     found = source(path=str(model)).find(KINDS, OTHERS)
     assert found.where == str(model)
     assert hub["asked"] == []
@@ -63,8 +63,8 @@ def test_a_folder_wins_over_ids_and_needs_no_hub(model, hub):
 
 
 @pytest.mark.parametrize("lost", ["tokenizer", "tokenizer/*"])
-def test_a_tokenizer_without_files_is_no_tokenizer(model, tmp_path, lost):
-    """Transformers makes one that knows no word; every prompt would read the same."""
+def test_a_tokenizer_without_files_is_refused(model, tmp_path, lost):
+    """Transformers would make one that knows no word, and every prompt would look the same."""
     folder = tmp_path / "model"
     shutil.copytree(model, folder)
     if lost == "tokenizer":
@@ -77,7 +77,7 @@ def test_a_tokenizer_without_files_is_no_tokenizer(model, tmp_path, lost):
         found.part("tokenizer")
 
 
-def test_parts_are_frozen_and_have_the_type_asked_for(model):
+def test_parts_are_frozen_and_have_the_requested_dtype(model):
     found = source(path=str(model)).find(KINDS, OTHERS)
     for name in ("unet", "vae", "text_encoder"):
         network = found.part(name, torch.bfloat16)
@@ -85,7 +85,7 @@ def test_parts_are_frozen_and_have_the_type_asked_for(model):
         assert all(p.dtype == torch.bfloat16 and not p.requires_grad for p in network.parameters())
 
 
-def test_a_skeleton_is_the_network_without_numbers(model):
+def test_a_skeleton_is_the_network_without_weights(model):
     found = source(path=str(model)).find(KINDS, OTHERS)
     for name in ("unet", "vae", "text_encoder"):
         skeleton, network = found.skeleton(name, torch.float16), found.part(name, torch.float16)
@@ -104,7 +104,7 @@ def test_the_identity_changes_with_the_files(model, tmp_path):
     assert before != source(path=str(copy)).find(KINDS, OTHERS).identity
 
 
-def test_a_wrong_folder_is_one_line(tmp_path):
+def test_a_wrong_folder_is_reported_in_one_line(tmp_path):
     (tmp_path / "file").write_text("x")
     for path, what in (
         ("/nowhere", "nothing there"),
@@ -127,13 +127,13 @@ def test_a_model_of_another_kind_names_the_prior_to_use(model, tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "no json", "[1]"])
-def test_a_damaged_index_is_one_line(tmp_path, text):
+def test_a_damaged_index_is_reported_in_one_line(tmp_path, text):
     (tmp_path / "model_index.json").write_text(text)
     with pytest.raises(UserError, match=r"model_index\.json"):
         source(path=str(tmp_path)).find(KINDS, OTHERS)
 
 
-def test_a_damaged_part_is_one_line(model, tmp_path):
+def test_a_damaged_part_is_reported_in_one_line(model, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(model, copy)
     found = source(path=str(copy)).find(KINDS, OTHERS)
@@ -147,7 +147,7 @@ def test_a_damaged_part_is_one_line(model, tmp_path):
 
 
 @pytest.mark.parametrize("entry", [("os", "system"), ("shap_e", "Nothing"), ("shap_e.os", "system")])
-def test_code_of_strangers_is_not_run(model, tmp_path, entry):
+def test_foreign_code_is_not_run(model, tmp_path, entry):
     index = json.loads((model / "model_index.json").read_text()) | {"unet": list(entry)}
     (tmp_path / "model_index.json").write_text(json.dumps(index))
     with pytest.raises(UserError, match=r"\.".join(entry)):
@@ -162,7 +162,7 @@ def test_a_part_that_only_one_pipeline_of_diffusers_has_is_found(tmp_path):
     assert isinstance(found.part("shap_e_renderer", torch.float32), ShapERenderer)
 
 
-def test_ids_are_tried_in_order_and_the_first_that_answers_is_taken(model, hub):
+def test_ids_are_tried_in_order_and_the_first_available_one_is_used(model, hub):
     hub["a/gone"] = refusal(huggingface_hub.errors.RepositoryNotFoundError)
     hub["b/gated"] = refusal(huggingface_hub.errors.GatedRepoError)
     hub["c/there"] = model / "model_index.json"
@@ -172,7 +172,7 @@ def test_ids_are_tried_in_order_and_the_first_that_answers_is_taken(model, hub):
     assert hub["asked"] == [(name, "v1", False) for name in ("a/gone", "b/gated", "c/there")]
 
 
-def test_when_none_answers_each_has_its_reason_and_there_is_a_way_out(hub):
+def test_if_no_id_is_available_each_has_its_reason_and_there_is_a_hint(hub):
     hub["a/gone"] = refusal(huggingface_hub.errors.RepositoryNotFoundError)
     hub["b/gated"] = refusal(huggingface_hub.errors.GatedRepoError)
     hub["c/revision"] = refusal(huggingface_hub.errors.RevisionNotFoundError)
@@ -192,7 +192,7 @@ def test_when_none_answers_each_has_its_reason_and_there_is_a_way_out(hub):
 
 
 def test_an_unreachable_hub_is_asked_once(hub):
-    """Every question takes half a minute of retries; what is on this disk is still found."""
+    """Every request takes half a minute of retries. Models on this disk are still found."""
     for name in ("a/one", "b/two"):
         hub[name] = huggingface_hub.errors.LocalEntryNotFoundError("no")
     with pytest.raises(UserError, match=r"a/one: not on this disk, and the hub cannot be reached"):
@@ -200,7 +200,7 @@ def test_an_unreachable_hub_is_asked_once(hub):
     assert [local for _, _, local in hub["asked"]] == [False, True]
 
 
-def test_offline_is_obeyed_and_said(hub, monkeypatch):
+def test_offline_mode_is_respected_and_reported(hub, monkeypatch):
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     hub["a/one"] = huggingface_hub.errors.LocalEntryNotFoundError("no")
     with pytest.raises(UserError, match="HF_HUB_OFFLINE is set"):
@@ -208,7 +208,7 @@ def test_offline_is_obeyed_and_said(hub, monkeypatch):
     assert hub["asked"] == [("a/one", None, True)]
 
 
-def test_without_the_extra_the_command_that_installs_it(monkeypatch):
+def test_a_missing_extra_is_reported_with_the_command_that_installs_it(monkeypatch):
     monkeypatch.setattr(pretrained, "find_spec", lambda name: None if name == "diffusers" else object())
     with pytest.raises(UserError, match=r"prior: needs diffusers. Try: pip install 'cadam3d\[diffusers\]'"):
         source().find(KINDS, OTHERS)
@@ -228,6 +228,6 @@ def test_wrong_values_are_named(changes, key):
         source(**changes)
 
 
-def test_neither_folder_nor_ids():
+def test_a_source_without_folder_and_ids_is_refused():
     with pytest.raises(UserError, match=r"prior.path: expected the folder of a model"):
         source(ids=[]).find(KINDS, OTHERS)

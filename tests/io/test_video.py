@@ -1,4 +1,4 @@
-"""Videos hold the frames they were given."""
+"""Videos contain the frames that were written."""
 
 import imageio.v3 as imageio
 import numpy as np
@@ -14,7 +14,7 @@ def greys(count, height, width):
 
 
 @pytest.mark.parametrize("shape", [(32, 48), (33, 47), (2, 2), (1, 1), (250, 130)])
-def test_frames_come_back_in_number_order_and_even_size(tmp_path, shape):
+def test_all_frames_are_read_back_in_order_and_with_even_sizes(tmp_path, shape):
     height, width = shape
     write_video(tmp_path / "a.mp4", greys(7, height, width), fps=10)
     frames = imageio.imread(tmp_path / "a.mp4")
@@ -35,14 +35,14 @@ def test_no_frames_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("executable", ["/nonexistent/ffmpeg", "/bin/false"])
-def test_a_missing_or_broken_ffmpeg_says_what_to_type(tmp_path, monkeypatch, executable):
+def test_a_missing_or_broken_ffmpeg_is_reported_with_a_hint(tmp_path, monkeypatch, executable):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", executable)
     with pytest.raises(UserError, match="pip install --force-reinstall imageio-ffmpeg"):
         write_video(tmp_path / "a.mp4", greys(30, 64, 64), fps=10)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failing_renderer_is_not_mistaken_for_ffmpeg_and_keeps_the_old_video(tmp_path):
+def test_an_error_of_the_renderer_is_not_blamed_on_ffmpeg_and_keeps_the_old_video(tmp_path):
     write_video(tmp_path / "a.mp4", greys(3, 16, 16), fps=10)
     before = (tmp_path / "a.mp4").read_bytes()
 

@@ -24,7 +24,7 @@ from cadam3d.prior.mvdream import MVDream, camera_numbers
 from cadam3d.prior.prompting import Plain
 
 diffusers = pytest.importorskip("diffusers")
-OWN = {"prompting": Plain(), "rescale": 0.0, "tokenizer": "nobody/nothing"}
+OWN = {"prompting": Plain(), "rescale": 0.0, "tokenizer": "owner/missing"}
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def prior(folder, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def file(pipe, tmp_path_factory):
-    """Everything in one file, as published."""
+    """The path of a single file that holds the whole model, as published."""
     file = tmp_path_factory.mktemp("published") / "sd-v2.1-base-4view.pt"
     torch.save(single_file(pipe.unet, pipe.vae, pipe.text_encoder), file)
     return file
@@ -76,11 +76,11 @@ def guess_of(prior, noisy, cameras, scale=7.5, t=0.4):
     return prior.predict(noisy, torch.full((len(noisy),), t), condition_of(prior, cameras), scale)
 
 
-# --- what it predicts -------------------------------------------------------------------------------------
+# --- predictions ------------------------------------------------------------------------------------------
 
 
 class FromScratch:
-    """Attention written out, across four views where it is self-attention."""
+    """Attention written out; self-attention spans four views."""
 
     def __call__(self, attention, states, encoder_hidden_states=None, **_):
         own = encoder_hidden_states is None
@@ -96,8 +96,8 @@ class FromScratch:
 
 
 @torch.no_grad()
-def test_a_prediction_is_what_the_parts_say_written_out(prior, pipe):
-    """Cameras as threestudio builds them: right, up and backward of a camera that looks at the origin."""
+def test_a_prediction_equals_the_parts_written_out(prior, pipe):
+    """Build cameras as threestudio does, from right, up and backward of a camera that faces the origin."""
     cameras, clean, noise, k = views(8), normal(8, 4, 8, 8), normal(8, 4, 8, 8, seed=1), 400
     azimuth, elevation = (torch.deg2rad(a) for a in (cameras.azimuth_deg, cameras.elevation_deg))
     centre = torch.stack(
@@ -105,8 +105,8 @@ def test_a_prediction_is_what_the_parts_say_written_out(prior, pipe):
     )
     right = normalize(torch.linalg.cross(-centre, torch.tensor([[0.0, 0.0, 1.0]]).expand(8, 3)), dim=-1)
     up = torch.linalg.cross(right, -centre)
-    told = torch.eye(4).repeat(8, 1, 1)
-    told[:, :3] = torch.stack([right, up, centre, centre], dim=-1)
+    encoded = torch.eye(4).repeat(8, 1, 1)
+    encoded[:, :3] = torch.stack([right, up, centre, centre], dim=-1)
 
     unet = type(pipe.unet).from_config(pipe.unet.config)
     unet.load_state_dict(pipe.unet.state_dict())
@@ -114,14 +114,14 @@ def test_a_prediction_is_what_the_parts_say_written_out(prior, pipe):
     noisy = pipe.scheduler.add_noise(clean, noise, torch.full((8,), k - 1))
     positive, negative = pipe.encode_prompt("a corgi", "cpu", 1, True, negative_prompt="ugly")
     full, ugly = (
-        unet(noisy, k - 1, encoder_hidden_states=text.repeat(8, 1, 1), class_labels=told.flatten(1)).sample
+        unet(noisy, k - 1, encoder_hidden_states=text.repeat(8, 1, 1), class_labels=encoded.flatten(1)).sample
         for text in (positive, negative)
     )
     guess = guess_of(prior, noisy, cameras, t=k / 1000)
     torch.testing.assert_close(guess.noise, ugly + 7.5 * (full - ugly), rtol=1e-4, atol=1e-4)
 
 
-def test_the_views_of_a_group_know_each_other_and_no_other_group(prior):
+def test_views_depend_on_their_own_group_and_on_no_other_group(prior):
     cameras, noisy = views(8), normal(8, 4, 8, 8)
     before = guess_of(prior, noisy, cameras).noise
     changed = noisy.clone()
@@ -131,20 +131,20 @@ def test_the_views_of_a_group_know_each_other_and_no_other_group(prior):
     assert (difference[4:] < 1e-5).all()
 
 
-def test_where_a_view_stands_changes_what_is_seen(prior):
+def test_the_camera_of_a_view_changes_its_prediction(prior):
     noisy = normal(4, 4, 8, 8)
     front, turned = level_with(), level_with(start=30.0)
     one, other = (guess_of(prior, noisy, cameras).noise for cameras in (front, turned))
     assert (one - other).abs().max() > 1e-3
 
 
-def test_neither_distance_nor_lens_is_told():
+def test_the_network_reads_neither_distance_nor_field_of_view():
     near, far = level_with(distance=2.0, fov=60.0), level_with(distance=9.0, fov=15.0)
     torch.testing.assert_close(camera_numbers(near), camera_numbers(far))
 
 
-def test_the_front_is_told_as_published():
-    """The first of the published samples: on Blender's +x, 15 degrees up."""
+def test_the_front_is_encoded_as_published():
+    """The first view of the published samples is on Blender's +x, 15 degrees up."""
     s, c = torch.sin(torch.deg2rad(torch.tensor(15.0))), torch.cos(torch.deg2rad(torch.tensor(15.0)))
     front = level_with(elevation=15.0).index(slice(0, 1))
     expected = [0, -s, c, c, 1, 0, 0, 0, 0, c, s, s, 0, 0, 0, 1]
@@ -155,15 +155,15 @@ def test_latents_are_those_of_the_autoencoder(prior, pipe):
     encodes_what_the_autoencoder_says(prior, pipe.vae)
 
 
-def test_micro_batch_changes_nothing(prior):
+def test_micro_batch_does_not_change_results(prior):
     micro_batch_changes_nothing(prior, size=4, condition=condition_of(prior, views(8)), channels=4)
 
 
-def test_it_computes_in_sixteen_bits(prior):
+def test_networks_compute_in_16_bits_and_return_float32(prior):
     computes_in_sixteen_bits(prior, lambda each: condition_of(each, views()))
 
 
-def test_memory_is_foreseen(prior):
+def test_memory_is_estimated(prior):
     memory_is_foreseen(prior, views=4)
     with pytest.raises(UserError, match=r"^views: expected a multiple of 4"):
         prior.memory("a corgi", "", 2, None)
@@ -176,7 +176,7 @@ def spreads(clean):
     return clean.unflatten(0, (-1, 4)).flatten(1).std(dim=1)
 
 
-def test_rescaling_gives_a_group_the_spread_of_its_unguided_guess(prior):
+def test_rescaling_gives_a_group_the_spread_of_its_unguided_prediction(prior):
     cameras, noisy = views(8), normal(8, 4, 8, 8)
     noisy[4:] *= 0.5  # so that groups differ
     guided, unguided = (guess_of(prior, noisy, cameras, scale).clean for scale in (50.0, 1.0))
@@ -187,7 +187,7 @@ def test_rescaling_gives_a_group_the_spread_of_its_unguided_guess(prior):
     torch.testing.assert_close(half.clean, (guided + whole.clean) / 2, rtol=1e-4, atol=1e-4)
 
 
-def test_a_rescaled_guess_is_still_one_guess_in_three_forms(prior):
+def test_the_three_forms_of_a_rescaled_prediction_agree(prior):
     noisy = normal(4, 4, 8, 8)
     guess = guess_of(replace(prior, rescale=0.5), noisy, views(), 50.0)
     t = torch.full((4,), 0.4)
@@ -229,13 +229,13 @@ def test_one_published_file_is_the_same_model(prior, pipe, folder, file, tmp_pat
     assert {p.dtype for p in replace(one, dtype="bfloat16").network.parameters()} == {torch.bfloat16}
 
 
-def test_memory_of_one_file_is_foreseen(prior, file, folder):
+def test_memory_of_one_file_is_estimated(prior, file, folder):
     one = replace(prior, path=str(file), tokenizer=str(folder / "tokenizer"))
     assert one.memory("a dog", "", 4, None) == prior.memory("a dog", "", 4, None)
 
 
 def test_the_tokenizer_of_one_file_pads_as_it_was_trained(prior, file, folder):
-    """With zeros; an exclamation mark in the prompt, whose number that is, stays what it is."""
+    """Padding is token 0, which is also the exclamation mark; the mark must survive in a prompt."""
     one = replace(prior, path=str(file), tokenizer=str(folder / "tokens"))
     tokenizer = one.found.part("tokenizer")
     numbers = tokenizer(["a!"], padding="max_length", max_length=77).input_ids[0]
@@ -245,7 +245,7 @@ def test_the_tokenizer_of_one_file_pads_as_it_was_trained(prior, file, folder):
 
 @pytest.mark.parametrize("where", ["empty", "other"])
 def test_a_tokenizer_that_does_not_fit_is_refused(prior, file, tmp_path, where):
-    """Where transformers finds no files, it makes a tokenizer that knows no word, and says nothing."""
+    """If transformers finds no files, it silently builds a tokenizer that knows no words."""
     if where == "other":
         (tmp_path / "vocab.json").write_text(json.dumps({"a": 0, "<|startoftext|>": 1, "<|endoftext|>": 2}))
         (tmp_path / "merges.txt").write_text("#version: 0.2\n")
@@ -254,7 +254,7 @@ def test_a_tokenizer_that_does_not_fit_is_refused(prior, file, tmp_path, where):
 
 
 def test_a_folder_whose_unet_keeps_its_old_names_is_the_same_model(prior, pipe, folder, tmp_path):
-    """As on the hub: its class is a stranger's, whose code is never run."""
+    """On the hub the UNet has a class of another package, of which no code is run."""
     model = tmp_path / "model"
     shutil.copytree(folder, model, ignore=shutil.ignore_patterns("unet", "tokens"))
     index = json.loads((model / "model_index.json").read_text())
@@ -271,16 +271,16 @@ def test_a_folder_whose_unet_keeps_its_old_names_is_the_same_model(prior, pipe, 
 def test_a_file_without_cameras_is_refused(prior, file, tmp_path):
     tensors = {k: v for k, v in torch.load(file).items() if "camera_embed" not in k}
     torch.save(tensors, tmp_path / "sd.pt")
-    with pytest.raises(UserError, match=r"is not MVDream: .* Try: prior=stable_diffusion"):
+    with pytest.raises(UserError, match=r"expected an MVDream model, .* Try: prior=stable_diffusion"):
         replace(prior, path=str(tmp_path / "sd.pt")).embed("a corgi", "")
 
 
 def test_a_folder_without_cameras_is_refused(prior, pipelines):
-    with pytest.raises(UserError, match=r"is not MVDream: .* Try: prior=stable_diffusion"):
+    with pytest.raises(UserError, match=r"expected an MVDream model, .* Try: prior=stable_diffusion"):
         replace(prior, path=str(pipelines("stable_diffusion"))).embed("a corgi", "")
 
 
-def test_a_damaged_or_foreign_file_is_one_line(prior, file, folder, tmp_path):
+def test_a_damaged_or_unsupported_file_gives_a_message_of_one_line(prior, file, folder, tmp_path):
     broken = tmp_path / "broken.pt"
     broken.write_bytes(file.read_bytes()[:1000])
     tensors = torch.load(file)
@@ -289,10 +289,10 @@ def test_a_damaged_or_foreign_file_is_one_line(prior, file, folder, tmp_path):
     torch.save({"other": torch.zeros(3)}, tmp_path / "other.pt")
     (tmp_path / "text.safetensors").write_text("hello")
     for name, words in (
-        ("broken.pt", "is no file of tensors"),
-        ("text.safetensors", "is no file of tensors"),
-        ("other.pt", "holds no unet"),
-        ("lacking.pt", "holds no unet"),
+        ("broken.pt", "is not a file of tensors"),
+        ("text.safetensors", "is not a file of tensors"),
+        ("other.pt", "contains no unet"),
+        ("lacking.pt", "contains no unet"),
     ):
         there = replace(prior, path=str(tmp_path / name), tokenizer=str(folder / "tokenizer"))
         with pytest.raises(UserError, match=words) as raised:
@@ -301,25 +301,25 @@ def test_a_damaged_or_foreign_file_is_one_line(prior, file, folder, tmp_path):
 
 
 def test_nothing_in_a_file_is_executed(prior, tmp_path):
-    class Stranger:
+    class Malicious:
         def __reduce__(self):
             return (exec, ("raise SystemExit('executed')",))
 
-    torch.save({"weight": torch.zeros(1), "code": Stranger()}, tmp_path / "evil.pt")
-    with pytest.raises(UserError, match="is no file of tensors"):
+    torch.save({"weight": torch.zeros(1), "code": Malicious()}, tmp_path / "evil.pt")
+    with pytest.raises(UserError, match="is not a file of tensors"):
         replace(prior, path=str(tmp_path / "evil.pt")).found  # noqa: B018
 
 
-# --- what it asks for -------------------------------------------------------------------------------------
+# --- requirements -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("count", "key"), [(3, "views"), (6, "views")])
-def test_views_come_in_fours(prior, count, key):
+def test_views_must_come_in_groups_of_four(prior, count, key):
     with pytest.raises(UserError, match=rf"^{key}: expected a multiple of 4.*Try: camera=multiview views=4"):
         condition_of(prior, turntable(count, elevation_deg=0.0, distance=3.0, fov_y_deg=40.0, size=64))
 
 
-def test_views_of_a_group_stand_a_quarter_turn_apart(prior):
+def test_views_of_a_group_must_be_a_quarter_turn_apart(prior):
     cameras = turntable(8, elevation_deg=0.0, distance=3.0, fov_y_deg=40.0, size=64)
     with pytest.raises(UserError, match=r"^camera: expected groups of four views.*azimuths 0, 45, 90, 135"):
         condition_of(prior, cameras)
@@ -327,13 +327,13 @@ def test_views_of_a_group_stand_a_quarter_turn_apart(prior):
     assert len(condition_of(prior, regrouped).cameras) == 8
 
 
-def test_views_of_a_group_stand_on_one_level(prior):
+def test_views_of_a_group_must_have_one_elevation(prior):
     cameras = level_with(elevation=torch.tensor([0.0, 0.0, 0.0, 20.0]))
     with pytest.raises(UserError, match=r"^camera: expected groups of four views.*elevations 0, 0, 0, 20"):
         condition_of(prior, cameras)
 
 
-def test_a_group_has_one_noise_level(prior):
+def test_a_group_must_have_one_noise_level(prior):
     t = torch.tensor([0.4, 0.4, 0.5, 0.4])
     with pytest.raises(UserError, match=r"^guidance\.shared_t: expected true"):
         prior.predict(normal(4, 4, 8, 8), t, condition_of(prior, views()), 7.5)

@@ -27,13 +27,13 @@ def pairs(count, dtype=torch.float64, seed=0):
 
 
 def inner_levels(count, seed=0):
-    """Away from the ends, where a form may be out of sight."""
+    """Levels away from the ends, where all forms are determined."""
     uniform = torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     return 0.01 + 0.98 * uniform
 
 
 def stable_diffusion_abar():
-    """The published table, written down a second time."""
+    """The published table, computed independently."""
     betas = np.square(np.linspace(math.sqrt(0.00085), math.sqrt(0.012), 1000))
     return np.cumprod(1 - betas)
 
@@ -154,8 +154,8 @@ def test_three_forms_of_the_truth_all_return_it(path):
 
 
 @every_path
-def test_three_forms_of_a_wrong_guess_agree(path):
-    """What a network says need not fit the true pair; its three forms must still be one guess."""
+def test_three_forms_of_a_wrong_prediction_agree(path):
+    """A network's output may differ from the true pair; its three forms must still agree."""
     t = inner_levels(50)
     noisy, wrong = pairs(50, seed=1)
     first = path.from_clean(noisy, wrong, t)
@@ -165,7 +165,7 @@ def test_three_forms_of_a_wrong_guess_agree(path):
 
 
 @every_path
-def test_a_guess_mixes_back_to_the_noisy_image(path):
+def test_a_prediction_mixes_back_to_the_noisy_image(path):
     t = inner_levels(50)
     noisy, wrong = pairs(50, seed=2)
     for complete in (path.from_clean, path.from_noise, path.from_velocity):

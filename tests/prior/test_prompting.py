@@ -1,4 +1,4 @@
-"""Which words stand for which view: rules at the angles where they change, and the arithmetic of guidance."""
+"""Prompting: the text of each view around the angles where it changes, and the arithmetic of guidance."""
 
 import math
 
@@ -135,7 +135,7 @@ def test_repulsion_acts_across_the_prompt_only():
         torch.testing.assert_close(extra[view], wanted)
 
 
-def test_what_lies_along_the_prompt_is_not_repelled():
+def test_the_component_along_the_prompt_is_not_repelled():
     negative, positive = random(1, 3, 4, 4), random(1, 3, 4, 4, seed=1)
     along = negative + 3 * (positive - negative)
     guided = guide(negative, positive, along[None], -torch.ones(1, 1).double(), 5.0)
@@ -151,6 +151,6 @@ def test_what_lies_along_the_prompt_is_not_repelled():
         (lambda: PerpNeg(curve="lucid", overhead_deg=100), "prompting.overhead_deg"),
     ],
 )
-def test_what_cannot_be(make, key):
+def test_impossible_values_are_refused_by_key(make, key):
     with pytest.raises(UserError, match=key):
         make()

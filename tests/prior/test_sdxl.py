@@ -1,4 +1,4 @@
-"""Laws of SDXL as a prior, against the pipeline of diffusers on the same folder."""
+"""Laws of SDXL as a prior, compared with the pipeline of diffusers on the same folder."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ def prior(folder, tmp_path_factory):
 
 @pytest.mark.parametrize("negative", ["ugly", ""])
 def test_texts_are_embedded_as_the_pipeline_embeds_them(prior, pipe, negative):
-    """Its empty negative prompt, None, is zeros: the index of the model says so."""
+    """The pipeline embeds its empty negative prompt, None, as zeros, since the index of the model says so."""
     texts = prior.embed("a red cube", negative).texts
     positive, other, pooled, other_pooled = pipe.encode_prompt(
         "a red cube, side view", negative_prompt=negative or None
@@ -59,8 +59,8 @@ def test_a_model_that_does_not_ask_for_zeros_reads_the_empty_text(prior, pipe):
 
 
 @torch.no_grad()
-def test_a_prediction_is_what_the_pipelines_parts_say(prior, pipe):
-    """Latents that are not square, since the network is told height and width."""
+def test_a_prediction_equals_that_of_the_pipelines_parts(prior, pipe):
+    """The latents are not square, since the network reads height and width."""
     clean, noise, k, scale = normal(2, 4, 8, 12), normal(2, 4, 8, 12, seed=1), 400, 7.5
     noisy = pipe.scheduler.add_noise(clean, noise, torch.tensor([k - 1, k - 1]))
     sizes = pipe._get_add_time_ids((64, 96), (0, 0), (64, 96), torch.float32, 32).repeat(2, 1)
@@ -81,32 +81,32 @@ def test_a_prediction_is_what_the_pipelines_parts_say(prior, pipe):
     torch.testing.assert_close(guess.clean, (noisy - (1 - a**2) ** 0.5 * expected) / a, rtol=1e-4, atol=1e-4)
 
 
-def test_the_network_is_told_the_size(prior):
-    """The same latents as a part of larger ones would not be the same image."""
+def test_the_network_reads_the_image_size(prior):
+    """The same latents as part of a larger image would have another embedding."""
     texts = prior.embed("a red cube", "").texts
     one = replace(texts, tokens=texts.tokens[:1], pooled=texts.pooled[:1])
     cameras = condition_of(prior, views=1).cameras
-    told = []
-    hook = prior.network.add_embedding.register_forward_pre_hook(lambda _, inputs: told.append(inputs[0]))
+    encoded = []
+    hook = prior.network.add_embedding.register_forward_pre_hook(lambda _, inputs: encoded.append(inputs[0]))
     for height, width in ((8, 8), (8, 16)):
         prior.denoise(normal(1, 4, height, width), torch.tensor([500.0]), one, cameras)
     hook.remove()
-    assert not torch.equal(told[0], told[1])
+    assert not torch.equal(encoded[0], encoded[1])
 
 
 def test_latents_are_those_of_the_pipelines_autoencoder(prior, pipe):
     encodes_what_the_autoencoder_says(prior, pipe.vae)
 
 
-def test_it_computes_in_sixteen_bits(prior):
+def test_networks_compute_in_16_bits_and_return_float32(prior):
     computes_in_sixteen_bits(prior, condition_of)
 
 
-def test_memory_is_foreseen(prior):
+def test_memory_is_estimated(prior):
     memory_is_foreseen(prior)
 
 
-def test_micro_batch_changes_nothing(prior):
+def test_micro_batch_does_not_change_results(prior):
     micro_batch_changes_nothing(prior, size=1, condition=condition_of(prior), channels=4)
 
 

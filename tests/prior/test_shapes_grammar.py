@@ -1,4 +1,4 @@
-"""What the grammar understands, and what it says when it does not."""
+"""The grammar of prompts and its error messages."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from cadam3d.prior.shapes.objects import ALIASES, known_objects, known_primitive
 from cadam3d.prior.shapes.vocabulary import COLOURS
 
 
-def test_the_world_is_as_rich_as_promised() -> None:
+def test_the_world_has_at_least_twelve_primitives_and_ten_objects() -> None:
     assert len(known_primitives()) >= 12
     assert len(known_objects()) >= 10
 
@@ -65,39 +65,57 @@ def test_between_takes_two_objects_and_chains_nest_to_the_right() -> None:
     assert chain == Sentence(red, "on", (Sentence(blue, "on", (Sentence(Phrase("table")),)),))
 
 
-def test_words_in_two_parts_and_words_about_pictures() -> None:
+def test_nouns_in_two_words_and_words_about_pictures_are_read() -> None:
     assert parse("a 3D model of a light-house") == Sentence(Phrase("lighthouse"))
     assert parse("a photo of an ice cream") == Sentence(Phrase("icecream"))
 
 
-def test_unknown_words_are_all_named_with_near_ones_and_the_way_out() -> None:
+def test_all_unknown_words_are_named_with_near_words_and_alternatives() -> None:
     with pytest.raises(UserError) as caught:
         parse("a fluffy lighthous on a redd cube")
     message = str(caught.value)
     assert all(word in message for word in ("'fluffy'", "'lighthous'", "'redd'"))
+    assert message.startswith("prompt: expected words that prior=shapes knows, got 'a fluffy lighthous")
     assert "did you mean lighthouse" in message
     assert all(word in message for group in known_words().values() for word in group)
     assert "cadam3d doctor" in message
-    assert "prompt=" in message
+    assert message.endswith('Try: prompt="a red and yellow checkered torus"')
     assert "'cube'" not in message
 
 
 @pytest.mark.parametrize(
-    ("prompt", "reason"),
+    ("prompt", "corrected"),
     [
-        ("red", "an object is missing"),
-        ("  ", "an object is missing"),
-        ("a cube on", "an object is missing"),
-        ("on a cube", "before 'on'"),
-        ("a cube sphere", "relation"),
-        ("a cube red", "relation"),
-        ("a dark cube", "'dark' wants a colour"),
-        ("a dark small red cube", "'dark' wants a colour"),
-        ("a red, green and blue cube", "at most 2 colours"),
-        ("a cube between a sphere", "joined by 'and'"),
+        ("a redd chiar, please on a tabel", "a red and yellow checkered torus"),  # "please" has no near word
+        ("A Redd chiar", "a red chair"),
+        ("a lihgthouse on a bal", "a lighthouse on a ball"),
+        ("a blu", "a red and yellow checkered torus"),  # "a blue" is no sentence
     ],
 )
-def test_broken_sentences_say_what_is_wrong(prompt: str, reason: str) -> None:
-    with pytest.raises(UserError, match=reason) as caught:
+def test_the_advice_for_misspelt_words_can_be_parsed(prompt: str, corrected: str) -> None:
+    with pytest.raises(UserError) as caught:
+        parse(prompt, "negative_prompt")
+    assert str(caught.value).startswith("negative_prompt: expected words")
+    assert str(caught.value).endswith(f'Try: negative_prompt="{corrected}"')
+    parse(corrected)
+
+
+@pytest.mark.parametrize(
+    ("prompt", "expected"),
+    [
+        ("red", "an object at the end"),
+        ("  ", "an object"),
+        ("a cube on", "an object at the end"),
+        ("on a cube", "an object before 'on'"),
+        ("a cube sphere", "a relation such as 'on' or 'next to' before 'sphere'"),
+        ("a cube red", "a relation such as 'on' or 'next to' before 'red'"),
+        ("a dark cube", "a colour after 'dark'"),
+        ("a dark small red cube", "a colour after 'dark'"),
+        ("a red, green and blue cube", "at most 2 colours for one object"),
+        ("a cube between a sphere", "two objects joined by 'and' after 'between'"),
+    ],
+)
+def test_broken_sentences_are_refused_with_what_was_expected(prompt: str, expected: str) -> None:
+    with pytest.raises(UserError) as caught:
         parse(prompt)
-    assert 'Try: prompt="' in str(caught.value)
+    assert str(caught.value).startswith(f"prompt: expected {expected}, got {prompt!r}. Try: prompt=")

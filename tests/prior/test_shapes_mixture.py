@@ -1,4 +1,4 @@
-"""The closed form of the denoiser, proved: against Monte-Carlo, against the score, by sampling with it."""
+"""The closed form of the denoiser, compared with Monte Carlo estimates, with the score and by sampling."""
 
 import math
 from itertools import pairwise
@@ -26,7 +26,7 @@ def small(views: int, sigma: Tensor = SIGMA) -> Mixture:
 
 
 def draw(count: int, generator: torch.Generator) -> Tensor:
-    """Samples of the mixture, the plain way."""
+    """Draw samples of the mixture directly."""
     mode = torch.multinomial(WEIGHTS, count, replacement=True, generator=generator)
     noise = torch.randn(count, 2, generator=generator, dtype=torch.float64)
     return (MEANS[mode] + SIGMA * noise).reshape(count, 1, 1, 2)
@@ -40,7 +40,7 @@ def at(path: NoisePath, t: float, views: int = 1) -> tuple[Tensor, Tensor, Tenso
 @pytest.mark.parametrize("path", PATHS)
 @pytest.mark.parametrize("t", [0.1, 0.4, 0.7, 0.95])
 def test_posterior_mean_equals_monte_carlo(path: NoisePath, t: float) -> None:
-    """Weigh samples of the prior by the likelihood of the noisy image: no formula of the mixture is used."""
+    """Weight samples of the prior by the likelihood of the noisy image, without a formula of the mixture."""
     generator = torch.Generator().manual_seed(0)
     samples = draw(400_000, generator).reshape(-1, 2)
     _, a, b = at(path, t)
@@ -120,7 +120,7 @@ def test_pure_noise_gives_the_mean_of_the_mixture() -> None:
     torch.testing.assert_close(noise, noisy)
 
 
-def test_certain_modes_answer_with_the_nearest() -> None:
+def test_without_spread_and_noise_the_nearest_mode_is_returned() -> None:
     _, a, b = at(DDPM(), 0.0)
     noisy = (MEANS[1] + 0.05).reshape(1, 1, 1, 2)
     clean, noise = small(1, torch.zeros(2, dtype=torch.float64)).denoise(noisy, a, b)
@@ -129,7 +129,7 @@ def test_certain_modes_answer_with_the_nearest() -> None:
 
 
 def test_large_images_do_not_underflow() -> None:
-    """A hundred thousand pixels: densities far below the smallest float, responsibilities still right."""
+    """The density of an image of 100,000 pixels is below the smallest float; responsibilities stay right."""
     means = torch.stack([torch.zeros(3, 200, 200), torch.full((3, 200, 200), 0.01)])[None]
     mixture = Mixture(means, torch.full((2,), math.log(0.5)), torch.full((1, 3, 200, 200), 0.04))
     noisy = torch.full((1, 3, 200, 200), 0.005)
@@ -138,7 +138,7 @@ def test_large_images_do_not_underflow() -> None:
 
 
 def check_recovered(samples: Tensor) -> None:
-    """Mode weights, means and spread of the samples, within five standard errors and the steps' bias."""
+    """Check mode weights, means and spread within five standard errors and the bias of the steps."""
     flat, count = samples.reshape(-1, 2), samples.shape[0]
     mode = ((flat[:, None] - MEANS) / SIGMA).square().sum(-1).argmin(1)
     shares = torch.bincount(mode, minlength=3).double() / count
@@ -152,7 +152,7 @@ def check_recovered(samples: Tensor) -> None:
 
 @pytest.mark.parametrize("path", PATHS)
 def test_ode_sampling_recovers_the_distribution(path: NoisePath) -> None:
-    """DDIM steps (on the flow: Euler steps of the velocity) carry noise to the mixture."""
+    """DDIM steps (Euler steps of the velocity on the flow) carry noise to the mixture."""
     count, generator = 8000, torch.Generator().manual_seed(3)
     times = torch.linspace(1, 0, 151, dtype=torch.float64) ** 2  # finer where the image appears
     mixture = small(count)
@@ -168,7 +168,7 @@ def test_ode_sampling_recovers_the_distribution(path: NoisePath) -> None:
 
 @pytest.mark.parametrize("path", PATHS)
 def test_ancestral_sampling_recovers_the_distribution(path: NoisePath) -> None:
-    """DDPM's own sampler: step to the posterior q(x_s | x_t, clean), with fresh noise each time."""
+    """The sampler of DDPM draws from the posterior q(x_s | x_t, clean), with new noise at each step."""
     count, generator = 8000, torch.Generator().manual_seed(4)
     times = torch.linspace(1, 0, 301, dtype=torch.float64) ** 2
     mixture = small(count)

@@ -1,4 +1,4 @@
-"""ShapesPrior as guidance sees it: scales, the unconditional branch, the prediction error, the truth."""
+"""ShapesPrior as guidance uses it: scales, the unconditional branch, the prediction error and the truth."""
 
 from dataclasses import replace
 
@@ -81,7 +81,7 @@ def test_both_ends_are_finite_and_explain_the_noisy_image(path: NoisePath, sprea
             )
 
 
-def test_a_mode_is_kept_and_its_noise_found() -> None:
+def test_a_noisy_mode_is_denoised_to_itself_and_its_noise() -> None:
     model = prior(spread=0.01, edge_spread=0.0)
     condition, t = condition_of(model), torch.tensor([0.25, 0.25])
     noise = noisy_image()
@@ -112,7 +112,7 @@ def test_scales_zero_and_one_are_single_branches() -> None:
     assert torch.equal(zero.clean, condition.empty.denoise(noisy_image(), a, b)[0])
 
 
-def test_unprompted_knows_neither_prompt() -> None:
+def test_unprompted_depends_on_neither_prompt() -> None:
     model, t = prior(), torch.tensor([0.4, 0.7])
     first = condition_of(model, "a lighthouse", "a red cube").unprompted()
     second = condition_of(model, "a torus").unprompted()
@@ -121,7 +121,7 @@ def test_unprompted_knows_neither_prompt() -> None:
     )
 
 
-def test_a_negative_prompt_is_a_scene_of_its_own() -> None:
+def test_a_negative_prompt_describes_another_scene() -> None:
     model, t = prior(), torch.tensor([0.4, 0.7])
     condition = condition_of(model, "a torus", "a lighthouse")
     alone = condition_of(model, "a lighthouse")
@@ -158,7 +158,7 @@ def test_spread_is_wider_at_silhouettes() -> None:
 
 
 def test_empty_prompt_has_the_moments_of_the_world() -> None:
-    """Against pictures composited one by one, without the algebra of the census."""
+    """Compare with images that are composited one by one, without the algebra of the census."""
     model = prior(spread=1e-4, edge_spread=0.0, samples_per_pixel=1)
     cameras = turntable(
         CENSUS_VIEWS,
@@ -180,7 +180,7 @@ def test_empty_prompt_has_the_moments_of_the_world() -> None:
     torch.testing.assert_close(empty.variance[0].permute(1, 2, 0).double(), variance, atol=1e-5, rtol=0)
 
 
-def test_truth_is_what_the_modes_show() -> None:
+def test_truth_equals_the_means_of_the_modes() -> None:
     model = prior()
     cameras, background = views(3), torch.rand(3, 3, generator=torch.Generator().manual_seed(0))
     images = model.truth("a spotted torus")(cameras, background)
@@ -206,7 +206,7 @@ def test_error_has_unit_rms_and_no_mean() -> None:
 
 
 def test_error_is_smooth() -> None:
-    """Of the energy of a field on 32 pixels, next to nothing lies above the frequency of its 8 cells."""
+    """A field on 32 pixels has almost no energy above the frequency of its 8 cells."""
     spectrum = torch.fft.fft2(fields()).abs().square().mean(dim=(0, 1))
     frequency = torch.fft.fftfreq(32, 1 / 32).abs()
     is_high = torch.maximum(frequency[:, None], frequency[None]) > 8
@@ -247,7 +247,7 @@ def test_configured_error_is_measured_in_the_prediction(path: NoisePath) -> None
     torch.testing.assert_close(total.sqrt(), 0.4 * b / (a * a + b * b).sqrt(), rtol=0.1, atol=0)
 
 
-def test_error_leaves_clean_images_alone_and_differs_between_branches() -> None:
+def test_clean_images_have_no_error_and_branches_have_different_errors() -> None:
     exact, wrong = prior(), prior(model_error=0.4)
     condition, t = condition_of(exact), torch.zeros(2)
     noisy = noisy_image()
@@ -264,7 +264,7 @@ def test_error_leaves_clean_images_alone_and_differs_between_branches() -> None:
     assert abs(float(correlation)) < 0.3
 
 
-# --- what a user can get wrong
+# --- user errors
 
 
 @pytest.mark.parametrize("prompt", ["", "   "])

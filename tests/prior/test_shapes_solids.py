@@ -55,7 +55,7 @@ def unit_vectors(count: int, seed: int = 1) -> torch.Tensor:
     return torch.nn.functional.normalize(random_points(count, seed), dim=0)
 
 
-def test_every_kind_is_tried_here() -> None:
+def test_every_kind_is_tested_in_this_file() -> None:
     assert {solid.kind for solid, _ in VOLUMES.values()} == set(KINDS)
 
 
@@ -70,7 +70,7 @@ def test_inside_has_the_volume_of_the_textbook(name: str) -> None:
 
 @pytest.mark.parametrize("solid", SOLIDS)
 def test_distance_never_overshoots_the_surface(solid: Solid) -> None:
-    """1-Lipschitz with the right sign: no point of the surface is nearer than the distance says."""
+    """The function is 1-Lipschitz with the right sign: no point of the surface is nearer than its value."""
     first, step = random_points(20_000), 0.3 * random_points(20_000, seed=2)
     difference = (solid.distance(first + step) - solid.distance(first)).abs()
     assert bool((difference <= step.norm(dim=0) * (1 + 1e-9)).all())
@@ -78,20 +78,20 @@ def test_distance_never_overshoots_the_surface(solid: Solid) -> None:
 
 @pytest.mark.parametrize("solid", SOLIDS)
 def test_distance_grows_on_the_way_out(solid: Solid) -> None:
-    """Far away the bound stays useful: a ray that marches by it gets on."""
+    """The bound stays useful far away, so that a ray that advances by it makes progress."""
     away = unit_vectors(500) * 6
     assert bool((solid.distance(away) > 0.3).all())
 
 
 @pytest.mark.parametrize("solid", SOLIDS)
-def test_no_inner_point_reaches_beyond_the_support(solid: Solid) -> None:
+def test_no_inner_point_is_beyond_the_support(solid: Solid) -> None:
     points, directions = random_points(40_000), unit_vectors(40)
     inner = points[:, solid.distance(points) < 0]
     assert bool((directions.T @ inner <= solid.support(directions)[:, None] + 1e-12).all())
 
 
 @pytest.mark.parametrize("solid", SOLIDS)
-def test_support_is_touched_by_the_surface(solid: Solid) -> None:
+def test_the_surface_touches_every_supporting_plane(solid: Solid) -> None:
     """The gradient of a support function is the point that touches the supporting plane."""
     moved = solid.turned("x", 20).turned("z", 50).at(0.1, -0.2, 0.3)
     directions = unit_vectors(60).requires_grad_(True)

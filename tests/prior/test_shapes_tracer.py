@@ -1,4 +1,4 @@
-"""Pictures of the world: inside the unit ball, equal to brute force, lit by a light that stays in place."""
+"""Traced images: inside the unit ball, equal to brute force, and lit by a light that does not move."""
 
 from dataclasses import replace
 
@@ -67,7 +67,7 @@ def test_every_scene_is_seen_from_all_sides_and_never_clipped(prompt: str) -> No
     "prompt", ["lighthouse", "mug", "star", "arch", "tetrahedron", "ring", *PROMPTS[1:3]]
 )
 def test_silhouette_equals_brute_force(prompt: str) -> None:
-    """A pixel is covered exactly if a fine walk along its ray steps into some solid."""
+    """A pixel is covered if and only if one of many points along its ray is inside a solid."""
     parts = assemble(parse(prompt))
     view = cameras(24, 2).to(torch.float64)
     layers = trace(compile_scene(parts), view, 1)
@@ -75,14 +75,14 @@ def test_silhouette_equals_brute_force(prompt: str) -> None:
     depths = fitting_distance(40.0) + torch.linspace(-0.9, 0.9, 500, dtype=torch.float64)
     points = origins[:, None, None, None] + depths[:, None] * directions[..., None, :]
     walked = inside(parts, points.reshape(-1, 3).T).reshape(points.shape[:-1]).any(-1)
-    # The walk may step over a thin corner, never the other way round.
+    # The walk may step over a thin corner; the opposite error is impossible.
     assert bool((layers.alpha[walked] > 0).all())
     assert float(((layers.alpha > 0) & ~walked).double().mean()) < 0.01
 
 
 @pytest.mark.parametrize("prompt", ["a rocket", "a hammer next to a tree", "a tall chair"])
 def test_picture_equals_brute_force(prompt: str) -> None:
-    """First point inside any solid, by walking and halving; its normal by autograd; its own part's colour."""
+    """Find the first point inside a solid by small steps and bisection, and its normal by autograd."""
     parts = assemble(parse(prompt))
     view = cameras(24, 2, elevation_deg=30.0).to(torch.float64)
     layers = trace(compile_scene(parts), view, 1)
@@ -109,12 +109,12 @@ def test_picture_equals_brute_force(prompt: str) -> None:
     scene = compile_scene(parts)
     image = layers.images(scene.albedo, torch.zeros(2, 3, dtype=torch.float64))[:, 0].permute(0, 2, 3, 1)
     error = (image[layers.alpha > 0][found] - colours[nearest] * light[:, None]).abs().amax(1)
-    # A ray that meets an edge within the tolerance of a hit may take the neighbouring face.
+    # A ray that meets an edge within the tolerance of a hit may hit the neighbouring face.
     assert float((error < 0.02).double().mean()) > 0.96
 
 
 def test_light_on_a_sphere_equals_the_formula() -> None:
-    """From every side the same point of the world has the same light: it depends on the normal alone."""
+    """A point of the world has the same light from every side, since light depends on the normal alone."""
     view = cameras(64, 3, elevation_deg=35.0).to(torch.float64)
     layers = trace(build("a white sphere"), view, 1)
     origins, directions = view.rays()
@@ -136,7 +136,7 @@ def test_turning_scene_and_camera_together_changes_no_silhouette() -> None:
 
 
 @pytest.mark.parametrize("prompt", ["sphere", "cube", "cone", "disc"])
-def test_what_is_symmetric_looks_the_same_from_every_quarter(prompt: str) -> None:
+def test_a_symmetric_object_looks_the_same_from_every_quarter(prompt: str) -> None:
     _, layers = look(prompt, samples=2)
     assert float((layers.alpha - layers.alpha[:1]).abs().mean()) < 2e-3
 
@@ -162,7 +162,7 @@ def test_finer_sampling_makes_soft_edges_of_the_same_shape() -> None:
     )
 
 
-def test_images_stay_in_range_and_show_the_background_through() -> None:
+def test_images_are_in_range_and_show_the_background_where_they_are_transparent() -> None:
     scene, layers = look("a striped cube", samples=2)
     background = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.2, 0.4, 0.6], [1.0, 0.0, 1.0]])
     images = layers.images(scene.albedo, background)
@@ -195,7 +195,7 @@ def test_on_and_under_are_above_and_below(prompt: str, above: bool) -> None:
     assert bool(mean_red < mean_blue) is above
 
 
-def test_between_stands_in_the_middle_as_seen_from_the_front() -> None:
+def test_between_is_in_the_middle_as_seen_from_the_front() -> None:
     scene, layers = look("a green sphere between a red cube and a blue cube")
     image = layers.images(scene.albedo, torch.zeros(4, 3))[0, 0]
     columns = torch.arange(40.0)

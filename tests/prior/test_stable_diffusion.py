@@ -1,4 +1,4 @@
-"""Stable Diffusion as a prior, against the pipeline's own pieces, on tiny models from files."""
+"""Stable Diffusion as a prior, compared with the parts of the pipeline, on tiny models from files."""
 
 import pytest
 import torch
@@ -78,8 +78,8 @@ LEVELS = torch.tensor([0.3, 0.8])
 
 
 @pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
-def test_a_guess_equals_the_pipelines_own(prediction, make, pipeline_of):
-    """Text encoder, UNet, guidance and scheduler of diffusers against ours, at levels of its own table."""
+def test_a_prediction_equals_that_of_the_pipeline(prediction, make, pipeline_of):
+    """Compare with text encoder, UNet, guidance and scheduler of diffusers, at levels of its table."""
     pipeline = pipeline_of(prediction)
     prior, clean, noise = make(prediction), random(2, 4, 8, 8), random(2, 4, 8, 8, seed=1)
     steps = torch.tensor([299, 799])  # rows of the table: t = (row + 1) / 1000
@@ -100,17 +100,17 @@ def test_a_guess_equals_the_pipelines_own(prediction, make, pipeline_of):
         torch.testing.assert_close(guess.clean[view], clean_guess, rtol=1e-3, atol=1e-3)
 
 
-def test_scale_zero_is_the_negative_prompt_alone_and_unprompted_knows_neither(make):
+def test_scale_zero_is_the_negative_prompt_alone_and_unprompted_uses_neither(make):
     prior, noisy = make(), random(2, 4, 8, 8)
     condition = condition_of(prior, 0, 90)
     swapped = condition_of(prior, 0, 90, prompt="ugly", negative="a corgi")
     zero = prior.predict(noisy, LEVELS, condition, 0.0)
     torch.testing.assert_close(zero.noise, prior.predict(noisy, LEVELS, swapped, 1.0).noise)
-    nobody = condition_of(prior, 0, 90, prompt="", negative="")
+    empty = condition_of(prior, 0, 90, prompt="", negative="")
     for scale in (1.0, 7.5):
         torch.testing.assert_close(
             prior.predict(noisy, LEVELS, condition.unprompted(), scale).noise,
-            prior.predict(noisy, LEVELS, nobody, 1.0).noise,
+            prior.predict(noisy, LEVELS, empty, 1.0).noise,
             rtol=1e-4,
             atol=1e-4,
         )
@@ -127,7 +127,7 @@ def test_encoding_is_the_mean_of_the_autoencoder_and_can_be_differentiated(make,
     assert rgb.grad.abs().sum() > 0
 
 
-def test_renders_of_any_size_are_resized_and_gradients_find_back(make):
+def test_renders_of_any_size_are_resized_and_gradients_reach_them(make):
     prior, rgb = make(), torch.rand(1, 50, 70, 3).requires_grad_()
     assert prior.encode(rgb).shape == (1, 4, 8, 8)
     prior.encode(rgb).sum().backward()
@@ -137,7 +137,7 @@ def test_renders_of_any_size_are_resized_and_gradients_find_back(make):
     assert make(size=None).encode(torch.rand(1, 32, 48, 3)).shape == (1, 4, 4, 6)
 
 
-def test_decoding_gives_images_of_the_size_asked_for(make, pipeline):
+def test_decoding_gives_images_of_the_requested_size(make, pipeline):
     prior, latents = make(), random(2, 4, 8, 8)
     images = prior.decode(latents, PIXELS, PIXELS)
     with torch.no_grad():
@@ -147,7 +147,7 @@ def test_decoding_gives_images_of_the_size_asked_for(make, pipeline):
 
 
 @pytest.mark.parametrize("micro_batch", [1, 2])
-def test_parts_leave_guess_and_gradient_as_they_are(make, micro_batch):
+def test_micro_batches_do_not_change_predictions_and_gradients(make, micro_batch):
     whole, parts = make(prompting=PERP_NEG), make(prompting=PERP_NEG, micro_batch=micro_batch)
     noisy, levels = random(3, 4, 8, 8), torch.tensor([0.2, 0.5, 0.9])
     guesses = [p.predict(noisy, levels, condition_of(p, 0, 100, -45), 7.5).clean for p in (whole, parts)]
@@ -160,7 +160,7 @@ def test_parts_leave_guess_and_gradient_as_they_are(make, micro_batch):
     torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-5)
 
 
-def test_views_get_their_own_words(make):
+def test_each_view_gets_the_text_of_its_direction(make):
     prior = make(prompting=Discrete(front_deg=45, back_deg=45, overhead_deg=60))
     noisy, levels = random(1, 4, 8, 8).repeat(3, 1, 1, 1), torch.full((3,), 0.5)
     front, back, again = prior.predict(noisy, levels, condition_of(prior, 0, 180, 10), 1.0).noise
@@ -180,7 +180,7 @@ def test_interpolated_embeddings_are_weighted_sums(make):
     torch.testing.assert_close(mixed, 2 / 3 * front + 1 / 3 * side, rtol=1e-5, atol=1e-5)
 
 
-def test_perp_neg_changes_what_a_side_view_wants(make):
+def test_perp_neg_changes_the_prediction_of_a_side_view(make):
     plain, repelled = make(prompting=Interpolated()), make(prompting=PERP_NEG)
     noisy, level = random(1, 4, 8, 8), torch.tensor([0.5])
     guesses = [p.predict(noisy, level, condition_of(p, 100), 7.5).noise for p in (plain, repelled)]
@@ -192,7 +192,7 @@ def test_perp_neg_changes_what_a_side_view_wants(make):
 
 @pytest.fixture
 def counted(monkeypatch):
-    """How many texts went through an encoder."""
+    """The texts that went through an encoder."""
     seen = []
     real = StableDiffusion.embed_texts
 
@@ -214,7 +214,7 @@ def test_a_text_is_embedded_once_per_model(make, counted, tmp_path):
     assert counted[4:] == ["a corgi", "ugly", ""]  # other numbers, another entry
 
 
-def test_a_damaged_entry_is_made_again_and_an_unwritable_cache_only_costs_time(make, counted, tmp_path):
+def test_a_damaged_entry_is_replaced_and_an_unwritable_cache_is_no_error(make, counted, tmp_path):
     make(cache_dir=str(tmp_path)).embed("a corgi", "")
     for file in (tmp_path / "texts").iterdir():
         file.write_bytes(b"cut")
@@ -225,7 +225,7 @@ def test_a_damaged_entry_is_made_again_and_an_unwritable_cache_only_costs_time(m
     assert len(counted) == 6
 
 
-def test_the_encoder_is_gone_before_the_denoiser_comes(make, tmp_path, monkeypatch):
+def test_the_text_encoder_is_freed_before_the_denoiser_is_loaded(make, tmp_path, monkeypatch):
     import weakref
 
     from cadam3d.io.pretrained import Pretrained
@@ -250,7 +250,7 @@ def test_the_encoder_is_gone_before_the_denoiser_comes(make, tmp_path, monkeypat
 # --- memory -----------------------------------------------------------------------------------------------
 
 
-def test_the_estimate_counts_weights_exactly_and_grows_with_what_is_at_once(make, tmp_path):
+def test_the_estimate_counts_weights_exactly_and_grows_with_the_batch(make, tmp_path):
     prior = make(cache_dir=str(tmp_path))
     estimate = prior.memory("a corgi", "", 2, None)
     assert "vae" not in prior.__dict__  # nothing was loaded
@@ -283,7 +283,7 @@ def test_the_estimate_of_the_autoencoder_is_what_autograd_keeps(make):
     assert 0.8 * saved < prior.memory("a corgi", "", 2, None).working < 2 * saved
 
 
-def test_what_is_not_on_this_disk_is_lacking_and_the_hub_is_not_asked(make, monkeypatch):
+def test_a_model_that_is_not_on_disk_is_lacking_and_the_hub_is_not_queried(make, monkeypatch):
     assert make().lacks() is None
     asked = []
 
@@ -297,7 +297,7 @@ def test_what_is_not_on_this_disk_is_lacking_and_the_hub_is_not_asked(make, monk
     assert "nothing there" in make(path="/nowhere").lacks()
 
 
-# --- what cannot be ---------------------------------------------------------------------------------------
+# --- impossible values ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -323,7 +323,7 @@ def test_wrong_values_are_named(make, changes, key):
         ({"prediction_type": "flow"}, "epsilon"),
     ],
 )
-def test_a_schedule_that_we_do_not_know_is_refused(make, changes, word):
+def test_an_unknown_noise_schedule_is_refused(make, changes, word):
     prior = make()
     object.__setattr__(prior, "scheduler", dict(prior.scheduler) | changes)
     with pytest.raises(UserError, match=word):

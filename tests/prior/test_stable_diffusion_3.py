@@ -1,4 +1,4 @@
-"""Laws of Stable Diffusion 3 as a prior, against the pipeline of diffusers on the same folder."""
+"""Laws of Stable Diffusion 3 as a prior, compared with the pipeline of diffusers on the same folder."""
 
 import shutil
 from dataclasses import replace
@@ -63,16 +63,16 @@ def test_without_t5_too(prior, folder):
     embeds_as_the_pipeline(replace(prior, t5=False), pipe)
 
 
-def test_a_model_that_comes_without_t5_needs_no_key(prior, pipelines):
+def test_a_model_without_t5_needs_no_key(prior, pipelines):
     folder = pipelines("stable_diffusion_3", t5=False)
     other = replace(prior, path=str(folder))
     assert other.encoders == ("text_encoder", "text_encoder_2")
-    none = {"text_encoder_3": None, "tokenizer_3": None}  # diffusers insists on hearing it
+    none = {"text_encoder_3": None, "tokenizer_3": None}  # diffusers needs both, explicitly
     embeds_as_the_pipeline(other, diffusers.StableDiffusion3Pipeline.from_pretrained(folder, **none))
 
 
-def test_t5_that_is_not_wanted_need_not_be_there(prior, folder, tmp_path):
-    """Nor its tokenizer: neither is looked for, so on the hub neither is downloaded."""
+def test_t5_may_be_missing_if_it_is_not_used(prior, folder, tmp_path):
+    """Neither T5 nor its tokenizer is searched, so neither is downloaded from the hub."""
     unwanted = ("text_encoder_3", "tokenizer_3", "tokens")
     shutil.copytree(folder, tmp_path / "model", ignore=shutil.ignore_patterns(*unwanted))
     there = replace(prior, path=str(tmp_path / "model"), t5=False)
@@ -83,7 +83,7 @@ def test_t5_that_is_not_wanted_need_not_be_there(prior, folder, tmp_path):
         replace(there, t5=True).embed("a red cube", "")
 
 
-def test_embeddings_with_and_without_t5_are_kept_apart(prior):
+def test_embeddings_with_and_without_t5_are_cached_separately(prior):
     with_t5, without = (replace(prior, t5=t5).embed("a red cube", "").texts.tokens for t5 in (True, False))
     torch.testing.assert_close(with_t5[:, :77], without[:, :77])
     assert with_t5[:, 77:].any()
@@ -91,8 +91,8 @@ def test_embeddings_with_and_without_t5_are_kept_apart(prior):
 
 
 @torch.no_grad()
-def test_a_prediction_is_what_the_pipelines_parts_say(prior, pipe):
-    """The scheduler's table of sigmas has the shift in it: row i is t = 1 - i / 1000."""
+def test_a_prediction_equals_that_of_the_pipelines_parts(prior, pipe):
+    """The scheduler's table of sigmas includes the shift: row i is t = 1 - i / 1000."""
     clean, noise, row, scale = normal(2, 16, 8, 8), normal(2, 16, 8, 8, seed=1), 600, 7.5
     sigma, timestep = pipe.scheduler.sigmas[row], pipe.scheduler.timesteps[row]
     noisy = pipe.scheduler.scale_noise(clean, timestep[None], noise)
@@ -117,7 +117,7 @@ def test_a_prediction_is_what_the_pipelines_parts_say(prior, pipe):
 
 
 def test_a_step_of_the_pipelines_sampler_is_a_mixture_of_the_prediction(prior, pipe):
-    """From one noise level of its schedule to the next: Euler there, NoisePath.mix here."""
+    """A step from one noise level to the next is an Euler step there and ``NoisePath.mix`` here."""
     scheduler = type(pipe.scheduler).from_config(pipe.scheduler.config)
     scheduler.set_timesteps(4)
     noisy, velocity = normal(1, 16, 8, 8), normal(1, 16, 8, 8, seed=1)
@@ -146,13 +146,13 @@ def test_latents_are_those_of_the_pipelines_autoencoder(prior, pipe):
     encodes_what_the_autoencoder_says(prior, pipe.vae)
 
 
-def test_it_computes_in_sixteen_bits(prior):
+def test_networks_compute_in_16_bits_and_return_float32(prior):
     computes_in_sixteen_bits(prior, condition_of)
 
 
-def test_memory_is_foreseen(prior):
+def test_memory_is_estimated(prior):
     memory_is_foreseen(prior)
 
 
-def test_micro_batch_changes_nothing(prior):
+def test_micro_batch_does_not_change_results(prior):
     micro_batch_changes_nothing(prior, size=1, condition=condition_of(prior), channels=16)

@@ -1,4 +1,4 @@
-"""Laws of the tiny prior: everything a real one has, except knowledge."""
+"""Laws of the tiny prior, which has the interface of a real prior and random weights."""
 
 import pytest
 import torch
@@ -30,7 +30,7 @@ def levels(views=2, value=0.5):
 
 
 @pytest.mark.parametrize("width", [16, 48])
-def test_it_is_tiny(width):
+def test_it_has_fewer_than_two_million_parameters(width):
     network = Tiny(**KEYS | {"width": width}).network
     assert sum(parameter.numel() for parameter in network.parameters()) < 2_000_000
 
@@ -49,7 +49,7 @@ def test_weights_depend_on_the_seed_alone():
     assert not torch.equal(first["enter.weight"], other["enter.weight"])
 
 
-def test_global_randomness_is_left_alone():
+def test_the_global_random_state_does_not_change():
     before = torch.get_rng_state()
     prior = Tiny(**KEYS)
     prior.predict(noisy_of(), levels(), condition_of(prior), 7.5)
@@ -105,7 +105,7 @@ def test_encoding_passes_a_gradient_to_every_pixel(prior):
 
 @pytest.mark.parametrize("size", [(8, 8), (9, 13)])
 @pytest.mark.parametrize("downscale", [1, 2, 3, 8])
-def test_what_was_decoded_encodes_to_what_it_was(size, downscale):
+def test_encoding_inverts_decoding(size, downscale):
     prior = Tiny(**KEYS | {"downscale": downscale})
     latents = prior.encode(torch.rand(2, *size, 3, generator=torch.Generator().manual_seed(0)))
     decoded = prior.decode(latents, *size)
@@ -136,7 +136,7 @@ def test_scale_one_is_the_prompt_alone_and_zero_the_negative_alone(prior):
         torch.testing.assert_close(got, prior.predict(noisy_of(), levels(), alone, 1.0).noise)
 
 
-def test_unprompted_forgets_both_prompts_and_keeps_the_views(prior):
+def test_unprompted_drops_both_prompts_and_keeps_the_views(prior):
     blank = condition_of(prior, "a red cube", "ugly").unprompted()
     empty = condition_of(prior, "", "")
     torch.testing.assert_close(
@@ -177,8 +177,8 @@ def test_views_do_not_influence_each_other(prior):
 
 
 @pytest.mark.parametrize("path", [DDPM(), RectifiedFlow(shift=3.0)], ids=["ddpm", "flow"])
-def test_the_output_means_what_predicts_says(path):
-    """The same network, read as noise and as velocity."""
+def test_predicts_decides_what_the_output_is(path):
+    """Read the output of the same network as noise and as velocity."""
     as_noise, as_velocity = (
         Tiny(**KEYS | {"noise_path": path, "predicts": p}) for p in ("noise", "velocity")
     )
@@ -196,8 +196,8 @@ def test_tokens_are_bytes_between_start_and_padding():
     assert len(tokens) == len(tokenize("x" * 1000)) == MAX_TOKENS
 
 
-def test_it_tells_the_user_what_it_is(prior):
-    assert "no meaningful object" in prior.notice()
+def test_the_user_is_warned_that_it_is_random(prior):
+    assert "cannot generate a meaningful object" in prior.notice()
     assert "prior=shapes" in prior.notice()
 
 

@@ -1,11 +1,16 @@
-"""The native kernels, compiled once for all tests: never from, or into, the cache of who runs them."""
+"""The rasterizers under test. Test processes share compiled files, apart from the cache of the user."""
+
+from pathlib import Path
 
 import pytest
 import torch
-from emulation import Emulator, compile_emulator
+from emulation import Emulator, content_hash, load_emulator
+from filelock import FileLock
+from mutants import MUTANTS, plant
 from splats import Backend
 
-from cadam3d.rasterizer.build import build, find_compiler
+from cadam3d.rasterizer import build as build_module
+from cadam3d.rasterizer.build import Build, build, find_compiler
 from cadam3d.rasterizer.cpu import CpuRasterizer
 from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
@@ -20,33 +25,72 @@ REFERENCES = {
 
 
 @pytest.fixture(scope="session")
-def kernel_build(tmp_path_factory):
-    if find_compiler() is None:
-        pytest.skip("no C++ compiler")
-    return build(tmp_path_factory.mktemp("kernels"))
+def build_cache(request, tmp_path_factory) -> Path:
+    """Return the folder of compiled files, which later test runs use again.
+
+    The name of a file contains a hash of everything that it was made from.
+    """
+    cache = getattr(request.config, "cache", None)
+    return cache.mkdir("rasterizer") if cache else tmp_path_factory.mktemp("rasterizer")
+
+
+def build_once(folder: Path, *machine_flags: tuple[str, ...]) -> Build:
+    """Return the CPU kernels in ``folder``, and compile them if they are missing, one process at a time."""
+    with FileLock(folder.with_suffix(".lock")):
+        built = sorted(folder.glob(f"*{build_module.SUFFIX}"))
+        if machine_flags and built:
+            return Build(built[0], 0.0)
+        return build(folder, machine_flags or build_module.MACHINE_FLAGS)
 
 
 @pytest.fixture(scope="session")
-def emulator(tmp_path_factory) -> Emulator:
-    """The CUDA kernels, on fibers."""
-    return compile_emulator(tmp_path_factory.mktemp("emulator"))
+def kernel_build(build_cache) -> Build:
+    """Return the CPU kernels as users get them."""
+    if find_compiler() is None:
+        pytest.skip("no C++ compiler")
+    source = Path(build_module.__file__).read_text()
+    return build_once(build_cache / f"cpu-{content_hash(source)}")
+
+
+@pytest.fixture(scope="session")
+def build_with_flags(build_cache, kernel_build):
+    """Return a function that compiles the CPU kernels with other flags for the machine."""
+    source = Path(build_module.__file__).read_text()
+
+    def build_other(*flags: str) -> Build:
+        key = content_hash(source, kernel_build.path.name, *flags)
+        return build_once(build_cache / f"cpu-{key}", flags)
+
+    return build_other
+
+
+@pytest.fixture(scope="session")
+def emulator(build_cache) -> Emulator:
+    """Return the CUDA kernels on fibers."""
+    return load_emulator(build_cache)
+
+
+@pytest.fixture(scope="session")
+def mutants(build_cache, tmp_path_factory) -> Emulator:
+    """Return the CUDA kernels on fibers, with all mistakes of mutants.py planted and switched off."""
+    return load_emulator(build_cache, plant(MUTANTS, tmp_path_factory.mktemp("mutants")), "-O0")
 
 
 @pytest.fixture(scope="session")
 def cpu(kernel_build) -> CpuRasterizer:
-    """The CPU kernels."""
+    """Return the CPU rasterizer."""
     return CpuRasterizer(cache_dir=str(kernel_build.path.parent))
 
 
 @pytest.fixture(scope="session", params=NATIVE)
 def backend(request) -> Backend:
-    """Each rasterizer with kernels of its own."""
+    """Return each rasterizer that has native kernels."""
     return find_backend(request)
 
 
 @pytest.fixture(scope="session", params=[*NATIVE, *REFERENCES])
 def any_backend(request) -> Backend:
-    """The same and the reference, for laws that hold whatever the truth is."""
+    """Return each of these and the reference, for laws that need no second implementation."""
     return REFERENCES.get(request.param) or find_backend(request)
 
 
@@ -63,7 +107,10 @@ def find_backend(request) -> Backend:
 
 @pytest.fixture
 def garbage_in_new_memory():
-    """Every ``torch.empty`` holds NaN or the largest number: to read what nobody wrote shows."""
-    torch.use_deterministic_algorithms(True)
+    """Fill every new tensor with NaN or the largest integer, so that reading uninitialized memory shows.
+
+    ``torch.use_deterministic_algorithms`` does the same, but first imports the inductor, for over a second.
+    """
+    torch.set_deterministic_debug_mode("error")
     yield
-    torch.use_deterministic_algorithms(False)
+    torch.set_deterministic_debug_mode("default")

@@ -1,4 +1,4 @@
-"""The automatic choice: compiled kernels that have proved themselves, else the reference and the reason."""
+"""The automatic choice: compiled kernels that pass their tests, or else the reference and a reason."""
 
 from dataclasses import dataclass, replace
 
@@ -21,7 +21,7 @@ CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
 
 @dataclass(frozen=True, kw_only=True)
 class Flat(ReferenceRasterizer):
-    """Shows that it was chosen: everything is transparent."""
+    """Renders everything transparent, which shows that it was chosen."""
 
     def render(self, gaussians, cameras, background, absgrad=False):
         return super().render(gaussians.index(slice(0, 0)), cameras, background, absgrad)
@@ -50,7 +50,7 @@ def brightest(rasterizer: AutoRasterizer) -> float:
 
 
 def refuse(device):
-    raise UserError("no compiler. Try: to get one")
+    raise UserError("no compiler. Try: install one")
 
 
 def test_the_fastest_for_the_device_renders(monkeypatch):
@@ -59,33 +59,33 @@ def test_the_fastest_for_the_device_renders(monkeypatch):
     assert brightest(AutoRasterizer()) == 0
 
 
-def test_where_it_cannot_be_had_the_reference_renders_and_the_reason_is_there(monkeypatch):
+def test_the_reference_is_the_fallback_and_gives_the_reason(monkeypatch):
     monkeypatch.setattr(auto, "FASTEST", {"cpu": refuse})
-    assert AutoRasterizer().prepare(CPU) == Backend("reference", reason="no compiler. Try: to get one")
+    assert AutoRasterizer().prepare(CPU) == Backend("reference", reason="no compiler. Try: install one")
     assert brightest(AutoRasterizer()) > 0
 
 
-def test_the_reference_needs_no_reason_where_nothing_faster_exists():
+def test_the_reference_has_no_reason_if_nothing_faster_exists():
     assert AutoRasterizer().prepare(torch.device("meta")) == Backend("reference", reason=None)
 
 
-def test_a_device_is_asked_once(monkeypatch):
-    asked = []
+def test_the_choice_for_a_device_is_made_once(monkeypatch):
+    choices = []
 
     def fastest(device):
-        asked.append(device)
+        choices.append(device)
         return ReferenceRasterizer()
 
     monkeypatch.setattr(auto, "FASTEST", {"cpu": fastest})
     brightest(AutoRasterizer())
     brightest(AutoRasterizer())
     AutoRasterizer().prepare(CPU)
-    assert asked == [CPU]
+    assert choices == [CPU]
 
 
-def test_nothing_is_asked_before_it_is_needed(monkeypatch):
+def test_the_choice_is_not_made_before_it_is_needed(monkeypatch):
     def fastest(device):
-        raise AssertionError("asked too early")
+        raise AssertionError("the choice is too early")
 
     monkeypatch.setattr(auto, "FASTEST", {"cpu": fastest})
     AutoRasterizer()
@@ -97,7 +97,7 @@ def test_there_is_a_backend_for_every_device(device):
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
-def test_what_auto_shows_on_a_cpu_is_what_the_native_rasterizer_shows():
+def test_on_a_cpu_auto_renders_the_images_of_the_native_rasterizer():
     choice = choose(CPU)
     assert choice.backend == Backend("cpu", reason=None)
     cameras = turntable(2, elevation_deg=10.0, distance=2.0, fov_y_deg=40.0, size=8)
@@ -113,7 +113,7 @@ def test_what_auto_shows_on_a_cpu_is_what_the_native_rasterizer_shows():
 
 @pytest.fixture
 def a_gpu(monkeypatch):
-    """A CUDA device on which the kernels compile and load; what its self-test comes to, the test says."""
+    """Fake a CUDA device on which the kernels compile and load; the test provides the self-test's result."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "a GPU")
@@ -144,9 +144,9 @@ def raising(error):
     return test
 
 
-def test_cuda_kernels_that_pass_the_self_test_are_taken_and_tested_once(a_gpu, agreement):
+def test_cuda_kernels_that_pass_the_self_test_are_used_and_tested_once(a_gpu, agreement):
     tested = a_gpu(lambda: agreement)
-    for device in (GPU, torch.device("cuda"), GPU):  # with or without a number, it is one device
+    for device in (GPU, torch.device("cuda"), GPU):  # two names of one device
         assert choose(device).backend == Backend("cuda", reason=None)
     assert tested == [(CudaRasterizer(cache_dir=None), GPU)]
 
@@ -154,7 +154,7 @@ def test_cuda_kernels_that_pass_the_self_test_are_taken_and_tested_once(a_gpu, a
 @pytest.mark.parametrize(
     "change", [{"gradients": {"means": 0.5}}, {"images": {"rgb": 0.5}}, {"repeats": False}]
 )
-def test_cuda_kernels_that_fail_the_self_test_are_not_taken(change, a_gpu, agreement):
+def test_cuda_kernels_that_fail_the_self_test_are_not_used(change, a_gpu, agreement):
     a_gpu(lambda: replace(agreement, **change))
     backend = choose(GPU).backend
     assert backend.name == "reference"
@@ -164,7 +164,7 @@ def test_cuda_kernels_that_fail_the_self_test_are_not_taken(change, a_gpu, agree
 
 
 @pytest.mark.parametrize("error", [RuntimeError("CUDA error\nat line 1"), MemoryError("full")])
-def test_cuda_kernels_that_crash_in_the_self_test_are_not_taken(error, a_gpu):
+def test_cuda_kernels_that_crash_in_the_self_test_are_not_used(error, a_gpu):
     a_gpu(raising(error))
     backend = choose(GPU).backend
     assert backend.name == "reference"
@@ -172,7 +172,7 @@ def test_cuda_kernels_that_crash_in_the_self_test_are_not_taken(error, a_gpu):
     assert "\n" not in backend.reason
 
 
-def test_a_device_that_a_crash_has_broken_is_not_rendered_on(a_gpu, monkeypatch):
+def test_a_device_that_a_crash_made_unusable_is_refused(a_gpu, monkeypatch):
     def synchronize(device):
         raise RuntimeError("an illegal memory access was encountered")
 
@@ -187,11 +187,11 @@ def test_a_device_that_a_crash_has_broken_is_not_rendered_on(a_gpu, monkeypatch)
 def test_kernels_that_do_not_compile_are_not_tested(a_gpu, monkeypatch):
     tested = a_gpu(raising(AssertionError("tested")))
     monkeypatch.setattr(CudaRasterizer, "prepare", lambda self, device: refuse(device))
-    assert choose(GPU).backend.reason == "no compiler. Try: to get one"
+    assert choose(GPU).backend.reason == "no compiler. Try: install one"
     assert not tested
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_the_gate_opens_on_this_gpu():
+def test_the_kernels_pass_the_self_test_on_this_gpu():
     assert proven_cuda(GPU) == CudaRasterizer(cache_dir=None)

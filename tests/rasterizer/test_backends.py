@@ -1,4 +1,4 @@
-"""Laws of every rasterizer with kernels of its own: on this CPU, on a GPU, and a GPU's kernels on fibers."""
+"""Laws of every rasterizer with native kernels: on this CPU, on a GPU, and of the GPU's kernels on fibers."""
 
 import math
 from dataclasses import replace
@@ -56,7 +56,7 @@ def test_agrees_on_adversarial_scenes(backend, gaussians):
 
 
 @pytest.mark.parametrize("image", IMAGES)
-def test_agrees_for_a_loss_on_one_image_alone(backend, image):
+def test_agrees_for_a_loss_on_one_image_only(backend, image):
     backend.agrees(make_gaussians(60, degree=1), make_cameras(1, 30, 30), images=(image,))
 
 
@@ -70,7 +70,7 @@ def test_the_bits_are_the_same_on_every_run(any_backend):
         assert_same_bits(first, bits(*any_backend.differentiate(*scene)))
 
 
-def test_a_batch_is_its_views(any_backend):
+def test_a_batch_equals_its_single_views(any_backend):
     gaussians, cameras = make_gaussians(100, degree=2), make_cameras(3, 23, 37)
     weights, background = make_weights(3, 23, 37), backgrounds(3)
     whole, whole_grads = any_backend.differentiate(gaussians, cameras, weights, background)
@@ -115,7 +115,8 @@ def test_moving_scene_and_cameras_together_changes_nothing(any_backend):
     other, moved_grads = any_backend.differentiate(moved, with_them, weights)
     for name in IMAGES:
         assert_close(name, getattr(other, name)[decided], getattr(plain, name)[decided], 2e-5)
-    grads["means"] = grads["means"] @ rotation.T.to(grads["means"])  # gradients move along
+    # The gradients turn with the scene.
+    grads["means"] = grads["means"] @ rotation.T.to(grads["means"])
     grads["quats"] = multiply_quats(turn.to(grads["quats"]), grads["quats"])
     for name, grad in grads.items():
         assert_close(f"gradient of {name}", moved_grads[name], grad, 2e-4)
@@ -149,7 +150,7 @@ def test_culled_gaussians_change_nothing_and_get_no_gradient(any_backend):
 
 def test_fading_a_gaussian_out_removes_it_without_a_jump(any_backend):
     gaussians, cameras = make_gaussians(10), make_cameras(2, 25, 25)
-    gaussians.means[0] = 0.3 * cameras.positions.mean(dim=0)  # before the others
+    gaussians.means[0] = 0.3 * cameras.positions.mean(dim=0)  # in front of the others
     without = any_backend.show(gaussians.index(slice(1, None)), cameras)
     for opacity, least, most in ((0.05, 0.02, 0.1), (1.02 / 255, 1e-3, 0.01), (0.98 / 255, 0.0, 0.0)):
         gaussians.opacity_logits[0] = math.log(opacity / (1 - opacity))
@@ -159,7 +160,7 @@ def test_fading_a_gaussian_out_removes_it_without_a_jump(any_backend):
             assert least <= (getattr(output, name) - getattr(without, name)).abs().max() <= most
 
 
-# -------------------------------------------------------------------------- a step of an autograd graph
+# -------------------------------------------------------------------------- autograd
 
 
 def test_a_backward_can_be_repeated_and_means2d_and_background_have_gradients(backend):
@@ -178,7 +179,7 @@ def test_a_backward_can_be_repeated_and_means2d_and_background_have_gradients(ba
     assert_same_bits([2 * grad for grad in once], twice)
     wanted = differentiate(ReferenceRasterizer().render, lambda tensors: tensors.to(torch.float64), 1)
     for got, want in zip(once, wanted, strict=True):
-        assert_close("gradient", got, want, 1e-3)  # no pixel is left out here
+        assert_close("gradient", got, want, 1e-3)  # includes the pixels on a step of the model
 
 
 def test_parameters_changed_in_place_before_backward_are_refused(backend):
@@ -191,7 +192,7 @@ def test_parameters_changed_in_place_before_backward_are_refused(backend):
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_one_tensor_alone_can_want_a_gradient(backend, field):
+def test_a_single_tensor_can_require_a_gradient(backend, field):
     gaussians, cameras, weights = (
         make_gaussians(30, degree=1),
         make_cameras(1, 20, 20),
@@ -207,7 +208,7 @@ def test_one_tensor_alone_can_want_a_gradient(backend, field):
     assert torch.equal(output.means2d.grad.cpu(), grads["means2d"])
 
 
-def test_without_gradients_the_same_images_and_no_graph(backend):
+def test_without_gradients_the_images_are_the_same_and_there_is_no_graph(backend):
     leaves = backend.put(make_gaussians(60, degree=1)).map(lambda tensor: tensor.requires_grad_())
     scene = make_cameras(2, 31, 31), backend.put(backgrounds(2))
     with torch.no_grad():
@@ -218,7 +219,7 @@ def test_without_gradients_the_same_images_and_no_graph(backend):
         assert torch.equal(getattr(plain, name), getattr(output, name))
 
 
-def test_inputs_are_left_alone(backend):
+def test_inputs_are_not_modified(backend):
     gaussians, cameras = backend.put(make_gaussians(20, degree=1)), make_cameras(1, 9, 9)
     before = gaussians.map(torch.clone)
     backend.differentiate(gaussians, cameras)

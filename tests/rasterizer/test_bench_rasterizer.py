@@ -1,4 +1,4 @@
-"""The script that checks and times rasterizers: it runs as it would on a GPU, with fibers in place of one."""
+"""The script that checks and times rasterizers runs as on a GPU, with fibers instead of a GPU."""
 
 import json
 import sys
@@ -16,7 +16,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.base import FAR, NEAR, Rasterizer
 from cadam3d.rasterizer.cpu import CpuRasterizer
-from cadam3d.rasterizer.cuda import Launcher
+from cadam3d.rasterizer.launcher import Launcher
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))  # as Python does for a script
@@ -39,7 +39,7 @@ def _one_thread_as_before():
 
 @dataclass(frozen=True)
 class Wrong(Rasterizer):
-    """The reference, and one mistake."""
+    """The reference with one mistake."""
 
     mistake: Callable[[Gaussians], Gaussians]
 
@@ -55,9 +55,18 @@ def run(words, backends, launcher: Launcher | None = None) -> int:
     return bench_rasterizer.run(bench_rasterizer.parse(words), backends, launcher)
 
 
-# -------------------------------------------------------------------------- the whole way
+@pytest.fixture
+def small_checks(monkeypatch):
+    """Make the scenes of the checks smaller, for tests of the script around them."""
+    monkeypatch.setattr(check, "SPLATS", 60)
+    monkeypatch.setattr(check, "SIZE", 25)
+    monkeypatch.setattr(check, "CROWD", {"cpu": (60, 20)})
 
 
+# -------------------------------------------------------------------------- whole runs
+
+
+@pytest.mark.usefixtures("small_checks")
 def test_checks_times_and_writes_every_backend_on_every_scene(kernel_build, tmp_path, capsys):
     path = tmp_path / "bench.json"
     cpu = CpuRasterizer(cache_dir=str(kernel_build.path.parent))
@@ -73,7 +82,7 @@ def test_checks_times_and_writes_every_backend_on_every_scene(kernel_build, tmp_
     for row in written["rows"]:
         assert 0 < row["forward_backward_min_ms"] <= row["forward_backward_ms"]
         assert min(row["forward_ms"], row["backward_ms"]) > 0
-        assert row["peak_bytes"] is None  # no honest number for a CPU
+        assert row["peak_bytes"] is None  # there is no reliable number for a CPU
         assert f"{row['forward_backward_ms']:.2f}" in shown
     first, second = written["rows"][:2]
     assert first["ratio"] == 1
@@ -84,8 +93,8 @@ def test_checks_times_and_writes_every_backend_on_every_scene(kernel_build, tmp_
     assert not written["stages"]
 
 
-def test_runs_stage_by_stage_on_kernels(emulator, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(check, "CROWD", {"cpu": (60, 20)})
+@pytest.mark.usefixtures("small_checks")
+def test_times_every_stage_of_the_kernels(emulator, tmp_path, capsys):
     path = tmp_path / "bench.json"
     code = run(
         [*TINY, "--json", str(path)],
@@ -103,7 +112,7 @@ def test_runs_stage_by_stage_on_kernels(emulator, tmp_path, monkeypatch, capsys)
         assert each["stage"] in shown
 
 
-def test_as_a_user_calls_it(kernel_build, monkeypatch, capsys):
+def test_the_command_line_checks_a_backend(kernel_build, monkeypatch, capsys):
     monkeypatch.setattr(
         bench_rasterizer, "component", lambda _: CpuRasterizer(cache_dir=str(kernel_build.path.parent))
     )
@@ -112,10 +121,10 @@ def test_as_a_user_calls_it(kernel_build, monkeypatch, capsys):
     assert shown == "check cpu: agrees with the reference\n"
 
 
-# -------------------------------------------------------------------------- who disagrees is not timed
+# -------------------------------------------------------------------------- backends that fail the check
 
 
-def turns_everybody_a_little(gaussians):
+def turns_all_slightly(gaussians):
     return changed(gaussians, quats=gaussians.quats + 1e-3)
 
 
@@ -129,6 +138,7 @@ def loses_the_last(gaussians):
     return changed(gaussians, opacity_logits=gaussians.opacity_logits - fainter)
 
 
+@pytest.mark.usefixtures("small_checks")
 def test_a_backend_that_disagrees_is_not_timed(monkeypatch, capsys):
     timed = []
     monkeypatch.setattr(bench_rasterizer, "time_all", lambda _, backends, __: timed.extend(backends))
@@ -136,31 +146,31 @@ def test_a_backend_that_disagrees_is_not_timed(monkeypatch, capsys):
     shown = capsys.readouterr().out
     assert timed == ["reference"]
     assert "check reference: agrees" in shown
-    assert "check auto: REFUSED" in shown
-    assert "the gradient of log_scales is off" in shown
+    assert "check auto: FAILED" in shown
+    assert "the gradient of log_scales is wrong" in shown
 
 
-@pytest.mark.parametrize("mistake", [turns_everybody_a_little, detaches, loses_the_last])
-def test_adversaries_find_the_mistake_without_the_self_test(mistake):
+@pytest.mark.parametrize("mistake", [turns_all_slightly, detaches, loses_the_last])
+def test_hard_scenes_show_the_mistake_without_the_self_test(mistake):
     adversaries = dict(check.adversaries(CPU))
     for kind in ("needles", "flat discs", "equal depths"):
         assert check.differences(Wrong(mistake), check.small_scene(adversaries[kind])), kind
 
 
-def test_a_backend_that_promises_the_same_bits_has_to_keep_it(monkeypatch):
+@pytest.mark.usefixtures("small_checks")
+def test_a_backend_that_promises_the_same_bits_must_give_them():
     factors = cycle([1, 1 + 2e-7])  # less than any tolerance
 
     def wobbles(gaussians):
         return changed(gaussians, means=gaussians.means * next(factors))
 
-    monkeypatch.setattr(check, "CROWD", {"cpu": (60, 20)})
-    assert not check.check("reference", Wrong(wobbles), CPU)  # which promises no bits
+    assert not check.check("reference", Wrong(wobbles), CPU)  # the reference does not promise that
     troubles = check.check("cuda", Wrong(wobbles), CPU)
     assert troubles
     assert all(f"not the same in {check.RUNS} runs" in trouble for trouble in troubles)
 
 
-def test_no_check_times_whoever_comes(capsys):
+def test_without_a_check_every_backend_is_timed(capsys):
     assert run([*TINY, "--no-check"], {"reference": ReferenceRasterizer()}) == 0
     assert "check" not in capsys.readouterr().out
 
@@ -173,7 +183,7 @@ def test_a_sort_that_is_wrong_is_found(emulator, monkeypatch):
 
 
 def gsplat_stand_in() -> ModuleType:
-    """``gsplat.rasterization`` as it is documented, by means of the reference."""
+    """Return a module with ``gsplat.rasterization`` as documented, implemented with the reference."""
 
     def rasterization(  # noqa: PLR0917
         means,
@@ -208,7 +218,7 @@ def gsplat_stand_in() -> ModuleType:
     return module
 
 
-def test_gsplat_is_asked_for_what_we_render(monkeypatch):
+def test_gsplat_renders_the_same_scene(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", gsplat_stand_in())
     assert not check.check("gsplat", GsplatRasterizer(), CPU)
     scene = make_scene(make_shell(50, 2, CPU), 20, 3)
@@ -227,7 +237,7 @@ class Greedy(Rasterizer):
         raise torch.OutOfMemoryError
 
 
-def test_who_runs_out_of_memory_is_out_and_the_others_go_on(capsys):
+def test_a_backend_that_runs_out_of_memory_does_not_stop_the_others(capsys):
     backends = {"auto": Greedy(), "reference": ReferenceRasterizer()}
     assert run([*TINY, "--no-check"], backends) == 0
     assert "auto   out of memory" in capsys.readouterr().out
@@ -236,7 +246,7 @@ def test_who_runs_out_of_memory_is_out_and_the_others_go_on(capsys):
     assert timings["reference"] is not None
 
 
-def test_every_turn_starts_without_gradients():
+def test_every_repetition_starts_without_gradients():
     scene = make_scene(make_shell(20, 1, CPU), 9, 1)
     scene.backward(scene.render(ReferenceRasterizer()))
     once = {name: tensor.grad.clone() for name, tensor in scene.gaussians.tensors().items()}
@@ -248,8 +258,8 @@ def test_every_turn_starts_without_gradients():
 # -------------------------------------------------------------------------- stages
 
 
-def test_every_launch_belongs_to_a_stage_we_know(emulator):
-    # The names of kernels live elsewhere: a new one must be put into a stage.
+def test_every_launch_belongs_to_a_known_stage(emulator):
+    # The kernels are defined elsewhere, and a new one must be assigned to a stage.
     clock = stages.StageClock(emulator)
     scene = make_scene(make_shell(300, 1, CPU), 24, 2)
     scene.backward(scene.render(stages.KernelRasterizer(clock)))
@@ -265,11 +275,11 @@ def test_every_launch_belongs_to_a_stage_we_know(emulator):
     assert kernels["project backward"] == ["project_backward_4", "centre_backward"]
 
 
-def test_load_counts_what_is_there(emulator):
+def test_the_load_of_a_scene_is_counted(emulator):
     clock = stages.StageClock(emulator)
     gaussians = make_shell(1, 0, CPU).detach()
     gaussians.means.zero_()
-    gaussians.log_scales.fill_(1.0)  # larger than the screen: every tile of 20 x 20 pixels in both views
+    gaussians.log_scales.fill_(1.0)  # larger than the screen, so it meets every tile in both views
     scene = make_scene(gaussians.map(lambda tensor: tensor.requires_grad_()), 20, 2)
     scene.render(stages.KernelRasterizer(clock))
     load = stages.measure_load(ReferenceRasterizer(), scene, clock.slots)
@@ -278,8 +288,8 @@ def test_load_counts_what_is_there(emulator):
     )
 
 
-def test_bytes_of_a_stage_are_those_of_its_arguments(emulator):
-    """As long as every pair is seen and lies in one tile, what is needed is what was handed over."""
+def test_the_bytes_of_a_stage_are_those_of_its_arguments(emulator):
+    """If every pair is visible and in one tile, a stage needs exactly the bytes of its arguments."""
     given = dict.fromkeys(stages.STAGES, 0)
 
     class Scales(stages.StageClock):
@@ -303,7 +313,7 @@ def test_bytes_of_a_stage_are_those_of_its_arguments(emulator):
         assert needed[stage] == pytest.approx(given[stage], rel=0.1), stage
 
 
-# -------------------------------------------------------------------------- demands
+# -------------------------------------------------------------------------- targets
 
 
 def rows_of(scene, device="NVIDIA H200", **both_ms):
@@ -321,25 +331,25 @@ def rows_of(scene, device="NVIDIA H200", **both_ms):
         ((1_000_000, 1024, 4, 0), {"cuda": 11.1}, False),
         ((1_000_000, 1024, 4, 0), {"gsplat": 19.8, "cuda": 11.0}, True),
         ((1_000_000, 1024, 4, 0), {"gsplat": 19.7, "cuda": 11.0}, False),  # 1.79 times as fast
-        ((1_000_000, 1024, 4, 3), {"gsplat": 19.7, "cuda": 11.0}, False),  # the ratio is demanded anywhere
+        ((1_000_000, 1024, 4, 3), {"gsplat": 19.7, "cuda": 11.0}, False),  # the ratio applies to all degrees
         ((20_000, 512, 1, 0), {"cuda": 0.5}, True),
         ((20_000, 512, 1, 0), {"cuda": 0.6}, False),
         ((1_000_000, 1024, 1, 0), {"cuda": 99.0}, None),
     ],
 )
-def test_demands_are_met_or_missed(scene, times, is_met):
+def test_targets_are_met_or_missed(scene, times, is_met):
     row = rows_of(scene, **times)["cuda"]
     assert row.is_met is is_met
     assert ("MISSED" in str(row), ": met" in str(row)) == (is_met is False, is_met is True)
 
 
-def test_nothing_is_demanded_of_others_or_on_unknown_devices():
+def test_other_backends_and_unknown_devices_have_no_targets():
     scene = (1_000_000, 1024, 4, 0)
     assert rows_of(scene, gsplat=1.0, cuda=1.0)["gsplat"].is_met is None
     assert rows_of(scene, device="a new card", cuda=99.0)["cuda"].is_met is None
 
 
-def test_more_work_is_never_demanded_in_less_time():
+def test_targets_grow_with_the_amount_of_work():
     for table in targets.MOST_MS.values():
         for size in (512, 1024):
             by_count = [ms for (_, pixels), ms in sorted(table.items()) if pixels == size]
@@ -347,13 +357,13 @@ def test_more_work_is_never_demanded_in_less_time():
         assert all(ms < table[count, 1024] for (count, pixels), ms in table.items() if pixels == 512)
 
 
-# -------------------------------------------------------------------------- what is typed
+# -------------------------------------------------------------------------- the command line
 
 
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ("--backends nobody", "invalid choice: 'nobody'"),
+        ("--backends unknown", "invalid choice: 'unknown'"),
         ("--counts 0", "invalid whole number >= 1 value: '0'"),
         ("--sizes big", "invalid whole number >= 1 value: 'big'"),
         ("--degrees 4", "invalid choice: 4"),
@@ -368,7 +378,7 @@ def test_more_work_is_never_demanded_in_less_time():
         ),
     ],
 )
-def test_a_mistake_is_one_line(words, says, capsys):
+def test_a_mistake_is_reported_in_one_line(words, says, capsys):
     try:
         code = bench_rasterizer.main(words.split())
     except SystemExit as ended:

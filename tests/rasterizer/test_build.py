@@ -1,4 +1,4 @@
-"""Building the native kernels: with a compiler that is only played, so that a test costs no compilation."""
+"""Building the native kernels. Most tests use a fake compiler, so they compile nothing."""
 
 import multiprocessing
 import re
@@ -20,17 +20,17 @@ from cadam3d.rasterizer.build import (
 )
 
 pytestmark = [
-    pytest.mark.skipif(sys.platform == "win32", reason="plays a compiler with a shell script"),
+    pytest.mark.skipif(sys.platform == "win32", reason="the fake compiler is a shell script"),
     pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler"),
 ]
 
 
 @pytest.fixture
-def play(tmp_path, monkeypatch, kernel_build):
-    """Put a compiler first that says its version, notes each call in ``calls`` and then runs ``body``."""
+def fake_compiler(tmp_path, monkeypatch, kernel_build):
+    """Install a compiler that prints its version, records each call in ``calls`` and then runs ``body``."""
 
-    def install(body="cp {library} $out", version="played 1.0"):
-        script, calls = tmp_path / "play", tmp_path / "calls"
+    def install(body="cp {library} $out", version="fake 1.0"):
+        script, calls = tmp_path / "compiler", tmp_path / "calls"
         script.write_text(
             "#!/bin/sh\n"
             f'[ "$1" = --version ] && echo {shlex.quote(version)} && exit 0\n'
@@ -51,30 +51,31 @@ def remove_compilers(monkeypatch):
     monkeypatch.setattr(module, "find_spec", lambda name: None)
 
 
-def test_compiles_once_and_then_hits_the_cache(play, tmp_path):
-    calls = play()
+def test_compiles_once_and_then_uses_the_cache(fake_compiler, tmp_path):
+    calls = fake_compiler()
     first, second = build(tmp_path / "cache"), build(tmp_path / "cache")
     assert len(calls()) == 1
     assert first.seconds > 0
     assert second.seconds == 0
     assert first.path == second.path
     assert load(second).cadam3d_self_test() == 0
-    assert list((tmp_path / "cache").iterdir()) == [first.path], "nothing is left behind"
+    assert list((tmp_path / "cache").iterdir()) == [first.path], "there are no temporary files"
 
 
-def test_the_real_compiler_builds_what_runs(kernel_build):
+def test_the_real_compiler_builds_kernels_that_run(kernel_build):
     assert load(kernel_build).cadam3d_self_test() == 0
-    assert 0 < kernel_build.seconds < 60  # about 3 on a machine that has nothing else to do
+    # About 3 s on an idle machine, and 0 if an earlier test run has compiled the same sources.
+    assert kernel_build.seconds < 60
 
 
-def test_names_the_constants_of_the_image_formation_model(play, tmp_path):
-    calls = play()
+def test_the_constants_of_the_model_are_passed_to_the_compiler(fake_compiler, tmp_path):
+    calls = fake_compiler()
     build(tmp_path / "cache")
     for name in module.CONSTANTS:
         assert f"-DSPLAT_{name}={getattr(module.base, name)!r}" in calls()[0].split()
 
 
-def test_every_constant_of_the_model_reaches_the_kernels():
+def test_the_kernels_use_every_constant_of_the_model():
     declared = {name for name, value in vars(module.base).items() if isinstance(value, float)}
     text = "".join((KERNELS / name).read_text(encoding="utf-8") for name in SOURCES)
     assert set(module.CONSTANTS) == declared
@@ -82,8 +83,8 @@ def test_every_constant_of_the_model_reaches_the_kernels():
 
 
 @pytest.mark.parametrize("name", module.CONSTANTS)
-def test_another_constant_means_another_build(name, tmp_path, monkeypatch, play):
-    calls = play()
+def test_another_constant_leads_to_another_build(name, tmp_path, monkeypatch, fake_compiler):
+    calls = fake_compiler()
     build(tmp_path / "cache")
     monkeypatch.setattr(module.base, name, getattr(module.base, name) / 2)
     build(tmp_path / "cache")
@@ -91,8 +92,8 @@ def test_another_constant_means_another_build(name, tmp_path, monkeypatch, play)
 
 
 @pytest.mark.parametrize("damage", [b"", b"not a library", None])
-def test_a_damaged_file_is_built_again(play, tmp_path, damage):
-    play()
+def test_a_damaged_file_is_built_again(fake_compiler, tmp_path, damage):
+    fake_compiler()
     path = build(tmp_path / "cache").path
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2] if damage is None else damage)
@@ -101,11 +102,11 @@ def test_a_damaged_file_is_built_again(play, tmp_path, damage):
     assert again.path.read_bytes() == content
 
 
-def test_another_compiler_source_or_machine_means_another_build(play, tmp_path, monkeypatch):
+def test_another_compiler_source_or_machine_leads_to_another_build(fake_compiler, tmp_path, monkeypatch):
     cache = tmp_path / "cache"
-    calls = play(version="played 1.0")
+    calls = fake_compiler(version="fake 1.0")
     build(cache)
-    play(version="played 2.0")
+    fake_compiler(version="fake 2.0")
     build(cache)
     assert len(calls()) == 2
     monkeypatch.setattr(module, "_machine", lambda: "another machine")
@@ -120,8 +121,9 @@ def test_another_compiler_source_or_machine_means_another_build(play, tmp_path, 
     assert len(calls()) == 4
 
 
-def test_two_processes_at_once_both_get_a_library(play, tmp_path):
-    calls = play(body="sleep 1; cp {library} $out")  # long enough that neither finds the other's
+def test_two_processes_that_build_at_once_both_get_a_library(fake_compiler, tmp_path):
+    # The pause is long enough that neither process finds the result of the other.
+    calls = fake_compiler(body="sleep 1; cp {library} $out")
     with multiprocessing.get_context("fork").Pool(2) as twins:
         built = twins.map(build, [tmp_path / "cache"] * 2, chunksize=1)
     assert len(calls()) == 2
@@ -130,23 +132,23 @@ def test_two_processes_at_once_both_get_a_library(play, tmp_path):
     assert load(built[0]).cadam3d_self_test() == 0
 
 
-def test_says_what_to_install_where_there_is_no_compiler(tmp_path, monkeypatch):
+def test_a_missing_compiler_is_reported_with_what_to_install(tmp_path, monkeypatch):
     remove_compilers(monkeypatch)
     with pytest.raises(UserError, match=r"apt install g\+\+.*'cadam3d\[compiler\]'.*rasterizer=reference"):
         build(tmp_path)
 
 
-def test_needs_no_compiler_once_built(play, tmp_path, monkeypatch):
-    play()
+def test_a_cached_library_needs_no_compiler(fake_compiler, tmp_path, monkeypatch):
+    fake_compiler()
     built = build(tmp_path / "cache")
     remove_compilers(monkeypatch)
     assert find_cached(tmp_path / "cache", None) == built.path
     assert build(tmp_path / "cache").path == built.path
 
 
-def test_shows_what_a_failing_compiler_said(play, tmp_path):
-    play(body="echo 'error: no such thing' >&2; exit 1")
-    with pytest.raises(UserError, match=r"(?s)played 1\.0.*no such thing.*rasterizer=reference"):
+def test_the_output_of_a_failing_compiler_is_shown(fake_compiler, tmp_path):
+    fake_compiler(body="echo 'error: no such thing' >&2; exit 1")
+    with pytest.raises(UserError, match=r"(?s)fake 1\.0.*no such thing.*rasterizer=reference"):
         build(tmp_path / "cache")
     assert list((tmp_path / "cache").iterdir()) == []
 
@@ -158,25 +160,25 @@ def test_shows_what_a_failing_compiler_said(play, tmp_path):
         pytest.param("echo junk > $out; exit 0", id="does not run"),
     ],
 )
-def test_falls_back_to_plainer_flags(play, tmp_path, body):
-    calls = play(body=f'case "$*" in *native*) {body};; esac; cp {{library}} $out')
+def test_falls_back_to_simpler_flags(fake_compiler, tmp_path, body):
+    calls = fake_compiler(body=f'case "$*" in *native*) {body};; esac; cp {{library}} $out')
     build(tmp_path / "cache")
     assert len(calls()) == len(module.MACHINE_FLAGS)
     assert "native" not in calls()[-1]
 
 
-def test_a_folder_that_cannot_be_written_is_the_users_to_choose(play, tmp_path):
-    play()
+def test_a_folder_that_cannot_be_written_is_reported_with_its_key(fake_compiler, tmp_path):
+    fake_compiler()
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"rasterizer\.cache_dir="):
         build(tmp_path / "file")
 
 
-def test_honours_the_users_choices(play, tmp_path, monkeypatch):
-    play(version="played 3.0")
+def test_environment_variables_choose_the_compiler_and_the_cache(fake_compiler, tmp_path, monkeypatch):
+    fake_compiler(version="fake 3.0")
     compiler = find_compiler()
     assert compiler is not None
-    assert compiler.version == "played 3.0"
+    assert compiler.version == "fake 3.0"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert default_cache_dir() == tmp_path / "cadam3d"
     monkeypatch.setenv("XDG_CACHE_HOME", "")
@@ -185,4 +187,4 @@ def test_honours_the_users_choices(play, tmp_path, monkeypatch):
 
 def test_the_shared_maths_needs_no_header():
     source = (KERNELS / "splat_math.h").read_text()
-    assert "#include" not in source, "a run-time CUDA compiler has none"
+    assert "#include" not in source, "a run-time CUDA compiler has no headers"

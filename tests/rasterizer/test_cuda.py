@@ -1,10 +1,9 @@
-"""The CUDA rasterizer: its very kernels, on fibers everywhere, and on a GPU where there is one."""
-
-import shutil
+"""The CUDA rasterizer: the same kernels on fibers on every machine, and on a GPU if there is one."""
 
 import pytest
 import torch
-from emulation import Emulator, compile_emulator, is_acquitted
+from emulation import Emulator, passes
+from mutants import NUMBERS, RENDERING, ROUNDING
 from splats import (
     assert_agrees,
     assert_same_bits,
@@ -33,7 +32,7 @@ CPU = torch.device("cpu")
 # -------------------------------------------------------------------------- order and limits
 
 
-def test_the_bits_do_not_depend_on_who_comes_first(emulator):
+def test_the_bits_do_not_depend_on_the_schedule_of_threads(emulator):
     scene = saturated(60), make_cameras(2, 37, 50), backgrounds(2), make_weights(2, 37, 50)
     results = [
         bits(*render_and_differentiate(emulator.shuffled(seed).render, *scene)) for seed in (0, 1, 2, 77)
@@ -43,14 +42,16 @@ def test_the_bits_do_not_depend_on_who_comes_first(emulator):
 
 
 @pytest.mark.parametrize("most", [100, 500])  # fewer than pixels; fewer than (splat, tile) pairs
-def test_more_than_numbers_can_count_is_refused_before_it_is_allocated(emulator, monkeypatch, most):
+def test_more_items_than_indices_can_count_are_refused_before_memory_is_allocated(
+    emulator, monkeypatch, most
+):
     monkeypatch.setattr(cuda, "MOST", most)
     with pytest.raises(UserError, match=r"too many\. Try: fewer"):
         emulator.render(make_gaussians(200, log_scale=0.0), make_cameras(1, 20, 20), backgrounds(1))
 
 
 @pytest.mark.gpu
-def test_runs_on_the_stream_that_is_current():
+def test_kernels_run_on_the_current_stream():
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     rasterizer, scene = CudaRasterizer(cache_dir=None), (make_cameras(1, 64, 64), backgrounds(1).cuda())
@@ -58,20 +59,20 @@ def test_runs_on_the_stream_that_is_current():
     want = rasterizer.render(gaussians, *scene).rgb
     torch.cuda.synchronize()
     with torch.cuda.stream(torch.cuda.Stream()):
-        torch.cuda._sleep(10**8)  # what another stream would overtake
+        torch.cuda._sleep(10**8)  # another stream would overtake this
         got = rasterizer.render(gaussians.map(lambda tensor: tensor + 0), *scene).rgb
     torch.cuda.synchronize()
     assert torch.equal(got, want)
 
 
-def test_off_cuda_it_says_what_to_type():
+def test_rendering_on_a_cpu_is_refused_with_a_hint():
     with pytest.raises(UserError, match="rasterizer=auto"):
         CudaRasterizer(cache_dir=None).render(make_gaussians(1), make_cameras(1, 9, 9), backgrounds(1))
     with pytest.raises(UserError, match="rasterizer=auto"):
         CudaRasterizer(cache_dir=None).prepare(CPU)
 
 
-def test_without_a_cuda_device_it_says_so_before_it_compiles_anything(monkeypatch):
+def test_a_missing_cuda_device_is_reported_before_anything_is_compiled(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(UserError, match="sees no CUDA device"):
         CudaRasterizer(cache_dir=None).prepare(torch.device("cuda"))
@@ -109,13 +110,13 @@ def test_the_sort_is_exact_and_stable(emulator, n):
         check_sort(emulator, n, distinct, bit_count)
 
 
-def test_the_sort_is_exact_where_its_counts_need_three_kernels(emulator):
+def test_the_sort_is_exact_when_its_counts_need_three_kernels(emulator):
     assert 270_000 // cuda.SORT_CHUNK * 2**cuda.RADIX_BITS > cuda.SCAN_SHORT
     check_sort(emulator, 270_000, 10**6, 16)
 
 
 @pytest.mark.gpu
-def test_the_sort_takes_more_than_2_to_27_keys(tmp_path):
+def test_the_sort_handles_more_than_2_to_27_keys(tmp_path):
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     n = 2**27 + 1
@@ -138,29 +139,29 @@ def test_the_sort_takes_more_than_2_to_27_keys(tmp_path):
 )
 def test_every_tile_with_a_pixel_in_reach_is_listed_and_few_others(emulator, gaussians, cameras):
     v, n, height, width = len(cameras), len(gaussians), cameras.height, cameras.width
-    frame = cuda._Frame(emulator, cameras, CPU)
-    frame.project(list(gaussians.tensors().values()))
+    views = cuda._CudaPass(emulator, cameras, CPU)
+    views.project(list(gaussians.tensors().values()))
     with emulator.on(CPU) as launch:
-        lists = frame._list(launch, *frame._split()[0])
-    listed = torch.zeros(v * frame.tiles, v * n, dtype=torch.bool)
+        lists = views._list(launch, *views._split()[0])
+    listed = torch.zeros(v * views.tiles, v * n, dtype=torch.bool)
     for tile, (begin, end) in enumerate(lists.ranges[:-1].tolist()):
         pairs = lists.pair_of_slot[lists.slots[begin:end].long()].long()
-        depths = frame.splats.view(-1, cuda.SPLAT)[pairs, 7]
+        depths = views.splats.view(-1, cuda.SPLAT)[pairs, 7]
         assert (depths.diff() >= 0).all()
         listed[tile, pairs] = True
-    assert listed.sum() == lists.slots.shape[0], "as many as were counted, none of them twice"
-    assert not lists.ranges[-1].any(), "none left over"
+    assert listed.sum() == lists.slots.shape[0], "as many as were counted, and none of them twice"
+    assert not lists.ranges[-1].any(), "no slot is left over"
 
-    x, y, l11, l12, l22, cut, *_ = frame.splats.double().view(-1, cuda.SPLAT, 1, 1).unbind(dim=1)
+    x, y, l11, l12, l22, cut, *_ = views.splats.double().view(-1, cuda.SPLAT, 1, 1).unbind(dim=1)
     tiles_y, tiles_x = -(-height // cuda.TILE), -(-width // cuda.TILE)
     rows, columns = (torch.arange(tiles * cuda.TILE)[None] + 0.5 for tiles in (tiles_y, tiles_x))
     dx, dy = columns.double() - x, rows.double().mT - y
     is_reached = (l11 * dx + l12 * dy).square() + (l22 * dy).square() <= cut * (1 - 1e-5)
     is_reached &= (rows.mT < height) & (columns < width)
-    is_seen = frame.depth_keys.flatten() != -1
+    is_seen = views.depth_keys.flatten() != -1
     in_tile = is_reached.view(-1, tiles_y, cuda.TILE, tiles_x, cuda.TILE).any(dim=4).any(dim=2).flatten(1)
     wanted = (in_tile & is_seen[:, None]).view(v, n, -1)
-    want = torch.zeros_like(listed).view(v, frame.tiles, v, n)
+    want = torch.zeros_like(listed).view(v, views.tiles, v, n)
     for view in range(v):
         want[view, :, view] = wanted[view].T
     want = want.view_as(listed)
@@ -187,11 +188,11 @@ def test_constants_mirror_those_of_the_kernels():
     assert "SORT_ROUNDS = 16;" in source
 
 
-# -------------------------------------------------------------------------- the judge is judged
+# -------------------------------------------------------------------------- mutants
 
 
 def judge(emulator: Emulator) -> None:
-    """What every mutant below must fail."""
+    """Check the results of kernels; every mutant must fail."""
     for seed in (1, 2):
         check_sort(emulator.shuffled(seed), 5000, 7, 9)
     scene = saturated(40), make_cameras(1, 21, 27)
@@ -201,84 +202,32 @@ def judge(emulator: Emulator) -> None:
     )
 
 
-MUTANTS = {
-    "no barrier in the prefix sum": (
-        "sort.cuh",
-        "    sums[t] = inclusive;\n    __syncthreads();\n  }",
-        "    sums[t] = inclusive;\n  }",
-    ),
-    "a barrier that not all reach": (
-        "sort.cuh",
-        "  __syncthreads();  // the",
-        "  if (t) __syncthreads();  // the",
-    ),
-    "no wait before a bin moves on": ("sort.cuh", "    __syncwarp();  // all", "    // all"),
-    "a bin that does not move on": ("sort.cuh", "= at + 1;", "= at;"),
-    "no barrier before bins become positions": (
-        "sort.cuh",
-        "  __syncthreads();\n  u32 position",
-        "  u32 position",
-    ),
-    "the last row of tiles forgotten": ("tiles.cuh", "row <= rows.last / TILE", "row < rows.last / TILE"),
-    "a list that misses its last splat": ("tiles.cuh", "= u32(e + 1);", "= u32(e);"),
-    "no wait for the stage": ("blend.cuh", "    __syncwarp();\n    const int count", "    const int count"),
-    "the last splat off by one": ("blend.cuh", "u32(base - begin) + j + 1)", "u32(base - begin) + j)"),
-    "a pixel that never closes": ("blend.cuh", "    pixel.is_open = false;\n", ""),
-    "no gate at the largest alpha": (
-        "blend.cuh",
-        "free <= float(SPLAT_ALPHA_MAX) ? -alpha * g_alpha : 0.0f",
-        "-alpha * g_alpha",
-    ),
-    "a shuffle in a branch": ("blend.cuh", "if (__any_sync(ALL, hit0 || hit1))", "if (hit0 || hit1)"),
-    "two sums swapped": ("blend.cuh", "fold(b4, s.gt, s.green, 16)", "fold(b4, s.green, s.gt, 16)"),
-    "records left as they were": ("blend.cuh", "e = begin + used + lane;", "e = end;"),
-    "half of a long run": (
-        "project.cuh",
-        "slot < from + many; slot += WARP",
-        "slot < from + many / 2; slot += WARP",
-    ),
-}
+def test_kernels_without_a_mistake_pass(emulator, mutants):
+    assert passes(emulator, judge)
+    assert passes(mutants, judge)
 
 
-def test_the_judge_acquits_the_innocent(emulator):
-    assert is_acquitted(emulator, judge)
-
-
-@pytest.mark.parametrize("mutant", MUTANTS)
-def test_a_mutant_is_caught(tmp_path, mutant):
-    name, original, changed = MUTANTS[mutant]
-    shutil.copytree(KERNELS, tmp_path / "kernels")
-    path = tmp_path / "kernels" / name
-    source = path.read_text()
-    assert source.count(original) == 1
-    path.write_text(source.replace(original, changed))
-    assert not is_acquitted(compile_emulator(tmp_path, tmp_path / "kernels", "-O0"), judge)
+@pytest.mark.parametrize("mutant", RENDERING)
+def test_a_mutant_is_caught(mutants, mutant):
+    assert not passes(mutants, judge, NUMBERS[mutant])
 
 
 def judge_slots(emulator: Emulator) -> None:
-    """Nobody took a slot of somebody else, and none was left as it was: every number is one."""
+    """Check that each pair fills exactly its own slots and that every rendered number is finite."""
     gaussians, cameras = make_gaussians(60, log_scale=-1.0), make_cameras(2, 21, 27)
-    frame = cuda._Frame(emulator, cameras, CPU)
-    frame.project(list(gaussians.tensors().values()))
+    views = cuda._CudaPass(emulator, cameras, CPU)
+    views.project(list(gaussians.tensors().values()))
     with emulator.on(CPU) as launch:
-        group = frame._list(launch, *frame._split()[0])
-    counts = frame.slot_count.flatten().long()
+        group = views._list(launch, *views._split()[0])
+    counts = views.slot_count.flatten().long()
     pairs = torch.arange(counts.numel()).repeat_interleave(counts)
     nth = torch.arange(pairs.numel()) - (counts.cumsum(0) - counts)[pairs]
-    assert torch.equal(group.pair_of_slot[frame.first_slot.flatten().long()[pairs] + nth].long(), pairs)
+    assert torch.equal(group.pair_of_slot[views.first_slot.flatten().long()[pairs] + nth].long(), pairs)
     assert group.ranges[-1].any(), "some slots are left over"
     scene = gaussians, cameras, backgrounds(2), make_weights(2, 21, 27)
     assert all(number.isfinite().all() for number in bits(*render_and_differentiate(emulator.render, *scene)))
 
 
-def test_lists_that_disagree_with_their_counts_leave_no_garbage(tmp_path):
-    # Should a compiler ever round listing otherwise than counting: one tile too many here, too few there.
-    shutil.copytree(KERNELS, tmp_path / "kernels")
-    path, listing = (
-        tmp_path / "kernels" / "tiles.cuh",
-        "each_tile_row(s, grid, [&](int row, int first, int last) {",
-    )
-    source = path.read_text()
-    assert source.count(listing) == 1
-    path.write_text(source.replace(listing, f"{listing} last += pair % 3 == 0 ? 1 : pair % 3 == 1 ? -1 : 0;"))
-    assert is_acquitted(compile_emulator(tmp_path, tmp_path / "kernels", "-O0"), judge_slots)
+@pytest.mark.parametrize("mutant", ROUNDING)
+def test_lists_that_disagree_with_their_counts_leave_no_garbage(mutants, mutant):
+    assert passes(mutants, judge_slots, NUMBERS[mutant])

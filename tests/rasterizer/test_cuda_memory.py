@@ -1,4 +1,4 @@
-"""Too much for one go: views are split into groups, and nobody can tell from the bits."""
+"""Views that need too much memory together are split into groups, which does not change the bits."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,7 +19,8 @@ from splats import (
 
 from cadam3d.core.checks import UserError
 from cadam3d.rasterizer import cuda
-from cadam3d.rasterizer.cuda import Launch, Launcher, rasterize
+from cadam3d.rasterizer.cuda import rasterize
+from cadam3d.rasterizer.launcher import Launch, Launcher
 
 pytestmark = pytest.mark.usefixtures("garbage_in_new_memory")
 
@@ -28,7 +29,7 @@ VIEWS = 4
 
 
 class Spy(Launcher):
-    """Passes every launch on and remembers it; ``meddle`` may then change what the kernel left."""
+    """Passes every launch on and records it; ``meddle`` may then change the results of the kernel."""
 
     def __init__(self, inner: Emulator, meddle=lambda kernel, arguments: None) -> None:
         self.inner, self.meddle = inner, meddle
@@ -51,7 +52,7 @@ class Spy(Launcher):
 
 
 def make_scene(degree=1):
-    # All around the cameras: who is seen, and by which views, differs from Gaussian to Gaussian.
+    # The Gaussians are all around the cameras, so each is visible in other views.
     gaussians = make_gaussians(120, degree=degree, spread=3.0, log_scale=-1.5)
     return gaussians, make_cameras(VIEWS, 29, 38), backgrounds(VIEWS), make_weights(VIEWS, 29, 38)
 
@@ -61,9 +62,9 @@ def differentiate(launcher: Launcher, scene):
 
 
 def slots_per_view(emulator, gaussians, cameras) -> list[int]:
-    frame = cuda._Frame(emulator, cameras, CPU)
-    frame.project(list(gaussians.tensors().values()))
-    return frame.slot_count.sum(dim=1).tolist()
+    views = cuda._CudaPass(emulator, cameras, CPU)
+    views.project(list(gaussians.tensors().values()))
+    return views.slot_count.sum(dim=1).tolist()
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -71,8 +72,8 @@ def test_the_bits_do_not_depend_on_the_memory_for_records(emulator, degree, monk
     scene = make_scene(degree)
     whole = differentiate(emulator, scene)
     visible = whole[0].visible
-    assert (visible.any(dim=0) & ~visible[-1]).any(), "somebody is seen, but not by the last view"
-    assert (~visible.any(dim=0)).any(), "somebody is not seen at all"
+    assert (visible.any(dim=0) & ~visible[-1]).any(), "some Gaussian is visible, but not in the last view"
+    assert (~visible.any(dim=0)).any(), "some Gaussian is not visible at all"
     slots = slots_per_view(emulator, *scene[:2])
     for most_slots, groups in ((sum(slots), 1), (sum(slots[:3]), 2), (max(slots), VIEWS), (0, VIEWS)):
         monkeypatch.setattr(cuda, "RECORD_MEMORY", 4 * cuda.RECORD * most_slots)
@@ -80,7 +81,8 @@ def test_the_bits_do_not_depend_on_the_memory_for_records(emulator, degree, monk
         assert_same_bits(bits(*whole), bits(*differentiate(spy, scene)))
         launches = spy.arguments_of("blend_backward")
         assert len(launches) == len(spy.arguments_of(f"project_backward_{(degree + 1) ** 2}")) == groups
-        most = max(4 * cuda.RECORD * most_slots, 4 * cuda.RECORD * max(slots))  # one view always has its own
+        # A single view always gets the memory that it needs.
+        most = max(4 * cuda.RECORD * most_slots, 4 * cuda.RECORD * max(slots))
         assert all(4 * arguments[-1].numel() <= most for arguments in launches)
 
 
@@ -91,11 +93,11 @@ def test_the_bits_do_not_depend_on_the_memory_for_records(emulator, degree, monk
         pytest.param(90, 1.0, (29, 38), id="slots"),
     ],
 )
-def test_the_bits_do_not_depend_on_how_many_numbers_have_32_bits(emulator, n, log_scale, size, monkeypatch):
+def test_the_bits_do_not_depend_on_how_much_32_bits_can_count(emulator, n, log_scale, size, monkeypatch):
     gaussians, cameras = make_gaussians(n, degree=1, log_scale=log_scale), make_cameras(VIEWS, *size)
     scene = gaussians, cameras, backgrounds(VIEWS), make_weights(VIEWS, *size)
     whole, slots = differentiate(emulator, scene), slots_per_view(emulator, gaussians, cameras)
-    # What one view needs just fits; what two need does not.
+    # One view just fits, two views do not.
     monkeypatch.setattr(cuda, "MOST", max(n, *slots, size[0] * size[1]))
     assert 2 * max(n, min(slots)) > cuda.MOST
     spy = Spy(emulator)
@@ -103,7 +105,7 @@ def test_the_bits_do_not_depend_on_how_many_numbers_have_32_bits(emulator, n, lo
     assert len(spy.arguments_of("blend_forward")) == VIEWS
 
 
-def test_what_fits_goes_together_and_a_view_at_least_goes_alone():
+def test_a_group_has_as_many_views_as_fit_and_at_least_one():
     split = cuda._split_views
     spans = [(views.start, views.stop, slots) for views, slots in split([3, 4, 5, 9, 0, 1], 8, 99)]
     assert spans == [(0, 2, 7), (2, 3, 5), (3, 4, 9), (4, 6, 1)]
@@ -115,10 +117,10 @@ def test_what_fits_goes_together_and_a_view_at_least_goes_alone():
 @pytest.mark.parametrize(("views", "pairs"), [(7, 2**29), (3, 2**31 - 1)])
 def test_views_beyond_32_bits_together_are_split(emulator, views, pairs, monkeypatch):
     monkeypatch.setattr(cuda, "RECORD_MEMORY", 2**60)
-    frame = cuda._Frame(emulator, make_cameras(views, 8, 8), CPU)
-    frame.slot_count = torch.tensor([[pairs - 1, 1, 0]] * views, dtype=torch.int32)
+    kernels = cuda._CudaPass(emulator, make_cameras(views, 8, 8), CPU)
+    kernels.slot_count = torch.tensor([[pairs - 1, 1, 0]] * views, dtype=torch.int32)
     assert views * pairs > cuda.MOST
-    groups = frame._split()
+    groups = kernels._split()
     assert sum(slots for _, slots in groups) == views * pairs
     assert all(slots <= cuda.MOST for _, slots in groups)
     assert len(groups) == -(-views // (cuda.MOST // pairs))
@@ -127,7 +129,7 @@ def test_views_beyond_32_bits_together_are_split(emulator, views, pairs, monkeyp
 def test_more_than_32_bits_of_pairs_in_one_view_are_refused_and_counted(emulator):
     def claim_too_much(kernel, arguments):
         if kernel.startswith("project_forward"):
-            arguments[-1].fill_(2**31 - 1)  # tiles of each splat: beyond 2**32 in all
+            arguments[-1].fill_(2**31 - 1)  # tiles of each splat; more than 2**32 in total
 
     gaussians, *scene = make_scene()
     spy = Spy(emulator, claim_too_much)
@@ -136,16 +138,16 @@ def test_more_than_32_bits_of_pairs_in_one_view_are_refused_and_counted(emulator
     assert not spy.arguments_of("tile_list")
 
 
-def test_without_a_backward_to_come_no_list_is_kept(emulator):
+def test_lists_are_kept_only_for_a_backward_pass(emulator):
     gaussians, cameras, background, _ = make_scene()
-    frame = cuda._Frame(emulator, cameras, CPU)
+    views = cuda._CudaPass(emulator, cameras, CPU)
     parameters = list(gaussians.tensors().values())
-    frame.project(parameters)
-    frame.blend(parameters, background, keeps=False)
-    assert frame.groups == []
-    frame.project(parameters)
-    frame.blend(parameters, background, keeps=True)
-    assert len(frame.groups) == 1
+    views.project(parameters)
+    views.blend(parameters, background, keeps=False)
+    assert views.groups == []
+    views.project(parameters)
+    views.blend(parameters, background, keeps=True)
+    assert len(views.groups) == 1
 
 
 def test_a_grid_may_have_more_blocks_than_its_other_dimensions_allow(emulator):

@@ -1,4 +1,4 @@
-"""Talking to the CUDA driver: which device and stream it is told, and what is said when it refuses."""
+"""Calls of the CUDA driver: the device and stream that kernels use, and the messages for its errors."""
 
 import ctypes
 import subprocess
@@ -18,7 +18,7 @@ from cadam3d.rasterizer.cuda import BLEND_BLOCK, MOST, WARP, CudaRasterizer, _la
 from cadam3d.rasterizer.driver import Module, load_driver
 from cadam3d.rasterizer.nvrtc import Cubin
 
-# A driver that launches the kernel "works" and notes how. "full" finds no memory, any other is unknown.
+# A driver that launches the kernel "works" and records how. It has no memory for "full", and knows no others.
 STUB = """
 #include <string.h>
 extern "C" {
@@ -63,7 +63,7 @@ def stub(tmp_path_factory) -> ctypes.CDLL:
     return ctypes.CDLL(str(folder / "stub.so"))
 
 
-def test_what_the_driver_refuses_is_quoted(stub):
+def test_errors_of_the_driver_are_quoted(stub):
     with (
         pytest.raises(UserError, match=r"cuModuleGetFunction: named symbol not found \(500\)"),
         Module(stub, 0, b"").launching(0) as launch,
@@ -73,12 +73,12 @@ def test_what_the_driver_refuses_is_quoted(stub):
         Module(stub, 0, b"foreign")
 
 
-def test_to_run_out_of_memory_is_an_outcome_and_not_a_mistake_of_the_user(stub):
+def test_running_out_of_memory_is_not_a_user_error(stub):
     with pytest.raises(MemoryError, match="out of memory"), Module(stub, 0, b"").launching(0) as launch:
         launch("full", 1, 32)
 
 
-def test_the_context_is_given_back_whatever_happens(stub):
+def test_the_context_is_popped_even_after_an_error(stub):
     before, inside = stub.stub_pushed(), []
     with pytest.raises(UserError), Module(stub, 0, b"").launching(0) as launch:
         launch("unknown", 1, inside.append(stub.stub_pushed()) or 32)
@@ -86,14 +86,14 @@ def test_the_context_is_given_back_whatever_happens(stub):
     assert stub.stub_pushed() == before
 
 
-def test_without_a_driver_it_says_what_to_type(monkeypatch):
-    monkeypatch.setattr(driver, "LIBRARY", "libcuda-of-nobody.so.1")
+def test_a_missing_driver_is_reported_with_a_hint(monkeypatch):
+    monkeypatch.setattr(driver, "LIBRARY", "libcuda-that-does-not-exist.so.1")
     with pytest.raises(UserError, match="Try: nvidia-smi"):
         load_driver()
 
 
 class FakeCuda:
-    """Two devices, as ``torch.cuda`` describes them; the current one is 0, with a side stream on each."""
+    """A replacement of ``torch.cuda`` with two devices; number 0 is current, and each has a side stream."""
 
     def __init__(self) -> None:
         self.index = 0
@@ -111,12 +111,12 @@ class FakeCuda:
         return (8, index)
 
     def current_stream(self, index: int) -> SimpleNamespace:
-        return SimpleNamespace(cuda_stream=2**40 + index)  # a handle is an address: more than 32 bits
+        return SimpleNamespace(cuda_stream=2**40 + index)  # a handle has more than 32 bits
 
 
 @pytest.fixture
 def built(stub, monkeypatch, tmp_path) -> list[tuple[int, int]]:
-    """The compute capabilities that kernels were asked for, by drivers on the stub and the fake devices."""
+    """Return the compute capabilities that kernels are built for, on the stub and the fake devices."""
     asked = []
 
     def build(_, capability):
@@ -139,7 +139,7 @@ def launched(stub) -> dict[str, object]:
 
 
 @pytest.mark.parametrize(("device", "index"), [("cuda", 0), ("cuda:0", 0), ("cuda:1", 1)])
-def test_kernels_run_on_the_device_asked_for_and_its_current_stream(stub, built, tmp_path, device, index):
+def test_kernels_run_on_the_given_device_and_its_current_stream(stub, built, tmp_path, device, index):
     with driver.Driver(tmp_path).on(torch.device(device)) as launch:
         assert torch.cuda.current_device() == index
         launch("works", 70_000, 256, None)
@@ -182,7 +182,7 @@ def leaves(device):
 
 
 @pytest.mark.gpu
-def test_forward_and_backward_wait_for_what_their_stream_waits_for():
+def test_forward_and_backward_run_on_the_current_stream():
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     cameras = make_cameras(2, 64, 80)

@@ -1,7 +1,8 @@
-"""An outside opinion: gsplat's own CPU projection, spherical harmonics and ``accumulate``, with autograd.
+"""The reference rasterizer agrees with gsplat's CPU projection, spherical harmonics and ``accumulate``.
 
-It comes with ``pip install -e .[dev]``; without it the tests skip themselves. It needs ``nerfacc`` for two
-small functions, which are given here, and a list of (Gaussian, pixel) hits, which its CUDA code would make.
+``pip install -e .[dev]`` installs gsplat; without it these tests are skipped. gsplat needs two small
+functions of ``nerfacc``, which are defined here, and a list of (Gaussian, pixel) hits, which its CUDA code
+would make.
 """
 
 import sys
@@ -23,7 +24,7 @@ from gsplat.cuda import _torch_impl as gsplat  # noqa: E402
 
 
 def scene(degree: int) -> Gaussians:
-    """Opacities below the caps (gsplat 1.5.3 caps at 0.999, we at 0.99)."""
+    """Return Gaussians with opacities below the caps, which are 0.999 in gsplat 1.5.3 and 0.99 here."""
     generator = torch.Generator().manual_seed(degree)
 
     def normal(*shape: int) -> Tensor:
@@ -46,11 +47,11 @@ def cameras(height: int, width: int) -> Cameras:
 
 @pytest.fixture
 def _nerfacc(monkeypatch):
-    """The two functions of nerfacc that ``accumulate`` imports, for hits sorted by ray."""
+    """Define the two functions of nerfacc that ``accumulate`` imports, for hits sorted by ray."""
 
     def render_weight_from_alpha(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
         through = torch.cat([alphas.new_zeros(1), torch.log1p(-alphas).cumsum(0)])
-        first = torch.searchsorted(ray_indices, ray_indices)  # where each hit's ray begins
+        first = torch.searchsorted(ray_indices, ray_indices)  # first hit of the same ray
         transmittance = (through[:-1] - through[first]).exp()
         return transmittance * alphas, transmittance
 
@@ -70,7 +71,7 @@ def _nerfacc(monkeypatch):
 def hits(
     means2d: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, height: int, width: int
 ) -> tuple[Tensor, Tensor]:
-    """All (Gaussian, pixel) pairs that a pixel blends, by pixel and then depth: brute force over one view."""
+    """Return all (Gaussian, pixel) pairs that one view blends, by pixel and then depth, by brute force."""
     pixels = torch.cartesian_prod(torch.arange(height), torch.arange(width)).flip(1) + 0.5
     dx, dy = (pixels[:, None] - means2d).unbind(-1)
     sigma = 0.5 * (conics[:, 0] * dx**2 + conics[:, 2] * dy**2) + conics[:, 1] * dx * dy
@@ -115,7 +116,7 @@ def oracle(gaussians: Gaussians, views: Cameras, background: Tensor) -> tuple[Te
 
 @pytest.mark.usefixtures("_nerfacc")
 @pytest.mark.parametrize(("height", "width", "degree"), [(61, 45, 3), (96, 96, 0), (1, 1, 1), (17, 8, 2)])
-def test_images_and_gradients_are_gsplats(height, width, degree):
+def test_images_and_gradients_agree_with_gsplat(height, width, degree):
     views, background = (
         cameras(height, width),
         torch.tensor([[0.1, 0.5, 0.9], [1, 1, 0]], dtype=torch.float64),
@@ -143,6 +144,6 @@ def assert_close_to_largest(got: Tensor | None, want: Tensor | None) -> None:
     torch.testing.assert_close(got, want, rtol=0, atol=1e-8 * float(want.abs().max() + 1e-3))
 
 
-def test_spherical_harmonics_are_gsplats():
+def test_spherical_harmonics_agree_with_gsplat():
     directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
     torch.testing.assert_close(sh_basis(directions, 3), gsplat._eval_sh_bases_fast(16, directions))

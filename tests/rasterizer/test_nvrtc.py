@@ -1,22 +1,25 @@
-"""Compiling the CUDA kernels at run time: for every architecture, cached, and with errors that help."""
+"""Compiling the CUDA kernels at run time: for every architecture, with a cache and helpful errors."""
 
 import ctypes
 import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from emulation import content_hash, make_once
 
 from cadam3d.core.checks import UserError
 from cadam3d.rasterizer import nvrtc
 from cadam3d.rasterizer.build import KERNELS
 from cadam3d.rasterizer.nvrtc import build, choose_architecture, compile_kernels, find_compiler
 
-# Every one since Turing; the oldest that CUDA 13 still compiles for.
+# All architectures since Turing, which is the oldest that CUDA 13 compiles for.
 ARCHITECTURES = (75, 80, 86, 87, 88, 89, 90, 100, 101, 103, 107, 110, 120, 121)
-# The most registers per thread that any of them takes, with the NVRTC of CUDA 12.6, 12.8, 13.0 and 13.5. Half
-# of an SM is in use at 64; the backward of degree 3, 48 coefficients at hand, less than a fifth.
+# The largest number of registers per thread on any of them, with the NVRTC of CUDA 12.6, 12.8, 13.0 and 13.5.
+# With 64 registers, half of an SM is in use; with those of the backward pass of degree 3, which holds 48
+# coefficients, less than a fifth.
 REGISTERS = {
     "blend_backward": 64,
     "blend_backward_absolute": 71,
@@ -50,19 +53,31 @@ def compiler():
     return found
 
 
-def test_no_architecture_is_forgotten(compiler):
+def test_all_architectures_of_the_compiler_are_tested(compiler):
     assert {each for each in compiler.architectures if each >= 75} <= set(ARCHITECTURES)
 
 
+def compile_verbosely(compiler: nvrtc.Compiler, architecture: int, folder: Path) -> str:
+    """Return the log of a compilation. A log in ``folder`` is used if nothing has changed since."""
+    key = content_hash(nvrtc._key(compiler), Path(nvrtc.__file__).read_text())
+
+    def write_log(path: Path) -> None:
+        logs = []
+        compiled = compile_kernels(compiler, architecture, logs.append)
+        assert compiled.startswith(b"\x7fELF")
+        path.write_text("\n".join(logs))
+
+    return make_once(folder / f"nvrtc-{key}-sm{architecture}.log", write_log).read_text()
+
+
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_every_kernel_fits_every_architecture_without_spills(compiler, architecture, monkeypatch):
+def test_every_kernel_fits_every_architecture_without_spills(
+    compiler, architecture, build_cache, monkeypatch
+):
     if architecture not in compiler.architectures:
         pytest.skip(f"the NVRTC of CUDA {compiler.version} does not know sm_{architecture}")
     monkeypatch.setattr(nvrtc, "OPTIONS", (*nvrtc.OPTIONS, "--ptxas-options=-v"))
-    logs = []
-    compiled = compile_kernels(compiler, architecture, logs.append)
-    assert compiled.startswith(b"\x7fELF")
-    [log] = logs
+    log = compile_verbosely(compiler, architecture, build_cache)
     usage = re.findall(
         r"entry function '(\w+)'.*?(\d+) bytes stack frame, (\d+) bytes spill stores.*?Used (\d+) registers",
         log,
@@ -80,7 +95,7 @@ def test_a_second_build_comes_from_the_cache(compiler, tmp_path):
     second = build(tmp_path, (8, 6))
     assert second.path == first.path
     assert second.seconds == 0
-    assert list(tmp_path.iterdir()) == [first.path]  # nothing half-done is left
+    assert list(tmp_path.iterdir()) == [first.path], "there are no temporary files"
 
 
 def test_a_damaged_file_is_built_again(compiler, tmp_path, monkeypatch):
@@ -108,26 +123,26 @@ def test_a_device_that_the_compiler_does_not_know_is_refused(capability):
         choose_architecture(capability, compiler)
 
 
-def test_without_a_compiler_it_says_what_to_install(monkeypatch, tmp_path):
+def test_a_missing_compiler_is_reported_with_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setattr(nvrtc, "find_compiler", lambda: None)
     with pytest.raises(UserError, match="pip install nvidia-cuda-nvrtc"):
         build(tmp_path, (8, 0))
 
 
-def test_a_kernel_that_does_not_compile_is_quoted(compiler, monkeypatch):
+def test_a_compilation_error_is_quoted(compiler, monkeypatch):
     monkeypatch.setattr(nvrtc, "OPTIONS", (*nvrtc.OPTIONS, "-DRECORD=nonsense*"))
     with pytest.raises(UserError, match="NVRTC_ERROR_COMPILATION"):
         compile_kernels(compiler, compiler.architectures[-1])
 
 
-def test_a_folder_that_cannot_be_written_is_named(compiler, tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_written_is_reported_with_its_key(compiler, tmp_path, monkeypatch):
     monkeypatch.setattr(nvrtc, "compile_kernels", lambda *_: b"")
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"rasterizer\.cache_dir="):
         build(tmp_path / "file", (8, 0))
 
 
-def test_the_cache_knows_sources_options_and_compiler_apart(compiler, monkeypatch):
+def test_the_cache_distinguishes_compilers_options_and_constants(compiler, monkeypatch):
     keys = {nvrtc._key(compiler), nvrtc._key(replace(compiler, version=(99, 0)))}
     monkeypatch.setattr(nvrtc, "OPTIONS", ())
     keys.add(nvrtc._key(compiler))
@@ -143,13 +158,13 @@ def test_every_source_is_passed_to_the_compiler():
             assert header in nvrtc.HEADERS
 
 
-def test_the_library_of_torchs_own_cuda_comes_first(monkeypatch, tmp_path):
+def test_the_library_of_torchs_cuda_version_comes_first(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.version, "cuda", "12.8")
     names = ("libnvrtc.alt.so.12", "libnvrtc.so.13", "libnvrtc.so.12")
     assert min((tmp_path / name for name in names), key=nvrtc._distance_from_torch).name == "libnvrtc.so.12"
 
 
-def test_it_is_found_where_wheels_for_cuda_12_and_13_put_it(monkeypatch, tmp_path):
+def test_it_is_found_in_the_folders_of_wheels_for_cuda_12_and_13(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(nvrtc, "PATTERN", "libnvrtc.so*")
     paths = [tmp_path / folder for folder in ("cuda_nvrtc/lib/libnvrtc.so.12", "cu13/lib/libnvrtc.so.13")]

@@ -1,4 +1,4 @@
-"""The reference rasterizer against the textbook, its invariances, and inputs that break others."""
+"""The reference rasterizer: agreement with the textbook, invariances, and inputs that break rasterizers."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ RASTERIZER = ReferenceRasterizer()
 
 
 def scene(n: int = 80, degree: int = 1, seed: int = 0, dtype: torch.dtype = torch.float64) -> Gaussians:
-    """Splats of all sizes, faint to nearly opaque, some colours below zero, the first row out of sight."""
+    """Return splats of all sizes, faint to nearly opaque, some with negative colours; the first is hidden."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -38,14 +38,14 @@ def scene(n: int = 80, degree: int = 1, seed: int = 0, dtype: torch.dtype = torc
 
 
 def cameras(views: int = 2, height: int = 29, width: int = 37, distance: float = 1.6) -> Cameras:
-    """Near enough that some of ``scene`` lies across the frustum's border."""
+    """Return cameras so close that some of ``scene`` crosses the border of the frustum."""
     azimuth = torch.arange(views, dtype=torch.float64) * 50 - 20
     full = torch.ones_like(azimuth)
     return orbit(azimuth, 25 * full, distance * full, 60 * full, height, width)
 
 
 def facing(size: int = 9, distance: float = 2.0) -> Cameras:
-    """One camera on +x with a focal length of ``size`` pixels, looking along -x."""
+    """Return one camera on +x with a focal length of ``size`` pixels, looking along -x."""
     fov_y_deg = math.degrees(2 * math.atan(0.5))
     return turntable(1, elevation_deg=0.0, distance=distance, fov_y_deg=fov_y_deg, size=size).to(
         torch.float64
@@ -53,7 +53,7 @@ def facing(size: int = 9, distance: float = 2.0) -> Cameras:
 
 
 def balls(*, x: list[float], radius: float, opacity: list[float], rgb: list[list[float]]) -> Gaussians:
-    """Round Gaussians of one colour each on the x axis; ``facing`` sees them all at its image centre."""
+    """Return round Gaussians of one colour each on the x axis, all at the image centre of ``facing``."""
     n = len(x)
     means = torch.zeros(n, 3, dtype=torch.float64)
     means[:, 0] = torch.tensor(x)
@@ -83,7 +83,7 @@ def images(output: RenderOutput) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def score(pictures: tuple[Tensor, ...]) -> Tensor:
-    """Some loss in which every pixel of every output has its own weight."""
+    """Return a loss in which every pixel of every output has its own weight."""
     generator = torch.Generator().manual_seed(5)
     weights = [torch.rand(p.shape, generator=generator, dtype=torch.float64).to(p) - 0.4 for p in pictures]
     return torch.stack([(p * weight).sum() for p, weight in zip(pictures, weights, strict=True)]).sum()
@@ -98,7 +98,7 @@ def gradients(gaussians: Gaussians, views: Cameras) -> dict[str, Tensor]:
 
 
 def textbook(gaussians: Gaussians, views: Cameras, background: Tensor) -> tuple[Tensor, ...]:
-    """EWA splatting as the papers write it: matrices, one splat after the other at every pixel."""
+    """Return rgb, alpha and depth of EWA splatting as in the papers: matrices, one splat after another."""
     pictures = []
     for view in range(len(views)):
         matrix, intrinsics = views.world_to_camera[view], views.intrinsics[view]
@@ -147,7 +147,7 @@ def textbook(gaussians: Gaussians, views: Cameras, background: Tensor) -> tuple[
     ("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)], ids=["float64", "float32"]
 )
 @pytest.mark.parametrize(("height", "width", "degree"), [(29, 37, 3), (16, 8, 0), (1, 1, 1), (3, 50, 2)])
-def test_images_and_gradients_are_the_textbooks(height, width, degree, dtype, tolerance):
+def test_images_and_gradients_agree_with_the_textbook(height, width, degree, dtype, tolerance):
     views = cameras(2, height, width).to(dtype)
     background = backgrounds(2).to(dtype)
     leaves, textbook_leaves = (as_parameters(scene(60, degree, dtype=dtype)) for _ in range(2))
@@ -165,28 +165,27 @@ def test_images_and_gradients_are_the_textbooks(height, width, degree, dtype, to
         )
 
 
-def test_the_textbook_scene_meets_every_branch():
+def test_the_textbook_scene_exercises_every_branch():
     gaussians, views = scene(60, 3), cameras(2)
     output = render(gaussians, views)
     in_camera = gaussians.means @ views.world_to_camera[0, :3, :3].T + views.world_to_camera[0, :3, 3]
-    assert (in_camera[:, 2] < 0.01).any(), "someone is behind the camera"
-    assert (gaussians.opacities > 0.99).any(), "someone is capped"
-    assert (gaussians.opacities < 1 / 255).any(), "someone is too faint"
+    assert (in_camera[:, 2] < 0.01).any(), "a splat is behind the camera"
+    assert (gaussians.opacities > 0.99).any(), "a splat is capped"
+    assert (gaussians.opacities < 1 / 255).any(), "a splat is too faint"
     assert (output.alpha == 0).any(), "some pixel is empty"
     assert (output.alpha > 0.9995).any(), "some pixel stops early"
     outside = (output.means2d[0] < -6) | (output.means2d[0] > 44)
-    assert (outside.any(dim=1) & output.visible[0]).any(), (
-        "someone reaches in from beyond the clamped Jacobian"
-    )
+    reaches_in = outside.any(dim=1) & output.visible[0]
+    assert reaches_in.any(), "a splat with a clamped Jacobian extends into the image"
     direction = torch.nn.functional.normalize(gaussians.means - views.positions[0], dim=-1)
     colors = torch.einsum("nk,nkc->nc", sh_basis(direction, 3), gaussians.sh) + 0.5
     assert (colors < 0).any(), "some colour is clamped at zero"
 
 
-# --- facts one can work out by hand
+# --- results that can be computed by hand
 
 
-def test_a_ball_is_a_gaussian_blot_of_its_projected_size_plus_blur():
+def test_a_ball_appears_as_a_gaussian_of_its_projected_size_plus_blur():
     output = render(
         balls(x=[0.0], radius=0.2, opacity=[0.8], rgb=[[1, 0.5, 0]]), facing(9), torch.zeros(1, 3)
     )
@@ -201,7 +200,7 @@ def test_a_ball_is_a_gaussian_blot_of_its_projected_size_plus_blur():
     assert output.radii.item() == pytest.approx(math.sqrt(2 * math.log(255 * 0.8) * variance))
 
 
-def test_the_near_one_hides_the_far_one_whatever_their_order():
+def test_the_near_splat_hides_the_far_one_in_any_order_of_rows():
     red_near = balls(x=[0.5, -0.5], radius=0.2, opacity=[0.6, 0.5], rgb=[[1, 0, 0], [0, 0, 1]])
     for rows in ([0, 1], [1, 0]):
         output = render(red_near.index(torch.tensor(rows)), facing(9), torch.ones(1, 3))
@@ -229,10 +228,10 @@ def test_the_splat_that_would_make_a_pixel_opaque_is_left_out():
     stack = balls(x=[0.3, 0.2, 0.1, 0.0], radius=0.2, opacity=[0.98, 0.98, 0.98, 0.1], rgb=[[1, 1, 1]] * 4)
     output = render(stack, facing(9))
     assert 1 - output.alpha[0, 4, 4].item() == pytest.approx(0.0004)
-    assert output.visible.all(), "being hidden is not being culled"
+    assert output.visible.all(), "hidden splats are not culled"
 
 
-def test_nothing_is_drawn_outside_the_radius_and_nothing_forgotten_inside():
+def test_exactly_the_pixels_within_the_radius_are_drawn():
     for opacity in (0.005, 0.1, 0.97):
         for x_offset in (0.0, 0.3, 0.8):
             ball = balls(x=[0.0], radius=0.3, opacity=[opacity], rgb=[[1, 1, 1]])
@@ -251,7 +250,7 @@ def test_nothing_is_drawn_outside_the_radius_and_nothing_forgotten_inside():
     ("z", "is_seen"),
     [(0.01, False), (0.010001, True), (0.0, False), (-1.0, False), (1e14, True), (1e15, False)],
 )
-def test_only_what_lies_between_the_near_and_the_far_plane_is_seen(z, is_seen):
+def test_only_gaussians_between_the_near_and_the_far_plane_are_visible(z, is_seen):
     views = replace(facing(9), world_to_camera=torch.eye(4, dtype=torch.float64)[None])
     ball = balls(x=[0.0], radius=0.001, opacity=[0.8], rgb=[[1, 1, 1]])
     ball.means[0, 2] = z
@@ -260,7 +259,7 @@ def test_only_what_lies_between_the_near_and_the_far_plane_is_seen(z, is_seen):
     assert (output.alpha.max() > 0).item() == is_seen
 
 
-def test_a_splat_that_is_nowhere_brighter_than_the_faintest_alpha_is_not_seen():
+def test_a_splat_that_never_exceeds_the_smallest_alpha_is_not_visible():
     ball = balls(x=[0.0], radius=0.3, opacity=[0.5], rgb=[[1, 1, 1]])
     for logit, is_seen in ((-math.log(254), False), (-math.log(254) + 1e-9, True)):
         ball.opacity_logits[0] = logit
@@ -270,7 +269,7 @@ def test_a_splat_that_is_nowhere_brighter_than_the_faintest_alpha_is_not_seen():
         assert output.alpha.any().item() == is_seen
 
 
-def test_a_huge_splat_behind_the_camera_leaves_no_ghost():
+def test_a_huge_splat_behind_the_camera_is_not_drawn():
     ball = balls(x=[3.0], radius=50.0, opacity=[0.9], rgb=[[1, 1, 1]])
     assert render(ball, facing(9)).alpha.max() == 0
 
@@ -297,7 +296,7 @@ def test_the_order_of_rows_does_not_matter():
         torch.testing.assert_close(other_grads[name], one_grads[name][order], rtol=1e-12, atol=1e-12)
 
 
-def test_a_batch_is_its_views_one_by_one():
+def test_a_batch_equals_its_single_views():
     gaussians, views, background = scene(), cameras(3), backgrounds(3)
     batch = render(gaussians, views, background)
     for view in range(3):
@@ -357,7 +356,7 @@ def test_fading_a_gaussian_out_removes_it_without_a_jump():
 
 
 @pytest.mark.parametrize(("tile", "block"), [(2, 1), (4, 1), (8, 100), (16, 2**17), (64, 2**30)])
-def test_tiles_and_blocks_are_nobodys_business(monkeypatch, tile, block):
+def test_the_result_does_not_depend_on_tile_and_block_sizes(monkeypatch, tile, block):
     gaussians, views = scene(40), cameras()
     wanted, wanted_grads = images(render(gaussians, views)), gradients(gaussians, views)
     monkeypatch.setattr(reference, "TILE", tile)
@@ -369,7 +368,7 @@ def test_tiles_and_blocks_are_nobodys_business(monkeypatch, tile, block):
         torch.testing.assert_close(grads[name], want, rtol=1e-10, atol=1e-10)
 
 
-# --- inputs that break others
+# --- inputs that break other rasterizers
 
 
 @pytest.mark.parametrize("value", [NAN, INF, -INF])
@@ -415,7 +414,7 @@ EXTREMES = [
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 def test_extreme_numbers_give_finite_images_and_gradients(value, dtype):
     views = cameras().to(dtype)
-    for name in FIELDS[:4]:  # a colour of 3e38 is honestly infinite
+    for name in FIELDS[:4]:  # with a colour of 3e38, infinite numbers are correct
         for only_one_component in (False, True):
             gaussians = scene(12, dtype=dtype)
             row = getattr(gaussians, name)[3].view(-1)
@@ -452,7 +451,7 @@ def test_a_huge_splat_fills_the_image_evenly():
 
 
 @pytest.mark.parametrize("n", [0, 4])
-def test_without_anything_to_see_the_background_is_returned_and_gradients_are_zero(n):
+def test_an_empty_image_shows_the_background_and_has_zero_gradients(n):
     gaussians, views = scene(n), cameras(2, 5, 7)
     gaussians.opacity_logits[:] = -20.0
     output = render(as_parameters(gaussians), views)
@@ -465,7 +464,7 @@ def test_without_anything_to_see_the_background_is_returned_and_gradients_are_ze
         assert not grad.any()
 
 
-def test_a_loss_may_look_at_one_output_only():
+def test_a_loss_may_use_one_output_only():
     views = cameras()
     for which in range(3):
         leaves = as_parameters(scene(20))
@@ -475,7 +474,7 @@ def test_a_loss_may_look_at_one_output_only():
         assert (leaves.sh.grad.any()) == (which == 0), "alpha and depth do not depend on colour"
 
 
-# --- manners
+# --- determinism, autograd, dtypes and memory
 
 
 def test_the_bits_do_not_depend_on_the_run_or_the_number_of_threads():
@@ -497,11 +496,11 @@ def test_the_bits_do_not_depend_on_the_run_or_the_number_of_threads():
         assert all(torch.equal(a, b) for a, b in zip(run, runs[0], strict=True))
 
 
-def test_means2d_keeps_its_gradient_exactly_while_gradients_are_on():
+def test_means2d_retains_its_gradient_only_while_gradients_are_on():
     gaussians, views = scene(20), cameras()
     with torch.no_grad():
         assert not render(as_parameters(gaussians), views).means2d.requires_grad
-    gaussians.opacity_logits.requires_grad_()  # nothing that means2d depends on
+    gaussians.opacity_logits.requires_grad_()  # means2d does not depend on it
     output = render(gaussians, views)
     output.rgb.sum().backward()
     assert output.means2d.grad is not None
@@ -509,7 +508,7 @@ def test_means2d_keeps_its_gradient_exactly_while_gradients_are_on():
     assert (output.means2d.grad.any(dim=-1) <= output.visible).all()
 
 
-def test_inputs_are_left_alone():
+def test_inputs_are_not_modified():
     gaussians, views = scene(20), cameras()
     before = gaussians.map(torch.clone)
     render(gaussians, views)
@@ -519,12 +518,12 @@ def test_inputs_are_left_alone():
     )
 
 
-def test_cameras_and_background_follow_the_gaussians():
+def test_cameras_and_background_are_converted_to_the_dtype_of_the_gaussians():
     output = render(scene(20, dtype=torch.float64), cameras().to(torch.float32), torch.ones(2, 3))
     assert output.rgb.dtype == output.alpha.dtype == output.depth.dtype == torch.float64
 
 
-def test_autocast_does_not_reach_inside():
+def test_autocast_has_no_effect_inside():
     gaussians, views = scene(40, dtype=torch.float32), cameras().to(torch.float32)
     plain, plain_grads = render(gaussians, views), gradients(gaussians, views)
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -543,7 +542,7 @@ def test_tensors_need_not_be_contiguous():
 
 
 def test_a_render_keeps_little_for_its_backward():
-    # 60 splats fill the image: 60 x 64 x 64 pairs; one float32 array of them would be a megabyte.
+    # 60 splats fill the image, so one float32 array of their 60 x 64 x 64 pairs would have a megabyte.
     gaussians = scene(60, dtype=torch.float32).map(lambda tensor: tensor.clone())
     gaussians.log_scales[:] = 0.0
     kept: dict[int, int] = {}

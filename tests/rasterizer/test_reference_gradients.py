@@ -1,7 +1,7 @@
-"""Gradients of the reference rasterizer against finite differences, in float64.
+"""Gradients of the reference rasterizer, compared with finite differences in float64.
 
-The image has steps where a contribution crosses 1/255 and where a pixel stops. A finite difference across one
-would be off by many orders of magnitude, so passing proves that the fixed scenes below keep clear of them.
+The image has steps where a contribution crosses 1/255 and where a pixel stops. A finite difference across a
+step would be wrong by many orders of magnitude, so a passing test proves that its scene is not near one.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ OUTPUTS: dict[str, Callable[[RenderOutput], Tensor]] = {
 
 
 def scene() -> Gaussians:
-    """Nine splats in one heap: some are capped, some hide others, one reaches in from outside."""
+    """Return nine overlapping splats: some are capped, some hide others, one extends into the image."""
     generator = torch.Generator().manual_seed(4)
 
     def normal(*shape: int) -> Tensor:
@@ -58,7 +58,7 @@ def render(gaussians: Gaussians, views: Cameras) -> RenderOutput:
 
 
 def score(picture: Tensor) -> Tensor:
-    """A different, fixed weight for each number."""
+    """Return the sum of all numbers, each with a different fixed weight."""
     generator = torch.Generator().manual_seed(5)
     return (picture * torch.randn(picture.shape, generator=generator, dtype=torch.float64)).sum()
 
@@ -87,8 +87,8 @@ def test_the_gradient_of_the_background_is_a_finite_difference(output):
 @pytest.mark.parametrize("output", OUTPUTS)
 @pytest.mark.parametrize("axis", [0, 1])
 def test_gradients_of_means2d_add_up_to_the_effect_of_shifting_the_image(output, axis):
-    # Moving the principal point moves every projected mean by the same pixels and changes nothing else,
-    # as long as no Jacobian is clamped: its bounds move along.
+    # Moving the principal point moves every projected mean by the same number of pixels. It changes nothing
+    # else as long as no Jacobian is clamped, because the bounds move too.
     gaussians, views = scene().index(slice(0, 8)), cameras()
 
     def loss(shift: float) -> tuple[Tensor, RenderOutput]:
@@ -114,10 +114,10 @@ def test_the_gradient_of_means2d_is_that_of_each_single_view():
     assert both.means2d.grad is not None
     assert single.means2d.grad is not None
     assert torch.equal(both.means2d.grad[1], single.means2d.grad[0])
-    assert not both.means2d.grad[0].any(), "the other view had no say"
+    assert not both.means2d.grad[0].any(), "the other view has no influence"
 
 
-def test_capped_splats_still_learn_their_colour_but_not_their_opacity():
+def test_capped_splats_have_a_gradient_for_colour_but_not_for_opacity():
     gaussians, views = scene().index(slice(0, 1)), cameras()
     gaussians.means[:] = 0.0
     gaussians.log_scales[:] = 3.0  # fills the image: capped everywhere
@@ -132,7 +132,7 @@ def test_capped_splats_still_learn_their_colour_but_not_their_opacity():
     assert leaves.sh.grad.any()
 
 
-def test_the_scene_meets_the_cap_the_stop_and_the_clamped_jacobian():
+def test_the_scene_exercises_the_cap_the_stop_and_the_clamped_jacobian():
     output = render(scene(), cameras())
     assert output.visible.all()
     assert (scene().opacities > 0.99).sum() >= 2

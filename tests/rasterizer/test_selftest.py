@@ -1,4 +1,4 @@
-"""The self-test: honest about rounding, deaf to nothing else."""
+"""The self-test accepts rounding errors and notices everything else."""
 
 import math
 from dataclasses import dataclass, replace
@@ -28,7 +28,7 @@ CPU = torch.device("cpu")
 
 @dataclass(frozen=True, kw_only=True)
 class Bent(Rasterizer):
-    """The reference with one thing wrong about it: ``before`` or ``after`` it renders."""
+    """The reference with one mistake: ``before`` changes its scene, or ``after`` its output."""
 
     before: object = staticmethod(lambda gaussians, cameras, background: (gaussians, cameras, background))
     after: object = staticmethod(lambda output: output)
@@ -39,7 +39,7 @@ class Bent(Rasterizer):
 
 
 class _Bend(torch.autograd.Function):
-    """The identity, with a gradient that is not one."""
+    """The identity, with a wrong gradient."""
 
     @staticmethod
     def forward(ctx, tensor, bend):
@@ -89,7 +89,7 @@ def test_the_cuda_kernels_pass_in_the_emulator(emulator):
 # -------------------------------------------------------------------------- the scene
 
 
-def test_no_number_of_the_scene_lies_near_a_step():
+def test_no_number_of_the_scene_is_near_a_step():
     scene = make_scene()
     assert not undecided(scene.gaussians, scene.cameras, within=1e-4).any()
 
@@ -97,7 +97,7 @@ def test_no_number_of_the_scene_lies_near_a_step():
 @pytest.mark.parametrize(
     "name", ["BLUR", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN", "FRUSTUM_MARGIN", "NEAR"]
 )
-def test_every_constant_of_the_model_shows(name, monkeypatch):
+def test_a_change_of_any_constant_of_the_model_is_noticed(name, monkeypatch):
     honest = {name: getattr(reference, name)}
     moved = {"BLUR": 0.31, "ALPHA_MIN": 1 / 250, "ALPHA_MAX": 0.98, "TRANSMITTANCE_MIN": 2e-4}
     moved |= {"FRUSTUM_MARGIN": 0.1, "NEAR": 0.3}
@@ -126,7 +126,7 @@ def test_the_scene_has_gaussians_behind_beside_and_across_the_border():
     assert output.alpha.max() > 0.99
 
 
-def test_the_scene_is_the_same_whatever_torch_draws():
+def test_the_scene_is_independent_of_torchs_random_generator():
     before = make_scene()
     state = torch.get_rng_state()
     torch.rand(1)
@@ -136,7 +136,7 @@ def test_the_scene_is_the_same_whatever_torch_draws():
     assert torch.equal(torch.get_rng_state(), state)
 
 
-# -------------------------------------------------------------------------- what it notices
+# -------------------------------------------------------------------------- mistakes
 
 
 @pytest.mark.parametrize("field", FIELDS)
@@ -148,7 +148,7 @@ def test_a_gradient_that_is_a_thousandth_too_large_is_noticed(field):
 
 
 @pytest.mark.parametrize("bend", [lambda grad: grad * math.nan, lambda grad: grad / 0, torch.zeros_like])
-def test_a_gradient_that_is_none_is_noticed(bend):
+def test_a_gradient_that_is_zero_or_not_finite_is_noticed(bend):
     agreement = self_test(bent_gradient("opacity_logits", bend), CPU)
     assert not agreement.holds
     assert agreement.worst_gradient >= 1
@@ -169,7 +169,7 @@ def test_an_absgrad_that_is_wrong_or_missing_is_noticed(bend):
     assert max(agreement.gradients, key=agreement.gradients.get) == "absgrad"
 
 
-def test_one_gaussian_less_is_noticed():
+def test_a_missing_gaussian_is_noticed():
     def before(gaussians, cameras, background):
         logits = gaussians.opacity_logits.clone()
         logits[150] = -100.0
@@ -205,10 +205,10 @@ def test_bits_that_differ_from_run_to_run_are_noticed():
     agreement = self_test(Bent(after=after), CPU)
     assert agreement.holds
     assert not agreement.repeats
-    assert str(agreement).endswith("; other bits the second time")
+    assert str(agreement).endswith("; different bits the second time")
 
 
-def test_gradients_may_be_off_around_it():
+def test_it_works_while_gradients_are_off():
     with torch.no_grad():
         assert self_test(ReferenceRasterizer(), CPU).holds
 

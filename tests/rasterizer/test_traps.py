@@ -1,4 +1,4 @@
-"""The ways rasterizers are known to break, one by one: rules that every one of ours keeps."""
+"""Inputs that are known to break rasterizers, and the rule that every backend follows for each of them."""
 
 import math
 from dataclasses import replace
@@ -29,11 +29,11 @@ from cadam3d.rasterizer.reference import ReferenceRasterizer
 pytestmark = pytest.mark.usefixtures("garbage_in_new_memory")
 
 NAN, INF = math.nan, math.inf
-ABOVE_NEAR = torch.tensor(NEAR).nextafter(torch.tensor(1.0)).item()  # the least float32 that is farther
+ABOVE_NEAR = torch.tensor(NEAR).nextafter(torch.tensor(1.0)).item()  # the next float32
 
 
 def one_in_a_heap(**fields):
-    """Twenty Gaussians around (0, 0, 2) that ``facing_camera`` sees, number 7 changed."""
+    """Return twenty Gaussians around (0, 0, 2), in view of ``facing_camera``, with number 7 changed."""
     gaussians = make_gaussians(20, degree=1, spread=0.2)
     gaussians.means[:, 2] += 2.0
     for name, value in fields.items():
@@ -42,7 +42,7 @@ def one_in_a_heap(**fields):
 
 
 def render_finite(backend, gaussians, cameras):
-    """The output and the gradients; every number in them is one."""
+    """Return the output and the gradients, all of which must be finite."""
     output, grads = backend.differentiate(gaussians, cameras)
     for tensor in bits(output, grads):
         assert tensor.isfinite().all()
@@ -50,7 +50,7 @@ def render_finite(backend, gaussians, cameras):
 
 
 def assert_leaves_no_trace(backend, gaussians, row, cameras):
-    """``row`` is not seen and has nothing; without it the others have the same bits."""
+    """Check that ``row`` is not visible, gets no gradient, and does not change the bits of the others."""
     assert_is_traceless(backend, gaussians, row, cameras, *render_finite(backend, gaussians, cameras))
 
 
@@ -67,7 +67,7 @@ def assert_is_traceless(backend, gaussians, row, cameras, output, grads):
 
 
 def assert_is_drawn(backend, gaussians, row, cameras):
-    """``row`` is seen, among finite numbers; returns its gradients."""
+    """Check that ``row`` is visible and all numbers are finite; return its gradients."""
     output, grads = render_finite(backend, gaussians, cameras)
     assert output.visible[0, row]
     return {name: grads[name][row] for name in FIELDS}
@@ -92,7 +92,7 @@ def test_the_length_of_any_other_quaternion_does_not_matter(any_backend, length)
     assert_close("alpha", output.alpha, plain.alpha, 1e-5)
 
 
-@pytest.mark.parametrize("log_scale", [-60.0, -104.0, -1e3, -1e38])  # the last two are scales of exactly zero
+@pytest.mark.parametrize("log_scale", [-60.0, -104.0, -1e3, -1e38])  # the last two scales are exactly zero
 def test_a_zero_scale_is_a_dot_of_the_blurs_size(any_backend, log_scale):
     cameras = facing_camera(11, 13)
     grads = assert_is_drawn(any_backend, one_in_a_heap(log_scales=[log_scale] * 3), 7, cameras)
@@ -116,7 +116,7 @@ def test_a_huge_scale_at_depth_zero_or_behind_is_culled(any_backend, log_scale, 
 @pytest.mark.parametrize("log_scale", [[46.0] * 3, [46.0, -46.0, 0.0]])  # exp(46) = 1e20
 def test_a_scale_whose_square_leaves_float32_is_culled(any_backend, log_scale):
     gaussians = one_in_a_heap(means=[0.0, 0.0, 2.0], log_scales=log_scale)
-    if any_backend.dtype == torch.float64:  # there it is a number like any other
+    if any_backend.dtype == torch.float64:  # the square is finite
         assert_is_drawn(any_backend, gaussians, 7, facing_camera(11, 13))
     else:
         assert_leaves_no_trace(any_backend, gaussians, 7, facing_camera(11, 13))
@@ -131,7 +131,7 @@ def test_an_infinite_scale_is_culled_not_a_splat_of_any_size(any_backend, log_sc
 
 
 @pytest.mark.parametrize(("z", "is_seen"), [(NEAR, False), (ABOVE_NEAR, True), (0.0, False), (-1.0, False)])
-def test_on_the_near_plane_is_culled_and_the_next_number_is_not(any_backend, z, is_seen):
+def test_a_centre_on_the_near_plane_is_culled_and_one_just_behind_it_is_not(any_backend, z, is_seen):
     gaussians = one_in_a_heap(means=[0.0, 0.0, z], log_scales=[-8.0] * 3)
     if is_seen:
         assert_is_drawn(any_backend, gaussians, 7, facing_camera(11, 13))
@@ -156,14 +156,14 @@ def test_at_the_horizon_nothing_overflows(any_backend, z, is_seen):
         ("means", [0.0, -40.0, 2.0], [0.0, -0.1, 2.0]),
     ],
 )
-def test_what_is_too_faint_or_off_screen_is_culled(any_backend, field, culled, seen):
+def test_a_gaussian_that_is_too_faint_or_off_screen_is_culled(any_backend, field, culled, seen):
     assert_leaves_no_trace(any_backend, one_in_a_heap(**{field: culled}), 7, facing_camera(11, 13))
     assert_is_drawn(any_backend, one_in_a_heap(**{field: seen}), 7, facing_camera(11, 13))
 
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    # A colour of 1e38 is seen, and what it gives its neighbours exceeds float32 by right.
+    # A colour of 1e38 is visible, and the gradients of its neighbours rightly exceed float32.
     [(field, value) for field in FIELDS for value in POISON if (field, abs(value)) != ("sh", 1e38)],
 )
 def test_poison_never_spreads(backend, field, value):
@@ -183,11 +183,11 @@ def test_one_poisoned_number_is_enough_to_cull(any_backend, field):
     assert not any_backend.show(gaussians, cameras).visible.any()
 
 
-# -------------------------------------------------------------------------- splats that are too much
+# -------------------------------------------------------------------------- large, many and opaque splats
 
 
-def test_huge_splats_that_touch_more_tiles_than_one_thread_takes(backend):
-    # 100 tiles of 8x8 each: on a GPU the whole warp lists one of these, and sums its records.
+def test_huge_splats_that_touch_more_tiles_than_one_thread_handles(backend):
+    # Each touches 100 tiles of 8x8 pixels: on a GPU, a whole warp lists such a splat and sums its records.
     backend.agrees(make_gaussians(5, seed=16, log_scale=1.5, opacity=-1.0), make_cameras(1, 75, 80), most=0.8)
 
 
@@ -198,14 +198,14 @@ def test_many_huge_splats_stop_where_those_of_the_reference_do(backend):
     assert (output.alpha > 0.999).all()
 
 
-@pytest.mark.parametrize("logit", [5.0, 20.0, 40.0, 1e38])  # the last three are opacities of exactly one
-def test_a_saturated_alpha_teaches_colour_but_neither_opacity_nor_shape(any_backend, logit):
+@pytest.mark.parametrize("logit", [5.0, 20.0, 40.0, 1e38])  # the last three opacities are exactly one
+def test_a_saturated_alpha_has_a_gradient_for_colour_but_not_for_opacity_or_shape(any_backend, logit):
     output, grads = any_backend.differentiate(stack(logit), facing_camera(5, 6))
     assert_close("alpha", output.alpha, torch.full_like(output.alpha, 0.99), 1e-6)
     for name in ("log_scales", "quats", "opacity_logits", "means2d"):
         assert not grads[name].any(), name
     assert grads["sh"].any()
-    assert grads["means"][0, 2] != 0  # the depth of the pixel is its own
+    assert grads["means"][0, 2] != 0  # through the depth of the pixel
     assert any_backend.differentiate(stack(4.0), facing_camera(5, 6))[1]["opacity_logits"].any()
 
 
@@ -226,7 +226,7 @@ def test_forward_and_backward_stop_at_the_same_splat(any_backend):
         assert not grads[name][2:].any(), name
     for name in ("opacity_logits", "sh", "log_scales"):
         assert grads[name].view(4, -1)[:2].any(dim=1).all(), name
-    assert output.visible.all(), "being hidden is not being culled"
+    assert output.visible.all(), "hidden splats are not culled"
 
 
 # -------------------------------------------------------------------------- borders
@@ -250,14 +250,14 @@ def test_an_ellipse_reaches_a_pixel_across_the_border_of_a_tile_exactly_or_not_a
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 19), (8, 8), (9, 7), (16, 16), (17, 15), (33, 7)])
-def test_sizes_that_are_no_multiple_of_a_tile(backend, height, width):
+def test_image_sizes_that_are_not_multiples_of_a_tile(backend, height, width):
     gaussians = make_gaussians(60, seed=2, degree=1, log_scale=-1.0)
     backend.agrees(gaussians, make_cameras(3, height, width), most=0.3)
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 8192), (8192, 1)])
 def test_images_of_8192_pixels(backend, height, width):
-    # Centres near pixel 8000 are known to 1/2000 of a pixel in float32; the splats are wide enough for that.
+    # In float32, centres near pixel 8000 are exact to 1/2000 of a pixel; the splats are wide enough for that.
     gaussians, cameras = make_gaussians(15, seed=6, spread=1.0, log_scale=-2.0), facing_camera(height, width)
     cameras.intrinsics[:, 0, 0], cameras.intrinsics[:, 1, 1] = width / 2.0, height / 2.0
     gaussians.means[:, 2] += 3.0
@@ -271,7 +271,7 @@ def test_images_of_8192_pixels(backend, height, width):
 
 
 @pytest.mark.parametrize("n", [0, 40])
-def test_nothing_visible_gives_the_background_and_gradients_of_zero(any_backend, n):
+def test_an_empty_image_shows_the_background_and_has_zero_gradients(any_backend, n):
     gaussians, cameras = make_gaussians(n), make_cameras(2, 20, 30)
     gaussians.opacity_logits -= 50.0
     output, grads = any_backend.differentiate(gaussians, cameras)
@@ -285,9 +285,9 @@ def test_nothing_visible_gives_the_background_and_gradients_of_zero(any_backend,
         assert not grad.any()
 
 
-def test_one_view_that_sees_nothing_among_others(backend):
+def test_an_empty_view_among_others(backend):
     cameras = make_cameras(3, 20, 30)
-    cameras.world_to_camera[1, 2, 3] = -9.0  # everything is behind this one
+    cameras.world_to_camera[1, 2, 3] = -9.0  # everything is behind this camera
     output, grads = backend.agrees(make_gaussians(40), cameras)
     assert output.visible.any(dim=1).tolist() == [True, False, True]
     assert not grads["means2d"][1].any()
@@ -307,7 +307,7 @@ def test_a_loss_on_means2d_alone(backend):
     assert_close("gradient of means", got, want, 1e-5)
 
 
-# -------------------------------------------------------------------------- tensors as they come
+# -------------------------------------------------------------------------- kinds of tensors
 
 
 def test_tensors_that_are_not_contiguous(any_backend):
@@ -325,7 +325,7 @@ def test_tensors_that_are_not_contiguous(any_backend):
             intrinsics=change(cameras.intrinsics),
         )
         output = any_backend.render(leaves, views, change(background))
-        output.alpha.sum().backward()  # whose gradient is one number, expanded with stride 0
+        output.alpha.sum().backward()  # the gradient of alpha is one number, expanded with stride 0
         images = [getattr(output, name).detach() for name in IMAGES]
         return [
             *images,
@@ -339,7 +339,7 @@ def test_tensors_that_are_not_contiguous(any_backend):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
-def test_other_dtypes_come_and_go(backend, dtype):
+def test_other_dtypes_are_converted_in_and_out(backend, dtype):
     gaussians, cameras = make_gaussians(40).to(dtype), make_cameras(1, 20, 20)
     weights, background = (
         [w.to(dtype).float() for w in make_weights(1, 20, 20)],
@@ -354,14 +354,14 @@ def test_other_dtypes_come_and_go(backend, dtype):
         assert torch.equal(output.rgb.float(), same.rgb)
 
 
-def test_autocast_does_not_reach_inside(any_backend):
+def test_autocast_has_no_effect_inside(any_backend):
     gaussians, cameras = make_gaussians(30, degree=1), make_cameras(1, 20, 20)
     plain = bits(*any_backend.differentiate(gaussians, cameras))
     with torch.autocast(any_backend.device, dtype=torch.bfloat16):
         assert_same_bits(plain, bits(*any_backend.differentiate(gaussians, cameras)))
 
 
-def test_cameras_and_background_follow_the_gaussians(backend):
+def test_cameras_and_background_are_converted_to_the_dtype_of_the_gaussians(backend):
     gaussians, cameras = backend.put(make_gaussians(20)), make_cameras(2, 9, 9)
     wanted = backend.render(gaussians, cameras, backend.put(backgrounds(2)))
     output = backend.render(gaussians, cameras.to(torch.float64), backgrounds(2).double())
@@ -371,12 +371,12 @@ def test_cameras_and_background_follow_the_gaussians(backend):
         assert torch.equal(getattr(output, name), getattr(wanted, name))
 
 
-def test_shapes_that_would_make_kernels_read_foreign_memory_are_refused(backend):
+def test_shapes_that_would_make_kernels_read_outside_their_tensors_are_refused(backend):
     gaussians, cameras, background = backend.put(make_gaussians(4)), make_cameras(2, 9, 9), backgrounds(2)
-    with pytest.raises(ValueError, match="wanted"):
+    with pytest.raises(ValueError, match="expected"):
         backend.render(gaussians, cameras.index(slice(0, 1)), background)
-    for coefficients in (2, 5, 25):  # of no degree, or of one too high
+    for coefficients in (2, 5, 25):  # of no degree, or of a degree that is too high
         torn = Gaussians(**gaussians.tensors() | {"sh": torch.zeros(4, coefficients, 3)})
-        with pytest.raises(ValueError, match="wanted"):
+        with pytest.raises(ValueError, match="expected"):
             backend.render(torn, cameras, background)
     assert backend.render(gaussians, cameras, background).visible.any()

@@ -1,4 +1,4 @@
-"""Sweep folders made by hand: jobs with every file that figures are made of, and numbers that are known."""
+"""Sweep folders made by hand: the layout of a real sweep, every file that figures need, known numbers."""
 
 import json
 import math
@@ -11,75 +11,123 @@ import numpy as np
 import pytest
 import yaml
 
-from cadam3d.report.rows import Row, read
+from cadam3d.core.chart import Chart, Curve, Level
+from cadam3d.io import run_folder
+from cadam3d.report.declarations import write_declarations
+from cadam3d.report.results import JobResult, read
+from cadam3d.sweep.folder import Plan, PlannedJob, write_plan
 
 SIZE = 12  # pixels of a picture
 STEPS = (40, 80, 120)
 
 
+# What a densifier with a score declares; the names are made up, because the reports know none.
+SHAKE = Chart(
+    title="Shaking of the Gaussians",
+    caption="How much each Gaussian shakes",
+    curves=(Curve(key="shake_median", label="median"),),
+    score="shake",
+    levels=(Level(label="tau_shake", value=0.1), Level(label="pure noise", value=0.229)),
+)
+
+
 class Jobs:
-    """Writes job folders as a sweep leaves them."""
+    """Writes the folder of a sweep: its plan, and a folder per job."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.number = 0
+        self.figures: list[str] | None = None
+        self.line: list[str] = []
+        self.planned: list[PlannedJob] = []
+
+    def plan(self, arm: str, overrides: Sequence[str], name: str = "") -> Path:
+        """Add a job to the plan and return its folder, which does not exist yet."""
+        name = name or f"{len(self.planned)}_{overrides[0].partition('=')[2]}"
+        self.planned.append(PlannedJob(arm=arm, folder=name, overrides=list(overrides), swept={}))
+        self.write_plan()
+        return self.folder / name
+
+    def write_plan(self) -> None:
+        """Write ``jobs.json`` anew."""
+        plan = Plan(
+            cwd=str(self.folder),
+            flags=[],
+            threads=None,
+            jobs=self.planned,
+            figures=self.figures,
+            line=self.line,
+        )
+        write_plan(self.folder, plan)
 
     def add(
-        self, arm: str, *more: str, n: float, psnr: float | None, outcome: str = "finished", **summary: Any
+        self,
+        densifier: str,
+        *more: str,
+        n: float,
+        psnr: float | None,
+        outcome: str = "finished",
+        arm: str = "",
+        **summary: Any,
     ) -> Path:
-        """One job of ``arm``; ``more`` are the other overrides of its line."""
-        overrides = [f"densifier={arm}", *more]
-        folder = self.folder / f"{self.number}_{arm}"
-        self.number += 1
-        (folder / ".hydra").mkdir(parents=True)
-        (folder / ".hydra/overrides.yaml").write_text(yaml.safe_dump(overrides))
-        told = dict(line.split("=") for line in overrides)
+        """Add one job that has run; ``more`` are the other overrides of its line."""
+        overrides = [f"densifier={densifier}", *more]
+        folder = self.plan(arm, overrides)
+        folder.mkdir(parents=True)
+        given = dict(line.split("=", 1) for line in overrides)
         facts = {
-            **{"prompt": told.get("prompt", "a cube"), "seed": int(told.get("seed", 0)), "outcome": outcome},
-            **{"num_gaussians": n, "num_gaussians_initial": 300, "psnr": psnr, "ssim": 0.9, "steps": 120},
-            **{
-                "asset_bytes": 68 * n,
-                "seconds": 1.5,
-                "densifier": arm,
-                "guidance": told.get("guidance", "sds"),
-            },
+            "prompt": given.get("prompt", "a cube"),
+            "seed": int(given.get("seed", 0)),
+            "outcome": outcome,
+            "num_gaussians": n,
+            "num_gaussians_initial": 300,
+            "psnr": psnr,
+            "ssim": 0.9,
+            "steps": 120,
+            "asset_bytes": 68 * n,
+            "seconds": 1.5,
+            "densifier": densifier,
+            "guidance": given.get("guidance", "sds"),
+            "warnings": [],
             **summary,
         }
-        (folder / "summary.json").write_text(json.dumps(facts))
+        (folder / run_folder.SUMMARY).write_text(json.dumps(facts))
         return folder
 
-    def files(self, folder: Path, n: float, snr: float = 0.2) -> None:
-        """What figures show beyond the summary: counts over time, histograms, pictures, settings."""
-        settings = {"tau_SNR": 0.1, "beta1": 0.9, "beta2": 0.999}
-        preview = {"exporter": {"preview": {"size": SIZE}}, "densifier": settings}
-        (folder / "config.yaml").write_text(yaml.safe_dump(preview))
+    def files(self, folder: Path, n: float, shake: float = 0.2) -> None:
+        """Write what figures show beyond the summary: counts over time, histograms, pictures, charts.
+
+        Only variants of CAdam have the score ``shake``.
+        """
+        settings = {"exporter": {"preview": {"size": SIZE}}}
+        (folder / run_folder.CONFIG).write_text(yaml.safe_dump(settings))
+        has_score = "cadam" in folder.name
+        write_declarations(folder, [SHAKE] if has_score else [])
         lines, before = [{"kind": "step", "step": 1, "num_gaussians": 300}], 300.0
         histograms = []
         for i, step in enumerate(STEPS, start=1):
             after = round(300 * (n / 300) ** (i / len(STEPS)))
             lines.append({"kind": "refine", "step": step, "before": before, "after": after})
             before = after
-            counts = [20, 60, 20]
-            first = math.floor(math.log10(snr) * 10) - 1
             histograms.append(
                 {
-                    **{
-                        "step": step,
-                        "score": "snr" if "cadam" in folder.name else "norm",
-                        "bins_per_decade": 10,
-                        "first": first,
-                    },
-                    **{"counts": counts, "selected": [0, 5, 5], "without_log": 0},
+                    "step": step,
+                    "score": "shake" if has_score else "norm",
+                    "bins_per_decade": 10,
+                    "first": math.floor(math.log10(shake) * 10) - 1,
+                    "counts": [20, 60, 20],
+                    "selected": [0, 5, 5],
+                    "without_log": 0,
                 }
             )
-        write_lines(folder / "metrics.jsonl", lines)
-        (folder / "candidates").mkdir()
-        write_lines(folder / "candidates/histograms.jsonl", histograms)
+        write_lines(folder / run_folder.METRICS, lines)
+        (folder / run_folder.CANDIDATES).mkdir()
+        write_lines(folder / run_folder.HISTOGRAMS, histograms)
         rng = np.random.default_rng(int(n))
         for step in STEPS:
             noise = rng.integers(0, 255, (SIZE, 2 * SIZE, 3), dtype=np.uint8)
-            imageio.imwrite(folder / f"candidates/step_{step:06d}.png", noise)
-        imageio.imwrite(folder / "preview.png", rng.integers(0, 255, (2 * SIZE, 3 * SIZE, 3), dtype=np.uint8))
+            imageio.imwrite(folder / run_folder.CANDIDATES / f"step_{step:06d}.png", noise)
+        preview = rng.integers(0, 255, (2 * SIZE, 3 * SIZE, 3), dtype=np.uint8)
+        imageio.imwrite(folder / run_folder.PREVIEW, preview)
 
 
 def write_lines(path: Path, lines: Sequence[dict]) -> None:
@@ -108,11 +156,12 @@ def bench(tmp_path_factory) -> Path:
                     for tau_snr, share in ((0.1, 1.0), (0.3, 0.7)):
                         keys = (f"densifier.tau_Q={tau_q}", f"densifier.tau_SNR={tau_snr}")
                         settings.append(("cadam", keys, n * share, 4.5))
-                for arm, keys, n, best in settings:
+                for densifier, keys, n, best in settings:
                     count = round(n * (1 + 0.1 * rng.standard_normal()))
                     gain = best * (1 - 300 / max(count, 300)) * (1 - loss / 12) + 0.05 * rng.standard_normal()
-                    folder = jobs.add(arm, *keys, *where, n=count, psnr=zero + gain)
+                    folder = jobs.add(densifier, *keys, *where, n=count, psnr=zero + gain)
                     jobs.files(folder, count)
+    jobs.line = ["grid=pareto", "prompt=a <b>cube</b>"]
     jobs.add(
         "baseline", "prompt=a cube", "seed=2", "noise=strong", n=40000, psnr=18.0, outcome="max_gaussians"
     )
@@ -123,5 +172,5 @@ def bench(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def bench_rows(bench) -> list[Row]:
+def bench_results(bench) -> list[JobResult]:
     return read(bench)

@@ -1,4 +1,4 @@
-"""What is claimed of hand-made rows: comparisons, frontiers, and one against the other."""
+"""Claims about results made by hand: comparisons, frontiers, and one against the other."""
 
 import math
 
@@ -14,17 +14,17 @@ from cadam3d.report.claims import (
     has_no_growth,
     over_seeds,
     settings_of,
-    stand,
-    standard,
+    standard_setting,
+    standing_of,
     standings,
 )
-from cadam3d.report.rows import Cell, Setting, at_noise, read
+from cadam3d.report.results import ArmSetting, Cell, at_noise, read
 
-OURS, THEIRS = Setting("cadam"), Setting("baseline")
+OURS, THEIRS = ArmSetting("cadam"), ArmSetting("baseline")
 
 
 def pair(jobs, ours, theirs, **cell):
-    """One cell with both arms; ``ours`` and ``theirs`` are count and PSNR."""
+    """Add one cell with both arms; ``ours`` and ``theirs`` are count and PSNR."""
     line = [f"{key}={value}" for key, value in cell.items()]
     for arm, (n, psnr) in (("cadam", ours), ("baseline", theirs)):
         jobs.add(arm, *line, n=n, psnr=psnr)
@@ -56,7 +56,7 @@ def test_a_cell_without_its_partner_is_counted_not_compared(jobs):
     assert (found.cells, found.unpaired, found.only_ours, found.only_theirs) == (1, 1, 1, 0)
 
 
-def test_an_early_end_is_compared_and_told(jobs):
+def test_an_early_end_is_compared_and_counted(jobs):
     jobs.add("cadam", n=100, psnr=20.0)
     jobs.add("baseline", n=1000, psnr=19.0, outcome="max_gaussians")
     found = compare(read(jobs.folder), OURS, THEIRS)
@@ -64,7 +64,7 @@ def test_an_early_end_is_compared_and_told(jobs):
     assert (found.early, found.theirs_early) == (0, 1)
 
 
-def test_nothing_shared_nothing_compared(jobs):
+def test_without_a_common_cell_nothing_is_compared(jobs):
     jobs.add("cadam", "seed=0", n=100, psnr=20.0)
     jobs.add("baseline", "seed=1", n=100, psnr=20.0)
     assert compare(read(jobs.folder), OURS, THEIRS) is None
@@ -80,7 +80,7 @@ def test_quartiles_of_one_value_are_that_value():
     assert Spread.of([3.0]) == Spread(3.0, 3.0, 3.0)
 
 
-# Hulls: the best that an arm can do.
+# Hulls: the best that an arm can reach.
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -142,12 +142,12 @@ def baseline_frontier(jobs, settings, **where):
         jobs.add("baseline", f"densifier.tau_pos={tau}", *line, n=n, psnr=psnr)
 
 
-def test_a_setting_stands_against_the_best_of_the_other_at_its_count(jobs):
+def test_a_setting_is_compared_with_the_best_of_the_other_arm_at_its_count(jobs):
     for prompt, shift in zip("abcdef", (0.0, 5.0, -5.0, 1.0, 2.0, 3.0), strict=True):
         where = {"prompt": prompt, "seed": 0}
         baseline_frontier(jobs, {0.001: (100, 10.0 + shift), 0.0002: (10000, 20.0 + shift)}, **where)
         jobs.add("cadam", f"prompt={prompt}", "seed=0", n=1000, psnr=17.5 + shift)
-    found = stand(read(jobs.folder), OURS, "baseline")
+    found = standing_of(read(jobs.folder), OURS, "baseline")
     assert found is not None
     assert found.psnr is not None
     assert found.psnr.median == pytest.approx(2.5)
@@ -156,11 +156,11 @@ def test_a_setting_stands_against_the_best_of_the_other_at_its_count(jobs):
     assert found.count_ratio == pytest.approx(10**0.5)
 
 
-def test_what_is_outside_the_range_is_said_not_guessed(jobs):
+def test_cells_outside_the_range_are_counted_not_extrapolated(jobs):
     for seed, n in enumerate((50, 1000, 50000)):
         baseline_frontier(jobs, {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, seed=seed)
         jobs.add("cadam", f"seed={seed}", n=n, psnr=25.0)
-    found = stand(read(jobs.folder), OURS, "baseline")
+    found = standing_of(read(jobs.folder), OURS, "baseline")
     assert found is not None
     assert found.psnr is not None
     assert (found.psnr.cells, found.fewer, found.more) == (1, 1, 1)
@@ -168,10 +168,10 @@ def test_what_is_outside_the_range_is_said_not_guessed(jobs):
     assert found.count_ratio == math.inf
 
 
-def test_no_setting_stands_above_its_own_frontier(bench_rows):
-    rows = at_noise(bench_rows, "medium")
+def test_no_setting_is_above_the_frontier_of_its_arm(bench_results):
+    results = at_noise(bench_results, "medium")
     for arm in ("baseline", "cadam"):
-        for found in standings(rows, arm, arm):
+        for found in standings(results, arm, arm):
             assert found.psnr is not None
             assert found.psnr.median <= 1e-9
 
@@ -180,7 +180,7 @@ def test_a_ratio_of_counts_is_free_of_their_scale(jobs):
     for seed, scale in enumerate((1, 7)):
         baseline_frontier(jobs, {0.001: (100 * scale, 10.0), 0.0002: (10000 * scale, 20.0)}, seed=seed)
         jobs.add("cadam", f"seed={seed}", n=1000 * scale, psnr=16.0)
-    found = stand(read(jobs.folder), OURS, "baseline")
+    found = standing_of(read(jobs.folder), OURS, "baseline")
     assert found is not None
     assert found.count_ratio == pytest.approx(10**0.2)
     assert found.psnr is not None
@@ -202,17 +202,17 @@ def test_qualities_out_of_reach_count_on_both_sides(jobs, qualities, ratio):
     for seed, psnr in enumerate(qualities):
         baseline_frontier(jobs, {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, seed=seed)
         jobs.add("cadam", f"seed={seed}", n=1000, psnr=psnr)
-    found = stand(read(jobs.folder), OURS, "baseline")
+    found = standing_of(read(jobs.folder), OURS, "baseline")
     assert found is not None
     assert found.count_ratio == pytest.approx(ratio)
     assert (found.always, found.never) == (qualities.count(9.0), qualities.count(25.0))
 
 
-def test_the_luck_of_seeds_is_that_of_the_difference(jobs):
+def test_the_spread_over_seeds_is_that_of_the_difference(jobs):
     for seed, psnr in enumerate((16.0, 18.0)):
         baseline_frontier(jobs, {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, seed=seed)
         jobs.add("cadam", f"seed={seed}", n=1000, psnr=psnr)
-    found = stand(read(jobs.folder), OURS, "baseline")
+    found = standing_of(read(jobs.folder), OURS, "baseline")
     assert found is not None
     assert found.psnr_over_seeds == pytest.approx(math.sqrt(2))
 
@@ -222,12 +222,12 @@ def test_cells_without_a_frontier_and_frontiers_without_the_setting_are_counted(
         baseline_frontier(jobs, {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, seed=seed)
     for seed in (1, 2, 3):
         jobs.add("cadam", f"seed={seed}", n=1000, psnr=15.0)
-    found = stand(read(jobs.folder), OURS, "baseline")
+    found = standing_of(read(jobs.folder), OURS, "baseline")
     assert found is not None
     assert found.unpaired == 3
 
 
-# How sure.
+# Uncertainty.
 
 
 def test_a_constant_has_an_interval_of_no_width():
@@ -236,15 +236,15 @@ def test_a_constant_has_an_interval_of_no_width():
     assert found.p_value == pytest.approx(2 * 0.5**6)
 
 
-def test_seeds_are_no_prompts():
-    """Many seeds of two prompts witness for two prompts: no interval, and a sign test of two."""
+def test_seeds_do_not_count_as_prompts():
+    """Many seeds of two prompts are two prompts: no interval, and a sign test with two votes."""
     found = Estimate.of({cell(prompt, seed): 1.0 for prompt in "ab" for seed in range(50)})
     assert found.low is found.high is None
     assert found.p_value == pytest.approx(0.5)
 
 
-def test_noise_levels_and_objectives_are_no_prompts():
-    """They share the object: three levels of two prompts witness for two."""
+def test_noise_levels_and_objectives_do_not_count_as_prompts():
+    """They share the object: three levels of two prompts are two votes."""
     axes = [(noise, guidance) for noise in ("weak", "medium", "strong") for guidance in ("ism", "sds")]
     values = {
         Cell((("guidance", guidance), ("noise", noise), ("prompt", prompt), ("seed", "0"))): 1.0
@@ -256,7 +256,7 @@ def test_noise_levels_and_objectives_are_no_prompts():
     assert found.p_value == pytest.approx(0.5)
 
 
-def test_levels_are_no_seeds():
+def test_noise_levels_do_not_count_as_seeds():
     values = {
         Cell((("noise", noise), ("prompt", "a"), ("seed", str(seed)))): level + seed
         for noise, level in (("weak", 0.0), ("strong", 100.0))
@@ -266,7 +266,7 @@ def test_levels_are_no_seeds():
 
 
 @pytest.mark.parametrize("prompts", [3, 4, 5])
-def test_few_prompts_have_no_interval(prompts):
+def test_with_few_prompts_there_is_no_interval(prompts):
     found = Estimate.of({cell(str(prompt), 0): 1.0 + prompt for prompt in range(prompts)})
     assert found.low is found.high is None
     assert not found.is_certain
@@ -276,7 +276,7 @@ def test_few_prompts_have_no_interval(prompts):
     ("prompts", "seeds", "least"), [(6, 1, 0.91), (6, 3, 0.87), (12, 1, 0.92), (12, 3, 0.9)]
 )
 def test_an_interval_covers_the_truth_as_often_as_the_documentation_says(prompts, seeds, least):
-    """The truth is 0; half a standard deviation of luck beside that of the prompts."""
+    """The truth is 0; seeds vary half as much as prompts."""
     rng = np.random.default_rng(0)
     hits = mistakes = 0
     for _ in range(400):
@@ -294,7 +294,7 @@ def test_an_interval_covers_the_truth_as_often_as_the_documentation_says(prompts
     assert mistakes <= 0.05 * 400
 
 
-def test_certain_is_what_interval_and_sign_test_agree_on():
+def test_a_difference_is_certain_if_interval_and_sign_test_agree():
     far = {cell(prompt, 0): 1.0 for prompt in "abcdefgh"}
     assert Estimate.of(far).is_certain
     one_against = Estimate.of({**far, cell("h", 0): -1.0})  # seven against one: p = 0.07
@@ -303,7 +303,7 @@ def test_certain_is_what_interval_and_sign_test_agree_on():
     assert not Estimate.of(dict.fromkeys(far, 0.0)).is_certain
 
 
-def test_same_rows_same_interval():
+def test_the_same_results_give_the_same_interval():
     values = {cell(prompt, seed): float(ord(prompt) * seed % 7) for prompt in "abcdef" for seed in range(3)}
     assert Estimate.of(values) == Estimate.of(dict(reversed(values.items())))
 
@@ -311,18 +311,18 @@ def test_same_rows_same_interval():
 # Frontiers over cells.
 
 
-def test_gains_are_counted_from_the_same_cell_without_growth(jobs):
+def test_gains_are_measured_from_the_same_cell_without_growth(jobs):
     for prompt, zero in (("a cube", 10.0), ("a torus", 30.0)):
         jobs.add("none", f"prompt={prompt}", n=100, psnr=zero)
         jobs.add("cadam", f"prompt={prompt}", n=200, psnr=zero + 2.0)
-    rows = read(jobs.folder)
-    assert has_no_growth(rows)
-    point = frontier(rows, "cadam")[0]
+    results = read(jobs.folder)
+    assert has_no_growth(results)
+    point = frontier(results, "cadam")[0]
     assert point.gain == Spread(2.0, 2.0, 2.0)
     assert (point.count.median, point.cells) == (200, 2)
 
 
-def test_without_a_job_without_growth_it_is_plain_psnr(jobs):
+def test_if_no_job_is_without_growth_the_gain_is_plain_psnr(jobs):
     jobs.add("cadam", n=200, psnr=12.0)
     assert frontier(read(jobs.folder), "cadam")[0].gain.median == 12.0
 
@@ -335,22 +335,22 @@ def test_a_cell_that_lacks_its_job_without_growth_is_left_out(jobs):
     assert (point.cells, point.gain.median) == (1, 2.0)
 
 
-def test_gains_of_one_level_can_be_counted_from_another(jobs):
-    """So that the curve without noise can be drawn where there is noise."""
+def test_gains_of_one_level_can_be_measured_from_another(jobs):
+    """This puts the curve without noise into the panels with noise."""
     jobs.add("none", "noise=strong", n=100, psnr=10.0)
     jobs.add("none", "noise=none", n=100, psnr=15.0)
     jobs.add("cadam", "noise=none", n=200, psnr=18.0)
-    rows = read(jobs.folder)
-    clean, noisy = at_noise(rows, "none"), at_noise(rows, "strong")
+    results = read(jobs.folder)
+    clean, noisy = at_noise(results, "none"), at_noise(results, "strong")
     assert frontier(clean, "cadam")[0].gain.median == pytest.approx(3.0)
-    assert frontier(clean, "cadam", zero=noisy)[0].gain.median == pytest.approx(8.0)
+    assert frontier(clean, "cadam", reference=noisy)[0].gain.median == pytest.approx(8.0)
 
 
 def test_the_standard_setting_is_the_shipped_one_or_the_only_one(jobs):
     jobs.add("baseline", "densifier.tau_pos=0.001", n=100, psnr=20.0)
-    assert standard(read(jobs.folder), "baseline") == Setting("baseline")
+    assert standard_setting(read(jobs.folder), "baseline") == ArmSetting("baseline")
     jobs.add("baseline", "densifier.tau_pos=0.004", n=100, psnr=20.0)
-    assert standard(read(jobs.folder), "baseline") is None
+    assert standard_setting(read(jobs.folder), "baseline") is None
     jobs.add("baseline", "densifier.tau_pos=0.0002", n=100, psnr=20.0)
-    assert standard(read(jobs.folder), "baseline") == Setting("baseline", (("tau_pos", 0.0002),))
+    assert standard_setting(read(jobs.folder), "baseline") == ArmSetting("baseline", (("tau_pos", 0.0002),))
     assert len(settings_of(read(jobs.folder), "baseline")) == 3

@@ -1,4 +1,4 @@
-"""Figures show the rows they are given, and nothing where there is nothing."""
+"""Figures show the results they are given, and there is none without data."""
 
 import math
 import re
@@ -9,9 +9,10 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from cadam3d.report import figures, pictures
-from cadam3d.report.rows import at_noise, read
-from cadam3d.report.style import DARK, KNOWN, css, inline, looks, spread_labels, styled, write_figure
-from cadam3d.report.sweep import FIGURES
+from cadam3d.report.palette import ARMS, DARK, css
+from cadam3d.report.results import read
+from cadam3d.report.style import KNOWN, inline, looks, spread_labels, styled, write_figure
+from cadam3d.report.sweep_page import KINDS
 
 
 def texts(figure) -> str:
@@ -20,32 +21,32 @@ def texts(figure) -> str:
     )
 
 
-def draw(name, rows):
+def draw(name, results):
     with styled():
-        return FIGURES[name][0](rows)
+        return KINDS[name].draw(results)
 
 
-@pytest.mark.parametrize("name", FIGURES)
-def test_no_jobs_no_figure(name):
+@pytest.mark.parametrize("name", KINDS)
+def test_without_jobs_there_is_no_figure(name):
     assert draw(name, []) is None
 
 
-@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("name", KINDS)
 def test_jobs_that_failed_before_they_wrote_anything_make_no_figure(name, jobs):
     jobs.add("cadam", n=0, psnr=None, outcome="failed")
     assert draw(name, read(jobs.folder)) is None
 
 
-@pytest.mark.parametrize("name", FIGURES)
-def test_jobs_without_any_file_but_the_summary_are_no_trouble(name, jobs):
+@pytest.mark.parametrize("name", KINDS)
+def test_jobs_with_nothing_but_a_summary_raise_no_error(name, jobs):
     for arm in ("cadam", "baseline"):
         for guidance in ("sds", "ism"):
             jobs.add(arm, f"guidance={guidance}", n=100, psnr=20.0)
     draw(name, read(jobs.folder))
 
 
-def test_a_frontier_has_a_panel_per_noise_level_and_names_thresholds(bench_rows):
-    figure = draw("frontier", bench_rows)
+def test_a_frontier_has_a_panel_per_noise_level_and_names_thresholds(bench_results):
+    figure = draw("frontier", bench_results)
     assert [axes.get_title(loc="left") for axes in figure.axes] == [
         "no noise",
         "medium noise",
@@ -91,25 +92,6 @@ def test_without_ssim_there_is_no_figure_of_it(jobs):
     assert draw("frontier_ssim", read(jobs.folder)) is None
 
 
-@pytest.mark.parametrize(("levels", "shape"), [(1, (3, 3)), (2, (7, 2)), (4, (7, 4))])
-def test_every_arm_with_an_snr_is_shown(jobs, levels, shape):
-    arms = ["cadam", *(f"cadam_{letter}" for letter in "abcdef")]
-    noises = ["none", "weak", "medium", "strong"][-levels:]
-    for i, arm in enumerate(arms):
-        for noise in noises:
-            jobs.files(jobs.add(arm, f"noise={noise}", n=500, psnr=20.0), 500, snr=10.0**-i)
-    figure = draw("snr", read(jobs.folder))
-    panels = [axes for axes in figure.axes if axes.get_visible()]
-    assert len(panels) == len(arms) * levels
-    assert figure.axes[0].get_gridspec().get_geometry() == shape
-    for arm in arms:
-        assert f"{arm}, strong noise" in texts(figure)
-    low, high = panels[0].get_ylim()
-    assert low < 1e-6  # whatever arm was drawn last
-    assert high > 1
-    assert sum(axes.get_xlabel() == "step" for axes in panels) == shape[1]
-
-
 def test_a_setting_that_lacks_cells_is_hollow_and_an_early_end_has_a_dagger(jobs):
     for seed in (0, 1):
         jobs.add("baseline", "densifier.tau_pos=0.0002", f"seed={seed}", n=1000, psnr=20.0)
@@ -139,55 +121,31 @@ def test_a_job_that_ended_early_keeps_its_count():
     assert figures.over_time([[(0, 100), (10, 500)], [(0, 100), (20, 100)]])[2].tolist() == [100, 300, 300]
 
 
-def test_shares_of_an_snr_map_add_to_one_at_every_step(bench_rows):
-    rows = [row for row in at_noise(bench_rows, "medium") if row.arm == "cadam"]
-    heat = figures.SnrMap(rows)
-    assert heat.steps == [40, 80, 120]
-    assert np.allclose(heat.shares.sum(axis=0), 1)
-    assert heat.tau == 0.1
-    assert heat.floor == pytest.approx(0.2294, abs=1e-4)
-
-
-def test_the_noise_floor_is_what_white_noise_leaves():
-    rng = np.random.default_rng(0)
-    m, v = np.zeros((4000, 3)), np.zeros((4000, 3))
-    for _ in range(3000):  # until the second moment has forgotten that it began at zero
-        gradient = rng.standard_normal((4000, 3))
-        m, v = 0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient**2
-    snr = np.linalg.norm(m, axis=1) / np.sqrt(v.sum(axis=1) / (1 - 0.999**3000))
-    assert np.sqrt((snr**2).mean()) == pytest.approx(figures.noise_floor(0.9, 0.999), rel=0.02)
-
-
-def test_a_short_second_moment_has_no_such_floor():
-    assert figures.noise_floor(0.9, 0.81) is None
-    assert figures.noise_floor(None, 0.999) is None
-
-
-def test_the_arm_with_two_thresholds_is_found(bench_rows):
-    assert figures.arm_of_two_thresholds(bench_rows) == "cadam"
-    figure = draw("thresholds", bench_rows)
+def test_the_arm_with_two_thresholds_is_found(bench_results):
+    assert figures.arm_of_two_thresholds(bench_results) == "cadam"
+    figure = draw("thresholds", bench_results)
     assert len(figure.axes) == 6
     assert figure.axes[0].get_xlabel() == "tau_Q"
 
 
-def test_masks_show_arms_by_steps(bench_rows):
-    figure = draw("masks", bench_rows)
+def test_masks_show_arms_by_steps(bench_results):
+    figure = draw("masks", bench_results)
     assert len(figure.axes) == 9
     assert "10 of 100" in texts(figure)
     assert "medium noise" in texts(figure)
 
 
-def test_a_mask_is_the_right_half_of_a_pair(bench_rows):
+def test_a_mask_is_the_right_half_of_a_pair(bench_results):
     pair = np.arange(2 * 4 * 4 * 3).reshape(4, 8, 3)
     assert (pictures.mask_of(pair) == pair[:, 4:]).all()
 
 
-def test_pictures_of_a_preview_are_cut_apart(bench_rows):
-    row = next(row for row in bench_rows if row.arm == "cadam")
-    assert [picture.shape for picture in pictures.views(row)] == [(12, 12, 3)] * 3
+def test_pictures_of_a_preview_are_cut_apart(bench_results):
+    result = next(result for result in bench_results if result.arm == "cadam")
+    assert [picture.shape for picture in pictures.views(result)] == [(12, 12, 3)] * 3
 
 
-def test_regimes_are_shown_in_the_cell_that_has_them_all(jobs):
+def test_regimes_are_shown_in_a_cell_that_has_all_of_them(jobs):
     for seed, settings in ((0, {0.9: 500}), (1, {0.95: 400, 0.9: 500, 0.7: 900})):
         for tau, n in settings.items():
             keys = (f"densifier.tau_Q={tau}", f"densifier.tau_SNR={0.1 if tau == 0.9 else 0.3}")
@@ -198,14 +156,14 @@ def test_regimes_are_shown_in_the_cell_that_has_them_all(jobs):
     assert "standard: tau_Q 0.9" in said
 
 
-def test_an_ablation_tells_count_quality_and_outcome(bench_rows):
-    said = texts(draw("ablation", bench_rows))
+def test_an_ablation_shows_count_quality_and_outcome(bench_results):
+    said = texts(draw("ablation", bench_results))
     assert said.count("Gaussians\n") == 3
     assert "finished" in said
 
 
-def test_objectives_need_two_of_them(bench_rows, jobs):
-    assert draw("objectives", bench_rows) is None
+def test_objectives_need_two_of_them(bench_results, jobs):
+    assert draw("objectives", bench_results) is None
     for arm in ("baseline", "cadam"):
         for guidance in ("sds", "vfds"):
             jobs.files(jobs.add(arm, f"guidance={guidance}", n=500, psnr=21.0), 500)
@@ -225,11 +183,11 @@ def test_a_dozen_unknown_arms_look_different_from_one_another_and_from_the_known
     arms = [*KNOWN, *(f"mine_{i}" for i in range(12))]
     found = looks(iter(arms))
     assert len({(look.color, look.marker) for look in found.values()}) == len(arms)
-    assert {look.color for look in found.values()} <= set(DARK)
-    assert len(set(DARK.values())) == len(DARK)
+    assert {look.color for look in found.values()} <= set(ARMS)
+    assert len(set(ARMS.values())) == len(ARMS)
 
 
-def test_the_arms_of_the_grids_that_are_compared_look_the_same_in_all_sweeps():
+def test_common_arms_look_the_same_in_all_sweeps():
     for arm in ("none", "baseline", "cadam", "cadam_annealed", "cadam_selective", "random"):
         assert looks([arm])[arm] == looks([arm, "aaa"])[arm]
 
@@ -253,11 +211,11 @@ def test_labels_keep_their_distance_and_their_order():
     assert sum(moved.values()) == pytest.approx(5.1)
 
 
-def test_written_figures_keep_their_text_and_leave_colours_to_the_page(tmp_path, bench_rows):
-    rows = bench_rows
+def test_written_figures_keep_their_text_and_leave_colours_to_the_page(tmp_path, bench_results):
+    results = bench_results
     with styled():
-        svg = write_figure(draw("growth", rows), tmp_path, "growth")
-        again = write_figure(draw("growth", rows), tmp_path, "growth")
+        svg = write_figure(draw("growth", results), tmp_path, "growth")
+        again = write_figure(draw("growth", results), tmp_path, "growth")
     assert svg == again
     assert (tmp_path / "growth.png").stat().st_size > 1000
     assert re.search(r"<text[^>]*>\s*cadam\s*</text>", svg)
@@ -266,13 +224,13 @@ def test_written_figures_keep_their_text_and_leave_colours_to_the_page(tmp_path,
     assert "<?xml" not in page
     for color in DARK:
         assert color not in re.sub(r"var\([^)]*\)", "", page)
-    named = set(re.findall(r"var\(--(arm-\w+)", page))
-    assert named <= set(re.findall(r"--(arm-\w+):", css()))
-    assert named
+    named = set(re.findall(r"var\(--([\w-]+)", page))
+    assert {"arm-0072b2", "ink", "soft"} <= named
+    assert named <= set(re.findall(r"--([\w-]+):", css()))
 
 
-def test_numbers_on_a_log_axis_are_plain(bench_rows):
-    figure = draw("growth", bench_rows)
+def test_numbers_on_a_log_axis_are_plain(bench_results):
+    figure = draw("growth", bench_results)
     labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
     assert "1k" in labels
     assert not any("10^" in label for label in labels)

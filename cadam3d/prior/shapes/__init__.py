@@ -1,4 +1,4 @@
-"""prior=shapes: an exact diffusion model of a procedural world."""
+"""prior=shapes: an exact diffusion model of a small procedural world."""
 
 from cadam3d.prior.shapes.grammar import known_words
 from cadam3d.prior.shapes.objects import known_objects, known_primitives

@@ -1,4 +1,4 @@
-"""From a prompt to a sentence: noun phrases joined by relations, read from the left.
+"""Parser of prompts: noun phrases joined by relations, read from left to right.
 
 sentence = phrase | phrase relation sentence | phrase "between" phrase "and" sentence
 relation = "on" | "under" | "above" | "next to" | "in front of" | "behind" | "and", which means next to
@@ -8,9 +8,10 @@ phrase   = (article | number | size | colour | "and" | pattern)* noun
 import difflib
 import math
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.checks import UserError, fail
 from cadam3d.prior.shapes.objects import ALIASES, known_objects, known_primitives
 from cadam3d.prior.shapes.vocabulary import (
     ARTICLES,
@@ -24,15 +25,15 @@ from cadam3d.prior.shapes.vocabulary import (
     STRETCHES,
 )
 
-TRY = 'Try: prompt="a red and yellow checkered torus"'
-FREE_TEXT = "Other words need a prior that reads free text: `cadam3d doctor` shows which ones are ready here."
+EXAMPLE = "a red and yellow checkered torus"
+FREE_TEXT = "Other priors read free text; `cadam3d doctor` lists those that are ready to use here."
 MAX_COLOURS = 2
 SHADES = ("dark", "light")
 
 
 @dataclass(frozen=True)
 class Phrase:
-    """One object, or a row of equal ones."""
+    """One object, or a row of equal objects."""
 
     noun: str
     colours: tuple[str, ...] = ()  # at most two; "dark green" and "light blue" are colours
@@ -44,15 +45,15 @@ class Phrase:
 
 @dataclass(frozen=True)
 class Sentence:
-    """A phrase, and how it stands to what follows: "a cube on (a ball on a table)"."""
+    """A phrase and its relation to the rest of the sentence: "a cube on (a ball on a table)"."""
 
     phrase: Phrase
     relation: str | None = None
-    others: tuple["Sentence", ...] = ()  # two for "between", none without a relation, else one
+    others: tuple["Sentence", ...] = ()  # two for "between", one for other relations
 
 
 def known_words() -> dict[str, tuple[str, ...]]:
-    """Everything the grammar knows, by part of speech."""
+    """Return all words that the grammar knows, by part of speech."""
     return {
         "primitives": known_primitives(),
         "objects": known_objects(),
@@ -65,18 +66,19 @@ def known_words() -> dict[str, tuple[str, ...]]:
     }
 
 
-def parse(prompt: str) -> Sentence:
-    """Read a prompt.
+def parse(prompt: str, key: str = "prompt") -> Sentence:
+    """Parse the prompt that the setting ``key`` holds.
 
-    Raises ``UserError`` that names every unknown word, with the nearest known ones, or says what is missing.
+    Raises ``UserError`` that names every unknown word, with the nearest known words, or the missing part of
+    the sentence.
     """
     words = _join_compounds(re.findall(r"[a-z0-9]+", prompt.lower()))
-    _reject_unknown(prompt, words)
-    return _Reader(prompt, [word for word in words if word not in FILLERS | ARTICLES]).sentence()
+    _reject_unknown(key, prompt, words)
+    return _Reader(key, prompt, [word for word in words if word not in FILLERS | ARTICLES]).sentence()
 
 
 def noun_of(word: str) -> str | None:
-    """The catalogue name behind a noun, singular or plural; None if it is not a noun."""
+    """Return the name of the object that a noun, singular or plural, stands for; None for other words."""
     nouns = {*known_primitives(), *known_objects()}
     irregular = {"tori": "torus", "boxes": "box", "arches": "arch"}
     for form in (irregular.get(word, word), word.removesuffix("s"), word.removesuffix("es")):
@@ -87,15 +89,15 @@ def noun_of(word: str) -> str | None:
 
 
 def is_plural(word: str) -> bool:
-    """Whether a noun is in the plural."""
+    """Return whether a noun is in the plural."""
     return word not in ALIASES and word not in {*known_primitives(), *known_objects()}
 
 
 class _Reader:
-    """A cursor over the words of one prompt, articles and fillers left out."""
+    """A cursor over the words of one prompt, without articles and fillers."""
 
-    def __init__(self, prompt: str, words: list[str]) -> None:
-        self.prompt, self.words, self.position = prompt, words, 0
+    def __init__(self, key: str, prompt: str, words: list[str]) -> None:
+        self.key, self.prompt, self.words, self.position = key, prompt, words, 0
 
     def sentence(self) -> Sentence:
         phrase = self.phrase()
@@ -106,7 +108,7 @@ class _Reader:
             return Sentence(phrase, relation, (self.sentence(),))
         first = Sentence(self.phrase())
         if not self.take("and"):
-            raise self.fail("'between' wants two objects joined by 'and'")
+            raise self.fail("two objects joined by 'and' after 'between'")
         return Sentence(phrase, relation, (first, self.sentence()))
 
     def phrase(self) -> Phrase:
@@ -114,7 +116,7 @@ class _Reader:
         while (word := self.peek()) is not None and noun_of(word) is None:
             self.position += 1
         if word is None:
-            raise self.fail("an object is missing" + (" at the end" if self.words else ""))
+            raise self.fail("an object at the end" if self.words else "an object")
         self.position += 1
         described = self.words[start : self.position - 1]
         return Phrase(
@@ -127,33 +129,33 @@ class _Reader:
         )
 
     def colours(self, described: list[str]) -> tuple[str, ...]:
-        """The colours among the words before a noun; refuses words that cannot stand there."""
+        """Return the colours among the words before a noun. Raises ``UserError`` for misplaced words."""
         adjectives = {*COLOURS, *COLOUR_ALIASES, *SHADES, *PATTERNS, *SIZES, *STRETCHES, *NUMBERS, "and"}
         for word in described:
             if word not in adjectives:
-                raise self.fail(f"an object is missing before {word!r}")
+                raise self.fail(f"an object before {word!r}")
         colours = []
         for before, word in zip(["", *described], [*described, "end"], strict=True):
             colour = COLOUR_ALIASES.get(word, word)
             if colour in COLOURS:
                 colours.append(f"{before} {colour}" if before in SHADES else colour)
             elif before in SHADES:
-                raise self.fail(f"{before!r} wants a colour after it")
+                raise self.fail(f"a colour after {before!r}")
         if len(colours) > MAX_COLOURS:
-            raise self.fail(f"at most {MAX_COLOURS} colours for one object, got {', '.join(colours)}")
+            raise self.fail(f"at most {MAX_COLOURS} colours for one object")
         return tuple(colours)
 
     def relation(self) -> str | None:
-        """Step over the relation at the cursor; None at the end."""
+        """Step over the relation at the cursor and return its name, or None at the end of the prompt."""
         for words, name in RELATIONS:
             if self.take(*words):
                 return name
         if self.peek() is not None:
-            raise self.fail(f"expected a relation such as 'on' or 'next to' before {self.peek()!r}")
+            raise self.fail(f"a relation such as 'on' or 'next to' before {self.peek()!r}")
         return None
 
     def take(self, *words: str) -> bool:
-        """Step over ``words`` if they come next."""
+        """Step over ``words`` if they come next, and return whether they do."""
         is_next = tuple(self.words[self.position : self.position + len(words)]) == words
         self.position += len(words) * is_next
         return is_next
@@ -161,12 +163,12 @@ class _Reader:
     def peek(self) -> str | None:
         return self.words[self.position] if self.position < len(self.words) else None
 
-    def fail(self, reason: str) -> UserError:
-        return UserError(f"prompt {self.prompt!r}: {reason}. {TRY}")
+    def fail(self, expected: str) -> UserError:
+        return fail(self.key, expected=expected, got=self.prompt, example=f'{self.key}="{EXAMPLE}"')
 
 
 def _join_compounds(words: list[str]) -> list[str]:
-    """Nouns that people write in two words: "light house", "ice cream", "pine tree"."""
+    """Join nouns that are often written as two words, such as "light house" or "ice cream"."""
     pairs = {
         ("light", "house"): "lighthouse",
         ("ice", "cream"): "icecream",
@@ -185,18 +187,32 @@ def _join_compounds(words: list[str]) -> list[str]:
     return joined
 
 
-def _reject_unknown(prompt: str, words: list[str]) -> None:
+def _reject_unknown(key: str, prompt: str, words: list[str]) -> None:
     vocabulary = {part for group in known_words().values() for entry in group for part in entry.split()}
     vocabulary |= ARTICLES | FILLERS | {"and"}
     unknown = [word for word in dict.fromkeys(words) if word not in vocabulary and noun_of(word) is None]
     if not unknown:
         return
-    named = []
-    for word in unknown:
-        near = difflib.get_close_matches(word, vocabulary - ARTICLES, n=2, cutoff=0.7)
-        named.append(f"{word!r}" + (f" (did you mean {' or '.join(near)}?)" if near else ""))
+    # Sorted, since the order of a set differs between processes and decides between equally near words.
+    candidates = sorted(vocabulary - ARTICLES)
+    near = {word: difflib.get_close_matches(word, candidates, n=2, cutoff=0.7) for word in unknown}
+    named = ", ".join(
+        f"{word!r}" + (f" (did you mean {' or '.join(known)}?)" if known else "")
+        for word, known in near.items()
+    )
     listed = "\n".join(f"  {group}: {', '.join(known)}" for group, known in known_words().items())
     raise UserError(
-        f"prompt {prompt!r}: prior=shapes does not know {', '.join(named)}. It knows\n{listed}\n"
-        f"{FREE_TEXT} {TRY}"
+        f"{key}: expected words that prior=shapes knows, got {prompt!r}. Unknown: {named}. Known words:\n"
+        f'{listed}\n{FREE_TEXT} Try: {key}="{_corrected(words, near) or EXAMPLE}"'
     )
+
+
+def _corrected(words: list[str], near: dict[str, list[str]]) -> str | None:
+    """Return the prompt with every unknown word replaced by its nearest known word, if that can be parsed."""
+    if not all(near.values()):
+        return None
+    prompt = " ".join(near[word][0] if word in near else word for word in words)
+    with suppress(UserError):
+        parse(prompt)
+        return prompt
+    return None

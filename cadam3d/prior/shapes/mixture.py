@@ -6,7 +6,7 @@ With p(x) = sum_m w_m N(x; mu_m, diag(sigma^2)), noisy = a x + b eps and s^2 = a
     E[x]     = sum_m r_m (mu_m + a sigma^2 / s^2 (noisy - a mu_m))               given noisy
     E[eps]   = sum_m r_m  b / s^2 (noisy - a mu_m)                               given noisy
 
-by Bayes' rule for a linear Gaussian observation. So noisy = a E[x] + b E[eps] holds exactly, and E[eps] is
+by Bayes' rule for a linear Gaussian observation. Hence noisy = a E[x] + b E[eps] holds exactly, and E[eps] is
 -b times the score of the noisy density (Tweedie's formula).
 """
 
@@ -18,8 +18,8 @@ from torch import Tensor
 
 from cadam3d.prior.path import per_view
 
-# Where a pixel is certain (sigma = 0) and free of noise (b = 0), the posterior is 0 / 0. A variance too small
-# to see stands in, which gives the limit b -> 0: the nearest mode.
+# If a pixel is certain (sigma = 0) and has no noise (b = 0), the posterior is 0 / 0. This variance is too
+# small to be visible and gives the limit b -> 0, the nearest mode.
 VARIANCE_FLOOR = 1e-12
 
 
@@ -34,7 +34,7 @@ class Mixture:
     def denoise(
         self, noisy: Float[Tensor, "v c h w"], a: Float[Tensor, "v"], b: Float[Tensor, "v"]
     ) -> tuple[Float[Tensor, "v c h w"], Float[Tensor, "v c h w"]]:
-        """Posterior means of the clean image and of the noise; finite for every a, b in [0, 1]."""
+        """Return the posterior means of the clean image and of the noise; finite for all a, b in [0, 1]."""
         a, b = per_view(a), per_view(b)
         total = (a * a * self.variance + b * b).clamp_min(VARIANCE_FLOOR)
         mean = self._mean_of_modes(noisy, a, total)
@@ -44,21 +44,21 @@ class Mixture:
     def responsibilities(
         self, noisy: Float[Tensor, "v c h w"], a: Float[Tensor, "v"], b: Float[Tensor, "v"]
     ) -> Float[Tensor, "v m"]:
-        """Posterior probability of each mode (float64)."""
+        """Return the posterior probability of each mode (float64)."""
         a, b = per_view(a), per_view(b)
         return self._responsibilities(noisy, a, (a * a * self.variance + b * b).clamp_min(VARIANCE_FLOOR))
 
     def log_density(
         self, noisy: Float[Tensor, "v c h w"], a: Float[Tensor, "v"], b: Float[Tensor, "v"]
     ) -> Float[Tensor, "v"]:
-        """Log-density of the noisy image (float64)."""
+        """Return the log-density of the noisy image (float64)."""
         a, b = per_view(a), per_view(b)
         total = (a * a * self.variance + b * b).clamp_min(VARIANCE_FLOOR).double()
         norm = (2 * torch.pi * total).log().sum(dim=(1, 2, 3))
         return self._log_joint(noisy, a, total).logsumexp(dim=1) - 0.5 * norm
 
     def _log_joint(self, noisy: Tensor, a: Tensor, total: Tensor) -> Float[Tensor, "v m"]:
-        """Log of weight times density, without the normalizer that all modes share."""
+        """Return the log of weight times density, without the normalizer, which is equal for all modes."""
         away = noisy[:, None] - a[:, None] * self.means
         distance = (away * away / total[:, None]).sum(dim=(2, 3, 4), dtype=torch.float64)
         return self.log_weights.double() - 0.5 * distance

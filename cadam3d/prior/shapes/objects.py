@@ -1,7 +1,7 @@
-"""The things of the world: primitives and composed objects, each a handful of painted solids.
+"""The objects of the world: primitives and composed objects, each made of a few painted solids.
 
-Own coordinates: +z up, front at +x; seen from the front, +y is to the right. Position and unit do not matter,
-since ``natural`` says how large a thing is beside others.
+Local coordinates have +z up and the front at +x; seen from the front, +y is to the right. Position and unit
+of an object do not matter, since ``natural`` defines its size relative to others.
 """
 
 from collections.abc import Callable
@@ -32,13 +32,13 @@ from cadam3d.prior.shapes.solids import (
 from cadam3d.prior.shapes.vocabulary import PLAIN
 
 MAIN, ACCENT = "main", "accent"  # colours that the prompt may choose
-OPEN = "open"  # a colour that the prompt leaves open: one mode per colour of the palette
+OPEN = "open"  # a colour that the prompt leaves open, with one mode per colour of the palette
 UNIT_AXES = torch.cat([torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)], dim=1)
 
 
 @dataclass(frozen=True)
 class Coat:
-    """What a part is painted with: names of colours, or MAIN and ACCENT until the prompt has spoken."""
+    """The colours of a part: names of colours, or MAIN and ACCENT for those that the prompt may choose."""
 
     first: str
     second: str
@@ -55,44 +55,44 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Thing:
-    """A named object before the prompt has painted it."""
+    """A named object before the colours of the prompt are applied."""
 
     parts: tuple[Part, ...]
     main: str  # default colour, or OPEN
     accent: str  # default second colour
-    natural: float = 1.0  # radius beside other things
-    seat: float | None = None  # height at which things stand on it; None: its top
-    shelter: tuple[float, float] | None = None  # (radius, height) of the room below it, for things under it
+    natural: float = 1.0  # radius relative to other objects
+    seat: float | None = None  # height at which other objects stand on it; None = its top
+    shelter: tuple[float, float] | None = None  # radius and height of the room for objects under it
 
 
 def bounds(parts: tuple[Part, ...]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """The tight box around all parts: low and high corner."""
+    """Return the low and the high corner of the tight box around all parts."""
     reach = torch.stack([part.solid.support(UNIT_AXES) for part in parts]).amax(0)
     return -reach[3:], reach[:3]
 
 
 def moved(parts: tuple[Part, ...], x: float, y: float, z: float) -> tuple[Part, ...]:
-    """All parts, moved together."""
+    """Return all parts, moved together."""
     return tuple(replace(part, solid=part.solid.at(x, y, z)) for part in parts)
 
 
 def stretched(parts: tuple[Part, ...], x: float, y: float, z: float) -> tuple[Part, ...]:
-    """All parts, stretched about the origin along the world axes."""
+    """Return all parts, stretched about the origin along the world axes."""
     return tuple(replace(part, solid=part.solid.stretched(x, y, z)) for part in parts)
 
 
 def known_primitives() -> tuple[str, ...]:
-    """Names of the single-solid objects."""
+    """Return the names of the objects that consist of one solid."""
     return tuple(PRIMITIVES)
 
 
 def known_objects() -> tuple[str, ...]:
-    """Names of the composed objects."""
+    """Return the names of the composed objects."""
     return tuple(COMPOSED)
 
 
 def thing(name: str) -> Thing:
-    """The object of that name (a key of PRIMITIVES or COMPOSED)."""
+    """Return the object of that name, a key of PRIMITIVES or COMPOSED."""
     if name in PRIMITIVES:
         return Thing((Part(PRIMITIVES[name], Coat(MAIN, ACCENT)),), OPEN, "white")
     return COMPOSED[name]()
@@ -239,11 +239,11 @@ def _rocket() -> Thing:
 def _house() -> Thing:
     def window(x: float, y: float, z: float, *, sideways: bool) -> list[Part]:
         turn = 90.0 if sideways else 0.0
-        frame = box(0.05, 0.34, 0.34).turned("z", turn).at(x, y, z)
+        border = box(0.05, 0.34, 0.34).turned("z", turn).at(x, y, z)
         pane = box(0.07, 0.27, 0.27).turned("z", turn).at(x, y, z)
         bars = [box(0.085, 0.27, 0.03), box(0.085, 0.03, 0.27)]
         return [
-            _p(frame, "white"),
+            _p(border, "white"),
             _p(pane, "navy"),
             *(_p(bar.turned("z", turn).at(x, y, z), "white") for bar in bars),
         ]

@@ -1,4 +1,4 @@
-"""ShapesPrior: an exact diffusion model of a procedural world. No weights, no training, a known truth."""
+"""ShapesPrior: an exact diffusion model of a procedural world, without weights and with a known truth."""
 
 import math
 from dataclasses import dataclass, replace
@@ -9,24 +9,24 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
-from cadam3d.core.checks import UserError, require_range, require_whole
+from cadam3d.core.checks import fail, require_range, require_whole
 from cadam3d.core.render import TruthFn
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import NoisePath, Prediction, per_view
-from cadam3d.prior.shapes.grammar import TRY
+from cadam3d.prior.shapes.grammar import EXAMPLE
 from cadam3d.prior.shapes.mixture import Mixture
 from cadam3d.prior.shapes.objects import known_objects, known_primitives
 from cadam3d.prior.shapes.scene import Scene, build
+from cadam3d.prior.shapes.trace_cache import shared_trace
 from cadam3d.prior.shapes.tracer import Layers
-from cadam3d.prior.shapes.traces import shared_trace
 
-CENSUS_VIEWS = 4  # of every object, around its equator
+CENSUS_VIEWS = 4  # per object, equally spaced in azimuth
 CENSUS_ELEVATION_DEG = 15.0
 CENSUS_FOV_DEG = 45.0
-ERROR_GRID = 8  # cells per side of the prediction error: smooth beside any image that is larger
-ERROR_FREQUENCY = (
-    3.0  # radians per standard deviation of the projected noise: error fields of two noises decorrelate
-)
+ERROR_GRID = 8  # cells per side of the prediction error, which makes it smooth in any larger image
+# Radians per standard deviation of the projected noise. At this frequency the error fields of two
+# independent noises are uncorrelated.
+ERROR_FREQUENCY = 3.0
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,10 @@ class Census:
     covariance: Float[Tensor, "3 s s"]  # of each colour with alpha
 
     def mixture(self, cameras: Cameras, background: Float[Tensor, "v 3"], floor: float) -> Mixture:
-        """One Gaussian per pixel over the given backdrops, in model space; variances at least ``floor``."""
+        """Return one Gaussian per pixel over the given backgrounds, in model space.
+
+        Variances are at least ``floor``.
+        """
         maps = torch.cat(
             [self.rgb, self.alpha[None], self.rgb_variance, self.alpha_variance[None], self.covariance]
         )
@@ -60,20 +63,20 @@ class Census:
 
 @dataclass(frozen=True)
 class ShapesCondition(Condition):
-    """The distributions of images of these views."""
+    """The distributions of images of these views, under the prompt, the negative prompt and no prompt."""
 
     positive: Mixture
     negative: Mixture
     empty: Mixture
 
     def unprompted(self) -> "ShapesCondition":
-        """The same views, knowing only that they show something of this world."""
+        """Return the same views under the empty prompt, which stands for every object of the world."""
         return replace(self, positive=self.empty, negative=self.empty)
 
 
 @dataclass(frozen=True)
 class ShapesEmbedding(PromptEmbedding):
-    """The scenes of a prompt and of a negative prompt (None: unconditional)."""
+    """The scenes of a prompt and of a negative prompt, which is None if it is empty."""
 
     prior: "ShapesPrior"
     positive: Scene
@@ -93,10 +96,10 @@ class ShapesPrior(DiffusionPrior):
 
     noise_path: NoisePath
     spread: float  # standard deviation of every pixel around its mode, model space ([-1, 1])
-    edge_spread: float  # added to it where a silhouette crosses the pixel
+    edge_spread: float  # added to the spread of pixels that a silhouette crosses
     model_error: float  # rms of the smooth prediction error, model space at full noise; 0 = exact
-    samples_per_pixel: int  # rays per pixel and axis
-    census_size: int  # pixels per side of the pictures that the empty prompt is measured on
+    samples_per_pixel: int  # rays per pixel along each axis
+    census_size: int  # pixels per side of the images from which the empty prompt is computed
     seed: int  # of the prediction error
 
     def __post_init__(self) -> None:
@@ -108,32 +111,32 @@ class ShapesPrior(DiffusionPrior):
         require_whole("prior.seed", self.seed, low=0, high=2**62, example=0)
 
     def embed(self, prompt: str, negative: str) -> ShapesEmbedding:
-        """Parse both prompts; the empty negative prompt is the whole world.
+        """Parse both prompts; an empty negative prompt stands for every object of the world.
 
         Raises ``UserError`` for an empty prompt and for words that the grammar does not know.
         """
         if not prompt.strip():
-            raise UserError(f"prompt: expected an object, got {prompt!r}. {TRY}")
+            raise fail("prompt", expected="an object", got=prompt, example=f'prompt="{EXAMPLE}"')
         positive = build(prompt)
         return ShapesEmbedding(
             prior=self,
             positive=positive,
-            negative=build(negative) if negative.strip() else None,
+            negative=build(negative, "negative_prompt") if negative.strip() else None,
             census=take_census(self.census_size),
         )
 
     def encode(self, rgb: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v 3 h w"]:
-        """Images in [0, 1] to [-1, 1]; the model denoises pixels."""
+        """Convert images in [0, 1] to [-1, 1]; the model denoises pixels."""
         return 2 * rgb.permute(0, 3, 1, 2) - 1
 
     @torch.no_grad()
     def decode(self, latents: Float[Tensor, "v 3 h w"], height: int, width: int) -> Float[Tensor, "v h w 3"]:
-        """[-1, 1] to images in [0, 1], clamped; pixels stay where they are."""
+        """Convert [-1, 1] to images in [0, 1], clamped, without any change of size."""
         assert latents.shape[2:] == (height, width)
         return ((latents.permute(0, 2, 3, 1) + 1) / 2).clamp(0, 1)
 
     def mixture(self, scene: Scene, cameras: Cameras, background: Float[Tensor, "v 3"]) -> Mixture:
-        """The distribution of images of a scene."""
+        """Return the distribution of images of a scene for each view."""
         layers, scene = self._layers(scene, cameras)
         edge = 4 * layers.alpha * (1 - layers.alpha)
         sigma = (self.spread + self.edge_spread * edge)[:, None].expand(-1, 3, -1, -1)
@@ -151,9 +154,10 @@ class ShapesPrior(DiffusionPrior):
         condition: ShapesCondition,
         scale: float,
     ) -> Prediction:
-        """Posterior means under guidance, plus the configured error; a branch of weight zero is not computed.
+        """Return the posterior means under guidance, plus the configured error.
 
-        The forms come from the posterior means of clean image and noise: none is divided by a small b.
+        Branches of weight 0 are not computed. The clean image and the noise are both computed directly, so
+        that nothing is divided by a small b.
         """
         clean, noise = torch.zeros_like(noisy), torch.zeros_like(noisy)
         for branch, (share, mixture) in enumerate(
@@ -166,7 +170,10 @@ class ShapesPrior(DiffusionPrior):
         return Prediction(clean=clean, noise=noise, velocity=self.noise_path.velocity(clean, noise, t))
 
     def truth(self, prompt: str) -> TruthFn:
-        """Images of every mode of ``prompt``: (cameras, background "v 3") -> "m v h w 3" in [0, 1]."""
+        """Return a function of cameras and background "v 3" that renders all m modes of ``prompt``.
+
+        Its images have shape "m v h w 3" and are in [0, 1].
+        """
         scene = build(prompt)
 
         def images(cameras: Cameras, background: Tensor) -> Tensor:
@@ -184,17 +191,19 @@ class ShapesPrior(DiffusionPrior):
         clean, noise = mixture.denoise(noisy, a, b)
         if self.model_error == 0:
             return clean, noise
-        # Split so that a * clean + b * noise stays put: no error on a clean image, all of it on pure noise.
+        # Split so that a * clean + b * noise does not change. A clean image has no error, pure noise the full
+        # error.
         norm = per_view((a * a + b * b).sqrt())
         error = self.model_error * error_field(noisy / norm, self.seed * 2 + branch)
         return clean + per_view(b) / norm * error, noise - per_view(a) / norm * error
 
 
 def error_field(image: Float[Tensor, "v c h w"], seed: int) -> Float[Tensor, "v c h w"]:
-    """A smooth field of mean about zero and unit rms that is a fixed, continuous function of ``image``.
+    """Return a smooth field of mean about zero and unit rms, a fixed and continuous function of ``image``.
 
-    The image is multiplied with random signs, summed over each cell of a coarse grid (white noise keeps its
-    variance), and the sine of that is upsampled bicubically: another noise, another field.
+    The image is multiplied with random signs and summed over each cell of a coarse grid, such that white
+    noise keeps its variance. The sine of the sums is upsampled bicubically. Different noise gives a different
+    field.
     """
     _, channels, height, width = image.shape
     signs, phase = _draws(channels, height, width, seed, image.dtype, image.device)
@@ -209,7 +218,7 @@ def error_field(image: Float[Tensor, "v c h w"], seed: int) -> Float[Tensor, "v 
 def _draws(
     channels: int, height: int, width: int, seed: int, dtype: torch.dtype, device: torch.device
 ) -> tuple[Float[Tensor, "c c h w"], Float[Tensor, "c g g"]]:
-    """Random signs and phases, the same for the same seed."""
+    """Return random signs and phases that depend on ``seed`` alone."""
     generator = torch.Generator().manual_seed(seed)
     signs = torch.randint(0, 2, (channels, channels, height, width), generator=generator) * 2 - 1
     phase = 2 * math.pi * torch.rand(channels, ERROR_GRID, ERROR_GRID, generator=generator)
@@ -218,7 +227,7 @@ def _draws(
 
 @lru_cache(maxsize=8)
 def _cells(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "g s"]:
-    """Sums over the cells of the error grid, scaled so that white noise keeps its variance."""
+    """Return the matrix of sums over the cells of the error grid; white noise keeps its variance."""
     cell = torch.arange(size, device=device) * ERROR_GRID // size
     member = (cell[None] == torch.arange(ERROR_GRID, device=device)[:, None]).to(dtype)
     return member / member.sum(1, keepdim=True).sqrt().clamp_min(1)
@@ -226,17 +235,18 @@ def _cells(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor,
 
 @lru_cache(maxsize=8)
 def _bicubic(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "s g"]:
-    """Interpolation from the error grid to ``size`` pixels; independent cells of unit variance keep it."""
+    """Return the interpolation matrix from the error grid to ``size`` pixels.
+
+    It keeps the variance of independent cells.
+    """
     grid = torch.eye(ERROR_GRID, device=device, dtype=dtype)[None, None]
-    rows = torch.nn.functional.interpolate(grid, (size, ERROR_GRID), mode="bicubic", align_corners=False)[
-        0, 0
-    ]
-    return rows / rows.norm(dim=1, keepdim=True)
+    rows = torch.nn.functional.interpolate(grid, (size, ERROR_GRID), mode="bicubic", align_corners=False)
+    return rows[0, 0] / rows[0, 0].norm(dim=1, keepdim=True)
 
 
 @lru_cache(maxsize=4)
 def take_census(size: int) -> Census:
-    """Moments over every object of the world, a few views of each and every mode, all equally likely."""
+    """Return the moments over all objects of the world, a few views of each and all modes, equally likely."""
     cameras = turntable(
         CENSUS_VIEWS,
         elevation_deg=CENSUS_ELEVATION_DEG,

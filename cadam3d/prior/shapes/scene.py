@@ -1,4 +1,4 @@
-"""From a sentence to a scene: objects painted, put in their places and fitted into the unit ball."""
+"""From a sentence to a scene: objects are painted, placed and scaled to fit into the unit ball."""
 
 import math
 from dataclasses import dataclass, replace
@@ -25,21 +25,21 @@ from cadam3d.prior.shapes.vocabulary import COLOURS, OPEN_PALETTE, PATTERNS, PLA
 
 FIT_RADIUS = 0.85  # every scene fits in the ball of this radius around the origin
 CLEARANCE = 0.12  # between neighbours, in units of a natural radius of 1
-SINK = 0.01  # how deep things sit into what they stand on: no light shines through the contact
-OPEN_STRIDE = 3  # open objects differ: the k-th takes the palette shifted by 3 k
+SINK = 0.01  # depth by which an object sinks into its support, so that no gap is visible between them
+OPEN_STRIDE = 3  # the k-th object of open colour takes the palette shifted by 3 k, so that colours differ
 SUPPORT_DIRECTIONS = 512
 PATTERN_NAMES = tuple(dict.fromkeys(PATTERNS.values()))
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything the tracer needs, one row per part; parts of one kind are neighbours."""
+    """The input of the tracer, one row per part; parts of the same kind are in consecutive rows."""
 
     kinds: tuple[tuple[Kind, int], ...]  # kind and number of parts, in row order
-    to_local: Float[Tensor, "p 3 3"]  # own = to_local @ (world - offsets)
+    to_local: Float[Tensor, "p 3 3"]  # local = to_local @ (world - offsets)
     offsets: Float[Tensor, "p 3"]
     sizes: Float[Tensor, "p 4"]
-    low: Float[Tensor, "p 3"]  # tight box in own coordinates
+    low: Float[Tensor, "p 3"]  # tight box in local coordinates
     high: Float[Tensor, "p 3"]
     centres: Float[Tensor, "p 3"]  # bounding ball in the world
     radii: Float[Tensor, "p"]
@@ -49,7 +49,7 @@ class Scene:
     log_weights: Float[Tensor, "m"]  # of the modes; they sum to one
 
     def to(self, device: torch.device, dtype: torch.dtype) -> "Scene":
-        """The same scene on ``device``, its numbers in ``dtype``."""
+        """Return the same scene on ``device``, with floating-point numbers in ``dtype``."""
         moved_tensors = {
             name: value.to(device, dtype if value.is_floating_point() else value.dtype)
             for name, value in vars(self).items()
@@ -60,7 +60,7 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class _Placed:
-    """A painted object with what others need to stand on it or shelter under it."""
+    """A painted object, with the height at which others stand on it and the room for others under it."""
 
     parts: tuple[Part, ...]
     seat: float
@@ -82,21 +82,21 @@ class _Placed:
         return _Placed(stretched(self.parts, factor, factor, factor), self.seat * factor, shelter)
 
 
-def build(prompt: str) -> Scene:
-    """The scene of a prompt.
+def build(prompt: str, key: str = "prompt") -> Scene:
+    """Return the scene of the prompt that the setting ``key`` holds.
 
     Raises ``UserError`` for words or sentences that the grammar does not know.
     """
-    return compile_scene(assemble(parse(prompt)))
+    return compile_scene(assemble(parse(prompt, key)))
 
 
 def assemble(sentence: Sentence) -> tuple[Part, ...]:
-    """Paint, place and fit all objects of a sentence."""
+    """Paint, place and scale all objects of a sentence."""
     return _fit(_arrange(sentence, 0).parts)
 
 
 def compile_scene(parts: tuple[Part, ...]) -> Scene:
-    """Parts to tensors, sorted by kind, in float64 on the CPU."""
+    """Convert parts to tensors, sorted by kind, in float64 on the CPU."""
     parts = tuple(sorted(parts, key=lambda part: KINDS.index(part.solid.kind)))
     kinds = [part.solid.kind for part in parts]
     colours = list(dict.fromkeys(name for part in parts for name in (part.coat.first, part.coat.second)))
@@ -106,7 +106,7 @@ def compile_scene(parts: tuple[Part, ...]) -> Scene:
     centres = (world_reach[:, :3] - world_reach[:, 3:]) / 2
     directions = sphere_directions(SUPPORT_DIRECTIONS).double().T
     reach = torch.stack([part.solid.support(directions) for part in parts])
-    radii = (reach - centres @ directions).amax(1) * 1.01  # directions are finitely many: a margin
+    radii = (reach - centres @ directions).amax(1) * 1.01  # with a margin, since directions are finitely many
     matrices = torch.stack([part.solid.matrix for part in parts])
     return Scene(
         kinds=tuple((kind, kinds.count(kind)) for kind in dict.fromkeys(kinds)),
@@ -127,7 +127,7 @@ def compile_scene(parts: tuple[Part, ...]) -> Scene:
 
 
 def sphere_directions(count: int) -> Float[Tensor, "count 3"]:
-    """Nearly uniform unit vectors (a Fibonacci lattice)."""
+    """Return nearly uniform unit vectors (a Fibonacci lattice)."""
     index = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1 - 2 * index / count
     angle = math.pi * (1 + math.sqrt(5)) * index
@@ -171,7 +171,7 @@ def _log_weights(colours: list[str]) -> Float[Tensor, "m"]:
 
 
 def _paint(item: Thing, phrase: Phrase, index: int) -> tuple[Part, ...]:
-    """Decide MAIN and ACCENT; a pattern goes to whatever is painted in plain MAIN."""
+    """Choose the colours of MAIN and ACCENT; a pattern is applied to all parts in plain MAIN."""
     open_colour = f"{OPEN}{index}"
     main = phrase.colours[0] if phrase.colours else (open_colour if item.main == OPEN else item.main)
     accent = item.accent
@@ -179,12 +179,10 @@ def _paint(item: Thing, phrase: Phrase, index: int) -> tuple[Part, ...]:
     if len(phrase.colours) == 2:
         accent = phrase.colours[1]
         pattern = pattern or ("striped" if item.main == OPEN else None)
-    # One colour and a pattern: the other colour is white, or black where white would not show.
-    other = (
-        phrase.colours[1]
-        if len(phrase.colours) == 2
-        else ("black" if main in ("white", "cream") else "white")
-    )
+    # With one colour and a pattern, the other colour is white, or black if white would not be visible.
+    other = "black" if main in ("white", "cream") else "white"
+    if len(phrase.colours) == 2:
+        other = phrase.colours[1]
 
     def coat(old: Coat) -> Coat:
         if pattern is not None and old == Coat(MAIN, ACCENT, PLAIN):
@@ -200,7 +198,7 @@ def _paint(item: Thing, phrase: Phrase, index: int) -> tuple[Part, ...]:
 
 
 def _arrange(sentence: Sentence, index: int) -> _Placed:
-    """All objects of a sentence; ``index`` counts phrases, so that open colours differ."""
+    """Place all objects of a sentence; ``index`` counts phrases, so that open colours differ."""
     first = _place(sentence.phrase, index)
     others = [_arrange(other, index + 1 + number) for number, other in enumerate(sentence.others)]
     if sentence.relation is None:
@@ -225,13 +223,13 @@ def _join(parts: list[_Placed], seat: float, shelter: tuple[float, float] | None
 
 
 def _stand(placed: _Placed, x: float, y: float, z: float) -> _Placed:
-    """Centred over (x, y), its lowest point at height z."""
+    """Move an object so that it is centred over (x, y) and its lowest point is at height z."""
     low, high = placed.low, placed.high
     return placed.at(x - (low[0] + high[0]) / 2, y - (low[1] + high[1]) / 2, z - low[2])
 
 
 def _row(items: list[_Placed]) -> _Placed:
-    """Side by side on one floor, left to right as seen from the front (-y to +y)."""
+    """Place objects side by side on one floor, left to right as seen from the front (-y to +y)."""
     placed, edge = [], 0.0
     for item in items:
         width = item.high[1] - item.low[1]
@@ -241,7 +239,7 @@ def _row(items: list[_Placed]) -> _Placed:
 
 
 def _relate(left: _Placed, relation: str, right: _Placed) -> _Placed:
-    """Put ``left`` in its relation to ``right``."""
+    """Place ``left`` in its relation to ``right``."""
     if relation == "next to":
         return _row([left, right])
     if relation == "under":
@@ -257,7 +255,7 @@ def _relate(left: _Placed, relation: str, right: _Placed) -> _Placed:
 
 
 def _under(left: _Placed, right: _Placed) -> _Placed:
-    """Between the legs of what has legs, shrunk to fit; otherwise below."""
+    """Place ``left`` between the legs of ``right``, shrunk to fit, or below it if it has no legs."""
     if right.shelter is None:
         lower = _stand(left, 0.0, 0.0, 0.0)
         upper = _stand(right, 0.0, 0.0, lower.seat - SINK)
@@ -270,7 +268,7 @@ def _under(left: _Placed, right: _Placed) -> _Placed:
 
 
 def _fit(parts: tuple[Part, ...]) -> tuple[Part, ...]:
-    """Centre the bounding box on the origin and scale so that the furthest point has radius FIT_RADIUS."""
+    """Centre the bounding box on the origin and scale so that the farthest point is at FIT_RADIUS."""
     low, high = bounds(parts)
     centre = ((low + high) / 2).tolist()
     centred = moved(parts, -centre[0], -centre[1], -centre[2])

@@ -1,9 +1,9 @@
-"""Solids as signed distance functions: negative inside, positive outside, never further than the surface is.
+"""Solids as signed distance functions: negative inside, positive outside, never larger than the distance.
 
-Each kind is written in its own coordinates and lives in the world through an affine map. A ray keeps its
-parameter under an affine map, so sphere tracing in own coordinates stays exact for stretched solids too: an
-ellipsoid is a stretched ball, and no approximate distance is needed. Every function here is 1-Lipschitz and
-has the right sign, which is all that sphere tracing asks (Hart 1996, sec. 2); many are the maximum of a few
+Each kind of solid is defined in local coordinates and placed in the world by an affine map. A ray keeps its
+parameter under an affine map, so sphere tracing in local coordinates is exact for stretched solids too: an
+ellipsoid is a stretched ball and needs no approximate distance. Every function here is 1-Lipschitz and has
+the right sign, which is all that sphere tracing requires (Hart 1996, sec. 2). Many are the maximum of a few
 planes.
 """
 
@@ -15,14 +15,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-SIZES_PER_SOLID = 4  # numbers that shape a solid; a kind uses as many as it needs
+SIZES_PER_SOLID = 4  # numbers that describe the shape of a solid; most kinds use fewer
 STAR_POINTS = 5
 AXES = {"x": 0, "y": 1, "z": 2}
 
-SdfFn = Callable[[Tensor, Tensor], Tensor]  # points "3 n" and sizes "4 n", own coordinates -> distances "n"
-SupportFn = Callable[
-    [Tensor, tuple[float, ...]], Tensor
-]  # directions "3 k" and sizes -> max of p.d over the solid
+# Maps points "3 n" and sizes "4 n", in local coordinates, to distances "n".
+SdfFn = Callable[[Tensor, Tensor], Tensor]
+# Maps directions "3 k" and sizes to the maximum of p . d over the points p of the solid, "k".
+SupportFn = Callable[[Tensor, tuple[float, ...]], Tensor]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +32,12 @@ class Kind:
     name: str
     sdf: SdfFn
     support: SupportFn
-    wrap: str  # how patterns lie on it: "ring" (two angles), "round" (azimuth, height) or "flat" (x, y, z)
+    wrap: str  # coordinates of patterns: "ring" (two angles), "round" (azimuth, height) or "flat" (x, y, z)
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """One solid in the world: world = matrix @ own + offset."""
+    """One solid in the world: world = matrix @ local + offset."""
 
     kind: Kind
     size: tuple[float, ...]
@@ -45,39 +45,39 @@ class Solid:
     offset: Float[Tensor, "3"]
 
     def at(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Solid":
-        """Moved by a vector."""
+        """Return the solid moved by a vector."""
         return replace(self, offset=self.offset + torch.tensor([x, y, z], dtype=torch.float64))
 
     def turned(self, axis: str, degrees: float) -> "Solid":
-        """Turned about a world axis through the origin, right-handed."""
+        """Return the solid turned about a world axis through the origin, right-handed."""
         return self.mapped(rotation(axis, degrees))
 
     def stretched(self, x: float = 1.0, y: float = 1.0, z: float = 1.0) -> "Solid":
-        """Stretched along the world axes, about the origin."""
+        """Return the solid stretched along the world axes, about the origin."""
         return self.mapped(torch.diag(torch.tensor([x, y, z], dtype=torch.float64)))
 
     def mapped(self, matrix: Float[Tensor, "3 3"]) -> "Solid":
-        """Under a linear map of the world."""
+        """Return the solid under a linear map of the world."""
         return replace(self, matrix=matrix @ self.matrix, offset=matrix @ self.offset)
 
     def support(self, directions: Float[Tensor, "3 k"]) -> Float[Tensor, "k"]:
-        """How far the solid reaches along each direction: the maximum of p . d over its points."""
+        """Return how far the solid extends along each direction: the maximum of p . d over its points p."""
         return self.kind.support(self.matrix.T @ directions, self.size) + self.offset @ directions
 
     def distance(self, points: Float[Tensor, "3 n"]) -> Float[Tensor, "n"]:
-        """A signed lower bound of the world distance to the surface (exact sign)."""
+        """Return a lower bound of the world distance to the surface, with the exact sign."""
         local = torch.linalg.inv(self.matrix) @ (points - self.offset[:, None])
         sizes = size_row(self.size)[:, None].expand(-1, local.shape[1])
         return self.kind.sdf(local, sizes) * torch.linalg.svdvals(self.matrix)[-1]
 
 
 def size_row(size: tuple[float, ...]) -> Float[Tensor, "4"]:
-    """The sizes of a solid, padded to a common length."""
+    """Return the sizes of a solid, padded with zeros to ``SIZES_PER_SOLID``."""
     return torch.tensor((*size, *[0.0] * (SIZES_PER_SOLID - len(size))), dtype=torch.float64)
 
 
 def rotation(axis: str, degrees: float) -> Float[Tensor, "3 3"]:
-    """Right-handed rotation about a world axis."""
+    """Return the right-handed rotation about a world axis."""
     angle, first = math.radians(degrees), (AXES[axis] + 1) % 3
     second = (first + 1) % 3
     matrix = torch.eye(3, dtype=torch.float64)
@@ -151,7 +151,7 @@ def _torus_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
     return size[0] * d[:2].norm(dim=0) + size[1] * d.norm(dim=0)
 
 
-# --- arc: the part of a torus within an angle (radians) of +y, round ends: ring radius, pipe radius, angle
+# --- arc: a torus within an angle (radians) of +y, with round ends: ring radius, pipe radius, angle
 
 
 def _arc_sdf(p: Tensor, size: Tensor) -> Tensor:
@@ -183,7 +183,7 @@ def _capsule_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
 
 
 def _star_sdf(p: Tensor, size: Tensor) -> Tensor:
-    # Fold the plane into one half of one point: reflections keep distances, so the bound survives.
+    # Fold the plane into one half of one point. Reflections keep distances, so the result is still a bound.
     sector = math.pi / STAR_POINTS
     angle = torch.atan2(p[1], p[2])
     folded = (torch.remainder(angle + sector, 2 * sector) - sector).abs()
@@ -201,11 +201,11 @@ def _star_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
     return (tips @ d[1:]).amax(0) + size[2] * d[0].abs()
 
 
-# --- polytopes: the maximum of their planes; they are shaped by their matrix alone
+# --- polytopes: the maximum of their planes; only their matrix changes their shape
 
 
 def _polytope(name: str, planes: list[list[float]], corners: list[list[float]]) -> Kind:
-    """``planes`` holds rows (nx, ny, nz, d) with n . p <= d inside; n need not be of unit length."""
+    """Return the kind with these planes, rows (nx, ny, nz, d) with n . p <= d inside, for n of any length."""
     rows = torch.tensor(planes, dtype=torch.float64)
     rows = rows / rows[:, :3].norm(dim=1, keepdim=True)
     points = torch.tensor(corners, dtype=torch.float64)
@@ -276,7 +276,7 @@ KINDS = (
 )
 
 
-# --- how objects are built: full lengths, centred on the origin
+# --- constructors: they take full lengths, and the solids are centred on the origin
 
 
 def _solid(kind: Kind, *size: float, stretch: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Solid:
@@ -285,75 +285,75 @@ def _solid(kind: Kind, *size: float, stretch: tuple[float, float, float] = (1.0,
 
 
 def ball(radius: float) -> Solid:
-    """A ball."""
+    """Return a ball."""
     return _solid(BALL, radius)
 
 
 def ellipsoid(x: float, y: float, z: float) -> Solid:
-    """An ellipsoid with these half axes."""
+    """Return an ellipsoid with these half axes."""
     return _solid(BALL, 1.0, stretch=(x, y, z))
 
 
 def box(x: float, y: float, z: float) -> Solid:
-    """A box with these side lengths."""
+    """Return a box with these side lengths."""
     return _solid(BOX, x / 2, y / 2, z / 2)
 
 
 def cylinder(radius: float, height: float) -> Solid:
-    """A cylinder about z."""
+    """Return a cylinder about z."""
     return _solid(FRUSTUM, radius, radius, height / 2)
 
 
 def frustum(bottom: float, top: float, height: float) -> Solid:
-    """A cone about z cut off at the ``top`` radius."""
+    """Return a cone about z that is cut off at the ``top`` radius."""
     return _solid(FRUSTUM, bottom, top, height / 2)
 
 
 def cone(radius: float, height: float) -> Solid:
-    """A cone about z, apex up."""
+    """Return a cone about z with its apex up."""
     return _solid(FRUSTUM, radius, 0.0, height / 2)
 
 
 def tube(outer: float, inner: float, height: float) -> Solid:
-    """A cylinder about z with a hole."""
+    """Return a cylinder about z with a hole."""
     return _solid(TUBE, outer, inner, height / 2)
 
 
 def torus(ring: float, pipe: float) -> Solid:
-    """A torus about z: radius of the ring, radius of the pipe."""
+    """Return a torus about z with these radii of the ring and of the pipe."""
     return _solid(TORUS, ring, pipe)
 
 
 def arc(ring: float, pipe: float, degrees: float) -> Solid:
-    """The part of a torus about z within ``degrees`` to either side of +y."""
+    """Return the part of a torus about z within ``degrees`` to either side of +y."""
     return _solid(ARC, ring, pipe, math.radians(degrees))
 
 
 def capsule(radius: float, length: float) -> Solid:
-    """A cylinder about z with round ends; ``length`` from end to end."""
+    """Return a cylinder about z with round ends, ``length`` from end to end."""
     return _solid(CAPSULE, radius, length / 2 - radius)
 
 
 def star(outer: float, inner: float, thickness: float) -> Solid:
-    """A five-pointed star facing +x."""
+    """Return a five-pointed star that faces +x."""
     return _solid(STAR, outer, inner, thickness / 2)
 
 
 def pyramid(x: float, y: float, z: float) -> Solid:
-    """A pyramid on a rectangular base."""
+    """Return a pyramid on a rectangular base."""
     return _solid(PYRAMID, stretch=(x / 2, y / 2, z / 2))
 
 
 def gable(x: float, y: float, z: float) -> Solid:
-    """A gable roof with its ridge along x."""
+    """Return a gable roof with its ridge along x."""
     return _solid(GABLE, stretch=(x / 2, y / 2, z / 2))
 
 
 def tetrahedron(radius: float) -> Solid:
-    """A regular tetrahedron in a ball of ``radius``, one face below."""
+    """Return a regular tetrahedron in a ball of ``radius``, with one face below."""
     return _solid(TETRAHEDRON, stretch=(radius, radius, radius))
 
 
 def octahedron(x: float, y: float, z: float) -> Solid:
-    """An octahedron with these half diagonals."""
+    """Return an octahedron with these half diagonals."""
     return _solid(OCTAHEDRON, stretch=(x, y, z))

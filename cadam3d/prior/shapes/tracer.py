@@ -1,8 +1,9 @@
-"""Sphere tracing: rays march by the distance to the surface until they touch it (Hart 1996).
+"""Sphere tracing: a ray advances by the distance to the surface until it touches the surface (Hart 1996).
 
-Every part is traced on its own, only by rays that meet its bounding box, in its own coordinates; the nearest
-hit wins. All parts of one kind march together, so the number of tensor operations does not grow with the
-number of parts. Light is baked into the world, not into the view: an asset of SH degree 0 can match it.
+Every part is traced separately, in its local coordinates and only by rays that meet its bounding box; the
+nearest hit is visible. All parts of one kind are traced together, so that the number of tensor operations
+does not grow with the number of parts. Light depends on the surface and not on the view, so that an asset of
+SH degree 0 can match it.
 """
 
 import math
@@ -17,29 +18,29 @@ from cadam3d.prior.shapes.scene import PATTERN_NAMES, Scene, sphere_directions
 from cadam3d.prior.shapes.solids import Kind
 
 MARCH_STEPS = 48
-COMPACT_EVERY = 4  # steps between throwing out rays that have arrived or left
-HIT_DISTANCE = 5e-4  # world units; a pixel of a usual view is thirty times wider
-GRAZE_DISTANCE = 4e-3  # a ray still this close after the last step has hit
-BALL_RADIUS = 0.9  # nothing lies outside it; scenes are fitted into 0.85
-NEAR = 0.01  # world units; as the rasterizers
-NORMAL_STEP = 1e-3  # of the finite differences, in own coordinates
-LIGHT = (0.60, 0.42, 0.68)  # towards the light; the front faces +x
-AMBIENT, SKY, DIFFUSE, WRAP = 0.46, 0.18, 0.36, 0.5  # the first three add up to one: never over-exposed
+COMPACT_EVERY = 4  # steps between removals of the rays that have hit or missed
+HIT_DISTANCE = 5e-4  # world units; a pixel of a typical view is thirty times wider
+GRAZE_DISTANCE = 4e-3  # world units; a ray this close to the surface after the last step has hit
+BALL_RADIUS = 0.9  # world units; contains every scene, since scenes are scaled to 0.85
+NEAR = 0.01  # world units; as in the rasterizers
+NORMAL_STEP = 1e-3  # of the finite differences, in local coordinates
+LIGHT = (0.60, 0.42, 0.68)  # direction towards the light; the front faces +x
+AMBIENT, SKY, DIFFUSE, WRAP = 0.46, 0.18, 0.36, 0.5  # the first three sum to 1, so that nothing saturates
 SPOTS = 26
 SPOT_COSINE = 0.965  # of the angular radius of a spot
 
 
 @dataclass(frozen=True)
 class Layers:
-    """A rendered scene before its colours are chosen: every mode is one product with its albedo."""
+    """A rendered scene before its colours are chosen; one product with its albedo gives each mode."""
 
     alpha: Float[Tensor, "v h w"]  # in [0, 1]
-    paints: Float[Tensor, "v h w paints"]  # light that each paint sends, premultiplied with its coverage
+    paints: Float[Tensor, "v h w paints"]  # light from each paint, premultiplied with its coverage
 
     def images(
         self, albedo: Float[Tensor, "m paints 3"], background: Float[Tensor, "v 3"]
     ) -> Float[Tensor, "v m 3 h w"]:
-        """Every mode's image over the background, in [0, 1]."""
+        """Return the image of every mode over the background, in [0, 1]."""
         colour = torch.einsum("vhwp,mpc->vmchw", self.paints, albedo)
         backdrop = torch.einsum("vhw,vc->vchw", 1 - self.alpha, background)
         return colour + backdrop[:, None]
@@ -51,23 +52,23 @@ class _Hits:
 
     ray: Int[Tensor, "n"]
     part: Int[Tensor, "n"]
-    local: Float[Tensor, "3 n"]  # own coordinates
+    local: Float[Tensor, "3 n"]  # position in local coordinates
 
 
 @dataclass(frozen=True)
 class _Rays:
-    """Rays of all views that meet the ball the scene lies in, sorted by view."""
+    """Rays of all views that meet the bounding ball of the scene, sorted by view."""
 
     origins: Float[Tensor, "v 3"]
-    directions: Float[Tensor, "3 r"]  # unit
+    directions: Float[Tensor, "3 r"]  # unit length
     views: Int[Tensor, "r"]
     pixels: Int[Tensor, "r"]  # number of the pixel among all pixels of all views
-    per_view: tuple[int, ...]  # how many rays each view has
+    per_view: tuple[int, ...]  # number of rays of each view
 
 
 @torch.no_grad()
 def trace(scene: Scene, cameras: Cameras, samples: int) -> Layers:
-    """Render with ``samples`` x ``samples`` rays per pixel, in the cameras' device and dtype."""
+    """Render with ``samples`` x ``samples`` rays per pixel, on the device and in the dtype of the cameras."""
     rays = _cast(cameras, samples)
     hits = _first_hits(scene, rays)
     light, paint = _shade(scene, hits)
@@ -80,7 +81,7 @@ def trace(scene: Scene, cameras: Cameras, samples: int) -> Layers:
 
 
 def _cast(cameras: Cameras, samples: int) -> _Rays:
-    """Rays through a regular grid of points in every pixel; those that miss the scene's ball are left out."""
+    """Return rays through a regular grid of points in every pixel, without those that miss the ball."""
     fine = cameras.resize(cameras.height * samples, cameras.width * samples)
     like = {"dtype": fine.intrinsics.dtype, "device": fine.intrinsics.device}
     rows, columns = torch.arange(fine.height, **like), torch.arange(fine.width, **like)
@@ -105,11 +106,11 @@ def _cast(cameras: Cameras, samples: int) -> _Rays:
 
 
 def _candidates(scene: Scene, rays: _Rays) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
-    """Pairs (part, ray) where the ray meets the part's bounding ball, sorted by part."""
+    """Return the pairs (part, ray) in which the ray meets the bounding ball of the part, sorted by part."""
     masks = []
     for origin, direction in zip(rays.origins, rays.directions.split(rays.per_view, dim=1), strict=True):
         away = scene.centres - origin
-        # |away|^2 - towards^2 <= radius^2, solved for what differs between rays.
+        # The condition |away|^2 - towards^2 <= radius^2, solved for `towards`, which differs between rays.
         beyond = away.square().sum(1, keepdim=True) - scene.radii[:, None].square()
         least = torch.where(beyond > 0, beyond.clamp_min(0).sqrt(), -torch.inf)
         masks.append(away @ direction >= least)
@@ -118,9 +119,9 @@ def _candidates(scene: Scene, rays: _Rays) -> tuple[Int[Tensor, "n"], Int[Tensor
 
 
 def _first_hits(scene: Scene, rays: _Rays) -> _Hits:
-    """For every ray that hits something: which part, and where."""
+    """Return the first hit of every ray that hits a part."""
     part, ray = _candidates(scene, rays)
-    # The same rays in the parts' own coordinates; the ray parameter stays in world units.
+    # The same rays in the local coordinates of the parts. The ray parameter stays in world units.
     start = torch.einsum("pij,vpj->ivp", scene.to_local, rays.origins[:, None] - scene.offsets[None])
     origin = start.flatten(1).index_select(1, rays.views[ray] * len(scene.radii) + part)
     direction = torch.einsum("ijn,jn->in", _matrices(scene, part), rays.directions.index_select(1, ray))
@@ -138,7 +139,7 @@ def _first_hits(scene: Scene, rays: _Rays) -> _Hits:
 
     nearest = torch.full_like(rays.directions[0], torch.inf).scatter_reduce_(0, ray, reached, "amin")
     first = ((reached <= nearest[ray]) & reached.isfinite()).nonzero()[:, 0]
-    # Two parts that touch the ray at the same point: the later one, so that no ray counts twice.
+    # If a ray hits two parts at the same point, the later part is chosen, so that no ray counts twice.
     winner = torch.full_like(rays.views, -1).scatter_reduce_(0, ray[first], first, "amax")
     chosen = winner[winner >= 0].sort().values
     point = origin.index_select(1, chosen) + reached[chosen] * direction.index_select(1, chosen)
@@ -146,25 +147,25 @@ def _first_hits(scene: Scene, rays: _Rays) -> _Hits:
 
 
 def _matrices(scene: Scene, part: Int[Tensor, "n"]) -> Float[Tensor, "3 3 n"]:
-    """``to_local`` of each part named; [i, j] is row i."""
+    """Return ``to_local`` of the given parts; [i, j] is row i and column j of the matrices."""
     return scene.to_local.flatten(1).T.contiguous().index_select(1, part).reshape(3, 3, -1)
 
 
 def _box_interval(scene: Scene, part: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Where each ray enters and leaves the box of its part, in front of the camera."""
+    """Return the ray parameters where each ray enters and leaves the box of its part, beyond ``NEAR``."""
     tiny = torch.full_like(direction, 1e-12)
     inverse = 1 / torch.where(direction.abs() < 1e-12, tiny, direction)
     first = (scene.low.T.index_select(1, part) - origin) * inverse
     second = (scene.high.T.index_select(1, part) - origin) * inverse
     begin = torch.minimum(first, second).amax(0).clamp_min(NEAR)
-    # A little longer than the box: at a flat face the interval of a grazing ray is empty but for rounding.
+    # Slightly longer than the box, since rounding can empty the interval of a ray along a flat face.
     return begin, torch.maximum(first, second).amin(0) + HIT_DISTANCE
 
 
 def _march(
     kind: Kind, origin: Tensor, direction: Tensor, sizes: Tensor, begin: Tensor, end: Tensor
 ) -> Tensor:
-    """Ray parameter of the first point on the surface; infinite for a miss."""
+    """Return the ray parameter of the first point on the surface, or infinity for a miss."""
     reached = torch.full_like(begin, torch.inf)
     rows = torch.arange(len(begin), device=begin.device)
     t, speed = begin, direction.square().sum(0).rsqrt()
@@ -185,7 +186,7 @@ def _march(
 
 
 def _runs(scene: Scene, part: Tensor) -> list[tuple[Kind, slice]]:
-    """Rows of each kind, given part numbers in ascending order."""
+    """Return the rows of each kind, given part numbers in ascending order."""
     runs, first, begin = [], 0, 0
     for kind, count in scene.kinds:
         first += count
@@ -200,7 +201,7 @@ def _runs(scene: Scene, part: Tensor) -> list[tuple[Kind, slice]]:
 
 
 def _shade(scene: Scene, hits: _Hits) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
-    """Light in [0, 1] and paint of every visible point."""
+    """Return the light in [0, 1] and the paint of every visible point."""
     sizes = scene.sizes.T.index_select(1, hits.part)
     normal = torch.empty_like(hits.local)
     for kind, rows in _runs(scene, hits.part):
@@ -224,12 +225,12 @@ def _shade(scene: Scene, hits: _Hits) -> tuple[Float[Tensor, "n"], Int[Tensor, "
 
 
 def _unit(vectors: Tensor) -> Tensor:
-    """Vectors of unit length along the first axis."""
+    """Normalize vectors that have their components along the first axis."""
     return vectors * vectors.square().sum(0).clamp_min(1e-30).rsqrt()
 
 
 def _gradient(kind: Kind, points: Tensor, sizes: Tensor) -> Tensor:
-    """Gradient of the distance, up to a factor, from four points of a tetrahedron around each point."""
+    """Return the gradient of the distance, up to a factor, from a tetrahedron of points around each point."""
     corners = points.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
     probes = points[:, None] + NORMAL_STEP * corners.T[:, :, None]
     distance = kind.sdf(probes.flatten(1), sizes.repeat(1, 4)).reshape(4, -1)
@@ -239,7 +240,7 @@ def _gradient(kind: Kind, points: Tensor, sizes: Tensor) -> Tensor:
 def _paint_second(
     kind: Kind, pattern: str, p: Tensor, sizes: Tensor, box: tuple[Tensor, Tensor]
 ) -> Bool[Tensor, "n"]:
-    """Whether a point wears the second colour of its pattern."""
+    """Return whether each point has the second colour of its pattern."""
     centre, half = box
     unit = (p - centre) / half  # in [-1, 1]
     if kind.wrap == "ring":
@@ -248,7 +249,7 @@ def _paint_second(
     if pattern == "spotted":
         return (sphere_directions(SPOTS).to(p) @ _unit(unit)).amax(0) > SPOT_COSINE
     if kind.wrap == "flat":
-        # A hair smaller, so that faces do not fall on the border between two cells.
+        # Slightly smaller, so that faces are not on the border between two cells.
         inner = 0.999 * unit
         if pattern == "striped":
             return _is_odd((inner[2] + 1) * 3)
@@ -256,7 +257,7 @@ def _paint_second(
     across = unit[:2].square().sum(0).sqrt().clamp_max(1)
     if kind.name == "ball":
         band = 3 * torch.asin(unit[2].clamp(-1, 1)) / (torch.pi / 2)
-    else:  # along the side, then over the top towards the axis
+    else:  # bands run up the side and then over the top to the axis
         reach, rise = half[:2].amax(0), half[2]
         band = 4 * (unit[2] * rise + (1 - across) * reach) / (reach + rise)
     if pattern == "striped":
@@ -266,12 +267,12 @@ def _paint_second(
 
 
 def _ring_pattern(pattern: str, turn: Tensor, roll: Tensor) -> Bool[Tensor, "n"]:
-    """Patterns on a torus; both angles in half turns, [-1, 1]."""
+    """Return the pattern on a torus; both angles are in half turns, in [-1, 1]."""
     if pattern == "striped":
         return _is_odd((turn + 1) * 8)
     if pattern == "checkered":
         return _is_odd_sum(torch.stack([(turn + 1) * 7, (roll + 1) * 4]))
-    # Spots: one per cell of a staggered grid, round because a cell is about as long as it is high.
+    # One spot per cell of a staggered grid. Spots are round, since a cell is about as long as it is high.
     along, around = (turn + 1) * 6, (roll + 1) * 2
     around = around + 0.5 * torch.remainder(along.floor(), 2)
     return (torch.remainder(along, 1) - 0.5).square() + (torch.remainder(around, 1) - 0.5).square() < 0.09

@@ -1,6 +1,7 @@
-"""The words of the world: colours, patterns, sizes, numbers, relations. Objects are in objects.py."""
+"""The words of the grammar: colours, patterns, sizes, numbers and relations. Objects are in objects.py."""
 
-# Albedo in [0, 1]. Saturated but never 0 or 1, so that shading and over-saturation stay visible.
+# Albedo in [0, 1]. The colours are saturated but never 0 or 1, so that shading and over-saturation stay
+# visible.
 COLOURS: dict[str, tuple[float, float, float]] = {
     "red": (0.86, 0.12, 0.12),
     "orange": (0.95, 0.50, 0.10),
@@ -30,7 +31,7 @@ COLOURS: dict[str, tuple[float, float, float]] = {
 }
 COLOUR_ALIASES = {"gray": "grey", "golden": "gold", "tan": "beige", "crimson": "maroon", "aqua": "cyan"}
 
-# What an object of open colour may be, each with the same weight: one mode of the mixture per colour.
+# The equally likely colours of an object without a given colour; each gives one mode of the mixture.
 OPEN_PALETTE = ("red", "orange", "yellow", "green", "cyan", "blue", "purple", "pink")
 
 PLAIN = "plain"
@@ -47,7 +48,7 @@ PATTERNS = {
     "spotty": "spotted",
 }
 
-# Factors on the natural size of an object; they show where two objects stand together.
+# Factors of the natural size of an object. They are visible only if a scene has several objects.
 SIZES = {"tiny": 0.4, "small": 0.65, "little": 0.65, "medium": 1.0, "large": 1.5, "big": 1.5, "huge": 2.2}
 # Factors along x, y and z.
 STRETCHES = {
@@ -60,7 +61,7 @@ STRETCHES = {
 }
 NUMBERS = {"one": 1, "two": 2, "three": 3, "four": 4, "five": 5}
 
-# Longest first, since the first that matches counts; "of" is a filler.
+# Longest first, since the first match is taken; "of" is a filler.
 RELATIONS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("on", "top"), "on"),
     (("in", "front"), "in front of"),
@@ -80,5 +81,5 @@ RELATIONS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("and",), "next to"),
 )
 ARTICLES = frozenset({"a", "an", "the", "some"})
-# Words of other people's prompts that say nothing about the scene: "a 3d model of a ...".
+# Words that are common in prompts and do not describe the scene, as in "a 3d model of a ...".
 FILLERS = frozenset({"photo", "picture", "image", "render", "rendering", "model", "3d", "of"})

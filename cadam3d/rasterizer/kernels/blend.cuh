@@ -1,8 +1,9 @@
 // Blending and its gradient: one warp per 8x8 tile, two pixels per lane, four rows apart.
 //
-// A warp fetches 32 splats at once, each lane one, and then all lanes walk over them. Lanes never wait for
-// another warp. Backward walks back to front with one running sum per pixel; ten sums over the pixels of the
-// tile are left in the slot of the splat, so nothing is ever added to what another warp wrote.
+// A warp loads 32 splats at once, one per lane, and then all lanes loop over them. Lanes never wait for
+// another warp. The backward pass goes back to front with one running sum per pixel. It writes ten sums over
+// the pixels of the tile into the slot of the splat, so a warp never adds to a number that another warp
+// wrote.
 #pragma once
 
 #include "device.cuh"
@@ -10,7 +11,7 @@
 constexpr int BLEND_BLOCK = 128;  // threads; mirrored in ../cuda.py
 constexpr int BLEND_WARPS = BLEND_BLOCK / WARP;
 
-// Where a warp and its lanes are.
+// The tile of a warp and the pixels of its lanes.
 struct Place {
   i64 view, pixel[2];  // pixel: index into [v h w]
   float x, y[2];       // pixel centres
@@ -32,8 +33,8 @@ SPLAT_FN Place make_place(i64 tile, i64 height, i64 width) {
   return place;
 }
 
-// |L d|^2. Forward and backward both call it, and products are fused only where written: they agree to the
-// last bit on who is skipped.
+// |L d|^2. The forward and the backward pass both call this function, and products are fused only where the
+// source says so. Therefore they agree to the last bit on which splats are skipped.
 struct Falloff {
   float u, t, exponent;
 };
@@ -87,7 +88,8 @@ blend_forward(const float4* splats, const u32* slots, const u32* pair_of_slot, c
   const i64 begin = ranges[2 * tile], end = ranges[2 * tile + 1];
   for (i64 base = begin; base < end; base += WARP) {
     if (!__any_sync(ALL, pixels[0].is_open || pixels[1].is_open)) break;
-    __syncwarp();  // every lane has left the last stage: a vote alone does not order memory
+    // All lanes have finished with the previous stage. The vote alone would not order memory accesses.
+    __syncwarp();
     if (base + lane < end) {
       const float4* from = splats + 3 * i64(pair_of_slot[slots[base + lane]]);
       for (int part = 0; part < 3; ++part) stage[part][lane] = from[part];
@@ -116,11 +118,12 @@ blend_forward(const float4* splats, const u32* slots, const u32* pair_of_slot, c
   }
 }
 
-// A pixel on the way back. With w = alpha T the loss sees it through sum w v, where v = rgb . g_rgb +
-// (z - D) g_depth / A, and through its final transmittance. ``suffix`` is what lies behind a splat:
-// dLoss/dalpha = T v - suffix / (1 - alpha).
+// A pixel in the backward pass. With w = alpha T, the loss depends on it through sum w v, where v = rgb .
+// g_rgb + (z - D) g_depth / A, and through its final transmittance. ``suffix`` is the sum over everything
+// behind a splat: dLoss/dalpha = T v - suffix / (1 - alpha).
 struct PixelBackward {
-  float transmittance, suffix, red, green, blue, far, depth;  // red .. far: gradients of what a weight adds
+  // red to far: gradients of the weighted sums.
+  float transmittance, suffix, red, green, blue, far, depth;
   u32 last;
 };
 
@@ -141,14 +144,14 @@ SPLAT_FN PixelBackward load_pixel(i64 at, const float* background, const float* 
   return pixel;
 }
 
-// The ten sums of a record, over the pixels seen so far.
+// The ten sums of a record over the pixels processed so far.
 struct Sums {
   float g, gu, gt, guu, gut, gtt, red, green, blue, depth;
 };
 
-// Two more, if absgrad is wanted: what pixels add to the gradient of the centre, in absolute value.
+// Two more sums for absgrad: the absolute values of what each pixel adds to the gradient of the centre.
 struct Absolutes {
-  float u, y;  // of |g u| and |g (l12 u + l22 t)|: see splat::mean2d_absolute
+  float u, y;  // sums of |g u| and |g (l12 u + l22 t)|: see splat::mean2d_absolute
 };
 
 template <bool ABSOLUTE>
@@ -181,14 +184,15 @@ SPLAT_FN void shade_backward(PixelBackward& pixel, const Splat& s, const Falloff
   absolutes.y += fabsf(__fmaf_rn(s.l12, gu, s.l22 * gt));
 }
 
-// Half of the lanes go on with ``low``, the other half with ``high``, and each gives away what it drops.
+// Half of the lanes continue with ``low`` and the other half with ``high``. Each sends the other value to its
+// partner.
 SPLAT_FN float fold(bool is_high, float low, float high, int reach) {
   return (is_high ? high : low) + __shfl_xor_sync(ALL, is_high ? low : high, reach);
 }
 
-// Ten sums over the warp in twelve shuffles: each fold halves how many a lane is responsible for. Lane
-// (b4 b3 b2 b1 b0) ends up with sum 5 b4 + 3 b3 + 2 b2 + b1, if there is one: see component_of. Written out,
-// for an array would be put into slow memory.
+// Ten sums over the warp in twelve shuffles: each fold halves the number of sums that a lane is responsible
+// for. Lane (b4 b3 b2 b1 b0) ends with sum 5 b4 + 3 b3 + 2 b2 + b1, if that exists: see component_of. The
+// sums are separate variables because an array would be placed in slow memory.
 SPLAT_FN float fold_sums(const Sums& s) {
   const int lane = lane_index();
   const bool b4 = lane & 16, b3 = lane & 8, b2 = lane & 4, b1 = lane & 2;
@@ -201,21 +205,21 @@ SPLAT_FN float fold_sums(const Sums& s) {
   return sum + __shfl_xor_sync(ALL, sum, 1);
 }
 
-// The first half of the lanes get the sum of u, the others that of y.
+// The first half of the lanes get the sum of u, the other half the sum of y.
 SPLAT_FN float fold_absolutes(const Absolutes& absolutes) {
   float sum = fold(lane_index() & 16, absolutes.u, absolutes.y, 16);
   for (int reach = 8; reach > 0; reach /= 2) sum += __shfl_xor_sync(ALL, sum, reach);
   return sum;
 }
 
-// Which sum a lane holds after fold_sums; -1 if none, or if its neighbour holds the same.
+// The sum that a lane holds after fold_sums; -1 if it holds none, or the same one as its neighbour.
 SPLAT_FN int component_of(int lane) {
   const int b4 = lane / 16, b3 = lane / 8 % 2, in_half = 3 * b3 + lane / 2 % 4;
   return lane % 2 == 0 && in_half < (b3 ? 5 : 3) ? 5 * b4 + in_half : -1;
 }
 
-// records [slots 10], absolutes [slots 2]. One list more than there are tiles: slots that no tile took get
-// zeros too.
+// records [slots 10], absolutes [slots 2]. There is one more list than tiles: it holds the slots that belong
+// to no tile, and they get zeros too.
 template <bool ABSOLUTE>
 SPLAT_FN void blend_tile_backward(const float4* splats, const u32* slots, const u32* pair_of_slot,
                                   const u32* ranges, i64 tiles, const float* background, i64 height, i64 width,
@@ -231,7 +235,7 @@ SPLAT_FN void blend_tile_backward(const float4* splats, const u32* slots, const 
   u32(&stage_slots)[WARP] = staged_slots[threadIdx.x / WARP];
   const Place place = make_place(tile, height, width);
   PixelBackward pixels[2] = {};
-  u32 used = 0;  // splats behind these reached no pixel of the tile
+  u32 used = 0;  // number of splats up to the last one that reached a pixel of the tile
   for (int p = 0; p < 2; ++p) {
     if (tile == tiles || !place.is_inside[p]) continue;
     pixels[p] = load_pixel(place.pixel[p], background + 3 * place.view, alpha, depth, transmittance, last,
@@ -252,7 +256,7 @@ SPLAT_FN void blend_tile_backward(const float4* splats, const u32* slots, const 
 
   for (i64 top = begin + used; top > begin; top -= WARP) {
     const i64 base = top - begin < WARP ? begin : top - WARP;
-    __syncwarp();  // every lane has left the last stage
+    __syncwarp();  // all lanes have finished with the previous stage
     if (base + lane < top) {
       const u32 slot = slots[base + lane];
       const float4* from = splats + 3 * i64(pair_of_slot[slot]);

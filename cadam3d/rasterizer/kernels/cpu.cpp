@@ -1,13 +1,14 @@
 // The CPU rasterizer: projection, tile lists, blending and their gradients, behind a C interface.
 //
-// A frame goes through five stages: project every Gaussian into every view; sort each view's visible ones by
-// depth; list for each 16x16 tile whose box touches it, front to back; blend the tiles. Backward walks each
-// tile back to front, leaves one record per (Gaussian, tile), sums the records of each Gaussian in a fixed
-// order and applies the chain rule. No two threads ever add to the same number, and work is cut into pieces
-// that do not depend on how many threads there are: the bits of every result are the same for any number.
+// The forward pass projects every Gaussian into every view, sorts the visible ones of each view by depth,
+// lists for each 16x16 tile the Gaussians with boxes that touch it, front to back, and blends the tiles. The
+// backward pass processes each tile back to front, writes one record per (Gaussian, tile), sums the records
+// of each Gaussian in a fixed order and applies the chain rule. No two threads ever add to the same number,
+// and the pieces of work do not depend on the number of threads. Therefore any number of threads gives the
+// same bits.
 //
-// Vectors hold LANES Gaussians where Gaussians are projected. Where tiles are blended they hold LANES pixels
-// of a cell of 4x4: splats are small, and a square wastes fewer lanes on them than a row.
+// In the projection a vector holds LANES Gaussians. In the blending it holds LANES pixels of a cell of 4x4
+// pixels: splats are small, and on a square they leave fewer lanes unused than on a row.
 #include <algorithm>
 #include <atomic>
 #include <cmath>
@@ -51,12 +52,13 @@ constexpr int CELL = 4;  // pixels along the edge
 constexpr int CELLS = (TILE / CELL) * (TILE / CELL);
 constexpr int PARTS = CELL * CELL / LANES;  // vectors per cell
 constexpr int64_t BLOCK = 256;              // Gaussians per piece of work; a whole number of vectors
-constexpr int RECORD = 16;   // floats left by the backward per (Gaussian, tile): one cache line
-constexpr int MOMENTS = 10;  // of them in use
-constexpr int ABSOLUTES = 2;  // the next ones, if absgrad is wanted
+constexpr int RECORD = 16;   // floats that the backward pass writes per (Gaussian, tile): one cache line
+constexpr int MOMENTS = 10;  // the first floats of a record
+constexpr int ABSOLUTES = 2;  // the next floats, used for absgrad
 static_assert(CELLS == CELL * CELL && BLOCK % LANES == 0, "a vector of cells is as long as one of pixels");
 
-// Bytes of records in flight, unless one view needs more; tests set a small one.
+// Bytes of the records that exist at the same time, unless a single view needs more. Tests set a small
+// number.
 #if !defined(SPLAT_RECORD_BUDGET)
 #define SPLAT_RECORD_BUDGET (256 << 20)
 #endif
@@ -69,13 +71,13 @@ struct Scene {
   const float *means, *log_scales, *quats, *opacity_logits, *sh, *world_to_camera, *intrinsics, *background;
 };
 
-// What the blend reads of a projected Gaussian: one cache line.
+// The data of a projected Gaussian that blending reads: one cache line.
 struct alignas(64) Splat {
   float x, y;                 // pixels
   float l11, l12, l22;        // whitening, see splat_math.h
   float cut, opacity, depth;  // alpha = opacity exp(-|y|^2) where |y|^2 <= cut
   float rgb[3];
-  uint32_t columns, rows;  // of tiles that its box touches: the first, and the end shifted by 16; 0 = none
+  uint32_t columns, rows;  // tiles that its box touches: first | end << 16; 0 = none
   float spare[3];
 };
 constexpr int SPLAT_FIELDS = 13;  // four bytes each; ``project_batch`` lists them in this order
@@ -86,7 +88,7 @@ struct Range {
 };
 inline Range unpack(uint32_t range) { return {range & 0xffff, range >> 16}; }
 
-// Memory whose first content does not matter; std::vector would write zeros first.
+// Uninitialized memory; std::vector would first write zeros.
 template <class T>
 class Buffer {
  public:
@@ -104,20 +106,20 @@ struct alignas(64) Record {
   float sums[RECORD];
 };
 
-// One Gaussian in the list of one tile, and where the record of the two lies.
+// One Gaussian in the list of one tile, and the slot of their record.
 struct Entry {
   uint32_t gaussian, slot;
 };
 
-// What one view keeps between forward and backward.
+// The data of one view that the backward pass needs again.
 struct View {
   splat::Camera<Wide> camera;
   std::vector<uint32_t> order;   // Gaussians on the screen, near to far
   Buffer<uint32_t> first_slot;   // gaussians + 1; one slot per (Gaussian, tile), grouped by Gaussian
   Buffer<uint32_t> first_entry;  // tiles + 1
   Buffer<Entry> entries;         // tile by tile, near to far
-  Buffer<uint16_t> reached;      // entries; the cells it reached, a bit each
-  Buffer<uint32_t> used;         // tiles; entries walked before every pixel was opaque
+  Buffer<uint16_t> reached;      // entries; one bit for each cell that the entry reached
+  Buffer<uint32_t> used;         // tiles; entries processed before every pixel was opaque
   Buffer<float> transmittance;   // tiles x AREA; after the last splat
   Buffer<int32_t> last;          // tiles x AREA; rank of the splat at which the pixel was opaque
 };
@@ -129,8 +131,8 @@ struct Frame {
   int64_t tiles() const { return tiles_x * tiles_y; }
 };
 
-// Runs body(0) .. body(items - 1), each once, on up to ``threads`` threads. Threads live for one call:
-// nothing outlives a fork, and starting them costs microseconds.
+// Runs body(0) .. body(items - 1), each once, on up to ``threads`` threads. The threads end with the call, so
+// that none has to survive a fork; starting them costs microseconds.
 template <class Body>
 void parallel_for(int64_t items, int64_t threads, const Body& body) {
   std::atomic<int64_t> next{0};
@@ -143,7 +145,7 @@ void parallel_for(int64_t items, int64_t threads, const Body& body) {
     team.reserve(size_t(helpers));
     try {
       for (int64_t i = 0; i < helpers; ++i) team.emplace_back(work);
-    } catch (...) {  // the system refuses another thread: those at hand do the work
+    } catch (...) {  // the system refuses another thread, so the existing ones do the work
     }
   }
   work();
@@ -152,7 +154,7 @@ void parallel_for(int64_t items, int64_t threads, const Body& body) {
 
 int64_t ceil_div(int64_t a, int64_t b) { return (a + b - 1) / b; }
 
-// LANES rows of a tensor from ``first`` on; the last one again where there are no more.
+// LANES rows of a tensor from ``first`` on. After the end of the tensor the last row is repeated.
 struct Rows {
   int64_t first, of_lane[LANES];
   int count;
@@ -173,7 +175,7 @@ struct Rows {
   }
 };
 
-// As many Gaussians.
+// LANES Gaussians from ``first`` on.
 struct Batch : Rows {
   splat::Gaussian<Wide> gaussian;
   Wide sh[3 * splat::MAX_COEFFICIENTS];
@@ -190,10 +192,10 @@ struct Batch : Rows {
     gaussian.sh = sh;
     gaussian.coefficients = int(scene.coefficients);
   }
-  Batch(const Batch&) = delete;  // ``gaussian`` points into it
+  Batch(const Batch&) = delete;  // ``gaussian`` points into this object
 };
 
-// Calls body(first) for all batches, a block of them at a time.
+// Calls body(first) for all batches; a thread processes one block of them at a time.
 template <class Body>
 void each_batch(const Scene& scene, const Body& body) {
   parallel_for(ceil_div(scene.gaussians, BLOCK), scene.threads, [&](int64_t block) {
@@ -209,9 +211,9 @@ splat::Camera<Wide> camera_of(const Scene& scene, int64_t v) {
 
 // ---------------------------------------------------------------------------------------------- project
 
-// The tiles of one axis that hold pixel centres within ``reach`` of ``centre``, as in ``Splat``.
+// The tiles along one axis with pixel centres within ``reach`` of ``centre``, packed as in ``Splat``.
 Ints touched_tiles(Floats centre, Floats reach, int64_t tiles, Mask is_seen) {
-  const Floats slack = 1e-3f + 1e-6f * (simd::absolute(centre) + reach);  // more than the rounding
+  const Floats slack = 1e-3f + 1e-6f * (simd::absolute(centre) + reach);  // more than the rounding error
   const auto tile = [&](Floats pixel) {
     return simd::to_ints(simd::min(simd::max(pixel * (1.0f / TILE), Floats{}), spread(float(tiles))));
   };
@@ -257,7 +259,8 @@ void project_batch(const Scene& scene, Frame& frame, int64_t first, float* means
 
 // ---------------------------------------------------------------------------------------------- tile lists
 
-// Stable least-significant-digit radix sort of ``order`` by positive depth; as many passes as depths differ in.
+// Stable radix sort of ``order`` by positive depth, least significant digit first. It makes as many passes as
+// the depths have differing digits.
 void sort_by_depth(std::vector<uint32_t>& order, const Splat* splats) {
   constexpr int BITS = 12, BINS = 1 << BITS;
   struct Item {
@@ -289,10 +292,10 @@ void sort_by_depth(std::vector<uint32_t>& order, const Splat* splats) {
   for (size_t i = 0; i < n; ++i) order[i] = items[int64_t(i)].gaussian;
 }
 
-// Who is on the screen in depth order, the slots of each, and where the list of each tile starts.
+// Computes the depth order of the visible Gaussians, the slots of each, and the start of each tile's list.
 void order_view(const Scene& scene, const Frame& frame, View& view, const Splat* splats) {
   const int64_t stride = frame.tiles_x + 1;
-  // By how many the lists grow from one tile to the next, along x and y: four changes per box.
+  // The change of the list length from one tile to the next, along x and y: each box makes four changes.
   std::vector<int64_t> change(size_t(stride * (frame.tiles_y + 1)), 0);
   view.first_slot.allocate(scene.gaussians + 1);
   view.order.resize(size_t(scene.gaussians));
@@ -330,14 +333,15 @@ void order_view(const Scene& scene, const Frame& frame, View& view, const Splat*
   view.entries.allocate(entries);
 }
 
-// What is needed ``AHEAD`` places later is asked for now: lists point all over memory.
+// Lists refer to scattered memory, so an item is prefetched ``AHEAD`` places before it is needed.
 constexpr int AHEAD = 6;
 inline void prefetch(const void* address) {
   __builtin_prefetch(address);
-  asm volatile("" : : "r"(address));  // GCC takes a function that only prefetches for one that does nothing
+  asm volatile("" : : "r"(address));  // GCC would remove a function that only prefetches
 }
 
-// Writes the lists of the tile rows [row_begin, row_end): near splats first, so every list is in depth order.
+// Writes the lists of the tile rows [row_begin, row_end). Near splats come first, so lists are in depth
+// order.
 void fill_entries(const Frame& frame, View& view, const Splat* splats, int64_t row_begin, int64_t row_end) {
   std::vector<uint32_t> next(size_t((row_end - row_begin) * frame.tiles_x));
   const int64_t first_tile = row_begin * frame.tiles_x;
@@ -358,7 +362,7 @@ void fill_entries(const Frame& frame, View& view, const Splat* splats, int64_t r
 }
 
 void build_tile_lists(const Scene& scene, Frame& frame) {
-  std::atomic<int> trouble{OK};  // an exception must not leave a thread
+  std::atomic<int> trouble{OK};  // collects failures, because an exception must not leave a thread
   const auto each = [&](int64_t items, auto&& stage) {
     parallel_for(items, scene.threads, [&](int64_t item) {
       try {
@@ -384,7 +388,7 @@ void build_tile_lists(const Scene& scene, Frame& frame) {
 
 // ---------------------------------------------------------------------------------------------- blend
 
-// Where a tile lies in its view and which part of it is inside the image.
+// The position of a tile in its view, and the part of it that is inside the image.
 struct Place {
   int64_t x, y;       // first pixel
   int columns, rows;  // pixels inside
@@ -396,7 +400,8 @@ Place place_of(const Scene& scene, const Frame& frame, int64_t tile) {
           int(std::min<int64_t>(TILE, scene.height - y))};
 }
 
-// Where the pixels of a cell lie from its middle, and the middles of the cells from the corner of the tile.
+// The offsets of the pixels of a cell from its middle, and of the middles of the cells from the tile's
+// corner.
 struct Grid {
   float offset_x[CELL * CELL], offset_y[CELL * CELL], middle_x[CELLS], middle_y[CELLS];
 };
@@ -410,14 +415,14 @@ constexpr Grid make_grid() {
 }
 constexpr Grid GRID = make_grid();
 
-// y = L d of a splat: at the middle of each cell, and what a pixel adds to that.
+// y = L d of a splat: at the middle of each cell, and the difference for each pixel of a cell.
 struct Aim {
   alignas(64) float u[CELLS], t[CELLS];
   Floats pixel_u[PARTS], pixel_t[PARTS];
 };
 
-// Forward and backward both call it and ``falloff``: they agree to the last bit on who is skipped. ``x`` and
-// ``y`` are the centre, relative to the tile.
+// The forward and the backward pass both call this function and ``falloff``, so they agree to the last bit on
+// which splats are skipped. ``x`` and ``y`` are the centre, relative to the tile.
 inline void take_aim(const Splat& s, float x, float y, Aim& aim) {
   const Floats l11 = spread(s.l11), l12 = spread(s.l12), l22 = spread(s.l22);
   for (int part = 0; part < PARTS; ++part) {
@@ -431,11 +436,11 @@ inline void take_aim(const Splat& s, float x, float y, Aim& aim) {
   }
 }
 
-// A bit for each cell that |L d|^2 <= cut can reach: within a cell, u and t leave their middle by so much
-// only.
+// Returns a bit for each cell that |L d|^2 <= cut can reach. Within a cell, u and t differ from their value
+// in the middle by at most a known margin.
 inline uint32_t reachable_cells(const Splat& s, const Aim& aim) {
   const Floats margin_u = spread(1.5f * (s.l11 + std::fabs(s.l12))), margin_t = spread(1.5f * s.l22);
-  const Floats cut = spread(s.cut + 1e-3f);  // and more than the rounding
+  const Floats cut = spread(s.cut + 1e-3f);  // includes more than the rounding error
   uint32_t cells = 0;
   for (int part = 0; part < PARTS; ++part) {
     const Floats u = simd::max(simd::absolute(simd::load(aim.u + part * LANES)) - margin_u, Floats{});
@@ -453,16 +458,17 @@ inline Falloff falloff(const Aim& aim, int cell, int part) {
   return {u, t, simd::fma(u, u, t * t)};
 }
 
-// The pixels of one vector, field by field: what a splat touches lies together.
+// The pixels of one vector, stored field by field, so that the data that a splat touches is contiguous.
 struct Pixels {
-  Floats transmittance, red, green, blue, weight, depth;  // depth: sum w z, in the end the expected z
+  Floats transmittance, red, green, blue, weight, depth;  // depth: sum w z, at the end the expected z
 };
 struct PixelsBackward {
-  Floats transmittance, suffix, red, green, blue, far, depth;  // red .. far: gradients of what a weight adds
+  // red to far: gradients of the weighted sums.
+  Floats transmittance, suffix, red, green, blue, far, depth;
   Ints last;
 };
 
-// Calls visit(vector, lane, pixel) for the pixels of a tile that lie inside the image.
+// Calls visit(vector, lane, pixel) for the pixels of a tile that are inside the image.
 template <class Visit>
 void each_pixel(const Scene& scene, const Place& place, const Visit& visit) {
   for (int row = 0; row < place.rows; ++row) {
@@ -574,8 +580,8 @@ void blend_tile(const Scene& scene, const Frame& frame, View& view, const Splat*
 }
 
 struct Images {
-  const float *alpha, *depth;                       // what the forward gave
-  const float *grad_rgb, *grad_alpha, *grad_depth;  // any may be null, which means zero
+  const float *alpha, *depth;                       // results of the forward pass
+  const float *grad_rgb, *grad_alpha, *grad_depth;  // each may be null, which means zero
 };
 
 void load_gradients(const Scene& scene, const View& view, int64_t tile, const Place& place,
@@ -605,9 +611,9 @@ void load_gradients(const Scene& scene, const View& view, int64_t tile, const Pl
   }
 }
 
-// Back to front. With w = alpha T the loss sees a pixel through sum w v, where v = rgb . g_rgb +
-// (z - D) g_depth / A, and through its final transmittance. ``suffix`` is what lies behind a splat:
-// dLoss/dalpha = T v - suffix / (1 - alpha).
+// Goes back to front. With w = alpha T, the loss depends on a pixel through sum w v, where v = rgb . g_rgb +
+// (z - D) g_depth / A, and through its final transmittance. ``suffix`` is the sum over everything behind a
+// splat: dLoss/dalpha = T v - suffix / (1 - alpha).
 template <bool ABSOLUTE>
 void blend_tile_backward(const Scene& scene, const Frame& frame, const View& view, const Splat* splats,
                          int64_t tile, const float* background, const Images& images, Record* records) {
@@ -644,7 +650,7 @@ void blend_tile_backward(const Scene& scene, const Frame& frame, const View& vie
         const Falloff fall = falloff(aim, cell, part);
         const Mask hit = simd::both(simd::less_equal(fall.exponent, cut), simd::less(index, p.last));
         if (PARTS > 1 && !simd::any(hit)) continue;
-        // Lanes that are not hit have alpha 0 from here on: they change nothing, and meet no slow denormals.
+        // Lanes that are not hit get alpha 0 here, so they change nothing and compute no slow denormals.
         const Floats free = simd::keep(hit, opacity * simd::exp_minus(fall.exponent));
         const Floats a = simd::min(free, alpha_max);
         const Floats after = p.transmittance, behind = p.suffix;
@@ -691,7 +697,7 @@ struct ParameterGradients {
   float *means2d, *absgrad, *means, *log_scales, *quats, *opacity_logits, *sh;  // absgrad may be null
 };
 
-// The sums over the tiles of one view; false if no Gaussian of the batch is on the screen.
+// Sums the records of one view over its tiles; returns false if no Gaussian of the batch is on the screen.
 bool gather_moments(const View& view, const Batch& batch, const Record* records,
                     splat::Moments<Wide>& moments, Wide (&absolutes)[ABSOLUTES]) {
   if (view.first_slot[batch.first] == view.first_slot[batch.first + batch.count]) return false;
@@ -721,7 +727,7 @@ void add_where(Truths condition, const splat::Gradient<Wide>& part, int64_t coef
   for (int64_t j = 0; j < 3 * coefficients; ++j) total.sh[j] += select(condition, part.sh[j], 0);
 }
 
-// Adds the gradients that the views [view_begin, view_end) give to LANES Gaussians.
+// Adds the gradients of LANES Gaussians from the views [view_begin, view_end).
 void batch_backward(const Scene& scene, const Frame& frame, int64_t view_begin, int64_t view_end,
                     int64_t first, const Record* const* records, const ParameterGradients& out) {
   const Batch batch(scene, first);
@@ -764,7 +770,7 @@ void batch_backward(const Scene& scene, const Frame& frame, int64_t view_begin, 
   for (int64_t j = 0; j < stride; ++j) batch.add(out.sh + j, stride, total.sh[j]);
 }
 
-// Views are taken in groups whose records fit the budget, at least one at a time.
+// Returns the end of a group of views with records that fit the budget. A group has at least one view.
 int64_t group_end(const Scene& scene, const Frame& frame, int64_t begin, int64_t& records) {
   records = 0;
   int64_t v = begin;
@@ -791,11 +797,12 @@ int guarded(const Body& body) {
 }  // namespace
 
 // ---------------------------------------------------------------------------------------------- C interface
-// Every tensor is contiguous float32 in the shape the Python side gives it. Functions return a Status.
+// Every tensor is contiguous float32, with the shape that the Python code gives it. Functions return a
+// Status.
 
 EXPORT const char* cadam3d_instruction_set() { return SIMD_NAME; }
 
-// Projects, and creates the frame that the other calls need. means2d [v n 2], radii [v n].
+// Projects the Gaussians and creates the data that the other calls need. means2d [v n 2], radii [v n].
 EXPORT int cadam3d_project(const Scene* scene, float* means2d, float* radii, void** out) {
   return guarded([&] {
     auto frame = std::make_unique<Frame>();
@@ -810,7 +817,8 @@ EXPORT int cadam3d_project(const Scene* scene, float* means2d, float* radii, voi
   });
 }
 
-// Blends. rgb [v h w 3], alpha [v h w], depth [v h w]; ``keeps`` stores what the backward needs.
+// Blends the images rgb [v h w 3], alpha [v h w] and depth [v h w]. With ``keeps``, stores the data that the
+// backward pass needs.
 EXPORT int cadam3d_blend(const Scene* scene, void* handle, float* rgb, float* alpha, float* depth,
                          int keeps) {
   return guarded([&] {
@@ -832,9 +840,9 @@ EXPORT int cadam3d_blend(const Scene* scene, void* handle, float* rgb, float* al
   });
 }
 
-// Adds to gradients that come zeroed; each image gradient may be null, and so may absgrad: then nobody sums
-// absolute values. The path through means2d is left to cadam3d_centre_backward: here it only arrives in
-// grad_means2d.
+// Adds to gradients that the caller has set to zero. Each image gradient may be null, and so may absgrad:
+// then no absolute values are summed. The path through means2d ends in grad_means2d; cadam3d_centre_backward
+// continues it.
 EXPORT int cadam3d_blend_backward(const Scene* scene, void* handle, const float* alpha, const float* depth,
                                   const float* grad_rgb, const float* grad_alpha, const float* grad_depth,
                                   float* grad_means2d, float* absgrad, float* grad_means,
@@ -871,7 +879,7 @@ EXPORT int cadam3d_blend_backward(const Scene* scene, void* handle, const float*
   });
 }
 
-// dLoss/dmeans [n 3] through the projected centres, from dLoss/dmeans2d [v n 2]; a culled Gaussian gets none.
+// dLoss/dmeans [n 3] through the projected centres, from dLoss/dmeans2d [v n 2]. A culled Gaussian gets zero.
 EXPORT int cadam3d_centre_backward(const Scene* scene, const float* radii, const float* grad_means2d,
                                    float* grad_means) {
   return guarded([&] {
@@ -897,7 +905,7 @@ EXPORT int cadam3d_centre_backward(const Scene* scene, const float* radii, const
 
 EXPORT void cadam3d_free(void* handle) { delete static_cast<Frame*>(handle); }
 
-// 0 if this machine can run the compiled code: one splat through every stage, forward and backward.
+// Returns 0 if this machine can run the compiled code: one splat passes every stage, forward and backward.
 EXPORT int cadam3d_self_test() {
   const float means[3] = {0, 0, 2}, log_scales[3] = {-2, -2, -2}, quat[4] = {1, 0, 0, 0};
   const float logit = 2, sh[3] = {1, 1, 1};

@@ -1,4 +1,4 @@
-// The CUDA rasterizer in one translation unit. How its kernels follow one another is written in ../cuda.py.
+// The CUDA rasterizer in one translation unit. See ../cuda.py for the order of the kernels.
 #include "blend.cuh"
 #include "project.cuh"
 #include "sort.cuh"

@@ -1,8 +1,9 @@
-// What every CUDA kernel here shares: short names, sizes, and who a thread is.
+// Definitions that all CUDA kernels share: short names, sizes, and the indices of a thread.
 //
-// No header of the toolkit is included: a run-time compiler has none. Every kernel parameter is eight bytes,
-// a pointer or an i64, so that a launch is a list of numbers (see ``Launcher`` in ../cuda.py). Grids have one
-// dimension. No kernel adds floats atomically, so every bit of every result follows from the input.
+// No header of the toolkit is included, because a run-time compiler has none. Every kernel parameter has
+// eight bytes, a pointer or an i64, so that a launch is a list of numbers (see ``Launch`` in
+// ../launcher.py). Grids have one dimension. No kernel adds floats atomically, so the input determines every
+// bit of every result.
 #pragma once
 
 #include "splat_math.h"
@@ -17,14 +18,14 @@ constexpr int WARP = 32;
 constexpr u32 ALL = 0xffffffffu;  // every lane of a warp
 constexpr int BLOCK = 256;        // threads of most kernels; mirrored in ../cuda.py
 constexpr int TILE = 8;           // pixels along the edge of a tile; mirrored in ../cuda.py
-constexpr int RECORD = 10;        // floats that the blend leaves per (splat, tile); mirrored in ../cuda.py
-constexpr int ABSOLUTES = 2;      // and besides, if absgrad is wanted; mirrored in ../cuda.py
-constexpr u32 CULLED = ALL;       // depth key of who is not seen: behind every other
+constexpr int RECORD = 10;        // floats that the blend writes per (splat, tile); mirrored in ../cuda.py
+constexpr int ABSOLUTES = 2;      // additional floats for absgrad; mirrored in ../cuda.py
+constexpr u32 CULLED = ALL;       // depth key of a culled pair, which sorts last
 
 SPLAT_FN i64 thread_index() { return i64(blockIdx.x) * blockDim.x + threadIdx.x; }
 SPLAT_FN int lane_index() { return int(threadIdx.x) % WARP; }
 
-// What tile lists and blend read of a projected Gaussian: three vectors of four.
+// The data of a projected Gaussian that tile lists and blending read: three vectors of four floats.
 struct Splat {
   float x, y;           // pixels
   float l11, l12, l22;  // whitening, see splat_math.h

@@ -1,4 +1,5 @@
-// From Gaussians to splats and from records back to Gaussians: one thread per Gaussian, looping over views.
+// Projection of Gaussians to splats, and its gradient from records: one thread per Gaussian loops over the
+// views.
 #pragma once
 
 #include "tiles.cuh"
@@ -6,7 +7,7 @@
 typedef splat::Camera<float> Camera;
 static_assert(sizeof(Camera) == 25 * sizeof(float), "mirrored in ../cuda.py");
 
-// One thread per view; the others read what it wrote.
+// One thread per view. Later kernels read the cameras.
 KERNEL(BLOCK)
 prepare_cameras(const float* world_to_camera, const float* intrinsics, i64 views, i64 height, i64 width,
                 Camera* cameras) {
@@ -33,7 +34,8 @@ SPLAT_FN Gaussian<COEFFICIENTS> load_gaussian(const float* means, const float* l
   return gaussian;
 }
 
-// splats [v n 3 float4], means2d [v n 2], radii [v n], depth_keys [v n], and in how many tiles: counts [v n]
+// splats [v n 3 float4], means2d [v n 2], radii [v n], depth_keys [v n], and the numbers of tiles: counts [v
+// n]
 template <int COEFFICIENTS>
 SPLAT_FN void project_gaussian(const float* means, const float* log_scales, const float* quats,
                                const float* opacity_logits, const float* sh, const Camera* cameras, i64 n,
@@ -68,8 +70,8 @@ SPLAT_FN void project_gaussian(const float* means, const float* log_scales, cons
 
 constexpr i64 LONG_RUN = 64;  // records; a longer run is summed by the whole warp
 
-// The sum of ``count`` records of so many floats from ``first`` on, for every lane its own. All lanes of a warp
-// must call it.
+// Sums ``count`` records of WIDTH floats from ``first`` on; each lane has its own run. All lanes of a warp
+// must call this function.
 template <int WIDTH>
 SPLAT_FN void sum_records(const float* records, i64 first, i64 count, float* sum) {
   for (int j = 0; j < WIDTH; ++j) sum[j] = 0;
@@ -97,8 +99,9 @@ SPLAT_FN void sum_records(const float* records, i64 first, i64 count, float* sum
   }
 }
 
-// What the views add to one by one. A launch takes some views in a row and the next one goes on, adding in the
-// same order as if there were one. ``axes`` [n 9] may be null if one launch takes them all.
+// The totals over the views. A launch processes some consecutive views and the next launch continues, so
+// numbers are added in the same order as in a single launch. ``axes`` [n 9] may be null if one launch
+// processes all views.
 template <int COEFFICIENTS>
 struct Totals {
   float *means, *axes, *opacity_logits, *sh;
@@ -120,8 +123,9 @@ struct Totals {
   }
 };
 
-// Every gradient of one Gaussian but the path through means2d, which only arrives in grad_means2d [v n 2]; of
-// the views first_view .. end_view - 1, whose records are there. The last views bring log-scales and quaternions.
+// All gradients of one Gaussian except the path through means2d, which ends in grad_means2d [v n 2].
+// Processes the views first_view .. end_view - 1, for which there are records. The launch with the last view
+// also computes the gradients of log-scales and quaternions.
 template <int COEFFICIENTS>
 SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, const float* quats,
                                 const float* opacity_logits, const float* sh, const Camera* cameras, i64 n,
@@ -130,10 +134,11 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
                                 const Totals<COEFFICIENTS>& totals, float* grad_log_scales,
                                 float* grad_quats) {
   const i64 i = thread_index();
-  const bool is_mine = i < n;  // the others stay to help with long runs
+  const bool is_mine = i < n;  // threads without a Gaussian help with long runs
   bool is_seen = false;
   for (i64 v = 0; v < views && is_mine; ++v) is_seen = is_seen || slot_count[v * n + i] > 0;
-  // Who is not seen loads somebody else's numbers and does not use them: no branch, no doubt about the loops.
+  // A thread without a Gaussian loads the first one and does not use it. This needs no branch, so the loops
+  // unroll.
   const Gaussian<COEFFICIENTS> gaussian =
       load_gaussian<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, is_mine ? i : 0);
   splat::Shape<float> shape;
@@ -166,12 +171,13 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
   for (int j = 0; j < 4; ++j) grad_quats[4 * i + j] = quat[j];
 }
 
-// absgrad [pairs 2]: over the pixels, the sum of what each adds to the gradient of a centre, in absolute value.
+// absgrad [pairs 2]: the sum over the pixels of the absolute value of what each adds to the gradient of a
+// centre.
 KERNEL(BLOCK)
 sum_absolutes(i64 pairs, const float* absolutes, const float4* splats, const u32* first_slot,
               const u32* slot_count, float* absgrad) {
   const i64 pair = thread_index();
-  const bool is_visible = pair < pairs && slot_count[pair] > 0;  // the others stay to help with long runs
+  const bool is_visible = pair < pairs && slot_count[pair] > 0;  // other threads help with long runs
   float sum[ABSOLUTES], absolute[2] = {0, 0};
   sum_records<ABSOLUTES>(absolutes, is_visible ? first_slot[pair] : 0, is_visible ? slot_count[pair] : 0, sum);
   if (is_visible) splat::mean2d_absolute(splats[3 * pair].z, sum, absolute);  // z: l11
@@ -179,7 +185,7 @@ sum_absolutes(i64 pairs, const float* absolutes, const float4* splats, const u32
   for (int j = 0; j < 2; ++j) absgrad[2 * pair + j] = absolute[j];
 }
 
-// dLoss/dmeans [n 3] through the projected centres, from dLoss/dmeans2d [v n 2]; who is culled gets none.
+// dLoss/dmeans [n 3] through the projected centres, from dLoss/dmeans2d [v n 2]. A culled Gaussian gets zero.
 KERNEL(BLOCK)
 centre_backward(const float* means, const Camera* cameras, i64 n, i64 views, const float* radii,
                 const float* grad_means2d, float* grad_means) {
@@ -196,7 +202,8 @@ centre_backward(const float* means, const Camera* cameras, i64 n, i64 views, con
   for (int j = 0; j < 3; ++j) grad_means[3 * i + j] = total[j];
 }
 
-constexpr int PROJECT_BLOCK = 128;  // threads: fewer, for each needs many registers; mirrored in ../cuda.py
+// Fewer threads than in other kernels, because each needs many registers. Mirrored in ../cuda.py.
+constexpr int PROJECT_BLOCK = 128;
 
 #define KERNELS_FOR(COEFFICIENTS)                                                                            \
   KERNEL(PROJECT_BLOCK)                                                                                      \

@@ -1,8 +1,9 @@
-// Many pixels or many Gaussians at a time: vectors of this machine's own width, and what is done with them.
+// Vectors of many pixels or Gaussians, with the width of this machine, and the operations on them.
 //
-// Wider vectors than the machine has would be lowered to scalar code, so the width follows the instruction
-// set: AVX-512 16 lanes, AVX2 8, everything else (SSE2, NEON, ...) 4. Products that are added are fused where
-// written fma() and nowhere else, so that forward and backward see the same bits.
+// A compiler lowers vectors that are wider than those of the machine to scalar code. Therefore the width
+// depends on the instruction set: 16 lanes for AVX-512, 8 for AVX2, 4 for everything else (SSE2, NEON, ...).
+// A product and a sum are fused only where the code says fma(), so that the forward and the backward pass
+// compute the same bits.
 #pragma once
 
 #if defined(__x86_64__) || defined(_M_X64)
@@ -14,7 +15,7 @@
 
 namespace simd {
 
-// Some clangs have AVX-512 instructions and yet no 64-byte registers: they say so by what they do not define.
+// Some versions of clang use AVX-512 instructions without 64-byte registers. They do not define __EVEX512__.
 #if __clang_major__ >= 18 && !defined(__EVEX512__)
 #define SIMD_HALF_AVX512 1
 #endif
@@ -42,7 +43,7 @@ constexpr int LANES = 4;
 
 typedef float Floats __attribute__((vector_size(4 * LANES)));
 typedef int Ints __attribute__((vector_size(4 * LANES)));
-typedef unsigned Bits __attribute__((vector_size(4 * LANES)));  // wraps around, as masked lanes will
+typedef unsigned Bits __attribute__((vector_size(4 * LANES)));  // unsigned, because masked lanes overflow
 typedef float Quad __attribute__((vector_size(16)));
 
 inline Floats spread(float x) { return x - Floats{}; }  // x - 0 is x, bit for bit
@@ -70,7 +71,7 @@ inline Floats fma(Floats a, Floats b, Floats c) {
 inline Floats min(Floats a, Floats b) { return (Floats)_mm512_min_ps((__m512)a, (__m512)b); }
 inline Floats max(Floats a, Floats b) { return (Floats)_mm512_max_ps((__m512)a, (__m512)b); }
 inline Floats root(Floats x) { return (Floats)_mm512_sqrt_ps((__m512)x); }
-inline Floats reciprocal(Floats x) {  // within 2 units in the last place; a division takes longer
+inline Floats reciprocal(Floats x) {  // within 2 units in the last place, and faster than a division
   const Floats guess = (Floats)_mm512_rcp14_ps((__m512)x);
   return fma(fma(-x, guess, spread(1.0f)), guess, guess);
 }
@@ -110,7 +111,7 @@ inline Floats to_floats(Ints x) { return __builtin_convertvector(x, Floats); }
 inline Ints to_ints(Floats x) { return __builtin_convertvector(x, Ints); }  // towards zero
 
 // ------------------------------------------------------------------------------------- masks
-// One truth per lane; a comparison with a NaN is false.
+// One boolean per lane; a comparison with NaN is false.
 #if defined(SIMD_AVX512)
 typedef __mmask16 Mask;
 inline Mask none() { return 0; }
@@ -130,7 +131,7 @@ inline Ints select(Mask m, Ints a, Ints b) {
 }
 inline Floats keep(Mask m, Floats a) { return (Floats)_mm512_maskz_mov_ps(m, (__m512)a); }
 #else
-typedef Ints Mask;  // all bits of a lane, or none
+typedef Ints Mask;  // all bits of a lane are equal
 inline Mask none() { return Mask{}; }
 inline Mask less_equal(Floats a, Floats b) { return a <= b; }
 inline Mask greater(Floats a, Floats b) { return a > b; }
@@ -158,11 +159,12 @@ inline bool any(Mask a) { return bits(a) != 0; }
 
 // ------------------------------------------------------------------------------------- exp and sums
 
-// exp(-x) for 0 <= x < 80, relative error below 3e-7; anything elsewhere, where the caller masks the lane.
-// exp(-x) = 2^n 2^f with n the nearest integer; the polynomial is the minimax of 2^f on [-1/2, 1/2] (Lawson).
+// exp(-x) for 0 <= x < 80, with a relative error below 3e-7. For other x the result is arbitrary, and the
+// caller masks the lane. exp(-x) = 2^n 2^f, where n is the nearest integer; the polynomial is the minimax
+// approximation of 2^f on [-1/2, 1/2] (Lawson).
 inline Floats exp_minus(Floats x) {
   const Floats scaled = x * spread(-1.44269504f);
-  const Floats magic = spread(12582912.0f);  // 1.5 * 2^23: adding it rounds, and leaves n in the low bits
+  const Floats magic = spread(12582912.0f);  // 1.5 * 2^23; adding it rounds, and n is in the low bits
   const Floats shifted = scaled + magic;
   const Floats f = scaled - (shifted - magic);
   Floats p = spread(1.3276472e-3f);
@@ -174,7 +176,7 @@ inline Floats exp_minus(Floats x) {
   return (Floats)((Bits)p + ((Bits)shifted << 23));
 }
 
-// exp(x) for any x that is a number, relative error below 3e-7 but for denormals; inf beyond the largest
+// exp(x) for any x except NaN, with a relative error below 3e-7 except for denormals; inf beyond the largest
 // float.
 inline Floats exp(Floats x) {
   x = min(max(x, spread(-104.0f)), spread(89.0f));
@@ -187,13 +189,13 @@ inline Floats exp(Floats x) {
   p = fma(p, r, spread(1.6666667e-1f));
   p = fma(p, r, spread(0.5f));
   p = fma(p * r, r, r) + spread(1.0f);
-  const Ints whole = to_ints(n), half = whole >> 1;  // 2^n may leave the floats where its halves do not
+  const Ints whole = to_ints(n), half = whole >> 1;  // 2^n may overflow where 2^(n/2) does not
   return p * as_floats((half + 127) << 23) * as_floats((whole - half + 127) << 23);
 }
 
-// The natural logarithm of a normal positive number, absolute error below 1e-7 times 1 + its size.
+// The natural logarithm of a normal positive number, with an absolute error below 1e-7 (1 + |log x|).
 inline Floats log(Floats x) {
-  const Ints above = as_ints(x) - 0x3f3504f3;  // of the root of 1/2
+  const Ints above = as_ints(x) - 0x3f3504f3;  // the bits of the square root of 1/2
   const Floats m = as_floats((above & 0x7fffff) + 0x3f3504f3), n = to_floats(above >> 23);
   const Floats s = (m - 1.0f) / (m + 1.0f), square = s * s;  // ln m = 2 artanh s
   Floats p = spread(2.2222222e-1f);
@@ -203,10 +205,10 @@ inline Floats log(Floats x) {
   return fma(n, spread(0.693147181f), fma(p * square, s, s + s));
 }
 
-// Writes the sums over the lanes of each vector to ``to[0] .. to[15]``, always added in the same order; what
-// lies behind the N-th is some number. ``to`` starts a cache line.
+// Writes the sums over the lanes of each of the N vectors to ``to[0] .. to[15]``, always added in the same
+// order. Numbers after the N-th are arbitrary. ``to`` is the start of a cache line.
 #if defined(SIMD_AVX512)
-// Lanes with the bit DISTANCE set belong to b, the others to a; each adds its partner DISTANCE lanes away.
+// Lanes with the bit DISTANCE set hold sums of b, the others of a; each adds its partner DISTANCE lanes away.
 template <int DISTANCE>
 inline Floats fold(Floats a, Floats b) {
   const auto from = [](int lane) { return (lane ^ DISTANCE) + (lane & DISTANCE ? 16 : 0); };
@@ -269,8 +271,8 @@ inline void store_sums(float* to, const Floats (&x)[12]) {
 
 // ------------------------------------------------------------------------------------- as a scalar
 
-// One truth, or one float, per lane, with the manners of bool and float: what is written for one Gaussian
-// (splat_math.h) then works on LANES of them.
+// One boolean or one float per lane, with the operators of bool and float, so that code for one Gaussian
+// (splat_math.h) works on LANES Gaussians.
 struct Truths {
   Mask mask;
   friend Truths operator&(Truths a, Truths b) { return {both(a.mask, b.mask)}; }

@@ -1,8 +1,9 @@
-// Prefix sums and a stable radix sort, of numbers whose sum has 32 bits.
+// Prefix sums with totals that fit into 32 bits, and a stable radix sort.
 //
-// The sort takes eight bits a pass, least significant first. A pass counts the digits of each chunk, turns
-// the counts (digit after digit, chunk after chunk) into positions by one prefix sum, and scatters: within a
-// chunk a warp owns consecutive items and ranks them by votes, so equal keys keep their order.
+// The sort handles eight bits per pass, least significant first. A pass counts the digits of each chunk,
+// converts the counts (digit after digit, chunk after chunk) to positions with one prefix sum, and scatters
+// the items. Within a chunk a warp owns consecutive items and ranks them by votes, so equal keys keep their
+// order.
 #pragma once
 
 #include "device.cuh"
@@ -16,8 +17,8 @@ constexpr int SORT_ROUNDS = 16;                  // items of one thread
 constexpr int SORT_CHUNK = BLOCK * SORT_ROUNDS;  // of one block; mirrored in ../cuda.py
 static_assert(BINS == BLOCK, "a thread per bin");
 
-// The sum over the threads before this one; ``total`` is the sum over all of the block. ``sums`` is shared
-// memory for BLOCK of them.
+// Returns the sum over the threads before this one; ``total`` is the sum over all threads of the block.
+// ``sums`` is shared memory for BLOCK numbers.
 SPLAT_FN u32 block_scan(u32 value, u32* sums, u32* total) {
   const int t = int(threadIdx.x);
   u32 inclusive = value;
@@ -31,12 +32,12 @@ SPLAT_FN u32 block_scan(u32 value, u32* sums, u32* total) {
     __syncthreads();
   }
   *total = sums[BLOCK - 1];
-  __syncthreads();  // the memory may be used again
+  __syncthreads();  // after this, the shared memory may be used again
   return inclusive - value;
 }
 
-// Exclusive prefix sums of one chunk, all of them raised by ``carry``; returns the sum of the chunk. ``out`` may
-// be ``in``: a thread reads and writes its own items alone.
+// Exclusive prefix sums of one chunk, all increased by ``carry``; returns the sum of the chunk. ``out`` may
+// be ``in``, because each thread reads and writes only its own items.
 SPLAT_FN u32 scan_chunk(const u32* in, i64 begin, i64 n, u32 carry, u32* out, u32* sums) {
   const i64 first = begin + i64(threadIdx.x) * SCAN_ITEMS;
   const i64 end = first + SCAN_ITEMS < n ? first + SCAN_ITEMS : n;
@@ -51,14 +52,14 @@ SPLAT_FN u32 scan_chunk(const u32* in, i64 begin, i64 n, u32 carry, u32* out, u3
   return total;
 }
 
-// One block walks over all chunks: for short arrays, and in place for the sums of chunks.
+// One block loops over all chunks. This is for short arrays, and in place for the sums of chunks.
 KERNEL(BLOCK) scan_short(const u32* in, i64 n, u32* out) {
   __shared__ u32 shared[BLOCK];
   u32 carry = 0;
   for (i64 begin = 0; begin < n; begin += SCAN_CHUNK) carry += scan_chunk(in, begin, n, carry, out, shared);
 }
 
-// A long array in three kernels: sums of the chunks, their prefix sums by scan_short, then each chunk alone.
+// A long array needs three kernels: the sums of the chunks, their prefix sums (scan_short), then each chunk.
 KERNEL(BLOCK) scan_reduce(const u32* in, i64 n, u32* sums) {
   __shared__ u32 shared[BLOCK];
   const i64 first = i64(blockIdx.x) * SCAN_CHUNK + i64(threadIdx.x) * SCAN_ITEMS;
@@ -90,11 +91,11 @@ KERNEL(BLOCK) sort_count(const u32* keys, i64 n, i64 shift, i64 chunks, u32* cou
   counts[t * chunks + blockIdx.x] = bins[t];
 }
 
-// ``positions`` are the prefix sums of the counts. Without ``values`` each item carries its index.
+// ``positions`` are the prefix sums of the counts. If ``values`` is null, the value of an item is its index.
 KERNEL(BLOCK)
 sort_scatter(const u32* keys, const u32* values, i64 n, i64 shift, i64 chunks, const u32* positions,
              u32* sorted_keys, u32* sorted_values) {
-  __shared__ u32 bins[WARPS][BINS];  // first how many, then where the next one goes
+  __shared__ u32 bins[WARPS][BINS];  // first the number of items, then the position of the next one
   const int t = int(threadIdx.x), lane = lane_index(), warp = t / WARP;
   for (int w = 0; w < WARPS; ++w) bins[w][t] = 0;
   __syncthreads();
@@ -122,7 +123,7 @@ sort_scatter(const u32* keys, const u32* values, i64 n, i64 shift, i64 chunks, c
       peers &= is_set ? votes : ~votes;
     }
     const u32 at = bins[warp][digit] + u32(__popc(peers & ((1u << lane) - 1)));
-    __syncwarp();  // all have read before one of the peers, the last, moves the bin on
+    __syncwarp();  // all lanes have read before the last of the peers advances the bin
     if (is_item && peers >> lane == 1) bins[warp][digit] = at + 1;
     __syncwarp();
     if (is_item) {

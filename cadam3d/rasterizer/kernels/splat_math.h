@@ -1,20 +1,20 @@
-// One splat, from world to screen and back: the maths every native backend shares.
+// One splat, from world to screen and back: the maths that all native backends share.
 //
-// Header-free on purpose (a run-time CUDA compiler has no headers), templated on the scalar, no allocation
-// and no branches, so that the scalar may also be many Gaussians at a time (``simd::Wide``). Derived from EWA
-// splatting (Zwicker et al. 2002; Kerbl et al. 2023, sec. 4), with one change of form that costs nothing and
-// keeps long thin splats accurate in float32:
+// This file includes no header, because a run-time CUDA compiler has none. It is templated on the scalar and
+// has neither allocations nor branches, so that a scalar may also stand for many Gaussians (``simd::Wide``).
+// The formulas are those of EWA splatting (Zwicker et al. 2002; Kerbl et al. 2023, sec. 4), in a form that
+// costs nothing more and keeps long thin splats accurate in float32:
 //
 //   screen covariance  C = B B^T + blur I,  B = J W R diag(s): two rows of three
 //   its determinant    |B0 x B1|^2 + blur (|B0|^2 + |B1|^2) + blur^2: a sum of squares, no cancellation
 //   its whitening      L^T L = C^-1 / 2,  L = [[l11, l12], [0, l22]]: closed form in C and det C
 //   falloff at d       exp(-|L d|^2): never above 1, by construction
 //
-// The blend gathers moments of y = L d, not of d; with Y = sum g y y^T and s = sum g y (g = dLoss/d|y|^2) the
-// backward is then  dLoss/dC = -2 L^T Y L,  dLoss/dB = -4 L^T Y (L B),  dLoss/dmean2d = -2 L^T s.
+// The blend gathers moments of y = L d, not of d. With Y = sum g y y^T and s = sum g y (g = dLoss/d|y|^2),
+// the gradients are  dLoss/dC = -2 L^T Y L,  dLoss/dB = -4 L^T Y (L B),  dLoss/dmean2d = -2 L^T s.
 //
-// The image formation constants (SPLAT_BLUR, SPLAT_ALPHA_MIN, SPLAT_NEAR, SPLAT_FAR, SPLAT_FRUSTUM_MARGIN)
-// are given by the build, from cadam3d/rasterizer/base.py: each has one home.
+// The build defines the constants of image formation (SPLAT_BLUR, SPLAT_ALPHA_MIN, SPLAT_NEAR, SPLAT_FAR,
+// SPLAT_FRUSTUM_MARGIN) from cadam3d/rasterizer/base.py, which is the only place that contains their values.
 #pragma once
 
 #if defined(__CUDACC__)
@@ -28,7 +28,7 @@
 namespace splat {
 
 constexpr int MAX_COEFFICIENTS = 16;       // spherical harmonics of degree 3
-constexpr float TINY_QUATERNION = 1e-12f;  // squared length; a shorter one has no direction: culled
+constexpr float TINY_QUATERNION = 1e-12f;  // squared length; a shorter one has no direction and is culled
 constexpr float FLOAT_MAX = 3.402823466e+38f;
 
 #if defined(__CUDACC__)
@@ -45,7 +45,7 @@ SPLAT_FN Real select(bool condition, Real yes, Real no) {
   return condition ? yes : no;
 }
 
-// What a comparison of two numbers gives, and how a coefficient is held; another for many numbers at a time.
+// The type of a comparison, and the type in which coefficients are stored. simd::Wide specializes both.
 template <class Real>
 struct Kinds {
   typedef bool Truth;
@@ -74,7 +74,7 @@ struct Camera {
   Real rotation[3][3], translation[3];  // world to camera; +x right, +y down, +z forward
   Real position[3];                     // in the world
   Real fx, fy, cx, cy, width, height;   // pixels; pixel centres at +0.5
-  Real slope_low[2], slope_high[2];     // x/z and y/z at which the Jacobian is held: the border and a margin
+  Real slope_low[2], slope_high[2];     // bounds of x/z and y/z in the Jacobian: the border and a margin
 };
 
 template <class Real>
@@ -135,7 +135,7 @@ SPLAT_FN void sh_basis(int coefficients, const Real* unit, Real* basis) {
   basis[15] = Real(SH_C3[6]) * x * (xx - 3 * yy);
 }
 
-// Gradient of sum_k weight[k] * basis[k] in x, y, z, each taken as a free variable.
+// Gradient of sum_k weight[k] * basis[k] with respect to x, y and z as free variables.
 template <class Real>
 SPLAT_FN void sh_basis_backward(int coefficients, const Real* unit, const Real* weight, Real* gradient) {
   const Real x = unit[0], y = unit[1], z = unit[2];
@@ -164,13 +164,13 @@ SPLAT_FN void sh_basis_backward(int coefficients, const Real* unit, const Real* 
 
 // ---------------------------------------------------------------------------------------------- one Gaussian
 
-// A number known when compiling: loops of so many turns unroll, and what they walk over stays in registers.
+// A number known at compile time. Loops with this count unroll, and their data stays in registers.
 template <int N>
 struct Fixed {
   SPLAT_FN constexpr operator int() const { return N; }
 };
 
-// The raw parameters of one Gaussian, as the optimizer holds them. Count is int, or Fixed.
+// The raw parameters of one Gaussian, as the optimizer stores them. Count is int or Fixed.
 template <class Real, class Count = int>
 struct Gaussian {
   Real mean[3], log_scale[3], quat[4], opacity_logit;
@@ -178,33 +178,33 @@ struct Gaussian {
   Count coefficients;
 };
 
-// What does not depend on the view: computed once for a batch.
+// The quantities that do not depend on the view, computed once per batch.
 template <class Real>
 struct Shape {
-  Real axes[3][3];      // columns: the own axes in the world, times their standard deviation
-  Real rotation[3][3];  // columns: the own axes in the world
+  Real axes[3][3];      // columns: the axes of the Gaussian in the world, times their standard deviations
+  Real rotation[3][3];  // columns: the axes of the Gaussian in the world
   Real unit_quat[4], inverse_length;
-  Real opacity, transparency;  // transparency = 1 - opacity, without its cancellation
-  Real log_cut;                // ln(opacity / alpha_min): the falloff exponent at which it fades out
+  Real opacity, transparency;  // transparency = 1 - opacity, computed without cancellation
+  Real log_cut;                // ln(opacity / alpha_min): the falloff exponent at which alpha is alpha_min
 };
 
-// What one view adds: everything the chain rule needs again.
+// The quantities of one view, which the chain rule needs again.
 template <class Real>
 struct Footprint {
   Real centre[3];   // in the camera
   Real axes[3][3];  // Shape::axes in the camera
   Real inverse_z, slope[2];
-  Truth<Real> is_held[2];  // the Jacobian sits at the border: its slope is a constant
+  Truth<Real> is_held[2];  // whether the slope in the Jacobian is clamped, and therefore constant
   Real rows[2][3];         // B
   Real mean2d[2];
   Real cov_xx, cov_xy, cov_yy, l11, l12, l22;
   Real reach[2];  // half-sizes of the box outside which alpha < alpha_min
 };
 
-// False if it cannot be seen from anywhere.
+// Returns false if the Gaussian is not visible in any view.
 template <class Real, class Count>
 SPLAT_FN Truth<Real> make_shape(const Gaussian<Real, Count>& gaussian, Shape<Real>& shape) {
-  Real poison = gaussian.opacity_logit - gaussian.opacity_logit;  // 0, or NaN if anything is not finite
+  Real poison = gaussian.opacity_logit - gaussian.opacity_logit;  // 0, or NaN if a parameter is not finite
   for (int i = 0; i < 3; ++i)
     poison += (gaussian.mean[i] - gaussian.mean[i]) + (gaussian.log_scale[i] - gaussian.log_scale[i]);
   for (int i = 0; i < 3 * gaussian.coefficients; ++i) poison += Real(gaussian.sh[i] - gaussian.sh[i]);
@@ -231,7 +231,7 @@ SPLAT_FN Truth<Real> make_shape(const Gaussian<Real, Count>& gaussian, Shape<Rea
          (shape.opacity > Real(SPLAT_ALPHA_MIN));
 }
 
-// False if the view does not see it. Comparisons are written so that a NaN culls.
+// Returns false if the Gaussian is not visible in the view. The comparisons are written such that NaN culls.
 template <class Real, class Count>
 SPLAT_FN Truth<Real> project(const Gaussian<Real, Count>& gaussian, const Shape<Real>& shape,
                              const Camera<Real>& camera, Footprint<Real>& out) {
@@ -274,7 +274,7 @@ SPLAT_FN Truth<Real> project(const Gaussian<Real, Count>& gaussian, const Shape<
          (out.mean2d[1] + out.reach[1] > Real(0)) & (out.mean2d[1] - out.reach[1] < camera.height);
 }
 
-// Unit vector from camera to Gaussian; returns one over their distance.
+// Writes the unit vector from camera to Gaussian and returns one over their distance.
 template <class Real, class Count>
 SPLAT_FN Real direction(const Gaussian<Real, Count>& gaussian, const Camera<Real>& camera, Real* unit) {
   for (int i = 0; i < 3; ++i) unit[i] = gaussian.mean[i] - camera.position[i];
@@ -283,7 +283,7 @@ SPLAT_FN Real direction(const Gaussian<Real, Count>& gaussian, const Camera<Real
   return inverse;
 }
 
-// The colour before it is clamped at 0 from below.
+// The colour before negative values are clamped to 0.
 template <class Real, class Count>
 SPLAT_FN void raw_colour(const Gaussian<Real, Count>& gaussian, const Real* basis, Real* rgb) {
   for (int c = 0; c < 3; ++c) {
@@ -311,7 +311,8 @@ struct Moments {
   Real rgb[3], depth;             // dLoss/d colour after the clamp, dLoss/d camera z
 };
 
-// Gradients of one Gaussian; shape gradients stay with the axes until every view has added its own.
+// Gradients of one Gaussian. Gradients of the shape are sums over the views with respect to the axes;
+// shape_backward converts them at the end.
 template <class Real>
 struct Gradient {
   Real mean[3], axes[3][3], opacity_logit, sh[3 * MAX_COEFFICIENTS];
@@ -332,14 +333,14 @@ SPLAT_FN void mean2d_gradient(const Footprint<Real>& footprint, const Moments<Re
   gradient[1] = -2 * (footprint.l12 * moments.gu + footprint.l22 * moments.gt);
 }
 
-// What pixels add to that in absolute value, from their sums of |g u| and of |g (l12 u + l22 t)|.
+// The sums of absolute contributions to mean2d_gradient, from the sums of |g u| and of |g (l12 u + l22 t)|.
 template <class Real>
 SPLAT_FN void mean2d_absolute(const Real& l11, const Real* sums, Real* absolute) {
   absolute[0] = 2 * l11 * sums[0];
   absolute[1] = 2 * sums[1];
 }
 
-// Adds one view to ``total``; the path through mean2d is left out, see centre_backward.
+// Adds the gradient of one view to ``total``, except the path through mean2d: see centre_backward.
 template <class Real, class Count>
 SPLAT_FN void project_backward(const Gaussian<Real, Count>& gaussian, const Shape<Real>& shape,
                                const Camera<Real>& camera, const Footprint<Real>& f,
@@ -394,7 +395,7 @@ SPLAT_FN void project_backward(const Gaussian<Real, Count>& gaussian, const Shap
   }
 }
 
-// dLoss/dmean of the pinhole projection alone: the path through mean2d.
+// Adds dLoss/dmean of the pinhole projection alone: the path through mean2d.
 template <class Real>
 SPLAT_FN void centre_backward(const Camera<Real>& camera, const Real* mean, const Real* mean2d_gradient,
                               Real* total) {
@@ -407,7 +408,7 @@ SPLAT_FN void centre_backward(const Camera<Real>& camera, const Real* mean, cons
     total[i] += camera.rotation[0][i] * x + camera.rotation[1][i] * y + camera.rotation[2][i] * z;
 }
 
-// From the axes, summed over the views, to log-scales and the raw quaternion.
+// Converts the gradient of the axes, summed over the views, to that of log-scales and raw quaternion.
 template <class Real, class Count>
 SPLAT_FN void shape_backward(const Shape<Real>& shape, const Gaussian<Real, Count>& gaussian,
                              const Gradient<Real>& total, Real* log_scale, Real* quat) {

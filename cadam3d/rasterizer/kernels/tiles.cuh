@@ -1,7 +1,8 @@
-// Which tiles a splat touches: counted, listed, and cut into one list per tile.
+// Counts and lists the tiles that each splat touches, and splits the slots into one list per tile.
 //
-// A splat gets one slot per tile it touches. Slots are numbered in depth order, so a stable sort by tile puts
-// every list in depth order; the slots of a splat stay together, where the backward leaves its records.
+// A splat gets one slot per tile it touches. Slots are numbered in depth order, so a stable sort by tile
+// leaves every list in depth order. The slots of a splat are consecutive; the backward pass writes its
+// records there.
 #pragma once
 
 #include "device.cuh"
@@ -18,7 +19,7 @@ struct Range {
   int first, last;  // both included; empty if last < first
 };
 
-// Pixels whose centres lie in [low, high], widened by more than the rounding of either bound.
+// The pixels with centres in [low, high], extended by more than the rounding error of either bound.
 SPLAT_FN Range pixels_between(float low, float high, int size) {
   const float slack = 2e-3f + 2e-6f * (fabsf(low) + fabsf(high));
   const float first = ceilf(low - slack - 0.5f), last = floorf(high + slack - 0.5f);
@@ -26,7 +27,7 @@ SPLAT_FN Range pixels_between(float low, float high, int size) {
 }
 
 // Calls visit(tile row, first column, last column) for each row of tiles that the ellipse |L d|^2 <= cut
-// meets, top to bottom. Counting and listing both come here, so they agree on every tile.
+// meets, from top to bottom. Counting and listing both use this function, so they agree on every tile.
 template <class Visit>
 SPLAT_FN void each_tile_row(const Splat& s, const Grid& grid, const Visit& visit) {
   const float reach_x = s.reach_x, reach_y = sqrtf(s.cut) / s.l22;
@@ -34,7 +35,7 @@ SPLAT_FN void each_tile_row(const Splat& s, const Grid& grid, const Visit& visit
   if (rows.last < rows.first) return;
   const float slope = -s.l12 / s.l11;  // the middle of the row at height d: slope * d
   const float extreme = slope * reach_y * (reach_y / reach_x);  // height of the rightmost point
-  const float cut = s.cut * (1 + 1e-5f) + 1e-6f;                // the tips are where rounding would cost most
+  const float cut = s.cut * (1 + 1e-5f) + 1e-6f;                // rounding matters most at the tips
   for (int row = rows.first / TILE; row <= rows.last / TILE; ++row) {
     const int top = row * TILE > rows.first ? row * TILE : rows.first;
     const int bottom = row * TILE + TILE - 1 < rows.last ? row * TILE + TILE - 1 : rows.last;
@@ -55,7 +56,7 @@ SPLAT_FN u32 count_tiles(const Splat& s, const Grid& grid) {
   return count;
 }
 
-// Fills the slots [slot, end) of one pair; lane ``first_lane`` of ``lanes`` takes every lanes-th tile of a
+// Fills the slots [slot, end) of one pair. Lane ``first_lane`` of ``lanes`` handles every lanes-th tile of a
 // row.
 SPLAT_FN void fill_slots(const Splat& s, const Grid& grid, u32 pair, u32 first_key, u32 sentinel, u32 slot,
                          u32 end, int first_lane, int lanes, u32* tile_keys, u32* pair_of_slot) {
@@ -72,8 +73,8 @@ SPLAT_FN void fill_slots(const Splat& s, const Grid& grid, u32 pair, u32 first_k
 
 constexpr u32 MANY_TILES = 32;  // a splat with more is listed by the whole warp
 
-// order, offsets [pairs]: nearest first, and the prefix sums of their counts. tile_keys, pair_of_slot [slots];
-// counts, first_slot [v n]: how many slots a pair has, and where they begin.
+// order, offsets [pairs]: the pairs, nearest first, and the prefix sums of their counts. tile_keys,
+// pair_of_slot [slots]. counts, first_slot [v n]: the number of slots of each pair, and the first of them.
 KERNEL(BLOCK)
 tile_list(const u32* order, const u32* counts, const u32* offsets, i64 pairs, i64 n, const float4* splats,
           i64 views, i64 height, i64 width, u32* tile_keys, u32* pair_of_slot, u32* first_slot) {
@@ -101,8 +102,8 @@ tile_list(const u32* order, const u32* counts, const u32* offsets, i64 pairs, i6
   }
 }
 
-// ranges [v tiles + 1, 2]: begin and end of each list among the sorted keys; arrives zeroed. The last list
-// holds the slots that listing left over: none, as long as it agrees with counting.
+// ranges [v tiles + 1, 2]: begin and end of each list among the sorted keys; the caller fills it with zeros.
+// The last list holds the slots that belong to no tile. It is empty as long as listing agrees with counting.
 KERNEL(BLOCK) tile_ranges(const u32* tile_keys, i64 slots, u32* ranges) {
   const i64 e = thread_index();
   if (e >= slots) return;

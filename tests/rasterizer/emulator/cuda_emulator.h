@@ -1,10 +1,12 @@
-// Runs CUDA kernels on a CPU, one fiber per thread, so that tests can judge the very source that a GPU runs.
+// Runs CUDA kernels on a CPU, one fiber per thread, so that tests can check the same source that a GPU runs.
 //
-// A thread runs until it meets a barrier or a warp operation, and then another of its block goes on, in an
-// order shuffled by a seed. So a result that depends on who comes first changes with the seed, a barrier that
-// is missing lets a thread read what nobody has written yet (shared memory starts as garbage in each block),
-// and a barrier that not everybody reaches is a deadlock that is reported. What this cannot show: the order
-// in which a real memory system lets others see a store, and the rounding of a real GPU's exponential.
+// A thread runs until it reaches a barrier or a warp operation. Then another thread of its block continues,
+// in an order shuffled by a seed. So a result that depends on the schedule changes with the seed. If a
+// barrier is missing, a thread reads memory before it is written; shared memory starts with garbage in each
+// block. A barrier that some threads do not reach is reported as a deadlock.
+//
+// The emulator cannot show the order in which a real memory system makes stores visible to other threads, nor
+// the rounding of a real GPU's exponential.
 #pragma once
 
 #include <setjmp.h>
@@ -23,7 +25,7 @@
 struct Index {
   unsigned x;
 };
-inline Index threadIdx, blockIdx, blockDim, gridDim;  // of the thread that runs now
+inline Index threadIdx, blockIdx, blockDim, gridDim;  // of the running thread
 
 struct float4 {
   float x, y, z, w;
@@ -39,12 +41,12 @@ struct Failure : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
-// Where threads wait for one another. All of them must come, for the same reason.
+// A point at which threads wait for one another. All members must arrive, and for the same reason.
 struct Meeting {
   int members = 0, arrived = 0;
   unsigned generation = 0;
   const char* reason = nullptr;
-  uint64_t values[2][WARP];  // of this generation and the one before: a slow reader is at most one behind
+  uint64_t values[2][WARP];  // of this generation and the previous one; a slow reader is at most one behind
 };
 
 struct Fiber {
@@ -57,7 +59,7 @@ struct Fiber {
   bool can_run() const { return !has_ended && (!waits_at || waits_at->generation != waits_since); }
 };
 
-// Small numbers in a fixed, lawless order (xorshift, Marsaglia 2003); quicker to compile than <random>.
+// A pseudo-random generator (xorshift, Marsaglia 2003) that compiles faster than <random>.
 struct Random {
   uint64_t state = 1;
   void seed(uint64_t seed) { state = seed * 0x9e3779b97f4a7c15u | 1; }
@@ -92,7 +94,7 @@ inline void fail(const std::string& trouble) {
   for (;;) yield();
 }
 
-// Returns the generation that the meeting had; its values stay until the next but one.
+// Returns the generation of the meeting. Its values stay valid for one more generation.
 inline unsigned meet(Meeting& meeting, const char* reason, int seat, uint64_t value) {
   Fiber& self = machine.fibers[size_t(machine.running)];
   const unsigned generation = meeting.generation;
@@ -156,7 +158,7 @@ inline void run_block(int threads) {
       alive -= machine.fibers[size_t(i)].has_ended;
       if (!machine.trouble.empty()) throw Failure(machine.trouble);
     }
-    if (!has_run) throw Failure("deadlock: some threads wait where others never come");
+    if (!has_run) throw Failure("deadlock: some threads wait at a barrier that others never reach");
   }
 }
 

@@ -1,7 +1,14 @@
-// The CUDA driver, as far as the rasterizer calls it, over the emulator: same functions, same arguments. A
-// module is every kernel below, and the handle of a stream is the seed of the schedule; 0 keeps to the order.
+// The part of the CUDA driver that the rasterizer calls, on top of the emulator: same functions, same
+// arguments. A module contains every kernel below. The handle of a stream is the seed of the schedule; seed
+// 0 runs blocks and threads in order.
 #include "cuda_emulator.h"
-// The emulator first: it says what __global__ and the like mean to the kernels.
+
+// The number of the planted mistake that is switched on. Only altered copies of the kernels read it.
+extern "C" {
+int active_mutant = 0;
+}
+
+// The emulator must come first, because it defines __global__ and the like for the kernels.
 #include "cuda.cu"
 
 typedef void (*Launcher)(unsigned blocks, int threads, uint64_t seed, void** arguments);
@@ -16,9 +23,11 @@ static const struct {
   const char* name;
   Launcher launcher;
 } KERNELS[] = {
-    ENTRY(prepare_cameras),     ENTRY(project_forward_1),  ENTRY(project_forward_4),
-    ENTRY(project_forward_9),   ENTRY(project_forward_16), ENTRY(project_backward_1),
+    ENTRY(prepare_cameras),     ENTRY(project_forward_1),  ENTRY(project_backward_1),
+#if !defined(EMULATOR_ONLY_DEGREE_0)
+    ENTRY(project_forward_4),   ENTRY(project_forward_9),  ENTRY(project_forward_16),
     ENTRY(project_backward_4),  ENTRY(project_backward_9), ENTRY(project_backward_16),
+#endif
     ENTRY(centre_backward),     ENTRY(scan_short),         ENTRY(scan_reduce),
     ENTRY(scan_apply),          ENTRY(sort_count),         ENTRY(sort_scatter),
     ENTRY(tile_list),           ENTRY(tile_ranges),        ENTRY(blend_forward),
@@ -28,7 +37,7 @@ static const struct {
 
 enum Status : int { OK = 0, NOT_FOUND = 500, LAUNCH_FAILED = 719 };
 static std::string trouble = "no such kernel";
-static int contexts = 0;  // pushed and not popped
+static int contexts = 0;  // pushed and not yet popped
 
 extern "C" {
 

@@ -1,4 +1,4 @@
-"""Shared traces: the same pictures to the bit, made once, and never in the way."""
+"""The trace cache: bit-identical images, traced once, and no errors if the cache cannot be used."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,7 @@ import torch
 
 from cadam3d.core.cameras import Cameras, turntable
 from cadam3d.io.cache import TRACES
-from cadam3d.prior.shapes import traces
+from cadam3d.prior.shapes import trace_cache
 from cadam3d.prior.shapes.scene import Scene, build
 from cadam3d.prior.shapes.tracer import Layers, trace
 
@@ -31,14 +31,14 @@ def folder(tmp_path: Path, monkeypatch) -> Path:
 
 @pytest.fixture
 def traced(monkeypatch) -> list[int]:
-    """One entry for each time that something is really traced."""
+    """A list with one entry for each call of the tracer."""
     calls: list[int] = []
 
     def count(scene: Scene, cameras: Cameras, samples: int) -> Layers:
         calls.append(samples)
         return trace(scene, cameras, samples)
 
-    monkeypatch.setattr(traces, "trace", count)
+    monkeypatch.setattr(trace_cache, "trace", count)
     return calls
 
 
@@ -48,10 +48,10 @@ def same(one: Layers, other: Layers) -> bool:
 
 @pytest.mark.parametrize("samples", [1, 2, 3])
 @pytest.mark.parametrize("prompt", ["a robot", "a cube", "three red and white spotted balls under a tree"])
-def test_what_was_kept_is_what_would_be_traced_to_the_bit(prompt, samples, folder, traced) -> None:
+def test_a_cached_trace_is_bit_identical(prompt, samples, folder, traced) -> None:
     expected = trace(scene_of(prompt), cameras(), samples)
-    first = traces.shared_trace(scene_of(prompt), cameras(), samples)
-    second = traces.shared_trace(scene_of(prompt), cameras(), samples)
+    first = trace_cache.shared_trace(scene_of(prompt), cameras(), samples)
+    second = trace_cache.shared_trace(scene_of(prompt), cameras(), samples)
     assert len(traced) == 1
     assert same(first, expected)
     assert same(second, expected)
@@ -71,44 +71,44 @@ def test_what_was_kept_is_what_would_be_traced_to_the_bit(prompt, samples, folde
     ],
     ids=["object", "pattern", "place", "size", "width", "views", "samples"],
 )
-def test_whatever_changes_the_picture_is_traced_anew(other, folder, traced) -> None:
+def test_a_trace_is_repeated_if_anything_changes_the_image(other, folder, traced) -> None:
     first = (scene_of("a red and white checkered cube"), cameras(), 1)
-    traces.shared_trace(*first)
-    assert same(traces.shared_trace(*other(*first)), trace(*other(*first)))
+    trace_cache.shared_trace(*first)
+    assert same(trace_cache.shared_trace(*other(*first)), trace(*other(*first)))
     assert len(traced) == 2
 
 
-def test_colours_are_put_on_afterwards_and_share_a_trace(folder, traced) -> None:
+def test_scenes_that_differ_in_colour_share_a_trace(folder, traced) -> None:
     for prompt in ("a red cube", "a blue cube"):
-        traces.shared_trace(scene_of(prompt), cameras(), 1)
+        trace_cache.shared_trace(scene_of(prompt), cameras(), 1)
     assert len(traced) == 1
 
 
 @pytest.mark.parametrize("damage", [b"", b"\x93NUMPY", b"no array at all"], ids=["empty", "cut", "other"])
-def test_a_damaged_file_is_traced_anew(damage, folder, traced) -> None:
+def test_a_damaged_file_is_replaced_by_a_new_trace(damage, folder, traced) -> None:
     given = (scene_of("a cube"), cameras(), 1)
-    expected = traces.shared_trace(*given)
+    expected = trace_cache.shared_trace(*given)
     [file] = folder.iterdir()
     file.write_bytes(damage or file.read_bytes()[:-9])
-    assert same(traces.shared_trace(*given), expected)
-    assert same(traces.shared_trace(*given), expected)
+    assert same(trace_cache.shared_trace(*given), expected)
+    assert same(trace_cache.shared_trace(*given), expected)
     assert len(traced) == 2
 
 
 @pytest.mark.parametrize("trouble", ["a file in its place", "a full disk"])
-def test_a_folder_that_takes_nothing_does_no_harm(trouble, folder, monkeypatch) -> None:
+def test_tracing_works_if_nothing_can_be_stored(trouble, folder, monkeypatch) -> None:
     if trouble == "a full disk":
-        monkeypatch.setattr(traces, "SPARE", 2**62)
+        monkeypatch.setattr(trace_cache, "SPARE", 2**62)
     else:
         folder.write_text("")
     given = (scene_of("a cube"), cameras(), 1)
     for _ in range(2):
-        assert same(traces.shared_trace(*given), trace(*given))
+        assert same(trace_cache.shared_trace(*given), trace(*given))
     assert folder.is_file() or list(folder.iterdir()) == []
 
 
 def test_without_the_variable_nothing_is_written(tmp_path, monkeypatch) -> None:
     monkeypatch.delenv(TRACES, raising=False)
     monkeypatch.chdir(tmp_path)
-    traces.shared_trace(scene_of("a cube"), cameras(), 1)
+    trace_cache.shared_trace(scene_of("a cube"), cameras(), 1)
     assert list(tmp_path.iterdir()) == []

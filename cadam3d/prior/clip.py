@@ -1,4 +1,4 @@
-"""What the larger models read: a text encoder's states before its last layer, and one vector per text."""
+"""CLIP text encoders as the larger models read them: states before the last layer, and a pooled vector."""
 
 from collections.abc import Sequence
 
@@ -12,10 +12,10 @@ from cadam3d.prior.latent import Texts, tokenize
 def penultimate(
     found: Pretrained, encoder: str, texts: Sequence[str], dtype: torch.dtype, device: torch.device
 ) -> Texts:
-    """CLIP's hidden states before its last layer, and its projected text (None where it projects none).
+    """Return CLIP's hidden states before the last layer, and its projected text if it has a projection.
 
-    ``encoder`` is a part such as ``"text_encoder_2"``; its tokenizer is the part of the same number. Both are
-    loaded, used and let go of.
+    ``encoder`` is a part such as ``"text_encoder_2"``; its tokenizer is the part with the same number. Both
+    are loaded, used and freed.
     """
     numbers = tokenize(found.part(encoder.replace("text_encoder", "tokenizer")), texts).to(device)
     network = found.part(encoder, dtype).to(device)

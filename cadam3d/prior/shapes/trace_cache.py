@@ -1,8 +1,7 @@
-"""Traced views that several runs share: the jobs of a sweep look at the same scene from the same places.
+"""A cache of traced views for runs that trace the same views of the same scene, such as the jobs of a sweep.
 
-Tracing is most of a step of ``prior=shapes``. A folder, named by an environment variable, keeps what was
-traced, and whoever needs the same views of the same scene reads them instead, to the bit what it would have
-traced.
+Tracing takes most of the time of a step with ``prior=shapes``. If an environment variable names a folder,
+traced views are stored in it, and other runs read them instead of tracing. The numbers are bit-identical.
 """
 
 import hashlib
@@ -21,13 +20,13 @@ from cadam3d.prior.shapes import solids, tracer
 from cadam3d.prior.shapes.scene import Scene
 from cadam3d.prior.shapes.tracer import Layers, trace
 
-SPARE = 2 * 1024**3  # bytes of the disk that are left to others
-# A folder may outlive the code that filled it.
+SPARE = 2 * 1024**3  # bytes of the disk that stay free
+# Part of the identity of a trace, since a folder may outlive the code that wrote it.
 CODE = b"".join(Path(str(module.__file__)).read_bytes() for module in (tracer, solids))
 
 
 def shared_trace(scene: Scene, cameras: Cameras, samples: int) -> Layers:
-    """:func:`~cadam3d.prior.shapes.tracer.trace`, or what another run kept of it."""
+    """Return :func:`~cadam3d.prior.shapes.tracer.trace` of the scene, from the cache if it is there."""
     folder = os.environ.get(TRACES)
     if not folder or cameras.intrinsics.dtype != torch.float32:
         return trace(scene, cameras, samples)
@@ -35,12 +34,12 @@ def shared_trace(scene: Scene, cameras: Cameras, samples: int) -> Layers:
     layers = _read(path, scene, cameras)
     if layers is None:
         layers = trace(scene, cameras, samples)
-        _keep(path, layers)
+        _store(path, layers)
     return layers
 
 
 def _identity(scene: Scene, cameras: Cameras, samples: int) -> str:
-    """A name for all that a trace depends on; colours come later."""
+    """Return a name that identifies everything a trace depends on; it does not depend on colours."""
     digest = hashlib.sha256(CODE)
     kinds = [(kind.name, count) for kind, count in scene.kinds]
     digest.update(repr((kinds, scene.albedo.shape[1], cameras.height, cameras.width, samples)).encode())
@@ -50,8 +49,8 @@ def _identity(scene: Scene, cameras: Cameras, samples: int) -> str:
     return f"{cameras.intrinsics.device.type}-{digest.hexdigest()}"
 
 
-def _keep(path: Path, layers: Layers) -> None:
-    """Write a trace, whole or not at all; if the disk is full or closed, the next one traces again."""
+def _store(path: Path, layers: Layers) -> None:
+    """Write a trace completely or not at all. If the disk is full or read-only, nothing is stored."""
     temporary = path.with_name(f".{os.getpid()}-{path.name}")
     with suppress(OSError):
         path.parent.mkdir(exist_ok=True)
@@ -65,7 +64,7 @@ def _keep(path: Path, layers: Layers) -> None:
 
 
 def _packed(layers: Layers) -> np.ndarray:
-    """Counts, places and values of what is not zero, as 32-bit words: most of a view is empty."""
+    """Return counts, positions and values of the nonzero numbers as 32-bit words; most of a view is empty."""
     places, values = [], []
     for tensor in (layers.alpha, layers.paints):
         flat = tensor.flatten().cpu()
@@ -76,7 +75,7 @@ def _packed(layers: Layers) -> np.ndarray:
 
 
 def _read(path: Path, scene: Scene, cameras: Cameras) -> Layers | None:
-    """What :func:`_keep` wrote; None if that is not there or not whole."""
+    """Read a trace that :func:`_store` wrote; None if the file is missing or damaged."""
     try:
         words = torch.from_numpy(np.load(path, allow_pickle=False))
     except (OSError, ValueError, EOFError):

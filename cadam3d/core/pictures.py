@@ -1,0 +1,65 @@
+"""PictureSettings: the settings that all pictures of Gaussians share, with their checks and cameras."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.core.cameras import Cameras, orbit, turntable
+from cadam3d.core.checks import are_numbers, require, require_color, require_range, require_whole
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureSettings:
+    """How square pictures are taken: from which distance, how large, and in front of which colour.
+
+    Exporters, callbacks and metrics that render inherit these four settings and add their own angles.
+    """
+
+    node: ClassVar[str]  # of the configuration, such as "exporter.preview"; begins the error messages
+
+    distance: float  # > 0: of the camera from the origin, in world units
+    fov_y_deg: float  # in (0, 180): vertical field of view, in degrees
+    size: int  # >= 1: height and width of each picture, in pixels
+    background: Sequence[float]  # RGB in [0, 1]
+
+    def __post_init__(self) -> None:
+        require_range(f"{self.node}.distance", self.distance, above=0, example=3.0)
+        require_range(f"{self.node}.fov_y_deg", self.fov_y_deg, above=0, below=180, example=40)
+        require_whole(f"{self.node}.size", self.size, low=1, example=256)
+        require_color(f"{self.node}.background", self.background)
+
+    def ring(self, views: int, elevation_deg: float) -> Cameras:
+        """Return ``views`` cameras evenly spaced over one full turn, starting at the front."""
+        return turntable(
+            views,
+            elevation_deg=elevation_deg,
+            distance=self.distance,
+            fov_y_deg=self.fov_y_deg,
+            size=self.size,
+        )
+
+    def cameras_at(self, azimuths_deg: Float[Tensor, "v"], elevations_deg: Float[Tensor, "v"]) -> Cameras:
+        """Return one camera for each pair of angles, in degrees; azimuth 0 is the front."""
+        full = torch.ones_like(azimuths_deg)
+        return orbit(
+            azimuths_deg, elevations_deg, full * self.distance, full * self.fov_y_deg, self.size, self.size
+        )
+
+    def backgrounds(self, views: int) -> Float[Tensor, "v 3"]:
+        """Return the background colour once per view."""
+        return torch.tensor([[float(channel) for channel in self.background]] * views)
+
+    def require_angles(self, name: str, angles_deg: object, *, limit: int, example: int) -> None:
+        """Raise ``UserError`` unless setting ``name`` is a list of angles in [-limit, limit] degrees."""
+        key = f"{self.node}.{name}"
+        require(
+            are_numbers(angles_deg, low=-limit, high=limit) and len(angles_deg) > 0,
+            key,
+            expected=f"at least one angle, each in [-{limit}, {limit}]",
+            got=angles_deg,
+            example=f"'{key}=[{example}]'",
+        )

@@ -1,0 +1,69 @@
+"""charts.json: the charts that the densifier and the objective of a run declare, kept as data with the run.
+
+The report of a sweep reads them from the folders of its jobs. A file that is missing, damaged or written by
+another version means that there are no declared charts, nothing worse.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from cadam3d.core.chart import Chart, Curve, Level
+from cadam3d.io.jsonl import write_json
+from cadam3d.io.run_folder import CHARTS
+
+
+def write_declarations(folder: Path, charts: Sequence[Chart]) -> None:
+    """Write ``charts.json`` into the folder of a run. Raises ``UserError`` if that is impossible."""
+    write_json(folder / CHARTS, [asdict(chart) for chart in charts])
+
+
+def read_declarations(folder: Path) -> tuple[Chart, ...]:
+    """Return the charts that the run in ``folder`` declared; those that cannot be read are left out."""
+    try:
+        content = json.loads((folder / CHARTS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return ()
+    found = []
+    for entry in content if isinstance(content, list) else []:
+        try:
+            found.append(_chart(entry))
+        except (AttributeError, LookupError, TypeError, ValueError):
+            continue
+    return tuple(found)
+
+
+def _chart(entry: Mapping[str, Any]) -> Chart:
+    """Return the chart that plain data describe. Raises some built-in exception if they do not."""
+    band, score = entry.get("band"), _text(entry.get("score", ""))
+    if score and not score.isidentifier():  # it names the files of a figure
+        raise ValueError(f"expected the name of a score, got {score!r}")
+    return Chart(
+        title=_text(entry["title"]),
+        caption=_text(entry["caption"]),
+        curves=tuple(
+            Curve(
+                key=_text(curve["key"]),
+                label=_text(curve.get("label", "")),
+                is_threshold=bool(curve.get("is_threshold")),
+            )
+            for curve in entry["curves"]
+        ),
+        band=None if band is None else (_text(band[0]), _text(band[1])),
+        band_label=_text(entry.get("band_label", "")),
+        log_y=bool(entry.get("log_y")),
+        percent=bool(entry.get("percent")),
+        score=score,
+        levels=tuple(
+            Level(label=_text(level["label"]), value=float(level["value"]))
+            for level in entry.get("levels", ())
+        ),
+    )
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"expected text, got {value!r}")
+    return value

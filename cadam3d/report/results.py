@@ -1,0 +1,302 @@
+"""Results: the jobs of a sweep as tidy records, each with its setting and its cell.
+
+A *setting* is an arm (a choice of ``densifier``) with its thresholds. A *cell* is everything else: prompt,
+seed, noise, objective and whatever other key the sweep varies. The jobs of one cell start from the same
+Gaussians and see the same views and noise, so settings are compared within cells.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+from cadam3d.core.outcome import Outcome
+from cadam3d.io.jsonl import read_jsonl
+from cadam3d.io.run_folder import CONFIG, HISTOGRAMS, METRICS
+from cadam3d.report.formatting import number
+from cadam3d.settings.compose import compose, config_dir, flatten
+from cadam3d.sweep.folder import UNFINISHED, load
+
+# The other outcomes leave nothing to measure.
+WITH_ASSET = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.OUT_OF_MEMORY)
+ARM, PREFIX = "densifier", "densifier."
+SEED, PROMPT, NOISE, GUIDANCE = "seed", "prompt", "noise", "guidance"
+NO_NOISE = "none"  # the level whose gradients have no noise
+NOISE_ORDER = (NO_NOISE, "weak", "medium", "strong")  # other levels follow in alphabetical order
+
+
+@dataclass(frozen=True)
+class ArmSetting:
+    """An arm and those of its thresholds that the sweep varies, if there are any."""
+
+    arm: str
+    thresholds: tuple[tuple[str, float | str], ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Return a name such as ``cadam`` or ``baseline (tau_pos 0.001)``."""
+        return f"{self.arm} ({self.short})" if self.thresholds else self.arm
+
+    @property
+    def short(self) -> str:
+        """Return the thresholds without the arm; empty if there are none."""
+        return ", ".join(f"{key} {_written(value)}" for key, value in self.thresholds)
+
+    @property
+    def values(self) -> str:
+        """Return the values of the thresholds without their names, for labels with little room."""
+        return ", ".join(_written(value) for _, value in self.thresholds)
+
+    @property
+    def order(self) -> tuple:
+        """Return a sorting key: by arm, then by threshold, numbers before words."""
+        return (self.arm, *((key, isinstance(value, str), value) for key, value in self.thresholds))
+
+
+@dataclass(frozen=True, order=True)
+class Cell:
+    """The conditions that jobs share if they are compared with each other: sorted pairs of key and value."""
+
+    axes: tuple[tuple[str, str], ...]
+
+    def __getitem__(self, key: str) -> str:
+        return dict(self.axes).get(key, "")
+
+    def without(self, *keys: str) -> "Cell":
+        """Return the cell without some of its axes, such as the seed."""
+        return Cell(tuple(pair for pair in self.axes if pair[0] not in keys))
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobResult:
+    """One job with the numbers it ended with."""
+
+    folder: Path
+    setting: ArmSetting
+    is_standard: bool  # every threshold has the value of the shipped configuration
+    cell: Cell
+    outcome: str
+    message: str  # the reason of a failure; empty otherwise
+    count: float | None  # Gaussians at the end
+    psnr: float | None  # dB
+    ssim: float | None
+    mib: float | None  # size of asset.ply
+    seconds: float | None
+
+    @property
+    def arm(self) -> str:
+        """Return the arm of its setting."""
+        return self.setting.arm
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the job left an asset whose count and quality may be compared."""
+        return self.outcome in WITH_ASSET and bool(self.count) and self.psnr is not None
+
+    @property
+    def is_unfinished(self) -> bool:
+        """Whether the job waits, runs, or was killed before it could report an outcome."""
+        return self.outcome == UNFINISHED
+
+    @property
+    def ended_early(self) -> bool:
+        """Whether the job stopped before its last step: its numbers are those of an unfinished asset."""
+        return self.outcome != Outcome.FINISHED
+
+
+@dataclass(frozen=True)
+class _KnownJob:
+    """A job by itself, before it is known what the sweep varies."""
+
+    arm: str
+    folder: Path
+    overrides: Mapping[str, Any]  # key to value
+    summary: Mapping[str, Any]
+    outcome: str
+
+    @property
+    def densifier(self) -> str:
+        return str(self.overrides.get(ARM, self.summary.get(ARM, "")))
+
+
+def read(sweep_folder: Path) -> list[JobResult]:
+    """Return every job of the sweep in ``sweep_folder``, in order, whether it is done or not.
+
+    A key that varies within an arm makes a difference: a key of the densifier is a threshold there, any other
+    key an axis of the cells. A key that only differs between arms belongs to the arm. Raises ``UserError`` if
+    the folder holds no sweep.
+    """
+    jobs = [_known(job) for job in load(sweep_folder)]
+    arms = {job.arm: [other for other in jobs if other.arm == job.arm] for job in jobs}
+    varied = {arm: _varied(members) for arm, members in arms.items()}
+    axes = dict.fromkeys(key for keys in varied.values() for key in keys if not key.startswith(PREFIX))
+    thresholds = {arm: [key for key in keys if key.startswith(PREFIX)] for arm, keys in varied.items()}
+    return [_result(job, thresholds[job.arm], list(axes)) for job in jobs]
+
+
+def _known(job: Any) -> _KnownJob:
+    """Return a job of :func:`cadam3d.sweep.folder.load` with its overrides parsed.
+
+    Without a grid the arm of a job has no name; it is then the densifier.
+    """
+    overrides = dict(_pair(str(line)) for line in job.overrides)
+    known = _KnownJob(job.arm, job.folder, overrides, job.summary, str(job.outcome))
+    return known if job.arm else _KnownJob(**{**vars(known), "arm": known.densifier or "default"})
+
+
+def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> JobResult:
+    shipped = _shipped(job.densifier)
+    numbers = {key: number(value) for key, value in job.summary.items()}
+    size = numbers.get("asset_bytes")
+    given = {key: value for key, value in job.overrides.items() if key.startswith(PREFIX)}
+    return JobResult(
+        folder=job.folder,
+        setting=ArmSetting(
+            job.arm, tuple((key.removeprefix(PREFIX), _value(job, key, shipped)) for key in thresholds)
+        ),
+        is_standard=all(_same(shipped.get(key.removeprefix(PREFIX)), value) for key, value in given.items()),
+        cell=_cell(job, axes),
+        outcome=job.outcome,
+        message=str(job.summary.get("message") or ""),
+        count=numbers.get("num_gaussians"),
+        psnr=numbers.get("psnr"),
+        ssim=numbers.get("ssim"),
+        mib=size / (1 << 20) if size is not None else None,
+        seconds=numbers.get("seconds"),
+    )
+
+
+def _cell(job: _KnownJob, axes: Sequence[str]) -> Cell:
+    known = {key: job.overrides.get(key, job.summary.get(key, "")) for key in (PROMPT, SEED)}
+    known[NOISE] = job.overrides.get(NOISE, "")
+    known |= {key: job.overrides.get(key, "default") for key in axes if key not in known}
+    return Cell(tuple(sorted((key, str(value)) for key, value in known.items())))
+
+
+def _value(job: _KnownJob, key: str, shipped: Mapping[str, Any]) -> float | str:
+    value = job.overrides.get(key, shipped.get(key.removeprefix(PREFIX)))
+    as_number = number(value)
+    return str(value) if as_number is None else as_number
+
+
+def _same(one: object, other: object) -> bool:
+    return one == other or (number(one) is not None and number(one) == number(other))
+
+
+def _varied(jobs: Sequence[_KnownJob]) -> list[str]:
+    """Return the keys with several values among these jobs, one of which may be the default."""
+    keys = dict.fromkeys(key for job in jobs for key in job.overrides if key != ARM)
+    return [key for key in keys if len({repr(job.overrides.get(key)) for job in jobs}) > 1]
+
+
+# The lines of a sweep's jobs repeat, and the parser takes milliseconds for each.
+@cache
+def _pair(line: str) -> tuple[str, Any]:
+    override = OverridesParser.create().parse_override(line)
+    return override.get_key_element().lstrip("+~"), override.value()
+
+
+def counts(result: JobResult) -> list[tuple[float, float]]:
+    """Return steps and Gaussians of a job over time; a refinement is two points at its step."""
+    points: list[tuple[float, int, float]] = []
+    for line in read_jsonl(result.folder / METRICS):
+        step = number(line.get("step"))
+        for key, order in (("num_gaussians", 0), ("before", 0), ("after", 1)):
+            value = number(line.get(key))
+            if step is not None and value is not None:
+                points.append((step, order, value))
+    return [(step, value) for step, _, value in sorted(points)]
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """One score of one population: bin ``i`` starts at ``10 ** ((first + i) / bins_per_decade)``."""
+
+    step: float
+    bins_per_decade: int
+    first: int
+    counts: list[int]
+    selected: list[int]
+
+
+def histograms(result: JobResult, score: str | None = None) -> list[Histogram]:
+    """Return the histograms of one score by step; [] if the job ran without the candidates callback.
+
+    ``None`` stands for the first score there is, because all of them count the same population.
+    """
+    lines = read_jsonl(result.folder / HISTOGRAMS)
+    score = lines[0].get("score") if lines and score is None else score
+    return [
+        Histogram(*(line[key] for key in ("step", "bins_per_decade", "first", "counts", "selected")))
+        for line in lines
+        if line.get("score") == score
+    ]
+
+
+def config(result: JobResult) -> dict[str, Any]:
+    """Return all settings that a job ran with; {} if it failed before they were known."""
+    path = result.folder / CONFIG
+    return (yaml.safe_load(path.read_text(encoding="utf-8")) or {}) if path.is_file() else {}
+
+
+def arms_of(results: Iterable[JobResult]) -> list[str]:
+    """Return the arms that left something to measure: none, then baseline, then the others by name."""
+    found = {result.arm for result in measured(results)}
+    return sorted(found, key=lambda arm: (arm != "none", arm != "baseline", arm))
+
+
+def levels_of(results: Iterable[JobResult]) -> list[str]:
+    """Return the noise levels at which something was measured."""
+    return in_noise_order(result.cell[NOISE] for result in measured(results))
+
+
+def level_title(level: str) -> str:
+    """Return the title of a panel for a noise level; empty if the sweep does not vary the noise."""
+    if level == NO_NOISE:
+        return "no noise"
+    return f"{level} noise" if level else ""
+
+
+def in_noise_order(levels: Iterable[str]) -> list[str]:
+    """Return the noise levels from none to strong, each once."""
+    position = {level: i for i, level in enumerate(NOISE_ORDER)}
+    return sorted(set(levels), key=lambda level: (position.get(level, len(position)), level))
+
+
+def at_noise(results: Iterable[JobResult], level: str) -> list[JobResult]:
+    """Return the results at one noise level."""
+    return [result for result in results if result.cell[NOISE] == level]
+
+
+def with_noise(results: Sequence[JobResult]) -> Sequence[JobResult]:
+    """Return the results with noisy gradients, which the paper is about; all results if there are none."""
+    return [result for result in results if result.cell[NOISE] != NO_NOISE] or results
+
+
+def measured(results: Iterable[JobResult]) -> list[JobResult]:
+    """Return the results whose count and quality may be compared."""
+    return [result for result in results if result.is_measured]
+
+
+@cache
+def _shipped(arm: str) -> Mapping[str, Any]:
+    """Return the settings of ``configs/densifier/<arm>.yaml`` by dotted key; empty for an arm from elsewhere.
+
+    A setting that has keys, such as a schedule, is there as a whole too: an override may replace it by a
+    number.
+    """
+    if not arm or not (config_dir() / ARM / f"{arm}.yaml").is_file():
+        return {}
+    node = compose([f"{ARM}={arm}", "prompt=any"])[ARM]
+    plain = OmegaConf.to_container(node, resolve=True)
+    assert isinstance(plain, dict)
+    return dict(flatten(plain, with_nodes=True))
+
+
+def _written(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:g}"

@@ -1,0 +1,57 @@
+"""Declared charts survive the way through a file, and a damaged file does no harm."""
+
+import json
+
+import pytest
+
+from cadam3d.core.chart import Chart, Curve, Level
+from cadam3d.report.declarations import read_declarations, write_declarations
+
+CHARTS = (
+    Chart(
+        title="A title",
+        caption="A caption.",
+        curves=(Curve(key="a", label="median"), Curve(key="b", is_threshold=True)),
+        band=("low", "high"),
+        band_label="10 to 90 %",
+        log_y=True,
+        score="a",
+        levels=(Level(label="b", value=0.5),),
+    ),
+    Chart(title="Shares", caption="", curves=(Curve(key="c"),), percent=True),
+)
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    write_declarations(tmp_path, CHARTS)
+    assert read_declarations(tmp_path) == CHARTS
+
+
+def test_a_missing_file_declares_nothing(tmp_path):
+    assert read_declarations(tmp_path) == ()
+
+
+@pytest.mark.parametrize("content", ["", "{", "null", "3", '{"title": 1}', "\udcff", "[1, null, [], {}]"])
+def test_a_damaged_file_declares_nothing(tmp_path, content):
+    (tmp_path / "charts.json").write_bytes(content.encode(errors="surrogateescape"))
+    assert read_declarations(tmp_path) == ()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        *({"title": None}, {"caption": 3}, {"curves": [{}]}, {"curves": "abc"}, {"band": ["low"]}),
+        *(
+            {"band": [1, 2]},
+            {"levels": [{"label": "b", "value": None}]},
+            {"score": ["a"]},
+            {"score": "../up"},
+        ),
+    ],
+)
+def test_a_damaged_chart_does_not_take_the_others_with_it(tmp_path, damage):
+    write_declarations(tmp_path, CHARTS)
+    content = json.loads((tmp_path / "charts.json").read_text(encoding="utf-8"))
+    content[0] |= damage
+    (tmp_path / "charts.json").write_text(json.dumps(content), encoding="utf-8")
+    assert read_declarations(tmp_path) == CHARTS[1:]

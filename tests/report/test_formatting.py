@@ -1,0 +1,47 @@
+"""Numbers are written the way people write them."""
+
+import math
+
+import pytest
+
+from cadam3d.report.formatting import elapsed, number, plural, short, show, shown_bytes
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0, "0"), (1e-17, "0"), (12300, "12.3k"), (-50, "-50"), (2e6, "2M"), (1.2e-4, "1.2e-4"), (0.25, "0.25")],
+)
+def test_numbers_on_axes_are_short(value, text):
+    assert short(value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        *((None, "-"), ("", "-"), (math.nan, "-"), ([], "-"), (True, "yes"), (9999, "9999")),
+        *((10_000, "10,000"), (3.0, "3"), (0.123456, "0.1235"), ([1, "b"], "1, b")),
+    ],
+)
+def test_any_value_has_a_text(value, text):
+    assert show(value) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(1.54, "1.5 s"), (59.9, "59.9 s"), (75, "1 min 15 s"), (3599.6, "1 h 0 min"), (7260, "2 h 1 min")],
+)
+def test_durations_have_suitable_units(seconds, text):
+    assert elapsed(seconds) == text
+
+
+def test_bytes_have_suitable_units():
+    assert [shown_bytes(n) for n in (5, 2048, 3 << 20, 5 << 30)] == ["5 B", "2.0 KiB", "3.0 MiB", "5.0 GiB"]
+
+
+@pytest.mark.parametrize("value", [True, None, "3", math.inf, math.nan])
+def test_a_number_is_finite_and_not_a_boolean(value):
+    assert number(value) is None
+
+
+def test_one_is_singular():
+    assert [plural(1, "job"), plural(0, "job"), plural(2, "job")] == ["1 job", "0 jobs", "2 jobs"]

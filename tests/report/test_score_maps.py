@@ -1,0 +1,62 @@
+"""Score maps show what the densifiers of the jobs declare and nothing else."""
+
+import numpy as np
+import pytest
+
+from cadam3d.report.declarations import write_declarations
+from cadam3d.report.results import at_noise, read
+from cadam3d.report.score_maps import ScoreMap, declared_scores, score_figure
+from cadam3d.report.style import styled
+
+
+def draw(folder):
+    results = read(folder)
+    with styled():
+        return score_figure(results, declared_scores(results)["shake"])
+
+
+@pytest.mark.parametrize(("levels", "shape"), [(1, (3, 3)), (2, (7, 2)), (4, (7, 4))])
+def test_every_arm_with_the_score_is_shown(jobs, levels, shape):
+    arms = ["cadam", *(f"cadam_{letter}" for letter in "abcdef")]
+    noises = ["none", "weak", "medium", "strong"][-levels:]
+    for i, arm in enumerate(arms):
+        for noise in noises:
+            jobs.files(jobs.add(arm, f"noise={noise}", n=500, psnr=20.0), 500, shake=10.0**-i)
+    figure = draw(jobs.folder)
+    panels = [axes for axes in figure.axes if axes.get_visible()]
+    assert len(panels) == len(arms) * levels
+    assert figure.axes[0].get_gridspec().get_geometry() == shape
+    texts = [axes.get_title(loc="left") for axes in panels]
+    for arm in arms:
+        assert f"{arm}, strong noise" in texts
+    low, high = panels[0].get_ylim()
+    assert low < 1e-6  # independent of the arm that was drawn last
+    assert high > 1
+    assert sum(axes.get_xlabel() == "step" for axes in panels) == shape[1]
+
+
+def test_shares_of_a_map_add_to_one_at_every_step(bench_results):
+    found = ScoreMap([each for each in at_noise(bench_results, "medium") if each.arm == "cadam"], "shake")
+    assert found.steps == [40, 80, 120]
+    assert np.allclose(found.shares.sum(axis=0), 1)
+
+
+def test_declared_levels_are_drawn_with_their_values(jobs):
+    jobs.files(jobs.add("cadam", n=500, psnr=20.0), 500)
+    [axes] = draw(jobs.folder).axes
+    assert [text.get_text() for text in axes.texts] == ["tau_shake 0.1", "pure noise 0.229"]
+    assert [line.get_ydata()[0] for line in axes.lines] == [0.1, 0.229]
+
+
+def test_a_score_that_no_job_declares_has_no_map(jobs):
+    folder = jobs.add("cadam", n=500, psnr=20.0)
+    jobs.files(folder, 500)
+    write_declarations(folder, [])
+    assert declared_scores(read(jobs.folder)) == {}
+
+
+def test_a_declared_score_without_histograms_has_no_map(jobs):
+    folder = jobs.add("cadam", n=500, psnr=20.0)
+    jobs.files(folder, 500)
+    (folder / "candidates/histograms.jsonl").unlink()
+    assert draw(jobs.folder) is None
