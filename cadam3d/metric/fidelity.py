@@ -1,7 +1,8 @@
-"""Fidelity: how near the renders come to the truth, where the prior knows it."""
+"""Fidelity: how close the renders are to the true images, if the prior knows those."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -23,10 +24,11 @@ VIEWS_AT_ONCE = 4  # bounds memory: the truth holds one image per mode and view
 @dataclass(frozen=True, kw_only=True)
 class Fidelity(Metric):
     """PSNR and SSIM of held-out views against the true images.
+
     Each view's PSNR comes from the mean squared error over all its pixels and channels, renders clamped to
-    [0, 1]; views are then averaged in dB. If the prompt leaves something open, the truth is a mixture: the
-    asset is scored against every mode over all views, and the mode with the best mean PSNR counts, one mode
-    for the whole object.
+    [0, 1]; the views are then averaged in dB. If the prompt leaves something open, the truth is a mixture: the
+    asset is compared with every mode over all views, and the mode with the best mean PSNR counts. It is one
+    mode for the whole object.
     """
 
     views: int  # azimuths per elevation
@@ -34,7 +36,7 @@ class Fidelity(Metric):
     distance: float  # of the camera from the origin, world units
     fov_y_deg: float
     size: int  # pixels, height and width
-    background: Sequence[float]  # RGB in [0, 1]; render and truth stand before the same one
+    background: Sequence[float]  # RGB in [0, 1], of the renders and of the true images
 
     def __post_init__(self) -> None:
         require_whole("metric.fidelity.views", self.views, low=1, example=12)
@@ -49,8 +51,10 @@ class Fidelity(Metric):
         require_whole("metric.fidelity.size", self.size, low=SSIM_WINDOW, example=128)
 
     def cameras(self) -> Cameras:
-        """The held-out views: azimuths half a step off those of a turntable, each elevation shifted a
-        little more, so that no two rings look from the same side.
+        """Return the held-out views.
+
+        Their azimuths are half a step off those of a turntable. Each elevation is shifted a little more, so that
+        no two rings look from the same side.
         """
         step = 360.0 / self.views
         rings = len(self.elevations_deg)
@@ -63,9 +67,13 @@ class Fidelity(Metric):
         full = torch.ones_like(azimuth)
         return orbit(azimuth, elevation, full * self.distance, full * self.fov_y_deg, self.size, self.size)
 
-    def measure(self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None) -> dict[str, float]:
-        """``psnr`` (dB, mean over views), ``psnr_min`` (dB, the worst view), ``ssim`` (mean over views) and
-        ``mode``, the index of the mode they belong to; {} without a truth.
+    def measure(
+        self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None, asset: Path | None
+    ) -> dict[str, float]:
+        """Return PSNR, SSIM and the mode that they belong to; {} without a truth.
+
+        ``psnr`` (dB) and ``ssim`` are means over the views, ``psnr_min`` (dB) is that of the worst view, and
+        ``mode`` is the index of the mode.
         """
         if truth is None:
             return {}
