@@ -14,7 +14,7 @@ from omegaconf.errors import InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import OVERRIDES, claim, holds_run
-from cadam3d.settings.advice import explain, reraise_interrupt, require_values
+from cadam3d.settings.advice import explain, require_values, reraise_interrupt
 from cadam3d.settings.compose import TEXT_KEYS
 from cadam3d.settings.hydra import (
     compose_line,
@@ -57,9 +57,9 @@ class Line:
 def launch(command: str, words: Sequence[str]) -> int:
     """Run ``cadam3d <command> <words>`` and return its exit code.
 
-    Raises ``UserError`` for mistakes of the user. Only here are the exceptions of Hydra and OmegaConf put into
-    words. If the command itself has raised one, it is a bug and keeps its traceback, unless a value refers to
-    something that only a running job can know to be absent.
+    Raises ``UserError`` for mistakes of the user. Only here are the exceptions of Hydra and OmegaConf put
+    into words. If the command itself has raised one, it is a bug and keeps its traceback, unless a value
+    refers to something that only a running job can know to be absent.
     """
     task = Task(command)
     try:
@@ -101,7 +101,7 @@ def _command(line: Line, task: Task) -> int:
     if _wants_page(options) or options.cfg or options.experimental_rerun:
         run_hydra(line.command, [*line.overrides, *line.flags], task)
         return 0
-    cfg = compose_line(line.command, line.overrides, options)
+    cfg = compose_line(line.command, [*line.overrides, "hydra.mode=RUN"], options)
     require_values(cfg)
     refuse_holes(cfg, line.command, line.overrides)
     if line.command in TRAINING:
@@ -189,7 +189,7 @@ def _wants_page(options: Namespace) -> bool:
 
 
 def _refuse_bare_words(command: str, overrides: Sequence[str]) -> None:
-    """Refuse words without ``=``, into which the shell splits an unquoted prompt, and join that prompt again."""
+    """Refuse words without ``=``, which the shell makes of an unquoted prompt, and show the line to type."""
     bare = [override for override in overrides if "=" not in override and not override.startswith("~")]
     if not bare:
         return

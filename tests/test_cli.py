@@ -17,10 +17,12 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from cadam3d import cli, launch
+from cadam3d import cli
 from cadam3d.core.errors import UserError
-from cadam3d.settings import advice
+from cadam3d.io.run_folder import OVERRIDES, claim
+from cadam3d.settings import advice, hydra
 from cadam3d.settings import compose as settings
+from cadam3d.settings.line import PATH_KEYS, quoted, resumed, split, text_of
 
 REPOSITORY = Path(__file__).parent.parent
 DENSIFIERS = sorted(path.stem for path in (settings.config_dir() / "densifier").glob("*.yaml"))
@@ -108,7 +110,7 @@ def small_configs(tmp_path_factory) -> Path:
 @pytest.fixture
 def jobs(monkeypatch, small_configs):
     """Instead of training: note the configuration, fail on seeds 7 and 8, else leave a summary."""
-    for module in (settings, launch, advice):
+    for module in (settings, hydra, advice):
         monkeypatch.setattr(module, "config_dir", lambda: small_configs)
     seen = []
 
@@ -251,7 +253,7 @@ def test_a_prompt_torn_apart_by_the_shell_is_given_back_whole(type_line):
     ],
 )
 def test_in_a_sweep_a_comma_without_a_blank_starts_the_next_prompt(value, prompts):
-    line = launch.quoted(f"prompt={value}", is_sweep=True)
+    line = quoted(f"prompt={value}", is_sweep=True)
     override = OverridesParser.create().parse_override(line)
     pieces = list(override.sweep_string_iterator()) if override.is_sweep_override() else [line[7:]]
     found = [OverridesParser.create().parse_override(f"prompt={piece}").value() for piece in pieces]
@@ -264,12 +266,12 @@ def test_a_path_with_brackets_and_commas_is_quoted_too(type_line, jobs, tmp_path
     assert jobs[0][1] == folder
 
 
-@pytest.mark.parametrize("key", launch.PATH_KEYS)
+@pytest.mark.parametrize("key", PATH_KEYS)
 def test_a_path_below_the_home_folder_is_text(key):
     for text in ("~/x", "~", "a~b/my mesh (1).ply"):
-        line = launch.quoted(f"{key}={text}", is_sweep=False)
+        line = quoted(f"{key}={text}", is_sweep=False)
         assert OverridesParser.create().parse_override(line).value() == text
-        assert launch._text(line) == text
+        assert text_of(line) == text
 
 
 def test_a_run_below_the_home_folder_is_written_and_resumed_there(type_line, jobs, tmp_path, monkeypatch):
@@ -288,17 +290,20 @@ def test_a_run_below_the_home_folder_is_written_and_resumed_there(type_line, job
 def test_a_missing_prompt_is_refused_before_anything_happens(words, type_line, jobs, tmp_path):
     result = type_line(*words)
     assert result.code == 1
-    assert (
-        result.message
-        == 'prompt: no value given. Try: cadam3d train prompt="a red and yellow checkered torus"'
+    kept = " ".join(words)
+    assert result.message == (
+        f'prompt: no value given. Try: cadam3d {kept} prompt="a red and yellow checkered torus"'
     )
     assert not jobs
     assert not list(tmp_path.iterdir())
 
 
-def test_any_other_missing_value_is_asked_for_too(type_line, tmp_path):
-    message = type_line("train", "prompt=a cube", "initializer=mesh").message
-    assert message == "initializer.path: no value given. Try: cadam3d train initializer.path=..."
+def test_any_other_missing_value_is_asked_for_with_the_rest_of_the_line(type_line, tmp_path):
+    message = type_line("train", "prompt=a cube", "initializer=mesh", "steps=5").message
+    assert message == (
+        "initializer.path: no value given. "
+        "Try: cadam3d train 'prompt=a cube' initializer=mesh steps=5 initializer.path=..."
+    )
     assert not list(tmp_path.iterdir())
 
 
@@ -311,7 +316,8 @@ def test_a_component_from_a_folder_of_the_users_own_is_found(type_line, jobs, tm
 
 
 def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, tmp_path):
-    assert type_line("sweep", "grid=densifiers").message.endswith('torus" grid=thresholds')
+    message = type_line("sweep", "grid=densifiers").message
+    assert message.endswith('Try: cadam3d sweep grid=densifiers prompt="a red and yellow checkered torus"')
     assert type_line("sweep", "prompt=a cube").message.startswith("sweep: nothing to sweep over. Try: ")
     assert not list(tmp_path.iterdir())
 
@@ -332,7 +338,7 @@ def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, 
         ("callback=[metrics,progres]", "got 'progres'. Try: callback=progress"),
         ("experiment=smok", "Try: experiment=smoke"),
         ("steps=1,2", "steps: several values make a sweep. Try: cadam3d sweep steps=1,2"),
-        ("~steps", "~steps: a setting can be changed, not taken away. Try: "),
+        ("~steps", "~steps: a setting can be changed but not removed. Try: "),
         ("~densifier", "~densifier: a setting can be changed"),
         ("densifier=null", f"expected one of {'|'.join(DENSIFIERS)}, got null. Try: densifier=none"),
         ("camera=null", "camera: expected one of "),
@@ -441,9 +447,9 @@ def test_a_refused_line_removes_neither_what_was_there_nor_what_was_made(
 
 
 def test_two_runs_in_one_second_do_not_share_a_folder(tmp_path):
-    claims = [launch.claim(tmp_path / "10-00-00_cube", "hydra.run.dir", is_chosen=False) for _ in range(3)]
+    claims = [claim(tmp_path / "10-00-00_cube", "hydra.run.dir", is_chosen=False) for _ in range(3)]
     assert [folder.name for folder in claims] == ["10-00-00_cube", "10-00-00_cube-2", "10-00-00_cube-3"]
-    assert launch.claim(claims[0], "hydra.run.dir", is_chosen=True) == claims[0]
+    assert claim(claims[0], "hydra.run.dir", is_chosen=True) == claims[0]
 
 
 @pytest.mark.parametrize(
@@ -532,8 +538,8 @@ def test_a_refused_resume_leaves_the_run_as_it_was(run_folder, type_line, jobs):
 )
 def test_taking_a_key_away_and_giving_it_anew_both_survive_a_resume(before, anew, after, tmp_path):
     (tmp_path / ".hydra").mkdir()
-    (tmp_path / launch.OVERRIDES).write_text(yaml.safe_dump(before), encoding="utf-8")
-    lines = launch.resumed([f"resume='{tmp_path}'", *anew], is_sweep=False)
+    (tmp_path / OVERRIDES).write_text(yaml.safe_dump(before), encoding="utf-8")
+    lines = resumed([f"resume='{tmp_path}'", *anew], is_sweep=False)
     assert [line for line in lines if not line.startswith(("resume=", "hydra.run.dir="))] == after
 
 
@@ -627,7 +633,7 @@ def test_ctrl_c_is_one_line_and_130(tmp_path):
     assert err.strip() == "cadam3d: interrupted"
 
 
-@pytest.mark.parametrize("function", ["compose", "hydra.main"])
+@pytest.mark.parametrize("function", ["compose_line", "run_composed"])
 def test_ctrl_c_that_another_exception_hides_is_still_ctrl_c(function, type_line, monkeypatch, jobs):
     def hide(*args, **kwargs):
         try:
@@ -642,4 +648,4 @@ def test_ctrl_c_that_another_exception_hides_is_still_ctrl_c(function, type_line
 
 def test_flags_may_stand_anywhere():
     words = ["a=1", "-m", "b=2", "--cfg", "job", "c=3"]
-    assert launch.split(words) == (["a=1", "b=2", "c=3"], ["-m", "--cfg", "job"])
+    assert split(words) == (["a=1", "b=2", "c=3"], ["-m", "--cfg", "job"])

@@ -17,9 +17,9 @@ from omegaconf import OmegaConf
 from cadam3d import cli, regularizer
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json, read_jsonl
-from cadam3d.launch import _read_flags
 from cadam3d.settings import advice
 from cadam3d.settings.compose import component, components, compose, config_dir, flatten, quote
+from cadam3d.settings.hydra import read_flags
 from cadam3d.sweep.plan import compose_all, read_sweep
 
 CONFIGS = config_dir()
@@ -33,7 +33,7 @@ EXPERIMENTS = sorted(
     for path in (CONFIGS / "experiment").rglob("*.yaml")
 )
 PROMPT = "prompt=a red cube"
-NO_FLAGS = _read_flags([])
+NO_FLAGS = read_flags([])
 
 
 def name_of(path: Path) -> str:

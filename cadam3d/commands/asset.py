@@ -71,7 +71,7 @@ def run_config(folder: Path) -> DictConfig:
 
 
 def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
-    """Return a function that renders ``gaussians`` with the configured rasterizer, prepared at its first use."""
+    """Return a function that renders ``gaussians`` and prepares the configured rasterizer at first use."""
     built: Rasterizer = component(rasterizer)
     render = render_fn(built, lambda: gaussians)
 

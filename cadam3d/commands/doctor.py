@@ -1,4 +1,4 @@
-"""``cadam3d doctor``: check this machine, and print what to type about each thing that is missing or broken."""
+"""``cadam3d doctor``: check this machine, and print what to type if something is missing or broken."""
 
 import json
 import os

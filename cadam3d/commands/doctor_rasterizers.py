@@ -1,4 +1,4 @@
-"""The rasterizer checks of ``cadam3d doctor``: how each backend was compiled, and whether it passes its self-test."""
+"""Rasterizer checks of ``cadam3d doctor``: how each backend was compiled, and its self-test."""
 
 import math
 import time

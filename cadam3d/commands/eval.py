@@ -16,7 +16,7 @@ from cadam3d.sweep.folder import is_sweep, load
 
 
 def run(cfg: DictConfig) -> None:
-    """Measure ``run=`` and write its ``eval.json``; for a sweep measure every job and write its report, too."""
+    """Measure ``run=`` and write its ``eval.json``; for a sweep, measure every job and write its report."""
     if cfg.run is None:
         raise UserError("run: expected a finished run or a sweep. Try: cadam3d eval run=outputs/latest")
     folder = Path(cfg.run).expanduser().resolve()
@@ -32,8 +32,8 @@ def run(cfg: DictConfig) -> None:
 def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     """Measure the run in ``folder`` with the metrics of ``cfg``, and write its ``eval.json``.
 
-    The rasterizer and the prior are those of the run. ``psnr`` and ``ssim`` compare with the true images of the
-    prior. If the prior knows none, these two are left out, and a note says so.
+    The rasterizer and the prior are those of the run. ``psnr`` and ``ssim`` compare with the true images of
+    the prior. If the prior knows none, these two are left out, and a note says so.
     """
     source = run_config(folder)
     asset = open_run(folder, cfg.device)

@@ -27,7 +27,7 @@ class Finding:
 
 
 def attempt(topic: str, check: Callable[[], Finding]) -> Finding:
-    """Return the finding of ``check``. Something that is not available here is a note; other errors are bugs."""
+    """Return the finding of ``check``. What is not available here is a note; other errors are bugs."""
     try:
         return check()
     except (UserError, ImportError, OSError) as error:

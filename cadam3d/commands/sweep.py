@@ -12,7 +12,7 @@ from cadam3d.sweep.start import start
 
 
 def run(command: str, overrides: Sequence[str], flags: Sequence[str], options: Namespace) -> int:
-    """Run the sweep of a line and report on it; return the exit code, which is 0 if every job has a result."""
+    """Run the sweep of a line and report on it. Return 0 if every job has a result."""
     ended = start(command, overrides, flags, options)
     if not ended.was_stopped:
         write_report(ended.folder)

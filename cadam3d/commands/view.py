@@ -20,7 +20,7 @@ def run(cfg: DictConfig) -> None:
 
 
 def has_display() -> bool:
-    """Return whether a browser window can appear; without one, a text browser would take over the terminal."""
+    """Return whether a window can appear; without one, a text browser would take over the terminal."""
     is_unix = sys.platform.startswith(("linux", "freebsd"))
     return not is_unix or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 

@@ -1,4 +1,4 @@
-"""Atomic writes: a file is written beside its place and then moved there, so it appears whole or not at all."""
+"""Atomic writes: a file is written beside its place and moved there, so it appears whole or not at all."""
 
 import os
 from collections.abc import Iterator
@@ -12,10 +12,11 @@ TEMPORARY = ".tmp-"  # in the name of every file that is still being written
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path in the same folder, with the same suffix. If the block succeeds, it becomes ``path``.
+    """Yield a temporary path in the same folder, with the same suffix.
 
-    If the block raises, the temporary file is removed and an old ``path`` stays unchanged. Raises ``UserError``
-    if the disk is full or the folder cannot be written.
+    If the block succeeds, the temporary file becomes ``path``. If the block raises, the temporary file is
+    removed and an old ``path`` stays unchanged. Raises ``UserError`` if the disk is full or the folder cannot
+    be written.
     """
     temporary = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
     try:
@@ -38,6 +39,6 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete the files that a killed process left half-written in ``folder``, which must have a single writer."""
+    """Delete what a killed process left half-written in ``folder``, which must have a single writer."""
     for leftover in folder.glob(f"{TEMPORARY}*"):
         leftover.unlink(missing_ok=True)

@@ -96,7 +96,7 @@ def prune_checkpoints(folder: Path, *, keep: int) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Return ``value`` with its tensors on the CPU and without hidden storage; refuse what is not plain data."""
+    """Return ``value`` with tensors on the CPU and without hidden storage; refuse what is not plain data."""
     if isinstance(value, Tensor):
         tensor = value.detach().cpu().contiguous()
         is_view = tensor.untyped_storage().nbytes() != tensor.nbytes

@@ -47,7 +47,7 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
 
 
 def truncate_after(path: Path, step: int) -> None:
-    """Remove lines whose ``step`` is greater than ``step`` and lines that were cut; do nothing without a file.
+    """Remove the lines of steps after ``step`` and lines that were cut; do nothing if there is no file.
 
     A resumed run calls this first because it will write those lines again.
     """

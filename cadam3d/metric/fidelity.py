@@ -26,9 +26,9 @@ class Fidelity(Metric):
     """PSNR and SSIM of held-out views against the true images.
 
     Each view's PSNR comes from the mean squared error over all its pixels and channels, renders clamped to
-    [0, 1]; the views are then averaged in dB. If the prompt leaves something open, the truth is a mixture: the
-    asset is compared with every mode over all views, and the mode with the best mean PSNR counts. It is one
-    mode for the whole object.
+    [0, 1]; the views are then averaged in dB. If the prompt leaves something open, the truth is a mixture:
+    the asset is compared with every mode over all views, and the mode with the best mean PSNR counts. It is
+    one mode for the whole object.
     """
 
     views: int  # azimuths per elevation
@@ -53,8 +53,8 @@ class Fidelity(Metric):
     def cameras(self) -> Cameras:
         """Return the held-out views.
 
-        Their azimuths are half a step off those of a turntable. Each elevation is shifted a little more, so that
-        no two rings look from the same side.
+        Their azimuths are half a step off those of a turntable. Each elevation is shifted a little more, so
+        that no two rings look from the same side.
         """
         step = 360.0 / self.views
         rings = len(self.elevations_deg)

@@ -19,9 +19,9 @@ class Size(Metric):
     ) -> dict[str, int | float]:
         """Return counts, sizes and medians.
 
-        ``num_gaussians`` is always there. ``asset_bytes``, ``asset_mib`` and ``bytes_per_gaussian`` need a file,
-        and the last one as well as ``median_scale`` (world units, longest axis) and ``median_opacity`` need at
-        least one Gaussian.
+        ``num_gaussians`` is always there. ``asset_bytes``, ``asset_mib`` and ``bytes_per_gaussian`` need a
+        file, and the last one as well as ``median_scale`` (world units, longest axis) and ``median_opacity``
+        need at least one Gaussian.
         """
         count = len(gaussians)
         sizes: dict[str, int | float] = {"num_gaussians": count}

@@ -10,8 +10,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
 from cadam3d.core.errors import UserError
-from cadam3d.settings.compose import TEXT_KEYS, compose, config_dir, flatten, quote
-from cadam3d.settings.line import key_of, split
+from cadam3d.settings.compose import compose, config_dir, flatten, quote
+from cadam3d.settings.line import key_of
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
 NO_NAME_COMPLAINT = "Config group override must be a string or a list"
@@ -21,10 +21,11 @@ LAUNCHERS = {  # the package of each option of hydra/launcher that Hydra itself 
     "submitit_local": "hydra-submitit-launcher",
     "ray": "hydra-ray-launcher",
 }
+CHOICE = re.compile(r"\+?[a-z]\w*=(\w+|\[[\w,]*\])")  # of an option, or of a list of them
 PROMPT_WORD = 'prompt="a red and yellow checkered torus"'
 
 
-class ValuesMissing(Exception):
+class MissingValuesError(Exception):
     """Settings that the user must give and has not given."""
 
     def __init__(self, keys: Sequence[str]) -> None:
@@ -32,7 +33,7 @@ class ValuesMissing(Exception):
         self.keys = keys
 
 
-class JobRefused(Exception):
+class RefusedJobError(Exception):
     """A job of a sweep that cannot be composed. The cause of this exception says why."""
 
     def __init__(self, arm: str, overrides: Sequence[str]) -> None:
@@ -53,29 +54,29 @@ def explain(error: BaseException, command: str, words: Sequence[str]) -> UserErr
 
     Returns None for exceptions that neither Hydra nor OmegaConf raises: those are bugs.
     """
-    if isinstance(error, UserError):
-        return error
-    if isinstance(error, JobRefused):
-        return _job_refused(error, command, words)
-    if isinstance(error, ValuesMissing):
-        return _ask_for(error.keys, command, words)
-    if isinstance(error, MissingConfigException):
-        return _unknown_option(error)
-    if isinstance(error, OverrideParseException):
-        return _unreadable(error.override, str(error).splitlines()[0])
-    if isinstance(error, ValueError) and str(error).startswith(NO_NAME_COMPLAINT):
-        return _no_name(str(error), words)
-    if isinstance(error, InterpolationResolutionError):
-        reason = str(error).splitlines()[0]
-        key = error.full_key or "a setting"
-        return UserError(f"{key}: {reason}. Try: a plain value; cadam3d {command} --cfg job lists the keys")
-    if isinstance(error, (CompactHydraException, OmegaConfBaseException)):
-        return _reworded(error, command, words)
-    return None
+    reason: UserError | None = None
+    match error:
+        case UserError():
+            reason = error
+        case RefusedJobError():
+            reason = _job_refused(error, command, words)
+        case MissingValuesError():
+            reason = _ask_for(error.keys, command, words)
+        case MissingConfigException():
+            reason = _unknown_option(error)
+        case OverrideParseException():
+            reason = _unreadable(error.override, str(error).splitlines()[0])
+        case ValueError() if str(error).startswith(NO_NAME_COMPLAINT):
+            reason = _no_name(str(error), words)
+        case InterpolationResolutionError():
+            reason = _unresolved(error, command)
+        case CompactHydraException() | OmegaConfBaseException():
+            reason = _reworded(error, command, words)
+    return reason
 
 
 def reraise_interrupt(error: BaseException) -> None:
-    """Raise ``KeyboardInterrupt`` if ``error`` only hides one, as the clean-up of OmegaConf can make it do."""
+    """Raise ``KeyboardInterrupt`` if ``error`` only hides one, which the clean-up of OmegaConf can cause."""
     seen: BaseException | None = error
     while seen is not None:
         if isinstance(seen, KeyboardInterrupt):
@@ -84,18 +85,18 @@ def reraise_interrupt(error: BaseException) -> None:
 
 
 def require_values(cfg: DictConfig) -> None:
-    """Raise ``ValuesMissing`` if keys are still ``???``, apart from Hydra's own."""
+    """Raise ``MissingValuesError`` if keys are still ``???``, apart from Hydra's own."""
     raw = OmegaConf.to_container(cfg, resolve=False)
     keys = [key for key, value in flatten(raw) if value == "???" and not key.startswith("hydra.")]
     if keys:
-        raise ValuesMissing(keys)
+        raise MissingValuesError(keys)
 
 
-def _job_refused(error: JobRefused, command: str, words: Sequence[str]) -> UserError | None:
+def _job_refused(error: RefusedJobError, command: str, words: Sequence[str]) -> UserError | None:
     """Name the arm of the job. What the user must give is asked for once, in the line of the sweep."""
     cause = error.__cause__
     assert cause is not None, "this exception is always raised from another one"
-    if isinstance(cause, ValuesMissing):
+    if isinstance(cause, MissingValuesError):
         return _ask_for(cause.keys, command, words)
     reason = explain(cause, "train", error.overrides)
     return UserError(f"arm {error.arm}: {reason}") if reason and error.arm else reason
@@ -105,14 +106,15 @@ def _ask_for(keys: Sequence[str], command: str, words: Sequence[str]) -> UserErr
     """Ask for values that the user must give, in a line that keeps the rest of what was typed."""
     kept = [shlex.quote(word) for word in words if key_of(word) not in keys]
     added = [PROMPT_WORD if key == "prompt" else f"{key}=..." for key in keys]
-    overrides, _ = split(words)
-    is_swept = any(
-        key_of(word) == "grid" or "," in word for word in overrides if key_of(word) not in TEXT_KEYS
-    )
-    if command == "sweep" and not is_swept:
-        added.append("grid=thresholds")
     line = " ".join(["cadam3d", command, *kept, *added])
     return UserError(f"{', '.join(keys)}: no value given. Try: {line}")
+
+
+def _unresolved(error: InterpolationResolutionError, command: str) -> UserError:
+    """Explain that a value refers to something that does not exist."""
+    key = error.full_key or "a setting"
+    reason = str(error).splitlines()[0]
+    return UserError(f"{key}: {reason}. Try: a plain value; cadam3d {command} --cfg job lists the keys")
 
 
 def _reworded(error: Exception, command: str, words: Sequence[str]) -> UserError:
@@ -174,8 +176,7 @@ def _unknown_key(key: str, command: str, words: Sequence[str]) -> UserError:
 
 def _known_keys(wrong: str, command: str, words: Sequence[str]) -> list[str]:
     """Return every key of the configuration, with the groups that the user has chosen if those compose."""
-    choices = [word for word in words if re.match(r"[a-z]\w*=[\[\]\w,]+$", word) and "." not in word]
-    choices = [word for word in choices if not word.startswith(f"{wrong}=")]
+    choices = [word for word in words if CHOICE.fullmatch(word) and not word.startswith(f"{wrong}=")]
     for attempt in (choices, []):
         try:
             cfg = compose(attempt, command)

@@ -82,9 +82,10 @@ def place_run(cfg: DictConfig, folder: Path) -> None:
 
 
 def run_composed(cfg: DictConfig, run: Run) -> None:
-    """Run a command on its composed configuration as a job of Hydra: with log, ``.hydra/`` and ``HydraConfig``.
+    """Run a command on its composed configuration as a job of Hydra.
 
-    Raises whatever the command raises. Hydra would print such an exception and exit.
+    The job has its log, its ``.hydra`` folder and ``HydraConfig``. Raises whatever the command raises, which
+    Hydra itself would print before it exits.
     """
     configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)
     name, callbacks = cfg.hydra.job.config_name, Callbacks(cfg)

@@ -1,4 +1,4 @@
-"""Line: what is typed after ``cadam3d COMMAND``, as text: overrides and flags, quoting, and resuming a run."""
+"""Line: the words after ``cadam3d COMMAND`` as text: overrides, flags, quoting, and resuming a run."""
 
 import re
 import shlex

@@ -112,7 +112,7 @@ def write_plan(sweep: Path, plan: Plan) -> None:
 
 
 def is_complete(summary: dict[str, Any]) -> bool:
-    """Return whether training wrote its whole summary: first its numbers, at the very end its ``warnings``."""
+    """Return whether training has written its whole summary, of which ``warnings`` is the last entry."""
     return "warnings" in summary
 
 

@@ -111,7 +111,8 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
 
     The line wins over the grid. A setting in the line goes to every arm that has such a setting, because
     densifiers have different ones; ``has_setting(overrides of an arm, key)`` decides that. A setting that no
-    arm has stays in all jobs, so that Hydra refuses it. Raises ``UserError`` if the line makes two arms equal.
+    arm has stays in all jobs, so that Hydra refuses it. Raises ``UserError`` if the line makes two arms
+    equal.
     """
     common = {key: axis for key, axis in line.items() if key not in grid.each}
     common |= {key: line.get(key, axis) for key, axis in grid.each.items()}

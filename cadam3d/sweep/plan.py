@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
-from cadam3d.settings.advice import JobRefused, require_values
+from cadam3d.settings.advice import RefusedJobError, require_values
 from cadam3d.settings.compose import flatten
 from cadam3d.settings.hydra import compose_line, refuse_holes
 from cadam3d.settings.line import SWEEP_FOLDER, key_of
@@ -116,7 +116,7 @@ class Composer:
         self._leaves = set(self._base([]).plain)
 
     def compose(self, overrides: Sequence[str]) -> Composed:
-        """Return the settings under ``overrides``. Raises an exception if they cannot be composed or lack a value."""
+        """Return the settings under ``overrides``. Raises if they cannot be composed or lack a value."""
         values = {}
         key_lines = []
         for line in overrides:
@@ -184,13 +184,13 @@ def sort_out(overrides: Sequence[str]) -> Parts:
 
 
 def compose_all(sweep: Sweep, composer: Composer) -> list[Composed]:
-    """Return the settings of every job. Raises ``JobRefused`` for the first one that cannot run."""
+    """Return the settings of every job. Raises ``RefusedJobError`` for the first one that cannot run."""
     composed = []
     for job in sweep.jobs:
         try:
             composed.append(composer.compose(job.overrides))
         except Exception as error:
-            raise JobRefused(job.arm, job.overrides) from error
+            raise RefusedJobError(job.arm, job.overrides) from error
     return composed
 
 

@@ -12,11 +12,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import IO
 
 from cadam3d.core.outcome import Outcome
 from cadam3d.io.cache import TRACES
@@ -45,8 +44,8 @@ TAIL = 20_000  # bytes at the end of the console in which the reason of a failur
 def run_job(sweep: Path, number: int) -> None:
     """Run job ``number`` of the sweep to its end, from its checkpoint if it has one.
 
-    Do nothing if the sweep is being stopped or the job has a result. If another process works on the job, such
-    as one that a killed sweep has left behind, wait until that has ended.
+    Do nothing if the sweep is being stopped or the job has a result. If another process works on the job,
+    such as one that a killed sweep has left behind, wait until that has ended.
     """
     plan, stop = read_plan(sweep), sweep / STOP
     _end_with_sweep()
@@ -145,7 +144,8 @@ def _signals() -> Iterator[list[int]]:
 
     The process of a sweep handles them itself. A worker of a launcher ignores Ctrl-C from now on, because it
     may come between two jobs; a SIGTERM is meant for the running job. The signal with which Slurm announces
-    the end of a job's time is for the launcher, which queues the job again: it gets it once the job has saved.
+    the end of a job's time is for the launcher, which queues the job again: it gets it once the job has
+    saved.
     """
     received: list[int] = []
     is_ours = signal.getsignal(signal.SIGINT) in (signal.default_int_handler, signal.SIG_IGN, signal.SIG_DFL)
@@ -205,8 +205,8 @@ def _last_words(console: Path) -> str:
 def _end_with_sweep() -> None:
     """End this process when the sweep ends, if it is a worker that the sweep itself has started (joblib).
 
-    Otherwise it would go on with the jobs it has been given. The sweep does not start the workers on Slurm and
-    Ray, and they may outlive it.
+    Otherwise it would go on with the jobs it has been given. The sweep does not start the workers on Slurm
+    and Ray, and they may outlive it.
     """
     sweep = multiprocessing.parent_process()
     if sweep is None or sweep.pid is None or IS_WINDOWS:

@@ -1,4 +1,4 @@
-"""Start: a sweep from its line to its table. Plan it, skip what is done, and let Hydra's launcher run the rest.
+"""Start: from the line of a sweep to its table. Finished jobs are skipped; a launcher of Hydra runs the rest.
 
 The same line always has the same folder, so typing the line again continues the sweep.
 """
@@ -169,7 +169,7 @@ def _read_yaml(path: Path) -> Any:
 
 
 def _threads(cfg: DictConfig, pending: int) -> int | None:
-    """Return the OpenMP threads of a job. Jobs side by side share the cores, unless the user chose a number."""
+    """Return the OpenMP threads of a job: a share of the cores, unless the user has chosen a number."""
     if "OMP_NUM_THREADS" in os.environ:
         return None
     launcher = cfg.get("launcher") or {}
@@ -210,7 +210,7 @@ def _launch(folder: Path, sweep: Sweep, pending: Sequence[Row], flags: Sequence[
 
 
 def _report_results(folder: Path, rows: Sequence[Row], problem: str) -> int:
-    """Print the table, or of a long one the jobs without a result, and what is left to do; return the exit code."""
+    """Print the table, or the jobs without a result if it is long, and what is left to do."""
     listed = rows if len(rows) <= LONGEST else [row for row in rows if not row.has_result][:LONGEST]
     table = f"\n{as_text(listed)}\n" if listed else ""
     print(f"{table}\n{_jobs(len(rows))}: {shown(folder / TABLE)}", flush=True)

@@ -21,8 +21,8 @@ SHOWN = (
 def write_table(sweep: Path) -> list[Row]:
     """Write the table of a sweep atomically, and return its rows.
 
-    Jobs that run side by side all write it. Each reads the disk again afterwards, so the last one to write has
-    seen every job that ended before.
+    Jobs that run side by side all write it. Each reads the disk again afterwards, so the last one to write
+    has seen every job that ended before.
     """
     rows = load(sweep)
     while True:
@@ -33,7 +33,7 @@ def write_table(sweep: Path) -> list[Row]:
 
 
 def as_text(rows: Sequence[Row]) -> str:
-    """Return a table for the terminal, without settings that follow from the arm or are the same in all jobs."""
+    """Return a table for the terminal, without settings that are the same in all jobs of an arm."""
     keys = varying_keys(rows)
     has_arms = any(row.arm for row in rows)
     lines = [["job", *(["arm"] if has_arms else []), *keys, "outcome", *SHOWN]]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-# Called as: PROGRAM -m cadam3d.sweep.process PARENT train key=value ...
+# Called as: PROGRAM -m cadam3d.job PARENT train key=value ...
 # It does what prompt= says, after noting how it was called in calls.jsonl beside the job folders: "meets" are
 # the earlier calls for the same job that are still at work.
 STAND_IN = r"""#!{python} -S

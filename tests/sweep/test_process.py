@@ -14,8 +14,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from cadam3d import job
+from cadam3d.io.lock import try_lock
+from cadam3d.io.run_folder import STOP
 from cadam3d.sweep import process
-from cadam3d.sweep.folder import STOP, Plan, PlannedJob, Row, load, write_plan
+from cadam3d.sweep.folder import Plan, PlannedJob, Row, load, write_plan
 from cadam3d.sweep.process import run_job
 
 REPOSITORY = Path(__file__).parents[2]
@@ -212,7 +215,7 @@ def test_a_lock_ends_with_the_job_whoever_has_inherited_it(tmp_path):
         left_behind = subprocess.Popen(["sleep", "60"], pass_fds=(lock,))
     try:
         with (tmp_path / ".lock").open("w") as file:
-            assert process._try_lock(file)
+            assert try_lock(file)
     finally:
         left_behind.kill()
         left_behind.wait()
@@ -231,7 +234,7 @@ def test_a_file_system_without_locks_runs_jobs_too(sweep, monkeypatch):
 def test_a_worker_ends_with_its_sweep_only_if_that_has_made_it(monkeypatch):
     """As with joblib. Those of Slurm and Ray are started by others, and go on."""
     done = []
-    monkeypatch.setattr(process, "_end_with", lambda parent: done.append(("watch", parent)))
+    monkeypatch.setattr(process, "end_with", lambda parent: done.append(("watch", parent)))
     process._end_with_sweep()
     assert not done
     monkeypatch.setattr("multiprocessing.parent_process", lambda: SimpleNamespace(pid=os.getppid()))
@@ -285,7 +288,7 @@ def test_a_launcher_that_announces_the_end_has_its_turn_when_the_job_has_saved(s
 
 
 def test_a_job_ends_with_the_process_that_started_it():
-    code = "import time; from cadam3d.sweep import process; process._end_with(PARENT); time.sleep(60)"
+    code = "import time; from cadam3d.sweep import process; process.end_with(PARENT); time.sleep(60)"
     job = [sys.executable, "-c", code.replace("PARENT", "__import__('os').getppid()")]
     launch = f"import subprocess, time; print(subprocess.Popen({job!r}).pid, flush=True); time.sleep(60)"
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
@@ -306,12 +309,12 @@ def test_a_job_ends_with_the_process_that_started_it():
 
 def test_a_job_does_not_hear_what_is_meant_for_its_launcher(monkeypatch):
     heard = []
-    monkeypatch.setattr("cadam3d.sweep.process._end_with", lambda parent: None)
+    monkeypatch.setattr("cadam3d.job.end_with", lambda parent: None)
     monkeypatch.setattr("cadam3d.cli.main", lambda: heard.extend(map(signal.getsignal, process.ANNOUNCING)))
     monkeypatch.setattr(sys, "argv", ["to be restored"])
     before = [(number, signal.getsignal(number)) for number in process.ANNOUNCING]
     try:
-        process.main(["1", "train", "seed=0"])
+        job.main(["1", "train", "seed=0"])
         assert heard == [signal.SIG_IGN] * 2
         assert sys.argv == ["cadam3d", "train", "seed=0"]
     finally:

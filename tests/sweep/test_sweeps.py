@@ -1,7 +1,6 @@
 """``cadam3d sweep`` from its line to its table, with a stand-in for training."""
 
 import csv
-import importlib.machinery
 import os
 import shutil
 import signal
@@ -17,12 +16,14 @@ import pytest
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from cadam3d import cli, launch
+from cadam3d import cli
 from cadam3d.core.errors import UserError
-from cadam3d.settings import advice
+from cadam3d.io.run_folder import JOBS
+from cadam3d.settings import advice, hydra
 from cadam3d.settings import compose as settings
+from cadam3d.settings.hydra import read_flags
 from cadam3d.sweep import plan, start
-from cadam3d.sweep.folder import JOBS, Row, load, read_plan
+from cadam3d.sweep.folder import Row, load, read_plan
 from cadam3d.sweep.process import run_job
 from cadam3d.sweep.table import as_text, varying_keys, write_table
 from cadam3d.sweep.watch import duration
@@ -66,9 +67,11 @@ def hydra_sweep(monkeypatch, capfd, tmp_path, small_configs, stand_in):
     """Type ``cadam3d sweep ...`` in an empty folder, in this process."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    for module in (settings, launch, advice):
+    for module in (settings, hydra, advice):
         monkeypatch.setattr(module, "config_dir", lambda: small_configs)
     monkeypatch.setattr(sys, "executable", str(stand_in))
+    monkeypatch.setattr("cadam3d.report.write_sweep", lambda folder: folder / "report.html")
+    monkeypatch.setattr("cadam3d.report.verdict", lambda folder: [])
 
     def run(*words: str, command: str = "sweep") -> Result:
         monkeypatch.setattr(sys, "argv", ["cadam3d", command, *words])
@@ -84,7 +87,7 @@ def hydra_sweep(monkeypatch, capfd, tmp_path, small_configs, stand_in):
 def sweep(hydra_sweep, monkeypatch):
     """The same, with a loop in the place of Hydra's multirun: it takes a third of the time."""
 
-    def run_jobs(name: str, arguments: list[str], _task: launch.Task) -> None:
+    def run_jobs(name: str, arguments: list[str], _run: Callable) -> None:
         given = dict(line.split("=", 1) for line in arguments if "=" in line)
         folder = Path(given["hydra.sweep.dir"].strip("'"))
         assert (name, arguments[-1]) == ("jobs", "--multirun")
@@ -181,7 +184,8 @@ def test_failed_and_killed_jobs_are_rows_and_the_rest_goes_on(sweep, calls):
     assert rows[3]["message"].startswith("by SIGKILL")
     assert result.code == 1
     assert result.err == (
-        "cadam3d: 3 of 6 jobs without a result (2 failed, 1 killed). The same line again runs only those.\n"
+        "cadam3d: 3 of 6 jobs have no result (2 failed, 1 killed); "
+        f"see multirun/x/{rows[1]['folder']}/console.txt. Rerun the same command to retry them.\n"
     )
 
 
@@ -194,7 +198,7 @@ def test_the_table_is_right_after_every_job(hydra_sweep, monkeypatch):
         seen.append([row["outcome"] for row in read_table(folder)])
         return rows
 
-    monkeypatch.setattr("cadam3d.commands.sweep.write_table", note)
+    monkeypatch.setattr("cadam3d.sweep.worker.write_table", note)
     hydra_sweep("prompt=a cube", "seed=0,1,2")
     finished, waiting = "finished", "unfinished"
     assert seen == [[finished, waiting, waiting], [finished, finished, waiting], [finished] * 3]
@@ -238,7 +242,7 @@ def test_finished_jobs_are_skipped_and_the_others_run_again(sweep, calls):
     result = sweep("seed=range(0,3)", 'prompt="a cube"')  # the same, said otherwise
     assert result.code == 0
     assert "3 jobs in " in result.out
-    assert "2 with a result already" in result.out
+    assert "2 already have a result" in result.out
     assert "[3/3] seed=1: 5 Gaussians" in result.out
     assert [call["folder"] for call in calls(only_sweep())] == [row.folder.name for row in (*rows, rows[1])]
 
@@ -298,7 +302,7 @@ def test_other_settings_in_the_same_folder_are_refused_with_the_key(sweep, calls
     assert result.err.startswith(f"cadam3d: optimizer.steps: was 5 in {folder}/baseline_a-cube_")
     assert result.err.endswith(
         ", is 9 now. Try: hydra.sweep.dir=multirun/densifiers-2, which is another folder, "
-        "or the settings of before\n"
+        "or the earlier settings\n"
     )
     assert (folder / "sweep.csv").read_bytes() == table
     assert not Path("multirun/densifiers-2").exists()
@@ -315,7 +319,7 @@ def test_what_only_a_running_job_knows_is_not_compared(sweep, monkeypatch):
         )
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)  # as in a new process
     result = sweep(*line)
-    assert (result.code, "3 with a result already" in result.out) == (0, True), result.err
+    assert (result.code, "3 already have a result" in result.out) == (0, True), result.err
 
 
 def test_a_job_that_failed_may_run_with_other_settings(sweep):
@@ -323,7 +327,7 @@ def test_a_job_that_failed_may_run_with_other_settings(sweep):
     for row in load(Path("multirun/densifiers")):
         (row.folder / "config.yaml").write_text("steps: 4")
     result = sweep("prompt=a bug", "grid=densifiers", "steps=9")
-    assert "The same line again" in result.err
+    assert "Rerun the same command" in result.err
 
 
 def test_rows_of_another_line_do_not_appear(sweep):
@@ -352,7 +356,7 @@ def test_a_second_sweep_in_the_folder_of_a_running_one_is_refused(sweep):
 def start_sweep(tmp_path, small_configs, stand_in):
     """Start a sweep as a process of its own; its launcher's workers too meet the stand-in."""
     python = tmp_path / "python"
-    is_job = 'case "$*" in *cadam3d.sweep.process*)'
+    is_job = 'case "$*" in *cadam3d.job*)'
     python.write_text(f'#!/bin/sh\n{is_job} exec {stand_in} "$@";; esac\nexec {PYTHON} "$@"\n')
     python.chmod(0o755)
     site = tmp_path / "site"
@@ -361,9 +365,9 @@ def start_sweep(tmp_path, small_configs, stand_in):
 
     def run(*words: str) -> subprocess.Popen:
         code = (
-            "import sys; from pathlib import Path; from cadam3d import cli, launch\n"
-            "from cadam3d.settings import advice, compose as settings\n"
-            "for module in (settings, launch, advice):\n"
+            "import sys; from pathlib import Path; from cadam3d import cli\n"
+            "from cadam3d.settings import advice, hydra, compose as settings\n"
+            "for module in (settings, hydra, advice):\n"
             f"    module.config_dir = lambda: Path({str(small_configs)!r})\n"
             f"sys.argv = {['cadam3d', 'sweep', *words]!r}\n"
             "cli.main()"
@@ -388,7 +392,7 @@ def test_sigint_stops_all_running_jobs_and_leaves_the_table_true(launcher, runni
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert "Stopping as soon as all running jobs have saved" in err
-    assert f"6 of 6 jobs without a result ({running} interrupted, {6 - running} unfinished)" in err
+    assert f"6 of 6 jobs have no result ({running} interrupted, {6 - running} unfinished)" in err
     assert "Traceback" not in err
     outcomes = [row["outcome"] for row in read_table(tmp_path / "x")]
     assert sorted(outcomes) == ["interrupted"] * running + ["unfinished"] * (6 - running)
@@ -502,7 +506,7 @@ def test_a_launcher_that_breaks_down_leaves_the_table_true(sweep, monkeypatch):
     result = sweep("prompt=a cube", "seed=0,1")
     assert result.code == 1
     assert result.err.splitlines()[0] == "cadam3d: the launcher gave up. RuntimeError: a worker was lost"
-    assert "2 of 2 jobs without a result (2 unfinished)" in result.err
+    assert "2 of 2 jobs have no result (2 unfinished). Rerun" in result.err
 
 
 # --- mistakes ---------------------------------------------------------------------------------------------
@@ -518,7 +522,7 @@ def test_a_launcher_that_breaks_down_leaves_the_table_true(sweep, monkeypatch):
             "arm baseline: nonsense.key: no such setting",
         ),
         (("grid=nope",), "got 'nope'. Try: grid="),
-        (("grid=densifiers", "densifier=none"), "densifier: tells the arms baseline and cadam apart"),
+        (("grid=densifiers", "densifier=none"), "densifier: the arms baseline and cadam differ in this setting"),
         (("seed=0,1", "launcher=jobli"), "Try: launcher=joblib"),
         (("seed=0,1", "launcher=joblib", "launcher.jobs=2"), "launcher.jobs: no such setting. Did you mean "),
         (
@@ -575,7 +579,7 @@ LINES = (
 
 
 def test_settings_put_in_afterwards_equal_those_that_hydra_composes(sweep):
-    composer = plan.Composer("sweep", launch._read_flags([]), [])
+    composer = plan.Composer(read_flags([]), [])
     for _ in range(2):  # the second time nothing is composed anew
         for line in LINES:
             cfg = OmegaConf.to_container(settings.compose(line), resolve=True)
@@ -587,7 +591,7 @@ def test_many_jobs_that_differ_in_values_are_composed_once(sweep, monkeypatch):
     original = plan.compose_line
     monkeypatch.setattr(plan, "compose_line", lambda *args: counted.append(args) or original(*args))
     line = ["prompt='a cube'", "seed=range(0,30)", "densifier.tau_Q=0.5,0.7"]
-    found = plan.compose_all(*plan.read_sweep("sweep", line, launch._read_flags([])))
+    found = plan.compose_all(*plan.read_sweep("sweep", line, read_flags([])))
     assert [job.get("seed") for job in found] == [seed for seed in range(30) for _ in range(2)]
     assert len(counted) == 3  # the sweep, what its plain values are, and one job
 
@@ -630,17 +634,24 @@ def test_a_plan_that_is_none_is_named(tmp_path):
         load(tmp_path)
 
 
-def test_the_comparison_is_made_of_a_sweep_where_there_is_one(sweep, monkeypatch):
+def test_the_report_and_its_verdict_follow_the_sweep(sweep, monkeypatch):
     made = []
-    module = type(sys)("comparison_of_mine")
-    module.write_sweep = lambda folder: (made.append(folder), folder / "report.html")[1]
-    module.verdict = lambda folder: ["Ours is better."]
-    monkeypatch.setitem(sys.modules, "comparison_of_mine", module)
-    module.__spec__ = importlib.machinery.ModuleSpec("comparison_of_mine", None)
-    monkeypatch.setattr(start, "COMPARISON", "comparison_of_mine")
-    said = sweep("prompt=a cube", "grid=densifiers").out
+    monkeypatch.setattr(
+        "cadam3d.report.write_sweep", lambda folder: (made.append(folder), folder / "report.html")[1]
+    )
+    monkeypatch.setattr("cadam3d.report.verdict", lambda folder: ["Ours is better."])
+    out = sweep("prompt=a cube", "grid=densifiers").out
     assert made == [Path("multirun/densifiers").resolve()]
-    assert said.endswith("sweep.csv\n\nOurs is better.\n\nreport: multirun/densifiers/report.html\n")
+    assert out.endswith("sweep.csv\n\nOurs is better.\n\nreport: multirun/densifiers/report.html\n")
+
+
+def test_a_report_that_fails_is_a_message_and_the_sweep_keeps_its_exit_code(sweep, monkeypatch):
+    def fail(folder):
+        raise UserError("report.html: cannot be written")
+
+    monkeypatch.setattr("cadam3d.report.write_sweep", fail)
+    result = sweep("prompt=a cube", "grid=densifiers")
+    assert (result.code, result.err) == (0, "cadam3d: report.html: cannot be written\n")
 
 
 def test_of_a_long_table_the_terminal_sees_what_has_no_result(sweep, monkeypatch):
@@ -653,7 +664,7 @@ def test_of_a_long_table_the_terminal_sees_what_has_no_result(sweep, monkeypatch
 
 
 def test_preparing_a_sweep_needs_no_torch(start_sweep, tmp_path):
-    code = "import sys, cadam3d.sweep.start, cadam3d.commands.sweep; assert 'torch' not in sys.modules"
+    code = "import sys, cadam3d.launch, cadam3d.commands.sweep; assert 'torch' not in sys.modules"
     subprocess.run([PYTHON, "-c", code], check=True, cwd=REPOSITORY)
 
 
