@@ -1,5 +1,6 @@
 """Launch: prepare a line for Hydra, refuse what cannot work before any work starts, and run the command."""
 
+import gc
 import shlex
 import shutil
 from argparse import Namespace
@@ -39,6 +40,8 @@ class Task:
     def __call__(self, cfg: DictConfig) -> Any:
         """Run the command on its composed configuration."""
         module = import_module(f"cadam3d.commands.{self.command}")
+        gc.freeze()  # what has been imported stays, so collections need not look at it
+        gc.enable()
         self.has_started = True
         return module.run(cfg)
 

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
-from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
+
+from cadam3d.core.rotation import rotation_matrices
 
 FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh")
 
@@ -46,7 +47,7 @@ class Gaussians:
     def rotations(self) -> Float[Tensor, "n 3 3"]:
         """Rotation matrices from own axes to world axes; a zero quaternion gives the identity."""
         largest = self.quats.detach().abs().amax(dim=-1, keepdim=True)  # its square might leave float32
-        return quaternion_to_rotation_matrix(self.quats / largest.clamp_min(torch.finfo(largest.dtype).tiny))
+        return rotation_matrices(self.quats / largest.clamp_min(torch.finfo(largest.dtype).tiny))
 
     @property
     def device(self) -> torch.device:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from kornia.metrics import psnr, ssim
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, orbit
@@ -97,6 +96,8 @@ class Fidelity(Metric):
 
 
 def _psnr(images: Float[Tensor, "v h w 3"], modes: Float[Tensor, "m v h w 3"]) -> Float[Tensor, "m v"]:
+    from kornia.metrics import psnr  # slow to import, and not needed before training has ended
+
     rows = [
         torch.stack([psnr(image, true, max_val=1.0) for image, true in zip(images, mode, strict=True)])
         for mode in modes
@@ -105,6 +106,8 @@ def _psnr(images: Float[Tensor, "v h w 3"], modes: Float[Tensor, "m v h w 3"]) -
 
 
 def _ssim(images: Float[Tensor, "v h w 3"], modes: Float[Tensor, "m v h w 3"]) -> Float[Tensor, "m v"]:
+    from kornia.metrics import ssim
+
     ours = images.permute(0, 3, 1, 2)
     maps = [ssim(ours, mode.permute(0, 3, 1, 2), window_size=SSIM_WINDOW) for mode in modes]
     return torch.stack(maps).mean(dim=(2, 3, 4))

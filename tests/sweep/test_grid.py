@@ -110,7 +110,7 @@ def test_a_setting_of_the_line_reaches_an_arm_that_does_not_name_it():
 
 
 def test_a_line_that_makes_two_arms_the_same_is_refused(pareto):
-    with pytest.raises(UserError, match=r"^densifier: differ in this setting.*'~grid.arms.two'"):
+    with pytest.raises(UserError, match=r"^densifier: the arms one and two differ in this setting.*'~grid.arms.two'"):
         expand(
             read_grid({"arms": {"one": {"densifier": "a"}, "two": {"densifier": "b"}}}),
             read_line(["densifier=c"]),
