@@ -55,10 +55,10 @@ def test_every_prior_is_tried(findings):
 
 
 def test_rasterizers_that_do_not_even_load_are_one_finding(monkeypatch):
-    monkeypatch.setitem(sys.modules, "cadam3d.commands.proofs", None)
+    monkeypatch.setitem(sys.modules, "cadam3d.commands.doctor_rasterizers", None)
     [finding] = doctor._rasterizers()
     assert finding.verdict is Verdict.BROKEN
-    assert "cadam3d.commands.proofs" in finding.found
+    assert "cadam3d.commands.doctor_rasterizers" in finding.found
 
 
 def test_every_dependency_is_looked_at():

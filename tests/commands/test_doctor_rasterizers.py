@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from cadam3d.commands import proofs
+from cadam3d.commands import doctor_rasterizers
 from cadam3d.commands.finding import Finding, Verdict
-from cadam3d.commands.proofs import prove_rasterizers
+from cadam3d.commands.doctor_rasterizers import check_rasterizers
 from cadam3d.core.errors import UserError
 from cadam3d.io.cache import default_cache_dir
 from cadam3d.rasterizer import auto, build, nvrtc
@@ -52,7 +52,7 @@ def agreement() -> Agreement:
 
 
 def by_topic() -> dict[str, Finding]:
-    found = list(prove_rasterizers())
+    found = list(check_rasterizers())
     assert all(json.loads(json.dumps(asdict(finding), allow_nan=False)) for finding in found)
     return {finding.topic: finding for finding in found}
 
@@ -82,7 +82,7 @@ def test_the_native_kernels_are_named_and_proved():
 def test_kernels_say_whether_they_were_compiled_now(seconds, words, monkeypatch):
     built = replace(build.build(default_cache_dir()), seconds=seconds)
     monkeypatch.setattr(build, "build", lambda cache_dir: built)
-    finding = proofs._cpu_kernels()
+    finding = doctor_rasterizers._cpu_kernels()
     assert words in finding.found
     assert finding.facts["compiled_now"] is (seconds > 0)
     assert finding.facts["compile_seconds"] == seconds
@@ -130,7 +130,7 @@ def a_gpu(bare, monkeypatch, tmp_path):
 
 
 def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu, monkeypatch, agreement):
-    monkeypatch.setattr(proofs, "self_test", lambda rasterizer, device: agreement)
+    monkeypatch.setattr(doctor_rasterizers, "self_test", lambda rasterizer, device: agreement)
     found = by_topic()
     assert found["kernels for cuda"].found.startswith(
         "sm_90 for a GPU (compute capability 9.0) by NVRTC 13.0 in /there/libnvrtc.so.13, compiled now in 7.0"
@@ -152,8 +152,8 @@ def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu
     ],
 )
 def test_what_fails_its_self_test_is_reported(topic, device, change, verdict, monkeypatch, agreement):
-    monkeypatch.setattr(proofs, "self_test", lambda rasterizer, device: replace(agreement, **change))
-    finding = proofs._proof(topic, CpuRasterizer(cache_dir=None), torch.device(device))
+    monkeypatch.setattr(doctor_rasterizers, "self_test", lambda rasterizer, device: replace(agreement, **change))
+    finding = doctor_rasterizers._proof(topic, CpuRasterizer(cache_dir=None), torch.device(device))
     assert finding.verdict is verdict
     assert ("report" in finding.hint) is (verdict is not Verdict.OK)
     json.dumps(finding.facts, allow_nan=False)
@@ -163,8 +163,8 @@ def test_a_self_test_that_crashes_is_a_finding(monkeypatch):
     def crash(rasterizer, device):
         raise RuntimeError("an illegal memory access\nsomewhere")
 
-    monkeypatch.setattr(proofs, "self_test", crash)
-    finding = proofs._proof("rasterizer=cuda", ReferenceRasterizer(), torch.device("cpu"))
+    monkeypatch.setattr(doctor_rasterizers, "self_test", crash)
+    finding = doctor_rasterizers._proof("rasterizer=cuda", ReferenceRasterizer(), torch.device("cpu"))
     assert finding.verdict is Verdict.BROKEN
     assert finding.found == "RuntimeError: an illegal memory access"
 
@@ -174,6 +174,6 @@ def test_what_a_compiler_complained_of_is_one_line_and_what_to_type(monkeypatch)
         raise UserError("rasterizer=cpu: c++ could not build the kernels:\nerror\nerror\nTry: another one")
 
     monkeypatch.setattr(build, "build", fail)
-    finding = next(prove_rasterizers())
+    finding = next(check_rasterizers())
     assert finding.found == "rasterizer=cpu: c++ could not build the kernels:"
     assert finding.hint == "Try: another one"

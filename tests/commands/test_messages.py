@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from cadam3d import cli
-from cadam3d.commands import notes
+from cadam3d.commands import messages
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import auto, cpu
 from cadam3d.rasterizer.base import Backend
@@ -25,10 +25,10 @@ SMALL += ["exporter=[ply]", "metric=[]", "camera.size=16"]
 
 @pytest.fixture(autouse=True)
 def _nothing_said_yet():
-    notes.note.cache_clear()
+    messages.note.cache_clear()
     auto._choose.cache_clear()
     yield
-    notes.note.cache_clear()
+    messages.note.cache_clear()
     auto._choose.cache_clear()
 
 
@@ -54,15 +54,15 @@ def type_line(monkeypatch, capsys, tmp_path):
 
 
 def test_a_note_is_printed_once(capsys):
-    notes.note("mind the gap")
-    notes.note("mind the gap")
-    notes.note("mind the step")
+    messages.note("mind the gap")
+    messages.note("mind the gap")
+    messages.note("mind the step")
     assert capsys.readouterr().err == "Note: mind the gap\nNote: mind the step\n"
 
 
 def test_a_backend_is_noted_only_where_something_faster_was_wanted(capsys):
-    notes.note_backend(Backend("cpu"))
-    notes.note_backend(Backend("reference", reason="No compiler. Install one"))
+    messages.note_backend(Backend("cpu"))
+    messages.note_backend(Backend("reference", reason="No compiler. Install one"))
     assert capsys.readouterr().err == (
         "Note: rendering with rasterizer=reference, which is slow: No compiler. Install one\n"
     )

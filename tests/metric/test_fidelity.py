@@ -53,7 +53,7 @@ def truths(*shifts):
 
 
 def measure(render, truth, **changes):
-    return Fidelity(**{**SETTINGS, **changes}).measure(no_gaussians(), render, truth)
+    return Fidelity(**{**SETTINGS, **changes}).measure(no_gaussians(), render, truth, None)
 
 
 @pytest.mark.parametrize(("error", "psnr"), [(0.1, 20.0), (-0.1, 20.0), (0.01, 40.0)])
