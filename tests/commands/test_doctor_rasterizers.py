@@ -61,17 +61,17 @@ def by_topic() -> dict[str, Finding]:
 def test_the_native_kernels_are_named_and_proved():
     cache = default_cache_dir()
     found = by_topic()
-    kernels, proof, choice = (
+    kernels, test, choice = (
         found[topic] for topic in ("kernels for cpu", "rasterizer=cpu", "rasterizer=auto")
     )
     assert find_compiler().version in kernels.found
     assert kernels.found.endswith(f" in {cache}")
     assert kernels.facts["instruction_set"] in ("avx512", "avx2", "sse2", "neon", "generic")
     assert Path(kernels.facts["path"]).is_file()
-    assert proof.verdict is Verdict.OK
-    assert proof.found.startswith("agrees with the reference: images ")
-    assert proof.found.endswith("same bits twice, on cpu")
-    assert proof.facts["agrees"]
+    assert test.verdict is Verdict.OK
+    assert test.found.startswith("agrees with the reference: images ")
+    assert test.found.endswith("same bits twice, on cpu")
+    assert test.facts["agrees"]
     assert choice.facts == {"device": "cpu", "backend": "cpu", "reason": None}
 
 
@@ -95,11 +95,11 @@ def test_with_nothing_installed_the_reference_is_proved_and_the_rest_says_what_i
     assert not [finding for finding in found.values() if finding.verdict is Verdict.BROKEN]
     assert "pip install 'cadam3d[compiler]'" in found["kernels for cpu"].found
     assert "rasterizer=cpu" not in found
-    assert found["kernels for cuda"].found == "torch sees no CUDA device; no NVRTC is here"
+    assert found["kernels for cuda"].found == "torch sees no CUDA device; no NVRTC was found"
     choice = found["rasterizer=auto"]
     assert choice.verdict is Verdict.NOTE
     assert choice.found.startswith(
-        "takes reference on cpu, which is slow: rasterizer=cpu needs a C++ compiler"
+        "chooses reference on cpu, which is slow: rasterizer=cpu needs a C++ compiler"
     )
     assert choice.facts["backend"] == "reference"
 
@@ -113,7 +113,7 @@ def an_nvrtc() -> nvrtc.Compiler:
 def test_an_nvrtc_without_a_device_is_mentioned(bare, monkeypatch):
     monkeypatch.setattr(nvrtc, "find_compiler", an_nvrtc)
     finding = by_topic()["kernels for cuda"]
-    assert finding.found == "torch sees no CUDA device; NVRTC 13.0 is here: /there/libnvrtc.so.13"
+    assert finding.found == "torch sees no CUDA device; NVRTC 13.0 is in /there/libnvrtc.so.13"
     assert finding.facts == {"nvrtc": "/there/libnvrtc.so.13", "nvrtc_version": "13.0"}
 
 
@@ -137,7 +137,7 @@ def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu
     )
     assert found["rasterizer=cuda"].verdict is Verdict.OK
     assert found["rasterizer=cuda"].found == f"{agreement}, on cuda:0"
-    assert found["rasterizer=auto"].found == "takes cuda on cuda:0: the fastest there is, and it works"
+    assert found["rasterizer=auto"].found == "chooses cuda on cuda:0: the fastest there is, and it works"
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu
 )
 def test_what_fails_its_self_test_is_reported(topic, device, change, verdict, monkeypatch, agreement):
     monkeypatch.setattr(doctor_rasterizers, "self_test", lambda rasterizer, device: replace(agreement, **change))
-    finding = doctor_rasterizers._proof(topic, CpuRasterizer(cache_dir=None), torch.device(device))
+    finding = doctor_rasterizers._tested(topic, CpuRasterizer(cache_dir=None), torch.device(device))
     assert finding.verdict is verdict
     assert ("report" in finding.hint) is (verdict is not Verdict.OK)
     json.dumps(finding.facts, allow_nan=False)
@@ -164,7 +164,7 @@ def test_a_self_test_that_crashes_is_a_finding(monkeypatch):
         raise RuntimeError("an illegal memory access\nsomewhere")
 
     monkeypatch.setattr(doctor_rasterizers, "self_test", crash)
-    finding = doctor_rasterizers._proof("rasterizer=cuda", ReferenceRasterizer(), torch.device("cpu"))
+    finding = doctor_rasterizers._tested("rasterizer=cuda", ReferenceRasterizer(), torch.device("cpu"))
     assert finding.verdict is Verdict.BROKEN
     assert finding.found == "RuntimeError: an illegal memory access"
 

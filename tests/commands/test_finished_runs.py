@@ -71,7 +71,7 @@ def test_exactly_one_asset_must_be_named(command, words, got, type_line):
 @pytest.mark.parametrize("command", ["render", "export", "view", "eval"])
 def test_a_folder_that_is_no_run_is_named(command, type_line, tmp_path):
     (tmp_path / "empty").mkdir()
-    for place, reason in (("nowhere", "no such folder"), ("empty", "it holds no config.yaml")):
+    for place, reason in (("nowhere", "no such folder"), ("empty", "it has no config.yaml")):
         code, _, err = type_line(command, f"run={place}")
         assert code == 1
         assert err.startswith(f"cadam3d: run: expected the folder of a run, got {place!r} ({reason}). Try: ")
