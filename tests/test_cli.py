@@ -1,4 +1,4 @@
-"""What a user types and what comes back: commands, courtesies, errors, sweeps, resume and completion."""
+"""The command line: commands, quoting, hints, error messages, sweeps, resuming and completion."""
 
 import json
 import os
@@ -59,7 +59,7 @@ class Result:
 
     @property
     def message(self) -> str:
-        """The one line of an error."""
+        """The single line of an error."""
         lines = self.err.strip().splitlines()
         assert len(lines) == 1, self.err
         assert lines[0].startswith("cadam3d: ")
@@ -109,7 +109,7 @@ def small_configs(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def jobs(monkeypatch, small_configs):
-    """Instead of training: note the configuration, fail on seeds 7 and 8, else leave a summary."""
+    """Replace training: record the configuration, fail on seeds 7 and 8, else write a summary."""
     for module in (settings, hydra, advice):
         monkeypatch.setattr(module, "config_dir", lambda: small_configs)
     seen = []
@@ -160,7 +160,7 @@ def test_help_is_instant_and_imports_nothing_heavy():
 
 
 @pytest.mark.parametrize("command", list(cli.COMMANDS))
-def test_every_command_has_a_module_and_says_in_its_yaml_what_it_is_for(command):
+def test_every_command_has_a_module_and_describes_itself_in_its_yaml(command):
     assert (REPOSITORY / f"cadam3d/commands/{command}.py").is_file()
     config = yaml.safe_load((settings.config_dir() / f"{command}.yaml").read_text(encoding="utf-8"))
     assert f"\n  cadam3d {command}" in config["hydra"]["help"]["header"]
@@ -184,22 +184,22 @@ def test_cfg_job_prints_the_settings_without_running(command, type_line):
 
 
 @pytest.mark.parametrize(("typed", "meant"), [("trian", "train"), ("EXPORT", "export"), ("docter", "doctor")])
-def test_an_unknown_command_is_answered_with_the_near_one(typed, meant, type_line):
+def test_the_answer_to_a_misspelt_command_is_the_right_one(typed, meant, type_line):
     result = type_line(typed, "prompt=a red cube")
     assert result.code == 1
     assert result.message.endswith(f"Try: cadam3d {meant} 'prompt=a red cube'")
 
 
-def test_a_bare_sentence_is_answered_with_the_line_it_wanted(type_line):
+def test_the_answer_to_a_bare_sentence_is_the_line_to_type(type_line):
     assert type_line("a red cube").message.endswith("Try: cadam3d train 'prompt=a red cube'")
     assert type_line("prompt=a cube").message.endswith("Try: cadam3d train 'prompt=a cube'")
 
 
-def test_a_word_like_nothing_else_gets_the_list_of_commands(type_line):
+def test_the_answer_to_any_other_word_is_the_list_of_commands(type_line):
     assert "|".join(cli.COMMANDS) in type_line("qqq").message
 
 
-# --- courtesy 1: prompts are text -----------------------------------------------------------------------
+# --- prompts are text -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("prompt", AWKWARD)
@@ -235,7 +235,7 @@ def test_a_prompt_that_is_quoted_already_is_left_alone(quoted, type_line, jobs):
     assert jobs[0][0].prompt == "a corgi, front view"
 
 
-def test_a_prompt_torn_apart_by_the_shell_is_given_back_whole(type_line):
+def test_the_words_of_an_unquoted_prompt_are_joined_in_the_message(type_line):
     assert type_line("train", "prompt=a", "red", "cube").message == (
         "'red': expected key=value. Try: cadam3d train prompt='a red cube'"
     )
@@ -281,7 +281,7 @@ def test_a_run_below_the_home_folder_is_written_and_resumed_there(type_line, job
     assert [folder for _, folder in jobs] == [tmp_path / "home/x"] * 2
 
 
-# --- courtesy 2: what is missing is asked for before any work -------------------------------------------
+# --- missing values are asked for before any work -------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -307,7 +307,7 @@ def test_any_other_missing_value_is_asked_for_with_the_rest_of_the_line(type_lin
     assert not list(tmp_path.iterdir())
 
 
-def test_a_component_from_a_folder_of_the_users_own_is_found(type_line, jobs, tmp_path):
+def test_a_component_from_a_folder_of_the_user_is_found(type_line, jobs, tmp_path):
     own = tmp_path / "my configs, (1)/densifier"
     own.mkdir(parents=True)
     (own / "mine.yaml").write_text("_target_: mypackage.Mine\n", encoding="utf-8")
@@ -322,7 +322,7 @@ def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, 
     assert not list(tmp_path.iterdir())
 
 
-# --- courtesy 3: did you mean ---------------------------------------------------------------------------
+# --- did you mean ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -375,13 +375,13 @@ def test_a_mistake_gets_one_message_that_says_what_to_type(line, ending, type_li
         (("-sc", "foo=bash"), 'Try: eval "$(cadam3d -sc install=bash)"'),
     ],
 )
-def test_flags_and_other_commands_have_manners_too(words, ending, type_line):
+def test_wrong_flags_and_other_commands_get_one_message_too(words, ending, type_line):
     result = type_line(*words)
     assert result.code == 1
     assert ending in result.message
 
 
-def test_the_traceback_is_there_for_those_who_ask(monkeypatch, tmp_path):
+def test_the_traceback_is_there_with_hydra_full_error(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.setattr(sys, "argv", ["cadam3d", "train", "densifer=cadam"])
@@ -428,9 +428,7 @@ def test_a_refused_line_leaves_no_folder_behind(place, type_line, jobs, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-def test_a_refused_line_removes_neither_what_was_there_nor_what_was_made(
-    type_line, jobs, tmp_path, monkeypatch
-):
+def test_a_refused_line_removes_neither_older_nor_new_files(type_line, jobs, tmp_path, monkeypatch):
     (tmp_path / "mine").mkdir()
     assert type_line("train", "prompt=a cube", "seed=7", "hydra.run.dir=mine/deep/er").code == 1
     assert type_line("train", "prompt=a cube", "seed=7", "hydra.run.dir=mine").code == 1
@@ -475,7 +473,7 @@ def run_folder(type_line, jobs) -> Path:
     return folder
 
 
-def test_resume_needs_no_prompt_and_keeps_what_the_run_was_started_with(run_folder, type_line, jobs):
+def test_resume_needs_no_prompt_and_keeps_the_settings_of_the_run(run_folder, type_line, jobs):
     assert type_line("train", f"resume={run_folder}").code == 0
     [(cfg, folder)] = jobs
     assert (cfg.prompt, cfg.steps, cfg.seed) == ("a car, (red)", 10, 3)
@@ -484,7 +482,7 @@ def test_resume_needs_no_prompt_and_keeps_what_the_run_was_started_with(run_fold
     assert Path(cfg.resume) == run_folder
 
 
-def test_what_the_line_says_anew_wins_and_sticks(run_folder, type_line, jobs):
+def test_settings_in_the_line_win_and_are_kept(run_folder, type_line, jobs):
     type_line("train", f"resume={run_folder}", "steps=20", "densifier=cadam")
     type_line("train", f"resume={run_folder}", "seed=4")
     assert [(cfg.steps, cfg.seed) for cfg, _ in jobs] == [(20, 3), (20, 4)]
@@ -503,7 +501,7 @@ def test_resume_follows_a_link_and_takes_a_checkpoint_file(run_folder, type_line
 
 
 @pytest.mark.parametrize("place", ["nowhere", "."])
-def test_resume_from_what_is_no_run_is_refused(place, type_line, jobs):
+def test_resuming_from_a_folder_without_a_run_is_refused(place, type_line, jobs):
     message = type_line("train", f"resume={place}").message
     assert "expected the folder of a run" in message
     assert not jobs
@@ -536,14 +534,14 @@ def test_a_refused_resume_leaves_the_run_as_it_was(run_folder, type_line, jobs):
         (["+a.b=5"], ["a.b=6"], ["+a.b=6"]),
     ],
 )
-def test_taking_a_key_away_and_giving_it_anew_both_survive_a_resume(before, anew, after, tmp_path):
+def test_removed_and_added_keys_survive_a_resume(before, anew, after, tmp_path):
     (tmp_path / ".hydra").mkdir()
     (tmp_path / OVERRIDES).write_text(yaml.safe_dump(before), encoding="utf-8")
     lines = resumed([f"resume='{tmp_path}'", *anew], is_sweep=False)
     assert [line for line in lines if not line.startswith(("resume=", "hydra.run.dir="))] == after
 
 
-# --- courtesy 4: completion -----------------------------------------------------------------------------
+# --- completion -----------------------------------------------------------------------------------------
 
 
 def complete(line: str, type_line, monkeypatch, shell: str = "bash") -> list[str]:
@@ -604,7 +602,7 @@ def test_bash_completes_the_command_word(tmp_path):
 
 
 def test_ctrl_c_is_one_line_and_130(tmp_path):
-    """The signal comes while Python imports: no command has taken charge of signals yet."""
+    """The signal arrives before the command has installed handlers."""
     code = (
         "import signal, sys, time, types\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a suite in the background ignores it

@@ -1,4 +1,4 @@
-"""doctor on rasterizers: it proves what it names, and says what is missing where something is."""
+"""doctor on rasterizers: it tests what it names, and prints what is missing."""
 
 import ctypes
 import json
@@ -31,7 +31,7 @@ def forget() -> None:
 
 @pytest.fixture(autouse=True)
 def _asked_anew():
-    """What a process remembers of its kernels neither reaches a test nor outlasts it."""
+    """Clear the caches of the process before and after each test."""
     forget()
     yield
     forget()
@@ -58,7 +58,7 @@ def by_topic() -> dict[str, Finding]:
 
 
 @needs_compiler
-def test_the_native_kernels_are_named_and_proved():
+def test_the_native_kernels_are_named_and_tested():
     cache = default_cache_dir()
     found = by_topic()
     kernels, test, choice = (
@@ -79,7 +79,7 @@ def test_the_native_kernels_are_named_and_proved():
 @pytest.mark.parametrize(
     ("seconds", "words"), [(0.0, "from the cache in "), (1.26, "compiled now in 1.3 s, kept in ")]
 )
-def test_kernels_say_whether_they_were_compiled_now(seconds, words, monkeypatch):
+def test_the_finding_states_whether_kernels_were_compiled_now(seconds, words, monkeypatch):
     built = replace(build.build(default_cache_dir()), seconds=seconds)
     monkeypatch.setattr(build, "build", lambda cache_dir: built)
     finding = doctor_rasterizers._cpu_kernels()
@@ -88,7 +88,7 @@ def test_kernels_say_whether_they_were_compiled_now(seconds, words, monkeypatch)
     assert finding.facts["compile_seconds"] == seconds
 
 
-def test_with_nothing_installed_the_reference_is_proved_and_the_rest_says_what_is_missing(bare):
+def test_with_nothing_installed_the_reference_is_tested_and_the_rest_is_named_as_missing(bare):
     found = by_topic()
     assert found["rasterizer=reference"].verdict is Verdict.OK
     assert found["rasterizer=reference"].facts["agrees"]
@@ -146,13 +146,15 @@ def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu
         ("rasterizer=cpu", "cpu", {"gradients": {"means": 0.1}}, Verdict.BROKEN),
         ("rasterizer=cpu", "cpu", {"images": {"rgb": math.inf}}, Verdict.BROKEN),
         ("rasterizer=cpu", "cpu", {"repeats": False}, Verdict.BROKEN),
-        ("rasterizer=cuda", "cuda:0", {"repeats": False}, Verdict.NOTE),  # auto does not take it
+        ("rasterizer=cuda", "cuda:0", {"repeats": False}, Verdict.NOTE),  # auto does not choose it
         ("rasterizer=reference", "cpu", {"repeats": False}, Verdict.BROKEN),
         ("rasterizer=reference", "cuda:0", {"repeats": False}, Verdict.OK),  # its sums use atomics there
     ],
 )
 def test_what_fails_its_self_test_is_reported(topic, device, change, verdict, monkeypatch, agreement):
-    monkeypatch.setattr(doctor_rasterizers, "self_test", lambda rasterizer, device: replace(agreement, **change))
+    monkeypatch.setattr(
+        doctor_rasterizers, "self_test", lambda rasterizer, device: replace(agreement, **change)
+    )
     finding = doctor_rasterizers._tested(topic, CpuRasterizer(cache_dir=None), torch.device(device))
     assert finding.verdict is verdict
     assert ("report" in finding.hint) is (verdict is not Verdict.OK)
@@ -169,7 +171,7 @@ def test_a_self_test_that_crashes_is_a_finding(monkeypatch):
     assert finding.found == "RuntimeError: an illegal memory access"
 
 
-def test_what_a_compiler_complained_of_is_one_line_and_what_to_type(monkeypatch):
+def test_an_error_of_the_compiler_is_one_line_and_what_to_type(monkeypatch):
     def fail(cache_dir):
         raise UserError("rasterizer=cpu: c++ could not build the kernels:\nerror\nerror\nTry: another one")
 

@@ -64,7 +64,7 @@ def small_configs(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def hydra_sweep(monkeypatch, capfd, tmp_path, small_configs, stand_in):
-    """Type ``cadam3d sweep ...`` in an empty folder, in this process."""
+    """Type ``cadam3d sweep ...`` in an empty folder, in this process and without its report."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     for module in (settings, hydra, advice):
@@ -85,7 +85,7 @@ def hydra_sweep(monkeypatch, capfd, tmp_path, small_configs, stand_in):
 
 @pytest.fixture
 def sweep(hydra_sweep, monkeypatch):
-    """The same, with a loop in the place of Hydra's multirun: it takes a third of the time."""
+    """The same with a loop instead of Hydra's multirun, which takes a third of the time."""
 
     def run_jobs(name: str, arguments: list[str], _run: Callable) -> None:
         given = dict(line.split("=", 1) for line in arguments if "=" in line)
@@ -136,7 +136,7 @@ def test_a_sweep_leaves_one_row_per_job(command, flags, hydra_sweep):
     assert all((only_sweep() / row["folder"] / "summary.json").is_file() for row in rows)
 
 
-def test_jobs_share_a_folder_for_their_traces_that_goes_with_the_sweep(sweep, calls):
+def test_jobs_share_a_folder_for_traces_that_is_removed_after_the_sweep(sweep, calls):
     sweep("prompt=a cube", "seed=0,1")
     folder = only_sweep()
     assert {call["traces"] for call in calls(folder)} == {str(folder.resolve() / "traces")}
@@ -150,7 +150,7 @@ def test_a_folder_for_traces_of_the_user_is_kept(sweep, calls, monkeypatch, tmp_
     assert (tmp_path / "mine").is_dir()
 
 
-def test_each_job_is_told_as_it_ends(sweep):
+def test_each_job_is_reported_as_it_ends(sweep):
     lines = sweep("prompt=a cube", "seed=0,1,2").out.splitlines()
     assert lines[0].startswith("3 jobs in multirun/")
     assert lines[1].startswith("[1/3] seed=0: 5 Gaussians, 20.25 dB, 2 s; about ")
@@ -165,7 +165,7 @@ def test_a_grid_gives_its_name_and_its_arms(sweep):
     assert [row["arm"] for row in rows] == ["baseline", "cadam", "none"] * 2
     assert [row["densifier"] for row in rows] == ["baseline", "cadam", "none"] * 2
     assert "[1/6] baseline, seed=0: " in result.out
-    assert "densifier" not in result.out.split("job  ")[1].splitlines()[0]  # the arm says it
+    assert "densifier" not in result.out.split("job  ")[1].splitlines()[0]  # it follows from the arm
 
 
 def test_an_arm_can_be_left_out(sweep):
@@ -204,8 +204,8 @@ def test_the_table_is_right_after_every_job(hydra_sweep, monkeypatch):
     assert seen == [[finished, waiting, waiting], [finished, finished, waiting], [finished] * 3]
 
 
-def test_several_writers_leave_what_the_last_of_them_saw(tmp_path, monkeypatch):
-    """A job that ended while the table was being written is in it none the less."""
+def test_the_last_of_several_writers_leaves_the_latest_state(tmp_path, monkeypatch):
+    """A job that ends while the table is being written is in it all the same."""
     before = Row(0, "", tmp_path / "a", [], {"seed": 0}, {})
     after = Row(0, "", tmp_path / "a", [], {"seed": 0}, {"outcome": "finished"})
     states = iter([[before], [after], [after]])
@@ -214,7 +214,7 @@ def test_several_writers_leave_what_the_last_of_them_saw(tmp_path, monkeypatch):
     assert read_table(tmp_path)[0]["outcome"] == "finished"
 
 
-def test_values_that_are_no_text_are_json_in_the_table(tmp_path):
+def test_values_other_than_text_are_json_in_the_table(tmp_path):
     row = Row(0, "", tmp_path, [], {"exporter": ["ply", "preview"], "on": True}, {})
     assert as_text([row, Row(1, "", tmp_path, [], {"exporter": [], "on": None}, {})]).splitlines()[1:] == [
         '0    ["ply", "preview"]  True  unfinished  -              -     -',
@@ -222,7 +222,7 @@ def test_values_that_are_no_text_are_json_in_the_table(tmp_path):
     ]
 
 
-def test_what_the_arm_tells_is_not_told_again(tmp_path):
+def test_settings_that_follow_from_the_arm_are_not_shown(tmp_path):
     rows = [
         Row(0, "a", tmp_path, [], {"densifier": "x", "seed": 0, "steps": 5}, {}),
         Row(1, "a", tmp_path, [], {"densifier": "x", "seed": 1, "steps": 5}, {}),
@@ -239,7 +239,7 @@ def test_finished_jobs_are_skipped_and_the_others_run_again(sweep, calls):
     sweep(*line)
     rows = load(only_sweep().resolve())
     (rows[1].folder / "summary.json").unlink()
-    result = sweep("seed=range(0,3)", 'prompt="a cube"')  # the same, said otherwise
+    result = sweep("seed=range(0,3)", 'prompt="a cube"')  # the same line, written differently
     assert result.code == 0
     assert "3 jobs in " in result.out
     assert "2 already have a result" in result.out
@@ -247,8 +247,8 @@ def test_finished_jobs_are_skipped_and_the_others_run_again(sweep, calls):
     assert [call["folder"] for call in calls(only_sweep())] == [row.folder.name for row in (*rows, rows[1])]
 
 
-def test_numbers_without_exports_are_no_result(sweep, calls):
-    """Training writes them first. If the whole machine goes down then, there is nobody to say killed."""
+def test_numbers_without_exports_are_not_a_result(sweep, calls):
+    """Training writes the numbers first. If the whole machine fails then, nothing records that."""
     sweep("prompt=a cube", "seed=0,1")
     [row, _] = load(only_sweep().resolve())
     (row.folder / "summary.json").write_text('{"outcome": "finished", "num_gaussians": 5}')
@@ -256,7 +256,7 @@ def test_numbers_without_exports_are_no_result(sweep, calls):
     assert [call["folder"] for call in calls(only_sweep())[2:]] == [row.folder.name]
 
 
-def test_a_sweep_that_is_done_only_tells_its_table(sweep, calls):
+def test_a_sweep_that_is_done_only_writes_its_table(sweep, calls):
     sweep("prompt=a cube", "grid=densifiers")
     Path("multirun/densifiers/sweep.csv").unlink()
     result = sweep("prompt=a cube", "grid=densifiers")
@@ -265,7 +265,7 @@ def test_a_sweep_that_is_done_only_tells_its_table(sweep, calls):
     assert len(read_table(Path("multirun/densifiers"))) == 3
 
 
-def test_a_killed_job_goes_on_from_its_checkpoint(sweep, calls, small_configs):
+def test_a_killed_job_continues_from_its_checkpoint(sweep, calls, small_configs):
     folder = Path("multirun/x")
     folder.mkdir(parents=True)
     config = yaml_of(sweep, "prompt=a kill")
@@ -309,7 +309,7 @@ def test_other_settings_in_the_same_folder_are_refused_with_the_key(sweep, calls
     assert len(calls(folder)) == 3
 
 
-def test_what_only_a_running_job_knows_is_not_compared(sweep, monkeypatch):
+def test_values_that_only_a_running_job_knows_are_not_compared(sweep, monkeypatch):
     line = ("prompt=a cube", "grid=densifiers", "optimizer.steps=${hydra:runtime.output_dir}")
     assert sweep(*line).code == 0
     for row in load(Path("multirun/densifiers")):
@@ -354,7 +354,7 @@ def test_a_second_sweep_in_the_folder_of_a_running_one_is_refused(sweep):
 
 @pytest.fixture
 def start_sweep(tmp_path, small_configs, stand_in):
-    """Start a sweep as a process of its own; its launcher's workers too meet the stand-in."""
+    """Start a sweep in a process of its own, whose workers also find the replacement of training."""
     python = tmp_path / "python"
     is_job = 'case "$*" in *cadam3d.job*)'
     python.write_text(f'#!/bin/sh\n{is_job} exec {stand_in} "$@";; esac\nexec {PYTHON} "$@"\n')
@@ -379,15 +379,15 @@ def start_sweep(tmp_path, small_configs, stand_in):
 
     started: list[subprocess.Popen] = []
     yield run
-    for process in started:  # of a test that failed; workers and jobs end with it
+    for process in started:  # only after a failure; workers and jobs end with it
         process.kill()
         process.wait()
 
 
 @pytest.mark.parametrize(("launcher", "running"), [((), 1), (("launcher=joblib", "launcher.n_jobs=2"), 2)])
-def test_sigint_stops_all_running_jobs_and_leaves_the_table_true(launcher, running, start_sweep, tmp_path):
+def test_sigint_stops_all_running_jobs_and_the_table_is_right(launcher, running, start_sweep, tmp_path):
     process = start_sweep("prompt=a wait", "seed=0,1,2,3,4,5", "hydra.sweep.dir=x", *launcher)
-    wait_for(tmp_path, "x/*/waiting", process, running)  # side by side, or it will never be
+    wait_for(tmp_path, "x/*/waiting", process, running)  # they run side by side
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
@@ -396,7 +396,7 @@ def test_sigint_stops_all_running_jobs_and_leaves_the_table_true(launcher, runni
     assert "Traceback" not in err
     outcomes = [row["outcome"] for row in read_table(tmp_path / "x")]
     assert sorted(outcomes) == ["interrupted"] * running + ["unfinished"] * (6 - running)
-    assert out.count("interrupted") == 2 * running  # as it ended, and in the table
+    assert out.count("interrupted") == 2 * running  # when it ended, and in the table
 
 
 def test_a_second_sigint_ends_at_once(start_sweep, tmp_path):
@@ -413,7 +413,9 @@ def test_a_second_sigint_ends_at_once(start_sweep, tmp_path):
 
 
 @pytest.mark.parametrize(("launcher", "running"), [((), 1), (("launcher=joblib", "launcher.n_jobs=2"), 2)])
-def test_a_killed_sweep_typed_again_has_no_job_twice_at_work(launcher, running, start_sweep, calls, tmp_path):
+def test_a_killed_sweep_typed_again_runs_no_job_twice_at_a_time(
+    launcher, running, start_sweep, calls, tmp_path
+):
     line = ("prompt=a long one", "seed=0,1,2,3", "hydra.sweep.dir=x")
     folder = tmp_path / "x"
     first = start_sweep(*line, *launcher)
@@ -422,7 +424,7 @@ def test_a_killed_sweep_typed_again_has_no_job_twice_at_work(launcher, running, 
     held = [call["folder"] for call in calls(folder)]
     opened = {lock: lock.stat().st_mtime_ns for lock in folder.glob("*/.lock")}
     second = start_sweep(*line, *launcher)
-    first.communicate(timeout=30)  # the pipes close when its workers have ended too; its jobs are still there
+    first.communicate(timeout=30)  # the pipes close once its workers have ended; its jobs still run
     wait_until(lambda: all(lock.stat().st_mtime_ns > time for lock, time in opened.items()), second)
     time.sleep(1)
     assert len(calls(folder)) == running
@@ -498,7 +500,7 @@ def test_a_launcher_whose_plugin_is_missing_is_named(sweep, monkeypatch):
     assert not Path("multirun").exists()
 
 
-def test_a_launcher_that_breaks_down_leaves_the_table_true(sweep, monkeypatch):
+def test_after_a_failure_of_the_launcher_the_table_is_right(sweep, monkeypatch):
     def fail(*args, **kwargs):
         raise RuntimeError("a worker was lost\nfor reasons")
 
@@ -522,7 +524,10 @@ def test_a_launcher_that_breaks_down_leaves_the_table_true(sweep, monkeypatch):
             "arm baseline: nonsense.key: no such setting",
         ),
         (("grid=nope",), "got 'nope'. Try: grid="),
-        (("grid=densifiers", "densifier=none"), "densifier: the arms baseline and cadam differ in this setting"),
+        (
+            ("grid=densifiers", "densifier=none"),
+            "densifier: the arms baseline and cadam differ in this setting",
+        ),
         (("seed=0,1", "launcher=jobli"), "Try: launcher=joblib"),
         (("seed=0,1", "launcher=joblib", "launcher.jobs=2"), "launcher.jobs: no such setting. Did you mean "),
         (
@@ -578,9 +583,9 @@ LINES = (
 )
 
 
-def test_settings_put_in_afterwards_equal_those_that_hydra_composes(sweep):
+def test_settings_changed_after_composing_equal_those_that_hydra_composes(sweep):
     composer = plan.Composer(read_flags([]), [])
-    for _ in range(2):  # the second time nothing is composed anew
+    for _ in range(2):  # the second time, nothing is composed
         for line in LINES:
             cfg = OmegaConf.to_container(settings.compose(line), resolve=True)
             assert composer.compose(line).values == dict(settings.flatten(cfg)), line
@@ -596,7 +601,7 @@ def test_many_jobs_that_differ_in_values_are_composed_once(sweep, monkeypatch):
     assert len(counted) == 3  # the sweep, what its plain values are, and one job
 
 
-def test_what_the_plan_remembers(sweep, tmp_path):
+def test_the_plan_records_folder_flags_and_line(sweep, tmp_path):
     own = tmp_path / "own/densifier"
     own.mkdir(parents=True)
     (own / "mine.yaml").write_text("_target_: mypackage.Mine\n", encoding="utf-8")
@@ -611,7 +616,7 @@ def test_what_the_plan_remembers(sweep, tmp_path):
     assert [job.swept["densifier"] for job in remembered.jobs] == ["mine", "none"]
 
 
-def test_grids_and_parts_may_lie_on_a_search_path(sweep, tmp_path):
+def test_grids_and_components_are_found_on_a_search_path(sweep, tmp_path):
     for name, text in (
         ("grid/mine.yaml", "arms: {one: {densifier: mine}}"),
         ("densifier/mine.yaml", "_target_: mypackage.Mine\ntau: 1"),
@@ -628,7 +633,7 @@ def test_grids_and_parts_may_lie_on_a_search_path(sweep, tmp_path):
     ]
 
 
-def test_a_plan_that_is_none_is_named(tmp_path):
+def test_an_invalid_plan_is_named_in_the_message(tmp_path):
     (tmp_path / JOBS).write_text('{"jobs": [{"what": 1}]}')
     with pytest.raises(UserError, match=r"jobs.json: not the plan of a sweep"):
         load(tmp_path)
@@ -654,11 +659,11 @@ def test_a_report_that_fails_is_a_message_and_the_sweep_keeps_its_exit_code(swee
     assert (result.code, result.err) == (0, "cadam3d: report.html: cannot be written\n")
 
 
-def test_of_a_long_table_the_terminal_sees_what_has_no_result(sweep, monkeypatch):
+def test_the_terminal_shows_only_jobs_without_a_result_of_a_long_table(sweep, monkeypatch):
     monkeypatch.setattr(start, "LONGEST", 2)
     said = sweep("prompt=a cube,a bug", "seed=0,1").out
     table = said[said.index("\njob ") :]
-    assert table.count("failed") > 1  # also counted below it
+    assert table.count("failed") > 1  # and once in the count below it
     assert "finished" not in table
     assert "\njob " not in sweep("prompt=a cube", "seed=0,1,2").out
 
