@@ -27,7 +27,7 @@ COMPLETION_FLAGS = ("--shell-completion", "-sc")
 
 
 def main() -> None:
-    """Run the command line of this process and exit with 0 (done), 1 (mistake or failure) or 130 (interrupted)."""
+    """Run the command line of this process and exit: 0 for success, 1 for an error, 130 for an interrupt."""
     wants_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1"
     # This must be set before torch loads OpenMP. If idle threads spin instead of sleeping, two busy programs
     # slow each other tenfold.
@@ -84,7 +84,7 @@ def help_text() -> str:
 
 
 def unknown_command(words: Sequence[str]) -> UserError:
-    """Return the message for an unknown command. For a sentence or an override, it shows the line to type."""
+    """Return the message for an unknown command; for a sentence or an override it shows the right line."""
     from cadam3d.settings.advice import did_you_mean
 
     first = words[0]
@@ -104,7 +104,7 @@ def unknown_command(words: Sequence[str]) -> UserError:
 def complete(words: Sequence[str]) -> int:
     """Serve tab completion: of the command here, and of the words that follow it through Hydra.
 
-    ``-sc install=SHELL`` prints a script for the shell. That script calls ``-sc query=SHELL`` with the line so
+    ``-sc install=SHELL`` prints a script for the shell. The script calls ``-sc query=SHELL`` with the line so
     far in ``COMP_LINE``.
     """
     action, _, shell = words[1].partition("=") if len(words) > 1 else ("", "", "")

@@ -1,5 +1,6 @@
 """The command line: commands, quoting, hints, error messages, sweeps, resuming and completion."""
 
+import ast
 import json
 import os
 import random
@@ -13,13 +14,16 @@ from pathlib import Path
 
 import pytest
 import yaml
+from hydra._internal.hydra import Hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
+from omegaconf.errors import ConfigAttributeError
 
 from cadam3d import cli
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import OVERRIDES, claim
+from cadam3d.launch import launch
 from cadam3d.settings import advice, hydra
 from cadam3d.settings import compose as settings
 from cadam3d.settings.line import PATH_KEYS, quoted, resumed, split, text_of
@@ -642,6 +646,54 @@ def test_ctrl_c_that_another_exception_hides_is_still_ctrl_c(function, type_line
     monkeypatch.setattr(f"cadam3d.launch.{function}", hide)
     result = type_line("train", "prompt=a cube")
     assert (result.code, result.message) == (130, "interrupted")
+
+
+def test_a_run_composes_its_settings_once(type_line, jobs, monkeypatch):
+    composed = []
+    original = Hydra.compose_config
+    monkeypatch.setattr(
+        Hydra, "compose_config", lambda *args, **kwargs: composed.append(args) or original(*args, **kwargs)
+    )
+    assert type_line("train", "prompt=a cube", "steps=5").code == 0
+    assert len(composed) == 1
+    assert type_line("train", "resume=" + str(jobs[0][1])).code == 0
+    assert len(composed) == 2
+
+
+def test_the_notes_of_hydra_about_a_run_are_complete(type_line, jobs):
+    type_line("train", "prompt=a cube", "steps=5", "hydra.run.dir=here")
+    notes = yaml.safe_load(Path("here/.hydra/hydra.yaml").read_text())["hydra"]
+    assert notes["overrides"] == {
+        "hydra": ["hydra.run.dir='here'", "hydra.mode=RUN"],
+        "task": ["prompt='a cube'", "steps=5"],
+    }
+    assert notes["mode"] == "RUN"
+    assert notes["runtime"]["output_dir"] == str(Path("here").resolve())
+    assert notes["runtime"]["choices"]["densifier"] == "cadam"
+
+
+def test_exceptions_of_hydra_are_explained_at_one_place_only():
+    calls = [
+        f"{path.relative_to(REPOSITORY)}:{node.lineno}"
+        for path in (REPOSITORY / "cadam3d").rglob("*.py")
+        if path.name != "advice.py"  # where it calls itself for the cause of an exception
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "explain"
+    ]
+    assert len(calls) == 1
+    assert calls[0].startswith("cadam3d/launch.py:")
+
+
+def test_an_exception_of_omegaconf_in_a_running_command_is_a_bug(type_line, jobs, monkeypatch):
+    monkeypatch.setattr("cadam3d.commands.train.run", lambda cfg: cfg.not_there)
+    with pytest.raises(ConfigAttributeError):
+        launch("train", ["prompt=a cube"])
+
+
+def test_a_reference_that_only_a_running_command_resolves_is_one_message(type_line, jobs, monkeypatch):
+    monkeypatch.setattr("cadam3d.commands.train.run", lambda cfg: cfg.seed)
+    assert type_line("train", "prompt=a cube", "seed=${oc.env:CADAM3D_NOT_SET}").message.startswith("seed: ")
+    assert not list(Path("outputs").rglob("*.yaml"))
 
 
 def test_flags_may_stand_anywhere():

@@ -104,7 +104,7 @@ NEVER_A_TRUTH = ("0", "1", "1.0", "null", "abc")
 
 @pytest.fixture(autouse=True)
 def as_users_run_it():
-    """Switch off the type checks of the test suite, which would refuse a wrong type before the component does."""
+    """Switch off the type checks of the suite, which would refuse a wrong type before the component does."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from cadam3d.commands import doctor_rasterizers
-from cadam3d.commands.finding import Finding, Verdict
 from cadam3d.commands.doctor_rasterizers import check_rasterizers
+from cadam3d.commands.finding import Finding, Verdict
 from cadam3d.core.errors import UserError
 from cadam3d.io.cache import default_cache_dir
 from cadam3d.rasterizer import auto, build, nvrtc

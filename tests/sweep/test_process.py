@@ -231,6 +231,26 @@ def test_a_file_system_without_locks_runs_jobs_too(sweep, monkeypatch):
     assert load(folder)[0].outcome == "finished"
 
 
+def test_a_machine_without_unix_locks_and_signals_can_import_all_of_it():
+    """Windows has none of them; there a lock is taken with msvcrt."""
+    code = (
+        "import multiprocessing, signal, subprocess, sys, tempfile, types, torch\n"
+        "for name in ('SIGUSR1', 'SIGUSR2', 'SIGKILL'): delattr(signal, name)\n"
+        "sys.modules['fcntl'] = None\n"
+        "locked = []\n"
+        "def locking(fd, mode, count):\n"
+        "    if mode == 1 and fd in locked: raise PermissionError\n"
+        "    (locked.append if mode == 1 else locked.remove)(fd)\n"
+        "sys.modules['msvcrt'] = types.SimpleNamespace(locking=locking, LK_NBLCK=1, LK_UNLCK=2)\n"
+        "import cadam3d.job, cadam3d.sweep.start, cadam3d.sweep.worker\n"
+        "from cadam3d.io.lock import try_lock, unlock\n"
+        "file = open(sys.argv[1], 'w')\n"
+        "assert [try_lock(file), try_lock(file), unlock(file), try_lock(file)] == [True, False, None, True]\n"
+    )
+    place = os.devnull
+    subprocess.run([PYTHON, "-c", code, place], check=True, cwd=REPOSITORY)
+
+
 def test_a_worker_ends_with_the_sweep_only_if_the_sweep_has_started_it(monkeypatch):
     """joblib starts workers like that. Slurm and Ray start theirs elsewhere, and these continue."""
     done = []
