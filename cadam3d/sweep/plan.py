@@ -113,6 +113,7 @@ class Composer:
     def __init__(self, options: Namespace, common: Sequence[str]) -> None:
         self._options, self._common = options, list(common)
         self._bases: dict[tuple[str, ...], Base] = {}
+        self._keys: dict[tuple[str, ...], list[str]] = {}  # settings and groups, by overrides
         self._leaves = set(self._base([]).plain)
 
     def compose(self, overrides: Sequence[str]) -> Composed:
@@ -134,9 +135,11 @@ class Composer:
 
     def has(self, overrides: Sequence[str], key: str) -> bool:
         """Return whether a job under ``overrides`` has a setting or a group called ``key``."""
-        base = self._base(overrides)
-        leaves = (*base.plain, *base.referring, *base.cfg.hydra.runtime.choices)
-        return any(f"{leaf}.".startswith(f"{key}.") for leaf in leaves)
+        arm = tuple(overrides)
+        if arm not in self._keys:
+            base = self._base(overrides)
+            self._keys[arm] = [*base.plain, *base.referring, *base.cfg.hydra.runtime.choices]
+        return any(f"{known}.".startswith(f"{key}.") for known in self._keys[arm])
 
     def _base(self, overrides: Sequence[str]) -> Base:
         return Base.of(compose_line("train", [*self._common, *overrides], self._options))

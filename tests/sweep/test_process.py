@@ -234,7 +234,7 @@ def test_a_file_system_without_locks_runs_jobs_too(sweep, monkeypatch):
 def test_a_machine_without_unix_locks_and_signals_can_import_all_of_it():
     """Windows has none of them; there a lock is taken with msvcrt."""
     code = (
-        "import multiprocessing, signal, subprocess, sys, tempfile, types, torch\n"
+        "import multiprocessing, signal, subprocess, sys, tempfile, types\n"
         "for name in ('SIGUSR1', 'SIGUSR2', 'SIGKILL'): delattr(signal, name)\n"
         "sys.modules['fcntl'] = None\n"
         "locked = []\n"

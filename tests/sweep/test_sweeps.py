@@ -112,14 +112,14 @@ def only_sweep() -> Path:
 # --- one row per job --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("command", "flags"),
-    [("sweep", ()), ("train", ("-m",)), ("train", ("--multirun",)), ("train", ("hydra.mode=MULTIRUN",))],
-)
-def test_a_sweep_leaves_one_row_per_job(command, flags, hydra_sweep):
-    result = hydra_sweep(
-        *flags, "prompt=a corgi, front view", "densifier=baseline,cadam", "seed=0,1", command=command
-    )
+@pytest.mark.parametrize("flag", ["-m", "--multirun", "hydra.mode=MULTIRUN"])
+def test_train_with_a_flag_is_a_sweep(flag, sweep):
+    assert sweep(flag, "prompt=a cube", "seed=0,1", command="train").code == 0
+    assert [row["seed"] for row in read_table(only_sweep())] == ["0", "1"]
+
+
+def test_a_sweep_leaves_one_row_per_job(hydra_sweep):
+    result = hydra_sweep("prompt=a corgi, front view", "densifier=baseline,cadam", "seed=0,1")
     assert result.code == 0, result.err
     rows = read_table(only_sweep())
     assert list(rows[0]) == [
@@ -599,6 +599,17 @@ def test_many_jobs_that_differ_in_values_are_composed_once(sweep, monkeypatch):
     found = plan.compose_all(*plan.read_sweep("sweep", line, read_flags([])))
     assert [job.get("seed") for job in found] == [seed for seed in range(30) for _ in range(2)]
     assert len(counted) == 3  # the sweep, what its plain values are, and one job
+
+
+def test_each_arm_is_composed_at_most_twice(sweep, monkeypatch):
+    """Once to see which settings it has, and once for its jobs."""
+    counted = []
+    original = plan.compose_line
+    monkeypatch.setattr(plan, "compose_line", lambda *args: counted.append(args) or original(*args))
+    line = ["prompt='a cube'", "seed=range(0,9)", "steps=7", "grid=densifiers"]
+    found = plan.compose_all(*plan.read_sweep("sweep", line, read_flags([])))
+    assert len(found) == 3 * 9
+    assert len(counted) == 2 + 2 * 3  # the first two: the sweep, and what its plain values are
 
 
 def test_the_plan_records_folder_flags_and_line(sweep, tmp_path):
