@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 # Called as: PROGRAM -m cadam3d.job PARENT train key=value ...
-# It writes how it was called into calls.jsonl beside the job folders, and does what prompt= says. "meets" lists
+# It appends how it was called to calls.jsonl beside the job folders and does what prompt= says. "meets" lists
 # the earlier calls for the same job that are still running.
 STAND_IN = r"""#!{python} -S
 import json, os, pathlib, signal, sys, time

@@ -191,7 +191,7 @@ def test_all_keys_in_which_jobs_may_differ_are_listed(pareto):
 
 
 @pytest.mark.parametrize(
-    ("node", "said"),
+    ("node", "expected"),
     [
         ({"densifier": "baseline,cadam"}, "grid: expected each, arms and figures, got densifier"),
         ([1], "grid: expected each, arms and figures"),
@@ -201,10 +201,10 @@ def test_all_keys_in_which_jobs_may_differ_are_listed(pareto):
         ({"each": {"seed": []}}, "grid.each: seed has no values"),
     ],
 )
-def test_an_invalid_grid_is_refused(node, said):
+def test_an_invalid_grid_is_refused(node, expected):
     with pytest.raises(UserError) as caught:
         read_grid(node)
-    assert str(caught.value).startswith(said)
+    assert str(caught.value).startswith(expected)
     assert "Try: " in str(caught.value)
 
 

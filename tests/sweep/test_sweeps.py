@@ -515,7 +515,7 @@ def test_after_a_failure_of_the_launcher_the_table_is_right(sweep, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "expected"),
     [
         (("densifier=cadam,cadm",), "got 'cadm'. Try: densifier=cadam"),
         (("seed=0,1", "densifier.tau_q=1"), "Did you mean densifier.tau_Q?"),
@@ -542,10 +542,10 @@ def test_after_a_failure_of_the_launcher_the_table_is_right(sweep, monkeypatch):
         (("steps=7",), "sweep: nothing to sweep over"),
     ],
 )
-def test_a_mistake_is_one_message_before_anything_runs(words, said, sweep):
+def test_a_mistake_is_one_message_before_anything_runs(words, expected, sweep):
     result = sweep("prompt=a cube", *words)
     assert result.code == 1
-    assert said in result.err
+    assert expected in result.err
     assert len(result.err.splitlines()) == 1
     assert not list(Path.cwd().iterdir())
 
@@ -672,8 +672,8 @@ def test_a_report_that_fails_is_a_message_and_the_sweep_keeps_its_exit_code(swee
 
 def test_the_terminal_shows_only_jobs_without_a_result_of_a_long_table(sweep, monkeypatch):
     monkeypatch.setattr(start, "LONGEST", 2)
-    said = sweep("prompt=a cube,a bug", "seed=0,1").out
-    table = said[said.index("\njob ") :]
+    out = sweep("prompt=a cube,a bug", "seed=0,1").out
+    table = out[out.index("\njob ") :]
     assert table.count("failed") > 1  # and once in the count below it
     assert "finished" not in table
     assert "\njob " not in sweep("prompt=a cube", "seed=0,1,2").out
