@@ -1,5 +1,7 @@
 """Kept: arrays that take long to compute and depend on this program only, in the cache folder of the user."""
 
+# pyright: reportArgumentType=false
+
 import hashlib
 import zipfile
 from collections.abc import Callable
@@ -26,7 +28,7 @@ def kept(kind: type[Arrays], name: str, make: Callable[[], Arrays]) -> Arrays:
     threads, because all of these may change the last bits. If the folder cannot be written, every process calls ``make``.
     """
     path = default_cache_dir() / "shapes" / f"{name}-{_identity()}.npz"
-    names = [field.name for field in fields(kind)]  # pyright: ignore[reportArgumentType]
+    names = [field.name for field in fields(kind)]
     try:
         with np.load(path) as file:
             tensors = {name: torch.from_numpy(file[name]) for name in names}
