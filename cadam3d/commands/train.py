@@ -27,6 +27,7 @@ from cadam3d.io.jsonl import read_jsonl, write_json
 from cadam3d.io.run_folder import ASSET, CHECKPOINTS, CONFIG, METRICS, PREVIEW, SUMMARY, TURNTABLE, shown
 from cadam3d.metric.base import Metric
 from cadam3d.rasterizer.base import Backend
+from cadam3d.report import write_report
 from cadam3d.settings.compose import component, components, flatten, load
 from cadam3d.state import Outcome, RunContext, TrainState
 from cadam3d.trainer import Trainer
@@ -93,10 +94,13 @@ def run(cfg: DictConfig) -> float | None:
         summary["warnings"] = warnings  # the last entry of a complete summary
         write_json(folder / SUMMARY, summary)
 
-        from cadam3d.report.run import write_report  # loads what training does not need
-
-        metrics_lines = read_jsonl(folder / METRICS)
-        report = write_report(folder, summary=summary, metrics=metrics_lines, config_text=config_text)
+        report = write_report(
+            folder,
+            summary=summary,
+            metrics=read_jsonl(folder / METRICS),
+            config_text=config_text,
+            charts=[*trainer.densifier.charts(), *trainer.guidance.charts()],
+        )
     print_result(folder, summary, report)
     if stop.received is not None:  # also if all steps were done already: the shell's loop must not go on
         sys.exit(128 + stop.received)
