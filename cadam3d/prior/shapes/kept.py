@@ -25,7 +25,8 @@ def kept(kind: type[Arrays], name: str, make: Callable[[], Arrays]) -> Arrays:
     """Return the result of ``make``, from the cache if an earlier process has put it there.
 
     A file belongs to one state of the sources, one version of torch, one instruction set and one number of
-    threads, because all of these may change the last bits. If the folder cannot be written, every process calls ``make``.
+    threads, because all of these may change the last bits. If the folder cannot be written, every process
+    calls ``make``.
     """
     path = default_cache_dir() / "shapes" / f"{name}-{_identity()}.npz"
     names = [field.name for field in fields(kind)]
