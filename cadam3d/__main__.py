@@ -1,4 +1,4 @@
-"""``python -m cadam3d`` is ``cadam3d``."""
+"""``python -m cadam3d`` does the same as ``cadam3d``."""
 
 from cadam3d.cli import main
 

@@ -4,7 +4,6 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 from jaxtyping import Float
-from kornia.losses import total_variation
 from torch import Tensor
 
 from cadam3d.core.checks import require_range
@@ -105,6 +104,8 @@ class TotalVariation(Weighted):
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
         """Return the mean over views, channels and directions, per pixel."""
+        from kornia.losses import total_variation  # slow to import, and rarely used
+
         images = output.rgb.permute(0, 3, 1, 2)
         return total_variation(images, reduction="mean").mean()
 

@@ -1,25 +1,35 @@
-"""The house rules that can be read off the source: imports point down, Hydra stays upstairs."""
+"""The rules of the house that can be read off the source: floors, circles, and where Hydra may appear.
+
+``docs/architecture.md`` explains the floors. Imports inside functions count like those at the top of a file.
+"""
 
 import ast
+import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
 
+from cadam3d.io import run_folder
+
 PACKAGE = Path(__file__).parent.parent / "cadam3d"
-TOP = ("cli", "launch", "settings", "sweep", "commands", "report", "__main__")
-FLOORS = {  # part of cadam3d -> floor; parts of one floor may meet only as MAY_MEET says
+FLOORS = {  # part of cadam3d -> floor; parts of one floor import each other only as SIDEWAYS says
+    "": -1.0,  # cadam3d itself: the version
     **dict.fromkeys(("core",), 0.0),
     **dict.fromkeys(("io",), 0.5),  # core, then io
     **dict.fromkeys(("camera", "background", "initializer", "rasterizer", "prior", "densifier"), 1.0),
     **dict.fromkeys(("augmentation", "optimizer", "exposure", "regularizer", "exporter", "metric"), 1.0),
     **dict.fromkeys(("state", "callback", "guidance"), 2.0),
     **dict.fromkeys(("trainer",), 3.0),
-    **dict.fromkeys(TOP, 4.0),
-    "": -1.0,  # cadam3d itself: the version
+    **dict.fromkeys(("settings",), 4.0),
+    **dict.fromkeys(("sweep",), 5.0),
+    **dict.fromkeys(("report",), 6.0),
+    **dict.fromkeys(("commands", "launch"), 7.0),
+    **dict.fromkeys(("cli", "__main__", "job"), 8.0),
 }
-MAY_MEET = {("callback", "state"), *((one, other) for one in TOP for other in TOP)}
+HYDRA_FLOOR = 4.0  # the lowest one that may import Hydra and OmegaConf
+SIDEWAYS = {("callback", "state"), ("launch", "commands"), ("__main__", "cli"), ("job", "cli")}
 # What the floors above may see of a floor-1 package: interfaces, and what is shared by all variants.
 OPEN_BELOW = {"prior": ("base", "path"), "densifier": ("base", "refine")}
 
@@ -33,9 +43,9 @@ def part_of(path: Path) -> str:
     return "" if relative.parts == ("__init__",) else relative.parts[0]
 
 
-def imports(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Module and names of every import in a file, lazy ones included; relative imports made absolute."""
-    package = ["cadam3d", *path.relative_to(PACKAGE).parts[:-1]]
+def imports(path: Path, root: Path = PACKAGE) -> Iterator[tuple[str, list[str]]]:
+    """Yield module and names of every import in a file, with relative imports made absolute."""
+    package = [root.name, *path.relative_to(root).parts[:-1]]
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from ((alias.name, []) for alias in node.names)
@@ -45,7 +55,7 @@ def imports(path: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 def own_imports(path: Path) -> Iterator[tuple[str, ...]]:
-    """The parts after ``cadam3d`` of every import of our own, such as ``("prior", "base")``."""
+    """Yield the parts after ``cadam3d`` of every import of our own, such as ``("prior", "base")``."""
     for module, names in imports(path):
         head, *rest = module.split(".")
         if head != "cadam3d":
@@ -58,9 +68,10 @@ def own_imports(path: Path) -> Iterator[tuple[str, ...]]:
 
 
 def arrow_problem(importer: str, target: tuple[str, ...]) -> str | None:
+    """Return what is wrong with an import of ``target`` in a part of the package; None if it points down."""
     imported = target[0]
     here, there = FLOORS[importer], FLOORS[imported]
-    if importer == imported or (importer, imported) in MAY_MEET:
+    if importer == imported or (importer, imported) in SIDEWAYS:
         return None
     if there >= here:
         return f"{importer} (floor {here:g}) must not import {'.'.join(target)} (floor {there:g})"
@@ -72,6 +83,43 @@ def arrow_problem(importer: str, target: tuple[str, ...]) -> str | None:
     ):
         return f"{importer} must see only the interface of {imported}, not {'.'.join(target)}"
     return None
+
+
+def import_graph(package: Path) -> dict[str, set[str]]:
+    """Return for each file of a package the files of it that it imports, as dotted names."""
+    files = {
+        ".".join([package.name, *path.relative_to(package).with_suffix("").parts]).removesuffix(
+            ".__init__"
+        ): path
+        for path in package.rglob("*.py")
+    }
+    graph: dict[str, set[str]] = {}
+    for name, path in files.items():
+        found = set()
+        for module, names in imports(path, package):
+            modules = {f"{module}.{each}" for each in names if f"{module}.{each}" in files} or {module}
+            found |= modules & files.keys()
+        graph[name] = found - {name}
+    return graph
+
+
+def circles(graph: Mapping[str, Iterable[str]]) -> list[list[str]]:
+    """Return the groups of nodes that reach each other (the strongly connected components of two or more)."""
+    reach = {node: reachable(graph, node) for node in graph}
+    groups = {frozenset(other for other in reach[node] if node in reach[other]) for node in graph}
+    return sorted(sorted(group) for group in groups if group)
+
+
+def reachable(graph: Mapping[str, Iterable[str]], start: str) -> set[str]:
+    """Return the nodes that paths of at least one step lead to."""
+    found: set[str] = set()
+    ahead = list(graph[start])
+    while ahead:
+        node = ahead.pop()
+        if node not in found:
+            found.add(node)
+            ahead.extend(graph[node])
+    return found
 
 
 @pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
@@ -94,9 +142,17 @@ def test_imports_point_down(path):
         ("io", ("trainer",)),
         ("state", ("callback", "base")),
         ("camera", ("settings",)),
+        ("settings", ("sweep", "folder")),
+        ("sweep", ("report",)),
+        ("sweep", ("launch",)),
+        ("sweep", ("commands", "train")),
+        ("sweep", ("cli",)),
+        ("report", ("commands", "asset")),
+        ("commands", ("launch",)),
+        ("launch", ("cli",)),
     ],
 )
-def test_a_wrong_arrow_is_noticed(importer, target):
+def test_an_upward_or_sideways_import_is_noticed(importer, target):
     assert arrow_problem(importer, target) is not None
 
 
@@ -108,21 +164,55 @@ def test_a_wrong_arrow_is_noticed(importer, target):
         ("trainer", ("densifier", "base")),
         ("callback", ("state",)),
         ("commands", ("prior", "shapes")),
+        ("sweep", ("settings", "line")),
+        ("report", ("sweep", "folder")),
+        ("launch", ("sweep", "plan")),
     ],
 )
-def test_a_right_arrow_is_allowed(importer, target):
+def test_a_downward_import_is_allowed(importer, target):
     assert arrow_problem(importer, target) is None
 
 
-def test_hydra_lives_on_the_top_floor_only():
-    guilty = {
-        str(path.relative_to(PACKAGE))
-        for path in sources()
-        if part_of(path) not in TOP
-        for module, _ in imports(path)
-        if module.split(".")[0] in ("hydra", "omegaconf")
-    }
-    assert not guilty
+def test_no_files_import_each_other_in_a_circle():
+    assert not circles(import_graph(PACKAGE))
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        {"a": "import {p}.b", "b": "from {p} import a"},
+        {"a": "from {p}.b import x", "b": "def run():\n    from {p}.a import y"},
+        {"a": "from . import b", "b": "from {p} import c", "c": "from .a import x"},
+        {
+            "a": "import {p}.part",
+            "part/__init__": "from {p}.part.b import x",
+            "part/b": "from {p}.a import y",
+        },
+    ],
+)
+def test_a_planted_circle_is_noticed(lines, tmp_path):
+    package = tmp_path / "planted"
+    for name, text in {"__init__": "", "alone": "import {p}.a", **lines}.items():
+        path = package / f"{name}.py"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text.format(p="planted"), encoding="utf-8")
+    [circle] = circles(import_graph(package))
+    assert circle == sorted(f"planted.{name}".replace("/", ".").removesuffix(".__init__") for name in lines)
+
+
+def test_hydra_is_imported_on_the_upper_floors_only():
+    assert not [path for path in sources() if FLOORS[part_of(path)] < HYDRA_FLOOR and imports_hydra(path)]
+
+
+def test_an_import_of_hydra_is_noticed(tmp_path):
+    for line in ("import hydra", "from omegaconf.errors import OmegaConfBaseException"):
+        path = tmp_path / "planted.py"
+        path.write_text(f"def run():\n    {line}\n", encoding="utf-8")
+        assert imports_hydra(path, tmp_path)
+
+
+def imports_hydra(path: Path, package: Path = PACKAGE) -> bool:
+    return any(module.split(".")[0] in ("hydra", "omegaconf") for module, _ in imports(path, package))
 
 
 def test_core_knows_tensors_and_the_standard_library_only():
@@ -257,3 +347,20 @@ def test_components_are_not_told_apart_by_their_class():
                 asked = {name.id for name in ast.walk(node.args[1]) if isinstance(name, ast.Name)}
                 guilty += [f"{path.name}: {name}" for name in asked & set(interfaces)]
     assert not guilty
+
+
+FILE_NAMES = {
+    value
+    for name, value in vars(run_folder).items()
+    if name.isupper() and re.search(r"[./]", value) and value != run_folder.CHECKPOINT_PATTERN
+}
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_only_one_module_spells_the_names_of_files_in_a_run_folder(path):
+    """Folders such as ``images`` are left out: their names are ordinary words. So are texts for readers."""
+    if path == Path(run_folder.__file__):
+        return
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    spelled = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+    assert not spelled & FILE_NAMES

@@ -1,5 +1,6 @@
-"""What a user types and what comes back: commands, courtesies, errors, sweeps, resume and completion."""
+"""The command line: commands, quoting, hints, error messages, sweeps, resuming and completion."""
 
+import ast
 import json
 import os
 import random
@@ -13,14 +14,19 @@ from pathlib import Path
 
 import pytest
 import yaml
+from hydra._internal.hydra import Hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
+from omegaconf.errors import ConfigAttributeError
 
-from cadam3d import cli, launch
+from cadam3d import cli
 from cadam3d.core.errors import UserError
-from cadam3d.settings import advice
+from cadam3d.io.run_folder import OVERRIDES, claim
+from cadam3d.launch import launch
+from cadam3d.settings import advice, hydra
 from cadam3d.settings import compose as settings
+from cadam3d.settings.line import PATH_KEYS, quoted, resumed, split, text_of
 
 REPOSITORY = Path(__file__).parent.parent
 DENSIFIERS = sorted(path.stem for path in (settings.config_dir() / "densifier").glob("*.yaml"))
@@ -57,7 +63,7 @@ class Result:
 
     @property
     def message(self) -> str:
-        """The one line of an error."""
+        """The single line of an error."""
         lines = self.err.strip().splitlines()
         assert len(lines) == 1, self.err
         assert lines[0].startswith("cadam3d: ")
@@ -107,8 +113,8 @@ def small_configs(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def jobs(monkeypatch, small_configs):
-    """Instead of training: note the configuration, fail on seeds 7 and 8, else leave a summary."""
-    for module in (settings, launch, advice):
+    """Replace training: record the configuration, fail on seeds 7 and 8, else write a summary."""
+    for module in (settings, hydra, advice):
         monkeypatch.setattr(module, "config_dir", lambda: small_configs)
     seen = []
 
@@ -181,22 +187,22 @@ def test_cfg_job_prints_the_settings_without_running(command, type_line):
 
 
 @pytest.mark.parametrize(("typed", "meant"), [("trian", "train"), ("EXPORT", "export"), ("docter", "doctor")])
-def test_an_unknown_command_is_answered_with_the_near_one(typed, meant, type_line):
+def test_the_answer_to_a_misspelt_command_is_the_right_one(typed, meant, type_line):
     result = type_line(typed, "prompt=a red cube")
     assert result.code == 1
     assert result.message.endswith(f"Try: cadam3d {meant} 'prompt=a red cube'")
 
 
-def test_a_bare_sentence_is_answered_with_the_line_it_wanted(type_line):
+def test_the_answer_to_a_bare_sentence_is_the_line_to_type(type_line):
     assert type_line("a red cube").message.endswith("Try: cadam3d train 'prompt=a red cube'")
     assert type_line("prompt=a cube").message.endswith("Try: cadam3d train 'prompt=a cube'")
 
 
-def test_a_word_like_nothing_else_gets_the_list_of_commands(type_line):
+def test_the_answer_to_any_other_word_is_the_list_of_commands(type_line):
     assert "|".join(cli.COMMANDS) in type_line("qqq").message
 
 
-# --- courtesy 1: prompts are text -----------------------------------------------------------------------
+# --- prompts are text -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("prompt", AWKWARD)
@@ -232,7 +238,7 @@ def test_a_prompt_that_is_quoted_already_is_left_alone(quoted, type_line, jobs):
     assert jobs[0][0].prompt == "a corgi, front view"
 
 
-def test_a_prompt_torn_apart_by_the_shell_is_given_back_whole(type_line):
+def test_the_words_of_an_unquoted_prompt_are_joined_in_the_message(type_line):
     assert type_line("train", "prompt=a", "red", "cube").message == (
         "'red': expected key=value. Try: cadam3d train prompt='a red cube'"
     )
@@ -250,7 +256,7 @@ def test_a_prompt_torn_apart_by_the_shell_is_given_back_whole(type_line):
     ],
 )
 def test_in_a_sweep_a_comma_without_a_blank_starts_the_next_prompt(value, prompts):
-    line = launch.quoted(f"prompt={value}", is_sweep=True)
+    line = quoted(f"prompt={value}", is_sweep=True)
     override = OverridesParser.create().parse_override(line)
     pieces = list(override.sweep_string_iterator()) if override.is_sweep_override() else [line[7:]]
     found = [OverridesParser.create().parse_override(f"prompt={piece}").value() for piece in pieces]
@@ -263,12 +269,12 @@ def test_a_path_with_brackets_and_commas_is_quoted_too(type_line, jobs, tmp_path
     assert jobs[0][1] == folder
 
 
-@pytest.mark.parametrize("key", launch.PATH_KEYS)
+@pytest.mark.parametrize("key", PATH_KEYS)
 def test_a_path_below_the_home_folder_is_text(key):
     for text in ("~/x", "~", "a~b/my mesh (1).ply"):
-        line = launch.quoted(f"{key}={text}", is_sweep=False)
+        line = quoted(f"{key}={text}", is_sweep=False)
         assert OverridesParser.create().parse_override(line).value() == text
-        assert launch._text(line) == text
+        assert text_of(line) == text
 
 
 def test_a_run_below_the_home_folder_is_written_and_resumed_there(type_line, jobs, tmp_path, monkeypatch):
@@ -278,7 +284,7 @@ def test_a_run_below_the_home_folder_is_written_and_resumed_there(type_line, job
     assert [folder for _, folder in jobs] == [tmp_path / "home/x"] * 2
 
 
-# --- courtesy 2: what is missing is asked for before any work -------------------------------------------
+# --- missing values are asked for before any work -------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -287,21 +293,24 @@ def test_a_run_below_the_home_folder_is_written_and_resumed_there(type_line, job
 def test_a_missing_prompt_is_refused_before_anything_happens(words, type_line, jobs, tmp_path):
     result = type_line(*words)
     assert result.code == 1
-    assert (
-        result.message
-        == 'prompt: no value given. Try: cadam3d train prompt="a red and yellow checkered torus"'
+    kept = " ".join(words)
+    assert result.message == (
+        f'prompt: no value given. Try: cadam3d {kept} prompt="a red and yellow checkered torus"'
     )
     assert not jobs
     assert not list(tmp_path.iterdir())
 
 
-def test_any_other_missing_value_is_asked_for_too(type_line, tmp_path):
-    message = type_line("train", "prompt=a cube", "initializer=mesh").message
-    assert message == "initializer.path: no value given. Try: cadam3d train initializer.path=..."
+def test_any_other_missing_value_is_asked_for_with_the_rest_of_the_line(type_line, tmp_path):
+    message = type_line("train", "prompt=a cube", "initializer=mesh", "steps=5").message
+    assert message == (
+        "initializer.path: no value given. "
+        "Try: cadam3d train 'prompt=a cube' initializer=mesh steps=5 initializer.path=..."
+    )
     assert not list(tmp_path.iterdir())
 
 
-def test_a_component_from_a_folder_of_the_users_own_is_found(type_line, jobs, tmp_path):
+def test_a_component_from_a_folder_of_the_user_is_found(type_line, jobs, tmp_path):
     own = tmp_path / "my configs, (1)/densifier"
     own.mkdir(parents=True)
     (own / "mine.yaml").write_text("_target_: mypackage.Mine\n", encoding="utf-8")
@@ -310,12 +319,13 @@ def test_a_component_from_a_folder_of_the_users_own_is_found(type_line, jobs, tm
 
 
 def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, tmp_path):
-    assert type_line("sweep", "grid=densifiers").message.endswith('torus" grid=thresholds')
+    message = type_line("sweep", "grid=densifiers").message
+    assert message.endswith('Try: cadam3d sweep grid=densifiers prompt="a red and yellow checkered torus"')
     assert type_line("sweep", "prompt=a cube").message.startswith("sweep: nothing to sweep over. Try: ")
     assert not list(tmp_path.iterdir())
 
 
-# --- courtesy 3: did you mean ---------------------------------------------------------------------------
+# --- did you mean ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -338,7 +348,7 @@ def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, 
         ("callback=[metrics,progres]", "got 'progres'. Try: callback=progress"),
         ("experiment=smok", "Try: experiment=smoke"),
         ("steps=1,2", "steps: several values make a sweep. Try: cadam3d sweep steps=1,2"),
-        ("~steps", "~steps: a setting can be changed, not taken away. Try: "),
+        ("~steps", "~steps: a setting can be changed but not removed. Try: "),
         ("~densifier", "~densifier: a setting can be changed"),
         ("densifier=null", f"expected one of {'|'.join(DENSIFIERS)}, got null. Try: densifier=none"),
         ("camera=null", "camera: expected one of "),
@@ -375,13 +385,13 @@ def test_a_mistake_gets_one_message_that_says_what_to_type(line, ending, type_li
         (("-sc", "foo=bash"), 'Try: eval "$(cadam3d -sc install=bash)"'),
     ],
 )
-def test_flags_and_other_commands_have_manners_too(words, ending, type_line):
+def test_wrong_flags_and_other_commands_get_one_message_too(words, ending, type_line):
     result = type_line(*words)
     assert result.code == 1
     assert ending in result.message
 
 
-def test_the_traceback_is_there_for_those_who_ask(monkeypatch, tmp_path):
+def test_the_traceback_is_there_with_hydra_full_error(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.setattr(sys, "argv", ["cadam3d", "train", "densifer=cadam"])
@@ -428,9 +438,7 @@ def test_a_refused_line_leaves_no_folder_behind(place, type_line, jobs, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-def test_a_refused_line_removes_neither_what_was_there_nor_what_was_made(
-    type_line, jobs, tmp_path, monkeypatch
-):
+def test_a_refused_line_removes_neither_older_nor_new_files(type_line, jobs, tmp_path, monkeypatch):
     (tmp_path / "mine").mkdir()
     assert type_line("train", "prompt=a cube", "seed=7", "hydra.run.dir=mine/deep/er").code == 1
     assert type_line("train", "prompt=a cube", "seed=7", "hydra.run.dir=mine").code == 1
@@ -447,9 +455,9 @@ def test_a_refused_line_removes_neither_what_was_there_nor_what_was_made(
 
 
 def test_two_runs_in_one_second_do_not_share_a_folder(tmp_path):
-    claims = [launch.claim(tmp_path / "10-00-00_cube", "hydra.run.dir", is_chosen=False) for _ in range(3)]
+    claims = [claim(tmp_path / "10-00-00_cube", "hydra.run.dir", is_chosen=False) for _ in range(3)]
     assert [folder.name for folder in claims] == ["10-00-00_cube", "10-00-00_cube-2", "10-00-00_cube-3"]
-    assert launch.claim(claims[0], "hydra.run.dir", is_chosen=True) == claims[0]
+    assert claim(claims[0], "hydra.run.dir", is_chosen=True) == claims[0]
 
 
 @pytest.mark.parametrize(
@@ -475,7 +483,7 @@ def run_folder(type_line, jobs) -> Path:
     return folder
 
 
-def test_resume_needs_no_prompt_and_keeps_what_the_run_was_started_with(run_folder, type_line, jobs):
+def test_resume_needs_no_prompt_and_keeps_the_settings_of_the_run(run_folder, type_line, jobs):
     assert type_line("train", f"resume={run_folder}").code == 0
     [(cfg, folder)] = jobs
     assert (cfg.prompt, cfg.steps, cfg.seed) == ("a car, (red)", 10, 3)
@@ -484,7 +492,7 @@ def test_resume_needs_no_prompt_and_keeps_what_the_run_was_started_with(run_fold
     assert Path(cfg.resume) == run_folder
 
 
-def test_what_the_line_says_anew_wins_and_sticks(run_folder, type_line, jobs):
+def test_settings_in_the_line_win_and_are_kept(run_folder, type_line, jobs):
     type_line("train", f"resume={run_folder}", "steps=20", "densifier=cadam")
     type_line("train", f"resume={run_folder}", "seed=4")
     assert [(cfg.steps, cfg.seed) for cfg, _ in jobs] == [(20, 3), (20, 4)]
@@ -503,7 +511,7 @@ def test_resume_follows_a_link_and_takes_a_checkpoint_file(run_folder, type_line
 
 
 @pytest.mark.parametrize("place", ["nowhere", "."])
-def test_resume_from_what_is_no_run_is_refused(place, type_line, jobs):
+def test_resuming_from_a_folder_without_a_run_is_refused(place, type_line, jobs):
     message = type_line("train", f"resume={place}").message
     assert "expected the folder of a run" in message
     assert not jobs
@@ -536,14 +544,14 @@ def test_a_refused_resume_leaves_the_run_as_it_was(run_folder, type_line, jobs):
         (["+a.b=5"], ["a.b=6"], ["+a.b=6"]),
     ],
 )
-def test_taking_a_key_away_and_giving_it_anew_both_survive_a_resume(before, anew, after, tmp_path):
+def test_removed_and_added_keys_survive_a_resume(before, anew, after, tmp_path):
     (tmp_path / ".hydra").mkdir()
-    (tmp_path / launch.OVERRIDES).write_text(yaml.safe_dump(before), encoding="utf-8")
-    lines = launch.resumed([f"resume='{tmp_path}'", *anew], is_sweep=False)
+    (tmp_path / OVERRIDES).write_text(yaml.safe_dump(before), encoding="utf-8")
+    lines = resumed([f"resume='{tmp_path}'", *anew], is_sweep=False)
     assert [line for line in lines if not line.startswith(("resume=", "hydra.run.dir="))] == after
 
 
-# --- courtesy 4: completion -----------------------------------------------------------------------------
+# --- completion -----------------------------------------------------------------------------------------
 
 
 def complete(line: str, type_line, monkeypatch, shell: str = "bash") -> list[str]:
@@ -601,7 +609,7 @@ def test_bash_completes_the_command_word(tmp_path):
 
 
 def test_ctrl_c_is_one_line_and_130(tmp_path):
-    """The signal comes while Python imports: no command has taken charge of signals yet."""
+    """The signal arrives before the command has installed handlers."""
     code = (
         "import signal, sys, time, types\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a suite in the background ignores it
@@ -630,7 +638,7 @@ def test_ctrl_c_is_one_line_and_130(tmp_path):
     assert err.strip() == "cadam3d: interrupted"
 
 
-@pytest.mark.parametrize("function", ["compose", "hydra.main"])
+@pytest.mark.parametrize("function", ["compose_line", "run_composed"])
 def test_ctrl_c_that_another_exception_hides_is_still_ctrl_c(function, type_line, monkeypatch, jobs):
     def hide(*args, **kwargs):
         try:
@@ -643,6 +651,54 @@ def test_ctrl_c_that_another_exception_hides_is_still_ctrl_c(function, type_line
     assert (result.code, result.message) == (130, "interrupted")
 
 
+def test_a_run_composes_its_settings_once(type_line, jobs, monkeypatch):
+    composed = []
+    original = Hydra.compose_config
+    monkeypatch.setattr(
+        Hydra, "compose_config", lambda *args, **kwargs: composed.append(args) or original(*args, **kwargs)
+    )
+    assert type_line("train", "prompt=a cube", "steps=5").code == 0
+    assert len(composed) == 1
+    assert type_line("train", "resume=" + str(jobs[0][1])).code == 0
+    assert len(composed) == 2
+
+
+def test_the_notes_of_hydra_about_a_run_are_complete(type_line, jobs):
+    type_line("train", "prompt=a cube", "steps=5", "hydra.run.dir=here")
+    notes = yaml.safe_load(Path("here/.hydra/hydra.yaml").read_text())["hydra"]
+    assert notes["overrides"] == {
+        "hydra": ["hydra.run.dir='here'", "hydra.mode=RUN"],
+        "task": ["prompt='a cube'", "steps=5"],
+    }
+    assert notes["mode"] == "RUN"
+    assert notes["runtime"]["output_dir"] == str(Path("here").resolve())
+    assert notes["runtime"]["choices"]["densifier"] == "cadam"
+
+
+def test_exceptions_of_hydra_are_explained_at_one_place_only():
+    calls = [
+        f"{path.relative_to(REPOSITORY)}:{node.lineno}"
+        for path in (REPOSITORY / "cadam3d").rglob("*.py")
+        if path.name != "advice.py"  # where it calls itself for the cause of an exception
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "explain"
+    ]
+    assert len(calls) == 1
+    assert calls[0].startswith("cadam3d/launch.py:")
+
+
+def test_an_exception_of_omegaconf_in_a_running_command_is_a_bug(type_line, jobs, monkeypatch):
+    monkeypatch.setattr("cadam3d.commands.train.run", lambda cfg: cfg.not_there)
+    with pytest.raises(ConfigAttributeError):
+        launch("train", ["prompt=a cube"])
+
+
+def test_a_reference_that_only_a_running_command_resolves_is_one_message(type_line, jobs, monkeypatch):
+    monkeypatch.setattr("cadam3d.commands.train.run", lambda cfg: cfg.seed)
+    assert type_line("train", "prompt=a cube", "seed=${oc.env:CADAM3D_NOT_SET}").message.startswith("seed: ")
+    assert not list(Path("outputs").rglob("*.yaml"))
+
+
 def test_flags_may_stand_anywhere():
     words = ["a=1", "-m", "b=2", "--cfg", "job", "c=3"]
-    assert launch.split(words) == (["a=1", "b=2", "c=3"], ["-m", "--cfg", "job"])
+    assert split(words) == (["a=1", "b=2", "c=3"], ["-m", "--cfg", "job"])

@@ -19,9 +19,9 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d import cli, regularizer
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json, read_jsonl
-from cadam3d.launch import _read_flags
 from cadam3d.settings import advice
 from cadam3d.settings.compose import component, components, compose, config_dir, flatten, quote
+from cadam3d.settings.hydra import read_flags
 from cadam3d.sweep import plan
 from cadam3d.sweep.plan import compose_all, read_sweep
 
@@ -40,7 +40,7 @@ EXPERIMENTS = sorted(
     for path in (CONFIGS / "experiment").rglob("*.yaml")
 )
 PROMPT = "prompt=a red cube"
-NO_FLAGS = _read_flags([])
+NO_FLAGS = read_flags([])
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,4 +1,4 @@
-"""A value of the wrong type is a message that names its key, whichever component it is meant for."""
+"""A value of the wrong type gets a message that names its key, in every component."""
 
 from functools import cache
 
@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import component, compose
 
-WHOLE = {  # what to choose, and the keys that count something
+WHOLE = {  # an option, and its keys that count something
     "camera=orbit": ["camera.size"],
     "camera=sphere": ["camera.size"],
     "camera=multiview": ["camera.size"],
@@ -104,7 +104,7 @@ NEVER_A_TRUTH = ("0", "1", "1.0", "null", "abc")
 
 @pytest.fixture(autouse=True)
 def as_users_run_it():
-    """Without the type checks of the test suite, which would refuse a wrong type before the component can."""
+    """Switch off the type checks of the suite, which would refuse a wrong type before the component does."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
@@ -117,7 +117,7 @@ def composed(choice: str) -> DictConfig:
 
 
 def build(choice: str, *lines: str):
-    """The component that ``choice`` chooses, with ``lines`` of YAML values on top."""
+    """Build the component of ``choice``, with ``lines`` of YAML values on top."""
     group, _, name = choice.partition("=")
     cfg = composed(choice).copy()
     for line in lines:
@@ -149,7 +149,7 @@ def test_what_is_counted_is_a_whole_number(choice, key):
 
 
 @pytest.mark.parametrize(("choice", "key"), pairs(LISTS))
-def test_a_list_of_numbers_is_nothing_else(choice, key):
+def test_a_list_of_numbers_holds_only_numbers(choice, key):
     for value in NEVER_A_LIST:
         refuses(choice, f"{key}={value}")
 
@@ -167,14 +167,14 @@ def test_a_range_that_widens_has_a_start_an_end_and_a_factor(value):
         refuses("camera=progressive", f"camera.elevation_deg.about={value}")
 
 
-def test_a_name_is_no_initializer_to_fall_back_on():
+def test_a_name_is_refused_as_a_fallback_initializer():
     with pytest.raises(
         UserError, match=r"^initializer\.fallback: expected .* Try: initializer/fallback=ball$"
     ):
         build("initializer=shap_e", "initializer.fallback=ball")
 
 
-def test_a_truth_value_bounds_nothing():
+def test_a_truth_value_is_refused_as_a_bound():
     refuses("guidance=sds", "guidance.clip=true")
     refuses("guidance=sds", "guidance.clip=abc")
 

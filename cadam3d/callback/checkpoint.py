@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 from cadam3d.callback.base import Callback
 from cadam3d.core.checks import require_whole
-from cadam3d.io.checkpoint import checkpoint_name, drop_after, prune_checkpoints, save_checkpoint
-from cadam3d.io.run_folder import CHECKPOINTS
+from cadam3d.io.checkpoint import drop_after, prune_checkpoints, save_checkpoint
+from cadam3d.io.run_folder import CHECKPOINTS, checkpoint_name
 from cadam3d.state import Outcome, RunContext, StepReport, TrainState
 
 

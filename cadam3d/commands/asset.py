@@ -1,4 +1,4 @@
-"""Opening what a run left behind: the shared first half of ``render``, ``export``, ``eval`` and ``view``."""
+"""Asset: open the results of a run, as ``render``, ``export``, ``eval`` and ``view`` do first."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,8 +8,7 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor
 
-from cadam3d.commands.notes import note_backend
-from cadam3d.commands.paths import shown
+from cadam3d.commands.messages import note_backend
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import UserError
 from cadam3d.core.device import resolve_device
@@ -17,25 +16,23 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.ply import read_ply
+from cadam3d.io.run_folder import ASSET, CONFIG, shown
 from cadam3d.rasterizer.base import Rasterizer, render_fn
 from cadam3d.settings.compose import component, components, load
 from cadam3d.sweep.folder import is_sweep
 
-ASSET = "asset.ply"
-CONFIG = "config.yaml"
-
 
 @dataclass(frozen=True)
 class Asset:
-    """Gaussians from disk, on the device asked for, and where they lay."""
+    """Gaussians from a file, on the requested device."""
 
     gaussians: Gaussians
-    ply: Path  # the file they came from
+    ply: Path  # the file
     folder: Path  # of the run; for a bare file, a folder named after it
 
 
 def open_asset(cfg: DictConfig) -> Asset:
-    """The asset that ``run=`` or ``ply=`` names, exactly one of which must be given."""
+    """Return the asset that ``run=`` or ``ply=`` names; exactly one of them must be given."""
     if (cfg.run is None) == (cfg.ply is None):
         got = "neither" if cfg.run is None else "both"
         raise UserError(f"run, ply: expected one of them, got {got}. Try: run=outputs/latest")
@@ -47,7 +44,7 @@ def open_asset(cfg: DictConfig) -> Asset:
 
 
 def open_run(folder: Path, device: str) -> Asset:
-    """The asset of the run in ``folder``."""
+    """Return the asset of the run in ``folder``."""
     ply = folder / ASSET
     if not ply.is_file():
         raise UserError(f"{shown(folder)}: has no {ASSET} yet. Try: cadam3d train resume={shown(folder)}")
@@ -55,26 +52,26 @@ def open_run(folder: Path, device: str) -> Asset:
 
 
 def find_run(text: str) -> Path:
-    """The folder of the run called ``text``."""
+    """Return the folder of the run that ``text`` names. Raises ``UserError`` if it does not hold a run."""
     folder = Path(text).expanduser().resolve()
     if (folder / CONFIG).is_file():
         return folder
     if not folder.is_dir():
         reason = "no such folder"
     elif is_sweep(folder):
-        reason = f"a sweep, which holds many runs; one of them is {_any_job(folder)}"
+        reason = f"a sweep, which has many runs; one of them is {_any_job(folder)}"
     else:
-        reason = f"it holds no {CONFIG}"
+        reason = f"it has no {CONFIG}"
     raise UserError(f"run: expected the folder of a run, got {text!r} ({reason}). Try: run=outputs/latest")
 
 
 def run_config(folder: Path) -> DictConfig:
-    """What the run in ``folder`` was configured with."""
+    """Return the settings of the run in ``folder``."""
     return load(folder / CONFIG)
 
 
 def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
-    """Renders ``gaussians`` with the rasterizer that the configuration names, prepared when first used."""
+    """Return a function that renders ``gaussians`` and prepares the configured rasterizer at first use."""
     built: Rasterizer = component(rasterizer)
     render = render_fn(built, lambda: gaussians)
 
@@ -86,7 +83,7 @@ def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
 
 
 def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
-    """Let every exporter of ``cfg`` write ``asset`` into ``folder``; returns what they wrote."""
+    """Let every exporter of ``cfg`` write ``asset`` into ``folder``; return the paths of the files."""
     exporters: Sequence[Exporter] = list(components(cfg.exporter).values())
     if not exporters:
         raise UserError("exporter: expected at least one, got none. Try: exporter=[images,turntable]")
@@ -99,5 +96,11 @@ def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
     return [path for exporter in exporters for path in exporter.export(asset.gaussians, render, folder)]
 
 
+def output_folder(cfg: DictConfig, asset: Asset, name: str) -> Path:
+    """Return the folder that ``output=`` names, by default ``name`` beside the asset."""
+    return Path(cfg.output).expanduser() if cfg.output else asset.folder / name
+
+
 def _any_job(sweep: Path) -> str:
+    """Return the name of a job of the sweep that has started."""
     return next((job.parent.name for job in sorted(sweep.glob(f"*/{CONFIG}"))), "not finished")

@@ -1,4 +1,4 @@
-"""``cadam3d doctor``: what this machine has, and what to type about each thing that it lacks."""
+"""``cadam3d doctor``: check this machine, and print what to type if something is missing or broken."""
 
 import json
 import os
@@ -23,11 +23,11 @@ from cadam3d.settings.compose import component, compose, config_dir
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "imageio", "imageio-ffmpeg", "jaxtyping", "kornia")
 PACKAGES += ("matplotlib", "pillow", "pyyaml", "scipy", "tqdm", "trimesh")
 IMPORT_NAMES = {"hydra-core": "hydra", "imageio-ffmpeg": "imageio_ffmpeg", "pillow": "PIL", "pyyaml": "yaml"}
-COMPILERS = {  # and what to say where there is none
+COMPILERS = {  # and the message if it is missing
     **dict.fromkeys(("c++", "g++", "clang++"), "not found; one C++ compiler is enough"),
     "nvcc": "not found, not needed",
 }
-SECONDS = 60  # longest wait for a program that we ask for its version
+SECONDS = 60  # longest wait for a program to print its version
 
 
 def run(cfg: DictConfig) -> None:
@@ -47,7 +47,7 @@ def run(cfg: DictConfig) -> None:
 
 
 def examine() -> Iterator[Finding]:
-    """Look at everything; no check may stop the ones after it."""
+    """Run all checks. A check that fails does not stop the following ones."""
     yield _python()
     yield from map(_package, PACKAGES)
     for check in (_torchvision, _device, _ffmpeg, _configs):
@@ -59,7 +59,7 @@ def examine() -> Iterator[Finding]:
 
 
 def _guarded(check: Callable[[], Finding]) -> Finding:
-    """A check that itself fails has found something broken."""
+    """Run a check. If it raises an exception, that is what is broken."""
     try:
         return check()
     except Exception as error:
@@ -75,7 +75,7 @@ def _python() -> Finding:
     if (3, 11) <= sys.version_info[:2] <= (3, 13):
         return Finding("python", Verdict.OK, found)
     return Finding(
-        "python", Verdict.BROKEN, found, "Wanted 3.11 to 3.13. Try: make clean demo PYTHON=python3.12"
+        "python", Verdict.BROKEN, found, "Expected 3.11 to 3.13. Try: make clean demo PYTHON=python3.12"
     )
 
 
@@ -89,7 +89,7 @@ def _package(name: str) -> Finding:
 
 
 def _torchvision() -> Finding:
-    """One that does not fit torch breaks every package that uses it as soon as it sees it, diffusers too."""
+    """Check that torchvision fits torch: otherwise every package that imports it breaks, diffusers too."""
     try:
         version = metadata.version("torchvision")
     except metadata.PackageNotFoundError:
@@ -149,18 +149,18 @@ def _compiler(name: str) -> Finding:
     if code != 0:
         return Finding(name, Verdict.NOTE, f"{path} does not run")
     lines = output.strip().splitlines() or [path]
-    release = [line for line in lines if "release" in line]  # nvcc says it on its fourth line
+    release = [line for line in lines if "release" in line]  # of nvcc, on the fourth line
     return Finding(name, Verdict.OK, (release or lines)[0].strip())
 
 
 def _rasterizers() -> Iterator[Finding]:
     try:
-        from cadam3d.commands.proofs import prove_rasterizers
-    except Exception as error:  # such as a torch that does not load, which has its own line above
+        from cadam3d.commands.doctor_rasterizers import check_rasterizers
+    except Exception as error:  # such as a torch that cannot be imported, which has its own line above
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        yield Finding("rasterizers", Verdict.BROKEN, f"none can be loaded: {reason}")
+        yield Finding("rasterizers", Verdict.BROKEN, f"cannot be loaded: {reason}")
         return
-    yield from prove_rasterizers()
+    yield from check_rasterizers()
 
 
 def _priors() -> Iterator[Finding]:
@@ -186,7 +186,7 @@ def _diffusers() -> Finding:
 
 
 def _models() -> Finding:
-    """Models in the cache of the Hugging Face hub, and what reads them; nothing is loaded."""
+    """List the models in the cache of the Hugging Face hub and what reads them, without loading any."""
     home = Path(os.environ.get("HF_HOME") or Path("~/.cache/huggingface").expanduser())
     cache = Path(os.environ.get("HF_HUB_CACHE") or home / "hub")
     folders = sorted(cache.glob("models--*"))
@@ -196,7 +196,7 @@ def _models() -> Finding:
 
 
 def _model(folder: Path) -> str:
-    """The name of a cached model and, as far as its index says so, what to type to use it."""
+    """Return the name of a cached model and, if its index shows that, what to type to use it."""
     from cadam3d.initializer import shap_e
     from cadam3d.io.pretrained import INDEX
     from cadam3d.prior.latent import PRIORS
@@ -205,13 +205,13 @@ def _model(folder: Path) -> str:
     name = folder.name.removeprefix("models--").replace("--", "/")
     uses = set[str]()
     for index in folder.glob(f"snapshots/*/{INDEX}"):
-        with suppress(OSError, ValueError, LookupError, TypeError):  # of another kind, or cut short
+        with suppress(OSError, ValueError, LookupError, TypeError):  # of an unknown kind, or incomplete
             uses.add(readers[json.loads(index.read_text(encoding="utf-8"))["_class_name"]])
     return f"{name} ({', '.join(sorted(uses))})" if uses else name
 
 
 def _ask(command: list[str]) -> tuple[int, str]:
-    """Exit code and output of a program; 127 if it cannot be run or does not answer."""
+    """Return the exit code and output of a program; code 127 if it cannot be run or does not end in time."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:

@@ -1,4 +1,4 @@
-"""``cadam3d eval``: how good is a finished run, or every run of a sweep."""
+"""``cadam3d eval``: measure the quality of a finished run, or of every run of a sweep."""
 
 import sys
 from pathlib import Path
@@ -8,17 +8,15 @@ from omegaconf import DictConfig
 
 from cadam3d import report
 from cadam3d.commands.asset import find_run, open_run, renderer, run_config
-from cadam3d.commands.paths import shown
 from cadam3d.core.checks import UserError
 from cadam3d.io.jsonl import write_json
+from cadam3d.io.run_folder import EVALUATION, shown
 from cadam3d.settings.compose import component, components
 from cadam3d.sweep.folder import is_sweep, load
 
-RESULT = "eval.json"
-
 
 def run(cfg: DictConfig) -> None:
-    """Measure ``run=`` and write its ``eval.json``; for a sweep every job, one file of all and its report."""
+    """Measure ``run=`` and write its ``eval.json``; for a sweep, measure every job and write its report."""
     if cfg.run is None:
         raise UserError("run: expected a finished run or a sweep. Try: cadam3d eval run=outputs/latest")
     folder = Path(cfg.run).expanduser().resolve()
@@ -28,14 +26,14 @@ def run(cfg: DictConfig) -> None:
     result = evaluate(cfg, find_run(cfg.run))
     for name, value in result.items():
         print(f"{name:<20}{value:.4f}" if isinstance(value, float) else f"{name:<20}{value}")
-    print(f"\n{shown(folder / RESULT)}")
+    print(f"\n{shown(folder / EVALUATION)}")
 
 
 def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     """Measure the run in ``folder`` with the metrics of ``cfg``, and write its ``eval.json``.
 
-    The rasterizer and the prior are those of the run; the prior's true images, where it knows them, are what
-    ``psnr`` and ``ssim`` compare with. Without them those two do not exist, and a note says so.
+    The rasterizer and the prior are those of the run. ``psnr`` and ``ssim`` compare with the true images of
+    the prior. If the prior knows none, these two are left out, and a note says so.
     """
     source = run_config(folder)
     asset = open_run(folder, cfg.device)
@@ -45,10 +43,10 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     render = renderer(source.rasterizer, asset.gaussians)
     result: dict[str, Any] = {"run": str(shown(folder)), "prompt": source.prompt}
     for metric in components(cfg.metric).values():
-        result |= metric.measure(asset.gaussians, render, truth)
+        result |= metric.measure(asset.gaussians, render, truth, asset.ply)
     if truth is None:
         result["note"] = "this prior knows no true images, so there is no psnr and no ssim"
-    write_json(folder / RESULT, result)
+    write_json(folder / EVALUATION, result)
     return result
 
 
@@ -66,6 +64,8 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
         quality = "no psnr" if psnr is None else f"{psnr:6.2f} dB"
         print(f"{quality}  {results[-1].get('num_gaussians', '-'):>8} Gaussians  {job.name}")
     if failures == len(results):
-        raise UserError(f"run={cfg.run}: no job of this sweep could be measured. Try: cadam3d sweep again")
-    write_json(folder / RESULT, results)
-    print(f"\n{len(results)} jobs: {shown(folder / RESULT)}\nreport: {shown(report.write_sweep(folder))}")
+        raise UserError(
+            f"run={cfg.run}: no job of this sweep could be measured. Try: rerun the command of the sweep"
+        )
+    write_json(folder / EVALUATION, results)
+    print(f"\n{len(results)} jobs: {shown(folder / EVALUATION)}\nreport: {shown(report.write_sweep(folder))}")

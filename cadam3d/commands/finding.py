@@ -1,4 +1,4 @@
-"""One line of what ``cadam3d doctor`` reports."""
+"""Finding: one line of the report of ``cadam3d doctor``."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -8,26 +8,26 @@ from cadam3d.core.errors import UserError
 
 
 class Verdict(StrEnum):
-    """What a finding means for training."""
+    """The meaning of a finding for training."""
 
     OK = "ok"
-    NOTE = "note"  # absent, and not needed by default
+    NOTE = "note"  # not available, and not needed by default
     BROKEN = "broken"
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report."""
+    """One line of the report of ``cadam3d doctor``."""
 
     topic: str
     verdict: Verdict
     found: str
-    hint: str = ""  # what to type, unless all is well
-    facts: Mapping[str, object] = field(default_factory=dict)  # the same for programs, in JSON's types
+    hint: str = ""  # what to type; empty if nothing is wrong
+    facts: Mapping[str, object] = field(default_factory=dict)  # the same for programs, in types of JSON
 
 
 def attempt(topic: str, check: Callable[[], Finding]) -> Finding:
-    """What ``check`` finds. What is not available here is a note, and says why; any other error is a bug."""
+    """Return the finding of ``check``. What is not available here is a note; other errors are bugs."""
     try:
         return check()
     except (UserError, ImportError, OSError) as error:

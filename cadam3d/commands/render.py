@@ -1,17 +1,15 @@
-"""``cadam3d render``: pictures of an asset that was made before."""
-
-from pathlib import Path
+"""``cadam3d render``: pictures of an asset that exists."""
 
 from omegaconf import DictConfig
 
-from cadam3d.commands.asset import export_all, open_asset
-from cadam3d.commands.paths import shown
+from cadam3d.commands.asset import export_all, open_asset, output_folder
+from cadam3d.io.run_folder import shown
 
 
 def run(cfg: DictConfig) -> None:
     """Render what ``exporter`` asks for into ``output``, by default ``render/`` beside the asset."""
     asset = open_asset(cfg)
-    folder = Path(cfg.output).expanduser() if cfg.output else asset.folder / "render"
+    folder = output_folder(cfg, asset, "render")
     paths = export_all(cfg, asset, folder)
     print(f"{len(paths)} files of {len(asset.gaussians)} Gaussians in {shown(folder)}:")
     for path in paths:

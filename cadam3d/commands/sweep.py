@@ -1,20 +1,29 @@
-"""``cadam3d sweep``: one job of it, as the launcher that Hydra was given runs it, here or elsewhere.
+"""``cadam3d sweep``: many trainings, one table, and a report that compares them."""
 
-The sweep itself is prepared and watched in ``cadam3d.sweep.start``. A job that fails or dies is a row of the
-table, not the end of the sweep, so nothing is raised here for it.
-"""
-
+import sys
+from argparse import Namespace
+from collections.abc import Sequence
 from pathlib import Path
 
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from cadam3d import report
+from cadam3d.core.errors import UserError
+from cadam3d.io.run_folder import shown
+from cadam3d.sweep.start import start
 
-from cadam3d.sweep.process import run_job
-from cadam3d.sweep.table import write_table
+
+def run(command: str, overrides: Sequence[str], flags: Sequence[str], options: Namespace) -> int:
+    """Run the sweep of a line and report on it. Return 0 if every job has a result."""
+    ended = start(command, overrides, flags, options)
+    if not ended.was_stopped:
+        write_report(ended.folder)
+    return ended.code
 
 
-def run(cfg: DictConfig) -> None:
-    """Run job number ``cfg.job`` of the sweep and bring the table up to date."""
-    sweep = Path(HydraConfig.get().sweep.dir)
-    run_job(sweep, cfg.job)
-    write_table(sweep)
+def write_report(folder: Path) -> None:
+    """Write the report of the sweep in ``folder`` and print its verdict. A failure does not end the sweep."""
+    try:
+        page = report.write_sweep(folder)
+        print("".join(f"\n{sentence}\n" for sentence in report.verdict(folder)))
+        print(f"report: {shown(page)}", flush=True)
+    except UserError as error:
+        print(f"cadam3d: {error}", file=sys.stderr)

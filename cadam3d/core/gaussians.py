@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
-from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
+
+from cadam3d.core.rotation import rotation_matrices
 
 FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh")
 
@@ -47,7 +48,7 @@ class Gaussians:
         """Return rotation matrices from own axes to world axes; a zero quaternion gives the identity."""
         # Divide by the largest component first, because squares might leave the range of float32.
         largest = self.quats.detach().abs().amax(dim=-1, keepdim=True)
-        return quaternion_to_rotation_matrix(self.quats / largest.clamp_min(torch.finfo(largest.dtype).tiny))
+        return rotation_matrices(self.quats / largest.clamp_min(torch.finfo(largest.dtype).tiny))
 
     @property
     def device(self) -> torch.device:

@@ -21,7 +21,6 @@ any memory at least as long as that of beta2 = beta1^2. For large n it becomes s
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.special import betaincinv
 from torch import Tensor
 
 AXES = 3  # along which the noise is assumed to be equally strong
@@ -33,6 +32,8 @@ def snr_threshold(alpha: float, beta1: float, beta2: float, age: Int[Tensor, "n"
     Infinite below age 2, because a single gradient cannot show whether it is consistent. Waits for the
     device.
     """
+    from scipy.special import betaincinv  # takes a fifth of a second to import
+
     ages, rows = age.unique(return_inverse=True)
     grown = np.maximum(ages.cpu().numpy().astype(np.float64), 2)
     steps = 1 / squared_weights(beta2, grown)

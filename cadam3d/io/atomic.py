@@ -1,4 +1,4 @@
-"""Files appear whole or not at all: written beside their place, then moved there in one step."""
+"""Atomic writes: a file is written beside its place and moved there, so it appears whole or not at all."""
 
 import os
 from collections.abc import Iterator
@@ -12,15 +12,17 @@ TEMPORARY = ".tmp-"  # in the name of every file that is still being written
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path in the same folder, with the same suffix; it becomes ``path`` if the block succeeds.
+    """Yield a temporary path in the same folder, with the same suffix.
 
-    If the block raises, the temporary file is removed and the old ``path``, if any, is left as it was. A
-    full disk or a folder that cannot be written is a ``UserError``.
+    If the block succeeds, the temporary file becomes ``path``. If the block raises, the temporary file is
+    removed and an old ``path`` stays unchanged. Raises ``UserError`` if the disk is full or the folder cannot
+    be written.
     """
     temporary = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.touch()  # a folder that cannot be written says so here, not through a broken pipe of ffmpeg
+        # Find out now whether the folder can be written: ffmpeg would only report a broken pipe.
+        temporary.touch()
         yield temporary
         # Contents before name: after a power cut the new name must not point to an empty file.
         with temporary.open("rb+") as file:
@@ -32,11 +34,11 @@ def replacing(path: Path) -> Iterator[Path]:
             f"{path}: cannot be written ({reason}). Try another place: hydra.run.dir=DIR, or free some space"
         ) from error
     finally:
-        with suppress(OSError):  # nothing to remove, or no way to: the first error matters
+        with suppress(OSError):  # an earlier error is the one that matters
             temporary.unlink()
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what a killed process left half-written in ``folder``; only where there is a single writer."""
+    """Delete what a killed process left half-written in ``folder``, which must have a single writer."""
     for leftover in folder.glob(f"{TEMPORARY}*"):
         leftover.unlink(missing_ok=True)

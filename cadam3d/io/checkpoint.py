@@ -12,17 +12,17 @@ from torch import Tensor
 
 from cadam3d.core.checks import UserError
 from cadam3d.io.atomic import remove_leftovers, replacing
+from cadam3d.io.run_folder import CHECKPOINT_PATTERN, checkpoint_name
 
 FORMAT = "cadam3d-checkpoint"
 VERSION = 1  # raise it when old payloads can no longer be understood
-PATTERN = "step_*.pt"  # zero-padded step numbers: the newest file sorts last
 
 
 def save_checkpoint(path: Path, payload: Mapping[str, Any]) -> None:
     """Write ``payload`` (dicts, lists, tensors, numbers, strings, None) atomically.
 
     Raises ``UserError`` if the file cannot be written, and ``TypeError`` for a value that a safe load would
-    refuse: better now than when the run has to be resumed.
+    refuse, because the error is better raised now than when the run is resumed.
     """
     content = {"format": FORMAT, "version": VERSION, "payload": _plain(payload)}
     buffer = io.BytesIO()  # a full disk would otherwise surface as an error inside torch's archive writer
@@ -32,15 +32,15 @@ def save_checkpoint(path: Path, payload: Mapping[str, Any]) -> None:
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """The payload, on the CPU. Executes nothing from the file (``weights_only``).
+    """Return the payload on the CPU, without executing anything from the file (``weights_only``).
 
-    Raises ``UserError`` if the file is missing, damaged (checksums are verified), not ours or of another
-    version.
+    Raises ``UserError`` if the file is missing, damaged (checksums are verified), not a checkpoint of cadam3d
+    or of another version.
     """
     if not path.is_file():
         raise UserError(f"{path}: no such checkpoint. Try: resume=RUN with the folder of a run")
     try:
-        # torch.load does not compare the checksums of the archive, so a flipped bit would go unseen.
+        # torch.load does not compare the checksums of the archive, so it would not notice a flipped bit.
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
         if damaged is not None:
@@ -63,11 +63,11 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def latest_checkpoint(folder: Path) -> Path | None:
-    """The newest sound checkpoint in ``folder``, falling back to older ones; None if there is no file at all.
+    """Return the newest sound checkpoint in ``folder``; None if the folder has no checkpoint at all.
 
-    Raises ``UserError`` if there are files and none is sound: starting over silently would hide the loss.
+    Raises ``UserError`` if there are files but none is sound: to start over silently would hide the loss.
     """
-    paths = sorted(folder.glob(PATTERN), reverse=True)
+    paths = sorted(folder.glob(CHECKPOINT_PATTERN), reverse=True)
     problem: UserError | None = None
     for path in paths:
         try:
@@ -81,14 +81,9 @@ def latest_checkpoint(folder: Path) -> Path | None:
     return None
 
 
-def checkpoint_name(step: int) -> str:
-    """The file name of the checkpoint of ``step``; names sort as steps do."""
-    return f"step_{step:07d}.pt"
-
-
 def drop_after(folder: Path, step: int) -> None:
     """Delete the checkpoints in ``folder`` of steps after ``step``."""
-    for path in folder.glob(PATTERN):
+    for path in folder.glob(CHECKPOINT_PATTERN):
         if path.name > checkpoint_name(step):
             path.unlink(missing_ok=True)
 
@@ -96,16 +91,16 @@ def drop_after(folder: Path, step: int) -> None:
 def prune_checkpoints(folder: Path, *, keep: int) -> None:
     """Delete all but the ``keep`` newest checkpoints in ``folder``, and half-written ones of killed runs."""
     remove_leftovers(folder)
-    for path in sorted(folder.glob(PATTERN))[:-keep]:
+    for path in sorted(folder.glob(CHECKPOINT_PATTERN))[:-keep]:
         path.unlink(missing_ok=True)
 
 
 def _plain(value: Any) -> Any:
-    """``value`` with its tensors on the CPU and no larger than they look; refuses what is not plain data."""
+    """Return ``value`` with tensors on the CPU and without hidden storage; refuse what is not plain data."""
     if isinstance(value, Tensor):
         tensor = value.detach().cpu().contiguous()
         is_view = tensor.untyped_storage().nbytes() != tensor.nbytes
-        return tensor.clone() if is_view else tensor  # a view would drag its whole storage into the file
+        return tensor.clone() if is_view else tensor  # torch saves the whole storage of a view
     if isinstance(value, Mapping):
         return {_plain_key(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""JSON that any reader accepts: whole files written atomically, and logs of one object per line."""
+"""JSON that any reader accepts: whole files, written atomically, and logs with one object per line."""
 
 import json
 import math
@@ -11,16 +11,16 @@ from cadam3d.io.atomic import replacing
 
 
 def append_jsonl(path: Path, line: Mapping[str, Any]) -> None:
-    """Append one object as one line and hand it to the operating system, so that even ``kill -9`` keeps it.
+    """Append one object as one line and flush it to the operating system, so that it survives ``kill -9``.
 
-    NaN and infinities become null. A last line that an earlier kill had cut is closed first. Raises
+    NaN and infinities become null. A last line that an earlier kill has cut is closed first. Raises
     ``UserError`` if the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a+b") as file:
             is_cut = file.tell() > 0 and _last_byte(file) != b"\n"
-            # One write call: the line arrives whole, or its tail is missing and the reader can tell.
+            # With a single write call, a kill can only cut the tail, which the reader notices.
             file.write(b"\n" * is_cut + to_json(line).encode() + b"\n")
             file.flush()
     except OSError as error:
@@ -29,10 +29,9 @@ def append_jsonl(path: Path, line: Mapping[str, Any]) -> None:
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:
-    """All objects of a log, oldest first; [] if there is no file yet.
+    """Return all objects of a log, oldest first; [] if there is no file yet.
 
-    Lines that were cut by a kill are left out: what can be read is worth more than a complaint about the
-    rest.
+    Lines that a kill has cut are left out: the readable ones are worth more than a complaint about the rest.
     """
     if not path.is_file():
         return []
@@ -48,9 +47,9 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
 
 
 def truncate_after(path: Path, step: int) -> None:
-    """Drop the lines whose ``step`` is greater than ``step``, and cut ones; nothing happens without a file.
+    """Remove the lines of steps after ``step`` and lines that were cut; do nothing if there is no file.
 
-    A resumed run calls this first: it will write those lines again.
+    A resumed run calls this first because it will write those lines again.
     """
     if not path.is_file():
         return
@@ -60,13 +59,13 @@ def truncate_after(path: Path, step: int) -> None:
 
 
 def write_json(path: Path, value: Mapping[str, Any] | Sequence[Any]) -> None:
-    """Write indented JSON, atomically; NaN and infinities become null. Raises ``UserError`` if it cannot."""
+    """Write indented JSON atomically. NaN and infinities become null. Raises ``UserError`` on failure."""
     with replacing(path) as temporary:
         temporary.write_text(to_json(value, indent=2) + "\n", encoding="utf-8")
 
 
 def read_json(path: Path) -> Any:
-    """The value in a JSON file. Raises ``UserError`` if it is missing or not JSON."""
+    """Return the value in a JSON file. Raises ``UserError`` if it is missing or not JSON."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -81,7 +80,7 @@ def read_json(path: Path) -> Any:
 
 
 def to_json(value: Any, indent: int | None = None) -> str:
-    """Standard JSON, without the NaN and Infinity that Python would write."""
+    """Return standard JSON, without the NaN and Infinity that Python would write."""
     return json.dumps(_standard(value), indent=indent, ensure_ascii=False, allow_nan=False)
 
 

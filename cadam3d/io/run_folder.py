@@ -1,4 +1,14 @@
-"""Run folder: the names of the files that a run leaves, and of those that a sweep adds."""
+"""Run folder: the names of the files in the folder of a run or a sweep, and what they say about it.
+
+No other module spells these names. This one does not load torch, so that a sweep is planned quickly.
+"""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from cadam3d.core.errors import UserError
+from cadam3d.io.jsonl import read_json
 
 # Written by training.
 ASSET = "asset.ply"
@@ -24,8 +34,71 @@ REPORT = "report.html"
 # Written by a sweep, into its own folder.
 FIGURES = "figures"  # a folder
 JOBS = "jobs.json"
+STOP = ".stop"  # while it exists, running jobs save and end, and no other job starts
 TABLE = "sweep.csv"
+SHARED = "traces"  # a folder that the jobs share while the sweep runs
 
 # Written by a sweep, into the folder of each job.
 CONSOLE = "console.txt"
-ENDED = "job.json"
+ENDED = "job.json"  # exit code and seconds of a process that has ended
+
+# In the folder of a sweep and of each of its jobs.
+LOCK = ".lock"  # held by the process that works there
+
+CHECKPOINT_PATTERN = "step_*.pt"  # zero-padded step numbers: the newest file sorts last
+
+
+def checkpoint_name(step: int) -> str:
+    """Return the file name of the checkpoint of ``step``; names sort as steps do."""
+    return f"step_{step:07d}.pt"
+
+
+def has_checkpoint(run: Path) -> bool:
+    """Return whether the run in ``run`` can continue from a checkpoint."""
+    return any((run / CHECKPOINTS).glob(CHECKPOINT_PATTERN))
+
+
+def holds_run(folder: Path) -> bool:
+    """Return whether a run has left results or checkpoints in ``folder``."""
+    return any((folder / name).exists() for name in (SUMMARY, CHECKPOINTS))
+
+
+def read_summary(run: Path) -> dict[str, Any]:
+    """Return the facts of the run in ``run``; {} if it has no summary or one that cannot be read."""
+    try:
+        summary = read_json(run / SUMMARY)
+    except UserError:
+        return {}
+    return summary if isinstance(summary, dict) else {}
+
+
+def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:
+    """Create a folder for results, check that it can be written, and return it.
+
+    ``is_chosen`` says that the user has named this very folder. Otherwise a name that is taken gets a number.
+    Raises ``UserError`` with the setting ``key`` if nothing can be written there.
+    """
+    free = folder if is_chosen else numbered(folder, first=1)
+    try:
+        free.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=free):
+            pass
+    except OSError as error:
+        raise UserError(
+            f"{key}: cannot write to {free} ({error.strerror}). Try: {key}=/tmp/cadam3d"
+        ) from error
+    return free
+
+
+def numbered(folder: Path, *, first: int = 2) -> Path:
+    """Return the first of ``folder`` (as number 1), ``folder-2``, ``folder-3``, ... that does not exist."""
+    number = first
+    while (place := folder.with_name(f"{folder.name}-{number}") if number > 1 else folder).exists():
+        number += 1
+    return place
+
+
+def shown(path: Path) -> Path:
+    """Return ``path`` as a user would type it: relative to the current folder if it is inside of it."""
+    path = path.resolve()
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

@@ -1,1 +1,1 @@
-"""How good is it: numbers about an asset."""
+"""Metrics: numbers about an asset, such as its quality and its size."""

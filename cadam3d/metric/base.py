@@ -1,17 +1,21 @@
 """Metric: numbers about a finished asset."""
 
 from abc import ABC, abstractmethod
+from pathlib import Path
 
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, TruthFn
 
 
 class Metric(ABC):
-    """Frozen hyper-parameters."""
+    """Interface of all metrics. A subclass is a frozen dataclass of its settings."""
 
     @abstractmethod
-    def measure(self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None) -> dict[str, float]:
-        """Named numbers. ``truth`` gives the true images where the prior knows them.
+    def measure(
+        self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None, asset: Path | None
+    ) -> dict[str, float]:
+        """Return named numbers.
 
-        Without it, a metric that needs them returns nothing.
+        ``truth`` gives the true images if the prior knows them, and ``asset`` is the file that holds these
+        Gaussians, if one was written. A metric leaves out the numbers for which it lacks one of them.
         """

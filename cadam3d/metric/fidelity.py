@@ -1,12 +1,12 @@
-"""Fidelity: how near the renders come to the truth, where the prior knows it."""
+"""Fidelity: how close the renders are to the true images, if the prior knows those."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import torch
 from jaxtyping import Float
-from kornia.metrics import psnr, ssim
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
@@ -24,10 +24,11 @@ VIEWS_AT_ONCE = 4  # bounds memory: the truth holds one image per mode and view
 @dataclass(frozen=True, kw_only=True)
 class Fidelity(PictureSettings, Metric):
     """PSNR and SSIM of held-out views against the true images.
+
     Each view's PSNR comes from the mean squared error over all its pixels and channels, renders clamped to
-    [0, 1]; views are then averaged in dB. If the prompt leaves something open, the truth is a mixture: the
-    asset is scored against every mode over all views, and the mode with the best mean PSNR counts, one mode
-    for the whole object.
+    [0, 1]; the views are then averaged in dB. If the prompt leaves something open, the truth is a mixture:
+    the asset is compared with every mode over all views, and the mode with the best mean PSNR counts. It is
+    one mode for the whole object.
     """
 
     node: ClassVar[str] = "metric.fidelity"
@@ -42,8 +43,10 @@ class Fidelity(PictureSettings, Metric):
         require_whole("metric.fidelity.size", self.size, low=SSIM_WINDOW, example=128)
 
     def cameras(self) -> Cameras:
-        """The held-out views: azimuths half a step off those of a turntable, each elevation shifted a
-        little more, so that no two rings look from the same side.
+        """Return the held-out views.
+
+        Their azimuths are half a step off those of a turntable. Each elevation is shifted a little more, so
+        that no two rings look from the same side.
         """
         step = 360.0 / self.views
         rings = len(self.elevations_deg)
@@ -55,9 +58,13 @@ class Fidelity(PictureSettings, Metric):
         )
         return self.cameras_at(azimuth, elevation)
 
-    def measure(self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None) -> dict[str, float]:
-        """``psnr`` (dB, mean over views), ``psnr_min`` (dB, the worst view), ``ssim`` (mean over views) and
-        ``mode``, the index of the mode they belong to; {} without a truth.
+    def measure(
+        self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None, asset: Path | None
+    ) -> dict[str, float]:
+        """Return PSNR, SSIM and the mode that they belong to; {} without a truth.
+
+        ``psnr`` (dB) and ``ssim`` are means over the views, ``psnr_min`` (dB) is that of the worst view, and
+        ``mode`` is the index of the mode.
         """
         if truth is None:
             return {}
@@ -81,6 +88,8 @@ class Fidelity(PictureSettings, Metric):
 
 
 def _psnr(images: Float[Tensor, "v h w 3"], modes: Float[Tensor, "m v h w 3"]) -> Float[Tensor, "m v"]:
+    from kornia.metrics import psnr  # slow to import, and not needed before training has ended
+
     rows = [
         torch.stack([psnr(image, true, max_val=1.0) for image, true in zip(images, mode, strict=True)])
         for mode in modes
@@ -89,6 +98,8 @@ def _psnr(images: Float[Tensor, "v h w 3"], modes: Float[Tensor, "m v h w 3"]) -
 
 
 def _ssim(images: Float[Tensor, "v h w 3"], modes: Float[Tensor, "m v h w 3"]) -> Float[Tensor, "m v"]:
+    from kornia.metrics import ssim
+
     ours = images.permute(0, 3, 1, 2)
     maps = [ssim(ours, mode.permute(0, 3, 1, 2), window_size=SSIM_WINDOW) for mode in modes]
     return torch.stack(maps).mean(dim=(2, 3, 4))

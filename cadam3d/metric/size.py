@@ -1,33 +1,36 @@
-"""Size: how much an asset costs to keep and to send."""
+"""Size: how many Gaussians an asset has, and how many bytes its file takes."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, TruthFn
-from cadam3d.io.ply import ply_bytes
 from cadam3d.metric.base import Metric
 
-MIB = 1 << 20
+MIB = 1 << 20  # bytes
 
 
 @dataclass(frozen=True, kw_only=True)
 class Size(Metric):
-    """Counts Gaussians, and the bytes of ``asset.ply`` at the asset's own SH degree (no padding)."""
+    """Counts Gaussians and the bytes of the file that was written, with the padding that it may have."""
 
     def measure(
-        self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None
+        self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None, asset: Path | None
     ) -> dict[str, int | float]:
-        """``num_gaussians``, ``asset_bytes``, ``asset_mib``, ``bytes_per_gaussian``, ``median_scale``
-        (world units, the longest axis) and ``median_opacity``; what has no meaning without Gaussians is
-        left out.
+        """Return counts, sizes and medians.
+
+        ``num_gaussians`` is always there. ``asset_bytes``, ``asset_mib`` and ``bytes_per_gaussian`` need a
+        file, and the last one as well as ``median_scale`` (world units, longest axis) and ``median_opacity``
+        need at least one Gaussian.
         """
         count = len(gaussians)
-        asset_bytes = ply_bytes(count, gaussians.sh_degree)
-        sizes = {"num_gaussians": count, "asset_bytes": asset_bytes, "asset_mib": asset_bytes / MIB}
-        if count == 0:
-            return sizes
-        return sizes | {
-            "bytes_per_gaussian": asset_bytes / count,
-            "median_scale": float(gaussians.scales.amax(dim=-1).median()),
-            "median_opacity": float(gaussians.opacities.median()),
-        }
+        sizes: dict[str, int | float] = {"num_gaussians": count}
+        if asset is not None:
+            asset_bytes = asset.stat().st_size
+            sizes |= {"asset_bytes": asset_bytes, "asset_mib": asset_bytes / MIB}
+            if count > 0:
+                sizes["bytes_per_gaussian"] = asset_bytes / count
+        if count > 0:
+            sizes["median_scale"] = float(gaussians.scales.amax(dim=-1).median())
+            sizes["median_opacity"] = float(gaussians.opacities.median())
+        return sizes

@@ -105,7 +105,7 @@ class JobResult:
 
     @property
     def ended_early(self) -> bool:
-        """Return whether the job stopped before its last step: its numbers are those of an unfinished asset."""
+        """Return whether the job stopped before its last step, so that its asset is unfinished."""
         return self.outcome != Outcome.FINISHED
 
 

@@ -1,4 +1,4 @@
-"""Advice: what Hydra complains about, said as one message that ends with what to type."""
+"""Advice: turn exceptions of Hydra and OmegaConf into one message that ends with what to type."""
 
 import difflib
 import re
@@ -11,63 +11,117 @@ from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseExceptio
 
 from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import compose, config_dir, flatten, quote
+from cadam3d.settings.line import key_of
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
 NO_NAME_COMPLAINT = "Config group override must be a string or a list"
-LAUNCHERS = {  # Hydra's plugins by what they add to hydra/launcher
+LAUNCHERS = {  # the package of each option of hydra/launcher that Hydra itself lacks
     "joblib": "hydra-joblib-launcher",
     "submitit_slurm": "hydra-submitit-launcher",
     "submitit_local": "hydra-submitit-launcher",
     "ray": "hydra-ray-launcher",
 }
-PASTE_PROMPT = 'prompt="a red and yellow checkered torus"'
+CHOICE = re.compile(r"\+?[a-z]\w*=(\w+|\[[\w,]*\])")  # of an option, or of a list of them
+PROMPT_WORD = 'prompt="a red and yellow checkered torus"'
+
+
+class MissingValuesError(Exception):
+    """Settings that the user must give and has not given."""
+
+    def __init__(self, keys: Sequence[str]) -> None:
+        super().__init__(", ".join(keys))
+        self.keys = keys
+
+
+class RefusedJobError(Exception):
+    """A job of a sweep that cannot be composed. The cause of this exception says why."""
+
+    def __init__(self, arm: str, overrides: Sequence[str]) -> None:
+        super().__init__(arm)
+        self.arm = arm  # of the grid; "" without one
+        self.overrides = overrides  # of the job
 
 
 def did_you_mean(word: str, known: Sequence[str]) -> list[str]:
-    """The known words that ``word`` may have been meant to be, the likeliest first; at most three."""
+    """Return at most three known words that ``word`` may be a misspelling of, the likeliest first."""
     by_lower = {name.lower(): name for name in known}
     matches = difflib.get_close_matches(word.lower(), list(by_lower), n=3, cutoff=0.6)
     return [by_lower[match] for match in matches]
 
 
-def explain(error: Exception, config_name: str, overrides: Sequence[str]) -> UserError | None:
-    """The message for an exception of Hydra or OmegaConf while composing; None for any other exception."""
-    if isinstance(error, MissingConfigException):
-        return _unknown_option(error, config_name, overrides)
-    if isinstance(error, OverrideParseException):
-        return _unreadable(error.override, str(error).splitlines()[0])
-    if isinstance(error, ValueError) and str(error).startswith(NO_NAME_COMPLAINT):
-        return _no_name(str(error), overrides)
-    if isinstance(error, InterpolationResolutionError):
-        reason = str(error).splitlines()[0]
-        key = error.full_key or "a setting"
-        return UserError(
-            f"{key}: {reason}. Try: a plain value; cadam3d {config_name} --cfg job lists the keys"
-        )
-    if isinstance(error, (CompactHydraException, OmegaConfBaseException)):
-        return _reworded(error, config_name, overrides)
-    return None
+def explain(error: BaseException, command: str, words: Sequence[str]) -> UserError | None:
+    """Return the message for an exception that ``cadam3d <command> <words>`` has met while composing.
+
+    Returns None for exceptions that neither Hydra nor OmegaConf raises: those are bugs.
+    """
+    reason: UserError | None = None
+    match error:
+        case UserError():
+            reason = error
+        case RefusedJobError():
+            reason = _job_refused(error, command, words)
+        case MissingValuesError():
+            reason = _ask_for(error.keys, command, words)
+        case MissingConfigException():
+            reason = _unknown_option(error)
+        case OverrideParseException():
+            reason = _unreadable(error.override, str(error).splitlines()[0])
+        case ValueError() if str(error).startswith(NO_NAME_COMPLAINT):
+            reason = _no_name(str(error), words)
+        case InterpolationResolutionError():
+            reason = _unresolved(error, command)
+        case CompactHydraException() | OmegaConfBaseException():
+            reason = _reworded(error, command, words)
+    return reason
 
 
-def missing_values(cfg: DictConfig) -> list[str]:
-    """The dotted keys that still say ``???``, apart from Hydra's own."""
+def reraise_interrupt(error: BaseException) -> None:
+    """Raise ``KeyboardInterrupt`` if ``error`` only hides one, which the clean-up of OmegaConf can cause."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, KeyboardInterrupt):
+            raise KeyboardInterrupt from error
+        seen = seen.__cause__ or seen.__context__
+
+
+def require_values(cfg: DictConfig) -> None:
+    """Raise ``MissingValuesError`` if keys are still ``???``, apart from Hydra's own."""
     raw = OmegaConf.to_container(cfg, resolve=False)
-    return [key for key, value in flatten(raw) if value == "???" and not key.startswith("hydra.")]
+    keys = [key for key, value in flatten(raw) if value == "???" and not key.startswith("hydra.")]
+    if keys:
+        raise MissingValuesError(keys)
 
 
-def ask_for(keys: Sequence[str], config_name: str) -> UserError:
-    """The message for values that the user must give."""
-    first = keys[0]
-    example = PASTE_PROMPT if first == "prompt" else f"{first}=..."
-    grid = " grid=thresholds" if config_name == "sweep" else ""
-    return UserError(f"{', '.join(keys)}: no value given. Try: cadam3d {config_name} {example}{grid}")
+def _job_refused(error: RefusedJobError, command: str, words: Sequence[str]) -> UserError | None:
+    """Name the arm of the job. What the user must give is asked for once, in the line of the sweep."""
+    cause = error.__cause__
+    assert cause is not None, "this exception is always raised from another one"
+    if isinstance(cause, MissingValuesError):
+        return _ask_for(cause.keys, command, words)
+    reason = explain(cause, "train", error.overrides)
+    return UserError(f"arm {error.arm}: {reason}") if reason and error.arm else reason
 
 
-def _reworded(error: Exception, config_name: str, overrides: Sequence[str]) -> UserError:
-    """A complaint that only its text tells from others."""
+def _ask_for(keys: Sequence[str], command: str, words: Sequence[str]) -> UserError:
+    """Ask for values that the user must give, in a line that keeps the rest of what was typed."""
+    kept = [shlex.quote(word) for word in words if key_of(word) not in keys]
+    added = [PROMPT_WORD if key == "prompt" else f"{key}=..." for key in keys]
+    line = " ".join(["cadam3d", command, *kept, *added])
+    return UserError(f"{', '.join(keys)}: no value given. Try: {line}")
+
+
+def _unresolved(error: InterpolationResolutionError, command: str) -> UserError:
+    """Explain that a value refers to something that does not exist."""
+    key = error.full_key or "a setting"
+    reason = str(error).splitlines()[0]
+    return UserError(f"{key}: {reason}. Try: a plain value; cadam3d {command} --cfg job lists the keys")
+
+
+def _reworded(error: Exception, command: str, words: Sequence[str]) -> UserError:
+    """Explain an exception that differs from others in its text only."""
     text = str(error).strip() or str(error.__cause__ or "")
     if key := re.search(r"Could not override '([^']+)'", text):
-        return _unknown_key(key.group(1), config_name, overrides)
+        return _unknown_key(key.group(1), command, words)
     if sweep := re.search(SWEEP_COMPLAINT, text, re.M):
         return _several_values(sweep.group(1))
     cause = error.__cause__
@@ -75,8 +129,8 @@ def _reworded(error: Exception, config_name: str, overrides: Sequence[str]) -> U
     return UserError(f"{' '.join(text.split())}{detail}")
 
 
-def _unknown_option(error: MissingConfigException, config_name: str, overrides: Sequence[str]) -> UserError:
-    """A group exists but not the chosen option of it, or the command itself has no YAML."""
+def _unknown_option(error: MissingConfigException) -> UserError:
+    """Explain that a group lacks the chosen option, or that the command itself has no YAML."""
     path = error.missing_cfg_file or ""
     group, _, option = path.rpartition("/")
     if group == "hydra/launcher" and option in LAUNCHERS:
@@ -89,10 +143,10 @@ def _unknown_option(error: MissingConfigException, config_name: str, overrides: 
     return UserError(f"{group}: expected one of {'|'.join(options)}, got {option!r}. Try: {group}={best}")
 
 
-def _no_name(reason: str, overrides: Sequence[str]) -> UserError:
-    """A group was given null, a number or a dict where the name of an option belongs."""
-    for line in overrides:
-        key, _, value = line.lstrip("+").partition("=")
+def _no_name(reason: str, words: Sequence[str]) -> UserError:
+    """Explain that a group has null, a number or a dict where it needs the name of an option."""
+    for word in words:
+        key, _, value = word.lstrip("+").partition("=")
         options = sorted(file.stem for file in (config_dir() / key).glob("*.yaml")) if key else []
         if options and value not in options and not value.startswith("["):
             best = "none" if "none" in options else options[0]
@@ -100,25 +154,23 @@ def _no_name(reason: str, overrides: Sequence[str]) -> UserError:
     return UserError(f"{reason}. Try: the name of an option instead of null")
 
 
-def _unknown_key(key: str, config_name: str, overrides: Sequence[str]) -> UserError:
-    """A key that the configuration does not have: look for it in another spelling or another place."""
-    if key == "grid" and config_name == "train":
-        name = next((line.partition("=")[2] for line in overrides if line.startswith("grid=")), "thresholds")
+def _unknown_key(key: str, command: str, words: Sequence[str]) -> UserError:
+    """Explain that a key does not exist, and look for it in another spelling or another place."""
+    if key == "grid" and command == "train":
+        name = next((word.partition("=")[2] for word in words if word.startswith("grid=")), "thresholds")
         return UserError(
             f"grid: grids belong to sweeps. Try: cadam3d sweep {shlex.quote('grid=' + name)} ..."
         )
-    value = next((line.split("=", 1)[1] for line in overrides if line.startswith(f"{key}=")), "...")
+    value = next((word.split("=", 1)[1] for word in words if word.startswith(f"{key}=")), "...")
     if owners := _options_with(key):
         line = f"{owners[0]} {shlex.quote(f'{key}={value}')}"
         return UserError(f"{key}: a setting of {' and '.join(owners)}, not of the chosen option. Try: {line}")
-    known = _known_keys(key, config_name, overrides)
+    known = _known_keys(key, command, words)
     last = key.rpartition(".")[2].lower()
     same_name = [name for name in known if name.rpartition(".")[2].lower() == last]
     suggestions = same_name or did_you_mean(key, known)
     if not suggestions:
-        return UserError(
-            f"{key}: no such setting. Try: cadam3d {config_name} --cfg job (it lists all of them)"
-        )
+        return UserError(f"{key}: no such setting. Try: cadam3d {command} --cfg job (it lists all of them)")
     meant = " or ".join(suggestions[:3])
     return UserError(
         f"{key}: no such setting. Did you mean {meant}? Try: {shlex.quote(f'{suggestions[0]}={value}')}"
@@ -141,13 +193,12 @@ def _options_with(key: str) -> list[str]:
     return owners
 
 
-def _known_keys(wrong: str, config_name: str, overrides: Sequence[str]) -> list[str]:
-    """Every key of the configuration, with the groups that the user chose if those compose."""
-    choices = [line for line in overrides if re.match(r"[a-z]\w*=[\[\]\w,]+$", line) and "." not in line]
-    choices = [line for line in choices if not line.startswith(f"{wrong}=")]
+def _known_keys(wrong: str, command: str, words: Sequence[str]) -> list[str]:
+    """Return every key of the configuration, with the groups that the user has chosen if those compose."""
+    choices = [word for word in words if CHOICE.fullmatch(word) and not word.startswith(f"{wrong}=")]
     for attempt in (choices, []):
         try:
-            cfg = compose(attempt, config_name)
+            cfg = compose(attempt, command)
         except (CompactHydraException, OmegaConfBaseException):
             continue
         keys = [key for key, _ in flatten(OmegaConf.to_container(cfg, resolve=False), with_nodes=True)]
@@ -156,6 +207,7 @@ def _known_keys(wrong: str, config_name: str, overrides: Sequence[str]) -> list[
 
 
 def _unreadable(override: str, reason: str) -> UserError:
+    """Explain that Hydra's grammar cannot read a value, and quote it."""
     key, _, value = override.partition("=")
     line = f"{key}={quote(value)}"
     typed = shlex.quote(line) if re.search(r'["$`\\!]', line) else f'"{line}"'
@@ -163,6 +215,7 @@ def _unreadable(override: str, reason: str) -> UserError:
 
 
 def _several_values(override: str) -> UserError:
+    """Explain that several values belong to a sweep, or into brackets."""
     key, _, value = override.partition("=")
     return UserError(
         f"{key}: several values make a sweep. Try: cadam3d sweep {shlex.quote(override)} ... "

@@ -1,4 +1,4 @@
-"""Settings: where the numbers live, how a command line changes them, and how they become objects."""
+"""Compose: where the numbers are, how a command line changes them, and how they become objects."""
 
 import re
 import unicodedata
@@ -7,24 +7,27 @@ from pathlib import Path
 from typing import Any
 
 import yaml  # comes with OmegaConf
-from hydra import compose as hydra_compose
-from hydra import initialize_config_dir
+from hydra import version
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path
+from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import InstantiationException
+from hydra.types import RunMode
 from hydra.utils import instantiate
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from cadam3d.core.errors import UserError
 
 VERSION_BASE = "1.3"  # Hydra's behaviour is pinned to this version, whatever is installed
-WRONG_CALL = r"unexpected keyword|missing (?:a|\d+) required"  # how Python says it
-TEXT_KEYS = ("prompt", "negative_prompt")  # always text, so quoted for the user
-SLUG_LENGTH = 60  # characters; even of three bytes each they fit a file name
+WRONG_CALL = r"unexpected keyword|missing (?:a|\d+) required"  # in the words of Python
+TEXT_KEYS = ("prompt", "negative_prompt")  # always text, so the user need not quote them for Hydra
+SLUG_LENGTH = 60  # characters; of three bytes each they still fit into a file name
 
 
 def config_dir() -> Path:
-    """The folder of YAML files: inside the installed package, or ``configs/`` of a checkout."""
+    """Return the folder of YAML files: inside the installed package, or ``configs/`` of a checkout."""
     package = Path(__file__).parent.parent
     packaged = package / "configs"
     return packaged if packaged.is_dir() else package.parent / "configs"
@@ -38,27 +41,38 @@ def compose(
     search_path: str | None = None,
     with_hydra: bool = False,
 ) -> DictConfig:
-    """The configuration that ``cadam3d <config_name> <overrides>`` would run with.
+    """Return the configuration that ``cadam3d <config_name> <overrides>`` would run with.
 
     ``folder`` replaces :func:`config_dir`, ``search_path`` is one more folder of YAML files, ``with_hydra``
-    keeps Hydra's own node. Raises Hydra's exceptions; ``cadam3d.settings.advice`` puts them into words.
+    keeps Hydra's own node. Raises Hydra's exceptions; ``cadam3d.settings.advice`` explains them to the user.
     """
     register_resolvers()
-    extra = [] if search_path is None else [f"hydra.searchpath=[{quote('file://' + str(search_path))}]"]
-    outer = GlobalHydra.instance().hydra  # we may be asked while a command runs, which is inside Hydra
+    places = create_config_search_path(str((folder or config_dir()).resolve()))
+    if search_path is not None:
+        own = Path(search_path).absolute()
+        if not own.is_dir():
+            raise UserError(f"--config-dir: expected a folder, got {search_path!r}. Try: --config-dir=DIR")
+        places.prepend("command-line", f"file://{own}", anchor=SearchPathQuery(provider="schema"))
+    outer = GlobalHydra.instance().hydra  # a command that runs inside Hydra may compose too
     GlobalHydra.instance().clear()
+    version.setbase(VERSION_BASE)
     try:
-        with initialize_config_dir(str((folder or config_dir()).resolve()), version_base=VERSION_BASE):
-            return hydra_compose(config_name, [*extra, *overrides], return_hydra_config=with_hydra)
+        cfg = Hydra.create_main_hydra2("cadam3d", places).compose_config(
+            config_name, list(overrides), run_mode=RunMode.RUN, from_shell=False
+        )
     finally:
         GlobalHydra.instance().hydra = outer
+    if not with_hydra:
+        with open_dict(cfg):
+            cfg.pop("hydra", None)
+    return cfg
 
 
 def component(node: DictConfig | ListConfig | None) -> Any:
-    """Build the object that ``node._target_`` names; nested nodes too; lists and dicts become plain Python.
+    """Build the object that ``node._target_`` names, and nested ones; lists and dicts become plain Python.
 
-    Raises ``UserError`` for what the configuration got wrong: values out of range, keys that the class does
-    not have, keys that it misses, a target that cannot be imported. A bug in a constructor stays what it is.
+    Raises ``UserError`` for mistakes in the configuration: values out of range, unknown keys, missing keys, a
+    target that cannot be imported. A bug in a constructor raises its own exception.
     """
     try:
         return instantiate(node, _convert_="all")
@@ -71,18 +85,18 @@ def component(node: DictConfig | ListConfig | None) -> Any:
 def components(group: DictConfig) -> dict[str, Any]:
     """Build every chosen member of a group of which several can be chosen, by name.
 
-    An experiment may tune a member that the line did not choose; such a node has keys but no ``_target_``.
+    An experiment may tune a member that the line has not chosen; such a node has keys but no ``_target_``.
     """
     return {str(name): component(node) for name, node in group.items() if "_target_" in node}
 
 
 def load(path: Path) -> DictConfig:
-    """The resolved ``config.yaml`` of a run: what looks like an interpolation there is somebody's text."""
+    """Return the resolved ``config.yaml`` of a run. What looks like an interpolation in it is plain text."""
     return DictConfig(_escaped(yaml.safe_load(path.read_text(encoding="utf-8"))))
 
 
 def flatten(node: object, prefix: str = "", *, with_nodes: bool = False) -> Iterator[tuple[str, object]]:
-    """Dotted keys and values of nested dicts; ``with_nodes`` yields the inner dicts as well."""
+    """Yield dotted keys and values of nested dicts; ``with_nodes`` yields the inner dicts as well."""
     if not isinstance(node, dict):
         yield prefix, node
         return
@@ -93,15 +107,15 @@ def flatten(node: object, prefix: str = "", *, with_nodes: bool = False) -> Iter
 
 
 def register_resolvers() -> None:
-    """Make ``${slug:...}`` and ``${span:...}`` known to OmegaConf; calling it again does nothing new."""
+    """Register ``${slug:...}`` and ``${span:...}`` with OmegaConf. It is safe to call this again."""
     OmegaConf.register_new_resolver("slug", slug, replace=True)
     OmegaConf.register_new_resolver("span", span, replace=True)
 
 
 def span(share: float, start: object, *ends: object) -> int:
-    """A part of the steps from ``start`` to the first of ``ends``, at least 1.
+    """Return a share of the steps from ``start`` to the first of ``ends``, at least 1.
 
-    Also 1 where they are no whole numbers: whoever owns the wrong key says so.
+    Returns 1 for non-integers; the component that owns the key reports the error.
     """
     if not all(type(step) is int for step in (start, *ends)):
         return 1
@@ -109,21 +123,21 @@ def span(share: float, start: object, *ends: object) -> int:
 
 
 def slug(*parts: object) -> str:
-    """A piece of a file name that says ``parts``: ``slug("A red car!")`` is ``"A-red-car"``."""
+    """Return a piece of a file name made of ``parts``: ``slug("A red car!")`` is ``"A-red-car"``."""
     text = unicodedata.normalize("NFKC", " ".join(str(part) for part in parts))
     text = re.sub(r"(?:[^\w.=]|(?<!\w)=)+", "-", text).strip("-.")
     return text[:SLUG_LENGTH].rstrip("-.") or "untitled"
 
 
 def escape(text: str) -> str:
-    """Text that OmegaConf reads back as ``text``, even if it holds ``${``."""
+    """Return the text that OmegaConf reads as ``text``, even if that contains ``${``."""
     return re.sub(r"(\\*)\$\{", lambda match: match.group(1) * 2 + r"\${", text)
 
 
 def quote(text: str) -> str:
-    r"""``text`` as a quoted value of Hydra's override grammar: it stays text, whatever it holds.
+    r"""Return ``text`` as a quoted value of Hydra's override grammar, which reads it as plain text.
 
-    Inside the quotes a backslash is special before a quote only, so only those are doubled.
+    Inside the quotes, a backslash is special only before a quote, so only such backslashes are doubled.
     """
     escaped = re.sub(r"(\\*)'", lambda match: match.group(1) * 2 + r"\'", escape(text))
     trailing = len(escaped) - len(escaped.rstrip("\\"))
@@ -131,7 +145,7 @@ def quote(text: str) -> str:
 
 
 def _construction_error(error: InstantiationException) -> BaseException:
-    """What really went wrong: a mistake in the configuration as ``UserError``, a bug as itself."""
+    """Return the cause of an error: ``UserError`` for a mistake in the configuration, a bug unchanged."""
     cause = error.__cause__
     key = re.search(r"full_key: (\S+)", str(error))
     where = key.group(1) if key else "configuration"

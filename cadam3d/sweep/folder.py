@@ -1,6 +1,6 @@
-"""The folder of a sweep: ``jobs.json`` says what belongs to it, and each job's folder how far that job is.
+"""The folder of a sweep: ``jobs.json`` lists its jobs, and the folder of each job shows its progress.
 
-Nothing else is remembered, so the truth survives any way to end: whoever asks reads it from the disk.
+Nothing is remembered elsewhere. Whatever way a sweep ends, its state is what can be read from the disk.
 """
 
 from collections.abc import Sequence
@@ -11,21 +11,15 @@ from typing import Any
 from cadam3d.core.errors import UserError
 from cadam3d.core.outcome import Outcome
 from cadam3d.io.jsonl import read_json, write_json
+from cadam3d.io.run_folder import JOBS, has_checkpoint, read_summary
 
-JOBS = "jobs.json"  # the mark of a sweep
-STOP = ".stop"  # while this is there, running jobs save and end, and no further one starts
-LOCK = ".lock"  # held while a sweep runs
-TRACED = "traces"  # what jobs that look at the same scene from the same places share, while the sweep runs
-ENDED = "job.json"  # in the folder of a job whose process has ended
-SUMMARY = "summary.json"  # of a run
-CONSOLE = "console.txt"  # what the process of a job said
-UNFINISHED = "unfinished"  # the outcome of a job that waits, runs, or ended without a word
+UNFINISHED = "unfinished"  # the outcome of a job that waits, runs, or has ended without a summary
 RESULTS = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.VANISHED, Outcome.OUT_OF_MEMORY)
 
 
 @dataclass(frozen=True)
 class PlannedJob:
-    """What one job is to run."""
+    """A job that a sweep has to run."""
 
     arm: str  # of the grid; "" without one
     folder: str  # inside the sweep's
@@ -35,19 +29,19 @@ class PlannedJob:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sweep is to run, as ``jobs.json`` holds it."""
+    """The content of ``jobs.json``: all that a worker has to know about a sweep."""
 
-    cwd: str  # where the line was typed: what its relative paths start from
+    cwd: str  # the folder in which the line was typed; its relative paths start there
     flags: list[str]  # of every job, such as --config-dir
-    threads: int | None  # OpenMP threads of a job; None: whatever its machine finds right
+    threads: int | None  # OpenMP threads of a job; None: the default of its machine
     jobs: list[PlannedJob]
-    figures: list[str] | None = None  # of the report; None: whatever the jobs have data for
+    figures: list[str] | None = None  # of the report; None: all that the jobs have data for
     line: list[str] = field(default_factory=list)  # what was typed after ``cadam3d sweep``
 
 
 @dataclass(frozen=True)
 class Row:
-    """One job and what became of it."""
+    """One job and its result so far."""
 
     number: int
     arm: str
@@ -63,26 +57,26 @@ class Row:
 
     @property
     def has_result(self) -> bool:
-        """Whether the job is done. Running out of memory is a result; being killed or interrupted is none."""
+        """Whether the job is done. An end for lack of memory is a result; a kill or an interrupt is not."""
         return self.outcome in RESULTS and is_complete(self.summary)
 
     @property
     def has_checkpoint(self) -> bool:
-        """Whether the job can go on where it was."""
-        return any((self.folder / "checkpoints").glob("step_*.pt"))
+        """Whether the job can continue from a checkpoint."""
+        return has_checkpoint(self.folder)
 
 
 def load(sweep: Path) -> list[Row]:
-    """Every job of the sweep in the folder ``sweep``, in order, with what is on disk of it now.
+    """Return every job of the sweep in the folder ``sweep``, in order, with its results on disk now.
 
-    Tables and figures are made of this: ``row.folder`` holds ``metrics.jsonl``, ``asset.ply`` and the other
-    files of a run, ``row.swept`` the values that jobs differ in. Raises ``UserError`` if ``sweep`` is none.
+    Tables and figures are made from this: ``row.folder`` is the folder of a run, and ``row.swept`` has the
+    values in which the jobs differ. Raises ``UserError`` if ``sweep`` is not the folder of a sweep.
     """
     return rows_of(sweep, read_plan(sweep).jobs)
 
 
 def rows_of(sweep: Path, jobs: Sequence[PlannedJob]) -> list[Row]:
-    """What is on disk of ``jobs``, which may never have run."""
+    """Return the state of ``jobs`` on disk. They may never have run."""
     return [
         Row(
             number=number,
@@ -97,18 +91,18 @@ def rows_of(sweep: Path, jobs: Sequence[PlannedJob]) -> list[Row]:
 
 
 def is_sweep(folder: Path) -> bool:
-    """Whether ``folder`` holds a sweep."""
+    """Return whether ``folder`` is the folder of a sweep."""
     return (folder / JOBS).is_file()
 
 
 def read_plan(sweep: Path) -> Plan:
-    """The plan of a sweep. Raises ``UserError`` if there is none that can be read."""
+    """Return the plan of a sweep. Raises ``UserError`` if the folder has none that can be read."""
     content = read_json(sweep / JOBS)
     try:
         return Plan(**{**content, "jobs": [PlannedJob(**job) for job in content["jobs"]]})
     except (TypeError, KeyError) as error:
         raise UserError(
-            f"{sweep / JOBS}: not the plan of a sweep ({error}). Try: the line of the sweep again"
+            f"{sweep / JOBS}: not the plan of a sweep ({error}). Try: the command of the sweep again"
         ) from error
 
 
@@ -117,21 +111,12 @@ def write_plan(sweep: Path, plan: Plan) -> None:
     write_json(sweep / JOBS, asdict(plan))
 
 
-def read_summary(job: Path) -> dict[str, Any]:
-    """The facts of a job; {} if there are none, or none that can be read."""
-    try:
-        summary = read_json(job / SUMMARY)
-    except UserError:
-        return {}
-    return summary if isinstance(summary, dict) else {}
-
-
 def is_complete(summary: dict[str, Any]) -> bool:
-    """Whether training has told all: it writes its numbers first, its ``warnings`` after all else."""
+    """Return whether training has written its whole summary, of which ``warnings`` is the last entry."""
     return "warnings" in summary
 
 
 def outcomes(rows: Sequence[Row]) -> dict[str, int]:
-    """How often each outcome occurred among the jobs without a result."""
+    """Return how often each outcome occurred among the jobs without a result."""
     left = [row.outcome for row in rows if not row.has_result]
     return {outcome: left.count(outcome) for outcome in dict.fromkeys(left)}

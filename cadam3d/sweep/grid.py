@@ -1,7 +1,7 @@
-"""Which jobs a sweep has: the arms of a grid, changed by what the command line says, as one list.
+"""Grid: the list of jobs of a sweep, made from the arms of a grid and the settings in the command line.
 
 A comparison is a union of products, such as a baseline at eight thresholds beside one CAdam, each for the
-same prompts and seeds. A single product, which is what ``key=a,b`` on a line says, cannot express it.
+same prompts and seeds. A single product, which ``key=a,b`` in a line stands for, cannot express it.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ from cadam3d.settings.compose import TEXT_KEYS, quote, slug
 
 IDENTIFIER = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)  # the same text to Hydra, quoted or not
 RESERVED = ("null", "true", "false", "nan", "inf")
-ALWAYS_TOLD = ("prompt", "seed")  # by tables and by the names of folders
+ALWAYS_SHOWN = ("prompt", "seed")  # in tables and in the names of folders
 EXAMPLE = "{each: {seed: [0, 1]}, arms: {mine: {densifier: cadam}}}"
 
 
@@ -35,7 +35,7 @@ class Setting:
 
     @property
     def text(self) -> str:
-        """The value for people: text without quotes."""
+        """The value for readers: text without quotes."""
         return json.loads(self.value) if self.value.startswith('"') else self.value
 
     @property
@@ -54,7 +54,7 @@ class Grid:
 
     each: Axes
     arms: dict[str, Axes]  # at least one; "" is the arm of a sweep without a grid
-    figures: list[str] | None = None  # of its report; None: whatever the jobs have data for
+    figures: list[str] | None = None  # of its report; None: all that the jobs have data for
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,9 @@ HasSetting = Callable[[Sequence[str], str], bool]
 
 
 def read_grid(node: Any) -> Grid:
-    """The grid that plain dicts and lists describe; None is a grid of one nameless arm.
+    """Return the grid that plain dicts and lists describe; None describes a grid of one nameless arm.
 
-    Raises ``UserError`` for anything but ``each``, ``arms`` and ``figures``.
+    Raises ``UserError`` for keys other than ``each``, ``arms`` and ``figures`` and for wrong values of these.
     """
     if node is None:
         return Grid(each={}, arms={"": {}})
@@ -94,9 +94,9 @@ def read_grid(node: Any) -> Grid:
 
 
 def read_line(overrides: Iterable[str]) -> Axes:
-    """The axes that a command line gives; ``a,b``, ``choice()`` and ``range()`` are several values.
+    """Return the axes that a command line gives; ``a,b``, ``choice()`` and ``range()`` are several values.
 
-    A key that comes twice has the later value. Raises Hydra's ``OverrideParseException``.
+    If a key comes twice, the later value counts. Raises Hydra's ``OverrideParseException``.
     """
     axes: Axes = {}
     for line in overrides:
@@ -107,11 +107,12 @@ def read_line(overrides: Iterable[str]) -> Axes:
 
 
 def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) -> list[Job]:
-    """The jobs of all arms, each once: prompt by prompt and seed by seed, so that comparisons fill up evenly.
+    """Return the jobs of all arms, each once: prompt by prompt and seed by seed, so comparisons fill evenly.
 
-    What the line says wins over the grid. It goes to every arm that has such a setting, since densifiers have
-    different ones: ``has_setting(overrides of an arm, key)`` tells. A setting that no arm has is left in, for
-    Hydra to complain about. Raises ``UserError`` if the line makes two arms the same.
+    The line wins over the grid. A setting in the line goes to every arm that has such a setting, because
+    densifiers have different ones; ``has_setting(overrides of an arm, key)`` decides that. A setting that no
+    arm has stays in all jobs, so that Hydra refuses it. Raises ``UserError`` if the line makes two arms
+    equal.
     """
     common = {key: axis for key, axis in line.items() if key not in grid.each}
     common |= {key: line.get(key, axis) for key, axis in grid.each.items()}
@@ -119,7 +120,7 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
         name: {key: line.get(key, axis) for key, axis in axes.items()} for name, axes in grid.arms.items()
     }
     foreign = _foreign(grid, line, arms, has_setting)
-    told, counted = _told(grid, line), swept_keys(grid, line)
+    named, counted = _named(grid, line), swept_keys(grid, line)
     found: dict[frozenset[str], Job] = {}
     for shared in product(*common.values()):
         for name, axes in arms.items():
@@ -128,30 +129,31 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
                 settings = (*taken, *own)
                 job = Job(
                     arm=name,
-                    name=_folder_name(name, settings, told, counted),
+                    name=_folder_name(name, settings, named, counted),
                     overrides=tuple(setting.line for setting in settings),
                 )
                 other = found.setdefault(frozenset(setting.identity for setting in settings), job)
-                if other.arm != name and (guilty := [key for key in axes if key in line]):
+                if other.arm != name and (causes := [key for key in axes if key in line]):
                     raise UserError(
-                        f"{guilty[0]}: tells the arms {other.arm} and {name} apart, so the line cannot set "
-                        f"it for both. Try: '~grid.arms.{name}', or without {guilty[0]}="
+                        f"{causes[0]}: the arms {other.arm} and {name} differ in this setting, so the line "
+                        f"cannot set it for both. Try: '~grid.arms.{name}', or without {causes[0]}="
                     )
     return list(found.values())
 
 
 def swept_keys(grid: Grid, line: Axes) -> list[str]:
-    """The keys in which jobs may differ: those of the grid and those to which the line gives several values.
+    """Return the keys in which jobs may differ: those of the grid, and those with several values in the line.
 
-    Also prompt and seed where the line gives them: another prompt is another job, not another setting of all.
+    Prompt and seed count too if the line gives them: another prompt is another job, not another setting of
+    all jobs.
     """
     keys = [*grid.each, *(key for axes in grid.arms.values() for key in axes)]
-    keys += [key for key, axis in line.items() if len(axis) > 1 or key in ALWAYS_TOLD]
+    keys += [key for key, axis in line.items() if len(axis) > 1 or key in ALWAYS_SHOWN]
     return list(dict.fromkeys(keys))
 
 
 def sweep_name(grid_name: str | None, line: Axes) -> str:
-    """The name of the folder of a sweep: its grid's, or else one that says what the line says."""
+    """Return the name of the folder of a sweep: the name of its grid, or else a summary of the line."""
     if grid_name:
         return slug(grid_name)
     keys = sorted(line, key=lambda key: (key not in TEXT_KEYS, len(line[key]) == 1, key))
@@ -176,7 +178,7 @@ def _axis(key: str, value: Any, where: str) -> list[Setting]:
 
 
 def _grammar(key: str, value: Any) -> str:
-    """A plain value as Hydra's grammar reads it back."""
+    """Write a plain value so that Hydra's grammar reads the same value."""
     if key in TEXT_KEYS:
         return quote(str(value))
     if isinstance(value, str):
@@ -212,7 +214,7 @@ def _parsed(line: str) -> Override:
 def _foreign(
     grid: Grid, line: Axes, arms: Mapping[str, Axes], has_setting: HasSetting
 ) -> dict[str, set[str]]:
-    """For each arm, the keys of the line that it has no setting for, while another arm has."""
+    """Return for each arm the keys of the line for which another arm has a setting and this one does not."""
     if len(arms) == 1:
         return {name: set() for name in arms}
     asked = [key for key in line if key not in grid.each and not line[key][0].line.startswith(("+", "~"))]
@@ -220,21 +222,21 @@ def _foreign(
     for name, axes in arms.items():
         base = [axis[0].line for key, axis in (grid.each | axes).items() if key not in asked]
         missing[name] = {key for key in asked if key not in axes and not has_setting(base, key)}
-    nobodys = set.intersection(*missing.values())
-    return {name: keys - nobodys for name, keys in missing.items()}
+    in_no_arm = set.intersection(*missing.values())
+    return {name: keys - in_no_arm for name, keys in missing.items()}
 
 
-def _told(grid: Grid, line: Axes) -> set[str]:
-    """The keys that the name of a folder tells: those that may vary, whether the line narrows them or not."""
+def _named(grid: Grid, line: Axes) -> set[str]:
+    """Return the keys that the name of a folder shows: all that may vary, even if the line narrows them."""
     varied = {key for axes in grid.arms.values() for key, axis in axes.items() if len(axis) > 1}
     varied |= {key for key, axis in grid.each.items() if len(axis) > 1}
     fixed = {key for axes in (*grid.arms.values(), grid.each) for key in axes} - varied
     return {key for key in swept_keys(grid, line) if key not in fixed or len(line.get(key, ())) > 1}
 
 
-def _folder_name(arm: str, settings: Sequence[Setting], told: set[str], counted: Sequence[str]) -> str:
-    """A readable name, and a digest of all that makes this job another one than its neighbours."""
-    shown = sorted((each for each in settings if each.key in told), key=lambda each: each.key)
+def _folder_name(arm: str, settings: Sequence[Setting], named: set[str], counted: Sequence[str]) -> str:
+    """Return a readable name with a digest of everything in which this job may differ from the others."""
+    shown = sorted((each for each in settings if each.key in named), key=lambda each: each.key)
     words = [each.text for each in shown if each.key in TEXT_KEYS]
     words += [f"{each.key.rpartition('.')[2]}={each.text}" for each in shown if each.key not in TEXT_KEYS]
     digest = _digest([arm, *sorted(each.identity for each in settings if each.key in counted)])

@@ -1,4 +1,4 @@
-"""From a line to the jobs of a sweep: every one is composed, so that mistakes show before anything runs."""
+"""Plan: from a line to the jobs of a sweep. Each job is composed, so mistakes show before anything runs."""
 
 import re
 from argparse import Namespace
@@ -13,12 +13,12 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
-from cadam3d.launch import compose_line, key_of, refuse_holes
-from cadam3d.settings.advice import ask_for, explain, missing_values
+from cadam3d.settings.advice import RefusedJobError, require_values
 from cadam3d.settings.compose import flatten
-from cadam3d.sweep.grid import ALWAYS_TOLD, Axes, Grid, Job, expand, read_grid, read_line, swept_keys
+from cadam3d.settings.hydra import compose_line, refuse_holes
+from cadam3d.settings.line import SWEEP_FOLDER, key_of
+from cadam3d.sweep.grid import ALWAYS_SHOWN, Axes, Grid, Job, expand, read_grid, read_line, swept_keys
 
-FOLDER = "hydra.sweep.dir"
 PLAIN_KEY = re.compile(r"[A-Za-z_][\w.]*=")  # neither an addition nor a deletion nor a package
 OF_THE_LAUNCHER = re.compile(r"launcher($|\.)|hydra[./]launcher($|\.)")
 OF_THE_GRID = re.compile(r"grid($|\.)")
@@ -29,8 +29,8 @@ NOTHING_TO_SWEEP = (
 
 
 @dataclass(frozen=True)
-class Line:
-    """The overrides of a line by whom they concern; a search path for YAML files concerns all of them."""
+class Parts:
+    """The overrides of a line by what they concern; a search path for YAML files concerns all of them."""
 
     grid: list[str]
     launcher: list[str]
@@ -40,17 +40,17 @@ class Line:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What a line asks for."""
+    """A sweep as a line asks for it."""
 
     cfg: DictConfig  # of the sweep itself: the grid, the launcher, Hydra's node
-    line: Line
+    parts: Parts  # of the line
     grid: Grid
     axes: Axes  # of the line
     jobs: list[Job]
 
     @property
     def grid_name(self) -> str | None:
-        """The grid as the line names it."""
+        """Name of the grid in the line."""
         return self.cfg.hydra.runtime.choices.get("grid")
 
 
@@ -63,17 +63,17 @@ class Composed:
     unknown: set[str]  # keys whose value only the running job knows
 
     def get(self, key: str) -> Any:
-        """A value, or what was chosen of a group; None if the job has no such key."""
+        """Return a value, or the option chosen of a group; None if the job has no such key."""
         return self.choices[key] if key in self.choices else self.values.get(key)
 
 
 @dataclass(frozen=True)
 class Base:
-    """A composed job, of which others differ in values only."""
+    """A composed job from which other jobs differ in plain values only."""
 
     cfg: DictConfig
     plain: dict[str, Any]  # leaves by dotted key
-    referring: list[str]  # leaves that interpolations make
+    referring: list[str]  # keys of leaves that are interpolations
 
     @classmethod
     def of(cls, cfg: DictConfig) -> "Base":
@@ -86,7 +86,7 @@ class Base:
         return cls(cfg, {key: leaves[key] for key in leaves.keys() - set(referring)}, referring)
 
     def composed(self, values: Mapping[str, Any]) -> Composed:
-        """The job with ``values`` instead, put in as Hydra does."""
+        """Return the job with other ``values``, set as Hydra sets them."""
         for key, value in values.items():
             OmegaConf.update(self.cfg, key, value, merge=True)
         resolved = {}
@@ -106,17 +106,18 @@ class Base:
 class Composer:
     """Composes ``cadam3d train`` with many lines quickly.
 
-    One line takes Hydra a sixth of a second, and most jobs of a sweep differ in plain values only. So lines
-    that choose the same parts and set the same keys are composed once.
+    One line takes Hydra a sixth of a second, and most jobs of a sweep differ in plain values only. Lines that
+    choose the same parts and set the same keys are therefore composed only once.
     """
 
-    def __init__(self, command: str, options: Namespace, common: Sequence[str]) -> None:
-        self._command, self._options, self._common = command, options, list(common)
+    def __init__(self, options: Namespace, common: Sequence[str]) -> None:
+        self._options, self._common = options, list(common)
         self._bases: dict[tuple[str, ...], Base] = {}
+        self._keys: dict[tuple[str, ...], list[str]] = {}  # settings and groups, by overrides
         self._leaves = set(self._base([]).plain)
 
     def compose(self, overrides: Sequence[str]) -> Composed:
-        """The settings under ``overrides``. Raises ``UserError`` if they do not compose or lack a value."""
+        """Return the settings under ``overrides``. Raises if they cannot be composed or lack a value."""
         values = {}
         key_lines = []
         for line in overrides:
@@ -127,77 +128,78 @@ class Composer:
         known = tuple(key_lines)
         if known not in self._bases:
             base = self._base(overrides)
-            if missing := missing_values(base.cfg):
-                raise ask_for(missing, self._command)
-            refuse_holes(base.cfg, self._command, overrides)
+            require_values(base.cfg)
+            refuse_holes(base.cfg, "sweep", overrides)
             self._bases[known] = base
         return self._bases[known].composed(values)
 
     def has(self, overrides: Sequence[str], key: str) -> bool:
-        """Whether a job under ``overrides`` has a setting or a group called ``key``."""
-        base = self._base(overrides)
-        leaves = (*base.plain, *base.referring, *base.cfg.hydra.runtime.choices)
-        return any(f"{leaf}.".startswith(f"{key}.") for leaf in leaves)
+        """Return whether a job under ``overrides`` has a setting or a group called ``key``."""
+        arm = tuple(overrides)
+        if arm not in self._keys:
+            base = self._base(overrides)
+            self._keys[arm] = [*base.plain, *base.referring, *base.cfg.hydra.runtime.choices]
+        return any(f"{known}.".startswith(f"{key}.") for known in self._keys[arm])
 
     def _base(self, overrides: Sequence[str]) -> Base:
         return Base.of(compose_line("train", [*self._common, *overrides], self._options))
 
 
 def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> tuple[Sweep, Composer]:
-    """What the line asks for. Raises ``UserError`` for a line that asks for no sweep or for too much."""
-    line = sort_out(overrides)
+    """Return the sweep that a line asks for, and what composes its jobs.
+
+    Raises ``UserError`` for a line that asks for no sweep or has settings that a sweep cannot have.
+    """
+    parts = sort_out(overrides)
     own = Namespace(**{**vars(options), "config_name": None})  # another name concerns the jobs
-    cfg = compose_line("sweep", [*line.grid, *line.launcher, *line.folder], own)
+    cfg = compose_line("sweep", [*parts.grid, *parts.launcher, *parts.folder], own)
     node = cfg.get("grid")
     grid = read_grid(None if node is None else OmegaConf.to_container(node, resolve=True))
-    try:
-        axes = read_line(line.jobs)
-    except UserError:
-        raise
-    except Exception as error:
-        raise explain(error, command, overrides) or error from error
-    composer = Composer(command, options, _search_path(overrides))
+    axes = read_line(parts.jobs)
+    composer = Composer(options, _search_path(overrides))
     jobs = expand(grid, axes, composer.has)
     if command == "sweep" and node is None and len(jobs) == 1:
         raise UserError(NOTHING_TO_SWEEP)
-    return Sweep(cfg=cfg, line=line, grid=grid, axes=axes, jobs=jobs), composer
+    return Sweep(cfg=cfg, parts=parts, grid=grid, axes=axes, jobs=jobs), composer
 
 
-def sort_out(overrides: Sequence[str]) -> Line:
-    """Tell the overrides of jobs from those of the sweep. Raises ``UserError`` for what fits in none."""
-    line = Line(grid=[], launcher=[], folder=[], jobs=[])
+def sort_out(overrides: Sequence[str]) -> Parts:
+    """Separate the overrides of jobs from those of the sweep. Raises ``UserError`` for what fits neither."""
+    parts = Parts(grid=[], launcher=[], folder=[], jobs=[])
     for override in overrides:
         key = key_of(override)
         if NOT_FOR_SWEEPS.match(key):
-            raise UserError(f"{key}: not for sweeps. Try: {FOLDER}=multirun/mine, where all jobs are")
+            raise UserError(
+                f"{key}: not for sweeps. Try: {SWEEP_FOLDER}=multirun/mine, the folder of all jobs"
+            )
         if key == "hydra.mode":
             continue
         if OF_THE_GRID.match(key):
-            line.grid.append(override)
+            parts.grid.append(override)
         elif OF_THE_LAUNCHER.match(key):
-            line.launcher.append(override.lstrip("+") if key == "launcher" else override)
-        elif key == FOLDER:
-            line.folder.append(override)
+            parts.launcher.append(override.lstrip("+") if key == "launcher" else override)
+        elif key == SWEEP_FOLDER:
+            parts.folder.append(override)
         else:
-            line.jobs.append(override)
-    line.grid.extend(_search_path(overrides))
-    return line
+            parts.jobs.append(override)
+    parts.grid.extend(_search_path(overrides))
+    return parts
 
 
 def compose_all(sweep: Sweep, composer: Composer) -> list[Composed]:
-    """The settings of every job. Raises ``UserError``, naming the arm, for a job that cannot run."""
+    """Return the settings of every job. Raises ``RefusedJobError`` for the first one that cannot run."""
     composed = []
     for job in sweep.jobs:
         try:
             composed.append(composer.compose(job.overrides))
-        except UserError as error:
-            raise UserError(f"arm {job.arm}: {error}" if job.arm else str(error)) from error
+        except Exception as error:
+            raise RefusedJobError(job.arm, job.overrides) from error
     return composed
 
 
-def told_keys(sweep: Sweep) -> list[str]:
-    """The keys whose values a table of this sweep must tell."""
-    return list(dict.fromkeys([*ALWAYS_TOLD, *swept_keys(sweep.grid, sweep.axes)]))
+def shown_keys(sweep: Sweep) -> list[str]:
+    """Return the keys whose values a table of this sweep must show."""
+    return list(dict.fromkeys([*ALWAYS_SHOWN, *swept_keys(sweep.grid, sweep.axes)]))
 
 
 def _search_path(overrides: Sequence[str]) -> list[str]:

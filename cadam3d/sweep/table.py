@@ -1,4 +1,4 @@
-"""``sweep.csv``: one row per job, gathered from the disk whenever it is asked for."""
+"""Table: ``sweep.csv`` with one row per job, made anew from the disk each time."""
 
 import csv
 from collections.abc import Sequence
@@ -7,18 +7,22 @@ from typing import Any
 
 from cadam3d.io.atomic import replacing
 from cadam3d.io.jsonl import to_json
+from cadam3d.io.run_folder import TABLE
 from cadam3d.sweep.folder import Row, load
 
-TABLE = "sweep.csv"
 FACTS = ("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "asset_bytes", "message")
-SHOWN = ("num_gaussians", "psnr", "seconds")  # in the terminal, beside what jobs differ in and the outcome
+SHOWN = (
+    "num_gaussians",
+    "psnr",
+    "seconds",
+)  # in the terminal, beside the outcome and the settings in which jobs differ
 
 
 def write_table(sweep: Path) -> list[Row]:
-    """Write the table of a sweep in one move, and return what it was made of.
+    """Write the table of a sweep atomically, and return its rows.
 
-    Jobs that end side by side all write it. Each looks at the disk again afterwards, so the last to write has
-    seen every job that ended before.
+    Jobs that run side by side all write it. Each reads the disk again afterwards, so the last one to write
+    has seen every job that ended before.
     """
     rows = load(sweep)
     while True:
@@ -29,7 +33,7 @@ def write_table(sweep: Path) -> list[Row]:
 
 
 def as_text(rows: Sequence[Row]) -> str:
-    """The rows as a table for the terminal, without what the arm tells or all jobs share."""
+    """Return a table for the terminal, without settings that are the same in all jobs of an arm."""
     keys = varying_keys(rows)
     has_arms = any(row.arm for row in rows)
     lines = [["job", *(["arm"] if has_arms else []), *keys, "outcome", *SHOWN]]
@@ -43,7 +47,7 @@ def as_text(rows: Sequence[Row]) -> str:
 
 
 def varying_keys(rows: Sequence[Row]) -> list[str]:
-    """The keys in which jobs of one arm differ."""
+    """Return the keys in which jobs of the same arm differ."""
     arms = len({row.arm for row in rows})
     return [
         key

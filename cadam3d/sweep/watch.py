@@ -1,4 +1,4 @@
-"""What a sweep says while it runs: one line for each job that has ended, wherever it ran."""
+"""Watch: print one line for each job of a running sweep that has ended, wherever it ran."""
 
 import textwrap
 import threading
@@ -7,14 +7,15 @@ from collections.abc import Sequence
 from typing import Any
 
 from cadam3d.core.outcome import Outcome
-from cadam3d.sweep.folder import ENDED, Row, read_summary
+from cadam3d.io.run_folder import ENDED, read_summary
+from cadam3d.sweep.folder import Row
 from cadam3d.sweep.table import varying_keys
 
 POLL_SECONDS = 0.5
 
 
 class Watch:
-    """While this is open, a thread looks at the folders of the jobs and reports those that end."""
+    """While this is open, a thread watches the folders of the jobs and reports those that end."""
 
     def __init__(self, rows: Sequence[Row], pending: Sequence[Row]) -> None:
         self._waiting = list(pending)
@@ -45,8 +46,8 @@ class Watch:
             self._waiting.remove(row)
             self._ended += 1
             position = f"{self._count - len(self._waiting):>{len(str(self._count))}}/{self._count}"
-            told = f"{describe(row, self._keys)}: {result(read_summary(row.folder))}{self._left()}"
-            print(f"[{position}] {told}", flush=True)
+            news = f"{describe(row, self._keys)}: {result(read_summary(row.folder))}{self._left()}"
+            print(f"[{position}] {news}", flush=True)
 
     def _left(self) -> str:
         if not self._waiting:
@@ -56,15 +57,15 @@ class Watch:
 
 
 def describe(row: Row, keys: Sequence[str]) -> str:
-    """A job in a few words: its arm and what tells it from the others of its arm."""
+    """Describe a job in a few words: its arm, and the settings in which it differs within that arm."""
     values = {key: row.swept[key] for key in keys if row.swept.get(key) is not None}
-    told = [str(value) if key == "prompt" else f"{key}={value}" for key, value in values.items()]
-    return ", ".join([*([row.arm] if row.arm else []), *told]) or str(row.swept.get("prompt"))
+    parts = [str(value) if key == "prompt" else f"{key}={value}" for key, value in values.items()]
+    return ", ".join([*([row.arm] if row.arm else []), *parts]) or str(row.swept.get("prompt"))
 
 
 def result(summary: dict[str, Any]) -> str:
-    """What became of a job in a few words."""
-    outcome = summary.get("outcome", "ended without a word")
+    """Describe the result of a job in a few words."""
+    outcome = summary.get("outcome", "ended without a summary")
     if message := summary.get("message"):
         return f"{outcome}: {textwrap.shorten(message, 160, placeholder=' ...')}"
     facts = [] if outcome == Outcome.FINISHED else [str(outcome)]
@@ -78,7 +79,7 @@ def result(summary: dict[str, Any]) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A time to wait, as precise as such estimates are."""
+    """Format a time to wait, as precisely as such estimates are."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = seconds / 60

@@ -1,4 +1,4 @@
-"""doctor: sees what is there, says what to type about what is not, and fails only where training would."""
+"""doctor: finds what is there, prints what to type otherwise, and fails only if training would fail."""
 
 import json
 import re
@@ -37,11 +37,11 @@ def test_this_machine_can_train(findings):
 @pytest.mark.parametrize(
     "topic", ["python", "torch", "device", "ffmpeg", "configs", "c++", "nvcc", "diffusers"]
 )
-def test_it_looks_at(topic, findings):
+def test_it_checks(topic, findings):
     assert findings[topic].found
 
 
-def test_every_rasterizer_that_this_machine_can_have_is_proved(findings):
+def test_every_rasterizer_that_this_machine_supports_is_tested(findings):
     assert findings["rasterizer=reference"].facts["agrees"]
     assert findings["rasterizer=auto"].facts["backend"] in ("cpu", "cuda", "reference")
     assert "kernels for cpu" in findings
@@ -54,14 +54,14 @@ def test_every_prior_is_tried(findings):
     assert findings["prior=shapes"].verdict is Verdict.OK
 
 
-def test_rasterizers_that_do_not_even_load_are_one_finding(monkeypatch):
-    monkeypatch.setitem(sys.modules, "cadam3d.commands.proofs", None)
+def test_rasterizers_that_cannot_be_imported_are_one_finding(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cadam3d.commands.doctor_rasterizers", None)
     [finding] = doctor._rasterizers()
     assert finding.verdict is Verdict.BROKEN
-    assert "cadam3d.commands.proofs" in finding.found
+    assert "cadam3d.commands.doctor_rasterizers" in finding.found
 
 
-def test_every_dependency_is_looked_at():
+def test_every_dependency_is_checked():
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     declared = {re.match(r"[\w-]+", line).group() for line in project["dependencies"]}
     assert set(doctor.PACKAGES) == declared
@@ -89,7 +89,7 @@ def test_no_ffmpeg_is_broken(monkeypatch):
     assert doctor._guarded(doctor._ffmpeg).verdict is Verdict.BROKEN
 
 
-def test_no_compiler_is_worth_a_note_only():
+def test_no_compiler_is_only_a_note():
     assert doctor._compiler("no-such-compiler").verdict is Verdict.NOTE
 
 
@@ -109,7 +109,7 @@ def test_models_on_disk_are_listed_by_name(monkeypatch, tmp_path):
 
 
 def test_models_on_disk_say_what_reads_them(monkeypatch, tmp_path):
-    """From the index in the cache; one that is damaged or of another kind stays a name."""
+    """The index in the cache shows that. A model with a damaged or unknown index is only a name."""
     for name, index in {
         "one--sdxl": '{"_class_name": "StableDiffusionXLPipeline"}',
         "two--shap": '{"_class_name": "ShapEPipeline"}',
@@ -131,7 +131,7 @@ def test_models_on_disk_say_what_reads_them(monkeypatch, tmp_path):
     ]
 
 
-def test_what_a_model_is_for_can_be_typed():
+def test_the_use_of_a_model_can_be_typed():
     for line in PRIORS.values():
         assert compose(["prompt=x", line]).prior._target_.startswith("cadam3d.prior.")
 
@@ -147,7 +147,7 @@ def sound(monkeypatch, *findings: Finding) -> None:
     monkeypatch.setattr(doctor, "examine", lambda: iter(findings))
 
 
-def test_all_well_is_exit_0_and_leaves_nothing_behind(monkeypatch, tmp_path, capsys):
+def test_without_problems_the_exit_code_is_0_and_no_file_is_left(monkeypatch, tmp_path, capsys):
     sound(monkeypatch, Finding("torch", Verdict.OK, "2"), Finding("nvcc", Verdict.NOTE, "none"))
     code, out = run_doctor(monkeypatch, tmp_path, capsys)
     assert code == 0
@@ -191,5 +191,5 @@ def test_a_gpu_that_torch_cannot_use_gets_a_hint(monkeypatch):
     assert finding.hint.startswith("Try: pip install")
 
 
-def test_asking_a_missing_program_is_no_crash():
+def test_a_missing_program_is_not_a_crash():
     assert doctor._ask(["/nowhere/program"])[0] == 127

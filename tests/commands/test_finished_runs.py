@@ -1,4 +1,4 @@
-"""render, export, eval and view: what they make of a run folder, a sweep folder or a bare file."""
+"""render, export, eval and view with a run folder, a sweep folder or a single file."""
 
 import json
 import sys
@@ -69,15 +69,15 @@ def test_exactly_one_asset_must_be_named(command, words, got, type_line):
 
 
 @pytest.mark.parametrize("command", ["render", "export", "view", "eval"])
-def test_a_folder_that_is_no_run_is_named(command, type_line, tmp_path):
+def test_a_folder_without_a_run_is_named(command, type_line, tmp_path):
     (tmp_path / "empty").mkdir()
-    for place, reason in (("nowhere", "no such folder"), ("empty", "it holds no config.yaml")):
+    for place, reason in (("nowhere", "no such folder"), ("empty", "it has no config.yaml")):
         code, _, err = type_line(command, f"run={place}")
         assert code == 1
         assert err.startswith(f"cadam3d: run: expected the folder of a run, got {place!r} ({reason}). Try: ")
 
 
-def test_a_run_without_an_asset_is_told_to_finish(run_folder, type_line):
+def test_the_message_for_a_run_without_an_asset_is_to_finish_it(run_folder, type_line):
     (run_folder / "asset.ply").unlink()
     code, _, err = type_line("render", f"run={run_folder}")
     assert code == 1
@@ -103,7 +103,7 @@ def test_render_writes_numbered_images_and_nothing_else(run_folder, type_line, t
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a run"]
 
 
-def test_render_takes_a_bare_file_and_a_folder_for_its_output(run_folder, type_line, tmp_path):
+def test_render_accepts_a_file_and_an_output_folder(run_folder, type_line, tmp_path):
     (run_folder / "asset.ply").rename(tmp_path / "thing.ply")
     words = ("exporter=[images]", "exporter.images.size=16", "exporter.images.views=1")
     assert type_line("render", "ply=thing.ply", "output=some (pictures)", *words)[0] == 0
@@ -133,7 +133,7 @@ def test_export_without_output_leaves_the_asset_of_the_run_alone(run_folder, typ
     assert len((run_folder / "export/asset.ply").read_bytes()) > len(before)
 
 
-def test_export_to_a_form_that_does_not_exist_says_which_do(run_folder, type_line):
+def test_export_to_an_unknown_format_lists_those_that_exist(run_folder, type_line):
     code, _, err = type_line("export", f"run={run_folder}", "exporter=[splat]")
     assert code == 1
     assert "images|ply|preview|turntable" in err
@@ -153,7 +153,7 @@ def test_eval_measures_against_the_truth_of_the_shapes_prior(run_folder, type_li
     assert "psnr" in out
 
 
-def test_eval_says_what_a_prior_without_truth_cannot_tell(tmp_path, gaussians, type_line):
+def test_eval_notes_which_numbers_are_missing_without_true_images(tmp_path, gaussians, type_line):
     folder = make_run(tmp_path / "run", gaussians, "prior=tiny")
     code, out, _ = type_line("eval", f"run={folder}", *SMALL)
     result = read_json(folder / "eval.json")
@@ -190,7 +190,7 @@ def test_eval_of_a_sweep_without_any_asset_fails(tmp_path, type_line):
     assert type_line("eval", "run=sweep")[0] == 1
 
 
-def test_other_commands_point_from_a_sweep_to_one_of_its_jobs(tmp_path, gaussians, type_line):
+def test_other_commands_suggest_a_job_of_a_sweep(tmp_path, gaussians, type_line):
     make_run(make_sweep(tmp_path / "sweep", "0_job") / "0_job", gaussians)
     code, _, err = type_line("render", "run=sweep")
     assert code == 1
@@ -208,7 +208,7 @@ def test_view_shows_the_report_of_a_run(run_folder, type_line, monkeypatch):
     assert out.startswith("Opened a run/report.html\n")
 
 
-def test_view_without_a_display_says_where_to_look_and_opens_nothing(run_folder, type_line, monkeypatch):
+def test_view_without_a_display_prints_the_path_and_opens_nothing(run_folder, type_line, monkeypatch):
     (run_folder / "report.html").touch()
     monkeypatch.setattr(view, "has_display", lambda: False)
     monkeypatch.setattr("webbrowser.open", lambda address: pytest.fail("a browser was started"))
@@ -218,7 +218,7 @@ def test_view_without_a_display_says_where_to_look_and_opens_nothing(run_folder,
     assert "no live viewer" in out
 
 
-def test_view_of_a_bare_file_makes_a_picture(run_folder, type_line, tmp_path):
+def test_view_of_a_file_makes_a_picture(run_folder, type_line, tmp_path):
     (run_folder / "asset.ply").rename(tmp_path / "thing.ply")
     words = ("browser=false", "exporter.preview.size=16", "exporter.preview.views=2")
     code, out, _ = type_line("view", "ply=thing.ply", *words)

@@ -1,4 +1,4 @@
-"""How training takes signals: the first one is a wish, a later one an order."""
+"""Signals to training: the first one asks it to stop, a later one stops it at once."""
 
 import os
 import signal
@@ -26,7 +26,7 @@ def test_the_first_signal_is_noted_and_the_handlers_are_put_back(number, clock):
     assert signal.getsignal(number) == before
 
 
-def test_one_signal_that_came_on_two_ways_is_one(clock):
+def test_a_signal_that_arrives_twice_within_a_second_counts_once(clock):
     with StopOnSignal() as stop:
         os.kill(os.getpid(), signal.SIGTERM)
         clock[0] += 0.9 * TOGETHER_SECONDS

@@ -1,4 +1,4 @@
-"""Checkpoints come back as they went in, or say that they do not."""
+"""Checkpoints are read as they were written, or an error is raised."""
 
 import os
 import signal
@@ -45,7 +45,7 @@ def assert_same(actual, expected) -> None:
             assert left[key] == value, key
 
 
-def test_the_payload_comes_back_as_it_went_in(tmp_path):
+def test_the_payload_is_read_as_it_was_written(tmp_path):
     save_checkpoint(tmp_path / "deep" / "step_0000007.pt", PAYLOAD)
     assert_same(load_checkpoint(tmp_path / "deep" / "step_0000007.pt"), PAYLOAD)
 
@@ -57,7 +57,7 @@ def test_tensors_that_require_gradients_are_saved_as_plain_tensors(tmp_path):
     assert not means.requires_grad
 
 
-def test_a_view_does_not_drag_its_whole_storage_into_the_file(tmp_path):
+def test_the_file_does_not_hold_the_whole_storage_of_a_view(tmp_path):
     save_checkpoint(tmp_path / "a.pt", {"view": torch.zeros(1_000_000)[:4]})
     assert (tmp_path / "a.pt").stat().st_size < 10_000
 
@@ -153,7 +153,7 @@ def test_only_damaged_checkpoints_are_an_error_not_a_fresh_start(tmp_path):
         latest_checkpoint(tmp_path)
 
 
-def test_pruning_keeps_the_newest_and_sweeps_up_after_a_kill(tmp_path):
+def test_pruning_keeps_the_newest_and_removes_leftovers_of_a_kill(tmp_path):
     for step in (1, 2, 3, 4):
         save_checkpoint(tmp_path / f"step_{step:07d}.pt", {"step": step})
     (tmp_path / ".tmp-123-step_0000005.pt").write_bytes(b"half")

@@ -33,7 +33,7 @@ def test_every_line_is_on_disk_before_the_next_one_is_written(tmp_path):
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_what_json_cannot_say_becomes_null(tmp_path, value):
+def test_values_that_json_lacks_become_null(tmp_path, value):
     append_jsonl(tmp_path / "m.jsonl", {"loss": value, "deep": {"list": [value, 1.0]}})
     write_json(tmp_path / "s.json", {"loss": value})
     assert read_jsonl(tmp_path / "m.jsonl") == [{"loss": None, "deep": {"list": [None, 1.0]}}]

@@ -26,7 +26,7 @@ def no_gaussians() -> Gaussians:
 
 
 def scene(cameras, background):
-    """A smooth picture that depends on the view and the background: "v h w 3"."""
+    """Return a smooth picture that depends on the view and the background: "v h w 3"."""
     size = cameras.height
     ramp = torch.linspace(0.2, 0.8, size)
     picture = torch.stack(
@@ -53,7 +53,7 @@ def truths(*shifts):
 
 
 def measure(render, truth, **changes):
-    return Fidelity(**{**SETTINGS, **changes}).measure(no_gaussians(), render, truth)
+    return Fidelity(**{**SETTINGS, **changes}).measure(no_gaussians(), render, truth, None)
 
 
 @pytest.mark.parametrize(("error", "psnr"), [(0.1, 20.0), (-0.1, 20.0), (0.01, 40.0)])
@@ -123,7 +123,7 @@ def test_the_nearest_mode_is_found_and_scored(right):
 
 def test_one_mode_counts_for_all_views():
     def truth(cameras, background):
-        """Each mode is right from one elevation only, the first a little nearer on the other."""
+        """Make each mode right at one elevation only; the first is a little closer at the other one."""
         low = (cameras.elevation_deg < 10)[:, None, None, None]
         right = scene(cameras, background)
         return torch.stack([right + torch.where(low, 0.01, 0.08), right + torch.where(low, 0.1, 0.01)])
@@ -133,7 +133,7 @@ def test_one_mode_counts_for_all_views():
     assert measured["psnr"] < 32  # choosing a mode per view would claim 40 dB
 
 
-def test_without_a_truth_there_is_nothing_to_say():
+def test_without_true_images_there_are_no_numbers():
     def never(cameras, background):
         raise AssertionError("nothing to render for")
 
@@ -150,7 +150,7 @@ def test_held_out_views_are_not_those_of_a_turntable_and_no_two_are_alike():
     assert sorted(set(fidelity.cameras().elevation_deg.tolist())) == [-10.0, 20.0, 50.0]
 
 
-def test_render_and_truth_stand_before_the_same_background():
+def test_render_and_truth_have_the_same_background():
     seen = []
 
     def truth(cameras, background):

@@ -1,4 +1,4 @@
-"""Size: the bytes it states are the bytes on disk."""
+"""Size: the bytes that it states are the bytes on disk, for every way to write the file."""
 
 import pytest
 import torch
@@ -22,27 +22,31 @@ def never_renders(cameras, background):
     raise AssertionError("counting needs no picture")
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize(("degree", "pad_sh"), [(0, 0), (0, 3), (1, 0), (1, 2), (3, 0)])
 @pytest.mark.parametrize("n", [0, 1, 500])
-def test_asset_bytes_are_the_bytes_of_the_file(tmp_path, degree, n):
-    write_ply(tmp_path / "asset.ply", gaussians(n, degree), up="-y", pad_sh=0)
-    measured = Size().measure(gaussians(n, degree), never_renders, None)
-    assert measured["asset_bytes"] == (tmp_path / "asset.ply").stat().st_size
+def test_sizes_are_those_of_the_file(tmp_path, degree, pad_sh, n):
+    path = tmp_path / "asset.ply"
+    write_ply(path, gaussians(n, degree), up="-y", pad_sh=pad_sh)
+    measured = Size().measure(gaussians(n, degree), never_renders, None, path)
+    size = path.stat().st_size
     assert measured["num_gaussians"] == n
+    assert measured["asset_bytes"] == size
+    assert measured["asset_mib"] == size / 2**20
+    assert measured.get("bytes_per_gaussian") == (size / n if n else None)
 
 
-def test_a_large_asset_of_degree_0_costs_68_bytes_per_gaussian():
-    measured = Size().measure(gaussians(100_000), never_renders, None)
-    assert measured["bytes_per_gaussian"] == pytest.approx(68, abs=0.01)
-    assert measured["asset_mib"] == pytest.approx(6.8e6 / 2**20, rel=1e-3)
+def test_without_a_file_there_are_no_sizes():
+    measured = Size().measure(gaussians(3), never_renders, None, None)
+    assert set(measured) == {"num_gaussians", "median_scale", "median_opacity"}
 
 
 def test_medians_are_of_the_longest_axis_and_of_the_opacity():
-    measured = Size().measure(gaussians(3), never_renders, None)
+    measured = Size().measure(gaussians(3), never_renders, None, None)
     assert measured["median_scale"] == pytest.approx(0.4)
     assert measured["median_opacity"] == pytest.approx(0.5)
 
 
-def test_counts_are_whole_numbers():
-    measured = Size().measure(gaussians(3), never_renders, None)
+def test_counts_are_whole_numbers(tmp_path):
+    write_ply(tmp_path / "asset.ply", gaussians(3), up="-y", pad_sh=0)
+    measured = Size().measure(gaussians(3), never_renders, None, tmp_path / "asset.ply")
     assert type(measured["num_gaussians"]) is type(measured["asset_bytes"]) is int

@@ -1,4 +1,4 @@
-"""A program that stands in for ``cadam3d train``, so that sweeps can be tested in a blink."""
+"""A small program that replaces ``cadam3d train``, so that tests of sweeps are fast."""
 
 import json
 import sys
@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-# Called as: PROGRAM -m cadam3d.sweep.process PARENT train key=value ...
-# It does what prompt= says, after noting how it was called in calls.jsonl beside the job folders: "meets" are
-# the earlier calls for the same job that are still at work.
+# Called as: PROGRAM -m cadam3d.job PARENT train key=value ...
+# It appends how it was called to calls.jsonl beside the job folders and does what prompt= says. "meets" lists
+# the earlier calls for the same job that are still running.
 STAND_IN = r"""#!{python} -S
 import json, os, pathlib, signal, sys, time
 given = dict(word.lstrip("+~").partition("=")[::2] for word in sys.argv[5:] if "=" in word)
@@ -58,14 +58,14 @@ if prompt == "a kill":
     (folder / "checkpoints" / "step_0000002.pt").touch()
     if (folder.parent / "config.yaml").is_file():
         (folder / "config.yaml").write_bytes((folder.parent / "config.yaml").read_bytes())
-    write("finished")  # the numbers are there, exports are not
+    write("finished")  # the numbers are written, exports are not
     os.kill(os.getpid(), signal.SIGKILL)
 if prompt == "a deaf one":
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 if prompt in ("a wait", "a deaf one"):
     (folder / "waiting").touch()
     time.sleep(60)
-if prompt == "a long one":  # its end, with its parent's or its own, is up to the test
+if prompt == "a long one":  # the test decides when it ends
     (folder / "waiting").touch()
     deadline = time.monotonic() + 60
     while not (beside / "go").exists() and time.monotonic() < deadline:
@@ -81,7 +81,7 @@ write("finished", psnr=20.25, ssim=0.5, asset_bytes=340, warnings=[])
 
 @pytest.fixture
 def stand_in(tmp_path_factory) -> Path:
-    """The program; put it into ``sys.executable``."""
+    """The path of the program, for ``sys.executable``."""
     path = tmp_path_factory.mktemp("bin") / "train"
     path.write_text(STAND_IN.format(python=sys.executable), encoding="utf-8")
     path.chmod(0o755)
@@ -90,7 +90,7 @@ def stand_in(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def calls():
-    """How the program was called, from the folder of a sweep."""
+    """Read how the program was called from the folder of a sweep."""
 
     def read(sweep: Path) -> list[dict]:
         path = sweep / "calls.jsonl"

@@ -1,4 +1,4 @@
-"""Which jobs a sweep has: laws of expansion, and names that stay."""
+"""Grids: which jobs a sweep has, and that their names do not change."""
 
 import itertools
 import random
@@ -25,7 +25,7 @@ def pareto() -> Grid:
 
 
 def has_setting(overrides, key) -> bool:
-    """A world in which each densifier has one threshold of its own, and everything else is everybody's."""
+    """Pretend that each densifier has one threshold that no other has; all other settings are common."""
     return key not in KEYS_OF.values() or any(KEYS_OF.get(line) == key for line in overrides)
 
 
@@ -75,20 +75,20 @@ def test_without_a_grid_the_line_is_one_product_in_its_own_order():
         ("steps=1e3,2", [1000.0, 2]),
     ],
 )
-def test_what_the_line_says_replaces_the_axis_of_the_grid(pareto, line, expected):
+def test_the_line_replaces_an_axis_of_the_grid(pareto, line, expected):
     jobs = expand(pareto, read_line([line]))
     key = line.partition("=")[0]
     assert sorted({values(job)[key] for job in jobs}) == sorted(expected)
     assert {job.arm for job in jobs} == {"baseline", "cadam"}
 
 
-def test_the_line_replaces_the_axis_of_an_arm_and_leaves_alone_those_who_have_no_such_setting(pareto):
+def test_the_line_replaces_the_axis_of_an_arm_but_not_of_arms_without_that_setting(pareto):
     jobs = expand(pareto, read_line(["densifier.tau_pos=0.01,0.02,0.03"]), has_setting)
     assert {values(job).get("densifier.tau_pos") for job in jobs} == {0.01, 0.02, 0.03, None}
     assert len(jobs) == 6 * (3 + 1)
 
 
-def test_a_setting_that_no_arm_names_goes_to_those_who_have_it(pareto):
+def test_a_setting_that_no_arm_names_goes_to_all_arms_that_have_it(pareto):
     jobs = expand(pareto, read_line(["densifier.tau_Q=0.5,0.7"]), has_setting)
     assert {(job.arm, values(job).get("densifier.tau_Q")) for job in jobs} == {
         ("baseline", None),
@@ -98,7 +98,7 @@ def test_a_setting_that_no_arm_names_goes_to_those_who_have_it(pareto):
     assert len(jobs) == 6 * (2 + 2)
 
 
-def test_a_setting_that_nobody_has_stays_in_for_hydra_to_complain_about(pareto):
+def test_a_setting_that_no_arm_has_stays_so_that_hydra_refuses_it(pareto):
     jobs = expand(pareto, read_line(["typo=1"]), lambda overrides, key: key != "typo")
     assert all(values(job)["typo"] == 1 for job in jobs)
 
@@ -110,7 +110,9 @@ def test_a_setting_of_the_line_reaches_an_arm_that_does_not_name_it():
 
 
 def test_a_line_that_makes_two_arms_the_same_is_refused(pareto):
-    with pytest.raises(UserError, match=r"^densifier: tells the arms one and two apart.*'~grid.arms.two'"):
+    with pytest.raises(
+        UserError, match=r"^densifier: the arms one and two differ in this setting.*'~grid.arms.two'"
+    ):
         expand(
             read_grid({"arms": {"one": {"densifier": "a"}, "two": {"densifier": "b"}}}),
             read_line(["densifier=c"]),
@@ -123,7 +125,7 @@ def test_a_job_that_two_arms_share_runs_once():
     assert [(job.arm, values(job)["tau"]) for job in jobs] == [("all", 1), ("all", 2), ("all", 3)]
 
 
-def test_names_tell_jobs_apart_and_keep_to_file_names(pareto):
+def test_names_are_unique_and_valid_file_names(pareto):
     names = [job.name for job in expand(pareto, read_line(["prompt='a/b','😀','" + "x" * 300 + "'"]))]
     assert len(set(names)) == len(names) == 27
     assert all("/" not in name and len(name.encode()) < 255 for name in names)
@@ -144,7 +146,7 @@ def test_a_name_stays_when_the_line_narrows_the_grid(pareto):
         assert narrowed < everything
 
 
-def test_a_name_stays_when_what_all_jobs_share_changes(pareto):
+def test_a_name_stays_when_a_setting_of_all_jobs_changes(pareto):
     """Then the folder is found again, and its settings are compared: see test_sweeps.py."""
     before = [job.name for job in expand(pareto, read_line(["steps=100"]))]
     assert [job.name for job in expand(pareto, read_line(["steps=200"]))] == before
@@ -183,13 +185,13 @@ def test_a_prompt_of_a_grid_is_text_even_if_it_looks_like_a_number():
     assert values(job)["prompt"] == "12"
 
 
-def test_all_keys_in_which_jobs_may_differ_are_told(pareto):
+def test_all_keys_in_which_jobs_may_differ_are_listed(pareto):
     line = read_line(["steps=5", "views=1,2", "seed=0"])
     assert swept_keys(pareto, line) == ["prompt", "seed", "densifier", "densifier.tau_pos", "views"]
 
 
 @pytest.mark.parametrize(
-    ("node", "said"),
+    ("node", "expected"),
     [
         ({"densifier": "baseline,cadam"}, "grid: expected each, arms and figures, got densifier"),
         ([1], "grid: expected each, arms and figures"),
@@ -199,10 +201,10 @@ def test_all_keys_in_which_jobs_may_differ_are_told(pareto):
         ({"each": {"seed": []}}, "grid.each: seed has no values"),
     ],
 )
-def test_a_grid_that_is_none_is_refused(node, said):
+def test_an_invalid_grid_is_refused(node, expected):
     with pytest.raises(UserError) as caught:
         read_grid(node)
-    assert str(caught.value).startswith(said)
+    assert str(caught.value).startswith(expected)
     assert "Try: " in str(caught.value)
 
 

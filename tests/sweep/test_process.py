@@ -1,4 +1,4 @@
-"""One job as a process of its own: how it is started, stopped, and what is written down when it ends."""
+"""A job in a process of its own: how it is started and stopped, and what is recorded when it ends."""
 
 import errno
 import json
@@ -14,8 +14,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from cadam3d import job
+from cadam3d.io.lock import try_lock
+from cadam3d.io.run_folder import STOP
 from cadam3d.sweep import process
-from cadam3d.sweep.folder import STOP, Plan, PlannedJob, Row, load, write_plan
+from cadam3d.sweep.folder import Plan, PlannedJob, Row, load, write_plan
 from cadam3d.sweep.process import run_job
 
 REPOSITORY = Path(__file__).parents[2]
@@ -24,7 +27,7 @@ PYTHON = sys.executable
 
 @pytest.fixture
 def sweep(tmp_path, stand_in, monkeypatch):
-    """Makes the folder of a sweep of one job with this prompt."""
+    """Make the folder of a sweep of one job with this prompt."""
     monkeypatch.setattr(sys, "executable", str(stand_in))
     folder = tmp_path / "a sweep, (1)"
     folder.mkdir()
@@ -56,7 +59,7 @@ def ended(folder: Path) -> tuple[Row, dict]:
         ("a kill", "killed", "by SIGKILL (out of memory?)", -signal.SIGKILL, False),
     ],
 )
-def test_however_a_process_ends_is_an_outcome(sweep, prompt, outcome, message, code, has_result):
+def test_every_end_of_a_process_is_an_outcome(sweep, prompt, outcome, message, code, has_result):
     folder = sweep(prompt)
     run_job(folder, 0)
     row, end = ended(folder)
@@ -65,14 +68,14 @@ def test_however_a_process_ends_is_an_outcome(sweep, prompt, outcome, message, c
     assert end["seconds"] > 0
 
 
-def test_numbers_that_a_killed_run_had_written_stay(sweep):
+def test_numbers_that_a_killed_run_has_written_stay(sweep):
     folder = sweep("a kill")
     run_job(folder, 0)
     row, _ = ended(folder)
     assert row.summary["num_gaussians"] == 5
 
 
-def test_what_a_job_says_goes_to_its_folder(sweep, capfd):
+def test_the_console_of_a_job_goes_to_its_folder(sweep, capfd):
     folder = sweep("a cube")
     run_job(folder, 0)
     assert (folder / "job_1/console.txt").read_text() == "at work on a cube\n"
@@ -91,14 +94,14 @@ def test_a_job_gets_its_folder_the_flags_and_the_threads_of_the_plan(sweep, call
     ]
 
 
-def test_a_plan_without_threads_leaves_the_environment_alone(sweep, calls, monkeypatch):
+def test_a_plan_without_threads_does_not_change_the_environment(sweep, calls, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     folder = sweep("a cube")
     run_job(folder, 0)
     assert calls(folder)[0]["threads"] == "7"
 
 
-def test_a_job_with_a_checkpoint_goes_on_from_it(sweep, calls):
+def test_a_job_with_a_checkpoint_continues_from_it(sweep, calls):
     folder = sweep("a kill")
     run_job(folder, 0)
     run_job(folder, 0)
@@ -117,10 +120,10 @@ def test_a_job_without_a_checkpoint_starts_in_an_empty_folder(sweep, calls):
     lock = (folder / "job_1/.lock").stat().st_ino
     run_job(folder, 0)
     assert [call["files"] for call in calls(folder)] == [[".lock", "console.txt"]] * 2
-    assert (folder / "job_1/.lock").stat().st_ino == lock  # or whoever waits for it would wait for nothing
+    assert (folder / "job_1/.lock").stat().st_ino == lock  # a waiting process must see the same file
 
 
-def test_a_job_with_a_result_is_left_alone(sweep, calls):
+def test_a_job_with_a_result_does_not_run_again(sweep, calls):
     folder = sweep("a cube")
     run_job(folder, 0)
     run_job(folder, 0)
@@ -151,7 +154,7 @@ def test_a_running_job_is_asked_to_save_when_the_sweep_is_stopped(sweep):
 
 
 def start_waiting(folder: Path) -> threading.Thread:
-    """Somebody else who is to run job 0, and finds it taken."""
+    """Start a second worker of job 0, which finds it taken."""
     thread = threading.Thread(target=run_job, args=(folder, 0), daemon=True)
     thread.start()
     thread.join(3 * process.POLL_SECONDS)
@@ -176,17 +179,17 @@ def test_two_workers_at_the_same_job_run_it_once(sweep, calls):
 
 
 @pytest.mark.parametrize("has_checkpoint", [False, True])
-def test_a_job_whose_worker_was_killed_is_taken_up_when_it_too_has_ended(has_checkpoint, sweep, calls):
+def test_a_job_of_a_killed_worker_runs_again_once_its_process_has_ended(has_checkpoint, sweep, calls):
     folder = sweep("a long one")
     worker = start_worker(folder)
     waiting = start_waiting(folder)
     worker.kill()
     worker.wait()
-    if has_checkpoint:  # after the other one had begun to wait
+    if has_checkpoint:  # after the other worker has begun to wait
         (folder / "job_1/checkpoints").mkdir()
         (folder / "job_1/checkpoints/step_0000002.pt").touch()
     time.sleep(3 * process.POLL_SECONDS)
-    [first] = calls(folder)  # its process is still there, and so is what it has made
+    [first] = calls(folder)  # its process is still running, and its files are still there
     assert (folder / "job_1/waiting").exists()
     (folder / "end").touch()
     wait_until(lambda: len(calls(folder)) == 2)
@@ -197,7 +200,7 @@ def test_a_job_whose_worker_was_killed_is_taken_up_when_it_too_has_ended(has_che
     assert not second["meets"], first
 
 
-def test_who_waits_for_a_job_leaves_when_the_sweep_is_stopped(sweep, calls):
+def test_a_worker_that_waits_for_a_job_ends_when_the_sweep_is_stopped(sweep, calls):
     folder = sweep("a cube")
     (folder / "job_1").mkdir()
     with process._locked(folder / "job_1", folder / STOP):
@@ -207,12 +210,12 @@ def test_who_waits_for_a_job_leaves_when_the_sweep_is_stopped(sweep, calls):
     assert not calls(folder)
 
 
-def test_a_lock_ends_with_the_job_whoever_has_inherited_it(tmp_path):
+def test_a_lock_ends_with_the_job_even_if_another_process_inherited_it(tmp_path):
     with process._locked(tmp_path, tmp_path / STOP) as lock:
         left_behind = subprocess.Popen(["sleep", "60"], pass_fds=(lock,))
     try:
         with (tmp_path / ".lock").open("w") as file:
-            assert process._try_lock(file)
+            assert try_lock(file)
     finally:
         left_behind.kill()
         left_behind.wait()
@@ -228,10 +231,30 @@ def test_a_file_system_without_locks_runs_jobs_too(sweep, monkeypatch):
     assert load(folder)[0].outcome == "finished"
 
 
-def test_a_worker_ends_with_its_sweep_only_if_that_has_made_it(monkeypatch):
-    """As with joblib. Those of Slurm and Ray are started by others, and go on."""
+def test_a_machine_without_unix_locks_and_signals_can_import_all_of_it():
+    """Windows has none of them; there a lock is taken with msvcrt."""
+    code = (
+        "import multiprocessing, signal, subprocess, sys, tempfile, types\n"
+        "for name in ('SIGUSR1', 'SIGUSR2', 'SIGKILL'): delattr(signal, name)\n"
+        "sys.modules['fcntl'] = None\n"
+        "locked = []\n"
+        "def locking(fd, mode, count):\n"
+        "    if mode == 1 and fd in locked: raise PermissionError\n"
+        "    (locked.append if mode == 1 else locked.remove)(fd)\n"
+        "sys.modules['msvcrt'] = types.SimpleNamespace(locking=locking, LK_NBLCK=1, LK_UNLCK=2)\n"
+        "import cadam3d.job, cadam3d.sweep.start, cadam3d.sweep.worker\n"
+        "from cadam3d.io.lock import try_lock, unlock\n"
+        "file = open(sys.argv[1], 'w')\n"
+        "assert [try_lock(file), try_lock(file), unlock(file), try_lock(file)] == [True, False, None, True]\n"
+    )
+    place = os.devnull
+    subprocess.run([PYTHON, "-c", code, place], check=True, cwd=REPOSITORY)
+
+
+def test_a_worker_ends_with_the_sweep_only_if_the_sweep_has_started_it(monkeypatch):
+    """joblib starts workers like that. Slurm and Ray start theirs elsewhere, and these continue."""
     done = []
-    monkeypatch.setattr(process, "_end_with", lambda parent: done.append(("watch", parent)))
+    monkeypatch.setattr(process, "end_with", lambda parent: done.append(("watch", parent)))
     process._end_with_sweep()
     assert not done
     monkeypatch.setattr("multiprocessing.parent_process", lambda: SimpleNamespace(pid=os.getppid()))
@@ -250,7 +273,7 @@ def test_a_worker_ends_with_its_sweep_only_if_that_has_made_it(monkeypatch):
 
 
 def start_worker(folder: Path, before: str = "") -> subprocess.Popen:
-    """A process as a launcher has them, at work on job 0."""
+    """Start a process that runs job 0, as a launcher does."""
     code = (
         f"import signal, sys; sys.executable = {sys.executable!r}\n"
         "from pathlib import Path; from cadam3d.sweep.process import run_job\n"
@@ -262,7 +285,7 @@ def start_worker(folder: Path, before: str = "") -> subprocess.Popen:
 
 
 def test_sigterm_of_a_worker_reaches_its_job(sweep):
-    """As Slurm sends it when a job is cancelled. Ctrl-C is left to the process of the sweep."""
+    """Slurm sends SIGTERM when a job is cancelled. Ctrl-C is handled by the process of the sweep."""
     folder = sweep("a wait")
     worker = start_worker(folder)
     worker.send_signal(signal.SIGINT)
@@ -273,19 +296,19 @@ def test_sigterm_of_a_worker_reaches_its_job(sweep):
     assert load(folder)[0].outcome == "interrupted"
 
 
-def test_a_launcher_that_announces_the_end_has_its_turn_when_the_job_has_saved(sweep):
-    """As submitit does when the time of a Slurm job is up: its handler queues the job again and exits."""
+def test_a_launcher_handles_the_announcement_of_the_end_once_the_job_has_saved(sweep):
+    """The handler of submitit queues a Slurm job again when its time is up, and exits."""
     folder = sweep("a wait")
     outcome = "(sweep / 'job_1/summary.json').read_text()"
     handler = f"signal.signal(signal.SIGUSR2, lambda *_: sys.exit(5 if 'interrupted' in {outcome} else 6))"
     worker = start_worker(folder, handler)
     worker.send_signal(signal.SIGUSR2)
     assert worker.wait(20) == 5
-    assert not (folder / "job_1/job.json").exists()  # it will go on
+    assert not (folder / "job_1/job.json").exists()  # it will continue
 
 
 def test_a_job_ends_with_the_process_that_started_it():
-    code = "import time; from cadam3d.sweep import process; process._end_with(PARENT); time.sleep(60)"
+    code = "import time; from cadam3d.sweep import process; process.end_with(PARENT); time.sleep(60)"
     job = [sys.executable, "-c", code.replace("PARENT", "__import__('os').getppid()")]
     launch = f"import subprocess, time; print(subprocess.Popen({job!r}).pid, flush=True); time.sleep(60)"
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
@@ -304,14 +327,14 @@ def test_a_job_ends_with_the_process_that_started_it():
         time.sleep(0.1)
 
 
-def test_a_job_does_not_hear_what_is_meant_for_its_launcher(monkeypatch):
+def test_a_job_ignores_signals_that_are_meant_for_its_launcher(monkeypatch):
     heard = []
-    monkeypatch.setattr("cadam3d.sweep.process._end_with", lambda parent: None)
+    monkeypatch.setattr("cadam3d.job.end_with", lambda parent: None)
     monkeypatch.setattr("cadam3d.cli.main", lambda: heard.extend(map(signal.getsignal, process.ANNOUNCING)))
     monkeypatch.setattr(sys, "argv", ["to be restored"])
     before = [(number, signal.getsignal(number)) for number in process.ANNOUNCING]
     try:
-        process.main(["1", "train", "seed=0"])
+        job.main(["1", "train", "seed=0"])
         assert heard == [signal.SIG_IGN] * 2
         assert sys.argv == ["cadam3d", "train", "seed=0"]
     finally:

@@ -1,7 +1,6 @@
 """``cadam3d sweep`` from its line to its table, with a stand-in for training."""
 
 import csv
-import importlib.machinery
 import os
 import shutil
 import signal
@@ -17,12 +16,14 @@ import pytest
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from cadam3d import cli, launch
+from cadam3d import cli
 from cadam3d.core.errors import UserError
-from cadam3d.settings import advice
+from cadam3d.io.run_folder import JOBS
+from cadam3d.settings import advice, hydra
 from cadam3d.settings import compose as settings
+from cadam3d.settings.hydra import read_flags
 from cadam3d.sweep import plan, start
-from cadam3d.sweep.folder import JOBS, Row, load, read_plan
+from cadam3d.sweep.folder import Row, load, read_plan
 from cadam3d.sweep.process import run_job
 from cadam3d.sweep.table import as_text, varying_keys, write_table
 from cadam3d.sweep.watch import duration
@@ -63,12 +64,14 @@ def small_configs(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def hydra_sweep(monkeypatch, capfd, tmp_path, small_configs, stand_in):
-    """Type ``cadam3d sweep ...`` in an empty folder, in this process."""
+    """Type ``cadam3d sweep ...`` in an empty folder, in this process and without its report."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    for module in (settings, launch, advice):
+    for module in (settings, hydra, advice):
         monkeypatch.setattr(module, "config_dir", lambda: small_configs)
     monkeypatch.setattr(sys, "executable", str(stand_in))
+    monkeypatch.setattr("cadam3d.report.write_sweep", lambda folder: folder / "report.html")
+    monkeypatch.setattr("cadam3d.report.verdict", lambda folder: [])
 
     def run(*words: str, command: str = "sweep") -> Result:
         monkeypatch.setattr(sys, "argv", ["cadam3d", command, *words])
@@ -82,9 +85,9 @@ def hydra_sweep(monkeypatch, capfd, tmp_path, small_configs, stand_in):
 
 @pytest.fixture
 def sweep(hydra_sweep, monkeypatch):
-    """The same, with a loop in the place of Hydra's multirun: it takes a third of the time."""
+    """The same with a loop instead of Hydra's multirun, which takes a third of the time."""
 
-    def run_jobs(name: str, arguments: list[str], _task: launch.Task) -> None:
+    def run_jobs(name: str, arguments: list[str], _run: Callable) -> None:
         given = dict(line.split("=", 1) for line in arguments if "=" in line)
         folder = Path(given["hydra.sweep.dir"].strip("'"))
         assert (name, arguments[-1]) == ("jobs", "--multirun")
@@ -109,14 +112,14 @@ def only_sweep() -> Path:
 # --- one row per job --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("command", "flags"),
-    [("sweep", ()), ("train", ("-m",)), ("train", ("--multirun",)), ("train", ("hydra.mode=MULTIRUN",))],
-)
-def test_a_sweep_leaves_one_row_per_job(command, flags, hydra_sweep):
-    result = hydra_sweep(
-        *flags, "prompt=a corgi, front view", "densifier=baseline,cadam", "seed=0,1", command=command
-    )
+@pytest.mark.parametrize("flag", ["-m", "--multirun", "hydra.mode=MULTIRUN"])
+def test_train_with_a_flag_is_a_sweep(flag, sweep):
+    assert sweep(flag, "prompt=a cube", "seed=0,1", command="train").code == 0
+    assert [row["seed"] for row in read_table(only_sweep())] == ["0", "1"]
+
+
+def test_a_sweep_leaves_one_row_per_job(hydra_sweep):
+    result = hydra_sweep("prompt=a corgi, front view", "densifier=baseline,cadam", "seed=0,1")
     assert result.code == 0, result.err
     rows = read_table(only_sweep())
     assert list(rows[0]) == [
@@ -133,7 +136,7 @@ def test_a_sweep_leaves_one_row_per_job(command, flags, hydra_sweep):
     assert all((only_sweep() / row["folder"] / "summary.json").is_file() for row in rows)
 
 
-def test_jobs_share_a_folder_for_their_traces_that_goes_with_the_sweep(sweep, calls):
+def test_jobs_share_a_folder_for_traces_that_is_removed_after_the_sweep(sweep, calls):
     sweep("prompt=a cube", "seed=0,1")
     folder = only_sweep()
     assert {call["traces"] for call in calls(folder)} == {str(folder.resolve() / "traces")}
@@ -147,7 +150,7 @@ def test_a_folder_for_traces_of_the_user_is_kept(sweep, calls, monkeypatch, tmp_
     assert (tmp_path / "mine").is_dir()
 
 
-def test_each_job_is_told_as_it_ends(sweep):
+def test_each_job_is_reported_as_it_ends(sweep):
     lines = sweep("prompt=a cube", "seed=0,1,2").out.splitlines()
     assert lines[0].startswith("3 jobs in multirun/")
     assert lines[1].startswith("[1/3] seed=0: 5 Gaussians, 20.25 dB, 2 s; about ")
@@ -162,7 +165,7 @@ def test_a_grid_gives_its_name_and_its_arms(sweep):
     assert [row["arm"] for row in rows] == ["baseline", "cadam", "none"] * 2
     assert [row["densifier"] for row in rows] == ["baseline", "cadam", "none"] * 2
     assert "[1/6] baseline, seed=0: " in result.out
-    assert "densifier" not in result.out.split("job  ")[1].splitlines()[0]  # the arm says it
+    assert "densifier" not in result.out.split("job  ")[1].splitlines()[0]  # it follows from the arm
 
 
 def test_an_arm_can_be_left_out(sweep):
@@ -181,7 +184,8 @@ def test_failed_and_killed_jobs_are_rows_and_the_rest_goes_on(sweep, calls):
     assert rows[3]["message"].startswith("by SIGKILL")
     assert result.code == 1
     assert result.err == (
-        "cadam3d: 3 of 6 jobs without a result (2 failed, 1 killed). The same line again runs only those.\n"
+        "cadam3d: 3 of 6 jobs have no result (2 failed, 1 killed); "
+        f"see multirun/x/{rows[1]['folder']}/console.txt. Rerun the same command to retry them.\n"
     )
 
 
@@ -194,14 +198,14 @@ def test_the_table_is_right_after_every_job(hydra_sweep, monkeypatch):
         seen.append([row["outcome"] for row in read_table(folder)])
         return rows
 
-    monkeypatch.setattr("cadam3d.commands.sweep.write_table", note)
+    monkeypatch.setattr("cadam3d.sweep.worker.write_table", note)
     hydra_sweep("prompt=a cube", "seed=0,1,2")
     finished, waiting = "finished", "unfinished"
     assert seen == [[finished, waiting, waiting], [finished, finished, waiting], [finished] * 3]
 
 
-def test_several_writers_leave_what_the_last_of_them_saw(tmp_path, monkeypatch):
-    """A job that ended while the table was being written is in it none the less."""
+def test_the_last_of_several_writers_leaves_the_latest_state(tmp_path, monkeypatch):
+    """A job that ends while the table is being written is in it all the same."""
     before = Row(0, "", tmp_path / "a", [], {"seed": 0}, {})
     after = Row(0, "", tmp_path / "a", [], {"seed": 0}, {"outcome": "finished"})
     states = iter([[before], [after], [after]])
@@ -210,7 +214,7 @@ def test_several_writers_leave_what_the_last_of_them_saw(tmp_path, monkeypatch):
     assert read_table(tmp_path)[0]["outcome"] == "finished"
 
 
-def test_values_that_are_no_text_are_json_in_the_table(tmp_path):
+def test_values_other_than_text_are_json_in_the_table(tmp_path):
     row = Row(0, "", tmp_path, [], {"exporter": ["ply", "preview"], "on": True}, {})
     assert as_text([row, Row(1, "", tmp_path, [], {"exporter": [], "on": None}, {})]).splitlines()[1:] == [
         '0    ["ply", "preview"]  True  unfinished  -              -     -',
@@ -218,7 +222,7 @@ def test_values_that_are_no_text_are_json_in_the_table(tmp_path):
     ]
 
 
-def test_what_the_arm_tells_is_not_told_again(tmp_path):
+def test_settings_that_follow_from_the_arm_are_not_shown(tmp_path):
     rows = [
         Row(0, "a", tmp_path, [], {"densifier": "x", "seed": 0, "steps": 5}, {}),
         Row(1, "a", tmp_path, [], {"densifier": "x", "seed": 1, "steps": 5}, {}),
@@ -235,16 +239,16 @@ def test_finished_jobs_are_skipped_and_the_others_run_again(sweep, calls):
     sweep(*line)
     rows = load(only_sweep().resolve())
     (rows[1].folder / "summary.json").unlink()
-    result = sweep("seed=range(0,3)", 'prompt="a cube"')  # the same, said otherwise
+    result = sweep("seed=range(0,3)", 'prompt="a cube"')  # the same line, written differently
     assert result.code == 0
     assert "3 jobs in " in result.out
-    assert "2 with a result already" in result.out
+    assert "2 already have a result" in result.out
     assert "[3/3] seed=1: 5 Gaussians" in result.out
     assert [call["folder"] for call in calls(only_sweep())] == [row.folder.name for row in (*rows, rows[1])]
 
 
-def test_numbers_without_exports_are_no_result(sweep, calls):
-    """Training writes them first. If the whole machine goes down then, there is nobody to say killed."""
+def test_numbers_without_exports_are_not_a_result(sweep, calls):
+    """Training writes the numbers first. If the whole machine fails then, nothing records that."""
     sweep("prompt=a cube", "seed=0,1")
     [row, _] = load(only_sweep().resolve())
     (row.folder / "summary.json").write_text('{"outcome": "finished", "num_gaussians": 5}')
@@ -252,7 +256,7 @@ def test_numbers_without_exports_are_no_result(sweep, calls):
     assert [call["folder"] for call in calls(only_sweep())[2:]] == [row.folder.name]
 
 
-def test_a_sweep_that_is_done_only_tells_its_table(sweep, calls):
+def test_a_sweep_that_is_done_only_writes_its_table(sweep, calls):
     sweep("prompt=a cube", "grid=densifiers")
     Path("multirun/densifiers/sweep.csv").unlink()
     result = sweep("prompt=a cube", "grid=densifiers")
@@ -261,7 +265,7 @@ def test_a_sweep_that_is_done_only_tells_its_table(sweep, calls):
     assert len(read_table(Path("multirun/densifiers"))) == 3
 
 
-def test_a_killed_job_goes_on_from_its_checkpoint(sweep, calls, small_configs):
+def test_a_killed_job_continues_from_its_checkpoint(sweep, calls, small_configs):
     folder = Path("multirun/x")
     folder.mkdir(parents=True)
     config = yaml_of(sweep, "prompt=a kill")
@@ -298,14 +302,14 @@ def test_other_settings_in_the_same_folder_are_refused_with_the_key(sweep, calls
     assert result.err.startswith(f"cadam3d: optimizer.steps: was 5 in {folder}/baseline_a-cube_")
     assert result.err.endswith(
         ", is 9 now. Try: hydra.sweep.dir=multirun/densifiers-2, which is another folder, "
-        "or the settings of before\n"
+        "or the earlier settings\n"
     )
     assert (folder / "sweep.csv").read_bytes() == table
     assert not Path("multirun/densifiers-2").exists()
     assert len(calls(folder)) == 3
 
 
-def test_what_only_a_running_job_knows_is_not_compared(sweep, monkeypatch):
+def test_values_that_only_a_running_job_knows_are_not_compared(sweep, monkeypatch):
     line = ("prompt=a cube", "grid=densifiers", "optimizer.steps=${hydra:runtime.output_dir}")
     assert sweep(*line).code == 0
     for row in load(Path("multirun/densifiers")):
@@ -315,7 +319,7 @@ def test_what_only_a_running_job_knows_is_not_compared(sweep, monkeypatch):
         )
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)  # as in a new process
     result = sweep(*line)
-    assert (result.code, "3 with a result already" in result.out) == (0, True), result.err
+    assert (result.code, "3 already have a result" in result.out) == (0, True), result.err
 
 
 def test_a_job_that_failed_may_run_with_other_settings(sweep):
@@ -323,7 +327,7 @@ def test_a_job_that_failed_may_run_with_other_settings(sweep):
     for row in load(Path("multirun/densifiers")):
         (row.folder / "config.yaml").write_text("steps: 4")
     result = sweep("prompt=a bug", "grid=densifiers", "steps=9")
-    assert "The same line again" in result.err
+    assert "Rerun the same command" in result.err
 
 
 def test_rows_of_another_line_do_not_appear(sweep):
@@ -350,9 +354,9 @@ def test_a_second_sweep_in_the_folder_of_a_running_one_is_refused(sweep):
 
 @pytest.fixture
 def start_sweep(tmp_path, small_configs, stand_in):
-    """Start a sweep as a process of its own; its launcher's workers too meet the stand-in."""
+    """Start a sweep in a process of its own, whose workers also find the replacement of training."""
     python = tmp_path / "python"
-    is_job = 'case "$*" in *cadam3d.sweep.process*)'
+    is_job = 'case "$*" in *cadam3d.job*)'
     python.write_text(f'#!/bin/sh\n{is_job} exec {stand_in} "$@";; esac\nexec {PYTHON} "$@"\n')
     python.chmod(0o755)
     site = tmp_path / "site"
@@ -361,9 +365,9 @@ def start_sweep(tmp_path, small_configs, stand_in):
 
     def run(*words: str) -> subprocess.Popen:
         code = (
-            "import sys; from pathlib import Path; from cadam3d import cli, launch\n"
-            "from cadam3d.settings import advice, compose as settings\n"
-            "for module in (settings, launch, advice):\n"
+            "import sys; from pathlib import Path; from cadam3d import cli\n"
+            "from cadam3d.settings import advice, hydra, compose as settings\n"
+            "for module in (settings, hydra, advice):\n"
             f"    module.config_dir = lambda: Path({str(small_configs)!r})\n"
             f"sys.argv = {['cadam3d', 'sweep', *words]!r}\n"
             "cli.main()"
@@ -375,24 +379,24 @@ def start_sweep(tmp_path, small_configs, stand_in):
 
     started: list[subprocess.Popen] = []
     yield run
-    for process in started:  # of a test that failed; workers and jobs end with it
+    for process in started:  # only after a failure; workers and jobs end with it
         process.kill()
         process.wait()
 
 
 @pytest.mark.parametrize(("launcher", "running"), [((), 1), (("launcher=joblib", "launcher.n_jobs=2"), 2)])
-def test_sigint_stops_all_running_jobs_and_leaves_the_table_true(launcher, running, start_sweep, tmp_path):
+def test_sigint_stops_all_running_jobs_and_the_table_is_right(launcher, running, start_sweep, tmp_path):
     process = start_sweep("prompt=a wait", "seed=0,1,2,3,4,5", "hydra.sweep.dir=x", *launcher)
-    wait_for(tmp_path, "x/*/waiting", process, running)  # side by side, or it will never be
+    wait_for(tmp_path, "x/*/waiting", process, running)  # they run side by side
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert "Stopping as soon as all running jobs have saved" in err
-    assert f"6 of 6 jobs without a result ({running} interrupted, {6 - running} unfinished)" in err
+    assert f"6 of 6 jobs have no result ({running} interrupted, {6 - running} unfinished)" in err
     assert "Traceback" not in err
     outcomes = [row["outcome"] for row in read_table(tmp_path / "x")]
     assert sorted(outcomes) == ["interrupted"] * running + ["unfinished"] * (6 - running)
-    assert out.count("interrupted") == 2 * running  # as it ended, and in the table
+    assert out.count("interrupted") == 2 * running  # when it ended, and in the table
 
 
 def test_a_second_sigint_ends_at_once(start_sweep, tmp_path):
@@ -409,7 +413,9 @@ def test_a_second_sigint_ends_at_once(start_sweep, tmp_path):
 
 
 @pytest.mark.parametrize(("launcher", "running"), [((), 1), (("launcher=joblib", "launcher.n_jobs=2"), 2)])
-def test_a_killed_sweep_typed_again_has_no_job_twice_at_work(launcher, running, start_sweep, calls, tmp_path):
+def test_a_killed_sweep_typed_again_runs_no_job_twice_at_a_time(
+    launcher, running, start_sweep, calls, tmp_path
+):
     line = ("prompt=a long one", "seed=0,1,2,3", "hydra.sweep.dir=x")
     folder = tmp_path / "x"
     first = start_sweep(*line, *launcher)
@@ -418,7 +424,7 @@ def test_a_killed_sweep_typed_again_has_no_job_twice_at_work(launcher, running, 
     held = [call["folder"] for call in calls(folder)]
     opened = {lock: lock.stat().st_mtime_ns for lock in folder.glob("*/.lock")}
     second = start_sweep(*line, *launcher)
-    first.communicate(timeout=30)  # the pipes close when its workers have ended too; its jobs are still there
+    first.communicate(timeout=30)  # the pipes close once its workers have ended; its jobs still run
     wait_until(lambda: all(lock.stat().st_mtime_ns > time for lock, time in opened.items()), second)
     time.sleep(1)
     assert len(calls(folder)) == running
@@ -494,7 +500,7 @@ def test_a_launcher_whose_plugin_is_missing_is_named(sweep, monkeypatch):
     assert not Path("multirun").exists()
 
 
-def test_a_launcher_that_breaks_down_leaves_the_table_true(sweep, monkeypatch):
+def test_after_a_failure_of_the_launcher_the_table_is_right(sweep, monkeypatch):
     def fail(*args, **kwargs):
         raise RuntimeError("a worker was lost\nfor reasons")
 
@@ -502,14 +508,14 @@ def test_a_launcher_that_breaks_down_leaves_the_table_true(sweep, monkeypatch):
     result = sweep("prompt=a cube", "seed=0,1")
     assert result.code == 1
     assert result.err.splitlines()[0] == "cadam3d: the launcher gave up. RuntimeError: a worker was lost"
-    assert "2 of 2 jobs without a result (2 unfinished)" in result.err
+    assert "2 of 2 jobs have no result (2 unfinished). Rerun" in result.err
 
 
 # --- mistakes ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "expected"),
     [
         (("densifier=cadam,cadm",), "got 'cadm'. Try: densifier=cadam"),
         (("seed=0,1", "densifier.tau_q=1"), "Did you mean densifier.tau_Q?"),
@@ -518,7 +524,10 @@ def test_a_launcher_that_breaks_down_leaves_the_table_true(sweep, monkeypatch):
             "arm baseline: nonsense.key: no such setting",
         ),
         (("grid=nope",), "got 'nope'. Try: grid="),
-        (("grid=densifiers", "densifier=none"), "densifier: tells the arms baseline and cadam apart"),
+        (
+            ("grid=densifiers", "densifier=none"),
+            "densifier: the arms baseline and cadam differ in this setting",
+        ),
         (("seed=0,1", "launcher=jobli"), "Try: launcher=joblib"),
         (("seed=0,1", "launcher=joblib", "launcher.jobs=2"), "launcher.jobs: no such setting. Did you mean "),
         (
@@ -533,10 +542,10 @@ def test_a_launcher_that_breaks_down_leaves_the_table_true(sweep, monkeypatch):
         (("steps=7",), "sweep: nothing to sweep over"),
     ],
 )
-def test_a_mistake_is_one_message_before_anything_runs(words, said, sweep):
+def test_a_mistake_is_one_message_before_anything_runs(words, expected, sweep):
     result = sweep("prompt=a cube", *words)
     assert result.code == 1
-    assert said in result.err
+    assert expected in result.err
     assert len(result.err.splitlines()) == 1
     assert not list(Path.cwd().iterdir())
 
@@ -574,9 +583,9 @@ LINES = (
 )
 
 
-def test_settings_put_in_afterwards_equal_those_that_hydra_composes(sweep):
-    composer = plan.Composer("sweep", launch._read_flags([]), [])
-    for _ in range(2):  # the second time nothing is composed anew
+def test_settings_changed_after_composing_equal_those_that_hydra_composes(sweep):
+    composer = plan.Composer(read_flags([]), [])
+    for _ in range(2):  # the second time, nothing is composed
         for line in LINES:
             cfg = OmegaConf.to_container(settings.compose(line), resolve=True)
             assert composer.compose(line).values == dict(settings.flatten(cfg)), line
@@ -587,12 +596,23 @@ def test_many_jobs_that_differ_in_values_are_composed_once(sweep, monkeypatch):
     original = plan.compose_line
     monkeypatch.setattr(plan, "compose_line", lambda *args: counted.append(args) or original(*args))
     line = ["prompt='a cube'", "seed=range(0,30)", "densifier.tau_Q=0.5,0.7"]
-    found = plan.compose_all(*plan.read_sweep("sweep", line, launch._read_flags([])))
+    found = plan.compose_all(*plan.read_sweep("sweep", line, read_flags([])))
     assert [job.get("seed") for job in found] == [seed for seed in range(30) for _ in range(2)]
     assert len(counted) == 3  # the sweep, what its plain values are, and one job
 
 
-def test_what_the_plan_remembers(sweep, tmp_path):
+def test_each_arm_is_composed_at_most_twice(sweep, monkeypatch):
+    """Once to see which settings it has, and once for its jobs."""
+    counted = []
+    original = plan.compose_line
+    monkeypatch.setattr(plan, "compose_line", lambda *args: counted.append(args) or original(*args))
+    line = ["prompt='a cube'", "seed=range(0,9)", "steps=7", "grid=densifiers"]
+    found = plan.compose_all(*plan.read_sweep("sweep", line, read_flags([])))
+    assert len(found) == 3 * 9
+    assert len(counted) == 2 + 2 * 3  # the first two: the sweep, and what its plain values are
+
+
+def test_the_plan_records_folder_flags_and_line(sweep, tmp_path):
     own = tmp_path / "own/densifier"
     own.mkdir(parents=True)
     (own / "mine.yaml").write_text("_target_: mypackage.Mine\n", encoding="utf-8")
@@ -607,7 +627,7 @@ def test_what_the_plan_remembers(sweep, tmp_path):
     assert [job.swept["densifier"] for job in remembered.jobs] == ["mine", "none"]
 
 
-def test_grids_and_parts_may_lie_on_a_search_path(sweep, tmp_path):
+def test_grids_and_components_are_found_on_a_search_path(sweep, tmp_path):
     for name, text in (
         ("grid/mine.yaml", "arms: {one: {densifier: mine}}"),
         ("densifier/mine.yaml", "_target_: mypackage.Mine\ntau: 1"),
@@ -624,36 +644,43 @@ def test_grids_and_parts_may_lie_on_a_search_path(sweep, tmp_path):
     ]
 
 
-def test_a_plan_that_is_none_is_named(tmp_path):
+def test_an_invalid_plan_is_named_in_the_message(tmp_path):
     (tmp_path / JOBS).write_text('{"jobs": [{"what": 1}]}')
     with pytest.raises(UserError, match=r"jobs.json: not the plan of a sweep"):
         load(tmp_path)
 
 
-def test_the_comparison_is_made_of_a_sweep_where_there_is_one(sweep, monkeypatch):
+def test_the_report_and_its_verdict_follow_the_sweep(sweep, monkeypatch):
     made = []
-    module = type(sys)("comparison_of_mine")
-    module.write_sweep = lambda folder: (made.append(folder), folder / "report.html")[1]
-    module.verdict = lambda folder: ["Ours is better."]
-    monkeypatch.setitem(sys.modules, "comparison_of_mine", module)
-    module.__spec__ = importlib.machinery.ModuleSpec("comparison_of_mine", None)
-    monkeypatch.setattr(start, "COMPARISON", "comparison_of_mine")
-    said = sweep("prompt=a cube", "grid=densifiers").out
+    monkeypatch.setattr(
+        "cadam3d.report.write_sweep", lambda folder: (made.append(folder), folder / "report.html")[1]
+    )
+    monkeypatch.setattr("cadam3d.report.verdict", lambda folder: ["Ours is better."])
+    out = sweep("prompt=a cube", "grid=densifiers").out
     assert made == [Path("multirun/densifiers").resolve()]
-    assert said.endswith("sweep.csv\n\nOurs is better.\n\nreport: multirun/densifiers/report.html\n")
+    assert out.endswith("sweep.csv\n\nOurs is better.\n\nreport: multirun/densifiers/report.html\n")
 
 
-def test_of_a_long_table_the_terminal_sees_what_has_no_result(sweep, monkeypatch):
+def test_a_report_that_fails_is_a_message_and_the_sweep_keeps_its_exit_code(sweep, monkeypatch):
+    def fail(folder):
+        raise UserError("report.html: cannot be written")
+
+    monkeypatch.setattr("cadam3d.report.write_sweep", fail)
+    result = sweep("prompt=a cube", "grid=densifiers")
+    assert (result.code, result.err) == (0, "cadam3d: report.html: cannot be written\n")
+
+
+def test_the_terminal_shows_only_jobs_without_a_result_of_a_long_table(sweep, monkeypatch):
     monkeypatch.setattr(start, "LONGEST", 2)
-    said = sweep("prompt=a cube,a bug", "seed=0,1").out
-    table = said[said.index("\njob ") :]
-    assert table.count("failed") > 1  # also counted below it
+    out = sweep("prompt=a cube,a bug", "seed=0,1").out
+    table = out[out.index("\njob ") :]
+    assert table.count("failed") > 1  # and once in the count below it
     assert "finished" not in table
     assert "\njob " not in sweep("prompt=a cube", "seed=0,1,2").out
 
 
 def test_preparing_a_sweep_needs_no_torch(start_sweep, tmp_path):
-    code = "import sys, cadam3d.sweep.start, cadam3d.commands.sweep; assert 'torch' not in sys.modules"
+    code = "import sys, cadam3d.launch, cadam3d.commands.sweep; assert 'torch' not in sys.modules"
     subprocess.run([PYTHON, "-c", code], check=True, cwd=REPOSITORY)
 
 

@@ -1,4 +1,4 @@
-"""What ``cadam3d doctor`` says of the rasterizers: how each was compiled, and what its self-test shows."""
+"""Rasterizer checks of ``cadam3d doctor``: how each backend was compiled, and its self-test."""
 
 import math
 import time
@@ -20,20 +20,20 @@ from cadam3d.rasterizer.selftest import self_test
 CPU = torch.device("cpu")
 
 
-def prove_rasterizers() -> Iterator[Finding]:
-    """Compile and prove each backend on each device; ``auto`` last, for it would compile unseen."""
+def check_rasterizers() -> Iterator[Finding]:
+    """Compile and test each backend on each device. ``auto`` is last because it would compile silently."""
     gpus = [torch.device("cuda", i) for i in range(torch.cuda.device_count())]
     yield (kernels := attempt("kernels for cpu", _cpu_kernels))
     if kernels.verdict is Verdict.OK:
-        yield _proof("rasterizer=cpu", CpuRasterizer(cache_dir=None), CPU)
+        yield _tested("rasterizer=cpu", CpuRasterizer(cache_dir=None), CPU)
     if not gpus:
         yield attempt("kernels for cuda", _no_cuda)
     for gpu in gpus:
         yield (kernels := attempt("kernels for cuda", partial(_cuda_kernels, gpu)))
         if kernels.verdict is Verdict.OK:
-            yield _proof("rasterizer=cuda", CudaRasterizer(cache_dir=None), gpu)
+            yield _tested("rasterizer=cuda", CudaRasterizer(cache_dir=None), gpu)
     for device in (CPU, *gpus):
-        yield _proof("rasterizer=reference", ReferenceRasterizer(), device)
+        yield _tested("rasterizer=reference", ReferenceRasterizer(), device)
     for device in (CPU, *gpus):
         yield attempt("rasterizer=auto", partial(_choice, device))
 
@@ -43,14 +43,14 @@ def _cpu_kernels() -> Finding:
     instructions = instruction_set(build.load(built))
     version = compiler.version if compiler else None
     facts = {"compiler": version, "instruction_set": instructions, **_kept(built)}
-    found = f"{instructions} by {version or 'a compiler that is gone'}, {_when(built)}"
+    found = f"{instructions} by {version or 'a compiler that was removed'}, {_when(built)}"
     return Finding("kernels for cpu", Verdict.OK, found, facts=facts)
 
 
 def _cuda_kernels(device: torch.device) -> Finding:
     name, capability = torch.cuda.get_device_name(device), torch.cuda.get_device_capability(device)
     built, compiler = nvrtc.build(default_cache_dir(), capability), nvrtc.find_compiler()
-    assert compiler is not None, "build() has just needed it"
+    assert compiler is not None, "build() has just used it"
     facts = {
         "device": name,
         "compute_capability": ".".join(map(str, capability)),
@@ -68,17 +68,17 @@ def _cuda_kernels(device: torch.device) -> Finding:
 def _no_cuda() -> Finding:
     compiler = nvrtc.find_compiler()
     if compiler is None:
-        return Finding("kernels for cuda", Verdict.NOTE, "torch sees no CUDA device; no NVRTC is here")
+        return Finding("kernels for cuda", Verdict.NOTE, "torch sees no CUDA device; no NVRTC was found")
     facts = _nvrtc(compiler)
-    found = f"torch sees no CUDA device; NVRTC {facts['nvrtc_version']} is here: {compiler.path}"
+    found = f"torch sees no CUDA device; NVRTC {facts['nvrtc_version']} is in {compiler.path}"
     return Finding("kernels for cuda", Verdict.NOTE, found, facts=facts)
 
 
-def _proof(topic: str, rasterizer: Rasterizer, device: torch.device) -> Finding:
-    return attempt(topic, partial(_prove, topic, rasterizer, device))
+def _tested(topic: str, rasterizer: Rasterizer, device: torch.device) -> Finding:
+    return attempt(topic, partial(_test, topic, rasterizer, device))
 
 
-def _prove(topic: str, rasterizer: Rasterizer, device: torch.device) -> Finding:
+def _test(topic: str, rasterizer: Rasterizer, device: torch.device) -> Finding:
     start = time.perf_counter()
     agreement = self_test(rasterizer, device)
     facts = {
@@ -93,19 +93,21 @@ def _prove(topic: str, rasterizer: Rasterizer, device: torch.device) -> Finding:
     promises_bits = topic != "rasterizer=reference" or device.type == "cpu"
     if agreement.holds and (agreement.repeats or not promises_bits):
         return Finding(topic, Verdict.OK, found, facts=facts)
-    # What auto does not take breaks nobody's training.
+    # auto does not choose a backend that fails, so training still works.
     verdict = Verdict.NOTE if topic == "rasterizer=cuda" else Verdict.BROKEN
-    return Finding(topic, verdict, found, "Please report this. Until mended: rasterizer=reference", facts)
+    return Finding(
+        topic, verdict, found, "Please report this. Until it is fixed, use rasterizer=reference", facts
+    )
 
 
 def _choice(device: torch.device) -> Finding:
     backend = AutoRasterizer().prepare(device)
     facts = {"device": str(device), "backend": backend.name, "reason": backend.reason}
     if backend.reason is None:
-        found = f"takes {backend.name} on {device}: the fastest there is, and it works"
+        found = f"chooses {backend.name} on {device}: the fastest there is, and it works"
         return Finding("rasterizer=auto", Verdict.OK, found, facts=facts)
     first, *others = backend.reason.splitlines()
-    found = f"takes {backend.name} on {device}, which is slow: {first}"
+    found = f"chooses {backend.name} on {device}, which is slow: {first}"
     return Finding("rasterizer=auto", Verdict.NOTE, found, others[-1] if others else "", facts)
 
 
@@ -123,5 +125,5 @@ def _nvrtc(compiler: nvrtc.Compiler) -> dict[str, object]:
 
 
 def _as_json(deviations: Mapping[str, float]) -> dict[str, float | None]:
-    # JSON has no infinity, which is what a deviation is where something is not finite.
+    # The deviation of values that are not finite is infinite, and JSON has no infinity.
     return {name: value if math.isfinite(value) else None for name, value in deviations.items()}

@@ -1,4 +1,4 @@
-"""doctor on rasterizers: it proves what it names, and says what is missing where something is."""
+"""doctor on rasterizers: it tests what it names, and prints what is missing."""
 
 import ctypes
 import json
@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from cadam3d.commands import proofs
+from cadam3d.commands import doctor_rasterizers
+from cadam3d.commands.doctor_rasterizers import check_rasterizers
 from cadam3d.commands.finding import Finding, Verdict
-from cadam3d.commands.proofs import prove_rasterizers
 from cadam3d.core.errors import UserError
 from cadam3d.io.cache import default_cache_dir
 from cadam3d.rasterizer import auto, build, nvrtc
@@ -31,7 +31,7 @@ def forget() -> None:
 
 @pytest.fixture(autouse=True)
 def _asked_anew():
-    """What a process remembers of its kernels neither reaches a test nor outlasts it."""
+    """Clear the caches of the process before and after each test."""
     forget()
     yield
     forget()
@@ -52,26 +52,26 @@ def agreement() -> Agreement:
 
 
 def by_topic() -> dict[str, Finding]:
-    found = list(prove_rasterizers())
+    found = list(check_rasterizers())
     assert all(json.loads(json.dumps(asdict(finding), allow_nan=False)) for finding in found)
     return {finding.topic: finding for finding in found}
 
 
 @needs_compiler
-def test_the_native_kernels_are_named_and_proved():
+def test_the_native_kernels_are_named_and_tested():
     cache = default_cache_dir()
     found = by_topic()
-    kernels, proof, choice = (
+    kernels, test, choice = (
         found[topic] for topic in ("kernels for cpu", "rasterizer=cpu", "rasterizer=auto")
     )
     assert find_compiler().version in kernels.found
     assert kernels.found.endswith(f" in {cache}")
     assert kernels.facts["instruction_set"] in ("avx512", "avx2", "sse2", "neon", "generic")
     assert Path(kernels.facts["path"]).is_file()
-    assert proof.verdict is Verdict.OK
-    assert proof.found.startswith("agrees with the reference: images ")
-    assert proof.found.endswith("same bits twice, on cpu")
-    assert proof.facts["agrees"]
+    assert test.verdict is Verdict.OK
+    assert test.found.startswith("agrees with the reference: images ")
+    assert test.found.endswith("same bits twice, on cpu")
+    assert test.facts["agrees"]
     assert choice.facts == {"device": "cpu", "backend": "cpu", "reason": None}
 
 
@@ -79,27 +79,27 @@ def test_the_native_kernels_are_named_and_proved():
 @pytest.mark.parametrize(
     ("seconds", "words"), [(0.0, "from the cache in "), (1.26, "compiled now in 1.3 s, kept in ")]
 )
-def test_kernels_say_whether_they_were_compiled_now(seconds, words, monkeypatch):
+def test_the_finding_states_whether_kernels_were_compiled_now(seconds, words, monkeypatch):
     built = replace(build.build(default_cache_dir()), seconds=seconds)
     monkeypatch.setattr(build, "build", lambda cache_dir: built)
-    finding = proofs._cpu_kernels()
+    finding = doctor_rasterizers._cpu_kernels()
     assert words in finding.found
     assert finding.facts["compiled_now"] is (seconds > 0)
     assert finding.facts["compile_seconds"] == seconds
 
 
-def test_with_nothing_installed_the_reference_is_proved_and_the_rest_says_what_is_missing(bare):
+def test_with_nothing_installed_the_reference_is_tested_and_the_rest_is_named_as_missing(bare):
     found = by_topic()
     assert found["rasterizer=reference"].verdict is Verdict.OK
     assert found["rasterizer=reference"].facts["agrees"]
     assert not [finding for finding in found.values() if finding.verdict is Verdict.BROKEN]
     assert "pip install 'cadam3d[compiler]'" in found["kernels for cpu"].found
     assert "rasterizer=cpu" not in found
-    assert found["kernels for cuda"].found == "torch sees no CUDA device; no NVRTC is here"
+    assert found["kernels for cuda"].found == "torch sees no CUDA device; no NVRTC was found"
     choice = found["rasterizer=auto"]
     assert choice.verdict is Verdict.NOTE
     assert choice.found.startswith(
-        "takes reference on cpu, which is slow: rasterizer=cpu needs a C++ compiler"
+        "chooses reference on cpu, which is slow: rasterizer=cpu needs a C++ compiler"
     )
     assert choice.facts["backend"] == "reference"
 
@@ -113,7 +113,7 @@ def an_nvrtc() -> nvrtc.Compiler:
 def test_an_nvrtc_without_a_device_is_mentioned(bare, monkeypatch):
     monkeypatch.setattr(nvrtc, "find_compiler", an_nvrtc)
     finding = by_topic()["kernels for cuda"]
-    assert finding.found == "torch sees no CUDA device; NVRTC 13.0 is here: /there/libnvrtc.so.13"
+    assert finding.found == "torch sees no CUDA device; NVRTC 13.0 is in /there/libnvrtc.so.13"
     assert finding.facts == {"nvrtc": "/there/libnvrtc.so.13", "nvrtc_version": "13.0"}
 
 
@@ -130,14 +130,14 @@ def a_gpu(bare, monkeypatch, tmp_path):
 
 
 def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu, monkeypatch, agreement):
-    monkeypatch.setattr(proofs, "self_test", lambda rasterizer, device: agreement)
+    monkeypatch.setattr(doctor_rasterizers, "self_test", lambda rasterizer, device: agreement)
     found = by_topic()
     assert found["kernels for cuda"].found.startswith(
         "sm_90 for a GPU (compute capability 9.0) by NVRTC 13.0 in /there/libnvrtc.so.13, compiled now in 7.0"
     )
     assert found["rasterizer=cuda"].verdict is Verdict.OK
     assert found["rasterizer=cuda"].found == f"{agreement}, on cuda:0"
-    assert found["rasterizer=auto"].found == "takes cuda on cuda:0: the fastest there is, and it works"
+    assert found["rasterizer=auto"].found == "chooses cuda on cuda:0: the fastest there is, and it works"
 
 
 @pytest.mark.parametrize(
@@ -146,14 +146,16 @@ def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu
         ("rasterizer=cpu", "cpu", {"gradients": {"means": 0.1}}, Verdict.BROKEN),
         ("rasterizer=cpu", "cpu", {"images": {"rgb": math.inf}}, Verdict.BROKEN),
         ("rasterizer=cpu", "cpu", {"repeats": False}, Verdict.BROKEN),
-        ("rasterizer=cuda", "cuda:0", {"repeats": False}, Verdict.NOTE),  # auto does not take it
+        ("rasterizer=cuda", "cuda:0", {"repeats": False}, Verdict.NOTE),  # auto does not choose it
         ("rasterizer=reference", "cpu", {"repeats": False}, Verdict.BROKEN),
         ("rasterizer=reference", "cuda:0", {"repeats": False}, Verdict.OK),  # its sums use atomics there
     ],
 )
 def test_what_fails_its_self_test_is_reported(topic, device, change, verdict, monkeypatch, agreement):
-    monkeypatch.setattr(proofs, "self_test", lambda rasterizer, device: replace(agreement, **change))
-    finding = proofs._proof(topic, CpuRasterizer(cache_dir=None), torch.device(device))
+    monkeypatch.setattr(
+        doctor_rasterizers, "self_test", lambda rasterizer, device: replace(agreement, **change)
+    )
+    finding = doctor_rasterizers._tested(topic, CpuRasterizer(cache_dir=None), torch.device(device))
     assert finding.verdict is verdict
     assert ("report" in finding.hint) is (verdict is not Verdict.OK)
     json.dumps(finding.facts, allow_nan=False)
@@ -163,17 +165,17 @@ def test_a_self_test_that_crashes_is_a_finding(monkeypatch):
     def crash(rasterizer, device):
         raise RuntimeError("an illegal memory access\nsomewhere")
 
-    monkeypatch.setattr(proofs, "self_test", crash)
-    finding = proofs._proof("rasterizer=cuda", ReferenceRasterizer(), torch.device("cpu"))
+    monkeypatch.setattr(doctor_rasterizers, "self_test", crash)
+    finding = doctor_rasterizers._tested("rasterizer=cuda", ReferenceRasterizer(), torch.device("cpu"))
     assert finding.verdict is Verdict.BROKEN
     assert finding.found == "RuntimeError: an illegal memory access"
 
 
-def test_what_a_compiler_complained_of_is_one_line_and_what_to_type(monkeypatch):
+def test_an_error_of_the_compiler_is_one_line_and_what_to_type(monkeypatch):
     def fail(cache_dir):
         raise UserError("rasterizer=cpu: c++ could not build the kernels:\nerror\nerror\nTry: another one")
 
     monkeypatch.setattr(build, "build", fail)
-    finding = next(prove_rasterizers())
+    finding = next(check_rasterizers())
     assert finding.found == "rasterizer=cpu: c++ could not build the kernels:"
     assert finding.hint == "Try: another one"

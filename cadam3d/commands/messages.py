@@ -1,4 +1,4 @@
-"""How commands tell the user what is worth knowing and no error."""
+"""Messages of commands that are neither results nor errors."""
 
 import sys
 from functools import cache
@@ -13,6 +13,6 @@ def note(text: str) -> None:
 
 
 def note_backend(backend: Backend) -> None:
-    """Say so where something slow renders in place of something faster."""
+    """Print a note if a slow backend renders because a faster one is not available."""
     if backend.reason:
         note(f"rendering with rasterizer={backend.name}, which is slow: {backend.reason}")

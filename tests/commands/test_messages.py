@@ -1,4 +1,4 @@
-"""Notes: said plainly, once; and a training without the fast kernels says so everywhere it should."""
+"""Notes are printed once, and training with slow kernels or a fallback is reported and recorded."""
 
 import json
 import sys
@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from cadam3d import cli
-from cadam3d.commands import notes
+from cadam3d.commands import messages
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import auto, cpu
 from cadam3d.rasterizer.base import Backend
@@ -25,10 +25,10 @@ SMALL += ["exporter=[ply]", "metric=[]", "camera.size=16"]
 
 @pytest.fixture(autouse=True)
 def _nothing_said_yet():
-    notes.note.cache_clear()
+    messages.note.cache_clear()
     auto._choose.cache_clear()
     yield
-    notes.note.cache_clear()
+    messages.note.cache_clear()
     auto._choose.cache_clear()
 
 
@@ -54,21 +54,21 @@ def type_line(monkeypatch, capsys, tmp_path):
 
 
 def test_a_note_is_printed_once(capsys):
-    notes.note("mind the gap")
-    notes.note("mind the gap")
-    notes.note("mind the step")
+    messages.note("mind the gap")
+    messages.note("mind the gap")
+    messages.note("mind the step")
     assert capsys.readouterr().err == "Note: mind the gap\nNote: mind the step\n"
 
 
-def test_a_backend_is_noted_only_where_something_faster_was_wanted(capsys):
-    notes.note_backend(Backend("cpu"))
-    notes.note_backend(Backend("reference", reason="No compiler. Install one"))
+def test_a_backend_is_noted_only_if_it_replaces_a_faster_one(capsys):
+    messages.note_backend(Backend("cpu"))
+    messages.note_backend(Backend("reference", reason="No compiler. Install one"))
     assert capsys.readouterr().err == (
         "Note: rendering with rasterizer=reference, which is slow: No compiler. Install one\n"
     )
 
 
-def test_a_training_without_a_compiler_says_so_once_and_writes_it_down(type_line, no_compiler, tmp_path):
+def test_training_without_a_compiler_is_noted_once_and_recorded(type_line, no_compiler, tmp_path):
     code, err = type_line("train", *SMALL)
     assert code == 0
     assert err.count(NEEDED) == 1
@@ -83,7 +83,7 @@ def test_a_training_without_a_compiler_says_so_once_and_writes_it_down(type_line
     assert NEEDED in (run / "report.html").read_text(encoding="utf-8")
 
 
-def test_another_command_says_it_when_it_renders(type_line, no_compiler):
+def test_another_command_notes_it_when_it_renders(type_line, no_compiler):
     assert type_line("train", *SMALL, "rasterizer=reference")[0] == 0
     code, err = type_line("export", "run=outputs/latest", "output=copy.ply")
     assert (code, err.count(NEEDED)) == (0, 0)
@@ -91,9 +91,7 @@ def test_another_command_says_it_when_it_renders(type_line, no_compiler):
     assert (code, err.count(NEEDED)) == (0, 1)
 
 
-def test_a_rasterizer_that_cannot_be_had_is_refused_before_anything_is_touched(
-    type_line, no_compiler, tmp_path
-):
+def test_an_unavailable_rasterizer_is_refused_before_anything_is_touched(type_line, no_compiler, tmp_path):
     assert type_line("train", *SMALL, "rasterizer=reference")[0] == 0
     latest = (tmp_path / "outputs/latest").resolve()
     before = sorted(tmp_path.rglob("*"))
@@ -106,14 +104,14 @@ def test_a_rasterizer_that_cannot_be_had_is_refused_before_anything_is_touched(
 SHAP_E = ["rasterizer=reference", "initializer=shap_e", "initializer.path=nowhere"]
 
 
-def test_an_initializer_that_cannot_be_had_is_refused_before_anything_is_touched(type_line, tmp_path):
+def test_an_unavailable_initializer_is_refused_before_anything_is_touched(type_line, tmp_path):
     code, err = type_line("train", *SMALL, *SHAP_E)
     assert code == 1
     assert err.startswith("cadam3d: initializer.path: expected a folder with a model_index.json")
     assert not list(tmp_path.iterdir())
 
 
-def test_what_stands_in_for_an_initializer_is_said_and_written_down(type_line, tmp_path):
+def test_the_fallback_of_an_initializer_is_reported_and_recorded(type_line, tmp_path):
     stand_in = ["initializer/fallback=ball", "initializer.fallback.count=9"]
     code, err = type_line("train", *SMALL, *SHAP_E, *stand_in, "hydra.run.dir=fallen")
     assert code == 0

@@ -1,0 +1,123 @@
+"""Hydra: read its flags, compose what a line asks for, and run a command as one of its jobs."""
+
+import os
+import sys
+from argparse import Namespace
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from hydra import main as hydra_main
+from hydra._internal.callbacks import Callbacks
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.utils import create_config_search_path, get_args_parser
+from hydra.core.utils import JobStatus, configure_log, run_job
+from hydra.types import HydraContext
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
+
+from cadam3d.core.errors import UserError
+from cadam3d.settings.compose import VERSION_BASE, compose, config_dir, quote, register_resolvers
+from cadam3d.settings.line import RUN_FOLDER, key_of
+
+Run = Callable[[DictConfig], Any]  # a command, given its composed configuration
+
+
+def read_flags(flags: Sequence[str]) -> Namespace:
+    """Parse the flags of a line. Raises ``UserError`` for unknown ones and for those that exclude another."""
+    parser = get_args_parser()
+    parser.error = _refuse_flags  # type: ignore[method-assign]
+    options = parser.parse_args(list(flags))
+    modes = [options.run, options.multirun and not options.cfg, bool(options.cfg), options.info is not None]
+    if sum(map(bool, modes)) > 1:
+        raise UserError(f"{' '.join(flags)}: these flags exclude one another. Try: one of them")
+    return options
+
+
+def compose_line(config_name: str, overrides: Sequence[str], options: Namespace) -> DictConfig:
+    """Return the configuration of a line, with Hydra's own node. Raises Hydra's exceptions."""
+    return compose(
+        overrides,
+        options.config_name or config_name,
+        folder=Path(options.config_path) if options.config_path else None,
+        search_path=options.config_dir,
+        with_hydra=True,
+    )
+
+
+def refuse_holes(cfg: DictConfig, command: str, overrides: Sequence[str]) -> None:
+    """Refuse a line that removes a whole setting or refers to one that does not exist.
+
+    Raises ``UserError`` for the former and OmegaConf's ``InterpolationKeyError`` for the latter.
+    """
+    for override in overrides:
+        key = key_of(override)
+        if override.startswith("~") and "." not in key and "/" not in key and key not in cfg:
+            raise UserError(
+                f"~{key}: a setting can be changed but not removed. "
+                f"Try: cadam3d {command} without it; cadam3d {command} --help lists the choices"
+            )
+    raw = OmegaConf.to_container(cfg, resolve=False)
+    assert isinstance(raw, dict)
+    # A wrong value comes before the settings that refer to it.
+    for key in sorted(raw, key=lambda key: isinstance(raw[key], dict)):
+        if key == "hydra" or "${" not in str(raw[key]):  # Hydra's node holds what only a running job knows
+            continue
+        try:
+            value = cfg[key]
+            if OmegaConf.is_config(value):
+                OmegaConf.to_container(value, resolve=True)
+        except InterpolationKeyError:
+            raise
+        except InterpolationResolutionError:  # such as ${hydra:...}, which only a running job can resolve
+            continue
+
+
+def place_run(cfg: DictConfig, folder: Path) -> None:
+    """Change ``cfg``, in place, as if the line had set ``hydra.run.dir`` to ``folder``."""
+    with open_dict(cfg):
+        cfg.hydra.run.dir = str(folder)
+        kept = [override for override in cfg.hydra.overrides.hydra if key_of(override) != RUN_FOLDER]
+        cfg.hydra.overrides.hydra = [f"{RUN_FOLDER}={quote(str(folder))}", *kept]
+
+
+def run_composed(cfg: DictConfig, run: Run) -> None:
+    """Run a command on its composed configuration as a job of Hydra.
+
+    The job has its log, its ``.hydra`` folder and ``HydraConfig``. Raises whatever the command raises, which
+    Hydra itself would print before it exits.
+    """
+    configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)
+    name, callbacks = cfg.hydra.job.config_name, Callbacks(cfg)
+    callbacks.on_run_start(config=cfg, config_name=name)
+    loader = ConfigLoaderImpl(config_search_path=create_config_search_path(str(config_dir())))
+    job = run_job(
+        task_function=run,
+        config=cfg,
+        job_dir_key=RUN_FOLDER,
+        job_subdir_key=None,
+        hydra_context=HydraContext(config_loader=loader, callbacks=callbacks),
+    )
+    callbacks.on_run_end(config=cfg, config_name=name, job_return=job)
+    if job.status is JobStatus.FAILED:
+        raise job._return_value  # the property of that name prints a line first
+
+
+def run_hydra(command: str, arguments: Sequence[str], run: Run) -> None:
+    """Let Hydra itself read ``arguments`` with the YAML of ``command``: for its pages, or for many jobs.
+
+    Raises Hydra's exceptions.
+    """
+    register_resolvers()
+    arguments_before, switch_before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    sys.argv = [sys.argv[0], *arguments]
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra would print exceptions and exit
+    try:
+        hydra_main(version_base=VERSION_BASE, config_path=str(config_dir()), config_name=command)(run)()
+    finally:
+        sys.argv = arguments_before
+        os.environ["HYDRA_FULL_ERROR"] = switch_before or "0"
+
+
+def _refuse_flags(message: str) -> NoReturn:
+    raise UserError(f"{message}. Try: cadam3d --help")

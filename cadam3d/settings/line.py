@@ -1,0 +1,144 @@
+"""Line: the words after ``cadam3d COMMAND`` as text: overrides, flags, quoting, and resuming a run."""
+
+import re
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml  # comes with OmegaConf
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+from cadam3d.core.errors import UserError
+from cadam3d.io.run_folder import OVERRIDES
+from cadam3d.settings.compose import TEXT_KEYS, quote
+
+RUN_FOLDER = "hydra.run.dir"
+SWEEP_FOLDER = "hydra.sweep.dir"
+PATH_KEYS = (  # quoted if necessary; so is a text that may be null
+    *("run", "ply", "output", "resume", RUN_FOLDER, SWEEP_FOLDER),
+    *("initializer.path", "initializer.prompt", "rasterizer.cache_dir"),
+)
+PLAIN_PATH = re.compile(r"[\w./+-]*", re.ASCII)  # to Hydra's grammar, which cannot read "~"
+QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
+SWEEP_CALL = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)", re.DOTALL)
+PIECE = re.compile(r"(?:[^,]|,(?=\s|$))*", re.DOTALL)  # up to a comma that no blank follows
+FLAGS_WITH_VALUE = (
+    *("--cfg", "-c", "--package", "-p", "--info", "-i", "--experimental-rerun"),
+    *("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
+)
+
+
+def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Separate overrides from flags, which may be anywhere in the line."""
+    overrides, flags = [], []
+    takes_value = False
+    for word in words:
+        if takes_value or word.startswith("-"):
+            flags.append(word)
+            takes_value = not takes_value and word in FLAGS_WITH_VALUE
+        else:
+            overrides.append(word)
+    return overrides, flags
+
+
+def key_of(override: str) -> str:
+    """Return the key of an override, without ``+`` or ``~``."""
+    return override.partition("=")[0].lstrip("+~")
+
+
+def text_of(override: str) -> str:
+    """Return the value of an override as plain text."""
+    value = OverridesParser.create().parse_override(override).value()
+    return OmegaConf.create({"value": value}).value if isinstance(value, str) else str(value or "null")
+
+
+def quoted(override: str, *, is_sweep: bool) -> str:
+    """Quote a prompt or a path, so that commas, brackets, ``=`` or emoji in it are plain text to Hydra.
+
+    In a sweep, a comma before a blank belongs to the sentence and any other comma separates two prompts:
+    ``prompt="a corgi, front view,a cat"`` is two. Values that are quoted already, and calls such as
+    ``choice(...)``, do not change.
+    """
+    key, equals, value = override.partition("=")
+    name = key.lstrip("+")
+    if not equals or QUOTED.fullmatch(value):
+        return override
+    if name in PATH_KEYS and not PLAIN_PATH.fullmatch(value) and "${" not in value:
+        return f"{key}={quote(value)}"
+    if name in TEXT_KEYS and not (is_sweep and SWEEP_CALL.fullmatch(value)):
+        pieces = _prompts(value) if is_sweep else [value]
+        return f"{key}=" + ",".join(part if QUOTED.fullmatch(part) else quote(part) for part in pieces)
+    return override
+
+
+def resumed(overrides: Sequence[str], *, is_sweep: bool) -> list[str]:
+    """Replace ``resume=RUN`` by the overrides that RUN was started with, changed by the others in the line.
+
+    A line without ``resume=`` does not change. Raises ``UserError`` if RUN is not the folder of a run, or a
+    checkpoint in one, or if the line asks for another folder or for a sweep.
+    """
+    given = {_entry(override): override for override in overrides}
+    if "resume" not in given or (text := text_of(given["resume"])) in ("null", ""):
+        return list(overrides)
+    if is_sweep:
+        raise UserError(f"resume: continues one run, not a sweep. Try: cadam3d train {resume_word(text)}")
+    path = Path(text).expanduser().resolve()
+    holders = [place for place in (path, *path.parents) if (place / OVERRIDES).is_file()]
+    folder = holders[0] if path.exists() and holders else None
+    if folder is None or (path.is_dir() and path != folder):
+        raise UserError(
+            f"resume: expected the folder of a run (it contains {OVERRIDES}), got {text!r}. "
+            "Try: cadam3d train resume=outputs/latest"
+        )
+    if RUN_FOLDER in given and Path(text_of(given[RUN_FOLDER])).expanduser().resolve() != folder:
+        raise UserError(
+            f"{RUN_FOLDER}: a resumed run stays in its folder. Try: cadam3d train {resume_word(text)}"
+        )
+    before = yaml.safe_load((folder / OVERRIDES).read_text(encoding="utf-8")) or []
+    merged = {_entry(override): override for override in before if key_of(override) != "grid"}
+    for override in given.values():
+        _merge(merged, override)
+    merged["resume"] = f"resume={quote(str(path))}"
+    merged[RUN_FOLDER] = f"{RUN_FOLDER}={quote(str(folder))}"
+    return list(merged.values())
+
+
+def resume_word(place: str | Path) -> str:
+    """Return ``resume=PLACE`` as it is typed into a shell."""
+    return shlex.quote(f"resume={place}")
+
+
+def _entry(override: str) -> str:
+    """Return what an override is about: to remove a key (``~key``) and to give it a value are two entries."""
+    return ("~" if override.startswith("~") else "") + key_of(override)
+
+
+def _merge(merged: dict[str, str], override: str) -> None:
+    """Add one more override to those of a run, in place. It replaces what it makes void."""
+    entry, key = _entry(override), key_of(override)
+    old = merged.get(key, "")
+    if entry != key:  # ~key
+        merged.pop(key, None)
+        if not old.startswith("+") or entry in merged:  # otherwise the key was an addition and is now gone
+            merged[entry] = override
+    elif override.startswith("+"):
+        merged[key] = override
+    else:
+        if not old:
+            merged.pop(f"~{key}", None)  # the key is back
+        merged[key] = old[: len(old) - len(old.lstrip("+"))] + override
+
+
+def _prompts(value: str) -> list[str]:
+    """Split the prompts of a sweep at the commas that separate them."""
+    pieces, rest = [], value
+    while True:
+        match = QUOTED.match(rest)
+        if match is None or rest[match.end() : match.end() + 1] not in ("", ","):
+            match = PIECE.match(rest)
+        assert match is not None, "PIECE matches the empty string too"
+        pieces.append(match.group().strip())
+        if match.end() == len(rest):
+            return pieces
+        rest = rest[match.end() + 1 :]
