@@ -49,7 +49,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Line:
-    """What was typed after ``cadam3d``."""
+    """The command line after ``cadam3d``, read."""
 
     command: str
     overrides: list[str]  # quoted for Hydra

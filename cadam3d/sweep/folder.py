@@ -57,12 +57,12 @@ class Row:
 
     @property
     def has_result(self) -> bool:
-        """Whether the job is done. An end for lack of memory is a result; a kill or an interrupt is not."""
+        """Return whether the job is done. An end for lack of memory is a result; a kill or an interrupt is not."""
         return self.outcome in RESULTS and is_complete(self.summary)
 
     @property
     def has_checkpoint(self) -> bool:
-        """Whether the job can continue from a checkpoint."""
+        """Return whether the job can continue from a checkpoint."""
         return has_checkpoint(self.folder)
 
 
