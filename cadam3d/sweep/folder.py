@@ -57,7 +57,7 @@ class Row:
 
     @property
     def has_result(self) -> bool:
-        """Return whether the job is done; running out of memory is a result, a kill or an interrupt is not."""
+        """Return whether the job is done; running out of memory is a result, being killed is not."""
         return self.outcome in RESULTS and is_complete(self.summary)
 
     @property
