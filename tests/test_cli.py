@@ -377,7 +377,7 @@ def test_a_mistake_gets_one_message_that_says_what_to_type(line, ending, type_li
     [
         (("train", "--bogus"), "unrecognized arguments: --bogus. Try: cadam3d --help"),
         (("train", "--cfg", "nope"), "invalid choice: 'nope'"),
-        (("train", "--cfg", "job", "--info", "config"), "exclude one another"),
+        (("train", "--cfg", "job", "--info", "config"), "cannot be combined"),
         (("eval", "-m", "run=a,b"), "only training can be swept"),
         (("doctor", "jsn=true"), "Did you mean json? Try: json=true"),
         (("-sc",), 'Try: eval "$(cadam3d -sc install=bash)"'),

@@ -160,7 +160,7 @@ def test_eval_notes_which_numbers_are_missing_without_true_images(tmp_path, gaus
     assert code == 0
     assert "psnr" not in result
     assert result["num_gaussians"] == 6
-    assert "knows no true images" in out
+    assert "has no true images" in out
 
 
 def make_sweep(folder: Path, *names: str) -> Path:
@@ -194,7 +194,7 @@ def test_other_commands_suggest_a_job_of_a_sweep(tmp_path, gaussians, type_line)
     make_run(make_sweep(tmp_path / "sweep", "0_job") / "0_job", gaussians)
     code, _, err = type_line("render", "run=sweep")
     assert code == 1
-    assert "one of them is 0_job" in err
+    assert "it is a sweep, which has many runs). Try: run=sweep/0_job" in err
 
 
 def test_view_shows_the_report_of_a_run(run_folder, type_line, monkeypatch):

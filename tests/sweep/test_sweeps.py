@@ -344,7 +344,7 @@ def test_a_second_sweep_in_the_folder_of_a_running_one_is_refused(sweep):
     with start._locked(folder):
         result = sweep("prompt=a cube", "grid=densifiers")
     assert result.code == 1
-    assert "another sweep is at work in multirun/densifiers" in result.err
+    assert "another sweep is running in multirun/densifiers" in result.err
     assert not (folder / JOBS).exists()
     assert sweep("prompt=a cube", "grid=densifiers").code == 0
 
@@ -404,7 +404,7 @@ def test_a_second_sigint_ends_at_once(start_sweep, tmp_path):
     wait_for(tmp_path, "x/*/waiting", process)
     process.send_signal(signal.SIGINT)
     assert process.stderr.readline() == "\n"
-    assert "once more to stop at once" in process.stderr.readline()
+    assert "interrupt again to stop at once" in process.stderr.readline()
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=30)
     assert process.returncode == 130
@@ -507,7 +507,7 @@ def test_after_a_failure_of_the_launcher_the_table_is_right(sweep, monkeypatch):
     monkeypatch.setattr(start, "run_hydra", fail)
     result = sweep("prompt=a cube", "seed=0,1")
     assert result.code == 1
-    assert result.err.splitlines()[0] == "cadam3d: the launcher gave up. RuntimeError: a worker was lost"
+    assert result.err.splitlines()[0] == "cadam3d: the launcher failed. RuntimeError: a worker was lost"
     assert "2 of 2 jobs have no result (2 unfinished). Rerun" in result.err
 
 
