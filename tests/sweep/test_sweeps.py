@@ -627,6 +627,15 @@ def test_the_plan_records_folder_flags_and_line(sweep, tmp_path):
     assert [job.swept["densifier"] for job in remembered.jobs] == ["mine", "none"]
 
 
+@pytest.mark.parametrize("flag", [("--config-name", "mine"), ("--config-name=mine",), ("-cn", "mine")])
+def test_another_config_name_is_for_the_jobs_only(flag, hydra_sweep, calls, small_configs):
+    """The sweep itself and its launcher keep their own YAML files."""
+    (small_configs / "mine.yaml").write_text(TRAIN.replace("steps: 5", "steps: 6"), encoding="utf-8")
+    result = hydra_sweep(*flag, "prompt=a cube", "seed=0,1", "hydra.sweep.dir=x")
+    assert result.code == 0, result.err
+    assert [call["words"][-1 - len(flag) : -1] for call in calls(Path("x"))] == [list(flag)] * 2
+
+
 def test_grids_and_components_are_found_on_a_search_path(sweep, tmp_path):
     for name, text in (
         ("grid/mine.yaml", "arms: {one: {densifier: mine}}"),
