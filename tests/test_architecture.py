@@ -215,7 +215,7 @@ def imports_hydra(path: Path, package: Path = PACKAGE) -> bool:
     return any(module.split(".")[0] in ("hydra", "omegaconf") for module, _ in imports(path, package))
 
 
-def test_core_knows_tensors_and_the_standard_library_only():
+def test_core_imports_only_tensor_packages_and_the_standard_library():
     allowed = {"torch", "numpy", "kornia", "jaxtyping", "cadam3d", *sys.stdlib_module_names}
     guilty = {
         f"{path.name}: {module}"
@@ -280,7 +280,7 @@ def _is_global_draw(call: ast.Call, name: str) -> bool:
 
 
 @pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_all_randomness_comes_from_a_generator_that_was_handed_in(path):
+def test_all_randomness_comes_from_a_generator_argument(path):
     assert not global_draws(path.read_text(encoding="utf-8"))
 
 
@@ -317,7 +317,7 @@ def test_a_draw_from_the_global_state_is_noticed(line):
         "import torch\nwith torch.random.fork_rng(devices=[]):\n    torch.manual_seed(0)",
     ],
 )
-def test_a_draw_from_a_state_of_its_own_is_allowed(line):
+def test_a_draw_from_an_explicit_generator_is_allowed(line):
     assert not global_draws(line)
 
 
@@ -335,7 +335,7 @@ def test_no_module_level_future_annotations():
     assert not [path for path in sources() for module, _ in imports(path) if module == "__future__"]
 
 
-def test_components_are_not_told_apart_by_their_class():
+def test_the_class_of_a_component_is_never_checked():
     """No ``isinstance`` against a component: an interface that does not suffice is to be changed instead."""
     interfaces = ("CameraSampler", "Initializer", "Rasterizer", "DiffusionPrior", "Guidance", "Densifier")
     interfaces += ("Exporter", "Metric", "Callback", "Background", "Regularizer", "Augmentation", "Exposure")

@@ -137,7 +137,7 @@ def test_the_momentum_ablation_differs_from_cadam_in_its_own_keys_only():
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_a_component_declares_no_values_of_its_own(path):
+def test_a_component_declares_no_default_values(path):
     """A number has one home, and it is the YAML; schedules and paths inside a component may have defaults."""
     content = composed(path)
     for node in [content] if "_target_" in content else content.values():
@@ -146,7 +146,7 @@ def test_a_component_declares_no_values_of_its_own(path):
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_files_of_groups_with_several_options_live_in_a_node_of_their_own(path):
+def test_an_option_of_a_group_with_several_choices_has_its_own_node(path):
     header = path.read_text(encoding="utf-8").splitlines()[0]
     wanted = f"# @package {path.parent.name}.{path.stem}"
     assert header == wanted if path.parent.name in SEVERAL else not header.startswith("# @package")
@@ -171,14 +171,14 @@ def test_every_option_of_a_nested_group_composes_and_builds(path):
     assert component(cfg[outer]) is not None
 
 
-def test_what_an_initializer_falls_back_on_has_the_values_it_has_by_itself():
+def test_a_fallback_initializer_has_the_values_of_the_initializer_itself():
     for path in sorted((CONFIGS / "initializer/fallback").glob("*.yaml")):
         cfg = compose([PROMPT, "initializer=shap_e", f"initializer/fallback={path.stem}"])
         assert cfg.initializer.fallback == composed(CONFIGS / f"initializer/{path.stem}.yaml")
         assert component(cfg.initializer).fallback is not None
 
 
-def test_every_regularizer_has_a_file_of_its_own_and_several_can_be_chosen():
+def test_every_regularizer_has_its_own_file_and_several_can_be_chosen():
     kinds = [kind for _, kind in inspect.getmembers(regularizer, inspect.isclass)]
     kinds = [kind for kind in kinds if issubclass(kind, regularizer.Regularizer)]
     classes = {kind.__name__ for kind in kinds if not inspect.isabstract(kind)}
@@ -242,7 +242,7 @@ def test_every_arm_of_a_grid_composes(grid, monkeypatch):
 
 
 @pytest.mark.parametrize("path", sorted((CONFIGS / "launcher").glob("*.yaml")), ids=lambda path: path.stem)
-def test_a_launcher_fills_in_a_launcher_of_hydra(path):
+def test_a_launcher_configures_a_launcher_of_hydra(path):
     """Whether its plugin is installed or not; test_sweeps.py runs the one that is."""
     text = path.read_text(encoding="utf-8")
     assert text.startswith("# @package _global_\n")
@@ -286,7 +286,7 @@ def node(target: str, **values: Any):
     return OmegaConf.create({"part": {"_target_": target, **values}}).part
 
 
-def test_a_mistake_found_in_a_constructor_comes_out_as_it_is():
+def test_a_user_error_in_a_constructor_is_raised_unchanged():
     with pytest.raises(
         UserError, match=r"^schedule.steps: expected a whole number >= 1, got 0. Try: schedule.steps=600$"
     ):
@@ -316,7 +316,7 @@ def test_a_value_that_is_still_missing_is_named():
         component(node("cadam3d.core.schedule.Constant", value="???"))
 
 
-def test_a_bug_in_a_constructor_stays_what_it_is():
+def test_a_bug_in_a_constructor_keeps_its_exception():
     with pytest.raises(ZeroDivisionError):
         component(node("operator.truediv", _args_=[1, 0]))
 

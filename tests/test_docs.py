@@ -255,7 +255,7 @@ def headings_of(page: Path) -> list[str]:
     return [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
 
 
-def test_quoted_messages_are_messages_of_ours():
+def test_quoted_messages_are_in_the_source():
     """Headings of the page on troubles that are quotes: each piece between dots is in the source."""
     page = (REPOSITORY / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     source = "".join(file.read_text(encoding="utf-8") for file in (REPOSITORY / "cadam3d").rglob("*.py"))

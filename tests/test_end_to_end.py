@@ -87,7 +87,7 @@ def test_eval_measures_what_train_measured(finished):
         assert evaluation[key] == pytest.approx(summary[key], rel=1e-6)
 
 
-def test_killed_and_resumed_equals_never_interrupted(finished, tmp_path):
+def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(finished, tmp_path):
     victim = tmp_path / "run"
     words = [*SMALL, f"hydra.run.dir={victim}", "callback.checkpoint.every=7", "callback.metrics.every=1"]
     process = start(tmp_path, "train", *words)
@@ -168,7 +168,7 @@ def test_a_dry_run_on_the_tiny_prior_prints_that_its_result_is_meaningless(tmp_p
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the process of a job in /proc")
-def test_a_sweep_survives_a_killed_job_and_the_same_line_finishes_it(finished, tmp_path):
+def test_a_sweep_continues_after_a_killed_job_and_the_same_line_completes_it(finished, tmp_path):
     words = [*SMALL, "densifier=cadam,none", "callback.checkpoint.every=7", "hydra.sweep.dir=table"]
     table = tmp_path / "table"
     process = start(tmp_path, "sweep", *words)

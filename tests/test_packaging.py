@@ -58,13 +58,13 @@ def test_the_wheel_carries_every_source_and_nothing_else_of_the_repository(wheel
     assert any(name.endswith("licenses/LICENSE") for name in names)
 
 
-def test_kernel_sources_travel_too(wheel):
+def test_the_wheel_carries_the_kernel_sources(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     sources = {path for pattern in ("*.cpp", "*.h", "*.cu", "*.cuh") for path in find("cadam3d", pattern)}
     assert {str(path.relative_to(REPOSITORY)) for path in sources} <= names
 
 
-def test_report_templates_travel_too(wheel):
+def test_the_wheel_carries_the_report_templates(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     templates = find("cadam3d/report/templates", "*.*")
     assert templates
@@ -92,7 +92,7 @@ def imports_of(nodes):
             yield str(node.module).partition(".")[0]
 
 
-def test_every_import_is_declared_or_ours():
+def test_every_imported_package_is_declared():
     """At the top of a module the core dependencies; inside a function those of an extra as well."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     core = {re.match(r"[\w-]+", line).group() for line in project["dependencies"]}
@@ -138,7 +138,7 @@ def test_python_minus_m_is_the_same_program(installed, tmp_path):
     assert by_module.stdout == by_script.stdout != ""
 
 
-def test_no_dependency_pulls_torchvision():
+def test_no_dependency_is_torchvision():
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     everything = [
         *project["dependencies"],
@@ -175,7 +175,7 @@ def test_the_projects_own_commands_use_the_tested_versions():
     assert "--constraint constraints.txt" in done.stdout
 
 
-def test_the_ci_runs_make_test_and_nothing_beside_it():
+def test_the_ci_runs_make_test_and_nothing_else():
     script = REPOSITORY / ".ci" / "run"
     assert os.access(script, os.X_OK)
     lines = [line for line in script.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
@@ -190,7 +190,7 @@ def test_the_ci_runs_make_test_and_nothing_beside_it():
         ("check", '-m "not slow"'),
     ],
 )
-def test_make_says_what_it_would_do(goal, expected):
+def test_a_make_target_runs_the_expected_command(goal, expected):
     done = subprocess.run(["make", "-n", goal], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     assert expected in done.stdout
 

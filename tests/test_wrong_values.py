@@ -141,7 +141,7 @@ def refuses(choice: str, line: str) -> None:
 
 
 @pytest.mark.parametrize(("choice", "key"), pairs(WHOLE))
-def test_what_is_counted_is_a_whole_number(choice, key):
+def test_a_count_must_be_a_whole_number(choice, key):
     for value in NEVER_WHOLE:
         refuses(choice, f"{key}={value}")
     if key not in NULLABLE.get(choice, ()):
@@ -174,12 +174,12 @@ def test_a_name_is_refused_as_a_fallback_initializer():
         build("initializer=shap_e", "initializer.fallback=ball")
 
 
-def test_a_truth_value_is_refused_as_a_bound():
+def test_a_boolean_is_refused_as_a_bound():
     refuses("guidance=sds", "guidance.clip=true")
     refuses("guidance=sds", "guidance.clip=abc")
 
 
-def test_a_parent_has_a_bounded_number_of_children():
+def test_the_number_of_split_children_is_bounded():
     assert build("refine=default", "refine.split_children=16").split_children == 16
     refuses("refine=default", "refine.split_children=17")
 
@@ -194,7 +194,7 @@ def test_a_schedule_counts_whole_steps(key, value):
 @pytest.mark.parametrize("key", ["start", "end"])
 @pytest.mark.parametrize("kind", ["Linear", "LogLinear"])
 @pytest.mark.parametrize("value", ["true", "null", "abc"])
-def test_a_schedule_goes_from_number_to_number(key, kind, value):
+def test_a_schedule_starts_and_ends_at_a_number(key, kind, value):
     with pytest.raises(UserError, match=rf"^schedule\.{key}: expected a"):
         build(
             "optimizer=adam",
@@ -203,7 +203,7 @@ def test_a_schedule_goes_from_number_to_number(key, kind, value):
         )
 
 
-def test_an_integer_is_a_fine_rate_of_decay():
+def test_an_integer_is_accepted_as_a_decay_rate():
     gaussians = build("initializer=ball", "initializer.count=3").build(
         "", torch.Generator().manual_seed(0), torch.device("cpu")
     )

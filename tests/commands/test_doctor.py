@@ -37,7 +37,7 @@ def test_this_machine_can_train(findings):
 @pytest.mark.parametrize(
     "topic", ["python", "torch", "device", "ffmpeg", "configs", "c++", "nvcc", "diffusers"]
 )
-def test_it_checks(topic, findings):
+def test_doctor_reports_on(topic, findings):
     assert findings[topic].found
 
 
@@ -48,7 +48,7 @@ def test_every_rasterizer_that_this_machine_supports_is_tested(findings):
     assert "kernels for cuda" in findings
 
 
-def test_every_prior_is_tried(findings):
+def test_every_prior_is_checked(findings):
     for path in (REPOSITORY / "configs" / "prior").glob("*.yaml"):
         assert f"prior={path.stem}" in findings
     assert findings["prior=shapes"].verdict is Verdict.OK
@@ -108,7 +108,7 @@ def test_models_on_disk_are_listed_by_name(monkeypatch, tmp_path):
     assert doctor._models().found == "someone/some-model"
 
 
-def test_models_on_disk_say_what_reads_them(monkeypatch, tmp_path):
+def test_models_on_disk_are_listed_with_the_settings_that_use_them(monkeypatch, tmp_path):
     """The index in the cache shows that. A model with a damaged or unknown index is only a name."""
     for name, index in {
         "one--sdxl": '{"_class_name": "StableDiffusionXLPipeline"}',
@@ -131,12 +131,12 @@ def test_models_on_disk_say_what_reads_them(monkeypatch, tmp_path):
     ]
 
 
-def test_the_use_of_a_model_can_be_typed():
+def test_the_listed_settings_of_models_compose():
     for line in PRIORS.values():
         assert compose(["prompt=x", line]).prior._target_.startswith("cadam3d.prior.")
 
 
-def test_a_program_that_does_not_answer_is_not_waited_for(monkeypatch):
+def test_a_program_that_does_not_end_is_stopped_after_a_while(monkeypatch):
     monkeypatch.setattr(doctor, "SECONDS", 0.1)
     code, output = doctor._ask([sys.executable, "-c", "import time; time.sleep(30)"])
     assert code == 127
@@ -155,7 +155,7 @@ def test_without_problems_the_exit_code_is_0_and_no_file_is_left(monkeypatch, tm
     assert not list(tmp_path.iterdir())
 
 
-def test_something_broken_is_exit_1_with_its_hint(monkeypatch, tmp_path, capsys):
+def test_a_broken_finding_prints_its_hint_and_causes_exit_code_1(monkeypatch, tmp_path, capsys):
     sound(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "Try: pip install torch"))
     code, out = run_doctor(monkeypatch, tmp_path, capsys)
     assert code == 1

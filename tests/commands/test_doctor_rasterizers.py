@@ -151,7 +151,7 @@ def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu
         ("rasterizer=reference", "cuda:0", {"repeats": False}, Verdict.OK),  # its sums use atomics there
     ],
 )
-def test_what_fails_its_self_test_is_reported(topic, device, change, verdict, monkeypatch, agreement):
+def test_a_failed_self_test_is_reported(topic, device, change, verdict, monkeypatch, agreement):
     monkeypatch.setattr(
         doctor_rasterizers, "self_test", lambda rasterizer, device: replace(agreement, **change)
     )
@@ -171,7 +171,7 @@ def test_a_self_test_that_crashes_is_a_finding(monkeypatch):
     assert finding.found == "RuntimeError: an illegal memory access"
 
 
-def test_an_error_of_the_compiler_is_one_line_and_what_to_type(monkeypatch):
+def test_an_error_of_the_compiler_is_one_line_and_a_hint(monkeypatch):
     def fail(cache_dir):
         raise UserError("rasterizer=cpu: c++ could not build the kernels:\nerror\nerror\nTry: another one")
 

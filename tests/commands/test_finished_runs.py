@@ -77,7 +77,7 @@ def test_a_folder_without_a_run_is_named(command, type_line, tmp_path):
         assert err.startswith(f"cadam3d: run: expected the folder of a run, got {place!r} ({reason}). Try: ")
 
 
-def test_the_message_for_a_run_without_an_asset_is_to_finish_it(run_folder, type_line):
+def test_the_message_for_a_run_without_an_asset_suggests_finishing_it(run_folder, type_line):
     (run_folder / "asset.ply").unlink()
     code, _, err = type_line("render", f"run={run_folder}")
     assert code == 1
@@ -110,7 +110,7 @@ def test_render_accepts_a_file_and_an_output_folder(run_folder, type_line, tmp_p
     assert len(list((tmp_path / "some (pictures)/images").iterdir())) == 1
 
 
-def test_render_without_an_exporter_says_which_to_choose(run_folder, type_line):
+def test_the_message_of_render_without_an_exporter_suggests_some(run_folder, type_line):
     code, _, err = type_line("render", f"run={run_folder}", "exporter=[]")
     assert code == 1
     assert "Try: exporter=[images,turntable]" in err
@@ -170,7 +170,7 @@ def make_sweep(folder: Path, *names: str) -> Path:
     return folder
 
 
-def test_eval_of_a_sweep_measures_every_job_and_names_those_it_cannot(tmp_path, gaussians, type_line):
+def test_eval_of_a_sweep_measures_every_job_and_reports_those_that_fail(tmp_path, gaussians, type_line):
     sweep = make_sweep(tmp_path / "sweep", "b", "a", "never-started", "c")
     for name in ("a", "b", "c", "of-another-sweep"):
         make_run(sweep / name, gaussians)

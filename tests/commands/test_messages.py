@@ -83,7 +83,7 @@ def test_training_without_a_compiler_is_noted_once_and_recorded(type_line, no_co
     assert NEEDED in (run / "report.html").read_text(encoding="utf-8")
 
 
-def test_another_command_notes_it_when_it_renders(type_line, no_compiler):
+def test_another_command_prints_the_note_when_it_renders(type_line, no_compiler):
     assert type_line("train", *SMALL, "rasterizer=reference")[0] == 0
     code, err = type_line("export", "run=outputs/latest", "output=copy.ply")
     assert (code, err.count(NEEDED)) == (0, 0)
@@ -91,7 +91,7 @@ def test_another_command_notes_it_when_it_renders(type_line, no_compiler):
     assert (code, err.count(NEEDED)) == (0, 1)
 
 
-def test_an_unavailable_rasterizer_is_refused_before_anything_is_touched(type_line, no_compiler, tmp_path):
+def test_an_unavailable_rasterizer_is_refused_before_any_file_changes(type_line, no_compiler, tmp_path):
     assert type_line("train", *SMALL, "rasterizer=reference")[0] == 0
     latest = (tmp_path / "outputs/latest").resolve()
     before = sorted(tmp_path.rglob("*"))
@@ -104,7 +104,7 @@ def test_an_unavailable_rasterizer_is_refused_before_anything_is_touched(type_li
 SHAP_E = ["rasterizer=reference", "initializer=shap_e", "initializer.path=nowhere"]
 
 
-def test_an_unavailable_initializer_is_refused_before_anything_is_touched(type_line, tmp_path):
+def test_an_unavailable_initializer_is_refused_before_any_file_is_written(type_line, tmp_path):
     code, err = type_line("train", *SMALL, *SHAP_E)
     assert code == 1
     assert err.startswith("cadam3d: initializer.path: expected a folder with a model_index.json")

@@ -67,7 +67,7 @@ def test_the_sizes_in_the_summary_are_those_on_disk(pad_sh, up, degree, exporter
     check_sizes(folder)
 
 
-def test_every_value_of_every_setting_is_among_those_above():
+def test_every_value_of_every_setting_is_tested():
     pads, ups, degrees, _ = (set(column) - {None} for column in zip(*SETTINGS, strict=True))
     assert (pads, ups, degrees) == (set(range(4)), {"-y", "+y", "+z"}, set(range(4)))
 

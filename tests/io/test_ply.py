@@ -290,7 +290,7 @@ def test_plyfile_reads_the_same_numbers(tmp_path, degree):
             assert np.array_equal(vertices[name], gaussians.sh[:, k, channel])
 
 
-def test_trimesh_opens_it_as_points(tmp_path):
+def test_trimesh_opens_the_file_as_points(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     gaussians = random_gaussians()
     write_ply(tmp_path / "a.ply", gaussians, up="+z", pad_sh=0)

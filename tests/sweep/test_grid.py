@@ -131,7 +131,7 @@ def test_names_are_unique_and_valid_file_names(pareto):
     assert all("/" not in name and len(name.encode()) < 255 for name in names)
 
 
-def test_a_name_stays_when_the_line_is_reordered_or_its_values_are_written_otherwise():
+def test_a_name_does_not_change_when_the_line_is_reordered_or_spelled_differently():
     lines = ["prompt='a cube','a ball'", "seed=0,1", "densifier.tau_Q=0.50,0.9", "steps=10"]
     rewritten = ['prompt="a ball","a cube"', "seed=range(0,2)", "densifier.tau_Q=0.9,5e-1", "steps=10"]
     names = {job.name for job in expand(read_grid(None), read_line(lines))}
@@ -139,14 +139,14 @@ def test_a_name_stays_when_the_line_is_reordered_or_its_values_are_written_other
         assert {job.name for job in expand(read_grid(None), read_line(order))} == names
 
 
-def test_a_name_stays_when_the_line_narrows_the_grid(pareto):
+def test_a_name_does_not_change_when_the_line_narrows_the_grid(pareto):
     everything = {job.name for job in expand(pareto, {})}
     for line in (["seed=1"], ["prompt='a lighthouse'", "seed=0,2"], ["densifier.tau_pos=0.001", "seed=0"]):
         narrowed = {job.name for job in expand(pareto, read_line(line), has_setting)}
         assert narrowed < everything
 
 
-def test_a_name_stays_when_a_setting_of_all_jobs_changes(pareto):
+def test_a_name_does_not_change_when_a_setting_of_all_jobs_changes(pareto):
     """Then the folder is found again, and its settings are compared: see test_sweeps.py."""
     before = [job.name for job in expand(pareto, read_line(["steps=100"]))]
     assert [job.name for job in expand(pareto, read_line(["steps=200"]))] == before
@@ -168,7 +168,7 @@ def test_the_name_of_a_sweep_is_its_grid_or_its_line_in_any_order():
     assert sweep_name(None, read_line(["steps=5,6"])) != sweep_name(None, read_line(["steps=5,7"]))
 
 
-def test_text_and_other_values_of_a_grid_arrive_as_they_were_written():
+def test_the_values_of_a_grid_are_unchanged_in_its_jobs():
     draw = random.Random(0)
     letters = ["\\", "'", '"', "{", ",", "(", "]", "=", " ", "a", "日", "#", "7", "."]
     texts = ["".join(draw.choices(letters, k=draw.randint(1, 8))) for _ in range(200)]

@@ -68,7 +68,7 @@ def test_every_end_of_a_process_is_an_outcome(sweep, prompt, outcome, message, c
     assert end["seconds"] > 0
 
 
-def test_numbers_that_a_killed_run_has_written_stay(sweep):
+def test_numbers_that_a_killed_run_has_written_are_kept(sweep):
     folder = sweep("a kill")
     run_job(folder, 0)
     row, _ = ended(folder)
@@ -138,7 +138,7 @@ def test_no_job_starts_in_a_sweep_that_is_being_stopped(sweep, calls):
     assert load(folder)[0].outcome == "unfinished"
 
 
-def test_a_running_job_is_asked_to_save_when_the_sweep_is_stopped(sweep):
+def test_a_running_job_saves_and_ends_when_the_sweep_is_stopped(sweep):
     folder = sweep("a wait")
     thread = threading.Thread(target=run_job, args=(folder, 0))
     thread.start()
@@ -167,7 +167,7 @@ def join(thread: threading.Thread) -> None:
     assert not thread.is_alive()
 
 
-def test_two_workers_at_the_same_job_run_it_once(sweep, calls):
+def test_two_workers_of_the_same_job_run_it_once(sweep, calls):
     folder = sweep("a long one")
     worker = start_worker(folder)
     waiting = start_waiting(folder)
@@ -231,7 +231,7 @@ def test_a_file_system_without_locks_runs_jobs_too(sweep, monkeypatch):
     assert load(folder)[0].outcome == "finished"
 
 
-def test_a_machine_without_unix_locks_and_signals_can_import_all_of_it():
+def test_a_machine_without_unix_locks_and_signals_can_import_every_module():
     """Windows has none of them; there a lock is taken with msvcrt."""
     code = (
         "import multiprocessing, signal, subprocess, sys, tempfile, types\n"
@@ -296,7 +296,7 @@ def test_sigterm_of_a_worker_reaches_its_job(sweep):
     assert load(folder)[0].outcome == "interrupted"
 
 
-def test_a_launcher_handles_the_announcement_of_the_end_once_the_job_has_saved(sweep):
+def test_a_launcher_handles_the_end_of_its_time_once_the_job_has_saved(sweep):
     """The handler of submitit queues a Slurm job again when its time is up, and exits."""
     folder = sweep("a wait")
     outcome = "(sweep / 'job_1/summary.json').read_text()"

@@ -118,7 +118,7 @@ def test_train_with_a_flag_is_a_sweep(flag, sweep):
     assert [row["seed"] for row in read_table(only_sweep())] == ["0", "1"]
 
 
-def test_a_sweep_leaves_one_row_per_job(hydra_sweep):
+def test_the_table_has_one_row_per_job(hydra_sweep):
     result = hydra_sweep("prompt=a corgi, front view", "densifier=baseline,cadam", "seed=0,1")
     assert result.code == 0, result.err
     rows = read_table(only_sweep())
@@ -173,7 +173,7 @@ def test_an_arm_can_be_left_out(sweep):
     assert [row["arm"] for row in read_table(Path("multirun/densifiers"))] == ["baseline", "cadam"]
 
 
-def test_failed_and_killed_jobs_are_rows_and_the_rest_goes_on(sweep, calls):
+def test_failed_and_killed_jobs_are_rows_and_the_other_jobs_still_run(sweep, calls):
     Path("multirun").mkdir()
     result = sweep("prompt=a cube,a mistake,a bug,a kill,a crowd,a ball", "hydra.sweep.dir=multirun/x")
     rows = read_table(Path("multirun/x"))
@@ -413,7 +413,7 @@ def test_a_second_sigint_ends_at_once(start_sweep, tmp_path):
 
 
 @pytest.mark.parametrize(("launcher", "running"), [((), 1), (("launcher=joblib", "launcher.n_jobs=2"), 2)])
-def test_a_killed_sweep_typed_again_runs_no_job_twice_at_a_time(
+def test_no_job_runs_twice_at_a_time_when_a_killed_sweep_is_started_again(
     launcher, running, start_sweep, calls, tmp_path
 ):
     line = ("prompt=a long one", "seed=0,1,2,3", "hydra.sweep.dir=x")
@@ -453,7 +453,7 @@ def wait_until(is_so: Callable[[], bool], process: subprocess.Popen) -> None:
 # --- launchers --------------------------------------------------------------------------------------------
 
 
-def test_joblib_runs_the_whole_sweep_and_a_plus_does_no_harm(start_sweep, tmp_path):
+def test_joblib_runs_the_whole_sweep_and_a_leading_plus_is_accepted(start_sweep, tmp_path):
     words = (
         "prompt=a cube,a mistake",
         "seed=0,1",
@@ -694,5 +694,5 @@ def test_preparing_a_sweep_needs_no_torch(start_sweep, tmp_path):
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(5.4, "5 s"), (240, "4 min"), (30_000, "8.3 h")])
-def test_durations_are_as_precise_as_estimates_are(seconds, text):
+def test_the_remaining_time_is_rounded(seconds, text):
     assert duration(seconds) == text
