@@ -18,7 +18,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session")
 def pipelines(tmp_path_factory) -> Callable[..., Path]:
-    """Return a function from the name of a builder in pipelines.py to the folder with its pipeline."""
+    """Return a function that calls a builder of pipelines.py by name and returns its folder."""
     for name in ("diffusers", "transformers"):
         pytest.importorskip(name)
     import pipelines as builders

@@ -63,7 +63,7 @@ class Result:
 
     @property
     def message(self) -> str:
-        """The single line of an error."""
+        """Return the single line of an error, without the name of the program."""
         lines = self.err.strip().splitlines()
         assert len(lines) == 1, self.err
         assert lines[0].startswith("cadam3d: ")
@@ -99,7 +99,7 @@ def test_idle_threads_sleep_unless_the_user_sets_another_policy(before, after, t
 
 @pytest.fixture(scope="session")
 def small_configs(tmp_path_factory) -> Path:
-    """The real folders that the command line itself needs, and a train.yaml that composes in no time."""
+    """Return a folder with the real groups that a line needs and a train.yaml that composes fast."""
     folder = tmp_path_factory.mktemp("configs")
     for name in ("hydra", "densifier", "grid", "launcher"):
         shutil.copytree(REPOSITORY / "configs" / name, folder / name)
@@ -206,9 +206,7 @@ def test_the_message_for_an_unknown_word_lists_the_commands(type_line):
 
 
 @pytest.mark.parametrize("prompt", AWKWARD)
-def test_a_prompt_is_unchanged_in_the_command_and_in_the_config_of_its_run(
-    prompt, tmp_path, type_line, jobs
-):
+def test_a_prompt_is_unchanged_in_the_command_and_in_the_config_of_its_run(prompt, tmp_path, type_line, jobs):
     assert type_line("train", f"prompt={prompt}").code == 0
     [(cfg, _)] = jobs
     assert cfg.prompt == prompt
@@ -284,7 +282,7 @@ def test_a_run_in_the_home_folder_is_written_and_resumed_there(type_line, jobs, 
     assert [folder for _, folder in jobs] == [tmp_path / "home/x"] * 2
 
 
-# --- missing values are asked for before any work -------------------------------------------------------
+# --- missing values are reported before any work -------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -609,10 +607,11 @@ def test_bash_completes_the_command_word(tmp_path):
 
 
 def test_ctrl_c_prints_one_line_and_exits_with_130(tmp_path):
-    """The signal arrives before the command has installed handlers."""
+    """The signal comes before the command has installed handlers."""
     code = (
         "import signal, sys, time, types\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a suite in the background ignores it
+        # A shell starts background jobs with SIGINT ignored.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "slow = types.ModuleType('cadam3d.commands.train')\n"
         "slow.run = lambda cfg: (print('started', flush=True), time.sleep(60))\n"
         "sys.modules[slow.__name__] = slow\n"
@@ -639,12 +638,14 @@ def test_ctrl_c_prints_one_line_and_exits_with_130(tmp_path):
 
 
 @pytest.mark.parametrize("function", ["compose_line", "run_composed"])
-def test_an_interrupt_hidden_by_another_exception_is_still_an_interrupt(function, type_line, monkeypatch, jobs):
+def test_an_interrupt_hidden_by_another_exception_is_still_an_interrupt(
+    function, type_line, monkeypatch, jobs
+):
     def hide(*args, **kwargs):
         try:
             raise KeyboardInterrupt
         finally:
-            raise AttributeError("what clean-up stumbled over")
+            raise AttributeError("raised by the clean-up")
 
     monkeypatch.setattr(f"cadam3d.launch.{function}", hide)
     result = type_line("train", "prompt=a cube")
@@ -679,7 +680,7 @@ def test_exceptions_of_hydra_are_explained_in_one_place_only():
     calls = [
         f"{path.relative_to(REPOSITORY)}:{node.lineno}"
         for path in (REPOSITORY / "cadam3d").rglob("*.py")
-        if path.name != "advice.py"  # where it calls itself for the cause of an exception
+        if path.name != "advice.py"  # it calls itself
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "explain"
     ]

@@ -1,4 +1,4 @@
-"""What a stranger installs: one wheel that carries its configuration and works from an empty folder."""
+"""Packaging: the wheel contains the configuration and works from an empty folder."""
 
 import ast
 import os
@@ -18,7 +18,7 @@ REPOSITORY = Path(__file__).parent.parent
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
-    """Built without network and without a build environment of its own."""
+    """Build the wheel without network and without an isolated build environment."""
     folder = tmp_path_factory.mktemp("dist")
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder)]
     done = subprocess.run([*command, str(REPOSITORY)], capture_output=True, text=True, check=False)
@@ -29,7 +29,7 @@ def wheel(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel, tmp_path_factory) -> Path:
-    """A folder that holds the installed package and nothing else."""
+    """Return a folder that contains the installed package and nothing else."""
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target"]
     subprocess.run([*command, str(folder), str(wheel)], check=True, capture_output=True)
@@ -93,7 +93,7 @@ def imports_of(nodes):
 
 
 def test_every_imported_package_is_declared():
-    """At the top of a module the core dependencies; inside a function those of an extra as well."""
+    """Core dependencies may be imported at the top of a module, those of an extra only inside functions."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     core = {re.match(r"[\w-]+", line).group() for line in project["dependencies"]}
     extra = {re.match(r"[\w-]+", line).group() for line in project["optional-dependencies"]["diffusers"]}
@@ -148,7 +148,7 @@ def test_no_dependency_is_torchvision():
 
 
 def test_the_package_forbids_no_newer_version():
-    """An upper bound in the package would make it refuse the environments of its users."""
+    """With an upper bound, the package could not be installed beside newer versions."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     for_users = [

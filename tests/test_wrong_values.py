@@ -11,7 +11,8 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import component, compose
 
-WHOLE = {  # an option, and its keys that count something
+# Options, and their keys that count something.
+WHOLE = {
     "camera=orbit": ["camera.size"],
     "camera=sphere": ["camera.size"],
     "camera=multiview": ["camera.size"],
@@ -83,7 +84,7 @@ LISTS = {
     "callback=[previews]": ["callback.previews.background"],
     "metric=[fidelity]": ["metric.fidelity.elevations_deg", "metric.fidelity.background"],
 }
-TRUTHS = {
+SWITCHES = {
     "densifier=cadam_open": ["densifier.reset_moments"],
     "guidance=sds": ["guidance.shared_t"],
     "guidance=ism": ["guidance.shared_t"],
@@ -91,7 +92,8 @@ TRUTHS = {
     "exporter=[preview]": ["exporter.preview.labels"],
     "prior=stable_diffusion_3": ["prior.t5"],
 }
-NULLABLE = {  # where null means never, all, or as it is
+# The keys among them that may be null.
+NULLABLE = {
     "callback=[previews]": ("callback.previews.every",),
     "refine=default": ("refine.reset_interval", "refine.max_gaussians"),
     "initializer=ply": ("initializer.count", "initializer.sh_degree"),
@@ -99,11 +101,11 @@ NULLABLE = {  # where null means never, all, or as it is
 }
 NEVER_WHOLE = ("2.5", "16.0", "true", "abc", "[1]", "-1000000000000.5")
 NEVER_A_LIST = ("5", "null", "abc", "[a,b,c]", "[true,true,true]", "[null,null]", "[]")
-NEVER_A_TRUTH = ("0", "1", "1.0", "null", "abc")
+NEVER_A_SWITCH = ("0", "1", "1.0", "null", "abc")
 
 
 @pytest.fixture(autouse=True)
-def as_users_run_it():
+def without_type_checks():
     """Switch off the type checks of the suite, which would refuse a wrong type before the component does."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
@@ -117,7 +119,7 @@ def composed(choice: str) -> DictConfig:
 
 
 def build(choice: str, *lines: str):
-    """Build the component of ``choice``, with ``lines`` of YAML values on top."""
+    """Build the component of ``choice`` after setting the YAML values of ``lines``."""
     group, _, name = choice.partition("=")
     cfg = composed(choice).copy()
     for line in lines:
@@ -154,9 +156,9 @@ def test_a_list_of_numbers_holds_only_numbers(choice, key):
         refuses(choice, f"{key}={value}")
 
 
-@pytest.mark.parametrize(("choice", "key"), pairs(TRUTHS))
+@pytest.mark.parametrize(("choice", "key"), pairs(SWITCHES))
 def test_a_switch_is_true_or_false(choice, key):
-    for value in NEVER_A_TRUTH:
+    for value in NEVER_A_SWITCH:
         refuses(choice, f"{key}={value}")
 
 

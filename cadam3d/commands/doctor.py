@@ -96,7 +96,7 @@ def _torchvision() -> Finding:
         version = metadata.version("torchvision")
     except metadata.PackageNotFoundError:
         return Finding("torchvision", Verdict.OK, "not installed, not needed")
-    code, output = _ask([sys.executable, "-c", "import torchvision"])
+    code, output = _run_program([sys.executable, "-c", "import torchvision"])
     if code == 0:
         return Finding("torchvision", Verdict.OK, version)
     reason = output.strip().splitlines()[-1] if output.strip() else "does not import"
@@ -118,7 +118,7 @@ def _device() -> Finding:
             "device", Verdict.OK, f"{properties.name}, {memory:.0f} GiB, CUDA {torch.version.cuda}"
         )
     found = f"CPU, {torch.get_num_threads()} threads"
-    if shutil.which("nvidia-smi") and _ask(["nvidia-smi", "-L"])[0] == 0:
+    if shutil.which("nvidia-smi") and _run_program(["nvidia-smi", "-L"])[0] == 0:
         built = f"torch is built for CUDA {torch.version.cuda}" if torch.version.cuda else "torch is CPU-only"
         hint = "Try: pip install --force-reinstall torch, with the CUDA version of your driver"
         return Finding("device", Verdict.NOTE, f"{found}; there is a GPU, but {built}", hint)
@@ -129,7 +129,7 @@ def _ffmpeg() -> Finding:
     import imageio_ffmpeg
 
     path = imageio_ffmpeg.get_ffmpeg_exe()
-    code, output = _ask([path, "-version"])
+    code, output = _run_program([path, "-version"])
     version = re.search(r"version (\S+)", output)
     if code == 0 and version:
         return Finding("ffmpeg", Verdict.OK, f"{version.group(1)}, {path}")
@@ -147,7 +147,7 @@ def _compiler(name: str) -> Finding:
     path = shutil.which(name)
     if path is None:
         return Finding(name, Verdict.NOTE, COMPILERS.get(name, "not found"))
-    code, output = _ask([path, "--version"])
+    code, output = _run_program([path, "--version"])
     if code != 0:
         return Finding(name, Verdict.NOTE, f"{path} does not run")
     lines = output.strip().splitlines() or [path]
@@ -215,7 +215,7 @@ def _model(folder: Path) -> str:
     return f"{name} ({', '.join(sorted(uses))})" if uses else name
 
 
-def _ask(command: list[str]) -> tuple[int, str]:
+def _run_program(command: list[str]) -> tuple[int, str]:
     """Return the exit code and output of a program; code 127 if it cannot be run or does not end in time."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)

@@ -1,4 +1,4 @@
-"""doctor: finds what is there, prints what to type otherwise, and fails only if training would fail."""
+"""``cadam3d doctor`` checks the machine, prints hints, and fails only if training would fail."""
 
 import json
 import re
@@ -76,8 +76,8 @@ def test_a_package_that_does_not_import_is_broken_and_has_a_hint(monkeypatch):
 
 def test_a_torchvision_that_does_not_fit_torch_is_broken(monkeypatch):
     monkeypatch.setattr(doctor.metadata, "version", lambda name: "0.28.0")
-    said = "Traceback ...\nRuntimeError: operator torchvision::nms does not exist"
-    monkeypatch.setattr(doctor, "_ask", lambda command: (1, said))
+    output = "Traceback ...\nRuntimeError: operator torchvision::nms does not exist"
+    monkeypatch.setattr(doctor, "_run_program", lambda command: (1, output))
     finding = doctor._torchvision()
     assert finding.verdict is Verdict.BROKEN
     assert "nms does not exist" in finding.found
@@ -109,7 +109,7 @@ def test_models_on_disk_are_listed_by_name(monkeypatch, tmp_path):
 
 
 def test_models_on_disk_are_listed_with_the_settings_that_use_them(monkeypatch, tmp_path):
-    """The index in the cache shows that. A model with a damaged or unknown index is only a name."""
+    """The settings follow from the index in the cache. Without a usable index, only the name is listed."""
     for name, index in {
         "one--sdxl": '{"_class_name": "StableDiffusionXLPipeline"}',
         "two--shap": '{"_class_name": "ShapEPipeline"}',
@@ -138,17 +138,17 @@ def test_the_listed_settings_of_models_compose():
 
 def test_a_program_that_does_not_end_is_stopped_after_a_while(monkeypatch):
     monkeypatch.setattr(doctor, "SECONDS", 0.1)
-    code, output = doctor._ask([sys.executable, "-c", "import time; time.sleep(30)"])
+    code, output = doctor._run_program([sys.executable, "-c", "import time; time.sleep(30)"])
     assert code == 127
     assert "timed out" in output
 
 
-def sound(monkeypatch, *findings: Finding) -> None:
+def replace_findings(monkeypatch, *findings: Finding) -> None:
     monkeypatch.setattr(doctor, "examine", lambda: iter(findings))
 
 
 def test_without_problems_the_exit_code_is_0_and_no_file_is_left(monkeypatch, tmp_path, capsys):
-    sound(monkeypatch, Finding("torch", Verdict.OK, "2"), Finding("nvcc", Verdict.NOTE, "none"))
+    replace_findings(monkeypatch, Finding("torch", Verdict.OK, "2"), Finding("nvcc", Verdict.NOTE, "none"))
     code, out = run_doctor(monkeypatch, tmp_path, capsys)
     assert code == 0
     assert "Ready to train." in out
@@ -156,7 +156,7 @@ def test_without_problems_the_exit_code_is_0_and_no_file_is_left(monkeypatch, tm
 
 
 def test_a_broken_finding_prints_its_hint_and_causes_exit_code_1(monkeypatch, tmp_path, capsys):
-    sound(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "Try: pip install torch"))
+    replace_findings(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "Try: pip install torch"))
     code, out = run_doctor(monkeypatch, tmp_path, capsys)
     assert code == 1
     assert "Try: pip install torch" in out
@@ -164,7 +164,7 @@ def test_a_broken_finding_prints_its_hint_and_causes_exit_code_1(monkeypatch, tm
 
 @pytest.mark.parametrize("word", ["json=true", "--json"])
 def test_json_is_one_object_for_other_programs(word, monkeypatch, tmp_path, capsys):
-    sound(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "hint", {"size": 3}))
+    replace_findings(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "hint", {"size": 3}))
     code, out = run_doctor(monkeypatch, tmp_path, capsys, word)
     report = json.loads(out)
     assert code == 1
@@ -184,7 +184,7 @@ def test_a_gpu_that_torch_cannot_use_gets_a_hint(monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/usr/bin/{name}")
-    monkeypatch.setattr(doctor, "_ask", lambda command: (0, "GPU 0"))
+    monkeypatch.setattr(doctor, "_run_program", lambda command: (0, "GPU 0"))
     finding = doctor._device()
     assert finding.verdict is Verdict.NOTE
     assert "there is a GPU" in finding.found
@@ -192,4 +192,4 @@ def test_a_gpu_that_torch_cannot_use_gets_a_hint(monkeypatch):
 
 
 def test_a_missing_program_is_not_a_crash():
-    assert doctor._ask(["/nowhere/program"])[0] == 127
+    assert doctor._run_program(["/nowhere/program"])[0] == 127

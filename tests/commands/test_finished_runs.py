@@ -1,4 +1,4 @@
-"""render, export, eval and view with a run folder, a sweep folder or a single file."""
+"""The commands render, export, eval and view, with a run folder, a sweep folder or a single file."""
 
 import json
 import sys

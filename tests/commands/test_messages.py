@@ -24,7 +24,7 @@ SMALL += ["exporter=[ply]", "metric=[]", "camera.size=16"]
 
 
 @pytest.fixture(autouse=True)
-def _nothing_said_yet():
+def empty_caches():
     messages.note.cache_clear()
     auto._choose.cache_clear()
     yield

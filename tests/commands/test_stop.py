@@ -1,4 +1,4 @@
-"""Signals to training: the first one asks it to stop, a later one stops it at once."""
+"""Signals to training: after the first one it saves and ends, and a later one stops it at once."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""Logs that survive a kill, and JSON that any reader accepts."""
+"""Logs stay readable after a kill, and any reader accepts the JSON."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""The run folder: what holds a run, how places are claimed, and how paths are shown."""
+"""The run folder: how a run is recognised, how a folder is claimed, and how paths are shown."""
 
 from pathlib import Path
 

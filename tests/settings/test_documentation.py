@@ -1,4 +1,4 @@
-"""The words of the configuration: every key has them, they have one home, and the page is made from them."""
+"""Every key of the configuration is described in one place, and docs/components.md is generated from that."""
 
 import importlib.util
 from pathlib import Path
@@ -59,7 +59,7 @@ def test_an_option_does_not_repeat_descriptions_of_its_base(group, name):
 
 
 def _opening(words: str) -> str:
-    """Return the part of the words that says what a key means; what follows may be about the value."""
+    """Return the beginning of a description, which is about the key; the rest may be about the value."""
     return words.lower().partition(";")[0].partition(",")[0]
 
 

@@ -1,4 +1,4 @@
-"""Help: every choice on one page, every setting of an option on another, at once and within the terminal."""
+"""The help of a command lists all choices, that of an option all its settings, and lines fit the terminal."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Grids: which jobs a sweep has, and that their names do not change."""
+"""Grids: the jobs of a sweep, and the names of their folders."""
 
 import itertools
 import random
@@ -25,7 +25,7 @@ def pareto() -> Grid:
 
 
 def has_setting(overrides, key) -> bool:
-    """Pretend that each densifier has one threshold that no other has; all other settings are common."""
+    """Pretend that each densifier has a threshold of another name and that all other settings are shared."""
     return key not in KEYS_OF.values() or any(KEYS_OF.get(line) == key for line in overrides)
 
 
@@ -147,7 +147,7 @@ def test_a_name_does_not_change_when_the_line_narrows_the_grid(pareto):
 
 
 def test_a_name_does_not_change_when_a_setting_of_all_jobs_changes(pareto):
-    """Then the folder is found again, and its settings are compared: see test_sweeps.py."""
+    """The folder of the job is then found again and its settings are compared; see test_sweeps.py."""
     before = [job.name for job in expand(pareto, read_line(["steps=100"]))]
     assert [job.name for job in expand(pareto, read_line(["steps=200"]))] == before
 

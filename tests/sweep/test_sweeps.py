@@ -1,4 +1,4 @@
-"""``cadam3d sweep`` from its line to its table, with a stand-in for training."""
+"""``cadam3d sweep`` from the command line to the table, with a small program in place of training."""
 
 import csv
 import os
@@ -52,7 +52,7 @@ class Result:
 
 @pytest.fixture(scope="session")
 def small_configs(tmp_path_factory) -> Path:
-    """The folders that sweeps need, and a train.yaml that composes in no time."""
+    """Return a folder with the real groups that sweeps need and a train.yaml that composes fast."""
     folder = tmp_path_factory.mktemp("configs")
     for name in ("hydra", "densifier", "grid", "launcher"):
         shutil.copytree(REPOSITORY / "configs" / name, folder / name)
@@ -85,7 +85,7 @@ def hydra_sweep(monkeypatch, capfd, tmp_path, small_configs, stand_in):
 
 @pytest.fixture
 def sweep(hydra_sweep, monkeypatch):
-    """The same with a loop instead of Hydra's multirun, which takes a third of the time."""
+    """Do the same with a loop instead of Hydra's multirun, in a third of the time."""
 
     def run_jobs(name: str, arguments: list[str], _run: Callable) -> None:
         given = dict(line.split("=", 1) for line in arguments if "=" in line)
@@ -165,7 +165,8 @@ def test_a_grid_gives_its_name_and_its_arms(sweep):
     assert [row["arm"] for row in rows] == ["baseline", "cadam", "none"] * 2
     assert [row["densifier"] for row in rows] == ["baseline", "cadam", "none"] * 2
     assert "[1/6] baseline, seed=0: " in result.out
-    assert "densifier" not in result.out.split("job  ")[1].splitlines()[0]  # it follows from the arm
+    # The table in the terminal has no column for the densifier, which follows from the arm.
+    assert "densifier" not in result.out.split("job  ")[1].splitlines()[0]
 
 
 def test_an_arm_can_be_left_out(sweep):
@@ -179,7 +180,7 @@ def test_failed_and_killed_jobs_are_rows_and_the_other_jobs_still_run(sweep, cal
     rows = read_table(Path("multirun/x"))
     outcomes = ["finished", "failed", "failed", "killed", "out_of_memory", "finished"]
     assert [row["outcome"] for row in rows] == outcomes
-    assert rows[1]["message"] == "prompt: I know no mistake. Try: a cube"
+    assert rows[1]["message"] == "prompt: expected a shape. Try: a cube"
     assert rows[2]["message"] == "ValueError: one two"
     assert rows[3]["message"].startswith("by SIGKILL")
     assert result.code == 1
@@ -205,7 +206,7 @@ def test_the_table_is_right_after_every_job(hydra_sweep, monkeypatch):
 
 
 def test_the_last_of_several_writers_leaves_the_latest_state(tmp_path, monkeypatch):
-    """A job that ends while the table is being written is in it all the same."""
+    """The table also has the result of a job that ends while the table is being written."""
     before = Row(0, "", tmp_path / "a", [], {"seed": 0}, {})
     after = Row(0, "", tmp_path / "a", [], {"seed": 0}, {"outcome": "finished"})
     states = iter([[before], [after], [after]])
@@ -248,7 +249,7 @@ def test_finished_jobs_are_skipped_and_the_others_run_again(sweep, calls):
 
 
 def test_numbers_without_exports_are_not_a_result(sweep, calls):
-    """Training writes the numbers first. If the whole machine fails then, nothing records that."""
+    """Training writes the numbers before the exports, and a failure of the machine can come between them."""
     sweep("prompt=a cube", "seed=0,1")
     [row, _] = load(only_sweep().resolve())
     (row.folder / "summary.json").write_text('{"outcome": "finished", "num_gaussians": 5}')
@@ -287,7 +288,7 @@ def test_a_narrower_line_finds_the_jobs_of_the_wider_one(seeds, sweep, calls):
     assert result.code == 0
     assert len(calls(Path("multirun/densifiers"))) == 9
     rows = read_table(Path("multirun/densifiers"))
-    assert {row["seed"] for row in rows} == set(seeds.split(","))  # the table is of this line
+    assert {row["seed"] for row in rows} == set(seeds.split(","))
 
 
 def test_other_settings_in_the_same_folder_are_refused_with_the_key(sweep, calls):
@@ -354,7 +355,7 @@ def test_a_second_sweep_in_the_folder_of_a_running_one_is_refused(sweep):
 
 @pytest.fixture
 def start_sweep(tmp_path, small_configs, stand_in):
-    """Start a sweep in a process of its own, whose workers also find the replacement of training."""
+    """Start a sweep in a separate process. Its workers use the replacement of training too."""
     python = tmp_path / "python"
     is_job = 'case "$*" in *cadam3d.job*)'
     python.write_text(f'#!/bin/sh\n{is_job} exec {stand_in} "$@";; esac\nexec {PYTHON} "$@"\n')
@@ -379,7 +380,8 @@ def start_sweep(tmp_path, small_configs, stand_in):
 
     started: list[subprocess.Popen] = []
     yield run
-    for process in started:  # only after a failure; workers and jobs end with it
+    # After a failed test, the workers and jobs end together with the process of the sweep.
+    for process in started:
         process.kill()
         process.wait()
 
@@ -400,7 +402,7 @@ def test_sigint_stops_all_running_jobs_and_the_table_is_right(launcher, running,
 
 
 def test_a_second_sigint_ends_at_once(start_sweep, tmp_path):
-    process = start_sweep("prompt=a deaf one", "seed=0,1", "hydra.sweep.dir=x")
+    process = start_sweep("prompt=a stuck one", "seed=0,1", "hydra.sweep.dir=x")
     wait_for(tmp_path, "x/*/waiting", process)
     process.send_signal(signal.SIGINT)
     assert process.stderr.readline() == "\n"
@@ -424,7 +426,8 @@ def test_no_job_runs_twice_at_a_time_when_a_killed_sweep_is_started_again(
     held = [call["folder"] for call in calls(folder)]
     opened = {lock: lock.stat().st_mtime_ns for lock in folder.glob("*/.lock")}
     second = start_sweep(*line, *launcher)
-    first.communicate(timeout=30)  # the pipes close once its workers have ended; its jobs still run
+    # The pipes close once its workers have ended. Its jobs are still running.
+    first.communicate(timeout=30)
     wait_until(lambda: all(lock.stat().st_mtime_ns > time for lock, time in opened.items()), second)
     time.sleep(1)
     assert len(calls(folder)) == running
@@ -435,16 +438,16 @@ def test_no_job_runs_twice_at_a_time_when_a_killed_sweep_is_started_again(
     assert second.returncode == 0, err
     times = Counter(call["folder"] for call in calls(folder))
     assert times == {row.folder.name: 1 + (row.folder.name in held) for row in load(folder)}
-    assert not any(call["meets"] for call in calls(folder))
+    assert not any(call["running"] for call in calls(folder))
 
 
 def wait_for(folder: Path, pattern: str, process: subprocess.Popen, count: int = 1) -> None:
     wait_until(lambda: len(list(folder.glob(pattern))) >= count, process)
 
 
-def wait_until(is_so: Callable[[], bool], process: subprocess.Popen) -> None:
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen) -> None:
     deadline = time.monotonic() + 90
-    while not is_so():
+    while not condition():
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.05)
@@ -602,7 +605,7 @@ def test_many_jobs_that_differ_in_values_are_composed_once(sweep, monkeypatch):
 
 
 def test_each_arm_is_composed_at_most_twice(sweep, monkeypatch):
-    """Once to see which settings it has, and once for its jobs."""
+    """It is composed once to find out which settings it has, and once for its jobs."""
     counted = []
     original = plan.compose_line
     monkeypatch.setattr(plan, "compose_line", lambda *args: counted.append(args) or original(*args))
