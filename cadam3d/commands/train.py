@@ -265,10 +265,10 @@ def print_result(folder: Path, summary: Mapping[str, Any], report: Path) -> None
 
 
 class StopOnSignal:
-    """Handles SIGINT and SIGTERM: the first one asks the loop to stop and save, a later one stops at once.
+    """Handles SIGINT and SIGTERM: after the first one the loop stops and saves, a later one stops it at once.
 
-    Signals within ``TOGETHER_SECONDS`` count as one: a scheduler sends its signal to a process and also to
-    its parent, which passes it on.
+    Signals within ``TOGETHER_SECONDS`` count as one, because a scheduler sends its signal to a process and
+    also to its parent, which passes it on.
     """
 
     def __init__(self) -> None:

@@ -130,12 +130,6 @@ def holds_gaussians(path: Path) -> bool:
     return not GAUSSIANS_ONLY.isdisjoint(line[-1] for line in words)
 
 
-def ply_bytes(num_gaussians: int, sh_degree: int) -> int:
-    """Return the size of a file of :func:`write_ply`: its header and ``4 (17 + rest)`` bytes per Gaussian."""
-    rest_size = REST_SIZES[sh_degree]
-    return len(_header(num_gaussians, rest_size, UPS[0])) + num_gaussians * 4 * len(_names(rest_size))
-
-
 def _names(rest_size: int) -> list[str]:
     rest = [f"f_rest_{i}" for i in range(rest_size)]
     last = [*COLUMNS["opacity_logits"], *COLUMNS["log_scales"], *COLUMNS["quats"]]

@@ -82,11 +82,11 @@ def read_grid(node: Any) -> Grid:
         return Grid(each={}, arms={"": {}})
     if not isinstance(node, dict) or not node or not node.keys() <= {"each", "arms", "figures"}:
         got = "|".join(map(str, node)) if isinstance(node, dict) else node
-        raise UserError(f"grid: expected each, arms and figures, got {got}. Try: a file that says {EXAMPLE}")
+        raise UserError(f"grid: expected each, arms and figures, got {got}. Try: a file with {EXAMPLE}")
     arms = node.get("arms")
     arms = {"": {}} if arms is None else arms
     if not isinstance(arms, dict) or not arms:
-        raise UserError(f"grid.arms: expected named arms, got {arms}. Try: a file that says {EXAMPLE}")
+        raise UserError(f"grid.arms: expected named arms, got {arms}. Try: a file with {EXAMPLE}")
     figures = node.get("figures")
     if figures is not None and not (isinstance(figures, list) and all(isinstance(f, str) for f in figures)):
         raise UserError(f"grid.figures: expected a list of names, got {figures}. Try: figures: [frontier]")
@@ -221,11 +221,11 @@ def _foreign(
     """Return for each arm the keys of the line for which another arm has a setting and this one does not."""
     if len(arms) == 1:
         return {name: set() for name in arms}
-    asked = [key for key in line if key not in grid.each and not line[key][0].line.startswith(("+", "~"))]
+    common = [key for key in line if key not in grid.each and not line[key][0].line.startswith(("+", "~"))]
     missing: dict[str, set[str]] = {}
     for name, axes in arms.items():
-        base = [axis[0].line for key, axis in (grid.each | axes).items() if key not in asked]
-        missing[name] = {key for key in asked if key not in axes and not has_setting(base, key)}
+        base = [axis[0].line for key, axis in (grid.each | axes).items() if key not in common]
+        missing[name] = {key for key in common if key not in axes and not has_setting(base, key)}
     in_no_arm = set.intersection(*missing.values())
     return {name: keys - in_no_arm for name, keys in missing.items()}
 

@@ -100,7 +100,7 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
 
 
 class Stop:
-    """Handles SIGINT and SIGTERM: the first one asks all jobs, wherever they run, to save and end.
+    """Handles SIGINT and SIGTERM: after the first one, all jobs save and end, on whatever machine they run.
 
     The second one ends everything at once.
     """

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from cadam3d import cli
 from cadam3d.commands import doctor
 from cadam3d.commands.finding import Finding, Verdict
 from cadam3d.prior.latent import PRIORS
@@ -20,14 +19,6 @@ REPOSITORY = Path(__file__).parent.parent.parent
 @pytest.fixture(scope="module")
 def findings():
     return {finding.topic: finding for finding in doctor.examine()}
-
-
-def run_doctor(monkeypatch, tmp_path, capsys, *words: str) -> tuple[int, str]:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["cadam3d", "doctor", *words])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    return int(ended.value.code or 0), capsys.readouterr().out
 
 
 def test_this_machine_can_train(findings):
@@ -147,25 +138,25 @@ def replace_findings(monkeypatch, *findings: Finding) -> None:
     monkeypatch.setattr(doctor, "examine", lambda: iter(findings))
 
 
-def test_without_problems_the_exit_code_is_0_and_no_file_is_left(monkeypatch, tmp_path, capsys):
+def test_without_problems_the_exit_code_is_0_and_no_file_is_left(monkeypatch, tmp_path, type_line):
     replace_findings(monkeypatch, Finding("torch", Verdict.OK, "2"), Finding("nvcc", Verdict.NOTE, "none"))
-    code, out = run_doctor(monkeypatch, tmp_path, capsys)
+    code, out, _ = type_line("doctor")
     assert code == 0
     assert "Ready to train." in out
     assert not list(tmp_path.iterdir())
 
 
-def test_a_broken_finding_prints_its_hint_and_causes_exit_code_1(monkeypatch, tmp_path, capsys):
+def test_a_broken_finding_prints_its_hint_and_causes_exit_code_1(monkeypatch, type_line):
     replace_findings(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "Try: pip install torch"))
-    code, out = run_doctor(monkeypatch, tmp_path, capsys)
+    code, out, _ = type_line("doctor")
     assert code == 1
     assert "Try: pip install torch" in out
 
 
 @pytest.mark.parametrize("word", ["json=true", "--json"])
-def test_json_is_one_object_for_other_programs(word, monkeypatch, tmp_path, capsys):
+def test_json_is_one_object_for_other_programs(word, monkeypatch, type_line):
     replace_findings(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "hint", {"size": 3}))
-    code, out = run_doctor(monkeypatch, tmp_path, capsys, word)
+    code, out, _ = type_line("doctor", word)
     report = json.loads(out)
     assert code == 1
     assert report["ok"] is False

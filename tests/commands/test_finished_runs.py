@@ -1,14 +1,12 @@
 """The commands render, export, eval and view, with a run folder, a sweep folder or a single file."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 from omegaconf import OmegaConf
 
-from cadam3d import cli
 from cadam3d.commands import view
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.jsonl import read_json
@@ -17,20 +15,6 @@ from cadam3d.settings.compose import compose
 from cadam3d.sweep.folder import Plan, PlannedJob, write_plan
 
 SMALL = ("metric.fidelity.views=2", "metric.fidelity.elevations_deg=[0]", "metric.fidelity.size=24")
-
-
-@pytest.fixture
-def type_line(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["cadam3d", *words])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        captured = capsys.readouterr()
-        return int(ended.value.code or 0), captured.out, captured.err
-
-    return run
 
 
 @pytest.fixture

@@ -1,11 +1,9 @@
 """Notes are printed once, and training with slow kernels or a fallback is reported and recorded."""
 
 import json
-import sys
 
 import pytest
 
-from cadam3d import cli
 from cadam3d.commands import messages
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import auto, cpu
@@ -40,19 +38,6 @@ def no_compiler(monkeypatch):
     monkeypatch.setattr(cpu, "load_kernels", no_kernels)
 
 
-@pytest.fixture
-def type_line(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words: str) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["cadam3d", *words])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        return int(ended.value.code or 0), capsys.readouterr().err
-
-    return run
-
-
 def test_a_note_is_printed_once(capsys):
     messages.note("mind the gap")
     messages.note("mind the gap")
@@ -69,7 +54,7 @@ def test_a_backend_is_noted_only_if_it_replaces_a_faster_one(capsys):
 
 
 def test_training_without_a_compiler_is_noted_once_and_recorded(type_line, no_compiler, tmp_path):
-    code, err = type_line("train", *SMALL)
+    code, _, err = type_line("train", *SMALL)
     assert code == 0
     assert err.count(NEEDED) == 1
     assert f"\nNote: rendering with rasterizer=reference, which is slow: {NEEDED}\n" in err
@@ -85,9 +70,9 @@ def test_training_without_a_compiler_is_noted_once_and_recorded(type_line, no_co
 
 def test_another_command_prints_the_note_when_it_renders(type_line, no_compiler):
     assert type_line("train", *SMALL, "rasterizer=reference")[0] == 0
-    code, err = type_line("export", "run=outputs/latest", "output=copy.ply")
+    code, _, err = type_line("export", "run=outputs/latest", "output=copy.ply")
     assert (code, err.count(NEEDED)) == (0, 0)
-    code, err = type_line("render", "run=outputs/latest", "exporter=[images]", "exporter.images.views=1")
+    code, _, err = type_line("render", "run=outputs/latest", "exporter=[images]", "exporter.images.views=1")
     assert (code, err.count(NEEDED)) == (0, 1)
 
 
@@ -95,7 +80,7 @@ def test_an_unavailable_rasterizer_is_refused_before_any_file_changes(type_line,
     assert type_line("train", *SMALL, "rasterizer=reference")[0] == 0
     latest = (tmp_path / "outputs/latest").resolve()
     before = sorted(tmp_path.rglob("*"))
-    code, err = type_line("train", *SMALL, "rasterizer=cpu")
+    code, _, err = type_line("train", *SMALL, "rasterizer=cpu")
     assert (code, err) == (1, f"cadam3d: {NEEDED}\n")
     assert (tmp_path / "outputs/latest").resolve() == latest
     assert sorted(tmp_path.rglob("*")) == before
@@ -105,7 +90,7 @@ SHAP_E = ["rasterizer=reference", "initializer=shap_e", "initializer.path=nowher
 
 
 def test_an_unavailable_initializer_is_refused_before_any_file_is_written(type_line, tmp_path):
-    code, err = type_line("train", *SMALL, *SHAP_E)
+    code, _, err = type_line("train", *SMALL, *SHAP_E)
     assert code == 1
     assert err.startswith("cadam3d: initializer.path: expected a folder with a model_index.json")
     assert not list(tmp_path.iterdir())
@@ -113,7 +98,7 @@ def test_an_unavailable_initializer_is_refused_before_any_file_is_written(type_l
 
 def test_the_fallback_of_an_initializer_is_reported_and_recorded(type_line, tmp_path):
     stand_in = ["initializer/fallback=ball", "initializer.fallback.count=9"]
-    code, err = type_line("train", *SMALL, *SHAP_E, *stand_in, "hydra.run.dir=fallen")
+    code, _, err = type_line("train", *SMALL, *SHAP_E, *stand_in, "hydra.run.dir=fallen")
     assert code == 0
     [line] = [line for line in err.splitlines() if "Shap-E" in line]
     assert line.startswith("Note: Ball stands in for Shap-E. initializer.path: expected a folder")
