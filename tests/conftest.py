@@ -1,4 +1,4 @@
-"""Shared fixtures (the command line in this process, tiny real pipelines), and the order of the test files."""
+"""Shared fixtures (the command line in this process, small real pipelines), and the order of test files."""
 
 import sys
 from collections.abc import Callable

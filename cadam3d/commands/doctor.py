@@ -21,7 +21,7 @@ from cadam3d.commands.finding import Finding, Verdict, attempt
 from cadam3d.settings.compose import component, compose, config_dir
 
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "imageio", "imageio-ffmpeg", "jaxtyping", "kornia")
-PACKAGES += ("matplotlib", "pillow", "pyyaml", "scipy", "tqdm", "trimesh")
+PACKAGES += ("jinja2", "matplotlib", "pillow", "pyyaml", "scipy", "tqdm", "trimesh")
 IMPORT_NAMES = {"hydra-core": "hydra", "imageio-ffmpeg": "imageio_ffmpeg", "pillow": "PIL", "pyyaml": "yaml"}
 # The messages for compilers that are missing.
 COMPILERS = {
