@@ -32,7 +32,7 @@ def main() -> None:
     # This must be set before torch loads OpenMP. If idle threads spin instead of sleeping, two busy programs
     # slow each other tenfold.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # Imports create many objects but no garbage, and collecting it would take a fifth of the start-up time.
+    # Imports create many objects but no garbage. Searching for it would take a fifth of the start-up time.
     gc.disable()
     try:
         code = dispatch(sys.argv[1:])
