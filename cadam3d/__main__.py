@@ -1,4 +1,4 @@
-"""``python -m cadam3d`` does the same as ``cadam3d``."""
+"""Run the command line: ``python -m cadam3d`` does the same as ``cadam3d``."""
 
 from cadam3d.cli import main
 

@@ -32,7 +32,7 @@ def main() -> None:
     # This must be set before torch loads OpenMP. If idle threads spin instead of sleeping, two busy programs
     # slow each other tenfold.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # Imports make many objects and no garbage. Looking for it would take a fifth of the time of a start.
+    # Imports create many objects but no garbage. Searching for it would take a fifth of the start-up time.
     gc.disable()
     try:
         code = dispatch(sys.argv[1:])
@@ -45,14 +45,15 @@ def main() -> None:
     except KeyboardInterrupt:
         print("\ncadam3d: interrupted", file=sys.stderr)
         code = 130
-    except BrokenPipeError:  # such as `cadam3d train --cfg job | head -3`
+    except BrokenPipeError:
+        # A reader such as head has closed the pipe. Python would complain when it flushes stdout at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
     sys.exit(code)
 
 
 def dispatch(words: Sequence[str]) -> int:
-    """Do what ``words`` ask for, and return the exit code."""
+    """Run the command line ``words``, without the program's name, and return the exit code."""
     if not words or words[0] in HELP_FLAGS:
         print(help_text())
         return 0
@@ -69,7 +70,7 @@ def dispatch(words: Sequence[str]) -> int:
 
 
 def help_text() -> str:
-    """Return the commands with one line each, and where to read more."""
+    """Return the help of the program: one line for each command, and how to get the help of a command."""
     lines = [
         f"cadam3d {__version__}: a sentence in, 3D Gaussians out",
         "",
@@ -84,7 +85,7 @@ def help_text() -> str:
 
 
 def unknown_command(words: Sequence[str]) -> UserError:
-    """Return the message for an unknown command; for a sentence or an override it shows the right line."""
+    """Return the error for an unknown command; for a sentence or an override it shows the right line."""
     from cadam3d.settings.advice import did_you_mean
 
     first = words[0]
@@ -102,14 +103,17 @@ def unknown_command(words: Sequence[str]) -> UserError:
 
 
 def complete(words: Sequence[str]) -> int:
-    """Serve tab completion: of the command here, and of the words that follow it through Hydra.
+    """Print tab completions. The command is completed here, and Hydra completes the words after it.
 
     ``-sc install=SHELL`` prints a script for the shell. The script calls ``-sc query=SHELL`` with the line so
     far in ``COMP_LINE``.
     """
     action, _, shell = words[1].partition("=") if len(words) > 1 else ("", "", "")
     if action not in ("install", "uninstall", "query") or shell not in ("bash", "zsh", "fish"):
-        raise UserError('-sc: expected install=bash|zsh|fish. Try: eval "$(cadam3d -sc install=bash)"')
+        got = words[1] if len(words) > 1 else "nothing"
+        raise UserError(
+            f'-sc: expected install=bash|zsh|fish, got {got}. Try: eval "$(cadam3d -sc install=bash)"'
+        )
     if action == "query":
         line = os.environ.get("COMP_LINE", "")
         typed = _words(line)[1:]
@@ -129,7 +133,8 @@ def complete(words: Sequence[str]) -> int:
     from cadam3d.settings.hydra import run_hydra
 
     command = typed[0] if action == "query" else "train"
-    with contextlib.suppress(Exception):  # a line that is wrong so far has no completions
+    # A line that is wrong so far has no completions.
+    with contextlib.suppress(Exception):
         run_hydra(command, list(words), Task(command))
     return 0
 

@@ -1,6 +1,6 @@
-"""``python -m cadam3d.job PARENT train key=value ...``: ``cadam3d`` for as long as process PARENT lives.
+"""Job: run ``cadam3d`` in a process that ends with its parent process, as a sweep starts its jobs.
 
-A sweep starts its jobs like this, so that they end with it.
+The command is ``python -m cadam3d.job PARENT train key=value ...``; PARENT is the id of the parent process.
 """
 
 import signal
@@ -13,7 +13,8 @@ from cadam3d.sweep.process import ANNOUNCING, end_with
 
 def main(words: Sequence[str]) -> None:
     """Run ``cadam3d`` with ``words[1:]`` until it ends or process ``words[0]`` ends."""
-    for number in ANNOUNCING:  # Slurm sends these to all processes; the launcher passes them on to the job
+    # Slurm sends these signals to all processes. The launcher handles them and stops this job.
+    for number in ANNOUNCING:
         signal.signal(number, signal.SIG_IGN)
     end_with(int(words[0]))
     sys.argv = ["cadam3d", *words[1:]]

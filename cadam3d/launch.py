@@ -1,4 +1,4 @@
-"""Launch: prepare a line for Hydra, refuse what cannot work before any work starts, and run the command."""
+"""Launch: read a command line, refuse one that cannot work before any work starts, and run its command."""
 
 import gc
 import shlex
@@ -22,7 +22,7 @@ from cadam3d.settings.hydra import (
     compose_line,
     place_run,
     read_flags,
-    refuse_holes,
+    refuse_missing_settings,
     run_composed,
     run_hydra,
 )
@@ -33,7 +33,7 @@ TRAINING = ("train", "sweep")  # the commands that have a run folder
 
 @dataclass
 class Task:
-    """The command, as Hydra runs it. Remembers whether the command itself has started."""
+    """A command in the form in which Hydra runs it. It records whether the command itself has started."""
 
     command: str
     has_started: bool = False
@@ -41,7 +41,8 @@ class Task:
     def __call__(self, cfg: DictConfig) -> Any:
         """Run the command on its composed configuration."""
         module = import_module(f"cadam3d.commands.{self.command}")
-        gc.freeze()  # what has been imported stays, so collections need not look at it
+        # Imported modules stay in memory, so the garbage collector need not scan them.
+        gc.freeze()
         gc.enable()
         self.has_started = True
         return module.run(cfg)
@@ -49,7 +50,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Line:
-    """The command line after ``cadam3d``, read."""
+    """The parsed command line after ``cadam3d``."""
 
     command: str
     overrides: list[str]  # quoted for Hydra
@@ -61,9 +62,9 @@ class Line:
 def launch(command: str, words: Sequence[str]) -> int:
     """Run ``cadam3d <command> <words>`` and return its exit code.
 
-    Raises ``UserError`` for mistakes of the user. Only here are the exceptions of Hydra and OmegaConf put
-    into words. If the command itself has raised one, it is a bug and keeps its traceback, unless a value
-    refers to something that only a running job can know to be absent.
+    Raises ``UserError`` for mistakes of the user. The exceptions of Hydra and OmegaConf are translated here
+    and nowhere else. An exception that the running command raises is a bug and keeps its traceback. Only a
+    reference that cannot be resolved is still translated then, because some show up only in a running job.
     """
     if command == "doctor":
         words = ["json=true" if word == "--json" else word for word in words]
@@ -91,7 +92,7 @@ def launch(command: str, words: Sequence[str]) -> int:
 
 
 def read_line(command: str, overrides: list[str], flags: list[str], options: Namespace) -> Line:
-    """Return what a line asks for: its overrides quoted and, if it resumes a run, those of the run too."""
+    """Parse a line: quote its overrides and, if it resumes a run, add the overrides of that run."""
     _refuse_bare_words(command, overrides)
     is_sweep = command == "sweep" or options.multirun or "hydra.mode=MULTIRUN" in overrides
     if is_sweep and command not in TRAINING:
@@ -110,7 +111,7 @@ def _command(line: Line, task: Task) -> int:
         return 0
     cfg = compose_line(line.command, [*line.overrides, "hydra.mode=RUN"], options)
     require_values(cfg)
-    refuse_holes(cfg, line.command, line.overrides)
+    refuse_missing_settings(cfg, line.command, line.overrides)
     if line.command in TRAINING:
         _train(cfg, line, task)
     else:
@@ -138,10 +139,10 @@ def _sweep(line: Line, task: Task) -> int:
 
 
 def _train(cfg: DictConfig, line: Line, task: Task) -> None:
-    """Fix the output folder and train there."""
+    """Choose the output folder and train there."""
     text = OmegaConf.select(cfg, RUN_FOLDER)
     if not text:
-        example = f"{RUN_FOLDER}=outputs/mine, or without it"
+        example = f"{RUN_FOLDER}=outputs/mine, or leave it out"
         raise UserError(f"{RUN_FOLDER}: expected a folder, got nothing. Try: {example}")
     wanted = Path(str(text)).expanduser()
     is_chosen = any(key_of(override) == RUN_FOLDER for override in line.overrides)
@@ -160,12 +161,12 @@ def _train(cfg: DictConfig, line: Line, task: Task) -> None:
 
 
 def _undoing_refusal(folder: Path, train: Callable[[], None]) -> None:
-    """Resume the run in ``folder``. If the line is refused, restore what Hydra has written there about it."""
-    remembered = {path: path.read_bytes() for path in (folder / OVERRIDES).parent.glob("*.yaml")}
+    """Resume the run in ``folder``. If the line is refused, restore the files that Hydra has overwritten."""
+    before = {path: path.read_bytes() for path in (folder / OVERRIDES).parent.glob("*.yaml")}
     try:
         train()
     except (UserError, InterpolationResolutionError):
-        for path, content in remembered.items():
+        for path, content in before.items():
             path.write_bytes(content)
         raise
 
@@ -191,12 +192,12 @@ def _nearest_existing(folder: Path) -> Path:
 
 
 def _wants_page(options: Namespace) -> bool:
-    """Return whether the line asks for facts about Hydra or for completion."""
+    """Return whether the line asks for one of Hydra's own pages or for completions."""
     return bool(options.hydra_help or options.info or options.shell_completion)
 
 
 def _refuse_bare_words(command: str, overrides: Sequence[str]) -> None:
-    """Refuse words without ``=``, which the shell makes of an unquoted prompt, and show the line to type."""
+    """Refuse words without ``=``, as an unquoted prompt leaves them, with the line to type instead."""
     bare = [override for override in overrides if "=" not in override and not override.startswith("~")]
     if not bare:
         return

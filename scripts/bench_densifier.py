@@ -1,4 +1,4 @@
-"""Measures the cost of a densifier: observe() beside the whole training step that it observes.
+"""Measure the cost of a densifier: the time of observe() as a share of a training step.
 
     python scripts/bench_densifier.py --densifiers cadam baseline --count 1000000 --size 512 --threads 1
 
@@ -60,19 +60,21 @@ def train_step(
 
 
 def milliseconds(work: Callable[[], object], device: torch.device) -> float:
+    """Return the time of ``work``: that of the CPU clock for a single thread, or else the wall-clock time."""
+
     def now() -> float:
         if device.type == "cuda":
             torch.cuda.synchronize(device)
-        is_alone = device.type == "cpu" and torch.get_num_threads() == 1
-        return time.process_time() if is_alone else time.perf_counter()
+        is_one_thread = device.type == "cpu" and torch.get_num_threads() == 1
+        return time.process_time() if is_one_thread else time.perf_counter()
 
     start = now()
     work()
     return (now() - start) * 1e3
 
 
-class Held(TorchDispatchMode):
-    """Counts the bytes of all tensors that were created inside and are still alive, and their peak."""
+class MemoryCounter(TorchDispatchMode):
+    """Counts the bytes of the tensors that were created in its context and still exist, and their peak."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -87,19 +89,20 @@ class Held(TorchDispatchMode):
             if storage._cdata not in given | self.known:
                 self.known.add(storage._cdata)
                 self.bytes += storage.nbytes()
-                weakref.finalize(storage, self.forget, storage._cdata, storage.nbytes())
+                weakref.finalize(storage, self.subtract, storage._cdata, storage.nbytes())
         self.peak = max(self.peak, self.bytes)
         return result
 
-    def forget(self, key: int, size: int) -> None:
+    def subtract(self, key: int, size: int) -> None:
         self.known.discard(key)
         self.bytes -= size
 
 
 def measure(densifier: Densifier, steps: list[float], signal: GradientSignal, repeats: int) -> str:
+    """Return one row of the table; ``steps`` are the times of training steps in milliseconds."""
     n, device, draw = signal.means.shape[0], signal.means.device, torch.Generator()
     state = densifier.observe(densifier.init_state(n, device), signal)
-    with Held() as held:
+    with MemoryCounter() as memory:
         densifier.observe(state, signal)
     observing = [milliseconds(lambda: densifier.observe(state, signal), device) for _ in range(repeats)]
     selecting = [milliseconds(lambda: densifier.select(state, 100, draw), device) for _ in range(3)]
@@ -107,7 +110,7 @@ def measure(densifier: Densifier, steps: list[float], signal: GradientSignal, re
     state_bytes = sum(rows.nbytes for rows in state.to_dict().values()) // n
     return (
         f"{observe:>11.2f} {100 * observe / (step + observe):>9.2f} % {statistics.median(selecting):>10.1f}"
-        f" {state_bytes:>8} {held.peak // n:>8}"
+        f" {state_bytes:>8} {memory.peak // n:>8}"
     )
 
 
@@ -128,7 +131,8 @@ def main() -> None:
     rasterizer = component(OmegaConf.load(config_dir() / "rasterizer" / f"{args.rasterizer}.yaml"))
     settings = component(compose(["prompt=bench"]).optimizer)
     optimizer = settings.start(shell(args.count).to(args.device))
-    signal = train_step(optimizer, rasterizer, args.size, args.views, 0)  # warms up
+    # The first step also warms up the rasterizer and is not timed.
+    signal = train_step(optimizer, rasterizer, args.size, args.views, 0)
     steps = [
         milliseconds(lambda: train_step(optimizer, rasterizer, args.size, args.views, 1), args.device)
         for _ in range(max(3, args.repeats // 3))

@@ -39,7 +39,7 @@ DEFAULTS = {
         "views": [1],
         "degrees": [0],
     },
-    "cuda": {  # the scenes of the table of targets
+    "cuda": {  # the scenes in targets.py
         "backends": ["gsplat", "cuda"],
         "counts": [20_000, 100_000, 500_000, 1_000_000, 3_400_000],
         "sizes": [512, 1024],
@@ -47,13 +47,16 @@ DEFAULTS = {
         "degrees": [0, 3],
     },
 }
-GSPLAT = "gsplat"  # the only backend without a file in configs/rasterizer
-COPY_BYTES = {"cuda": 2**31, "cpu": 2**25}  # size of the copy that determines the floor
-LONG_SORT = 2**27 + 1  # keys; one more than a counter of 27 bits can count
+# The only backend without a file in configs/rasterizer.
+GSPLAT = "gsplat"
+# The size of the copy that determines the floor of each stage.
+COPY_BYTES = {"cuda": 2**31, "cpu": 2**25}
+# Keys; more than a counter of 27 bits can count.
+LONG_SORT = 2**27 + 1
 
 
 class Parser(argparse.ArgumentParser):
-    """Reports errors in one line."""
+    """A parser that reports errors in one line."""
 
     def error(self, message: str) -> NoReturn:
         """Print the message and end the program."""
@@ -74,6 +77,7 @@ def whole(low: int):
 
 
 def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
+    """Parse and check the command line, and fill in the defaults of the device."""
     parser = Parser(
         "bench_rasterizer", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -130,20 +134,21 @@ def check_all(
     """Return the backends that agree with the reference, and print the verdict for each."""
     agreeing: dict[str, Rasterizer] = {}
     for name, rasterizer in backends.items():
-        troubles = check(name, rasterizer, device)
+        problems = check(name, rasterizer, device)
         if launcher and name == device.type == "cuda":
             try:
-                troubles += check_long_sort(launcher, device, LONG_SORT)
+                problems += check_long_sort(launcher, device, LONG_SORT)
             except OUT_OF_MEMORY:
                 print(f"not enough memory to check a sort of {LONG_SORT} keys")
-        if not troubles:
+        if not problems:
             agreeing[name] = rasterizer
-        verdict = "agrees with the reference" if not troubles else "FAILED, not timed"
-        print(f"check {name}: {verdict}", *troubles, sep="\n  ", flush=True)
+        verdict = "agrees with the reference" if not problems else "FAILED, not timed"
+        print(f"check {name}: {verdict}", *problems, sep="\n  ", flush=True)
     return agreeing
 
 
 def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher: Launcher | None) -> None:
+    """Time the backends on every scene, print the results, and write them to the JSON file."""
     device = torch.device(args.device)
     report = start_report(device, {name: value for name, value in vars(args).items() if name != "json"})
     if launcher:
@@ -162,7 +167,8 @@ def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher
                 stages = time_stages(launcher, scene, args.repeats, report.copy_bytes_per_ms)
                 report.stages.append(SceneStages(*at, stages))
                 print(show_stages(stages), flush=True)
-            if args.json:  # after every scene, because a later one may be too large
+            # The file is written after every scene, because a later one may exceed the memory.
+            if args.json:
                 report.write(args.json)
     verdicts = [row.is_met for row in report.rows if row.is_met is not None]
     if verdicts:
@@ -172,7 +178,7 @@ def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher
 def run(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher: Launcher | None) -> int:
     """Check and time the backends, and return the exit code.
 
-    ``launcher`` is that of the backend ``cuda``; with it, the stages of that backend are timed too.
+    ``launcher`` is that of the backend ``cuda``. If it is given, the stages of that backend are timed too.
     """
     torch.set_num_threads(args.threads)
     good = check_all(backends, launcher, torch.device(args.device)) if args.check else backends

@@ -95,7 +95,7 @@ def stable_diffusion_3(folder: Path, tiny: bool, weights: bool) -> None:
 def save(
     folder: Path, kind: str, parts: dict[str, Callable[[], Any]], scheduler: Any, dtype: torch.dtype | None
 ) -> None:
-    """Write a model in the layout of diffusers, one part at a time; without a dtype there are no weights."""
+    """Write a model in the layout of diffusers, one part at a time; without a dtype, it has no weights."""
     index: dict[str, Any] = {"_class_name": kind, "scheduler": ["diffusers", type(scheduler).__name__]}
     torch.manual_seed(0)
     torch.set_default_dtype(dtype or torch.float32)
@@ -113,7 +113,7 @@ def save(
 
 
 class Stopwatch:
-    """Measures seconds per stage. It waits for a GPU at both ends of a stage, which slows the run down."""
+    """Measures seconds per stage. It synchronizes a GPU before and after each stage, which slows the run."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -137,7 +137,7 @@ class Stopwatch:
 
 
 def random_texts(prior: Any) -> None:
-    """Replace the text encoders, which run once per prompt and are not part of a step."""
+    """Replace the text encoders by random embeddings; they run once per prompt and are not part of a step."""
     from cadam3d.prior.latent import Texts, blank_texts
 
     def embed_texts(found: Any, texts: list[str], device: torch.device) -> Texts:
@@ -154,7 +154,7 @@ def random_texts(prior: Any) -> None:
 
 
 def measure(recipe: str, model: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """Train for some steps, and return seconds per step and stage and the peak of memory."""
+    """Train for some steps, and return the seconds per step and per stage, and the peak memory in bytes."""
     device = resolve_device(args.device)
     lines = [f"experiment={recipe}", "prompt=a corgi", f"prior.path={model}", "initializer=ball"]
     lines += [f"initializer.count={args.count}", f"steps={args.steps}", f"prior.cache_dir={model / 'texts'}"]

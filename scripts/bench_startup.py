@@ -1,10 +1,10 @@
-"""How long a training takes from the shell to the end of its first step, here and in another checkout.
+"""Measure the time from the shell to the end of the first training step, here and in another checkout.
 
     python scripts/bench_startup.py --base ../cadam3d-before
 
 Both trees run the demo in turn, so that a busy machine slows both alike. A run is killed as soon as the first
-line of its metrics.jsonl is on the disk, which is the end of step 1. Wall-clock time depends on what else the
-machine does; the CPU time (user plus system) of the process hardly does.
+line of its metrics.jsonl is on the disk, which is the end of step 1. The wall-clock time depends on the other
+load of the machine. The CPU time (user plus system) of the process hardly does.
 """
 
 import argparse
@@ -26,17 +26,18 @@ LONGEST_SECONDS = 120.0
 
 @dataclass(frozen=True)
 class Timing:
-    """One start, in seconds."""
+    """The times of one start, in seconds."""
 
     wall: float
-    cpu: float  # user plus system, of the process and the children it waited for
+    cpu: float  # user plus system, children included
 
 
 def main() -> None:
     args = read_arguments()
     trees = {"base": args.base, "here": HERE} if args.base else {"here": HERE}
     for tree in trees.values():
-        measure(tree, args.settings)  # fills the caches: bytecode, compiled kernels, the disk's
+        # The first run fills the caches of bytecode, compiled kernels and the disk.
+        measure(tree, args.settings)
     timings: dict[str, list[Timing]] = {name: [] for name in trees}
     for _ in range(args.repeats):
         for name, tree in trees.items():
@@ -100,7 +101,7 @@ def summarize(timings: dict[str, list[Timing]]) -> dict[str, object]:
 
 
 def as_text(timings: dict[str, list[Timing]]) -> str:
-    """A table of medians, and how much faster this tree is than the other."""
+    """Return a table of medians, and the ratio of this tree to the other one."""
     lines = [f"{'':<8}{'wall':>9}{'CPU':>9}   median of {len(timings['here'])} starts"]
     found = summarize(timings)
     for name in timings:

@@ -1,4 +1,4 @@
-"""Print the test files that belong to what has changed since a commit, for ``make check``.
+"""Print the test files that belong to the changes since a commit, for ``make check``.
 
 A changed module selects the test files that import it directly, and the folder of tests that mirrors its
 package. A changed option of the configuration selects the tests of its group and ``tests/test_configs.py``, a
@@ -77,7 +77,7 @@ def imported_modules(path: Path) -> Iterator[str]:
 
 
 def git(*words: str) -> list[str]:
-    """Return the lines that git prints; an empty list if it fails, as without a branch of that name."""
+    """Return the lines that git prints; an empty list if it fails, for example without such a branch."""
     done = subprocess.run(["git", *words], cwd=REPOSITORY, capture_output=True, text=True, check=False)
     return done.stdout.split("\n")[:-1] if done.returncode == 0 else []
 

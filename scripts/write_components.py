@@ -1,8 +1,8 @@
 """Write the generated parts of docs/components.md: python scripts/write_components.py
 
-They are made from the comments in configs/. A generated part is between two lines, ``<!-- begin generated:
-NAME -->`` and ``<!-- end generated -->``. NAME is a group of options, or a command, which stands for its
-settings. Everything around these parts is written by hand.
+These parts are made from the comments in configs/. Each is between two lines, ``<!-- begin generated: NAME
+-->`` and ``<!-- end generated -->``. If NAME is a group, the part lists its options and their settings. If
+NAME is a command, it lists the settings of the command. Everything around these parts is written by hand.
 """
 
 import re
@@ -14,8 +14,10 @@ from cadam3d.settings.documentation import Library, Option, Setting
 
 PAGE = Path(__file__).parent.parent / "docs" / "components.md"
 PART = re.compile(r"(<!-- begin generated: (\S+) -->\n).*?(<!-- end generated -->)", re.DOTALL)
-LISTED_ONLY = ("grid",)  # lists of runs, which have no settings
-RECIPES = ("experiment", "noise", "vram")  # change settings of other groups, which are documented there
+# Options of these groups are lists of runs and have no settings.
+LISTED_ONLY = ("grid",)
+# Options of these groups change settings of other groups, which are documented there.
+RECIPES = ("experiment", "noise", "vram")
 
 
 def main() -> None:
@@ -23,7 +25,7 @@ def main() -> None:
 
 
 def written(text: str) -> str:
-    """Return the page with all generated parts made anew."""
+    """Return the page with all generated parts brought up to date."""
     library = Library([config_dir()])
     chosen = {group.name: group.chosen for group in library.groups("sweep")}
 
@@ -52,7 +54,7 @@ def group(library: Library, name: str, chosen: tuple[str, ...]) -> str:
 
 
 def settings(name: str, option: Option) -> str:
-    """Return the settings of an option, folded away. If it builds on another option, only what it changes."""
+    """Return the settings of an option in a folded section: only the changed ones if it has a base."""
     own = [each for each in option.settings if not option.base or each.key in option.own_keys]
     if not own:
         return ""
@@ -74,7 +76,7 @@ def table(settings: Iterable[Setting], prefix: str = "") -> str:
 
 
 def changes(settings: Iterable[Setting]) -> str:
-    """Return what a recipe chooses and changes."""
+    """Return the options and settings that a recipe changes, as lines of code."""
     lines = [f"    {each.key}={each.value}" for each in settings if each.value]
     return "\n".join(lines)
 

@@ -1,7 +1,9 @@
-"""Tiny real pipelines, each built at most once per process, and the order of the test files."""
+"""Shared fixtures (the command line in this process, small real pipelines), and the order of test files."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -16,9 +18,43 @@ def pytest_collection_modifyitems(items):
     items.sort(key=place)
 
 
+class Result(NamedTuple):
+    """The result of a command line."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def message(self) -> str:
+        """Return the single line of an error, without the name of the program."""
+        lines = self.err.strip().splitlines()
+        assert len(lines) == 1, self.err
+        assert lines[0].startswith("cadam3d: ")
+        return lines[0].removeprefix("cadam3d: ")
+
+
+@pytest.fixture
+def type_line(monkeypatch, capsys, tmp_path) -> Callable[..., Result]:
+    """Return a function that runs ``cadam3d ...`` in an empty folder, in this process."""
+    from cadam3d import cli
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+
+    def run(*words: str) -> Result:
+        monkeypatch.setattr(sys, "argv", ["cadam3d", *words])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        captured = capsys.readouterr()
+        return Result(int(ended.value.code or 0), captured.out, captured.err)
+
+    return run
+
+
 @pytest.fixture(scope="session")
 def pipelines(tmp_path_factory) -> Callable[..., Path]:
-    """Return a function from the name of a builder in pipelines.py to the folder with its pipeline."""
+    """Return a function that calls a builder of pipelines.py by name and returns its folder."""
     for name in ("diffusers", "transformers"):
         pytest.importorskip(name)
     import pipelines as builders

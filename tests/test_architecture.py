@@ -1,4 +1,4 @@
-"""The rules of the house that can be read off the source: floors, circles, and where Hydra may appear.
+"""Rules about the source code: floors, circles of imports, uses of Hydra, and sources of random numbers.
 
 ``docs/architecture.md`` explains the floors. Imports inside functions count like those at the top of a file.
 """
@@ -14,10 +14,11 @@ import pytest
 from cadam3d.io import run_folder
 
 PACKAGE = Path(__file__).parent.parent / "cadam3d"
-FLOORS = {  # part of cadam3d -> floor; parts of one floor import each other only as SIDEWAYS says
-    "": -1.0,  # cadam3d itself: the version
+# The floor of each part of cadam3d. Parts of the same floor import each other only if SIDEWAYS lists that.
+FLOORS = {
+    "": -1.0,  # the version
     **dict.fromkeys(("core",), 0.0),
-    **dict.fromkeys(("io",), 0.5),  # core, then io
+    **dict.fromkeys(("io",), 0.5),
     **dict.fromkeys(("camera", "background", "initializer", "rasterizer", "prior", "densifier"), 1.0),
     **dict.fromkeys(("augmentation", "optimizer", "exposure", "regularizer", "exporter", "metric"), 1.0),
     **dict.fromkeys(("state", "callback", "guidance"), 2.0),
@@ -28,9 +29,10 @@ FLOORS = {  # part of cadam3d -> floor; parts of one floor import each other onl
     **dict.fromkeys(("commands", "launch"), 7.0),
     **dict.fromkeys(("cli", "__main__", "job"), 8.0),
 }
-HYDRA_FLOOR = 4.0  # the lowest one that may import Hydra and OmegaConf
+# The lowest floor that may import Hydra and OmegaConf.
+HYDRA_FLOOR = 4.0
 SIDEWAYS = {("callback", "state"), ("launch", "commands"), ("__main__", "cli"), ("job", "cli")}
-# What the floors above may see of a floor-1 package: interfaces, and what is shared by all variants.
+# The modules of a floor-1 package that floors 2 and 3 may import: interfaces and code shared by all variants.
 OPEN_BELOW = {"prior": ("base", "path"), "densifier": ("base", "refine")}
 
 
@@ -55,14 +57,14 @@ def imports(path: Path, root: Path = PACKAGE) -> Iterator[tuple[str, list[str]]]
 
 
 def own_imports(path: Path) -> Iterator[tuple[str, ...]]:
-    """Yield the parts after ``cadam3d`` of every import of our own, such as ``("prior", "base")``."""
+    """Yield every import of our own as its parts after ``cadam3d``, such as ``("prior", "base")``."""
     for module, names in imports(path):
         head, *rest = module.split(".")
         if head != "cadam3d":
             continue
         if rest:
             yield tuple(rest)
-        else:  # from cadam3d import x: a module or a public name of the package
+        else:  # from cadam3d import x
             known = {name for name in names if name in FLOORS}
             yield from ((name,) for name in known) if known else iter([("",)])
 
@@ -81,12 +83,12 @@ def arrow_problem(importer: str, target: tuple[str, ...]) -> str | None:
         and is_component
         and target[1:2] not in [(name,) for name in OPEN_BELOW.get(imported, ("base",))]
     ):
-        return f"{importer} must see only the interface of {imported}, not {'.'.join(target)}"
+        return f"{importer} must import only the interface of {imported}, not {'.'.join(target)}"
     return None
 
 
 def import_graph(package: Path) -> dict[str, set[str]]:
-    """Return for each file of a package the files of it that it imports, as dotted names."""
+    """Return for each file of a package the files of the same package that it imports, as dotted names."""
     files = {
         ".".join([package.name, *path.relative_to(package).with_suffix("").parts]).removesuffix(
             ".__init__"
@@ -104,7 +106,7 @@ def import_graph(package: Path) -> dict[str, set[str]]:
 
 
 def circles(graph: Mapping[str, Iterable[str]]) -> list[list[str]]:
-    """Return the groups of nodes that reach each other (the strongly connected components of two or more)."""
+    """Return the groups of nodes that reach each other, which are the strongly connected components."""
     reach = {node: reachable(graph, node) for node in graph}
     groups = {frozenset(other for other in reach[node] if node in reach[other]) for node in graph}
     return sorted(sorted(group) for group in groups if group)
@@ -125,7 +127,7 @@ def reachable(graph: Mapping[str, Iterable[str]], start: str) -> set[str]:
 @pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_imports_point_down(path):
     part = part_of(path)
-    assert part in FLOORS, f"{part} has no floor yet: give it one in {__file__}"
+    assert part in FLOORS, f"{part} has no floor yet. Add it to FLOORS in {__file__}"
     problems = [problem for target in own_imports(path) if (problem := arrow_problem(part, target))]
     assert not problems
 
@@ -215,7 +217,7 @@ def imports_hydra(path: Path, package: Path = PACKAGE) -> bool:
     return any(module.split(".")[0] in ("hydra", "omegaconf") for module, _ in imports(path, package))
 
 
-def test_core_knows_tensors_and_the_standard_library_only():
+def test_core_imports_only_tensor_packages_and_the_standard_library():
     allowed = {"torch", "numpy", "kornia", "jaxtyping", "cadam3d", *sys.stdlib_module_names}
     guilty = {
         f"{path.name}: {module}"
@@ -227,7 +229,7 @@ def test_core_knows_tensors_and_the_standard_library_only():
     assert not guilty
 
 
-# Draw from the generator of the process unless they are given another; the in-place ones are methods.
+# Functions that draw from the global generator unless they get another one. The in-place ones are methods.
 DRAWS = {"rand", "randn", "randint", "randperm", "multinomial", "normal", "bernoulli", "poisson"}
 DRAWS |= {"rand_like", "randn_like", "randint_like"}
 DRAWS_IN_PLACE = {"bernoulli_", "cauchy_", "exponential_", "geometric_", "log_normal_", "normal_", "random_"}
@@ -236,9 +238,9 @@ OWN_STATE = {"SeedSequence", "Generator", "PCG64", "Philox", "default_rng", "Ran
 
 
 def global_draws(source: str) -> list[str]:
-    """What ``source`` calls that reads or moves the random state of the process.
+    """Return the calls in ``source`` that read or change the random state of the process.
 
-    Inside ``with torch.random.fork_rng(...)`` anything goes: that state is put back.
+    Calls inside ``with torch.random.fork_rng(...)`` are left out, because that state is restored.
     """
     tree = ast.parse(source)
     full_names = {}  # local name -> what was imported
@@ -280,7 +282,7 @@ def _is_global_draw(call: ast.Call, name: str) -> bool:
 
 
 @pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_all_randomness_comes_from_a_generator_that_was_handed_in(path):
+def test_all_randomness_comes_from_a_generator_argument(path):
     assert not global_draws(path.read_text(encoding="utf-8"))
 
 
@@ -317,7 +319,7 @@ def test_a_draw_from_the_global_state_is_noticed(line):
         "import torch\nwith torch.random.fork_rng(devices=[]):\n    torch.manual_seed(0)",
     ],
 )
-def test_a_draw_from_a_state_of_its_own_is_allowed(line):
+def test_a_draw_from_an_explicit_generator_is_allowed(line):
     assert not global_draws(line)
 
 
@@ -331,12 +333,12 @@ def test_no_folder_is_called_utils():
 
 
 def test_no_module_level_future_annotations():
-    """They would turn the shapes into strings, and the shape checks off."""
+    """They would turn annotations into strings and thus switch off the checks of shapes."""
     assert not [path for path in sources() for module, _ in imports(path) if module == "__future__"]
 
 
-def test_components_are_not_told_apart_by_their_class():
-    """No ``isinstance`` against a component: an interface that does not suffice is to be changed instead."""
+def test_the_class_of_a_component_is_never_checked():
+    """If an interface does not suffice, it must be changed; ``isinstance`` is not the solution."""
     interfaces = ("CameraSampler", "Initializer", "Rasterizer", "DiffusionPrior", "Guidance", "Densifier")
     interfaces += ("Exporter", "Metric", "Callback", "Background", "Regularizer", "Augmentation", "Exposure")
     guilty = []
@@ -344,8 +346,8 @@ def test_components_are_not_told_apart_by_their_class():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             is_check = isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
             if is_check and node.func.id in ("isinstance", "issubclass") and len(node.args) == 2:
-                asked = {name.id for name in ast.walk(node.args[1]) if isinstance(name, ast.Name)}
-                guilty += [f"{path.name}: {name}" for name in asked & set(interfaces)]
+                checked = {name.id for name in ast.walk(node.args[1]) if isinstance(name, ast.Name)}
+                guilty += [f"{path.name}: {name}" for name in checked & set(interfaces)]
     assert not guilty
 
 
@@ -358,7 +360,7 @@ FILE_NAMES = {
 
 @pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_only_one_module_spells_the_names_of_files_in_a_run_folder(path):
-    """Folders such as ``images`` are left out: their names are ordinary words. So are texts for readers."""
+    """Names of folders such as ``images`` are not checked, because they are ordinary words."""
     if path == Path(run_folder.__file__):
         return
     tree = ast.parse(path.read_text(encoding="utf-8"))

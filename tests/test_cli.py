@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -55,39 +54,8 @@ AWKWARD = (
 )
 
 
-@dataclass(frozen=True)
-class Result:
-    code: int
-    out: str
-    err: str
-
-    @property
-    def message(self) -> str:
-        """The single line of an error."""
-        lines = self.err.strip().splitlines()
-        assert len(lines) == 1, self.err
-        assert lines[0].startswith("cadam3d: ")
-        return lines[0].removeprefix("cadam3d: ")
-
-
-@pytest.fixture
-def type_line(monkeypatch, capsys, tmp_path):
-    """Type ``cadam3d ...`` in an empty folder, in this process."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-
-    def run(*words: str) -> Result:
-        monkeypatch.setattr(sys, "argv", ["cadam3d", *words])
-        with pytest.raises(SystemExit) as exit_info:
-            cli.main()
-        captured = capsys.readouterr()
-        return Result(int(exit_info.value.code or 0), captured.out, captured.err)
-
-    return run
-
-
 @pytest.mark.parametrize(("before", "after"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
-def test_idle_threads_sleep_unless_the_user_says_otherwise(before, after, type_line, monkeypatch):
+def test_idle_threads_sleep_unless_the_user_sets_another_policy(before, after, type_line, monkeypatch):
     monkeypatch.setenv("OMP_WAIT_POLICY", "to be restored")
     if before is None:
         monkeypatch.delenv("OMP_WAIT_POLICY")
@@ -99,7 +67,7 @@ def test_idle_threads_sleep_unless_the_user_says_otherwise(before, after, type_l
 
 @pytest.fixture(scope="session")
 def small_configs(tmp_path_factory) -> Path:
-    """The real folders that the command line itself needs, and a train.yaml that composes in no time."""
+    """Return a folder with the real groups that a line needs and a train.yaml that composes fast."""
     folder = tmp_path_factory.mktemp("configs")
     for name in ("hydra", "densifier", "grid", "launcher"):
         shutil.copytree(REPOSITORY / "configs" / name, folder / name)
@@ -145,7 +113,7 @@ def test_help_shows_every_command_on_one_line(type_line):
     assert max(len(line) for line in result.out.splitlines()) <= 110
 
 
-def test_no_word_at_all_shows_the_help(type_line):
+def test_cadam3d_without_arguments_prints_the_help(type_line):
     assert type_line() == type_line("--help")
 
 
@@ -170,7 +138,7 @@ def test_every_command_has_a_module_and_a_file_of_settings(command):
 
 
 @pytest.mark.parametrize("command", ["train", "doctor"])
-def test_the_help_page_of_a_command_is_ours(command, type_line):
+def test_a_command_prints_our_help_page_and_not_that_of_hydra(command, type_line):
     result = type_line(command, "--help")
     assert result.code == 0
     assert f"cadam3d {command}" in result.out
@@ -187,18 +155,18 @@ def test_cfg_job_prints_the_settings_without_running(command, type_line):
 
 
 @pytest.mark.parametrize(("typed", "meant"), [("trian", "train"), ("EXPORT", "export"), ("docter", "doctor")])
-def test_the_answer_to_a_misspelt_command_is_the_right_one(typed, meant, type_line):
+def test_the_message_for_a_misspelt_command_suggests_the_right_one(typed, meant, type_line):
     result = type_line(typed, "prompt=a red cube")
     assert result.code == 1
     assert result.message.endswith(f"Try: cadam3d {meant} 'prompt=a red cube'")
 
 
-def test_the_answer_to_a_bare_sentence_is_the_line_to_type(type_line):
+def test_the_message_for_a_bare_sentence_shows_the_line_to_type(type_line):
     assert type_line("a red cube").message.endswith("Try: cadam3d train 'prompt=a red cube'")
     assert type_line("prompt=a cube").message.endswith("Try: cadam3d train 'prompt=a cube'")
 
 
-def test_the_answer_to_any_other_word_is_the_list_of_commands(type_line):
+def test_the_message_for_an_unknown_word_lists_the_commands(type_line):
     assert "|".join(cli.COMMANDS) in type_line("qqq").message
 
 
@@ -206,9 +174,7 @@ def test_the_answer_to_any_other_word_is_the_list_of_commands(type_line):
 
 
 @pytest.mark.parametrize("prompt", AWKWARD)
-def test_a_prompt_arrives_as_it_was_typed_and_survives_the_config_of_its_run(
-    prompt, tmp_path, type_line, jobs
-):
+def test_a_prompt_is_unchanged_in_the_command_and_in_the_config_of_its_run(prompt, tmp_path, type_line, jobs):
     assert type_line("train", f"prompt={prompt}").code == 0
     [(cfg, _)] = jobs
     assert cfg.prompt == prompt
@@ -255,7 +221,7 @@ def test_the_words_of_an_unquoted_prompt_are_joined_in_the_message(type_line):
         ("a car (red),${x}", ["a car (red)", "${x}"]),
     ],
 )
-def test_in_a_sweep_a_comma_without_a_blank_starts_the_next_prompt(value, prompts):
+def test_in_a_sweep_a_comma_without_a_space_starts_the_next_prompt(value, prompts):
     line = quoted(f"prompt={value}", is_sweep=True)
     override = OverridesParser.create().parse_override(line)
     pieces = list(override.sweep_string_iterator()) if override.is_sweep_override() else [line[7:]]
@@ -270,21 +236,21 @@ def test_a_path_with_brackets_and_commas_is_quoted_too(type_line, jobs, tmp_path
 
 
 @pytest.mark.parametrize("key", PATH_KEYS)
-def test_a_path_below_the_home_folder_is_text(key):
+def test_a_path_in_the_home_folder_is_read_as_text(key):
     for text in ("~/x", "~", "a~b/my mesh (1).ply"):
         line = quoted(f"{key}={text}", is_sweep=False)
         assert OverridesParser.create().parse_override(line).value() == text
         assert text_of(line) == text
 
 
-def test_a_run_below_the_home_folder_is_written_and_resumed_there(type_line, jobs, tmp_path, monkeypatch):
+def test_a_run_in_the_home_folder_is_written_and_resumed_there(type_line, jobs, tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     assert type_line("train", "prompt=a cube", "hydra.run.dir=~/x").code == 0
     assert type_line("train", "resume=~/x", "hydra.run.dir=~/x").code == 0
     assert [folder for _, folder in jobs] == [tmp_path / "home/x"] * 2
 
 
-# --- missing values are asked for before any work -------------------------------------------------------
+# --- missing values are reported before any work -------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -301,7 +267,7 @@ def test_a_missing_prompt_is_refused_before_anything_happens(words, type_line, j
     assert not list(tmp_path.iterdir())
 
 
-def test_any_other_missing_value_is_asked_for_with_the_rest_of_the_line(type_line, tmp_path):
+def test_the_message_for_another_missing_value_keeps_the_rest_of_the_line(type_line, tmp_path):
     message = type_line("train", "prompt=a cube", "initializer=mesh", "steps=5").message
     assert message == (
         "initializer.path: no value given. "
@@ -364,7 +330,7 @@ def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, 
         ("hydra.run.dir=/dev/null/x", "hydra.run.dir: cannot write to /dev/null/x (Not a directory). Try: "),
     ],
 )
-def test_a_mistake_gets_one_message_that_says_what_to_type(line, ending, type_line):
+def test_a_mistake_causes_one_message_with_what_to_type(line, ending, type_line):
     result = type_line("train", "prompt=a cube", line)
     assert result.code == 1
     assert ending in f"cadam3d: {result.message}"
@@ -377,7 +343,7 @@ def test_a_mistake_gets_one_message_that_says_what_to_type(line, ending, type_li
     [
         (("train", "--bogus"), "unrecognized arguments: --bogus. Try: cadam3d --help"),
         (("train", "--cfg", "nope"), "invalid choice: 'nope'"),
-        (("train", "--cfg", "job", "--info", "config"), "exclude one another"),
+        (("train", "--cfg", "job", "--info", "config"), "cannot be combined"),
         (("eval", "-m", "run=a,b"), "only training can be swept"),
         (("doctor", "jsn=true"), "Did you mean json? Try: json=true"),
         (("-sc",), 'Try: eval "$(cadam3d -sc install=bash)"'),
@@ -385,13 +351,13 @@ def test_a_mistake_gets_one_message_that_says_what_to_type(line, ending, type_li
         (("-sc", "foo=bash"), 'Try: eval "$(cadam3d -sc install=bash)"'),
     ],
 )
-def test_wrong_flags_and_other_commands_get_one_message_too(words, ending, type_line):
+def test_wrong_flags_and_other_commands_cause_one_message_too(words, ending, type_line):
     result = type_line(*words)
     assert result.code == 1
     assert ending in result.message
 
 
-def test_the_traceback_is_there_with_hydra_full_error(monkeypatch, tmp_path):
+def test_hydra_full_error_shows_the_traceback(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.setattr(sys, "argv", ["cadam3d", "train", "densifer=cadam"])
@@ -544,7 +510,7 @@ def test_a_refused_resume_leaves_the_run_as_it_was(run_folder, type_line, jobs):
         (["+a.b=5"], ["a.b=6"], ["+a.b=6"]),
     ],
 )
-def test_removed_and_added_keys_survive_a_resume(before, anew, after, tmp_path):
+def test_a_resumed_run_keeps_removed_and_added_keys(before, anew, after, tmp_path):
     (tmp_path / ".hydra").mkdir()
     (tmp_path / OVERRIDES).write_text(yaml.safe_dump(before), encoding="utf-8")
     lines = resumed([f"resume='{tmp_path}'", *anew], is_sweep=False)
@@ -577,7 +543,7 @@ def complete(line: str, type_line, monkeypatch, shell: str = "bash") -> list[str
         ("cadam3d nothing ", []),
     ],
 )
-def test_completion_crosses_the_command_word(line, expected, type_line, monkeypatch):
+def test_the_command_and_the_words_after_it_are_completed(line, expected, type_line, monkeypatch):
     assert complete(line, type_line, monkeypatch) == expected
 
 
@@ -608,11 +574,12 @@ def test_bash_completes_the_command_word(tmp_path):
 # --- as a process ---------------------------------------------------------------------------------------
 
 
-def test_ctrl_c_is_one_line_and_130(tmp_path):
-    """The signal arrives before the command has installed handlers."""
+def test_ctrl_c_prints_one_line_and_exits_with_130(tmp_path):
+    """The signal comes before the command has installed handlers."""
     code = (
         "import signal, sys, time, types\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a suite in the background ignores it
+        # A shell starts background jobs with SIGINT ignored.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "slow = types.ModuleType('cadam3d.commands.train')\n"
         "slow.run = lambda cfg: (print('started', flush=True), time.sleep(60))\n"
         "sys.modules[slow.__name__] = slow\n"
@@ -639,12 +606,14 @@ def test_ctrl_c_is_one_line_and_130(tmp_path):
 
 
 @pytest.mark.parametrize("function", ["compose_line", "run_composed"])
-def test_ctrl_c_that_another_exception_hides_is_still_ctrl_c(function, type_line, monkeypatch, jobs):
+def test_an_interrupt_hidden_by_another_exception_is_still_an_interrupt(
+    function, type_line, monkeypatch, jobs
+):
     def hide(*args, **kwargs):
         try:
             raise KeyboardInterrupt
         finally:
-            raise AttributeError("what clean-up stumbled over")
+            raise AttributeError("raised by the clean-up")
 
     monkeypatch.setattr(f"cadam3d.launch.{function}", hide)
     result = type_line("train", "prompt=a cube")
@@ -663,7 +632,7 @@ def test_a_run_composes_its_settings_once(type_line, jobs, monkeypatch):
     assert len(composed) == 2
 
 
-def test_the_notes_of_hydra_about_a_run_are_complete(type_line, jobs):
+def test_the_record_that_hydra_keeps_of_a_run_is_complete(type_line, jobs):
     type_line("train", "prompt=a cube", "steps=5", "hydra.run.dir=here")
     notes = yaml.safe_load(Path("here/.hydra/hydra.yaml").read_text())["hydra"]
     assert notes["overrides"] == {
@@ -675,11 +644,11 @@ def test_the_notes_of_hydra_about_a_run_are_complete(type_line, jobs):
     assert notes["runtime"]["choices"]["densifier"] == "cadam"
 
 
-def test_exceptions_of_hydra_are_explained_at_one_place_only():
+def test_exceptions_of_hydra_are_explained_in_one_place_only():
     calls = [
         f"{path.relative_to(REPOSITORY)}:{node.lineno}"
         for path in (REPOSITORY / "cadam3d").rglob("*.py")
-        if path.name != "advice.py"  # where it calls itself for the cause of an exception
+        if path.name != "advice.py"  # it calls itself
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "explain"
     ]
@@ -699,6 +668,6 @@ def test_a_reference_that_only_a_running_command_resolves_is_one_message(type_li
     assert not list(Path("outputs").rglob("*.yaml"))
 
 
-def test_flags_may_stand_anywhere():
+def test_flags_may_be_anywhere_in_a_line():
     words = ["a=1", "-m", "b=2", "--cfg", "job", "c=3"]
     assert split(words) == (["a=1", "b=2", "c=3"], ["-m", "--cfg", "job"])

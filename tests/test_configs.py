@@ -1,4 +1,4 @@
-"""Python declares, YAML decides: every file has exactly the keys of its class, composes, builds and runs."""
+"""Configuration files: each has exactly the keys of its class, composes, and builds a component that runs."""
 
 import dataclasses
 import gc
@@ -26,7 +26,7 @@ from cadam3d.sweep import plan
 from cadam3d.sweep.plan import compose_all, read_sweep
 
 CONFIGS = config_dir()
-SEVERAL = ("exporter", "callback", "metric")  # groups of which a run has several at once
+SEVERAL = ("exporter", "callback", "metric")  # groups with several choices
 NO_COMPONENTS = ("hydra", "grid", "launcher", "experiment", "noise", "vram")
 GROUPS = {
     path.name: sorted(file.stem for file in path.glob("*.yaml"))
@@ -45,7 +45,7 @@ NO_FLAGS = read_flags([])
 
 @pytest.fixture(scope="module", autouse=True)
 def large_heap():
-    """Keep the garbage collector from walking through all of torch again and again while Hydra composes."""
+    """Keep the garbage collector from scanning all of torch repeatedly while Hydra composes."""
     gc.freeze()
     yield
     gc.unfreeze()
@@ -60,12 +60,12 @@ def read(path: Path) -> Any:
 
 
 def nested_groups(path: Path) -> set[str]:
-    """Return the keys that a group inside of this group fills in, such as ``fallback`` of an initializer."""
+    """Return the keys that a group inside this group sets, such as ``fallback`` of an initializer."""
     entries = read(path).get("defaults", [])
     return {name for entry in entries if isinstance(entry, dict) for name in entry}
 
 
-NESTED = sorted((CONFIGS / "initializer").glob("*/*.yaml"))  # groups inside of a group
+NESTED = sorted((CONFIGS / "initializer").glob("*/*.yaml"))  # of groups inside a group
 VARIANTS = [path for path in FILES if "defaults" in read(path) and not nested_groups(path)]
 
 
@@ -85,7 +85,8 @@ def composed(path: Path) -> DictConfig:
     group, name = path.parent.name, path.stem
     try:
         cfg = round_of_choices(GROUPS[group].index(name))
-    except Exception:  # one of the others may be broken
+    except Exception:
+        # Another option of the same round may be broken, so this one is composed without the others.
         cfg = compose([PROMPT, f"{group}=[{name}]" if group in SEVERAL else f"{group}={name}"])
     return cfg[group][name] if group in SEVERAL else cfg[group]
 
@@ -124,7 +125,8 @@ def test_a_variant_changes_values_of_what_it_builds_on(path):
     base, itself = changes.pop("defaults")
     original = read(path.with_stem(base))
     assert itself == "_self_"
-    assert set(changes) < set(original) or "_target_" in changes  # another class may have further keys
+    # A variant with another class may have further keys.
+    assert set(changes) < set(original) or "_target_" in changes
     assert not [key for key, value in changes.items() if key in original and value == original[key]]
 
 
@@ -137,8 +139,8 @@ def test_the_momentum_ablation_differs_from_cadam_in_its_own_keys_only():
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_a_component_declares_no_values_of_its_own(path):
-    """A number has one home, and it is the YAML; schedules and paths inside a component may have defaults."""
+def test_a_component_declares_no_default_values(path):
+    """Numbers are only in the YAML files. Schedules and paths inside a component may have defaults."""
     content = composed(path)
     for node in [content] if "_target_" in content else content.values():
         settings = [field for field in dataclasses.fields(class_of(node)) if field.init]
@@ -146,7 +148,7 @@ def test_a_component_declares_no_values_of_its_own(path):
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_files_of_groups_with_several_options_live_in_a_node_of_their_own(path):
+def test_an_option_of_a_group_with_several_choices_has_its_own_node(path):
     header = path.read_text(encoding="utf-8").splitlines()[0]
     wanted = f"# @package {path.parent.name}.{path.stem}"
     assert header == wanted if path.parent.name in SEVERAL else not header.startswith("# @package")
@@ -155,7 +157,8 @@ def test_files_of_groups_with_several_options_live_in_a_node_of_their_own(path):
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_every_option_composes_and_builds(path):
     node = composed(path)
-    if "???" in path.read_text(encoding="utf-8"):  # needs a value that only the user has
+    # Some options need a value that only the user can give.
+    if "???" in path.read_text(encoding="utf-8"):
         with pytest.raises(UserError, match=r"(?i)missing"):
             component(node)
     else:
@@ -171,14 +174,14 @@ def test_every_option_of_a_nested_group_composes_and_builds(path):
     assert component(cfg[outer]) is not None
 
 
-def test_what_an_initializer_falls_back_on_has_the_values_it_has_by_itself():
+def test_a_fallback_initializer_has_the_values_of_the_initializer_itself():
     for path in sorted((CONFIGS / "initializer/fallback").glob("*.yaml")):
         cfg = compose([PROMPT, "initializer=shap_e", f"initializer/fallback={path.stem}"])
         assert cfg.initializer.fallback == composed(CONFIGS / f"initializer/{path.stem}.yaml")
         assert component(cfg.initializer).fallback is not None
 
 
-def test_every_regularizer_has_a_file_of_its_own_and_several_can_be_chosen():
+def test_every_regularizer_has_its_own_file_and_several_can_be_chosen():
     kinds = [kind for _, kind in inspect.getmembers(regularizer, inspect.isclass)]
     kinds = [kind for kind in kinds if issubclass(kind, regularizer.Regularizer)]
     classes = {kind.__name__ for kind in kinds if not inspect.isabstract(kind)}
@@ -196,7 +199,7 @@ def test_the_groups_of_train_are_the_packages_of_components():
 
 
 def choice_of(override: str) -> str:
-    """Return what decides whether an override composes: the key of a setting, or a choice with its value."""
+    """Return the part of an override on which composing depends: a key, or a choice with its value."""
     key = override.partition("=")[0]
     return key if "." in key else override
 
@@ -211,10 +214,11 @@ ORIGINAL_COMPOSE_LINE = plan.compose_line
 
 @pytest.mark.parametrize("grid", GRIDS)
 def test_every_arm_of_a_grid_composes(grid, monkeypatch):
-    """Check one value of what all arms share; the number of jobs that the file claims counts the others too.
+    """Compose enough jobs that each arm and each choice occurs at least once.
 
-    The jobs that are composed have each arm and each choice at least once. Values of single settings do not
-    count as choices, since a value does not change what composes.
+    Of the prompts, seeds and noises that all arms share, only the first is composed. The number of jobs that
+    the file claims is compared with the product of all. Values of single settings are not choices, because
+    composing does not depend on them.
     """
     monkeypatch.setattr(plan, "compose_line", lambda command, line, _: line_of_jobs(command, tuple(line)))
     text = (CONFIGS / "grid" / f"{grid}.yaml").read_text(encoding="utf-8")
@@ -237,13 +241,13 @@ def test_every_arm_of_a_grid_composes(grid, monkeypatch):
             seen |= choices
             covering.append(job)
     last = compose_all(dataclasses.replace(sweep, jobs=covering), composer)[-1]
-    cfg = OmegaConf.to_container(compose(covering[-1].overrides), resolve=True)  # as Hydra composes it alone
+    cfg = OmegaConf.to_container(compose(covering[-1].overrides), resolve=True)
     assert last.values == dict(flatten(cfg))
 
 
 @pytest.mark.parametrize("path", sorted((CONFIGS / "launcher").glob("*.yaml")), ids=lambda path: path.stem)
-def test_a_launcher_fills_in_a_launcher_of_hydra(path):
-    """Whether its plugin is installed or not; test_sweeps.py runs the one that is."""
+def test_a_launcher_configures_a_launcher_of_hydra(path):
+    """The plugins need not be installed for this. test_sweeps.py runs a launcher with an installed plugin."""
     text = path.read_text(encoding="utf-8")
     assert text.startswith("# @package _global_\n")
     assert "pip install" in text
@@ -255,10 +259,9 @@ def test_a_launcher_fills_in_a_launcher_of_hydra(path):
     assert used | {"threads"} == content["launcher"].keys()
 
 
-RECIPES = {  # with a pretrained prior, through which test_recipes.py trains them
-    name for name in EXPERIMENTS if "/prior:" in (CONFIGS / "experiment" / f"{name}.yaml").read_text()
-}
-RUN_ELSEWHERE = RECIPES | {"smoke"}  # which test_end_to_end.py trains
+# Experiments with a pretrained prior, which test_recipes.py trains.
+RECIPES = {name for name in EXPERIMENTS if "/prior:" in (CONFIGS / "experiment" / f"{name}.yaml").read_text()}
+RUN_ELSEWHERE = RECIPES | {"smoke"}  # test_end_to_end.py trains it
 
 
 @pytest.mark.parametrize("experiment", sorted(set(EXPERIMENTS) - RUN_ELSEWHERE))
@@ -281,12 +284,10 @@ def test_every_experiment_runs_two_steps_on_the_tiny_prior(experiment, tmp_path,
 
 
 def node(target: str, **values: Any):
-    from omegaconf import OmegaConf
-
     return OmegaConf.create({"part": {"_target_": target, **values}}).part
 
 
-def test_a_mistake_found_in_a_constructor_comes_out_as_it_is():
+def test_a_user_error_in_a_constructor_is_raised_unchanged():
     with pytest.raises(
         UserError, match=r"^schedule.steps: expected a whole number >= 1, got 0. Try: schedule.steps=600$"
     ):
@@ -316,7 +317,7 @@ def test_a_value_that_is_still_missing_is_named():
         component(node("cadam3d.core.schedule.Constant", value="???"))
 
 
-def test_a_bug_in_a_constructor_stays_what_it_is():
+def test_a_bug_in_a_constructor_keeps_its_exception():
     with pytest.raises(ZeroDivisionError):
         component(node("operator.truediv", _args_=[1, 0]))
 

@@ -39,7 +39,8 @@ PROGRAMS = (
     "pyright",
     "compute-sanitizer",
 )
-SETTING = r"'?~?[a-z][\w./]*=[^|]*[\[({*?]"  # with characters that a shell may read in its own way
+# A setting with characters that have a special meaning in a shell.
+SETTING = r"'?~?[a-z][\w./]*=[^|]*[\[({*?]"
 CALL = rf"(?:\w+=\S* )*(?:\.venv/bin/)?(?:{'|'.join(PROGRAMS)}) "
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"^ {4}\S.*$", re.MULTILINE)
@@ -47,7 +48,7 @@ NAMED_BLOCK = re.compile(
     r"`([\w./]+\.(?:py|yaml|toml))`[^`\n]*:\n\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL
 )
 
-# Writes the words that it was called with to the file RECORD, instead of doing anything.
+# This program only writes the words of its command line to the file RECORD.
 STAND_IN = """#!/bin/sh
 { for word in "${0##*/}" "$@"; do printf '%s\\0' "$word"; done; printf '\\036\\0'; } >> "$RECORD"
 """
@@ -74,19 +75,19 @@ def lines_of(page: Path) -> list[Line]:
 
 
 def settings_of(page: Path) -> list[Line]:
-    """Return the settings in the prose of a page that a shell may misread, as part of a line."""
+    """Return the settings in the prose of a page that a shell may misread, as parts of command lines."""
     return [Line(page.name, f"cadam3d {span}") for span in spans_of(page) if re.match(SETTING, span)]
 
 
 def spans_of(page: Path) -> list[str]:
-    """Return what the prose of a page shows as code."""
+    """Return the pieces of code in the prose of a page."""
     prose = INDENTED.sub("", FENCE.sub("", page.read_text(encoding="utf-8")))
     paragraphs = re.split(r"\n\s*\n", prose)
     return [" ".join(span.split()) for text in paragraphs for span in re.findall(r"`([^`]+)`", text)]
 
 
 def help_lines() -> list[Line]:
-    """Return the command lines that the program's own help and the comments of its settings show."""
+    """Return the command lines in the help of the program and in the comments of the YAML files."""
     found = [Line("cadam3d --help", example) for _, example in cli.COMMANDS.values()]
     for file in sorted((REPOSITORY / "configs").rglob("*.yaml")):
         text = file.read_text(encoding="utf-8")
@@ -101,13 +102,13 @@ SETTINGS = list(dict.fromkeys(line for page in PAGES for line in settings_of(pag
 
 
 def named_blocks(page: Path) -> dict[str, str]:
-    """Return the files that a page asks the reader to write: name to content."""
+    """Return the files that the reader of a page writes: name to content."""
     return dict(NAMED_BLOCK.findall(page.read_text(encoding="utf-8")))
 
 
 @cache
 def split_by(shell: str, line: str, place: Path) -> list[list[str]]:
-    """Run ``line`` in a real shell, with stand-ins for every program, and return the words that each got."""
+    """Run ``line`` in a real shell with a stand-in for every program, and return the words of each call."""
     record = place / f"{shell}.record"
     record.unlink(missing_ok=True)
     environment = {"PATH": str(place / "bin"), "HOME": str(place), "RECORD": str(record)}
@@ -129,7 +130,7 @@ def split_by(shell: str, line: str, place: Path) -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory) -> Path:
-    """A folder as the pages assume it: with a run, a sweep, and the files that a reader writes."""
+    """Return a folder with a run, a sweep, and the files that a reader writes, as the pages assume it."""
     place = tmp_path_factory.mktemp("place")
     for folder in ("bin", ".venv/bin"):
         (place / folder).mkdir(parents=True)
@@ -152,7 +153,7 @@ def place(tmp_path_factory) -> Path:
 
 
 def write_sweep(folder: Path) -> None:
-    """Write what a sweep of two densifiers over three prompts leaves, as far as tables are made of it."""
+    """Write the files of a sweep of two densifiers over three prompts that tables are made from."""
     jobs = []
     for prompt in ("a cube", "a torus", "a cone"):
         for arm, count, psnr in (("baseline", 20000, 22.0), ("cadam", 1000, 22.5)):
@@ -169,7 +170,7 @@ def write_sweep(folder: Path) -> None:
 
 
 def without_missing_launcher(words: list[str]) -> list[str]:
-    """Leave out a launcher that is not installed (only joblib is sure to be), and its settings."""
+    """Leave out a launcher that is not installed, and its settings. Only joblib is always installed."""
     name = next((word.partition("=")[2] for word in words if word.startswith("launcher=")), "joblib")
     if name == "joblib" or find_spec(f"hydra_plugins.hydra_{name}_launcher"):
         return words
@@ -185,7 +186,7 @@ def test_a_documented_line_means_the_same_in_every_shell(line, shell, place):
 
 @pytest.mark.parametrize("line", DISTINCT, ids=str)
 def test_a_documented_line_can_be_pasted(line):
-    """A shell that is typed into expands ``!``, and zsh takes a comment behind a command for its words."""
+    """An interactive shell expands ``!``, and an interactive zsh passes a comment on to the command."""
     assert "!" not in re.sub(r"'[^']*'", "", line.text)
     assert shlex.split(line.text, comments=True) == shlex.split(line.text)
 
@@ -199,8 +200,8 @@ def test_a_documented_line_composes(line, place, monkeypatch, capsys):
         flags = [] if is_only_printed else ["--cfg", "job"]
         monkeypatch.chdir(place)
         monkeypatch.setattr(sys, "argv", [*without_missing_launcher(words), *flags])
-        # In a thread, which halves the time: composing recurses so deeply that at the depth of a test CPython
-        # 3.11 maps and unmaps the next piece of its stack all the time.
+        # A thread halves the time. Composing recurses deeply, and at the depth of a test CPython 3.11 would
+        # allocate and free the next piece of its stack again and again.
         with pytest.raises(SystemExit) as ended, ThreadPoolExecutor(1) as thread:
             thread.submit(cli.main).result()
         assert not ended.value.code, capsys.readouterr().err
@@ -216,7 +217,7 @@ def test_a_documented_script_or_test_exists(line, place):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_the_python_of_a_page_runs(page, place, monkeypatch):
-    """Scripts run; blocks that belong into a file of the reader's are run by test_extending."""
+    """Run the scripts of a page. The blocks that belong to a named file are run by test_extending."""
     text = NAMED_BLOCK.sub("", page.read_text(encoding="utf-8"))
     monkeypatch.chdir(place)
     for number, (language, body) in enumerate(FENCE.findall(text)):
@@ -228,7 +229,7 @@ def test_the_python_of_a_page_runs(page, place, monkeypatch):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_the_yaml_of_a_page_names_its_file(page):
-    """So that it is written where the command lines of the page look for it, and composes with them."""
+    """With a name, the test of command lines can write the file, so that the lines compose with it."""
     text = NAMED_BLOCK.sub("", page.read_text(encoding="utf-8"))
     assert not [body for language, body in FENCE.findall(text) if language == "yaml"]
 
@@ -255,8 +256,8 @@ def headings_of(page: Path) -> list[str]:
     return [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
 
 
-def test_quoted_messages_are_messages_of_ours():
-    """Headings of the page on troubles that are quotes: each piece between dots is in the source."""
+def test_quoted_messages_are_in_the_source():
+    """Look up the quoted messages of troubleshooting.md; each piece between dots must be in the source."""
     page = (REPOSITORY / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     source = "".join(file.read_text(encoding="utf-8") for file in (REPOSITORY / "cadam3d").rglob("*.py"))
     quotes = re.findall(r'^\*\*"(.+?)"\.\*\*', page, re.MULTILINE)
@@ -265,7 +266,7 @@ def test_quoted_messages_are_messages_of_ours():
 
 
 def test_documented_files_exist():
-    """Paths in backticks that look like ours are real: documentation must not outlive what it describes."""
+    """Look up all paths in backticks that begin with a folder of the repository."""
     missing = []
     for page in PAGES:
         text = FENCE.sub("", page.read_text(encoding="utf-8"))

@@ -17,8 +17,8 @@ from cadam3d.io.jsonl import read_jsonl
 from cadam3d.io.ply import read_ply
 
 SMALL = ["prompt=a red cube", "experiment=smoke", "rasterizer=reference"]
-IMPORTED = "imported.txt"  # every module that a training loaded
-SECONDS = 240  # longest wait for one process, on a busy machine
+IMPORTED = "imported.txt"  # lists the modules that a training has loaded
+SECONDS = 240  # longest wait for one process
 
 
 def start(folder: Path, *words: str, **more: str) -> subprocess.Popen:
@@ -43,8 +43,8 @@ def run(folder: Path, *words: str, code: int = 0, **more: str) -> tuple[str, str
 def wait_for(path: Path, process: subprocess.Popen) -> None:
     deadline = time.monotonic() + SECONDS
     while not path.exists():
-        assert process.poll() is None, f"ended before {path.name} was there: {process.communicate()}"
-        assert time.monotonic() < deadline, f"{path.name} never came"
+        assert process.poll() is None, f"ended before {path.name} was written: {process.communicate()}"
+        assert time.monotonic() < deadline, f"{path.name} was not written"
         time.sleep(0.02)
 
 
@@ -54,7 +54,7 @@ def without_time(lines: list[dict]) -> list[dict]:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> Path:
-    """The folder in which one small run was made, from its first step to its last."""
+    """Return a folder in which one small run was trained from its first step to its last."""
     folder = tmp_path_factory.mktemp("user")
     _, err = run(folder, "train", *SMALL, PYTHONPROFILEIMPORTTIME="1")
     (folder / IMPORTED).write_text(err)
@@ -87,19 +87,19 @@ def test_eval_measures_what_train_measured(finished):
         assert evaluation[key] == pytest.approx(summary[key], rel=1e-6)
 
 
-def test_killed_and_resumed_equals_never_interrupted(finished, tmp_path):
-    victim = tmp_path / "run"
-    words = [*SMALL, f"hydra.run.dir={victim}", "callback.checkpoint.every=7", "callback.metrics.every=1"]
+def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(finished, tmp_path):
+    run_folder = tmp_path / "run"
+    words = [*SMALL, f"hydra.run.dir={run_folder}", "callback.checkpoint.every=7", "callback.metrics.every=1"]
     process = start(tmp_path, "train", *words)
-    wait_for(victim / "checkpoints" / "step_0000014.pt", process)
+    wait_for(run_folder / "checkpoints" / "step_0000014.pt", process)
     process.kill()  # SIGKILL: the process cannot clean up
     process.communicate()
-    assert not (victim / "summary.json").exists()
+    assert not (run_folder / "summary.json").exists()
 
-    run(tmp_path, "train", f"resume={victim}")
+    run(tmp_path, "train", f"resume={run_folder}")
     whole = finished / "outputs" / "latest"
-    assert (victim / "asset.ply").read_bytes() == (whole / "asset.ply").read_bytes()
-    lines = read_jsonl(victim / "metrics.jsonl")
+    assert (run_folder / "asset.ply").read_bytes() == (whole / "asset.ply").read_bytes()
+    lines = read_jsonl(run_folder / "metrics.jsonl")
     steps = [line["step"] for line in lines if line["kind"] == "step"]
     assert steps == list(range(1, 41))
     logged = [line for line in lines if line["kind"] == "refine" or line["step"] in (1, *range(0, 41, 5))]
@@ -119,7 +119,8 @@ def test_a_run_is_refused_in_a_folder_that_holds_another_one(finished):
 def test_a_run_starts_without_slow_imports(finished):
     imported = (finished / IMPORTED).read_text()
     assert "torch.optim" in imported
-    before_training = imported.partition("?step/s")[0]  # of the progress bar at step 0
+    # The progress bar shows this text at step 0.
+    before_training = imported.partition("?step/s")[0]
     assert before_training != imported
     for name in ("torch._dynamo", "kornia", "scipy.stats", "matplotlib", "trimesh"):
         assert name not in before_training
@@ -127,24 +128,24 @@ def test_a_run_starts_without_slow_imports(finished):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_everything_and_prints_how_to_continue(finished, tmp_path, number):
-    victim = tmp_path / "run"
-    process = start(tmp_path, "train", *SMALL, f"hydra.run.dir={victim}", "callback.checkpoint.every=5")
-    wait_for(victim / "checkpoints" / "step_0000005.pt", process)
+    run_folder = tmp_path / "run"
+    process = start(tmp_path, "train", *SMALL, f"hydra.run.dir={run_folder}", "callback.checkpoint.every=5")
+    wait_for(run_folder / "checkpoints" / "step_0000005.pt", process)
     process.send_signal(number)
     out, err = process.communicate(timeout=SECONDS)
     assert process.returncode == 128 + number, err
     assert "Traceback" not in err
-    summary = json.loads((victim / "summary.json").read_text())
+    summary = json.loads((run_folder / "summary.json").read_text())
     assert summary["outcome"] == "interrupted"
     assert 5 <= summary["steps"] < 40
-    assert len(read_ply(victim / "asset.ply")) == summary["num_gaussians"]
-    assert f"cadam3d train resume={victim.name}" in out
+    assert len(read_ply(run_folder / "asset.ply")) == summary["num_gaussians"]
+    assert f"cadam3d train resume={run_folder.name}" in out
 
     if number == signal.SIGTERM:
-        return  # the same code handles both signals, so resuming is tested once
-    run(tmp_path, "train", f"resume={victim}")
+        return  # resuming is tested once
+    run(tmp_path, "train", f"resume={run_folder}")
     whole = finished / "outputs" / "latest"
-    assert (victim / "asset.ply").read_bytes() == (whole / "asset.ply").read_bytes()
+    assert (run_folder / "asset.ply").read_bytes() == (whole / "asset.ply").read_bytes()
 
 
 @pytest.mark.parametrize(("guidance", "densifier"), [("ism", "none"), ("gcs", "mcmc")])
@@ -168,7 +169,7 @@ def test_a_dry_run_on_the_tiny_prior_prints_that_its_result_is_meaningless(tmp_p
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the process of a job in /proc")
-def test_a_sweep_survives_a_killed_job_and_the_same_line_finishes_it(finished, tmp_path):
+def test_a_sweep_continues_after_a_killed_job_and_the_same_line_completes_it(finished, tmp_path):
     words = [*SMALL, "densifier=cadam,none", "callback.checkpoint.every=7", "hydra.sweep.dir=table"]
     table = tmp_path / "table"
     process = start(tmp_path, "sweep", *words)
@@ -202,7 +203,7 @@ def rows_of(sweep: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "expected"),
     [
         ([], "prompt"),
         (["prompt=a red florb"], "florb"),
@@ -215,8 +216,9 @@ def rows_of(sweep: Path) -> list[dict[str, str]]:
         (["resume=nowhere"], "resume"),
     ],
 )
-def test_a_mistake_is_one_message_and_exit_code_1(tmp_path, words, said, monkeypatch, capfd):
-    if said == "florb":  # once as a process, the others in this one
+def test_a_mistake_is_one_message_and_exit_code_1(tmp_path, words, expected, monkeypatch, capfd):
+    # One of them is tested in a separate process, the others in this one, which is faster.
+    if expected == "florb":
         _, err = run(tmp_path, "train", *words, code=1)
     else:
         monkeypatch.chdir(tmp_path)
@@ -225,7 +227,7 @@ def test_a_mistake_is_one_message_and_exit_code_1(tmp_path, words, said, monkeyp
             cli.main()
         assert ended.value.code == 1
         err = capfd.readouterr().err
-    assert said in err
+    assert expected in err
     assert "Traceback" not in err
     assert "HYDRA_FULL_ERROR" not in err
     assert len(err.strip().splitlines()) <= 12

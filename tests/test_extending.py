@@ -1,4 +1,4 @@
-"""docs/extending.md, followed word by word from a folder outside the package."""
+"""The examples in docs/extending.md work as written, from a folder outside the package."""
 
 import json
 import os
@@ -18,9 +18,10 @@ REPOSITORY = Path(__file__).parent.parent
 PAGE = (REPOSITORY / "docs" / "extending.md").read_text(encoding="utf-8")
 BLOCK = re.compile(r"^`([\w./]+)`:\n\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMAND = re.findall(r"^```sh\n(.* train .*)\n```$", PAGE, re.MULTILINE)[0]
-ENOUGH = "experiment=smoke prior=tiny"  # a few steps with small images: the law is that the parts are used
+# A few steps with small images suffice to show that the new parts are used.
+SMALL = "experiment=smoke prior=tiny"
 
-# The installed command for the sources of this repository; the current folder is not on its path.
+# The command as it is installed, for the sources of this repository. The current folder is not on its path.
 PROGRAM = f"""#!{sys.executable}
 import sys
 sys.path.insert(0, {str(REPOSITORY)!r})
@@ -41,7 +42,7 @@ def place(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(place) -> Path:
-    """The run folder after the command of the page."""
+    """Run the command of the page and return the run folder."""
     program = place / "bin" / "cadam3d"
     program.parent.mkdir()
     program.write_text(PROGRAM, encoding="utf-8")
@@ -49,7 +50,7 @@ def run(place) -> Path:
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     environment |= {"PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}", "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        ["bash", "-c", f"{COMMAND} {ENOUGH}"],
+        ["bash", "-c", f"{COMMAND} {SMALL}"],
         cwd=place,
         env=environment,
         capture_output=True,
@@ -62,7 +63,7 @@ def run(place) -> Path:
 
 @pytest.fixture
 def energy(place, monkeypatch):
-    """The densifier of the page, with the values of its YAML file."""
+    """Build the densifier of the page with the values of its YAML file."""
     monkeypatch.syspath_prepend(str(place))
     from cadam3d.settings.compose import component, load
 

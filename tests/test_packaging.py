@@ -1,4 +1,4 @@
-"""What a stranger installs: one wheel that carries its configuration and works from an empty folder."""
+"""Packaging: the wheel contains the configuration and works from an empty folder."""
 
 import ast
 import os
@@ -18,7 +18,7 @@ REPOSITORY = Path(__file__).parent.parent
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
-    """Built without network and without a build environment of its own."""
+    """Build the wheel without network and without an isolated build environment."""
     folder = tmp_path_factory.mktemp("dist")
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder)]
     done = subprocess.run([*command, str(REPOSITORY)], capture_output=True, text=True, check=False)
@@ -29,7 +29,7 @@ def wheel(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel, tmp_path_factory) -> Path:
-    """A folder that holds the installed package and nothing else."""
+    """Return a folder that contains the installed package and nothing else."""
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target"]
     subprocess.run([*command, str(folder), str(wheel)], check=True, capture_output=True)
@@ -58,13 +58,13 @@ def test_the_wheel_carries_every_source_and_nothing_else_of_the_repository(wheel
     assert any(name.endswith("licenses/LICENSE") for name in names)
 
 
-def test_kernel_sources_travel_too(wheel):
+def test_the_wheel_carries_the_kernel_sources(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     sources = {path for pattern in ("*.cpp", "*.h", "*.cu", "*.cuh") for path in find("cadam3d", pattern)}
     assert {str(path.relative_to(REPOSITORY)) for path in sources} <= names
 
 
-def test_report_templates_travel_too(wheel):
+def test_the_wheel_carries_the_report_templates(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     templates = find("cadam3d/report/templates", "*.*")
     assert templates
@@ -92,8 +92,8 @@ def imports_of(nodes):
             yield str(node.module).partition(".")[0]
 
 
-def test_every_import_is_declared_or_ours():
-    """At the top of a module the core dependencies; inside a function those of an extra as well."""
+def test_every_imported_package_is_declared():
+    """Core dependencies may be imported at the top of a module, those of an extra only inside functions."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     core = {re.match(r"[\w-]+", line).group() for line in project["dependencies"]}
     extra = {re.match(r"[\w-]+", line).group() for line in project["optional-dependencies"]["diffusers"]}
@@ -138,7 +138,7 @@ def test_python_minus_m_is_the_same_program(installed, tmp_path):
     assert by_module.stdout == by_script.stdout != ""
 
 
-def test_no_dependency_pulls_torchvision():
+def test_no_dependency_is_torchvision():
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     everything = [
         *project["dependencies"],
@@ -148,7 +148,7 @@ def test_no_dependency_pulls_torchvision():
 
 
 def test_the_package_forbids_no_newer_version():
-    """An upper bound in the package would make it refuse the environments of its users."""
+    """With an upper bound, the package could not be installed beside newer versions."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     for_users = [
@@ -175,7 +175,7 @@ def test_the_projects_own_commands_use_the_tested_versions():
     assert "--constraint constraints.txt" in done.stdout
 
 
-def test_the_ci_runs_make_test_and_nothing_beside_it():
+def test_the_ci_runs_make_test_and_nothing_else():
     script = REPOSITORY / ".ci" / "run"
     assert os.access(script, os.X_OK)
     lines = [line for line in script.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
@@ -190,7 +190,7 @@ def test_the_ci_runs_make_test_and_nothing_beside_it():
         ("check", '-m "not slow"'),
     ],
 )
-def test_make_says_what_it_would_do(goal, expected):
+def test_a_make_target_runs_the_expected_command(goal, expected):
     done = subprocess.run(["make", "-n", goal], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     assert expected in done.stdout
 

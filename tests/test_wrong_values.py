@@ -11,7 +11,8 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import component, compose
 
-WHOLE = {  # an option, and its keys that count something
+# Options, and their keys that count something.
+WHOLE = {
     "camera=orbit": ["camera.size"],
     "camera=sphere": ["camera.size"],
     "camera=multiview": ["camera.size"],
@@ -83,7 +84,7 @@ LISTS = {
     "callback=[previews]": ["callback.previews.background"],
     "metric=[fidelity]": ["metric.fidelity.elevations_deg", "metric.fidelity.background"],
 }
-TRUTHS = {
+SWITCHES = {
     "densifier=cadam_open": ["densifier.reset_moments"],
     "guidance=sds": ["guidance.shared_t"],
     "guidance=ism": ["guidance.shared_t"],
@@ -91,7 +92,8 @@ TRUTHS = {
     "exporter=[preview]": ["exporter.preview.labels"],
     "prior=stable_diffusion_3": ["prior.t5"],
 }
-NULLABLE = {  # where null means never, all, or as it is
+# The keys among them that may be null.
+NULLABLE = {
     "callback=[previews]": ("callback.previews.every",),
     "refine=default": ("refine.reset_interval", "refine.max_gaussians"),
     "initializer=ply": ("initializer.count", "initializer.sh_degree"),
@@ -99,11 +101,11 @@ NULLABLE = {  # where null means never, all, or as it is
 }
 NEVER_WHOLE = ("2.5", "16.0", "true", "abc", "[1]", "-1000000000000.5")
 NEVER_A_LIST = ("5", "null", "abc", "[a,b,c]", "[true,true,true]", "[null,null]", "[]")
-NEVER_A_TRUTH = ("0", "1", "1.0", "null", "abc")
+NEVER_A_SWITCH = ("0", "1", "1.0", "null", "abc")
 
 
 @pytest.fixture(autouse=True)
-def as_users_run_it():
+def without_type_checks():
     """Switch off the type checks of the suite, which would refuse a wrong type before the component does."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
@@ -117,7 +119,7 @@ def composed(choice: str) -> DictConfig:
 
 
 def build(choice: str, *lines: str):
-    """Build the component of ``choice``, with ``lines`` of YAML values on top."""
+    """Build the component of ``choice`` after setting the YAML values of ``lines``."""
     group, _, name = choice.partition("=")
     cfg = composed(choice).copy()
     for line in lines:
@@ -141,7 +143,7 @@ def refuses(choice: str, line: str) -> None:
 
 
 @pytest.mark.parametrize(("choice", "key"), pairs(WHOLE))
-def test_what_is_counted_is_a_whole_number(choice, key):
+def test_a_count_must_be_a_whole_number(choice, key):
     for value in NEVER_WHOLE:
         refuses(choice, f"{key}={value}")
     if key not in NULLABLE.get(choice, ()):
@@ -154,9 +156,9 @@ def test_a_list_of_numbers_holds_only_numbers(choice, key):
         refuses(choice, f"{key}={value}")
 
 
-@pytest.mark.parametrize(("choice", "key"), pairs(TRUTHS))
+@pytest.mark.parametrize(("choice", "key"), pairs(SWITCHES))
 def test_a_switch_is_true_or_false(choice, key):
-    for value in NEVER_A_TRUTH:
+    for value in NEVER_A_SWITCH:
         refuses(choice, f"{key}={value}")
 
 
@@ -174,12 +176,12 @@ def test_a_name_is_refused_as_a_fallback_initializer():
         build("initializer=shap_e", "initializer.fallback=ball")
 
 
-def test_a_truth_value_is_refused_as_a_bound():
+def test_a_boolean_is_refused_as_a_bound():
     refuses("guidance=sds", "guidance.clip=true")
     refuses("guidance=sds", "guidance.clip=abc")
 
 
-def test_a_parent_has_a_bounded_number_of_children():
+def test_the_number_of_split_children_is_bounded():
     assert build("refine=default", "refine.split_children=16").split_children == 16
     refuses("refine=default", "refine.split_children=17")
 
@@ -194,7 +196,7 @@ def test_a_schedule_counts_whole_steps(key, value):
 @pytest.mark.parametrize("key", ["start", "end"])
 @pytest.mark.parametrize("kind", ["Linear", "LogLinear"])
 @pytest.mark.parametrize("value", ["true", "null", "abc"])
-def test_a_schedule_goes_from_number_to_number(key, kind, value):
+def test_a_schedule_starts_and_ends_at_a_number(key, kind, value):
     with pytest.raises(UserError, match=rf"^schedule\.{key}: expected a"):
         build(
             "optimizer=adam",
@@ -203,7 +205,7 @@ def test_a_schedule_goes_from_number_to_number(key, kind, value):
         )
 
 
-def test_an_integer_is_a_fine_rate_of_decay():
+def test_an_integer_is_accepted_as_a_decay_rate():
     gaussians = build("initializer=ball", "initializer.count=3").build(
         "", torch.Generator().manual_seed(0), torch.device("cpu")
     )

@@ -1,1 +1,1 @@
-"""What the user types: one module per command."""
+"""Commands: one module for each command of the command line, and the parts that they share."""

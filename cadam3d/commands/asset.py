@@ -27,8 +27,8 @@ class Asset:
     """Gaussians from a file, on the requested device."""
 
     gaussians: Gaussians
-    ply: Path  # the file
-    folder: Path  # of the run; for a bare file, a folder named after it
+    ply: Path
+    folder: Path  # of the run, or named after a single file
 
 
 def open_asset(cfg: DictConfig) -> Asset:
@@ -54,15 +54,18 @@ def open_run(folder: Path, device: str) -> Asset:
 def find_run(text: str) -> Path:
     """Return the folder of the run that ``text`` names. Raises ``UserError`` if it does not hold a run."""
     folder = Path(text).expanduser().resolve()
+    example = "run=outputs/latest"
     if (folder / CONFIG).is_file():
         return folder
     if not folder.is_dir():
         reason = "no such folder"
     elif is_sweep(folder):
-        reason = f"a sweep, which has many runs; one of them is {_any_job(folder)}"
+        reason = "it is a sweep, which has many runs"
+        started = [config.parent for config in sorted(folder.glob(f"*/{CONFIG}"))]
+        example = f"run={shown(started[0])}" if started else example
     else:
         reason = f"it has no {CONFIG}"
-    raise UserError(f"run: expected the folder of a run, got {text!r} ({reason}). Try: run=outputs/latest")
+    raise UserError(f"run: expected the folder of a run, got {text!r} ({reason}). Try: {example}")
 
 
 def run_config(folder: Path) -> DictConfig:
@@ -83,7 +86,7 @@ def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
 
 
 def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
-    """Let every exporter of ``cfg`` write ``asset`` into ``folder``; return the paths of the files."""
+    """Run every exporter of ``cfg`` on ``asset``, and return the paths of the files in ``folder``."""
     exporters: Sequence[Exporter] = list(components(cfg.exporter).values())
     if not exporters:
         raise UserError("exporter: expected at least one, got none. Try: exporter=[images,turntable]")
@@ -99,8 +102,3 @@ def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
 def output_folder(cfg: DictConfig, asset: Asset, name: str) -> Path:
     """Return the folder that ``output=`` names, by default ``name`` beside the asset."""
     return Path(cfg.output).expanduser() if cfg.output else asset.folder / name
-
-
-def _any_job(sweep: Path) -> str:
-    """Return the name of a job of the sweep that has started."""
-    return next((job.parent.name for job in sorted(sweep.glob(f"*/{CONFIG}"))), "not finished")

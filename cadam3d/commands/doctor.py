@@ -21,13 +21,14 @@ from cadam3d.commands.finding import Finding, Verdict, attempt
 from cadam3d.settings.compose import component, compose, config_dir
 
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "imageio", "imageio-ffmpeg", "jaxtyping", "kornia")
-PACKAGES += ("matplotlib", "pillow", "pyyaml", "scipy", "tqdm", "trimesh")
+PACKAGES += ("jinja2", "matplotlib", "pillow", "pyyaml", "scipy", "tqdm", "trimesh")
 IMPORT_NAMES = {"hydra-core": "hydra", "imageio-ffmpeg": "imageio_ffmpeg", "pillow": "PIL", "pyyaml": "yaml"}
-COMPILERS = {  # and the message if it is missing
+# The messages for compilers that are missing.
+COMPILERS = {
     **dict.fromkeys(("c++", "g++", "clang++"), "not found; one C++ compiler is enough"),
     "nvcc": "not found, not needed",
 }
-SECONDS = 60  # longest wait for a program to print its version
+SECONDS = 60  # longest wait for a program
 
 
 def run(cfg: DictConfig) -> None:
@@ -59,7 +60,7 @@ def examine() -> Iterator[Finding]:
 
 
 def _guarded(check: Callable[[], Finding]) -> Finding:
-    """Run a check. If it raises an exception, that is what is broken."""
+    """Return the finding of a check, or a broken one if the check raises an exception."""
     try:
         return check()
     except Exception as error:
@@ -83,18 +84,19 @@ def _package(name: str) -> Finding:
     try:
         import_module(IMPORT_NAMES.get(name, name))
         return Finding(name, Verdict.OK, metadata.version(name))
-    except Exception as error:  # a package may fail to import in any way
+    except Exception as error:
+        # The code of a package may raise anything when it is imported.
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         return Finding(name, Verdict.BROKEN, reason, f"Try: pip install --force-reinstall {name}")
 
 
 def _torchvision() -> Finding:
-    """Check that torchvision fits torch: otherwise every package that imports it breaks, diffusers too."""
+    """Check that torchvision fits torch. Otherwise diffusers and other packages that import it fail."""
     try:
         version = metadata.version("torchvision")
     except metadata.PackageNotFoundError:
         return Finding("torchvision", Verdict.OK, "not installed, not needed")
-    code, output = _ask([sys.executable, "-c", "import torchvision"])
+    code, output = _run_program([sys.executable, "-c", "import torchvision"])
     if code == 0:
         return Finding("torchvision", Verdict.OK, version)
     reason = output.strip().splitlines()[-1] if output.strip() else "does not import"
@@ -116,7 +118,7 @@ def _device() -> Finding:
             "device", Verdict.OK, f"{properties.name}, {memory:.0f} GiB, CUDA {torch.version.cuda}"
         )
     found = f"CPU, {torch.get_num_threads()} threads"
-    if shutil.which("nvidia-smi") and _ask(["nvidia-smi", "-L"])[0] == 0:
+    if shutil.which("nvidia-smi") and _run_program(["nvidia-smi", "-L"])[0] == 0:
         built = f"torch is built for CUDA {torch.version.cuda}" if torch.version.cuda else "torch is CPU-only"
         hint = "Try: pip install --force-reinstall torch, with the CUDA version of your driver"
         return Finding("device", Verdict.NOTE, f"{found}; there is a GPU, but {built}", hint)
@@ -127,7 +129,7 @@ def _ffmpeg() -> Finding:
     import imageio_ffmpeg
 
     path = imageio_ffmpeg.get_ffmpeg_exe()
-    code, output = _ask([path, "-version"])
+    code, output = _run_program([path, "-version"])
     version = re.search(r"version (\S+)", output)
     if code == 0 and version:
         return Finding("ffmpeg", Verdict.OK, f"{version.group(1)}, {path}")
@@ -145,18 +147,20 @@ def _compiler(name: str) -> Finding:
     path = shutil.which(name)
     if path is None:
         return Finding(name, Verdict.NOTE, COMPILERS.get(name, "not found"))
-    code, output = _ask([path, "--version"])
+    code, output = _run_program([path, "--version"])
     if code != 0:
         return Finding(name, Verdict.NOTE, f"{path} does not run")
     lines = output.strip().splitlines() or [path]
-    release = [line for line in lines if "release" in line]  # of nvcc, on the fourth line
+    # nvcc prints its version on the fourth line.
+    release = [line for line in lines if "release" in line]
     return Finding(name, Verdict.OK, (release or lines)[0].strip())
 
 
 def _rasterizers() -> Iterator[Finding]:
     try:
         from cadam3d.commands.doctor_rasterizers import check_rasterizers
-    except Exception as error:  # such as a torch that cannot be imported, which has its own line above
+    except Exception as error:
+        # For example, torch cannot be imported. The check of that package has reported it already.
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         yield Finding("rasterizers", Verdict.BROKEN, f"cannot be loaded: {reason}")
         return
@@ -186,7 +190,7 @@ def _diffusers() -> Finding:
 
 
 def _models() -> Finding:
-    """List the models in the cache of the Hugging Face hub and what reads them, without loading any."""
+    """List the models in the cache of the Hugging Face hub and the settings that use them."""
     home = Path(os.environ.get("HF_HOME") or Path("~/.cache/huggingface").expanduser())
     cache = Path(os.environ.get("HF_HUB_CACHE") or home / "hub")
     folders = sorted(cache.glob("models--*"))
@@ -196,7 +200,7 @@ def _models() -> Finding:
 
 
 def _model(folder: Path) -> str:
-    """Return the name of a cached model and, if its index shows that, what to type to use it."""
+    """Return the name of a cached model and, if its index names a known kind, the setting that uses it."""
     from cadam3d.initializer import shap_e
     from cadam3d.io.pretrained import INDEX
     from cadam3d.prior.latent import PRIORS
@@ -205,12 +209,13 @@ def _model(folder: Path) -> str:
     name = folder.name.removeprefix("models--").replace("--", "/")
     uses = set[str]()
     for index in folder.glob(f"snapshots/*/{INDEX}"):
-        with suppress(OSError, ValueError, LookupError, TypeError):  # of an unknown kind, or incomplete
+        # The index may be incomplete or name an unknown kind.
+        with suppress(OSError, ValueError, LookupError, TypeError):
             uses.add(readers[json.loads(index.read_text(encoding="utf-8"))["_class_name"]])
     return f"{name} ({', '.join(sorted(uses))})" if uses else name
 
 
-def _ask(command: list[str]) -> tuple[int, str]:
+def _run_program(command: list[str]) -> tuple[int, str]:
     """Return the exit code and output of a program; code 127 if it cannot be run or does not end in time."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)

@@ -33,7 +33,7 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     """Measure the run in ``folder`` with the metrics of ``cfg``, and write its ``eval.json``.
 
     The rasterizer and the prior are those of the run. ``psnr`` and ``ssim`` compare with the true images of
-    the prior. If the prior knows none, these two are left out, and a note says so.
+    the prior. If the prior has no true images, a note in the file replaces these two.
     """
     source = run_config(folder)
     asset = open_run(folder, cfg.device)
@@ -45,12 +45,13 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     for metric in components(cfg.metric).values():
         result |= metric.measure(asset.gaussians, render, truth, asset.ply)
     if truth is None:
-        result["note"] = "this prior knows no true images, so there is no psnr and no ssim"
+        result["note"] = "this prior has no true images, so psnr and ssim are missing"
     write_json(folder / EVALUATION, result)
     return result
 
 
 def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
+    """Measure every job of a sweep, and write the ``eval.json`` and the report of the sweep."""
     results, failures = [], 0
     for job in (row.folder for row in load(folder)):
         try:
@@ -65,7 +66,7 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
         print(f"{quality}  {results[-1].get('num_gaussians', '-'):>8} Gaussians  {job.name}")
     if failures == len(results):
         raise UserError(
-            f"run={cfg.run}: no job of this sweep could be measured. Try: rerun the command of the sweep"
+            f"run={cfg.run}: no job of this sweep could be measured. Try: run the command of the sweep again"
         )
     write_json(folder / EVALUATION, results)
     print(f"\n{len(results)} jobs: {shown(folder / EVALUATION)}\nreport: {shown(report.write_sweep(folder))}")

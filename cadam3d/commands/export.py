@@ -1,4 +1,4 @@
-"""``cadam3d export``: an asset in the format that another program needs."""
+"""``cadam3d export``: write an asset in the format that another program needs."""
 
 import tempfile
 from pathlib import Path

@@ -23,11 +23,11 @@ class Finding:
     verdict: Verdict
     found: str
     hint: str = ""  # what to type; empty if nothing is wrong
-    facts: Mapping[str, object] = field(default_factory=dict)  # the same for programs, in types of JSON
+    facts: Mapping[str, object] = field(default_factory=dict)  # JSON values, for programs
 
 
 def attempt(topic: str, check: Callable[[], Finding]) -> Finding:
-    """Return the finding of ``check``. What is not available here is a note; other errors are bugs."""
+    """Return the finding of ``check``: a note if something is not available, broken after any other error."""
     try:
         return check()
     except (UserError, ImportError, OSError) as error:

@@ -1,4 +1,4 @@
-"""Messages of commands that are neither results nor errors."""
+"""Notes: messages that are neither results nor errors."""
 
 import sys
 from functools import cache

@@ -1,4 +1,4 @@
-"""``cadam3d render``: pictures of an asset that exists."""
+"""``cadam3d render``: make pictures or videos of an asset."""
 
 from omegaconf import DictConfig
 
@@ -7,7 +7,7 @@ from cadam3d.io.run_folder import shown
 
 
 def run(cfg: DictConfig) -> None:
-    """Render what ``exporter`` asks for into ``output``, by default ``render/`` beside the asset."""
+    """Run the exporters and write their files into ``output``, by default ``render/`` beside the asset."""
     asset = open_asset(cfg)
     folder = output_folder(cfg, asset, "render")
     paths = export_all(cfg, asset, folder)

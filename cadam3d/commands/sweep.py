@@ -1,4 +1,4 @@
-"""``cadam3d sweep``: many trainings, one table, and a report that compares them."""
+"""``cadam3d sweep``: train many times, and write a table and a report that compares the runs."""
 
 import sys
 from argparse import Namespace
@@ -20,7 +20,7 @@ def run(command: str, overrides: Sequence[str], flags: Sequence[str], options: N
 
 
 def write_report(folder: Path) -> None:
-    """Write the report of the sweep in ``folder`` and print its verdict. A failure does not end the sweep."""
+    """Write the report of the sweep in ``folder`` and print its verdict. A failure is printed, not raised."""
     try:
         page = report.write_sweep(folder)
         print("".join(f"\n{sentence}\n" for sentence in report.verdict(folder)))

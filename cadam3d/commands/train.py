@@ -1,4 +1,4 @@
-"""``cadam3d train``: from a prompt to a run folder with an asset."""
+"""``cadam3d train``: optimise an asset for a prompt and write it into a run folder."""
 
 import logging
 import signal
@@ -34,20 +34,21 @@ from cadam3d.trainer import Trainer
 
 log = logging.getLogger(__name__)
 
-TOGETHER_SECONDS = 1.0  # signals closer than this are one
+# Signals that arrive within this time of each other count as one.
+TOGETHER_SECONDS = 1.0
 LATEST = Path("outputs") / "latest"
 COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "camera", "refine", "optimizer")
 
 
 def run(cfg: DictConfig) -> float | None:
-    """Train, export, measure and report. Return the PSNR in dB if the prior knows the true images."""
+    """Train, export, measure and report. Return the PSNR in dB if the prior has true images."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     device = resolve_device(cfg.device)
     for key, least in (("seed", 0), ("steps", 1), ("views", 1)):
         require_whole(key, cfg[key], low=least, example=3)
     require_determinism(device)
 
-    # All that can be refused is refused here, before the folder changes.
+    # Everything that can be refused is refused here, before the folder changes.
     trainer = build_trainer(cfg, device)
     backend = trainer.rasterizer.prepare(device)
     exporters: dict[str, Exporter] = components(cfg.exporter)
@@ -82,7 +83,8 @@ def run(cfg: DictConfig) -> float | None:
         log.info("%s after %d steps: %d Gaussians", outcome, state.step, len(state.gaussians))
 
         summary = summarize(cfg, state, outcome, backend) | memory | measure_memory(device)
-        write_json(folder / SUMMARY, summary)  # before the exports, which may fail
+        # The summary is written before the exports, which may fail.
+        write_json(folder / SUMMARY, summary)
         gaussians = state.gaussians.detach()
         written, warnings = export(exporters, gaussians, render, folder)
         asset = folder / ASSET if folder / ASSET in written else None
@@ -91,7 +93,8 @@ def run(cfg: DictConfig) -> float | None:
             summary |= metric.measure(gaussians, render, truth, asset)
         if asset is not None:
             summary["asset_bytes"] = asset.stat().st_size
-        summary["warnings"] = warnings  # the last entry of a complete summary
+        # This is the last entry of a complete summary.
+        summary["warnings"] = warnings
         write_json(folder / SUMMARY, summary)
 
         report = write_report(
@@ -102,13 +105,14 @@ def run(cfg: DictConfig) -> float | None:
             charts=[*trainer.densifier.charts(), *trainer.guidance.charts()],
         )
     print_result(folder, summary, report)
-    if stop.received is not None:  # also if all steps were done already: the shell's loop must not go on
+    # This also applies if all steps were done already, so that a loop in a shell script ends.
+    if stop.received is not None:
         sys.exit(128 + stop.received)
     return summary.get("psnr")
 
 
 def require_determinism(device: torch.device) -> None:
-    """Let torch refuse operations whose result is not reproducible: on the CPU we need none of them.
+    """Make torch refuse operations without reproducible results on the CPU, where training needs none.
 
     This has the effect of ``use_deterministic_algorithms``, which would load torch's compiler first and thus
     take more than a second.
@@ -137,7 +141,7 @@ def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
 
 
 def estimate_memory(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
-    """Return what the prior will need, in GiB, and print it: better now than by a failure minutes later."""
+    """Return the memory that the prior will need, in GiB, and print it before the work begins."""
     size = cfg.camera.get("size")
     estimate = trainer.prior.memory(cfg.prompt, cfg.negative_prompt, trainer.views, size)
     if estimate is None:
@@ -147,7 +151,7 @@ def estimate_memory(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
 
 
 def measure_memory(device: torch.device) -> dict[str, float]:
-    """Return the peak of the memory on a CUDA device so far, in GiB; it includes that of the Gaussians."""
+    """Return the peak memory of a CUDA device so far, in GiB, the Gaussians included."""
     if device.type != "cuda":
         return {}
     return {"memory_peak_gib": round(torch.cuda.max_memory_allocated(device) / 2**30, 3)}
@@ -177,7 +181,7 @@ def start_or_resume(cfg: DictConfig, trainer: Trainer, device: torch.device, fol
 
 
 def note_changes(cfg: DictConfig, folder: Path) -> None:
-    """Print the settings that have changed: only with the same ones does resuming equal an unbroken run."""
+    """Print the settings that have changed, because the run then differs from an uninterrupted one."""
     if not (folder / CONFIG).is_file():
         return
     before = dict(flatten(OmegaConf.to_container(load(folder / CONFIG), resolve=True)))
@@ -188,7 +192,7 @@ def note_changes(cfg: DictConfig, folder: Path) -> None:
 
 
 def link_latest(folder: Path) -> None:
-    """Make ``outputs/latest`` a link to ``folder``. A file system without links only loses the shortcut."""
+    """Make ``outputs/latest`` a link to ``folder``. If the file system has no links, print a note."""
     try:
         LATEST.parent.mkdir(parents=True, exist_ok=True)
         target, base = folder.resolve(), LATEST.parent.resolve()
@@ -261,10 +265,10 @@ def print_result(folder: Path, summary: Mapping[str, Any], report: Path) -> None
 
 
 class StopOnSignal:
-    """Handles SIGINT and SIGTERM: the first one asks the loop to stop and save, a later one stops at once.
+    """Handles SIGINT and SIGTERM: after the first one the loop stops and saves, a later one stops it at once.
 
-    Signals within ``TOGETHER_SECONDS`` count as one: a scheduler sends its signal to a process and also to
-    its parent, which passes it on.
+    Signals within ``TOGETHER_SECONDS`` count as one, because a scheduler sends its signal to a process and
+    also to its parent, which passes it on.
     """
 
     def __init__(self) -> None:
@@ -291,4 +295,4 @@ class StopOnSignal:
                 return
             raise KeyboardInterrupt
         self.received, self._received_at = number, time.monotonic()
-        print("\nStopping as soon as all is saved; once more to stop at once.", file=sys.stderr)
+        print("\nStopping as soon as everything is saved; interrupt again to stop at once.", file=sys.stderr)

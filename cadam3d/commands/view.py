@@ -1,4 +1,4 @@
-"""``cadam3d view``: the report of a run, or a picture of a file. There is no live viewer yet."""
+"""``cadam3d view``: show the report of a run, or a picture of a file. There is no live viewer yet."""
 
 import os
 import sys
@@ -12,7 +12,7 @@ from cadam3d.io.run_folder import REPORT, shown
 
 
 def run(cfg: DictConfig) -> None:
-    """Show the report of ``run=``. If it has none, and for ``ply=``, make a picture and show that."""
+    """Show the report of ``run=``. For ``ply=``, or without a report, make a picture and show that."""
     page = _page(cfg)
     is_open = cfg.browser and has_display() and webbrowser.open(page.resolve().as_uri())
     print(f"{'Opened' if is_open else 'Open this in a browser:'} {shown(page)}")

@@ -1,1 +1,1 @@
-"""Floor 0: one file per format on disk."""
+"""Files on disk: one module for each format, and for the folder of a run."""

@@ -1,4 +1,4 @@
-"""Atomic writes: a file is written beside its place and moved there, so it appears whole or not at all."""
+"""Atomic writes: a file is written under another name and then renamed, so it appears whole or not at all."""
 
 import os
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ def replacing(path: Path) -> Iterator[Path]:
         # Find out now whether the folder can be written: ffmpeg would only report a broken pipe.
         temporary.touch()
         yield temporary
-        # Contents before name: after a power cut the new name must not point to an empty file.
+        # After a power cut, the new name must not point to an empty file, so the contents are written first.
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
@@ -34,11 +34,12 @@ def replacing(path: Path) -> Iterator[Path]:
             f"{path}: cannot be written ({reason}). Try another place: hydra.run.dir=DIR, or free some space"
         ) from error
     finally:
-        with suppress(OSError):  # an earlier error is the one that matters
+        # An earlier error is more important than one of the clean-up.
+        with suppress(OSError):
             temporary.unlink()
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what a killed process left half-written in ``folder``, which must have a single writer."""
+    """Delete the half-written files of a killed process in ``folder``, which must have a single writer."""
     for leftover in folder.glob(f"{TEMPORARY}*"):
         leftover.unlink(missing_ok=True)

@@ -1,9 +1,10 @@
-"""Cache: the user's folder for files that are expensive to make and can be made again."""
+"""Cache: the user's folder for files that are expensive but can be made again."""
 
 import os
 from pathlib import Path
 
-TRACES = "CADAM3D_TRACES"  # environment variable: a folder that the jobs of a sweep share
+# The environment variable with the folder that the jobs of a sweep share.
+TRACES = "CADAM3D_TRACES"
 
 
 def default_cache_dir() -> Path:

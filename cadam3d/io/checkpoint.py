@@ -15,7 +15,8 @@ from cadam3d.io.atomic import remove_leftovers, replacing
 from cadam3d.io.run_folder import CHECKPOINT_PATTERN, checkpoint_name
 
 FORMAT = "cadam3d-checkpoint"
-VERSION = 1  # raise it when old payloads can no longer be understood
+# This number increases when old payloads can no longer be read.
+VERSION = 1
 
 
 def save_checkpoint(path: Path, payload: Mapping[str, Any]) -> None:
@@ -25,7 +26,8 @@ def save_checkpoint(path: Path, payload: Mapping[str, Any]) -> None:
     refuse, because the error is better raised now than when the run is resumed.
     """
     content = {"format": FORMAT, "version": VERSION, "payload": _plain(payload)}
-    buffer = io.BytesIO()  # a full disk would otherwise surface as an error inside torch's archive writer
+    # Written to memory first, because a full disk would cause an obscure error in torch's archive writer.
+    buffer = io.BytesIO()
     torch.save(content, buffer)
     with replacing(path) as temporary:
         temporary.write_bytes(buffer.getbuffer())
@@ -65,7 +67,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 def latest_checkpoint(folder: Path) -> Path | None:
     """Return the newest sound checkpoint in ``folder``; None if the folder has no checkpoint at all.
 
-    Raises ``UserError`` if there are files but none is sound: to start over silently would hide the loss.
+    Raises ``UserError`` if all files are damaged, because starting again silently would hide the loss.
     """
     paths = sorted(folder.glob(CHECKPOINT_PATTERN), reverse=True)
     problem: UserError | None = None
@@ -100,7 +102,8 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Tensor):
         tensor = value.detach().cpu().contiguous()
         is_view = tensor.untyped_storage().nbytes() != tensor.nbytes
-        return tensor.clone() if is_view else tensor  # torch saves the whole storage of a view
+        # Torch would save the whole storage of a view.
+        return tensor.clone() if is_view else tensor
     if isinstance(value, Mapping):
         return {_plain_key(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""Converts between the axes of the world and those of files.
+"""Conversion between the axes of the world and those of files.
 
 The world is +z up with the front at +x, but viewers of 3DGS files expect -y up. Every choice of axes here is
 a signed permutation that moves the front (+x) to +z of the file, where viewers put their first camera. Two
@@ -32,7 +32,7 @@ AXES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "+z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),  # the world, Blender
 }
 UPS = tuple(AXES)
-TURNS = (0, 90, 180, 270)  # degrees; only quarter turns permute axes
+TURNS = (0, 90, 180, 270)  # degrees
 
 
 def world_to_file(gaussians: Gaussians, up: str) -> Gaussians:
@@ -108,7 +108,8 @@ def _rotate_band(band: Float[Tensor, "n b 3"], permute, axes: Float[Tensor, "3 3
     size = band.shape[1]
     if size == 1:
         return band
-    if size == 3:  # basis (-y, z, -x): the colour's gradient direction is the vector (-c2, -c0, c1)
+    # The basis of band 1 is (-y, z, -x), so the colour increases along the vector (-c2, -c0, c1).
+    if size == 3:
         vector = torch.stack([-band[:, 2], -band[:, 0], band[:, 1]], dim=1)
         x, y, z = torch.stack([permute(vector[..., channel]) for channel in range(3)], dim=-1).unbind(1)
         return torch.stack([-y, z, -x], dim=1)
@@ -125,7 +126,8 @@ def band_matrix(degree: int, rotation: tuple[float, ...]) -> Float[Tensor, "b b"
     fit is exact, because rotations do not mix bands.
     """
     matrix = torch.tensor(rotation, dtype=torch.float64).reshape(3, 3)
-    generator = torch.Generator().manual_seed(0)  # any directions work; these are always the same
+    # Any directions work. A fixed seed makes them always the same.
+    generator = torch.Generator().manual_seed(0)
     directions = torch.randn(64, 3, dtype=torch.float64, generator=generator)
     directions = torch.nn.functional.normalize(directions, dim=1)
     band = slice(degree**2, (degree + 1) ** 2)

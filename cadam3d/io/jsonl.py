@@ -13,14 +13,14 @@ from cadam3d.io.atomic import replacing
 def append_jsonl(path: Path, line: Mapping[str, Any]) -> None:
     """Append one object as one line and flush it to the operating system, so that it survives ``kill -9``.
 
-    NaN and infinities become null. A last line that an earlier kill has cut is closed first. Raises
-    ``UserError`` if the file cannot be written.
+    NaN and infinities become null. If a kill has cut the last line of the file, that line is closed first.
+    Raises ``UserError`` if the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a+b") as file:
             is_cut = file.tell() > 0 and _last_byte(file) != b"\n"
-            # With a single write call, a kill can only cut the tail, which the reader notices.
+            # With a single write call, a kill can only cut off the end, which the reader detects.
             file.write(b"\n" * is_cut + to_json(line).encode() + b"\n")
             file.flush()
     except OSError as error:
@@ -31,7 +31,7 @@ def append_jsonl(path: Path, line: Mapping[str, Any]) -> None:
 def read_jsonl(path: Path) -> list[dict[str, Any]]:
     """Return all objects of a log, oldest first; [] if there is no file yet.
 
-    Lines that a kill has cut are left out: the readable ones are worth more than a complaint about the rest.
+    Lines that a kill has cut are left out without an error, so that the others can be used.
     """
     if not path.is_file():
         return []

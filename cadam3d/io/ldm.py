@@ -1,4 +1,4 @@
-"""Reads networks with the names of the latent diffusion code (Rombach et al. 2022) into classes of diffusers.
+"""Networks with the tensor names of latent diffusion (Rombach et al. 2022), read into classes of diffusers.
 
 Files of this kind contain tensors but no configuration. The configuration follows from the shapes of the
 tensors. Everything else is constant in the family of Stable Diffusion 2, the only one that is supported.

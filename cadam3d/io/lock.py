@@ -1,7 +1,8 @@
-"""Lock: keep a second process away from a folder, on file systems and machines that offer file locks.
+"""Lock: keep a second process away from a folder, on systems with file locks.
 
-A lock belongs to an open file and ends with it, however its process ends. On Linux and macOS a child process
-that inherits the open file holds the lock too. Windows does not pass locks on to children.
+A lock belongs to an open file and is released when the file is closed, however its process ends. On Linux and
+macOS a child process that inherits the open file holds the lock too. Windows does not pass locks on to
+children.
 """
 
 from typing import IO
@@ -16,14 +17,15 @@ except ImportError:  # Windows
 def try_lock(file: IO[str]) -> bool:
     """Lock an open file without waiting. Return False if another process holds its lock.
 
-    A file system without locks answers with an error. Work goes on there without protection.
+    On a file system without locks this returns True, so the work continues without protection.
     """
     try:
         if fcntl is not None:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         else:
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
-    except (BlockingIOError, PermissionError):  # the latter is what Windows answers
+    # Windows raises PermissionError.
+    except (BlockingIOError, PermissionError):
         return False
     except OSError:
         pass
@@ -31,7 +33,7 @@ def try_lock(file: IO[str]) -> bool:
 
 
 def unlock(file: IO[str]) -> None:
-    """Release the lock of an open file, also if a child process has inherited the file."""
+    """Release the lock of an open file, even if a child process has inherited the file."""
     try:
         if fcntl is not None:
             fcntl.flock(file, fcntl.LOCK_UN)

@@ -6,8 +6,8 @@ scales, and quaternions wxyz of any length. There are ``r = (degree + 1)^2 - 1``
 channel, stored channel-major (all of red, then green, then blue). Normals are zeros.
 
 A comment line records the axes, so that files of this project are read back into world axes automatically.
-Reading a file that was written here gives the same bits. The exception are SH bands 2 and 3 in axes other
-than ``+z`` (see ``frames.py``), which are rounded to float32 once when writing and once when reading.
+Reading a file that was written here gives the same bits. The only exceptions are SH bands 2 and 3 in axes
+other than ``+z`` (see ``frames.py``), which are rounded to float32 once when writing and once when reading.
 """
 
 import re
@@ -37,8 +37,8 @@ COLUMNS = {
 # No reader uses the normals, but readers with a fixed record size expect them.
 NORMALS = ["nx", "ny", "nz"]
 SH0 = ["f_dc_0", "f_dc_1", "f_dc_2"]
-# Properties that only Gaussians have, never mere points.
-SIGNS = {"f_dc_0", "scale_0", "rot_0", "packed_position"}
+# Properties that Gaussians have and plain points do not have.
+GAUSSIANS_ONLY = {"f_dc_0", "scale_0", "rot_0", "packed_position"}
 REST_SIZES = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_DEGREE + 1)]
 MAX_HEADER_BYTES = 1 << 16
 NUMPY_TYPES = {
@@ -86,8 +86,8 @@ def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
     """Read Gaussians into world axes, on the CPU, as float32.
 
     Properties are found by name, so their order, additional ones and missing normals do not matter. ``up`` is
-    the up axis of files that do not record it; files of this project do. Raises ``UserError``, which names
-    the problem, if ``path`` is not such a file.
+    the up axis of files that do not record it; files of this project do. Raises ``UserError`` if ``path`` is
+    not such a file.
     """
     require_choice("up", up, UPS)
     try:
@@ -118,7 +118,7 @@ def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
 
 
 def holds_gaussians(path: Path) -> bool:
-    """Return whether a PLY file has properties of Gaussians, complete or not, rather than of mere points.
+    """Return whether a PLY file has properties of Gaussians, complete or not, rather than of plain points.
 
     Raises ``UserError`` if ``path`` is not a PLY file.
     """
@@ -127,13 +127,7 @@ def holds_gaussians(path: Path) -> bool:
             words = [line for line in _header_lines(path, file) if line[0] == "property"]
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror or error}). Try: another file") from error
-    return not SIGNS.isdisjoint(line[-1] for line in words)
-
-
-def ply_bytes(num_gaussians: int, sh_degree: int) -> int:
-    """Return the size of a file of :func:`write_ply`: its header and ``4 (17 + rest)`` bytes per Gaussian."""
-    rest_size = REST_SIZES[sh_degree]
-    return len(_header(num_gaussians, rest_size, UPS[0])) + num_gaussians * 4 * len(_names(rest_size))
+    return not GAUSSIANS_ONLY.isdisjoint(line[-1] for line in words)
 
 
 def _names(rest_size: int) -> list[str]:
@@ -180,16 +174,16 @@ def _parse_header(path: Path, file: BinaryIO) -> _Header:
             case ["property", kind, name] if elements and kind in NUMPY_TYPES:
                 elements[-1][2].append((name, NUMPY_TYPES[kind]))
             case ["property", "list", *_] if elements and any(e[0] == "vertex" for e in elements[:-1]):
-                pass  # faces and the like after the vertices are never read
+                pass  # faces after the vertices are never read
             case ["comment" | "obj_info", *_]:
                 pass
             case _:
-                raise UserError(f"{path}: not a Gaussian ply: cannot read header line {' '.join(words)!r}")
+                raise _unusable(path, f"not a Gaussian ply: cannot read header line {' '.join(words)!r}")
     for name, count, properties in elements:
         if name == "vertex":
             return _vertex_header(path, skip_bytes, count, properties, up)
         skip_bytes += count * sum(np.dtype(kind).itemsize for _, kind in properties)
-    raise UserError(f"{path}: not a Gaussian ply: it has no vertices")
+    raise _unusable(path, "not a Gaussian ply: it has no vertices")
 
 
 def _require_format(path: Path, version: str) -> None:
@@ -206,7 +200,7 @@ def _require_format(path: Path, version: str) -> None:
 
 def _require_up(path: Path, up: str) -> str:
     if up not in UPS:
-        raise UserError(f"{path}: expected up={'|'.join(UPS)} in the header, got up={up}")
+        raise _unusable(path, f"expected up={'|'.join(UPS)} in the header, got up={up}")
     return up
 
 
@@ -214,7 +208,7 @@ def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:
     """Yield the words of each line between ``ply`` and ``end_header``."""
     line = file.readline(MAX_HEADER_BYTES)
     if line.strip() != b"ply":
-        raise UserError(f"{path}: not a ply file: it begins with {line[:16]!r}")
+        raise _unusable(path, f"not a ply file: it begins with {line[:16]!r}")
     while file.tell() < MAX_HEADER_BYTES:
         line = file.readline(MAX_HEADER_BYTES)
         if not line.endswith(b"\n"):
@@ -224,7 +218,7 @@ def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:
             return
         if words:
             yield words
-    raise UserError(f"{path}: truncated: the header has no end")
+    raise _unusable(path, "truncated: the header has no end")
 
 
 def _vertex_header(
@@ -234,19 +228,23 @@ def _vertex_header(
     wanted = [*COLUMNS["means"], *SH0, *_names(0)[-8:]]
     missing = [name for name in wanted if name not in names]
     if missing:
-        raise UserError(
-            f"{path}: not a Gaussian ply: properties missing: {', '.join(missing)}"
-            + (" (a compressed ply: decompress it first)" if "packed_position" in names else "")
-        )
+        compressed = " (a compressed ply: decompress it first)" if "packed_position" in names else ""
+        raise _unusable(path, f"not a Gaussian ply: properties missing: {', '.join(missing)}{compressed}")
     if len(set(names)) < len(names):
-        raise UserError(f"{path}: not a Gaussian ply: a property appears twice")
+        raise _unusable(path, "not a Gaussian ply: a property appears twice")
     rest_size = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
     if rest_size not in REST_SIZES or any(f"f_rest_{i}" not in names for i in range(rest_size)):
-        raise UserError(
-            f"{path}: not a Gaussian ply: expected f_rest_0.. for SH degree 0 to {MAX_DEGREE} "
-            f"({', '.join(map(str, REST_SIZES))} of them), got {rest_size}"
+        sizes = ", ".join(map(str, REST_SIZES))
+        raise _unusable(
+            path,
+            f"not a Gaussian ply: expected f_rest_0.. for SH degree 0 to {MAX_DEGREE} ({sizes} of them), "
+            f"got {rest_size}",
         )
     return _Header(skip_bytes, count, np.dtype(properties), rest_size, up)
+
+
+def _unusable(path: Path, problem: str) -> UserError:
+    return UserError(f"{path}: {problem}. Try: another file")
 
 
 def _read_rows(path: Path, file: BinaryIO, header: _Header) -> np.ndarray:
@@ -254,8 +252,7 @@ def _read_rows(path: Path, file: BinaryIO, header: _Header) -> np.ndarray:
     available = max(file.seek(0, 2) - start, 0)
     whole = available // header.record.itemsize
     if whole < header.count:
-        raise UserError(
-            f"{path}: truncated: the header promises {header.count} Gaussians, the file holds {whole}"
-        )
+        problem = f"truncated: the header promises {header.count} Gaussians, the file holds {whole}"
+        raise _unusable(path, problem)
     file.seek(start)
     return np.frombuffer(file.read(header.count * header.record.itemsize), dtype=header.record)

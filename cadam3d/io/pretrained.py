@@ -28,10 +28,10 @@ class Source:
     """The places to search for a model. ``key`` is their node in the configuration, for messages."""
 
     key: str  # such as "prior"
-    path: str | None  # folder on this machine; takes precedence over ``ids``
-    ids: Sequence[str]  # names on the Hugging Face hub, tried in order
-    revision: str | None  # branch, tag or commit on the hub; None: the newest
-    variant: str | None  # of the weight files, such as "fp16"
+    path: str | None  # a folder
+    ids: Sequence[str]  # on the Hugging Face hub
+    revision: str | None  # on the hub
+    variant: str | None  # of the weight files
 
     def __post_init__(self) -> None:
         key = self.key
@@ -108,7 +108,7 @@ class Pretrained:
     """A model that was found. :meth:`part` loads its parts."""
 
     source: Source
-    where: str  # the folder, or the id on the hub
+    where: str  # a folder, or an id on the hub
     revision: str | None
     file: Path  # the index on this disk
     index: dict[str, Any]
@@ -176,7 +176,7 @@ class Pretrained:
     def identity(self) -> str:
         """Return a text that changes with the model: names, sizes and times of files, or the hub's commit."""
         if not Path(self.where).is_dir():
-            # The name of a snapshot folder is its commit.
+            # In the cache of the hub, the name of a snapshot folder is its commit.
             return f"{self.where}@{self.file.resolve().parent.name}"
         files = sorted(path for path in Path(self.where).rglob("*") if path.is_file())
         facts = [(str(f.relative_to(self.where)), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
@@ -234,7 +234,7 @@ def _read_index(key: str, file: Path) -> dict[str, Any]:
 
 
 def _fetch_index(name: str, revision: str | None, can_ask: bool) -> tuple[Path | None, str, bool]:
-    """Return the index of a model on the hub, or why there is none, and whether to ask the hub again."""
+    """Return the index of a model on the hub, or None and the reason, and whether to ask the hub again."""
     from huggingface_hub import constants, hf_hub_download, utils
     from huggingface_hub.errors import (
         EntryNotFoundError,
@@ -262,7 +262,8 @@ def _fetch_index(name: str, revision: str | None, can_ask: bool) -> tuple[Path |
         reason = (
             f"not on this disk, and {'HF_HUB_OFFLINE is set' if offline else 'the hub cannot be reached'}"
         )
-        can_ask = False  # every further request would take as long
+        # Every further request would take as long.
+        can_ask = False
     except EntryNotFoundError:
         reason = f"has no {INDEX}: not in the layout of diffusers"
     except (HfHubHTTPError, OSError) as error:

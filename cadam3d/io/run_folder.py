@@ -1,6 +1,6 @@
-"""Run folder: the names of the files in the folder of a run or a sweep, and what they say about it.
+"""Run folder: the names of the files in the folder of a run or a sweep, and functions that inspect it.
 
-No other module spells these names. This one does not load torch, so that a sweep is planned quickly.
+No other module spells these names. This module does not import torch, so that a sweep is planned quickly.
 """
 
 import tempfile
@@ -34,18 +34,20 @@ REPORT = "report.html"
 # Written by a sweep, into its own folder.
 FIGURES = "figures"  # a folder
 JOBS = "jobs.json"
-STOP = ".stop"  # while it exists, running jobs save and end, and no other job starts
+# While this file exists, running jobs save and end, and no other job starts.
+STOP = ".stop"
 TABLE = "sweep.csv"
-SHARED = "traces"  # a folder that the jobs share while the sweep runs
+SHARED = "traces"  # a folder, removed after the sweep
 
 # Written by a sweep, into the folder of each job.
 CONSOLE = "console.txt"
-ENDED = "job.json"  # exit code and seconds of a process that has ended
+ENDED = "job.json"  # exit code and seconds
 
 # In the folder of a sweep and of each of its jobs.
 LOCK = ".lock"  # held by the process that works there
 
-CHECKPOINT_PATTERN = "step_*.pt"  # zero-padded step numbers: the newest file sorts last
+# The step numbers are zero-padded, so that the newest file sorts last.
+CHECKPOINT_PATTERN = "step_*.pt"
 
 
 def checkpoint_name(step: int) -> str:
@@ -75,8 +77,8 @@ def read_summary(run: Path) -> dict[str, Any]:
 def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:
     """Create a folder for results, check that it can be written, and return it.
 
-    ``is_chosen`` says that the user has named this very folder. Otherwise a name that is taken gets a number.
-    Raises ``UserError`` with the setting ``key`` if nothing can be written there.
+    ``is_chosen`` means that the user has named this folder. Otherwise a name that exists gets a number.
+    Raises ``UserError`` with the setting ``key`` if the folder cannot be written.
     """
     free = folder if is_chosen else numbered(folder, first=1)
     try:
@@ -99,6 +101,6 @@ def numbered(folder: Path, *, first: int = 2) -> Path:
 
 
 def shown(path: Path) -> Path:
-    """Return ``path`` as a user would type it: relative to the current folder if it is inside of it."""
+    """Return ``path`` as a user would type it: relative to the current folder if it is inside it."""
     path = path.resolve()
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

@@ -1,1 +1,1 @@
-"""Settings: the only code that knows Hydra and OmegaConf."""
+"""Settings: read command lines, compose the configuration, and print help about both."""

@@ -15,18 +15,20 @@ from cadam3d.settings.line import key_of
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
 NO_NAME_COMPLAINT = "Config group override must be a string or a list"
-LAUNCHERS = {  # the package of each option of hydra/launcher that Hydra itself lacks
+# The package of each option of hydra/launcher that Hydra itself lacks.
+LAUNCHERS = {
     "joblib": "hydra-joblib-launcher",
     "submitit_slurm": "hydra-submitit-launcher",
     "submitit_local": "hydra-submitit-launcher",
     "ray": "hydra-ray-launcher",
 }
-CHOICE = re.compile(r"\+?[a-z]\w*=(\w+|\[[\w,]*\])")  # of an option, or of a list of them
+# The choice of an option or of a list of options.
+CHOICE = re.compile(r"\+?[a-z]\w*=(\w+|\[[\w,]*\])")
 PROMPT_WORD = 'prompt="a red and yellow checkered torus"'
 
 
 class MissingValuesError(Exception):
-    """Settings that the user must give and has not given."""
+    """Required settings have no value."""
 
     def __init__(self, keys: Sequence[str]) -> None:
         super().__init__(", ".join(keys))
@@ -34,12 +36,12 @@ class MissingValuesError(Exception):
 
 
 class RefusedJobError(Exception):
-    """A job of a sweep that cannot be composed. The cause of this exception says why."""
+    """A job of a sweep cannot be composed. The reason is the ``__cause__`` of this exception."""
 
     def __init__(self, arm: str, overrides: Sequence[str]) -> None:
         super().__init__(arm)
-        self.arm = arm  # of the grid; "" without one
-        self.overrides = overrides  # of the job
+        self.arm = arm  # "" without a grid
+        self.overrides = overrides
 
 
 def did_you_mean(word: str, known: Sequence[str]) -> list[str]:
@@ -50,9 +52,9 @@ def did_you_mean(word: str, known: Sequence[str]) -> list[str]:
 
 
 def explain(error: BaseException, command: str, words: Sequence[str]) -> UserError | None:
-    """Return the message for an exception that ``cadam3d <command> <words>`` has met while composing.
+    """Return the message for an exception that was raised while composing ``cadam3d <command> <words>``.
 
-    Returns None for exceptions that neither Hydra nor OmegaConf raises: those are bugs.
+    Returns None for an exception that neither Hydra nor OmegaConf raises, because that is a bug.
     """
     reason: UserError | None = None
     match error:
@@ -61,7 +63,7 @@ def explain(error: BaseException, command: str, words: Sequence[str]) -> UserErr
         case RefusedJobError():
             reason = _job_refused(error, command, words)
         case MissingValuesError():
-            reason = _ask_for(error.keys, command, words)
+            reason = _missing_values(error.keys, command, words)
         case MissingConfigException():
             reason = _unknown_option(error)
         case OverrideParseException():
@@ -76,7 +78,7 @@ def explain(error: BaseException, command: str, words: Sequence[str]) -> UserErr
 
 
 def reraise_interrupt(error: BaseException) -> None:
-    """Raise ``KeyboardInterrupt`` if ``error`` only hides one, which the clean-up of OmegaConf can cause."""
+    """Raise ``KeyboardInterrupt`` if one caused ``error``; the clean-up of OmegaConf can hide it."""
     seen: BaseException | None = error
     while seen is not None:
         if isinstance(seen, KeyboardInterrupt):
@@ -93,17 +95,17 @@ def require_values(cfg: DictConfig) -> None:
 
 
 def _job_refused(error: RefusedJobError, command: str, words: Sequence[str]) -> UserError | None:
-    """Name the arm of the job. What the user must give is asked for once, in the line of the sweep."""
+    """Explain why a job is refused, with its arm. Missing values are reported for the line of the sweep."""
     cause = error.__cause__
     assert cause is not None, "this exception is always raised from another one"
     if isinstance(cause, MissingValuesError):
-        return _ask_for(cause.keys, command, words)
+        return _missing_values(cause.keys, command, words)
     reason = explain(cause, "train", error.overrides)
     return UserError(f"arm {error.arm}: {reason}") if reason and error.arm else reason
 
 
-def _ask_for(keys: Sequence[str], command: str, words: Sequence[str]) -> UserError:
-    """Ask for values that the user must give, in a line that keeps the rest of what was typed."""
+def _missing_values(keys: Sequence[str], command: str, words: Sequence[str]) -> UserError:
+    """Explain that required settings have no value, with a line that keeps the rest of what was typed."""
     kept = [shlex.quote(word) for word in words if key_of(word) not in keys]
     added = [PROMPT_WORD if key == "prompt" else f"{key}=..." for key in keys]
     line = " ".join(["cadam3d", command, *kept, *added])
@@ -111,14 +113,14 @@ def _ask_for(keys: Sequence[str], command: str, words: Sequence[str]) -> UserErr
 
 
 def _unresolved(error: InterpolationResolutionError, command: str) -> UserError:
-    """Explain that a value refers to something that does not exist."""
+    """Explain that a value refers to a setting that does not exist."""
     key = error.full_key or "a setting"
     reason = str(error).splitlines()[0]
     return UserError(f"{key}: {reason}. Try: a plain value; cadam3d {command} --cfg job lists the keys")
 
 
 def _reworded(error: Exception, command: str, words: Sequence[str]) -> UserError:
-    """Explain an exception that differs from others in its text only."""
+    """Explain an exception of which only the text shows what is wrong."""
     text = str(error).strip() or str(error.__cause__ or "")
     if key := re.search(r"Could not override '([^']+)'", text):
         return _unknown_key(key.group(1), command, words)
@@ -180,7 +182,7 @@ def _unknown_key(key: str, command: str, words: Sequence[str]) -> UserError:
 def _options_with(key: str) -> list[str]:
     """Return the options (such as ``densifier=cadam_open``) of the group of ``key`` that have its setting.
 
-    Left out are options that build on another one, and those that need a value from the user.
+    Options that build on another one are left out, and so are options with a required value.
     """
     group, _, name = key.partition(".")
     owners = []
@@ -194,7 +196,7 @@ def _options_with(key: str) -> list[str]:
 
 
 def _known_keys(wrong: str, command: str, words: Sequence[str]) -> list[str]:
-    """Return every key of the configuration, with the groups that the user has chosen if those compose."""
+    """Return every key of the configuration, with the options that the user has chosen if those compose."""
     choices = [word for word in words if CHOICE.fullmatch(word) and not word.startswith(f"{wrong}=")]
     for attempt in (choices, []):
         try:
@@ -215,7 +217,7 @@ def _unreadable(override: str, reason: str) -> UserError:
 
 
 def _several_values(override: str) -> UserError:
-    """Explain that several values belong to a sweep, or into brackets."""
+    """Explain that several values need a sweep, or brackets if they are one list."""
     key, _, value = override.partition("=")
     return UserError(
         f"{key}: several values make a sweep. Try: cadam3d sweep {shlex.quote(override)} ... "

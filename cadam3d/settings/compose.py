@@ -1,4 +1,4 @@
-"""Compose: where the numbers are, how a command line changes them, and how they become objects."""
+"""Compose: read the YAML files, apply the overrides of a command line, and build the objects."""
 
 import re
 import unicodedata
@@ -20,10 +20,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cadam3d.core.errors import UserError
 
-VERSION_BASE = "1.3"  # Hydra's behaviour is pinned to this version, whatever is installed
-WRONG_CALL = r"unexpected keyword|missing (?:a|\d+) required"  # in the words of Python
-TEXT_KEYS = ("prompt", "negative_prompt")  # always text, so the user need not quote them for Hydra
-SLUG_LENGTH = 60  # characters; of three bytes each they still fit into a file name
+# Hydra behaves like this version even if a newer one is installed.
+VERSION_BASE = "1.3"
+# Python's wording of the two kinds of wrong calls.
+WRONG_CALL = r"unexpected keyword|missing (?:a|\d+) required"
+# Values of these keys are always text, so the user need not quote them for Hydra.
+TEXT_KEYS = ("prompt", "negative_prompt")
+# Characters. At three bytes each they still fit into a file name.
+SLUG_LENGTH = 60
 
 
 def config_dir() -> Path:
@@ -53,7 +57,8 @@ def compose(
         if not own.is_dir():
             raise UserError(f"--config-dir: expected a folder, got {search_path!r}. Try: --config-dir=DIR")
         places.prepend("command-line", f"file://{own}", anchor=SearchPathQuery(provider="schema"))
-    outer = GlobalHydra.instance().hydra  # a command that runs inside Hydra may compose too
+    # A command that runs inside Hydra may compose too, so Hydra's global state is restored afterwards.
+    outer = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     version.setbase(VERSION_BASE)
     try:
@@ -91,7 +96,7 @@ def components(group: DictConfig) -> dict[str, Any]:
 
 
 def load(path: Path) -> DictConfig:
-    """Return the resolved ``config.yaml`` of a run. What looks like an interpolation in it is plain text."""
+    """Return the resolved ``config.yaml`` of a run. Text that looks like an interpolation stays text."""
     return DictConfig(_escaped(yaml.safe_load(path.read_text(encoding="utf-8"))))
 
 
@@ -113,7 +118,7 @@ def register_resolvers() -> None:
 
 
 def span(share: float, start: object, *ends: object) -> int:
-    """Return a share of the steps from ``start`` to the first of ``ends``, at least 1.
+    """Return a share of the steps from ``start`` to the smallest of ``ends``, at least 1.
 
     Returns 1 for non-integers; the component that owns the key reports the error.
     """
@@ -130,7 +135,7 @@ def slug(*parts: object) -> str:
 
 
 def escape(text: str) -> str:
-    """Return the text that OmegaConf reads as ``text``, even if that contains ``${``."""
+    """Return ``text`` in a form that OmegaConf reads literally, even if it contains ``${``."""
     return re.sub(r"(\\*)\$\{", lambda match: match.group(1) * 2 + r"\${", text)
 
 
@@ -145,7 +150,7 @@ def quote(text: str) -> str:
 
 
 def _construction_error(error: InstantiationException) -> BaseException:
-    """Return the cause of an error: ``UserError`` for a mistake in the configuration, a bug unchanged."""
+    """Return ``UserError`` for a mistake in the configuration, or else the exception of the constructor."""
     cause = error.__cause__
     key = re.search(r"full_key: (\S+)", str(error))
     where = key.group(1) if key else "configuration"

@@ -1,12 +1,12 @@
-"""Documentation: the words of the configuration, read from the comments in its YAML files.
+"""Documentation: read the descriptions of settings and options from the comments in the YAML files.
 
-The comment beside a key, or directly above it, says what the key means. The first comment of a file says
-what the option is. The help of the command line and ``docs/components.md`` are both made from what is read
-here, so there is no second copy that could disagree.
+The comment beside a key, or directly above it, describes the key. The first comment of a file describes the
+option. The help of the command line and ``docs/components.md`` are both generated from these descriptions,
+so there is no second copy that could disagree. In the code, ``words`` is the description of a key.
 
-A file that builds on another one (``defaults: [cadam, _self_]``) takes over its words, and a comment beside a
-key that it repeats is a note about the new value. A key without a comment has the words of the same key
-elsewhere in its group, in a component of the same class.
+A file that builds on another one (``defaults: [cadam, _self_]``) inherits its descriptions, and a comment
+beside a key that it repeats is a note about the new value. A key without a comment has the description of the
+same key in another component of the same class in its group.
 """
 
 import itertools
@@ -30,7 +30,7 @@ Value = Any  # text as YAML spells it (numbers, null and true too), or lists and
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """A key with its value and its meaning."""
+    """A key with its value and its description."""
 
     key: str  # as in a command line, such as "camera.fov_y_deg"
     # As YAML spells it, or the call that builds an object, such as "Linear(start=0.98, end=0.5, steps=500)".
@@ -41,10 +41,10 @@ class Setting:
 
 @dataclass(frozen=True, kw_only=True)
 class Option:
-    """An option that ``group=name`` chooses, or a command with the settings that are in no group."""
+    """An option that ``group=name`` chooses, or a command with its settings outside of all groups."""
 
     name: str
-    about: str  # paragraphs between empty lines; a line that begins with a blank is an example
+    about: str  # paragraphs between empty lines; a line that begins with a space is an example
     target: str  # the class, such as "cadam3d.camera.orbit.Orbit", or ""
     base: str  # the option of the same group that this one builds on, or ""
     settings: tuple[Setting, ...]
@@ -55,9 +55,9 @@ class Option:
 class Group:
     """A group of options as a command uses it."""
 
-    name: str  # such as "camera", or "initializer/fallback" for a group inside of a group
-    chosen: tuple[str, ...]  # by default
-    is_list: bool  # several options can be chosen at once
+    name: str  # such as "camera", or "initializer/fallback" for a group inside a group
+    chosen: tuple[str, ...]  # the default
+    is_list: bool  # several options can be chosen
     words: str
 
 
@@ -65,7 +65,7 @@ class Group:
 class Page:
     """One YAML file: its values as they are spelled, and the comments that belong to its keys."""
 
-    package: str  # where the settings go, if the first line of the file says so; else ""
+    package: str  # named in the first line; else ""
     about: str
     values: dict[str, Value]
     words: dict[str, str]  # by dotted key
@@ -74,7 +74,7 @@ class Page:
 
 
 class Library:
-    """All YAML files in some folders. If two folders have a file of the same name, the first one counts."""
+    """All YAML files in some folders. If two folders have a file of the same name, the first one is used."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         self.folders = folders
@@ -83,7 +83,7 @@ class Library:
 
     @cached_property
     def options(self) -> dict[str, list[str]]:
-        """The names of the options of each group, without the groups of Hydra itself."""
+        """Return the names of the options of each group, without the groups of Hydra itself."""
         names: dict[str, set[str]] = {}
         for folder in self.folders:
             for path in folder.glob("*/**/*.yaml"):
@@ -104,19 +104,19 @@ class Library:
         return self._pages[name]
 
     def summary(self, group: str, name: str) -> str:
-        """Return the first sentence of what an option is. This reads the top of its file only."""
+        """Return the first sentence of the description of an option. Only the top of its file is read."""
         return first_sentence(
             _header(self._find(f"{group}/{name}").read_text(encoding="utf-8").splitlines())[1]
         )
 
     def groups(self, command: str) -> list[Group]:
-        """Return the groups that a command uses, first those of the command that it builds on."""
+        """Return the groups that a command uses. Those of the command that it builds on come first."""
         page = self.page(command)
         inherited = [group for base in page.bases for group in self.groups(base)]
         return [*inherited, *(group for group in page.groups if group.name != "hydra")]
 
     def command(self, name: str) -> Option:
-        """Return a command with the settings that are in no group."""
+        """Return a command with its settings outside of all groups."""
         page = self.page(name)
         in_groups = {group.name for group in self.groups(name)} | {"hydra"}
         own = [each for each in settings_of(page.values, page.words) if _head(each.key) not in in_groups]
@@ -129,7 +129,7 @@ class Library:
     def option(self, group: str, name: str, command: str = "train") -> Option:
         """Return an option with all its settings, including those of the option that it builds on.
 
-        A recipe changes settings of other groups; their words are those that ``command`` has for them.
+        A recipe changes settings of other groups. Their descriptions are those that they have in ``command``.
         """
         page = self.page(f"{group}/{name}")
         values, words = self._resolved(group, name)
@@ -155,7 +155,7 @@ class Library:
         raise UserError(f"{name}.yaml: expected this file in {places}, got none. Try: cadam3d doctor")
 
     def _resolved(self, group: str, name: str) -> tuple[dict[str, Value], dict[str, str]]:
-        """Return values and words of an option, merged with those of the file that it builds on."""
+        """Return the values and descriptions of an option, merged with those of its base."""
         page = self.page(f"{group}/{name}")
         values, words = page.values, page.words
         for base in page.bases:
@@ -172,7 +172,7 @@ class Library:
         return values, words
 
     def _group_words(self, group: str) -> dict[tuple[str, str], str]:
-        """Return the words of the keys of objects in a group, by class and key; the first file counts."""
+        """Return the descriptions of keys in a group by class and key; the first file takes precedence."""
         if group not in self._words:
             places = [place for place in self.options if _head(place, "/") == group]
             pages = [self.page(f"{place}/{name}") for place in places for name in self.options[place]]
@@ -183,7 +183,7 @@ class Library:
         return self._words[group]
 
     def _recipe(self, page: Page, settings: Sequence[Setting], command: str) -> list[Setting]:
-        """Return what a recipe chooses and changes, each with the words of what it changes."""
+        """Return the options and settings that a recipe changes, with their descriptions."""
         groups = [group for group in page.groups if _head(group.name, "/") != "hydra"]
         chosen = {group.name: group.chosen for group in [*self.groups(command), *groups]}
         known = {each.key: each.words for each in self.command(command).settings}
@@ -231,7 +231,7 @@ def read_page(text: str) -> Page:
 def settings_of(values: dict[str, Value], words: Mapping[str, str], prefix: str = "") -> Iterator[Setting]:
     """Yield the settings in ``values`` in their order, with ``prefix`` before their keys.
 
-    The numbers of a schedule are part of its value. A group of keys is yielded if it has words.
+    The numbers of a schedule are part of its value. A group of keys is yielded only if it has a description.
     """
     for path, value, parent in _flat(values):
         is_class = isinstance(value, dict) and "_target_" in value
@@ -254,9 +254,11 @@ def first_sentence(about: str) -> str:
 
 @dataclass(frozen=True)
 class _Comment:
+    """A comment on one line of a file."""
+
     column: int
     text: str
-    is_beside: bool  # there is something else on its line
+    is_beside: bool  # follows a key or a value
 
 
 def _header(lines: Sequence[str]) -> tuple[str, str]:
@@ -269,7 +271,7 @@ def _header(lines: Sequence[str]) -> tuple[str, str]:
 
 
 def _flowing(lines: Iterable[str]) -> str:
-    """Join the lines of each paragraph. Lines that begin with a blank are examples and stay as they are."""
+    """Join the lines of each paragraph. Lines that begin with a space are examples and stay separate."""
     flowing = [""]
     for line in lines:
         if line and flowing[-1] and not line.startswith(" ") and not flowing[-1].startswith(" "):
@@ -289,7 +291,8 @@ def _entries(node: yaml.Node | None, prefix: str = "") -> Iterator[tuple[str, ya
 
 def _comments(lines: Sequence[str], root: yaml.Node | None) -> dict[int, _Comment]:
     """Return the comment of each line that has one."""
-    ends, covered = {}, set()  # where values end in their last line; lines that belong to a value to the end
+    ends: dict[int, int] = {}  # line to the column where its last value ends
+    covered: set[int] = set()  # lines inside a value
     for node in _leaves(root):
         start, end = node.start_mark, node.end_mark
         ends[end.line] = max(end.column, ends.get(end.line, 0))
@@ -304,7 +307,7 @@ def _comments(lines: Sequence[str], root: yaml.Node | None) -> dict[int, _Commen
 
 
 def _leaves(node: yaml.Node | None) -> Iterator[yaml.Node]:
-    """Yield every node of which the text has no comments inside: plain values and ``[...]`` or ``{...}``."""
+    """Yield every node whose text contains no comments: plain values and ``[...]`` or ``{...}``."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style:
         for item in node.value:
             for part in item if isinstance(item, tuple) else (item,):
@@ -314,12 +317,13 @@ def _leaves(node: yaml.Node | None) -> Iterator[yaml.Node]:
 
 
 def _words_of(key: yaml.Node, comments: Mapping[int, _Comment]) -> str:
-    """Return the words of a key: the comment directly above it, then the one beside it and below that."""
+    """Return the description of a key: the comment above it, then the one beside it and its further lines."""
     line, column = key.start_mark.line, key.start_mark.column
     above = []
     while (comment := comments.get(line - len(above) - 1)) and comment.column == column:
         above.insert(0, comment.text)
-    if len(above) == line:  # the first comment of the file says what the option is
+    # The first comment of the file describes the option.
+    if len(above) == line:
         above = []
     beside = []
     if (comment := comments.get(line)) and comment.is_beside:
@@ -335,7 +339,7 @@ def _words_of(key: yaml.Node, comments: Mapping[int, _Comment]) -> str:
 
 
 def _group(item: yaml.MappingNode, comments: Mapping[int, _Comment]) -> Group:
-    """Return the group that an entry in a list of defaults is about."""
+    """Return the group in an entry of a list of defaults."""
     key, value = item.value[0]
     plain = _plain(value)
     chosen = plain if isinstance(plain, list) else [] if plain == "null" else [plain]
@@ -364,14 +368,14 @@ def _plain(node: yaml.Node) -> Value:
 
 
 def _merged(base: Value, changes: Value) -> Value:
-    """Return ``base`` with ``changes``, as Hydra merges them: dicts by key, everything else as a whole."""
+    """Return ``base`` with ``changes``, as Hydra merges them: dicts key by key, other values as a whole."""
     if not isinstance(base, dict) or not isinstance(changes, dict):
         return changes
     return base | {key: _merged(base.get(key), value) for key, value in changes.items()}
 
 
 def _with_note(meaning: str, note: str) -> str:
-    """Return the meaning of a key with a note about its value; a note that repeats it is left out."""
+    """Return the description of a key with a note about its value; a repetition is left out."""
     if not meaning or not note or note in meaning:
         return meaning or note
     return f"{meaning.removesuffix('.')}. Here: {note}"
@@ -386,7 +390,7 @@ def _flat(values: dict[str, Value], prefix: str = "") -> Iterator[tuple[str, Val
 
 
 def _keys_by_class(values: dict[str, Value]) -> Iterator[tuple[str, str]]:
-    """Yield the dotted keys of every object but schedules, each with the class of the object."""
+    """Yield the dotted keys of all objects except schedules, each with the class of its object."""
     for path, _, parent in _flat(values):
         target = parent.get("_target_", SCHEDULES)
         if not target.startswith(SCHEDULES):
@@ -394,7 +398,7 @@ def _keys_by_class(values: dict[str, Value]) -> Iterator[tuple[str, str]]:
 
 
 def _words_by_class(values: dict[str, Value], words: Mapping[str, str]) -> dict[tuple[str, str], str]:
-    """Return the words of the keys of objects, by class and key; the first key with words counts."""
+    """Return the descriptions of the keys of objects, by class and key; the first one takes precedence."""
     known: dict[tuple[str, str], str] = {}
     for key, target in _keys_by_class(values):
         if key in words:
@@ -403,7 +407,7 @@ def _words_by_class(values: dict[str, Value], words: Mapping[str, str]) -> dict[
 
 
 def _spelled(value: Value) -> str:
-    """Return a value as a command line spells it, or what builds an object."""
+    """Return a value as a command line spells it, or the call that builds an object."""
     if isinstance(value, list):
         return f"[{','.join(map(_spelled, value))}]"
     if not isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Help page: what ``cadam3d COMMAND --help`` prints, made from the words of the configuration.
+"""Help page: the output of ``cadam3d COMMAND --help``, generated from the comments in the YAML files.
 
 Nothing is composed and torch is not imported, so the page appears at once.
 """
@@ -15,13 +15,14 @@ from cadam3d.settings.advice import did_you_mean
 from cadam3d.settings.compose import config_dir
 from cadam3d.settings.documentation import Group, Library, Setting
 
-NARROWEST, WIDEST = 60, 120  # characters per line, whatever the terminal has
-FIRST_COLUMN = 34  # characters; if the first column needs more, its words begin on the next line
+NARROWEST, WIDEST = 60, 120  # characters per line
+# Characters. The description of a longer key begins on the next line.
+FIRST_COLUMN = 34
 NAME = re.compile(r"\w+")
 
 
 def help_text(command: str, overrides: Sequence[str], options: Namespace) -> str:
-    """Return the help of a command, or of what the overrides choose, such as ``camera=orbit``.
+    """Return the help of a command, or of the options that the overrides choose, such as ``camera=orbit``.
 
     A word without ``=`` that names a group lists its options; overrides of single settings are ignored.
     ``options`` are the flags of the line, of which ``--config-path`` and ``--config-dir`` name folders of
@@ -47,7 +48,7 @@ def help_text(command: str, overrides: Sequence[str], options: Namespace) -> str
 
 
 def _groups(library: Library, command: str) -> Iterator[Group]:
-    """Yield the groups of a command that have options, each followed by the groups inside of it."""
+    """Yield the groups of a command that have options, each followed by the groups inside it."""
     for group in library.groups(command):
         if group.name in library.options:
             yield group
@@ -61,7 +62,7 @@ def _groups(library: Library, command: str) -> Iterator[Group]:
 
 
 def _overview(library: Library, command: str, config_name: str, groups: dict[str, Group], width: int) -> str:
-    """Return what a command is for, its settings, and its groups with their options."""
+    """Return the purpose of a command, its settings, and its groups with their options."""
     about = library.command(config_name)
     parts = [_paragraphs(about.about, width)]
     if about.settings:
@@ -78,7 +79,7 @@ def _overview(library: Library, command: str, config_name: str, groups: dict[str
 
 
 def _group(library: Library, group: Group, width: int) -> str:
-    """Return a group with one line for each option."""
+    """Return the text for a group, with one line for each option."""
     names = library.options[group.name]
     rows = [
         (("* " if name in group.chosen else "  ") + name, library.summary(group.name, name)) for name in names
@@ -90,7 +91,7 @@ def _group(library: Library, group: Group, width: int) -> str:
 
 
 def _option(library: Library, command: str, group: str, name: str, width: int) -> str:
-    """Return an option with all its settings. Raises ``UserError`` if there is no such option."""
+    """Return the text for an option and its settings. Raises ``UserError`` if there is no such option."""
     if name not in library.options[group]:
         names = library.options[group]
         best = (did_you_mean(name, names) or names)[0]
@@ -110,7 +111,7 @@ def _option(library: Library, command: str, group: str, name: str, width: int) -
 
 
 def _settings(settings: Iterable[Setting], width: int) -> str:
-    """Return one row for each setting, as a command line names it."""
+    """Return a table with one row for each setting, under the key of the command line."""
     rows = []
     for each in settings:
         sign = ": " if each.is_object and each.value else "" if each.is_object else "="
@@ -131,13 +132,13 @@ def _table(rows: Sequence[tuple[str, str]], width: int, *, narrow: bool = False)
 
 
 def _paragraphs(text: str, width: int) -> str:
-    """Wrap each line of a text; lines that begin with a blank stay as they are."""
+    """Wrap each line of a text, except those that begin with a space."""
     lines = text.splitlines()
     return "\n".join(line if line.startswith(" ") else textwrap.fill(line, width) for line in lines)
 
 
 def _hint(command: str, group: Group, width: int) -> str:
-    """Return where to read on."""
+    """Return a hint at the pages with more details."""
     example = group.chosen[0] if group.chosen else "NAME"
     text = (
         f"cadam3d {command} --help {group.name}={example} lists the settings of an option. "
@@ -147,7 +148,7 @@ def _hint(command: str, group: Group, width: int) -> str:
 
 
 def _no_group(command: str, word: str, groups: dict[str, Group]) -> UserError:
-    """Return the error for a word that names no group of the command."""
+    """Return the error for a word that is not a group of the command."""
     name = word.partition("=")[0].partition(".")[0]
     near = [name] if name in groups else did_you_mean(name, list(groups))
     if not groups:

@@ -1,4 +1,4 @@
-"""Hydra: read its flags, compose what a line asks for, and run a command as one of its jobs."""
+"""Hydra: read its flags, compose the configuration of a line, and run a command as one of its jobs."""
 
 import os
 import sys
@@ -24,13 +24,13 @@ Run = Callable[[DictConfig], Any]  # a command, given its composed configuration
 
 
 def read_flags(flags: Sequence[str]) -> Namespace:
-    """Parse the flags of a line. Raises ``UserError`` for unknown ones and for those that exclude another."""
+    """Parse the flags of a line. Raises ``UserError`` for unknown ones and for conflicting ones."""
     parser = get_args_parser()
     parser.error = _refuse_flags  # type: ignore[method-assign]
     options = parser.parse_args(list(flags))
     modes = [options.run, options.multirun and not options.cfg, bool(options.cfg), options.info is not None]
     if sum(map(bool, modes)) > 1:
-        raise UserError(f"{' '.join(flags)}: these flags exclude one another. Try: one of them")
+        raise UserError(f"{' '.join(flags)}: these flags cannot be combined. Try: only one of them")
     return options
 
 
@@ -45,8 +45,8 @@ def compose_line(config_name: str, overrides: Sequence[str], options: Namespace)
     )
 
 
-def refuse_holes(cfg: DictConfig, command: str, overrides: Sequence[str]) -> None:
-    """Refuse a line that removes a whole setting or refers to one that does not exist.
+def refuse_missing_settings(cfg: DictConfig, command: str, overrides: Sequence[str]) -> None:
+    """Refuse a line that removes a top-level setting or refers to a setting that does not exist.
 
     Raises ``UserError`` for the former and OmegaConf's ``InterpolationKeyError`` for the latter.
     """
@@ -59,9 +59,10 @@ def refuse_holes(cfg: DictConfig, command: str, overrides: Sequence[str]) -> Non
             )
     raw = OmegaConf.to_container(cfg, resolve=False)
     assert isinstance(raw, dict)
-    # A wrong value comes before the settings that refer to it.
+    # Plain values come first, so that the message names the wrong value and not a setting that refers to it.
     for key in sorted(raw, key=lambda key: isinstance(raw[key], dict)):
-        if key == "hydra" or "${" not in str(raw[key]):  # Hydra's node holds what only a running job knows
+        # Hydra's own node refers to values that exist only in a running job.
+        if key == "hydra" or "${" not in str(raw[key]):
             continue
         try:
             value = cfg[key]
@@ -69,8 +70,8 @@ def refuse_holes(cfg: DictConfig, command: str, overrides: Sequence[str]) -> Non
                 OmegaConf.to_container(value, resolve=True)
         except InterpolationKeyError:
             raise
-        except InterpolationResolutionError:  # such as ${hydra:...}, which only a running job can resolve
-            continue
+        except InterpolationResolutionError:
+            continue  # such as ${hydra:...}, which only a running job can resolve
 
 
 def place_run(cfg: DictConfig, folder: Path) -> None:
@@ -100,18 +101,20 @@ def run_composed(cfg: DictConfig, run: Run) -> None:
     )
     callbacks.on_run_end(config=cfg, config_name=name, job_return=job)
     if job.status is JobStatus.FAILED:
-        raise job._return_value  # the property of that name prints a line first
+        # The property ``return_value`` would print a line first.
+        raise job._return_value
 
 
 def run_hydra(command: str, arguments: Sequence[str], run: Run) -> None:
-    """Let Hydra itself read ``arguments`` with the YAML of ``command``: for its pages, or for many jobs.
+    """Run Hydra's main function on ``arguments`` and the YAML of ``command``, for a page or for many jobs.
 
     Raises Hydra's exceptions.
     """
     register_resolvers()
     arguments_before, switch_before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     sys.argv = [sys.argv[0], *arguments]
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra would print exceptions and exit
+    # Otherwise Hydra would print exceptions and exit.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         hydra_main(version_base=VERSION_BASE, config_path=str(config_dir()), config_name=command)(run)()
     finally:

@@ -1,4 +1,4 @@
-"""Line: the words after ``cadam3d COMMAND`` as text: overrides, flags, quoting, and resuming a run."""
+"""Line: read the words after ``cadam3d COMMAND``: overrides, flags, quoting, and resuming a run."""
 
 import re
 import shlex
@@ -15,14 +15,17 @@ from cadam3d.settings.compose import TEXT_KEYS, quote
 
 RUN_FOLDER = "hydra.run.dir"
 SWEEP_FOLDER = "hydra.sweep.dir"
-PATH_KEYS = (  # quoted if necessary; so is a text that may be null
+# Values of these keys are quoted if necessary: paths, and a text that may be null.
+PATH_KEYS = (
     *("run", "ply", "output", "resume", RUN_FOLDER, SWEEP_FOLDER),
     *("initializer.path", "initializer.prompt", "rasterizer.cache_dir"),
 )
-PLAIN_PATH = re.compile(r"[\w./+-]*", re.ASCII)  # to Hydra's grammar, which cannot read "~"
+# A path that Hydra's grammar reads without quotes. It cannot read "~".
+PLAIN_PATH = re.compile(r"[\w./+-]*", re.ASCII)
 QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
 SWEEP_CALL = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)", re.DOTALL)
-PIECE = re.compile(r"(?:[^,]|,(?=\s|$))*", re.DOTALL)  # up to a comma that no blank follows
+# The text up to a comma that is not followed by a space.
+PIECE = re.compile(r"(?:[^,]|,(?=\s|$))*", re.DOTALL)
 FLAGS_WITH_VALUE = (
     *("--cfg", "-c", "--package", "-p", "--info", "-i", "--experimental-rerun"),
     *("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
@@ -56,7 +59,7 @@ def text_of(override: str) -> str:
 def quoted(override: str, *, is_sweep: bool) -> str:
     """Quote a prompt or a path, so that commas, brackets, ``=`` or emoji in it are plain text to Hydra.
 
-    In a sweep, a comma before a blank belongs to the sentence and any other comma separates two prompts:
+    In a sweep, a comma before a space belongs to the sentence and any other comma separates two prompts:
     ``prompt="a corgi, front view,a cat"`` is two. Values that are quoted already, and calls such as
     ``choice(...)``, do not change.
     """
@@ -110,23 +113,24 @@ def resume_word(place: str | Path) -> str:
 
 
 def _entry(override: str) -> str:
-    """Return what an override is about: to remove a key (``~key``) and to give it a value are two entries."""
+    """Return the entry that an override changes. Removing a key (``~key``) and setting it are two entries."""
     return ("~" if override.startswith("~") else "") + key_of(override)
 
 
 def _merge(merged: dict[str, str], override: str) -> None:
-    """Add one more override to those of a run, in place. It replaces what it makes void."""
+    """Add one more override to those of a run, in place. Overrides that it cancels are removed."""
     entry, key = _entry(override), key_of(override)
     old = merged.get(key, "")
     if entry != key:  # ~key
         merged.pop(key, None)
-        if not old.startswith("+") or entry in merged:  # otherwise the key was an addition and is now gone
+        # If the run had added the key itself, dropping the addition is enough.
+        if not old.startswith("+") or entry in merged:
             merged[entry] = override
     elif override.startswith("+"):
         merged[key] = override
     else:
         if not old:
-            merged.pop(f"~{key}", None)  # the key is back
+            merged.pop(f"~{key}", None)
         merged[key] = old[: len(old) - len(old.lstrip("+"))] + override
 
 

@@ -1,1 +1,1 @@
-"""A sweep: many trains, each a process of its own, and one table. The folder remembers what is done."""
+"""Sweeps: many trainings, each in a separate process, and one table. The folder records their progress."""

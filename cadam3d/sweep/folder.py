@@ -1,6 +1,6 @@
 """The folder of a sweep: ``jobs.json`` lists its jobs, and the folder of each job shows its progress.
 
-Nothing is remembered elsewhere. Whatever way a sweep ends, its state is what can be read from the disk.
+No state is kept elsewhere. However a sweep ends, its state can be read from this folder.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,8 @@ from cadam3d.core.outcome import Outcome
 from cadam3d.io.jsonl import read_json, write_json
 from cadam3d.io.run_folder import JOBS, has_checkpoint, read_summary
 
-UNFINISHED = "unfinished"  # the outcome of a job that waits, runs, or has ended without a summary
+# The outcome of a job that waits, runs, or has ended without a summary.
+UNFINISHED = "unfinished"
 RESULTS = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.VANISHED, Outcome.OUT_OF_MEMORY)
 
 
@@ -21,21 +22,22 @@ RESULTS = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.VANISHED, Outcome.OU
 class PlannedJob:
     """A job that a sweep has to run."""
 
-    arm: str  # of the grid; "" without one
-    folder: str  # inside the sweep's
+    arm: str  # "" without a grid
+    folder: str  # relative to that of the sweep
     overrides: list[str]  # of ``cadam3d train``
-    swept: dict[str, Any]  # the values of the keys in which jobs of this sweep differ; always prompt and seed
+    # The prompt, the seed, and the values of all other keys in which jobs of this sweep differ.
+    swept: dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The content of ``jobs.json``: all that a worker has to know about a sweep."""
+    """The content of ``jobs.json``: everything that a worker needs to run a job of the sweep."""
 
-    cwd: str  # the folder in which the line was typed; its relative paths start there
+    cwd: str  # to which the paths in the line are relative
     flags: list[str]  # of every job, such as --config-dir
     threads: int | None  # OpenMP threads of a job; None: the default of its machine
     jobs: list[PlannedJob]
-    figures: list[str] | None = None  # of the report; None: all that the jobs have data for
+    figures: list[str] | None = None  # of the report; None: all for which there are data
     line: list[str] = field(default_factory=list)  # what was typed after ``cadam3d sweep``
 
 
@@ -48,16 +50,16 @@ class Row:
     folder: Path
     overrides: list[str]
     swept: dict[str, Any]
-    summary: dict[str, Any] = field(repr=False)  # {} where there is none yet
+    summary: dict[str, Any] = field(repr=False)  # {} if there is none yet
 
     @property
     def outcome(self) -> str:
-        """An :class:`~cadam3d.core.outcome.Outcome`, or ``unfinished``."""
+        """Return an :class:`~cadam3d.core.outcome.Outcome`, or ``unfinished``."""
         return self.summary.get("outcome", UNFINISHED)
 
     @property
     def has_result(self) -> bool:
-        """Return whether the job is done; running out of memory is a result, being killed is not."""
+        """Return whether the job is done. Lack of memory is a result; a kill or an interrupt is not."""
         return self.outcome in RESULTS and is_complete(self.summary)
 
     @property
@@ -69,14 +71,14 @@ class Row:
 def load(sweep: Path) -> list[Row]:
     """Return every job of the sweep in the folder ``sweep``, in order, with its results on disk now.
 
-    Tables and figures are made from this: ``row.folder`` is the folder of a run, and ``row.swept`` has the
-    values in which the jobs differ. Raises ``UserError`` if ``sweep`` is not the folder of a sweep.
+    Tables and figures are made from these rows. ``row.folder`` is the folder of a run, and ``row.swept`` has
+    the values in which the jobs differ. Raises ``UserError`` if ``sweep`` is not the folder of a sweep.
     """
     return rows_of(sweep, read_plan(sweep).jobs)
 
 
 def rows_of(sweep: Path, jobs: Sequence[PlannedJob]) -> list[Row]:
-    """Return the state of ``jobs`` on disk. They may never have run."""
+    """Return ``jobs`` with their results on disk. Jobs that have never started have an empty summary."""
     return [
         Row(
             number=number,
@@ -102,12 +104,12 @@ def read_plan(sweep: Path) -> Plan:
         return Plan(**{**content, "jobs": [PlannedJob(**job) for job in content["jobs"]]})
     except (TypeError, KeyError) as error:
         raise UserError(
-            f"{sweep / JOBS}: not the plan of a sweep ({error}). Try: the command of the sweep again"
+            f"{sweep / JOBS}: not the plan of a sweep ({error}). Try: run the command of the sweep again"
         ) from error
 
 
 def write_plan(sweep: Path, plan: Plan) -> None:
-    """Write ``jobs.json``."""
+    """Write ``jobs.json`` atomically."""
     write_json(sweep / JOBS, asdict(plan))
 
 

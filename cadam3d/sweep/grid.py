@@ -1,7 +1,8 @@
 """Grid: the list of jobs of a sweep, made from the arms of a grid and the settings in the command line.
 
 A comparison is a union of products, such as a baseline at eight thresholds beside one CAdam, each for the
-same prompts and seeds. A single product, which ``key=a,b`` in a line stands for, cannot express it.
+same prompts and seeds. Lists of values in a command line (``key=a,b``) are a single product and cannot
+express this.
 """
 
 import hashlib
@@ -19,9 +20,11 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import to_json
 from cadam3d.settings.compose import TEXT_KEYS, quote, slug
 
-IDENTIFIER = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)  # the same text to Hydra, quoted or not
+# Text that Hydra reads the same way with and without quotes, apart from the reserved words.
+IDENTIFIER = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)
 RESERVED = ("null", "true", "false", "nan", "inf")
-ALWAYS_SHOWN = ("prompt", "seed")  # in tables and in the names of folders
+# Keys that are shown in every table and count for the name of every folder.
+ALWAYS_SHOWN = ("prompt", "seed")
 EXAMPLE = "{each: {seed: [0, 1]}, arms: {mine: {densifier: cadam}}}"
 
 
@@ -31,21 +34,22 @@ class Setting:
 
     key: str  # without a leading + or ~
     line: str  # as it was written for Hydra
-    value: str  # as JSON: the same for every way to write it
+    value: str  # as JSON
 
     @property
     def text(self) -> str:
-        """The value for readers: text without quotes."""
+        """Return the value as it is shown to readers: text has no quotes."""
         return json.loads(self.value) if self.value.startswith('"') else self.value
 
     @property
     def identity(self) -> str:
-        """The same for every way to write this setting."""
+        """Return a text that is the same for every spelling of this setting."""
         head = self.line[: len(self.line) - len(self.line.lstrip("+~"))]
         return f"{head}{self.key}={self.value}"
 
 
-Axes = dict[str, list[Setting]]  # of each key, every job takes one
+# The settings of each key, of which every job takes one.
+Axes = dict[str, list[Setting]]
 
 
 @dataclass(frozen=True)
@@ -53,8 +57,8 @@ class Grid:
     """A named comparison. Every job takes one setting of each axis of ``each`` and of one arm."""
 
     each: Axes
-    arms: dict[str, Axes]  # at least one; "" is the arm of a sweep without a grid
-    figures: list[str] | None = None  # of its report; None: all that the jobs have data for
+    arms: dict[str, Axes]  # at least one; named "" without a grid
+    figures: list[str] | None = None  # of its report; None: all for which there are data
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ class Job:
     """One run of a sweep."""
 
     arm: str
-    name: str  # of its folder: the same whenever its arm and its settings are
+    name: str  # of its folder; depends only on its arm and its settings
     overrides: tuple[str, ...]  # of ``cadam3d train``
 
 
@@ -78,11 +82,11 @@ def read_grid(node: Any) -> Grid:
         return Grid(each={}, arms={"": {}})
     if not isinstance(node, dict) or not node or not node.keys() <= {"each", "arms", "figures"}:
         got = "|".join(map(str, node)) if isinstance(node, dict) else node
-        raise UserError(f"grid: expected each, arms and figures, got {got}. Try: a file that says {EXAMPLE}")
+        raise UserError(f"grid: expected each, arms and figures, got {got}. Try: a file with {EXAMPLE}")
     arms = node.get("arms")
     arms = {"": {}} if arms is None else arms
     if not isinstance(arms, dict) or not arms:
-        raise UserError(f"grid.arms: expected named arms, got {arms}. Try: a file that says {EXAMPLE}")
+        raise UserError(f"grid.arms: expected named arms, got {arms}. Try: a file with {EXAMPLE}")
     figures = node.get("figures")
     if figures is not None and not (isinstance(figures, list) and all(isinstance(f, str) for f in figures)):
         raise UserError(f"grid.figures: expected a list of names, got {figures}. Try: figures: [frontier]")
@@ -107,12 +111,12 @@ def read_line(overrides: Iterable[str]) -> Axes:
 
 
 def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) -> list[Job]:
-    """Return the jobs of all arms, each once: prompt by prompt and seed by seed, so comparisons fill evenly.
+    """Return the jobs of all arms, each once, so that all arms of one prompt and seed come before the next.
 
-    The line wins over the grid. A setting in the line goes to every arm that has such a setting, because
-    densifiers have different ones; ``has_setting(overrides of an arm, key)`` decides that. A setting that no
-    arm has stays in all jobs, so that Hydra refuses it. Raises ``UserError`` if the line makes two arms
-    equal.
+    The line takes precedence over the grid. A setting in the line applies to every arm that has such a
+    setting, because densifiers have different ones; ``has_setting(overrides of an arm, key)`` decides that. A
+    setting that no arm has stays in all jobs, so that Hydra refuses it. Raises ``UserError`` if the line
+    makes two arms equal.
     """
     common = {key: axis for key, axis in line.items() if key not in grid.each}
     common |= {key: line.get(key, axis) for key, axis in grid.each.items()}
@@ -217,11 +221,11 @@ def _foreign(
     """Return for each arm the keys of the line for which another arm has a setting and this one does not."""
     if len(arms) == 1:
         return {name: set() for name in arms}
-    asked = [key for key in line if key not in grid.each and not line[key][0].line.startswith(("+", "~"))]
+    common = [key for key in line if key not in grid.each and not line[key][0].line.startswith(("+", "~"))]
     missing: dict[str, set[str]] = {}
     for name, axes in arms.items():
-        base = [axis[0].line for key, axis in (grid.each | axes).items() if key not in asked]
-        missing[name] = {key for key in asked if key not in axes and not has_setting(base, key)}
+        base = [axis[0].line for key, axis in (grid.each | axes).items() if key not in common]
+        missing[name] = {key for key in common if key not in axes and not has_setting(base, key)}
     in_no_arm = set.intersection(*missing.values())
     return {name: keys - in_no_arm for name, keys in missing.items()}
 

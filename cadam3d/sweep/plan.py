@@ -1,4 +1,4 @@
-"""Plan: from a line to the jobs of a sweep. Each job is composed, so mistakes show before anything runs."""
+"""Plan: list the jobs of a sweep and compose each of them, so that mistakes show before anything runs."""
 
 import re
 from argparse import Namespace
@@ -15,14 +15,15 @@ from omegaconf.errors import InterpolationResolutionError
 from cadam3d.core.errors import UserError
 from cadam3d.settings.advice import RefusedJobError, require_values
 from cadam3d.settings.compose import flatten
-from cadam3d.settings.hydra import compose_line, refuse_holes
+from cadam3d.settings.hydra import compose_line, refuse_missing_settings
 from cadam3d.settings.line import SWEEP_FOLDER, key_of
 from cadam3d.sweep.grid import ALWAYS_SHOWN, Axes, Grid, Job, expand, read_grid, read_line, swept_keys
 
-PLAIN_KEY = re.compile(r"[A-Za-z_][\w.]*=")  # neither an addition nor a deletion nor a package
-OF_THE_LAUNCHER = re.compile(r"launcher($|\.)|hydra[./]launcher($|\.)")
-OF_THE_GRID = re.compile(r"grid($|\.)")
-NOT_FOR_SWEEPS = re.compile(r"hydra\.run\.dir$|hydra\.sweep\.subdir$|hydra[./]sweeper($|\.)")
+# An override that is neither an addition nor a deletion and names no package.
+PLAIN_KEY = re.compile(r"[A-Za-z_][\w.]*=")
+LAUNCHER_KEY = re.compile(r"launcher($|\.)|hydra[./]launcher($|\.)")
+GRID_KEY = re.compile(r"grid($|\.)")
+REFUSED_KEY = re.compile(r"hydra\.run\.dir$|hydra\.sweep\.subdir$|hydra[./]sweeper($|\.)")
 NOTHING_TO_SWEEP = (
     "sweep: nothing to sweep over. Try: cadam3d sweep grid=thresholds ... or densifier=baseline,cadam"
 )
@@ -30,7 +31,7 @@ NOTHING_TO_SWEEP = (
 
 @dataclass(frozen=True)
 class Parts:
-    """The overrides of a line by what they concern; a search path for YAML files concerns all of them."""
+    """The overrides of a line, sorted by what they change. A search path for YAML files applies to all."""
 
     grid: list[str]
     launcher: list[str]
@@ -40,9 +41,9 @@ class Parts:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep as a line asks for it."""
+    """A sweep that a line describes."""
 
-    cfg: DictConfig  # of the sweep itself: the grid, the launcher, Hydra's node
+    cfg: DictConfig  # the grid, the launcher, Hydra's node
     parts: Parts  # of the line
     grid: Grid
     axes: Axes  # of the line
@@ -50,7 +51,7 @@ class Sweep:
 
     @property
     def grid_name(self) -> str | None:
-        """Name of the grid in the line."""
+        """Return the name of the grid in the line; None without one."""
         return self.cfg.hydra.runtime.choices.get("grid")
 
 
@@ -60,7 +61,7 @@ class Composed:
 
     values: dict[str, Any]  # by dotted key
     choices: Mapping[str, Any]  # by group
-    unknown: set[str]  # keys whose value only the running job knows
+    unknown: set[str]  # keys with values that only a running job has
 
     def get(self, key: str) -> Any:
         """Return a value, or the option chosen of a group; None if the job has no such key."""
@@ -72,12 +73,12 @@ class Base:
     """A composed job from which other jobs differ in plain values only."""
 
     cfg: DictConfig
-    plain: dict[str, Any]  # leaves by dotted key
-    referring: list[str]  # keys of leaves that are interpolations
+    plain: dict[str, Any]  # by dotted key
+    referring: list[str]  # keys of interpolations
 
     @classmethod
     def of(cls, cfg: DictConfig) -> "Base":
-        """Sort the leaves of ``cfg``, apart from Hydra's own."""
+        """Return ``cfg`` with its values sorted into plain ones and interpolations, without Hydra's own."""
         raw = OmegaConf.to_container(cfg, resolve=False)
         assert isinstance(raw, dict)
         raw.pop("hydra", None)
@@ -104,10 +105,10 @@ class Base:
 
 
 class Composer:
-    """Composes ``cadam3d train`` with many lines quickly.
+    """Composes many lines of ``cadam3d train`` quickly.
 
-    One line takes Hydra a sixth of a second, and most jobs of a sweep differ in plain values only. Lines that
-    choose the same parts and set the same keys are therefore composed only once.
+    Hydra needs a sixth of a second for one line, and most jobs of a sweep differ in plain values only. Lines
+    that choose the same parts and set the same keys are therefore composed only once.
     """
 
     def __init__(self, options: Namespace, common: Sequence[str]) -> None:
@@ -129,7 +130,7 @@ class Composer:
         if known not in self._bases:
             base = self._base(overrides)
             require_values(base.cfg)
-            refuse_holes(base.cfg, "sweep", overrides)
+            refuse_missing_settings(base.cfg, "sweep", overrides)
             self._bases[known] = base
         return self._bases[known].composed(values)
 
@@ -146,12 +147,13 @@ class Composer:
 
 
 def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> tuple[Sweep, Composer]:
-    """Return the sweep that a line asks for, and what composes its jobs.
+    """Return the sweep that a line describes, and the composer of its jobs.
 
-    Raises ``UserError`` for a line that asks for no sweep or has settings that a sweep cannot have.
+    Raises ``UserError`` for a line with a single job or with settings that a sweep cannot have.
     """
-    parts = sort_out(overrides)
-    own = Namespace(**{**vars(options), "config_name": None})  # another name concerns the jobs
+    parts = sort_overrides(overrides)
+    # The flag --config-name is for the jobs and not for the sweep itself.
+    own = Namespace(**{**vars(options), "config_name": None})
     cfg = compose_line("sweep", [*parts.grid, *parts.launcher, *parts.folder], own)
     node = cfg.get("grid")
     grid = read_grid(None if node is None else OmegaConf.to_container(node, resolve=True))
@@ -163,20 +165,20 @@ def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> tu
     return Sweep(cfg=cfg, parts=parts, grid=grid, axes=axes, jobs=jobs), composer
 
 
-def sort_out(overrides: Sequence[str]) -> Parts:
-    """Separate the overrides of jobs from those of the sweep. Raises ``UserError`` for what fits neither."""
+def sort_overrides(overrides: Sequence[str]) -> Parts:
+    """Separate the overrides of jobs from those of the sweep. Raises ``UserError`` for keys of neither."""
     parts = Parts(grid=[], launcher=[], folder=[], jobs=[])
     for override in overrides:
         key = key_of(override)
-        if NOT_FOR_SWEEPS.match(key):
+        if REFUSED_KEY.match(key):
             raise UserError(
                 f"{key}: not for sweeps. Try: {SWEEP_FOLDER}=multirun/mine, the folder of all jobs"
             )
         if key == "hydra.mode":
             continue
-        if OF_THE_GRID.match(key):
+        if GRID_KEY.match(key):
             parts.grid.append(override)
-        elif OF_THE_LAUNCHER.match(key):
+        elif LAUNCHER_KEY.match(key):
             parts.launcher.append(override.lstrip("+") if key == "launcher" else override)
         elif key == SWEEP_FOLDER:
             parts.folder.append(override)

@@ -1,4 +1,4 @@
-"""Process: run one job of a sweep in a process of its own, so that whatever ends it ends nothing else.
+"""Process: run one job of a sweep in a separate process, so that a crash of the job ends nothing else.
 
 This module waits for the process, passes on the request to stop, and records how it ended. The process runs
 ``cadam3d train`` through ``cadam3d.job``, which ends it together with the sweep.
@@ -28,24 +28,22 @@ from cadam3d.sweep.folder import Plan, Row, is_complete, read_plan, rows_of
 
 POLL_SECONDS = 0.2
 IS_WINDOWS = sys.platform == "win32"
-STOPPED = (
-    128 + signal.SIGINT,
-    128 + signal.SIGTERM,
-    -signal.SIGINT,
-    -signal.SIGTERM,
-)  # exit codes on request
-# By one of these signals a launcher learns that it is about to be ended. Windows does not have them.
+# Exit codes of a process that was asked to stop.
+STOPPED = (128 + signal.SIGINT, 128 + signal.SIGTERM, -signal.SIGINT, -signal.SIGTERM)
+# Slurm sends one of these signals to a launcher shortly before it ends it. Windows does not have them.
 ANNOUNCING = tuple(getattr(signal, name) for name in ("SIGUSR1", "SIGUSR2") if hasattr(signal, name))
 KILL = getattr(signal, "SIGKILL", signal.SIGTERM)
-MESSAGE, TRACEBACK = "cadam3d: ", "Traceback (most recent call last)"  # how a reason begins
-TAIL = 20_000  # bytes at the end of the console in which the reason of a failure is looked for
+# The text with which the reason of a failure begins in the console.
+MESSAGE, TRACEBACK = "cadam3d: ", "Traceback (most recent call last)"
+# Bytes at the end of the console that are searched for it.
+TAIL = 20_000
 
 
 def run_job(sweep: Path, number: int) -> None:
     """Run job ``number`` of the sweep to its end, from its checkpoint if it has one.
 
-    Do nothing if the sweep is being stopped or the job has a result. If another process works on the job,
-    such as one that a killed sweep has left behind, wait until that has ended.
+    Do nothing if the sweep is being stopped or the job has a result. If another process runs the same job,
+    such as one that a killed sweep has left behind, wait until that process has ended.
     """
     plan, stop = read_plan(sweep), sweep / STOP
     _end_with_sweep()
@@ -54,40 +52,44 @@ def run_job(sweep: Path, number: int) -> None:
     folder = sweep / plan.jobs[number].folder
     folder.mkdir(parents=True, exist_ok=True)
     with _locked(folder, stop) as lock:
-        row = rows_of(sweep, plan.jobs)[number]  # only now: the last holder of the lock may have changed it
+        # The row is read under the lock, because the previous holder of the lock may have changed it.
+        row = rows_of(sweep, plan.jobs)[number]
         if lock is None or stop.exists() or row.has_result:
             return
         started = time.monotonic()
-        if not row.has_checkpoint:  # files of an earlier attempt would be mistaken for new ones
+        # Files of an earlier attempt would be mistaken for new ones.
+        if not row.has_checkpoint:
             _empty(folder)
         for name in (SUMMARY, ENDED):
             (folder / name).unlink(missing_ok=True)
         code = _wait(plan, row, stop, lock)
-        folder.mkdir(exist_ok=True)  # a run that was refused may have tidied up after itself
+        # A run that was refused may have removed its folder.
+        folder.mkdir(exist_ok=True)
         _record_outcome(folder, code)
         write_json(folder / ENDED, {"exit_code": code, "seconds": round(time.monotonic() - started, 2)})
 
 
 @contextmanager
 def _locked(folder: Path, stop: Path) -> Iterator[int | None]:
-    """Wait until no other process works on a job, and lock it; yield None if this process is to stop first.
+    """Wait until no other process runs the job, and lock its folder; yield None if a stop comes first.
 
     The process of the job inherits the lock, so the lock lasts as long as that process, even if this one is
     killed. (Windows does not pass on locks.)
     """
     with (folder / LOCK).open("w") as file:
         with _signals() as signals:
-            while not (is_ours := try_lock(file)) and not signals and not stop.exists():
+            while not (has_lock := try_lock(file)) and not signals and not stop.exists():
                 time.sleep(POLL_SECONDS)
         try:
-            yield file.fileno() if is_ours and not signals else None
+            yield file.fileno() if has_lock and not signals else None
         finally:
-            if is_ours:  # to close the file is not enough if the job has left a process behind
+            # Closing the file would not release the lock if the job has left a process behind.
+            if has_lock:
                 unlock(file)
 
 
 def _empty(folder: Path) -> None:
-    """Remove all but the lock: a process that waits for it must meet the same file under that name."""
+    """Remove everything except the lock file, which other processes may have open and wait for."""
     for path in folder.iterdir():
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -96,12 +98,13 @@ def _empty(folder: Path) -> None:
 
 
 def _wait(plan: Plan, row: Row, stop: Path, lock: int) -> int:
-    """Start the process, wait for it and return its exit code; minus the signal if one killed it."""
+    """Start the process, wait for it and return its exit code; minus the signal if one ended it."""
     words = [f"resume={quote(str(row.folder))}"] if row.has_checkpoint else row.overrides
     command = [sys.executable, "-m", "cadam3d.job", str(os.getpid()), "train", *words]
     command += [*plan.flags, f"{RUN_FOLDER}={quote(str(row.folder))}"]
     environment = dict(os.environ)
-    # Set here while Hydra is at work. In the job, a mistake of the user is to be a single message.
+    # Hydra's main function sets this in the process of the sweep. A job prints a mistake of the user without
+    # a traceback.
     environment.pop("HYDRA_FULL_ERROR", None)
     environment.setdefault(TRACES, str(stop.with_name(SHARED)))
     if plan.threads is not None:
@@ -114,7 +117,8 @@ def _wait(plan: Plan, row: Row, stop: Path, lock: int) -> int:
             stdin=subprocess.DEVNULL,
             stdout=console,
             stderr=subprocess.STDOUT,
-            start_new_session=True,  # else Ctrl-C would reach it twice, which means to stop at once
+            # Otherwise Ctrl-C would reach the job twice, and the second signal stops it at once.
+            start_new_session=True,
             pass_fds=() if IS_WINDOWS else (lock,),
         )
         is_asked = False
@@ -126,12 +130,13 @@ def _wait(plan: Plan, row: Row, stop: Path, lock: int) -> int:
                     _ask_to_stop(process)
                     is_asked = True
         finally:
-            process.kill()  # only an exception leaves it running
+            # This has an effect only if an exception has ended the loop.
+            process.kill()
             process.wait()
 
 
 def _ask_to_stop(process: subprocess.Popen) -> None:
-    """Let a job save and end. Windows cannot send it that signal: there the last checkpoint has to do."""
+    """Make a job save and end. On Windows it ends without saving and later continues from its checkpoint."""
     if IS_WINDOWS:
         process.terminate()
     else:
@@ -140,16 +145,17 @@ def _ask_to_stop(process: subprocess.Popen) -> None:
 
 @contextmanager
 def _signals() -> Iterator[list[int]]:
-    """Yield a list of the signals that arrive meanwhile, unless this process already handles them.
+    """Yield a list to which signals are added as they arrive, unless this process already handles them.
 
-    The process of a sweep handles them itself. A worker of a launcher ignores Ctrl-C from now on, because it
-    may come between two jobs; a SIGTERM is meant for the running job. The signal with which Slurm announces
-    the end of a job's time is for the launcher, which queues the job again: it gets it once the job has
-    saved.
+    The process of the sweep itself handles signals in ``start.py``. In a worker of a launcher, SIGTERM is
+    collected here for the running job. Ctrl-C is ignored from now on, even between two jobs, because the
+    process of the sweep handles it. The signal with which Slurm announces the end of a job's time is raised
+    again once the job has saved, because the launcher then queues the job again.
     """
     received: list[int] = []
-    is_ours = signal.getsignal(signal.SIGINT) in (signal.default_int_handler, signal.SIG_IGN, signal.SIG_DFL)
-    if not is_ours or threading.current_thread() is not threading.main_thread():
+    unhandled = (signal.default_int_handler, signal.SIG_IGN, signal.SIG_DFL)
+    is_handled = signal.getsignal(signal.SIGINT) not in unhandled
+    if is_handled or threading.current_thread() is not threading.main_thread():
         yield received
         return
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -168,7 +174,7 @@ def _signals() -> Iterator[list[int]]:
 
 
 def _record_outcome(folder: Path, code: int) -> None:
-    """Write into ``summary.json`` how the process ended, unless training itself has written all of it."""
+    """Write into ``summary.json`` how the process ended, unless training has written a complete summary."""
     summary = read_summary(folder)
     if is_complete(summary):
         return
@@ -178,7 +184,7 @@ def _record_outcome(folder: Path, code: int) -> None:
         outcome = Outcome.KILLED
         message = f"by {_signal_name(-code)}" + " (out of memory?)" * (code == -KILL)
     else:
-        outcome, message = Outcome.FAILED, _last_words(folder / CONSOLE) or f"exit code {code}"
+        outcome, message = Outcome.FAILED, _failure_reason(folder / CONSOLE) or f"exit code {code}"
     write_json(folder / SUMMARY, {**summary, "outcome": str(outcome), "message": message})
 
 
@@ -189,8 +195,8 @@ def _signal_name(number: int) -> str:
         return f"signal {number}"
 
 
-def _last_words(console: Path) -> str:
-    """Return why a process failed, in its own words: its message, or the last line of its traceback."""
+def _failure_reason(console: Path) -> str:
+    """Return why a process failed: its error message, or the last line of its traceback or its output."""
     with console.open("rb") as file:
         file.seek(max(0, console.stat().st_size - TAIL))
         lines = file.read().decode(errors="replace").split("\n")
@@ -205,8 +211,8 @@ def _last_words(console: Path) -> str:
 def _end_with_sweep() -> None:
     """End this process when the sweep ends, if it is a worker that the sweep itself has started (joblib).
 
-    Otherwise it would go on with the jobs it has been given. The sweep does not start the workers on Slurm
-    and Ray, and they may outlive it.
+    Otherwise it would continue with its remaining jobs. The workers of Slurm and Ray are not started by the
+    sweep and may continue after it has ended.
     """
     sweep = multiprocessing.parent_process()
     if sweep is None or sweep.pid is None or IS_WINDOWS:
@@ -214,15 +220,16 @@ def _end_with_sweep() -> None:
     end_with(os.getppid())
     try:
         os.kill(sweep.pid, 0)
-    except ProcessLookupError:  # the sweep has ended already, which the watch cannot notice
+    except ProcessLookupError:
+        # The sweep has ended already, so the parent process will not change any more.
         os.kill(os.getpid(), KILL)
 
 
-@cache  # one thread, however many jobs follow
+@cache  # starts one thread only
 def end_with(parent: int) -> None:
-    """End this process as soon as its parent process ends, so that a rerun of the sweep is alone at work.
+    """End this process as soon as its parent process ends, so that it does not disturb a rerun of the sweep.
 
-    Windows does not tell a process that its parent has ended, so this does nothing there.
+    This does nothing on Windows, where a process cannot detect the end of its parent.
     """
 
     def watch() -> None:

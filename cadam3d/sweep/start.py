@@ -1,4 +1,4 @@
-"""Start: from the line of a sweep to its table. Finished jobs are skipped; a launcher of Hydra runs the rest.
+"""Start: run a sweep. Finished jobs are skipped, a launcher of Hydra runs the others, and a table is written.
 
 The same line always has the same folder, so typing the line again continues the sweep.
 """
@@ -43,9 +43,11 @@ from cadam3d.sweep.plan import Composed, Sweep, compose_all, read_sweep, shown_k
 from cadam3d.sweep.table import as_text, write_table
 from cadam3d.sweep.watch import Watch
 
-PLACE = Path("multirun")
-LONGEST = 40  # jobs that a table in the terminal has at most
-FOR_JOBS = ("--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn")  # flags that jobs need too
+PARENT = Path("multirun")
+LONGEST = 40  # rows of a table in the terminal
+FOLDER_FLAGS = ("--config-dir", "-cd", "--config-path", "-cp")
+# The flags of a sweep that its jobs need too.
+JOB_FLAGS = (*FOLDER_FLAGS, "--config-name", "-cn")
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Ended:
     """A sweep that has ended."""
 
     folder: Path
-    code: int  # for the shell: 0 if every job has a result
+    code: int  # exit code; 0 if every job has a result
     was_stopped: bool  # by a signal
 
 
@@ -74,11 +76,11 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
         pending = [row for row in rows if not row.has_result]
         plan = Plan(
             cwd=str(Path.cwd()),
-            flags=_flags_of_jobs(flags),
+            flags=_flags_named(flags, JOB_FLAGS),
             threads=_threads(sweep.cfg, len(pending)),
             jobs=jobs,
             figures=sweep.grid.figures,
-            line=[*_flags_of_jobs(flags), *overrides],
+            line=[*_flags_named(flags, JOB_FLAGS), *overrides],
         )
         write_plan(folder, plan)
         done = len(rows) - len(pending)
@@ -98,7 +100,7 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
 
 
 class Stop:
-    """Handles SIGINT and SIGTERM: the first one asks all jobs, wherever they run, to save and end.
+    """Handles SIGINT and SIGTERM: after the first one, all jobs save and end, on whatever machine they run.
 
     The second one ends everything at once.
     """
@@ -114,22 +116,23 @@ class Stop:
         self.received = number
         self._mark.touch()
         print(
-            "\nStopping as soon as all running jobs have saved; once more to stop at once.", file=sys.stderr
+            "\nStopping as soon as all running jobs have saved; interrupt again to stop at once.",
+            file=sys.stderr,
         )
 
 
 def _folder(sweep: Sweep) -> Path:
     """Return the folder of the sweep, which may not exist yet."""
-    place = PLACE / sweep_name(sweep.grid_name, sweep.axes)
+    place = PARENT / sweep_name(sweep.grid_name, sweep.axes)
     if sweep.parts.folder:
         text = OmegaConf.select(sweep.cfg, SWEEP_FOLDER)
         if not text:
-            example = f"{SWEEP_FOLDER}={place}, or without it"
+            example = f"{SWEEP_FOLDER}={place}, or leave it out"
             raise UserError(f"{SWEEP_FOLDER}: expected a folder, got nothing. Try: {example}")
         place = Path(str(text)).expanduser()
     if holds_run(place):
         raise UserError(
-            f"{SWEEP_FOLDER}: {place} holds a run. Try: {SWEEP_FOLDER}=multirun/mine, or without it"
+            f"{SWEEP_FOLDER}: {place} holds a run. Try: {SWEEP_FOLDER}=multirun/mine, or leave it out"
         )
     return place.resolve()
 
@@ -148,7 +151,7 @@ def _planned(sweep: Sweep, composed: Sequence[Composed]) -> list[PlannedJob]:
 
 
 def _refuse_other_settings(folder: Path, rows: Sequence[Row], composed: Sequence[Composed]) -> None:
-    """Refuse results on disk that were made with other settings: the table would show wrong ones for them."""
+    """Refuse results on disk that were made with other settings, because the table would mislabel them."""
     for row, now in zip(rows, composed, strict=True):
         config = row.folder / CONFIG
         if not config.is_file() or not (row.has_result or row.has_checkpoint):
@@ -164,7 +167,8 @@ def _refuse_other_settings(folder: Path, rows: Sequence[Row], composed: Sequence
 
 
 def _read_yaml(path: Path) -> Any:
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the former is ten times as fast
+    # The loader in C is ten times as fast, but not every build of PyYAML has it.
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     return yaml.load(path.read_text(encoding="utf-8"), loader)
 
 
@@ -179,38 +183,39 @@ def _threads(cfg: DictConfig, pending: int) -> int | None:
     if side_by_side is None:
         return None
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if side_by_side < 0:  # joblib: -1 is all cores, -2 all but one
+    # In joblib, -1 means all cores, -2 all except one, and so on.
+    if side_by_side < 0:
         side_by_side = max(1, cores + 1 + side_by_side)
     return max(1, cores // max(1, min(side_by_side, pending)))
 
 
-def _flags_of_jobs(flags: Sequence[str]) -> list[str]:
-    """Return the flags that a job needs too; the others concern the sweep."""
+def _flags_named(flags: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Return the flags with one of these names, each with its value."""
     kept: list[str] = []
     for position, flag in enumerate(flags):
-        if flag.partition("=")[0] in FOR_JOBS:
+        if flag.partition("=")[0] in names:
             kept += [flag] if "=" in flag else flags[position : position + 2]
     return kept
 
 
 def _launch(folder: Path, sweep: Sweep, pending: Sequence[Row], flags: Sequence[str]) -> str:
-    """Let Hydra run the jobs, and return what went wrong with the launcher itself."""
+    """Run the jobs with Hydra, and return what went wrong with the launcher itself."""
     numbers = ",".join(str(row.number) for row in pending)
     overrides = [override for override in sweep.parts.grid if key_of(override) == "hydra.searchpath"]
     overrides += [*sweep.parts.launcher, f"job={numbers}", f"{SWEEP_FOLDER}={quote(str(folder))}"]
-    own = [word for word in _flags_of_jobs(flags) if word not in ("--config-name", "-cn")]
     try:
-        run_hydra("jobs", [*overrides, *own, "--multirun"], worker.run)
+        run_hydra("jobs", [*overrides, *_flags_named(flags, FOLDER_FLAGS), "--multirun"], worker.run)
     except (UserError, HydraException, KeyboardInterrupt):
         raise
-    except Exception as error:  # of the launcher: what the jobs have done is in their folders
+    except Exception as error:
+        # A launcher may raise anything. The results of the jobs are in their folders.
         reason = (str(error).strip().splitlines() or ["no reason given"])[0]
-        return f"the launcher gave up. {type(error).__name__}: {reason}"
+        return f"the launcher failed. {type(error).__name__}: {reason}"
     return ""
 
 
 def _report_results(folder: Path, rows: Sequence[Row], problem: str) -> int:
-    """Print the table, or the jobs without a result if it is long, and what is left to do."""
+    """Print the table and what is left to do. A long table is cut down to the jobs without a result."""
     listed = rows if len(rows) <= LONGEST else [row for row in rows if not row.has_result][:LONGEST]
     table = f"\n{as_text(listed)}\n" if listed else ""
     print(f"{table}\n{_jobs(len(rows))}: {shown(folder / TABLE)}", flush=True)
@@ -236,12 +241,12 @@ def _report_results(folder: Path, rows: Sequence[Row], problem: str) -> int:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep a second sweep out of the folder. The lock ends with the process, however that ends."""
+    """Keep a second sweep out of the folder. The lock is released when this process ends, in whatever way."""
     with (folder / LOCK).open("w") as file:
         if not try_lock(file):
             raise UserError(
-                f"{SWEEP_FOLDER}: another sweep is at work in {shown(folder)}. "
-                f"Try: again when it has ended, or {SWEEP_FOLDER}={shown(numbered(folder))}"
+                f"{SWEEP_FOLDER}: another sweep is running in {shown(folder)}. "
+                f"Try: wait until it has ended, or use {SWEEP_FOLDER}={shown(numbered(folder))}"
             )
         yield
 

@@ -1,4 +1,4 @@
-"""Table: ``sweep.csv`` with one row per job, made anew from the disk each time."""
+"""Table: write ``sweep.csv``, with one row per job, from the files on disk."""
 
 import csv
 from collections.abc import Sequence
@@ -11,11 +11,8 @@ from cadam3d.io.run_folder import TABLE
 from cadam3d.sweep.folder import Row, load
 
 FACTS = ("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "asset_bytes", "message")
-SHOWN = (
-    "num_gaussians",
-    "psnr",
-    "seconds",
-)  # in the terminal, beside the outcome and the settings in which jobs differ
+# Columns of the table in the terminal, besides the outcome and the settings in which jobs differ.
+SHOWN = ("num_gaussians", "psnr", "seconds")
 
 
 def write_table(sweep: Path) -> list[Row]:

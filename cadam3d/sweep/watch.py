@@ -27,7 +27,8 @@ class Watch:
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> "Watch":
-        for row in self._waiting:  # of an earlier attempt
+        # Files of an earlier attempt would be reported as new results.
+        for row in self._waiting:
             (row.folder / ENDED).unlink(missing_ok=True)
         self._thread.start()
         return self
@@ -79,7 +80,7 @@ def result(summary: dict[str, Any]) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Format a time to wait, as precisely as such estimates are."""
+    """Return an estimated time as text, in whole seconds, whole minutes, or tenths of an hour."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = seconds / 60

@@ -1,6 +1,6 @@
-"""Worker: what a launcher calls for each job of a sweep, on this machine or on another one.
+"""Worker: the function that a launcher calls for each job of a sweep, on this machine or on another one.
 
-A job that fails or is killed is a row of the table and not the end of the sweep, so it raises nothing here.
+It raises nothing if a job fails or is killed, because the table records that and the sweep continues.
 """
 
 from pathlib import Path

@@ -20,8 +20,9 @@ def why_absent(device: torch.device) -> str | None:
     if find_spec("gsplat") is None:
         return "it is not installed. Try: pip install gsplat==1.5.3"
     try:
-        from gsplat.cuda._backend import _C  # compiles now if it was installed without binaries
-    except Exception as error:  # a build with an unknown toolkit may raise anything
+        # This import compiles gsplat if it was installed without binaries, which may raise anything.
+        from gsplat.cuda._backend import _C
+    except Exception as error:
         return f"it cannot be imported here: {error}"
     return None if _C is not None else "it found no CUDA toolkit to compile its kernels"
 
@@ -37,10 +38,10 @@ class GsplatRasterizer(Rasterizer):
         background: Float[Tensor, "v 3"],
         absgrad: bool = False,
     ) -> RenderOutput:
-        """See :meth:`Rasterizer.render`. It includes the activations, which our kernels compute too."""
+        """See :meth:`Rasterizer.render`. The activations are computed here, as our kernels do."""
         from gsplat import rasterization
 
-        assert not absgrad, "it is never timed"
+        assert not absgrad, "the benchmark never times absgrad"
         images, alphas, extra = rasterization(
             gaussians.means,
             gaussians.quats,

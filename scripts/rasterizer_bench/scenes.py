@@ -1,4 +1,4 @@
-"""The scene of the benchmark: a bumpy shell of splats about as large as the distance to the next one."""
+"""The scene of the benchmark: a bumpy shell of splats whose size is about the distance between neighbours."""
 
 import math
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ RADIUS = 0.6  # world units, of the shell
 class Scene:
     """The input of a backend and the gradients of its images, which are the same for every backend."""
 
-    gaussians: Gaussians  # leaves
+    gaussians: Gaussians  # leaf tensors
     cameras: Cameras
     background: Tensor  # [v 3]
     gradients: tuple[Tensor, Tensor, Tensor]  # of rgb, alpha and depth

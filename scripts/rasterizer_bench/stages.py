@@ -1,4 +1,4 @@
-"""Times the stages of the CUDA rasterizer: each launch is measured by two events and compared with a floor.
+"""Time the stages of the CUDA rasterizer with two events per launch, and compare each stage with a floor.
 
 The floor of a stage is the number of bytes that it must read and write at least once, divided by the measured
 speed of a plain copy. It considers bandwidth alone, so a stage that computes much per byte, as both blends
@@ -36,7 +36,8 @@ STAGES = {
     "blend backward": ("blend_backward",),
     "project backward": ("project_backward", "sum_absolutes", "centre_backward"),
 }
-REST = "rest"  # time outside of launches: allocation, autograd, the host, one wait for the device
+# The time outside of launches: allocation, autograd, the host, and one wait for the device.
+REST = "rest"
 WORD = 4  # bytes of a float and of an index
 SPLAT, RECORD = WORD * cuda.SPLAT, WORD * cuda.RECORD
 
@@ -69,12 +70,12 @@ class Span:
 
 
 class StageClock(Launcher):
-    """Passes every launch on and records when it began and ended."""
+    """Forwards every launch to another launcher and records when it began and ended."""
 
     def __init__(self, inner: Launcher) -> None:
         self._inner = inner
         self.spans: list[Span] = []
-        self.slots = 0  # (splat, tile) pairs since ``spans`` was emptied
+        self.slots = 0  # (splat, tile) pairs of ``spans``
 
     @contextmanager
     def on(self, device: torch.device) -> Iterator[Launch]:
@@ -180,8 +181,8 @@ class StageTiming:
     stage: str
     launches: int
     median_ms: float
-    bytes: int | None  # None where nothing was counted
-    floor_ms: float | None  # bytes over the speed of a copy
+    bytes: int | None  # None for ``REST``
+    floor_ms: float | None
 
 
 def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: float) -> list[StageTiming]:
@@ -202,7 +203,7 @@ def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: fl
         StageTiming(
             stage,
             launches.get(stage, 0),
-            statistics.median(times[stage] for times in samples[1:]),  # without the first, which warms up
+            statistics.median(times[stage] for times in samples[1:]),  # the first one warms up
             needed.get(stage),
             needed[stage] / bytes_per_ms if stage in needed else None,
         )
@@ -211,6 +212,7 @@ def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: fl
 
 
 def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:
+    """Return the amount of work in one render of a scene, in which ``slots`` pairs were counted."""
     with torch.no_grad():
         output = rasterizer.render(scene.gaussians, scene.cameras, scene.background)
     views, height, width = output.alpha.shape
@@ -226,7 +228,7 @@ def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:
 
 
 def copy_speed(device: torch.device, size: int) -> float:
-    """Return the speed of the fastest of some copies of ``size`` bytes, in bytes per ms read and written."""
+    """Return the speed of the fastest of eight copies of ``size`` bytes, in bytes read and written per ms."""
     source = torch.zeros(size, dtype=torch.uint8, device=device)
     target = torch.empty_like(source)
     fastest = float("inf")

@@ -1,4 +1,4 @@
-"""Targets of the CUDA rasterizer, set before it ran: milliseconds, and the ratio to gsplat."""
+"""Targets of the CUDA rasterizer, set before the first measurement: times, and a ratio to gsplat."""
 
 # The largest accepted time of forward + backward in ms, for 4 views and degree 0. The keys are a part of the
 # device's name, and then the number of Gaussians and the size in pixels.
@@ -24,7 +24,7 @@ MOST_MS = {
         (3_400_000, 1024): 55.0,
     },
 }
-# The same in ms for one view and up to SMALL Gaussians and SMALL_SIZE pixels, where overhead dominates.
+# The same for one view, at most SMALL Gaussians and at most SMALL_SIZE pixels, where overhead dominates.
 MOST_MS_SMALL = 0.5
 SMALL, SMALL_SIZE = 20_000, 512
 # gsplat's time divided by ours, for 4 views and at least MANY Gaussians.

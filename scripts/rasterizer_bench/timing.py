@@ -1,4 +1,4 @@
-"""Measures the time and the memory of the phases of a step."""
+"""Measure the time and the memory of the phases of a step."""
 
 import statistics
 import time
@@ -47,6 +47,7 @@ def take_turns(backends: dict[str, Rasterizer], scene: Scene, repeats: int) -> d
 
 
 def summarize(samples: list[dict[str, float]], peak: int | None) -> Timing:
+    """Return the median and the minimum of each phase."""
     by_phase = {phase: [sample[phase] for sample in samples] for phase in PHASES}
     return Timing(
         {phase: statistics.median(each) for phase, each in by_phase.items()},

@@ -1,4 +1,4 @@
-"""doctor: finds what is there, prints what to type otherwise, and fails only if training would fail."""
+"""``cadam3d doctor`` checks the machine, prints hints, and fails only if training would fail."""
 
 import json
 import re
@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from cadam3d import cli
 from cadam3d.commands import doctor
 from cadam3d.commands.finding import Finding, Verdict
 from cadam3d.prior.latent import PRIORS
@@ -22,14 +21,6 @@ def findings():
     return {finding.topic: finding for finding in doctor.examine()}
 
 
-def run_doctor(monkeypatch, tmp_path, capsys, *words: str) -> tuple[int, str]:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["cadam3d", "doctor", *words])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    return int(ended.value.code or 0), capsys.readouterr().out
-
-
 def test_this_machine_can_train(findings):
     assert not [finding for finding in findings.values() if finding.verdict is Verdict.BROKEN]
 
@@ -37,7 +28,7 @@ def test_this_machine_can_train(findings):
 @pytest.mark.parametrize(
     "topic", ["python", "torch", "device", "ffmpeg", "configs", "c++", "nvcc", "diffusers"]
 )
-def test_it_checks(topic, findings):
+def test_doctor_reports_on(topic, findings):
     assert findings[topic].found
 
 
@@ -48,7 +39,7 @@ def test_every_rasterizer_that_this_machine_supports_is_tested(findings):
     assert "kernels for cuda" in findings
 
 
-def test_every_prior_is_tried(findings):
+def test_every_prior_is_checked(findings):
     for path in (REPOSITORY / "configs" / "prior").glob("*.yaml"):
         assert f"prior={path.stem}" in findings
     assert findings["prior=shapes"].verdict is Verdict.OK
@@ -76,8 +67,8 @@ def test_a_package_that_does_not_import_is_broken_and_has_a_hint(monkeypatch):
 
 def test_a_torchvision_that_does_not_fit_torch_is_broken(monkeypatch):
     monkeypatch.setattr(doctor.metadata, "version", lambda name: "0.28.0")
-    said = "Traceback ...\nRuntimeError: operator torchvision::nms does not exist"
-    monkeypatch.setattr(doctor, "_ask", lambda command: (1, said))
+    output = "Traceback ...\nRuntimeError: operator torchvision::nms does not exist"
+    monkeypatch.setattr(doctor, "_run_program", lambda command: (1, output))
     finding = doctor._torchvision()
     assert finding.verdict is Verdict.BROKEN
     assert "nms does not exist" in finding.found
@@ -108,8 +99,8 @@ def test_models_on_disk_are_listed_by_name(monkeypatch, tmp_path):
     assert doctor._models().found == "someone/some-model"
 
 
-def test_models_on_disk_say_what_reads_them(monkeypatch, tmp_path):
-    """The index in the cache shows that. A model with a damaged or unknown index is only a name."""
+def test_models_on_disk_are_listed_with_the_settings_that_use_them(monkeypatch, tmp_path):
+    """The settings follow from the index in the cache. Without a usable index, only the name is listed."""
     for name, index in {
         "one--sdxl": '{"_class_name": "StableDiffusionXLPipeline"}',
         "two--shap": '{"_class_name": "ShapEPipeline"}',
@@ -131,41 +122,41 @@ def test_models_on_disk_say_what_reads_them(monkeypatch, tmp_path):
     ]
 
 
-def test_the_use_of_a_model_can_be_typed():
+def test_the_listed_settings_of_models_compose():
     for line in PRIORS.values():
         assert compose(["prompt=x", line]).prior._target_.startswith("cadam3d.prior.")
 
 
-def test_a_program_that_does_not_answer_is_not_waited_for(monkeypatch):
+def test_a_program_that_does_not_end_is_stopped_after_a_while(monkeypatch):
     monkeypatch.setattr(doctor, "SECONDS", 0.1)
-    code, output = doctor._ask([sys.executable, "-c", "import time; time.sleep(30)"])
+    code, output = doctor._run_program([sys.executable, "-c", "import time; time.sleep(30)"])
     assert code == 127
     assert "timed out" in output
 
 
-def sound(monkeypatch, *findings: Finding) -> None:
+def replace_findings(monkeypatch, *findings: Finding) -> None:
     monkeypatch.setattr(doctor, "examine", lambda: iter(findings))
 
 
-def test_without_problems_the_exit_code_is_0_and_no_file_is_left(monkeypatch, tmp_path, capsys):
-    sound(monkeypatch, Finding("torch", Verdict.OK, "2"), Finding("nvcc", Verdict.NOTE, "none"))
-    code, out = run_doctor(monkeypatch, tmp_path, capsys)
+def test_without_problems_the_exit_code_is_0_and_no_file_is_left(monkeypatch, tmp_path, type_line):
+    replace_findings(monkeypatch, Finding("torch", Verdict.OK, "2"), Finding("nvcc", Verdict.NOTE, "none"))
+    code, out, _ = type_line("doctor")
     assert code == 0
     assert "Ready to train." in out
     assert not list(tmp_path.iterdir())
 
 
-def test_something_broken_is_exit_1_with_its_hint(monkeypatch, tmp_path, capsys):
-    sound(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "Try: pip install torch"))
-    code, out = run_doctor(monkeypatch, tmp_path, capsys)
+def test_a_broken_finding_prints_its_hint_and_causes_exit_code_1(monkeypatch, type_line):
+    replace_findings(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "Try: pip install torch"))
+    code, out, _ = type_line("doctor")
     assert code == 1
     assert "Try: pip install torch" in out
 
 
 @pytest.mark.parametrize("word", ["json=true", "--json"])
-def test_json_is_one_object_for_other_programs(word, monkeypatch, tmp_path, capsys):
-    sound(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "hint", {"size": 3}))
-    code, out = run_doctor(monkeypatch, tmp_path, capsys, word)
+def test_json_is_one_object_for_other_programs(word, monkeypatch, type_line):
+    replace_findings(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "hint", {"size": 3}))
+    code, out, _ = type_line("doctor", word)
     report = json.loads(out)
     assert code == 1
     assert report["ok"] is False
@@ -184,7 +175,7 @@ def test_a_gpu_that_torch_cannot_use_gets_a_hint(monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/usr/bin/{name}")
-    monkeypatch.setattr(doctor, "_ask", lambda command: (0, "GPU 0"))
+    monkeypatch.setattr(doctor, "_run_program", lambda command: (0, "GPU 0"))
     finding = doctor._device()
     assert finding.verdict is Verdict.NOTE
     assert "there is a GPU" in finding.found
@@ -192,4 +183,4 @@ def test_a_gpu_that_torch_cannot_use_gets_a_hint(monkeypatch):
 
 
 def test_a_missing_program_is_not_a_crash():
-    assert doctor._ask(["/nowhere/program"])[0] == 127
+    assert doctor._run_program(["/nowhere/program"])[0] == 127

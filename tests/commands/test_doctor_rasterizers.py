@@ -1,4 +1,4 @@
-"""doctor on rasterizers: it tests what it names, and prints what is missing."""
+"""The rasterizer checks of ``cadam3d doctor`` test every backend that works and name the missing parts."""
 
 import ctypes
 import json
@@ -24,22 +24,22 @@ from cadam3d.rasterizer.selftest import Agreement, self_test
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
 
 
-def forget() -> None:
+def clear_caches() -> None:
     auto._choose.cache_clear()
     load_kernels.cache_clear()
 
 
 @pytest.fixture(autouse=True)
-def _asked_anew():
+def empty_caches():
     """Clear the caches of the process before and after each test."""
-    forget()
+    clear_caches()
     yield
-    forget()
+    clear_caches()
 
 
 @pytest.fixture
 def bare(monkeypatch, tmp_path):
-    """A machine on which nothing is installed, compiled or plugged in."""
+    """Simulate a machine without compilers, compiled kernels and GPUs."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(build, "find_compiler", lambda: None)
     monkeypatch.setattr(nvrtc, "find_compiler", lambda: None)
@@ -119,7 +119,7 @@ def test_an_nvrtc_without_a_device_is_mentioned(bare, monkeypatch):
 
 @pytest.fixture
 def a_gpu(bare, monkeypatch, tmp_path):
-    """One CUDA device, for which the kernels were just compiled."""
+    """Simulate one CUDA device, for which the kernels have just been compiled."""
     built = nvrtc.Cubin(tmp_path / "kernels.cubin", 7.0)
     monkeypatch.setattr(nvrtc, "find_compiler", an_nvrtc)
     monkeypatch.setattr(nvrtc, "build", lambda cache_dir, capability: built)
@@ -146,12 +146,14 @@ def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu
         ("rasterizer=cpu", "cpu", {"gradients": {"means": 0.1}}, Verdict.BROKEN),
         ("rasterizer=cpu", "cpu", {"images": {"rgb": math.inf}}, Verdict.BROKEN),
         ("rasterizer=cpu", "cpu", {"repeats": False}, Verdict.BROKEN),
-        ("rasterizer=cuda", "cuda:0", {"repeats": False}, Verdict.NOTE),  # auto does not choose it
+        # Without its self-test, auto chooses another backend.
+        ("rasterizer=cuda", "cuda:0", {"repeats": False}, Verdict.NOTE),
         ("rasterizer=reference", "cpu", {"repeats": False}, Verdict.BROKEN),
-        ("rasterizer=reference", "cuda:0", {"repeats": False}, Verdict.OK),  # its sums use atomics there
+        # On a GPU, the sums of the reference use atomics.
+        ("rasterizer=reference", "cuda:0", {"repeats": False}, Verdict.OK),
     ],
 )
-def test_what_fails_its_self_test_is_reported(topic, device, change, verdict, monkeypatch, agreement):
+def test_a_failed_self_test_is_reported(topic, device, change, verdict, monkeypatch, agreement):
     monkeypatch.setattr(
         doctor_rasterizers, "self_test", lambda rasterizer, device: replace(agreement, **change)
     )
@@ -171,7 +173,7 @@ def test_a_self_test_that_crashes_is_a_finding(monkeypatch):
     assert finding.found == "RuntimeError: an illegal memory access"
 
 
-def test_an_error_of_the_compiler_is_one_line_and_what_to_type(monkeypatch):
+def test_an_error_of_the_compiler_is_one_line_and_a_hint(monkeypatch):
     def fail(cache_dir):
         raise UserError("rasterizer=cpu: c++ could not build the kernels:\nerror\nerror\nTry: another one")
 

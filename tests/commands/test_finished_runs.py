@@ -1,14 +1,12 @@
-"""render, export, eval and view with a run folder, a sweep folder or a single file."""
+"""The commands render, export, eval and view, with a run folder, a sweep folder or a single file."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 from omegaconf import OmegaConf
 
-from cadam3d import cli
 from cadam3d.commands import view
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.jsonl import read_json
@@ -17,20 +15,6 @@ from cadam3d.settings.compose import compose
 from cadam3d.sweep.folder import Plan, PlannedJob, write_plan
 
 SMALL = ("metric.fidelity.views=2", "metric.fidelity.elevations_deg=[0]", "metric.fidelity.size=24")
-
-
-@pytest.fixture
-def type_line(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["cadam3d", *words])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        captured = capsys.readouterr()
-        return int(ended.value.code or 0), captured.out, captured.err
-
-    return run
 
 
 @pytest.fixture
@@ -77,7 +61,7 @@ def test_a_folder_without_a_run_is_named(command, type_line, tmp_path):
         assert err.startswith(f"cadam3d: run: expected the folder of a run, got {place!r} ({reason}). Try: ")
 
 
-def test_the_message_for_a_run_without_an_asset_is_to_finish_it(run_folder, type_line):
+def test_the_message_for_a_run_without_an_asset_suggests_finishing_it(run_folder, type_line):
     (run_folder / "asset.ply").unlink()
     code, _, err = type_line("render", f"run={run_folder}")
     assert code == 1
@@ -110,7 +94,7 @@ def test_render_accepts_a_file_and_an_output_folder(run_folder, type_line, tmp_p
     assert len(list((tmp_path / "some (pictures)/images").iterdir())) == 1
 
 
-def test_render_without_an_exporter_says_which_to_choose(run_folder, type_line):
+def test_the_message_of_render_without_an_exporter_suggests_some(run_folder, type_line):
     code, _, err = type_line("render", f"run={run_folder}", "exporter=[]")
     assert code == 1
     assert "Try: exporter=[images,turntable]" in err
@@ -160,7 +144,7 @@ def test_eval_notes_which_numbers_are_missing_without_true_images(tmp_path, gaus
     assert code == 0
     assert "psnr" not in result
     assert result["num_gaussians"] == 6
-    assert "knows no true images" in out
+    assert "has no true images" in out
 
 
 def make_sweep(folder: Path, *names: str) -> Path:
@@ -170,7 +154,7 @@ def make_sweep(folder: Path, *names: str) -> Path:
     return folder
 
 
-def test_eval_of_a_sweep_measures_every_job_and_names_those_it_cannot(tmp_path, gaussians, type_line):
+def test_eval_of_a_sweep_measures_every_job_and_reports_those_that_fail(tmp_path, gaussians, type_line):
     sweep = make_sweep(tmp_path / "sweep", "b", "a", "never-started", "c")
     for name in ("a", "b", "c", "of-another-sweep"):
         make_run(sweep / name, gaussians)
@@ -194,7 +178,7 @@ def test_other_commands_suggest_a_job_of_a_sweep(tmp_path, gaussians, type_line)
     make_run(make_sweep(tmp_path / "sweep", "0_job") / "0_job", gaussians)
     code, _, err = type_line("render", "run=sweep")
     assert code == 1
-    assert "one of them is 0_job" in err
+    assert "it is a sweep, which has many runs). Try: run=sweep/0_job" in err
 
 
 def test_view_shows_the_report_of_a_run(run_folder, type_line, monkeypatch):

@@ -1,11 +1,9 @@
 """Notes are printed once, and training with slow kernels or a fallback is reported and recorded."""
 
 import json
-import sys
 
 import pytest
 
-from cadam3d import cli
 from cadam3d.commands import messages
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import auto, cpu
@@ -24,7 +22,7 @@ SMALL += ["exporter=[ply]", "metric=[]", "camera.size=16"]
 
 
 @pytest.fixture(autouse=True)
-def _nothing_said_yet():
+def empty_caches():
     messages.note.cache_clear()
     auto._choose.cache_clear()
     yield
@@ -38,19 +36,6 @@ def no_compiler(monkeypatch):
         raise UserError(NEEDED)
 
     monkeypatch.setattr(cpu, "load_kernels", no_kernels)
-
-
-@pytest.fixture
-def type_line(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words: str) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["cadam3d", *words])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        return int(ended.value.code or 0), capsys.readouterr().err
-
-    return run
 
 
 def test_a_note_is_printed_once(capsys):
@@ -69,7 +54,7 @@ def test_a_backend_is_noted_only_if_it_replaces_a_faster_one(capsys):
 
 
 def test_training_without_a_compiler_is_noted_once_and_recorded(type_line, no_compiler, tmp_path):
-    code, err = type_line("train", *SMALL)
+    code, _, err = type_line("train", *SMALL)
     assert code == 0
     assert err.count(NEEDED) == 1
     assert f"\nNote: rendering with rasterizer=reference, which is slow: {NEEDED}\n" in err
@@ -83,19 +68,19 @@ def test_training_without_a_compiler_is_noted_once_and_recorded(type_line, no_co
     assert NEEDED in (run / "report.html").read_text(encoding="utf-8")
 
 
-def test_another_command_notes_it_when_it_renders(type_line, no_compiler):
+def test_another_command_prints_the_note_when_it_renders(type_line, no_compiler):
     assert type_line("train", *SMALL, "rasterizer=reference")[0] == 0
-    code, err = type_line("export", "run=outputs/latest", "output=copy.ply")
+    code, _, err = type_line("export", "run=outputs/latest", "output=copy.ply")
     assert (code, err.count(NEEDED)) == (0, 0)
-    code, err = type_line("render", "run=outputs/latest", "exporter=[images]", "exporter.images.views=1")
+    code, _, err = type_line("render", "run=outputs/latest", "exporter=[images]", "exporter.images.views=1")
     assert (code, err.count(NEEDED)) == (0, 1)
 
 
-def test_an_unavailable_rasterizer_is_refused_before_anything_is_touched(type_line, no_compiler, tmp_path):
+def test_an_unavailable_rasterizer_is_refused_before_any_file_changes(type_line, no_compiler, tmp_path):
     assert type_line("train", *SMALL, "rasterizer=reference")[0] == 0
     latest = (tmp_path / "outputs/latest").resolve()
     before = sorted(tmp_path.rglob("*"))
-    code, err = type_line("train", *SMALL, "rasterizer=cpu")
+    code, _, err = type_line("train", *SMALL, "rasterizer=cpu")
     assert (code, err) == (1, f"cadam3d: {NEEDED}\n")
     assert (tmp_path / "outputs/latest").resolve() == latest
     assert sorted(tmp_path.rglob("*")) == before
@@ -104,8 +89,8 @@ def test_an_unavailable_rasterizer_is_refused_before_anything_is_touched(type_li
 SHAP_E = ["rasterizer=reference", "initializer=shap_e", "initializer.path=nowhere"]
 
 
-def test_an_unavailable_initializer_is_refused_before_anything_is_touched(type_line, tmp_path):
-    code, err = type_line("train", *SMALL, *SHAP_E)
+def test_an_unavailable_initializer_is_refused_before_any_file_is_written(type_line, tmp_path):
+    code, _, err = type_line("train", *SMALL, *SHAP_E)
     assert code == 1
     assert err.startswith("cadam3d: initializer.path: expected a folder with a model_index.json")
     assert not list(tmp_path.iterdir())
@@ -113,7 +98,7 @@ def test_an_unavailable_initializer_is_refused_before_anything_is_touched(type_l
 
 def test_the_fallback_of_an_initializer_is_reported_and_recorded(type_line, tmp_path):
     stand_in = ["initializer/fallback=ball", "initializer.fallback.count=9"]
-    code, err = type_line("train", *SMALL, *SHAP_E, *stand_in, "hydra.run.dir=fallen")
+    code, _, err = type_line("train", *SMALL, *SHAP_E, *stand_in, "hydra.run.dir=fallen")
     assert code == 0
     [line] = [line for line in err.splitlines() if "Shap-E" in line]
     assert line.startswith("Note: Ball stands in for Shap-E. initializer.path: expected a folder")

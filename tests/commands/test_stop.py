@@ -1,4 +1,4 @@
-"""Signals to training: the first one asks it to stop, a later one stops it at once."""
+"""Signals to training: after the first one it saves and ends, and a later one stops it at once."""
 
 import os
 import signal
@@ -16,7 +16,7 @@ def clock(monkeypatch):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_first_signal_is_noted_and_the_handlers_are_put_back(number, clock):
+def test_the_first_signal_is_recorded_and_the_handlers_are_restored(number, clock):
     before = signal.getsignal(number)
     with StopOnSignal() as stop:
         assert not stop()

@@ -1,4 +1,4 @@
-"""The summary of a run: its numbers describe the files that were really written."""
+"""The numbers in the summary of a run are those of the files on disk."""
 
 import json
 import sys
@@ -43,8 +43,10 @@ def check_sizes(folder: Path) -> None:
     assert summary["bytes_per_gaussian"] == size / count
 
 
-# Not all combinations, because each run takes a third of a second; the test below says what is covered.
-SETTINGS = [  # least SH degree of the file, its up axis, SH degree of the asset, exporters
+# Each run takes a third of a second, so these are not all combinations. A test below checks that each value
+# occurs. The columns are the least SH degree of the file, its up axis, the SH degree of the asset, and the
+# exporters.
+SETTINGS = [
     (0, "-y", 0, "[ply]"),
     (1, "+y", 0, "[ply,preview]"),
     (2, "+z", 0, "[preview,ply]"),
@@ -67,7 +69,7 @@ def test_the_sizes_in_the_summary_are_those_on_disk(pad_sh, up, degree, exporter
     check_sizes(folder)
 
 
-def test_every_value_of_every_setting_is_among_those_above():
+def test_every_value_of_every_setting_is_tested():
     pads, ups, degrees, _ = (set(column) - {None} for column in zip(*SETTINGS, strict=True))
     assert (pads, ups, degrees) == (set(range(4)), {"-y", "+y", "+z"}, set(range(4)))
 

@@ -1,4 +1,4 @@
-"""Logs that survive a kill, and JSON that any reader accepts."""
+"""Logs stay readable after a kill, and any reader accepts the JSON."""
 
 import json
 import math
@@ -15,7 +15,7 @@ def refuse_constant(name):
     raise AssertionError(f"{name} is not JSON")
 
 
-def test_lines_come_back_in_order(tmp_path):
+def test_lines_are_read_in_the_order_in_which_they_were_written(tmp_path):
     lines = [
         {"step": step, "loss": 0.1 * step, "prompt": "ein Ü\nzwei", "nested": {"a": [1, None]}}
         for step in range(5)
@@ -90,7 +90,7 @@ def test_truncating_nothing_makes_no_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_json_files_come_back(tmp_path):
+def test_a_json_file_is_read_as_it_was_written(tmp_path):
     write_json(tmp_path / "s.json", {"prompt": "Ü", "path": Path("/a"), "counts": (1, 2)})
     assert read_json(tmp_path / "s.json") == {"prompt": "Ü", "path": "/a", "counts": [1, 2]}
 

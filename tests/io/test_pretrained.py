@@ -31,7 +31,7 @@ def model(tmp_path_factory):
 
 @pytest.fixture
 def hub(monkeypatch):
-    """Fake a hub that gives a set answer for every id and records the requests."""
+    """Replace the hub by a dict with the answer for every id, which also records the requests."""
     answers, asked = {}, []
 
     def download(name, file, *, revision, local_files_only):

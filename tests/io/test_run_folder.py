@@ -1,4 +1,4 @@
-"""The run folder: what holds a run, how places are claimed, and how paths are shown."""
+"""The run folder: how a run is recognised, how a folder is claimed, and how paths are shown."""
 
 from pathlib import Path
 
@@ -41,7 +41,7 @@ def test_a_summary_that_cannot_be_read_is_empty(content, tmp_path):
     assert read_summary(tmp_path) == {}
 
 
-def test_a_chosen_folder_is_taken_as_it_is_and_another_gets_a_number(tmp_path):
+def test_a_chosen_folder_is_used_unchanged_and_another_gets_a_number(tmp_path):
     folder = tmp_path / "a" / "run"
     assert claim(folder, "key", is_chosen=False) == folder
     assert claim(folder, "key", is_chosen=True) == folder

@@ -60,7 +60,7 @@ def small_checks(monkeypatch):
     """Make the scenes of the checks smaller, for tests of the script around them."""
     monkeypatch.setattr(check, "SPLATS", 60)
     monkeypatch.setattr(check, "SIZE", 25)
-    monkeypatch.setattr(check, "CROWD", {"cpu": (60, 20)})
+    monkeypatch.setattr(check, "REPEATED", {"cpu": (60, 20)})
 
 
 # -------------------------------------------------------------------------- whole runs
@@ -152,7 +152,7 @@ def test_a_backend_that_disagrees_is_not_timed(monkeypatch, capsys):
 
 @pytest.mark.parametrize("mistake", [turns_all_slightly, detaches, loses_the_last])
 def test_hard_scenes_show_the_mistake_without_the_self_test(mistake):
-    adversaries = dict(check.adversaries(CPU))
+    adversaries = dict(check.difficult_scenes(CPU))
     for kind in ("needles", "flat discs", "equal depths"):
         assert check.differences(Wrong(mistake), check.small_scene(adversaries[kind])), kind
 

@@ -1,4 +1,4 @@
-"""The words of the configuration: every key has them, they have one home, and the page is made from them."""
+"""Every key of the configuration is described in one place, and docs/components.md is generated from that."""
 
 import importlib.util
 from pathlib import Path
@@ -30,17 +30,17 @@ def library(folder: Path, **files: str) -> Library:
 
 
 @pytest.mark.parametrize(("group", "name"), OPTIONS, ids=map("/".join, OPTIONS))
-def test_every_option_says_what_it_is(group, name):
+def test_every_option_has_a_description(group, name):
     assert len(LIBRARY.summary(group, name)) > 10
 
 
 @pytest.mark.parametrize(("group", "name"), DOCUMENTED, ids=NAMES)
-def test_every_setting_of_an_option_has_words(group, name):
+def test_every_setting_of_an_option_has_a_description(group, name):
     assert not [each.key for each in LIBRARY.option(group, name).settings if not each.words]
 
 
 @pytest.mark.parametrize("command", list(cli.COMMANDS))
-def test_every_setting_and_every_group_of_a_command_has_words(command):
+def test_every_setting_and_every_group_of_a_command_has_a_description(command):
     about = LIBRARY.command(command)
     assert f"\n  cadam3d {command}" in about.about
     assert not [each.key for each in about.settings if not each.words]
@@ -48,7 +48,7 @@ def test_every_setting_and_every_group_of_a_command_has_words(command):
 
 
 @pytest.mark.parametrize(("group", "name"), DOCUMENTED, ids=NAMES)
-def test_an_option_does_not_repeat_the_words_of_what_it_builds_on(group, name):
+def test_an_option_does_not_repeat_descriptions_of_its_base(group, name):
     """A second copy could disagree with the first. A note about the new value is not a copy."""
     page = LIBRARY.page(f"{group}/{name}")
     for base in page.bases:
@@ -59,7 +59,7 @@ def test_an_option_does_not_repeat_the_words_of_what_it_builds_on(group, name):
 
 
 def _opening(words: str) -> str:
-    """Return the part of the words that says what a key means; what follows may be about the value."""
+    """Return the beginning of a description, which is about the key; the rest may be about the value."""
     return words.lower().partition(";")[0].partition(",")[0]
 
 
@@ -78,7 +78,7 @@ def test_the_page_of_components_is_up_to_date():
 # --- reading comments -------------------------------------------------------------------------------------
 
 
-def test_words_are_beside_a_key_or_directly_above_it():
+def test_a_description_is_beside_its_key_or_directly_above_it():
     page = read_page(
         "# What it is.\n"
         "_target_: a.B\n"
@@ -129,7 +129,7 @@ def test_text_blocks_have_no_comments():
     assert page.words == {"key": "words"}
 
 
-def test_an_option_takes_over_the_words_of_what_it_builds_on(tmp_path):
+def test_an_option_inherits_the_descriptions_of_its_base(tmp_path):
     base = "# Base.\n_target_: a.B\nsize: 1 # pixels\nrate: 2 # per step\nkept: 3 # as it is\n"
     derived = "# Derived.\ndefaults: [base, _self_]\nsize: 4\nrate: 5 # small\n"
     option = library(tmp_path, thing__base=base, thing__derived=derived).option("thing", "derived", "none")
@@ -142,7 +142,7 @@ def test_an_option_takes_over_the_words_of_what_it_builds_on(tmp_path):
     assert option.own_keys == {"thing.size", "thing.rate"}
 
 
-def test_a_key_without_words_has_those_of_the_same_class(tmp_path):
+def test_a_key_without_a_description_has_that_of_the_same_class(tmp_path):
     one = (
         "# One.\n_target_: a.B\nsize: 1 # pixels\ninner:  # an object\n  _target_: a.C\n  size: 2 # metres\n"
     )
@@ -158,7 +158,7 @@ def test_a_schedule_is_one_value(tmp_path):
     assert (rate.key, rate.value) == ("thing.rate", "Linear(start=1, end=0)")
 
 
-def test_a_recipe_has_the_words_of_what_it_changes():
+def test_a_recipe_has_the_descriptions_of_the_settings_that_it_changes():
     settings = {each.key: each for each in LIBRARY.option("experiment", "bench").settings}
     orbit = {each.key: each.words for each in LIBRARY.option("camera", "orbit").settings}
     assert settings["camera.size"].value == "96"
@@ -166,7 +166,7 @@ def test_a_recipe_has_the_words_of_what_it_changes():
     assert settings["exporter"].value == "[ply,preview]"
 
 
-def test_the_first_of_two_folders_counts(tmp_path):
+def test_the_first_of_two_folders_takes_precedence(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     library(tmp_path / "a", thing__it="# First.\n")

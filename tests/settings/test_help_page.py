@@ -1,4 +1,4 @@
-"""Help: every choice on one page, every setting of an option on another, at once and within the terminal."""
+"""The help of a command lists all choices, that of an option all its settings, and lines fit the terminal."""
 
 import subprocess
 import sys
@@ -26,7 +26,7 @@ def flat(text: str) -> str:
     return " ".join(text.split())
 
 
-def test_the_page_of_a_command_lists_every_option_with_its_words():
+def test_the_page_of_a_command_lists_every_option_with_its_description():
     text = flat(page())
     for group in LIBRARY.groups("train"):
         assert f"{group.name}: {group.words}" in text
@@ -56,14 +56,14 @@ def test_the_page_of_an_option_lists_its_settings():
     assert "densifier" not in text.replace("densifier.tau_pos", "")
 
 
-def test_the_page_of_a_variant_says_what_it_changes():
+def test_the_page_of_a_variant_lists_what_it_changes():
     text = page("prior=sdxl")
     assert "Builds on prior=stable_diffusion and changes ids, size." in text
     assert "prior.size=1024" in text
     assert "prior.tiling=false" in text
 
 
-def test_several_options_of_a_group_can_be_asked_for():
+def test_several_options_of_a_group_can_be_listed_at_once():
     text = page("metric=[fidelity,size]")
     assert "metric=fidelity" in text
     assert "metric=size" in text
@@ -84,7 +84,7 @@ def test_lines_fit_into_the_terminal(columns, monkeypatch):
     assert max(map(len, prose)) <= min(max(columns, 60), 120)
 
 
-def test_options_of_a_folder_of_ones_own_are_listed_too(tmp_path):
+def test_options_of_a_user_folder_are_listed_too(tmp_path):
     (tmp_path / "densifier").mkdir()
     mine = tmp_path / "densifier" / "mine.yaml"
     mine.write_text("# Grow what I like.\n_target_: mine.Mine\nshare: 0.1 # in (0, 1)\n", encoding="utf-8")
@@ -102,7 +102,7 @@ def test_options_of_a_folder_of_ones_own_are_listed_too(tmp_path):
         (("grid=thresholds",), r"^'grid=thresholds': expected a group of cadam3d train "),
     ],
 )
-def test_a_name_that_does_not_exist_is_answered_with_the_near_one(words, message):
+def test_the_message_for_an_unknown_name_suggests_a_similar_one(words, message):
     with pytest.raises(UserError, match=message):
         page(*words)
 
@@ -113,7 +113,7 @@ def test_a_config_that_does_not_exist_is_named():
         page(flags=flags)
 
 
-def test_a_command_without_groups_says_so():
+def test_a_group_is_refused_by_a_command_without_groups():
     with pytest.raises(UserError, match=r"has no groups\. Try: cadam3d doctor --help"):
         page("camera", command="doctor")
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 # Called as: PROGRAM -m cadam3d.job PARENT train key=value ...
-# It appends how it was called to calls.jsonl beside the job folders and does what prompt= says. "meets" lists
-# the earlier calls for the same job that are still running.
+# It appends its call to calls.jsonl beside the job folders, and prompt= decides how it ends. "running" lists
+# the processes of earlier calls for the same job that have not ended.
 STAND_IN = r"""#!{python} -S
 import json, os, pathlib, signal, sys, time
 given = dict(word.lstrip("+~").partition("=")[::2] for word in sys.argv[5:] if "=" in word)
@@ -17,7 +17,7 @@ beside, parent = folder.parent, int(sys.argv[3])
 log = beside / "calls.jsonl"
 earlier = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
 
-def is_at_work(pid):
+def is_running(pid):
     try:
         return pathlib.Path(f"/proc/{{pid}}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -25,7 +25,8 @@ def is_at_work(pid):
 
 note = {{"folder": folder.name, "words": sys.argv[4:], "threads": os.environ.get("OMP_NUM_THREADS")}}
 note["pid"] = os.getpid()
-note["meets"] = [call["pid"] for call in earlier if call["folder"] == folder.name and is_at_work(call["pid"])]
+same_job = [call["pid"] for call in earlier if call["folder"] == folder.name]
+note["running"] = [pid for pid in same_job if is_running(pid)]
 note["traces"] = os.environ.get("CADAM3D_TRACES")
 if note["traces"]:
     os.makedirs(note["traces"], exist_ok=True)
@@ -44,12 +45,12 @@ def stop(number, frame):
     sys.exit(128 + number)
 
 signal.signal(signal.SIGINT, stop)
-print("at work on", prompt, flush=True)
+print("training", prompt, flush=True)
 if prompt == "a bug":
     print("Traceback (most recent call last):\n  ...\nValueError: one two")
     sys.exit(1)
 if prompt == "a mistake":
-    print("Note: before\ncadam3d: prompt: I know\n  no mistake. Try: a cube")
+    print("Note: before\ncadam3d: prompt: expected\n  a shape. Try: a cube")
     sys.exit(1)
 if prompt == "a scancel":
     os.kill(os.getpid(), signal.SIGTERM)
@@ -58,14 +59,14 @@ if prompt == "a kill":
     (folder / "checkpoints" / "step_0000002.pt").touch()
     if (folder.parent / "config.yaml").is_file():
         (folder / "config.yaml").write_bytes((folder.parent / "config.yaml").read_bytes())
-    write("finished")  # the numbers are written, exports are not
+    write("finished")  # without warnings, so before the exports
     os.kill(os.getpid(), signal.SIGKILL)
-if prompt == "a deaf one":
+if prompt == "a stuck one":
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-if prompt in ("a wait", "a deaf one"):
+if prompt in ("a wait", "a stuck one"):
     (folder / "waiting").touch()
     time.sleep(60)
-if prompt == "a long one":  # the test decides when it ends
+if prompt == "a long one":  # until the test ends it
     (folder / "waiting").touch()
     deadline = time.monotonic() + 60
     while not (beside / "go").exists() and time.monotonic() < deadline:
@@ -81,7 +82,7 @@ write("finished", psnr=20.25, ssim=0.5, asset_bytes=340, warnings=[])
 
 @pytest.fixture
 def stand_in(tmp_path_factory) -> Path:
-    """The path of the program, for ``sys.executable``."""
+    """Return the path of the program, for ``sys.executable``."""
     path = tmp_path_factory.mktemp("bin") / "train"
     path.write_text(STAND_IN.format(python=sys.executable), encoding="utf-8")
     path.chmod(0o755)
@@ -90,7 +91,7 @@ def stand_in(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def calls():
-    """Read how the program was called from the folder of a sweep."""
+    """Return a function that reads the calls of the program in the folder of a sweep."""
 
     def read(sweep: Path) -> list[dict]:
         path = sweep / "calls.jsonl"

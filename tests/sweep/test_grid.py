@@ -1,4 +1,4 @@
-"""Grids: which jobs a sweep has, and that their names do not change."""
+"""Grids: the jobs of a sweep, and the names of their folders."""
 
 import itertools
 import random
@@ -25,7 +25,7 @@ def pareto() -> Grid:
 
 
 def has_setting(overrides, key) -> bool:
-    """Pretend that each densifier has one threshold that no other has; all other settings are common."""
+    """Pretend that each densifier has a threshold of another name and that all other settings are shared."""
     return key not in KEYS_OF.values() or any(KEYS_OF.get(line) == key for line in overrides)
 
 
@@ -131,7 +131,7 @@ def test_names_are_unique_and_valid_file_names(pareto):
     assert all("/" not in name and len(name.encode()) < 255 for name in names)
 
 
-def test_a_name_stays_when_the_line_is_reordered_or_its_values_are_written_otherwise():
+def test_a_name_does_not_change_when_the_line_is_reordered_or_spelled_differently():
     lines = ["prompt='a cube','a ball'", "seed=0,1", "densifier.tau_Q=0.50,0.9", "steps=10"]
     rewritten = ['prompt="a ball","a cube"', "seed=range(0,2)", "densifier.tau_Q=0.9,5e-1", "steps=10"]
     names = {job.name for job in expand(read_grid(None), read_line(lines))}
@@ -139,15 +139,15 @@ def test_a_name_stays_when_the_line_is_reordered_or_its_values_are_written_other
         assert {job.name for job in expand(read_grid(None), read_line(order))} == names
 
 
-def test_a_name_stays_when_the_line_narrows_the_grid(pareto):
+def test_a_name_does_not_change_when_the_line_narrows_the_grid(pareto):
     everything = {job.name for job in expand(pareto, {})}
     for line in (["seed=1"], ["prompt='a lighthouse'", "seed=0,2"], ["densifier.tau_pos=0.001", "seed=0"]):
         narrowed = {job.name for job in expand(pareto, read_line(line), has_setting)}
         assert narrowed < everything
 
 
-def test_a_name_stays_when_a_setting_of_all_jobs_changes(pareto):
-    """Then the folder is found again, and its settings are compared: see test_sweeps.py."""
+def test_a_name_does_not_change_when_a_setting_of_all_jobs_changes(pareto):
+    """The folder of the job is then found again and its settings are compared; see test_sweeps.py."""
     before = [job.name for job in expand(pareto, read_line(["steps=100"]))]
     assert [job.name for job in expand(pareto, read_line(["steps=200"]))] == before
 
@@ -168,7 +168,7 @@ def test_the_name_of_a_sweep_is_its_grid_or_its_line_in_any_order():
     assert sweep_name(None, read_line(["steps=5,6"])) != sweep_name(None, read_line(["steps=5,7"]))
 
 
-def test_text_and_other_values_of_a_grid_arrive_as_they_were_written():
+def test_the_values_of_a_grid_are_unchanged_in_its_jobs():
     draw = random.Random(0)
     letters = ["\\", "'", '"', "{", ",", "(", "]", "=", " ", "a", "日", "#", "7", "."]
     texts = ["".join(draw.choices(letters, k=draw.randint(1, 8))) for _ in range(200)]

@@ -1,4 +1,4 @@
-"""A job in a process of its own: how it is started and stopped, and what is recorded when it ends."""
+"""The process of a job: how it is started and stopped, and what is recorded when it ends."""
 
 import errno
 import json
@@ -27,7 +27,7 @@ PYTHON = sys.executable
 
 @pytest.fixture
 def sweep(tmp_path, stand_in, monkeypatch):
-    """Make the folder of a sweep of one job with this prompt."""
+    """Return a function that makes the folder of a sweep of one job with a given prompt."""
     monkeypatch.setattr(sys, "executable", str(stand_in))
     folder = tmp_path / "a sweep, (1)"
     folder.mkdir()
@@ -54,7 +54,7 @@ def ended(folder: Path) -> tuple[Row, dict]:
         ("a cube", "finished", None, 0, True),
         ("a crowd", "out_of_memory", None, 0, True),
         ("a bug", "failed", "ValueError: one two", 1, False),
-        ("a mistake", "failed", "prompt: I know no mistake. Try: a cube", 1, False),
+        ("a mistake", "failed", "prompt: expected a shape. Try: a cube", 1, False),
         ("a scancel", "interrupted", "stopped", -signal.SIGTERM, False),
         ("a kill", "killed", "by SIGKILL (out of memory?)", -signal.SIGKILL, False),
     ],
@@ -68,7 +68,7 @@ def test_every_end_of_a_process_is_an_outcome(sweep, prompt, outcome, message, c
     assert end["seconds"] > 0
 
 
-def test_numbers_that_a_killed_run_has_written_stay(sweep):
+def test_numbers_that_a_killed_run_has_written_are_kept(sweep):
     folder = sweep("a kill")
     run_job(folder, 0)
     row, _ = ended(folder)
@@ -78,7 +78,7 @@ def test_numbers_that_a_killed_run_has_written_stay(sweep):
 def test_the_console_of_a_job_goes_to_its_folder(sweep, capfd):
     folder = sweep("a cube")
     run_job(folder, 0)
-    assert (folder / "job_1/console.txt").read_text() == "at work on a cube\n"
+    assert (folder / "job_1/console.txt").read_text() == "training a cube\n"
     assert capfd.readouterr() == ("", "")
 
 
@@ -138,7 +138,7 @@ def test_no_job_starts_in_a_sweep_that_is_being_stopped(sweep, calls):
     assert load(folder)[0].outcome == "unfinished"
 
 
-def test_a_running_job_is_asked_to_save_when_the_sweep_is_stopped(sweep):
+def test_a_running_job_saves_and_ends_when_the_sweep_is_stopped(sweep):
     folder = sweep("a wait")
     thread = threading.Thread(target=run_job, args=(folder, 0))
     thread.start()
@@ -150,11 +150,11 @@ def test_a_running_job_is_asked_to_save_when_the_sweep_is_stopped(sweep):
     assert (row.outcome, row.has_result, end["exit_code"]) == ("interrupted", False, 130)
 
 
-# --- two at the same job ----------------------------------------------------------------------------------
+# --- two workers of the same job --------------------------------------------------------------------------
 
 
 def start_waiting(folder: Path) -> threading.Thread:
-    """Start a second worker of job 0, which finds it taken."""
+    """Start a second worker of job 0, which waits for the first one."""
     thread = threading.Thread(target=run_job, args=(folder, 0), daemon=True)
     thread.start()
     thread.join(3 * process.POLL_SECONDS)
@@ -167,7 +167,7 @@ def join(thread: threading.Thread) -> None:
     assert not thread.is_alive()
 
 
-def test_two_workers_at_the_same_job_run_it_once(sweep, calls):
+def test_two_workers_of_the_same_job_run_it_once(sweep, calls):
     folder = sweep("a long one")
     worker = start_worker(folder)
     waiting = start_waiting(folder)
@@ -185,11 +185,12 @@ def test_a_job_of_a_killed_worker_runs_again_once_its_process_has_ended(has_chec
     waiting = start_waiting(folder)
     worker.kill()
     worker.wait()
-    if has_checkpoint:  # after the other worker has begun to wait
+    if has_checkpoint:  # since the other worker waits
         (folder / "job_1/checkpoints").mkdir()
         (folder / "job_1/checkpoints/step_0000002.pt").touch()
     time.sleep(3 * process.POLL_SECONDS)
-    [first] = calls(folder)  # its process is still running, and its files are still there
+    # The process of the first worker is still running, and its files are still there.
+    [first] = calls(folder)
     assert (folder / "job_1/waiting").exists()
     (folder / "end").touch()
     wait_until(lambda: len(calls(folder)) == 2)
@@ -197,7 +198,7 @@ def test_a_job_of_a_killed_worker_runs_again_once_its_process_has_ended(has_chec
     join(waiting)
     _, second = calls(folder)
     assert second["words"][1].partition("=")[0] == ("resume" if has_checkpoint else "prompt")
-    assert not second["meets"], first
+    assert not second["running"], first
 
 
 def test_a_worker_that_waits_for_a_job_ends_when_the_sweep_is_stopped(sweep, calls):
@@ -231,8 +232,8 @@ def test_a_file_system_without_locks_runs_jobs_too(sweep, monkeypatch):
     assert load(folder)[0].outcome == "finished"
 
 
-def test_a_machine_without_unix_locks_and_signals_can_import_all_of_it():
-    """Windows has none of them; there a lock is taken with msvcrt."""
+def test_a_machine_without_unix_locks_and_signals_can_import_every_module():
+    """On Windows, these signals are missing and locks use msvcrt."""
     code = (
         "import multiprocessing, signal, subprocess, sys, tempfile, types\n"
         "for name in ('SIGUSR1', 'SIGUSR2', 'SIGKILL'): delattr(signal, name)\n"
@@ -252,7 +253,7 @@ def test_a_machine_without_unix_locks_and_signals_can_import_all_of_it():
 
 
 def test_a_worker_ends_with_the_sweep_only_if_the_sweep_has_started_it(monkeypatch):
-    """joblib starts workers like that. Slurm and Ray start theirs elsewhere, and these continue."""
+    """The sweep starts the workers of joblib. Those of Slurm and Ray are started elsewhere and continue."""
     done = []
     monkeypatch.setattr(process, "end_with", lambda parent: done.append(("watch", parent)))
     process._end_with_sweep()
@@ -269,7 +270,7 @@ def test_a_worker_ends_with_the_sweep_only_if_the_sweep_has_started_it(monkeypat
     assert done == [("watch", os.getppid()), signal.SIGKILL]
 
 
-# --- ends from outside ------------------------------------------------------------------------------------
+# --- signals from outside ---------------------------------------------------------------------------------
 
 
 def start_worker(folder: Path, before: str = "") -> subprocess.Popen:
@@ -285,7 +286,7 @@ def start_worker(folder: Path, before: str = "") -> subprocess.Popen:
 
 
 def test_sigterm_of_a_worker_reaches_its_job(sweep):
-    """Slurm sends SIGTERM when a job is cancelled. Ctrl-C is handled by the process of the sweep."""
+    """Slurm sends SIGTERM when a job is cancelled. A worker ignores Ctrl-C, which the sweep handles."""
     folder = sweep("a wait")
     worker = start_worker(folder)
     worker.send_signal(signal.SIGINT)
@@ -296,7 +297,7 @@ def test_sigterm_of_a_worker_reaches_its_job(sweep):
     assert load(folder)[0].outcome == "interrupted"
 
 
-def test_a_launcher_handles_the_announcement_of_the_end_once_the_job_has_saved(sweep):
+def test_a_launcher_handles_the_end_of_its_time_once_the_job_has_saved(sweep):
     """The handler of submitit queues a Slurm job again when its time is up, and exits."""
     folder = sweep("a wait")
     outcome = "(sweep / 'job_1/summary.json').read_text()"
@@ -328,14 +329,16 @@ def test_a_job_ends_with_the_process_that_started_it():
 
 
 def test_a_job_ignores_signals_that_are_meant_for_its_launcher(monkeypatch):
-    heard = []
+    handlers = []
     monkeypatch.setattr("cadam3d.job.end_with", lambda parent: None)
-    monkeypatch.setattr("cadam3d.cli.main", lambda: heard.extend(map(signal.getsignal, process.ANNOUNCING)))
+    monkeypatch.setattr(
+        "cadam3d.cli.main", lambda: handlers.extend(map(signal.getsignal, process.ANNOUNCING))
+    )
     monkeypatch.setattr(sys, "argv", ["to be restored"])
     before = [(number, signal.getsignal(number)) for number in process.ANNOUNCING]
     try:
         job.main(["1", "train", "seed=0"])
-        assert heard == [signal.SIG_IGN] * 2
+        assert handlers == [signal.SIG_IGN] * 2
         assert sys.argv == ["cadam3d", "train", "seed=0"]
     finally:
         for number, handler in before:
@@ -354,8 +357,8 @@ def wait_for(path: Path) -> None:
     wait_until(path.exists)
 
 
-def wait_until(is_so: Callable[[], bool]) -> None:
+def wait_until(condition: Callable[[], bool]) -> None:
     deadline = time.monotonic() + 60
-    while not is_so():
+    while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.02)

@@ -1,4 +1,4 @@
-"""``cadam3d sweep`` from its line to its table, with a stand-in for training."""
+"""``cadam3d sweep`` from the command line to the table, with a small program in place of training."""
 
 import csv
 import os
@@ -52,7 +52,7 @@ class Result:
 
 @pytest.fixture(scope="session")
 def small_configs(tmp_path_factory) -> Path:
-    """The folders that sweeps need, and a train.yaml that composes in no time."""
+    """Return a folder with the real groups that sweeps need and a train.yaml that composes fast."""
     folder = tmp_path_factory.mktemp("configs")
     for name in ("hydra", "densifier", "grid", "launcher"):
         shutil.copytree(REPOSITORY / "configs" / name, folder / name)
@@ -85,7 +85,7 @@ def hydra_sweep(monkeypatch, capfd, tmp_path, small_configs, stand_in):
 
 @pytest.fixture
 def sweep(hydra_sweep, monkeypatch):
-    """The same with a loop instead of Hydra's multirun, which takes a third of the time."""
+    """Do the same with a loop instead of Hydra's multirun, in a third of the time."""
 
     def run_jobs(name: str, arguments: list[str], _run: Callable) -> None:
         given = dict(line.split("=", 1) for line in arguments if "=" in line)
@@ -118,7 +118,7 @@ def test_train_with_a_flag_is_a_sweep(flag, sweep):
     assert [row["seed"] for row in read_table(only_sweep())] == ["0", "1"]
 
 
-def test_a_sweep_leaves_one_row_per_job(hydra_sweep):
+def test_the_table_has_one_row_per_job(hydra_sweep):
     result = hydra_sweep("prompt=a corgi, front view", "densifier=baseline,cadam", "seed=0,1")
     assert result.code == 0, result.err
     rows = read_table(only_sweep())
@@ -165,7 +165,8 @@ def test_a_grid_gives_its_name_and_its_arms(sweep):
     assert [row["arm"] for row in rows] == ["baseline", "cadam", "none"] * 2
     assert [row["densifier"] for row in rows] == ["baseline", "cadam", "none"] * 2
     assert "[1/6] baseline, seed=0: " in result.out
-    assert "densifier" not in result.out.split("job  ")[1].splitlines()[0]  # it follows from the arm
+    # The table in the terminal has no column for the densifier, which follows from the arm.
+    assert "densifier" not in result.out.split("job  ")[1].splitlines()[0]
 
 
 def test_an_arm_can_be_left_out(sweep):
@@ -173,13 +174,13 @@ def test_an_arm_can_be_left_out(sweep):
     assert [row["arm"] for row in read_table(Path("multirun/densifiers"))] == ["baseline", "cadam"]
 
 
-def test_failed_and_killed_jobs_are_rows_and_the_rest_goes_on(sweep, calls):
+def test_failed_and_killed_jobs_are_rows_and_the_other_jobs_still_run(sweep, calls):
     Path("multirun").mkdir()
     result = sweep("prompt=a cube,a mistake,a bug,a kill,a crowd,a ball", "hydra.sweep.dir=multirun/x")
     rows = read_table(Path("multirun/x"))
     outcomes = ["finished", "failed", "failed", "killed", "out_of_memory", "finished"]
     assert [row["outcome"] for row in rows] == outcomes
-    assert rows[1]["message"] == "prompt: I know no mistake. Try: a cube"
+    assert rows[1]["message"] == "prompt: expected a shape. Try: a cube"
     assert rows[2]["message"] == "ValueError: one two"
     assert rows[3]["message"].startswith("by SIGKILL")
     assert result.code == 1
@@ -205,7 +206,7 @@ def test_the_table_is_right_after_every_job(hydra_sweep, monkeypatch):
 
 
 def test_the_last_of_several_writers_leaves_the_latest_state(tmp_path, monkeypatch):
-    """A job that ends while the table is being written is in it all the same."""
+    """The table also has the result of a job that ends while the table is being written."""
     before = Row(0, "", tmp_path / "a", [], {"seed": 0}, {})
     after = Row(0, "", tmp_path / "a", [], {"seed": 0}, {"outcome": "finished"})
     states = iter([[before], [after], [after]])
@@ -248,7 +249,7 @@ def test_finished_jobs_are_skipped_and_the_others_run_again(sweep, calls):
 
 
 def test_numbers_without_exports_are_not_a_result(sweep, calls):
-    """Training writes the numbers first. If the whole machine fails then, nothing records that."""
+    """Training writes the numbers before the exports, and a failure of the machine can come between them."""
     sweep("prompt=a cube", "seed=0,1")
     [row, _] = load(only_sweep().resolve())
     (row.folder / "summary.json").write_text('{"outcome": "finished", "num_gaussians": 5}')
@@ -287,7 +288,7 @@ def test_a_narrower_line_finds_the_jobs_of_the_wider_one(seeds, sweep, calls):
     assert result.code == 0
     assert len(calls(Path("multirun/densifiers"))) == 9
     rows = read_table(Path("multirun/densifiers"))
-    assert {row["seed"] for row in rows} == set(seeds.split(","))  # the table is of this line
+    assert {row["seed"] for row in rows} == set(seeds.split(","))
 
 
 def test_other_settings_in_the_same_folder_are_refused_with_the_key(sweep, calls):
@@ -344,7 +345,7 @@ def test_a_second_sweep_in_the_folder_of_a_running_one_is_refused(sweep):
     with start._locked(folder):
         result = sweep("prompt=a cube", "grid=densifiers")
     assert result.code == 1
-    assert "another sweep is at work in multirun/densifiers" in result.err
+    assert "another sweep is running in multirun/densifiers" in result.err
     assert not (folder / JOBS).exists()
     assert sweep("prompt=a cube", "grid=densifiers").code == 0
 
@@ -354,7 +355,7 @@ def test_a_second_sweep_in_the_folder_of_a_running_one_is_refused(sweep):
 
 @pytest.fixture
 def start_sweep(tmp_path, small_configs, stand_in):
-    """Start a sweep in a process of its own, whose workers also find the replacement of training."""
+    """Start a sweep in a separate process. Its workers use the replacement of training too."""
     python = tmp_path / "python"
     is_job = 'case "$*" in *cadam3d.job*)'
     python.write_text(f'#!/bin/sh\n{is_job} exec {stand_in} "$@";; esac\nexec {PYTHON} "$@"\n')
@@ -379,7 +380,8 @@ def start_sweep(tmp_path, small_configs, stand_in):
 
     started: list[subprocess.Popen] = []
     yield run
-    for process in started:  # only after a failure; workers and jobs end with it
+    # After a failed test, the workers and jobs end together with the process of the sweep.
+    for process in started:
         process.kill()
         process.wait()
 
@@ -400,11 +402,11 @@ def test_sigint_stops_all_running_jobs_and_the_table_is_right(launcher, running,
 
 
 def test_a_second_sigint_ends_at_once(start_sweep, tmp_path):
-    process = start_sweep("prompt=a deaf one", "seed=0,1", "hydra.sweep.dir=x")
+    process = start_sweep("prompt=a stuck one", "seed=0,1", "hydra.sweep.dir=x")
     wait_for(tmp_path, "x/*/waiting", process)
     process.send_signal(signal.SIGINT)
     assert process.stderr.readline() == "\n"
-    assert "once more to stop at once" in process.stderr.readline()
+    assert "interrupt again to stop at once" in process.stderr.readline()
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=30)
     assert process.returncode == 130
@@ -413,7 +415,7 @@ def test_a_second_sigint_ends_at_once(start_sweep, tmp_path):
 
 
 @pytest.mark.parametrize(("launcher", "running"), [((), 1), (("launcher=joblib", "launcher.n_jobs=2"), 2)])
-def test_a_killed_sweep_typed_again_runs_no_job_twice_at_a_time(
+def test_no_job_runs_twice_at_a_time_when_a_killed_sweep_is_started_again(
     launcher, running, start_sweep, calls, tmp_path
 ):
     line = ("prompt=a long one", "seed=0,1,2,3", "hydra.sweep.dir=x")
@@ -424,7 +426,8 @@ def test_a_killed_sweep_typed_again_runs_no_job_twice_at_a_time(
     held = [call["folder"] for call in calls(folder)]
     opened = {lock: lock.stat().st_mtime_ns for lock in folder.glob("*/.lock")}
     second = start_sweep(*line, *launcher)
-    first.communicate(timeout=30)  # the pipes close once its workers have ended; its jobs still run
+    # The pipes close once its workers have ended. Its jobs are still running.
+    first.communicate(timeout=30)
     wait_until(lambda: all(lock.stat().st_mtime_ns > time for lock, time in opened.items()), second)
     time.sleep(1)
     assert len(calls(folder)) == running
@@ -435,16 +438,16 @@ def test_a_killed_sweep_typed_again_runs_no_job_twice_at_a_time(
     assert second.returncode == 0, err
     times = Counter(call["folder"] for call in calls(folder))
     assert times == {row.folder.name: 1 + (row.folder.name in held) for row in load(folder)}
-    assert not any(call["meets"] for call in calls(folder))
+    assert not any(call["running"] for call in calls(folder))
 
 
 def wait_for(folder: Path, pattern: str, process: subprocess.Popen, count: int = 1) -> None:
     wait_until(lambda: len(list(folder.glob(pattern))) >= count, process)
 
 
-def wait_until(is_so: Callable[[], bool], process: subprocess.Popen) -> None:
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen) -> None:
     deadline = time.monotonic() + 90
-    while not is_so():
+    while not condition():
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.05)
@@ -453,7 +456,7 @@ def wait_until(is_so: Callable[[], bool], process: subprocess.Popen) -> None:
 # --- launchers --------------------------------------------------------------------------------------------
 
 
-def test_joblib_runs_the_whole_sweep_and_a_plus_does_no_harm(start_sweep, tmp_path):
+def test_joblib_runs_the_whole_sweep_and_a_leading_plus_is_accepted(start_sweep, tmp_path):
     words = (
         "prompt=a cube,a mistake",
         "seed=0,1",
@@ -507,7 +510,7 @@ def test_after_a_failure_of_the_launcher_the_table_is_right(sweep, monkeypatch):
     monkeypatch.setattr(start, "run_hydra", fail)
     result = sweep("prompt=a cube", "seed=0,1")
     assert result.code == 1
-    assert result.err.splitlines()[0] == "cadam3d: the launcher gave up. RuntimeError: a worker was lost"
+    assert result.err.splitlines()[0] == "cadam3d: the launcher failed. RuntimeError: a worker was lost"
     assert "2 of 2 jobs have no result (2 unfinished). Rerun" in result.err
 
 
@@ -602,7 +605,7 @@ def test_many_jobs_that_differ_in_values_are_composed_once(sweep, monkeypatch):
 
 
 def test_each_arm_is_composed_at_most_twice(sweep, monkeypatch):
-    """Once to see which settings it has, and once for its jobs."""
+    """It is composed once to find out which settings it has, and once for its jobs."""
     counted = []
     original = plan.compose_line
     monkeypatch.setattr(plan, "compose_line", lambda *args: counted.append(args) or original(*args))
@@ -625,6 +628,15 @@ def test_the_plan_records_folder_flags_and_line(sweep, tmp_path):
         *("--config-dir", "own", "prompt='a cube'", "densifier=mine,none", "hydra.sweep.dir=x")
     ]
     assert [job.swept["densifier"] for job in remembered.jobs] == ["mine", "none"]
+
+
+@pytest.mark.parametrize("flag", [("--config-name", "mine"), ("--config-name=mine",), ("-cn", "mine")])
+def test_another_config_name_is_for_the_jobs_only(flag, hydra_sweep, calls, small_configs):
+    """The sweep itself and its launcher keep their own YAML files."""
+    (small_configs / "mine.yaml").write_text(TRAIN.replace("steps: 5", "steps: 6"), encoding="utf-8")
+    result = hydra_sweep(*flag, "prompt=a cube", "seed=0,1", "hydra.sweep.dir=x")
+    assert result.code == 0, result.err
+    assert [call["words"][-1 - len(flag) : -1] for call in calls(Path("x"))] == [list(flag)] * 2
 
 
 def test_grids_and_components_are_found_on_a_search_path(sweep, tmp_path):
@@ -685,5 +697,5 @@ def test_preparing_a_sweep_needs_no_torch(start_sweep, tmp_path):
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(5.4, "5 s"), (240, "4 min"), (30_000, "8.3 h")])
-def test_durations_are_as_precise_as_estimates_are(seconds, text):
+def test_the_remaining_time_is_rounded(seconds, text):
     assert duration(seconds) == text
