@@ -42,14 +42,14 @@ class CAdam(Densifier[CAdamState]):
     Both tests are independent of the scale of the loss: one is a rank, the other a ratio.
     """
 
-    tau_Q: float | Schedule | None  # in [0, 1): quantile of the drift that candidates exceed; null = off
-    tau_SNR: float | None  # >= 0: SNR above which a Gaussian is reliable (eq. 11 and 13); null = off
-    beta1: float  # in [0, 1): decay of m
-    beta2: float  # in [0, 1): decay of v
-    eps: float  # > 0: added to the noise, in loss per world unit; without any gradient the SNR is 0
-    min_age: int  # updates before a Gaussian may grow
-    reset: str  # which opacities a reset lowers: unreliable (paper), all (3DGS) or none
-    reset_min_age: int  # updates before a Gaussian may be called unreliable
+    tau_Q: float | Schedule | None  # in [0, 1), eq. 9
+    tau_SNR: float | None  # >= 0, eq. 11 and 13
+    beta1: float  # in [0, 1), decay of m
+    beta2: float  # in [0, 1), decay of v
+    eps: float  # > 0, loss per world unit
+    min_age: int  # updates
+    reset: str  # one of RESET
+    reset_min_age: int  # updates
 
     def __post_init__(self) -> None:
         if self.tau_Q is not None:
@@ -132,11 +132,11 @@ class CAdam(Densifier[CAdamState]):
 
     def _reset_threshold(self) -> float:
         """Return the SNR below which a Gaussian is unreliable."""
-        assert self.tau_SNR is not None, "_check_reset_threshold"
+        assert self.tau_SNR is not None, "_check_reset_threshold requires it"
         return self.tau_SNR
 
     def _eps(self, noise: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-        """Return the number that is added to ``noise`` in the SNR."""
+        """Return what is added to ``noise``, so that the SNR of a Gaussian without any gradient is 0."""
         return noise.new_tensor(self.eps)
 
     def _check_reset_threshold(self) -> None:

@@ -20,7 +20,8 @@ NO_GROWTH = "none"  # the arm that gains are measured from
 RESAMPLES = 2000
 CONFIDENCE = 0.95
 BOOTSTRAP_SEED = 0  # the same results give the same interval
-# Prompts. With 4 a bootstrap of the median covers the truth in only 85 %, and 5 cannot pass a sign test.
+# Prompts that an interval needs. With 4, a bootstrap of the median covers the true value in only 85 % of
+# cases, and 5 cannot pass a sign test.
 LEAST_FOR_INTERVAL = 6
 SIGNIFICANT = 1 - CONFIDENCE  # of the sign test
 
@@ -409,7 +410,8 @@ def _grouped(
 ) -> dict[Hashable, list[float]]:
     """Return the values of the cells of each group."""
     groups: dict[Hashable, list[float]] = defaultdict(list)
-    for cell, value in sorted(values.items()):  # a fixed order, so that the bootstrap is reproducible
+    # The order is fixed, so that the bootstrap is reproducible.
+    for cell, value in sorted(values.items()):
         groups[group_of(cell)].append(value)
     return dict(groups)
 

@@ -45,7 +45,7 @@ def reduction_sentence(comparison: PairedComparison) -> str:
         f"no more than {COMPARABLE} dB lower in {comparison.comparable(COMPARABLE)} of them"
     )
     if comparison.psnr_over_seeds is not None:
-        sentence += f", {comparison.psnr_over_seeds:.2f} dB spread over seeds"
+        sentence += f", with a spread of {comparison.psnr_over_seeds:.2f} dB over seeds"
     for name, early in (
         (comparison.ours.arm, comparison.early),
         (comparison.theirs.arm, comparison.theirs_early),
@@ -77,7 +77,7 @@ def standing_sentence(standing: Standing, where: str = "") -> str:
         f"{standing.settings} thresholds at equal count, above it in {share}"
     )
     if standing.psnr_over_seeds is not None:
-        sentence += f", {standing.psnr_over_seeds:.2f} dB spread over seeds"
+        sentence += f", with a spread of {standing.psnr_over_seeds:.2f} dB over seeds"
     if not is_certain(standing):
         sentence += f", which is not a certain difference ({plural(estimate.prompts, 'prompt')})"
     if outside:

@@ -66,7 +66,7 @@ def test_a_difference_comes_with_its_spread_over_seeds(jobs):
         for tau, n, best in ((0.001, 100, 10.0), (0.0002, 10000, 20.0)):
             jobs.add("baseline", f"densifier.tau_pos={tau}", f"seed={seed}", n=n, psnr=best)
         jobs.add("cadam", f"seed={seed}", n=1000, psnr=psnr)
-    assert "in 2 of 2 cells, 0.14 dB spread over seeds" in headline(read(jobs.folder))[1]
+    assert "in 2 of 2 cells, with a spread of 0.14 dB over seeds" in headline(read(jobs.folder))[1]
 
 
 def test_cells_without_a_partner_are_reported_for_each_arm(jobs):
