@@ -152,5 +152,5 @@ def _draw(axes: Axes, found: ScoreMap) -> None:
             va="bottom" if side > 0 else "top",
             fontsize=7.5,
             color=color,
-            bbox={"facecolor": BACKGROUND, "alpha": 0.6, "lw": 0, "pad": 0.5},
+            bbox={"facecolor": BACKGROUND, "alpha": 0.85, "lw": 0, "pad": 0.5},
         )
