@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 from evidence import (
@@ -23,7 +22,7 @@ from cadam3d.core.checks import UserError
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.schedule import Linear
 from cadam3d.densifier.base import GradientSignal
-from cadam3d.densifier.cadam import CAdamState, quantile, white_noise_snr
+from cadam3d.densifier.cadam import CAdamState, quantile
 from cadam3d.densifier.refine import Refine
 
 # The moments (eq. 8 and 10).
@@ -370,18 +369,3 @@ def test_the_selective_reset_needs_a_threshold():
     assert cadam(tau_SNR=None, reset="all").tau_SNR is None
     with pytest.raises(UserError, match=r"densifier\.tau_SNR: .* Try: densifier=cadam_no_snr"):
         cadam(tau_SNR=None)
-
-
-def test_the_level_of_white_noise_agrees_with_a_simulation():
-    rng = np.random.default_rng(0)
-    m, v = np.zeros((4000, 3)), np.zeros((4000, 3))
-    # After 3000 steps the start at zero no longer affects the second moment.
-    for _ in range(3000):
-        gradient = rng.standard_normal((4000, 3))
-        m, v = 0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient**2
-    snr = np.linalg.norm(m, axis=1) / np.sqrt(v.sum(axis=1) / (1 - 0.999**3000))
-    assert np.sqrt((snr**2).mean()) == pytest.approx(white_noise_snr(0.9, 0.999), rel=0.02)
-
-
-def test_a_short_second_moment_has_no_level_of_white_noise():
-    assert white_noise_snr(0.9, 0.81) is None

@@ -12,7 +12,7 @@ import torch
 
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.cadam import CAdam, CAdamState
-from cadam3d.densifier.noise_floor import snr_threshold, squared_weights
+from cadam3d.densifier.noise_floor import snr_threshold, squared_weights, white_noise_snr
 from cadam3d.prior.path import DDPM
 from cadam3d.settings.compose import component, compose
 
@@ -265,3 +265,18 @@ def test_at_a_large_age_the_threshold_follows_from_chi_square():
 
     expected = math.sqrt(0.1 / 1.9 * chi2.ppf(0.95, 3) / 3)
     assert float(snr_threshold(0.05, 0.9, 0.9999, torch.tensor([10**6]))) == pytest.approx(expected, rel=1e-3)
+
+
+def test_the_level_of_white_noise_agrees_with_a_simulation():
+    rng = np.random.default_rng(0)
+    m, v = np.zeros((4000, 3)), np.zeros((4000, 3))
+    # After 3000 steps the start at zero no longer affects the second moment.
+    for _ in range(3000):
+        gradient = rng.standard_normal((4000, 3))
+        m, v = 0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient**2
+    snr = np.linalg.norm(m, axis=1) / np.sqrt(v.sum(axis=1) / (1 - 0.999**3000))
+    assert np.sqrt((snr**2).mean()) == pytest.approx(white_noise_snr(0.9, 0.999), rel=0.02)
+
+
+def test_a_short_second_moment_has_no_level_of_white_noise():
+    assert white_noise_snr(0.9, 0.81) is None
