@@ -23,7 +23,7 @@ class Gaussians:
     log_scales: Float[Tensor, "n 3"]  # natural log of standard deviations in world units
     quats: Float[Tensor, "n 4"]  # wxyz, of any length > 0
     opacity_logits: Float[Tensor, "n"]
-    sh: Float[Tensor, "n k 3"]  # k = (degree + 1)**2; coefficient 0 is the view-independent one
+    sh: Float[Tensor, "n k 3"]  # k = (degree + 1)**2; 0 is view-independent
 
     def __len__(self) -> int:
         return self.means.shape[0]

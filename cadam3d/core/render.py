@@ -21,7 +21,8 @@ class RenderOutput:
 
     rgb: Float[Tensor, "v h w 3"]  # composited over the background; not clamped above
     alpha: Float[Tensor, "v h w"]  # in [0, 1)
-    depth: Float[Tensor, "v h w"]  # expected camera z, sum(w z) / sum(w), world units; 0 where alpha is 0
+    # Expected camera z, sum(w z) / sum(w), in world units; 0 where alpha is 0.
+    depth: Float[Tensor, "v h w"]
     means2d: Float[Tensor, "v n 2"]  # pixels; keeps its gradient while training
     radii: Float[Tensor, "v n"]  # pixels; 0 = not seen
     # Zeros, only on request and if gradients are on. The gradient that a backward pass leaves on them is not

@@ -96,7 +96,8 @@ class MCMC(GradientFree):
 class _Population:
     """A population under construction: which row each member copies, and how it differs from that row."""
 
-    rows: Int[Tensor, "m"]  # row numbers before the edit; ascending among members that are not new
+    # Row numbers before the edit, ascending among members that are not new.
+    rows: Int[Tensor, "m"]
     logits: Float[Tensor, "m"]  # of opacity, in double precision
     log_shrink: Float[Tensor, "m"]  # added to log-scales
     is_new: Bool[Tensor, "m"]  # copies, and the Gaussians that were copied

@@ -21,9 +21,10 @@ class RefinePlan:
 
     edit: RowEdit
     is_selected: Bool[Tensor, "n"]  # rows before the edit that get children
-    cloned: int  # children that are added beside their parent; one for each selected parent that is not split
-    split: int  # parents that are replaced by their children
-    pruned: int  # survivors and newborns removed
+    # Children that are added beside their parent: one for each selected parent that is not split.
+    cloned: int
+    split: int  # parents replaced by their children
+    pruned: int  # removed survivors and newborns
 
     @property
     def selected(self) -> int:

@@ -59,7 +59,7 @@ def other_plots(steps: Lines, refinements: Lines, charts: Sequence[Chart]) -> li
 
 
 def plot_of(chart: Chart, lines: Lines, x_range: Point) -> Plot:
-    """Return what a declared chart shows of ``lines``; empty if none of its keys was logged there."""
+    """Return what a declared chart shows of ``lines``; empty if these lines have none of its keys."""
     factor = 100 if chart.percent else 1
 
     def points(key: str) -> list[Point]:

@@ -47,7 +47,8 @@ from cadam3d.report.style import (
     spread_labels,
 )
 
-EARLY = "\u2020"  # a dagger: some jobs of the setting ended before their last step
+# A dagger: some jobs of the setting ended before their last step.
+EARLY = "\u2020"
 ROOM = 0.07  # between labels, as a share of the axis
 MARK = 6.0  # half the side of the square that a mark covers, in pixels
 # Possible places for the name of an arm, the best first: alignment, and offset in points.

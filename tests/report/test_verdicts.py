@@ -30,7 +30,9 @@ def test_the_claim_of_the_paper_comes_first_then_the_tuned_baseline(jobs):
 
 def test_a_larger_count_is_reported_as_more(jobs):
     cells(jobs, (2000, 20.0), {0.0002: (1000, 20.0)})
-    assert headline(read(jobs.folder))[0].startswith("cadam ends with 100.0% more Gaussians")
+    sentence = headline(read(jobs.folder))[0]
+    assert sentence.startswith("cadam ends with 100.0% more Gaussians than baseline (median of 6 cells")
+    assert "quartiles 100.0% to 100.0% more" in sentence
 
 
 def test_a_setting_below_the_frontier_is_reported_as_below(jobs):
