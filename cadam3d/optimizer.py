@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.optim.adam import adam
 
-from cadam3d.core.checks import UserError, require_range
+from cadam3d.core.checks import require, require_range
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
@@ -25,16 +25,16 @@ MOMENTS = ("exp_avg", "exp_avg_sq")  # as torch names them
 class AdamSettings:
     """Learning rates (a number, or a schedule of the step) and constants of Adam (Kingma and Ba 2015)."""
 
-    means_lr: float | Schedule  # >= 0, like all rates; world units per step
-    sh_dc_lr: float | Schedule  # of the view-independent colour coefficient
-    sh_rest_lr: float | Schedule  # of all other colour coefficients; unused at SH degree 0
-    opacity_lr: float | Schedule  # logits per step
-    scale_lr: float | Schedule  # natural logs per step
-    quat_lr: float | Schedule  # of the quaternions
-    beta1: float  # in [0, 1): decay of the first moment
-    beta2: float  # in [0, 1): decay of the second moment
-    eps: float  # > 0: far below any gradient, because world gradients can be tiny
-    clip_norm: float | Schedule | None  # > 0: largest Euclidean norm of each part's gradient; None = off
+    means_lr: float | Schedule  # >= 0, world units per step
+    sh_dc_lr: float | Schedule  # >= 0
+    sh_rest_lr: float | Schedule  # >= 0
+    opacity_lr: float | Schedule  # >= 0, logits per step
+    scale_lr: float | Schedule  # >= 0, natural logs per step
+    quat_lr: float | Schedule  # >= 0
+    beta1: float  # in [0, 1)
+    beta2: float  # in [0, 1)
+    eps: float  # > 0
+    clip_norm: float | Schedule | None  # > 0, of each part
 
     def __post_init__(self) -> None:
         for part in PARTS:
@@ -126,7 +126,7 @@ class GaussianOptimizer:
     def scale_colors(self, factor: float) -> None:
         """Multiply every colour coefficient, the view-independent one too, and zero the moments of colours.
 
-        Coefficients are zero at mid grey, so a factor below 1 draws bright and dark colours towards it
+        Coefficients are zero at mid grey, so a factor below 1 moves bright and dark colours towards it
         (GCS-BEG). All other tensors and moments stay.
         """
         self._gaussians.sh.mul_(factor)
@@ -150,11 +150,14 @@ class GaussianOptimizer:
         moments: dict[str, Any] = {"steps": state["steps"]}
         for kind in MOMENTS:
             for name, part in parts.items():
-                if state[kind][name].shape != part.shape:
-                    raise UserError(
-                        f"checkpoint: {kind} of {name} has shape {tuple(state[kind][name].shape)}, but the "
-                        f"Gaussians have {tuple(part.shape)}. Try: another checkpoint of this run"
-                    )
+                found = state[kind][name].shape
+                require(
+                    found == part.shape,
+                    "resume",
+                    expected=f"a checkpoint whose {kind} of {name} has the shape {tuple(part.shape)}",
+                    got=tuple(found),
+                    example="resume=RUN/checkpoints/<an earlier one>",
+                )
             moments[kind] = {name: state[kind][name].to(part, copy=True) for name, part in parts.items()}
         self._install(self._gaussians.detach(), moments)
 
@@ -162,8 +165,8 @@ class GaussianOptimizer:
     def _move(self, part: str, gradient: Tensor, rate: float) -> None:
         """Do one step of torch's Adam on one part.
 
-        This uses the function, because the class loads torch's compiler with its first object, which takes
-        more than a second.
+        This calls torch's function instead of its class, because the first object of the class loads torch's
+        compiler, which takes more than a second.
         """
         adam(
             [self._parts[part]],

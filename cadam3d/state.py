@@ -42,11 +42,15 @@ class TrainState:
     step: int  # steps done
     seconds: float  # wall-clock time spent on them
     num_initial: int  # Gaussians at step 0
-    initial_note: str | None  # which fallback replaced the chosen initializer, and why; None if none did
-    skipped: int  # steps without an update, because a gradient was not finite
-    dimmed: int  # steps after which the exposure guard dimmed all colours
-    refused: bool  # whether the refinement after the last step was refused, for exceeding max_gaussians
-    seed: int  # from which all generators descend
+    # Which fallback replaced the chosen initializer, and why; None if the chosen one was used.
+    initial_note: str | None
+    # Steps without an update, because a gradient was not finite.
+    skipped: int
+    # Steps after which the exposure guard dimmed all colours.
+    dimmed: int
+    # Whether the refinement after the last step was refused, because it would have exceeded max_gaussians.
+    refused: bool
+    seed: int  # of all generators
     optimizer: GaussianOptimizer  # owns the Gaussians
     densifier: RowState
     generators: dict[str, torch.Generator]  # one per source of randomness, on the CPU
@@ -128,7 +132,8 @@ class StepReport:
     """Result of one training step."""
 
     step: int  # 1 after the first step
-    loss: float  # surrogate value: half the squared norm of the guidance gradient, plus regularizers
+    # A surrogate: half the squared norm of the guidance gradient, plus regularizers.
+    loss: float
     log: dict[str, float]  # of the guidance and the regularizers
     num_gaussians: int
 
@@ -171,7 +176,8 @@ class RunContext:
     prompt: str
     total_steps: int
     render: RenderFn  # renders the current Gaussians, without gradient
-    rasterizer: Rasterizer  # to render other Gaussians, such as those before a refinement
+    # Renders other Gaussians, such as those before a refinement.
+    rasterizer: Rasterizer
 
 
 def start_generators(seed: int) -> dict[str, torch.Generator]:

@@ -60,7 +60,7 @@ class Trainer:
         self.camera.check_views(self.views)
 
     def _step(self, state: TrainState, embedding: PromptEmbedding) -> tuple[StepReport, RefineReport | None]:
-        """Advance ``state`` in place by one step, and by a refinement or opacity reset where one is due."""
+        """Advance ``state`` in place by one step, and by a refinement or opacity reset if one is due."""
         gaussians, draw = state.gaussians, state.generators
 
         # Render the Gaussians from a few cameras.
@@ -188,7 +188,7 @@ class Trainer:
         """Advance ``state`` in place until ``steps`` are done or another outcome ends the run.
 
         ``stop()`` is called after every step and interrupts the run if it returns True. Running out of memory
-        is an outcome; any other exception ends the callbacks' work and is raised.
+        is an outcome. Any other exception is raised again after ``on_abort`` of the callbacks.
         """
         for callback in self.callbacks:
             callback.on_start(context, state)
@@ -236,7 +236,7 @@ class Trainer:
         refined: RefineReport | None,
         report: StepReport | None,
     ) -> None:
-        """Show the callbacks what was done; they may look but not change anything."""
+        """Pass what was done to the callbacks, which must not change anything."""
         for callback in self.callbacks:
             if refined is not None:
                 callback.on_refine(context, state, refined)

@@ -1,4 +1,4 @@
-"""Gradients and histories for the tests of CAdam and its open choices."""
+"""Gradients and gradient histories for the tests of CAdam and its open choices."""
 
 import torch
 

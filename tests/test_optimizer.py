@@ -55,7 +55,7 @@ def as_named(moments: dict) -> dict[str, torch.Tensor]:
     return {f"{kind}/{name}": moments[kind][name].clone() for kind in MOMENTS for name in PARTS}
 
 
-def test_it_is_torch_adam_on_every_tensor():
+def test_every_tensor_moves_as_under_the_adam_of_torch():
     start = gaussians(7)
     ours = settings().start(start)
     parts = _parts(start.map(torch.clone))
@@ -71,7 +71,7 @@ def test_it_is_torch_adam_on_every_tensor():
         torch.testing.assert_close(part, parts[name], rtol=0, atol=1e-6)
 
 
-def test_the_given_gaussians_are_left_alone():
+def test_the_given_gaussians_are_not_modified():
     start = gaussians(5)
     copies = {name: tensor.clone() for name, tensor in start.tensors().items()}
     train(settings().start(start), range(3))
@@ -139,7 +139,7 @@ def test_a_long_gradient_is_shortened_to_the_bound_and_keeps_its_direction():
     clipped, plain = settings(clip_norm=2.0).start(gaussians(20)), settings().start(gaussians(20))
     for optimizer in (clipped, plain):
         push(optimizer, seed=0)
-        optimizer.gaussians.opacity_logits.grad *= 0.01  # a short one
+        optimizer.gaussians.opacity_logits.grad *= 0.01  # shorter than the bound
         optimizer.step(0)
     assert norms(plain)["opacity"] < 0.1
     assert norms(clipped)["opacity"] == norms(plain)["opacity"]
@@ -168,7 +168,7 @@ def test_a_bound_that_no_gradient_reaches_changes_no_bit():
 
 
 def test_a_zero_gradient_stays_zero_under_a_bound():
-    optimizer = settings(clip_norm=2.0).start(gaussians(6, k=1))  # sh_rest has no element at all
+    optimizer = settings(clip_norm=2.0).start(gaussians(6, k=1))  # sh_rest is empty
     optimizer.step(0)
     assert all(tensor.isfinite().all() for tensor in optimizer.gaussians.tensors().values())
 
@@ -183,7 +183,7 @@ def test_one_bad_gradient_is_noticed(name, bad):
     assert not optimizer.finite_gradients()
 
 
-def test_no_gradients_are_finite_gradients():
+def test_missing_gradients_count_as_finite():
     assert settings().start(gaussians(4)).finite_gradients()
 
 
@@ -212,7 +212,7 @@ def test_an_edit_that_changes_nothing_changes_no_later_step():
         assert torch.equal(getattr(plain.gaussians, name), getattr(edited.gaussians, name))
 
 
-def test_an_edit_leaves_fresh_leaves_that_train():
+def test_after_an_edit_the_new_leaf_tensors_can_be_trained():
     optimizer = settings().start(gaussians(6))
     train(optimizer, range(2))
     optimizer.apply(edit_of(6, keep=[1], parents=[1, 1]))
@@ -221,7 +221,7 @@ def test_an_edit_leaves_fresh_leaves_that_train():
     assert (optimizer.gaussians.sh != before).all()
 
 
-def test_all_gaussians_may_vanish():
+def test_an_edit_may_remove_all_gaussians():
     optimizer = settings().start(gaussians(3))
     train(optimizer, range(2))
     optimizer.apply(RowEdit(keep=torch.arange(0), children=gaussians(0), parents=torch.arange(0)))
@@ -229,7 +229,7 @@ def test_all_gaussians_may_vanish():
     assert len(optimizer.gaussians) == 0
 
 
-def test_a_displacement_moves_the_means_and_leaves_the_moments():
+def test_a_displacement_moves_the_means_and_changes_no_moment():
     optimizer = settings().start(gaussians(5))
     train(optimizer, range(3))
     before, moments = optimizer.gaussians.map(torch.clone).detach(), as_named(optimizer.state_dict())
@@ -240,7 +240,8 @@ def test_a_displacement_moves_the_means_and_leaves_the_moments():
     assert optimizer.gaussians.means.requires_grad
     twin = settings().start(gaussians(5))
     train(twin, range(4))
-    train(optimizer, range(3, 4))  # what Adam moves is what was displaced
+    # Adam continues from the displaced means.
+    train(optimizer, range(3, 4))
     torch.testing.assert_close(optimizer.gaussians.means, twin.gaussians.means + offsets)
 
 
@@ -255,7 +256,7 @@ def test_a_reset_never_raises_an_opacity():
     assert 0 < lowered < 50
 
 
-def test_a_reset_touches_exactly_the_marked_rows_and_only_the_opacity():
+def test_a_reset_changes_exactly_the_marked_rows_and_only_their_opacity():
     optimizer = settings().start(gaussians(10))
     train(optimizer, range(5))
     values = optimizer.gaussians.detach().map(torch.clone)
@@ -273,7 +274,7 @@ def test_a_reset_touches_exactly_the_marked_rows_and_only_the_opacity():
         assert torch.equal(now, expected), name
 
 
-def test_a_reset_moves_what_is_rendered_next():
+def test_a_reset_changes_the_leaf_tensor_in_place():
     optimizer = settings().start(gaussians(10))
     leaf = optimizer.gaussians.opacity_logits
     optimizer.reset_opacity(torch.ones(10, dtype=torch.bool), 0.01)
@@ -298,7 +299,7 @@ def test_dimming_multiplies_every_colour_coefficient_and_zeroes_their_moments_on
         assert moments[name].any()
 
 
-def test_dimmed_colours_are_drawn_towards_mid_grey_and_train_on():
+def test_dimmed_colours_move_towards_mid_grey_and_can_be_trained():
     optimizer = settings().start(gaussians(10, k=1))
     bright = rgb_to_sh0(torch.tensor([[1.2, 0.5, 0.0]])).expand(10, 3)
     optimizer.gaussians.sh.data[:, 0] = bright
@@ -343,7 +344,7 @@ def test_resuming_copies_the_moments():
 
 
 def test_moments_of_other_gaussians_are_refused():
-    with pytest.raises(UserError, match=r"exp_avg of means has shape \(5, 3\).*\(4, 3\)"):
+    with pytest.raises(UserError, match=r"exp_avg of means has the shape \(4, 3\), got \(5, 3\)"):
         settings().start(gaussians(4)).load_state_dict(settings().start(gaussians(5)).state_dict())
 
 

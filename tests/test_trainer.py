@@ -37,8 +37,8 @@ SMALL = [
 
 
 @dataclass
-class Witness(Callback):
-    """Records its calls."""
+class Recorder(Callback):
+    """Records the reports and outcomes that the trainer passes on."""
 
     steps: list[StepReport] = field(default_factory=list)
     refinements: list[RefineReport] = field(default_factory=list)
@@ -89,7 +89,7 @@ def same(left: dict, right: dict) -> bool:
 
 
 @pytest.mark.parametrize("densifier", ["cadam", "baseline", "absgrad", "none", "random", "mcmc"])
-def test_same_seed_same_bytes(tmp_path, densifier):
+def test_the_same_seed_gives_the_same_bytes(tmp_path, densifier):
     payloads = []
     for _ in range(2):
         trainer, state = make([f"densifier={densifier}"])
@@ -123,7 +123,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, densifie
     go(trainer, whole, tmp_path)
 
     _, state = make([f"densifier={densifier}"])
-    go(replace(trainer, steps=cut), state, tmp_path)  # stopped early, with the schedules of the whole run
+    # The run stops early but has the schedules of the whole run.
+    go(replace(trainer, steps=cut), state, tmp_path)
     torch.save(state.to_payload(), tmp_path / "half.pt")
     resumed = restore(trainer, torch.load(tmp_path / "half.pt", weights_only=True))
     assert go(trainer, resumed, tmp_path) is Outcome.FINISHED
@@ -140,8 +141,8 @@ def test_densifiers_with_one_seed_see_the_same_views_and_noise(tmp_path):
         assert torch.equal(ends["cadam"][source], ends["none"][source])
 
 
-def test_a_stream_depends_on_its_place_and_on_no_later_name():
-    """A new source of randomness then moves no other, and old results stay reproducible."""
+def test_a_random_stream_depends_only_on_its_position_in_the_list():
+    """A new source of randomness then changes no other stream, and old results stay reproducible."""
     children = np.random.SeedSequence(7).spawn(5)
     old = [
         torch.Generator().manual_seed(int(child.generate_state(1, np.uint64)[0] >> 1)) for child in children
@@ -155,7 +156,7 @@ def test_a_stream_depends_on_its_place_and_on_no_later_name():
 AUGMENTED = ["augmentation=lucid", "augmentation.disparity=0.5"]
 
 
-def test_an_augmented_run_is_another_run_in_which_all_other_streams_are_the_same(tmp_path):
+def test_augmentation_changes_the_result_and_no_other_random_stream(tmp_path):
     ends = {}
     for lines in ([], AUGMENTED):
         trainer, state = make(["densifier=none", *lines])
@@ -172,7 +173,7 @@ def test_an_augmented_run_is_another_run_in_which_all_other_streams_are_the_same
 def test_guidance_gets_the_shown_images_and_regularizers_the_rendered_ones(tmp_path):
     seen = {}
 
-    class Eye(LucidAugmentation):
+    class WatchedAugmentation(LucidAugmentation):
         def perturb(self, gaussians, generator):
             seen["perturbed"] = super().perturb(gaussians, generator)
             return seen["perturbed"]
@@ -181,12 +182,12 @@ def test_guidance_gets_the_shown_images_and_regularizers_the_rendered_ones(tmp_p
             seen["output"], seen["shown"] = output, super().show(output, generator)
             return seen["shown"]
 
-    class Ear(type(make()[0].guidance)):
+    class WatchedGuidance(type(make()[0].guidance)):
         def __call__(self, rgb, *args):
             assert rgb is seen["shown"]
             return super().__call__(rgb, *args)
 
-    class Hand(MeanScale):
+    class WatchedRegularizer(MeanScale):
         def penalty(self, gaussians, output):
             assert gaussians is seen["perturbed"]
             assert output is seen["output"]
@@ -195,9 +196,9 @@ def test_guidance_gets_the_shown_images_and_regularizers_the_rendered_ones(tmp_p
     trainer, state = make(["steps=2"])
     watched = replace(
         trainer,
-        augmentation=Eye(scale_noise=0.1, disparity=0.5, flip=1.0),
-        guidance=Ear(**vars(trainer.guidance)),
-        regularizers={"mean_scale": Hand(weight=1.0)},
+        augmentation=WatchedAugmentation(scale_noise=0.1, disparity=0.5, flip=1.0),
+        guidance=WatchedGuidance(**vars(trainer.guidance)),
+        regularizers={"mean_scale": WatchedRegularizer(weight=1.0)},
     )
     assert go(watched, state, tmp_path) is Outcome.FINISHED
     assert seen.keys() == {"perturbed", "output", "shown"}
@@ -219,14 +220,14 @@ ALWAYS = ["exposure=beg", "exposure.begin=2", "exposure.end=6", "exposure.thresh
 
 def test_colours_are_dimmed_after_steps_that_are_too_bright_and_the_steps_are_counted(tmp_path):
     trainer, state = make(["densifier=none", *ALWAYS])
-    witness = Witness()
-    go(replace(trainer, callbacks=[witness]), state, tmp_path)
-    counts = [report.log.get("dimmed") for report in witness.steps]
+    recorder = Recorder()
+    go(replace(trainer, callbacks=[recorder]), state, tmp_path)
+    counts = [report.log.get("dimmed") for report in recorder.steps]
     assert counts == [None, None, 1, 2, 3, 3, 3, 3]
     assert state.to_payload()["dimmed"] == 3
 
 
-def test_dimming_comes_after_the_step_and_touches_nothing_else(tmp_path):
+def test_dimming_comes_after_the_step_and_changes_only_colours(tmp_path):
     results = []
     for lines in (["exposure=none"], [*ALWAYS, "exposure.begin=7", "exposure.end=9"]):
         trainer, state = make(["densifier=none", *lines])
@@ -264,7 +265,7 @@ def test_the_densifier_observes_gradients_that_are_not_clipped(tmp_path):
 
 
 def test_rows_of_all_three_owners_agree_after_every_refinement(tmp_path):
-    class Auditor(Callback):
+    class RowCheck(Callback):
         def on_refine(self, context, state, report):
             assert report.after == len(state.gaussians)
             assert report.after == report.before + report.cloned + report.split - report.pruned
@@ -272,39 +273,39 @@ def test_rows_of_all_three_owners_agree_after_every_refinement(tmp_path):
             assert state.optimizer.state_dict()["exp_avg"]["means"].shape[0] == report.after
 
     trainer, state = make()
-    witness = Witness()
-    go(replace(trainer, callbacks=[Auditor(), witness]), state, tmp_path)
-    assert [report.step for report in witness.refinements] == [2, 4, 6, 8]
-    assert any(report.cloned + report.split for report in witness.refinements)
+    recorder = Recorder()
+    go(replace(trainer, callbacks=[RowCheck(), recorder]), state, tmp_path)
+    assert [report.step for report in recorder.refinements] == [2, 4, 6, 8]
+    assert any(report.cloned + report.split for report in recorder.refinements)
 
 
 def test_callbacks_see_every_step_once_and_the_end(tmp_path):
     trainer, state = make()
-    witness = Witness()
-    go(replace(trainer, callbacks=[witness]), state, tmp_path)
-    assert [report.step for report in witness.steps] == list(range(1, 9))
-    assert witness.ends == [Outcome.FINISHED]
+    recorder = Recorder()
+    go(replace(trainer, callbacks=[recorder]), state, tmp_path)
+    assert [report.step for report in recorder.steps] == list(range(1, 9))
+    assert recorder.ends == [Outcome.FINISHED]
 
 
 def test_a_stop_signal_ends_the_run_after_the_current_step(tmp_path):
     trainer, state = make()
-    asked = iter([False, False, True])
-    assert go(trainer, state, tmp_path, stop=lambda: next(asked)) is Outcome.INTERRUPTED
+    answers = iter([False, False, True])
+    assert go(trainer, state, tmp_path, stop=lambda: next(answers)) is Outcome.INTERRUPTED
     assert state.step == 3
 
 
 def test_growth_beyond_max_gaussians_is_an_outcome_and_is_not_applied(tmp_path):
     trainer, state = make(["refine.max_gaussians=30"])
-    witness = Witness()
-    outcome = go(replace(trainer, callbacks=[witness]), state, tmp_path)
+    recorder = Recorder()
+    outcome = go(replace(trainer, callbacks=[recorder]), state, tmp_path)
     assert outcome is Outcome.MAX_GAUSSIANS
-    assert witness.ends == [outcome]
+    assert recorder.ends == [outcome]
     assert len(state.gaussians) == 30
-    assert witness.refinements[-1].selected > 0
+    assert recorder.refinements[-1].selected > 0
 
 
 @pytest.mark.parametrize("densifier", ["cadam", "random", "mcmc"])
-def test_a_resumed_run_with_a_larger_cap_equals_one_that_never_met_it(tmp_path, densifier):
+def test_a_resumed_run_with_a_larger_cap_equals_a_run_without_a_cap(tmp_path, densifier):
     free, whole = make([f"densifier={densifier}"])
     go(free, whole, tmp_path)
 
@@ -316,7 +317,8 @@ def test_a_resumed_run_with_a_larger_cap_equals_one_that_never_met_it(tmp_path, 
         return restore(free, torch.load(tmp_path / "capped.pt", weights_only=True))
 
     again = restored()
-    assert go(capped, again, tmp_path) is Outcome.MAX_GAUSSIANS  # the same cap refuses the same refinement
+    # The same cap refuses the same refinement.
+    assert go(capped, again, tmp_path) is Outcome.MAX_GAUSSIANS
     assert again.step == state.step
     resumed = restored()
     assert go(free, resumed, tmp_path) is Outcome.FINISHED
@@ -347,7 +349,7 @@ def test_losing_every_gaussian_is_an_outcome(tmp_path):
     trainer, state = make(["refine.min_opacity=0.999999", "refine.reset_interval=null"])
     assert go(trainer, state, tmp_path) is Outcome.VANISHED
     assert len(state.gaussians) == 0
-    assert go(trainer, state, tmp_path) is Outcome.VANISHED  # and stays the outcome
+    assert go(trainer, state, tmp_path) is Outcome.VANISHED  # resuming it changes nothing
     camera = component(compose(SMALL).camera).sample(0, 1, torch.Generator())
     image = trainer.renderer(state)(camera, torch.ones(1, 3))
     assert torch.equal(image.rgb, torch.ones_like(image.rgb))
@@ -382,7 +384,7 @@ def test_owners_of_rows_agree_even_if_memory_runs_out_within_a_refinement(tmp_pa
     assert state.optimizer.state_dict()["exp_avg"]["means"].shape[0] == rows
 
 
-def test_another_runtime_error_is_not_swallowed(tmp_path, monkeypatch):
+def test_another_runtime_error_is_raised(tmp_path, monkeypatch):
     trainer, state = make()
 
     def broken(*_args):
@@ -407,7 +409,8 @@ def test_a_step_with_a_non_finite_gradient_changes_nothing_but_is_counted(tmp_pa
     go(replace(trainer, guidance=poisoned), state, tmp_path)
     after = state.to_payload()
     assert after["skipped"] == 1
-    for owner in ("gaussians", "optimizer", "densifier"):  # nor does the noise of MCMC
+    # The noise of MCMC is skipped too.
+    for owner in ("gaussians", "optimizer", "densifier"):
         assert same({owner: before[owner]}, {owner: after[owner]})
 
 
@@ -424,8 +427,8 @@ def test_a_number_of_views_that_the_cameras_cannot_give_is_refused_before_the_st
     make(["camera=multiview", "views=4"])
 
 
-def test_an_unknown_or_absent_device_says_what_to_type():
-    with pytest.raises(UserError, match="device=cpu"):
+def test_the_error_for_an_unknown_device_suggests_the_cpu():
+    with pytest.raises(UserError, match=r"^device: expected .*, got 'toaster'\. Try: device=cpu$"):
         resolve_device("toaster")
     assert resolve_device("cpu") == CPU
 

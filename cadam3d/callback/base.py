@@ -21,4 +21,7 @@ class Callback(ABC):  # noqa: B024 (every hook has a sensible default: do nothin
         """Called after the last step, whatever the outcome."""
 
     def on_abort(self, context: RunContext) -> None:  # noqa: B027
-        """Called when the loop raised, to release the terminal. The state may be half updated: not passed."""
+        """Called when the loop raised an exception, to release the terminal.
+
+        The state is not passed, because it may be half updated.
+        """

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.callback.base import Callback
@@ -32,15 +32,15 @@ class Candidates(PictureSettings, Callback):
 
     A picture shows the population before the edit from each azimuth: as it is rendered, and beside it the
     selected Gaussians in vermilion among the others in grey. This callback never draws a random number, so it
-    changes no bit of a run.
+    does not change the run.
     """
 
     node: ClassVar[str] = "callback.candidates"
 
-    every: int  # steps; refinements at its multiples are drawn
-    azimuths_deg: Sequence[float]  # one view for each, in [-360, 360]; 0 = front
+    every: int  # steps
+    azimuths_deg: Sequence[float]  # in [-360, 360]
     elevation_deg: float  # in [-90, 90]
-    bins_per_decade: int  # of the histograms, which are logarithmic
+    bins_per_decade: int  # >= 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -114,13 +114,9 @@ def histogram(
         "bins_per_decade": bins_per_decade,
         "first": first,
         "counts": counts.tolist(),
-        "selected": _selected_counts(bins - first, is_selected[has_log], len(counts)),
+        "selected": (bins - first)[is_selected[has_log]].bincount(minlength=len(counts)).tolist(),
         "without_log": int((~has_log).sum()),
     }
-
-
-def _selected_counts(bins: Int[Tensor, "m"], is_selected: Bool[Tensor, "m"], length: int) -> list[int]:
-    return bins[is_selected].bincount(minlength=length).tolist()
 
 
 def pictures(run_folder: Path) -> list[tuple[int, Path]]:

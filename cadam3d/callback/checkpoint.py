@@ -13,8 +13,8 @@ from cadam3d.state import Outcome, RunContext, StepReport, TrainState
 class Checkpoint(Callback):
     """Save the whole :class:`TrainState`, atomically, into ``checkpoints/`` of the run folder."""
 
-    every: int  # steps between checkpoints
-    keep: int  # number of newest files that are kept
+    every: int  # steps
+    keep: int  # files
 
     def __post_init__(self) -> None:
         require_whole("callback.checkpoint.every", self.every, low=1, example=100)

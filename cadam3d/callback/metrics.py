@@ -13,7 +13,7 @@ from cadam3d.state import RefineReport, RunContext, StepReport, TrainState
 class Metrics(Callback):
     """Append to ``metrics.jsonl`` in the run folder; a resumed run first deletes what it will repeat."""
 
-    every: int  # steps between lines; refinements are always written
+    every: int  # steps
 
     def __post_init__(self) -> None:
         require_whole("callback.metrics.every", self.every, low=1, example=10)

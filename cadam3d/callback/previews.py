@@ -20,8 +20,8 @@ class Previews(PictureSettings, Callback):
 
     node: ClassVar[str] = "callback.previews"
 
-    every: int | None  # steps between sheets; null = never
-    views: int  # azimuths, evenly spaced from the front on
+    every: int | None  # steps
+    views: int  # >= 1
     elevation_deg: float  # in [-90, 90]
 
     def __post_init__(self) -> None:

@@ -22,9 +22,10 @@ class Progress(Callback):
     memory that tensors have used at once; torch's cache and the driver use more.
     """
 
-    refresh_seconds: float  # between redraws, at least
+    refresh_seconds: float
     _bar: tqdm | None = field(default=None, init=False, repr=False)
-    _begun: tuple[int, float] = field(default=(0, 0.0), init=False, repr=False)  # step and time of day
+    # Step and time, in seconds since the epoch, at which this process started training.
+    _begun: tuple[int, float] = field(default=(0, 0.0), init=False, repr=False)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Open the bar at the current step."""

@@ -10,9 +10,12 @@ from dataclasses import dataclass
 class Curve:
     """One line of a chart: a number that is logged under ``key``."""
 
-    key: str  # of a densifier's statistics, or of an objective's log
-    label: str = ""  # in the legend; empty if the chart has one curve only
-    is_threshold: bool = False  # drawn dashed: a value that the other curves are compared with
+    # Key of a densifier's statistics or of an objective's log.
+    key: str
+    # Entry in the legend; empty if the chart has one curve only.
+    label: str = ""
+    # Whether the other curves are compared with this one, which is then dashed.
+    is_threshold: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,11 +39,15 @@ class Chart:
     """
 
     title: str
-    caption: str  # one sentence: what the numbers are and how to read them
+    # One sentence about what the numbers are and how to read them.
+    caption: str
     curves: tuple[Curve, ...]
-    band: tuple[str, str] | None = None  # keys of a lower and an upper bound, shaded between
-    band_label: str = ""  # in the legend, such as "10 to 90 %"
+    # Keys of a lower and an upper bound, with the area between them shaded, and its entry in the legend.
+    band: tuple[str, str] | None = None
+    band_label: str = ""
     log_y: bool = False
-    percent: bool = False  # the logged numbers are shares in [0, 1] and are shown as percentages
-    score: str = ""  # one of the densifier's scores; empty if the chart is not about a score
-    levels: tuple[Level, ...] = ()  # horizontal lines in the distribution of that score
+    # Whether the logged numbers are shares in [0, 1] that are shown as percentages.
+    percent: bool = False
+    # One of the densifier's scores, or empty, and horizontal lines in the distribution of that score.
+    score: str = ""
+    levels: tuple[Level, ...] = ()

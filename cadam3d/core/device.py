@@ -1,8 +1,8 @@
-"""Device: turns the name that a user types into a device that works on this machine."""
+"""Device: from the name that a user types to a device that works on this machine."""
 
 import torch
 
-from cadam3d.core.errors import UserError
+from cadam3d.core.checks import fail
 
 
 def resolve_device(name: str) -> torch.device:
@@ -17,5 +17,6 @@ def resolve_device(name: str) -> torch.device:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).strip().splitlines()[0]
-        raise UserError(f"device={name}: not usable here ({reason}). Try: device=cpu") from error
+        expected = f"a device of this machine ({reason})"
+        raise fail("device", expected=expected, got=name, example="device=cpu") from error
     return device

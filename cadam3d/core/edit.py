@@ -26,7 +26,7 @@ class RowEdit:
     parents: Int[Tensor, "born"]  # old row number of each child's parent
 
     def __post_init__(self) -> None:
-        assert len(self.children) == self.parents.shape[0], "every child names one parent"
+        assert len(self.children) == self.parents.shape[0], "every child has one parent"
 
     @property
     def rows_after(self) -> int:
@@ -55,5 +55,5 @@ class RowState:
         return type(self)(**{field.name: edit.carry(getattr(self, field.name)) for field in fields(self)})
 
     def to_dict(self) -> dict[str, Tensor]:
-        """The tensors by name, for a checkpoint."""
+        """Return the tensors by name, for a checkpoint."""
         return {field.name: getattr(self, field.name) for field in fields(self)}

@@ -1,4 +1,4 @@
-"""UserError: separate from the checks that raise it, so that the command line imports it without torch."""
+"""UserError: the one exception that is shown to users as a message. Importing it loads nothing else."""
 
 
 class UserError(Exception):

@@ -21,9 +21,9 @@ class Gaussians:
 
     means: Float[Tensor, "n 3"]  # world units
     log_scales: Float[Tensor, "n 3"]  # natural log of standard deviations in world units
-    quats: Float[Tensor, "n 4"]  # wxyz, of any length that is not nearly zero
+    quats: Float[Tensor, "n 4"]  # wxyz, of any length > 0
     opacity_logits: Float[Tensor, "n"]
-    sh: Float[Tensor, "n k 3"]  # k = (degree + 1)**2; coefficient 0 is the view-independent one
+    sh: Float[Tensor, "n k 3"]  # k = (degree + 1)**2; 0 is view-independent
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -35,7 +35,7 @@ class Gaussians:
 
     @property
     def scales(self) -> Float[Tensor, "n 3"]:
-        """Return standard deviations along the three own axes, in world units, > 0."""
+        """Return standard deviations along the three axes of each Gaussian, in world units, > 0."""
         return self.log_scales.exp()
 
     @property
@@ -45,7 +45,7 @@ class Gaussians:
 
     @property
     def rotations(self) -> Float[Tensor, "n 3 3"]:
-        """Return rotation matrices from own axes to world axes; a zero quaternion gives the identity."""
+        """Return matrices from each Gaussian's axes to world axes; the identity for a zero quaternion."""
         # Divide by the largest component first, because squares might leave the range of float32.
         largest = self.quats.detach().abs().amax(dim=-1, keepdim=True)
         return rotation_matrices(self.quats / largest.clamp_min(torch.finfo(largest.dtype).tiny))

@@ -19,11 +19,12 @@ class PictureSettings:
     Exporters, callbacks and metrics that render inherit these four settings and add their own angles.
     """
 
-    node: ClassVar[str]  # of the configuration, such as "exporter.preview"; begins the error messages
+    # Node of the configuration, such as "exporter.preview", with which error messages begin.
+    node: ClassVar[str]
 
-    distance: float  # > 0: of the camera from the origin, in world units
-    fov_y_deg: float  # in (0, 180): vertical field of view, in degrees
-    size: int  # >= 1: height and width of each picture, in pixels
+    distance: float  # > 0, world units
+    fov_y_deg: float  # in (0, 180)
+    size: int  # >= 1, pixels
     background: Sequence[float]  # RGB in [0, 1]
 
     def __post_init__(self) -> None:

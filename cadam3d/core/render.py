@@ -9,8 +9,10 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 
-SOLID = 0.9  # alpha from which a pixel counts as object when disparities are stretched
-FLAT = 1e-6  # per world unit: spread of inverse depths below which disparities are not stretched to [0, 1]
+# Alpha from which a pixel counts as object when disparities are stretched to [0, 1].
+SOLID = 0.9
+# Spread of inverse depths, per world unit, below which disparities are not stretched.
+FLAT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -19,11 +21,12 @@ class RenderOutput:
 
     rgb: Float[Tensor, "v h w 3"]  # composited over the background; not clamped above
     alpha: Float[Tensor, "v h w"]  # in [0, 1)
-    depth: Float[Tensor, "v h w"]  # expected camera z, sum(w z) / sum(w), world units; 0 where alpha is 0
+    # Expected camera z, sum(w z) / sum(w), in world units; 0 where alpha is 0.
+    depth: Float[Tensor, "v h w"]
     means2d: Float[Tensor, "v n 2"]  # pixels; keeps its gradient while training
     radii: Float[Tensor, "v n"]  # pixels; 0 = not seen
     # Zeros, only on request and if gradients are on. The gradient that a backward pass leaves on them is not
-    # a derivative but the sum over pixels of |dLoss/dmeans2d|, each axis by itself (AbsGS).
+    # a derivative but the sum over pixels of |dLoss/dmeans2d|, separately for each axis (AbsGS).
     absgrad: Float[Tensor, "v n 2"] | None = None
 
     @property
@@ -50,5 +53,5 @@ class RenderOutput:
 # From cameras and one RGB background per view (in [0, 1]) to images of given Gaussians, without gradients.
 RenderFn = Callable[[Cameras, Tensor], RenderOutput]
 
-# From cameras and one background per view to the true images of each mode, "m v h w 3". Few priors know them.
+# From cameras and one background per view to the true images of each mode, "m v h w 3". Few priors have them.
 TruthFn = Callable[[Cameras, Tensor], Tensor]

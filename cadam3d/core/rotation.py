@@ -8,8 +8,8 @@ from torch import Tensor
 def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
     """Return the matrices of quaternions (w, x, y, z) of any length; a zero quaternion gives the identity.
 
-    The results are those of ``kornia.geometry.conversions.quaternion_to_rotation_matrix`` to the last bit. To
-    import kornia would take a fifth of a second of every start.
+    The results equal those of ``kornia.geometry.conversions.quaternion_to_rotation_matrix`` to the last bit.
+    Importing kornia would add a fifth of a second to every start.
     """
     length = torch.linalg.vector_norm(quats, dim=-1, keepdim=True)
     w, x, y, z = (quats / torch.where(length != 0, length, torch.ones_like(length))).unbind(dim=-1)

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 from cadam3d.core.checks import are_numbers, require, require_range, require_whole
 
-FAR_STEP = 10**9  # by then every schedule has its final value
+# A step at which every schedule has its final value.
+FAR_STEP = 10**9
 
 
 class Schedule(ABC):
@@ -37,8 +38,8 @@ class Constant(Schedule):
 
 
 @dataclass(frozen=True)
-class Linear(Schedule):
-    """From ``start`` at step ``begin`` in a straight line to ``end`` ``steps`` later, then ``end``."""
+class _Ramp(Schedule):
+    """From ``start`` at step ``begin`` to ``end`` at ``steps`` steps later, and constant before and after."""
 
     start: float
     end: float
@@ -51,29 +52,32 @@ class Linear(Schedule):
         require_range("schedule.start", self.start, example=1e-3)
         require_range("schedule.end", self.end, example=1e-5)
 
-    def __call__(self, step: int) -> float:
-        """Return the value at ``step``."""
-        return self.start + (self.end - self.start) * _progress(step, self.begin, self.steps)
+    def _progress(self, step: int) -> float:
+        """Return the share of the way that is done at ``step``, in [0, 1]."""
+        return min(max((step - self.begin) / self.steps, 0.0), 1.0)
 
 
 @dataclass(frozen=True)
-class LogLinear(Schedule):
+class Linear(_Ramp):
+    """A straight line from ``start`` at step ``begin`` to ``end``, ``steps`` steps later."""
+
+    def __call__(self, step: int) -> float:
+        """Return the value at ``step``."""
+        return self.start + (self.end - self.start) * self._progress(step)
+
+
+@dataclass(frozen=True)
+class LogLinear(_Ramp):
     """Like :class:`Linear`, but in the logarithm: equal factors over equal times, as for 3DGS' rates."""
 
-    start: float
-    end: float
-    steps: int
-    begin: int = 0
-
     def __post_init__(self) -> None:
-        require_whole("schedule.steps", self.steps, low=1, example=600)
-        require_whole("schedule.begin", self.begin, example=0)
+        super().__post_init__()
         require_range("schedule.start", self.start, above=0, example=1e-3)
         require_range("schedule.end", self.end, above=0, example=1e-5)
 
     def __call__(self, step: int) -> float:
         """Return the value at ``step``."""
-        progress = _progress(step, self.begin, self.steps)
+        progress = self._progress(step)
         return math.exp(math.log(self.start) * (1 - progress) + math.log(self.end) * progress)
 
 
@@ -112,13 +116,9 @@ def require_scheduled(key: str, value: object, *, example: object, **bounds: flo
     ``bounds`` are those of :func:`~cadam3d.core.checks.require_range`: ``low``, ``high``, ``below`` and
     ``above``.
     """
-    is_one = isinstance(value, int | float | Schedule)
-    require(is_one, key, expected="a number or a schedule", got=value, example=f"{key}={example}")
+    is_scheduled = isinstance(value, int | float | Schedule)
+    require(is_scheduled, key, expected="a number or a schedule", got=value, example=f"{key}={example}")
     # Most mistakes are visible at one of the two ends.
     for step in (0, FAR_STEP):
         number = value(step) if isinstance(value, Schedule) else value
         require_range(key, number, example=example, **bounds)
-
-
-def _progress(step: int, begin: int, steps: int) -> float:
-    return min(max((step - begin) / steps, 0.0), 1.0)

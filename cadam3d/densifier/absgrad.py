@@ -13,9 +13,9 @@ from cadam3d.densifier.baseline import Baseline
 class AbsGrad(Baseline):
     """Select Gaussians whose mean norm of absolute gradients reaches a fixed threshold.
 
-    The baseline takes the view-space gradient, a sum over pixels that pull in many directions. This class
-    takes the sums over pixels of the absolute values, along x and along y separately. A large Gaussian over
-    fine detail, whose pixels disagree, then stands out. Everything else is the baseline's. Absolute values
+    The baseline takes the view-space gradient, a sum over pixels in which opposite directions cancel. This
+    class takes the sums over pixels of the absolute values, along x and along y separately. A large Gaussian
+    over fine detail, whose pixels disagree, then stands out. All else is as in the baseline. Absolute values
     are larger, and those of noise do not cancel either, so the threshold must be higher.
     """
 
@@ -25,5 +25,5 @@ class AbsGrad(Baseline):
         return True
 
     def _pulls(self, signal: GradientSignal) -> Float[Tensor, "v n 2"]:
-        assert signal.absgrad is not None, "needs_absgrad"
+        assert signal.absgrad is not None, "needs_absgrad requests it"
         return signal.absgrad

@@ -22,7 +22,7 @@ class GradientSignal:
     """The gradients that one backward pass left on each Gaussian, before the optimizer step."""
 
     means: Float[Tensor, "n 3"]  # dLoss/dmeans, loss per world unit: CAdam's evidence
-    means2d: Float[Tensor, "v n 2"]  # dLoss/dmeans2d, loss per pixel, every view: the baseline's evidence
+    means2d: Float[Tensor, "v n 2"]  # dLoss/dmeans2d, loss per pixel: the baseline's evidence
     radii: Float[Tensor, "v n"]  # on screen, in pixels; 0 = not seen
     height: int  # image size in pixels, to turn means2d into NDC units
     width: int
@@ -148,6 +148,23 @@ class Densifier(ABC, Generic[State]):
     def charts(self) -> tuple[Chart, ...]:
         """Declare the charts that the report draws of :meth:`statistics`; none by default."""
         return ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class GradientFree(Densifier[RowCount]):
+    """Base of densifiers that decide without gradients and reset no opacity."""
+
+    def init_state(self, n: int, device: torch.device) -> RowCount:
+        """Return a state without statistics."""
+        return RowCount.of(n, device)
+
+    def observe(self, state: RowCount, signal: GradientSignal) -> RowCount:
+        """Return the same state, because gradients decide nothing."""
+        return state
+
+    def unreliable(self, state: RowCount) -> Bool[Tensor, "n"]:
+        """Return the empty mask: without gradients, no Gaussian is called unreliable."""
+        return state.no_rows
 
 
 def _gradient_of(tensor: Tensor) -> Tensor:

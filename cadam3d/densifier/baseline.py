@@ -41,10 +41,10 @@ class Baseline(Densifier[BaselineState]):
     does. It always depends on the scale of the loss and of its noise (paper sec. 4.1: the dilemma).
     """
 
-    tau_pos: float | Schedule  # > 0: loss per NDC unit
-    views: str  # how the views of one batch are combined, see `_norms`
-    grad_multiplier: float  # > 0: applied to gradients first, for recipes that threshold scaled losses
-    screen_px: float | None  # > 0: Gaussians that were larger on screen, in pixels, are pruned; null = never
+    tau_pos: float | Schedule  # > 0, loss per NDC unit
+    views: str  # one of VIEWS, see `_norms`
+    grad_multiplier: float  # > 0
+    screen_px: float | None  # > 0, pixels
 
     def __post_init__(self) -> None:
         require_scheduled("densifier.tau_pos", self.tau_pos, above=0, example=2e-4)
@@ -63,7 +63,7 @@ class Baseline(Densifier[BaselineState]):
 
     def observe(self, state: BaselineState, signal: GradientSignal) -> BaselineState:
         """Return the sums after one more batch. A gradient that is not finite counts as not seen."""
-        # Both axes by themselves, because broadcasting over rows of two is slow.
+        # Each axis is scaled separately, because broadcasting over rows of two is slow.
         x, y = self._pulls(signal).unbind(dim=-1)
         # An NDC unit is half the image size.
         x = x * (self.grad_multiplier * signal.width / 2)
@@ -86,8 +86,8 @@ class Baseline(Densifier[BaselineState]):
     def unwanted(self, state: BaselineState) -> Bool[Tensor, "n"] | None:
         """Return the mask of Gaussians larger than ``screen_px`` in any view since the last refinement.
 
-        3DGS intends this (20 pixels) but clears its radii before it compares them, so as shipped it prunes
-        none: ``null``.
+        3DGS intends this, at 20 pixels, but clears its radii before it compares them. As shipped it prunes no
+        Gaussian, which is ``null`` here.
         """
         return None if self.screen_px is None else state.radius > self.screen_px
 
@@ -137,10 +137,10 @@ class Baseline(Densifier[BaselineState]):
     def _norms(
         self, x: Float[Tensor, "v n"], y: Float[Tensor, "v n"], visible: Bool[Tensor, "v n"]
     ) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
-        """Return what a batch adds to the sum of norms and to their number; released codes disagree about it.
+        """Return what a batch adds to the sum of norms and to their number. Published codes differ in this.
 
-        ``sum_norm``: every view by itself (gsplat, gsgen). ``sum_vector``: the norm of the sum, one count per
-        batch (GaussianDreamer). ``last``: only the last view (LucidDreamer, FlowDreamer, GCS-BEG).
+        ``sum_norm``: every view counts separately (gsplat, gsgen). ``sum_vector``: the norm of the sum, one
+        count per batch (GaussianDreamer). ``last``: only the last view (LucidDreamer, FlowDreamer, GCS-BEG).
         """
         norms = torch.hypot(x, y)
         seen = visible & norms.isfinite()

@@ -2,7 +2,7 @@
 
 The gradient of a Gaussian is a drift plus noise of mean zero (sec. 4.1). Its first moment m keeps the drift
 while the noise cancels; its second moment v measures both. A Gaussian grows if its drift is large among all
-Gaussians and large beside its own noise. Choices that the paper leaves open, and our variants, are in
+Gaussians and large compared with its own noise. Choices that the paper leaves open, and our variants, are in
 ``cadam_open.py``.
 """
 
@@ -18,6 +18,7 @@ from cadam3d.core.checks import require, require_choice, require_range, require_
 from cadam3d.core.edit import RowState
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.densifier.base import Densifier, GradientSignal
+from cadam3d.densifier.noise_floor import white_noise_snr
 
 RESET = ("unreliable", "all", "none")
 
@@ -37,19 +38,19 @@ class CAdamState(RowState):
 
 @dataclass(frozen=True, kw_only=True)
 class CAdam(Densifier[CAdamState]):
-    """Select Gaussians whose drift is in the top quantile and exceeds its own noise.
+    """Select Gaussians whose drift is in the top quantile and large compared with its own noise.
 
     Both tests are independent of the scale of the loss: one is a rank, the other a ratio.
     """
 
-    tau_Q: float | Schedule | None  # in [0, 1): quantile of the drift that candidates exceed; null = off
-    tau_SNR: float | None  # >= 0: SNR above which a Gaussian is reliable (eq. 11 and 13); null = off
-    beta1: float  # in [0, 1): decay of m
-    beta2: float  # in [0, 1): decay of v
-    eps: float  # > 0: added to the noise, in loss per world unit; without any gradient the SNR is 0
-    min_age: int  # updates before a Gaussian may grow
-    reset: str  # which opacities a reset lowers: unreliable (paper), all (3DGS) or none
-    reset_min_age: int  # updates before a Gaussian may be called unreliable
+    tau_Q: float | Schedule | None  # in [0, 1), eq. 9
+    tau_SNR: float | None  # >= 0, eq. 11 and 13
+    beta1: float  # in [0, 1), decay of m
+    beta2: float  # in [0, 1), decay of v
+    eps: float  # > 0, loss per world unit
+    min_age: int  # updates
+    reset: str  # one of RESET
+    reset_min_age: int  # updates
 
     def __post_init__(self) -> None:
         if self.tau_Q is not None:
@@ -122,21 +123,17 @@ class CAdam(Densifier[CAdamState]):
             return drift.new_tensor(-math.inf)
         return quantile(drift, as_schedule(self.tau_Q)(step))
 
-    def _limits_drift(self) -> bool:
-        """Return whether any drift threshold is set."""
-        return self.tau_Q is not None
-
     def _snr_threshold(self, state: CAdamState) -> Float[Tensor, "n"]:
         """Return the SNR that each candidate exceeds; 0 if there is no such gate."""
         return torch.full_like(state.age, self.tau_SNR or 0.0, dtype=state.m.dtype)
 
     def _reset_threshold(self) -> float:
         """Return the SNR below which a Gaussian is unreliable."""
-        assert self.tau_SNR is not None, "_check_reset_threshold"
+        assert self.tau_SNR is not None, "_check_reset_threshold requires it"
         return self.tau_SNR
 
     def _eps(self, noise: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-        """Return the number that is added to ``noise`` in the SNR."""
+        """Return what is added to ``noise``, so that the SNR of a Gaussian without any gradient is 0."""
         return noise.new_tensor(self.eps)
 
     def _check_reset_threshold(self) -> None:
@@ -212,18 +209,14 @@ class CAdam(Densifier[CAdamState]):
             ),
         )
 
+    def _limits_drift(self) -> bool:
+        """Return whether any drift threshold is set."""
+        return self.tau_Q is not None
+
     def _snr_levels(self) -> tuple[Level, ...]:
         """Return the SNR values that the distribution of the SNR is compared with."""
         values = {"tau_SNR": self.tau_SNR, "white noise": white_noise_snr(self.beta1, self.beta2)}
         return tuple(Level(label=label, value=value) for label, value in values.items() if value)
-
-
-def white_noise_snr(beta1: float, beta2: float) -> float | None:
-    """Return the root mean square SNR of stationary white noise: ``sqrt((1 - beta1) / (1 + beta1))``.
-
-    ``None`` for a ``beta2`` below 0.99: with so short a second moment the SNR of noise has no fixed level.
-    """
-    return math.sqrt((1 - beta1) / (1 + beta1)) if beta2 >= 0.99 else None
 
 
 def quantile(values: Float[Tensor, "n"], share: float) -> Float[Tensor, ""]:

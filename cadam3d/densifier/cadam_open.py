@@ -1,7 +1,7 @@
 """CAdam with every choice that the paper leaves open as a setting, and with gates of our own.
 
-With the values of ``configs/densifier/cadam_open.yaml`` this is exactly ``cadam.py``. ``docs/method.md`` says
-why the paper's option has those values.
+With the values of ``configs/densifier/cadam_open.yaml`` this is exactly ``cadam.py``. ``docs/method.md``
+gives the reason for each value.
 """
 
 from dataclasses import dataclass, replace
@@ -31,21 +31,21 @@ class CAdamOpen(CAdam):
     """CAdam with other evidence, other gates, another inheritance or another reset."""
 
     # Evidence: which gradients the moments average.
-    grad_source: str  # gradient of the total loss, or of the guidance without the regularizers
-    grad_norm: str  # none, or per_step_rms: gradients over their root mean square over all Gaussians
-    invisible: str  # Gaussians that no view sees: zero (gradient 0) or skip (no update and no ageing)
-    nonfinite: str  # a NaN or infinite gradient: skip_step for all Gaussians, or skip_row for its own
+    grad_source: str  # one of GRAD_SOURCE
+    grad_norm: str  # one of GRAD_NORM
+    invisible: str  # one of INVISIBLE
+    nonfinite: str  # one of NONFINITE
     # Gates: which Gaussians are candidates.
-    quantile_over: str  # population of tau_Q: all, mature (age >= min_age) or seen (v > 0)
-    tau_m: float | None  # >= 0: absolute drift that candidates exceed, in loss per world unit; null = off
-    alpha: float | None  # in (0, 1): share of pure noise that may pass the SNR gate; null = use tau_SNR
-    eps_mode: str  # unit of eps: abs (loss per world unit) or rel_median (shares of the median noise)
+    quantile_over: str  # one of QUANTILE_OVER
+    tau_m: float | None  # >= 0, loss per world unit
+    alpha: float | None  # in (0, 1), replaces tau_SNR
+    eps_mode: str  # one of EPS_MODE
     # Histories: moments and ages after a refinement.
-    child_state: str  # of newborns: zero, inherit (the parent's) or inherit_half (of half its gradients)
-    parent_state: str  # of a cloned parent: keep, or reset to zero
+    child_state: str  # one of CHILD_STATE
+    parent_state: str  # one of PARENT_STATE
     # Resets.
-    tau_reset: float | None  # >= 0: SNR below which a Gaussian is unreliable; null = tau_SNR
-    reset_moments: bool  # whether an opacity reset also zeroes the moments and ages of its Gaussians
+    tau_reset: float | None  # >= 0, null = tau_SNR
+    reset_moments: bool
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -183,19 +183,19 @@ class CAdamOpen(CAdam):
         require(
             self.beta2 >= self.beta1**2 - 1e-6,
             "densifier.beta2",
-            expected=f"at least beta1^2 = {self.beta1**2:g}, from where on densifier.alpha is calibrated",
+            expected=f"at least beta1^2 = {self.beta1**2:g}, because densifier.alpha is not calibrated below",
             got=self.beta2,
             example=f"densifier.beta2={max(self.beta1**2, 0.99):g}",
         )
 
 
 def _finite_rows(values: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Return the mask of rows without NaN and infinity, both of which zero turns into NaN."""
+    """Return the mask of rows without NaN or infinity, which become NaN when they are multiplied by 0."""
     x, y, z = (values * 0).unbind(dim=-1)
     return (x + y + z) == 0
 
 
 def _over_population_rms(gradients: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Return gradients over the root mean square of their norms: without a common scale, such as w(t)."""
+    """Return gradients over the root mean square of their norms, which removes a shared scale."""
     rms = gradients.square().sum(dim=-1).mean().sqrt()
     return gradients / torch.where(rms > 0, rms, 1.0)

@@ -14,7 +14,7 @@ from torch.nn.functional import softplus
 from cadam3d.core.checks import require_range, require_whole
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.densifier.base import Densifier, GradientSignal, RowCount
+from cadam3d.densifier.base import GradientFree, RowCount
 from cadam3d.densifier.refine import Refine, RefinePlan
 
 # The noise fades with opacity as sigmoid(SHARPNESS * (FAINT - opacity)): half of it is left at FAINT.
@@ -26,38 +26,26 @@ ABOVE = 1e-5
 
 
 @dataclass(frozen=True, kw_only=True)
-class MCMC(Densifier[RowCount]):
+class MCMC(GradientFree):
     """Relocation instead of pruning, growth by a fixed share up to a cap, and Langevin noise on the means.
 
     A Gaussian is dead if ``refine`` would prune it. The other keys of ``refine`` about "how" (``tau_scale``,
     ``split_*``) are not used: a copy starts at the position of its original, until gradients and noise
     separate them. Gradients decide nothing. The method needs two regularizers,
-    ``regularizer=[mean_opacity,mean_scale]``.
+    ``regularizer=[mean_opacity,mean_scale]``. Unlike ``refine.max_gaussians``, the cap does not end the run.
     """
 
-    cap: int  # Gaussians at which growth stops; unlike refine.max_gaussians it does not end the run
-    growth: float  # in [0, 1]: share of the Gaussians that each refinement adds
-    noise_lr: float  # times the learning rate of the means: scale of the noise, in 1 / world units
+    cap: int  # Gaussians
+    growth: float  # in [0, 1], share per refinement
+    noise_lr: float  # >= 0, 1 / world units
 
     def __post_init__(self) -> None:
         require_whole("densifier.cap", self.cap, low=1, example=20_000)
         require_range("densifier.growth", self.growth, low=0, high=1, example=0.05)
         require_range("densifier.noise_lr", self.noise_lr, low=0, example=8000)
 
-    def init_state(self, n: int, device: torch.device) -> RowCount:
-        """Return a state without statistics."""
-        return RowCount.of(n, device)
-
-    def observe(self, state: RowCount, signal: GradientSignal) -> RowCount:
-        """Return the same state, because gradients decide nothing."""
-        return state
-
     def select(self, state: RowCount, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
         """Return the empty mask: :meth:`plan` grows in its own way, without clones and splits."""
-        return state.no_rows
-
-    def unreliable(self, state: RowCount) -> Bool[Tensor, "n"]:
-        """Return the empty mask: no opacity is reset."""
         return state.no_rows
 
     def plan(
@@ -108,7 +96,8 @@ class MCMC(Densifier[RowCount]):
 class _Population:
     """A population under construction: which row each member copies, and how it differs from that row."""
 
-    rows: Int[Tensor, "m"]  # row numbers before the edit; ascending among members that are not new
+    # Row numbers before the edit, ascending among members that are not new.
+    rows: Int[Tensor, "m"]
     logits: Float[Tensor, "m"]  # of opacity, in double precision
     log_shrink: Float[Tensor, "m"]  # added to log-scales
     is_new: Bool[Tensor, "m"]  # copies, and the Gaussians that were copied
@@ -161,7 +150,7 @@ def share(
         sum over k < N of  C(N, k + 1) (-1)^k o'^(k + 1) / sqrt(k + 1)
 
     up to a factor that it shares with ``o s``. This is the double sum of the paper with its inner binomials
-    added up. It alternates, but loses no more digits than 1 - o has leading zeros.
+    added up. The signs of its terms alternate, but it loses no more digits than 1 - o has leading zeros.
     """
     clear = softplus(logits.clamp_max(LOGIT_MAX)) / among  # -log(1 - o')
     opacity = -torch.expm1(-clear)

@@ -18,6 +18,8 @@ This is exact if v has an infinite memory. ``tests/densifier/test_noise_floor.py
 any memory at least as long as that of beta2 = beta1^2. For large n it becomes s(beta1, a) chi^2_3 / 3.
 """
 
+import math
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -40,6 +42,14 @@ def snr_threshold(alpha: float, beta1: float, beta2: float, age: Int[Tensor, "n"
     share = betaincinv(AXES / 2, AXES * (steps - 1) / 2, 1 - alpha)
     thresholds = torch.from_numpy(np.sqrt(squared_weights(beta1, grown) * steps * share))
     return thresholds.float().to(age.device)[rows].masked_fill(age < 2, torch.inf)
+
+
+def white_noise_snr(beta1: float, beta2: float) -> float | None:
+    """Return the root mean square SNR of stationary white noise: ``sqrt((1 - beta1) / (1 + beta1))``.
+
+    ``None`` for a ``beta2`` below 0.99: with so short a second moment the SNR of noise has no fixed level.
+    """
+    return math.sqrt((1 - beta1) / (1 + beta1)) if beta2 >= 0.99 else None
 
 
 def squared_weights(beta: float, age: np.ndarray) -> np.ndarray:

@@ -6,25 +6,13 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from cadam3d.densifier.base import Densifier, GradientSignal, RowCount
+from cadam3d.densifier.base import GradientFree, RowCount
 
 
 @dataclass(frozen=True, kw_only=True)
-class NoGrowth(Densifier[RowCount]):
+class NoGrowth(GradientFree):
     """Select no Gaussian for growth and none for an opacity reset."""
-
-    def init_state(self, n: int, device: torch.device) -> RowCount:
-        """Return a state without statistics."""
-        return RowCount.of(n, device)
-
-    def observe(self, state: RowCount, signal: GradientSignal) -> RowCount:
-        """Return the same state, because gradients decide nothing."""
-        return state
 
     def select(self, state: RowCount, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
         """Return the empty mask."""
-        return state.no_rows
-
-    def unreliable(self, state: RowCount) -> Bool[Tensor, "n"]:
-        """Return the empty mask: no opacity is reset."""
         return state.no_rows

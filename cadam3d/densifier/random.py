@@ -1,4 +1,4 @@
-"""Random growth, the control of every experiment: as many as CAdam's quantile passes, chosen at random."""
+"""Random growth, the control of every experiment: as many Gaussians as CAdam's quantile lets through."""
 
 import math
 from dataclasses import dataclass
@@ -9,39 +9,27 @@ from torch import Tensor
 
 from cadam3d.core.chart import Chart, Curve
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
-from cadam3d.densifier.base import Densifier, GradientSignal, RowCount
+from cadam3d.densifier.base import GradientFree, RowCount
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomGrowth(Densifier[RowCount]):
+class RandomGrowth(GradientFree):
     """Select a share of the Gaussians uniformly at random, whatever their gradients; reset no opacity.
 
-    What a densifier gains over this one at the same share is what its evidence is worth.
+    If another densifier does no better at the same share, its evidence is worth nothing.
     """
 
-    share: float | Schedule  # in [0, 1): of the Gaussians, at each refinement; matches tau_Q = 1 - share
+    share: float | Schedule  # in [0, 1), tau_Q = 1 - share
 
     def __post_init__(self) -> None:
         require_scheduled("densifier.share", self.share, low=0, below=1, example=0.1)
 
-    def init_state(self, n: int, device: torch.device) -> RowCount:
-        """Return a state without statistics."""
-        return RowCount.of(n, device)
-
-    def observe(self, state: RowCount, signal: GradientSignal) -> RowCount:
-        """Return the same state, because gradients decide nothing."""
-        return state
-
     def select(self, state: RowCount, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
-        """Mark exactly as many as exceed the quantile ``1 - share`` of distinct numbers (paper eq. 9)."""
+        """Return a random mask of as many Gaussians as exceed the quantile ``1 - share`` (paper eq. 9)."""
         n = len(state.no_rows)
         rank = (1 - as_schedule(self.share)(step)) * (n - 1)
         drawn = torch.randperm(n, generator=generator)[: max(n - 1 - math.floor(rank), 0)]
         return state.no_rows.index_fill(0, drawn.to(state.no_rows.device), True)
-
-    def unreliable(self, state: RowCount) -> Bool[Tensor, "n"]:
-        """Return the empty mask: without evidence, no Gaussian is doubtful."""
-        return state.no_rows
 
     def statistics(self, state: RowCount, step: int) -> dict[str, float]:
         """Return the share of this step."""

@@ -21,9 +21,10 @@ class RefinePlan:
 
     edit: RowEdit
     is_selected: Bool[Tensor, "n"]  # rows before the edit that get children
-    cloned: int  # children that are added beside their parent; one for each selected parent that is not split
-    split: int  # parents that are replaced by their children
-    pruned: int  # survivors and newborns removed
+    # Children that are added beside their parent: one for each selected parent that is not split.
+    cloned: int
+    split: int  # parents replaced by their children
+    pruned: int  # removed survivors and newborns
 
     @property
     def selected(self) -> int:
@@ -33,23 +34,26 @@ class RefinePlan:
 
 @dataclass(frozen=True, kw_only=True)
 class Refine:
-    """When and how Gaussians are cloned, split, pruned and reset. Steps count from 1, in world units."""
+    """When and how Gaussians are cloned, split, pruned and reset.
 
-    start: int  # refinements happen at multiples of `interval` strictly between `start` and `end`
-    end: int  # see `start`
-    interval: int  # steps; the paper's K
-    tau_scale: float  # a selected Gaussian with a longer standard deviation splits; others are cloned
-    split_children: int  # number of Gaussians that replace a split one, 2 to 16
-    split_shrink: float  # >= 1: standard deviations of children are those of the parent divided by this
-    min_opacity: float  # in [0, 1): fainter Gaussians are pruned at every refinement
-    max_scale: float | None  # Gaussians with a longer standard deviation are pruned; null = never
-    prune_from: int  # `max_scale`, and the densifier's own pruning, apply only after this step
-    reset_interval: int | None  # opacity resets at its multiples in [reset_from, reset_until); null = never
-    reset_from: int  # see `reset_interval`
-    reset_until: int  # see `reset_interval`
-    reset_value: float  # in (0, 1): opacity to which a reset lowers
-    prune_grace: int  # steps after a reset in which no Gaussian is pruned for its opacity
-    max_gaussians: int | None  # growth beyond this ends the run; null = no limit
+    Steps count from 1, and lengths are in world units.
+    """
+
+    start: int  # step
+    end: int  # step
+    interval: int  # steps, the paper's K
+    tau_scale: float  # > 0
+    split_children: int  # 2 to 16
+    split_shrink: float  # >= 1
+    min_opacity: float  # in [0, 1)
+    max_scale: float | None  # > 0
+    prune_from: int  # step
+    reset_interval: int | None  # steps
+    reset_from: int  # step
+    reset_until: int  # step
+    reset_value: float  # in (0, 1), opacity
+    prune_grace: int  # steps
+    max_gaussians: int | None
 
     def __post_init__(self) -> None:
         require_whole("refine.start", self.start, low=0, example=100)

@@ -20,8 +20,8 @@ class ImagesExporter(PictureSettings, Exporter):
 
     node: ClassVar[str] = "exporter.images"
 
-    views: int  # azimuths per elevation, evenly spaced from the front on
-    elevations_deg: Sequence[float]  # one ring of views for each
+    views: int  # >= 1, per elevation
+    elevations_deg: Sequence[float]  # in [-90, 90]
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -17,8 +17,8 @@ from cadam3d.io.run_folder import ASSET
 class PlyExporter(Exporter):
     """Write ``asset.ply`` in the de-facto 3DGS layout; ``io/ply.py`` lists what reads back bit for bit."""
 
-    up: str  # -y, +y or +z: up axis of the file
-    pad_sh: int  # smallest SH degree of the file, 0 to 3
+    up: str  # one of UPS
+    pad_sh: int  # 0 to 3
 
     def __post_init__(self) -> None:
         require_choice("exporter.ply.up", self.up, UPS)

@@ -22,9 +22,9 @@ class PreviewExporter(PictureSettings, Exporter):
 
     node: ClassVar[str] = "exporter.preview"
 
-    views: int  # azimuths per elevation
-    elevations_deg: Sequence[float]  # one row of pictures for each
-    labels: bool  # whether azimuth and elevation are written into the corner of each picture
+    views: int  # >= 1, per elevation
+    elevations_deg: Sequence[float]  # in [-90, 90]
+    labels: bool
 
     def __post_init__(self) -> None:
         super().__post_init__()

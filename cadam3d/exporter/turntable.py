@@ -28,10 +28,10 @@ class TurntableExporter(PictureSettings, Exporter):
 
     node: ClassVar[str] = "exporter.turntable"
 
-    views: int  # frames of one full turn
+    views: int  # >= 1, frames
     elevation_deg: float  # in [-90, 90]
     fps: int  # frames per second
-    beside: str  # second picture of each frame: depth, alpha or none
+    beside: str  # depth, alpha or none
 
     def __post_init__(self) -> None:
         super().__post_init__()

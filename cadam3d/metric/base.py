@@ -16,6 +16,6 @@ class Metric(ABC):
     ) -> dict[str, float]:
         """Return named numbers.
 
-        ``truth`` gives the true images if the prior knows them, and ``asset`` is the file that holds these
-        Gaussians, if one was written. A metric leaves out the numbers for which it lacks one of them.
+        ``truth`` gives the true images if the prior has them, and ``asset`` is the file with these
+        Gaussians if one was written. Numbers that need one of them are left out if it is ``None``.
         """

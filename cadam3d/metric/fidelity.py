@@ -17,8 +17,10 @@ from cadam3d.core.render import RenderFn, TruthFn
 from cadam3d.metric.base import Metric
 
 SSIM_WINDOW = 11  # pixels (Wang et al. 2004)
-PSNR_MAX = 100.0  # dB; equal images would be infinite, which neither averages nor fits into JSON
-VIEWS_AT_ONCE = 4  # bounds memory: the truth holds one image per mode and view
+# In dB. The PSNR of equal images is infinite, which can neither be averaged nor written as JSON.
+PSNR_MAX = 100.0
+# Views that are compared at once. This bounds the memory, because there is a true image per mode and view.
+VIEWS_AT_ONCE = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,14 +29,13 @@ class Fidelity(PictureSettings, Metric):
 
     Each view's PSNR comes from the mean squared error over all its pixels and channels, renders clamped to
     [0, 1]; the views are then averaged in dB. If the prompt leaves something open, the truth is a mixture:
-    the asset is compared with every mode over all views, and the mode with the best mean PSNR counts. It is
-    one mode for the whole object.
+    the asset is compared with every mode over all views, and only the mode with the best mean PSNR counts.
     """
 
     node: ClassVar[str] = "metric.fidelity"
 
-    views: int  # azimuths per elevation
-    elevations_deg: Sequence[float]
+    views: int  # >= 1, per elevation
+    elevations_deg: Sequence[float]  # in [-90, 90]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -61,7 +62,7 @@ class Fidelity(PictureSettings, Metric):
     def measure(
         self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None, asset: Path | None
     ) -> dict[str, float]:
-        """Return PSNR, SSIM and the mode that they belong to; {} without a truth.
+        """Return PSNR, SSIM and the mode that they belong to; {} if there are no true images.
 
         ``psnr`` (dB) and ``ssim`` are means over the views, ``psnr_min`` (dB) is that of the worst view, and
         ``mode`` is the index of the mode.

@@ -12,16 +12,16 @@ MIB = 1 << 20  # bytes
 
 @dataclass(frozen=True, kw_only=True)
 class Size(Metric):
-    """Counts Gaussians and the bytes of the file that was written, with the padding that it may have."""
+    """Number of Gaussians, and size of the written file including any padding."""
 
     def measure(
         self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None, asset: Path | None
     ) -> dict[str, int | float]:
         """Return counts, sizes and medians.
 
-        ``num_gaussians`` is always there. ``asset_bytes``, ``asset_mib`` and ``bytes_per_gaussian`` need a
-        file, and the last one as well as ``median_scale`` (world units, longest axis) and ``median_opacity``
-        need at least one Gaussian.
+        ``num_gaussians`` is always present. ``asset_bytes``, ``asset_mib`` and ``bytes_per_gaussian`` need a
+        file. ``bytes_per_gaussian``, ``median_scale`` (world units, longest axis) and ``median_opacity`` need
+        at least one Gaussian.
         """
         count = len(gaussians)
         sizes: dict[str, int | float] = {"num_gaussians": count}

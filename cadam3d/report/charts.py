@@ -15,7 +15,7 @@ from cadam3d.report.plots import Band, Bar, Plot, Point, Section, Series, smooth
 Lines = Sequence[Mapping[str, Any]]
 
 SMOOTHING = 15  # the running median covers one part in 15 of a noisy curve
-# What the plots of every run show, or what is no number to plot.
+# Keys that the plots of every run show already, or that are not numbers to plot.
 ALWAYS_PLOTTED = ("kind", "step", "loss", "num_gaussians", "seconds")
 ALWAYS_PLOTTED += ("before", "after", "selected", "cloned", "split", "pruned", "reset")
 CURVE_COLORS = (1, 2, 3)
@@ -29,8 +29,7 @@ def sections(steps: Lines, refinements: Lines, charts: Sequence[Chart]) -> list[
     refinements on the same level as their counts. A declared chart is looked up in the refinements first,
     where the densifier logs, and then in the steps, where the objective does.
     """
-    end = max((number(line.get("step")) or 0 for line in (*steps, *refinements)), default=0) or 1
-    x_range = (0, end)
+    x_range = _x_range(steps, refinements)
     by_densifier = [plot_of(chart, refinements, x_range) for chart in charts]
     by_objective = [
         plot_of(chart, steps, x_range)
@@ -49,18 +48,18 @@ def sections(steps: Lines, refinements: Lines, charts: Sequence[Chart]) -> list[
 def other_plots(steps: Lines, refinements: Lines, charts: Sequence[Chart]) -> list[Plot]:
     """Return one plain plot for each number that was logged and that no other plot of the page shows."""
     declared = {key for chart in charts for key in _keys(chart)}
-    end = max((number(line.get("step")) or 0 for line in (*steps, *refinements)), default=0) or 1
+    x_range = _x_range(steps, refinements)
     plots = []
     for lines in (steps, refinements):
         for key in dict.fromkeys(key for line in lines for key in line):
             if key not in ALWAYS_PLOTTED and key not in declared and (points := _points(lines, key)):
                 series = Series(label="", points=points, color=3)
-                plots.append(Plot(title=key, series=[series], x_range=(0, end)))
+                plots.append(Plot(title=key, series=[series], x_range=x_range))
     return plots
 
 
 def plot_of(chart: Chart, lines: Lines, x_range: Point) -> Plot:
-    """Return what a declared chart shows of ``lines``; empty if none of its keys was logged there."""
+    """Return what a declared chart shows of ``lines``; empty if these lines have none of its keys."""
     factor = 100 if chart.percent else 1
 
     def points(key: str) -> list[Point]:
@@ -93,12 +92,20 @@ def plot_of(chart: Chart, lines: Lines, x_range: Point) -> Plot:
     )
 
 
+def _x_range(steps: Lines, refinements: Lines) -> Point:
+    """Return the range of the steps of all plots, which is not empty even if nothing was logged."""
+    return 0, max((number(line.get("step")) or 0 for line in (*steps, *refinements)), default=0) or 1
+
+
 def _keys(chart: Chart) -> list[str]:
     return [*(curve.key for curve in chart.curves), *(chart.band or ())]
 
 
 def _growth_plots(steps: Lines, refinements: Lines, x_range: Point) -> list[Plot]:
     loss = _points(steps, "loss")
+    window = len(loss) // SMOOTHING
+    smoothed = Series(label="running median", points=smooth(loss, window), color=1)
+    logged = Series(label="logged", points=loss, color=1, is_faint=window > 1)
     resets = [(step, count) for step, count in _points(refinements, "reset") if count > 0]
     return [
         Plot(
@@ -112,10 +119,7 @@ def _growth_plots(steps: Lines, refinements: Lines, x_range: Point) -> list[Plot
         Plot(
             title="Loss",
             caption="Half the squared norm of the guidance gradient plus regularizers.",
-            series=[
-                Series(label="logged", points=loss, color=1, is_faint=True),
-                Series(label="running median", points=smooth(loss, max(len(loss) // SMOOTHING, 1)), color=1),
-            ],
+            series=[logged, smoothed] if window > 1 else [logged],
             log_y=True,
             x_range=x_range,
         ),

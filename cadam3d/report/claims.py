@@ -20,7 +20,8 @@ NO_GROWTH = "none"  # the arm that gains are measured from
 RESAMPLES = 2000
 CONFIDENCE = 0.95
 BOOTSTRAP_SEED = 0  # the same results give the same interval
-# Prompts. With 4 a bootstrap of the median covers the truth in only 85 %, and 5 cannot pass a sign test.
+# Prompts that an interval needs. With 4, a bootstrap of the median covers the true value in only 85 % of
+# cases, and 5 cannot pass a sign test.
 LEAST_FOR_INTERVAL = 6
 SIGNIFICANT = 1 - CONFIDENCE  # of the sign test
 
@@ -73,9 +74,11 @@ class Estimate:
     """A median over cells and its uncertainty."""
 
     median: float
-    low: float | None  # ends of the 95 % bootstrap interval; None with fewer than LEAST_FOR_INTERVAL prompts
+    # Ends of the 95 % bootstrap interval; None with fewer than LEAST_FOR_INTERVAL prompts.
+    low: float | None
     high: float | None
-    p_value: float | None  # two-sided sign test of "the median is 0" over prompts; None if all are 0
+    # Two-sided sign test of "the median is 0" over prompts; None if all values are 0.
+    p_value: float | None
     cells: int
     prompts: int
 
@@ -140,8 +143,10 @@ class PairedComparison:
     reduction: Spread
     psnr: Spread
     ssim: Spread | None
-    psnr_over_seeds: float | None  # standard deviation over seeds, averaged; None without two seeds
-    early: int  # cells in which ours stopped before its last step
+    # Standard deviation over seeds, averaged; None without two seeds.
+    psnr_over_seeds: float | None
+    # Cells in which ours, or theirs, stopped before its last step.
+    early: int
     theirs_early: int
 
     @property
@@ -191,8 +196,10 @@ class FrontierPoint:
     cells: int
     early: int  # cells whose job stopped before its last step
     count: Spread
-    left_out: int  # cells without a job without growth, or without a measured quality
-    gain: Spread  # quality minus that of the job without growth; plain quality if the sweep has none
+    # Cells that lack the job without growth, or a measured quality.
+    left_out: int
+    # Quality minus that of the job without growth; plain quality if the sweep has no such job.
+    gain: Spread
     count_over_seeds: float | None  # standard deviation of log10 count
     gain_over_seeds: float | None
 
@@ -317,17 +324,26 @@ class Standing:
     """One setting compared with the whole frontier of another arm, cell by cell."""
 
     setting: ArmSetting
-    arm: str  # the arm of the frontier
-    settings: int  # most settings that the arm has in one cell
-    unpaired: int  # cells in which only the setting or only the arm left something to measure
-    psnr: Estimate | None  # dB above the frontier at equal count; None if no cell has an equal count
-    psnr_over_seeds: float | None  # its standard deviation over seeds, averaged; None without two seeds
-    above: int  # those cells of psnr in which the setting is above the frontier
-    fewer: int  # cells in which it has fewer Gaussians than any setting of the arm
-    more: int  # cells in which it has more than any
-    count_ratio: float | None  # median of (count the arm needs for the same PSNR) / (count of the setting)
-    never: int  # cells in which no setting of the arm reaches that PSNR; they count as an infinite ratio
-    always: int  # cells in which every setting of the arm exceeds it; they count as a ratio of 0
+    arm: str  # of the frontier
+    # The largest number of settings that the arm has in one cell.
+    settings: int
+    # Cells in which only the setting or only the arm left something to measure.
+    unpaired: int
+    # How far the setting is above the frontier at equal count, in dB; None if no cell has an equal count.
+    psnr: Estimate | None
+    # The standard deviation of that over seeds, averaged; None without two seeds.
+    psnr_over_seeds: float | None
+    # Cells in which the setting is above the frontier at equal count.
+    above: int
+    # Cells in which the setting has fewer, or more, Gaussians than any setting of the arm.
+    fewer: int
+    more: int
+    # The median of the count that the arm needs for the same PSNR, over the count of the setting.
+    count_ratio: float | None
+    # Cells in which no setting of the arm reaches that PSNR, which count as an infinite ratio.
+    never: int
+    # Cells in which every setting of the arm exceeds that PSNR, which count as a ratio of 0.
+    always: int
 
 
 def standing_of(results: Sequence[JobResult], setting: ArmSetting, arm: str) -> Standing | None:
@@ -409,7 +425,8 @@ def _grouped(
 ) -> dict[Hashable, list[float]]:
     """Return the values of the cells of each group."""
     groups: dict[Hashable, list[float]] = defaultdict(list)
-    for cell, value in sorted(values.items()):  # a fixed order, so that the bootstrap is reproducible
+    # The order is fixed, so that the bootstrap is reproducible.
+    for cell, value in sorted(values.items()):
         groups[group_of(cell)].append(value)
     return dict(groups)
 

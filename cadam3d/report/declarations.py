@@ -1,7 +1,7 @@
 """charts.json: the charts that the densifier and the objective of a run declare, kept as data with the run.
 
-The report of a sweep reads them from the folders of its jobs. A file that is missing, damaged or written by
-another version means that there are no declared charts, nothing worse.
+The report of a sweep reads them from the folders of its jobs. If the file is missing,
+damaged or written by another version, there are no declared charts; that is not an error.
 """
 
 import json
@@ -36,9 +36,10 @@ def read_declarations(folder: Path) -> tuple[Chart, ...]:
 
 
 def _chart(entry: Mapping[str, Any]) -> Chart:
-    """Return the chart that plain data describe. Raises some built-in exception if they do not."""
+    """Return the chart that plain data describe. Raises a built-in exception if they describe none."""
     band, score = entry.get("band"), _text(entry.get("score", ""))
-    if score and not score.isidentifier():  # it names the files of a figure
+    # The score becomes the name of files.
+    if score and not score.isidentifier():
         raise ValueError(f"expected the name of a score, got {score!r}")
     return Chart(
         title=_text(entry["title"]),

@@ -37,12 +37,22 @@ from cadam3d.report.results import (
     levels_of,
     measured,
 )
-from cadam3d.report.style import Look, label_log_axis, looks, new_figure, spread_labels
+from cadam3d.report.style import (
+    Look,
+    label_log_axis,
+    label_ticks,
+    looks,
+    new_figure,
+    round_ticks,
+    spread_labels,
+)
 
-EARLY = "\u2020"  # a dagger: some jobs of the setting ended before their last step
+# A dagger: some jobs of the setting ended before their last step.
+EARLY = "\u2020"
 ROOM = 0.07  # between labels, as a share of the axis
 MARK = 6.0  # half the side of the square that a mark covers, in pixels
-SPOTS = (  # possible places for the name of an arm, the best first: alignment, and offset in points
+# Possible places for the name of an arm, the best first: alignment, and offset in points.
+SPOTS = (
     ("center", 0, 8),
     ("center", 0, -16),
     *((ha, x, y) for y in (8, -16, 19, -27, 30, -38) for ha, x in (("left", -6), ("right", 6))),
@@ -124,7 +134,8 @@ def _frontier_curve(axes: Axes, points: Sequence[FrontierPoint], look: Look) -> 
         )
         if is_line:
             _annotate(axes, point.setting.values + EARLY * (point.early > 0), place, (0, -11))
-    if len(points) > 1 and not is_line:  # too many to name each: name the two ends
+    # A curve of several thresholds has too many settings to label each, so only its ends are labelled.
+    if len(points) > 1 and not is_line:
         _annotate(axes, points[0].setting.values, places[0], (-6, -2), ha="right")
         _annotate(axes, points[-1].setting.values, places[-1], (6, -2), ha="left")
     return next((at for point, at in zip(points, places, strict=True) if point.is_standard), places[-1])
@@ -290,6 +301,7 @@ def _label_ends(axes: Axes, ends: dict[str, tuple[float, float]], style: dict[st
     heights = spread_labels({arm: math.log10(y) for arm, (_, y) in ends.items()}, ROOM * (high - low))
     right = max(x for x, _ in ends.values())
     axes.set_xlim(0, right * 1.28)
+    label_ticks(axes.xaxis, round_ticks(0, right))
     for arm, height in heights.items():
         axes.text(
             right * 1.02, 10**height, arm, color=style[arm].color, va="center", fontsize=8, weight="bold"

@@ -22,7 +22,7 @@ from cadam3d.report.results import (
     level_title,
     measured,
 )
-from cadam3d.report.style import looks, new_figure, pictures_only
+from cadam3d.report.style import hide_axes, looks, new_figure
 
 MAX_COLUMNS = 7  # pictures in one line
 MAX_VIEWS = 4  # of one asset
@@ -184,7 +184,7 @@ def _grid(lines: int, columns: int, *, inch: float = PICTURE_INCH, more_width: f
     figure = new_figure(columns, lines, width=inch * columns + more_width, height=inch * 1.14)
     panels = figure.subplots(lines, columns, squeeze=False)
     for axes in panels.flat:
-        pictures_only(axes)
+        hide_axes(axes)
     return figure, panels
 
 

@@ -24,8 +24,9 @@ DPI = 72  # one pixel of matplotlib is then one unit of the SVG
 WIDTH, HEIGHT = 560, 250  # units; the picture scales with the page
 LEFT, RIGHT, TOP, BOTTOM = 58, 12, 12, 40  # margins around the plotting area
 FONT = 11.5  # units
-BAR_WIDTHS = (1.5, 22.0)  # units, the least and the largest
-HINTS = 200  # a curve with more points has tooltips on an even selection of them
+BAR_WIDTHS = (1.5, 22.0)  # units; smallest and largest
+# A curve with more points has tooltips on an even selection of them.
+HINTS = 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +74,7 @@ class Hint:
     color: int
     x: float
     y: float  # from the top
-    width: float = 0.0  # of a bar; 0: a point
+    width: float = 0.0  # of a bar; 0 for a point
     height: float = 0.0
 
 
@@ -87,7 +88,7 @@ class Drawing:
 
 @dataclass(frozen=True, kw_only=True)
 class Plot:
-    """The numbers of one plot, with everything the page says about them."""
+    """The numbers of one plot, with its title, caption and axes."""
 
     title: str
     caption: str = ""
@@ -102,7 +103,8 @@ class Plot:
     unit: str = ""  # behind the numbers of the y axis
 
     def __post_init__(self) -> None:
-        if self.log_y:  # a logarithmic axis shows positive numbers only
+        # A logarithmic axis can show positive numbers only.
+        if self.log_y:
             series = [replace(each, points=_positive(each.points)) for each in self.series]
             bands = [replace(band, low=_positive(band.low), high=_positive(band.high)) for band in self.bands]
             object.__setattr__(self, "series", series)

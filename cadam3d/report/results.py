@@ -111,7 +111,7 @@ class JobResult:
 
 @dataclass(frozen=True)
 class _KnownJob:
-    """A job by itself, before it is known what the sweep varies."""
+    """A job with its overrides parsed, before it is known which keys the sweep varies."""
 
     arm: str
     folder: Path
@@ -127,8 +127,8 @@ class _KnownJob:
 def read(sweep_folder: Path) -> list[JobResult]:
     """Return every job of the sweep in ``sweep_folder``, in order, whether it is done or not.
 
-    A key that varies within an arm makes a difference: a key of the densifier is a threshold there, any other
-    key an axis of the cells. A key that only differs between arms belongs to the arm. Raises ``UserError`` if
+    Keys that vary within an arm are distinguished: those of the densifier are thresholds, all others are axes
+    of the cells. A key that only differs between arms belongs to the arm. Raises ``UserError`` if
     the folder holds no sweep.
     """
     jobs = [_known(job) for job in load(sweep_folder)]
@@ -227,7 +227,7 @@ class Histogram:
 def histograms(result: JobResult, score: str | None = None) -> list[Histogram]:
     """Return the histograms of one score by step; [] if the job ran without the candidates callback.
 
-    ``None`` stands for the first score there is, because all of them count the same population.
+    ``None`` stands for the first score in the file, because all scores count the same population.
     """
     lines = read_jsonl(result.folder / HISTOGRAMS)
     score = lines[0].get("score") if lines and score is None else score

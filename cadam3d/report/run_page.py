@@ -1,4 +1,4 @@
-"""report.html of a run: one file that shows the run to someone who did not see it happen."""
+"""report.html of a run: one file with its result, its charts and its settings."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -14,13 +14,15 @@ from matplotlib.figure import Figure
 from cadam3d.core.chart import Chart, Level
 from cadam3d.report.claims import by_cell, standard_setting
 from cadam3d.report.declarations import read_declarations
-from cadam3d.report.palette import INK, PAPER
 from cadam3d.report.results import JobResult, arms_of, at_noise, histograms, level_title, levels_of, measured
 from cadam3d.report.style import label_log_axis, new_figure
 
 MAX_COLUMNS = 3  # maps in one line, unless there are more noise levels
 LEAST_SHARE = 0.002  # of the Gaussians; emptier bins do not widen the axis
-LEVEL_COLORS = ("#d55e00", INK, "#009e73")
+# The map is light on dark pages too, so that darker always means more. None of these colours may be one that
+# palette.py replaces on dark pages.
+BACKGROUND = "#f7fbff"
+LEVEL_COLORS = ("#c85a00", "#111111", "#00805c")
 
 
 def declared_scores(results: Iterable[JobResult]) -> dict[str, Chart]:
@@ -69,7 +71,8 @@ def score_figure(results: Sequence[JobResult], chart: Chart) -> Figure | None:
         axes.set_ylabel(chart.score)
     for axes in panels.flat[len(places) :]:
         axes.set_visible(False)
-    for axes in panels.flat[len(places) - columns : len(places)]:  # the lowest of each column
+    # The lowest panel of each column.
+    for axes in panels.flat[len(places) - columns : len(places)]:
         axes.set_xlabel("step")
         axes.tick_params(labelbottom=True)
     return figure
@@ -121,6 +124,8 @@ class ScoreMap:
 
 
 def _draw(axes: Axes, found: ScoreMap) -> None:
+    axes.set_facecolor(BACKGROUND)
+    axes.grid(visible=False)
     for column, step in enumerate(found.steps):
         axes.pcolormesh(
             [step - found.half, step + found.half],
@@ -134,7 +139,8 @@ def _draw(axes: Axes, found: ScoreMap) -> None:
     top = max((level.value for level in found.levels), default=0.0)
     for i, level in enumerate(found.levels):
         color = LEVEL_COLORS[i % len(LEVEL_COLORS)]
-        side = 1 if level.value == top else -1  # the label of the highest is above its line, others are below
+        # The label of the highest level is above its line, the others are below theirs.
+        side = 1 if level.value == top else -1
         axes.axhline(level.value, color=color, lw=1.1, ls="--")
         axes.annotate(
             f"{level.label} {level.value:.3g}",
@@ -146,5 +152,5 @@ def _draw(axes: Axes, found: ScoreMap) -> None:
             va="bottom" if side > 0 else "top",
             fontsize=7.5,
             color=color,
-            bbox={"facecolor": PAPER, "alpha": 0.6, "lw": 0, "pad": 0.5},
+            bbox={"facecolor": BACKGROUND, "alpha": 0.85, "lw": 0, "pad": 0.5},
         )

@@ -28,14 +28,17 @@ KNOWN = {  # arm -> colour, marker
     "random": ("#8a5a44", "v"),
 }
 SPARE_COLORS = ("#56b4e9", "#b07d00", "#6a5acd", "#5c7a00", "#00838f", "#1f2d6b", "#b5179e", "#5b2c6f")
-SPARE_MARKERS = ("<", ">", "p", "*", "d", "h")  # with eight colours: a pair repeats after 24 arms
+# With eight colours, a pair repeats after 24 arms.
+SPARE_MARKERS = ("<", ">", "p", "*", "d", "h")
 INCH = 2.9  # height of a panel
 TICKS = 5  # approximate number per axis
-RC: Any = {  # Any: matplotlib has a type for the names of its settings
+# The type is Any, because matplotlib types the names of its settings one by one.
+RC: Any = {
     "font.family": "sans-serif",
     "font.size": 9,
-    "svg.fonttype": "none",  # text stays text
-    "text.parse_math": False,  # a dollar sign that a user typed is just a dollar sign
+    # Text stays text in a drawing, and a dollar sign in a prompt does not begin a formula.
+    "svg.fonttype": "none",
+    "text.parse_math": False,
     "axes.edgecolor": SOFT,
     "axes.labelcolor": SOFT,
     "axes.titlesize": 10,
@@ -59,7 +62,7 @@ RC: Any = {  # Any: matplotlib has a type for the names of its settings
 
 @dataclass(frozen=True)
 class Look:
-    """Colour, marker and line of an arm in every figure."""
+    """Colour and marker of an arm in every figure."""
 
     color: str
     marker: str
@@ -92,7 +95,7 @@ def styled(more: Any = None):
     return rc_context(RC | (more or {}))
 
 
-def pictures_only(axes: Axes) -> None:
+def hide_axes(axes: Axes) -> None:
     """Remove the ticks, the grid and the frame of a panel that holds a picture."""
     axes.set_xticks([])
     axes.set_yticks([])
@@ -185,7 +188,9 @@ def inline(svg: str) -> str:
     """
     text = svg[svg.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>", "", text, flags=re.DOTALL)
-    text = re.sub(r'(<svg[^>]*?) width="([\d.]+)pt"', r'\1 style="max-width: \2pt"', text, count=1)
+    text = re.sub(
+        r'(<svg[^>]*?) width="([\d.]+)pt"', r'\1 style="max-width: \2pt; --width: \2pt"', text, count=1
+    )
     text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
     text = re.sub(r' xmlns(:\w+)?="[^"]*"| version="1.1"', "", text, count=3)
     text = re.sub(r'<g id="[^"]*"', "<g", text)

@@ -39,7 +39,8 @@ class ShownFigure:
     svg: str
 
 
-KINDS = {  # the figures that need nothing but results; those of declared scores come after "growth"
+# The figures of every sweep. Those of declared scores come after "growth".
+KINDS = {
     "frontier": FigureKind(
         figures.frontier_figure,
         "Quality against count",

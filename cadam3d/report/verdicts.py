@@ -15,7 +15,7 @@ def headline(results: Sequence[JobResult]) -> list[str]:
     """Return the verdict of a sweep; empty if nothing is comparable.
 
     The first sentence is the paper's claim over all levels of noise. Then each level is compared with the
-    tuned baseline, and at last the variants of CAdam are.
+    tuned baseline, and finally the variants of CAdam are.
     """
     sentences = []
     noisy = with_noise(results)
@@ -35,17 +35,18 @@ def headline(results: Sequence[JobResult]) -> list[str]:
 
 
 def reduction_sentence(comparison: PairedComparison) -> str:
-    """Return the reduction in Gaussians, its cost in PSNR, the number of cells, and what ended early."""
+    """Return the reduction in Gaussians, its cost in PSNR, the number of cells, and how many jobs ended early."""
     fewer, psnr = comparison.reduction, comparison.psnr
-    many = "fewer" if fewer.median >= 0 else "more"
+    many, sign = ("fewer", 1) if fewer.median >= 0 else ("more", -1)
+    low, high = sorted((sign * fewer.low, sign * fewer.high))
     sentence = (
         f"{comparison.ours.name} ends with {abs(fewer.median):.1%} {many} Gaussians than "
-        f"{comparison.theirs.name} (median of {_cells(comparison.cells)}; quartiles {fewer.low:.1%} to "
-        f"{fewer.high:.1%} fewer), at {psnr.median:+.2f} dB PSNR ({psnr.low:+.2f} to {psnr.high:+.2f}), "
+        f"{comparison.theirs.name} (median of {_cells(comparison.cells)}; quartiles {low:.1%} to "
+        f"{high:.1%} {many}), at {psnr.median:+.2f} dB PSNR ({psnr.low:+.2f} to {psnr.high:+.2f}), "
         f"no more than {COMPARABLE} dB lower in {comparison.comparable(COMPARABLE)} of them"
     )
     if comparison.psnr_over_seeds is not None:
-        sentence += f", {comparison.psnr_over_seeds:.2f} dB spread over seeds"
+        sentence += f", with a spread of {comparison.psnr_over_seeds:.2f} dB over seeds"
     for name, early in (
         (comparison.ours.arm, comparison.early),
         (comparison.theirs.arm, comparison.theirs_early),
@@ -66,7 +67,7 @@ def standing_sentence(standing: Standing, where: str = "") -> str:
     ours, theirs = standing.setting.name, standing.arm
     outside = _outside(standing)
     if standing.psnr is None:
-        needed = needed_clause(standing)
+        needed = _needed_clause(standing)
         return f"{where}{ours} never ends within the range of {theirs}'s frontier: {outside}{needed}."
     estimate = standing.psnr
     side = "above" if estimate.median >= 0 else "below"
@@ -77,15 +78,15 @@ def standing_sentence(standing: Standing, where: str = "") -> str:
         f"{standing.settings} thresholds at equal count, above it in {share}"
     )
     if standing.psnr_over_seeds is not None:
-        sentence += f", {standing.psnr_over_seeds:.2f} dB spread over seeds"
-    if not is_certain(standing):
+        sentence += f", with a spread of {standing.psnr_over_seeds:.2f} dB over seeds"
+    if not estimate.is_certain:
         sentence += f", which is not a certain difference ({plural(estimate.prompts, 'prompt')})"
     if outside:
         sentence += f"; {outside}"
-    return sentence + needed_clause(standing) + "."
+    return sentence + _needed_clause(standing) + "."
 
 
-def needed_clause(standing: Standing) -> str:
+def _needed_clause(standing: Standing) -> str:
     """Return how many Gaussians the other arm would need for the same quality; empty if that is unknown."""
     ratio, theirs = standing.count_ratio, standing.arm
     if ratio is None:
@@ -102,11 +103,6 @@ def needed_clause(standing: Standing) -> str:
     return "".join(
         f"; {part}" for part in (known, *((always, never) if ratio == 0 else (never, always))) if part
     )
-
-
-def is_certain(standing: Standing) -> bool:
-    """Return whether the interval excludes 0 and the sign test agrees; False if either is missing."""
-    return standing.psnr is not None and standing.psnr.is_certain
 
 
 def _outside(standing: Standing) -> str:

@@ -1,4 +1,4 @@
-"""Candidates: its pictures and counts, and that it changes nothing."""
+"""Candidates: pictures and histograms, written without changing the run."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ def train(folder, *, with_callback: bool):
 
 def test_a_run_with_the_callback_equals_one_without(tmp_path):
     watched, alone = train(tmp_path, with_callback=True), train(tmp_path, with_callback=False)
-    assert len(watched.gaussians) != 30, "nothing grew, so the test would prove little"
+    assert len(watched.gaussians) != 30, "nothing grew, so this test proves little"
     for name, tensor in alone.gaussians.tensors().items():
         assert torch.equal(watched.gaussians.tensors()[name], tensor), name
     for name, rows in alone.densifier.to_dict().items():
@@ -103,7 +103,8 @@ def test_selected_gaussians_are_drawn_in_one_colour_and_the_others_in_another():
     painted = marked(gaussians, torch.tensor([True, False]))
     image = ReferenceRasterizer().render(painted, camera, torch.ones(1, 3)).rgb[0]
     columns = [int(x) for x in (16.5 + 0.5 / 3 * camera.intrinsics[0, 0, 0] * torch.tensor([-1, 1])).tolist()]
-    seen = image[16, columns]  # the camera is on +x and looks back, so +y is on its right
+    # The camera is on +x and looks at the origin, so +y is on its right.
+    seen = image[16, columns]
     assert torch.allclose(seen, torch.tensor([SELECTED, OTHERS]), atol=0.03)
 
 

@@ -1,4 +1,4 @@
-"""Previews: its pictures, and that it changes nothing."""
+"""Previews: contact sheets, written without changing the run."""
 
 import imageio.v3 as imageio
 import numpy as np
@@ -41,12 +41,12 @@ def names(folder) -> list[str]:
     return sorted(path.name for path in (folder / "previews").glob("*"))
 
 
-def test_by_default_there_are_none(tmp_path):
+def test_by_default_no_previews_are_written(tmp_path):
     train(tmp_path)
     assert not (tmp_path / "previews").exists()
 
 
-def test_one_key_switches_them_on_in_every_run(tmp_path):
+def test_one_setting_turns_previews_on(tmp_path):
     assert "previews" in compose(["prompt=a red cube"]).callback
     train(tmp_path, "callback.previews.every=3")
     assert names(tmp_path) == ["step_000003.png", "step_000006.png"]
@@ -64,7 +64,7 @@ def test_a_sheet_shows_the_object_from_all_sides_in_one_row(tmp_path):
 
 def test_a_run_with_the_callback_equals_one_without(tmp_path):
     drawn, alone = train(tmp_path, "callback.previews.every=1"), train(tmp_path / "other")
-    assert len(drawn.gaussians) != 30, "nothing grew, so the test would prove little"
+    assert len(drawn.gaussians) != 30, "nothing grew, so this test proves little"
     for name, tensor in alone.gaussians.tensors().items():
         assert torch.equal(drawn.gaussians.tensors()[name], tensor), name
     for name, generator in alone.generators.items():

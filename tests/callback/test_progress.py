@@ -57,17 +57,17 @@ def test_the_bar_shows_the_step_and_the_time_of_the_end(at_noon, run, capsys):
     bar = Progress(refresh_seconds=0.0)
     bar.on_start(*run)
     for number in range(1, 5):
-        at_noon.now += 600  # ten minutes a step: six more take an hour
+        at_noon.now += 600  # ten minutes per step, so six more steps take an hour
         step(bar, run, number)
     line = last_line(capsys)
     assert "4/10" in line
     assert "N=5" in line
     assert "loss=0.5" in line
     assert "done=13:40" in line
-    assert "VRAM" not in line  # on a CPU there is no such number
+    assert "VRAM" not in line  # only on CUDA devices
 
 
-def test_a_resumed_run_is_timed_by_its_own_steps(at_noon, run, capsys):
+def test_the_pace_of_a_resumed_run_counts_only_its_own_steps(at_noon, run, capsys):
     bar = Progress(refresh_seconds=0.0)
     run[1].step = 6
     bar.on_start(*run)
@@ -89,7 +89,7 @@ def test_a_finished_run_shows_no_time_of_the_end(at_noon, run, capsys):
     assert "done=" not in line
 
 
-def test_a_bar_that_is_switched_off_is_no_error(run, capsys, monkeypatch):
+def test_a_disabled_bar_raises_no_error(run, capsys, monkeypatch):
     """Users and cluster scripts do this with the environment variable TQDM_DISABLE."""
     monkeypatch.setattr(progress, "tqdm", partial(progress.tqdm, disable=True))
     bar = Progress(refresh_seconds=0.0)
@@ -108,18 +108,18 @@ def test_the_bar_shows_the_peak_of_the_gpu(at_noon, run, capsys, monkeypatch):
     assert "VRAM=7.3GiB" in last_line(capsys)
 
 
-def test_the_peak_is_torch_s_number_on_a_cuda_device_and_none_elsewhere(monkeypatch):
-    asked = []
-    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: asked.append(device) or 123)
+def test_peak_memory_is_known_on_cuda_devices_only(monkeypatch):
+    devices = []
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: devices.append(device) or 123)
     assert peak_memory(torch.device("cuda:1")) == 123
-    assert asked == [torch.device("cuda:1")]
+    assert devices == [torch.device("cuda:1")]
     assert peak_memory(CPU) is None
-    assert len(asked) == 1
+    assert len(devices) == 1
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_the_peak_counts_memory_that_is_free_again():
+def test_the_peak_includes_memory_that_was_freed_since():
     device = torch.device("cuda")
     torch.cuda.reset_peak_memory_stats(device)
     block = torch.empty(2**26, dtype=torch.uint8, device=device)
@@ -131,5 +131,5 @@ def test_the_peak_counts_memory_that_is_free_again():
     ("seconds", "shown"),
     [(0, "12:00"), (3600 * 11.5, "23:30"), (3600 * 13, "01:00"), (3600 * 37, "Fri 01:00")],
 )
-def test_the_clock_names_the_day_from_a_day_on(seconds, shown):
+def test_the_clock_shows_the_weekday_if_the_time_is_a_day_or_more_away(seconds, shown):
     assert clock(NOON, seconds) == shown

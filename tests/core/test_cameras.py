@@ -1,4 +1,4 @@
-"""Cameras: their positions, what they see where, and copies that keep both."""
+"""Cameras: their positions and projections, also after copying, indexing and resizing."""
 
 import math
 
@@ -95,7 +95,7 @@ def test_rays_leave_the_camera_through_pixel_centres():
     torch.testing.assert_close(to_pixels(cameras, points), torch.stack([x, y], -1).reshape(-1, 2).double())
 
 
-def test_resizing_scales_what_is_seen_with_the_image():
+def test_resizing_scales_pixel_coordinates_with_the_image():
     cameras, points = (
         one(height=6, width=8),
         torch.randn(5, 3, generator=torch.Generator().manual_seed(0)).double(),

@@ -27,12 +27,12 @@ def test_a_true_claim_passes_and_a_false_one_is_a_user_error():
 
 
 @pytest.mark.parametrize("value", [0, 0.0, 0.5, 0.999])
-def test_numbers_inside_pass(value):
+def test_numbers_in_range_pass(value):
     require_range("key", value, low=0, below=1, example=0.5)
 
 
 @pytest.mark.parametrize("value", [-1e-9, 1, 1.0, math.nan, math.inf, -math.inf, None, "0.5", True, [0.5]])
-def test_numbers_outside_and_values_that_are_not_numbers_are_refused(value):
+def test_numbers_out_of_range_and_other_values_are_refused(value):
     with pytest.raises(UserError, match=r"key: expected a number >= 0 and < 1, got .*\. Try: key=0.5"):
         require_range("key", value, low=0, below=1, example=0.5)
 
@@ -67,12 +67,12 @@ def test_an_infinite_number_never_passes_a_one_sided_bound():
 
 
 @pytest.mark.parametrize("value", [2, 3, 16])
-def test_whole_numbers_inside_pass(value):
+def test_whole_numbers_in_range_pass(value):
     require_whole("key", value, low=2, high=16, example=2)
 
 
 @pytest.mark.parametrize("value", [1, 17, 2.0, 2.5, True, False, None, "3", [3], math.nan, math.inf])
-def test_everything_except_whole_numbers_inside_is_refused(value):
+def test_everything_except_whole_numbers_in_range_is_refused(value):
     with pytest.raises(
         UserError, match=r"^key: expected a whole number >= 2 and <= 16, got .*\. Try: key=2$"
     ):
@@ -91,7 +91,7 @@ def test_bounds_of_whole_numbers_are_optional():
     ("value", "choices"),
     [(0, (True, False)), (True, range(4)), (1.0, range(4)), ([], range(4)), (None, "ab")],
 )
-def test_a_choice_has_the_type_of_what_it_equals(value, choices):
+def test_a_value_equal_to_a_choice_but_of_another_type_is_refused(value, choices):
     with pytest.raises(UserError, match="key: expected one of"):
         require_choice("key", value, choices)
 

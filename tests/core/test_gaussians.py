@@ -20,9 +20,9 @@ def make(n: int, degree: int = 1, seed: int = 0) -> Gaussians:
     return Gaussians(**{name: torch.randn(n, *shape, generator=generator) for name, shape in shapes.items()})
 
 
-def assert_same(got: Gaussians, want: Gaussians) -> None:
+def assert_same(got: Gaussians, expected: Gaussians) -> None:
     for name in FIELDS:
-        assert torch.equal(getattr(got, name), getattr(want, name)), name
+        assert torch.equal(getattr(got, name), getattr(expected, name)), name
 
 
 def test_activations_map_raw_numbers_to_physical_ones():
@@ -47,12 +47,12 @@ def test_quaternions_are_wxyz_and_turn_by_the_right_hand_rule(axis, turned):
 @pytest.mark.parametrize("length", [1e-30, 1e-7, 1e20, 1e38])
 def test_quaternions_may_have_any_length(length):
     gaussians = make(20)
-    wanted = gaussians.rotations
+    expected = gaussians.rotations
     gaussians.quats = gaussians.quats * length
-    torch.testing.assert_close(gaussians.rotations, wanted)
+    torch.testing.assert_close(gaussians.rotations, expected)
 
 
-def test_a_zero_quaternion_does_not_turn():
+def test_a_zero_quaternion_is_the_identity():
     gaussians = make(1)
     gaussians.quats = torch.zeros(1, 4)
     assert torch.equal(gaussians.rotations[0], torch.eye(3))

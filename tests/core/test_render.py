@@ -45,7 +45,7 @@ def test_disparity_does_not_depend_on_the_unit_of_length():
     torch.testing.assert_close(output(alpha, 7 * depth).disparity(), output(alpha, depth).disparity())
 
 
-def test_each_view_is_stretched_by_itself():
+def test_each_view_is_stretched_independently():
     alpha, depth = scene()
     both = output(alpha, depth).disparity()
     depth[1] *= 3

@@ -1,4 +1,4 @@
-"""Laws of AbsGS: pixels that pull in opposite directions count in full. The rest is in test_baseline.py."""
+"""Laws of AbsGS: gradients of opposite pixels count in full. All other laws are in test_baseline.py."""
 
 from dataclasses import replace
 
@@ -29,17 +29,17 @@ def signal(means2d: torch.Tensor, absgrad: torch.Tensor | None, height=2, width=
     )
 
 
-def test_pulls_that_cancel_count():
+def test_gradients_that_cancel_count_in_full():
     cancelled, pulls = torch.zeros(1, 2, 2), torch.tensor([[[0.3, 0.0], [0.1, 0.1]]])
-    torn = signal(cancelled, pulls)
-    state = AbsGrad(**SETTINGS).observe(AbsGrad(**SETTINGS).init_state(2, CPU), torn)
+    evidence = signal(cancelled, pulls)
+    state = AbsGrad(**SETTINGS).observe(AbsGrad(**SETTINGS).init_state(2, CPU), evidence)
     assert AbsGrad(**SETTINGS).select(state, STEP, DRAWS).tolist() == [True, False]
-    state = Baseline(**SETTINGS).observe(Baseline(**SETTINGS).init_state(2, CPU), torn)
+    state = Baseline(**SETTINGS).observe(Baseline(**SETTINGS).init_state(2, CPU), evidence)
     assert not Baseline(**SETTINGS).select(state, STEP, DRAWS).any()
 
 
 @pytest.mark.parametrize("views", VIEWS)
-def test_it_is_the_baseline_on_other_evidence(views):
+def test_absgrad_is_the_baseline_with_absolute_gradients(views):
     pulls = torch.rand(3, 9, 2, generator=torch.Generator().manual_seed(0))
     settings = SETTINGS | {"views": views, "grad_multiplier": 2.0}
     ours, theirs = AbsGrad(**settings), Baseline(**settings)
@@ -49,12 +49,12 @@ def test_it_is_the_baseline_on_other_evidence(views):
     assert torch.equal(ours.unreliable(one), theirs.unreliable(two))
 
 
-def test_it_needs_absolute_gradients_and_the_baseline_does_not():
+def test_absgrad_needs_absolute_gradients_and_the_baseline_does_not():
     assert AbsGrad(**SETTINGS).needs_absgrad
     assert not Baseline(**SETTINGS).needs_absgrad
 
 
-def test_its_threshold_may_be_a_schedule():
+def test_the_threshold_may_be_a_schedule():
     densifier = replace(AbsGrad(**SETTINGS), tau_pos=Linear(start=0.1, end=1.0, steps=10))
     state = densifier.observe(
         densifier.init_state(1, CPU), signal(torch.zeros(1, 1, 2), torch.full((1, 1, 2), 0.4))

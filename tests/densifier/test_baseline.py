@@ -57,7 +57,8 @@ def test_noise_that_cancels_still_counts_in_full():
     state = baseline().init_state(1, CPU)
     for one in there_and_back:
         state = baseline().observe(state, one)
-    assert baseline().select(state, STEP, DRAWS).all()  # the dilemma of paper sec. 4.1
+    # This is the dilemma of paper sec. 4.1.
+    assert baseline().select(state, STEP, DRAWS).all()
 
 
 def test_steps_that_do_not_see_a_gaussian_do_not_dilute_its_mean():
@@ -77,7 +78,8 @@ def test_a_gaussian_never_seen_is_never_selected():
 def test_the_criterion_does_not_depend_on_the_image_size(views):
     densifier, pixel = baseline(views=views), gradients(2, 6)
     small = mean_norms(densifier, signal(pixel, height=50, width=40))
-    large = mean_norms(densifier, signal(pixel / 4, height=200, width=160))  # the same scene, finer pixels
+    # The same scene with finer pixels.
+    large = mean_norms(densifier, signal(pixel / 4, height=200, width=160))
     torch.testing.assert_close(small, large)
 
 
@@ -111,7 +113,7 @@ def test_the_views_of_a_batch_combine_as_chosen():
         assert float(mean_norms(baseline(views=views), signal(pixel, visible))) == pytest.approx(norm)
 
 
-def test_under_last_only_the_last_view_decides_which_gaussians_are_seen():
+def test_with_views_last_only_the_last_view_counts():
     visible = torch.tensor([[True, False], [False, True]])
     state = baseline(views="last").observe(
         baseline().init_state(2, CPU), signal(torch.ones(2, 2, 2), visible)
@@ -157,7 +159,7 @@ def test_the_accumulators_are_cleared_by_every_refinement():
     assert after.sightings.tolist() == [0] * 4
 
 
-def test_observe_leaves_the_old_state_and_the_signal_alone():
+def test_observe_modifies_neither_the_old_state_nor_the_signal():
     before = baseline().observe(baseline().init_state(4, CPU), signal(gradients(2, 4)))
     copy = {name: rows.clone() for name, rows in before.to_dict().items()}
     pixel = gradients(2, 4, seed=1)

@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 from evidence import (
@@ -23,7 +22,7 @@ from cadam3d.core.checks import UserError
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.schedule import Linear
 from cadam3d.densifier.base import GradientSignal
-from cadam3d.densifier.cadam import CAdamState, quantile, white_noise_snr
+from cadam3d.densifier.cadam import CAdamState, quantile
 from cadam3d.densifier.refine import Refine
 
 # The moments (eq. 8 and 10).
@@ -59,7 +58,7 @@ def test_snr_of_pure_noise_settles_at_the_root_of_one_minus_beta1_over_one_plus_
     assert float(ratio.square().mean().sqrt()) == pytest.approx(math.sqrt(0.1 / 1.9), rel=0.02)
 
 
-def test_observe_leaves_the_old_state_and_the_signal_alone():
+def test_observe_modifies_neither_the_old_state_nor_the_signal():
     before = observe(cadam(), noise(3, 5))
     copy = CAdamState(**{name: tensor.clone() for name, tensor in before.to_dict().items()})
     evidence = signal(noise(1, 5, seed=1)[0])
@@ -109,7 +108,7 @@ def test_a_newborn_corrects_its_bias_by_its_own_age():
     torch.testing.assert_close(cadam().strengths(state)[0], torch.tensor([2.0, 2.0]))
 
 
-def test_a_newborn_that_saw_nothing_has_no_nan():
+def test_a_newborn_without_a_gradient_has_no_nan():
     drift, strength = cadam().strengths(cadam().init_state(3, CPU))
     assert drift.tolist() == strength.tolist() == [0.0, 0.0, 0.0]
 
@@ -144,7 +143,7 @@ def test_drift_is_preferred_to_stronger_noise():
     assert gradients[:, :50].norm(dim=-1).mean() < gradients[:, 50:].norm(dim=-1).mean()
 
 
-def test_a_quantile_that_rises_lets_many_grow_early_and_few_late():
+def test_with_a_rising_quantile_many_gaussians_grow_early_and_few_late():
     densifier = cadam(tau_Q=Linear(start=0.5, end=0.98, begin=100, steps=150), tau_SNR=0.0)
     state = observe(densifier, noise(30, 1001))
     selected = [int(densifier.select(state, step, DRAWS).sum()) for step in (1, 100, 175, 250, 10_000)]
@@ -166,7 +165,7 @@ def test_equal_drifts_select_no_gaussian():
     assert not cadam().select(observe(cadam(), same), STEP, DRAWS).any()
 
 
-def test_the_gate_vetoes_strong_but_unsteady_drift():
+def test_the_snr_gate_rejects_strong_but_unsteady_drift():
     gradients = noise(400, 1000)
     lenient, strict = cadam(tau_SNR=0.0), cadam(tau_SNR=10.0)
     assert lenient.select(observe(lenient, gradients), STEP, DRAWS).sum() == 100
@@ -206,7 +205,8 @@ def test_growth_is_bounded_by_the_quantile_at_every_call():
 
 def test_growth_ends_softly_when_drift_fades_under_noise_of_changing_strength():
     steps, n = 600, 1000
-    strength = torch.logspace(0, -1, steps)[:, None, None]  # the noise of a settling scene: ten times weaker
+    # The noise of a settling scene becomes ten times weaker.
+    strength = torch.logspace(0, -1, steps)[:, None, None]
     gradients = noise(steps, n) * strength
     drifting = gradients.clone()
     drifting[:, :, 0] += strength[:, :, 0]
@@ -218,7 +218,8 @@ def test_growth_ends_softly_when_drift_fades_under_noise_of_changing_strength():
     assert passing[1] < 0.2
     assert cadam().select(early, STEP, DRAWS).sum() == 100
     assert cadam().select(late, STEP, DRAWS).sum() < 100
-    assert cadam(tau_SNR=0.0).select(late, STEP, DRAWS).sum() == 100  # the quantile alone never ends
+    # Under the quantile alone, growth never ends.
+    assert cadam(tau_SNR=0.0).select(late, STEP, DRAWS).sum() == 100
 
 
 def test_young_gaussians_do_not_grow_before_min_age():
@@ -300,18 +301,19 @@ def test_scores_are_what_the_gates_compare():
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999, 1.0])
 @pytest.mark.parametrize("n", [1, 2, 3, 10, 1001])
-def test_quantile_is_that_of_torch(n, share):
+def test_quantile_agrees_with_torch(n, share):
     values = torch.randn(n, generator=torch.Generator().manual_seed(n), dtype=torch.float64)
     torch.testing.assert_close(quantile(values, share), torch.quantile(values, share), rtol=1e-12, atol=0)
 
 
 def test_quantile_has_no_limit_on_the_count():
-    n = 2**24 + 3  # torch.quantile refuses this many, and float32 cannot count them
+    # torch.quantile refuses this many values, and float32 cannot represent their number.
+    n = 2**24 + 3
     descending = torch.arange(n - 1, -1, -1, dtype=torch.int32).sub_(n // 2).float()
-    assert float(quantile(descending, 0.25)) == (n - 1) / 4 - n // 2  # half way between two
+    assert float(quantile(descending, 0.25)) == (n - 1) / 4 - n // 2  # halfway between two values
 
 
-def test_a_rank_that_is_whole_is_whole_for_a_decimal_share():
+def test_a_decimal_share_gives_a_whole_rank_exactly():
     assert 0.29 * 100 != 29
     for percent in range(101):
         assert float(quantile(torch.arange(101.0) ** 2, percent / 100)) == percent**2
@@ -367,17 +369,3 @@ def test_the_selective_reset_needs_a_threshold():
     assert cadam(tau_SNR=None, reset="all").tau_SNR is None
     with pytest.raises(UserError, match=r"densifier\.tau_SNR: .* Try: densifier=cadam_no_snr"):
         cadam(tau_SNR=None)
-
-
-def test_the_level_of_white_noise_is_what_white_noise_leaves():
-    rng = np.random.default_rng(0)
-    m, v = np.zeros((4000, 3)), np.zeros((4000, 3))
-    for _ in range(3000):  # until the second moment has forgotten that it began at zero
-        gradient = rng.standard_normal((4000, 3))
-        m, v = 0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient**2
-    snr = np.linalg.norm(m, axis=1) / np.sqrt(v.sum(axis=1) / (1 - 0.999**3000))
-    assert np.sqrt((snr**2).mean()) == pytest.approx(white_noise_snr(0.9, 0.999), rel=0.02)
-
-
-def test_a_short_second_moment_has_no_level_of_white_noise():
-    assert white_noise_snr(0.9, 0.81) is None

@@ -28,7 +28,7 @@ from cadam3d.densifier.cadam_open import CAdamOpen
 from cadam3d.settings.compose import compose
 
 
-def test_with_its_given_values_it_is_the_paper_s_densifier():
+def test_with_the_values_of_the_paper_it_equals_cadam():
     gradients = noise(60, 300)
     gradients[:, :50] += 0.3
     gradients[7, 3, 1] = math.nan
@@ -43,7 +43,7 @@ def test_with_its_given_values_it_is_the_paper_s_densifier():
     assert cadam().charts() == open_cadam().charts()
 
 
-def test_its_option_has_the_values_of_the_paper_s_option():
+def test_the_option_cadam_open_has_the_values_of_cadam():
     paper, ours = (compose(["prompt=a", f"densifier={name}"]).densifier for name in ("cadam", "cadam_open"))
     assert {key: ours[key] for key in paper if key != "_target_"} == {
         key: value for key, value in paper.items() if key != "_target_"
@@ -67,7 +67,7 @@ def test_moments_are_those_of_adam_to_the_bit_if_nothing_is_skipped(n, choice):
     assert torch.equal(state.v, saved["exp_avg_sq"]["means"])
 
 
-def test_observe_leaves_the_old_state_and_the_signal_alone():
+def test_observe_modifies_neither_the_old_state_nor_the_signal():
     before = observe(open_cadam(), noise(3, 5))
     copy = CAdamState(**{name: tensor.clone() for name, tensor in before.to_dict().items()})
     evidence = signal(noise(1, 5, seed=1)[0])
@@ -139,7 +139,7 @@ def test_unseen_gaussians_age_and_lose_snr_under_zero_and_keep_their_state_under
         assert snr(densifier, after)[1] == pytest.approx(1.0 if choice == "skip" else 0.67, abs=0.01)
 
 
-def test_being_seen_by_one_view_of_the_batch_is_being_seen():
+def test_a_gaussian_in_one_view_of_the_batch_counts_as_seen():
     densifier = open_cadam(invisible="skip")
     visible = torch.tensor([[True, False, False], [False, True, False]])
     state = densifier.observe(densifier.init_state(3, CPU), signal(torch.ones(3, 3), visible))
@@ -182,7 +182,7 @@ def test_per_step_rms_removes_a_scale_that_all_gaussians_share():
     assert float(densifier.strengths(plain)[1].square().mean()) == pytest.approx(1.0, rel=1e-3)
 
 
-def test_per_step_rms_of_no_gradient_at_all_is_zero():
+def test_per_step_rms_of_zero_gradients_is_zero():
     state = observe(open_cadam(grad_norm="per_step_rms"), torch.zeros(2, 3, 3))
     assert not state.m.any()
     assert not state.v.any()
@@ -214,7 +214,7 @@ def test_under_skip_row_a_bad_row_changes_no_other_row(grad_norm):
     assert torch.equal(with_bad.v[[0, 2]], with_zero.v[[0, 2]])
 
 
-def test_eps_relative_to_the_median_noise_does_not_depend_on_the_scale_and_an_absolute_one_does():
+def test_only_an_eps_relative_to_the_median_noise_is_independent_of_the_scale():
     gradients = noise(60, 501)
     for mode, is_free in (("abs", False), ("rel_median", True)):
         densifier = open_cadam(eps=0.5, eps_mode=mode)
@@ -249,7 +249,7 @@ def test_an_absolute_threshold_selects_by_drift_alone():
     assert 0 < both.select(state, STEP, DRAWS).sum() < momentum.select(state, STEP, DRAWS).sum()
 
 
-def test_unreliability_can_have_its_own_threshold():
+def test_the_reset_can_have_its_own_threshold():
     state = observe(open_cadam(), noise(60, 300))
     ratio = snr(open_cadam(), state)
     assert torch.equal(open_cadam().unreliable(state), ratio < 0.1)
@@ -298,6 +298,6 @@ def test_an_impossible_value_of_an_open_choice_is_refused_by_name(key, value):
         ({"alpha": 0.05, "tau_SNR": None, "tau_reset": 0.1, "beta2": 0.8}, "beta2"),
     ],
 )
-def test_a_key_that_would_do_nothing_or_mislead_is_refused(changes, key):
+def test_a_setting_without_effect_or_with_a_misleading_one_is_refused(changes, key):
     with pytest.raises(UserError, match=rf"densifier\.{key}: expected .* Try: densifier\."):
         open_cadam(**changes)

@@ -1,4 +1,4 @@
-"""Laws of densifiers inside the training loop: what they observe, and what follows from what they return."""
+"""Laws of densifiers inside the training loop: what they observe, and the effects of what they return."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -39,7 +39,7 @@ REGULARIZED = ["regularizer=[mean_scale,total_variation]", "regularizer.total_va
 
 
 @dataclass
-class Witness(Callback):
+class Recorder(Callback):
     """Records reports, and the densifier state after each refinement."""
 
     reports: list[RefineReport] = field(default_factory=list)
@@ -50,21 +50,21 @@ class Witness(Callback):
         self.states.append({name: rows.clone() for name, rows in state.densifier.to_dict().items()})
 
 
-def run(overrides: Sequence[str], folder: Path) -> tuple[TrainState, Witness, Outcome]:
+def run(overrides: Sequence[str], folder: Path) -> tuple[TrainState, Recorder, Outcome]:
     is_cadam = not any(line.startswith("densifier=") and "cadam" not in line for line in overrides)
     cfg = compose([*SMALL, *(["densifier.min_age=0"] if is_cadam else []), *overrides])
-    witness = Witness()
-    trainer = replace(build_trainer(cfg, CPU), callbacks=[witness])
+    recorder = Recorder()
+    trainer = replace(build_trainer(cfg, CPU), callbacks=[recorder])
     state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
     context = RunContext(folder, cfg.prompt, trainer.steps, trainer.renderer(state), trainer.rasterizer)
     outcome = trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context)
-    return state, witness, outcome
+    return state, recorder, outcome
 
 
 def test_moments_of_never_densified_gaussians_are_those_of_the_optimizer_to_the_bit(tmp_path):
-    state, witness, _ = run(["densifier.reset=all", *REGULARIZED], tmp_path)
+    state, recorder, _ = run(["densifier.reset=all", *REGULARIZED], tmp_path)
     old = state.densifier.age == state.step
-    assert any(report.cloned + report.split for report in witness.reports)
+    assert any(report.cloned + report.split for report in recorder.reports)
     assert 5 < int(old.sum()) < len(old)
     saved = state.optimizer.state_dict()
     assert torch.equal(state.densifier.m[old], saved["exp_avg"]["means"][old])
@@ -151,9 +151,9 @@ def test_observing_never_waits_for_the_device(choice):
         bool(evidence.means.sum())
 
 
-@pytest.mark.parametrize(("choice", "wants"), [("absgrad", True), ("baseline", False), ("cadam", False)])
+@pytest.mark.parametrize(("choice", "is_needed"), [("absgrad", True), ("baseline", False), ("cadam", False)])
 def test_absolute_gradients_are_summed_only_for_densifiers_that_need_them(
-    choice, wants, tmp_path, monkeypatch
+    choice, is_needed, tmp_path, monkeypatch
 ):
     seen: list[GradientSignal] = []
     densifier = type(component(compose([*SMALL, f"densifier={choice}"]).densifier))
@@ -166,8 +166,8 @@ def test_absolute_gradients_are_summed_only_for_densifiers_that_need_them(
     run([f"densifier={choice}", "steps=2"], tmp_path)
     assert len(seen) == 2
     for signal in seen:
-        assert (signal.absgrad is not None) == wants
-        if wants:
+        assert (signal.absgrad is not None) == is_needed
+        if is_needed:
             slack = 1e-5 * float(signal.absgrad.max())
             assert (signal.absgrad >= signal.means2d.abs() - slack).all()
             assert (signal.absgrad > 1.01 * signal.means2d.abs() + slack).any()
@@ -186,9 +186,9 @@ def test_a_report_has_the_population_before_the_edit_and_the_selected_gaussians(
         return plan(self, gaussians, *args)
 
     monkeypatch.setattr(refine, "plan", spy)
-    _, witness, _ = run([], tmp_path)
-    assert any(report.after > report.before for report in witness.reports)
-    for report, gaussians in zip(witness.reports, seen, strict=True):
+    _, recorder, _ = run([], tmp_path)
+    assert any(report.after > report.before for report in recorder.reports)
+    for report, gaussians in zip(recorder.reports, seen, strict=True):
         population = report.population
         for name in FIELDS:
             assert torch.equal(getattr(population.gaussians, name), getattr(gaussians, name))
@@ -200,13 +200,13 @@ def test_a_report_has_the_population_before_the_edit_and_the_selected_gaussians(
 
 
 def test_a_reset_without_refinement_reports_an_empty_selection(tmp_path):
-    _, witness, _ = run(["refine.end=0"], tmp_path)
-    assert [report.step for report in witness.reports] == [4]
-    assert not witness.reports[0].population.is_selected.any()
-    assert set(witness.reports[0].population.scores) == {"drift", "noise", "snr"}
+    _, recorder, _ = run(["refine.end=0"], tmp_path)
+    assert [report.step for report in recorder.reports] == [4]
+    assert not recorder.reports[0].population.is_selected.any()
+    assert set(recorder.reports[0].population.scores) == {"drift", "noise", "snr"}
 
 
-# What follows.
+# Effects on the run.
 
 
 @pytest.mark.parametrize(("screen_px", "outcome"), [("null", Outcome.FINISHED), ("0.01", Outcome.VANISHED)])
@@ -217,8 +217,8 @@ def test_screen_size_prunes_as_intended_or_as_shipped(screen_px, outcome, tmp_pa
 
 @pytest.mark.parametrize(("choice", "is_global"), [("cadam_no_reset", False), ("cadam_global_reset", True)])
 def test_the_densifier_decides_which_opacities_are_reset(choice, is_global, tmp_path):
-    _, witness, _ = run([f"densifier={choice}"], tmp_path)
-    at_reset = witness.reports[1]
+    _, recorder, _ = run([f"densifier={choice}"], tmp_path)
+    at_reset = recorder.reports[1]
     assert at_reset.step == 4
     assert at_reset.reset == (at_reset.after if is_global else 0)
 
@@ -230,9 +230,9 @@ def test_noise_moves_the_means_after_the_optimizer_step_and_nothing_else(tmp_pat
     trainer = build_trainer(cfg, CPU)
     draws = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU).generators["densifier"]
     lr = trainer.optimizer.learning_rates(0)["means"]
-    wanted = trainer.densifier.perturb(still.gaussians.detach(), lr, draws)
-    torch.testing.assert_close(moved.gaussians.means - still.gaussians.means, wanted, rtol=1e-3, atol=1e-6)
-    assert wanted.abs().max() > 1e-3
+    expected = trainer.densifier.perturb(still.gaussians.detach(), lr, draws)
+    torch.testing.assert_close(moved.gaussians.means - still.gaussians.means, expected, rtol=1e-3, atol=1e-6)
+    assert expected.abs().max() > 1e-3
     for name in set(FIELDS) - {"means"}:
         assert torch.equal(getattr(moved.gaussians, name), getattr(still.gaussians, name))
 
@@ -240,9 +240,9 @@ def test_noise_moves_the_means_after_the_optimizer_step_and_nothing_else(tmp_pat
 @pytest.mark.parametrize("clears", ["false", "true"])
 def test_reset_moments_gives_reset_gaussians_age_zero(clears, tmp_path):
     line = f"densifier.reset_moments={clears}"
-    _, witness, _ = run(
+    _, recorder, _ = run(
         ["densifier=cadam_open", "densifier.reset=all", line, "densifier.tau_m=1e9"], tmp_path
     )
-    ages, m = witness.states[1]["age"], witness.states[1]["m"]
+    ages, m = recorder.states[1]["age"], recorder.states[1]["m"]
     assert ages.tolist() == [0 if clears == "true" else 4] * len(ages)
     assert bool(m.any()) == (clears == "false")

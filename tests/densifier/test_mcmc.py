@@ -49,12 +49,12 @@ def plan(densifier: MCMC, scene: Gaussians, how: Refine | None = None, seed: int
     return densifier.plan(state, scene, step, how or refine(), draws(seed))
 
 
-# What N coincident Gaussians show (equation 9).
+# How coincident copies share the opacity and the size of their original (equation 9).
 
 
 @pytest.mark.parametrize("opacity", [0.001, 0.1, 0.5, 0.9, 0.999, 0.999999])
 @pytest.mark.parametrize("among", [1, 2, 3, 10, 60, 1000])
-def test_coincident_gaussians_show_what_the_one_showed(opacity, among):
+def test_coincident_copies_look_like_the_original(opacity, among):
     logits = torch.tensor([opacity], dtype=torch.float64).logit()
     new, log_shrink = share(logits, torch.tensor([among]))
     each, width = float(new.sigmoid()), math.exp(float(log_shrink))
@@ -67,14 +67,14 @@ def test_coincident_gaussians_show_what_the_one_showed(opacity, among):
     assert line == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-5)
 
 
-def test_one_for_one_is_no_change():
+def test_a_single_copy_is_unchanged():
     logits = torch.linspace(-6, 13, 20, dtype=torch.float64)
     new, log_shrink = share(logits, torch.ones(20, dtype=torch.long))
     torch.testing.assert_close(new, logits)
     torch.testing.assert_close(log_shrink, torch.zeros_like(logits), atol=1e-9, rtol=0)
 
 
-def test_shares_of_a_batch_are_those_of_each_alone():
+def test_shares_do_not_depend_on_the_rest_of_the_batch():
     logits, among = torch.tensor([-2.0, 0.5, 3.0]).double(), torch.tensor([7, 1, 40])
     together = torch.stack(share(logits, among))
     alone = torch.cat([torch.stack(share(logits[i : i + 1], among[i : i + 1])) for i in range(3)], dim=1)
@@ -124,17 +124,17 @@ def test_copies_have_the_position_of_their_original_and_share_its_opacity_and_si
     scene = gaussians(30)
     scene.opacity_logits[:20] = -9.0
     edit = plan(mcmc(growth=0.0), scene).edit
-    assert edit.parents.bincount().max() > 2, "someone was drawn twice: shares are not of two only"
+    assert edit.parents.bincount().max() > 2, "no parent was drawn twice, so only shares of two are tested"
     for parent in edit.parents.unique():
         mine = edit.parents == parent
-        wanted_logit, log_shrink = share(scene.opacity_logits[parent][None].double(), mine.sum()[None])
+        expected_logit, log_shrink = share(scene.opacity_logits[parent][None].double(), mine.sum()[None])
         for field in ("means", "quats", "sh"):
             original = getattr(scene, field)[parent]
             assert torch.equal(
                 getattr(edit.children, field)[mine], original.expand(int(mine.sum()), *original.shape)
             )
         torch.testing.assert_close(
-            edit.children.opacity_logits[mine].double(), wanted_logit.expand(int(mine.sum()))
+            edit.children.opacity_logits[mine].double(), expected_logit.expand(int(mine.sum()))
         )
         torch.testing.assert_close(
             edit.children.log_scales[mine].double(),
@@ -153,7 +153,7 @@ def test_copied_gaussians_lose_their_moments_and_no_others_do():
 
 
 @pytest.mark.parametrize("growth", [0.05, 0.1])
-def test_the_population_grows_by_its_share_up_to_the_cap_and_stays(growth):
+def test_the_population_grows_by_its_share_up_to_the_cap_and_then_keeps_its_size(growth):
     scene, counts = gaussians(100, low=0.5), [100]
     for call in range(20):
         scene = plan(mcmc(growth=growth, cap=180), scene, seed=call).edit.apply(scene)
@@ -162,7 +162,7 @@ def test_the_population_grows_by_its_share_up_to_the_cap_and_stays(growth):
     assert counts[-1] == counts[-2] == 180
 
 
-def test_more_than_the_cap_neither_grow_nor_shrink():
+def test_a_population_above_the_cap_neither_grows_nor_shrinks():
     scene = gaussians(50)
     scene.opacity_logits[:10] = -9.0
     assert plan(mcmc(cap=20), scene).edit.rows_after == 50
@@ -171,7 +171,7 @@ def test_more_than_the_cap_neither_grow_nor_shrink():
 def test_relocated_and_added_copies_share_one_original():
     scene = gaussians(40)
     scene.opacity_logits[1:] = -9.0
-    edit = plan(mcmc(growth=0.05), scene).edit  # one alive: all 42 share what it was
+    edit = plan(mcmc(growth=0.05), scene).edit  # one is alive: its 42 copies share its opacity
     assert edit.rows_after == 42
     assert set(edit.parents.tolist()) == {0}
     clear = torch.log1p(-edit.children.opacities.double()).sum()
@@ -200,7 +200,7 @@ def test_gaussians_that_refinement_would_prune_for_another_reason_are_dead_too()
 
 
 @pytest.mark.parametrize("n", [0, 5])
-def test_without_a_live_gaussian_none_is_born(n):
+def test_without_a_live_gaussian_no_copies_are_made(n):
     scene = gaussians(n)
     scene.opacity_logits -= 20
     decided = plan(mcmc(), scene)
@@ -208,7 +208,7 @@ def test_without_a_live_gaussian_none_is_born(n):
     assert (decided.cloned, decided.pruned, decided.selected) == (0, n, 0)
 
 
-def test_a_plan_follows_from_its_generator_and_changes_nothing():
+def test_a_plan_depends_on_the_generator_and_changes_nothing():
     scene = gaussians(50, low=0.001)
     before = scene.map(torch.clone)
     first, again, other = (plan(mcmc(), scene, seed=seed).edit for seed in (0, 0, 1))
@@ -241,9 +241,9 @@ def test_the_noise_has_the_squared_covariance_of_each_gaussian():
     many = one.index(torch.zeros(200_000, dtype=torch.long))
     moved = mcmc(noise_lr=6.0).perturb(many, 0.5, draws()).double()
     spread = one.rotations[0] * one.scales[0].square() @ one.rotations[0].T
-    wanted = (0.5 * 6.0 * 0.5) ** 2 * spread.double() @ spread.double()
-    error = (moved.T @ moved / len(moved) - wanted).abs().max()
-    assert error < 0.01 * wanted.diagonal().max()
+    expected = (0.5 * 6.0 * 0.5) ** 2 * spread.double() @ spread.double()
+    error = (moved.T @ moved / len(moved) - expected).abs().max()
+    assert error < 0.01 * expected.diagonal().max()
 
 
 def test_noise_moves_faint_gaussians_and_not_opaque_ones():

@@ -1,4 +1,4 @@
-"""The SNR of pure noise, when tau_SNR = 0.1 rejects it, and which share passes a calibrated gate.
+"""The SNR of pure noise, when tau_SNR = 0.1 rejects it, and the share of it that passes a calibrated gate.
 
 Everything is simulated through ``CAdam.observe``: 4,000 Gaussians whose gradients are zero-mean noise. The
 tables of docs/method.md are these numbers.
@@ -12,7 +12,7 @@ import torch
 
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.cadam import CAdam, CAdamState
-from cadam3d.densifier.noise_floor import snr_threshold, squared_weights
+from cadam3d.densifier.noise_floor import snr_threshold, squared_weights, white_noise_snr
 from cadam3d.prior.path import DDPM
 from cadam3d.settings.compose import component, compose
 
@@ -125,7 +125,7 @@ def test_the_published_gate_passes_noise_unless_its_scale_falls(case, beta2, sca
 
 
 @pytest.mark.parametrize(("visibility", "zero", "skip"), [(0.3, 84, 90), (0.1, 64, 91), (0.02, 29, 96)])
-def test_the_published_gate_rejects_rarely_seen_gaussians_unless_their_pauses_are_skipped(
+def test_the_published_gate_rejects_rarely_seen_gaussians_unless_unseen_steps_are_skipped(
     visibility, zero, skip
 ):
     for choice, percent in (("zero", zero), ("skip", skip)):
@@ -134,7 +134,7 @@ def test_the_published_gate_rejects_rarely_seen_gaussians_unless_their_pauses_ar
         assert passes(densifier, state) == pytest.approx(percent, abs=3)
 
 
-def test_a_weight_common_to_all_opens_and_shuts_the_gate_for_all_gaussians():
+def test_a_weight_that_all_gaussians_share_opens_and_closes_the_gate_for_all():
     densifier = cadam()
     states = simulate(densifier, gamma_of_ism(1500), looks=range(200, 1501, 100))
     shares = [passes(densifier, state) for state in states.values()]
@@ -170,7 +170,7 @@ def test_shares_selected_without_and_with_a_drift(name, noise, signal):
 @pytest.mark.parametrize(
     ("beta1", "beta2"), [(0.9, 0.81), (0.9, 0.99), (0.9, 0.999), (0.98, 0.99), (0.98, 0.999)]
 )
-def test_isotropic_noise_passes_as_often_as_alpha_says_at_every_age(beta1, beta2):
+def test_the_share_of_isotropic_noise_that_passes_is_alpha_at_every_age(beta1, beta2):
     densifier = cadam(beta1=beta1, beta2=beta2)
     states = simulate(densifier, [1.0] * AGES[-1], looks=AGES)
     for alpha in (0.01, 0.05, 0.2):
@@ -182,7 +182,7 @@ def test_isotropic_noise_passes_as_often_as_alpha_says_at_every_age(beta1, beta2
 
 
 @pytest.mark.parametrize("visibility", [0.1, 0.3, 1.0])
-def test_with_skipped_pauses_visibility_does_not_matter(visibility):
+def test_visibility_does_not_matter_if_unseen_steps_are_skipped(visibility):
     densifier = cadam(invisible="skip", beta2=0.81)
     for state in simulate(densifier, [1.0] * 300, visibility=visibility, looks=(100, 300)).values():
         grown = densifier.scores(state)["snr"][state.age >= 5]
@@ -207,7 +207,8 @@ def test_with_beta2_of_beta1_squared_no_change_of_scale_lets_more_noise_pass(sca
     rates = [alarms(short, state) for state in simulate(short, scales, looks=looks).values()]
     assert 0.01 < min(rates) <= max(rates) < ALPHA + ERROR
     rates = [alarms(long, state) for state in simulate(long, scales, looks=looks).values()]
-    assert max(rates) > 2 * ALPHA or min(rates) < 0.01  # a long memory does not keep the rate
+    # With a long memory the rate is not constant.
+    assert max(rates) > 2 * ALPHA or min(rates) < 0.01
 
 
 def test_noise_along_fewer_axes_passes_more_often():
@@ -218,7 +219,7 @@ def test_noise_along_fewer_axes_passes_more_often():
         assert alarms(densifier, state) == pytest.approx(rate, abs=ERROR)
 
 
-def test_drift_of_the_strength_of_the_noise_passes_the_calibrated_gate():
+def test_drift_as_strong_as_the_noise_passes_the_calibrated_gate():
     def drifting(draw: torch.Generator) -> torch.Tensor:
         return isotropic(draw) + torch.tensor([1.0, 1.0, 1.0])
 
@@ -247,20 +248,35 @@ def test_select_uses_the_threshold_of_each_age():
 # The function.
 
 
-def test_fewer_alarms_need_a_higher_threshold_at_every_age():
+def test_a_smaller_alpha_gives_a_higher_threshold_at_every_age():
     ages = torch.arange(2, 2000)
     strict, usual, lax = (snr_threshold(alpha, 0.9, 0.999, ages) for alpha in (0.01, 0.05, 0.5))
     assert (strict > usual).all()
     assert (usual > lax).all()
 
 
-def test_no_gaussian_passes_on_one_gradient():
+def test_no_gaussian_passes_after_a_single_gradient():
     assert snr_threshold(0.5, 0.9, 0.999, torch.tensor([0, 1, 2])).isinf().tolist() == [True, True, False]
     assert snr_threshold(0.5, 0.9, 0.999, torch.arange(0)).shape == (0,)
 
 
-def test_in_the_end_the_threshold_is_that_of_chi_square():
+def test_at_a_large_age_the_threshold_follows_from_chi_square():
     from scipy.stats import chi2
 
     expected = math.sqrt(0.1 / 1.9 * chi2.ppf(0.95, 3) / 3)
     assert float(snr_threshold(0.05, 0.9, 0.9999, torch.tensor([10**6]))) == pytest.approx(expected, rel=1e-3)
+
+
+def test_the_level_of_white_noise_agrees_with_a_simulation():
+    rng = np.random.default_rng(0)
+    m, v = np.zeros((4000, 3)), np.zeros((4000, 3))
+    # After 3000 steps the start at zero no longer affects the second moment.
+    for _ in range(3000):
+        gradient = rng.standard_normal((4000, 3))
+        m, v = 0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient**2
+    snr = np.linalg.norm(m, axis=1) / np.sqrt(v.sum(axis=1) / (1 - 0.999**3000))
+    assert np.sqrt((snr**2).mean()) == pytest.approx(white_noise_snr(0.9, 0.999), rel=0.02)
+
+
+def test_a_short_second_moment_has_no_level_of_white_noise():
+    assert white_noise_snr(0.9, 0.81) is None

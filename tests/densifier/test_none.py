@@ -41,5 +41,5 @@ def test_the_masks_follow_the_count_when_pruning_removes_rows():
     assert NoGrowth().select(state, STEP, DRAWS).tolist() == [False] * 2
 
 
-def test_there_is_nothing_to_report():
+def test_there_are_no_statistics():
     assert NoGrowth().statistics(NoGrowth().init_state(4, CPU), STEP) == {}

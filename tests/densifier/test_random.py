@@ -66,7 +66,7 @@ def test_gradients_change_nothing_and_no_gaussian_is_reset():
     assert not densifier.unreliable(observed).any()
 
 
-def test_selecting_leaves_the_state_alone():
+def test_selecting_does_not_modify_the_state():
     densifier = RandomGrowth(share=0.5)
     state = densifier.init_state(8, CPU)
     assert densifier.select(state, STEP, draws()).any()
@@ -80,7 +80,7 @@ def test_a_schedule_of_the_share_is_followed():
     assert densifier.statistics(densifier.init_state(3, CPU), 175)["share"] == pytest.approx(0.26)
 
 
-def test_the_annealed_control_selects_as_many_as_its_original_at_every_refinement():
+def test_the_annealed_control_selects_as_many_as_cadam_annealed_at_every_refinement():
     cadam, control = (
         component(compose(["prompt=a red cube", f"densifier={name}"]).densifier)
         for name in ("cadam_annealed", "random_annealed")

@@ -166,14 +166,14 @@ def test_split_children_are_distributed_like_their_parent():
     torch.testing.assert_close(offsets.mean(dim=0), torch.zeros(3), atol=0.04, rtol=0)
 
 
-def test_the_plan_is_decided_by_the_generator():
+def test_the_plan_depends_on_the_generator():
     scene, all_rows = gaussians(10), torch.ones(10, dtype=torch.bool)
     first, again, other = (refine().plan(scene, all_rows, LATE, draw(seed)) for seed in (0, 0, 1))
     assert torch.equal(first.edit.children.means, again.edit.children.means)
     assert not torch.equal(first.edit.children.means, other.edit.children.means)
 
 
-def test_planning_changes_nothing_and_leaves_no_graph():
+def test_planning_changes_nothing_and_keeps_no_autograd_graph():
     scene = gaussians(10).map(lambda tensor: tensor.requires_grad_())
     copies = {name: tensor.detach().clone() for name, tensor in scene.tensors().items()}
     plan = refine().plan(scene, torch.ones(10, dtype=torch.bool), LATE, draw())
@@ -324,11 +324,11 @@ def test_an_impossible_value_is_refused_by_name(key, value):
         refine(**{key: value})
 
 
-def test_a_reset_that_would_delete_is_refused():
+def test_a_reset_below_the_pruning_threshold_is_refused():
     with pytest.raises(UserError, match=r"refine\.min_opacity.*refine\.prune_grace=100"):
         refine(reset_interval=300, min_opacity=0.05)
 
 
-def test_a_grace_without_end_is_refused():
+def test_a_grace_as_long_as_the_reset_interval_is_refused():
     with pytest.raises(UserError, match=r"refine\.prune_grace.*refine\.reset_interval=300"):
         refine(reset_interval=300, prune_grace=300)

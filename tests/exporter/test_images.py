@@ -39,8 +39,8 @@ def test_each_file_shows_the_view_in_its_name(tmp_path):
     for path in paths:
         _, azimuth, elevation = path.stem.split("_")
         pixel = imageio.imread(path)[3, 3]
-        wanted = [round(int(azimuth[2:]) / 360 * 255), round(int(elevation[2:]) / 90 * 255), 0]
-        np.testing.assert_allclose(pixel, wanted, atol=1)
+        expected = [round(int(azimuth[2:]) / 360 * 255), round(int(elevation[2:]) / 90 * 255), 0]
+        np.testing.assert_allclose(pixel, expected, atol=1)
 
 
 def test_names_sort_in_the_order_of_the_views(tmp_path):

@@ -28,7 +28,7 @@ def test_the_asset_reads_back_bit_for_bit_whatever_the_frame(tmp_path, up):
         assert torch.equal(back.tensors()[name], tensor), name
 
 
-def test_padding_reaches_the_file(tmp_path):
+def test_the_file_has_padded_spherical_harmonics(tmp_path):
     PlyExporter(up="-y", pad_sh=3).export(random_gaussians(), never_renders, tmp_path)
     assert read_ply(tmp_path / "asset.ply").sh_degree == 3
 

@@ -50,7 +50,7 @@ def export(folder, **changes):
     return imageio.imread(folder / "turntable.mp4").astype(float) / 255, render
 
 
-def test_one_turn_in_order_starting_at_the_front(tmp_path):
+def test_the_video_shows_one_turn_in_order_from_the_front(tmp_path):
     frames, render = export(tmp_path)
     assert frames.shape == (9, 32, 64, 3)
     shades = frames[:, :, :32].mean(axis=(1, 2, 3))

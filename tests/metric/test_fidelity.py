@@ -63,7 +63,7 @@ def test_a_constant_error_has_the_psnr_of_its_square(error, psnr):
     assert measured["psnr_min"] == pytest.approx(psnr, abs=1e-3)
 
 
-def test_equal_images_score_the_finite_best():
+def test_equal_images_have_a_psnr_of_100_db():
     assert measure(renders(0.0), truths(0.0)) == {
         "psnr": 100.0,
         "psnr_min": 100.0,
@@ -130,12 +130,12 @@ def test_one_mode_counts_for_all_views():
 
     measured = measure(renders(0.0), truth)
     assert measured["mode"] == 0
-    assert measured["psnr"] < 32  # choosing a mode per view would claim 40 dB
+    assert measured["psnr"] < 32  # a choice of the mode per view would give 40 dB
 
 
 def test_without_true_images_there_are_no_numbers():
     def never(cameras, background):
-        raise AssertionError("nothing to render for")
+        raise AssertionError("rendered although there are no true images")
 
     assert measure(never, None) == {}
 

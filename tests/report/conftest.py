@@ -1,4 +1,4 @@
-"""Sweep folders made by hand: the layout of a real sweep, every file that figures need, known numbers."""
+"""Sweep folders made by hand: the layout of a real sweep, all files that figures need, and known numbers."""
 
 import json
 import math
@@ -21,7 +21,7 @@ SIZE = 12  # pixels of a picture
 STEPS = (40, 80, 120)
 
 
-# What a densifier with a score declares; the names are made up, because the reports know none.
+# The chart that a densifier with a score declares. Its names are invented, because the reports know no score.
 SHAKE = Chart(
     title="Shaking of the Gaussians",
     caption="How much each Gaussian shakes",

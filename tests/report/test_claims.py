@@ -1,4 +1,4 @@
-"""Claims about results made by hand: comparisons, frontiers, and one against the other."""
+"""Claims about results made by hand: comparisons, frontiers, and settings compared with frontiers."""
 
 import math
 
@@ -107,11 +107,11 @@ def test_between_settings_a_hull_is_straight_in_log_count():
     assert hull.count_for(15.0) == pytest.approx(1000.0)
 
 
-def test_a_setting_under_the_line_of_others_does_not_pull_a_hull_down():
+def test_a_setting_below_the_line_between_others_does_not_lower_a_hull():
     assert Hull([(100.0, 10.0), (1000.0, 11.0), (10000.0, 20.0)]).psnr_at(1000.0) == pytest.approx(15.0)
 
 
-def test_more_gaussians_that_only_hurt_leave_a_hull_level():
+def test_a_hull_stays_level_where_more_gaussians_lower_the_quality():
     hull = Hull([(100.0, 10.0), (1000.0, 20.0), (10000.0, 5.0)])
     assert hull.psnr_at(10000.0) == pytest.approx(20.0)
     assert hull.count_for(20.0) == pytest.approx(1000.0)
@@ -176,7 +176,7 @@ def test_no_setting_is_above_the_frontier_of_its_arm(bench_results):
             assert found.psnr.median <= 1e-9
 
 
-def test_a_ratio_of_counts_is_free_of_their_scale(jobs):
+def test_a_ratio_of_counts_does_not_depend_on_their_scale(jobs):
     for seed, scale in enumerate((1, 7)):
         baseline_frontier(jobs, {0.001: (100 * scale, 10.0), 0.0002: (10000 * scale, 20.0)}, seed=seed)
         jobs.add("cadam", f"seed={seed}", n=1000 * scale, psnr=16.0)
@@ -190,15 +190,15 @@ def test_a_ratio_of_counts_is_free_of_their_scale(jobs):
 @pytest.mark.parametrize(
     ("qualities", "ratio"),
     [
-        ((9.0, 25.0, 15.0), 1.0),  # one always exceeded, one never reached: the two sides weigh the same
+        ((9.0, 25.0, 15.0), 1.0),  # one always exceeded, one never reached
         ((9.0, 9.0, 15.0), 0.0),
         ((25.0, 25.0, 15.0), math.inf),
-        ((10.0, 20.0), (0.1 + 10) / 2),  # both in the middle are known: their mean
-        ((9.0, 15.0), 0.0),  # one of the two is not: the lower
+        ((10.0, 20.0), (0.1 + 10) / 2),  # the mean of the two in the middle, both known
+        ((9.0, 15.0), 0.0),  # the lower one, because one of the two is unknown
         ((15.0, 25.0), 1.0),
     ],
 )
-def test_qualities_out_of_reach_count_on_both_sides(jobs, qualities, ratio):
+def test_qualities_out_of_reach_count_as_zero_and_infinite_ratios(jobs, qualities, ratio):
     for seed, psnr in enumerate(qualities):
         baseline_frontier(jobs, {0.001: (100, 10.0), 0.0002: (10000, 20.0)}, seed=seed)
         jobs.add("cadam", f"seed={seed}", n=1000, psnr=psnr)

@@ -1,4 +1,4 @@
-"""Declared charts survive the way through a file, and a damaged file does no harm."""
+"""Declared charts are read back as they were written, and a damaged file is not an error."""
 
 import json
 
@@ -22,7 +22,7 @@ CHARTS = (
 )
 
 
-def test_what_is_written_is_read_back(tmp_path):
+def test_charts_are_read_back_as_they_were_written(tmp_path):
     write_declarations(tmp_path, CHARTS)
     assert read_declarations(tmp_path) == CHARTS
 
@@ -49,7 +49,7 @@ def test_a_damaged_file_declares_nothing(tmp_path, content):
         ),
     ],
 )
-def test_a_damaged_chart_does_not_take_the_others_with_it(tmp_path, damage):
+def test_a_damaged_chart_is_left_out_and_the_others_are_kept(tmp_path, damage):
     write_declarations(tmp_path, CHARTS)
     content = json.loads((tmp_path / "charts.json").read_text(encoding="utf-8"))
     content[0] |= damage

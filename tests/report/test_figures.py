@@ -1,4 +1,4 @@
-"""Figures show the results they are given, and there is none without data."""
+"""Figures show the given results, and without data there is no figure."""
 
 import math
 import re
@@ -52,9 +52,9 @@ def test_a_frontier_has_a_panel_per_noise_level_and_names_thresholds(bench_resul
         "medium noise",
         "strong noise",
     ]
-    said = texts(figure)
+    shown = texts(figure)
     for expected in ("0.0002", "0.004", "baseline: tau_pos", "cadam: tau_Q, tau_SNR", "without noise"):
-        assert expected in said
+        assert expected in shown
 
 
 def test_a_frontier_puts_each_setting_where_its_median_is(jobs):
@@ -69,7 +69,7 @@ def test_a_frontier_puts_each_setting_where_its_median_is(jobs):
     assert marks == [(100.0, 0.0), (2000.0, 3.0)]
 
 
-def test_a_frontier_of_ssim_is_one_of_ssim(jobs):
+def test_a_frontier_of_ssim_shows_ssim(jobs):
     for seed, ssim in enumerate((0.8, 0.85, 0.95)):
         jobs.add("cadam", f"seed={seed}", n=1000, psnr=20.0, ssim=ssim)
         jobs.add("none", f"seed={seed}", n=100, psnr=18.0, ssim=0.7)
@@ -121,7 +121,7 @@ def test_a_job_that_ended_early_keeps_its_count():
     assert figures.over_time([[(0, 100), (10, 500)], [(0, 100), (20, 100)]])[2].tolist() == [100, 300, 300]
 
 
-def test_the_arm_with_two_thresholds_is_found(bench_results):
+def test_the_thresholds_of_the_arm_that_varies_two_are_drawn(bench_results):
     assert figures.arm_of_two_thresholds(bench_results) == "cadam"
     figure = draw("thresholds", bench_results)
     assert len(figure.axes) == 6
@@ -140,7 +140,7 @@ def test_a_mask_is_the_right_half_of_a_pair(bench_results):
     assert (pictures.mask_of(pair) == pair[:, 4:]).all()
 
 
-def test_pictures_of_a_preview_are_cut_apart(bench_results):
+def test_a_preview_is_cut_into_single_pictures(bench_results):
     result = next(result for result in bench_results if result.arm == "cadam")
     assert [picture.shape for picture in pictures.views(result)] == [(12, 12, 3)] * 3
 
@@ -150,19 +150,19 @@ def test_regimes_are_shown_in_a_cell_that_has_all_of_them(jobs):
         for tau, n in settings.items():
             keys = (f"densifier.tau_Q={tau}", f"densifier.tau_SNR={0.1 if tau == 0.9 else 0.3}")
             jobs.files(jobs.add("cadam", *keys, f"seed={seed}", n=n, psnr=20.0), n)
-    said = texts(draw("regimes", read(jobs.folder)))
-    assert "seed 1" in said
-    assert "fewest: tau_Q 0.95" in said
-    assert "standard: tau_Q 0.9" in said
+    shown = texts(draw("regimes", read(jobs.folder)))
+    assert "seed 1" in shown
+    assert "fewest: tau_Q 0.95" in shown
+    assert "standard: tau_Q 0.9" in shown
 
 
 def test_an_ablation_shows_count_quality_and_outcome(bench_results):
-    said = texts(draw("ablation", bench_results))
-    assert said.count("Gaussians\n") == 3
-    assert "finished" in said
+    shown = texts(draw("ablation", bench_results))
+    assert shown.count("Gaussians\n") == 3
+    assert "finished" in shown
 
 
-def test_objectives_need_two_of_them(bench_results, jobs):
+def test_the_figure_of_objectives_needs_two_of_them(bench_results, jobs):
     assert draw("objectives", bench_results) is None
     for arm in ("baseline", "cadam"):
         for guidance in ("sds", "vfds"):
@@ -237,7 +237,7 @@ def test_numbers_on_a_log_axis_are_plain(bench_results):
     assert all(math.isfinite(value) for value in figure.axes[0].get_ylim())
 
 
-def test_names_of_arms_that_end_in_one_place_do_not_cover_each_other(jobs):
+def test_names_of_arms_at_the_same_place_do_not_overlap(jobs):
     for prompt in ("a cube", "a torus"):
         for arm, n, psnr in (("none", 300, 18.0), ("cadam", 1000, 20.0), ("cadam_annealed", 990, 20.0)):
             jobs.add(arm, f"prompt={prompt}", "noise=weak", n=n, psnr=psnr)

@@ -1,4 +1,4 @@
-"""Numbers are written the way people write them."""
+"""Numbers, durations and sizes are written in a readable form."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Plots put the numbers where the axes say."""
+"""Plots draw every number at its place on the axes."""
 
 import math
 import re
@@ -29,12 +29,12 @@ def plot(points, **settings) -> Plot:
 
 
 def places(made: Plot) -> list[tuple[float, float]]:
-    """Where the tooltips of the points are: x, and y from the top."""
+    """Return the places of the tooltips of the points: x, and y from the top."""
     return [(hint.x, hint.y) for hint in made.draw().hints]
 
 
 def curve(svg: str) -> list[tuple[float, float]]:
-    """The points of the first curve as it is drawn."""
+    """Return the points of the first curve as it is drawn."""
     variable = SERIES["#2a6fdb"][0]
     data = re.search(rf'<path d="([^"]*)"[^>]*style="fill: none; stroke: var\(--{variable}', svg)
     assert data is not None
@@ -42,7 +42,7 @@ def curve(svg: str) -> list[tuple[float, float]]:
 
 
 def ticks(made: Plot) -> dict[str, float]:
-    """The labels of the y axis and their heights."""
+    """Return the labels of the y axis and their heights."""
     found = re.findall(
         r'text-anchor: end[^>]* y="([\d.]+)"[^>]*>([^<]+)<|text-anchor: end[^>]*>([^<]+)<', made.draw().svg
     )
@@ -90,7 +90,7 @@ def test_logarithmic_axes_have_ticks_whatever_the_range(decades):
     assert 2 <= len(ticks(plot([(0, 1e-3), (1, 1e-3 * 10**decades)], log_y=True))) <= 8
 
 
-def test_a_logarithmic_axis_leaves_out_what_it_cannot_show():
+def test_a_logarithmic_axis_leaves_out_numbers_that_are_not_positive():
     assert len(places(plot([(0, 0.0), (1, -3.0), (2, 1.0), (3, 10.0)], log_y=True))) == 2
 
 

@@ -1,4 +1,4 @@
-"""Jobs become results: what makes a setting, what makes a cell, and what may be compared."""
+"""Jobs become results: which keys make settings and cells, and which results may be compared."""
 
 import pytest
 
@@ -19,7 +19,7 @@ def test_a_threshold_that_varies_within_an_arm_makes_settings(jobs):
     assert len({result.cell for result in results}) == 1
 
 
-def test_a_job_that_leaves_a_swept_threshold_alone_has_the_shipped_one(jobs):
+def test_a_job_that_does_not_set_a_swept_threshold_has_the_shipped_value(jobs):
     jobs.add("baseline", n=100, psnr=20.0)
     jobs.add("baseline", "densifier.tau_pos=0.001", n=100, psnr=20.0)
     results = read(jobs.folder)
@@ -32,7 +32,7 @@ def test_a_changed_threshold_is_not_standard_even_if_it_never_varies(jobs):
     assert not read(jobs.folder)[0].is_standard
 
 
-def test_the_key_of_a_schedule_has_its_shipped_value_too(jobs):
+def test_a_key_within_a_schedule_has_a_shipped_value_too(jobs):
     for start in (0.35, 0.5, 0.65):
         jobs.add("cadam_annealed", f"densifier.tau_Q.start={start}", n=100, psnr=20.0)
     jobs.add("cadam_annealed", n=100, psnr=20.0)
@@ -41,12 +41,12 @@ def test_the_key_of_a_schedule_has_its_shipped_value_too(jobs):
     assert results[1].setting == results[3].setting == ArmSetting("cadam_annealed", (("tau_Q.start", 0.5),))
 
 
-def test_a_number_in_place_of_a_schedule_is_not_the_shipped_one(jobs):
+def test_a_number_in_place_of_a_schedule_is_not_standard(jobs):
     jobs.add("cadam_annealed", "densifier.tau_Q=0.9", n=100, psnr=20.0)
     assert not read(jobs.folder)[0].is_standard
 
 
-def test_where_no_threshold_is_the_shipped_one_nothing_is_standard(jobs):
+def test_without_a_shipped_threshold_no_result_is_standard(jobs):
     for growth in (0.05, 0.1):
         jobs.add("mcmc", "densifier.cap=1500", f"densifier.growth={growth}", n=100, psnr=20.0)
     assert not any(result.is_standard for result in read(jobs.folder))
@@ -76,7 +76,7 @@ def test_a_key_that_only_differs_between_arms_belongs_to_the_arm(jobs):
     assert len({result.cell for result in read(jobs.folder)}) == 1
 
 
-def test_named_arms_of_one_densifier_stay_apart(jobs):
+def test_named_arms_of_one_densifier_are_distinguished(jobs):
     jobs.add("cadam", "refine.reset_interval=null", n=100, psnr=20.0, arm="no_reset")
     jobs.add("cadam", n=100, psnr=20.0, arm="paper")
     jobs.plan("paper", ["densifier=cadam", "seed=1"])
@@ -87,7 +87,7 @@ def test_named_arms_of_one_densifier_stay_apart(jobs):
 
 
 @pytest.mark.parametrize(
-    ("outcome", "may"),
+    ("outcome", "is_measured"),
     [
         ("finished", True),
         ("max_gaussians", True),
@@ -97,10 +97,10 @@ def test_named_arms_of_one_densifier_stay_apart(jobs):
         ("vanished", False),
     ],
 )
-def test_only_assets_at_an_end_are_measured(jobs, outcome, may):
+def test_only_jobs_with_a_final_asset_are_measured(jobs, outcome, is_measured):
     jobs.add("cadam", n=100, psnr=20.0, outcome=outcome)
     result = read(jobs.folder)[0]
-    assert result.is_measured == may
+    assert result.is_measured == is_measured
     assert result.ended_early == (outcome != "finished")
 
 
@@ -117,7 +117,7 @@ def test_jobs_keep_the_order_of_the_plan(jobs):
     assert [result.cell["seed"] for result in read(jobs.folder)] == [str(seed) for seed in range(12)]
 
 
-def test_a_prompt_with_commas_and_quotes_comes_back_whole(jobs):
+def test_a_prompt_with_commas_and_quotes_is_read_back_unchanged(jobs):
     jobs.add("cadam", r"prompt='a red, \'old\' cube=1'", n=100, psnr=20.0)
     assert read(jobs.folder)[0].cell["prompt"] == "a red, 'old' cube=1"
 
@@ -130,14 +130,14 @@ def test_counts_show_a_refinement_as_a_jump(jobs):
     ]
 
 
-def test_histograms_are_read_by_score_or_the_first_there_is(jobs):
+def test_histograms_are_read_of_the_given_or_the_first_score(jobs):
     jobs.files(jobs.add("baseline", n=600, psnr=20.0), 600)
     result = read(jobs.folder)[0]
     assert histograms(result, "shake") == []
     assert [line.step for line in histograms(result)] == [40, 80, 120]
 
 
-def test_noise_runs_from_none_to_strong(jobs):
+def test_noise_levels_are_ordered_from_none_to_strong(jobs):
     assert in_noise_order(["strong", "weak", "none", "medium", "weak", "zzz"]) == [
         *("none", "weak", "medium", "strong", "zzz")
     ]
@@ -146,6 +146,6 @@ def test_noise_runs_from_none_to_strong(jobs):
     assert len(at_noise(read(jobs.folder), "weak")) == 1
 
 
-def test_a_folder_that_is_no_sweep_is_refused(tmp_path):
+def test_a_folder_that_is_not_a_sweep_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"jobs\.json"):
         read(tmp_path)

@@ -219,7 +219,7 @@ def test_a_declared_chart_of_the_objective_is_drawn_from_its_log(tmp_path):
     assert "<h2>Densifier</h2>" not in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_a_declared_chart_without_numbers_leaves_no_trace_in_the_page(tmp_path):
+def test_a_declared_chart_without_numbers_does_not_change_the_page(tmp_path):
     metrics = [step(1), refine(2), step(3)]
     make(tmp_path, metrics=metrics)
     without = (tmp_path / "report.html").read_bytes()
@@ -289,7 +289,7 @@ def test_other_logged_numbers_get_a_chart_each(tmp_path):
         ("failed", "bad"),
     ],
 )
-def test_the_colour_of_the_outcome_says_how_bad_it_is(tmp_path, outcome, mood):
+def test_the_colour_of_the_outcome_follows_its_severity(tmp_path, outcome, mood):
     page = make(tmp_path, {**SUMMARY, "outcome": outcome})
     assert ("span", "class", f"outcome {mood}") in page.attributes
     assert outcome.replace("_", " ") in page.text

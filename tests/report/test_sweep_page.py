@@ -73,7 +73,7 @@ def test_ids_are_not_shared_between_figures(whole):
     assert len(ids) == len(set(ids)) > 0
 
 
-def test_half_a_sweep_has_a_page_too(jobs):
+def test_an_unfinished_sweep_has_a_page_too(jobs):
     folder = jobs.add("cadam", n=100, psnr=20.0)
     jobs.add("baseline", n=1000, psnr=20.5)
     (folder / "summary.json").unlink()
@@ -96,7 +96,7 @@ def test_nothing_that_a_user_typed_becomes_markup(jobs):
     assert nasty not in report.write_sweep(jobs.folder).read_text(encoding="utf-8")
 
 
-def test_a_folder_that_is_no_sweep_is_refused(tmp_path):
+def test_a_folder_that_is_not_a_sweep_is_refused(tmp_path):
     with pytest.raises(UserError, match="expected a sweep"):
         report.write_sweep(tmp_path)
 

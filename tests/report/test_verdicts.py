@@ -1,4 +1,4 @@
-"""Sentences follow from the numbers and claim no more than they show."""
+"""The sentences of a verdict follow from the numbers and claim no more than these show."""
 
 from cadam3d.report.results import read
 from cadam3d.report.verdicts import headline
@@ -28,12 +28,14 @@ def test_the_claim_of_the_paper_comes_first_then_the_tuned_baseline(jobs):
     assert "above it in 6 of 6 cells; for the same PSNR baseline needs 3.2 times as many" in second
 
 
-def test_more_gaussians_are_called_more(jobs):
+def test_a_larger_count_is_reported_as_more(jobs):
     cells(jobs, (2000, 20.0), {0.0002: (1000, 20.0)})
-    assert headline(read(jobs.folder))[0].startswith("cadam ends with 100.0% more Gaussians")
+    sentence = headline(read(jobs.folder))[0]
+    assert sentence.startswith("cadam ends with 100.0% more Gaussians than baseline (median of 6 cells")
+    assert "quartiles 100.0% to 100.0% more" in sentence
 
 
-def test_a_worse_setting_is_called_worse(jobs):
+def test_a_setting_below_the_frontier_is_reported_as_below(jobs):
     cells(jobs, (1000, 12.0), {0.001: (100, 10.0), 0.0002: (10000, 20.0)})
     assert "3.00 dB [-3.00, -3.00] below the best" in headline(read(jobs.folder))[1]
 
@@ -66,7 +68,7 @@ def test_a_difference_comes_with_its_spread_over_seeds(jobs):
         for tau, n, best in ((0.001, 100, 10.0), (0.0002, 10000, 20.0)):
             jobs.add("baseline", f"densifier.tau_pos={tau}", f"seed={seed}", n=n, psnr=best)
         jobs.add("cadam", f"seed={seed}", n=1000, psnr=psnr)
-    assert "in 2 of 2 cells, 0.14 dB spread over seeds" in headline(read(jobs.folder))[1]
+    assert "in 2 of 2 cells, with a spread of 0.14 dB over seeds" in headline(read(jobs.folder))[1]
 
 
 def test_cells_without_a_partner_are_reported_for_each_arm(jobs):
