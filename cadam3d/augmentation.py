@@ -11,7 +11,8 @@ from cadam3d.core.checks import require_range
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 
-LEAST = 1e-3  # smallest factor that noise multiplies a scale by; its logarithm must be finite
+# The smallest factor that noise multiplies a scale by. It is positive, so its logarithm is finite.
+LEAST = 1e-3
 LARGEST_SEED = 2**63 - 1
 
 
@@ -55,9 +56,9 @@ class LucidAugmentation(Augmentation):
     left from right, a mirrored image is wrong.
     """
 
-    scale_noise: float  # standard deviation of the factor by which each scale is multiplied
-    disparity: float  # probability, per step, of showing the disparity of all views as grey images
-    flip: float  # probability, per step, of mirroring all views left to right
+    scale_noise: float  # standard deviation
+    disparity: float  # probability
+    flip: float  # probability
 
     def __post_init__(self) -> None:
         require_range("augmentation.scale_noise", self.scale_noise, low=0, high=1, example=0.1118)

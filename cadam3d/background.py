@@ -55,8 +55,8 @@ class RandomBackground(Background):
 class LucidBackground(Background):
     """Independently for each view: often black or a random colour, else the constant one (LucidDreamer)."""
 
-    probability: float  # in [0, 1]; of black or a random colour instead of the constant one
-    black: float  # in [0, 1]; share of black among those; the others are uniformly random
+    probability: float  # in [0, 1]
+    black: float  # share, in [0, 1]
     color: Sequence[float]  # RGB in [0, 1]
 
     def __post_init__(self) -> None:

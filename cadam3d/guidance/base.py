@@ -15,7 +15,7 @@ from cadam3d.prior.base import Condition, DiffusionPrior
 class GuidanceOutput:
     """A surrogate loss, and numbers to follow during training."""
 
-    loss: Float[Tensor, ""]  # its gradient IS the distillation gradient
+    loss: Float[Tensor, ""]  # its gradient is the distillation gradient
     log: dict[str, float]  # for people to read; training never reads it
 
 

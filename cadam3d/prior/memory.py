@@ -26,7 +26,8 @@ def working_bytes(call: Callable[[], object], existing: Iterable[Tensor]) -> int
     kept = [tensor.untyped_storage() for tensor in existing]
     counter = _Counter({storage._cdata for storage in kept})
     with torch.device("meta"), counter, _EfficientAttention():
-        result = call()  # kept alive together with its graph, which is part of the measurement
+        # The result keeps its graph alive, which is part of the measurement.
+        result = call()
     del result
     return counter.peak
 

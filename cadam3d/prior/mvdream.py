@@ -20,8 +20,10 @@ from cadam3d.prior.path import Prediction, per_view
 from cadam3d.prior.stable_diffusion import StableDiffusion
 
 VIEWS = 4  # per group
-CAMERA = 16  # numbers that describe the camera of a view to the network
-TOLERANCE_DEG = 1.0  # largest deviation from a quarter turn between the views of a group
+# The network reads a camera as a matrix of four by four numbers.
+CAMERA = 16
+# Largest deviation from a quarter turn between the views of a group, and of their elevations.
+TOLERANCE_DEG = 1.0
 # The noise schedule of the published files, which do not contain it.
 SCHEDULER = {
     "beta_schedule": "scaled_linear",
@@ -51,7 +53,7 @@ class MVDream(StableDiffusion):
     tokenizer; ``tokenizer`` is then a folder, or a name on the hub, with CLIP's vocabulary.
     """
 
-    rescale: float  # in [0, 1]; how far the spread of the guided prediction returns to that without guidance
+    rescale: float  # in [0, 1]
     tokenizer: str  # a folder or a name on the hub
 
     kinds: ClassVar = ("MVDreamPipeline", "StableDiffusionPipeline")

@@ -44,7 +44,8 @@ class StableDiffusionXL(StableDiffusion):
     ) -> Float[Tensor, "b c h w"]:
         """Run the UNet with text cross-attention; pooled text and image sizes are added to the time input."""
         height, width = (FACTOR * side for side in noisy.shape[2:])
-        sizes = noisy.new_tensor([[height, width, 0, 0, height, width]])  # original, top left corner, target
+        # The original size, the top left corner of the crop and the target size.
+        sizes = noisy.new_tensor([[height, width, 0, 0, height, width]])
         added = {"text_embeds": texts.pooled, "time_ids": sizes.expand(len(noisy), -1)}
         return self.network(
             noisy, timestep, encoder_hidden_states=texts.tokens, added_cond_kwargs=added

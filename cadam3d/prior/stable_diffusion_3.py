@@ -28,7 +28,7 @@ class StableDiffusion3(LatentPrior):
     table of sigmas in the model's scheduler. With ``t5`` false, T5 is neither downloaded nor loaded.
     """
 
-    t5: bool  # whether to use the T5 text encoder, if the model has one
+    t5: bool
 
     kinds: ClassVar = ("StableDiffusion3Pipeline",)
     network_part: ClassVar = "transformer"

@@ -1,4 +1,4 @@
-"""Checks that a backend may be timed: it must agree with the reference and give the same bits every time."""
+"""Check that a backend may be timed: it must agree with the reference and give the same bits every time."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Times the stages of the CUDA rasterizer: each launch is measured by two events and compared with a floor.
+"""Time the stages of the CUDA rasterizer: each launch is measured by two events and compared with a floor.
 
 The floor of a stage is the number of bytes that it must read and write at least once, divided by the measured
 speed of a plain copy. It considers bandwidth alone, so a stage that computes much per byte, as both blends

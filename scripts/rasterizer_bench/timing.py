@@ -1,4 +1,4 @@
-"""Measures the time and the memory of the phases of a step."""
+"""Measure the time and the memory of the phases of a step."""
 
 import statistics
 import time

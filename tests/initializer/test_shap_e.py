@@ -221,7 +221,7 @@ def test_colors_are_those_that_the_model_paints_with(models):
 
 
 def test_a_missing_surface_is_reported(models):
-    with pytest.raises(UserError, match=r"found no surface.*Try: another seed, or initializer\.prompt="):
+    with pytest.raises(UserError, match=r"found no surface.*Try: another seed, or 'initializer\.prompt="):
         shap_e(models[False]).build("a corgi", seeded(), CPU)
 
 
@@ -258,7 +258,7 @@ def test_a_missing_model_is_an_error_or_the_fallback_with_a_note():
     with pytest.raises(UserError, match=r"initializer\.path: expected a folder with a model_index\.json"):
         begin()
     made = begin(fallback=BALL)
-    assert made.note.startswith("Ball stands in for Shap-E. initializer.path: expected a folder")
+    assert made.note.startswith("Ball is used instead of Shap-E. initializer.path: expected a folder")
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -272,8 +272,8 @@ def test_the_fallback_gives_the_same_gaussians_as_without_shap_e(models, seed):
 
 def test_nested_fallbacks_are_all_named():
     note = begin(fallback=shap_e("elsewhere", fallback=BALL)).note
-    assert note.index("ShapE stands in for Shap-E") < note.index("'nowhere'")
-    assert note.index("Ball stands in for Shap-E") < note.index("'elsewhere'")
+    assert note.index("ShapE is used instead of Shap-E") < note.index("'nowhere'")
+    assert note.index("Ball is used instead of Shap-E") < note.index("'elsewhere'")
 
 
 def test_a_mistake_in_the_fallback_is_an_error():

@@ -370,7 +370,7 @@ def test_targets_grow_with_the_amount_of_work():
         ("--check-only --no-check", "leave nothing to do"),
         ("--json nowhere/bench.json", "Try: mkdir -p nowhere"),
         ("--backends gsplat", "no backend is left"),
-        ("--backends cuda", "rasterizer=cuda cannot render on cpu"),
+        ("--backends cuda", "rasterizer=cuda: expected a CUDA device, got cpu"),
         pytest.param(
             "--device cuda",
             "torch sees no CUDA device",

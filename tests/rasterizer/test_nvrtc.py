@@ -11,7 +11,7 @@ import torch
 from emulation import content_hash, make_once
 
 from cadam3d.core.checks import UserError
-from cadam3d.rasterizer import nvrtc
+from cadam3d.rasterizer import base, nvrtc
 from cadam3d.rasterizer.build import KERNELS
 from cadam3d.rasterizer.nvrtc import build, choose_architecture, compile_kernels, find_compiler
 
@@ -146,7 +146,7 @@ def test_the_cache_distinguishes_compilers_options_and_constants(compiler, monke
     keys = {nvrtc._key(compiler), nvrtc._key(replace(compiler, version=(99, 0)))}
     monkeypatch.setattr(nvrtc, "OPTIONS", ())
     keys.add(nvrtc._key(compiler))
-    monkeypatch.setattr(nvrtc.base, "BLUR", 0.1)
+    monkeypatch.setattr(base, "BLUR", 0.1)
     keys.add(nvrtc._key(compiler))
     assert len(keys) == 4
 

@@ -24,7 +24,8 @@ from cadam3d.prior.shapes.tracer import Layers
 CENSUS_VIEWS = 4  # per object, equally spaced in azimuth
 CENSUS_ELEVATION_DEG = 15.0
 CENSUS_FOV_DEG = 45.0
-ERROR_GRID = 8  # cells per side of the prediction error, which makes it smooth in any larger image
+# Cells per side of the grid on which the prediction error is drawn. It is smooth in any larger image.
+ERROR_GRID = 8
 # Radians per standard deviation of the projected noise. At this frequency the error fields of two
 # independent noises are uncorrelated.
 ERROR_FREQUENCY = 3.0
@@ -93,15 +94,18 @@ class ShapesEmbedding(PromptEmbedding):
 
 @dataclass(frozen=True, kw_only=True)
 class ShapesPrior(DiffusionPrior):
-    """A Gaussian mixture over images of the scene, one mode per choice that the prompt leaves open."""
+    """A Gaussian mixture over images of the scene, one mode per choice that the prompt leaves open.
+
+    Model space is RGB in [-1, 1].
+    """
 
     noise_path: NoisePath
-    spread: float  # standard deviation of every pixel around its mode, model space ([-1, 1])
-    edge_spread: float  # added to the spread of pixels that a silhouette crosses
-    model_error: float  # rms of the smooth prediction error, model space at full noise; 0 = exact
-    samples_per_pixel: int  # rays per pixel along each axis
-    census_size: int  # pixels per side of the images from which the empty prompt is computed
-    seed: int  # of the prediction error
+    spread: float  # in model space
+    edge_spread: float  # in model space
+    model_error: float  # in model space
+    samples_per_pixel: int  # along each axis
+    census_size: int  # pixels per side
+    seed: int
 
     def __post_init__(self) -> None:
         require_range("prior.spread", self.spread, low=0, high=10, example=0.1)
@@ -252,7 +256,7 @@ def take_census(size: int) -> Census:
 
 
 def _measure(size: int) -> Census:
-    """Trace every object for :func:`take_census`, which takes a quarter of a second."""
+    """Compute the census by tracing every object, which takes a quarter of a second."""
     cameras = turntable(
         CENSUS_VIEWS,
         elevation_deg=CENSUS_ELEVATION_DEG,

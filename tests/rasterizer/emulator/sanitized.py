@@ -1,4 +1,4 @@
-"""Runs sanitized kernels at small and at odd sizes, and then once with each planted mistake.
+"""Run sanitized kernels at small and at odd sizes, and then once with each planted mistake.
 
 python sanitized.py LIBRARY NUMBER_OF_MISTAKES, started by test_cuda_sanitizer.py. Writes a line to stderr
 before each planted mistake, so that the findings of the sanitizers can be distinguished.
