@@ -13,10 +13,13 @@ from cadam3d.rasterizer.launcher import Launcher
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import self_test
 
-PROMISE_BITS = ("cpu", "cuda")  # backends that promise the same bits on every run
+# Backends that promise the same bits on every run.
+PROMISE_BITS = ("cpu", "cuda")
 RUNS = 5
-SPLATS, SIZE, VIEWS = 150, 45, 2  # of the small scenes; the size is no multiple of a tile
-CROWD = {"cpu": (500, 64), "cuda": (100_000, 256)}  # splats and pixels of the scene for repeated runs
+# The small scenes. Their size in pixels is not a multiple of a tile.
+SPLATS, SIZE, VIEWS = 150, 45, 2
+# Splats and pixels of the scene for repeated runs.
+CROWD = {"cpu": (500, 64), "cuda": (100_000, 256)}
 
 # Relative to the largest number of each tensor. A pixel with a larger deviation is on a step of the image
 # formation model (see selftest.py), where float32 may decide either way. Such pixels are left out of the
@@ -25,8 +28,9 @@ MOST_IMAGE, MOST_GRADIENT, MOST_OUTLIERS = 1e-4, 2e-3, 0.03
 
 
 def check(name: str, rasterizer: Rasterizer, device: torch.device) -> list[str]:
-    """Return the problems of the backend, in words."""
-    if name == "gsplat":  # it caps alpha at another value, so this scene has no alpha near the cap
+    """Return one sentence for each problem of the backend."""
+    # gsplat caps alpha at another value, so its scene has no alpha near the cap.
+    if name == "gsplat":
         return differences(rasterizer, small_scene(make_shell(SPLATS, 3, device)))
     agreement = self_test(rasterizer, device)
     troubles = [] if agreement.holds else [f"self-test: {agreement}"]
@@ -108,7 +112,7 @@ def changes(rasterizer: Rasterizer, scene: Scene) -> list[str]:
     first: dict[str, Tensor] = {}
     changed: set[str] = set()
     for _ in range(RUNS):
-        scene.forget()
+        scene.zero_grad()
         images = scene.render(rasterizer)
         scene.backward(images)
         numbers = dict(zip(("rgb", "alpha", "depth"), images, strict=True))

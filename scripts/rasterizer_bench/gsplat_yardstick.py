@@ -19,9 +19,10 @@ def why_absent(device: torch.device) -> str | None:
         return "it renders on CUDA only"
     if find_spec("gsplat") is None:
         return "it is not installed. Try: pip install gsplat==1.5.3"
+    # The import compiles gsplat if it was installed without binaries, and a build may raise any exception.
     try:
-        from gsplat.cuda._backend import _C  # compiles now if it was installed without binaries
-    except Exception as error:  # a build with an unknown toolkit may raise anything
+        from gsplat.cuda._backend import _C
+    except Exception as error:
         return f"it cannot be imported here: {error}"
     return None if _C is not None else "it found no CUDA toolkit to compile its kernels"
 
@@ -40,7 +41,7 @@ class GsplatRasterizer(Rasterizer):
         """See :meth:`Rasterizer.render`. It includes the activations, which our kernels compute too."""
         from gsplat import rasterization
 
-        assert not absgrad, "it is never timed"
+        assert not absgrad, "absgrad is never timed"
         images, alphas, extra = rasterization(
             gaussians.means,
             gaussians.quats,

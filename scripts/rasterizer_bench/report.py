@@ -1,4 +1,4 @@
-"""The results of the benchmark, as rows for people and as JSON for programs."""
+"""The results of the benchmark, as a table to read and as JSON for programs."""
 
 import json
 import platform
@@ -137,6 +137,7 @@ def start_report(device: torch.device, settings: dict[str, object]) -> Report:
 
 
 def describe(device: torch.device) -> dict[str, object]:
+    """Return the facts about a device that affect its times."""
     if device.type != "cuda":
         return {"name": processor(), "driver": None, "threads": torch.get_num_threads()}
     facts = torch.cuda.get_device_properties(device)
@@ -158,6 +159,7 @@ def processor() -> str:
 
 
 def versions() -> dict[str, str | None]:
+    """Return the versions of everything that affects the times; ``None`` for what is not installed."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:

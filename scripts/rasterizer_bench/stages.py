@@ -36,8 +36,10 @@ STAGES = {
     "blend backward": ("blend_backward",),
     "project backward": ("project_backward", "sum_absolutes", "centre_backward"),
 }
-REST = "rest"  # time outside of launches: allocation, autograd, the host, one wait for the device
-WORD = 4  # bytes of a float and of an index
+# The time outside of launches: allocation, autograd, the host and one wait for the device.
+REST = "rest"
+# The size of a float and of an index.
+WORD = 4  # bytes
 SPLAT, RECORD = WORD * cuda.SPLAT, WORD * cuda.RECORD
 
 
@@ -74,7 +76,8 @@ class StageClock(Launcher):
     def __init__(self, inner: Launcher) -> None:
         self._inner = inner
         self.spans: list[Span] = []
-        self.slots = 0  # (splat, tile) pairs since ``spans`` was emptied
+        # The number of (splat, tile) pairs since ``spans`` was emptied.
+        self.slots = 0
 
     @contextmanager
     def on(self, device: torch.device) -> Iterator[Launch]:
@@ -158,14 +161,17 @@ def stage_bytes(load: Load) -> dict[str, int]:
     """Return the least bytes that each stage reads and writes: each number once, for all views together."""
     parameters = load.gaussians * WORD * (11 + 3 * load.coefficients)
     pairs, slots, pixels = load.pairs * WORD, load.slots, load.pixels
-    entry = 2 * WORD + SPLAT  # of a tile's list: slot, pair, splat
+    # An entry of a tile's list: slot, pair and splat.
+    entry = 2 * WORD + SPLAT
     return {
-        "project": parameters + 5 * pairs + load.visible * SPLAT,  # centre, radius, depth key, count
+        # Per pair: the centre, the radius, the depth key and the count.
+        "project": parameters + 5 * pairs + load.visible * SPLAT,
         "depth sort": sorted_bytes(load.pairs, cuda.DEPTH_BITS),
         # Prefix sum: in, out. List: order, count, offset, first slot; tile and pair of every slot.
         "tile lists": 6 * pairs + load.visible * SPLAT + slots * 2 * WORD,
         "tile sort": sorted_bytes(slots, load.tiles.bit_length()) + slots * WORD + load.tiles * 2 * WORD,
-        "blend forward": slots * entry + pixels * 7 * WORD,  # rgb, alpha, depth, transmittance, last
+        # Rgb, alpha, depth, transmittance and last per pixel.
+        "blend forward": slots * entry + pixels * 7 * WORD,
         # Alpha, depth, transmittance, last and five gradients per pixel.
         "blend backward": slots * (entry + RECORD) + pixels * 9 * WORD,
         # First slot, count and gradient of the centre; radius and that gradient again; means in and out.
@@ -180,8 +186,8 @@ class StageTiming:
     stage: str
     launches: int
     median_ms: float
-    bytes: int | None  # None where nothing was counted
-    floor_ms: float | None  # bytes over the speed of a copy
+    bytes: int | None  # None for ``REST``
+    floor_ms: float | None  # None for ``REST``
 
 
 def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: float) -> list[StageTiming]:
@@ -190,7 +196,7 @@ def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: fl
     rasterizer, samples = KernelRasterizer(clock), []
     launches, slots = {}, 0
     for _ in range(repeats + 1):
-        scene.forget()
+        scene.zero_grad()
         start = now(device)
         scene.backward(scene.render(rasterizer))
         wall = (now(device) - start) * 1e3
@@ -202,7 +208,8 @@ def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: fl
         StageTiming(
             stage,
             launches.get(stage, 0),
-            statistics.median(times[stage] for times in samples[1:]),  # without the first, which warms up
+            # The first sample warms up and is not counted.
+            statistics.median(times[stage] for times in samples[1:]),
             needed.get(stage),
             needed[stage] / bytes_per_ms if stage in needed else None,
         )
@@ -211,6 +218,7 @@ def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: fl
 
 
 def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:
+    """Return the amount of work of one render, given its number of (splat, tile) pairs."""
     with torch.no_grad():
         output = rasterizer.render(scene.gaussians, scene.cameras, scene.background)
     views, height, width = output.alpha.shape

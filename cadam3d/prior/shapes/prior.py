@@ -13,8 +13,8 @@ from cadam3d.core.checks import fail, require_range, require_whole
 from cadam3d.core.render import TruthFn
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import NoisePath, Prediction, per_view
+from cadam3d.prior.shapes.array_cache import cached_arrays
 from cadam3d.prior.shapes.grammar import EXAMPLE
-from cadam3d.prior.shapes.kept import kept
 from cadam3d.prior.shapes.mixture import Mixture
 from cadam3d.prior.shapes.objects import known_objects, known_primitives
 from cadam3d.prior.shapes.scene import Scene, build
@@ -252,7 +252,7 @@ def _bicubic(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tenso
 @lru_cache(maxsize=4)
 def take_census(size: int) -> Census:
     """Return the moments over all objects of the world, a few views of each and all modes, equally likely."""
-    return kept(Census, f"census-{size}", lambda: _measure(size))
+    return cached_arrays(Census, f"census-{size}", lambda: _measure(size))
 
 
 def _measure(size: int) -> Census:
