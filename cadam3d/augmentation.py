@@ -17,7 +17,7 @@ LARGEST_SEED = 2**63 - 1
 
 
 class Augmentation(ABC):
-    """Two differentiable changes to what a training step renders and shows.
+    """Two differentiable changes: to the Gaussians of a training step, and to its images.
 
     Holds frozen hyper-parameters; all randomness comes from the generator.
     """
@@ -82,10 +82,7 @@ class LucidAugmentation(Augmentation):
 
     def show(self, output: RenderOutput, generator: torch.Generator) -> Float[Tensor, "v h w 3"]:
         """Return colours or disparities, possibly mirrored; the same two choices hold for all views."""
-        as_disparity, flipped = (torch.rand(2, generator=generator) < torch.tensor(self._odds)).tolist()
+        odds = torch.tensor([float(self.disparity), float(self.flip)])
+        as_disparity, flipped = (torch.rand(2, generator=generator) < odds).tolist()
         images = output.disparity()[..., None].expand_as(output.rgb) if as_disparity else output.rgb
         return images.flip(dims=(2,)) if flipped else images
-
-    @property
-    def _odds(self) -> tuple[float, float]:
-        return float(self.disparity), float(self.flip)

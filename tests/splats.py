@@ -175,7 +175,7 @@ def assert_agrees(
     """Check that ``render`` agrees with the reference in float64, in all images and gradients."""
     v, height, width = len(cameras), cameras.height, cameras.width
     decided = ~undecided(gaussians, cameras)
-    assert decided.double().mean() > most, "too many pixels are on a step: the test would prove little"
+    assert decided.double().mean() > most, "too many pixels are on a step, so the test would prove little"
     weights = [
         weight * decided.view(*decided.shape, *[1] * (weight.ndim - 3)) if name in images else None
         for name, weight in zip(IMAGES, make_weights(v, height, width), strict=True)

@@ -28,7 +28,7 @@ def output(size: int = 6) -> RenderOutput:
     )
 
 
-def test_none_is_the_identity_and_draws_nothing():
+def test_no_augmentation_is_the_identity_and_draws_nothing():
     gaussians, seen, generator = make_gaussians(5), output(), draw()
     before = generator.get_state()
     assert NoAugmentation().perturb(gaussians, generator) is gaussians

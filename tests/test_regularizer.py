@@ -75,7 +75,7 @@ def test_the_weight_multiplies_and_may_follow_the_step(regularizer):
 
 
 @pytest.mark.parametrize("regularizer", EVERY, ids=NAMES)
-def test_an_empty_scene_gives_a_number(regularizer):
+def test_an_empty_scene_gives_a_finite_penalty(regularizer):
     assert math.isfinite(at(regularizer, means=torch.zeros(0, 3)))
 
 

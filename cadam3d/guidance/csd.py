@@ -1,4 +1,4 @@
-"""CSD: only what the prompt adds, the direction that classifier-free guidance would amplify."""
+"""CSD: follows only the difference that the prompt makes, which classifier-free guidance amplifies."""
 
 from dataclasses import dataclass, replace
 

@@ -1,8 +1,8 @@
-"""Memory estimates of networks before they are loaded: a network is run without data and its tensors counted.
+"""Estimates of the memory of networks that are not loaded: a network runs without data, to count its tensors.
 
-Everything happens on torch's ``meta`` device, which has shapes and no numbers. Counted are the tensors that
-the operations of the network create and keep alive, its activations. Attention counts as it is computed by
-the memory-efficient kernels of GPUs.
+Everything happens on torch's ``meta`` device, which has shapes and no numbers. The estimates count the
+tensors that the operations of the network create and keep alive, its activations. They assume the attention
+of the memory-efficient kernels of GPUs.
 """
 
 import weakref

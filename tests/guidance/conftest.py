@@ -157,7 +157,7 @@ def make():
 
 
 @pytest.fixture
-def ask():
+def run():
     """A function that returns G / D, by autograd and in the layout of latents, and the output."""
 
     def evaluate(guidance, rgb, condition, prior, *, step=0, seed=0):

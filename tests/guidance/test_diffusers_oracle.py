@@ -45,7 +45,7 @@ class NetworkPrior(DiffusionPrior):
     noise_path: object
 
     def embed(self, prompt, negative):
-        pytest.fail("objectives are handed a condition and must not embed")
+        pytest.fail("objectives receive a condition and must not embed prompts")
 
     def encode(self, rgb):
         return rgb.permute(0, 3, 1, 2)
@@ -93,7 +93,7 @@ def gamma(scheduler, row):
 
 
 @pytest.fixture
-def still(make, ask, rgb):
+def still(make, run, rgb):
     """Return G of an objective at one fixed t, and its noise, drawn after ``skipped`` draws of levels."""
 
     def evaluate(guidance, path, skipped=1):
@@ -101,7 +101,7 @@ def still(make, ask, rgb):
         for _ in range(skipped):
             torch.rand(3, generator=generator)
         noise = torch.randn(3, 3, 4, 5, generator=generator).double()
-        gradient, _ = ask(guidance, rgb, Words(), NetworkPrior(path))
+        gradient, _ = run(guidance, rgb, Words(), NetworkPrior(path))
         return gradient, noise
 
     return evaluate

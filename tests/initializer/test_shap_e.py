@@ -82,7 +82,7 @@ def test_a_quarter_turn_brings_shap_es_front_to_ours():
     assert torch.equal(means, wanted)
 
 
-def test_random_points_of_the_surface_are_colored_as_it_is():
+def test_random_points_of_the_surface_have_its_colors():
     made = settle(radius=None, count=3000)
     assert len(made) == 3000
     assert made.means[:, 2].abs().max() == 0
@@ -102,7 +102,7 @@ def test_growth_adds_points_near_the_surface_and_keeps_the_surface():
     assert ((grown >= low) & (grown <= high)).all()
 
 
-def test_growth_takes_all_points_that_are_near():
+def test_growth_adds_all_candidates_that_are_near():
     vertices = torch.tensor([[0.0, 0, 0], [1, 1, 1]])
     mesh = ColoredMesh(vertices, torch.tensor([[0, 1, 1]]), torch.zeros(2, 3))
     made = settle(mesh=mesh, radius=None, grow_points=200_000, grow_distance=0.5)
@@ -151,7 +151,7 @@ def latent(path, seed: int = 0, run_prompt: str = "a corgi", **changes) -> torch
     return made.sample(made._source().find((KIND,), OTHERS), run_prompt, seeded(seed), CPU)
 
 
-def test_a_seed_gives_the_same_latent_and_another_another(models):
+def test_the_latent_depends_on_the_seed(models):
     assert torch.equal(latent(models[True]), latent(models[True]))
     assert not torch.equal(latent(models[True]), latent(models[True], seed=1))
 
@@ -167,7 +167,7 @@ def test_the_latent_is_that_of_the_pipeline_itself(models):
     torch.testing.assert_close(latent(models[True]), wanted)
 
 
-def test_the_prompt_is_used_unless_shap_e_has_another(models):
+def test_the_initializers_own_prompt_replaces_that_of_the_run(models):
     cube = latent(models[True], run_prompt="a red cube")
     assert not torch.equal(cube, latent(models[True]))
     assert torch.equal(cube, latent(models[True], prompt="a red cube"))

@@ -9,8 +9,8 @@ import torch
 from latents import (
     KEYS,
     computes_in_sixteen_bits,
-    encodes_what_the_autoencoder_says,
-    memory_is_foreseen,
+    encodes_like_the_autoencoder,
+    memory_is_estimated,
     micro_batch_changes_nothing,
     normal,
 )
@@ -152,7 +152,7 @@ def test_the_front_is_encoded_as_published():
 
 
 def test_latents_are_those_of_the_autoencoder(prior, pipe):
-    encodes_what_the_autoencoder_says(prior, pipe.vae)
+    encodes_like_the_autoencoder(prior, pipe.vae)
 
 
 def test_micro_batch_does_not_change_results(prior):
@@ -164,7 +164,7 @@ def test_networks_compute_in_16_bits_and_return_float32(prior):
 
 
 def test_memory_is_estimated(prior):
-    memory_is_foreseen(prior, views=4)
+    memory_is_estimated(prior, views=4)
     with pytest.raises(UserError, match=r"^views: expected a multiple of 4"):
         prior.memory("a corgi", "", 2, None)
 

@@ -32,7 +32,7 @@ def views(azimuth, elevation=0.0):
 
 
 @pytest.mark.parametrize("prompting", EVERY, ids=lambda each: type(each).__name__)
-def test_laws(prompting):
+def test_weights_are_valid_and_the_same_on_both_sides(prompting):
     mix = prompting.mix(views(torch.linspace(-180, 180, 73), elevation=30))
     k = len(prompting.texts("a corgi"))
     for rows in (mix.positive, mix.repelled):
@@ -62,7 +62,7 @@ def test_laws(prompting):
         (180, 80, OVERHEAD),
     ],
 )
-def test_discrete_rules_and_overhead_wins(azimuth, elevation, text):
+def test_discrete_rules_with_precedence_for_overhead(azimuth, elevation, text):
     assert DISCRETE.mix(views(azimuth, elevation)).positive.argmax() == text
 
 

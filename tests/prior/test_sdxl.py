@@ -8,8 +8,8 @@ from latents import (
     KEYS,
     computes_in_sixteen_bits,
     condition_of,
-    encodes_what_the_autoencoder_says,
-    memory_is_foreseen,
+    encodes_like_the_autoencoder,
+    memory_is_estimated,
     micro_batch_changes_nothing,
     normal,
 )
@@ -49,7 +49,7 @@ def test_texts_are_embedded_as_the_pipeline_embeds_them(prior, pipe, negative):
     assert bool(texts.tokens[-1].any()) is False
 
 
-def test_a_model_that_does_not_ask_for_zeros_reads_the_empty_text(prior, pipe):
+def test_a_model_without_the_option_for_zeros_embeds_the_empty_text(prior, pipe):
     found = replace(prior.found, index=prior.found.index | {"force_zeros_for_empty_prompt": False})
     texts = prior.embed_texts(found, [""], torch.device("cpu"))
     tokens, _, pooled, _ = pipe.encode_prompt("", do_classifier_free_guidance=False)
@@ -95,7 +95,7 @@ def test_the_network_reads_the_image_size(prior):
 
 
 def test_latents_are_those_of_the_pipelines_autoencoder(prior, pipe):
-    encodes_what_the_autoencoder_says(prior, pipe.vae)
+    encodes_like_the_autoencoder(prior, pipe.vae)
 
 
 def test_networks_compute_in_16_bits_and_return_float32(prior):
@@ -103,7 +103,7 @@ def test_networks_compute_in_16_bits_and_return_float32(prior):
 
 
 def test_memory_is_estimated(prior):
-    memory_is_foreseen(prior)
+    memory_is_estimated(prior)
 
 
 def test_micro_batch_does_not_change_results(prior):

@@ -195,7 +195,7 @@ def test_on_and_under_are_above_and_below(prompt: str, above: bool) -> None:
     assert bool(mean_red < mean_blue) is above
 
 
-def test_between_is_in_the_middle_as_seen_from_the_front() -> None:
+def test_an_object_between_others_is_in_the_middle_as_seen_from_the_front() -> None:
     scene, layers = look("a green sphere between a red cube and a blue cube")
     image = layers.images(scene.albedo, torch.zeros(4, 3))[0, 0]
     columns = torch.arange(40.0)

@@ -33,7 +33,7 @@ OF_A_VIEW = (*IMAGES, "means2d", "radii")
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_agrees_on_random_scenes(backend, degree):
+def test_every_backend_agrees_on_random_scenes(backend, degree):
     backend.agrees(make_gaussians(150, degree=degree, seed=degree), make_cameras(2, 45, 61))
 
 
@@ -51,12 +51,12 @@ def test_agrees_on_random_scenes(backend, degree):
         pytest.param(make_gaussians(1, seed=15), id="alone"),
     ],
 )
-def test_agrees_on_adversarial_scenes(backend, gaussians):
+def test_every_backend_agrees_on_adversarial_scenes(backend, gaussians):
     backend.agrees(gaussians, make_cameras(2, 37, 50, seed=1), most=0.5, tolerance=backend.rounding)
 
 
 @pytest.mark.parametrize("image", IMAGES)
-def test_agrees_for_a_loss_on_one_image_only(backend, image):
+def test_every_backend_agrees_for_a_loss_on_one_image_only(backend, image):
     backend.agrees(make_gaussians(60, degree=1), make_cameras(1, 30, 30), images=(image,))
 
 

@@ -67,7 +67,7 @@ def small_checks(monkeypatch):
 
 
 @pytest.mark.usefixtures("small_checks")
-def test_checks_times_and_writes_every_backend_on_every_scene(kernel_build, tmp_path, capsys):
+def test_every_backend_is_checked_timed_and_written_for_every_scene(kernel_build, tmp_path, capsys):
     path = tmp_path / "bench.json"
     cpu = CpuRasterizer(cache_dir=str(kernel_build.path.parent))
     words = ["--counts", "50", "80", "--sizes", "16", "24", "--degrees", "0", "1", "--repeats", "2"]
@@ -94,7 +94,7 @@ def test_checks_times_and_writes_every_backend_on_every_scene(kernel_build, tmp_
 
 
 @pytest.mark.usefixtures("small_checks")
-def test_times_every_stage_of_the_kernels(emulator, tmp_path, capsys):
+def test_every_stage_of_the_kernels_is_timed(emulator, tmp_path, capsys):
     path = tmp_path / "bench.json"
     code = run(
         [*TINY, "--json", str(path)],
@@ -112,7 +112,7 @@ def test_times_every_stage_of_the_kernels(emulator, tmp_path, capsys):
         assert each["stage"] in shown
 
 
-def test_the_command_line_checks_a_backend(kernel_build, monkeypatch, capsys):
+def test_a_backend_can_be_checked_from_the_command_line(kernel_build, monkeypatch, capsys):
     monkeypatch.setattr(
         bench_rasterizer, "component", lambda _: CpuRasterizer(cache_dir=str(kernel_build.path.parent))
     )
@@ -182,7 +182,7 @@ def test_a_sort_that_is_wrong_is_found(emulator, monkeypatch):
     assert check.check_long_sort(emulator, CPU, 5000) == ["5000 keys are sorted wrongly"]
 
 
-def gsplat_stand_in() -> ModuleType:
+def fake_gsplat() -> ModuleType:
     """Return a module with ``gsplat.rasterization`` as documented, implemented with the reference."""
 
     def rasterization(  # noqa: PLR0917
@@ -219,7 +219,7 @@ def gsplat_stand_in() -> ModuleType:
 
 
 def test_gsplat_renders_the_same_scene(monkeypatch):
-    monkeypatch.setitem(sys.modules, "gsplat", gsplat_stand_in())
+    monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat())
     assert not check.check("gsplat", GsplatRasterizer(), CPU)
     scene = make_scene(make_shell(50, 2, CPU), 20, 3)
     output = GsplatRasterizer().render(scene.gaussians, scene.cameras, scene.background)

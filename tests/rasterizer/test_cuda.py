@@ -59,7 +59,8 @@ def test_kernels_run_on_the_current_stream():
     want = rasterizer.render(gaussians, *scene).rgb
     torch.cuda.synchronize()
     with torch.cuda.stream(torch.cuda.Stream()):
-        torch.cuda._sleep(10**8)  # another stream would overtake this
+        # Kernels on another stream would overtake this pause.
+        torch.cuda._sleep(10**8)
         got = rasterizer.render(gaussians.map(lambda tensor: tensor + 0), *scene).rgb
     torch.cuda.synchronize()
     assert torch.equal(got, want)

@@ -164,7 +164,7 @@ def test_the_library_of_torchs_cuda_version_comes_first(monkeypatch, tmp_path):
     assert min((tmp_path / name for name in names), key=nvrtc._distance_from_torch).name == "libnvrtc.so.12"
 
 
-def test_it_is_found_in_the_folders_of_wheels_for_cuda_12_and_13(monkeypatch, tmp_path):
+def test_nvrtc_is_found_in_the_folders_of_wheels_for_cuda_12_and_13(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(nvrtc, "PATTERN", "libnvrtc.so*")
     paths = [tmp_path / folder for folder in ("cuda_nvrtc/lib/libnvrtc.so.12", "cu13/lib/libnvrtc.so.13")]

@@ -101,6 +101,7 @@ def thing(name: str) -> Thing:
 
 
 def _p(solid: Solid, first: str, second: str = ACCENT, pattern: str = PLAIN) -> Part:
+    """Return a painted part; the name is short, since the objects below consist of hundreds of parts."""
     return Part(solid, Coat(first, second, pattern))
 
 
