@@ -9,7 +9,8 @@ from cadam3d.core.cameras import turntable
 from cadam3d.prior.latent import LatentPrior, TextCondition
 from cadam3d.prior.prompting import Discrete
 
-KEYS = {  # of every pretrained prior; tests add path and cache_dir
+# The keys of every pretrained prior; tests add path and cache_dir.
+KEYS = {
     "ids": [],
     "revision": None,
     "variant": None,

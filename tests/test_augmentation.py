@@ -126,7 +126,7 @@ def test_consecutive_steps_have_different_noise():
 
 
 def test_later_draws_do_not_depend_on_the_number_of_gaussians_or_on_earlier_outcomes():
-    """Densifiers with the same seed must see the same images, however many Gaussians each has."""
+    """Runs with the same seed must train on the same images, however many Gaussians each has."""
     states = []
     for n, augmentation in ((5, lucid(0.1)), (50, lucid(0.1)), (5, lucid(0.1, 1.0, 1.0))):
         generator = draw()

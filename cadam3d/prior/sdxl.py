@@ -20,7 +20,7 @@ class StableDiffusionXL(StableDiffusion):
     """Podell et al. 2023: Stable Diffusion with a network that reads more inputs.
 
     Every image is presented as uncropped and with its own size (their sec. 2.2). The empty text is embedded
-    as zeros if the configuration of the model says so, as in training.
+    as zeros if the configuration of the model requires it, as in training.
     """
 
     kinds: ClassVar = ("StableDiffusionXLPipeline",)

@@ -34,7 +34,7 @@ FLAGS = (
     "-fPIC",
     "-pthread",
     "-fvisibility=hidden",
-    # Multiplications and additions are fused only where the source says so, because the forward and the
+    # Multiplications and additions are fused only where the source calls fma, because the forward and the
     # backward pass must compute the same bits.
     "-ffp-contract=off",
     # Makes sqrt a single instruction; the values stay IEEE.

@@ -25,7 +25,7 @@ SOURCE = "cuda.cu"
 HEADERS = ("blend.cuh", "device.cuh", "project.cuh", "sort.cuh", "splat_math.h", "tiles.cuh")
 OPTIONS = (
     "--std=c++17",
-    # Multiplications and additions are fused only where the source says so, because the forward and the
+    # Multiplications and additions are fused only where the source calls fma, because the forward and the
     # backward pass must compute the same bits.
     "--fmad=false",
 )
@@ -43,7 +43,7 @@ class Compiler:
     library: ctypes.CDLL
     path: str
     version: tuple[int, int]  # of CUDA
-    architectures: tuple[int, ...]  # ascending; 75 stands for sm_75
+    architectures: tuple[int, ...]  # ascending; 75 is sm_75
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def _load(path: str) -> Compiler:
 
 
 def choose_architecture(capability: tuple[int, int], compiler: Compiler) -> int:
-    """Return the newest architecture that the compiler knows and a device of this compute capability runs.
+    """Return the newest architecture that the compiler supports and that a device of this capability runs.
 
     Raises :class:`UserError` if there is none.
     """

@@ -151,7 +151,7 @@ def _splat(gaussians: Gaussians, view: _View) -> _Splats:
 def _see(gaussians: Gaussians, view: _View) -> tuple[Int[Tensor, "m"], Float[Tensor, "m 2"]]:
     """Return the rows and half-sizes of the visible Gaussians, nearest first.
 
-    Autograd never sees the other Gaussians, so their gradients are zero and cannot be NaN. Each test is
+    Autograd never processes the other Gaussians, so their gradients are zero, never NaN. Each test is
     written such that NaN fails it.
     """
     projection = _project(gaussians, view)
@@ -254,7 +254,7 @@ def _bin(
 ) -> tuple[Int[Tensor, "e"], Int[Tensor, "t"]]:
     """Return the splats of each tile, nearest first, one tile after another, and their number per tile.
 
-    A splat belongs to every tile that its box meets.
+    A splat belongs to every tile that its box touches.
     """
     grid = torch.tensor([tiles_x, tiles_y], device=means2d.device)
     # The boxes are closed and the pixel centres are half a pixel inside a tile, so rounding loses no pixel.

@@ -155,7 +155,8 @@ def test_each_jitter_has_its_published_size():
 
     aimed = draw(changed(published(), **{**STILL, "target_jitter": 0.1}), views=20_000)
     forward, distance = aimed.world_to_camera[:, 2, :3], aimed.positions.norm(dim=-1, keepdim=True)
-    missed = aimed.positions + forward * distance  # about the point of the view axis nearest to the origin
+    # This is about the point of the view axis that is nearest to the origin.
+    missed = aimed.positions + forward * distance
     assert float(missed.square().sum(-1).mean().sqrt()) == pytest.approx(0.1 * 2**0.5, abs=3e-3)
 
     tilted = draw(changed(published(), **{**STILL, "up_jitter": 0.01}), views=20_000)

@@ -57,7 +57,8 @@ def published_loss(rgb, path, prior, condition, draws, weights):
     now = original(x_e, e, eps_e)
     wanted = original(y_e, e, eps(y_e, e, condition, 2.0)).detach()
     gc = (now - wanted).square().sum()
-    moved = (x_0 + wanted - now).detach()  # the decoder of this prior is the identity
+    # The decoder of this prior is the identity.
+    moved = (x_0 + wanted - now).detach()
     cp = (x_0 - moved).square().sum()
     return w_cc * cc + w_gc * gc + w_cp * cp
 

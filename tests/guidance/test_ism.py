@@ -31,7 +31,8 @@ def test_gradient_equals_the_closed_form(scale, path, make, run, gaussian, means
     clean = rgb.detach().permute(0, 3, 1, 2)
     t = drawn_t(3, 0.4, 0.5, seed=11)
     s = t - 0.1
-    now, off = torch.zeros_like(t), clean - means.empty  # off = x - a * mean of the empty prompt
+    # Here off is x - a * mean of the empty prompt.
+    now, off = torch.zeros_like(t), clean - means.empty
     for then in (torch.full_like(t, 0.25), s):
         now, off = then, off * step_factor(path, now, then, SPREAD)
     a, b = per_view(path.a(s)), per_view(path.b(s))

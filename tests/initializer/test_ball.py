@@ -66,7 +66,8 @@ def test_scale_opacity_and_degree_are_as_requested():
 
 def test_neighbouring_gaussians_just_overlap_by_default():
     scales = build(count=4000).scales.mean()
-    spacing = 0.5 * (4 / 3 * torch.pi / 4000) ** (1 / 3)  # of as many points on a grid in this ball
+    # The spacing of as many points on a grid in this ball.
+    spacing = 0.5 * (4 / 3 * torch.pi / 4000) ** (1 / 3)
     assert 0.5 * spacing < scales < 1.5 * spacing
 
 

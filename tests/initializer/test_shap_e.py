@@ -107,7 +107,8 @@ def test_growth_adds_all_candidates_that_are_near():
     mesh = ColoredMesh(vertices, torch.tensor([[0, 1, 1]]), torch.zeros(2, 3))
     made = settle(mesh=mesh, radius=None, grow_points=200_000, grow_distance=0.5)
     share = (len(made) - 2) / 200_000
-    assert share == pytest.approx(2 * torch.pi * 0.5**3 / 6, rel=0.05)  # an eighth of a ball at each corner
+    # The candidates fill an eighth of a ball at each corner.
+    assert share == pytest.approx(2 * torch.pi * 0.5**3 / 6, rel=0.05)
 
 
 def test_grown_points_are_the_color_of_their_neighbour_and_a_little_brighter():
@@ -192,7 +193,8 @@ def test_cuda_in_half_precision_agrees_with_the_cpu(models):
     torch.testing.assert_close(there.cpu(), latent(models[True]), atol=0.05, rtol=0)
     before = torch.cuda.memory_allocated()
     assert asked.build("a corgi", seeded(), cuda).device.type == "cuda"
-    assert torch.cuda.memory_allocated() <= before + 2**20  # the Gaussians, and nothing of the model
+    # Only the Gaussians remain in memory, and nothing of the model.
+    assert torch.cuda.memory_allocated() <= before + 2**20
 
 
 def test_the_prompt_becomes_gaussians(models):
@@ -213,7 +215,8 @@ def test_colors_are_those_that_the_model_paints_with(models):
     described = asked.sample(found, "a corgi", seeded(), CPU)
     mesh = asked.decode(found, described)
     renderer = found.part("shap_e_renderer", torch.float32)
-    renderer.decode_to_mesh(described, CPU, grid_size=8)  # which sets the weights of its network
+    # This call sets the weights of the renderer's network.
+    renderer.decode_to_mesh(described, CPU, grid_size=8)
     painted = renderer.mlp(
         position=mesh.vertices[None], direction=None, ts=None, nerf_level="fine", rendering_mode="stf"
     ).channels[0]
@@ -264,7 +267,8 @@ def test_a_missing_model_is_an_error_or_the_fallback_with_a_note():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_fallback_gives_the_same_gaussians_as_without_shap_e(models, seed):
     wanted = BALL.build("a corgi", seeded(seed), CPU)
-    for path in ("nowhere", models[False]):  # the latter draws, and then finds no surface
+    # The second path draws random numbers before it finds no surface.
+    for path in ("nowhere", models[False]):
         made = begin(path=path, fallback=BALL, seed=seed)
         assert torch.equal(made.gaussians.means, wanted.means)
         assert torch.equal(made.gaussians.sh, wanted.sh)

@@ -128,7 +128,8 @@ def test_repulsion_acts_across_the_prompt_only():
     direction = (positive - negative).flatten(1)
     extra = (guided - positive).flatten(1)
     torch.testing.assert_close((extra * direction).sum(dim=1), torch.zeros(2).double(), atol=1e-10, rtol=0)
-    for view in range(2):  # by projection matrices, one view at a time
+    # Compute the same with projection matrices, one view at a time.
+    for view in range(2):
         d = direction[view]
         across = torch.eye(len(d)).double() - torch.outer(d, d) / d.square().sum()
         wanted = sum(strengths[view, i] * across @ (others[i] - negative)[view].flatten() for i in range(2))

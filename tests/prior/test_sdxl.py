@@ -37,7 +37,7 @@ def prior(folder, tmp_path_factory):
 
 @pytest.mark.parametrize("negative", ["ugly", ""])
 def test_texts_are_embedded_as_the_pipeline_embeds_them(prior, pipe, negative):
-    """The pipeline embeds its empty negative prompt, None, as zeros, since the index of the model says so."""
+    """The pipeline embeds an empty negative prompt, None, as zeros, since the model's index requires it."""
     texts = prior.embed("a red cube", negative).texts
     positive, other, pooled, other_pooled = pipe.encode_prompt(
         "a red cube, side view", negative_prompt=negative or None

@@ -179,7 +179,8 @@ def test_a_backward_can_be_repeated_and_means2d_and_background_have_gradients(ba
     assert_same_bits([2 * grad for grad in once], twice)
     wanted = differentiate(ReferenceRasterizer().render, lambda tensors: tensors.to(torch.float64), 1)
     for got, want in zip(once, wanted, strict=True):
-        assert_close("gradient", got, want, 1e-3)  # includes the pixels on a step of the model
+        # The tolerance includes the pixels on a step of the model.
+        assert_close("gradient", got, want, 1e-3)
 
 
 def test_parameters_changed_in_place_before_backward_are_refused(backend):

@@ -82,7 +82,8 @@ def test_every_backend_is_checked_timed_and_written_for_every_scene(kernel_build
     for row in written["rows"]:
         assert 0 < row["forward_backward_min_ms"] <= row["forward_backward_ms"]
         assert min(row["forward_ms"], row["backward_ms"]) > 0
-        assert row["peak_bytes"] is None  # there is no reliable number for a CPU
+        # There is no reliable number for a CPU.
+        assert row["peak_bytes"] is None
         assert f"{row['forward_backward_ms']:.2f}" in shown
     first, second = written["rows"][:2]
     assert first["ratio"] == 1
@@ -164,7 +165,8 @@ def test_a_backend_that_promises_the_same_bits_must_give_them():
     def wobbles(gaussians):
         return changed(gaussians, means=gaussians.means * next(factors))
 
-    assert not check.check("reference", Wrong(wobbles), CPU)  # the reference does not promise that
+    # The reference does not promise the same bits.
+    assert not check.check("reference", Wrong(wobbles), CPU)
     troubles = check.check("cuda", Wrong(wobbles), CPU)
     assert troubles
     assert all(f"not the same in {check.RUNS} runs" in trouble for trouble in troubles)
@@ -279,7 +281,8 @@ def test_the_load_of_a_scene_is_counted(emulator):
     clock = stages.StageClock(emulator)
     gaussians = make_shell(1, 0, CPU).detach()
     gaussians.means.zero_()
-    gaussians.log_scales.fill_(1.0)  # larger than the screen, so it meets every tile in both views
+    # The splat is larger than the screen, so it touches every tile in both views.
+    gaussians.log_scales.fill_(1.0)
     scene = make_scene(gaussians.map(lambda tensor: tensor.requires_grad_()), 20, 2)
     scene.render(stages.KernelRasterizer(clock))
     load = stages.measure_load(ReferenceRasterizer(), scene, clock.slots)
@@ -298,7 +301,8 @@ def test_the_bytes_of_a_stage_are_those_of_its_arguments(emulator):
             tensors = [each for each in arguments if isinstance(each, torch.Tensor)]
             given[self.spans[-1].stage] += sum(tensor.nbytes for tensor in tensors)
 
-    n = 2000  # many, so that cameras, bins and ranges weigh little
+    # With many splats, the bytes of cameras, bins and ranges hardly count.
+    n = 2000
     gaussians = make_shell(n, 1, CPU).detach()
     gaussians.means.mul_(0.02)
     gaussians.log_scales.fill_(-9.0)
@@ -361,7 +365,7 @@ def test_targets_grow_with_the_amount_of_work():
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         ("--backends unknown", "invalid choice: 'unknown'"),
         ("--counts 0", "invalid whole number >= 1 value: '0'"),
@@ -378,14 +382,14 @@ def test_targets_grow_with_the_amount_of_work():
         ),
     ],
 )
-def test_a_mistake_is_reported_in_one_line(words, says, capsys):
+def test_a_mistake_is_reported_in_one_line(words, message, capsys):
     try:
         code = bench_rasterizer.main(words.split())
     except SystemExit as ended:
         code = ended.code
     error = capsys.readouterr().err
     assert code == 2
-    assert says in error
+    assert message in error
     assert error.startswith("bench_rasterizer: ")
     assert error.count("\n") == 1
 

@@ -41,7 +41,8 @@ def test_the_bits_do_not_depend_on_the_schedule_of_threads(emulator):
         assert_same_bits(results[0], other)
 
 
-@pytest.mark.parametrize("most", [100, 500])  # fewer than pixels; fewer than (splat, tile) pairs
+# The limits are below the number of pixels, and below the number of (splat, tile) pairs.
+@pytest.mark.parametrize("most", [100, 500])
 def test_more_items_than_indices_can_count_are_refused_before_memory_is_allocated(
     emulator, monkeypatch, most
 ):

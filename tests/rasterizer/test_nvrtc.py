@@ -75,7 +75,7 @@ def test_every_kernel_fits_every_architecture_without_spills(
     compiler, architecture, build_cache, monkeypatch
 ):
     if architecture not in compiler.architectures:
-        pytest.skip(f"the NVRTC of CUDA {compiler.version} does not know sm_{architecture}")
+        pytest.skip(f"the NVRTC of CUDA {compiler.version} does not support sm_{architecture}")
     monkeypatch.setattr(nvrtc, "OPTIONS", (*nvrtc.OPTIONS, "--ptxas-options=-v"))
     log = compile_verbosely(compiler, architecture, build_cache)
     usage = re.findall(
@@ -117,7 +117,7 @@ def test_the_newest_architecture_that_runs_on_the_device_is_chosen(capability, w
 
 
 @pytest.mark.parametrize("capability", [(6, 1), (7, 0), (11, 0)])
-def test_a_device_that_the_compiler_does_not_know_is_refused(capability):
+def test_a_device_that_the_compiler_does_not_support_is_refused(capability):
     compiler = nvrtc.Compiler(ctypes.CDLL(None), "", (13, 0), (75, 80, 86, 87, 90, 100, 101, 120))
     with pytest.raises(UserError, match=rf"CUDA 13\.0 .* capability {capability[0]}\.{capability[1]}"):
         choose_architecture(capability, compiler)

@@ -182,7 +182,7 @@ def test_the_textbook_scene_exercises_every_branch():
     assert (colors < 0).any(), "some colour is clamped at zero"
 
 
-# --- results that can be computed by hand
+# --- results in closed form
 
 
 def test_a_ball_appears_as_a_gaussian_of_its_projected_size_plus_blur():
@@ -414,7 +414,8 @@ EXTREMES = [
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 def test_extreme_numbers_give_finite_images_and_gradients(value, dtype):
     views = cameras().to(dtype)
-    for name in FIELDS[:4]:  # with a colour of 3e38, infinite numbers are correct
+    # Colours are left out, since infinite images are correct for a colour of 3e38.
+    for name in FIELDS[:4]:
         for only_one_component in (False, True):
             gaussians = scene(12, dtype=dtype)
             row = getattr(gaussians, name)[3].view(-1)

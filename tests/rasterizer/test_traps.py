@@ -92,7 +92,8 @@ def test_the_length_of_any_other_quaternion_does_not_matter(any_backend, length)
     assert_close("alpha", output.alpha, plain.alpha, 1e-5)
 
 
-@pytest.mark.parametrize("log_scale", [-60.0, -104.0, -1e3, -1e38])  # the last two scales are exactly zero
+# The last two scales are exactly zero.
+@pytest.mark.parametrize("log_scale", [-60.0, -104.0, -1e3, -1e38])
 def test_a_zero_scale_is_a_dot_of_the_blurs_size(any_backend, log_scale):
     cameras = facing_camera(11, 13)
     grads = assert_is_drawn(any_backend, changed_gaussian(log_scales=[log_scale] * 3), 7, cameras)
@@ -114,7 +115,7 @@ def test_a_huge_scale_at_depth_zero_or_behind_is_culled(any_backend, log_scale, 
 
 
 @pytest.mark.parametrize("log_scale", [[46.0] * 3, [46.0, -46.0, 0.0]])  # exp(46) = 1e20
-def test_a_scale_whose_square_leaves_float32_is_culled(any_backend, log_scale):
+def test_a_scale_with_a_square_beyond_float32_is_culled(any_backend, log_scale):
     gaussians = changed_gaussian(means=[0.0, 0.0, 2.0], log_scales=log_scale)
     if any_backend.dtype == torch.float64:  # the square is finite
         assert_is_drawn(any_backend, gaussians, 7, facing_camera(11, 13))
@@ -198,7 +199,8 @@ def test_many_huge_splats_stop_where_those_of_the_reference_do(backend):
     assert (output.alpha > 0.999).all()
 
 
-@pytest.mark.parametrize("logit", [5.0, 20.0, 40.0, 1e38])  # the last three opacities are exactly one
+# The last three opacities are exactly one.
+@pytest.mark.parametrize("logit", [5.0, 20.0, 40.0, 1e38])
 def test_a_saturated_alpha_has_a_gradient_for_colour_but_not_for_opacity_or_shape(any_backend, logit):
     output, grads = any_backend.differentiate(stack(logit), facing_camera(5, 6))
     assert_close("alpha", output.alpha, torch.full_like(output.alpha, 0.99), 1e-6)
@@ -325,7 +327,8 @@ def test_tensors_that_are_not_contiguous(any_backend):
             intrinsics=change(cameras.intrinsics),
         )
         output = any_backend.render(leaves, views, change(background))
-        output.alpha.sum().backward()  # the gradient of alpha is one number, expanded with stride 0
+        # The gradient of alpha is one number, expanded with stride 0.
+        output.alpha.sum().backward()
         images = [getattr(output, name).detach() for name in IMAGES]
         return [
             *images,
@@ -375,7 +378,8 @@ def test_shapes_that_would_make_kernels_read_outside_their_tensors_are_refused(b
     gaussians, cameras, background = backend.put(make_gaussians(4)), make_cameras(2, 9, 9), backgrounds(2)
     with pytest.raises(ValueError, match="expected"):
         backend.render(gaussians, cameras.index(slice(0, 1)), background)
-    for coefficients in (2, 5, 25):  # of no degree, or of a degree that is too high
+    # These numbers belong to no degree, or to a degree that is too high.
+    for coefficients in (2, 5, 25):
         torn = Gaussians(**gaussians.tensors() | {"sh": torch.zeros(4, coefficients, 3)})
         with pytest.raises(ValueError, match="expected"):
             backend.render(torn, cameras, background)

@@ -72,7 +72,7 @@ class ShapesCondition(Condition):
     empty: Mixture
 
     def unprompted(self) -> "ShapesCondition":
-        """Return the same views under the empty prompt, which stands for every object of the world."""
+        """Return the same views under the empty prompt, which allows every object of the world."""
         return replace(self, positive=self.empty, negative=self.empty)
 
 
@@ -116,7 +116,7 @@ class ShapesPrior(DiffusionPrior):
         require_whole("prior.seed", self.seed, low=0, high=2**62, example=0)
 
     def embed(self, prompt: str, negative: str) -> ShapesEmbedding:
-        """Parse both prompts; an empty negative prompt stands for every object of the world.
+        """Parse both prompts; an empty negative prompt allows every object of the world.
 
         Raises ``UserError`` for an empty prompt and for words that the grammar does not know.
         """

@@ -1,6 +1,6 @@
 """Sphere tracing: a ray advances by the distance to the surface until it touches the surface (Hart 1996).
 
-Every part is traced separately, in its local coordinates and only by rays that meet its bounding box; the
+Every part is traced separately, in its local coordinates and only by rays that hit its bounding box; the
 nearest hit is visible. All parts of one kind are traced together, so that the number of tensor operations
 does not grow with the number of parts. Light depends on the surface and not on the view, so that an asset of
 SH degree 0 can match it.
@@ -66,7 +66,7 @@ class _Hits:
 
 @dataclass(frozen=True)
 class _Rays:
-    """Rays of all views that meet the bounding ball of the scene, sorted by view."""
+    """Rays of all views that hit the bounding ball of the scene, sorted by view."""
 
     origins: Float[Tensor, "v 3"]
     directions: Float[Tensor, "3 r"]  # unit length
@@ -115,7 +115,7 @@ def _cast(cameras: Cameras, samples: int) -> _Rays:
 
 
 def _candidates(scene: Scene, rays: _Rays) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
-    """Return the pairs (part, ray) in which the ray meets the bounding ball of the part, sorted by part."""
+    """Return the pairs (part, ray) in which the ray hits the bounding ball of the part, sorted by part."""
     masks = []
     for origin, direction in zip(rays.origins, rays.directions.split(rays.per_view, dim=1), strict=True):
         away = scene.centres - origin
