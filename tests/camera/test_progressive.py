@@ -93,7 +93,7 @@ def test_widenings_are_at_multiples_from_begin_on(begin, every, steps):
 
 
 @pytest.mark.parametrize("begin", [0, 1])
-def test_the_first_step_never_sees_a_widened_range(begin):
+def test_the_first_step_never_uses_a_widened_range(begin):
     sampler = changed(published(), begin=begin, every=1)
     assert [sampler.widenings(step) for step in range(4)] == [0, 1, 2, 3]
 

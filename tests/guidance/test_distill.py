@@ -189,7 +189,7 @@ def test_the_window_follows_its_schedules(make, run, gaussian, means, rgb):
         assert ((prior.calls[-1].t >= low) & (prior.calls[-1].t <= high)).all()
 
 
-def test_a_window_of_no_width_leaves_t_to_its_schedule(distillation, make, run, prior, means, rgb):
+def test_in_a_window_of_zero_width_t_follows_the_schedule(distillation, make, run, prior, means, rgb):
     """DreamGaussian anneals t = 1 - step / 500, for every view and seed."""
     anneal = Linear(start=0.9, end=0.2, steps=7)
     guidance = make(distillation, t_min=anneal, t_max=anneal)

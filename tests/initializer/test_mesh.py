@@ -82,7 +82,7 @@ def test_a_file_with_y_up_is_upright_and_faces_the_front(tmp_path):
     assert top[0] < 0
 
 
-def test_a_turn_brings_one_side_to_the_front(tmp_path):
+def test_a_turn_moves_another_side_to_the_front(tmp_path):
     # The triangle is long towards -y, the front of Blender's objects.
     corners = np.array([[0, 0, 0], [0, -3.0, 0], [0, 0, 1]])
     path = save(trimesh.Trimesh(corners, [[0, 1, 2]], process=False), tmp_path / "mark.ply")
@@ -111,7 +111,7 @@ def test_vertex_colors_are_interpolated(tmp_path):
     assert rgb(made)[:, 1:].abs().max() < 1e-3
 
 
-def test_face_colors_do_not_bleed(tmp_path):
+def test_face_colors_end_at_the_border_of_the_face(tmp_path):
     box = trimesh.creation.box(extents=(2, 2, 2))
     colors = np.zeros((12, 4), dtype=np.uint8)
     colors[:, 2], colors[:, 3] = np.where(box.face_normals[:, 2] > 0.5, 255, 0), 255

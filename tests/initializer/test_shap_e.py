@@ -76,7 +76,7 @@ def test_the_mesh_is_centred_and_scaled():
     torch.testing.assert_close(means.amin(dim=0), -means.amax(dim=0))
 
 
-def test_a_quarter_turn_brings_shap_es_front_to_ours():
+def test_a_quarter_turn_moves_the_front_of_shap_e_to_our_front():
     means = settle(radius=None, turn_deg=90).means
     wanted = torch.stack([-a_mesh().vertices[:, 1], a_mesh().vertices[:, 0], a_mesh().vertices[:, 2]], dim=1)
     assert torch.equal(means, wanted)

@@ -105,7 +105,7 @@ def test_the_curves_of_threestudio(azimuth, strengths):
     torch.testing.assert_close(THREESTUDIO.mix(views(azimuth)).strengths[0], torch.tensor(strengths))
 
 
-def test_overhead_repels_nothing():
+def test_nothing_is_repelled_from_overhead_views():
     mix = THREESTUDIO.mix(views([0, 120], elevation=70))
     assert (mix.positive.argmax(dim=-1) == OVERHEAD).all()
     assert (mix.strengths == 0).all()

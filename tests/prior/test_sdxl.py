@@ -114,5 +114,5 @@ def test_micro_batch_does_not_change_results(prior):
     ("dtype", "expected"),
     [("float16", torch.float32), ("bfloat16", torch.bfloat16), ("float32", torch.float32)],
 )
-def test_the_autoencoder_overflows_in_float16_and_stays_out_of_it(prior, dtype, expected):
+def test_the_autoencoder_never_computes_in_float16(prior, dtype, expected):
     assert replace(prior, dtype=dtype).vae.dtype == expected

@@ -196,7 +196,7 @@ def test_tokens_are_bytes_between_start_and_padding():
     assert len(tokens) == len(tokenize("x" * 1000)) == MAX_TOKENS
 
 
-def test_the_user_is_warned_that_it_is_random(prior):
+def test_the_user_is_warned_that_the_network_is_random(prior):
     assert "cannot generate a meaningful object" in prior.notice()
     assert "prior=shapes" in prior.notice()
 

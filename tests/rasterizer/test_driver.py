@@ -18,8 +18,8 @@ from cadam3d.rasterizer.cuda import BLEND_BLOCK, MOST, WARP, CudaRasterizer, _la
 from cadam3d.rasterizer.driver import Module, load_driver
 from cadam3d.rasterizer.nvrtc import Cubin
 
-# A driver that has the kernels "works" and "full". It records how it launches the first one, and has no memory
-# for the second one.
+# A driver with the kernels "works" and "full". It records the launches of the first kernel, and it has no
+# memory for the second.
 STUB = """
 #include <string.h>
 extern "C" {

@@ -542,7 +542,7 @@ def test_tensors_need_not_be_contiguous():
     assert torch.equal(render(strided, views).rgb, render(gaussians, views).rgb)
 
 
-def test_a_render_keeps_little_for_its_backward():
+def test_a_render_stores_little_for_the_backward_pass():
     # 60 splats fill the image, so one float32 array of their 60 x 64 x 64 pairs would have a megabyte.
     gaussians = scene(60, dtype=torch.float32).map(lambda tensor: tensor.clone())
     gaussians.log_scales[:] = 0.0

@@ -187,7 +187,7 @@ def test_one_poisoned_number_is_enough_to_cull(any_backend, field):
 # -------------------------------------------------------------------------- large, many and opaque splats
 
 
-def test_huge_splats_that_touch_more_tiles_than_one_thread_handles(backend):
+def test_huge_splats_that_touch_more_tiles_than_one_thread_handles_agree(backend):
     # Each touches 100 tiles of 8x8 pixels: on a GPU, a whole warp lists such a splat and sums its records.
     backend.agrees(make_gaussians(5, seed=16, log_scale=1.5, opacity=-1.0), make_cameras(1, 75, 80), most=0.8)
 
@@ -252,13 +252,13 @@ def test_an_ellipse_reaches_a_pixel_across_the_border_of_a_tile_exactly_or_not_a
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 19), (8, 8), (9, 7), (16, 16), (17, 15), (33, 7)])
-def test_image_sizes_that_are_not_multiples_of_a_tile(backend, height, width):
+def test_image_sizes_that_are_not_multiples_of_a_tile_agree(backend, height, width):
     gaussians = make_gaussians(60, seed=2, degree=1, log_scale=-1.0)
     backend.agrees(gaussians, make_cameras(3, height, width), most=0.3)
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 8192), (8192, 1)])
-def test_images_of_8192_pixels(backend, height, width):
+def test_images_of_8192_pixels_agree(backend, height, width):
     # In float32, centres near pixel 8000 are exact to 1/2000 of a pixel; the splats are wide enough for that.
     gaussians, cameras = make_gaussians(15, seed=6, spread=1.0, log_scale=-2.0), facing_camera(height, width)
     cameras.intrinsics[:, 0, 0], cameras.intrinsics[:, 1, 1] = width / 2.0, height / 2.0
@@ -287,7 +287,7 @@ def test_an_empty_image_shows_the_background_and_has_zero_gradients(any_backend,
         assert not grad.any()
 
 
-def test_an_empty_view_among_others(backend):
+def test_an_empty_view_among_others_agrees_and_gets_no_gradient(backend):
     cameras = make_cameras(3, 20, 30)
     cameras.world_to_camera[1, 2, 3] = -9.0  # everything is behind this camera
     output, grads = backend.agrees(make_gaussians(40), cameras)
@@ -295,7 +295,7 @@ def test_an_empty_view_among_others(backend):
     assert not grads["means2d"][1].any()
 
 
-def test_a_loss_on_means2d_alone(backend):
+def test_a_loss_may_use_means2d_alone(backend):
     cameras = make_cameras(2, 20, 30)
 
     def gradient(render, put):
@@ -312,7 +312,7 @@ def test_a_loss_on_means2d_alone(backend):
 # -------------------------------------------------------------------------- kinds of tensors
 
 
-def test_tensors_that_are_not_contiguous(any_backend):
+def test_tensors_need_not_be_contiguous(any_backend):
     gaussians, cameras = any_backend.put(make_gaussians(60, degree=1)), make_cameras(2, 31, 31)
     background = any_backend.put(backgrounds(2))
 
