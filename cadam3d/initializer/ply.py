@@ -40,15 +40,14 @@ class Ply(Initializer):
     """The Gaussians or points of a PLY file; the prompt is not used.
 
     Gaussians (3DGS layout, any SH degree, written by any program) keep their shapes, colours and opacities.
-    Points (ASCII or binary, such as those of Point-E or a scan) become round Gaussians with their colours;
-    ``scale``, ``opacity``, ``color``, ``replicate`` and ``replicate_radius`` apply to points only.
+    Points (ASCII or binary, such as those of Point-E or a scan) become round Gaussians with their colours.
     """
 
     path: str
     up: str | None  # one of UPS
     turn_deg: int  # one of TURNS
     radius: float | None  # world units
-    count: int | None  # at most
+    count: int | None  # largest number of rows
     sh_degree: int | None  # 0 to 3
     replicate: int  # Gaussians per point
     replicate_radius: float  # world units

@@ -47,8 +47,7 @@ class ShapE(Initializer):
 
     The points can be grown or replicated. The parts of the model are loaded one after the other and freed
     before training. If the model is not available or finds no surface, ``fallback`` builds the Gaussians
-    and the run reports it; without a fallback that is an error. With ``dtype`` "auto", the text encoder and
-    the denoiser use float16 on CUDA and float32 elsewhere.
+    and the run reports it; without a fallback that is an error.
     """
 
     path: str | None  # folder

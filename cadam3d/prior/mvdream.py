@@ -49,8 +49,7 @@ class MVDream(StableDiffusion):
     """Shi et al. 2024, on Stable Diffusion 2.1: views that agree, since they are denoised together.
 
     Consecutive views form a group of four, a quarter turn apart, at one elevation and one ``t``, as drawn by
-    ``camera=multiview``. ``path`` may also be the published file (``sd-v2.1-base-4view.pt``), which has no
-    tokenizer; ``tokenizer`` is then a folder, or a name on the hub, with CLIP's vocabulary.
+    ``camera=multiview``.
     """
 
     rescale: float  # in [0, 1]
