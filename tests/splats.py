@@ -263,6 +263,13 @@ def duplicated(n):
     return make_gaussians(n // 3, seed=10).index(torch.arange(n // 3).repeat(3))
 
 
+def multiply_quats(p: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+    """Return the products of one quaternion ``p`` with each row of ``q``."""
+    w = p[0] * q[:, 0] - q[:, 1:] @ p[1:]
+    xyz = p[0] * q[:, 1:] + q[:, :1] * p[1:] + torch.linalg.cross(p[1:].expand_as(q[:, 1:]), q[:, 1:], dim=-1)
+    return torch.cat([w[:, None], xyz], dim=1)
+
+
 def facing_camera(height, width) -> Cameras:
     """Return one camera at the origin that looks along +z, with its principal point at the image centre."""
     return replace(

@@ -16,6 +16,7 @@ from splats import (
     make_cameras,
     make_gaussians,
     make_weights,
+    multiply_quats,
     needles,
     saturated,
     undecided,
@@ -120,12 +121,6 @@ def test_moving_scene_and_cameras_together_changes_nothing(any_backend):
     grads["quats"] = multiply_quats(turn.to(grads["quats"]), grads["quats"])
     for name, grad in grads.items():
         assert_close(f"gradient of {name}", moved_grads[name], grad, 2e-4)
-
-
-def multiply_quats(p, q):
-    w = p[0] * q[:, 0] - q[:, 1:] @ p[1:]
-    xyz = p[0] * q[:, 1:] + q[:, :1] * p[1:] + torch.linalg.cross(p[1:].expand_as(q[:, 1:]), q[:, 1:], dim=-1)
-    return torch.cat([w[:, None], xyz], dim=1)
 
 
 def test_culled_gaussians_change_nothing_and_get_no_gradient(any_backend):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from splats import multiply_quats
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, orbit, turntable
@@ -320,12 +321,6 @@ def test_moving_scene_and_cameras_together_changes_nothing():
     moved_views = replace(views, world_to_camera=views.world_to_camera @ motion.inverse())
     for got, want in zip(images(render(moved, moved_views)), images(render(gaussians, views)), strict=True):
         torch.testing.assert_close(got, want, rtol=1e-10, atol=1e-10)
-
-
-def multiply_quats(p: Tensor, q: Tensor) -> Tensor:
-    w = p[0] * q[:, 0] - q[:, 1:] @ p[1:]
-    xyz = p[0] * q[:, 1:] + q[:, :1] * p[1:] + torch.linalg.cross(p[1:].expand_as(q[:, 1:]), q[:, 1:], dim=-1)
-    return torch.cat([w[:, None], xyz], dim=1)
 
 
 def test_culled_gaussians_change_nothing_and_get_no_gradient():
