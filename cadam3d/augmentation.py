@@ -11,12 +11,13 @@ from cadam3d.core.checks import require_range
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 
-LEAST = 1e-3  # smallest factor that noise multiplies a scale by; its logarithm must be finite
+# The smallest factor that noise multiplies a scale by. It is positive, so its logarithm is finite.
+LEAST = 1e-3
 LARGEST_SEED = 2**63 - 1
 
 
 class Augmentation(ABC):
-    """Two differentiable changes to what a training step renders and shows.
+    """Two differentiable changes: to the Gaussians of a training step, and to its images.
 
     Holds frozen hyper-parameters; all randomness comes from the generator.
     """
@@ -55,9 +56,9 @@ class LucidAugmentation(Augmentation):
     left from right, a mirrored image is wrong.
     """
 
-    scale_noise: float  # standard deviation of the factor by which each scale is multiplied
-    disparity: float  # probability, per step, of showing the disparity of all views as grey images
-    flip: float  # probability, per step, of mirroring all views left to right
+    scale_noise: float  # standard deviation
+    disparity: float  # probability
+    flip: float  # probability
 
     def __post_init__(self) -> None:
         require_range("augmentation.scale_noise", self.scale_noise, low=0, high=1, example=0.1118)
@@ -81,10 +82,7 @@ class LucidAugmentation(Augmentation):
 
     def show(self, output: RenderOutput, generator: torch.Generator) -> Float[Tensor, "v h w 3"]:
         """Return colours or disparities, possibly mirrored; the same two choices hold for all views."""
-        as_disparity, flipped = (torch.rand(2, generator=generator) < torch.tensor(self._odds)).tolist()
+        odds = torch.tensor([float(self.disparity), float(self.flip)])
+        as_disparity, flipped = (torch.rand(2, generator=generator) < odds).tolist()
         images = output.disparity()[..., None].expand_as(output.rgb) if as_disparity else output.rgb
         return images.flip(dims=(2,)) if flipped else images
-
-    @property
-    def _odds(self) -> tuple[float, float]:
-        return float(self.disparity), float(self.flip)

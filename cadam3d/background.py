@@ -30,12 +30,12 @@ class ConstantBackground(Background):
 
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
         """Return the colour, repeated for every view."""
-        return torch.tensor([float(channel) for channel in self.color]).repeat(views, 1)
+        return _rgb(self.color).repeat(views, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomBackground(Background):
-    """Independently for each view: a uniformly random colour with ``probability``, else the constant one."""
+    """A uniformly random colour in some views and the constant one in the others, drawn for each view."""
 
     probability: float  # in [0, 1]
     color: Sequence[float]  # RGB in [0, 1]
@@ -48,15 +48,15 @@ class RandomBackground(Background):
         """Return one colour per view; the number of random draws does not depend on their outcome."""
         is_random = torch.rand(views, 1, generator=generator) < self.probability
         colors = torch.rand(views, 3, generator=generator)
-        return torch.where(is_random, colors, torch.tensor([float(channel) for channel in self.color]))
+        return torch.where(is_random, colors, _rgb(self.color))
 
 
 @dataclass(frozen=True, kw_only=True)
 class LucidBackground(Background):
-    """Independently for each view: often black or a random colour, else the constant one (LucidDreamer)."""
+    """Black, a random colour or the constant one, drawn for each view (LucidDreamer)."""
 
-    probability: float  # in [0, 1]; of black or a random colour instead of the constant one
-    black: float  # in [0, 1]; share of black among those; the others are uniformly random
+    probability: float  # in [0, 1]
+    black: float  # share, in [0, 1]
     color: Sequence[float]  # RGB in [0, 1]
 
     def __post_init__(self) -> None:
@@ -69,12 +69,12 @@ class LucidBackground(Background):
         is_other = torch.rand(views, 1, generator=generator) < self.probability
         is_black = torch.rand(views, 1, generator=generator) < self.black
         colors = torch.where(is_black, 0.0, torch.rand(views, 3, generator=generator))
-        return torch.where(is_other, colors, torch.tensor([float(channel) for channel in self.color]))
+        return torch.where(is_other, colors, _rgb(self.color))
 
 
 @dataclass(frozen=True, kw_only=True)
 class BlackOrWhite(Background):
-    """Independently for each view: white with probability ``white``, else black (DreamGaussian)."""
+    """White with probability ``white`` and otherwise black, drawn for each view (DreamGaussian)."""
 
     white: float  # in [0, 1]
 
@@ -84,3 +84,7 @@ class BlackOrWhite(Background):
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
         """Return black or white for each view."""
         return (torch.rand(views, 1, generator=generator) < self.white).float().repeat(1, 3)
+
+
+def _rgb(color: Sequence[float]) -> Float[Tensor, "3"]:
+    return torch.tensor([float(channel) for channel in color])

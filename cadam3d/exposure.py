@@ -39,11 +39,11 @@ class BrightnessGuard(Exposure):
     black this equals the published code, which counts a background of any other colour as part of the object.
     """
 
-    begin: int  # the guard acts at steps strictly between `begin` and `end`, counted from 1
-    end: int
-    quantile: float  # of the object's pixels in a view, and then of the views
-    threshold: float  # of that brightness; white is 1
-    rate: float  # factor for the colours, in (0, 1)
+    begin: int  # step
+    end: int  # step
+    quantile: float  # in [0, 1]
+    threshold: float  # brightness
+    rate: float  # in (0, 1)
 
     def __post_init__(self) -> None:
         require_whole("exposure.begin", self.begin, low=0, example=1000)

@@ -11,7 +11,8 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 
-CLEAR = 1e-5  # keeps logarithms finite where a pixel is fully transparent or fully opaque
+# Distance of alpha from 0 and 1 that keeps logarithms finite in transparent and in opaque pixels.
+CLEAR = 1e-5
 
 
 class Regularizer(ABC):
@@ -104,7 +105,8 @@ class TotalVariation(Weighted):
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
         """Return the mean over views, channels and directions, per pixel."""
-        from kornia.losses import total_variation  # slow to import, and rarely used
+        # Imported here, since kornia is slow to import and this penalty is rarely used.
+        from kornia.losses import total_variation
 
         images = output.rgb.permute(0, 3, 1, 2)
         return total_variation(images, reduction="mean").mean()

@@ -1,4 +1,4 @@
-"""Runs the CUDA kernels on a CPU: the same source, compiled by a C++ compiler, with one fiber per thread."""
+"""Run the CUDA kernels on a CPU: the same source, compiled by a C++ compiler, with one fiber per thread."""
 
 import ctypes
 import faulthandler
@@ -18,8 +18,7 @@ from filelock import FileLock
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.render import RenderOutput
-from cadam3d.rasterizer import base
-from cadam3d.rasterizer.build import CONSTANTS, KERNELS, find_compiler
+from cadam3d.rasterizer.build import KERNELS, definitions, find_compiler
 from cadam3d.rasterizer.cuda import rasterize
 from cadam3d.rasterizer.driver import Module
 from cadam3d.rasterizer.launcher import Launch, Launcher
@@ -65,8 +64,7 @@ def build_emulator(folder: Path, kernels: Path, optimize: str, extra: tuple[str,
     compiler = find_compiler()
     if compiler is None:
         pytest.skip("no C++ compiler")
-    defines = [f"-DSPLAT_{name}={getattr(base, name)!r}" for name in CONSTANTS]
-    flags = [*FLAGS, optimize, *extra, *defines]
+    flags = [*FLAGS, optimize, *extra, *definitions()]
     sources = sorted([*kernels.iterdir(), *SOURCE.parent.glob("*.h"), SOURCE], key=lambda path: path.name)
     key = content_hash(compiler.version, platform.machine(), *flags, *(path.read_text() for path in sources))
 

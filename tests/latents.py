@@ -9,7 +9,8 @@ from cadam3d.core.cameras import turntable
 from cadam3d.prior.latent import LatentPrior, TextCondition
 from cadam3d.prior.prompting import Discrete
 
-KEYS = {  # of every pretrained prior; tests add path and cache_dir
+# The keys of every pretrained prior; tests add path and cache_dir.
+KEYS = {
     "ids": [],
     "revision": None,
     "variant": None,
@@ -33,7 +34,7 @@ def condition_of(prior: LatentPrior, prompt="a red cube", negative="ugly", views
     return prior.embed(prompt, negative).at(cameras, torch.zeros(views, 3))
 
 
-def encodes_what_the_autoencoder_says(prior: LatentPrior, vae) -> None:
+def encodes_like_the_autoencoder(prior: LatentPrior, vae) -> None:
     """Check that images are resized and that latents are the posterior's mean, shifted and scaled."""
     rgb = torch.rand(2, 48, 48, 3, generator=torch.Generator().manual_seed(1))
     images = torch.nn.functional.interpolate(rgb.permute(0, 3, 1, 2), (64, 64), mode="bilinear")
@@ -42,7 +43,7 @@ def encodes_what_the_autoencoder_says(prior: LatentPrior, vae) -> None:
     torch.testing.assert_close(prior.encode(rgb), expected, rtol=1e-4, atol=1e-5)
 
 
-def memory_is_foreseen(prior: LatentPrior, views: int = 2) -> None:
+def memory_is_estimated(prior: LatentPrior, views: int = 2) -> None:
     """Check that the estimate, from configurations alone, has exact weights and counts work and texts."""
     unloaded = replace(prior)
     estimate = unloaded.memory("a prompt that is not cached", "", views, None)

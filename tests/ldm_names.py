@@ -1,4 +1,4 @@
-"""Renames tensors from the names of diffusers to those of latent diffusion, as in published files."""
+"""Rename tensors from the names of diffusers to those of latent diffusion, as in published files."""
 
 import re
 

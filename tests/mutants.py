@@ -1,4 +1,4 @@
-"""Mistakes that tests plant in a copy of the CUDA kernels, to prove that they would find them.
+"""Mistakes that are planted in a copy of the CUDA kernels, to prove that the tests find them.
 
 A mutant is a file, a piece of its text, and the text that replaces it. ``MUTANT`` in the new text is true
 while that mutant is switched on (``Emulator.activate``), so one compilation holds all of them.

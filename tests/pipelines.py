@@ -240,7 +240,8 @@ def shap_e(folder: Path, surface: bool = True) -> Path:
     from diffusers import HeunDiscreteScheduler, PriorTransformer, ShapEPipeline
     from diffusers.pipelines.shap_e import ShapERenderer
 
-    width, layers = 8, 4  # of the renderer's network; each row of its weights is one token of the latent
+    # The size of the renderer's network. Each row of its weights is one token of the latent.
+    width, layers = 8, 4
     with torch.random.fork_rng():
         torch.manual_seed(0)
         tokenizer = clip_tokenizer(folder / "tokens")
@@ -282,7 +283,7 @@ def shap_e(folder: Path, surface: bool = True) -> Path:
 def triangles_of_cubes() -> tuple[torch.Tensor, torch.Tensor]:
     """Return a table for marching cubes with a fan over the cut edges of each cube, a crumpled surface.
 
-    Bit x + 2 y + 4 z of a case says whether that corner is inside. Edges along x come first, then y, then z.
+    Bit x + 2 y + 4 z of a case is set if that corner is inside. Edges along x come first, then y, then z.
     """
     corners = [(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]
     edges = []

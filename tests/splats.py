@@ -175,7 +175,7 @@ def assert_agrees(
     """Check that ``render`` agrees with the reference in float64, in all images and gradients."""
     v, height, width = len(cameras), cameras.height, cameras.width
     decided = ~undecided(gaussians, cameras)
-    assert decided.double().mean() > most, "too many pixels are on a step: the test would prove little"
+    assert decided.double().mean() > most, "too many pixels are on a step, so the test would prove little"
     weights = [
         weight * decided.view(*decided.shape, *[1] * (weight.ndim - 3)) if name in images else None
         for name, weight in zip(IMAGES, make_weights(v, height, width), strict=True)
@@ -261,6 +261,13 @@ def saturated(n):
 
 def duplicated(n):
     return make_gaussians(n // 3, seed=10).index(torch.arange(n // 3).repeat(3))
+
+
+def multiply_quats(p: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+    """Return the products of one quaternion ``p`` with each row of ``q``."""
+    w = p[0] * q[:, 0] - q[:, 1:] @ p[1:]
+    xyz = p[0] * q[:, 1:] + q[:, :1] * p[1:] + torch.linalg.cross(p[1:].expand_as(q[:, 1:]), q[:, 1:], dim=-1)
+    return torch.cat([w[:, None], xyz], dim=1)
 
 
 def facing_camera(height, width) -> Cameras:

@@ -28,7 +28,7 @@ def output(size: int = 6) -> RenderOutput:
     )
 
 
-def test_none_is_the_identity_and_draws_nothing():
+def test_no_augmentation_is_the_identity_and_draws_nothing():
     gaussians, seen, generator = make_gaussians(5), output(), draw()
     before = generator.get_state()
     assert NoAugmentation().perturb(gaussians, generator) is gaussians
@@ -126,7 +126,7 @@ def test_consecutive_steps_have_different_noise():
 
 
 def test_later_draws_do_not_depend_on_the_number_of_gaussians_or_on_earlier_outcomes():
-    """Densifiers with the same seed must see the same images, however many Gaussians each has."""
+    """Runs with the same seed must train on the same images, however many Gaussians each has."""
     states = []
     for n, augmentation in ((5, lucid(0.1)), (50, lucid(0.1)), (5, lucid(0.1, 1.0, 1.0))):
         generator = draw()

@@ -55,7 +55,7 @@ def test_a_lucid_background_is_random_black_or_constant_with_its_probabilities(p
 
 
 @pytest.mark.parametrize("white", [0.0, 0.5, 0.8, 1.0])
-def test_black_or_white_is_nothing_else_and_white_with_its_probability(white):
+def test_black_or_white_gives_only_these_two_and_white_with_its_probability(white):
     colors = BlackOrWhite(white=white).sample(20_000, draw())
     assert set(colors.unique().tolist()) <= {0.0, 1.0}
     assert (colors == colors[:, :1]).all()

@@ -34,7 +34,7 @@ def scene(*levels: float) -> tuple[RenderOutput, torch.Tensor]:
     return over(white, torch.tensor(levels)[:, None, None, None].expand(-1, 8, 8, 3), alpha), white
 
 
-def test_none_never_dims():
+def test_no_exposure_never_dims():
     output, background = scene(5.0, 5.0)
     assert all(NoExposure().dimming(output, background, step) is None for step in (1, 2000, 10**6))
 
@@ -51,13 +51,13 @@ def test_colours_are_dimmed_above_the_threshold(level, dims):
     assert (guard().dimming(*scene(level, level), 2000) is not None) == dims
 
 
-def test_it_takes_a_quantile_of_the_views():
+def test_dimming_depends_on_a_quantile_of_the_views():
     """The 0.85 quantile of four views is 0.45 times the third plus 0.55 times the fourth."""
     assert guard().dimming(*scene(0.0, 0.0, 0.8, 1.0), 2000) == 0.8  # 0.91
     assert guard().dimming(*scene(0.0, 0.0, 0.7, 1.0), 2000) is None  # 0.865
 
 
-def test_it_takes_a_quantile_of_the_pixels_without_the_background():
+def test_brightness_is_a_quantile_of_the_pixels_without_the_background():
     alpha = torch.zeros(1, 10, 11)
     alpha[:, :, :10] = 1.0
     alpha[:, :, 10] = 0.0

@@ -101,7 +101,7 @@ def test_a_recipe_has_the_published_numbers(recipe):
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_a_recipe_leaves_every_group_to_the_line(recipe):
+def test_the_command_line_can_replace_every_group_of_a_recipe(recipe):
     """No value of a recipe remains in a group that the command line replaces, such as the densifier."""
     others = ["prior=shapes", "guidance=sds", "camera=orbit", "initializer=ball", "densifier=none"]
     others += ["optimizer=adam", "refine=default", "augmentation=none", "background=white", "exposure=none"]

@@ -75,7 +75,7 @@ def test_the_weight_multiplies_and_may_follow_the_step(regularizer):
 
 
 @pytest.mark.parametrize("regularizer", EVERY, ids=NAMES)
-def test_an_empty_scene_gives_a_number(regularizer):
+def test_an_empty_scene_gives_a_finite_penalty(regularizer):
     assert math.isfinite(at(regularizer, means=torch.zeros(0, 3)))
 
 
@@ -152,7 +152,7 @@ def test_a_step_costs_squared_variation_more_than_a_ramp_and_total_variation_the
     assert at(squared, rgb=step) == pytest.approx(4 * at(squared, rgb=ramp))
 
 
-def test_disparity_variation_is_the_squared_variation_of_the_disparity_and_sees_no_colour():
+def test_disparity_variation_is_the_squared_variation_of_the_disparity_alone():
     rgb, alpha = noise(2, 6, 6, 3), 0.9 + 0.1 * noise(2, 6, 6)
     grey = output(rgb, alpha).disparity()[..., None].repeat(1, 1, 1, 3)
     variation = at(DisparityVariation(weight=1.0), rgb=rgb, alpha=alpha)

@@ -101,7 +101,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path, densifier):
 def test_the_fallback_of_an_initializer_is_recorded_in_checkpoints():
     lines = ["initializer=shap_e", "initializer.path=nowhere", "initializer/fallback=ball"]
     trainer, state = make(lines)
-    assert state.initial_note.startswith("Ball stands in for Shap-E")
+    assert state.initial_note.startswith("Ball is used instead of Shap-E")
     assert len(state.gaussians) == state.num_initial == 4000
     assert restore(trainer, state.to_payload()).initial_note == state.initial_note
 

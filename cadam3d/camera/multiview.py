@@ -19,8 +19,10 @@ from cadam3d.core.cameras import Cameras, orbit
 from cadam3d.core.checks import require
 from cadam3d.core.schedule import Schedule
 
-GROUP = 4  # views; multi-view networks were trained on groups of this size
-OUTSIDE = 1.0  # world units; cameras stay outside the unit ball, which the object may fill
+# Multi-view networks were trained on groups of this size.
+GROUP = 4  # views
+# Cameras stay at least this far from the origin, outside the unit ball, which the object may fill.
+OUTSIDE = 1.0  # world units
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,11 +33,11 @@ class Multiview(CameraSampler):
     starting at a random angle in the first quarter. Consecutive views form a group: 0 to 3, 4 to 7, etc.
     """
 
-    size: int | Schedule  # pixels; images are square
-    elevation_deg: Sequence[float]  # 0 = horizon, 90 = from above
-    elevation_law: str  # uniform, sphere or mixture: see camera/ranges.py
-    relative_distance: Sequence[float]  # times 1 / tan(fov / 2): half the image's height at the origin
-    fov_y_deg: Sequence[float]  # vertical field of view
+    size: int | Schedule  # pixels
+    elevation_deg: Sequence[float]
+    elevation_law: str  # one of ELEVATION_LAWS
+    relative_distance: Sequence[float]  # world units
+    fov_y_deg: Sequence[float]
 
     def __post_init__(self) -> None:
         require_size(self.size)
@@ -70,7 +72,8 @@ class Multiview(CameraSampler):
         starts = torch.rand(groups, 1, generator=generator)
         turns = (starts + torch.arange(GROUP)) / GROUP  # [groups 4], in [0, 1)
         fov_y_deg = uniform(self.fov_y_deg, groups, generator)
-        half_height = uniform(self.relative_distance, groups, generator)  # of the image, at the origin
+        # The relative distance is half the height of the image, in world units at the origin.
+        half_height = uniform(self.relative_distance, groups, generator)
         distance = half_height / torch.tan(torch.deg2rad(fov_y_deg) / 2)
         elevation_deg = elevations(self.elevation_law, self.elevation_deg, groups, generator)
         size = image_size(self.size, step)

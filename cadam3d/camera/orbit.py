@@ -27,12 +27,12 @@ class Orbit(CameraSampler):
     a step never shows the object from one side only.
     """
 
-    size: int | Schedule  # pixels; images are square
-    azimuth_deg: Sequence[float]  # 0 = front (+x), 90 = the +y side
-    elevation_deg: Sequence[float]  # 0 = horizon, 90 = from above
-    elevation_law: str  # uniform, sphere or mixture; see camera/ranges.py
-    distance: Sequence[float]  # world units from the origin; the object fits in the unit ball
-    fov_y_deg: Sequence[float]  # vertical field of view
+    size: int | Schedule  # pixels
+    azimuth_deg: Sequence[float]
+    elevation_deg: Sequence[float]
+    elevation_law: str  # one of ELEVATION_LAWS
+    distance: Sequence[float]  # world units
+    fov_y_deg: Sequence[float]
 
     def __post_init__(self) -> None:
         require_size(self.size)

@@ -21,19 +21,22 @@ LARGEST_LOG = 500.0
 
 @dataclass(frozen=True, kw_only=True)
 class Widening:
-    """A range with bounds that move by a constant factor at every widening until they reach their ends."""
+    """A range with bounds that move by a constant factor at every widening until they reach their ends.
 
-    start: Sequence[float]  # [low, high] before the first widening
-    end: Sequence[float]  # [low, high] after the last widening
-    factor: Sequence[float]  # of low and of high, at every widening; > 0
-    about: float = 0.0  # the factors multiply the distance to this point
+    The factors multiply the distance of the bounds from ``about``.
+    """
+
+    start: Sequence[float]  # [low, high]
+    end: Sequence[float]  # [low, high]
+    factor: Sequence[float]  # of low and of high
+    about: float = 0.0
 
     def at(self, widenings: int) -> tuple[float, float]:
         """Return the range after ``widenings`` widenings."""
         low, high = (self._end(side, widenings) for side in (0, 1))
         return low, high
 
-    def moves_as_meant(self) -> bool:
+    def reaches_its_end(self) -> bool:
         """Return whether each factor leads from its start to its end, or start and end are equal."""
         return all(
             start == end or (start - self.about) * (factor - 1) * (end - start) > 0
@@ -60,17 +63,17 @@ class Progressive(CameraSampler):
     also shears the image slightly; the cameras here stay rigid.
     """
 
-    size: int | Schedule  # pixels; images are square
-    azimuth_deg: Widening  # 0 = front (+x), 90 = the +y side
-    elevation_deg: Widening  # 0 = horizon, 90 = from above
-    distance: Widening  # world units from the origin; the object fits in the unit ball
-    fov_y_deg: Widening  # vertical field of view
-    begin: int  # the first step that may widen
-    every: int  # steps; widenings are at its multiples
-    gamma: float  # of elevation and azimuth; 1 = uniform
-    position_jitter: float  # world units; half-width of a uniform deviation along each axis
-    target_jitter: float  # world units; standard deviation of the target point along each axis
-    up_jitter: float  # standard deviation added to each axis of the unit up vector
+    size: int | Schedule  # pixels
+    azimuth_deg: Widening
+    elevation_deg: Widening
+    distance: Widening  # world units
+    fov_y_deg: Widening
+    begin: int  # step
+    every: int  # steps
+    gamma: float  # exponent
+    position_jitter: float  # world units
+    target_jitter: float  # world units
+    up_jitter: float  # standard deviation
 
     def __post_init__(self) -> None:
         require_size(self.size)
@@ -144,7 +147,7 @@ def _require_widening(key: str, value: object) -> None:
 
 def _require_motion(key: str, value: Widening) -> None:
     require(
-        value.moves_as_meant(),
+        value.reaches_its_end(),
         f"{key}.factor",
         expected=f"factors that lead from {value.start} to {value.end}",
         got=value.factor,

@@ -19,9 +19,9 @@ class Sphere(CameraSampler):
     (see :class:`~cadam3d.camera.orbit.Orbit`).
     """
 
-    size: int | Schedule  # pixels; images are square
-    distance: Sequence[float]  # [low, high], world units from the origin; the object fits in the unit ball
-    fov_y_deg: Sequence[float]  # [low, high], vertical field of view
+    size: int | Schedule  # pixels
+    distance: Sequence[float]  # [low, high], world units
+    fov_y_deg: Sequence[float]  # [low, high]
 
     def __post_init__(self) -> None:
         require_size(self.size)

@@ -13,10 +13,10 @@ from cadam3d.prior.base import Condition, DiffusionPrior
 
 @dataclass(frozen=True)
 class GuidanceOutput:
-    """A surrogate loss, and numbers to follow during training."""
+    """A surrogate loss, and numbers that show how training proceeds."""
 
-    loss: Float[Tensor, ""]  # its gradient IS the distillation gradient
-    log: dict[str, float]  # for people to read; training never reads it
+    loss: Float[Tensor, ""]  # its gradient is the distillation gradient
+    log: dict[str, float]  # for reports; training never reads it
 
 
 class Guidance(ABC):

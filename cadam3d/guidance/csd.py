@@ -1,4 +1,4 @@
-"""CSD: only what the prompt adds, the direction that classifier-free guidance would amplify."""
+"""CSD: follows only the difference that the prompt makes, which classifier-free guidance amplifies."""
 
 from dataclasses import dataclass, replace
 
@@ -29,7 +29,7 @@ class CSD(Distillation):
     Each step makes two predictions of a single branch, and a third if 0 < r < 1.
     """
 
-    empty_share: float | Schedule  # of the empty prompt in the reference prediction; in [0, 1]
+    empty_share: float | Schedule  # in [0, 1]
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -87,7 +87,7 @@ class Distillation(WindowedGuidance):
     the predicted clean image. No network is differentiated. Elements of G that are not finite become 0 and
     are counted in the log.
 
-    D depends on ``reduction``:
+    The authors' repositories call ``weight`` lambda_guidance. D depends on ``reduction``:
 
     - ``mean``: v * c * h * w, the number of elements. This is the scale of a photometric mean squared error,
       for which 3DGS chose its densification threshold of 2e-4.
@@ -98,10 +98,10 @@ class Distillation(WindowedGuidance):
     minus the predicted clean image) and ``guidance_nonfinite`` (elements replaced by 0).
     """
 
-    weight: float  # of the objective; the repositories call it lambda_guidance
+    weight: float  # > 0
     weighting: str  # w(t), one of WEIGHTINGS
     reduction: str  # one of DIVISORS
-    clip: float | Schedule | None  # largest |G| per element; None = off
+    clip: float | Schedule | None  # > 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -160,9 +160,12 @@ class Distillation(WindowedGuidance):
 
 @dataclass(frozen=True, kw_only=True)
 class GuidedDistillation(Distillation):
-    """A distillation that predicts the clean image under classifier-free guidance."""
+    """A distillation that predicts the clean image under classifier-free guidance.
 
-    scale: float  # conventional: negative + scale * (positive - negative)
+    Guidance has the conventional form, negative + scale * (positive - negative).
+    """
+
+    scale: float  # >= 0
 
     def __post_init__(self) -> None:
         super().__post_init__()

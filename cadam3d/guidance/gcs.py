@@ -18,7 +18,8 @@ from cadam3d.prior.path import Prediction, per_view
 
 # One of the thousand rows of Stable Diffusion's noise table, in units of t; the smallest e.
 ROW = 0.001
-GAP = 10 * ROW  # smallest distance between e and s
+# The smallest distance between e and s.
+GAP = 10 * ROW
 TERMS = Chart(
     title="Terms of GCS",
     caption="Root mean square of the gradient that each term applies, with its weight, before it is divided "
@@ -65,9 +66,11 @@ class GCS(WindowedGuidance):
         CP = || decode(x0_hat(x_e, e)) - decode(x0_bar(y_e, e)) ||^2     pixel constraint
         loss = weight (w_cc CC + w_gc GC + w_cp CP) / D
 
-    The second term of each difference and the networks are constants. The slope of the chain of DDIM steps
-    that carries x0 into the first term telescopes to a(e) for CC and to 1 for GC. CP applies its difference
-    to the pixels of the render directly, without the encoder. The gradients, before D, are
+    Guidance has the conventional form, negative + scale * (positive - negative); the authors' repository
+    calls ``weight`` lambda_guidance. The second term of each difference and the networks are constants. The
+    slope of the chain of DDIM steps that carries x0 into the first term telescopes to a(e) for CC and to 1
+    for GC. CP applies its difference to the pixels of the render directly, without the encoder. The
+    gradients, before D, are
 
         2 weight (a(e) w_cc [CC's difference] + w_gc [GC's])  on x0,    2 weight w_cp [CP's]  on the render.
 
@@ -86,13 +89,13 @@ class GCS(WindowedGuidance):
     predicted clean image) and ``guidance_nonfinite`` (elements replaced by 0).
     """
 
-    scale: float  # classifier-free guidance, conventional: negative + scale * (positive - negative)
-    weight: float  # of the objective; the repository calls it lambda_guidance
-    w_cc: float  # of compact consistency; >= 0
-    w_gc: float  # of conditional guidance; >= 0
-    w_cp: float  # of the pixel constraint; >= 0
-    delta: float | Schedule  # from s to t, in t units; in (0.01, 0.5]
-    fixed_noise: bool  # one noise for the whole run, or new noise at every step
+    scale: float  # >= 0
+    weight: float  # > 0
+    w_cc: float  # >= 0
+    w_gc: float  # >= 0
+    w_cp: float  # >= 0
+    delta: float | Schedule  # in t; in (0.01, 0.5]
+    fixed_noise: bool
     reduction: str  # one of DIVISORS
 
     def __post_init__(self) -> None:

@@ -24,9 +24,9 @@ class ISM(GuidedDistillation):
     render before it is inverted, as LucidDreamer's code does; the paper does not.
     """
 
-    delta: float | Schedule  # length of the interval, in t units; in (0, 1]
-    inversion_stride: float  # largest DDIM step on the way to s, in t units; in (0, 1]
-    initial_noise: float  # t of the noised image where the inversion starts; in [0, 1); 0 as in the paper
+    delta: float | Schedule  # in t; in (0, 1]
+    inversion_stride: float  # in t; in (0, 1]
+    initial_noise: float  # in t; in [0, 1)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -36,10 +36,10 @@ class SDI(GuidedDistillation):
     A step makes ceil(t' / inversion_stride) + 1 predictions, all under guidance.
     """
 
-    inversion_scale: float  # guidance scale of the inversion, conventional; may be negative
-    inversion_stride: float  # largest DDIM step of the inversion, in t units; in (0, 1]
-    overshoot: float  # largest distance by which the inversion goes beyond t; in [0, 1)
-    eta: float  # share of new noise added to the inverted noise, at full noise; >= 0
+    inversion_scale: float
+    inversion_stride: float  # in t; in (0, 1]
+    overshoot: float  # in t; in [0, 1)
+    eta: float  # >= 0
 
     def __post_init__(self) -> None:
         super().__post_init__()

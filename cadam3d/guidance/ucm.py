@@ -38,8 +38,8 @@ class UCM(GuidedDistillation):
     """
 
     inversion_steps: int  # >= 1
-    inversion_grid: str  # spacing of the steps, one of GRIDS: even in sigma (b on any path) or in t
-    fresh_noise: float  # in [0, 1]; 0 = off
+    inversion_grid: str  # one of GRIDS
+    fresh_noise: float  # in [0, 1]
 
     def __post_init__(self) -> None:
         super().__post_init__()

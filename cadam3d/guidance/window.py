@@ -20,7 +20,7 @@ class WindowedGuidance(Guidance):
 
     t_min: float | Schedule  # in [0, t_max]
     t_max: float | Schedule  # in [t_min, 1]
-    shared_t: bool  # one t for all views of a step, or one for each
+    shared_t: bool
 
     def __post_init__(self) -> None:
         require_choice("guidance.shared_t", self.shared_t, (True, False))

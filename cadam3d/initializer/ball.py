@@ -13,19 +13,15 @@ from cadam3d.initializer.points import PointCloud, gaussians_at, one_color, poin
 
 @dataclass(frozen=True, kw_only=True)
 class Ball(Initializer):
-    """``count`` Gaussians at uniformly random points of a ball; the prompt is not used.
-
-    ``scale`` is their standard deviation in world units; None takes the mean distance to the three nearest
-    neighbours.
-    """
+    """``count`` Gaussians at uniformly random points of a ball; the prompt is not used."""
 
     count: int
-    radius: float  # world units; at most 1, since the object fits in the unit ball
+    radius: float  # world units
     scale: float | None  # world units
     opacity: float  # in (0, 1)
-    sh_degree: int  # of the colours, 0 to 3
+    sh_degree: int  # 0 to 3
     color: Sequence[float]  # mean RGB, in [0, 1]
-    color_noise: float  # half-width of a uniform deviation of every channel
+    color_noise: float  # in [0, 1]
 
     def __post_init__(self) -> None:
         require_points(self.count, self.scale, self.opacity, self.sh_degree)

@@ -12,7 +12,7 @@ from cadam3d.core.gaussians import Gaussians
 class Beginning:
     """The initial Gaussians of a run, with a note if they are not the requested ones.
 
-    The note names the fallback and the reason; the user reads it on the console and in the summary.
+    The note names the fallback and the reason. It appears on the console and in the summary.
     """
 
     gaussians: Gaussians

@@ -33,22 +33,18 @@ EXAMPLE = "/path/to/mesh.glb"
 class Mesh(Initializer):
     """``count`` Gaussians at uniformly random points of a surface; the prompt is not used.
 
-    Reads all formats of trimesh (PLY, OBJ, STL, GLB, OFF, ...), with vertex, face or texture colours. The
-    mesh is moved and scaled so that its bounding box is centred at the origin and its farthest point is at
-    ``radius``; None keeps position and size as in the file. ``up`` is the axis of the file that points up:
-    "z", or "y" as in glTF and most OBJ files, where the front is then +z. ``scale`` is the standard deviation
-    of the Gaussians; None takes the mean distance to the three nearest neighbours.
+    Reads all formats of trimesh (PLY, OBJ, STL, GLB, OFF, ...), with vertex, face or texture colours.
     """
 
-    path: str  # of the file
-    up: str  # z or y
-    turn_deg: int  # about the up axis, counterclockwise from above; 0, 90, 180 or 270
-    radius: float | None  # world units; at most 1, since the object fits in the unit ball
+    path: str
+    up: str  # one of UPS
+    turn_deg: int  # one of TURNS
+    radius: float | None  # world units
     count: int
     scale: float | None  # world units
     opacity: float  # in (0, 1)
-    sh_degree: int  # of the colours, 0 to 3
-    color: Sequence[float]  # RGB in [0, 1], used if the file has no colours
+    sh_degree: int  # 0 to 3
+    color: Sequence[float]  # RGB in [0, 1]
 
     def __post_init__(self) -> None:
         require_points(self.count, self.scale, self.opacity, self.sh_degree)
@@ -72,9 +68,10 @@ class Mesh(Initializer):
     def _load(self) -> list[trimesh.Trimesh]:
         """Return the surfaces of the file, each at its place in the scene and with its own colours."""
         path = found_file(self.path, EXAMPLE)
+        # Every format has its own parser, with its own exceptions.
         try:
             parts = [part for part in trimesh.load_scene(path).dump() if isinstance(part, trimesh.Trimesh)]
-        except Exception as error:  # every format has its own parser, with its own exceptions
+        except Exception as error:
             reason = str(error) or type(error).__name__
             raise UserError(
                 f"initializer.path: expected a PLY, OBJ, STL, GLB or OFF file, got {self.path!r}, which "
@@ -82,7 +79,8 @@ class Mesh(Initializer):
             ) from error
         is_finite = all(np.isfinite(part.vertices).all() for part in parts)
         if not is_finite or sum(float(part.area) for part in parts) <= 0:
-            vertices, faces = (sum(len(getattr(part, of)) for part in parts) for of in ("vertices", "faces"))
+            vertices = sum(len(part.vertices) for part in parts)
+            faces = sum(len(part.faces) for part in parts)
             raise UserError(
                 f"initializer.path: expected a mesh with triangles, got {self.path!r}, which has no surface "
                 f"({vertices} vertices, {faces} faces). Try: initializer.path={EXAMPLE}, or initializer=ply "

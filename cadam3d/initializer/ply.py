@@ -28,8 +28,10 @@ from cadam3d.initializer.points import (
 from cadam3d.io.frames import UPS, points_to_world, turned, turned_points
 from cadam3d.io.ply import holds_gaussians, read_ply
 
-UP_OF_GAUSSIANS = "-y"  # as in 3DGS, which takes its axes from COLMAP
-UP_OF_POINTS = "+z"  # as in Point-E and most scans
+# 3DGS takes its axes from COLMAP.
+UP_OF_GAUSSIANS = "-y"
+# Point-E and most scans use this axis.
+UP_OF_POINTS = "+z"
 EXAMPLE = "/path/to/asset.ply"
 
 
@@ -38,21 +40,20 @@ class Ply(Initializer):
     """The Gaussians or points of a PLY file; the prompt is not used.
 
     Gaussians (3DGS layout, any SH degree, written by any program) keep their shapes, colours and opacities.
-    Points (ASCII or binary, such as those of Point-E or a scan) become round Gaussians with their colours;
-    ``scale``, ``opacity``, ``color``, ``replicate`` and ``replicate_radius`` apply to points only.
+    Points (ASCII or binary, such as those of Point-E or a scan) become round Gaussians with their colours.
     """
 
-    path: str  # of the file
-    up: str | None  # -y, +y or +z, unless the file names its up axis; null = -y for Gaussians, +z for points
-    turn_deg: int  # about the up axis, counterclockwise from above; 0, 90, 180 or 270
-    radius: float | None  # world units from the centre of the bounding box to the farthest; null = unscaled
-    count: int | None  # at most this many rows of the file, drawn at random; null = all
-    sh_degree: int | None  # of the colours, 0 to 3; null = that of the file
-    replicate: int  # Gaussians for each point
-    replicate_radius: float  # world units; of the ball that holds them
-    scale: float | None  # world units; null = mean distance to the three nearest neighbours
+    path: str
+    up: str | None  # one of UPS
+    turn_deg: int  # one of TURNS
+    radius: float | None  # world units
+    count: int | None  # largest number of rows
+    sh_degree: int | None  # 0 to 3
+    replicate: int  # Gaussians per point
+    replicate_radius: float  # world units
+    scale: float | None  # world units
     opacity: float  # in (0, 1)
-    color: Sequence[float]  # RGB in [0, 1], used if the file has no colours
+    color: Sequence[float]  # RGB in [0, 1]
 
     def __post_init__(self) -> None:
         count = 1 if self.count is None else self.count
@@ -105,9 +106,10 @@ class Ply(Initializer):
 
     def _read_points(self, path: Path) -> tuple[Tensor, Tensor]:
         """Return positions in the axes of the file, and RGB in [0, 1]."""
+        # The parser has no exceptions of its own.
         try:
             loaded = trimesh.load(path)
-        except Exception as error:  # the parser has no exceptions of its own
+        except Exception as error:
             reason = str(error) or type(error).__name__
             raise UserError(
                 f"initializer.path: expected a PLY file of Gaussians or points, got {self.path!r}, which "

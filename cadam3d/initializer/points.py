@@ -15,8 +15,10 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE, rgb_to_sh0
 from cadam3d.io.frames import TURNS
 
-NEIGHBOURS = 3  # as in 3DGS (Kerbl et al. 2023, sec. 5.1)
-SMALLEST = 1e-4  # world units; keeps the size of coincident points above zero
+# As in 3DGS (Kerbl et al. 2023, sec. 5.1).
+NEIGHBOURS = 3
+# Keeps the size of coincident points above zero.
+SMALLEST = 1e-4  # world units
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,8 @@ def neighbour_distance(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     if count < 1:
         return torch.ones_like(points[:, 0])
     array = points.cpu().numpy()
-    distances, _ = KDTree(array).query(array, k=count + 1)  # the first is the point itself
+    # The nearest neighbour that the tree finds is the point itself.
+    distances, _ = KDTree(array).query(array, k=count + 1)
     return torch.from_numpy(distances[:, 1:].mean(axis=1)).to(points).clamp_min(SMALLEST)
 
 
@@ -74,7 +77,8 @@ def one_color(color: Sequence[float], count: int) -> Float[Tensor, "count 3"]:
 def points_in_ball(count: int, radius: float, generator: torch.Generator) -> Float[Tensor, "count 3"]:
     """Draw random points with equal density everywhere in a ball around the origin."""
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
-    radii = radius * torch.rand(count, 1, generator=generator) ** (1 / 3)  # volume grows as r^3
+    # The volume of a ball grows with the cube of its radius.
+    radii = radius * torch.rand(count, 1, generator=generator) ** (1 / 3)
     return directions * radii
 
 
@@ -90,7 +94,8 @@ def points_on_surface(
     drawn = torch.rand(count, generator=generator, dtype=torch.float64) * areas[-1]
     faces = torch.searchsorted(areas, drawn, right=True).clamp_max(len(areas) - 1)
     root, share = torch.rand(count, 2, generator=generator).unbind(dim=1)
-    root = root.sqrt()  # uniform over the area of the triangle
+    # The square root makes the points uniform over the area of the triangle.
+    root = root.sqrt()
     return faces, torch.stack([1 - root, root * (1 - share), root * share], dim=1)
 
 
@@ -125,7 +130,8 @@ def grown(
     drawn = low + (high - low) * torch.rand(candidates, 3, generator=generator)
     _, nearest = KDTree(cloud.points.numpy()).query(drawn.numpy(), distance_upper_bound=distance)
     neighbour = torch.from_numpy(nearest)
-    is_near = neighbour < len(cloud)  # the tree returns len(cloud) if no point is within `distance`
+    # The tree returns len(cloud) if no point is within ``distance``.
+    is_near = neighbour < len(cloud)
     rgb = cloud.rgb[neighbour[is_near]] + noise * torch.rand(int(is_near.sum()), 3, generator=generator)
     return PointCloud(torch.cat([cloud.points, drawn[is_near]]), torch.cat([cloud.rgb, rgb.clamp_max(1)]))
 
@@ -143,7 +149,7 @@ def fit(points: Float[Tensor, "n 3"], radius: float | None) -> tuple[Float[Tenso
 
 
 def found_file(path: str, example: str) -> Path:
-    """Return the path of the file that ``initializer.path`` names. Raises ``UserError`` if it is no file."""
+    """Return the path that ``initializer.path`` names. Raises ``UserError`` unless it is a file."""
     found = Path(path).expanduser()
     if not found.is_file():
         what = "is a folder" if found.is_dir() else "does not exist"

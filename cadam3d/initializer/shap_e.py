@@ -47,30 +47,29 @@ class ShapE(Initializer):
 
     The points can be grown or replicated. The parts of the model are loaded one after the other and freed
     before training. If the model is not available or finds no surface, ``fallback`` builds the Gaussians
-    and the run reports it; without a fallback that is an error. With ``dtype`` "auto", the text encoder and
-    the denoiser use float16 on CUDA and float32 elsewhere.
+    and the run reports it; without a fallback that is an error.
     """
 
-    path: str | None  # a folder in the layout of diffusers; takes precedence over ids
-    ids: Sequence[str]  # names on the hub, tried in order
+    path: str | None  # folder
+    ids: Sequence[str]  # on the hub
     revision: str | None  # on the hub
     variant: str | None  # of weight files
-    dtype: str  # auto, or one of DTYPES
-    prompt: str | None  # for Shap-E only; None = that of the run
-    steps: int  # of denoising
-    guidance_scale: float  # 1 = no guidance
-    grid_size: int  # cells per side of the grid on which the surface is extracted
-    turn_deg: int  # about the up axis, counterclockwise from above; 0, 90, 180 or 270
-    radius: float | None  # world units from the centre of the bounding box to the farthest; null = unscaled
-    count: int | None  # random points of the surface; null = the vertices
-    grow_points: int  # candidates in the bounding box; 0 = off
-    grow_distance: float  # Shap-E's units; candidates this close to a point of the surface are added
-    grow_noise: float  # in [0, 1]; largest amount added to each channel of their colours
-    replicate: int  # Gaussians for each point
-    replicate_radius: float  # world units; of the ball that holds them
-    scale: float | None  # world units; null = mean distance to the three nearest neighbours
+    dtype: str  # auto or one of DTYPES
+    prompt: str | None
+    steps: int
+    guidance_scale: float  # >= 1
+    grid_size: int  # cells per side
+    turn_deg: int  # one of TURNS
+    radius: float | None  # world units
+    count: int | None
+    grow_points: int  # candidates
+    grow_distance: float  # Shap-E's units
+    grow_noise: float  # in [0, 1]
+    replicate: int  # Gaussians per point
+    replicate_radius: float  # world units
+    scale: float | None  # world units
     opacity: float  # in (0, 1)
-    sh_degree: int  # of the colours, 0 to 3
+    sh_degree: int  # 0 to 3
     fallback: Initializer | None
 
     def __post_init__(self) -> None:
@@ -110,7 +109,7 @@ class ShapE(Initializer):
             # Rewind, so that the run equals one that was started with the fallback.
             generator.set_state(before)
             instead = self.fallback.begin(prompt, generator, device)
-            note = f"{type(self.fallback).__name__} stands in for Shap-E. {error}"
+            note = f"{type(self.fallback).__name__} is used instead of Shap-E. {error}"
             return Beginning(instead.gaussians, f"{note} {instead.note}" if instead.note else note)
 
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
@@ -166,10 +165,11 @@ class ShapE(Initializer):
         """Return the surface that a latent describes, on the CPU. Raises ``UserError`` if there is none."""
         # Always float32: positions are encoded with frequencies up to 2^14, too high for half precision.
         renderer = found.part("shap_e_renderer", torch.float32).to(latent.device)
-        renderer.mesh_decoder.register_forward_hook(_refuse_nothing)
+        renderer.mesh_decoder.register_forward_hook(_refuse_empty_mesh)
         mesh = renderer.decode_to_mesh(latent, latent.device, grid_size=self.grid_size)
         linear = torch.stack([mesh.vertex_channels[channel] for channel in "RGB"])
-        rgb = linear_rgb_to_rgb(linear[..., None])[..., 0].T  # the decoder's colours are linear
+        # The decoder returns colours in linear light.
+        rgb = linear_rgb_to_rgb(linear[..., None])[..., 0].T
         return ColoredMesh(mesh.verts.cpu(), mesh.faces.cpu(), rgb.clamp(0, 1).cpu())
 
     def settle(self, mesh: ColoredMesh, generator: torch.Generator, device: torch.device) -> Gaussians:
@@ -195,15 +195,15 @@ class ShapE(Initializer):
         return Source("initializer", self.path, self.ids, self.revision, self.variant)
 
 
-def _refuse_nothing(_decoder: object, _inputs: object, mesh: Any) -> None:
-    """Raise ``UserError`` for an empty mesh; runs after the marching cubes.
+def _refuse_empty_mesh(_decoder: object, _inputs: object, mesh: Any) -> None:
+    """Raise ``UserError`` for an empty mesh.
 
-    The code of diffusers that follows fails on an empty mesh.
+    This hook runs after the marching cubes, because the code of diffusers that follows fails on such a mesh.
     """
     if len(mesh.faces) == 0:
         raise UserError(
             "initializer: Shap-E found no surface for this prompt. Try: another seed, or "
-            "initializer.prompt='a simpler description'"
+            "'initializer.prompt=a simpler description'"
         )
 
 

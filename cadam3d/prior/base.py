@@ -15,7 +15,7 @@ from cadam3d.prior.path import NoisePath, Prediction
 class Condition(ABC):
     """The input that a prediction is conditioned on: the prompt for particular views.
 
-    Guidance passes it to the prior and does not look inside.
+    Guidance passes it to the prior without reading it.
     """
 
     @abstractmethod

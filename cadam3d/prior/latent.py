@@ -36,8 +36,10 @@ PRIORS = {
     "StableDiffusion3Pipeline": "prior=stable_diffusion_3",
     "MVDreamPipeline": "prior=mvdream",
 }
-TOKENS, T5_TOKENS = 77, 256  # per text; of CLIP and of T5
-FACTOR = 8  # pixels per latent and side, in every model of this family
+# Tokens per text, of CLIP and of T5.
+TOKENS, T5_TOKENS = 77, 256
+# Every model of this family has this factor between an image and its latents.
+FACTOR = 8  # pixels per side
 
 
 @dataclass(frozen=True)
@@ -103,18 +105,18 @@ class LatentPrior(DiffusionPrior):
     float32 elsewhere.
     """
 
-    path: str | None  # a folder in the layout of diffusers; takes precedence over ids
-    ids: Sequence[str]  # names on the hub, tried in order
+    path: str | None  # folder
+    ids: Sequence[str]  # on the hub
     revision: str | None  # on the hub
     variant: str | None  # of weight files
     prompting: Prompting
-    size: int | None  # pixels per side that renders are resized to; None = not resized
-    dtype: str  # of the networks: auto, or one of DTYPES
-    micro_batch: int | None  # images in a network at a time; None = all
-    tiling: bool  # decode and encode large images in tiles
-    compile: bool  # torch.compile for the denoiser
-    text_device: str  # where prompts are embedded: auto (the device of the run) or cpu
-    cache_dir: str | None  # of embedded texts; None = the user's cache folder
+    size: int | None  # pixels per side
+    dtype: str  # auto or one of DTYPES
+    micro_batch: int | None  # images
+    tiling: bool
+    compile: bool
+    text_device: str  # auto or cpu
+    cache_dir: str | None  # folder
 
     kinds: ClassVar[tuple[str, ...]]  # pipeline classes that this prior can use
     encoders: ClassVar[tuple[str, ...]]  # parts that embed text
@@ -426,7 +428,7 @@ class LatentPrior(DiffusionPrior):
         try:
             kept = load_file(file)
         except (OSError, SafetensorError):
-            return None  # truncated by a crash; the text is embedded again
+            return None  # truncated by a crash
         return Texts(kept["tokens"], kept.get("pooled"))
 
     def _remember(self, text: str, row: Texts) -> None:
@@ -437,7 +439,8 @@ class LatentPrior(DiffusionPrior):
             with replacing(self._cache_file(text)) as temporary:
                 save_file({name: value.contiguous().cpu() for name, value in kept.items()}, temporary)
         except UserError:
-            pass  # a cache that cannot be written only costs time
+            # A cache that cannot be written only costs time.
+            pass
 
     def _cache_file(self, text: str) -> Path:
         folder = Path(self.cache_dir).expanduser() if self.cache_dir else default_cache_dir()

@@ -1,8 +1,8 @@
-"""Memory estimates of networks before they are loaded: a network is run without data and its tensors counted.
+"""Estimates of the memory of networks that are not loaded: a network runs without data, to count its tensors.
 
-Everything happens on torch's ``meta`` device, which has shapes and no numbers. Counted are the tensors that
-the operations of the network create and keep alive, its activations. Attention counts as it is computed by
-the memory-efficient kernels of GPUs.
+Everything happens on torch's ``meta`` device, which has shapes and no numbers. The estimates count the
+tensors that the operations of the network create and keep alive, its activations. They assume the attention
+of the memory-efficient kernels of GPUs.
 """
 
 import weakref
@@ -26,7 +26,8 @@ def working_bytes(call: Callable[[], object], existing: Iterable[Tensor]) -> int
     kept = [tensor.untyped_storage() for tensor in existing]
     counter = _Counter({storage._cdata for storage in kept})
     with torch.device("meta"), counter, _EfficientAttention():
-        result = call()  # kept alive together with its graph, which is part of the measurement
+        # The result keeps its graph alive, which is part of the measurement.
+        result = call()
     del result
     return counter.peak
 

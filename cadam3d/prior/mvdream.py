@@ -20,8 +20,10 @@ from cadam3d.prior.path import Prediction, per_view
 from cadam3d.prior.stable_diffusion import StableDiffusion
 
 VIEWS = 4  # per group
-CAMERA = 16  # numbers that describe the camera of a view to the network
-TOLERANCE_DEG = 1.0  # largest deviation from a quarter turn between the views of a group
+# The network reads a camera as a matrix of four by four numbers.
+CAMERA = 16
+# Largest deviation from a quarter turn between the views of a group, and of their elevations.
+TOLERANCE_DEG = 1.0
 # The noise schedule of the published files, which do not contain it.
 SCHEDULER = {
     "beta_schedule": "scaled_linear",
@@ -47,11 +49,10 @@ class MVDream(StableDiffusion):
     """Shi et al. 2024, on Stable Diffusion 2.1: views that agree, since they are denoised together.
 
     Consecutive views form a group of four, a quarter turn apart, at one elevation and one ``t``, as drawn by
-    ``camera=multiview``. ``path`` may also be the published file (``sd-v2.1-base-4view.pt``), which has no
-    tokenizer; ``tokenizer`` is then a folder, or a name on the hub, with CLIP's vocabulary.
+    ``camera=multiview``.
     """
 
-    rescale: float  # in [0, 1]; how far the spread of the guided prediction returns to that without guidance
+    rescale: float  # in [0, 1]
     tokenizer: str  # a folder or a name on the hub
 
     kinds: ClassVar = ("MVDreamPipeline", "StableDiffusionPipeline")

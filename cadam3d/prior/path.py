@@ -16,7 +16,8 @@ from torch import Tensor
 
 from cadam3d.core.checks import require_range, require_whole
 
-HALVINGS = 53  # bisections until an interval of length 1 reaches the resolution of double precision
+# Bisections until an interval of length 1 reaches the resolution of double precision.
+HALVINGS = 53
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,8 @@ class DDPM(NoisePath):
 
     def b(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
         """Return sqrt(1 - alpha_bar), which is 0 at t = 0."""
-        return torch.expm1(self._log_alpha_bar(t)).abs().sqrt()  # expm1 is accurate for small b
+        # expm1 is accurate for small b.
+        return torch.expm1(self._log_alpha_bar(t)).abs().sqrt()
 
     def velocity(
         self, clean: Float[Tensor, "v c h w"], noise: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]

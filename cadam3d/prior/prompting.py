@@ -17,7 +17,8 @@ from cadam3d.core.checks import require, require_choice, require_range
 
 FRONT, SIDE, BACK, OVERHEAD = range(4)
 SUFFIXES = (", front view", ", side view", ", back view", ", overhead view")
-QUARTER = 90.0  # degrees between front, side and back, between which embeddings are interpolated
+# The angle between front, side and back. Embeddings are interpolated within it.
+QUARTER = 90.0  # degrees
 
 
 @dataclass(frozen=True)
@@ -61,9 +62,9 @@ class Discrete(Prompting):
     A view above ``overhead_deg`` is overhead, whatever its azimuth.
     """
 
-    front_deg: float  # a view with |azimuth| below this is a front view
-    back_deg: float  # a view with |azimuth| above 180 minus this is a back view
-    overhead_deg: float  # a view with an elevation above this is an overhead view
+    front_deg: float
+    back_deg: float
+    overhead_deg: float
 
     def __post_init__(self) -> None:
         require_range("prompting.front_deg", self.front_deg, low=0, high=180, example=45)
@@ -127,8 +128,8 @@ class PerpNeg(Prompting):
     nothing is repelled from them.
     """
 
-    curve: str  # "lucid" or "threestudio"
-    overhead_deg: float | None  # elevations above this are overhead views; null = there are none
+    curve: str  # lucid or threestudio
+    overhead_deg: float | None
 
     def __post_init__(self) -> None:
         require_choice("prompting.curve", self.curve, ("lucid", "threestudio"))

@@ -20,7 +20,7 @@ class StableDiffusionXL(StableDiffusion):
     """Podell et al. 2023: Stable Diffusion with a network that reads more inputs.
 
     Every image is presented as uncropped and with its own size (their sec. 2.2). The empty text is embedded
-    as zeros if the configuration of the model says so, as in training.
+    as zeros if the configuration of the model requires it, as in training.
     """
 
     kinds: ClassVar = ("StableDiffusionXLPipeline",)
@@ -44,7 +44,8 @@ class StableDiffusionXL(StableDiffusion):
     ) -> Float[Tensor, "b c h w"]:
         """Run the UNet with text cross-attention; pooled text and image sizes are added to the time input."""
         height, width = (FACTOR * side for side in noisy.shape[2:])
-        sizes = noisy.new_tensor([[height, width, 0, 0, height, width]])  # original, top left corner, target
+        # The original size, the top left corner of the crop and the target size.
+        sizes = noisy.new_tensor([[height, width, 0, 0, height, width]])
         added = {"text_embeds": texts.pooled, "time_ids": sizes.expand(len(noisy), -1)}
         return self.network(
             noisy, timestep, encoder_hidden_states=texts.tokens, added_cond_kwargs=added

@@ -36,7 +36,7 @@ class StableDiffusion(LatentPrior):
     def complete(
         self, noisy: Float[Tensor, "v c h w"], output: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
     ) -> Prediction:
-        """Complete the network's output, which is the noise or the velocity, as the scheduler says."""
+        """Complete the network's output; the scheduler defines whether it is the noise or the velocity."""
         return completion(self.noise_path, self.scheduler)(noisy, output, t)
 
     @torch.no_grad()

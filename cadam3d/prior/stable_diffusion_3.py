@@ -25,10 +25,10 @@ class StableDiffusion3(LatentPrior):
     """Esser et al. 2024. The model predicts the velocity, noise - clean; the CAdam paper uses 3.5 for VFDS.
 
     The noise path applies the model's own ``shift`` to ``t``, so that a uniform ``t`` is a uniform row of the
-    table of sigmas in the model's scheduler. With ``t5`` false, T5 is neither downloaded nor loaded.
+    table of sigmas in the model's scheduler.
     """
 
-    t5: bool  # whether to use the T5 text encoder, if the model has one
+    t5: bool
 
     kinds: ClassVar = ("StableDiffusion3Pipeline",)
     network_part: ClassVar = "transformer"

@@ -14,7 +14,8 @@ from cadam3d.core.checks import require_choice, require_whole
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import NoisePath, Prediction
 
-START, PADDING = 256, 257  # special tokens; 0 to 255 are the bytes of the prompt
+# The special tokens; 0 to 255 are the bytes of the prompt.
+START, PADDING = 256, 257
 MAX_TOKENS = 96  # longer prompts are cut
 GROUPS = 8  # of every normalization
 FREQUENCIES = 32  # of the time embedding
@@ -58,8 +59,8 @@ class Tiny(DiffusionPrior):
 
     predicts: str  # noise or velocity
     noise_path: NoisePath
-    width: int  # channels at full size
-    downscale: int  # pixels per latent, per side
+    width: int  # channels
+    downscale: int  # pixels per side
     seed: int
 
     def __post_init__(self) -> None:
@@ -72,7 +73,8 @@ class Tiny(DiffusionPrior):
     def network(self) -> "TinyUNet":
         """Return the frozen network, which is created on first use."""
         with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(self.seed)  # torch.manual_seed would also reseed all GPUs
+            # torch.manual_seed would also reseed all GPUs.
+            torch.default_generator.manual_seed(self.seed)
             network = TinyUNet(self.width)
         return network.requires_grad_(False).eval()
 

@@ -18,7 +18,7 @@ from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import self_test
 
-REPORT = "Please report this with the output of `cadam3d doctor`, and for now try: rasterizer=reference"
+REPORT = "Try: rasterizer=reference, and please report this with the output of `cadam3d doctor`"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,14 +71,14 @@ def _choose(device: torch.device) -> Choice:
         return Choice(reference, replace(reference.prepare(device), reason=str(error)))
 
 
-def native(device: torch.device) -> Rasterizer:
-    """Return the native CPU rasterizer; its kernels were tested when they were built."""
+def native_cpu(device: torch.device) -> Rasterizer:
+    """Return the native CPU rasterizer, which is tested when its kernels are built."""
     rasterizer = CpuRasterizer(cache_dir=None)
     rasterizer.prepare(device)
     return rasterizer
 
 
-def proven_cuda(device: torch.device) -> Rasterizer:
+def tested_cuda(device: torch.device) -> Rasterizer:
     """Return the CUDA rasterizer. Raises :class:`UserError` unless it passes the self-test on ``device``."""
     rasterizer = CudaRasterizer(cache_dir=None)
     rasterizer.prepare(device)
@@ -96,7 +96,7 @@ def proven_cuda(device: torch.device) -> Rasterizer:
 
 
 # For each type of device, a function that returns a rasterizer that works there or raises UserError.
-FASTEST: Mapping[str, Callable[[torch.device], Rasterizer]] = {"cpu": native, "cuda": proven_cuda}
+FASTEST: Mapping[str, Callable[[torch.device], Rasterizer]] = {"cpu": native_cpu, "cuda": tested_cuda}
 
 
 def _refuse_broken(device: torch.device) -> None:

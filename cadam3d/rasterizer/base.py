@@ -35,7 +35,8 @@ class Backend:
     """The rasterizer that renders on a device."""
 
     name: str  # as in rasterizer=<name>
-    reason: str | None = None  # why nothing faster renders, and what to type; None if nothing faster exists
+    # Why nothing faster renders, and what to type; None if nothing faster exists.
+    reason: str | None = None
 
 
 class Rasterizer(ABC):
@@ -65,7 +66,7 @@ class Rasterizer(ABC):
         """
 
     def prepare(self, device: torch.device) -> Backend:
-        """Compile and load everything that rendering on ``device`` needs, and return what will render there.
+        """Compile and load everything that rendering on ``device`` needs, and return the backend for it.
 
         Raises :class:`UserError` if that fails. Without this call, the first render does the same.
         """

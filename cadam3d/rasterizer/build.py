@@ -1,4 +1,4 @@
-"""Builds the native CPU kernels with a compiler of this machine, and keeps them in the user's cache folder.
+"""Build the native CPU kernels with a compiler of this machine, and keep them in the user's cache folder.
 
 The name of a cached file contains three hashes: of the sources, flags and machine; of the compiler; and of
 the bytes of the file. So a copied home folder, a new release, another compiler or a damaged file each lead to
@@ -16,7 +16,8 @@ import sys
 import sysconfig
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,7 +34,7 @@ FLAGS = (
     "-fPIC",
     "-pthread",
     "-fvisibility=hidden",
-    # Multiplications and additions are fused only where the source says so, because the forward and the
+    # Multiplications and additions are fused only where the source calls fma, because the forward and the
     # backward pass must compute the same bits.
     "-ffp-contract=off",
     # Makes sqrt a single instruction; the values stay IEEE.
@@ -88,9 +89,9 @@ def find_cached(cache_dir: Path, compiler: Compiler | None) -> Path | None:
 
     Only libraries built by ``compiler`` count, or by any compiler if that is ``None``.
     """
-    by = _short_hash(compiler.version) if compiler else "*"
+    by = short_hash(compiler.version) if compiler else "*"
     for path in sorted(cache_dir.glob(f"rasterizer-{_key()}-{by}-*{SUFFIX}")):
-        if path.stem.endswith(_short_hash(path.read_bytes())):
+        if path.stem.endswith(short_hash(path.read_bytes())):
             return path
     return None
 
@@ -107,32 +108,51 @@ def build(cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAG
         return Build(cached, 0.0)
     if compiler is None:
         raise UserError(
-            "rasterizer=cpu needs a C++ compiler once, and found none ($CXX, c++, g++, clang++). "
-            "Install one: `apt install g++`, `xcode-select --install` or `pip install 'cadam3d[compiler]'`. "
-            "Or try: rasterizer=reference"
+            "rasterizer=cpu: expected a C++ compiler ($CXX, c++, g++ or clang++) to build the kernels once, "
+            "got none. Try: `apt install g++`, `xcode-select --install`, `pip install 'cadam3d[compiler]'`, "
+            "or rasterizer=reference"
         )
     start = time.perf_counter()
-    try:
-        cache_dir.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=cache_dir, prefix="build-") as folder:
-            path = _compile(compiler, Path(folder) / f"rasterizer{SUFFIX}", machine_flags)
-            by, digest = _short_hash(compiler.version), _short_hash(path.read_bytes())
-            final = cache_dir / f"rasterizer-{_key()}-{by}-{digest}{SUFFIX}"
-            path.replace(final)
-    except OSError as error:
-        raise UserError(
-            f"rasterizer=cpu cannot keep its compiled kernels in {cache_dir}: {error}. "
-            "Try: rasterizer.cache_dir=/tmp/cadam3d"
-        ) from error
+    with build_folder(cache_dir, "cpu") as folder:
+        path = _compile(compiler, folder / f"rasterizer{SUFFIX}", machine_flags)
+        by, digest = short_hash(compiler.version), short_hash(path.read_bytes())
+        final = cache_dir / f"rasterizer-{_key()}-{by}-{digest}{SUFFIX}"
+        path.replace(final)
     return Build(final, time.perf_counter() - start)
 
 
+@contextmanager
+def build_folder(cache_dir: Path, name: str) -> Iterator[Path]:
+    """Yield an empty folder in ``cache_dir`` for files of rasterizer=``name`` that are not finished yet.
+
+    Raises :class:`UserError` if ``cache_dir`` cannot be written.
+    """
+    try:
+        cache_dir.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache_dir, prefix="build-") as folder:
+            yield Path(folder)
+    except OSError as error:
+        raise UserError(
+            f"rasterizer={name}: expected a folder for compiled kernels that can be written, got {cache_dir} "
+            f"({error}). Try: rasterizer.cache_dir=/tmp/cadam3d"
+        ) from error
+
+
+def definitions() -> list[str]:
+    """Return the compiler flags that define the constants of the image formation model."""
+    return [f"-DSPLAT_{name}={getattr(base, name)!r}" for name in CONSTANTS]
+
+
+def short_hash(content: str | bytes) -> str:
+    """Return 16 hexadecimal digits that identify ``content`` in the name of a cached file."""
+    return hashlib.sha256(content.encode() if isinstance(content, str) else content).hexdigest()[:16]
+
+
 def _compile(compiler: Compiler, target: Path, machine_flags: Sequence[Sequence[str]]) -> Path:
-    defines = [f"-DSPLAT_{name}={getattr(base, name)!r}" for name in CONSTANTS]
     source = str(KERNELS / SOURCES[0])
     complaint = ""
     for flags in machine_flags:
-        answer = _run([*compiler.command, *FLAGS, *flags, *defines, source, "-o", str(target)])
+        answer = _run([*compiler.command, *FLAGS, *flags, *definitions(), source, "-o", str(target)])
         if answer.returncode == 0:
             # The test runs in another process, which an instruction unknown to this machine would end.
             answer = _run([sys.executable, "-I", "-S", "-c", SELF_TEST, str(target)])
@@ -141,7 +161,7 @@ def _compile(compiler: Compiler, target: Path, machine_flags: Sequence[Sequence[
         complaint = answer.stderr.strip()[-2000:] or f"exit code {answer.returncode}"
     raise UserError(
         f"rasterizer=cpu: {' '.join(compiler.command)} ({compiler.version}) could not build the kernels:\n"
-        f"{complaint}\nSet CXX to another compiler, or try: rasterizer=reference"
+        f"{complaint}\nTry: another compiler in $CXX, or rasterizer=reference"
     )
 
 
@@ -155,7 +175,7 @@ def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
 def _key() -> str:
     parts = [(KERNELS / name).read_text() for name in SOURCES]
     parts += [repr((FLAGS, MACHINE_FLAGS)), repr([getattr(base, name) for name in CONSTANTS])]
-    return _short_hash("\0".join([*parts, _machine()]))
+    return short_hash("\0".join([*parts, _machine()]))
 
 
 def _machine() -> str:
@@ -170,10 +190,6 @@ def _machine() -> str:
     elif sys.platform == "darwin":
         facts.append(_run(["sysctl", "-n", "machdep.cpu.brand_string"]).stdout)
     return "\n".join(facts)
-
-
-def _short_hash(content: str | bytes) -> str:
-    return hashlib.sha256(content.encode() if isinstance(content, str) else content).hexdigest()[:16]
 
 
 def load(build: Build) -> ctypes.CDLL:

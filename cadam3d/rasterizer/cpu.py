@@ -27,7 +27,7 @@ class CpuRasterizer(Rasterizer):
     Other dtypes are converted on the way in and out. The kernels are compiled at the first use on a machine.
     """
 
-    cache_dir: str | None  # folder of the compiled kernels; None: the user's cache folder
+    cache_dir: str | None  # folder
 
     def render(
         self,
@@ -46,7 +46,9 @@ class CpuRasterizer(Rasterizer):
     def prepare(self, device: torch.device) -> Backend:
         """See :meth:`Rasterizer.prepare`."""
         if device.type != "cpu":
-            raise UserError(f"rasterizer=cpu cannot render on {device}. Try: rasterizer=auto")
+            raise UserError(
+                f"rasterizer=cpu: expected Gaussians on the CPU, got {device}. Try: rasterizer=auto"
+            )
         load_kernels(self.cache_dir)
         return super().prepare(device)
 

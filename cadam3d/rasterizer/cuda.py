@@ -43,7 +43,7 @@ SPLAT, RECORD, ABSOLUTES, CAMERA = 12, 10, 2, 25  # floats
 SCAN_CHUNK, SORT_CHUNK, RADIX_BITS = 2048, 4096, 8
 
 DEPTH_BITS = 32
-# One block scans up to this many numbers by itself, which is faster than three launches.
+# One block scans up to this many numbers alone, which is faster than three launches.
 SCAN_SHORT = 8 * SCAN_CHUNK
 # The kernels count the pairs, slots and tiles of a group and the pixels of a view with 32 bits.
 MOST = 2**31 - 1
@@ -59,7 +59,7 @@ class CudaRasterizer(Rasterizer):
     torch compiles the kernels when a device of a new compute capability is first used.
     """
 
-    cache_dir: str | None  # folder of the compiled kernels; None: the user's cache folder
+    cache_dir: str | None  # folder
 
     def render(
         self,
@@ -86,7 +86,7 @@ class CudaRasterizer(Rasterizer):
 
 def _refuse_others(device: torch.device) -> None:
     if device.type != "cuda":
-        raise UserError(f"rasterizer=cuda cannot render on {device}. Try: rasterizer=auto")
+        raise UserError(f"rasterizer=cuda: expected a CUDA device, got {device}. Try: rasterizer=auto")
 
 
 @cache
@@ -104,9 +104,11 @@ def rasterize(
 ) -> RenderOutput:
     """Render with the kernels of ``launcher``; see :meth:`Rasterizer.render`."""
     require_shapes(gaussians, cameras, background)
-    if max(len(gaussians), cameras.height * cameras.width) > MOST:
+    pixels = cameras.height * cameras.width
+    if max(len(gaussians), pixels) > MOST:
         raise UserError(
-            f"rasterizer=cuda: more than {MOST} Gaussians or pixels in a view are too many. Try: fewer"
+            f"rasterizer=cuda: expected at most {MOST} Gaussians, and as many pixels in a view, got "
+            f"{len(gaussians)} and {pixels}. Try: a smaller camera.size"
         )
     return run_pass(_CudaPass(launcher, cameras, gaussians.device, absgrad), gaussians, background)
 
@@ -180,7 +182,8 @@ class _CudaPass(RenderPass):
         largest = max(slots, default=0)
         if largest > MOST:
             raise UserError(
-                f"rasterizer=cuda: {largest} (splat, tile) pairs in a view are too many. Try: fewer pixels"
+                f"rasterizer=cuda: expected at most {MOST} (splat, tile) pairs in a view, got {largest}. "
+                "Try: a smaller camera.size"
             )
         record = RECORD + ABSOLUTES * self.absgrad
         most_slots = min(RECORD_MEMORY // (4 * record), MOST)

@@ -1,4 +1,4 @@
-"""Runs compiled kernels through the CUDA driver, on torch's current stream and in torch's own context."""
+"""Run compiled kernels through the CUDA driver, on torch's current stream and in torch's own context."""
 
 import ctypes
 import sys

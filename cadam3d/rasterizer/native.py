@@ -16,7 +16,8 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.rasterizer.base import absgrad_probe
 
-SH_SIZES = (1, 4, 9, 16)  # coefficients of degree 0 to 3
+# The numbers of coefficients of degree 0 to 3.
+SH_SIZES = (1, 4, 9, 16)
 
 
 class RenderPass(ABC):
@@ -28,7 +29,8 @@ class RenderPass(ABC):
 
     def __init__(self, cameras: Cameras, device: torch.device, absgrad: bool = False) -> None:
         self.height, self.width, self.device = cameras.height, cameras.width, device
-        self.absgrad = absgrad  # whether the backward pass computes absgrad as well
+        # Whether the backward pass computes absgrad as well.
+        self.absgrad = absgrad
         self.matrices = plain(cameras.world_to_camera.detach(), device)
         self.intrinsics = plain(cameras.intrinsics.detach(), device)
 
@@ -47,7 +49,7 @@ class RenderPass(ABC):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return ``rgb`` [v h w 3], ``alpha`` and ``depth`` [v h w].
 
-        ``keeps`` says whether a backward pass may follow, which needs the intermediate results.
+        With ``keeps``, a backward pass may follow, which needs the intermediate results.
         """
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Compiles the CUDA kernels at run time with the NVRTC of torch's wheels, without nvcc or the CUDA toolkit.
+"""Compile the CUDA kernels at run time with the NVRTC of torch's wheels, without nvcc or the CUDA toolkit.
 
 The result is always a cubin for a real architecture, never PTX, because a driver refuses PTX from a newer
 compiler. The name of a cached file contains the architecture and two hashes: of the sources, constants,
@@ -8,9 +8,7 @@ file that matches its name is usable.
 """
 
 import ctypes
-import hashlib
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,14 +19,13 @@ from pathlib import Path
 import torch
 
 from cadam3d.core.checks import UserError
-from cadam3d.rasterizer import base
-from cadam3d.rasterizer.build import CONSTANTS, KERNELS
+from cadam3d.rasterizer.build import KERNELS, build_folder, definitions, short_hash
 
 SOURCE = "cuda.cu"
 HEADERS = ("blend.cuh", "device.cuh", "project.cuh", "sort.cuh", "splat_math.h", "tiles.cuh")
 OPTIONS = (
     "--std=c++17",
-    # Multiplications and additions are fused only where the source says so, because the forward and the
+    # Multiplications and additions are fused only where the source calls fma, because the forward and the
     # backward pass must compute the same bits.
     "--fmad=false",
 )
@@ -37,7 +34,6 @@ BUILTINS = "*nvrtc-builtins*.dll" if sys.platform == "win32" else "libnvrtc-buil
 SYSTEM = ("libnvrtc.so", "libnvrtc.so.13", "libnvrtc.so.12")
 # Architectures of embedded boards; no other device runs their code.
 EMBEDDED = (72, 87, 101)
-INSTALL = "It comes with torch built for CUDA; try: pip install nvidia-cuda-nvrtc"
 
 
 @dataclass(frozen=True)
@@ -47,7 +43,7 @@ class Compiler:
     library: ctypes.CDLL
     path: str
     version: tuple[int, int]  # of CUDA
-    architectures: tuple[int, ...]  # ascending; 75 stands for sm_75
+    architectures: tuple[int, ...]  # ascending; 75 is sm_75
 
 
 @dataclass(frozen=True)
@@ -102,7 +98,7 @@ def _load(path: str) -> Compiler:
 
 
 def choose_architecture(capability: tuple[int, int], compiler: Compiler) -> int:
-    """Return the newest architecture that the compiler knows and a device of this compute capability runs.
+    """Return the newest architecture that the compiler supports and that a device of this capability runs.
 
     Raises :class:`UserError` if there is none.
     """
@@ -117,7 +113,7 @@ def choose_architecture(capability: tuple[int, int], compiler: Compiler) -> int:
         version = ".".join(map(str, compiler.version))
         raise UserError(
             f"rasterizer=cuda: the NVRTC of CUDA {version} cannot compile for compute capability "
-            f"{major}.{minor}. Install a torch for this GPU, or try: rasterizer=reference"
+            f"{major}.{minor}. Try: a torch built for this GPU, or rasterizer=reference"
         )
     return max(fitting)
 
@@ -129,26 +125,22 @@ def build(cache_dir: Path, capability: tuple[int, int]) -> Cubin:
     """
     compiler = find_compiler()
     if compiler is None:
-        raise UserError(f"rasterizer=cuda found no NVRTC. {INSTALL}. Or try: rasterizer=reference")
+        raise UserError(
+            "rasterizer=cuda: expected NVRTC, which comes with torch built for CUDA, got none. "
+            "Try: pip install nvidia-cuda-nvrtc, or rasterizer=reference"
+        )
     architecture = choose_architecture(capability, compiler)
     name = f"rasterizer-{_key(compiler)}-sm{architecture}"
     for path in sorted(cache_dir.glob(f"{name}-*.cubin")):
-        if path.stem.endswith(_short_hash(path.read_bytes())):
+        if path.stem.endswith(short_hash(path.read_bytes())):
             return Cubin(path, 0.0)
     start = time.perf_counter()
     code = compile_kernels(compiler, architecture)
-    final = cache_dir / f"{name}-{_short_hash(code)}.cubin"
-    try:
-        cache_dir.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=cache_dir, prefix="build-") as folder:
-            path = Path(folder) / "rasterizer.cubin"
-            path.write_bytes(code)
-            path.replace(final)
-    except OSError as error:
-        raise UserError(
-            f"rasterizer=cuda cannot keep its compiled kernels in {cache_dir}: {error}. "
-            "Try: rasterizer.cache_dir=/tmp/cadam3d"
-        ) from error
+    final = cache_dir / f"{name}-{short_hash(code)}.cubin"
+    with build_folder(cache_dir, "cuda") as folder:
+        path = folder / "rasterizer.cubin"
+        path.write_bytes(code)
+        path.replace(final)
     return Cubin(final, time.perf_counter() - start)
 
 
@@ -174,7 +166,7 @@ def compile_kernels(
         ),
     )
     try:
-        options = [*OPTIONS, *_definitions(), f"--gpu-architecture=sm_{architecture}"]
+        options = [*OPTIONS, *definitions(), f"--gpu-architecture=sm_{architecture}"]
         array = (ctypes.c_char_p * len(options))(*(option.encode() for option in options))
         status = library.nvrtcCompileProgram(program, len(options), array)
         log = _fetch(compiler, "nvrtcGetProgramLog", program).rstrip(b"\0").decode(errors="replace")
@@ -199,18 +191,10 @@ def _check(library: ctypes.CDLL, status: int, log: str = "") -> None:
         reason = library.nvrtcGetErrorString(status).decode()
         raise UserError(
             f"rasterizer=cuda: NVRTC reports {reason}. {log}\nTry: pip install --force-reinstall torch, "
-            "or: rasterizer=reference"
+            "or rasterizer=reference"
         )
-
-
-def _definitions() -> list[str]:
-    return [f"-DSPLAT_{name}={getattr(base, name)!r}" for name in CONSTANTS]
 
 
 def _key(compiler: Compiler) -> str:
     parts = [(KERNELS / name).read_text() for name in (SOURCE, *HEADERS)]
-    return _short_hash("\0".join([*parts, *OPTIONS, *_definitions(), repr(compiler.version)]).encode())
-
-
-def _short_hash(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()[:16]
+    return short_hash("\0".join([*parts, *OPTIONS, *definitions(), repr(compiler.version)]))

@@ -151,11 +151,12 @@ def _splat(gaussians: Gaussians, view: _View) -> _Splats:
 def _see(gaussians: Gaussians, view: _View) -> tuple[Int[Tensor, "m"], Float[Tensor, "m 2"]]:
     """Return the rows and half-sizes of the visible Gaussians, nearest first.
 
-    Autograd never sees the other Gaussians, so their gradients are zero and cannot be NaN. Each test is
+    Autograd never processes the other Gaussians, so their gradients are zero, never NaN. Each test is
     written such that NaN fails it.
     """
     projection = _project(gaussians, view)
-    reach = torch.log(gaussians.opacities / ALPHA_MIN).mul(2).sqrt()  # standard deviations; NaN if too faint
+    # In standard deviations; NaN for a Gaussian that is too faint.
+    reach = torch.log(gaussians.opacities / ALPHA_MIN).mul(2).sqrt()
     half_sizes = reach[:, None] * projection.variances.sqrt()
     squares = (gaussians.quats * gaussians.quats).sum(dim=-1)
     size = half_sizes.new_tensor([view.width, view.height])
@@ -194,7 +195,8 @@ def _project(gaussians: Gaussians, view: _View) -> _Projection:
     # always positive.
     cross = torch.linalg.cross(along_x, along_y, dim=-1)
     determinant = (cross * cross).sum(dim=-1) + BLUR * (square_x + square_y) + BLUR**2
-    across = (variance_y / determinant).sqrt()  # 1 / the deviation along x at a given y
+    # One over the standard deviation along x at a given y.
+    across = (variance_y / determinant).sqrt()
     return _Projection(
         means2d=torch.stack([x, y], dim=-1) * focal + center,
         depths=z,
@@ -252,7 +254,7 @@ def _bin(
 ) -> tuple[Int[Tensor, "e"], Int[Tensor, "t"]]:
     """Return the splats of each tile, nearest first, one tile after another, and their number per tile.
 
-    A splat belongs to every tile that its box meets.
+    A splat belongs to every tile that its box touches.
     """
     grid = torch.tensor([tiles_x, tiles_y], device=means2d.device)
     # The boxes are closed and the pixel centres are half a pixel inside a tile, so rounding loses no pixel.

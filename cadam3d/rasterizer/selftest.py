@@ -28,7 +28,8 @@ MOST_IMAGES = 2e-5
 MOST_GRADIENTS = 1e-4
 
 COUNT, SH_COEFFICIENTS = 300, 4  # degree 1
-HEIGHT, WIDTH = 37, 53  # pixels; no multiple of any tile
+# Not multiples of the size of any tile.
+HEIGHT, WIDTH = 37, 53  # pixels
 # The first seed that gives a scene without a number near a step.
 SEED = 12
 IMAGES = ("rgb", "alpha", "depth")

@@ -13,42 +13,43 @@ from cadam3d.rasterizer.launcher import Launcher
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import self_test
 
-PROMISE_BITS = ("cpu", "cuda")  # backends that promise the same bits on every run
+# Backends that promise the same bits on every run.
+PROMISE_BITS = ("cpu", "cuda")
 RUNS = 5
-# The small scenes. Their size in pixels is not a multiple of the size of a tile.
+# The small scenes. Their size in pixels is not a multiple of a tile.
 SPLATS, SIZE, VIEWS = 150, 45, 2
-# The splats and the size of the scene for repeated runs.
-REPEATED = {"cpu": (500, 64), "cuda": (100_000, 256)}
+# Splats and pixels of the scene for repeated runs.
+CROWD = {"cpu": (500, 64), "cuda": (100_000, 256)}
 
-# The largest accepted errors, relative to the largest number of each tensor. A pixel with a larger error is
-# at a discontinuity of the image formation model (see selftest.py), where rounding to float32 decides. Such
-# pixels are left out of the loss, and MOST_OUTLIERS is their largest accepted share.
+# Relative to the largest number of each tensor. A pixel with a larger deviation is on a step of the image
+# formation model (see selftest.py), where float32 may decide either way. Such pixels are left out of the
+# loss, and there must be few of them.
 MOST_IMAGE, MOST_GRADIENT, MOST_OUTLIERS = 1e-4, 2e-3, 0.03
 
 
 def check(name: str, rasterizer: Rasterizer, device: torch.device) -> list[str]:
-    """Return a description of each problem of the backend."""
-    # gsplat limits alpha to another value, so it is compared on a scene without alpha near that limit.
+    """Return one sentence for each problem of the backend."""
+    # gsplat caps alpha at another value, so its scene has no alpha near the cap.
     if name == "gsplat":
         return differences(rasterizer, small_scene(make_shell(SPLATS, 3, device)))
     agreement = self_test(rasterizer, device)
-    problems = [] if agreement.holds else [f"self-test: {agreement}"]
-    for kind, gaussians in difficult_scenes(device):
-        problems += [
+    troubles = [] if agreement.holds else [f"self-test: {agreement}"]
+    for kind, gaussians in adversaries(device):
+        troubles += [
             f"{kind}: {difference}" for difference in differences(rasterizer, small_scene(gaussians))
         ]
     if name in PROMISE_BITS:
-        count, size = REPEATED[device.type]
-        problems += changes(rasterizer, make_scene(make_shell(count, 1, device), size, VIEWS))
-    return problems
+        count, size = CROWD[device.type]
+        troubles += changes(rasterizer, make_scene(make_shell(count, 1, device), size, VIEWS))
+    return troubles
 
 
 def small_scene(gaussians: Gaussians) -> Scene:
     return make_scene(gaussians, SIZE, VIEWS)
 
 
-def difficult_scenes(device: torch.device) -> Iterator[tuple[str, Gaussians]]:
-    """Yield scenes that reveal mistakes that ordinary scenes do not reveal."""
+def adversaries(device: torch.device) -> Iterator[tuple[str, Gaussians]]:
+    """Yield scenes that show mistakes which do not show in an ordinary scene."""
 
     def shell(means: float = 1.0, log_scale: Tensor | float = 0.0, opacity: float = 0.0) -> Gaussians:
         plain = make_shell(SPLATS, 3, torch.device("cpu")).detach()
@@ -88,16 +89,16 @@ def differences(rasterizer: Rasterizer, scene: Scene) -> list[str]:
         return [f"{share:.1%} of the pixels are wrong"]
     exact.without(is_off).backward(want)
     scene.without(is_off).backward(got)
-    problems = []
+    troubles = []
     for name, theirs in exact.gaussians.tensors().items():
         ours = scene.gaussians.tensors()[name].grad
         if ours is None or not ours.isfinite().all():
-            problems.append(f"the gradient of {name} is missing or not finite")
+            troubles.append(f"the gradient of {name} is missing or not finite")
             continue
         error = ((ours.cpu() - theirs.grad).abs().max() / theirs.grad.abs().max().clamp_min(1e-20)).item()
         if error > MOST_GRADIENT:
-            problems.append(f"the gradient of {name} is wrong by {error:.1e} of its largest number")
-    return problems
+            troubles.append(f"the gradient of {name} is wrong by {error:.1e} of its largest number")
+    return troubles
 
 
 def _deviation(got: Tensor, want: Tensor) -> Tensor:
@@ -107,11 +108,11 @@ def _deviation(got: Tensor, want: Tensor) -> Tensor:
 
 
 def changes(rasterizer: Rasterizer, scene: Scene) -> list[str]:
-    """Return the results that do not have the same bits in every run."""
+    """Return the results that are not the same to the last bit in every run."""
     first: dict[str, Tensor] = {}
     changed: set[str] = set()
     for _ in range(RUNS):
-        scene.forget()
+        scene.zero_grad()
         images = scene.render(rasterizer)
         scene.backward(images)
         numbers = dict(zip(("rgb", "alpha", "depth"), images, strict=True))

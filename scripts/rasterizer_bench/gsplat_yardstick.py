@@ -19,8 +19,8 @@ def why_absent(device: torch.device) -> str | None:
         return "it renders on CUDA only"
     if find_spec("gsplat") is None:
         return "it is not installed. Try: pip install gsplat==1.5.3"
+    # The import compiles gsplat if it was installed without binaries, and a build may raise any exception.
     try:
-        # This import compiles gsplat if it was installed without binaries, which may raise anything.
         from gsplat.cuda._backend import _C
     except Exception as error:
         return f"it cannot be imported here: {error}"
@@ -38,10 +38,10 @@ class GsplatRasterizer(Rasterizer):
         background: Float[Tensor, "v 3"],
         absgrad: bool = False,
     ) -> RenderOutput:
-        """See :meth:`Rasterizer.render`. The activations are computed here, as our kernels do."""
+        """See :meth:`Rasterizer.render`. It includes the activations, which our kernels compute too."""
         from gsplat import rasterization
 
-        assert not absgrad, "the benchmark never times absgrad"
+        assert not absgrad, "absgrad is never timed"
         images, alphas, extra = rasterization(
             gaussians.means,
             gaussians.quats,

@@ -1,4 +1,4 @@
-"""The results of the benchmark, as rows of a table and as JSON."""
+"""The results of the benchmark, as a table to read and as JSON for programs."""
 
 import json
 import platform
@@ -33,11 +33,11 @@ class Row:
     backward_ms: float | None = None
     forward_backward_ms: float | None = None
     forward_backward_min_ms: float | None = None
-    ratio: float | None = None  # first backend to this one
+    ratio: float | None = None  # time of the first backend divided by this one's, forward + backward
     peak_bytes: int | None = None
     demanded_ms: float | None = None
-    demanded_ratio: float | None = None  # gsplat to this backend
-    is_met: bool | None = None  # None without a target
+    demanded_ratio: float | None = None  # gsplat's time divided by this one's
+    is_met: bool | None = None  # whether both targets are met; None without a target to compare with
 
     def __str__(self) -> str:
         scene = f"{self.count:>9} {self.size:>6} {self.views:>5} {self.degree:>2} {self.backend:>10}"
@@ -122,7 +122,7 @@ class Report:
     versions: dict[str, str | None]
     commit: str | None
     settings: dict[str, object]
-    copy_bytes_per_ms: float | None = None  # read and written
+    copy_bytes_per_ms: float | None = None  # read and written; determines the floors of the stages
     rows: list[Row] = field(default_factory=list)
     stages: list[SceneStages] = field(default_factory=list)
 
@@ -137,7 +137,7 @@ def start_report(device: torch.device, settings: dict[str, object]) -> Report:
 
 
 def describe(device: torch.device) -> dict[str, object]:
-    """Return the facts about a device on which its times depend."""
+    """Return the facts about a device that affect its times."""
     if device.type != "cuda":
         return {"name": processor(), "driver": None, "threads": torch.get_num_threads()}
     facts = torch.cuda.get_device_properties(device)
@@ -151,7 +151,7 @@ def describe(device: torch.device) -> dict[str, object]:
 
 
 def processor() -> str:
-    """Return the name of the CPU, or its architecture if the system does not report a name."""
+    """Return the name of the CPU, as far as the system reports it."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     found = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -159,7 +159,7 @@ def processor() -> str:
 
 
 def versions() -> dict[str, str | None]:
-    """Return the versions of the programs on which the times depend."""
+    """Return the versions of everything that affects the times; ``None`` for what is not installed."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:
@@ -185,7 +185,7 @@ def commit() -> str | None:
 
 def _first_line(*command: str) -> str | None:
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip().splitlines()[0] if done.stdout.strip() else None
+    return answer.stdout.strip().splitlines()[0] if answer.stdout.strip() else None

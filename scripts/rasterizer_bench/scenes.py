@@ -10,7 +10,7 @@ from cadam3d.core.cameras import Cameras, turntable
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.rasterizer.base import Rasterizer
 
-RADIUS = 0.6  # world units, of the shell
+RADIUS = 0.6  # world units
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class Scene:
 
     def without(self, pixels: Tensor) -> "Scene":
         """Return the scene with zero gradient at some pixels [v h w]; the Gaussians are shared."""
-        keeps = ~pixels.to(self.background.device)
+        is_kept = ~pixels.to(self.background.device)
         rgb, alpha, depth = self.gradients
-        return replace(self, gradients=(rgb * keeps[..., None], alpha * keeps, depth * keeps))
+        return replace(self, gradients=(rgb * is_kept[..., None], alpha * is_kept, depth * is_kept))
 
     def to(self, device: torch.device, dtype: torch.dtype) -> "Scene":
         """Return a copy with new leaf tensors on another device and in another dtype."""
@@ -44,7 +44,7 @@ class Scene:
         cameras = self.cameras.to(device)
         return Scene(gaussians, cameras, self.background.to(device, dtype), (rgb, alpha, depth))
 
-    def forget(self) -> None:
+    def zero_grad(self) -> None:
         """Remove the gradients, as an optimizer does before each step."""
         for tensor in self.gaussians.tensors().values():
             tensor.grad = None

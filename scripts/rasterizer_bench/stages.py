@@ -1,4 +1,4 @@
-"""Time the stages of the CUDA rasterizer with two events per launch, and compare each stage with a floor.
+"""Time the stages of the CUDA rasterizer: each launch is measured by two events and compared with a floor.
 
 The floor of a stage is the number of bytes that it must read and write at least once, divided by the measured
 speed of a plain copy. It considers bandwidth alone, so a stage that computes much per byte, as both blends
@@ -36,9 +36,10 @@ STAGES = {
     "blend backward": ("blend_backward",),
     "project backward": ("project_backward", "sum_absolutes", "centre_backward"),
 }
-# The time outside of launches: allocation, autograd, the host, and one wait for the device.
+# The time outside of launches: allocation, autograd, the host and one wait for the device.
 REST = "rest"
-WORD = 4  # bytes of a float and of an index
+# The size of a float and of an index.
+WORD = 4  # bytes
 SPLAT, RECORD = WORD * cuda.SPLAT, WORD * cuda.RECORD
 
 
@@ -70,12 +71,13 @@ class Span:
 
 
 class StageClock(Launcher):
-    """Forwards every launch to another launcher and records when it began and ended."""
+    """Passes every launch on and records when it began and ended."""
 
     def __init__(self, inner: Launcher) -> None:
         self._inner = inner
         self.spans: list[Span] = []
-        self.slots = 0  # (splat, tile) pairs of ``spans``
+        # The number of (splat, tile) pairs since ``spans`` was emptied.
+        self.slots = 0
 
     @contextmanager
     def on(self, device: torch.device) -> Iterator[Launch]:
@@ -159,14 +161,17 @@ def stage_bytes(load: Load) -> dict[str, int]:
     """Return the least bytes that each stage reads and writes: each number once, for all views together."""
     parameters = load.gaussians * WORD * (11 + 3 * load.coefficients)
     pairs, slots, pixels = load.pairs * WORD, load.slots, load.pixels
-    entry = 2 * WORD + SPLAT  # of a tile's list: slot, pair, splat
+    # An entry of a tile's list: slot, pair and splat.
+    entry = 2 * WORD + SPLAT
     return {
-        "project": parameters + 5 * pairs + load.visible * SPLAT,  # centre, radius, depth key, count
+        # Per pair: the centre, the radius, the depth key and the count.
+        "project": parameters + 5 * pairs + load.visible * SPLAT,
         "depth sort": sorted_bytes(load.pairs, cuda.DEPTH_BITS),
         # Prefix sum: in, out. List: order, count, offset, first slot; tile and pair of every slot.
         "tile lists": 6 * pairs + load.visible * SPLAT + slots * 2 * WORD,
         "tile sort": sorted_bytes(slots, load.tiles.bit_length()) + slots * WORD + load.tiles * 2 * WORD,
-        "blend forward": slots * entry + pixels * 7 * WORD,  # rgb, alpha, depth, transmittance, last
+        # Rgb, alpha, depth, transmittance and last per pixel.
+        "blend forward": slots * entry + pixels * 7 * WORD,
         # Alpha, depth, transmittance, last and five gradients per pixel.
         "blend backward": slots * (entry + RECORD) + pixels * 9 * WORD,
         # First slot, count and gradient of the centre; radius and that gradient again; means in and out.
@@ -182,7 +187,7 @@ class StageTiming:
     launches: int
     median_ms: float
     bytes: int | None  # None for ``REST``
-    floor_ms: float | None
+    floor_ms: float | None  # None for ``REST``
 
 
 def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: float) -> list[StageTiming]:
@@ -191,7 +196,7 @@ def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: fl
     rasterizer, samples = KernelRasterizer(clock), []
     launches, slots = {}, 0
     for _ in range(repeats + 1):
-        scene.forget()
+        scene.zero_grad()
         start = now(device)
         scene.backward(scene.render(rasterizer))
         wall = (now(device) - start) * 1e3
@@ -203,7 +208,8 @@ def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: fl
         StageTiming(
             stage,
             launches.get(stage, 0),
-            statistics.median(times[stage] for times in samples[1:]),  # the first one warms up
+            # The first sample warms up and is not counted.
+            statistics.median(times[stage] for times in samples[1:]),
             needed.get(stage),
             needed[stage] / bytes_per_ms if stage in needed else None,
         )
@@ -212,7 +218,7 @@ def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: fl
 
 
 def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:
-    """Return the amount of work in one render of a scene, in which ``slots`` pairs were counted."""
+    """Return the amount of work of one render, given its number of (splat, tile) pairs."""
     with torch.no_grad():
         output = rasterizer.render(scene.gaussians, scene.cameras, scene.background)
     views, height, width = output.alpha.shape
@@ -228,7 +234,7 @@ def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:
 
 
 def copy_speed(device: torch.device, size: int) -> float:
-    """Return the speed of the fastest of eight copies of ``size`` bytes, in bytes read and written per ms."""
+    """Return the speed of the fastest of some copies of ``size`` bytes, in bytes per ms read and written."""
     source = torch.zeros(size, dtype=torch.uint8, device=device)
     target = torch.empty_like(source)
     fastest = float("inf")

@@ -42,12 +42,12 @@ def take_turns(backends: dict[str, Rasterizer], scene: Scene, repeats: int) -> d
                     samples[name].append(time_phases(rasterizer, scene))
             except OUT_OF_MEMORY:
                 failed.add(name)
-            scene.forget()
+            scene.zero_grad()
     return {name: None if name in failed else summarize(samples[name], peaks[name]) for name in backends}
 
 
 def summarize(samples: list[dict[str, float]], peak: int | None) -> Timing:
-    """Return the median and the minimum of each phase."""
+    """Return the median and the smallest time of each phase, with the peak of memory."""
     by_phase = {phase: [sample[phase] for sample in samples] for phase in PHASES}
     return Timing(
         {phase: statistics.median(each) for phase, each in by_phase.items()},
@@ -62,14 +62,14 @@ def time_phases(rasterizer: Rasterizer, scene: Scene) -> dict[str, float]:
     Forward and backward together are timed separately, without waiting for the device between them.
     """
     device = scene.gaussians.device
-    scene.forget()
+    scene.zero_grad()
     start = now(device)
     images = scene.render(rasterizer)
     middle = now(device)
     scene.backward(images)
     end = now(device)
     del images
-    scene.forget()
+    scene.zero_grad()
     again = now(device)
     scene.backward(scene.render(rasterizer))
     whole = now(device) - again
@@ -94,7 +94,7 @@ def peak_memory(rasterizer: Rasterizer, scene: Scene) -> int | None:
     keeps freed memory, so the result would be unreliable and is ``None``.
     """
     device = scene.gaussians.device
-    scene.forget()
+    scene.zero_grad()
     if device.type == "cuda":
         torch.cuda.synchronize(device)
         before = torch.cuda.memory_allocated(device)

@@ -70,11 +70,11 @@ def test_opposite_views_look_at_each_other():
 
 @pytest.mark.parametrize(("views", "hint"), [(1, 4), (2, 4), (5, 4), (6, 8), (7, 8), (10, 8)])
 def test_an_incomplete_group_is_refused_with_a_number_that_works(views, hint):
-    for ask in (lambda: sample(views), lambda: Multiview(**PUBLISHED).check_views(views)):
+    for call in (lambda: sample(views), lambda: Multiview(**PUBLISHED).check_views(views)):
         with pytest.raises(
             UserError, match=rf"^views: expected a multiple of 4.*got {views}\. Try: views={hint}$"
         ):
-            ask()
+            call()
 
 
 def test_whole_groups_are_accepted():

@@ -76,7 +76,8 @@ def test_the_elevation_law_sets_how_often_the_top_is_seen(law, power):
 
 def test_the_mixture_is_uniform_in_degrees_in_half_of_the_steps_and_threestudios_law_in_the_others():
     steps = [sample(64, seed, elevation_law="mixture").elevation_deg for seed in range(300)]
-    is_wide = [bool(views.max() > 45) for views in steps]  # of 64 uniform views some are above 45
+    # Some of 64 uniform views are above 45 degrees.
+    is_wide = [bool(views.max() > 45) for views in steps]
     assert sum(is_wide) / 300 == pytest.approx(0.5, abs=0.1)
     wide = torch.cat([views for views, yes in zip(steps, is_wide, strict=True) if yes])
     other = torch.cat([views for views, yes in zip(steps, is_wide, strict=True) if not yes])
@@ -93,7 +94,8 @@ def test_the_mixture_draws_equally_many_numbers_in_both_cases():
         orbit(elevation_law="mixture").sample(0, 3, generator)
         after = torch.rand(1, generator=generator)
         generator.manual_seed(seed)
-        torch.rand(3 + 1 + 3 + 3 + 3, generator=generator)  # azimuth, toss, elevation, distance, lens
+        # These are the draws for azimuth, choice of the law, elevation, distance and lens.
+        torch.rand(3 + 1 + 3 + 3 + 3, generator=generator)
         states[seed] = torch.equal(after, torch.rand(1, generator=generator))
     assert all(states.values())
 

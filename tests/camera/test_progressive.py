@@ -46,7 +46,7 @@ def test_the_field_of_view_narrows_as_published(step, narrowest):
 @pytest.mark.parametrize(
     ("step", "radii"), [(0, (5.2, 5.5)), (500, (4.94, 5.225)), (1000, (4.693, 5.0)), (4000, (3.5, 5.0))]
 )
-def test_the_cameras_come_closer_as_published_at_two_of_our_units_to_one(step, radii):
+def test_the_cameras_come_closer_as_published_with_all_lengths_doubled(step, radii):
     sampler = published()
     assert sampler.distance.at(sampler.widenings(step)) == pytest.approx([2 * r for r in radii], abs=1e-3)
 
@@ -57,21 +57,21 @@ def test_heads_are_seen_all_around_after_two_widenings():
     assert ranges == [pytest.approx((-end, end)) for end in (80, 120, 180, 180)]
 
 
-def test_polar_angles_are_what_widens_about_the_pole():
+def test_elevations_widen_as_published_polar_angles_do():
     """Polar [60, 90] becomes [60 / 1.5, 90 * 1.5], clamped to [45, 105], in one step as published."""
     sampler = published("camera.elevation_deg.start=[0,30]")
     assert sampler.elevation_deg.at(0) == pytest.approx((0, 30))
     assert sampler.elevation_deg.at(1) == pytest.approx((-15, 45))
 
 
-def test_the_closed_form_is_what_step_by_step_multiplication_gives():
+def test_the_closed_form_equals_step_by_step_multiplication():
     for start, end, factor, about in (
         ([18.0, 34.0], [9.0, 60.0], [0.75, 1.1], 0.0),
         ([-80.0, 80.0], [-180.0, 180.0], [1.5, 1.5], 0.0),
         ([0.0, 30.0], [-15.0, 45.0], [1.1, 0.9], 90.0),
     ):
         moving = widening(start, end, factor, about)
-        assert moving.moves_as_meant()
+        assert moving.reaches_its_end()
         ends = list(start)
         for count in range(30):
             assert moving.at(count) == pytest.approx(ends)
@@ -93,7 +93,7 @@ def test_widenings_are_at_multiples_from_begin_on(begin, every, steps):
 
 
 @pytest.mark.parametrize("begin", [0, 1])
-def test_the_first_step_never_sees_a_widened_range(begin):
+def test_the_first_step_never_uses_a_widened_range(begin):
     sampler = changed(published(), begin=begin, every=1)
     assert [sampler.widenings(step) for step in range(4)] == [0, 1, 2, 3]
 
@@ -120,7 +120,7 @@ def test_views_of_a_step_share_one_field_of_view_that_fills_its_range():
 
 
 @pytest.mark.parametrize("gamma", [1.0, 1.5, 3.0])
-def test_gamma_says_how_close_to_the_middle_most_views_are(gamma):
+def test_gamma_sets_how_close_to_the_middle_most_views_are(gamma):
     cameras = draw(changed(published(), gamma=gamma), views=40_000)
     for values, middle, half in ((cameras.azimuth_deg, 0, 180), (cameras.elevation_deg, 15, 30)):
         within_half = ((values - middle).abs() < half / 2).float().mean()
@@ -155,7 +155,8 @@ def test_each_jitter_has_its_published_size():
 
     aimed = draw(changed(published(), **{**STILL, "target_jitter": 0.1}), views=20_000)
     forward, distance = aimed.world_to_camera[:, 2, :3], aimed.positions.norm(dim=-1, keepdim=True)
-    missed = aimed.positions + forward * distance  # about the point of the view axis nearest to the origin
+    # This is about the point of the view axis that is nearest to the origin.
+    missed = aimed.positions + forward * distance
     assert float(missed.square().sum(-1).mean().sqrt()) == pytest.approx(0.1 * 2**0.5, abs=3e-3)
 
     tilted = draw(changed(published(), **{**STILL, "up_jitter": 0.01}), views=20_000)

@@ -101,11 +101,11 @@ def test_the_fallback_of_an_initializer_is_reported_and_recorded(type_line, tmp_
     code, _, err = type_line("train", *SMALL, *SHAP_E, *stand_in, "hydra.run.dir=fallen")
     assert code == 0
     [line] = [line for line in err.splitlines() if "Shap-E" in line]
-    assert line.startswith("Note: Ball stands in for Shap-E. initializer.path: expected a folder")
+    assert line.startswith("Note: Ball is used instead of Shap-E. initializer.path: expected a folder")
     summary = json.loads((tmp_path / "fallen/summary.json").read_text(encoding="utf-8"))
     assert summary["initializer"] == "shap_e"
     assert f"Note: {summary['initializer_note']}" == line
-    assert "Ball stands in for Shap-E" in (tmp_path / "fallen/report.html").read_text(encoding="utf-8")
+    assert "Ball is used instead of Shap-E" in (tmp_path / "fallen/report.html").read_text(encoding="utf-8")
 
     assert type_line("train", *SMALL, "rasterizer=reference", "hydra.run.dir=asked")[0] == 0
     fallen, asked = ((tmp_path / run / "asset.ply").read_bytes() for run in ("fallen", "asked"))

@@ -16,14 +16,16 @@ from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
 
 SHARED = {"weight": 1.0, "t_min": 0.02, "t_max": 0.98, "shared_t": False, "reduction": "sum"}
-GUIDED = {  # distillations that predict under classifier-free guidance
+# Distillations that predict under classifier-free guidance.
+GUIDED = {
     "sds": (SDS, {}),
     "ism": (ISM, {"delta": 0.05, "inversion_stride": 0.2, "initial_noise": 0.0}),
     "vfds": (VFDS, {}),
     "sdi": (SDI, {"inversion_scale": -2.0, "inversion_stride": 0.25, "overshoot": 0.03, "eta": 0.3}),
     "ucm": (UCM, {"inversion_steps": 3, "inversion_grid": "t", "fresh_noise": 0.0}),
 }
-DISTILLATIONS = GUIDED | {"csd": (CSD, {"empty_share": 0.0})}  # weighted differences of two predictions
+# Weighted differences of two predictions.
+DISTILLATIONS = GUIDED | {"csd": (CSD, {"empty_share": 0.0})}
 OBJECTIVES = DISTILLATIONS | {
     "gcs": (GCS, {"w_cc": 1.0, "w_gc": 0.5, "w_cp": 0.5, "delta": 0.05, "fixed_noise": False})
 }
@@ -157,7 +159,7 @@ def make():
 
 
 @pytest.fixture
-def ask():
+def run():
     """A function that returns G / D, by autograd and in the layout of latents, and the output."""
 
     def evaluate(guidance, rgb, condition, prior, *, step=0, seed=0):

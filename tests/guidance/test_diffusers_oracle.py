@@ -16,7 +16,8 @@ from cadam3d.prior.path import DDPM, RectifiedFlow
 pytestmark = pytest.mark.oracle
 diffusers = pytest.importorskip("diffusers")
 
-PROMPT, NEGATIVE, EMPTY = 1.0, -0.5, 0.25  # words, to this network
+# This network reads a prompt as one number.
+PROMPT, NEGATIVE, EMPTY = 1.0, -0.5, 0.25
 SCALE = 7.5
 
 
@@ -45,7 +46,7 @@ class NetworkPrior(DiffusionPrior):
     noise_path: object
 
     def embed(self, prompt, negative):
-        pytest.fail("objectives are handed a condition and must not embed")
+        pytest.fail("objectives receive a condition and must not embed prompts")
 
     def encode(self, rgb):
         return rgb.permute(0, 3, 1, 2)
@@ -93,7 +94,7 @@ def gamma(scheduler, row):
 
 
 @pytest.fixture
-def still(make, ask, rgb):
+def still(make, run, rgb):
     """Return G of an objective at one fixed t, and its noise, drawn after ``skipped`` draws of levels."""
 
     def evaluate(guidance, path, skipped=1):
@@ -101,7 +102,7 @@ def still(make, ask, rgb):
         for _ in range(skipped):
             torch.rand(3, generator=generator)
         noise = torch.randn(3, 3, 4, 5, generator=generator).double()
-        gradient, _ = ask(guidance, rgb, Words(), NetworkPrior(path))
+        gradient, _ = run(guidance, rgb, Words(), NetworkPrior(path))
         return gradient, noise
 
     return evaluate
@@ -143,7 +144,8 @@ def test_ism(make, still, clean, table):
     guidance = make("ism", **at(0.8), delta=0.2, inversion_stride=0.2, weighting="gamma", weight=0.1)
     gradient, _ = still(guidance, DDPM())
     ddim, inverse = table(200)
-    noisy, row = clean, 0  # the prediction for the clean image is made at row 0
+    # The prediction for the clean image is made at row 0.
+    noisy, row = clean, 0
     for then in (199, 399, 599):
         noisy, row = up(inverse, network(noisy, rows(row), EMPTY), then, noisy), then
     before = network(noisy, rows(599), EMPTY)
@@ -188,7 +190,8 @@ def test_gcs(weights, make, still, clean, table, monkeypatch):
     cc = down(long, asked(x_t, t), t, x_t) - down(short, asked(y_s, s), s, y_s).detach()
     now = short.step(asked(x_e, e), e, x_e).pred_original_sample
     wanted = short.step(guided(y_e, rows(e)), e, y_e).pred_original_sample
-    cp = leaf - (leaf + (wanted - now) / 2).detach()  # this prior decodes to half of a difference
+    # This prior decodes a difference to half of it.
+    cp = leaf - (leaf + (wanted - now) / 2).detach()
     loss = sum(w * part.square().sum() for w, part in zip(weights, (cc, now - wanted, cp), strict=True))
     (expected,) = torch.autograd.grad(0.1 * loss / 3, leaf)
     close(gradient, expected)

@@ -57,28 +57,29 @@ def published_loss(rgb, path, prior, condition, draws, weights):
     now = original(x_e, e, eps_e)
     wanted = original(y_e, e, eps(y_e, e, condition, 2.0)).detach()
     gc = (now - wanted).square().sum()
-    moved = (x_0 + wanted - now).detach()  # the decoder of this prior is the identity
+    # The decoder of this prior is the identity.
+    moved = (x_0 + wanted - now).detach()
     cp = (x_0 - moved).square().sum()
     return w_cc * cc + w_gc * gc + w_cp * cp
 
 
 @pytest.mark.parametrize("weights", [*ALONE.values(), ALL], ids=[*ALONE, "all"])
-def test_gradient_is_that_of_the_published_loss(weights, path, make, ask, gaussian, means, rgb):
+def test_gradient_is_that_of_the_published_loss(weights, path, make, run, gaussian, means, rgb):
     """Check with autograd that the slopes through chains of DDIM steps telescope."""
     prior, window = gaussian(path), {"t_min": 0.4, "t_max": 0.9, "delta": 0.1}
-    gradient, _ = ask(make("gcs", **window, **weights_of(*weights)), rgb, means, prior, seed=11)
+    gradient, _ = run(make("gcs", **window, **weights_of(*weights)), rgb, means, prior, seed=11)
     draws = redraw(rgb.permute(0, 3, 1, 2), 0.4, 0.9, 0.1, seed=11)
     loss = published_loss(rgb, path, prior, means, draws, weights)
     (expected,) = torch.autograd.grad(loss, rgb)
     torch.testing.assert_close(gradient, expected.permute(0, 3, 1, 2), rtol=1e-8, atol=1e-8)
 
 
-def test_the_terms_add_up_and_are_logged_with_their_weights(make, ask, prior, means, rgb):
-    total, output = ask(make("gcs"), rgb, means, prior, seed=3)
+def test_the_terms_add_up_and_are_logged_with_their_weights(make, run, prior, means, rgb):
+    total, output = run(make("gcs"), rgb, means, prior, seed=3)
     parts, logs = {}, {}
     for name, alone in ALONE.items():
         weights = [w * own for w, own in zip(ALL, alone, strict=True)]
-        parts[name], out = ask(make("gcs", **weights_of(*weights)), rgb, means, prior, seed=3)
+        parts[name], out = run(make("gcs", **weights_of(*weights)), rgb, means, prior, seed=3)
         logs[name] = out.log
     torch.testing.assert_close(sum(parts.values()), total, rtol=1e-9, atol=1e-10)
     for name, part in parts.items():
@@ -92,17 +93,17 @@ def test_the_terms_add_up_and_are_logged_with_their_weights(make, ask, prior, me
     assert output.loss.item() == pytest.approx(float(halves), rel=1e-9)
 
 
-def test_the_noise_averages_out_to_a_pull_towards_the_image(make, ask, gaussian, one_among_many, rgb):
+def test_the_noise_averages_out_to_a_pull_towards_the_image(make, run, gaussian, one_among_many, rgb):
     """If the prompt determines the image m and the empty prompt allows any, GC is x0 + gamma n - m."""
     guidance = make("gcs", t_min=0.5, t_max=0.5, **weights_of(*ALONE["gc"]))
     prior, count = gaussian(DDPM(), spread=0.0), 40
     offset = rgb.detach().permute(0, 3, 1, 2) - one_among_many.positive
-    draws = torch.stack([ask(guidance, rgb, one_among_many, prior, seed=seed)[0] for seed in range(count)])
+    draws = torch.stack([run(guidance, rgb, one_among_many, prior, seed=seed)[0] for seed in range(count)])
     z = (draws.mean(dim=0) - 2 * offset) / (draws.std(dim=0) / count**0.5)
     assert z.abs().max() < 4.5
 
 
-def test_descent_arrives_at_the_image(path, make, ask, gaussian, one_among_many, rgb):
+def test_descent_reaches_the_image(path, make, run, gaussian, one_among_many, rgb):
     """The remaining distance shrinks with the noise, which GC cannot distinguish from the render."""
     prior, render = gaussian(path, spread=0.02), rgb.detach()
     target = one_among_many.positive.permute(0, 2, 3, 1)
@@ -110,7 +111,7 @@ def test_descent_arrives_at_the_image(path, make, ask, gaussian, one_among_many,
     for step in range(20):
         t = 0.05 + 0.9 * 0.7**step
         guidance = make("gcs", t_min=t, t_max=t, delta=0.03)
-        gradient, _ = ask(guidance, render, one_among_many, prior, step=step, seed=step)
+        gradient, _ = run(guidance, render, one_among_many, prior, step=step, seed=step)
         render = render - 0.2 * gradient.permute(0, 2, 3, 1)
     assert (render - target).square().mean().sqrt() < 0.1 * before
 
@@ -135,14 +136,14 @@ def test_the_levels_keep_their_distances(make, rgb):
     assert (t - e)[inside].max() > 0.099
 
 
-def test_the_smallest_t_leaves_room_below(make, ask, gaussian, means, rgb):
+def test_the_smallest_t_leaves_room_below(make, run, gaussian, means, rgb):
     prior = gaussian(DDPM())
-    _, output = ask(make("gcs", t_min=0.0, t_max=0.0, delta=0.08), rgb, means, prior)
+    _, output = run(make("gcs", t_min=0.0, t_max=0.0, delta=0.08), rgb, means, prior)
     assert output.log["t"] == pytest.approx(0.081)
     assert sorted({round(float(t), 6) for call in prior.calls for t in call.t}) == [0.001, 0.081]
 
 
-def test_the_window_may_slide_and_the_interval_shrink(make, ask, gaussian, means, rgb):
+def test_the_window_may_slide_and_the_interval_shrink(make, run, gaussian, means, rgb):
     """The published t goes from [0.5, 0.98) to [0.02, 0.5), and delta from 0.1 to 0.08."""
     guidance = make(
         "gcs",
@@ -153,13 +154,13 @@ def test_the_window_may_slide_and_the_interval_shrink(make, ask, gaussian, means
     for step, low, high, delta in ((0, 0.5, 0.98, 0.1), (5, 0.26, 0.74, 0.09), (10, 0.081, 0.5, 0.08)):
         for seed in range(5):
             prior = gaussian(DDPM())
-            ask(guidance, rgb, means, prior, step=step, seed=seed)
+            run(guidance, rgb, means, prior, step=step, seed=seed)
             s, t = prior.calls[1].t, prior.calls[2].t
             assert ((low <= t) & (t < high)).all()
             torch.testing.assert_close(t - s, torch.full_like(t, delta))
 
 
-def test_fixed_noise_is_the_same_at_every_step_and_after_a_restart(make, ask, gaussian, means, rgb):
+def test_fixed_noise_is_the_same_at_every_step_and_after_a_restart(make, run, gaussian, means, rgb):
     """A checkpoint keeps the state of the generator, which includes its seed."""
     clean, generator = rgb.detach().permute(0, 3, 1, 2), torch.Generator().manual_seed(7)
 
@@ -190,9 +191,9 @@ def test_with_fixed_noise_only_the_levels_are_drawn(make, means, gaussian, rgb):
 # --- cost
 
 
-def test_predictions_are_made_as_the_method_says(make, ask, gaussian, means, rgb):
+def test_predictions_follow_the_published_method(make, run, gaussian, means, rgb):
     prior = gaussian(DDPM())
-    ask(make("gcs", t_min=0.5, t_max=0.5, delta=0.05), rgb, means, prior)
+    run(make("gcs", t_min=0.5, t_max=0.5, delta=0.05), rgb, means, prior)
     asked = [(round(float(call.t[0]), 6), call.condition is means, call.scale) for call in prior.calls]
     e = asked[0][0]
     assert 0.4 <= e < 0.44
@@ -210,11 +211,11 @@ def test_predictions_are_made_as_the_method_says(make, ask, gaussian, means, rgb
 
 
 @pytest.mark.parametrize("cost", [("cc", 5, 0), ("gc", 4, 0), ("cp", 4, 2)], ids=ALONE)
-def test_a_term_of_weight_zero_makes_no_predictions(cost, make, ask, gaussian, means, rgb, monkeypatch):
+def test_a_term_of_weight_zero_makes_no_predictions(cost, make, run, gaussian, means, rgb, monkeypatch):
     decoded, decode = [], gaussian.decode
     monkeypatch.setattr(gaussian, "decode", lambda *given: decoded.append(given) or decode(*given))
     prior, (term, calls, decodings) = gaussian(DDPM()), cost
-    ask(make("gcs", **weights_of(*ALONE[term])), rgb, means, prior)
+    run(make("gcs", **weights_of(*ALONE[term])), rgb, means, prior)
     assert (len(prior.calls), len(decoded)) == (calls, decodings)
 
 
@@ -234,9 +235,8 @@ def test_the_pixel_term_does_not_pass_through_the_encoder(make):
     assert output.log["guidance_rms"] == 0
     blocks = render.grad.reshape(2, 8, 2, 8, 2, 3)
     assert torch.equal(blocks[:, :, :1, :, :1].expand_as(blocks), blocks)
-    assert (
-        float(render.grad.abs().max()) <= 0.1 + 1e-6
-    )  # 2 weight (1 - 0) / views: decoded images are in [0, 1]
+    # Decoded images are in [0, 1], so the largest gradient is 2 weight (1 - 0) / views.
+    assert float(render.grad.abs().max()) <= 0.1 + 1e-6
 
 
 def test_a_mean_is_over_latents_or_over_pixels(make):
@@ -256,10 +256,10 @@ def test_a_mean_is_over_latents_or_over_pixels(make):
 # --- numbers
 
 
-def test_numbers_that_are_not_finite_become_zero_and_are_counted(make, ask, prior, means, rgb):
-    healthy, before = ask(make("gcs"), rgb, means, prior)
+def test_numbers_that_are_not_finite_become_zero_and_are_counted(make, run, prior, means, rgb):
+    healthy, before = run(make("gcs"), rgb, means, prior)
     means.positive[0, 0, 0, 0], means.positive[1, 2, 3, 4] = torch.nan, torch.inf
-    sick, after = ask(make("gcs"), rgb, means, prior)
+    sick, after = run(make("gcs"), rgb, means, prior)
     is_sick = ~means.positive.isfinite()
     assert (sick[is_sick] == 0).all()
     torch.testing.assert_close(sick[~is_sick], healthy[~is_sick])

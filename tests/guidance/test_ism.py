@@ -23,15 +23,16 @@ def step_factor(path, start, end, spread):
 
 
 @pytest.mark.parametrize("scale", [0.0, 1.0, 7.5])
-def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means, rgb):
+def test_gradient_equals_the_closed_form(scale, path, make, run, gaussian, means, rgb):
     """Follow x - a * mean through 0 -> 0.25 -> s -> t by hand, since every step is affine."""
     keys = {"t_min": 0.4, "t_max": 0.5, "delta": 0.1, "inversion_stride": 0.25, "weighting": "gamma"}
-    gradient, _ = ask(make("ism", scale=scale, **keys), rgb, means, gaussian(path, spread=SPREAD), seed=11)
+    gradient, _ = run(make("ism", scale=scale, **keys), rgb, means, gaussian(path, spread=SPREAD), seed=11)
 
     clean = rgb.detach().permute(0, 3, 1, 2)
     t = drawn_t(3, 0.4, 0.5, seed=11)
     s = t - 0.1
-    now, off = torch.zeros_like(t), clean - means.empty  # off = x - a * mean of the empty prompt
+    # Here off is x - a * mean of the empty prompt.
+    now, off = torch.zeros_like(t), clean - means.empty
     for then in (torch.full_like(t, 0.25), s):
         now, off = then, off * step_factor(path, now, then, SPREAD)
     a, b = per_view(path.a(s)), per_view(path.b(s))
@@ -43,10 +44,10 @@ def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means
     torch.testing.assert_close(gradient, b / a * (noise_at_t - noise_at_s), rtol=1e-8, atol=1e-9)
 
 
-def test_predictions_are_made_as_the_method_says(make, ask, prior, means, rgb):
+def test_predictions_follow_the_published_method(make, run, prior, means, rgb):
     """Predictions are unprompted at 0, 0.2, 0.4 and s, and prompted with guidance at t."""
     keys = {"t_min": 0.6, "t_max": 0.6, "delta": 0.1, "inversion_stride": 0.2}
-    ask(make("ism", scale=7.5, **keys), rgb, means, prior)
+    run(make("ism", scale=7.5, **keys), rgb, means, prior)
     assert [float(call.t[0]) for call in prior.calls] == pytest.approx([0.0, 0.2, 0.4, 0.5, 0.6])
     *unprompted, prompted = prior.calls
     assert all(call.condition.positive is means.empty for call in unprompted)
@@ -55,35 +56,35 @@ def test_predictions_are_made_as_the_method_says(make, ask, prior, means, rgb):
     assert prompted.scale == 7.5
 
 
-def test_an_interval_longer_than_t_starts_at_the_render(make, ask, gaussian, means, rgb):
+def test_an_interval_longer_than_t_starts_at_the_render(make, run, gaussian, means, rgb):
     prior = gaussian(DDPM())
-    ask(make("ism", t_min=0.02, t_max=0.04, delta=0.05), rgb, means, prior)
+    run(make("ism", t_min=0.02, t_max=0.04, delta=0.05), rgb, means, prior)
     assert [bool((call.t == 0).all()) for call in prior.calls] == [True, False]
 
 
-def test_the_interval_may_be_a_schedule(make, ask, gaussian, means, rgb):
+def test_the_interval_may_be_a_schedule(make, run, gaussian, means, rgb):
     guidance = make("ism", delta=Linear(start=0.1, end=0.05, steps=10))
     for step, delta in ((0, 0.1), (5, 0.075), (10, 0.05)):
         prior = gaussian(DDPM())
-        ask(guidance, rgb, means, prior, step=step, seed=1)
+        run(guidance, rgb, means, prior, step=step, seed=1)
         gap = prior.calls[-1].t - prior.calls[-2].t
         torch.testing.assert_close(gap, torch.full_like(gap, delta))
 
 
-def test_without_initial_noise_it_is_deterministic_given_t(make, ask, prior, means, rgb):
+def test_without_initial_noise_the_gradient_is_a_function_of_t(make, run, prior, means, rgb):
     keys = {"t_min": 0.5, "t_max": 0.5}
-    first, again = (ask(make("ism", **keys), rgb, means, prior, seed=s)[0] for s in (0, 1))
+    first, again = (run(make("ism", **keys), rgb, means, prior, seed=s)[0] for s in (0, 1))
     torch.testing.assert_close(first, again, rtol=1e-6, atol=1e-8)
     keys |= {"initial_noise": 0.002}
-    first, again = (ask(make("ism", **keys), rgb, means, prior, seed=s)[0] for s in (0, 1))
+    first, again = (run(make("ism", **keys), rgb, means, prior, seed=s)[0] for s in (0, 1))
     assert (first - again).abs().max() > 1e-4
 
 
-def test_initial_noise_is_on_the_path(path, make, ask, gaussian, means, rgb):
+def test_initial_noise_is_on_the_path(path, make, run, gaussian, means, rgb):
     """The inversion starts on a x0 + b n at t = initial_noise, or at s if that is smaller."""
     guidance = make("ism", initial_noise=0.2, t_min=0.051, t_max=0.5, delta=0.05, inversion_stride=1.0)
     prior = gaussian(path, spread=SPREAD)
-    gradient, _ = ask(guidance, rgb, means, prior, seed=4)
+    gradient, _ = run(guidance, rgb, means, prior, seed=4)
     starts = prior.calls[0].t
     s = drawn_t(3, 0.051, 0.5, seed=4) - 0.05
     assert s.min() < 0.2 < s.max()
@@ -98,10 +99,10 @@ def test_initial_noise_is_on_the_path(path, make, ask, gaussian, means, rgb):
     torch.testing.assert_close(gradient, after.noise - before.noise, rtol=1e-7, atol=1e-7)
 
 
-def test_at_t_one_of_a_flow_gamma_gives_nothing_rather_than_infinity(make, ask, gaussian, means, rgb):
+def test_an_infinite_gamma_at_the_end_of_a_flow_gives_zero_gradients(make, run, gaussian, means, rgb):
     guidance = make("ism", weighting="gamma", t_min=1 - 1e-9, t_max=1.0)  # 1 in single precision
     single = type(means)(means.positive.float(), means.negative.float(), means.empty.float())
-    gradient, output = ask(guidance, rgb.float(), single, gaussian(RectifiedFlow()))
+    gradient, output = run(guidance, rgb.float(), single, gaussian(RectifiedFlow()))
     assert (gradient == 0).all()
     assert output.log["guidance_nonfinite"] == gradient.numel()
 

@@ -29,12 +29,12 @@ def invert(guidance, clean, t, condition, prior, seed=0):
 
 
 @pytest.mark.parametrize("scales", [(1.0, 1.0), (7.5, -7.5), (7.5, 0.0)])
-def test_gradient_equals_the_closed_form(scales, path, make, ask, gaussian, means, rgb):
+def test_gradient_equals_the_closed_form(scales, path, make, run, gaussian, means, rgb):
     """Follow 0 -> 0.25 -> 0.5 -> t' by hand, since every step is affine, with one prediction at t."""
     scale, inversion_scale = scales
     keys = {"scale": scale, "inversion_scale": inversion_scale, "inversion_stride": 0.25}
     guidance = make("sdi", overshoot=0.1, eta=0.3, t_min=0.5, t_max=0.6, **keys)
-    gradient, _ = ask(guidance, rgb, means, gaussian(path, spread=SPREAD), seed=11)
+    gradient, _ = run(guidance, rgb, means, gaussian(path, spread=SPREAD), seed=11)
 
     clean = rgb.detach().permute(0, 3, 1, 2)
     t, tau, fresh = redraw(clean, 0.5, 0.6, seed=11)
@@ -53,9 +53,9 @@ def test_gradient_equals_the_closed_form(scales, path, make, ask, gaussian, mean
     torch.testing.assert_close(gradient, expected, rtol=1e-8, atol=1e-8)
 
 
-def test_with_the_published_weight_g_is_the_difference_to_the_clean_prediction(make, ask, prior, means, rgb):
+def test_with_the_published_weight_g_is_the_difference_to_the_clean_prediction(make, run, prior, means, rgb):
     """G = x0 - x0_hat, as for a mean squared error to the predicted clean image."""
-    gradient, output = ask(make("sdi", weighting="gamma", **STILL), rgb, means, prior)
+    gradient, output = run(make("sdi", weighting="gamma", **STILL), rgb, means, prior)
     clean = rgb.detach().permute(0, 3, 1, 2)
     t = torch.full((3,), 0.6, dtype=torch.float64)
     noise = invert(make("sdi", **STILL), clean, t, means, prior)
@@ -64,10 +64,10 @@ def test_with_the_published_weight_g_is_the_difference_to_the_clean_prediction(m
     assert output.log["guidance_rms"] == pytest.approx(output.log["residual_rms"], rel=1e-8)
 
 
-def test_predictions_are_made_as_the_method_says(make, ask, prior, means, rgb):
+def test_predictions_follow_the_published_method(make, run, prior, means, rgb):
     """There are ten steps for t = 1 and fewer for a smaller t, under the prompt and the inversion's scale."""
     keys = {"inversion_stride": 0.1, "overshoot": 0.0, "t_min": 0.35, "t_max": 0.35}
-    ask(make("sdi", scale=7.5, inversion_scale=-7.5, **keys), rgb, means, prior)
+    run(make("sdi", scale=7.5, inversion_scale=-7.5, **keys), rgb, means, prior)
     *inversion, last = prior.calls
     assert [float(call.t[0]) for call in inversion] == pytest.approx([0, 0.1, 0.2, 0.3])
     assert {call.scale for call in inversion} == {-7.5}
@@ -75,7 +75,7 @@ def test_predictions_are_made_as_the_method_says(make, ask, prior, means, rgb):
     assert (last.scale, float(last.t[0])) == (7.5, pytest.approx(0.35))
 
 
-def test_the_inversion_overshoots_but_never_leaves_the_path(make, ask, gaussian, means, rgb):
+def test_the_inversion_overshoots_but_never_leaves_the_path(make, run, gaussian, means, rgb):
     """With a stride of 1 there is one step from the render, and the next prediction is at t again."""
     prior, path = gaussian(RectifiedFlow()), RectifiedFlow()
     clean, t = rgb.detach().permute(0, 3, 1, 2), torch.tensor([0.5, 0.9, 0.99], dtype=torch.float64)
@@ -90,8 +90,8 @@ def test_the_inversion_overshoots_but_never_leaves_the_path(make, ask, gaussian,
     torch.testing.assert_close(path.mix(clean, noise, beyond), pushed, rtol=1e-9, atol=1e-9)
 
 
-def test_without_overshoot_and_eta_it_is_deterministic_given_t(make, ask, prior, means, rgb):
-    first, again = (ask(make("sdi", **STILL), rgb, means, prior, seed=seed)[0] for seed in (0, 1))
+def test_without_overshoot_and_eta_the_gradient_is_a_function_of_t(make, run, prior, means, rgb):
+    first, again = (run(make("sdi", **STILL), rgb, means, prior, seed=seed)[0] for seed in (0, 1))
     assert torch.equal(first, again)
 
 
@@ -106,7 +106,7 @@ def test_eta_adds_noise_in_proportion_to_b(path, make, gaussian, means, rgb):
     torch.testing.assert_close(moved - still, 0.3 * per_view(path.b(t)) * fresh, rtol=1e-9, atol=1e-12)
 
 
-def test_only_the_inversion_may_be_guided_backwards(make):
+def test_only_the_scale_of_the_inversion_may_be_negative(make):
     assert make("sdi", inversion_scale=-7.5).inversion_scale == -7.5
     with pytest.raises(UserError, match=r"guidance.scale: expected a number >= 0"):
         make("sdi", scale=-7.5)
@@ -129,7 +129,7 @@ def test_wrong_values_are_refused_by_key(key, value, make):
         make("sdi", **{key: value})
 
 
-def test_views_that_share_t_share_the_overshoot(make, ask, gaussian, means, rgb):
+def test_views_that_share_t_share_the_overshoot(make, run, gaussian, means, rgb):
     prior = gaussian(DDPM())
-    ask(make("sdi", shared_t=True, overshoot=0.2, inversion_stride=0.05), rgb, means, prior)
+    run(make("sdi", shared_t=True, overshoot=0.2, inversion_stride=0.05), rgb, means, prior)
     assert all(len(call.t.unique()) == 1 for call in prior.calls)

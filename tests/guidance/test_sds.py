@@ -16,10 +16,10 @@ def redraw(like, seed, dtype=torch.float64):
 
 
 @pytest.mark.parametrize("scale", [0.0, 1.0, 7.5])
-def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means, rgb):
+def test_gradient_equals_the_closed_form(scale, path, make, run, gaussian, means, rgb):
     """eps_hat - eps = (a b (x0 - m) - a^2 s^2 eps) / (a^2 s^2 + b^2), m the guided mean."""
     guidance = make("sds", scale=scale, weighting="one_minus_abar", t_min=LOW, t_max=HIGH)
-    gradient, output = ask(guidance, rgb, means, gaussian(path, spread=SPREAD), seed=11)
+    gradient, output = run(guidance, rgb, means, gaussian(path, spread=SPREAD), seed=11)
 
     clean = rgb.detach().permute(0, 3, 1, 2)
     t, noise = redraw(clean, seed=11)
@@ -31,33 +31,34 @@ def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means
     assert output.log["t"] == pytest.approx(float(t.mean()))
 
 
-def test_gradient_is_the_residual_over_gamma(make, ask, prior, means, rgb):
+def test_gradient_is_the_residual_over_gamma(make, run, prior, means, rgb):
     """Paper eq. 4: G = w / gamma * (x0 - x0_hat), so with w = gamma its norm is that of the residual."""
-    _, output = ask(make("sds", weighting="gamma"), rgb, means, prior)
+    _, output = run(make("sds", weighting="gamma"), rgb, means, prior)
     assert output.log["guidance_rms"] == pytest.approx(output.log["residual_rms"], rel=1e-9)
 
 
-def test_mean_gradient_over_noise_is_linear_in_the_distance(make, ask, gaussian, one_image, rgb):
+def test_mean_gradient_over_noise_is_linear_in_the_distance(make, run, gaussian, one_image, rgb):
     """The noise averages out: E[G] = a b (x0 - m) / (a^2 s^2 + b^2)."""
     guidance = make("sds", scale=1.0, t_min=0.5, t_max=0.5)
     prior, count = gaussian(DDPM(), spread=SPREAD), 400
-    draws = torch.stack([ask(guidance, rgb, one_image, prior, seed=seed)[0] for seed in range(count)])
+    draws = torch.stack([run(guidance, rgb, one_image, prior, seed=seed)[0] for seed in range(count)])
     t = torch.tensor([0.5], dtype=torch.float64)
     a, b = per_view(DDPM().a(t)), per_view(DDPM().b(t))
     expected = a * b * (rgb.detach().permute(0, 3, 1, 2) - one_image.positive) / (a**2 * SPREAD**2 + b**2)
     z = (draws.mean(dim=0) - expected) / (draws.std(dim=0) / count**0.5)
     assert z.abs().max() < 4.5
-    assert float(z.square().mean()) == pytest.approx(1, abs=0.4)  # as many near misses as chance allows
+    # The deviations are as large as chance makes them.
+    assert float(z.square().mean()) == pytest.approx(1, abs=0.4)
 
 
-def test_one_guided_prediction_per_step(make, ask, gaussian, means, rgb):
+def test_one_guided_prediction_per_step(make, run, gaussian, means, rgb):
     prior = gaussian(DDPM())
-    ask(make("sds", scale=7.5), rgb, means, prior)
+    run(make("sds", scale=7.5), rgb, means, prior)
     assert [(call.scale, call.condition) for call in prior.calls] == [(7.5, means)]
 
 
-def test_single_and_double_precision_see_the_same_noise(make, ask, gaussian, means, rgb):
+def test_single_and_double_precision_see_the_same_noise(make, run, gaussian, means, rgb):
     single = type(means)(means.positive.float(), means.negative.float(), means.empty.float())
-    double_gradient, _ = ask(make("sds"), rgb, means, gaussian(DDPM()), seed=2)
-    single_gradient, _ = ask(make("sds"), rgb.float(), single, gaussian(DDPM()), seed=2)
+    double_gradient, _ = run(make("sds"), rgb, means, gaussian(DDPM()), seed=2)
+    single_gradient, _ = run(make("sds"), rgb.float(), single, gaussian(DDPM()), seed=2)
     torch.testing.assert_close(single_gradient.double(), double_gradient, rtol=1e-4, atol=1e-5)

@@ -16,7 +16,7 @@ def levels(*values):
 @pytest.mark.parametrize(
     ("s", "calls"), [(0.0, 0), (0.1, 1), (0.2, 1), (0.2001, 2), (0.6, 3), (0.93, 5), (1.0, 5)]
 )
-def test_inversion_takes_as_many_steps_as_strides_fit(s, calls, gaussian, means):
+def test_the_number_of_inversion_steps_follows_from_the_stride(s, calls, gaussian, means):
     prior = gaussian(DDPM())
     ddim(means.positive, strides(levels(0, 0, 0), levels(s, s, s), 0.2), means, prior)
     assert len(prior.calls) == calls
@@ -66,7 +66,7 @@ def test_fine_inversion_follows_the_probability_flow(path, gaussian, means):
     assert errors[1] == pytest.approx(errors[0] / 2, rel=0.25)  # a first-order method
 
 
-def test_a_view_that_has_arrived_waits_unchanged(path, gaussian, means):
+def test_a_view_that_has_arrived_does_not_change(path, gaussian, means):
     start, end = levels(0.0, 0.0, 0.0), levels(0.0, 0.2, 0.9)
     prior = gaussian(path, spread=SPREAD)
     together = ddim(means.empty, strides(start, end, 0.2), means, prior)

@@ -29,10 +29,10 @@ def case_of(clean, prior, condition, t=0.5):
 
 
 @pytest.mark.parametrize("scale", [0.0, 1.0, 40.0])
-def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means, rgb):
+def test_gradient_equals_the_closed_form(scale, path, make, run, gaussian, means, rgb):
     """Take four affine steps along the trajectory of the empty prompt, and one prediction under guidance."""
     guidance = make("ucm", scale=scale, inversion_steps=4, t_min=0.2, t_max=0.9)
-    gradient, _ = ask(guidance, rgb, means, gaussian(path, spread=SPREAD), seed=11)
+    gradient, _ = run(guidance, rgb, means, gaussian(path, spread=SPREAD), seed=11)
 
     clean, end = rgb.detach().permute(0, 3, 1, 2), torch.ones(1, dtype=torch.float64)
     off = clean - means.empty
@@ -46,11 +46,11 @@ def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means
     torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_on_a_flow_the_noise_is_the_end_of_the_euler_steps(make, ask, gaussian, means, rgb):
+def test_on_a_flow_the_noise_is_the_end_of_the_euler_steps(make, run, gaussian, means, rgb):
     """FlowDreamer takes three steps of a third each, the first from sigma = 0."""
     prior = gaussian(RectifiedFlow(shift=3.0))
     guidance = make("ucm", scale=40.0, inversion_grid="sigma", t_min=0.6, t_max=0.6)
-    gradient, _ = ask(guidance, rgb, means, prior)
+    gradient, _ = run(guidance, rgb, means, prior)
     clean = rgb.detach().permute(0, 3, 1, 2)
     noise = clean
     for sigma in (0.0, 1 / 3, 2 / 3):
@@ -63,11 +63,11 @@ def test_on_a_flow_the_noise_is_the_end_of_the_euler_steps(make, ask, gaussian, 
 
 
 @pytest.mark.parametrize(("grid", "sigmas"), [("sigma", [0, 1 / 3, 2 / 3]), ("t", [0, 0.5, 0.75, 0.9])])
-def test_the_published_grids(grid, sigmas, make, ask, gaussian, means, rgb):
+def test_the_published_grids(grid, sigmas, make, run, gaussian, means, rgb):
     """The second grid is even in t, to which Stable Diffusion 3 applies the shift 3."""
     path = RectifiedFlow(shift=3.0)
     prior = gaussian(path)
-    ask(make("ucm", inversion_grid=grid, inversion_steps=len(sigmas)), rgb, means, prior)
+    run(make("ucm", inversion_grid=grid, inversion_steps=len(sigmas)), rgb, means, prior)
     asked = [call.t for call in prior.calls[:-1]]
     for t, sigma in zip(asked, sigmas, strict=True):
         torch.testing.assert_close(path.b(t), torch.full_like(t, sigma))
@@ -75,10 +75,10 @@ def test_the_published_grids(grid, sigmas, make, ask, gaussian, means, rgb):
 
 
 @pytest.mark.parametrize("steps", [1, 5])
-def test_predictions_are_made_as_the_method_says(steps, path, make, ask, gaussian, means, rgb):
+def test_predictions_follow_the_published_method(steps, path, make, run, gaussian, means, rgb):
     """Predictions are unprompted along the grid, which is even in b; the last one is prompted and guided."""
     prior = gaussian(path)
-    ask(make("ucm", scale=40.0, inversion_steps=steps, inversion_grid="sigma"), rgb, means, prior)
+    run(make("ucm", scale=40.0, inversion_steps=steps, inversion_grid="sigma"), rgb, means, prior)
     *unprompted, prompted = prior.calls
     assert len(unprompted) == steps
     assert all(call.condition.positive is call.condition.negative is means.empty for call in unprompted)
@@ -111,16 +111,16 @@ def test_the_noise_of_an_image_is_its_standard_score(shift, make, gaussian, mean
     assert errors[1] == pytest.approx(errors[0] / 2, rel=0.1)  # a first-order method
 
 
-def test_it_is_deterministic_given_t(make, ask, prior, means, rgb):
+def test_the_gradient_is_a_function_of_t(make, run, prior, means, rgb):
     guidance = make("ucm", t_min=0.5, t_max=0.5)
-    first, again = (ask(guidance, rgb, means, prior, seed=seed)[0] for seed in (0, 1))
+    first, again = (run(guidance, rgb, means, prior, seed=seed)[0] for seed in (0, 1))
     assert torch.equal(first, again)
 
 
-def test_fresh_noise_enters_in_proportion_to_b(path, make, ask, gaussian, means, rgb):
+def test_fresh_noise_enters_in_proportion_to_b(path, make, run, gaussian, means, rgb):
     """eps* <- (1 - b / 2) eps* + b / 2 eps', as in FlowDreamer's variant with Perp-Neg."""
     prior, clean = gaussian(path), rgb.detach().permute(0, 3, 1, 2)
-    gradient, _ = ask(make("ucm", fresh_noise=0.5, t_min=0.3, t_max=0.8), rgb, means, prior, seed=4)
+    gradient, _ = run(make("ucm", fresh_noise=0.5, t_min=0.3, t_max=0.8), rgb, means, prior, seed=4)
     t, generator = drawn_t(3, 0.3, 0.8, seed=4)
     fresh = torch.randn(clean.shape, generator=generator).double()
     noise = make("ucm").couple(case_of(clean, prior, means))
@@ -130,12 +130,12 @@ def test_fresh_noise_enters_in_proportion_to_b(path, make, ask, gaussian, means,
     torch.testing.assert_close(gradient, velocity - path.velocity(clean, noise, t), rtol=1e-7, atol=1e-8)
 
 
-def test_gradient_is_the_residual_over_b(make, ask, prior, means, rgb):
-    _, output = ask(make("ucm", weighting="sigma"), rgb, means, prior)
+def test_gradient_is_the_residual_over_b(make, run, prior, means, rgb):
+    _, output = run(make("ucm", weighting="sigma"), rgb, means, prior)
     assert output.log["guidance_rms"] == pytest.approx(output.log["residual_rms"], rel=1e-9)
 
 
-def test_half_precision_keeps_its_coupling(make, gaussian, one_image):
+def test_the_coupling_works_in_half_precision(make, gaussian, one_image):
     """Levels are never in half precision, and fresh noise in half precision can be added."""
     prior = gaussian(DDPM())
     render = one_image.positive.to(torch.bfloat16).permute(0, 2, 3, 1).requires_grad_()

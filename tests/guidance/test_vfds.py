@@ -9,10 +9,10 @@ SPREAD = 0.5
 
 
 @pytest.mark.parametrize("scale", [0.0, 1.0, 40.0])
-def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means, rgb):
+def test_gradient_equals_the_closed_form(scale, path, make, run, gaussian, means, rgb):
     """v_hat - v = (b (x0 - m) - a s^2 eps) / (a^2 s^2 + b^2), m the guided mean; on either kind of path."""
     prior = gaussian(path, spread=SPREAD)
-    gradient, _ = ask(make("vfds", scale=scale, t_min=0.2, t_max=0.9), rgb, means, prior, seed=11)
+    gradient, _ = run(make("vfds", scale=scale, t_min=0.2, t_max=0.9), rgb, means, prior, seed=11)
 
     clean = rgb.detach().permute(0, 3, 1, 2)
     generator = torch.Generator().manual_seed(11)
@@ -24,11 +24,11 @@ def test_gradient_equals_the_closed_form(scale, path, make, ask, gaussian, means
     torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_on_a_flow_the_target_is_noise_minus_render(make, ask, gaussian, means, rgb):
+def test_on_a_flow_the_target_is_noise_minus_render(make, run, gaussian, means, rgb):
     """G = v_hat - (eps - x0), with the sign of FlowDreamer."""
     path = RectifiedFlow(shift=3.0)
     prior = gaussian(path)
-    gradient, _ = ask(make("vfds", scale=40.0), rgb, means, prior, seed=3)
+    gradient, _ = run(make("vfds", scale=40.0), rgb, means, prior, seed=3)
     clean = rgb.detach().permute(0, 3, 1, 2)
     generator = torch.Generator().manual_seed(3)
     t = 0.02 + 0.96 * torch.rand(clean.shape[0], generator=generator).double()
@@ -38,18 +38,18 @@ def test_on_a_flow_the_target_is_noise_minus_render(make, ask, gaussian, means, 
     torch.testing.assert_close(gradient, guess - (noise - clean), rtol=1e-9, atol=1e-9)
 
 
-def test_gradient_is_the_residual_over_b(make, ask, prior, means, rgb):
-    _, output = ask(make("vfds", weighting="sigma"), rgb, means, prior)
+def test_gradient_is_the_residual_over_b(make, run, prior, means, rgb):
+    _, output = run(make("vfds", weighting="sigma"), rgb, means, prior)
     assert output.log["guidance_rms"] == pytest.approx(output.log["residual_rms"], rel=1e-9)
 
 
-def test_times_a_it_is_sds(path, make, ask, prior, means, rgb):
-    velocity, _ = ask(make("vfds"), rgb, means, prior, seed=4)
-    noise, _ = ask(make("sds"), rgb, means, prior, seed=4)
+def test_vfds_times_a_equals_sds(path, make, run, prior, means, rgb):
+    velocity, _ = run(make("vfds"), rgb, means, prior, seed=4)
+    noise, _ = run(make("sds"), rgb, means, prior, seed=4)
     torch.testing.assert_close(velocity * per_view(path.a(prior.calls[-1].t)), noise, rtol=1e-8, atol=1e-9)
 
 
-def test_paths_agree_at_equal_b_and_an_equal_clean_prediction(make, ask, gaussian, one_image, rgb):
+def test_paths_agree_at_equal_b_and_an_equal_clean_prediction(make, run, gaussian, one_image, rgb):
     """Without spread the predicted clean image is the image itself, on any path."""
     gradients = []
     for path, t in (
@@ -57,11 +57,11 @@ def test_paths_agree_at_equal_b_and_an_equal_clean_prediction(make, ask, gaussia
         (RectifiedFlow(), float(DDPM().b(torch.tensor([0.4], dtype=torch.float64)))),
     ):
         guidance = make("vfds", t_min=t, t_max=t)
-        gradients.append(ask(guidance, rgb, one_image, gaussian(path, spread=0.0))[0])
+        gradients.append(run(guidance, rgb, one_image, gaussian(path, spread=0.0))[0])
     torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-7, atol=1e-9)
 
 
-def test_one_guided_prediction_per_step(make, ask, gaussian, means, rgb):
+def test_one_guided_prediction_per_step(make, run, gaussian, means, rgb):
     prior = gaussian(RectifiedFlow())
-    ask(make("vfds", scale=40.0), rgb, means, prior)
+    run(make("vfds", scale=40.0), rgb, means, prior)
     assert [(call.scale, call.condition) for call in prior.calls] == [(40.0, means)]

@@ -50,7 +50,7 @@ def test_colors_scatter_around_the_mean_within_the_noise():
     assert float((rgb - center).abs().max()) == pytest.approx(0.1, abs=1e-3)
 
 
-def test_colors_stay_colors():
+def test_colors_stay_in_their_range():
     rgb = 0.5 + SH_C0 * build(color=[0.0, 1.0, 0.5], color_noise=1.0).sh[:, 0]
     assert rgb.min() >= -1e-6
     assert rgb.max() <= 1 + 1e-6
@@ -66,7 +66,8 @@ def test_scale_opacity_and_degree_are_as_requested():
 
 def test_neighbouring_gaussians_just_overlap_by_default():
     scales = build(count=4000).scales.mean()
-    spacing = 0.5 * (4 / 3 * torch.pi / 4000) ** (1 / 3)  # of as many points on a grid in this ball
+    # The spacing of as many points on a grid in this ball.
+    spacing = 0.5 * (4 / 3 * torch.pi / 4000) ** (1 / 3)
     assert 0.5 * spacing < scales < 1.5 * spacing
 
 

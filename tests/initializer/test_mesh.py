@@ -68,28 +68,31 @@ def test_the_bounding_box_is_centred(tmp_path):
 
 
 def test_a_file_with_y_up_is_upright_and_faces_the_front(tmp_path):
-    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 3.0, 0], [0, 0, 2.0]])  # tall in y, its front towards +z
+    # The mesh is tall in y, and its front is towards +z.
+    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 3.0, 0], [0, 0, 2.0]])
     mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 1, 3], [0, 2, 3]], process=False)
     path = save(mesh, tmp_path / "mark.ply")
     extent = {up: build(path, up=up, count=5000).means for up in ("y", "z")}
     size = {up: means.amax(dim=0) - means.amin(dim=0) for up, means in extent.items()}
     assert size["z"].argsort().tolist() == [0, 2, 1]  # as in the file
-    assert size["y"].argsort().tolist() == [1, 0, 2]  # file y is world z, file z is world x
+    # The y of the file is the z of the world, and its z is x.
+    assert size["y"].argsort().tolist() == [1, 0, 2]
+    # The top is at the back, where the file has z = 0.
     top = extent["y"][extent["y"][:, 2].argmax()]
-    assert top[0] < 0  # where the file has z = 0, the back
+    assert top[0] < 0
 
 
-def test_a_turn_brings_one_side_to_the_front(tmp_path):
-    corners = np.array(
-        [[0, 0, 0], [0, -3.0, 0], [0, 0, 1]]
-    )  # long towards -y, the front of Blender's objects
+def test_a_turn_moves_another_side_to_the_front(tmp_path):
+    # The triangle is long towards -y, the front of Blender's objects.
+    corners = np.array([[0, 0, 0], [0, -3.0, 0], [0, 0, 1]])
     path = save(trimesh.Trimesh(corners, [[0, 1, 2]], process=False), tmp_path / "mark.ply")
     means = build(path, turn_deg=90).means
     torch.testing.assert_close(means[:, 1], torch.zeros(2000), atol=1e-5, rtol=0)
-    assert means[means[:, 2].argmax(), 0] < means[:, 0].mean()  # the tip is where the long side begins
+    # The tip is above the point where the long side begins.
+    assert means[means[:, 2].argmax(), 0] < means[:, 0].mean()
 
 
-def test_without_a_radius_it_stays_as_it_is(tmp_path):
+def test_without_a_radius_position_and_size_are_those_of_the_file(tmp_path):
     mesh = trimesh.creation.box(extents=(0.2, 0.2, 0.2)).apply_translation([0.1, 0.5, 0])
     means = build(save(mesh, tmp_path / "box.ply"), radius=None).means
     torch.testing.assert_close(means.amin(dim=0), torch.tensor([0.0, 0.4, -0.1]), atol=0.01, rtol=0)
@@ -108,7 +111,7 @@ def test_vertex_colors_are_interpolated(tmp_path):
     assert rgb(made)[:, 1:].abs().max() < 1e-3
 
 
-def test_face_colors_do_not_bleed(tmp_path):
+def test_face_colors_end_at_the_border_of_the_face(tmp_path):
     box = trimesh.creation.box(extents=(2, 2, 2))
     colors = np.zeros((12, 4), dtype=np.uint8)
     colors[:, 2], colors[:, 3] = np.where(box.face_normals[:, 2] > 0.5, 255, 0), 255
@@ -136,7 +139,7 @@ def test_textures_are_read_at_each_point(tmp_path):
 QUAD = "v 0 0 0{0}\nv 1 0 0{0}\nv 1 1 0{0}\nv 0 1 0{0}\n"
 
 
-def test_an_obj_brings_its_colors_at_vertices_in_materials_and_in_textures(tmp_path):
+def test_an_obj_may_have_colors_in_vertices_materials_or_textures(tmp_path):
     Image.new("RGB", (4, 4), (0, 0, 255)).save(tmp_path / "blue.png")
     (tmp_path / "all.mtl").write_text("newmtl plain\nKd 0 1 0\nnewmtl image\nKd 1 1 1\nmap_Kd blue.png\n")
     files = {
@@ -196,11 +199,12 @@ def test_a_body_of_seven_thousand_vertices_becomes_fifty_thousand_gaussians(tmp_
     body = trimesh.creation.capsule(height=1.2, radius=0.3, count=[84, 84])
     made = build(save(body, tmp_path / "body.obj"), up="z", count=50_000, scale=None)
     assert len(made) == 50_000
-    spacing = (body.area / 50_000) ** 0.5  # it is 1.8 tall, so nothing is scaled
+    # The body is 1.8 tall, so its size does not change.
+    spacing = (body.area / 50_000) ** 0.5
     assert 0.4 * spacing < float(made.scales.mean()) < 1.2 * spacing
 
 
-def test_a_file_without_colors_gets_the_given_one(tmp_path):
+def test_a_file_without_colors_gets_the_configured_color(tmp_path):
     made = build(save(trimesh.creation.box(), tmp_path / "box.stl"), color=[0.2, 0.4, 0.6])
     torch.testing.assert_close(rgb(made), torch.tensor([[0.2, 0.4, 0.6]]).expand(2000, 3))
 

@@ -62,7 +62,7 @@ def saved(tmp_path, gaussians: Gaussians, up: str = "-y"):
     return tmp_path / "asset.ply"
 
 
-def from_strangers(path):
+def without_our_comments(path):
     """Remove the comments that name the program and the up axis."""
     lines = path.read_bytes().split(b"\n")
     path.write_bytes(b"\n".join(line for line in lines if not line.startswith(b"comment cadam3d")))
@@ -90,7 +90,7 @@ def test_assets_of_any_degree_are_read_back_up_to_rounding(tmp_path, degree):
 @pytest.mark.parametrize(("written", "asked"), [("-y", None), ("+z", "+z"), ("+y", "+y")])
 def test_the_up_axis_of_other_programs_assets_can_be_given(tmp_path, written, asked):
     asset = some_gaussians()
-    assert_equal(build(from_strangers(saved(tmp_path, asset, written)), up=asked), asset)
+    assert_equal(build(without_our_comments(saved(tmp_path, asset, written)), up=asked), asset)
 
 
 @pytest.mark.parametrize("turn_deg", [0, 90, 180, 270])
@@ -120,7 +120,7 @@ def test_an_asset_is_scaled_as_a_whole(tmp_path):
     assert torch.equal(made.opacity_logits, asset.opacity_logits)
 
 
-def test_of_a_large_asset_a_random_part_is_taken(tmp_path):
+def test_a_cap_selects_random_rows_of_an_asset(tmp_path):
     asset = some_gaussians()
     made = build(saved(tmp_path, asset), count=20)
     rows = [int((asset.means == mean).all(dim=1).nonzero()) for mean in made.means]
@@ -200,14 +200,14 @@ def test_points_keep_their_places_and_colors_in_every_layout(tmp_path, layout, k
     assert made.sh_degree == 0
 
 
-def test_points_without_colors_get_the_given_one(tmp_path):
+def test_points_without_colors_get_the_configured_color(tmp_path):
     made = build(point_cloud(tmp_path, names=""), sh_degree=1)
     torch.testing.assert_close(rgb(made), torch.tensor([[0.2, 0.4, 0.6]]).expand(40, 3))
     assert made.sh_degree == 1
 
 
 @pytest.mark.parametrize(
-    ("up", "world"), [("+z", (0, 1, 2)), ("+y", (2, 0, 1)), (None, (0, 1, 2))], ids=["+z", "+y", "unsaid"]
+    ("up", "world"), [("+z", (0, 1, 2)), ("+y", (2, 0, 1)), (None, (0, 1, 2))], ids=["+z", "+y", "not given"]
 )
 def test_points_are_upright(tmp_path, up, world):
     torch.testing.assert_close(build(point_cloud(tmp_path), up=up).means, POINTS[:, world])
@@ -229,7 +229,7 @@ def test_points_are_scaled_before_they_are_replicated(tmp_path):
     torch.testing.assert_close(rgb(made).view(40, 20, 3), (COLORS / 255)[:, None].expand(40, 20, 3))
 
 
-def test_a_cap_counts_points_not_their_copies(tmp_path):
+def test_a_cap_applies_to_points_before_they_are_replicated(tmp_path):
     assert len(build(point_cloud(tmp_path), count=10, replicate=20)) == 200
 
 

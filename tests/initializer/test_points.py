@@ -96,7 +96,7 @@ def test_every_point_is_replicated_at_the_same_offsets():
     assert torch.equal(made.rgb.view(50, 20, 3), original.rgb[:, None].expand(50, 20, 3))
 
 
-def test_one_of_each_is_the_cloud_itself_and_draws_nothing():
+def test_one_copy_of_each_point_is_the_cloud_itself_without_random_draws():
     generator = seeded()
     before = generator.get_state()
     original = colored(5)
@@ -104,7 +104,7 @@ def test_one_of_each_is_the_cloud_itself_and_draws_nothing():
     assert torch.equal(generator.get_state(), before)
 
 
-def test_a_ball_is_full():
+def test_points_fill_a_ball_with_equal_density():
     radii = points_in_ball(20_000, 0.5, seeded()).norm(dim=-1)
     assert radii.max() <= 0.5 + 1e-6
     assert float((radii < 0.25).float().mean()) == pytest.approx(1 / 8, abs=0.01)
@@ -119,11 +119,11 @@ def test_rows_are_a_random_choice_in_order():
 
 
 @pytest.mark.parametrize("count", [None, 10, 11])
-def test_no_cap_below_the_count_leaves_all_rows(count):
+def test_all_rows_remain_unless_the_cap_is_smaller(count):
     assert rows_of(10, count, seeded()).tolist() == list(range(10))
 
 
-def test_what_fits_is_centred_and_its_farthest_point_at_the_radius():
+def test_fitted_points_are_centred_with_the_farthest_at_the_radius():
     points = cloud(500) * torch.tensor([1.0, 2.0, 0.5]) + 7
     center, factor = fit(points, 0.9)
     placed = (points - center) * factor
@@ -131,12 +131,12 @@ def test_what_fits_is_centred_and_its_farthest_point_at_the_radius():
     torch.testing.assert_close(placed.amin(dim=0), -placed.amax(dim=0), atol=1e-5, rtol=0)
 
 
-def test_without_a_radius_everything_stays_as_it_is():
+def test_without_a_radius_points_do_not_move():
     center, factor = fit(cloud(5), None)
     assert torch.equal((cloud(5) - center) * factor, cloud(5))
 
 
-def test_a_single_point_fits_anywhere():
+def test_a_single_point_is_moved_to_the_origin():
     center, factor = fit(cloud(1), 0.5)
     assert ((cloud(1) - center) * factor).tolist() == [[0, 0, 0]]
 

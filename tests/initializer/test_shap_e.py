@@ -76,13 +76,13 @@ def test_the_mesh_is_centred_and_scaled():
     torch.testing.assert_close(means.amin(dim=0), -means.amax(dim=0))
 
 
-def test_a_quarter_turn_brings_shap_es_front_to_ours():
+def test_a_quarter_turn_moves_the_front_of_shap_e_to_our_front():
     means = settle(radius=None, turn_deg=90).means
     wanted = torch.stack([-a_mesh().vertices[:, 1], a_mesh().vertices[:, 0], a_mesh().vertices[:, 2]], dim=1)
     assert torch.equal(means, wanted)
 
 
-def test_random_points_of_the_surface_are_colored_as_it_is():
+def test_random_points_of_the_surface_have_its_colors():
     made = settle(radius=None, count=3000)
     assert len(made) == 3000
     assert made.means[:, 2].abs().max() == 0
@@ -102,12 +102,13 @@ def test_growth_adds_points_near_the_surface_and_keeps_the_surface():
     assert ((grown >= low) & (grown <= high)).all()
 
 
-def test_growth_takes_all_points_that_are_near():
+def test_growth_adds_all_candidates_that_are_near():
     vertices = torch.tensor([[0.0, 0, 0], [1, 1, 1]])
     mesh = ColoredMesh(vertices, torch.tensor([[0, 1, 1]]), torch.zeros(2, 3))
     made = settle(mesh=mesh, radius=None, grow_points=200_000, grow_distance=0.5)
     share = (len(made) - 2) / 200_000
-    assert share == pytest.approx(2 * torch.pi * 0.5**3 / 6, rel=0.05)  # an eighth of a ball at each corner
+    # The candidates fill an eighth of a ball at each corner.
+    assert share == pytest.approx(2 * torch.pi * 0.5**3 / 6, rel=0.05)
 
 
 def test_grown_points_are_the_color_of_their_neighbour_and_a_little_brighter():
@@ -151,7 +152,7 @@ def latent(path, seed: int = 0, run_prompt: str = "a corgi", **changes) -> torch
     return made.sample(made._source().find((KIND,), OTHERS), run_prompt, seeded(seed), CPU)
 
 
-def test_a_seed_gives_the_same_latent_and_another_another(models):
+def test_the_latent_depends_on_the_seed(models):
     assert torch.equal(latent(models[True]), latent(models[True]))
     assert not torch.equal(latent(models[True]), latent(models[True], seed=1))
 
@@ -167,7 +168,7 @@ def test_the_latent_is_that_of_the_pipeline_itself(models):
     torch.testing.assert_close(latent(models[True]), wanted)
 
 
-def test_the_prompt_is_used_unless_shap_e_has_another(models):
+def test_the_initializers_own_prompt_replaces_that_of_the_run(models):
     cube = latent(models[True], run_prompt="a red cube")
     assert not torch.equal(cube, latent(models[True]))
     assert torch.equal(cube, latent(models[True], prompt="a red cube"))
@@ -192,7 +193,8 @@ def test_cuda_in_half_precision_agrees_with_the_cpu(models):
     torch.testing.assert_close(there.cpu(), latent(models[True]), atol=0.05, rtol=0)
     before = torch.cuda.memory_allocated()
     assert asked.build("a corgi", seeded(), cuda).device.type == "cuda"
-    assert torch.cuda.memory_allocated() <= before + 2**20  # the Gaussians, and nothing of the model
+    # Only the Gaussians remain in memory, and nothing of the model.
+    assert torch.cuda.memory_allocated() <= before + 2**20
 
 
 def test_the_prompt_becomes_gaussians(models):
@@ -213,7 +215,8 @@ def test_colors_are_those_that_the_model_paints_with(models):
     described = asked.sample(found, "a corgi", seeded(), CPU)
     mesh = asked.decode(found, described)
     renderer = found.part("shap_e_renderer", torch.float32)
-    renderer.decode_to_mesh(described, CPU, grid_size=8)  # which sets the weights of its network
+    # This call sets the weights of the renderer's network.
+    renderer.decode_to_mesh(described, CPU, grid_size=8)
     painted = renderer.mlp(
         position=mesh.vertices[None], direction=None, ts=None, nerf_level="fine", rendering_mode="stf"
     ).channels[0]
@@ -221,7 +224,7 @@ def test_colors_are_those_that_the_model_paints_with(models):
 
 
 def test_a_missing_surface_is_reported(models):
-    with pytest.raises(UserError, match=r"found no surface.*Try: another seed, or initializer\.prompt="):
+    with pytest.raises(UserError, match=r"found no surface.*Try: another seed, or 'initializer\.prompt="):
         shap_e(models[False]).build("a corgi", seeded(), CPU)
 
 
@@ -258,13 +261,14 @@ def test_a_missing_model_is_an_error_or_the_fallback_with_a_note():
     with pytest.raises(UserError, match=r"initializer\.path: expected a folder with a model_index\.json"):
         begin()
     made = begin(fallback=BALL)
-    assert made.note.startswith("Ball stands in for Shap-E. initializer.path: expected a folder")
+    assert made.note.startswith("Ball is used instead of Shap-E. initializer.path: expected a folder")
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_fallback_gives_the_same_gaussians_as_without_shap_e(models, seed):
     wanted = BALL.build("a corgi", seeded(seed), CPU)
-    for path in ("nowhere", models[False]):  # the latter draws, and then finds no surface
+    # The second path draws random numbers before it finds no surface.
+    for path in ("nowhere", models[False]):
         made = begin(path=path, fallback=BALL, seed=seed)
         assert torch.equal(made.gaussians.means, wanted.means)
         assert torch.equal(made.gaussians.sh, wanted.sh)
@@ -272,8 +276,8 @@ def test_the_fallback_gives_the_same_gaussians_as_without_shap_e(models, seed):
 
 def test_nested_fallbacks_are_all_named():
     note = begin(fallback=shap_e("elsewhere", fallback=BALL)).note
-    assert note.index("ShapE stands in for Shap-E") < note.index("'nowhere'")
-    assert note.index("Ball stands in for Shap-E") < note.index("'elsewhere'")
+    assert note.index("ShapE is used instead of Shap-E") < note.index("'nowhere'")
+    assert note.index("Ball is used instead of Shap-E") < note.index("'elsewhere'")
 
 
 def test_a_mistake_in_the_fallback_is_an_error():

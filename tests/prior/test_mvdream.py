@@ -9,8 +9,8 @@ import torch
 from latents import (
     KEYS,
     computes_in_sixteen_bits,
-    encodes_what_the_autoencoder_says,
-    memory_is_foreseen,
+    encodes_like_the_autoencoder,
+    memory_is_estimated,
     micro_batch_changes_nothing,
     normal,
 )
@@ -152,7 +152,7 @@ def test_the_front_is_encoded_as_published():
 
 
 def test_latents_are_those_of_the_autoencoder(prior, pipe):
-    encodes_what_the_autoencoder_says(prior, pipe.vae)
+    encodes_like_the_autoencoder(prior, pipe.vae)
 
 
 def test_micro_batch_does_not_change_results(prior):
@@ -164,7 +164,7 @@ def test_networks_compute_in_16_bits_and_return_float32(prior):
 
 
 def test_memory_is_estimated(prior):
-    memory_is_foreseen(prior, views=4)
+    memory_is_estimated(prior, views=4)
     with pytest.raises(UserError, match=r"^views: expected a multiple of 4"):
         prior.memory("a corgi", "", 2, None)
 
@@ -235,7 +235,7 @@ def test_memory_of_one_file_is_estimated(prior, file, folder):
 
 
 def test_the_tokenizer_of_one_file_pads_as_it_was_trained(prior, file, folder):
-    """Padding is token 0, which is also the exclamation mark; the mark must survive in a prompt."""
+    """Padding is token 0, which is also the exclamation mark; the mark must not be lost in a prompt."""
     one = replace(prior, path=str(file), tokenizer=str(folder / "tokens"))
     tokenizer = one.found.part("tokenizer")
     numbers = tokenizer(["a!"], padding="max_length", max_length=77).input_ids[0]
@@ -245,7 +245,7 @@ def test_the_tokenizer_of_one_file_pads_as_it_was_trained(prior, file, folder):
 
 @pytest.mark.parametrize("where", ["empty", "other"])
 def test_a_tokenizer_that_does_not_fit_is_refused(prior, file, tmp_path, where):
-    """If transformers finds no files, it silently builds a tokenizer that knows no words."""
+    """If transformers finds no files, it silently builds a tokenizer without a vocabulary."""
     if where == "other":
         (tmp_path / "vocab.json").write_text(json.dumps({"a": 0, "<|startoftext|>": 1, "<|endoftext|>": 2}))
         (tmp_path / "merges.txt").write_text("#version: 0.2\n")
@@ -253,7 +253,7 @@ def test_a_tokenizer_that_does_not_fit_is_refused(prior, file, tmp_path, where):
         replace(prior, path=str(file), tokenizer=str(tmp_path)).embed("a corgi", "")
 
 
-def test_a_folder_whose_unet_keeps_its_old_names_is_the_same_model(prior, pipe, folder, tmp_path):
+def test_a_folder_with_the_published_names_in_its_unet_is_the_same_model(prior, pipe, folder, tmp_path):
     """On the hub the UNet has a class of another package, of which no code is run."""
     model = tmp_path / "model"
     shutil.copytree(folder, model, ignore=shutil.ignore_patterns("unet", "tokens"))

@@ -59,7 +59,7 @@ def test_a_falls_and_b_rises(path):
 
 @every_path
 @every_dtype
-def test_a_share_of_noise_belongs_to_one_t(path, dtype):
+def test_t_at_inverts_the_share_of_noise(path, dtype):
     t = torch.cat([torch.tensor([1e-4]), inner_levels(50)]).to(dtype)
     found = path.t_at(path.b(t))
     assert found.dtype == dtype
@@ -144,7 +144,7 @@ def complete_every_form(path, clean, noise, t):
 
 
 @every_path
-def test_three_forms_of_the_truth_all_return_it(path):
+def test_the_three_forms_of_the_true_pair_all_return_that_pair(path):
     t = inner_levels(50)
     clean, noise = pairs(50)
     for guess in complete_every_form(path, clean, noise, t).values():

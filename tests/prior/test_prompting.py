@@ -32,7 +32,7 @@ def views(azimuth, elevation=0.0):
 
 
 @pytest.mark.parametrize("prompting", EVERY, ids=lambda each: type(each).__name__)
-def test_laws(prompting):
+def test_weights_are_valid_and_the_same_on_both_sides(prompting):
     mix = prompting.mix(views(torch.linspace(-180, 180, 73), elevation=30))
     k = len(prompting.texts("a corgi"))
     for rows in (mix.positive, mix.repelled):
@@ -62,7 +62,7 @@ def test_laws(prompting):
         (180, 80, OVERHEAD),
     ],
 )
-def test_discrete_rules_and_overhead_wins(azimuth, elevation, text):
+def test_discrete_rules_with_precedence_for_overhead(azimuth, elevation, text):
     assert DISCRETE.mix(views(azimuth, elevation)).positive.argmax() == text
 
 
@@ -105,7 +105,7 @@ def test_the_curves_of_threestudio(azimuth, strengths):
     torch.testing.assert_close(THREESTUDIO.mix(views(azimuth)).strengths[0], torch.tensor(strengths))
 
 
-def test_overhead_repels_nothing():
+def test_nothing_is_repelled_from_overhead_views():
     mix = THREESTUDIO.mix(views([0, 120], elevation=70))
     assert (mix.positive.argmax(dim=-1) == OVERHEAD).all()
     assert (mix.strengths == 0).all()
@@ -128,7 +128,8 @@ def test_repulsion_acts_across_the_prompt_only():
     direction = (positive - negative).flatten(1)
     extra = (guided - positive).flatten(1)
     torch.testing.assert_close((extra * direction).sum(dim=1), torch.zeros(2).double(), atol=1e-10, rtol=0)
-    for view in range(2):  # by projection matrices, one view at a time
+    # Compute the same with projection matrices, one view at a time.
+    for view in range(2):
         d = direction[view]
         across = torch.eye(len(d)).double() - torch.outer(d, d) / d.square().sum()
         wanted = sum(strengths[view, i] * across @ (others[i] - negative)[view].flatten() for i in range(2))

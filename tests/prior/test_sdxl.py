@@ -8,8 +8,8 @@ from latents import (
     KEYS,
     computes_in_sixteen_bits,
     condition_of,
-    encodes_what_the_autoencoder_says,
-    memory_is_foreseen,
+    encodes_like_the_autoencoder,
+    memory_is_estimated,
     micro_batch_changes_nothing,
     normal,
 )
@@ -37,7 +37,7 @@ def prior(folder, tmp_path_factory):
 
 @pytest.mark.parametrize("negative", ["ugly", ""])
 def test_texts_are_embedded_as_the_pipeline_embeds_them(prior, pipe, negative):
-    """The pipeline embeds its empty negative prompt, None, as zeros, since the index of the model says so."""
+    """The pipeline embeds an empty negative prompt, None, as zeros, since the model's index requires it."""
     texts = prior.embed("a red cube", negative).texts
     positive, other, pooled, other_pooled = pipe.encode_prompt(
         "a red cube, side view", negative_prompt=negative or None
@@ -49,7 +49,7 @@ def test_texts_are_embedded_as_the_pipeline_embeds_them(prior, pipe, negative):
     assert bool(texts.tokens[-1].any()) is False
 
 
-def test_a_model_that_does_not_ask_for_zeros_reads_the_empty_text(prior, pipe):
+def test_a_model_without_the_option_for_zeros_embeds_the_empty_text(prior, pipe):
     found = replace(prior.found, index=prior.found.index | {"force_zeros_for_empty_prompt": False})
     texts = prior.embed_texts(found, [""], torch.device("cpu"))
     tokens, _, pooled, _ = pipe.encode_prompt("", do_classifier_free_guidance=False)
@@ -95,7 +95,7 @@ def test_the_network_reads_the_image_size(prior):
 
 
 def test_latents_are_those_of_the_pipelines_autoencoder(prior, pipe):
-    encodes_what_the_autoencoder_says(prior, pipe.vae)
+    encodes_like_the_autoencoder(prior, pipe.vae)
 
 
 def test_networks_compute_in_16_bits_and_return_float32(prior):
@@ -103,7 +103,7 @@ def test_networks_compute_in_16_bits_and_return_float32(prior):
 
 
 def test_memory_is_estimated(prior):
-    memory_is_foreseen(prior)
+    memory_is_estimated(prior)
 
 
 def test_micro_batch_does_not_change_results(prior):
@@ -114,5 +114,5 @@ def test_micro_batch_does_not_change_results(prior):
     ("dtype", "expected"),
     [("float16", torch.float32), ("bfloat16", torch.bfloat16), ("float32", torch.float32)],
 )
-def test_the_autoencoder_overflows_in_float16_and_stays_out_of_it(prior, dtype, expected):
+def test_the_autoencoder_never_computes_in_float16(prior, dtype, expected):
     assert replace(prior, dtype=dtype).vae.dtype == expected

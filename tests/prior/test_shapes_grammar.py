@@ -89,7 +89,7 @@ def test_all_unknown_words_are_named_with_near_words_and_alternatives() -> None:
         ("a redd chiar, please on a tabel", "a red and yellow checkered torus"),  # "please" has no near word
         ("A Redd chiar", "a red chair"),
         ("a lihgthouse on a bal", "a lighthouse on a ball"),
-        ("a blu", "a red and yellow checkered torus"),  # "a blue" is no sentence
+        ("a blu", "a red and yellow checkered torus"),  # "a blue" is not a sentence
     ],
 )
 def test_the_advice_for_misspelt_words_can_be_parsed(prompt: str, corrected: str) -> None:

@@ -107,9 +107,8 @@ def test_ends_of_the_path_are_finite(path: NoisePath, sigma: float, t: float, dt
     assert bool(clean.isfinite().all())
     assert bool(noise.isfinite().all())
     if sigma > 0 and t == 0:
-        torch.testing.assert_close(
-            clean, torch.ones(2, 1, 1, 2, dtype=dtype)
-        )  # a clean image is its own mean
+        # The posterior mean of a clean image is the image itself.
+        torch.testing.assert_close(clean, torch.ones(2, 1, 1, 2, dtype=dtype))
 
 
 def test_pure_noise_gives_the_mean_of_the_mixture() -> None:

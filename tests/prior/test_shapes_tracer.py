@@ -109,7 +109,7 @@ def test_picture_equals_brute_force(prompt: str) -> None:
     scene = compile_scene(parts)
     image = layers.images(scene.albedo, torch.zeros(2, 3, dtype=torch.float64))[:, 0].permute(0, 2, 3, 1)
     error = (image[layers.alpha > 0][found] - colours[nearest] * light[:, None]).abs().amax(1)
-    # A ray that meets an edge within the tolerance of a hit may hit the neighbouring face.
+    # A ray that passes an edge within the tolerance of a hit may hit the neighbouring face.
     assert float((error < 0.02).double().mean()) > 0.96
 
 
@@ -120,7 +120,8 @@ def test_light_on_a_sphere_equals_the_formula() -> None:
     origins, directions = view.rays()
     along = -(origins[:, None, None] * directions).sum(-1)
     square = along**2 - (origins.square().sum(-1) - FIT_RADIUS**2)[:, None, None]
-    is_inner = square > 0.02  # away from the rim, where a normal turns fast
+    # Leave out the rim, where normals change fast.
+    is_inner = square > 0.02
     point = origins[:, None, None] + (along - square.clamp_min(0).sqrt())[..., None] * directions
     expected = expected_light(point / FIT_RADIUS)
     torch.testing.assert_close(layers.paints.sum(-1)[is_inner], expected[is_inner], atol=5e-3, rtol=0)
@@ -132,7 +133,8 @@ def test_turning_scene_and_camera_together_changes_no_silhouette() -> None:
     view = cameras(40, 4).to(torch.float64)
     before = trace(compile_scene(parts), view, 2).alpha
     after = trace(compile_scene(turned), view, 2).alpha
-    assert float((after - before.roll(1, 0)).abs().mean()) < 1e-3  # view i sees what view i - 1 saw
+    # View i now shows the same side as view i - 1 did before.
+    assert float((after - before.roll(1, 0)).abs().mean()) < 1e-3
 
 
 @pytest.mark.parametrize("prompt", ["sphere", "cube", "cone", "disc"])
@@ -195,7 +197,7 @@ def test_on_and_under_are_above_and_below(prompt: str, above: bool) -> None:
     assert bool(mean_red < mean_blue) is above
 
 
-def test_between_is_in_the_middle_as_seen_from_the_front() -> None:
+def test_an_object_between_others_is_in_the_middle_as_seen_from_the_front() -> None:
     scene, layers = look("a green sphere between a red cube and a blue cube")
     image = layers.images(scene.albedo, torch.zeros(4, 3))[0, 0]
     columns = torch.arange(40.0)

@@ -82,7 +82,8 @@ def test_a_prediction_equals_that_of_the_pipeline(prediction, make, pipeline_of)
     """Compare with text encoder, UNet, guidance and scheduler of diffusers, at levels of its table."""
     pipeline = pipeline_of(prediction)
     prior, clean, noise = make(prediction), random(2, 4, 8, 8), random(2, 4, 8, 8, seed=1)
-    steps = torch.tensor([299, 799])  # rows of the table: t = (row + 1) / 1000
+    # Rows of the table, where t = (row + 1) / 1000.
+    steps = torch.tensor([299, 799])
     noisy = pipeline.scheduler.add_noise(clean, noise, steps)
     torch.testing.assert_close(prior.noise_path.mix(clean, noise, LEVELS), noisy, rtol=1e-5, atol=1e-5)
     positive, negative = pipeline.encode_prompt("a corgi", "cpu", 1, True, negative_prompt="ugly")
@@ -211,7 +212,8 @@ def test_a_text_is_embedded_once_per_model(make, counted, tmp_path):
     assert counted == ["a corgi", "ugly", "", "blurry"]
     torch.testing.assert_close(first[[0, 2]], second[[0, 2]], rtol=0, atol=0)
     make(cache_dir=str(tmp_path), dtype="bfloat16").embed("a corgi", "ugly")
-    assert counted[4:] == ["a corgi", "ugly", ""]  # other numbers, another entry
+    # Another dtype gives other numbers, so it has another entry.
+    assert counted[4:] == ["a corgi", "ugly", ""]
 
 
 def test_a_damaged_entry_is_replaced_and_an_unwritable_cache_is_no_error(make, counted, tmp_path):
@@ -263,7 +265,8 @@ def test_the_estimate_counts_weights_exactly_and_grows_with_the_batch(make, tmp_
     assert make(dtype="bfloat16").memory("a corgi", "", 2, None).working < 0.7 * estimate.working
     assert estimate.texts > 0
     prior.embed("a corgi", "")
-    assert prior.memory("a corgi", "", 2, None).texts == 0  # known: no encoder will be loaded
+    # The texts are cached, so no encoder will be loaded.
+    assert prior.memory("a corgi", "", 2, None).texts == 0
 
 
 def test_the_estimate_of_the_autoencoder_is_what_autograd_keeps(make):

@@ -9,8 +9,8 @@ from latents import (
     KEYS,
     computes_in_sixteen_bits,
     condition_of,
-    encodes_what_the_autoencoder_says,
-    memory_is_foreseen,
+    encodes_like_the_autoencoder,
+    memory_is_estimated,
     micro_batch_changes_nothing,
     normal,
 )
@@ -58,12 +58,12 @@ def test_texts_are_embedded_as_the_pipeline_embeds_them(prior, pipe):
     embeds_as_the_pipeline(prior, pipe)
 
 
-def test_without_t5_too(prior, folder):
+def test_texts_are_embedded_as_the_pipeline_embeds_them_without_t5(prior, folder):
     pipe = diffusers.StableDiffusion3Pipeline.from_pretrained(folder, text_encoder_3=None, tokenizer_3=None)
     embeds_as_the_pipeline(replace(prior, t5=False), pipe)
 
 
-def test_a_model_without_t5_needs_no_key(prior, pipelines):
+def test_a_model_without_t5_needs_no_setting(prior, pipelines):
     folder = pipelines("stable_diffusion_3", t5=False)
     other = replace(prior, path=str(folder))
     assert other.encoders == ("text_encoder", "text_encoder_2")
@@ -143,7 +143,7 @@ def test_the_shift_is_the_models_own(prior, folder, tmp_path):
 
 def test_latents_are_those_of_the_pipelines_autoencoder(prior, pipe):
     assert pipe.vae.config.shift_factor
-    encodes_what_the_autoencoder_says(prior, pipe.vae)
+    encodes_like_the_autoencoder(prior, pipe.vae)
 
 
 def test_networks_compute_in_16_bits_and_return_float32(prior):
@@ -151,7 +151,7 @@ def test_networks_compute_in_16_bits_and_return_float32(prior):
 
 
 def test_memory_is_estimated(prior):
-    memory_is_foreseen(prior)
+    memory_is_estimated(prior)
 
 
 def test_micro_batch_does_not_change_results(prior):

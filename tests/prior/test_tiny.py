@@ -30,12 +30,12 @@ def levels(views=2, value=0.5):
 
 
 @pytest.mark.parametrize("width", [16, 48])
-def test_it_has_fewer_than_two_million_parameters(width):
+def test_the_network_has_fewer_than_two_million_parameters(width):
     network = Tiny(**KEYS | {"width": width}).network
     assert sum(parameter.numel() for parameter in network.parameters()) < 2_000_000
 
 
-def test_it_is_frozen(prior):
+def test_the_network_is_frozen(prior):
     assert not any(parameter.requires_grad for parameter in prior.network.parameters())
 
 
@@ -149,22 +149,22 @@ def noise_of(prior, **keys):
     return prior.predict(noisy_of(1), levels(1), condition_of(prior, views=1, **keys), 1.0).noise
 
 
-def test_another_prompt_is_another_image(prior):
+def test_the_prediction_depends_on_the_prompt(prior):
     assert (noise_of(prior, prompt="a red cube") - noise_of(prior, prompt="a red cone")).abs().max() > 1e-3
 
 
-def test_word_order_matters(prior):
+def test_the_prediction_depends_on_the_word_order(prior):
     assert (
         noise_of(prior, prompt="cube on ball") - noise_of(prior, prompt="ball on cube")
     ).abs().max() > 1e-4
 
 
-def test_another_view_is_another_image(prior):
+def test_the_prediction_depends_on_the_view(prior):
     guess = prior.predict(noisy_of(1).repeat(2, 1, 1, 1), levels(), condition_of(prior), 1.0).noise
     assert (guess[0] - guess[1]).abs().max() > 1e-3
 
 
-def test_another_noise_level_is_another_image(prior):
+def test_the_prediction_depends_on_the_noise_level(prior):
     condition = condition_of(prior, views=1)
     low, high = (prior.predict(noisy_of(1), levels(1, t), condition, 1.0).noise for t in (0.2, 0.8))
     assert (low - high).abs().max() > 1e-3
@@ -196,12 +196,12 @@ def test_tokens_are_bytes_between_start_and_padding():
     assert len(tokens) == len(tokenize("x" * 1000)) == MAX_TOKENS
 
 
-def test_the_user_is_warned_that_it_is_random(prior):
+def test_the_user_is_warned_that_the_network_is_random(prior):
     assert "cannot generate a meaningful object" in prior.notice()
     assert "prior=shapes" in prior.notice()
 
 
-def test_moving_returns_the_prior(prior):
+def test_to_returns_the_prior(prior):
     assert prior.to(torch.device("cpu")) is prior
 
 

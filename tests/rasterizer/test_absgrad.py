@@ -36,7 +36,7 @@ pytestmark = pytest.mark.usefixtures("garbage_in_new_memory")
         pytest.param(needles(12), id="needles"),
     ],
 )
-def test_it_is_the_sum_of_the_absolute_gradients_of_single_pixels(gaussians):
+def test_absgrad_is_the_sum_of_the_absolute_gradients_of_single_pixels(gaussians):
     cameras, (v, h, w) = make_cameras(2, 7, 9), (2, 7, 9)
     scene = gaussians.to(torch.float64).map(lambda tensor: tensor.requires_grad_())
     output = ReferenceRasterizer().render(scene, cameras, backgrounds(v).double(), absgrad=True)
@@ -79,14 +79,14 @@ def test_runs_of_records_that_need_a_whole_warp_agree(backend):
 
 
 @pytest.mark.parametrize("image", IMAGES)
-def test_it_agrees_for_a_loss_on_one_image_only(backend, image):
+def test_every_backend_agrees_for_a_loss_on_one_image_only(backend, image):
     backend.agrees(make_gaussians(60), make_cameras(1, 30, 30), images=(image,), absgrad=True)
 
 
 # -------------------------------------------------------------------------- laws that need no reference
 
 
-def test_requesting_it_changes_no_other_bit(any_backend):
+def test_requesting_absgrad_changes_no_other_bit(any_backend):
     scene = make_gaussians(200, degree=1), make_cameras(2, 40, 50)
     plain, plain_grads = any_backend.differentiate(*scene)
     asked, asked_grads = any_backend.differentiate(*scene, absgrad=True)
@@ -94,14 +94,14 @@ def test_requesting_it_changes_no_other_bit(any_backend):
     assert_same_bits(bits(plain, plain_grads), bits(asked, asked_grads))
 
 
-def test_it_is_none_unless_requested(any_backend):
+def test_absgrad_is_none_unless_requested(any_backend):
     scene = any_backend.put(make_gaussians(20)), make_cameras(1, 9, 9), any_backend.put(backgrounds(1))
     assert any_backend.render(*scene).absgrad is None
     with torch.no_grad():
         assert any_backend.render(*scene, True).absgrad is None
 
 
-def test_its_value_is_zero_and_its_gradient_at_least_as_large_as_that_of_means2d(any_backend):
+def test_absgrad_is_zero_and_its_gradient_is_at_least_that_of_means2d(any_backend):
     gaussians, cameras = make_gaussians(100), make_cameras(2, 30, 40)
     scene = any_backend.put(gaussians), cameras, any_backend.put(backgrounds(2))
     assert not any_backend.render(*scene, True).absgrad.any()
@@ -164,7 +164,7 @@ def test_the_bits_do_not_depend_on_the_schedule_of_threads(emulator):
     assert_same_bits(results[:1] * 2, results[1:])
 
 
-def test_groups_of_views_give_the_same_bits_and_leave_room_for_its_memory(emulator, monkeypatch):
+def test_groups_of_views_give_the_same_bits_and_account_for_absgrad_memory(emulator, monkeypatch):
     gaussians = make_gaussians(120, spread=3.0, log_scale=-1.5)
     scene = gaussians, make_cameras(4, 29, 38), backgrounds(4), make_weights(4, 29, 38)
     _, whole = render_and_differentiate(emulator.render, *scene, absgrad=True)

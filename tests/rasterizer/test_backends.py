@@ -16,6 +16,7 @@ from splats import (
     make_cameras,
     make_gaussians,
     make_weights,
+    multiply_quats,
     needles,
     saturated,
     undecided,
@@ -33,7 +34,7 @@ OF_A_VIEW = (*IMAGES, "means2d", "radii")
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_agrees_on_random_scenes(backend, degree):
+def test_every_backend_agrees_on_random_scenes(backend, degree):
     backend.agrees(make_gaussians(150, degree=degree, seed=degree), make_cameras(2, 45, 61))
 
 
@@ -51,12 +52,12 @@ def test_agrees_on_random_scenes(backend, degree):
         pytest.param(make_gaussians(1, seed=15), id="alone"),
     ],
 )
-def test_agrees_on_adversarial_scenes(backend, gaussians):
+def test_every_backend_agrees_on_adversarial_scenes(backend, gaussians):
     backend.agrees(gaussians, make_cameras(2, 37, 50, seed=1), most=0.5, tolerance=backend.rounding)
 
 
 @pytest.mark.parametrize("image", IMAGES)
-def test_agrees_for_a_loss_on_one_image_only(backend, image):
+def test_every_backend_agrees_for_a_loss_on_one_image_only(backend, image):
     backend.agrees(make_gaussians(60, degree=1), make_cameras(1, 30, 30), images=(image,))
 
 
@@ -122,12 +123,6 @@ def test_moving_scene_and_cameras_together_changes_nothing(any_backend):
         assert_close(f"gradient of {name}", moved_grads[name], grad, 2e-4)
 
 
-def multiply_quats(p, q):
-    w = p[0] * q[:, 0] - q[:, 1:] @ p[1:]
-    xyz = p[0] * q[:, 1:] + q[:, :1] * p[1:] + torch.linalg.cross(p[1:].expand_as(q[:, 1:]), q[:, 1:], dim=-1)
-    return torch.cat([w[:, None], xyz], dim=1)
-
-
 def test_culled_gaussians_change_nothing_and_get_no_gradient(any_backend):
     seen, cameras = make_gaussians(60, degree=1), make_cameras(2, 25, 25)
     culled = make_gaussians(5, degree=1, seed=9)
@@ -179,7 +174,8 @@ def test_a_backward_can_be_repeated_and_means2d_and_background_have_gradients(ba
     assert_same_bits([2 * grad for grad in once], twice)
     wanted = differentiate(ReferenceRasterizer().render, lambda tensors: tensors.to(torch.float64), 1)
     for got, want in zip(once, wanted, strict=True):
-        assert_close("gradient", got, want, 1e-3)  # includes the pixels on a step of the model
+        # The tolerance includes the pixels on a step of the model.
+        assert_close("gradient", got, want, 1e-3)
 
 
 def test_parameters_changed_in_place_before_backward_are_refused(backend):

@@ -67,7 +67,7 @@ def small_checks(monkeypatch):
 
 
 @pytest.mark.usefixtures("small_checks")
-def test_checks_times_and_writes_every_backend_on_every_scene(kernel_build, tmp_path, capsys):
+def test_every_backend_is_checked_timed_and_written_for_every_scene(kernel_build, tmp_path, capsys):
     path = tmp_path / "bench.json"
     cpu = CpuRasterizer(cache_dir=str(kernel_build.path.parent))
     words = ["--counts", "50", "80", "--sizes", "16", "24", "--degrees", "0", "1", "--repeats", "2"]
@@ -82,7 +82,8 @@ def test_checks_times_and_writes_every_backend_on_every_scene(kernel_build, tmp_
     for row in written["rows"]:
         assert 0 < row["forward_backward_min_ms"] <= row["forward_backward_ms"]
         assert min(row["forward_ms"], row["backward_ms"]) > 0
-        assert row["peak_bytes"] is None  # there is no reliable number for a CPU
+        # There is no reliable number for a CPU.
+        assert row["peak_bytes"] is None
         assert f"{row['forward_backward_ms']:.2f}" in shown
     first, second = written["rows"][:2]
     assert first["ratio"] == 1
@@ -94,7 +95,7 @@ def test_checks_times_and_writes_every_backend_on_every_scene(kernel_build, tmp_
 
 
 @pytest.mark.usefixtures("small_checks")
-def test_times_every_stage_of_the_kernels(emulator, tmp_path, capsys):
+def test_every_stage_of_the_kernels_is_timed(emulator, tmp_path, capsys):
     path = tmp_path / "bench.json"
     code = run(
         [*TINY, "--json", str(path)],
@@ -112,7 +113,7 @@ def test_times_every_stage_of_the_kernels(emulator, tmp_path, capsys):
         assert each["stage"] in shown
 
 
-def test_the_command_line_checks_a_backend(kernel_build, monkeypatch, capsys):
+def test_a_backend_can_be_checked_from_the_command_line(kernel_build, monkeypatch, capsys):
     monkeypatch.setattr(
         bench_rasterizer, "component", lambda _: CpuRasterizer(cache_dir=str(kernel_build.path.parent))
     )
@@ -164,7 +165,8 @@ def test_a_backend_that_promises_the_same_bits_must_give_them():
     def wobbles(gaussians):
         return changed(gaussians, means=gaussians.means * next(factors))
 
-    assert not check.check("reference", Wrong(wobbles), CPU)  # the reference does not promise that
+    # The reference does not promise the same bits.
+    assert not check.check("reference", Wrong(wobbles), CPU)
     troubles = check.check("cuda", Wrong(wobbles), CPU)
     assert troubles
     assert all(f"not the same in {check.RUNS} runs" in trouble for trouble in troubles)
@@ -182,7 +184,7 @@ def test_a_sort_that_is_wrong_is_found(emulator, monkeypatch):
     assert check.check_long_sort(emulator, CPU, 5000) == ["5000 keys are sorted wrongly"]
 
 
-def gsplat_stand_in() -> ModuleType:
+def fake_gsplat() -> ModuleType:
     """Return a module with ``gsplat.rasterization`` as documented, implemented with the reference."""
 
     def rasterization(  # noqa: PLR0917
@@ -219,7 +221,7 @@ def gsplat_stand_in() -> ModuleType:
 
 
 def test_gsplat_renders_the_same_scene(monkeypatch):
-    monkeypatch.setitem(sys.modules, "gsplat", gsplat_stand_in())
+    monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat())
     assert not check.check("gsplat", GsplatRasterizer(), CPU)
     scene = make_scene(make_shell(50, 2, CPU), 20, 3)
     output = GsplatRasterizer().render(scene.gaussians, scene.cameras, scene.background)
@@ -279,7 +281,8 @@ def test_the_load_of_a_scene_is_counted(emulator):
     clock = stages.StageClock(emulator)
     gaussians = make_shell(1, 0, CPU).detach()
     gaussians.means.zero_()
-    gaussians.log_scales.fill_(1.0)  # larger than the screen, so it meets every tile in both views
+    # The splat is larger than the screen, so it touches every tile in both views.
+    gaussians.log_scales.fill_(1.0)
     scene = make_scene(gaussians.map(lambda tensor: tensor.requires_grad_()), 20, 2)
     scene.render(stages.KernelRasterizer(clock))
     load = stages.measure_load(ReferenceRasterizer(), scene, clock.slots)
@@ -298,7 +301,8 @@ def test_the_bytes_of_a_stage_are_those_of_its_arguments(emulator):
             tensors = [each for each in arguments if isinstance(each, torch.Tensor)]
             given[self.spans[-1].stage] += sum(tensor.nbytes for tensor in tensors)
 
-    n = 2000  # many, so that cameras, bins and ranges weigh little
+    # With many splats, the bytes of cameras, bins and ranges hardly count.
+    n = 2000
     gaussians = make_shell(n, 1, CPU).detach()
     gaussians.means.mul_(0.02)
     gaussians.log_scales.fill_(-9.0)
@@ -361,7 +365,7 @@ def test_targets_grow_with_the_amount_of_work():
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         ("--backends unknown", "invalid choice: 'unknown'"),
         ("--counts 0", "invalid whole number >= 1 value: '0'"),
@@ -370,7 +374,7 @@ def test_targets_grow_with_the_amount_of_work():
         ("--check-only --no-check", "leave nothing to do"),
         ("--json nowhere/bench.json", "Try: mkdir -p nowhere"),
         ("--backends gsplat", "no backend is left"),
-        ("--backends cuda", "rasterizer=cuda cannot render on cpu"),
+        ("--backends cuda", "rasterizer=cuda: expected a CUDA device, got cpu"),
         pytest.param(
             "--device cuda",
             "torch sees no CUDA device",
@@ -378,14 +382,14 @@ def test_targets_grow_with_the_amount_of_work():
         ),
     ],
 )
-def test_a_mistake_is_reported_in_one_line(words, says, capsys):
+def test_a_mistake_is_reported_in_one_line(words, message, capsys):
     try:
         code = bench_rasterizer.main(words.split())
     except SystemExit as ended:
         code = ended.code
     error = capsys.readouterr().err
     assert code == 2
-    assert says in error
+    assert message in error
     assert error.startswith("bench_rasterizer: ")
     assert error.count("\n") == 1
 

@@ -51,7 +51,7 @@ def remove_compilers(monkeypatch):
     monkeypatch.setattr(module, "find_spec", lambda name: None)
 
 
-def test_compiles_once_and_then_uses_the_cache(fake_compiler, tmp_path):
+def test_kernels_are_compiled_once_and_then_read_from_the_cache(fake_compiler, tmp_path):
     calls = fake_compiler()
     first, second = build(tmp_path / "cache"), build(tmp_path / "cache")
     assert len(calls()) == 1
@@ -160,7 +160,7 @@ def test_the_output_of_a_failing_compiler_is_shown(fake_compiler, tmp_path):
         pytest.param("echo junk > $out; exit 0", id="does not run"),
     ],
 )
-def test_falls_back_to_simpler_flags(fake_compiler, tmp_path, body):
+def test_simpler_flags_are_used_if_the_native_ones_fail(fake_compiler, tmp_path, body):
     calls = fake_compiler(body=f'case "$*" in *native*) {body};; esac; cp {{library}} $out')
     build(tmp_path / "cache")
     assert len(calls()) == len(module.MACHINE_FLAGS)

@@ -27,7 +27,7 @@ def _threads():
     torch.set_num_threads(before)
 
 
-def test_bits_do_not_depend_on_the_number_of_threads(cpu):
+def test_the_bits_do_not_depend_on_the_number_of_threads(cpu):
     gaussians, cameras = make_gaussians(2000, degree=1, log_scale=-2.5), make_cameras(2, 70, 90)
     results = []
     for threads in (1, 2, 3, 7):

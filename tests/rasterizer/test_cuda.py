@@ -41,12 +41,13 @@ def test_the_bits_do_not_depend_on_the_schedule_of_threads(emulator):
         assert_same_bits(results[0], other)
 
 
-@pytest.mark.parametrize("most", [100, 500])  # fewer than pixels; fewer than (splat, tile) pairs
+# The limits are below the number of pixels, and below the number of (splat, tile) pairs.
+@pytest.mark.parametrize("most", [100, 500])
 def test_more_items_than_indices_can_count_are_refused_before_memory_is_allocated(
     emulator, monkeypatch, most
 ):
     monkeypatch.setattr(cuda, "MOST", most)
-    with pytest.raises(UserError, match=r"too many\. Try: fewer"):
+    with pytest.raises(UserError, match=rf"expected at most {most} .*Try: a smaller camera\.size"):
         emulator.render(make_gaussians(200, log_scale=0.0), make_cameras(1, 20, 20), backgrounds(1))
 
 
@@ -59,7 +60,8 @@ def test_kernels_run_on_the_current_stream():
     want = rasterizer.render(gaussians, *scene).rgb
     torch.cuda.synchronize()
     with torch.cuda.stream(torch.cuda.Stream()):
-        torch.cuda._sleep(10**8)  # another stream would overtake this
+        # Kernels on another stream would overtake this pause.
+        torch.cuda._sleep(10**8)
         got = rasterizer.render(gaussians.map(lambda tensor: tensor + 0), *scene).rgb
     torch.cuda.synchronize()
     assert torch.equal(got, want)

@@ -54,7 +54,7 @@ def outcome(runtime, build_cache, tmp_path_factory) -> subprocess.CompletedProce
     options = {
         "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tests"))),
         "LD_PRELOAD": runtime,
-        # Python leaks by design, and fibers have stacks that the sanitizer does not know.
+        # Python leaks by design, and the sanitizer does not track the stacks of fibers.
         "ASAN_OPTIONS": "detect_leaks=0:detect_stack_use_after_return=0:halt_on_error=0",
         "OMP_NUM_THREADS": "1",
     }

@@ -18,7 +18,8 @@ from cadam3d.rasterizer.cuda import BLEND_BLOCK, MOST, WARP, CudaRasterizer, _la
 from cadam3d.rasterizer.driver import Module, load_driver
 from cadam3d.rasterizer.nvrtc import Cubin
 
-# A driver that launches the kernel "works" and records how. It has no memory for "full", and knows no others.
+# A driver with the kernels "works" and "full". It records the launches of the first kernel, and it has no
+# memory for the second.
 STUB = """
 #include <string.h>
 extern "C" {
@@ -190,7 +191,8 @@ def test_forward_and_backward_run_on_the_current_stream():
     source, late = leaves("cuda"), leaves("cuda").map(torch.zeros_like)
     torch.cuda.synchronize()
     with torch.cuda.stream(torch.cuda.Stream()):
-        torch.cuda._sleep(10**8)  # a kernel on another stream would see the zeros
+        # A kernel on another stream would read the zeros.
+        torch.cuda._sleep(10**8)
         for name, tensor in late.tensors().items():
             tensor.copy_(getattr(source, name).detach())
         got = differentiate(late.map(lambda tensor: tensor.requires_grad_()), cameras, "cuda")

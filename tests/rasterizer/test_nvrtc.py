@@ -11,7 +11,7 @@ import torch
 from emulation import content_hash, make_once
 
 from cadam3d.core.checks import UserError
-from cadam3d.rasterizer import nvrtc
+from cadam3d.rasterizer import base, nvrtc
 from cadam3d.rasterizer.build import KERNELS
 from cadam3d.rasterizer.nvrtc import build, choose_architecture, compile_kernels, find_compiler
 
@@ -75,7 +75,7 @@ def test_every_kernel_fits_every_architecture_without_spills(
     compiler, architecture, build_cache, monkeypatch
 ):
     if architecture not in compiler.architectures:
-        pytest.skip(f"the NVRTC of CUDA {compiler.version} does not know sm_{architecture}")
+        pytest.skip(f"the NVRTC of CUDA {compiler.version} does not support sm_{architecture}")
     monkeypatch.setattr(nvrtc, "OPTIONS", (*nvrtc.OPTIONS, "--ptxas-options=-v"))
     log = compile_verbosely(compiler, architecture, build_cache)
     usage = re.findall(
@@ -117,7 +117,7 @@ def test_the_newest_architecture_that_runs_on_the_device_is_chosen(capability, w
 
 
 @pytest.mark.parametrize("capability", [(6, 1), (7, 0), (11, 0)])
-def test_a_device_that_the_compiler_does_not_know_is_refused(capability):
+def test_a_device_that_the_compiler_does_not_support_is_refused(capability):
     compiler = nvrtc.Compiler(ctypes.CDLL(None), "", (13, 0), (75, 80, 86, 87, 90, 100, 101, 120))
     with pytest.raises(UserError, match=rf"CUDA 13\.0 .* capability {capability[0]}\.{capability[1]}"):
         choose_architecture(capability, compiler)
@@ -146,7 +146,7 @@ def test_the_cache_distinguishes_compilers_options_and_constants(compiler, monke
     keys = {nvrtc._key(compiler), nvrtc._key(replace(compiler, version=(99, 0)))}
     monkeypatch.setattr(nvrtc, "OPTIONS", ())
     keys.add(nvrtc._key(compiler))
-    monkeypatch.setattr(nvrtc.base, "BLUR", 0.1)
+    monkeypatch.setattr(base, "BLUR", 0.1)
     keys.add(nvrtc._key(compiler))
     assert len(keys) == 4
 
@@ -164,7 +164,7 @@ def test_the_library_of_torchs_cuda_version_comes_first(monkeypatch, tmp_path):
     assert min((tmp_path / name for name in names), key=nvrtc._distance_from_torch).name == "libnvrtc.so.12"
 
 
-def test_it_is_found_in_the_folders_of_wheels_for_cuda_12_and_13(monkeypatch, tmp_path):
+def test_nvrtc_is_found_in_the_folders_of_wheels_for_cuda_12_and_13(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(nvrtc, "PATTERN", "libnvrtc.so*")
     paths = [tmp_path / folder for folder in ("cuda_nvrtc/lib/libnvrtc.so.12", "cu13/lib/libnvrtc.so.13")]

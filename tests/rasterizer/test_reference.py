@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from splats import multiply_quats
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, orbit, turntable
@@ -182,7 +183,7 @@ def test_the_textbook_scene_exercises_every_branch():
     assert (colors < 0).any(), "some colour is clamped at zero"
 
 
-# --- results that can be computed by hand
+# --- results in closed form
 
 
 def test_a_ball_appears_as_a_gaussian_of_its_projected_size_plus_blur():
@@ -322,12 +323,6 @@ def test_moving_scene_and_cameras_together_changes_nothing():
         torch.testing.assert_close(got, want, rtol=1e-10, atol=1e-10)
 
 
-def multiply_quats(p: Tensor, q: Tensor) -> Tensor:
-    w = p[0] * q[:, 0] - q[:, 1:] @ p[1:]
-    xyz = p[0] * q[:, 1:] + q[:, :1] * p[1:] + torch.linalg.cross(p[1:].expand_as(q[:, 1:]), q[:, 1:], dim=-1)
-    return torch.cat([w[:, None], xyz], dim=1)
-
-
 def test_culled_gaussians_change_nothing_and_get_no_gradient():
     seen, views = scene(), cameras()
     culled = scene(5, seed=9)
@@ -414,7 +409,8 @@ EXTREMES = [
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 def test_extreme_numbers_give_finite_images_and_gradients(value, dtype):
     views = cameras().to(dtype)
-    for name in FIELDS[:4]:  # with a colour of 3e38, infinite numbers are correct
+    # Colours are left out, since infinite images are correct for a colour of 3e38.
+    for name in FIELDS[:4]:
         for only_one_component in (False, True):
             gaussians = scene(12, dtype=dtype)
             row = getattr(gaussians, name)[3].view(-1)
@@ -541,7 +537,7 @@ def test_tensors_need_not_be_contiguous():
     assert torch.equal(render(strided, views).rgb, render(gaussians, views).rgb)
 
 
-def test_a_render_keeps_little_for_its_backward():
+def test_a_render_stores_little_for_the_backward_pass():
     # 60 splats fill the image, so one float32 array of their 60 x 64 x 64 pairs would have a megabyte.
     gaussians = scene(60, dtype=torch.float32).map(lambda tensor: tensor.clone())
     gaussians.log_scales[:] = 0.0

@@ -28,7 +28,7 @@ CPU = torch.device("cpu")
 
 @dataclass(frozen=True, kw_only=True)
 class Bent(Rasterizer):
-    """The reference with one mistake: ``before`` changes its scene, or ``after`` its output."""
+    """The reference with one mistake: ``before`` changes its scene, or ``after`` changes its output."""
 
     before: object = staticmethod(lambda gaussians, cameras, background: (gaussians, cameras, background))
     after: object = staticmethod(lambda output: output)
@@ -98,7 +98,7 @@ def test_no_number_of_the_scene_is_near_a_step():
     "name", ["BLUR", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN", "FRUSTUM_MARGIN", "NEAR"]
 )
 def test_a_change_of_any_constant_of_the_model_is_noticed(name, monkeypatch):
-    honest = {name: getattr(reference, name)}
+    original = {name: getattr(reference, name)}
     moved = {"BLUR": 0.31, "ALPHA_MIN": 1 / 250, "ALPHA_MAX": 0.98, "TRANSMITTANCE_MIN": 2e-4}
     moved |= {"FRUSTUM_MARGIN": 0.1, "NEAR": 0.3}
 
@@ -107,7 +107,7 @@ def test_a_change_of_any_constant_of_the_model_is_noticed(name, monkeypatch):
         return scene
 
     def after(output):
-        monkeypatch.setattr(reference, name, honest[name])
+        monkeypatch.setattr(reference, name, original[name])
         return output
 
     assert not self_test(Bent(before=before, after=after), CPU).holds
@@ -208,7 +208,7 @@ def test_bits_that_differ_from_run_to_run_are_noticed():
     assert str(agreement).endswith("; different bits the second time")
 
 
-def test_it_works_while_gradients_are_off():
+def test_the_self_test_works_while_gradients_are_off():
     with torch.no_grad():
         assert self_test(ReferenceRasterizer(), CPU).holds
 

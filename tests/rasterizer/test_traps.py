@@ -32,8 +32,8 @@ NAN, INF = math.nan, math.inf
 ABOVE_NEAR = torch.tensor(NEAR).nextafter(torch.tensor(1.0)).item()  # the next float32
 
 
-def one_in_a_heap(**fields):
-    """Return twenty Gaussians around (0, 0, 2), in view of ``facing_camera``, with number 7 changed."""
+def changed_gaussian(**fields):
+    """Return twenty Gaussians around (0, 0, 2), in view of ``facing_camera``, with row 7 changed."""
     gaussians = make_gaussians(20, degree=1, spread=0.2)
     gaussians.means[:, 2] += 2.0
     for name, value in fields.items():
@@ -78,12 +78,12 @@ def assert_is_drawn(backend, gaussians, row, cameras):
 
 @pytest.mark.parametrize("quat", [[0.0] * 4, [9e-7, 0.0, 0.0, 0.0], [0.0, 0.0, 1e-30, 0.0], [1e-45] * 4])
 def test_a_zero_or_tiny_quaternion_is_culled(any_backend, quat):
-    assert_leaves_no_trace(any_backend, one_in_a_heap(quats=quat), 7, facing_camera(11, 13))
+    assert_leaves_no_trace(any_backend, changed_gaussian(quats=quat), 7, facing_camera(11, 13))
 
 
 @pytest.mark.parametrize("length", [1.1e-6, 1e-3, 1e3, 1e18])
 def test_the_length_of_any_other_quaternion_does_not_matter(any_backend, length):
-    gaussians, cameras = one_in_a_heap(), facing_camera(11, 13)
+    gaussians, cameras = changed_gaussian(), facing_camera(11, 13)
     gaussians.quats[7] /= gaussians.quats[7].norm()
     plain = any_backend.show(gaussians, cameras)
     gaussians.quats[7] *= length
@@ -92,14 +92,15 @@ def test_the_length_of_any_other_quaternion_does_not_matter(any_backend, length)
     assert_close("alpha", output.alpha, plain.alpha, 1e-5)
 
 
-@pytest.mark.parametrize("log_scale", [-60.0, -104.0, -1e3, -1e38])  # the last two scales are exactly zero
+# The last two scales are exactly zero.
+@pytest.mark.parametrize("log_scale", [-60.0, -104.0, -1e3, -1e38])
 def test_a_zero_scale_is_a_dot_of_the_blurs_size(any_backend, log_scale):
     cameras = facing_camera(11, 13)
-    grads = assert_is_drawn(any_backend, one_in_a_heap(log_scales=[log_scale] * 3), 7, cameras)
+    grads = assert_is_drawn(any_backend, changed_gaussian(log_scales=[log_scale] * 3), 7, cameras)
     assert grads["log_scales"].abs().max() < 1e-20
     assert grads["means"].any()
     small, none = (
-        any_backend.show(one_in_a_heap(log_scales=[value] * 3), cameras) for value in (-30.0, log_scale)
+        any_backend.show(changed_gaussian(log_scales=[value] * 3), cameras) for value in (-30.0, log_scale)
     )
     assert_close("rgb", none.rgb, small.rgb, 1e-6)
 
@@ -109,13 +110,13 @@ def test_a_zero_scale_is_a_dot_of_the_blurs_size(any_backend, log_scale):
 )
 @pytest.mark.parametrize("z", [0.0, -2.0])
 def test_a_huge_scale_at_depth_zero_or_behind_is_culled(any_backend, log_scale, z):
-    gaussians = one_in_a_heap(means=[0.0, 0.0, z], log_scales=log_scale)
+    gaussians = changed_gaussian(means=[0.0, 0.0, z], log_scales=log_scale)
     assert_leaves_no_trace(any_backend, gaussians, 7, facing_camera(11, 13))
 
 
 @pytest.mark.parametrize("log_scale", [[46.0] * 3, [46.0, -46.0, 0.0]])  # exp(46) = 1e20
-def test_a_scale_whose_square_leaves_float32_is_culled(any_backend, log_scale):
-    gaussians = one_in_a_heap(means=[0.0, 0.0, 2.0], log_scales=log_scale)
+def test_a_scale_with_a_square_beyond_float32_is_culled(any_backend, log_scale):
+    gaussians = changed_gaussian(means=[0.0, 0.0, 2.0], log_scales=log_scale)
     if any_backend.dtype == torch.float64:  # the square is finite
         assert_is_drawn(any_backend, gaussians, 7, facing_camera(11, 13))
     else:
@@ -123,16 +124,16 @@ def test_a_scale_whose_square_leaves_float32_is_culled(any_backend, log_scale):
 
 
 @pytest.mark.parametrize("log_scale", [INF, 1e38, NAN])
-def test_an_infinite_scale_is_culled_not_a_splat_of_any_size(any_backend, log_scale):
+def test_an_infinite_scale_is_culled(any_backend, log_scale):
     for axis in range(3):
         scales = [0.0, 0.0, 0.0]
         scales[axis] = log_scale
-        assert_leaves_no_trace(any_backend, one_in_a_heap(log_scales=scales), 7, facing_camera(11, 13))
+        assert_leaves_no_trace(any_backend, changed_gaussian(log_scales=scales), 7, facing_camera(11, 13))
 
 
 @pytest.mark.parametrize(("z", "is_seen"), [(NEAR, False), (ABOVE_NEAR, True), (0.0, False), (-1.0, False)])
 def test_a_centre_on_the_near_plane_is_culled_and_one_just_behind_it_is_not(any_backend, z, is_seen):
-    gaussians = one_in_a_heap(means=[0.0, 0.0, z], log_scales=[-8.0] * 3)
+    gaussians = changed_gaussian(means=[0.0, 0.0, z], log_scales=[-8.0] * 3)
     if is_seen:
         assert_is_drawn(any_backend, gaussians, 7, facing_camera(11, 13))
     else:
@@ -140,8 +141,8 @@ def test_a_centre_on_the_near_plane_is_culled_and_one_just_behind_it_is_not(any_
 
 
 @pytest.mark.parametrize(("z", "is_seen"), [(1e14, True), (1e20, False), (1e38, False)])
-def test_at_the_horizon_nothing_overflows(any_backend, z, is_seen):
-    gaussians = one_in_a_heap(means=[0.0, 0.0, z])
+def test_nothing_overflows_at_very_large_depths(any_backend, z, is_seen):
+    gaussians = changed_gaussian(means=[0.0, 0.0, z])
     if is_seen:
         assert_is_drawn(any_backend, gaussians, 7, facing_camera(11, 13))
     else:
@@ -157,8 +158,8 @@ def test_at_the_horizon_nothing_overflows(any_backend, z, is_seen):
     ],
 )
 def test_a_gaussian_that_is_too_faint_or_off_screen_is_culled(any_backend, field, culled, seen):
-    assert_leaves_no_trace(any_backend, one_in_a_heap(**{field: culled}), 7, facing_camera(11, 13))
-    assert_is_drawn(any_backend, one_in_a_heap(**{field: seen}), 7, facing_camera(11, 13))
+    assert_leaves_no_trace(any_backend, changed_gaussian(**{field: culled}), 7, facing_camera(11, 13))
+    assert_is_drawn(any_backend, changed_gaussian(**{field: seen}), 7, facing_camera(11, 13))
 
 
 @pytest.mark.parametrize(
@@ -166,7 +167,7 @@ def test_a_gaussian_that_is_too_faint_or_off_screen_is_culled(any_backend, field
     # A colour of 1e38 is visible, and the gradients of its neighbours rightly exceed float32.
     [(field, value) for field in FIELDS for value in POISON if (field, abs(value)) != ("sh", 1e38)],
 )
-def test_poison_never_spreads(backend, field, value):
+def test_a_bad_number_never_spreads_to_other_gaussians(backend, field, value):
     gaussians, cameras = make_gaussians(30, degree=1), make_cameras(2, 11, 13)
     getattr(gaussians, field).view(30, -1)[7] = value
     output, grads = render_finite(backend, gaussians, cameras)
@@ -186,7 +187,7 @@ def test_one_poisoned_number_is_enough_to_cull(any_backend, field):
 # -------------------------------------------------------------------------- large, many and opaque splats
 
 
-def test_huge_splats_that_touch_more_tiles_than_one_thread_handles(backend):
+def test_huge_splats_that_touch_more_tiles_than_one_thread_handles_agree(backend):
     # Each touches 100 tiles of 8x8 pixels: on a GPU, a whole warp lists such a splat and sums its records.
     backend.agrees(make_gaussians(5, seed=16, log_scale=1.5, opacity=-1.0), make_cameras(1, 75, 80), most=0.8)
 
@@ -198,7 +199,8 @@ def test_many_huge_splats_stop_where_those_of_the_reference_do(backend):
     assert (output.alpha > 0.999).all()
 
 
-@pytest.mark.parametrize("logit", [5.0, 20.0, 40.0, 1e38])  # the last three opacities are exactly one
+# The last three opacities are exactly one.
+@pytest.mark.parametrize("logit", [5.0, 20.0, 40.0, 1e38])
 def test_a_saturated_alpha_has_a_gradient_for_colour_but_not_for_opacity_or_shape(any_backend, logit):
     output, grads = any_backend.differentiate(stack(logit), facing_camera(5, 6))
     assert_close("alpha", output.alpha, torch.full_like(output.alpha, 0.99), 1e-6)
@@ -250,13 +252,13 @@ def test_an_ellipse_reaches_a_pixel_across_the_border_of_a_tile_exactly_or_not_a
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 19), (8, 8), (9, 7), (16, 16), (17, 15), (33, 7)])
-def test_image_sizes_that_are_not_multiples_of_a_tile(backend, height, width):
+def test_image_sizes_that_are_not_multiples_of_a_tile_agree(backend, height, width):
     gaussians = make_gaussians(60, seed=2, degree=1, log_scale=-1.0)
     backend.agrees(gaussians, make_cameras(3, height, width), most=0.3)
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 8192), (8192, 1)])
-def test_images_of_8192_pixels(backend, height, width):
+def test_images_of_8192_pixels_agree(backend, height, width):
     # In float32, centres near pixel 8000 are exact to 1/2000 of a pixel; the splats are wide enough for that.
     gaussians, cameras = make_gaussians(15, seed=6, spread=1.0, log_scale=-2.0), facing_camera(height, width)
     cameras.intrinsics[:, 0, 0], cameras.intrinsics[:, 1, 1] = width / 2.0, height / 2.0
@@ -285,7 +287,7 @@ def test_an_empty_image_shows_the_background_and_has_zero_gradients(any_backend,
         assert not grad.any()
 
 
-def test_an_empty_view_among_others(backend):
+def test_an_empty_view_among_others_agrees_and_gets_no_gradient(backend):
     cameras = make_cameras(3, 20, 30)
     cameras.world_to_camera[1, 2, 3] = -9.0  # everything is behind this camera
     output, grads = backend.agrees(make_gaussians(40), cameras)
@@ -293,7 +295,7 @@ def test_an_empty_view_among_others(backend):
     assert not grads["means2d"][1].any()
 
 
-def test_a_loss_on_means2d_alone(backend):
+def test_a_loss_may_use_means2d_alone(backend):
     cameras = make_cameras(2, 20, 30)
 
     def gradient(render, put):
@@ -310,7 +312,7 @@ def test_a_loss_on_means2d_alone(backend):
 # -------------------------------------------------------------------------- kinds of tensors
 
 
-def test_tensors_that_are_not_contiguous(any_backend):
+def test_tensors_need_not_be_contiguous(any_backend):
     gaussians, cameras = any_backend.put(make_gaussians(60, degree=1)), make_cameras(2, 31, 31)
     background = any_backend.put(backgrounds(2))
 
@@ -325,7 +327,8 @@ def test_tensors_that_are_not_contiguous(any_backend):
             intrinsics=change(cameras.intrinsics),
         )
         output = any_backend.render(leaves, views, change(background))
-        output.alpha.sum().backward()  # the gradient of alpha is one number, expanded with stride 0
+        # The gradient of alpha is one number, expanded with stride 0.
+        output.alpha.sum().backward()
         images = [getattr(output, name).detach() for name in IMAGES]
         return [
             *images,
@@ -375,7 +378,8 @@ def test_shapes_that_would_make_kernels_read_outside_their_tensors_are_refused(b
     gaussians, cameras, background = backend.put(make_gaussians(4)), make_cameras(2, 9, 9), backgrounds(2)
     with pytest.raises(ValueError, match="expected"):
         backend.render(gaussians, cameras.index(slice(0, 1)), background)
-    for coefficients in (2, 5, 25):  # of no degree, or of a degree that is too high
+    # These numbers belong to no degree, or to a degree that is too high.
+    for coefficients in (2, 5, 25):
         torn = Gaussians(**gaussians.tensors() | {"sh": torch.zeros(4, coefficients, 3)})
         with pytest.raises(ValueError, match="expected"):
             backend.render(torn, cameras, background)

@@ -78,7 +78,7 @@ def parse(prompt: str, key: str = "prompt") -> Sentence:
 
 
 def noun_of(word: str) -> str | None:
-    """Return the name of the object that a noun, singular or plural, stands for; None for other words."""
+    """Return the name of the object that a noun, singular or plural, denotes; None for other words."""
     nouns = {*known_primitives(), *known_objects()}
     irregular = {"tori": "torus", "boxes": "box", "arches": "arch"}
     for form in (irregular.get(word, word), word.removesuffix("s"), word.removesuffix("es")):

@@ -31,8 +31,10 @@ from cadam3d.prior.shapes.solids import (
 )
 from cadam3d.prior.shapes.vocabulary import PLAIN
 
-MAIN, ACCENT = "main", "accent"  # colours that the prompt may choose
-OPEN = "open"  # a colour that the prompt leaves open, with one mode per colour of the palette
+# Colours that the prompt may choose.
+MAIN, ACCENT = "main", "accent"
+# A colour that the prompt leaves open. It gives one mode per colour of the palette.
+OPEN = "open"
 UNIT_AXES = torch.cat([torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)], dim=1)
 
 
@@ -99,6 +101,7 @@ def thing(name: str) -> Thing:
 
 
 def _p(solid: Solid, first: str, second: str = ACCENT, pattern: str = PLAIN) -> Part:
+    """Return a painted part; the name is short, since the objects below consist of hundreds of parts."""
     return Part(solid, Coat(first, second, pattern))
 
 

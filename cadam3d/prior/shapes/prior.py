@@ -13,8 +13,8 @@ from cadam3d.core.checks import fail, require_range, require_whole
 from cadam3d.core.render import TruthFn
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import NoisePath, Prediction, per_view
+from cadam3d.prior.shapes.array_cache import cached_arrays
 from cadam3d.prior.shapes.grammar import EXAMPLE
-from cadam3d.prior.shapes.kept import kept
 from cadam3d.prior.shapes.mixture import Mixture
 from cadam3d.prior.shapes.objects import known_objects, known_primitives
 from cadam3d.prior.shapes.scene import Scene, build
@@ -24,7 +24,8 @@ from cadam3d.prior.shapes.tracer import Layers
 CENSUS_VIEWS = 4  # per object, equally spaced in azimuth
 CENSUS_ELEVATION_DEG = 15.0
 CENSUS_FOV_DEG = 45.0
-ERROR_GRID = 8  # cells per side of the prediction error, which makes it smooth in any larger image
+# Cells per side of the grid on which the prediction error is drawn. It is smooth in any larger image.
+ERROR_GRID = 8
 # Radians per standard deviation of the projected noise. At this frequency the error fields of two
 # independent noises are uncorrelated.
 ERROR_FREQUENCY = 3.0
@@ -71,7 +72,7 @@ class ShapesCondition(Condition):
     empty: Mixture
 
     def unprompted(self) -> "ShapesCondition":
-        """Return the same views under the empty prompt, which stands for every object of the world."""
+        """Return the same views under the empty prompt, which allows every object of the world."""
         return replace(self, positive=self.empty, negative=self.empty)
 
 
@@ -93,15 +94,18 @@ class ShapesEmbedding(PromptEmbedding):
 
 @dataclass(frozen=True, kw_only=True)
 class ShapesPrior(DiffusionPrior):
-    """A Gaussian mixture over images of the scene, one mode per choice that the prompt leaves open."""
+    """A Gaussian mixture over images of the scene, one mode per choice that the prompt leaves open.
+
+    Model space is RGB in [-1, 1].
+    """
 
     noise_path: NoisePath
-    spread: float  # standard deviation of every pixel around its mode, model space ([-1, 1])
-    edge_spread: float  # added to the spread of pixels that a silhouette crosses
-    model_error: float  # rms of the smooth prediction error, model space at full noise; 0 = exact
-    samples_per_pixel: int  # rays per pixel along each axis
-    census_size: int  # pixels per side of the images from which the empty prompt is computed
-    seed: int  # of the prediction error
+    spread: float  # in model space
+    edge_spread: float  # in model space
+    model_error: float  # in model space
+    samples_per_pixel: int  # along each axis
+    census_size: int  # pixels per side
+    seed: int
 
     def __post_init__(self) -> None:
         require_range("prior.spread", self.spread, low=0, high=10, example=0.1)
@@ -112,7 +116,7 @@ class ShapesPrior(DiffusionPrior):
         require_whole("prior.seed", self.seed, low=0, high=2**62, example=0)
 
     def embed(self, prompt: str, negative: str) -> ShapesEmbedding:
-        """Parse both prompts; an empty negative prompt stands for every object of the world.
+        """Parse both prompts; an empty negative prompt allows every object of the world.
 
         Raises ``UserError`` for an empty prompt and for words that the grammar does not know.
         """
@@ -248,11 +252,11 @@ def _bicubic(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tenso
 @lru_cache(maxsize=4)
 def take_census(size: int) -> Census:
     """Return the moments over all objects of the world, a few views of each and all modes, equally likely."""
-    return kept(Census, f"census-{size}", lambda: _measure(size))
+    return cached_arrays(Census, f"census-{size}", lambda: _measure(size))
 
 
 def _measure(size: int) -> Census:
-    """Trace every object for :func:`take_census`, which takes a quarter of a second."""
+    """Compute the census by tracing every object, which takes a quarter of a second."""
     cameras = turntable(
         CENSUS_VIEWS,
         elevation_deg=CENSUS_ELEVATION_DEG,

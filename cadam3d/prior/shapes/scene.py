@@ -23,10 +23,14 @@ from cadam3d.prior.shapes.objects import (
 from cadam3d.prior.shapes.solids import KINDS, Kind, size_row
 from cadam3d.prior.shapes.vocabulary import COLOURS, OPEN_PALETTE, PATTERNS, PLAIN
 
-FIT_RADIUS = 0.85  # every scene fits in the ball of this radius around the origin
-CLEARANCE = 0.12  # between neighbours, in units of a natural radius of 1
-SINK = 0.01  # depth by which an object sinks into its support, so that no gap is visible between them
-OPEN_STRIDE = 3  # the k-th object of open colour takes the palette shifted by 3 k, so that colours differ
+# Every scene fits in the ball of this radius around the origin.
+FIT_RADIUS = 0.85
+# The gap between neighbours, in units of a natural radius of 1.
+CLEARANCE = 0.12
+# The depth by which an object sinks into its support, so that no gap is visible between them.
+SINK = 0.01
+# The k-th object of open colour takes the palette shifted by 3 k, so that the colours of objects differ.
+OPEN_STRIDE = 3
 SUPPORT_DIRECTIONS = 512
 PATTERN_NAMES = tuple(dict.fromkeys(PATTERNS.values()))
 
@@ -106,7 +110,8 @@ def compile_scene(parts: tuple[Part, ...]) -> Scene:
     centres = (world_reach[:, :3] - world_reach[:, 3:]) / 2
     directions = sphere_directions(SUPPORT_DIRECTIONS).double().T
     reach = torch.stack([part.solid.support(directions) for part in parts])
-    radii = (reach - centres @ directions).amax(1) * 1.01  # with a margin, since directions are finitely many
+    # The margin covers points between the finitely many directions.
+    radii = (reach - centres @ directions).amax(1) * 1.01
     matrices = torch.stack([part.solid.matrix for part in parts])
     return Scene(
         kinds=tuple((kind, kinds.count(kind)) for kind in dict.fromkeys(kinds)),
@@ -146,12 +151,13 @@ def _colour(name: str) -> Float[Tensor, "3"]:
     return 0.5 * rgb + 0.5 if shade == "light" else rgb
 
 
-def _slots(colours: list[str]) -> list[str]:
-    return [name for name in colours if name.startswith(OPEN)]
+def _modes(colours: list[str]) -> int:
+    """Return the number of modes: one per colour of the palette if a colour is open, else one."""
+    return len(OPEN_PALETTE) if any(name.startswith(OPEN) for name in colours) else 1
 
 
 def _albedo(colours: list[str]) -> Float[Tensor, "m paints 3"]:
-    modes = len(OPEN_PALETTE) if _slots(colours) else 1
+    modes = _modes(colours)
 
     def row(mode: int) -> Tensor:
         names = [
@@ -166,7 +172,7 @@ def _albedo(colours: list[str]) -> Float[Tensor, "m paints 3"]:
 
 
 def _log_weights(colours: list[str]) -> Float[Tensor, "m"]:
-    modes = len(OPEN_PALETTE) if _slots(colours) else 1
+    modes = _modes(colours)
     return torch.full((modes,), -math.log(modes), dtype=torch.float64)
 
 
@@ -174,15 +180,14 @@ def _paint(item: Thing, phrase: Phrase, index: int) -> tuple[Part, ...]:
     """Choose the colours of MAIN and ACCENT; a pattern is applied to all parts in plain MAIN."""
     open_colour = f"{OPEN}{index}"
     main = phrase.colours[0] if phrase.colours else (open_colour if item.main == OPEN else item.main)
-    accent = item.accent
     pattern = phrase.pattern
     if len(phrase.colours) == 2:
-        accent = phrase.colours[1]
+        accent = other = phrase.colours[1]
         pattern = pattern or ("striped" if item.main == OPEN else None)
-    # With one colour and a pattern, the other colour is white, or black if white would not be visible.
-    other = "black" if main in ("white", "cream") else "white"
-    if len(phrase.colours) == 2:
-        other = phrase.colours[1]
+    else:
+        accent = item.accent
+        # With one colour and a pattern, the other colour is white, or black if white would not be visible.
+        other = "black" if main in ("white", "cream") else "white"
 
     def coat(old: Coat) -> Coat:
         if pattern is not None and old == Coat(MAIN, ACCENT, PLAIN):

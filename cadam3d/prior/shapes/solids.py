@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-SIZES_PER_SOLID = 4  # numbers that describe the shape of a solid; most kinds use fewer
+# At most this many numbers describe the shape of a solid; most kinds use fewer.
+SIZES_PER_SOLID = 4
 STAR_POINTS = 5
 AXES = {"x": 0, "y": 1, "z": 2}
 
@@ -230,17 +231,20 @@ TORUS = Kind("torus", _torus_sdf, _torus_support, "ring")
 ARC = Kind("arc", _arc_sdf, _arc_support, "ring")
 CAPSULE = Kind("capsule", _capsule_sdf, _capsule_support, "round")
 STAR = Kind("star", _star_sdf, _star_support, "flat")
-PYRAMID = _polytope(  # square base of side 2 at z = -1, apex at z = 1
+# A square base of side 2 at z = -1 and an apex at z = 1.
+PYRAMID = _polytope(
     "pyramid",
     [[0, 0, -1, 1], [2, 0, 1, 1], [-2, 0, 1, 1], [0, 2, 1, 1], [0, -2, 1, 1]],
     [[0, 0, 1], [1, 1, -1], [1, -1, -1], [-1, 1, -1], [-1, -1, -1]],
 )
-GABLE = _polytope(  # a roof: base of side 2 at z = -1, ridge along x at z = 1
+# A roof: a base of side 2 at z = -1 and a ridge along x at z = 1.
+GABLE = _polytope(
     "gable",
     [[0, 0, -1, 1], [1, 0, 0, 1], [-1, 0, 0, 1], [0, 2, 1, 1], [0, -2, 1, 1]],
     [[1, 0, 1], [-1, 0, 1], [1, 1, -1], [1, -1, -1], [-1, 1, -1], [-1, -1, -1]],
 )
-TETRAHEDRON = _polytope(  # regular, circumradius 1, one face below
+# A regular tetrahedron of circumradius 1, with one face below.
+TETRAHEDRON = _polytope(
     "tetrahedron",
     [
         [0, 0, -1, 1 / 3],

@@ -20,13 +20,14 @@ from cadam3d.prior.shapes import solids, tracer
 from cadam3d.prior.shapes.scene import Scene
 from cadam3d.prior.shapes.tracer import Layers, trace
 
-SPARE = 2 * 1024**3  # bytes of the disk that stay free
+# Space of the disk that stays free.
+SPARE = 2 * 1024**3  # bytes
 # Part of the identity of a trace, since a folder may outlive the code that wrote it.
 CODE = b"".join(Path(str(module.__file__)).read_bytes() for module in (tracer, solids))
 
 
 def shared_trace(scene: Scene, cameras: Cameras, samples: int) -> Layers:
-    """Return :func:`~cadam3d.prior.shapes.tracer.trace` of the scene, from the cache if it is there."""
+    """Return the result of :func:`~cadam3d.prior.shapes.tracer.trace`, from the cache if it is there."""
     folder = os.environ.get(TRACES)
     if not folder or cameras.intrinsics.dtype != torch.float32:
         return trace(scene, cameras, samples)

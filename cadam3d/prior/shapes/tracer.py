@@ -1,6 +1,6 @@
 """Sphere tracing: a ray advances by the distance to the surface until it touches the surface (Hart 1996).
 
-Every part is traced separately, in its local coordinates and only by rays that meet its bounding box; the
+Every part is traced separately, in its local coordinates and only by rays that hit its bounding box; the
 nearest hit is visible. All parts of one kind are traced together, so that the number of tensor operations
 does not grow with the number of parts. Light depends on the surface and not on the view, so that an asset of
 SH degree 0 can match it.
@@ -18,16 +18,25 @@ from cadam3d.prior.shapes.scene import PATTERN_NAMES, Scene, sphere_directions
 from cadam3d.prior.shapes.solids import Kind
 
 MARCH_STEPS = 48
-COMPACT_EVERY = 4  # steps between removals of the rays that have hit or missed
-HIT_DISTANCE = 5e-4  # world units; a pixel of a typical view is thirty times wider
-GRAZE_DISTANCE = 4e-3  # world units; a ray this close to the surface after the last step has hit
-BALL_RADIUS = 0.9  # world units; contains every scene, since scenes are scaled to 0.85
-NEAR = 0.01  # world units; as in the rasterizers
-NORMAL_STEP = 1e-3  # of the finite differences, in local coordinates
-LIGHT = (0.60, 0.42, 0.68)  # direction towards the light; the front faces +x
-AMBIENT, SKY, DIFFUSE, WRAP = 0.46, 0.18, 0.36, 0.5  # the first three sum to 1, so that nothing saturates
+# Steps between removals of the rays that have hit or missed.
+COMPACT_EVERY = 4
+# A ray this close to the surface has hit it. A pixel of a typical view is thirty times wider.
+HIT_DISTANCE = 5e-4  # world units
+# After the last step, a ray this close to the surface has hit it too.
+GRAZE_DISTANCE = 4e-3  # world units
+# The ball of this radius contains every scene, since scenes are scaled to FIT_RADIUS.
+BALL_RADIUS = 0.9  # world units
+# As in the rasterizers.
+NEAR = 0.01  # world units
+# The step of the finite differences that give normals.
+NORMAL_STEP = 1e-3  # local coordinates
+# The direction towards the light; the front of objects faces +x.
+LIGHT = (0.60, 0.42, 0.68)
+# The first three sum to 1, so that nothing saturates.
+AMBIENT, SKY, DIFFUSE, WRAP = 0.46, 0.18, 0.36, 0.5
 SPOTS = 26
-SPOT_COSINE = 0.965  # of the angular radius of a spot
+# The cosine of the angular radius of a spot.
+SPOT_COSINE = 0.965
 
 
 @dataclass(frozen=True)
@@ -57,7 +66,7 @@ class _Hits:
 
 @dataclass(frozen=True)
 class _Rays:
-    """Rays of all views that meet the bounding ball of the scene, sorted by view."""
+    """Rays of all views that hit the bounding ball of the scene, sorted by view."""
 
     origins: Float[Tensor, "v 3"]
     directions: Float[Tensor, "3 r"]  # unit length
@@ -106,7 +115,7 @@ def _cast(cameras: Cameras, samples: int) -> _Rays:
 
 
 def _candidates(scene: Scene, rays: _Rays) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
-    """Return the pairs (part, ray) in which the ray meets the bounding ball of the part, sorted by part."""
+    """Return the pairs (part, ray) in which the ray hits the bounding ball of the part, sorted by part."""
     masks = []
     for origin, direction in zip(rays.origins, rays.directions.split(rays.per_view, dim=1), strict=True):
         away = scene.centres - origin
@@ -206,7 +215,8 @@ def _shade(scene: Scene, hits: _Hits) -> tuple[Float[Tensor, "n"], Int[Tensor, "
     normal = torch.empty_like(hits.local)
     for kind, rows in _runs(scene, hits.part):
         normal[:, rows] = _gradient(kind, hits.local[:, rows], sizes[:, rows])
-    normal = _unit(torch.einsum("ijn,in->jn", _matrices(scene, hits.part), normal))  # transposed inverse
+    # A normal is mapped to the world by the transposed inverse of the matrix that maps points.
+    normal = _unit(torch.einsum("ijn,in->jn", _matrices(scene, hits.part), normal))
     light = _unit(normal.new_tensor(LIGHT))
     facing = ((light @ normal + WRAP) / (1 + WRAP)).clamp_min(0)
     sent = AMBIENT + SKY * (0.5 + 0.5 * normal[2]) + DIFFUSE * facing
@@ -257,7 +267,8 @@ def _paint_second(
     across = unit[:2].square().sum(0).sqrt().clamp_max(1)
     if kind.name == "ball":
         band = 3 * torch.asin(unit[2].clamp(-1, 1)) / (torch.pi / 2)
-    else:  # bands run up the side and then over the top to the axis
+    else:
+        # Bands run up the side and then over the top to the axis.
         reach, rise = half[:2].amax(0), half[2]
         band = 4 * (unit[2] * rise + (1 - across) * reach) / (reach + rise)
     if pattern == "striped":

@@ -33,8 +33,8 @@ SPLAT_FN Place make_place(i64 tile, i64 height, i64 width) {
   return place;
 }
 
-// |L d|^2. The forward and the backward pass both call this function, and products are fused only where the
-// source says so. Therefore they agree to the last bit on which splats are skipped.
+// |L d|^2. The forward and the backward pass both call this function, and products are fused only where it
+// calls __fmaf_rn. Therefore they agree to the last bit on which splats are skipped.
 struct Falloff {
   float u, t, exponent;
 };

@@ -106,7 +106,7 @@ struct alignas(64) Record {
   float sums[RECORD];
 };
 
-// One Gaussian in the list of one tile, and the slot of their record.
+// One Gaussian in the list of one tile, and the slot of the record of this pair.
 struct Entry {
   uint32_t gaussian, slot;
 };
@@ -132,7 +132,7 @@ struct Frame {
 };
 
 // Runs body(0) .. body(items - 1), each once, on up to ``threads`` threads. The threads end with the call, so
-// that none has to survive a fork; starting them costs microseconds.
+// that none exists when the process forks; starting them costs microseconds.
 template <class Body>
 void parallel_for(int64_t items, int64_t threads, const Body& body) {
   std::atomic<int64_t> next{0};

@@ -2,7 +2,7 @@
 //
 // A compiler lowers vectors that are wider than those of the machine to scalar code. Therefore the width
 // depends on the instruction set: 16 lanes for AVX-512, 8 for AVX2, 4 for everything else (SSE2, NEON, ...).
-// A product and a sum are fused only where the code says fma(), so that the forward and the backward pass
+// A product and a sum are fused only where the code calls fma(), so that the forward and the backward pass
 // compute the same bits.
 #pragma once
 

@@ -1,7 +1,7 @@
 // One splat, from world to screen and back: the maths that all native backends share.
 //
 // This file includes no header, because a run-time CUDA compiler has none. It is templated on the scalar and
-// has neither allocations nor branches, so that a scalar may also stand for many Gaussians (``simd::Wide``).
+// has neither allocations nor branches, so that a scalar type may also hold many Gaussians (``simd::Wide``).
 // The formulas are those of EWA splatting (Zwicker et al. 2002; Kerbl et al. 2023, sec. 4), in a form that
 // costs nothing more and keeps long thin splats accurate in float32:
 //

@@ -27,7 +27,7 @@ SPLAT_FN Range pixels_between(float low, float high, int size) {
 }
 
 // Calls visit(tile row, first column, last column) for each row of tiles that the ellipse |L d|^2 <= cut
-// meets, from top to bottom. Counting and listing both use this function, so they agree on every tile.
+// touches, from top to bottom. Counting and listing both use this function, so they agree on every tile.
 template <class Visit>
 SPLAT_FN void each_tile_row(const Splat& s, const Grid& grid, const Visit& visit) {
   const float reach_x = s.reach_x, reach_y = sqrtf(s.cut) / s.l22;

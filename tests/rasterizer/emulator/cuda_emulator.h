@@ -99,7 +99,7 @@ inline unsigned meet(Meeting& meeting, const char* reason, int seat, uint64_t va
   Fiber& self = machine.fibers[size_t(machine.running)];
   const unsigned generation = meeting.generation;
   if (meeting.arrived > 0 && std::strcmp(meeting.reason, reason) != 0)
-    fail(std::string("divergence: ") + reason + " meets " + meeting.reason);
+    fail(std::string("divergence: ") + reason + " in one thread, " + meeting.reason + " in another");
   meeting.reason = reason;
   meeting.values[generation % 2][seat] = value;
   if (++meeting.arrived == meeting.members) {

@@ -1,4 +1,4 @@
-"""Runs sanitized kernels at small and at odd sizes, and then once with each planted mistake.
+"""Run sanitized kernels at small and at odd sizes, and then once with each planted mistake.
 
 python sanitized.py LIBRARY NUMBER_OF_MISTAKES, started by test_cuda_sanitizer.py. Writes a line to stderr
 before each planted mistake, so that the findings of the sanitizers can be distinguished.
@@ -29,7 +29,7 @@ def run_everything(emulator: Emulator) -> None:
         # One group per view, or one for all views.
         cuda.RECORD_MEMORY = 0 if degree == 1 else 256 * 2**20
         render(emulator, 33, degree, -1.0, (2, 9 + degree, 17), absgrad=degree > 0)
-    # These splats meet more tiles, and have more records, than one thread handles alone.
+    # These splats touch more tiles, and have more records, than one thread handles alone.
     for absgrad in (False, True):
         render(emulator, 3, 0, 1.5, (1, 75, 70), absgrad=absgrad)
 

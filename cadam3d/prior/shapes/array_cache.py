@@ -1,4 +1,4 @@
-"""Kept: arrays that take long to compute and depend on this program only, in the cache folder of the user."""
+"""A cache, in the user's cache folder, of arrays that take long to compute and depend on the code alone."""
 
 # pyright: reportArgumentType=false
 
@@ -17,11 +17,12 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
 from cadam3d.io.cache import default_cache_dir
 
-Arrays = TypeVar("Arrays")  # a dataclass of tensors on the CPU
+# A dataclass of tensors on the CPU.
+Arrays = TypeVar("Arrays")
 PACKAGE = Path(__file__).parents[2]
 
 
-def kept(kind: type[Arrays], name: str, make: Callable[[], Arrays]) -> Arrays:
+def cached_arrays(kind: type[Arrays], name: str, make: Callable[[], Arrays]) -> Arrays:
     """Return the result of ``make``, from the cache if an earlier process has put it there.
 
     A file belongs to one state of the sources, one version of torch, one instruction set and one number of
@@ -30,12 +31,9 @@ def kept(kind: type[Arrays], name: str, make: Callable[[], Arrays]) -> Arrays:
     """
     path = default_cache_dir() / "shapes" / f"{name}-{_identity()}.npz"
     names = [field.name for field in fields(kind)]
-    try:
-        with np.load(path) as file:
-            tensors = {name: torch.from_numpy(file[name]) for name in names}
-        return kind(**tensors)
-    except (OSError, EOFError, ValueError, LookupError, zipfile.BadZipFile):  # not there yet, or damaged
-        pass
+    # The file may not exist yet, or it may be damaged.
+    with suppress(OSError, EOFError, ValueError, LookupError, zipfile.BadZipFile), np.load(path) as file:
+        return kind(**{name: torch.from_numpy(file[name]) for name in names})
     made = make()
     with suppress(UserError), replacing(path) as temporary:
         np.savez(temporary, **{name: getattr(made, name).numpy() for name in names})

@@ -1,11 +1,11 @@
-"""Arrays in the user's cache: the same bits, and a damaged or unwritable cache is no problem."""
+"""Arrays in the user's cache have the same bits, and a damaged or unwritable cache is not an error."""
 
 from dataclasses import fields
 
 import pytest
 import torch
 
-from cadam3d.prior.shapes import kept, prior
+from cadam3d.prior.shapes import array_cache, prior
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def equal(one, other) -> bool:
 def test_the_second_process_reads_the_bits_of_the_first(cache, monkeypatch):
     made = census()
     [path] = cache.iterdir()
-    monkeypatch.setattr(prior, "_measure", lambda size: pytest.fail("it was in the cache"))
+    monkeypatch.setattr(prior, "_measure", lambda size: pytest.fail("the arrays were in the cache"))
     assert equal(census(), made)
     assert path.name.startswith("census-4-")
 
@@ -46,7 +46,7 @@ def test_a_damaged_file_is_made_again(content, cache):
     assert path.stat().st_size > len(content)
 
 
-def test_a_cache_that_cannot_be_written_is_no_problem(monkeypatch):
+def test_arrays_are_computed_if_the_cache_cannot_be_written(monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
     assert equal(census(), prior._measure(4))
-    assert kept.default_cache_dir().parts[1] == "dev"
+    assert array_cache.default_cache_dir().parts[1] == "dev"
