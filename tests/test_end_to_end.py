@@ -16,6 +16,8 @@ from cadam3d import cli
 from cadam3d.io.jsonl import read_jsonl
 from cadam3d.io.ply import read_ply
 
+pytestmark = pytest.mark.slow
+
 SMALL = ["prompt=a red cube", "experiment=smoke", "rasterizer=reference"]
 IMPORTED = "imported.txt"  # lists the modules that a training has loaded
 SECONDS = 240  # longest wait for one process

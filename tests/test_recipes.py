@@ -9,6 +9,8 @@ from cadam3d.core.schedule import as_schedule
 from cadam3d.io.jsonl import read_json
 from cadam3d.settings.compose import component, compose
 
+pytestmark = pytest.mark.slow
+
 LUCID = {"views": 4, "tau_pos": 7.5e-4, "stats": "last", "calls": (200, 2900)}
 FLOW = LUCID | {"steps": 5000, "calls": (200, 1400), "scale": 40, "weight": 0.1, "reduction": "sum"}
 FLOW |= {"t": {0: (0.02, 0.98), 750: (0.02, 0.74), 1500: (0.02, 0.5), 4999: (0.02, 0.5)}, "disparity": 0.1}

@@ -12,6 +12,8 @@ from mutants import plant
 
 from cadam3d.rasterizer.build import find_compiler
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 PROGRAM = Path(__file__).parent / "emulator" / "sanitized.py"
 # The program continues after a finding, so that one run shows all of them.

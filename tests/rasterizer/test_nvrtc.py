@@ -15,6 +15,8 @@ from cadam3d.rasterizer import base, nvrtc
 from cadam3d.rasterizer.build import KERNELS
 from cadam3d.rasterizer.nvrtc import build, choose_architecture, compile_kernels, find_compiler
 
+pytestmark = pytest.mark.slow
+
 # All architectures since Turing, which is the oldest that CUDA 13 compiles for.
 ARCHITECTURES = (75, 80, 86, 87, 88, 89, 90, 100, 101, 103, 107, 110, 120, 121)
 # The largest number of registers per thread on any of them, with the NVRTC of CUDA 12.6, 12.8, 13.0 and 13.5.

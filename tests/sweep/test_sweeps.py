@@ -414,6 +414,7 @@ def test_a_second_sigint_ends_at_once(start_sweep, tmp_path):
     assert [row["outcome"] for row in read_table(tmp_path / "x")] == ["unfinished"] * 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("launcher", "running"), [((), 1), (("launcher=joblib", "launcher.n_jobs=2"), 2)])
 def test_no_job_runs_twice_at_a_time_when_a_killed_sweep_is_started_again(
     launcher, running, start_sweep, calls, tmp_path
