@@ -50,8 +50,10 @@ def tests_of(changed: list[str]) -> list[str]:
                 selected.add(REPOSITORY / path)
             case "tests":
                 selected |= set((REPOSITORY / path).parent.glob("test_*.py"))
+            case "scripts":
+                selected |= set((REPOSITORY / "tests").rglob(f"test_{path.stem}.py"))
             case "docs":
-                selected.add(REPOSITORY / "tests" / "test_docs.py")
+                selected |= {REPOSITORY / "tests" / name for name in ("test_docs.py", "test_extending.py")}
             case "pyproject.toml" | "Makefile" | "constraints.txt":
                 selected.add(REPOSITORY / "tests" / "test_packaging.py")
             case _ if path.suffix == ".md":

@@ -1,0 +1,42 @@
+"""``make check`` runs the tests that belong to what has changed, and no others."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parent.parent
+sys.path.insert(0, str(REPOSITORY / "scripts"))
+import changed_tests  # noqa: E402
+
+
+@pytest.mark.parametrize(
+    ("changed", "test"),
+    [
+        ("cadam3d/densifier/cadam.py", "tests/densifier/test_cadam.py"),
+        ("cadam3d/state.py", "tests/test_trainer.py"),  # imports it
+        ("cadam3d/trainer.py", "tests/test_trainer.py"),
+        ("cadam3d/rasterizer/kernels/blend.cuh", "tests/rasterizer/test_cuda.py"),
+        ("configs/densifier/cadam.yaml", "tests/densifier/test_cadam.py"),
+        ("configs/train.yaml", "tests/test_configs.py"),
+        ("docs/extending.md", "tests/test_extending.py"),
+        ("README.md", "tests/test_docs.py"),
+        ("pyproject.toml", "tests/test_packaging.py"),
+        ("scripts/bench_recipes.py", "tests/test_bench_recipes.py"),
+        ("tests/io/test_ply.py", "tests/io/test_ply.py"),
+    ],
+)
+def test_a_change_selects_the_tests_that_belong_to_it(changed, test):
+    assert test in changed_tests.tests_of([changed])
+
+
+def test_a_change_selects_no_tests_of_other_packages():
+    assert not [
+        name
+        for name in changed_tests.tests_of(["cadam3d/camera/sphere.py"])
+        if name.startswith("tests/prior/")
+    ]
+
+
+def test_the_rules_of_the_house_are_always_checked():
+    assert set(changed_tests.ALWAYS) <= set(changed_tests.tests_of(["LICENSE"]))
