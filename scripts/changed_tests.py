@@ -13,7 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 REPOSITORY = Path(__file__).parent.parent
-ALWAYS = ("tests/test_architecture.py", "tests/test_prose.py")
+TESTS = REPOSITORY / "tests"
+ALWAYS = ("test_architecture.py", "test_prose.py")  # rules that any change can break
 
 
 def main() -> None:
@@ -32,40 +33,43 @@ def changed_files(base: str) -> list[str]:
 
 def tests_of(changed: list[str]) -> list[str]:
     """Return the test files for the changed paths, in order and each once."""
-    files = sorted((REPOSITORY / "tests").rglob("test_*.py"))
-    imports = {path: set(imported_modules(path)) for path in files}
-    selected = {REPOSITORY / name for name in ALWAYS}
+    selected = {TESTS / name for name in ALWAYS}
     for name in changed:
-        path = Path(name)
-        match path.parts[0]:
-            case "cadam3d" if path.suffix == ".py":
-                module = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
-                selected |= {test for test, modules in imports.items() if module in modules}
-                selected |= mirror(path.parts[1:])
-            case "cadam3d":
-                selected |= mirror(path.parts[1:])
-            case "configs":
-                selected |= {REPOSITORY / "tests" / "test_configs.py", *mirror(path.parts[1:])}
-            case "tests" if path.name.startswith("test_"):
-                selected.add(REPOSITORY / path)
-            case "tests":
-                selected |= set((REPOSITORY / path).parent.glob("test_*.py"))
-            case "scripts":
-                selected |= set((REPOSITORY / "tests").rglob(f"test_{path.stem}.py"))
-            case "docs":
-                selected |= {REPOSITORY / "tests" / name for name in ("test_docs.py", "test_extending.py")}
-            case "pyproject.toml" | "Makefile" | "constraints.txt":
-                selected.add(REPOSITORY / "tests" / "test_packaging.py")
-            case _ if path.suffix == ".md":
-                selected.add(REPOSITORY / "tests" / "test_docs.py")
+        selected |= tests_of_path(Path(name))
     return sorted(str(path.relative_to(REPOSITORY)) for path in selected if path.is_file())
+
+
+def tests_of_path(path: Path) -> set[Path]:
+    """Return the test files for one changed path; some may not exist."""
+    match path.parts[0]:
+        case "cadam3d":
+            return importers(path) | mirror(path.parts[1:])
+        case "configs":
+            return {TESTS / "test_configs.py", *mirror(path.parts[1:])}
+        case "tests":
+            is_test = path.name.startswith("test_")
+            return {REPOSITORY / path} if is_test else set((REPOSITORY / path).parent.glob("test_*.py"))
+        case "scripts":
+            return set(TESTS.rglob(f"test_{path.stem}.py"))
+        case "pyproject.toml" | "Makefile" | "constraints.txt":
+            return {TESTS / "test_packaging.py"}
+        case _ if path.suffix == ".md":
+            return {TESTS / "test_docs.py", TESTS / "test_extending.py"}
+        case _:
+            return set()
+
+
+def importers(path: Path) -> set[Path]:
+    """Return the test files that import a module of the package directly."""
+    module = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+    return {test for test in TESTS.rglob("test_*.py") if module in imported_modules(test)}
 
 
 def mirror(parts: tuple[str, ...]) -> set[Path]:
     """Return the test files that mirror a path of the package or of the configuration."""
     if len(parts) > 1:
-        return set((REPOSITORY / "tests" / parts[0]).glob("test_*.py"))
-    return {REPOSITORY / "tests" / f"test_{Path(parts[0]).stem}.py"}
+        return set((TESTS / parts[0]).glob("test_*.py"))
+    return {TESTS / f"test_{Path(parts[0]).stem}.py"}
 
 
 def imported_modules(path: Path) -> Iterator[str]:
