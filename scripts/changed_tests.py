@@ -41,22 +41,21 @@ def tests_of(changed: list[str]) -> list[str]:
 
 def tests_of_path(path: Path) -> set[Path]:
     """Return the test files for one changed path; some may not exist."""
+    selected: set[Path] = set()
     match path.parts[0]:
         case "cadam3d":
-            return importers(path) | mirror(path.parts[1:])
+            selected = importers(path) | mirror(path.parts[1:])
         case "configs":
-            return {TESTS / "test_configs.py", *mirror(path.parts[1:])}
-        case "tests":
-            is_test = path.name.startswith("test_")
-            return {REPOSITORY / path} if is_test else set((REPOSITORY / path).parent.glob("test_*.py"))
-        case "scripts":
-            return set(TESTS.rglob(f"test_{path.stem}.py"))
+            selected = {TESTS / "test_configs.py", *mirror(path.parts[1:])}
+        case "tests" if path.name.startswith("test_"):
+            selected = {REPOSITORY / path}
+        case "tests" | "scripts":  # a helper of the tests beside it, or a script with a test of its own
+            selected = {*(REPOSITORY / path).parent.glob("test_*.py"), *TESTS.rglob(f"test_{path.stem}.py")}
         case "pyproject.toml" | "Makefile" | "constraints.txt":
-            return {TESTS / "test_packaging.py"}
+            selected = {TESTS / "test_packaging.py"}
         case _ if path.suffix == ".md":
-            return {TESTS / "test_docs.py", TESTS / "test_extending.py"}
-        case _:
-            return set()
+            selected = {TESTS / "test_docs.py", TESTS / "test_extending.py"}
+    return selected
 
 
 def importers(path: Path) -> set[Path]:

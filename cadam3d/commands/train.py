@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import __version__
@@ -24,7 +23,17 @@ from cadam3d.exporter.base import Exporter
 from cadam3d.io.atomic import remove_leftovers
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import read_jsonl, write_json
-from cadam3d.io.run_folder import ASSET, CHECKPOINTS, CONFIG, METRICS, PREVIEW, SUMMARY, TURNTABLE, shown
+from cadam3d.io.run_folder import (
+    ASSET,
+    CHECKPOINTS,
+    CONFIG,
+    LOCK,
+    METRICS,
+    PREVIEW,
+    SUMMARY,
+    TURNTABLE,
+    shown,
+)
 from cadam3d.metric.base import Metric
 from cadam3d.rasterizer.base import Backend
 from cadam3d.report import write_report
@@ -65,7 +74,7 @@ def run(cfg: DictConfig) -> float | None:
     remove_leftovers(folder)
     config_text = OmegaConf.to_yaml(cfg, resolve=True)
     (folder / CONFIG).write_text(config_text, encoding="utf-8")
-    if HydraConfig.get().mode != RunMode.MULTIRUN:
+    if not (folder / LOCK).exists():  # a sweep locks the folders of its jobs
         link_latest(folder)
     log.info("prompt %r, seed %d, on %s, from step %d", cfg.prompt, cfg.seed, device, state.step)
     log.info("rasterizer=%s; %s", backend.name, backend.reason or "nothing faster is known here")
