@@ -128,7 +128,7 @@ def _reworded(error: Exception, command: str, words: Sequence[str]) -> UserError
         return _several_values(sweep.group(1))
     cause = error.__cause__
     detail = f" ({str(cause).splitlines()[0]})" if isinstance(cause, OmegaConfBaseException) else ""
-    return UserError(f"{' '.join(text.split())}{detail}")
+    return UserError(f"{' '.join(text.split()).rstrip('.')}{detail}. Try: cadam3d {command} --help")
 
 
 def _unknown_option(error: MissingConfigException) -> UserError:

@@ -84,7 +84,10 @@ def component(node: DictConfig | ListConfig | None) -> Any:
     except InstantiationException as error:
         raise _construction_error(error) from error
     except OmegaConfBaseException as error:
-        raise UserError(f"{error.full_key or 'configuration'}: {str(error.msg).splitlines()[0]}") from error
+        reason = str(error.msg).splitlines()[0]
+        raise UserError(
+            f"{error.full_key or 'configuration'}: {reason}. Try: another value; --cfg job lists the keys"
+        ) from error
 
 
 def components(group: DictConfig) -> dict[str, Any]:

@@ -138,7 +138,7 @@ def _paragraphs(text: str, width: int) -> str:
 
 
 def _hint(command: str, group: Group, width: int) -> str:
-    """Return a hint at the pages with more details."""
+    """Return a hint about the pages with more details."""
     example = group.chosen[0] if group.chosen else "NAME"
     text = (
         f"cadam3d {command} --help {group.name}={example} lists the settings of an option. "
