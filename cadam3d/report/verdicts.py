@@ -35,7 +35,7 @@ def headline(results: Sequence[JobResult]) -> list[str]:
 
 
 def reduction_sentence(comparison: PairedComparison) -> str:
-    """Return the reduction in Gaussians, its cost in PSNR, and the numbers of cells and of early ends."""
+    """Return the reduction in Gaussians, its cost in PSNR, the number of cells, and how many ended early."""
     fewer, psnr = comparison.reduction, comparison.psnr
     many, sign = ("fewer", 1) if fewer.median >= 0 else ("more", -1)
     low, high = sorted((sign * fewer.low, sign * fewer.high))
