@@ -9,7 +9,7 @@ from cadam3d.core.cameras import turntable
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.rasterizer import auto
-from cadam3d.rasterizer.auto import AutoRasterizer, choose, checked_cuda
+from cadam3d.rasterizer.auto import AutoRasterizer, checked_cuda, choose
 from cadam3d.rasterizer.base import Backend
 from cadam3d.rasterizer.build import find_compiler
 from cadam3d.rasterizer.cuda import CudaRasterizer
