@@ -78,7 +78,7 @@ def native_cpu(device: torch.device) -> Rasterizer:
     return rasterizer
 
 
-def tested_cuda(device: torch.device) -> Rasterizer:
+def checked_cuda(device: torch.device) -> Rasterizer:
     """Return the CUDA rasterizer. Raises :class:`UserError` unless it passes the self-test on ``device``."""
     rasterizer = CudaRasterizer(cache_dir=None)
     rasterizer.prepare(device)
@@ -96,7 +96,7 @@ def tested_cuda(device: torch.device) -> Rasterizer:
 
 
 # For each type of device, a function that returns a rasterizer that works there or raises UserError.
-FASTEST: Mapping[str, Callable[[torch.device], Rasterizer]] = {"cpu": native_cpu, "cuda": tested_cuda}
+FASTEST: Mapping[str, Callable[[torch.device], Rasterizer]] = {"cpu": native_cpu, "cuda": checked_cuda}
 
 
 def _refuse_broken(device: torch.device) -> None:

@@ -9,7 +9,7 @@ from cadam3d.core.cameras import turntable
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.rasterizer import auto
-from cadam3d.rasterizer.auto import AutoRasterizer, choose, tested_cuda
+from cadam3d.rasterizer.auto import AutoRasterizer, checked_cuda, choose
 from cadam3d.rasterizer.base import Backend
 from cadam3d.rasterizer.build import find_compiler
 from cadam3d.rasterizer.cuda import CudaRasterizer
@@ -194,4 +194,4 @@ def test_kernels_that_do_not_compile_are_not_tested(a_gpu, monkeypatch):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_the_kernels_pass_the_self_test_on_this_gpu():
-    assert tested_cuda(GPU) == CudaRasterizer(cache_dir=None)
+    assert checked_cuda(GPU) == CudaRasterizer(cache_dir=None)
