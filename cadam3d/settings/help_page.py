@@ -71,7 +71,7 @@ def _overview(library: Library, command: str, config_name: str, groups: dict[str
         lists = [f"'{group.name}=[{','.join(group.chosen)}]'" for group in groups.values() if group.is_list]
         note = f"; a list needs quotes, as in {lists[0]}" if lists else ""
         title = f"Parts (group=option{note}). * marks what is chosen by default."
-        parts.append(textwrap.fill(title, width))
+        parts.append(_fill(title, width))
     parts += [_group(library, group, width) for group in groups.values()]
     if groups:
         parts.append(_hint(command, groups.get("densifier") or next(iter(groups.values())), width))
@@ -86,7 +86,10 @@ def _group(library: Library, group: Group, width: int) -> str:
     ]
     title = f"{group.name}: {group.words}" if group.words else group.name
     return "\n".join(
-        [*textwrap.wrap(title, width, subsequent_indent="  "), *_table(rows, width, narrow=True)]
+        [
+            _fill(title, width, indent="  "),
+            *_table(rows, width, narrow=True),
+        ]
     )
 
 
@@ -106,7 +109,7 @@ def _option(library: Library, command: str, group: str, name: str, width: int) -
         changed = [each.key for each in option.settings if each.key in option.own_keys]
         whole = [key for key in changed if key.rpartition(".")[0] not in changed]
         names = ", ".join(key.removeprefix(f"{group}.") for key in whole)
-        lines.append(textwrap.fill(f"Builds on {group}={option.base} and changes {names}.", width))
+        lines.append(_fill(f"Builds on {group}={option.base} and changes {names}.", width))
     return "\n".join([*lines, _settings(option.settings, width) or "  It has no settings."])
 
 
@@ -123,7 +126,7 @@ def _table(rows: Sequence[tuple[str, str]], width: int, *, narrow: bool = False)
     """Yield the lines of a table of two columns, the second of which is wrapped."""
     column = min(max((len(first) for first, _ in rows), default=0), 24 if narrow else FIRST_COLUMN) + 2
     for first, second in rows:
-        lines = textwrap.wrap(second, width - column, break_long_words=False)
+        lines = textwrap.wrap(second, width - column, break_long_words=False, break_on_hyphens=False)
         if len(first) > column - 2:
             yield first
         else:
@@ -134,7 +137,7 @@ def _table(rows: Sequence[tuple[str, str]], width: int, *, narrow: bool = False)
 def _paragraphs(text: str, width: int) -> str:
     """Wrap each line of a text, except those that begin with a space."""
     lines = text.splitlines()
-    return "\n".join(line if line.startswith(" ") else textwrap.fill(line, width) for line in lines)
+    return "\n".join(line if line.startswith(" ") else _fill(line, width) for line in lines)
 
 
 def _hint(command: str, group: Group, width: int) -> str:
@@ -144,7 +147,7 @@ def _hint(command: str, group: Group, width: int) -> str:
         f"cadam3d {command} --help {group.name}={example} lists the settings of an option. "
         f"cadam3d {command} --cfg job prints the settings that a command line runs with."
     )
-    return textwrap.fill(text, width)
+    return _fill(text, width)
 
 
 def _no_group(command: str, word: str, groups: dict[str, Group]) -> UserError:
@@ -157,3 +160,8 @@ def _no_group(command: str, word: str, groups: dict[str, Group]) -> UserError:
         f"{word!r}: expected a group of cadam3d {command} ({', '.join(groups)}). "
         f"Try: cadam3d {command} --help {(near or list(groups))[0]}"
     )
+
+
+def _fill(text: str, width: int, *, indent: str = "") -> str:
+    """Return ``text`` in lines of at most ``width`` characters, the later ones indented; words stay whole."""
+    return textwrap.fill(text, width, subsequent_indent=indent, break_on_hyphens=False)

@@ -19,7 +19,7 @@ RUNS = 5
 # The small scenes. Their size in pixels is not a multiple of a tile.
 SPLATS, SIZE, VIEWS = 150, 45, 2
 # Splats and pixels of the scene for repeated runs.
-CROWD = {"cpu": (500, 64), "cuda": (100_000, 256)}
+REPEATED = {"cpu": (500, 64), "cuda": (100_000, 256)}
 
 # Relative to the largest number of each tensor. A pixel with a larger deviation is on a step of the image
 # formation model (see selftest.py), where float32 may decide either way. Such pixels are left out of the
@@ -34,12 +34,12 @@ def check(name: str, rasterizer: Rasterizer, device: torch.device) -> list[str]:
         return differences(rasterizer, small_scene(make_shell(SPLATS, 3, device)))
     agreement = self_test(rasterizer, device)
     troubles = [] if agreement.holds else [f"self-test: {agreement}"]
-    for kind, gaussians in adversaries(device):
+    for kind, gaussians in difficult_scenes(device):
         troubles += [
             f"{kind}: {difference}" for difference in differences(rasterizer, small_scene(gaussians))
         ]
     if name in PROMISE_BITS:
-        count, size = CROWD[device.type]
+        count, size = REPEATED[device.type]
         troubles += changes(rasterizer, make_scene(make_shell(count, 1, device), size, VIEWS))
     return troubles
 
@@ -48,7 +48,7 @@ def small_scene(gaussians: Gaussians) -> Scene:
     return make_scene(gaussians, SIZE, VIEWS)
 
 
-def adversaries(device: torch.device) -> Iterator[tuple[str, Gaussians]]:
+def difficult_scenes(device: torch.device) -> Iterator[tuple[str, Gaussians]]:
     """Yield scenes that show mistakes which do not show in an ordinary scene."""
 
     def shell(means: float = 1.0, log_scale: Tensor | float = 0.0, opacity: float = 0.0) -> Gaussians:

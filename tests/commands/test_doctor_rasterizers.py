@@ -99,7 +99,7 @@ def test_with_nothing_installed_the_reference_is_tested_and_the_rest_is_named_as
     choice = found["rasterizer=auto"]
     assert choice.verdict is Verdict.NOTE
     assert choice.found.startswith(
-        "chooses reference on cpu, which is slow: rasterizer=cpu needs a C++ compiler"
+        "chooses reference on cpu, which is slow: rasterizer=cpu: expected a C++ compiler"
     )
     assert choice.facts["backend"] == "reference"
 
