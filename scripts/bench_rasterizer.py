@@ -25,7 +25,7 @@ from rasterizer_bench.scenes import make_scene, make_shell
 from rasterizer_bench.stages import copy_speed, time_stages
 from rasterizer_bench.timing import OUT_OF_MEMORY, take_turns
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cuda import load_kernels
 from cadam3d.rasterizer.launcher import Launcher

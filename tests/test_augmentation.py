@@ -5,7 +5,7 @@ import torch
 from splats import make_gaussians
 
 from cadam3d.augmentation import LEAST, LucidAugmentation, NoAugmentation
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.render import RenderOutput
 
 

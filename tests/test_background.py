@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from cadam3d.background import BlackOrWhite, ConstantBackground, LucidBackground, RandomBackground
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 
 
 def draw(seed: int = 0) -> torch.Generator:

@@ -5,7 +5,7 @@ import torch
 from splats import make_gaussians
 
 from cadam3d.core.cameras import turntable
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.render import RenderOutput
 from cadam3d.exposure import BrightnessGuard, NoExposure
 from cadam3d.rasterizer.reference import ReferenceRasterizer

@@ -65,9 +65,9 @@ def run(place) -> Path:
 def energy(place, monkeypatch):
     """Build the densifier of the page with the values of its YAML file."""
     monkeypatch.syspath_prepend(str(place))
-    from cadam3d.settings.compose import component, load
+    from cadam3d.settings.compose import component, load_config
 
-    yield component(load(place / "myconfigs/densifier/energy.yaml"))
+    yield component(load_config(place / "myconfigs/densifier/energy.yaml"))
     for name in [name for name in sys.modules if name.partition(".")[0] == "mypackage"]:
         del sys.modules[name]
 

@@ -10,15 +10,15 @@ from torch import Tensor
 
 from cadam3d.commands.messages import note_backend
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import UserError
 from cadam3d.core.device import resolve_device
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.ply import read_ply
 from cadam3d.io.run_folder import ASSET, CONFIG, shown
 from cadam3d.rasterizer.base import Rasterizer, render_fn
-from cadam3d.settings.compose import component, components, load
+from cadam3d.settings.compose import component, components, load_config
 from cadam3d.sweep.folder import is_sweep
 
 
@@ -70,7 +70,7 @@ def find_run(text: str) -> Path:
 
 def run_config(folder: Path) -> DictConfig:
     """Return the settings of the run in ``folder``."""
-    return load(folder / CONFIG)
+    return load_config(folder / CONFIG)
 
 
 def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:

@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 
 from cadam3d import report
 from cadam3d.commands.asset import find_run, open_run, renderer, run_config
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.run_folder import EVALUATION, shown
 from cadam3d.settings.compose import component, components

@@ -6,7 +6,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from cadam3d.commands.asset import Asset, export_all, open_asset, output_folder
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import shown
 
 

@@ -15,8 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import __version__
 from cadam3d.commands.messages import note, note_backend
-from cadam3d.core.checks import UserError, require, require_whole
+from cadam3d.core.checks import require, require_whole
 from cadam3d.core.device import resolve_device
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn
 from cadam3d.exporter.base import Exporter
@@ -37,7 +38,7 @@ from cadam3d.io.run_folder import (
 from cadam3d.metric.base import Metric
 from cadam3d.rasterizer.base import Backend
 from cadam3d.report import write_report
-from cadam3d.settings.compose import component, components, flatten, load
+from cadam3d.settings.compose import component, components, flatten, load_config
 from cadam3d.state import Outcome, RunContext, TrainState
 from cadam3d.trainer import Trainer
 
@@ -193,7 +194,7 @@ def note_changes(cfg: DictConfig, folder: Path) -> None:
     """Print the settings that have changed, because the run then differs from an uninterrupted one."""
     if not (folder / CONFIG).is_file():
         return
-    before = dict(flatten(OmegaConf.to_container(load(folder / CONFIG), resolve=True)))
+    before = dict(flatten(OmegaConf.to_container(load_config(folder / CONFIG), resolve=True)))
     now = dict(flatten(OmegaConf.to_container(cfg, resolve=True)))
     for key in sorted(before.keys() | now.keys()):
         if key != "resume" and before.get(key) != now.get(key):

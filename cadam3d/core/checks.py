@@ -6,17 +6,6 @@ from typing import TypeGuard
 
 from cadam3d.core.errors import UserError
 
-__all__ = [
-    "UserError",
-    "are_numbers",
-    "fail",
-    "require",
-    "require_choice",
-    "require_color",
-    "require_range",
-    "require_whole",
-]
-
 
 def fail(key: str, *, expected: str, got: object, example: str) -> UserError:
     """Build the error for one configuration key; the caller raises it.

@@ -10,7 +10,8 @@ import torch
 import trimesh
 from torch import Tensor
 
-from cadam3d.core.checks import UserError, require, require_choice, require_color
+from cadam3d.core.checks import require, require_choice, require_color
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.initializer.points import (

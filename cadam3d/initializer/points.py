@@ -10,7 +10,8 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from cadam3d.core.checks import UserError, require_choice, require_range, require_whole
+from cadam3d.core.checks import require_choice, require_range, require_whole
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE, rgb_to_sh0
 from cadam3d.io.frames import TURNS

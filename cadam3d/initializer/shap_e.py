@@ -10,7 +10,8 @@ from jaxtyping import Float, Int
 from kornia.color import linear_rgb_to_rgb
 from torch import Tensor
 
-from cadam3d.core.checks import UserError, require, require_choice, require_range, require_whole
+from cadam3d.core.checks import require, require_choice, require_range, require_whole
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Beginning, Initializer
 from cadam3d.initializer.points import (

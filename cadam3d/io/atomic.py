@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 
 TEMPORARY = ".tmp-"  # in the name of every file that is still being written
 

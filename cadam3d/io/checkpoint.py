@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import remove_leftovers, replacing
 from cadam3d.io.run_folder import CHECKPOINT_PATTERN, checkpoint_name
 

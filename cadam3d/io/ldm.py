@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.io.pretrained import LIBRARIES, Pretrained, Source, require_extra
 
 HEAD = 64  # channels of one attention head, in the UNet and in the text encoder

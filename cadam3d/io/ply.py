@@ -20,7 +20,8 @@ import numpy as np
 import torch
 
 from cadam3d import __version__
-from cadam3d.core.checks import UserError, require_choice
+from cadam3d.core.checks import require_choice
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE
 from cadam3d.io.atomic import replacing

@@ -14,7 +14,8 @@ from typing import Any
 
 import torch
 
-from cadam3d.core.checks import UserError, require
+from cadam3d.core.checks import require
+from cadam3d.core.errors import UserError
 
 INDEX = "model_index.json"
 # Parts may only have classes of these libraries, so that no foreign code runs.

@@ -7,7 +7,8 @@ import imageio.v2 as imageio
 import numpy as np
 from jaxtyping import UInt8
 
-from cadam3d.core.checks import UserError, require
+from cadam3d.core.checks import require
+from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
 
 # 18 is visually lossless; larger numbers give smaller and worse files.

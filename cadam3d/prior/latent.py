@@ -20,7 +20,8 @@ from torch.nn import functional as F  # noqa: N812  (the usual name)
 from torch.utils.checkpoint import checkpoint
 
 from cadam3d.core.cameras import Cameras, orbit
-from cadam3d.core.checks import UserError, require, require_choice, require_whole
+from cadam3d.core.checks import require, require_choice, require_whole
+from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
 from cadam3d.io.cache import default_cache_dir
 from cadam3d.io.pretrained import DTYPES, Pretrained, Source

@@ -11,7 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import UserError, require, require_range
+from cadam3d.core.checks import require, require_range
+from cadam3d.core.errors import UserError
 from cadam3d.io.ldm import SingleFile, with_ldm_unet
 from cadam3d.io.pretrained import Pretrained
 from cadam3d.prior.base import MemoryEstimate

@@ -27,7 +27,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.io.cache import default_cache_dir

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import torch
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.rasterizer.build import KERNELS, build_folder, definitions, short_hash
 
 SOURCE = "cuda.cu"

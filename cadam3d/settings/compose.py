@@ -98,7 +98,7 @@ def components(group: DictConfig) -> dict[str, Any]:
     return {str(name): component(node) for name, node in group.items() if "_target_" in node}
 
 
-def load(path: Path) -> DictConfig:
+def load_config(path: Path) -> DictConfig:
     """Return the resolved ``config.yaml`` of a run. Text that looks like an interpolation stays text."""
     return DictConfig(_escaped(yaml.safe_load(path.read_text(encoding="utf-8"))))
 

@@ -29,7 +29,7 @@ EXAMPLE = "{each: {seed: [0, 1]}, arms: {mine: {densifier: cadam}}}"
 
 
 @dataclass(frozen=True)
-class Setting:
+class AxisValue:
     """One override: a key with one value."""
 
     key: str  # without a leading + or ~
@@ -49,7 +49,7 @@ class Setting:
 
 
 # The settings of each key, of which every job takes one.
-Axes = dict[str, list[Setting]]
+Axes = dict[str, list[AxisValue]]
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def _axes(node: Any, where: str) -> Axes:
     return {str(key).lstrip("+"): _axis(str(key), value, where) for key, value in node.items()}
 
 
-def _axis(key: str, value: Any, where: str) -> list[Setting]:
+def _axis(key: str, value: Any, where: str) -> list[AxisValue]:
     values = value if isinstance(value, list) else [value]
     if not values:
         raise UserError(f"{where}: {key} has no values. Try: at least one")
@@ -205,9 +205,9 @@ def _alternatives(line: str) -> list[str]:
     return [f"{key}={value}" for value in override.sweep_string_iterator()]
 
 
-def _setting(line: str) -> Setting:
+def _setting(line: str) -> AxisValue:
     value = _parsed(line).value()
-    return Setting(key=line.partition("=")[0].lstrip("+~"), line=line, value=to_json(value))
+    return AxisValue(key=line.partition("=")[0].lstrip("+~"), line=line, value=to_json(value))
 
 
 def _parsed(line: str) -> Override:
@@ -238,7 +238,7 @@ def _named(grid: Grid, line: Axes) -> set[str]:
     return {key for key in swept_keys(grid, line) if key not in fixed or len(line.get(key, ())) > 1}
 
 
-def _folder_name(arm: str, settings: Sequence[Setting], named: set[str], counted: Sequence[str]) -> str:
+def _folder_name(arm: str, settings: Sequence[AxisValue], named: set[str], counted: Sequence[str]) -> str:
     """Return a readable name with a digest of everything in which this job may differ from the others."""
     shown = sorted((each for each in settings if each.key in named), key=lambda each: each.key)
     words = [each.text for each in shown if each.key in TEXT_KEYS]

@@ -9,7 +9,7 @@ from cadam3d.callback.checkpoint import Checkpoint
 from cadam3d.callback.metrics import Metrics
 from cadam3d.callback.progress import Progress
 from cadam3d.commands.train import build_trainer
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import append_jsonl, read_jsonl
 from cadam3d.rasterizer.reference import ReferenceRasterizer

@@ -10,7 +10,7 @@ import torch
 from cadam3d.callback.candidates import OTHERS, SELECTED, Candidates, histogram, marked, pictures
 from cadam3d.commands.train import build_trainer
 from cadam3d.core.cameras import turntable
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.jsonl import append_jsonl, read_jsonl
 from cadam3d.rasterizer.reference import ReferenceRasterizer

@@ -7,7 +7,7 @@ import torch
 
 from cadam3d.callback.previews import Previews
 from cadam3d.commands.train import build_trainer
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import component, compose
 from cadam3d.state import Outcome, RunContext, TrainState
 

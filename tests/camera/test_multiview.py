@@ -7,7 +7,7 @@ import torch
 
 from cadam3d.camera.multiview import Multiview
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 
 PUBLISHED = {
     "size": 40,

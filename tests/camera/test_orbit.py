@@ -5,7 +5,7 @@ import torch
 
 from cadam3d.camera.orbit import Orbit
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.schedule import Steps
 
 RANGES = {

@@ -8,7 +8,7 @@ import torch
 
 from cadam3d.camera.progressive import Progressive, Widening
 from cadam3d.core.cameras import Cameras, around
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import component, compose
 
 STILL = {"position_jitter": 0.0, "target_jitter": 0.0, "up_jitter": 0.0}

@@ -5,7 +5,7 @@ import torch
 
 from cadam3d.camera.sphere import Sphere
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 
 
 def sample(views: int, seed: int = 0, **changes) -> Cameras:

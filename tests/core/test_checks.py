@@ -4,15 +4,8 @@ import math
 
 import pytest
 
-from cadam3d.core.checks import (
-    UserError,
-    fail,
-    require,
-    require_choice,
-    require_color,
-    require_range,
-    require_whole,
-)
+from cadam3d.core.checks import fail, require, require_choice, require_color, require_range, require_whole
+from cadam3d.core.errors import UserError
 
 
 def test_a_message_has_key_expected_got_and_what_to_type():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from cadam3d.core.cameras import orbit, turntable
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.pictures import PictureSettings
 
 GIVEN = {"distance": 3.0, "fov_y_deg": 40.0, "size": 16, "background": [1, 0.5, 0]}

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.schedule import Constant, Linear, LogLinear, Steps, as_schedule, require_scheduled
 
 

@@ -18,8 +18,8 @@ from evidence import (
     some_gaussians,
 )
 
-from cadam3d.core.checks import UserError
 from cadam3d.core.edit import RowEdit
+from cadam3d.core.errors import UserError
 from cadam3d.core.schedule import Linear
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.cadam import CAdamState, quantile

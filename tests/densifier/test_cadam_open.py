@@ -21,7 +21,7 @@ from evidence import (
     some_gaussians,
 )
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.cadam import CAdam, CAdamState
 from cadam3d.densifier.cadam_open import CAdamOpen

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.integrate import quad
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.mcmc import MCMC, draw, share

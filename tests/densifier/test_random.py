@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from cadam3d.core.checks import UserError
 from cadam3d.core.edit import RowEdit
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.schedule import Linear
 from cadam3d.densifier.base import GradientSignal

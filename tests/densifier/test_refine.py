@@ -6,7 +6,7 @@ import pytest
 import torch
 from evidence import cadam
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.baseline import Baseline

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.exporter.ply import PlyExporter
 from cadam3d.io.ply import read_ply

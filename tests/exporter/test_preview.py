@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.exporter.preview import PreviewExporter

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.schedule import Linear
 from cadam3d.prior.path import DDPM, per_view
 

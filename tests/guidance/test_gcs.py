@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from cadam3d.core.cameras import turntable
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.schedule import Linear
 from cadam3d.guidance.distill import Case
 from cadam3d.prior.path import DDPM, RectifiedFlow, per_view

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.guidance.distill import Case
 from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
 

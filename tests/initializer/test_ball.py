@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0
 from cadam3d.initializer.ball import Ball

@@ -6,7 +6,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0
 from cadam3d.initializer.mesh import Mesh

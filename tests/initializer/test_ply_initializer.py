@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0, evaluate_sh
 from cadam3d.initializer.ply import Ply

@@ -5,7 +5,7 @@ import gc
 import pytest
 import torch
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.sh import SH_C0
 from cadam3d.initializer.ball import Ball
 from cadam3d.initializer.shap_e import KIND, OTHERS, ColoredMesh, ShapE

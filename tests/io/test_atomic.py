@@ -2,7 +2,7 @@
 
 import pytest
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import remove_leftovers, replacing
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.io import checkpoint
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint, prune_checkpoints, save_checkpoint
 

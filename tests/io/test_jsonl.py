@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.io import jsonl
 from cadam3d.io.jsonl import append_jsonl, read_json, read_jsonl, truncate_after, write_json
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io import ply
 from cadam3d.io.frames import UPS

@@ -6,7 +6,7 @@ import shutil
 import pytest
 import torch
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.io import pretrained
 from cadam3d.io.pretrained import Source
 

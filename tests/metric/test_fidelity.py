@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from cadam3d.core.cameras import turntable
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.metric.fidelity import Fidelity

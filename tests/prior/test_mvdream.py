@@ -19,7 +19,7 @@ from torch.nn.functional import normalize
 
 from cadam3d.camera.multiview import Multiview
 from cadam3d.core.cameras import orbit, turntable
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.prior.mvdream import MVDream, camera_numbers
 from cadam3d.prior.prompting import Plain
 

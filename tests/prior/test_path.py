@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
 
 PATHS = {

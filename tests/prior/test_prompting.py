@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from cadam3d.core.cameras import orbit
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.prior.prompting import (
     BACK,
     FRONT,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.prior.shapes.grammar import Phrase, Sentence, known_words, parse
 from cadam3d.prior.shapes.objects import ALIASES, known_objects, known_primitives
 from cadam3d.prior.shapes.vocabulary import COLOURS

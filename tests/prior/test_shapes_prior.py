@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.prior.path import DDPM, NoisePath, Prediction, RectifiedFlow
 from cadam3d.prior.shapes import ShapesPrior, known_objects, known_primitives
 from cadam3d.prior.shapes.prior import (

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from cadam3d.core.cameras import orbit
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.prior.prompting import Discrete, Interpolated, PerpNeg, Plain
 from cadam3d.prior.stable_diffusion import StableDiffusion
 

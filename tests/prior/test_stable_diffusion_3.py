@@ -15,7 +15,7 @@ from latents import (
     normal,
 )
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json, write_json
 from cadam3d.prior.path import RectifiedFlow
 from cadam3d.prior.stable_diffusion_3 import StableDiffusion3

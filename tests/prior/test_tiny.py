@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from cadam3d.core.cameras import turntable
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.prior.path import DDPM, RectifiedFlow
 from cadam3d.prior.tiny import MAX_TOKENS, PADDING, Tiny, tokenize
 

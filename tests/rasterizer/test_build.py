@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.io.cache import default_cache_dir
 from cadam3d.rasterizer import build as module
 from cadam3d.rasterizer.build import (

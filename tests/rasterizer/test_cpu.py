@@ -15,7 +15,7 @@ from splats import (
     render_and_differentiate,
 )
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.rasterizer.build import load
 from cadam3d.rasterizer.cpu import instruction_set, rasterize
 

@@ -19,7 +19,7 @@ from splats import (
     saturated,
 )
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.build import KERNELS
 from cadam3d.rasterizer.cuda import CudaRasterizer

@@ -17,7 +17,7 @@ from splats import (
     render_and_differentiate,
 )
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.cuda import rasterize
 from cadam3d.rasterizer.launcher import Launch, Launcher

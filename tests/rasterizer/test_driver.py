@@ -11,7 +11,7 @@ import pytest
 import torch
 from splats import backgrounds, make_cameras, make_gaussians
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import driver
 from cadam3d.rasterizer.build import find_compiler
 from cadam3d.rasterizer.cuda import BLEND_BLOCK, MOST, WARP, CudaRasterizer, _launch_each

@@ -10,7 +10,7 @@ import pytest
 import torch
 from emulation import content_hash, make_once
 
-from cadam3d.core.checks import UserError
+from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import base, nvrtc
 from cadam3d.rasterizer.build import KERNELS
 from cadam3d.rasterizer.nvrtc import build, choose_architecture, compile_kernels, find_compiler

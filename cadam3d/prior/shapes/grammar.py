@@ -11,7 +11,8 @@ import re
 from contextlib import suppress
 from dataclasses import dataclass
 
-from cadam3d.core.checks import UserError, fail
+from cadam3d.core.checks import fail
+from cadam3d.core.errors import UserError
 from cadam3d.prior.shapes.objects import ALIASES, known_objects, known_primitives
 from cadam3d.prior.shapes.vocabulary import (
     ARTICLES,
