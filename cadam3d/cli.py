@@ -79,6 +79,7 @@ def help_text() -> str:
         *(f"  {name:<8}{summary:<50}{example}" for name, (summary, example) in COMMANDS.items()),
         "",
         "Settings of a command:  cadam3d COMMAND --help",
+        "Settings of an option:  cadam3d train --help densifier=cadam",
         'Tab completion (bash):  eval "$(cadam3d -sc install=bash)"',
     ]
     return "\n".join(lines)
