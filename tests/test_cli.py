@@ -180,7 +180,7 @@ def test_a_prompt_is_unchanged_in_the_command_and_in_the_config_of_its_run(promp
     assert cfg.prompt == prompt
     path = tmp_path / "config.yaml"
     path.write_text(OmegaConf.to_yaml(cfg, resolve=True), encoding="utf-8")
-    assert settings.load(path).prompt == prompt
+    assert settings.load_config(path).prompt == prompt
 
 
 def test_a_negative_prompt_is_text_too(type_line, jobs):
