@@ -1,5 +1,6 @@
 """Figures of a sweep that show assets: lines and columns of pictures, each with its numbers underneath."""
 
+import textwrap
 from collections.abc import Callable, Hashable, Sequence
 
 import imageio.v3 as imageio
@@ -25,6 +26,7 @@ from cadam3d.report.results import (
 from cadam3d.report.style import hide_axes, looks, new_figure
 
 MAX_COLUMNS = 7  # pictures in one line
+TITLE_CHARACTERS_PER_INCH = 15  # that surely fit at the size of a title
 MAX_VIEWS = 4  # of one asset
 PICTURE_INCH = 1.45
 PREFERRED_NOISE = ("medium", "weak", "strong")  # the level to show, the first choice first
@@ -197,8 +199,11 @@ def _line_title(axes: Axes, text: str, color: str = SOFT) -> None:
 
 
 def _name_cell(figure: Figure, cell: Cell) -> None:
+    """Write prompt, noise and seed of a cell above a figure, in as many lines as its width needs."""
     words = [cell["prompt"], level_title(cell[NOISE]), f"seed {cell['seed']}"]
-    figure.suptitle(", ".join(word for word in words if word), fontsize=8.5, color=SOFT, x=0.01, ha="left")
+    title = ", ".join(word for word in words if word)
+    lines = textwrap.fill(title, int(TITLE_CHARACTERS_PER_INCH * figure.get_figwidth()))
+    figure.suptitle(lines, fontsize=8.5, color=SOFT, x=0.01, ha="left")
 
 
 def _evenly(length: int, most: int) -> list[int]:
