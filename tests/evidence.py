@@ -1,4 +1,4 @@
-"""Gradients and gradient histories for the tests of CAdam and its open choices."""
+"""Gradients and gradient histories for the tests of densifiers."""
 
 import torch
 
@@ -53,6 +53,18 @@ def signal(means: torch.Tensor, visible: torch.Tensor | None = None) -> Gradient
     visible = torch.ones(1, n, dtype=torch.bool) if visible is None else visible
     return GradientSignal(
         means=means, means2d=torch.zeros(len(visible), n, 2), radii=visible.float(), height=8, width=8
+    )
+
+
+def signal_without_values() -> GradientSignal:
+    """Return a signal of 4 Gaussians whose tensors have shapes only, so that reading a value is an error."""
+    meta = torch.device("meta")
+    return GradientSignal(
+        means=torch.empty(4, 3, device=meta),
+        means2d=torch.empty(2, 4, 2, device=meta),
+        radii=torch.empty(2, 4, device=meta),
+        height=8,
+        width=8,
     )
 
 

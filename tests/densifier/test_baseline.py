@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from evidence import signal_without_values
 
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.errors import UserError
@@ -172,16 +173,9 @@ def test_observe_modifies_neither_the_old_state_nor_the_signal():
 
 @pytest.mark.parametrize("views", VIEWS)
 def test_observe_never_waits_for_the_device(views):
-    meta = torch.device("meta")  # its tensors have no values, so reading one is an error
-    evidence = GradientSignal(
-        means=torch.empty(4, 3, device=meta),
-        means2d=torch.empty(2, 4, 2, device=meta),
-        radii=torch.empty(2, 4, device=meta),
-        height=8,
-        width=8,
-    )
+    evidence = signal_without_values()
     densifier = baseline(views=views)
-    assert densifier.observe(densifier.init_state(4, meta), evidence).norm_sum.shape == (4,)
+    assert densifier.observe(densifier.init_state(4, evidence.means.device), evidence).norm_sum.shape == (4,)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])

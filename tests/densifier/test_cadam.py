@@ -14,6 +14,7 @@ from evidence import (
     noise,
     observe,
     signal,
+    signal_without_values,
     snr,
     some_gaussians,
 )
@@ -21,7 +22,6 @@ from evidence import (
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.errors import UserError
 from cadam3d.core.schedule import Linear
-from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.cadam import CAdamState, quantile
 from cadam3d.densifier.refine import Refine
 
@@ -69,16 +69,9 @@ def test_observe_modifies_neither_the_old_state_nor_the_signal():
 
 
 def test_observe_never_waits_for_the_device():
-    meta = torch.device("meta")  # its tensors have no values, so reading one is an error
+    evidence = signal_without_values()
     densifier = cadam()
-    evidence = GradientSignal(
-        means=torch.empty(4, 3, device=meta),
-        means2d=torch.empty(2, 4, 2, device=meta),
-        radii=torch.empty(2, 4, device=meta),
-        height=8,
-        width=8,
-    )
-    state = densifier.observe(densifier.init_state(4, meta), evidence)
+    state = densifier.observe(densifier.init_state(4, evidence.means.device), evidence)
     assert state.m.shape == (4, 3)
 
 

@@ -17,12 +17,12 @@ from evidence import (
     observe,
     open_cadam,
     signal,
+    signal_without_values,
     snr,
     some_gaussians,
 )
 
 from cadam3d.core.errors import UserError
-from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.cadam import CAdam, CAdamState
 from cadam3d.densifier.cadam_open import CAdamOpen
 from cadam3d.settings.compose import compose
@@ -82,16 +82,9 @@ def test_observe_modifies_neither_the_old_state_nor_the_signal():
     "choice", [{"invisible": "skip"}, {"grad_norm": "per_step_rms"}, {"nonfinite": "skip_row"}]
 )
 def test_observe_never_waits_for_the_device(choice):
-    meta = torch.device("meta")  # its tensors have no values, so reading one is an error
+    evidence = signal_without_values()
     densifier = open_cadam(**choice)
-    evidence = GradientSignal(
-        means=torch.empty(4, 3, device=meta),
-        means2d=torch.empty(2, 4, 2, device=meta),
-        radii=torch.empty(2, 4, device=meta),
-        height=8,
-        width=8,
-    )
-    state = densifier.observe(densifier.init_state(4, meta), evidence)
+    state = densifier.observe(densifier.init_state(4, evidence.means.device), evidence)
     assert state.m.shape == (4, 3)
 
 
