@@ -1,0 +1,106 @@
+"""Reading: open files that a stranger may have written, so that every problem is one message.
+
+A file is read only if it is a regular file of a plausible size. A pipe or a device is refused, because
+reading it could wait forever. YAML is read as plain data: without tags, without aliases (a few lines of which
+can describe gigabytes), and with a limited depth.
+"""
+
+import os
+import stat
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import yaml  # comes with OmegaConf
+
+from cadam3d.core.errors import UserError
+
+# Bytes. A configuration has some ten thousand; the table of a run of many hours has some ten million.
+LARGEST_TEXT = 1 << 28
+LARGEST_YAML = 1 << 22
+DEEPEST = 64  # levels of YAML
+KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+
+
+# The loader in C is ten times as fast, but not every build of PyYAML has it.
+_SAFE: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(_SAFE):
+    """Reads plain data. A date stays text, as OmegaConf reads and writes it."""
+
+    yaml_implicit_resolvers = {
+        first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
+        for first, resolvers in _SAFE.yaml_implicit_resolvers.items()
+    }
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file for reading bytes.
+
+    Raises ``UserError`` if ``path`` is not a regular file, and ``OSError`` if it cannot be opened (for a name
+    with a null byte, ``ValueError``).
+    """
+    # Without this flag, opening a named pipe waits for a writer.
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(descriptor)
+        kind = KINDS.get(stat.S_IFMT(mode), "something else")
+        raise UserError(f"{path}: expected a file, got {kind}. Try: another file")
+    return os.fdopen(descriptor, "rb")
+
+
+def read_bytes(path: Path, *, largest: int) -> bytes:
+    """Return the content of a regular file of at most ``largest`` bytes. Raises ``UserError`` on failure."""
+    try:
+        with open_regular(path) as file:
+            content = file.read(largest + 1)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"{path}: cannot be read ({reason}). Try: another file") from error
+    if len(content) > largest:
+        raise UserError(f"{path}: expected at most {largest:,} bytes, got more. Try: another file")
+    return content
+
+
+def read_text(path: Path, *, largest: int = LARGEST_TEXT) -> str:
+    """Return the content of a UTF-8 file of at most ``largest`` bytes. Raises ``UserError`` on failure."""
+    try:
+        return read_bytes(path, largest=largest).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: expected UTF-8 text, got other bytes. Try: another file") from error
+
+
+def read_yaml(path: Path) -> Any:
+    """Return the plain data in a YAML file: dicts, lists, text, numbers, truth values and None.
+
+    Raises ``UserError`` if the file cannot be read, or contains anything else.
+    """
+    text = read_text(path, largest=LARGEST_YAML)
+    try:
+        _require_plain(text)
+        return yaml.load(text, _Loader)
+    # A number with thousands of digits raises ValueError.
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{path}: expected plain YAML, got {reason}. Try: another file") from error
+
+
+def _require_plain(text: str) -> None:
+    """Raise ``ValueError`` for aliases and for too many levels, before anything is built."""
+    depth = 0
+    for event in yaml.parse(text, _Loader):
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError(f"an alias, *{event.anchor}")
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+            if depth > DEEPEST:
+                raise ValueError(f"more than {DEEPEST} levels")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
