@@ -8,7 +8,7 @@ can describe gigabytes), and with a limited depth.
 import os
 import stat
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ClassVar
 
 import yaml  # comes with OmegaConf
 
@@ -34,7 +34,7 @@ _SAFE: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 class _Loader(_SAFE):
     """Reads plain data. A date stays text, as OmegaConf reads and writes it."""
 
-    yaml_implicit_resolvers = {
+    yaml_implicit_resolvers: ClassVar = {
         first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
         for first, resolvers in _SAFE.yaml_implicit_resolvers.items()
     }
