@@ -2,9 +2,8 @@
 
 import gc
 import shlex
-import shutil
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -14,7 +13,6 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.run_folder import OVERRIDES, claim, holds_run
 from cadam3d.settings.advice import explain, require_values, reraise_interrupt
 from cadam3d.settings.compose import TEXT_KEYS
 from cadam3d.settings.help_page import help_text
@@ -26,7 +24,8 @@ from cadam3d.settings.hydra import (
     run_composed,
     run_hydra,
 )
-from cadam3d.settings.line import RUN_FOLDER, key_of, quoted, resume_word, resumed, split
+from cadam3d.settings.line import RUN_FOLDER, key_of, quoted, resumed, split
+from cadam3d.settings.place import occupied
 
 TRAINING = ("train", "sweep")  # the commands that have a run folder
 
@@ -146,49 +145,10 @@ def _train(cfg: DictConfig, line: Line, task: Task) -> None:
         raise UserError(f"{RUN_FOLDER}: expected a folder, got nothing. Try: {example}")
     wanted = Path(str(text)).expanduser()
     is_chosen = any(key_of(override) == RUN_FOLDER for override in line.overrides)
-    existing = _nearest_existing(wanted if is_chosen else wanted.parent)
-    folder = claim(wanted, RUN_FOLDER, is_chosen=is_chosen)
-    place_run(cfg, folder)
-    if cfg.resume is not None:
-        _undoing_refusal(folder, lambda: run_composed(cfg, task))
-    elif holds_run(folder):
-        raise UserError(
-            f"{RUN_FOLDER}: {folder} holds a run already. "
-            f"Try: cadam3d train {resume_word(folder)}, or another folder"
-        )
-    else:
-        _removing_refused(folder, existing, lambda: run_composed(cfg, task))
-
-
-def _undoing_refusal(folder: Path, train: Callable[[], None]) -> None:
-    """Resume the run in ``folder``. If the line is refused, restore the files that Hydra has overwritten."""
-    before = {path: path.read_bytes() for path in (folder / OVERRIDES).parent.glob("*.yaml")}
-    try:
-        train()
-    except (UserError, InterpolationResolutionError):
-        for path, content in before.items():
-            path.write_bytes(content)
-        raise
-
-
-def _removing_refused(folder: Path, existing: Path, train: Callable[[], None]) -> None:
-    """Train in the new ``folder``. If the line is refused, remove it and its parents up to ``existing``."""
-    try:
-        train()
-    except (UserError, InterpolationResolutionError, KeyboardInterrupt):
-        is_untouched = all(path.name == ".hydra" or path.suffix == ".log" for path in folder.iterdir())
-        if folder != existing and is_untouched:
-            shutil.rmtree(folder, ignore_errors=True)
-            for parent in folder.parents:
-                if parent == existing or any(parent.iterdir()):
-                    break
-                parent.rmdir()
-        raise
-
-
-def _nearest_existing(folder: Path) -> Path:
-    """Return ``folder``, or the nearest of its parents that exists."""
-    return next((place for place in (folder, *folder.parents) if place.exists()), folder)
+    resume = Path(str(cfg.resume)) if cfg.resume else None
+    with occupied(wanted, is_chosen=is_chosen, resume=resume) as folder:
+        place_run(cfg, folder)
+        run_composed(cfg, task)
 
 
 def _wants_page(options: Namespace) -> bool:

@@ -1,6 +1,8 @@
 """``cadam3d train``: optimise an asset for a prompt and write it into a run folder."""
 
+import errno
 import logging
+import os
 import signal
 import sys
 import time
@@ -24,11 +26,12 @@ from cadam3d.exporter.base import Exporter
 from cadam3d.io.atomic import remove_leftovers
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import read_jsonl, write_json
+from cadam3d.io.lock import INHERITED
 from cadam3d.io.run_folder import (
     ASSET,
     CHECKPOINTS,
     CONFIG,
-    LOCK,
+    LATEST,
     METRICS,
     PREVIEW,
     SUMMARY,
@@ -46,7 +49,6 @@ log = logging.getLogger(__name__)
 
 # Signals that arrive within this time of each other count as one.
 TOGETHER_SECONDS = 1.0
-LATEST = Path("outputs") / "latest"
 COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "camera", "refine", "optimizer")
 
 
@@ -75,7 +77,8 @@ def run(cfg: DictConfig) -> float | None:
     remove_leftovers(folder)
     config_text = OmegaConf.to_yaml(cfg, resolve=True)
     (folder / CONFIG).write_text(config_text, encoding="utf-8")
-    if not (folder / LOCK).exists():  # a sweep locks the folders of its jobs
+    # This is for single runs: a sweep locks the folders of its jobs and passes the locks on.
+    if INHERITED not in os.environ:
         link_latest(folder)
     log.info("prompt %r, seed %d, on %s, from step %d", cfg.prompt, cfg.seed, device, state.step)
     log.info("rasterizer=%s; %s", backend.name, backend.reason or "nothing faster is known here")
@@ -202,19 +205,22 @@ def note_changes(cfg: DictConfig, folder: Path) -> None:
 
 
 def link_latest(folder: Path) -> None:
-    """Make ``outputs/latest`` a link to ``folder``. If the file system has no links, print a note."""
+    """Make ``outputs/latest`` a link to ``folder``. If that is not possible, print a note."""
+    latest = Path(LATEST)
+    fresh = latest.with_name(f".latest-{os.getpid()}")
     try:
-        LATEST.parent.mkdir(parents=True, exist_ok=True)
-        target, base = folder.resolve(), LATEST.parent.resolve()
-        fresh = LATEST.with_name(f".latest-{folder.name}")
+        latest.parent.mkdir(parents=True, exist_ok=True)
+        target, base = folder.resolve(), latest.parent.resolve()
+        if os.path.lexists(latest) and not latest.is_symlink():
+            raise FileExistsError(errno.EEXIST, "it exists and is not a link")
         fresh.unlink(missing_ok=True)
         fresh.symlink_to(target.relative_to(base) if target.is_relative_to(base) else target)
         try:
-            fresh.replace(LATEST)
+            fresh.replace(latest)
         finally:
             fresh.unlink(missing_ok=True)
     except OSError as error:
-        print(f"Note: {LATEST} not updated ({error.strerror}).", file=sys.stderr)
+        print(f"Note: {latest} not updated ({error.strerror}).", file=sys.stderr)
 
 
 def summarize(cfg: DictConfig, state: TrainState, outcome: Outcome, backend: Backend) -> dict[str, Any]:

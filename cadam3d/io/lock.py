@@ -1,11 +1,23 @@
 """Lock: keep a second process away from a folder, on systems with file locks.
 
-A lock belongs to an open file and is released when the file is closed, however its process ends. On Linux and
-macOS a child process that inherits the open file holds the lock too. Windows does not pass locks on to
-children.
+A lock belongs to an open file and is released when the file is closed, however its process ends. The file
+itself locks nothing, so one that a killed process has left behind has no effect. On Linux and macOS a child
+process that inherits the open file holds the lock too. Windows does not pass locks on to children.
 """
 
-from typing import IO
+import json
+import os
+import shlex
+import socket
+import stat
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+from cadam3d.core.errors import UserError
 
 try:
     import fcntl
@@ -13,8 +25,49 @@ except ImportError:  # Windows
     fcntl = None
     import msvcrt
 
+# A process that starts another one under its lock sets this variable to the descriptor of the lock file.
+INHERITED = "CADAM3D_LOCK"
+# On Windows, other processes cannot read a locked byte, so the byte that is locked is far behind the text.
+LOCKED_BYTE = 1 << 30
+# Bytes of a lock file that are read, and characters of a command line that are written and shown.
+LONGEST_NOTE, LONGEST_COMMAND, LONGEST_SHOWN = 1 << 16, 4000, 160
 
-def try_lock(file: IO[str]) -> bool:
+
+@contextmanager
+def locked(path: Path, refusal: Callable[[str], UserError]) -> Iterator[None]:
+    """Hold the lock file ``path``, with a note in it about this process.
+
+    If another process holds the lock, raises ``refusal(holder)``, where ``holder`` describes that process.
+    Raises ``UserError`` if ``path`` is not a regular file, and ``OSError`` if it cannot be opened.
+    """
+    file = take(path)
+    if file is None:
+        raise refusal(describe_holder(path))
+    # Closing the file releases the lock, unless another process has passed the lock on to this one.
+    with file:
+        yield
+
+
+def take(path: Path) -> IO[bytes] | None:
+    """Lock ``path`` without waiting and return the open file, or None if another process holds the lock.
+
+    The lock that the parent process has passed on counts as free. Raises the exceptions of :func:`locked`.
+    """
+    while True:
+        file = _inherited(path) or _open(path)
+        # Windows does not pass on the lock of the parent process, so there the variable is believed.
+        is_passed_on = fcntl is None and INHERITED in os.environ
+        if not is_passed_on and not try_lock(file):
+            file.close()
+            return None
+        # A run that was refused removes its lock file, and locking a removed file has no effect.
+        if _is_open_at(file, path):
+            _write_note(file)
+            return file
+        file.close()
+
+
+def try_lock(file: IO[Any]) -> bool:
     """Lock an open file without waiting. Return False if another process holds its lock.
 
     On a file system without locks this returns True, so the work continues without protection.
@@ -23,6 +76,7 @@ def try_lock(file: IO[str]) -> bool:
         if fcntl is not None:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         else:
+            os.lseek(file.fileno(), LOCKED_BYTE, os.SEEK_SET)
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
     # Windows raises PermissionError.
     except (BlockingIOError, PermissionError):
@@ -32,12 +86,82 @@ def try_lock(file: IO[str]) -> bool:
     return True
 
 
-def unlock(file: IO[str]) -> None:
+def unlock(file: IO[Any]) -> None:
     """Release the lock of an open file, even if a child process has inherited the file."""
     try:
         if fcntl is not None:
             fcntl.flock(file, fcntl.LOCK_UN)
         else:
+            os.lseek(file.fileno(), LOCKED_BYTE, os.SEEK_SET)
             msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
     except OSError:  # a file system without locks
         pass
+
+
+def describe_holder(path: Path) -> str:
+    """Describe the process that holds the lock file ``path``, as far as its note can be read."""
+    try:
+        with _open(path, os.O_RDONLY) as file:
+            note = json.loads(file.read(LONGEST_NOTE))
+        parts = [str(note[key]) for key in ("pid", "host", "since", "command")]
+    except (OSError, UserError, ValueError, TypeError, KeyError, RecursionError):
+        return "another process"
+    # The file may come from elsewhere, and a terminal would obey control characters.
+    pid, host, since, command = (
+        "".join(letter if letter.isprintable() else "?" for letter in part) for part in parts
+    )
+    if len(command) > LONGEST_SHOWN:
+        command = command[:LONGEST_SHOWN] + " ..."
+    return f"process {pid[:20]} on {host[:100]} since {since[:30]} ({command})"
+
+
+def _open(path: Path, mode: int = os.O_RDWR | os.O_CREAT) -> IO[bytes]:
+    """Open a lock file without changing its content, without following a link, and without waiting."""
+    for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY", "O_CLOEXEC"):
+        mode |= getattr(os, name, 0)
+    if path.is_symlink():
+        raise UserError(f"{path}: expected a lock file, got a link. Try: rm {shlex.quote(str(path))}")
+    descriptor = os.open(path, mode, 0o666)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise UserError(f"{path}: expected a lock file, got something else. Try: rm {shlex.quote(str(path))}")
+    return os.fdopen(descriptor, "rb" if mode & os.O_RDWR == 0 else "r+b", buffering=0)
+
+
+def _inherited(path: Path) -> IO[bytes] | None:
+    """Return the lock file that the parent process has passed on, if it is the file ``path``."""
+    number = os.environ.get(INHERITED, "")
+    if fcntl is None or not number.isdecimal():
+        return None
+    try:
+        # Closing the copy keeps the lock, because the copy and the original are the same open file.
+        file = os.fdopen(os.dup(int(number)), "r+b", buffering=0)
+    except (OSError, OverflowError, ValueError):
+        return None
+    if _is_open_at(file, path):
+        return file
+    file.close()
+    return None
+
+
+def _is_open_at(file: IO[bytes], path: Path) -> bool:
+    """Return whether ``path`` is still the name of the open file."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), os.lstat(path))
+    except OSError:
+        return False
+
+
+def _write_note(file: IO[bytes]) -> None:
+    """Write into a lock file which process holds it."""
+    note = {
+        "pid": os.getpid(),
+        "host": socket.gethostname(),
+        "since": time.strftime("%Y-%m-%d %H:%M:%S"),
+        "command": shlex.join(["cadam3d", *sys.argv[1:]])[:LONGEST_COMMAND],
+    }
+    # The lock works without the note, for example on a full disk.
+    with suppress(OSError):
+        file.truncate(0)
+        file.seek(0)
+        file.write(json.dumps(note).encode() + b"\n")

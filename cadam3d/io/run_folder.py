@@ -3,7 +3,12 @@
 No other module spells these names. This module does not import torch, so that a sweep is planned quickly.
 """
 
+import os
+import shlex
+import stat
 import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +20,8 @@ ASSET = "asset.ply"
 CHARTS = "charts.json"  # the charts that the densifier and the objective declare
 CHECKPOINTS = "checkpoints"  # a folder
 CONFIG = "config.yaml"  # every setting, resolved
+HYDRA = ".hydra"  # a folder: the settings as Hydra has read them
+LOG = "train.log"
 METRICS = "metrics.jsonl"
 OVERRIDES = ".hydra/overrides.yaml"  # what was typed
 SUMMARY = "summary.json"
@@ -43,8 +50,10 @@ SHARED = "traces"  # a folder, removed after the sweep
 CONSOLE = "console.txt"
 ENDED = "job.json"  # exit code and seconds
 
-# In the folder of a sweep and of each of its jobs.
+# In the folder of every run and of every sweep.
 LOCK = ".lock"  # held by the process that works there
+
+LATEST = "outputs/latest"  # a link to the newest run, beside the runs that have no other place
 
 # The step numbers are zero-padded, so that the newest file sorts last.
 CHECKPOINT_PATTERN = "step_*.pt"
@@ -74,30 +83,118 @@ def read_summary(run: Path) -> dict[str, Any]:
     return summary if isinstance(summary, dict) else {}
 
 
+def occupant(folder: Path, *more: str) -> str | None:
+    """Return the name of something in ``folder`` that a run would overwrite or add to; None if there is none.
+
+    The names ``more`` count too. Files with other names may be in the folder of a run, because no run touches
+    them.
+    """
+    names = (*_written_by_runs(), JOBS, TABLE, *more)
+    return next((name for name in names if os.path.lexists(folder / name)), None)
+
+
+def stray(run: Path) -> Path | None:
+    """Return a link or a special file, such as a named pipe, where a resumed run would write.
+
+    A run follows such a file out of its folder, or waits for it. Returns None if there is none.
+    """
+    for name in _written_by_runs():
+        for path in _tree(run / name):
+            with suppress(FileNotFoundError):
+                mode = path.lstat().st_mode
+                if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                    return path
+    return None
+
+
+def _written_by_runs() -> tuple[str, ...]:
+    """Return every name in the folder of a run that training, its exporters, its callbacks or eval write."""
+    files = (ASSET, CHARTS, CONFIG, EVALUATION, LOG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE)
+    return (*files, CANDIDATES, CHECKPOINTS, HYDRA, IMAGES, PREVIEWS)
+
+
+def _tree(path: Path) -> Iterator[Path]:
+    yield path
+    for folder, folders, files in os.walk(path):
+        yield from (Path(folder, name) for name in (*folders, *files))
+
+
 def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:
     """Create a folder for results, check that it can be written, and return it.
 
-    ``is_chosen`` means that the user has named this folder. Otherwise a name that exists gets a number.
-    Raises ``UserError`` with the setting ``key`` if the folder cannot be written.
+    ``is_chosen`` means that the user has named this folder. Otherwise the folder is new, even if other
+    processes claim the same name at the same time: a name that exists gets a number. Raises ``UserError``
+    with the setting ``key`` if the folder cannot be written.
     """
-    free = folder if is_chosen else numbered(folder, first=1)
+    free, number = folder, 1
     try:
-        free.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=free):
-            pass
+        while True:
+            try:
+                free.mkdir(parents=True, exist_ok=is_chosen)
+                break
+            except FileExistsError:
+                if is_chosen:
+                    raise
+                number += 1
+                free = folder.with_name(f"{folder.name}-{number}")
+        require_writable(free)
     except OSError as error:
         raise UserError(
-            f"{key}: cannot write to {free} ({error.strerror}). Try: {key}=/tmp/cadam3d"
+            f"{key}: cannot write to {free} ({error.strerror or error}). Try: {key}={spare('cadam3d')}"
         ) from error
     return free
+
+
+def require_writable(folder: Path) -> None:
+    """Raise ``OSError`` if no file can be created in ``folder``."""
+    with tempfile.TemporaryFile(dir=folder):
+        pass
 
 
 def numbered(folder: Path, *, first: int = 2) -> Path:
     """Return the first of ``folder`` (as number 1), ``folder-2``, ``folder-3``, ... that does not exist."""
     number = first
-    while (place := folder.with_name(f"{folder.name}-{number}") if number > 1 else folder).exists():
+    while os.path.lexists(place := folder.with_name(f"{folder.name}-{number}") if number > 1 else folder):
         number += 1
     return place
+
+
+def spare(name: str) -> Path:
+    """Return a path in the folder for temporary files that does not exist yet, to suggest it to the user."""
+    return numbered(Path(tempfile.gettempdir(), name), first=1)
+
+
+def copying(run: Path) -> tuple[str, Path]:
+    """Return a shell command that copies ``run`` to a place that can be written, and the path of the copy."""
+    copy = spare(run.name or "run")
+    source, target = shlex.quote(str(shown(run))), shlex.quote(str(copy))
+    return f"cp -rL {source} {target} && chmod -R u+w {target}", copy
+
+
+def existing_run(*needed: str) -> Path | None:
+    """Return a finished or begun run that has all files ``needed``, for suggestions; None if there is none.
+
+    This is ``outputs/latest`` if that is a run, or else the run in ``outputs`` whose files are the newest.
+    """
+
+    def has_all(folder: Path) -> bool:
+        try:
+            return all((folder / name).is_file() for name in needed)
+        except OSError:
+            return False
+
+    latest = Path(LATEST)
+    if has_all(latest):
+        return latest
+    outputs = latest.parent
+    found = [folder for folder in (*outputs.glob("*"), *outputs.glob("*/*")) if has_all(folder)]
+    return max(found, key=lambda folder: (folder / needed[0]).stat().st_mtime, default=None)
+
+
+def suggestion(command: str, key: str, *needed: str) -> str:
+    """Return ``COMMAND KEY=RUN`` with a run that exists and has the files ``needed``, or how to train one."""
+    run = existing_run(*needed)
+    return f"{command} {shlex.quote(f'{key}={run}')}" if run else 'cadam3d train prompt="a red torus"'
 
 
 def shown(path: Path) -> Path:

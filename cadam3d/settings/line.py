@@ -10,7 +10,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.run_folder import OVERRIDES
+from cadam3d.io.run_folder import OVERRIDES, suggestion
 from cadam3d.settings.compose import TEXT_KEYS, quote
 
 RUN_FOLDER = "hydra.run.dir"
@@ -92,7 +92,7 @@ def resumed(overrides: Sequence[str], *, is_sweep: bool) -> list[str]:
     if folder is None or (path.is_dir() and path != folder):
         raise UserError(
             f"resume: expected the folder of a run (it contains {OVERRIDES}), got {text!r}. "
-            "Try: cadam3d train resume=outputs/latest"
+            f"Try: {suggestion('cadam3d train', 'resume', OVERRIDES)}"
         )
     if RUN_FOLDER in given and Path(text_of(given[RUN_FOLDER])).expanduser().resolve() != folder:
         raise UserError(
@@ -110,6 +110,11 @@ def resumed(overrides: Sequence[str], *, is_sweep: bool) -> list[str]:
 def resume_word(place: str | Path) -> str:
     """Return ``resume=PLACE`` as it is typed into a shell."""
     return shlex.quote(f"resume={place}")
+
+
+def setting_word(key: str, value: object) -> str:
+    """Return ``KEY=VALUE`` as it is typed into a shell."""
+    return shlex.quote(f"{key}={value}")
 
 
 def _entry(override: str) -> str:

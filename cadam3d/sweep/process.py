@@ -20,7 +20,7 @@ from pathlib import Path
 from cadam3d.core.outcome import Outcome
 from cadam3d.io.cache import TRACES
 from cadam3d.io.jsonl import write_json
-from cadam3d.io.lock import try_lock, unlock
+from cadam3d.io.lock import INHERITED, describe_holder, take, unlock
 from cadam3d.io.run_folder import CONSOLE, ENDED, LOCK, SHARED, STOP, SUMMARY, read_summary
 from cadam3d.settings.compose import quote
 from cadam3d.settings.line import RUN_FOLDER
@@ -76,16 +76,22 @@ def _locked(folder: Path, stop: Path) -> Iterator[int | None]:
     The process of the job inherits the lock, so the lock lasts as long as that process, even if this one is
     killed. (Windows does not pass on locks.)
     """
-    with (folder / LOCK).open("w") as file:
-        with _signals() as signals:
-            while not (has_lock := try_lock(file)) and not signals and not stop.exists():
-                time.sleep(POLL_SECONDS)
+    path, is_waiting = folder / LOCK, False
+    with _signals() as signals:
+        while (file := take(path)) is None and not signals and not stop.exists():
+            if not is_waiting:
+                print(f"{folder.name}: waiting for {describe_holder(path)}", file=sys.stderr, flush=True)
+                is_waiting = True
+            time.sleep(POLL_SECONDS)
+    if file is None:
+        yield None
+        return
+    with file:
         try:
-            yield file.fileno() if has_lock and not signals else None
+            yield None if signals else file.fileno()
         finally:
             # Closing the file would not release the lock if the job has left a process behind.
-            if has_lock:
-                unlock(file)
+            unlock(file)
 
 
 def _empty(folder: Path) -> None:
@@ -107,6 +113,7 @@ def _wait(plan: Plan, row: Row, stop: Path, lock: int) -> int:
     # a traceback.
     environment.pop("HYDRA_FULL_ERROR", None)
     environment.setdefault(TRACES, str(stop.with_name(SHARED)))
+    environment[INHERITED] = str(lock)
     if plan.threads is not None:
         environment["OMP_NUM_THREADS"] = str(plan.threads)
     with (row.folder / CONSOLE).open("ab") as console, _signals() as signals:

@@ -9,7 +9,7 @@ import signal
 import sys
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -20,24 +20,29 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.lock import try_lock
+from cadam3d.io.lock import locked
 from cadam3d.io.run_folder import (
     CONFIG,
     CONSOLE,
+    FIGURES,
     LOCK,
+    OVERRIDES,
     SHARED,
     STOP,
     TABLE,
     claim,
     holds_run,
     numbered,
+    occupant,
     shown,
+    spare,
 )
 from cadam3d.settings.compose import flatten, quote
 from cadam3d.settings.hydra import run_hydra
-from cadam3d.settings.line import SWEEP_FOLDER, key_of
+from cadam3d.settings.line import SWEEP_FOLDER, key_of, setting_word
+from cadam3d.settings.place import in_use
 from cadam3d.sweep import worker
-from cadam3d.sweep.folder import Plan, PlannedJob, Row, outcomes, rows_of, write_plan
+from cadam3d.sweep.folder import Plan, PlannedJob, Row, is_sweep, outcomes, rows_of, write_plan
 from cadam3d.sweep.grid import sweep_name
 from cadam3d.sweep.plan import Composed, Sweep, compose_all, read_sweep, shown_keys
 from cadam3d.sweep.table import as_text, write_table
@@ -72,6 +77,7 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
     _refuse_other_settings(folder, rows_of(folder, jobs), composed)
     claim(folder, SWEEP_FOLDER, is_chosen=True)
     with _locked(folder), _stoppable(folder) as stop:
+        _refuse_occupied(folder)
         rows = rows_of(folder, jobs)
         pending = [row for row in rows if not row.has_result]
         plan = Plan(
@@ -130,11 +136,19 @@ def _folder(sweep: Sweep) -> Path:
             example = f"{SWEEP_FOLDER}={place}, or leave it out"
             raise UserError(f"{SWEEP_FOLDER}: expected a folder, got nothing. Try: {example}")
         place = Path(str(text)).expanduser()
-    if holds_run(place):
-        raise UserError(
-            f"{SWEEP_FOLDER}: {place} holds a run. Try: {SWEEP_FOLDER}=multirun/mine, or leave it out"
-        )
+    _refuse_occupied(place)
     return place.resolve()
+
+
+def _refuse_occupied(folder: Path) -> None:
+    """Refuse a folder that is not that of a sweep and holds something that a sweep would overwrite."""
+    name = None if is_sweep(folder) else occupant(folder, FIGURES, SHARED, STOP)
+    if name is not None:
+        what = "a run" if (folder / OVERRIDES).is_file() or holds_run(folder) else name
+        raise UserError(
+            f"{SWEEP_FOLDER}: {shown(folder)} holds {what}. "
+            f"Try: {setting_word(SWEEP_FOLDER, shown(numbered(folder)))}"
+        )
 
 
 def _planned(sweep: Sweep, composed: Sequence[Composed]) -> list[PlannedJob]:
@@ -241,13 +255,15 @@ def _report_results(folder: Path, rows: Sequence[Row], problem: str) -> int:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep a second sweep out of the folder. The lock is released when this process ends, in whatever way."""
-    with (folder / LOCK).open("w") as file:
-        if not try_lock(file):
+    """Keep other sweeps and runs out of the folder until this process ends, in whatever way."""
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(locked(folder / LOCK, lambda holder: in_use(folder, holder, SWEEP_FOLDER)))
+        except OSError as error:
             raise UserError(
-                f"{SWEEP_FOLDER}: another sweep is running in {shown(folder)}. "
-                f"Try: wait until it has ended, or use {SWEEP_FOLDER}={shown(numbered(folder))}"
-            )
+                f"{SWEEP_FOLDER}: cannot write to {shown(folder)} ({error.strerror or error}). "
+                f"Try: {setting_word(SWEEP_FOLDER, spare('cadam3d'))}"
+            ) from error
         yield
 
 
