@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
+from cadam3d.io.run_folder import expanded
 from cadam3d.settings.advice import explain, require_values, reraise_interrupt
 from cadam3d.settings.compose import TEXT_KEYS
 from cadam3d.settings.help_page import help_text
@@ -24,10 +25,11 @@ from cadam3d.settings.hydra import (
     run_composed,
     run_hydra,
 )
-from cadam3d.settings.line import RUN_FOLDER, key_of, quoted, resumed, split
+from cadam3d.settings.line import RUN_FOLDER, exporting, key_of, quoted, resumed, split
 from cadam3d.settings.place import occupied
 
 TRAINING = ("train", "sweep")  # the commands that have a run folder
+EXPORTING = ("render", "export", "view")  # the commands with output=
 
 
 @dataclass
@@ -99,6 +101,8 @@ def read_line(command: str, overrides: list[str], flags: list[str], options: Nam
     overrides = [quoted(override, is_sweep=is_sweep) for override in overrides]
     if command in TRAINING:
         overrides = resumed(overrides, is_sweep=is_sweep)
+    elif command in EXPORTING:
+        overrides = exporting(overrides)
     return Line(command, overrides, flags, options, is_sweep)
 
 
@@ -143,7 +147,7 @@ def _train(cfg: DictConfig, line: Line, task: Task) -> None:
     if not text:
         example = f"{RUN_FOLDER}=outputs/mine, or leave it out"
         raise UserError(f"{RUN_FOLDER}: expected a folder, got nothing. Try: {example}")
-    wanted = Path(str(text)).expanduser()
+    wanted = expanded(str(text))
     is_chosen = any(key_of(override) == RUN_FOLDER for override in line.overrides)
     resume = Path(str(cfg.resume)) if cfg.resume else None
     with occupied(wanted, is_chosen=is_chosen, resume=resume) as folder:

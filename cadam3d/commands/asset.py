@@ -1,5 +1,7 @@
 """Asset: open the results of a run, as ``render``, ``export``, ``eval`` and ``view`` do first."""
 
+import os
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,15 +12,30 @@ from torch import Tensor
 
 from cadam3d.commands.messages import note_backend
 from cadam3d.core.cameras import Cameras
+from cadam3d.core.checks import fail
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.ply import read_ply
-from cadam3d.io.run_folder import ASSET, CONFIG, shown
+from cadam3d.io.run_folder import (
+    ASSET,
+    CONFIG,
+    expanded,
+    has_file,
+    nearest_existing,
+    numbered,
+    remove_empty,
+    require_writable,
+    shown,
+    spare,
+    suggestion,
+    typed_path,
+)
 from cadam3d.rasterizer.base import Rasterizer, render_fn
 from cadam3d.settings.compose import component, components, load_config
+from cadam3d.settings.line import resume_word, setting_word
 from cadam3d.sweep.folder import is_sweep
 
 
@@ -35,10 +52,10 @@ def open_asset(cfg: DictConfig) -> Asset:
     """Return the asset that ``run=`` or ``ply=`` names; exactly one of them must be given."""
     if (cfg.run is None) == (cfg.ply is None):
         got = "neither" if cfg.run is None else "both"
-        raise UserError(f"run, ply: expected one of them, got {got}. Try: run=outputs/latest")
+        raise UserError(f"run, ply: expected one of them, got {got}. Try: {suggestion('', 'run', ASSET)}")
     if cfg.run is not None:
-        return open_run(find_run(cfg.run), cfg.device)
-    ply = Path(cfg.ply).expanduser()
+        return open_run(find_run(str(cfg.run)), cfg.device)
+    ply = expanded(str(cfg.ply))
     gaussians = read_ply(ply, up=cfg.ply_up).to(resolve_device(cfg.device))
     return Asset(gaussians=gaussians, ply=ply, folder=ply.with_suffix(""))
 
@@ -46,23 +63,26 @@ def open_asset(cfg: DictConfig) -> Asset:
 def open_run(folder: Path, device: str) -> Asset:
     """Return the asset of the run in ``folder``."""
     ply = folder / ASSET
-    if not ply.is_file():
-        raise UserError(f"{shown(folder)}: has no {ASSET} yet. Try: cadam3d train resume={shown(folder)}")
+    if not has_file(ply):
+        line = f"cadam3d train {resume_word(shown(folder))}"
+        raise UserError(f"{shown(folder)}: has no {ASSET} yet. Try: {line}")
     return Asset(gaussians=read_ply(ply).to(resolve_device(device)), ply=ply, folder=folder)
 
 
 def find_run(text: str) -> Path:
     """Return the folder of the run that ``text`` names. Raises ``UserError`` if it does not hold a run."""
-    folder = Path(text).expanduser().resolve()
-    example = "run=outputs/latest"
-    if (folder / CONFIG).is_file():
+    folder = typed_path(text)
+    if has_file(folder, CONFIG):
         return folder
-    if not folder.is_dir():
+    example = suggestion("", "run", CONFIG)
+    if not os.path.lexists(folder):
         reason = "no such folder"
+    elif has_file(folder):
+        reason = "it is a file"
     elif is_sweep(folder):
         reason = "it is a sweep, which has many runs"
         started = [config.parent for config in sorted(folder.glob(f"*/{CONFIG}"))]
-        example = f"run={shown(started[0])}" if started else example
+        example = setting_word("run", shown(started[0])) if started else example
     else:
         reason = f"it has no {CONFIG}"
     raise UserError(f"run: expected the folder of a run, got {text!r} ({reason}). Try: {example}")
@@ -90,15 +110,57 @@ def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
     exporters: Sequence[Exporter] = list(components(cfg.exporter).values())
     if not exporters:
         raise UserError("exporter: expected at least one, got none. Try: exporter=[images,turntable]")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        reason = error.strerror or error
-        raise UserError(f"output: cannot write to {folder} ({reason}). Try: output=/tmp/cadam3d") from error
     render = renderer(cfg.rasterizer, asset.gaussians)
     return [path for exporter in exporters for path in exporter.export(asset.gaussians, render, folder)]
 
 
-def output_folder(cfg: DictConfig, asset: Asset, name: str) -> Path:
-    """Return the folder that ``output=`` names, by default ``name`` beside the asset."""
-    return Path(cfg.output).expanduser() if cfg.output else asset.folder / name
+def write_outputs(cfg: DictConfig, asset: Asset, name: str) -> list[Path]:
+    """Run the exporters of ``cfg`` on ``asset``, and return the paths of the files that they have written.
+
+    ``output=`` names a file if it has a suffix, does not end with a slash, and is not a folder that exists.
+    Otherwise it names a folder, by default ``name`` beside the asset.
+    """
+    text = str(asset.folder / name if cfg.output is None else cfg.output)
+    target = expanded(text)
+    if not text.strip() or typed_path(text) == Path(target.anchor):
+        raise fail("output", expected="a file or a folder", got=text, example=f"output={name}")
+    try:
+        if cfg.output is not None and target.suffix and not text.endswith("/") and not target.is_dir():
+            return [_one_file(cfg, asset, target)]
+        if os.path.lexists(target) and not target.is_dir():
+            line = setting_word("output", numbered(target))
+            raise UserError(f"output: expected a folder, got {text!r}, which is a file. Try: {line}")
+        existing = nearest_existing(target)
+        target.mkdir(parents=True, exist_ok=True)
+        require_writable(target)
+    except OSError as error:
+        reason = error.strerror or error
+        line = setting_word("output", spare(target.name[:40] or name))
+        raise UserError(f"output: cannot write to {target} ({reason}). Try: {line}") from error
+    try:
+        return export_all(cfg, asset, target)
+    finally:
+        remove_empty(target, existing)
+
+
+def _one_file(cfg: DictConfig, asset: Asset, target: Path) -> Path:
+    """Export into a folder beside ``target``, then move the file to its final name in a single step.
+
+    Raises ``OSError`` if ``target`` cannot be written.
+    """
+    existing = nearest_existing(target.parent)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".export-") as folder:
+            paths = export_all(cfg, asset, Path(folder))
+            suffixes = {path.suffix for path in paths}
+            if len(paths) != 1 or suffixes != {target.suffix.lower()}:
+                line = setting_word("output", f"{numbered(target.with_suffix(''), first=1)}/")
+                raise UserError(
+                    f"output: expected the name of a folder, got {str(target)!r}, because "
+                    f"exporter=[{','.join(cfg.exporter)}] writes {len(paths)} file(s) with suffix "
+                    f"{'|'.join(sorted(suffixes))}. Try: {line}"
+                )
+            return paths[0].replace(target)
+    finally:
+        remove_empty(target.parent, existing)

@@ -10,27 +10,33 @@ from cadam3d import report
 from cadam3d.commands.asset import find_run, open_run, renderer, run_config
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import write_json
-from cadam3d.io.run_folder import EVALUATION, shown
+from cadam3d.io.run_folder import ASSET, CONFIG, EVALUATION, copying, shown, suggestion, typed_path
 from cadam3d.settings.compose import component, components
+from cadam3d.settings.line import setting_word
 from cadam3d.sweep.folder import is_sweep, load
 
 
 def run(cfg: DictConfig) -> None:
     """Measure ``run=`` and write its ``eval.json``; for a sweep, measure every job and write its report."""
     if cfg.run is None:
-        raise UserError("run: expected a finished run or a sweep. Try: cadam3d eval run=outputs/latest")
-    folder = Path(cfg.run).expanduser().resolve()
+        line = suggestion("cadam3d eval", "run", CONFIG, ASSET)
+        raise UserError(f"run: expected a finished run or a sweep, got nothing. Try: {line}")
+    folder = typed_path(str(cfg.run))
     if is_sweep(folder):
         _evaluate_sweep(cfg, folder)
         return
-    result = evaluate(cfg, find_run(cfg.run))
+    result = evaluate(cfg, find_run(str(cfg.run)))
     for name, value in result.items():
         print(f"{name:<20}{value:.4f}" if isinstance(value, float) else f"{name:<20}{value}")
+    try:
+        write_json(folder / EVALUATION, result)
+    except UserError as error:
+        raise _not_saved(folder, error) from error
     print(f"\n{shown(folder / EVALUATION)}")
 
 
 def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
-    """Measure the run in ``folder`` with the metrics of ``cfg``, and write its ``eval.json``.
+    """Return what the metrics of ``cfg`` measure of the run in ``folder``, for its ``eval.json``.
 
     The rasterizer and the prior are those of the run. ``psnr`` and ``ssim`` compare with the true images of
     the prior. If the prior has no true images, a note in the file replaces these two.
@@ -46,13 +52,13 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
         result |= metric.measure(asset.gaussians, render, truth, asset.ply)
     if truth is None:
         result["note"] = "this prior has no true images, so psnr and ssim are missing"
-    write_json(folder / EVALUATION, result)
     return result
 
 
 def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
     """Measure every job of a sweep, and write the ``eval.json`` and the report of the sweep."""
     results, failures = [], 0
+    problem: UserError | None = None
     for job in (row.folder for row in load(folder)):
         try:
             results.append(evaluate(cfg, find_run(str(job))))
@@ -63,10 +69,29 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
             continue
         psnr = results[-1].get("psnr")
         quality = "no psnr" if psnr is None else f"{psnr:6.2f} dB"
-        print(f"{quality}  {results[-1].get('num_gaussians', '-'):>8} Gaussians  {job.name}")
+        print(f"{quality}  {results[-1].get('num_gaussians', '-'):>8} Gaussians  {job.name}", flush=True)
+        try:
+            write_json(job / EVALUATION, results[-1])
+        except UserError as error:
+            problem = problem or error
     if failures == len(results):
         raise UserError(
             f"run={cfg.run}: no job of this sweep could be measured. Try: run the command of the sweep again"
         )
-    write_json(folder / EVALUATION, results)
+    try:
+        write_json(folder / EVALUATION, results)
+    except UserError as error:
+        problem = problem or error
+    if problem is not None:
+        raise _not_saved(folder, problem) from problem
     print(f"\n{len(results)} jobs: {shown(folder / EVALUATION)}\nreport: {shown(report.write_sweep(folder))}")
+
+
+def _not_saved(folder: Path, error: UserError) -> UserError:
+    """Return the error for numbers that are printed already but cannot be written into ``folder``."""
+    reason = getattr(error.__cause__, "strerror", None) or error
+    line, copy = copying(folder)
+    return UserError(
+        f"run: cannot write to {shown(folder)} ({reason}), so the numbers above are not saved. "
+        f"Try: {line} && cadam3d eval {setting_word('run', copy)}"
+    )

@@ -2,15 +2,15 @@
 
 from omegaconf import DictConfig
 
-from cadam3d.commands.asset import export_all, open_asset, output_folder
+from cadam3d.commands.asset import open_asset, write_outputs
 from cadam3d.io.run_folder import shown
 
 
 def run(cfg: DictConfig) -> None:
-    """Run the exporters and write their files into ``output``, by default ``render/`` beside the asset."""
+    """Write ``output``: a file if it has a suffix, else a folder (by default ``render`` beside the asset)."""
     asset = open_asset(cfg)
-    folder = output_folder(cfg, asset, "render")
-    paths = export_all(cfg, asset, folder)
-    print(f"{len(paths)} files of {len(asset.gaussians)} Gaussians in {shown(folder)}:")
+    paths = write_outputs(cfg, asset, "render")
+    files = "1 file" if len(paths) == 1 else f"{len(paths)} files"
+    print(f"{files} of {len(asset.gaussians)} Gaussians:")
     for path in paths:
         print(f"  {shown(path)}")

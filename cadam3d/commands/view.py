@@ -1,4 +1,4 @@
-"""``cadam3d view``: show the report of a run, or a picture of a file. There is no live viewer yet."""
+"""``cadam3d view``: show the report of a run or a sweep, or a picture of a file. There is no live viewer."""
 
 import os
 import sys
@@ -7,12 +7,14 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from cadam3d.commands.asset import export_all, find_run, open_asset, output_folder
-from cadam3d.io.run_folder import REPORT, shown
+from cadam3d import report
+from cadam3d.commands.asset import find_run, open_asset, write_outputs
+from cadam3d.io.run_folder import REPORT, has_file, shown, typed_path
+from cadam3d.sweep.folder import is_sweep
 
 
 def run(cfg: DictConfig) -> None:
-    """Show the report of ``run=``. For ``ply=``, or without a report, make a picture and show that."""
+    """Show the report of ``run=``; for ``ply=``, or for a run without a report, show a picture."""
     page = _page(cfg)
     is_open = cfg.browser and has_display() and webbrowser.open(page.resolve().as_uri())
     print(f"{'Opened' if is_open else 'Open this in a browser:'} {shown(page)}")
@@ -26,7 +28,10 @@ def has_display() -> bool:
 
 
 def _page(cfg: DictConfig) -> Path:
-    if cfg.run is not None and cfg.ply is None and (report := find_run(cfg.run) / REPORT).is_file():
-        return report
-    asset = open_asset(cfg)
-    return export_all(cfg, asset, output_folder(cfg, asset, "view"))[0]
+    if cfg.run is not None and cfg.ply is None:
+        folder = typed_path(str(cfg.run))
+        if is_sweep(folder):
+            return folder / REPORT if has_file(folder, REPORT) else report.write_sweep(folder)
+        if has_file(find_run(str(cfg.run)), REPORT):
+            return folder / REPORT
+    return write_outputs(cfg, open_asset(cfg), "view")[0]

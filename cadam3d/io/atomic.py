@@ -1,7 +1,8 @@
 """Atomic writes: a file is written under another name and then renamed, so it appears whole or not at all."""
 
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -39,7 +40,38 @@ def replacing(path: Path) -> Iterator[Path]:
             temporary.unlink()
 
 
+@contextmanager
+def replacing_series(folder: Path, is_member: Callable[[str], bool]) -> Iterator[Path]:
+    """Yield a temporary folder for a new series of files, which replaces an old series in ``folder``.
+
+    ``is_member`` returns whether a name belongs to the series; other files in ``folder`` stay. If the block
+    raises, the old series stays. A kill may leave a part of one series, but never a mixture of both. Raises
+    ``UserError`` if ``folder`` cannot be written.
+    """
+    temporary = folder.with_name(f"{TEMPORARY}{os.getpid()}-{folder.name}")
+    try:
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir(parents=True)
+        yield temporary
+        folder.mkdir(exist_ok=True)
+        for old in folder.iterdir():
+            if is_member(old.name) and not old.is_dir():
+                old.unlink()
+        for new in sorted(temporary.iterdir()):
+            new.replace(folder / new.name)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise UserError(
+            f"{folder}: cannot be written ({reason}). Try another place, or free some space"
+        ) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
 def remove_leftovers(folder: Path) -> None:
-    """Delete the half-written files of a killed process in ``folder``, which must have a single writer."""
+    """Delete what a killed process has half written in ``folder``, which must have a single writer."""
     for leftover in folder.glob(f"{TEMPORARY}*"):
-        leftover.unlink(missing_ok=True)
+        if leftover.is_dir() and not leftover.is_symlink():
+            shutil.rmtree(leftover, ignore_errors=True)
+        else:
+            leftover.unlink(missing_ok=True)

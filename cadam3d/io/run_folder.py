@@ -83,13 +83,17 @@ def read_summary(run: Path) -> dict[str, Any]:
     return summary if isinstance(summary, dict) else {}
 
 
-def occupant(folder: Path, *more: str) -> str | None:
+def occupant(folder: Path) -> str | None:
     """Return the name of something in ``folder`` that a run would overwrite or add to; None if there is none.
 
-    The names ``more`` count too. Files with other names may be in the folder of a run, because no run touches
-    them.
+    Files with other names may be in the folder of a run, because no run touches them.
     """
-    names = (*_written_by_runs(), JOBS, TABLE, *more)
+    return next((name for name in (*_written_by_runs(), JOBS) if os.path.lexists(folder / name)), None)
+
+
+def occupant_of_sweep(folder: Path) -> str | None:
+    """Return the name of something in ``folder`` that a sweep would overwrite or remove; None if nothing."""
+    names = (TABLE, REPORT, EVALUATION, FIGURES, SHARED, STOP)
     return next((name for name in names if os.path.lexists(folder / name)), None)
 
 
@@ -151,6 +155,22 @@ def require_writable(folder: Path) -> None:
         pass
 
 
+def nearest_existing(folder: Path) -> Path:
+    """Return ``folder``, or the nearest of its parents that exists."""
+    return next((place for place in (folder, *folder.parents) if os.path.lexists(place)), folder)
+
+
+def remove_empty(folder: Path, existing: Path) -> None:
+    """Remove ``folder`` and its parents up to ``existing``, as far as they are empty."""
+    for place in (folder, *folder.parents):
+        if place == existing:
+            return
+        try:
+            place.rmdir()
+        except OSError:
+            return
+
+
 def numbered(folder: Path, *, first: int = 2) -> Path:
     """Return the first of ``folder`` (as number 1), ``folder-2``, ``folder-3``, ... that does not exist."""
     number = first
@@ -178,10 +198,7 @@ def existing_run(*needed: str) -> Path | None:
     """
 
     def has_all(folder: Path) -> bool:
-        try:
-            return all((folder / name).is_file() for name in needed)
-        except OSError:
-            return False
+        return all(has_file(folder, name) for name in needed)
 
     latest = Path(LATEST)
     if has_all(latest):
@@ -194,10 +211,37 @@ def existing_run(*needed: str) -> Path | None:
 def suggestion(command: str, key: str, *needed: str) -> str:
     """Return ``COMMAND KEY=RUN`` with a run that exists and has the files ``needed``, or how to train one."""
     run = existing_run(*needed)
-    return f"{command} {shlex.quote(f'{key}={run}')}" if run else 'cadam3d train prompt="a red torus"'
+    if run is None:
+        return 'cadam3d train prompt="a red torus"'
+    return f"{command} {shlex.quote(f'{key}={run}')}".strip()
+
+
+def expanded(text: str) -> Path:
+    """Return the path that a user has typed, with the home folder in place of ``~``."""
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:  # no such user
+        return Path(text)
+
+
+def typed_path(text: str) -> Path:
+    """Return the absolute path that a user has typed, without links unless these form a circle."""
+    path = expanded(text)
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError):
+        return path.absolute()
+
+
+def has_file(folder: Path, name: str = "") -> bool:
+    """Return whether ``folder / name`` is a file; False also for a name that no file can have."""
+    try:
+        return (folder / name).is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def shown(path: Path) -> Path:
     """Return ``path`` as a user would type it: relative to the current folder if it is inside it."""
-    path = path.resolve()
+    path = typed_path(str(path))
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

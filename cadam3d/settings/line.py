@@ -1,5 +1,6 @@
 """Line: read the words after ``cadam3d COMMAND``: overrides, flags, quoting, and resuming a run."""
 
+import os
 import re
 import shlex
 from collections.abc import Sequence
@@ -10,7 +11,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.run_folder import OVERRIDES, suggestion
+from cadam3d.io.run_folder import ASSET, OVERRIDES, PREVIEW, TURNTABLE, has_file, suggestion, typed_path
 from cadam3d.settings.compose import TEXT_KEYS, quote
 
 RUN_FOLDER = "hydra.run.dir"
@@ -26,6 +27,8 @@ QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
 SWEEP_CALL = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)", re.DOTALL)
 # The text up to a comma that is not followed by a space.
 PIECE = re.compile(r"(?:[^,]|,(?=\s|$))*", re.DOTALL)
+# The exporter that writes a single file with this suffix.
+EXPORTERS = {Path(ASSET).suffix: "ply", Path(PREVIEW).suffix: "preview", Path(TURNTABLE).suffix: "turntable"}
 FLAGS_WITH_VALUE = (
     *("--cfg", "-c", "--package", "-p", "--info", "-i", "--experimental-rerun"),
     *("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
@@ -86,15 +89,15 @@ def resumed(overrides: Sequence[str], *, is_sweep: bool) -> list[str]:
         return list(overrides)
     if is_sweep:
         raise UserError(f"resume: continues one run, not a sweep. Try: cadam3d train {resume_word(text)}")
-    path = Path(text).expanduser().resolve()
-    holders = [place for place in (path, *path.parents) if (place / OVERRIDES).is_file()]
-    folder = holders[0] if path.exists() and holders else None
+    path = typed_path(text)
+    holders = [place for place in (path, *path.parents) if has_file(place, OVERRIDES)]
+    folder = holders[0] if holders and os.path.lexists(path) else None
     if folder is None or (path.is_dir() and path != folder):
         raise UserError(
             f"resume: expected the folder of a run (it contains {OVERRIDES}), got {text!r}. "
             f"Try: {suggestion('cadam3d train', 'resume', OVERRIDES)}"
         )
-    if RUN_FOLDER in given and Path(text_of(given[RUN_FOLDER])).expanduser().resolve() != folder:
+    if RUN_FOLDER in given and typed_path(text_of(given[RUN_FOLDER])) != folder:
         raise UserError(
             f"{RUN_FOLDER}: a resumed run stays in its folder. Try: cadam3d train {resume_word(text)}"
         )
@@ -105,6 +108,19 @@ def resumed(overrides: Sequence[str], *, is_sweep: bool) -> list[str]:
     merged["resume"] = f"resume={quote(str(path))}"
     merged[RUN_FOLDER] = f"{RUN_FOLDER}={quote(str(folder))}"
     return list(merged.values())
+
+
+def exporting(overrides: Sequence[str]) -> list[str]:
+    """Choose the exporter for a file that ``output=`` names by its suffix, unless the line chooses exporters.
+
+    Any other line does not change.
+    """
+    given = {key_of(override): override for override in overrides}
+    if "output" not in given or "exporter" in given:
+        return list(overrides)
+    name = text_of(given["output"])
+    exporter = None if name.endswith("/") else EXPORTERS.get(Path(name).suffix.lower())
+    return [*overrides, f"exporter=[{exporter}]"] if exporter else list(overrides)
 
 
 def resume_word(place: str | Path) -> str:

@@ -17,8 +17,10 @@ from cadam3d.io.run_folder import (
     OVERRIDES,
     claim,
     copying,
+    nearest_existing,
     numbered,
     occupant,
+    remove_empty,
     require_writable,
     shown,
     spare,
@@ -82,7 +84,7 @@ def occupied(wanted: Path, *, is_chosen: bool, resume: Path | None) -> Iterator[
     folder is left as it was. Raises ``UserError`` if another process trains in the folder, if a fresh run
     would overwrite something in it, or if it cannot be written.
     """
-    existing = _nearest_existing(wanted if is_chosen else wanted.parent)
+    existing = nearest_existing(wanted if is_chosen else wanted.parent)
     folder = wanted if resume is not None else claim(wanted, RUN_FOLDER, is_chosen=is_chosen)
     has_lock_file = (folder / LOCK).exists()
     with ExitStack() as stack:
@@ -106,7 +108,7 @@ def occupied(wanted: Path, *, is_chosen: bool, resume: Path | None) -> Iterator[
                 snapshot.restore()
             if not has_lock_file:
                 (folder / LOCK).unlink(missing_ok=True)
-            _remove_empty(folder, existing)
+            remove_empty(folder, existing)
             if problem := _problem_of(error, folder):
                 raise _not_writable(folder, resume, problem) from error
             raise
@@ -187,19 +189,3 @@ def _entries(folder: Path) -> dict[str, tuple[int, ...]]:
                 facts = entry.stat(follow_symlinks=False)
                 seen[entry.name] = (facts.st_ino, facts.st_size, facts.st_mtime_ns)
     return seen
-
-
-def _remove_empty(folder: Path, existing: Path) -> None:
-    """Remove ``folder`` and its parents up to ``existing``, as far as they are empty."""
-    for place in (folder, *folder.parents):
-        if place == existing:
-            return
-        try:
-            place.rmdir()
-        except OSError:
-            return
-
-
-def _nearest_existing(folder: Path) -> Path:
-    """Return ``folder``, or the nearest of its parents that exists."""
-    return next((place for place in (folder, *folder.parents) if place.exists()), folder)

@@ -24,18 +24,20 @@ from cadam3d.io.lock import locked
 from cadam3d.io.run_folder import (
     CONFIG,
     CONSOLE,
-    FIGURES,
     LOCK,
     OVERRIDES,
     SHARED,
     STOP,
     TABLE,
     claim,
+    expanded,
+    has_file,
     holds_run,
     numbered,
-    occupant,
+    occupant_of_sweep,
     shown,
     spare,
+    typed_path,
 )
 from cadam3d.settings.compose import flatten, quote
 from cadam3d.settings.hydra import run_hydra
@@ -135,20 +137,19 @@ def _folder(sweep: Sweep) -> Path:
         if not text:
             example = f"{SWEEP_FOLDER}={place}, or leave it out"
             raise UserError(f"{SWEEP_FOLDER}: expected a folder, got nothing. Try: {example}")
-        place = Path(str(text)).expanduser()
+        place = expanded(str(text))
     _refuse_occupied(place)
-    return place.resolve()
+    return typed_path(str(place))
 
 
 def _refuse_occupied(folder: Path) -> None:
-    """Refuse a folder that is not that of a sweep and holds something that a sweep would overwrite."""
-    name = None if is_sweep(folder) else occupant(folder, FIGURES, SHARED, STOP)
-    if name is not None:
-        what = "a run" if (folder / OVERRIDES).is_file() or holds_run(folder) else name
-        raise UserError(
-            f"{SWEEP_FOLDER}: {shown(folder)} holds {what}. "
-            f"Try: {setting_word(SWEEP_FOLDER, shown(numbered(folder)))}"
-        )
+    """Refuse the folder of a run, and one with something that a sweep would overwrite or remove."""
+    name = occupant_of_sweep(folder)
+    if has_file(folder, OVERRIDES) or holds_run(folder):
+        name = "a run"
+    if name is not None and not is_sweep(folder):
+        line = setting_word(SWEEP_FOLDER, shown(numbered(folder)))
+        raise UserError(f"{SWEEP_FOLDER}: {shown(folder)} holds {name}. Try: {line}")
 
 
 def _planned(sweep: Sweep, composed: Sequence[Composed]) -> list[PlannedJob]:

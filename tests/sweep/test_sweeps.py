@@ -345,7 +345,8 @@ def test_a_second_sweep_in_the_folder_of_a_running_one_is_refused(sweep):
     with start._locked(folder):
         result = sweep("prompt=a cube", "grid=densifiers")
     assert result.code == 1
-    assert "another sweep is running in multirun/densifiers" in result.err
+    assert f"hydra.sweep.dir: multirun/densifiers is in use by process {os.getpid()} on " in result.err
+    assert result.err.endswith("Try: hydra.sweep.dir=multirun/densifiers-2\n")
     assert not (folder / JOBS).exists()
     assert sweep("prompt=a cube", "grid=densifiers").code == 0
 
@@ -425,11 +426,13 @@ def test_no_job_runs_twice_at_a_time_when_a_killed_sweep_is_started_again(
     wait_for(folder, "*/waiting", first, running)
     first.kill()
     held = [call["folder"] for call in calls(folder)]
-    opened = {lock: lock.stat().st_mtime_ns for lock in folder.glob("*/.lock")}
     second = start_sweep(*line, *launcher)
     # The pipes close once its workers have ended. Its jobs are still running.
     first.communicate(timeout=30)
-    wait_until(lambda: all(lock.stat().st_mtime_ns > time for lock, time in opened.items()), second)
+    # Each of its own workers reports that it waits for a job.
+    for _ in range(running):
+        while "waiting for process" not in (line := second.stderr.readline()):
+            assert line, second.communicate()
     time.sleep(1)
     assert len(calls(folder)) == running
     (folder / "end").touch()
@@ -559,7 +562,18 @@ def test_a_folder_that_holds_a_run_is_refused(sweep):
     Path("run/summary.json").write_text("{}")
     result = sweep("prompt=a cube", "seed=0,1", "hydra.sweep.dir=run")
     assert result.code == 1
-    assert "holds a run. Try: hydra.sweep.dir=multirun/mine" in result.err
+    assert "holds a run. Try: hydra.sweep.dir=run-2" in result.err
+
+
+@pytest.mark.parametrize("name", ["sweep.csv", "report.html", "eval.json", "figures", "traces", ".stop"])
+def test_a_sweep_overwrites_and_removes_no_files_of_the_user(name, sweep):
+    own = Path("mine", name)
+    own.parent.mkdir()
+    own.mkdir() if "." not in name else own.write_text("my own")
+    result = sweep("prompt=a cube", "seed=0,1", "hydra.sweep.dir=mine")
+    assert result.code == 1
+    assert f"mine holds {name}. Try: hydra.sweep.dir=mine-2" in result.err
+    assert [path.name for path in own.parent.iterdir()] == [name]
 
 
 def test_cfg_job_shows_the_first_job(sweep):
