@@ -35,8 +35,10 @@ from cadam3d.io.run_folder import (
 )
 from cadam3d.rasterizer.base import Rasterizer, render_fn
 from cadam3d.settings.compose import component, components, load_config
-from cadam3d.settings.line import resume_word, setting_word
+from cadam3d.settings.line import EXPORTERS, resume_word, setting_word
 from cadam3d.sweep.folder import is_sweep
+
+LONGEST_NAME = 60  # characters of a name in a suggestion
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,9 @@ def write_outputs(cfg: DictConfig, asset: Asset, name: str) -> list[Path]:
         require_writable(target)
     except OSError as error:
         reason = error.strerror or error
-        line = setting_word("output", spare(target.name[:40] or name))
+        # A long name loses its suffix here, and an unknown suffix would be refused: both become folders.
+        is_file = target.suffix.lower() in EXPORTERS and len(target.name) <= LONGEST_NAME
+        line = setting_word("output", spare(target.name if is_file else target.stem[:LONGEST_NAME] or name))
         raise UserError(f"output: cannot write to {target} ({reason}). Try: {line}") from error
     try:
         return export_all(cfg, asset, target)

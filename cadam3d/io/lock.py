@@ -31,6 +31,7 @@ INHERITED = "CADAM3D_LOCK"
 LOCKED_BYTE = 1 << 30
 # Bytes of a lock file that are read, and characters of a command line that are written and shown.
 LONGEST_NOTE, LONGEST_COMMAND, LONGEST_SHOWN = 1 << 16, 4000, 160
+READINGS, READING_SECONDS = 10, 0.02  # of a note that is not written yet
 
 
 @contextmanager
@@ -45,7 +46,14 @@ def locked(path: Path, refusal: Callable[[str], UserError]) -> Iterator[None]:
         raise refusal(describe_holder(path))
     # Closing the file releases the lock, unless another process has passed the lock on to this one.
     with file:
-        yield
+        try:
+            yield
+        finally:
+            # Otherwise the note would describe this process until the next one has written its own. If the
+            # parent process has passed the lock on, it still holds it.
+            if INHERITED not in os.environ:
+                with suppress(OSError):
+                    file.truncate(0)
 
 
 def take(path: Path) -> IO[bytes] | None:
@@ -100,11 +108,12 @@ def unlock(file: IO[Any]) -> None:
 
 def describe_holder(path: Path) -> str:
     """Describe the process that holds the lock file ``path``, as far as its note can be read."""
-    try:
-        with _open(path, os.O_RDONLY) as file:
-            note = json.loads(file.read(LONGEST_NOTE))
-        parts = [str(note[key]) for key in ("pid", "host", "since", "command")]
-    except (OSError, UserError, ValueError, TypeError, KeyError, RecursionError):
+    # A process that has just locked the file needs a moment to write its note.
+    for _ in range(READINGS):
+        if parts := _read_note(path):
+            break
+        time.sleep(READING_SECONDS)
+    else:
         return "another process"
     # The file may come from elsewhere, and a terminal would obey control characters.
     pid, host, since, command = (
@@ -113,6 +122,16 @@ def describe_holder(path: Path) -> str:
     if len(command) > LONGEST_SHOWN:
         command = command[:LONGEST_SHOWN] + " ..."
     return f"process {pid[:20]} on {host[:100]} since {since[:30]} ({command})"
+
+
+def _read_note(path: Path) -> list[str] | None:
+    """Return process id, host, time and command line of a note; None if there is none that can be read."""
+    try:
+        with _open(path, os.O_RDONLY) as file:
+            note = json.loads(file.read(LONGEST_NOTE))
+        return [str(note[key]) for key in ("pid", "host", "since", "command")]
+    except (OSError, UserError, ValueError, TypeError, KeyError, RecursionError):
+        return None
 
 
 def _open(path: Path, mode: int = os.O_RDWR | os.O_CREAT) -> IO[bytes]:

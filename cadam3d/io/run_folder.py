@@ -41,6 +41,7 @@ REPORT = "report.html"
 # Written by a sweep, into its own folder.
 FIGURES = "figures"  # a folder
 JOBS = "jobs.json"
+MULTIRUN = "multirun.yaml"  # written by Hydra
 # While this file exists, running jobs save and end, and no other job starts.
 STOP = ".stop"
 TABLE = "sweep.csv"
@@ -93,7 +94,7 @@ def occupant(folder: Path) -> str | None:
 
 def occupant_of_sweep(folder: Path) -> str | None:
     """Return the name of something in ``folder`` that a sweep would overwrite or remove; None if nothing."""
-    names = (TABLE, REPORT, EVALUATION, FIGURES, SHARED, STOP)
+    names = (TABLE, REPORT, EVALUATION, FIGURES, MULTIRUN, SHARED, STOP)
     return next((name for name in names if os.path.lexists(folder / name)), None)
 
 

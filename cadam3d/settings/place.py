@@ -143,10 +143,11 @@ def _refuse_stray(folder: Path, resume: Path) -> None:
     """Refuse to resume a run with links or special files where it would write."""
     path = stray(folder)
     if path is not None:
+        # The link itself is removed, not what it points to.
+        path = shown(folder) / path.relative_to(folder)
         raise UserError(
-            f"resume: expected files and folders in {shown(folder)}, got a link or a special file, "
-            f"{path.relative_to(folder)}. Try: rm {shlex.quote(str(shown(path)))} && "
-            f"cadam3d train {resume_word(shown(resume))}"
+            f"resume: expected files and folders where the run writes, got a link or a special file, {path}. "
+            f"Try: rm {shlex.quote(str(path))} && cadam3d train {resume_word(shown(resume))}"
         )
 
 

@@ -48,7 +48,7 @@ def test_exactly_one_asset_must_be_named(command, words, got, type_line):
     code, _, err = type_line(command, *words)
     assert (code, err) == (
         1,
-        f"cadam3d: run, ply: expected one of them, got {got}. Try: run=outputs/latest\n",
+        f'cadam3d: run, ply: expected one of them, got {got}. Try: cadam3d train prompt="a red torus"\n',
     )
 
 
@@ -65,7 +65,7 @@ def test_the_message_for_a_run_without_an_asset_suggests_finishing_it(run_folder
     (run_folder / "asset.ply").unlink()
     code, _, err = type_line("render", f"run={run_folder}")
     assert code == 1
-    assert "has no asset.ply yet. Try: cadam3d train resume=a run" in err
+    assert "has no asset.ply yet. Try: cadam3d train 'resume=a run'" in err
 
 
 def test_a_broken_file_is_one_message(type_line, tmp_path):

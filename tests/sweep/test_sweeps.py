@@ -565,7 +565,9 @@ def test_a_folder_that_holds_a_run_is_refused(sweep):
     assert "holds a run. Try: hydra.sweep.dir=run-2" in result.err
 
 
-@pytest.mark.parametrize("name", ["sweep.csv", "report.html", "eval.json", "figures", "traces", ".stop"])
+@pytest.mark.parametrize(
+    "name", ["sweep.csv", "report.html", "eval.json", "multirun.yaml", "figures", "traces", ".stop"]
+)
 def test_a_sweep_overwrites_and_removes_no_files_of_the_user(name, sweep):
     own = Path("mine", name)
     own.parent.mkdir()

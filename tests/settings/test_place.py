@@ -1,0 +1,246 @@
+"""The folder of a run: one process at a time, nothing overwritten, and nothing left by a refused run."""
+
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cadam3d.core.errors import UserError
+from cadam3d.io.run_folder import LOCK, claim, occupant, stray
+from cadam3d.settings.place import occupied
+from cadam3d.sweep import process
+
+REPOSITORY = Path(__file__).parents[2]
+SMALL = ["prior=tiny", "prompt=a cube", "rasterizer=reference", "camera.size=8", "views=1", "steps=4"]
+SMALL += ["initializer.count=7", "metric=[size]", "exporter=[ply]", "callback.metrics.every=1"]
+PROCESSES, ROUNDS = 4, 12
+
+
+def start(code: str, folder: Path, *words: str) -> subprocess.Popen:
+    """Start a process that can be written to and read from."""
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def say(process: subprocess.Popen, text: str) -> None:
+    process.stdin.write(text + "\n")
+    process.stdin.flush()
+
+
+RACER = """
+import sys
+from pathlib import Path
+from cadam3d.core.errors import UserError
+from cadam3d.settings.place import occupied
+print("ready", flush=True)
+for line in sys.stdin:
+    kind, name = line.split()
+    resume = Path(name) if kind == "resume" else None
+    try:
+        with occupied(Path(name), is_chosen=kind != "unnamed", resume=resume) as folder:
+            (folder / "config.yaml").open("a").write("begun")
+            print("won", folder.name, flush=True)
+            sys.stdin.readline()
+    except UserError as error:
+        print("lost", str(error).splitlines()[0], flush=True)
+        sys.stdin.readline()
+    print("left", flush=True)
+"""
+
+
+def test_of_processes_that_start_at_the_same_moment_one_gets_the_folder(tmp_path):
+    racers = [start(RACER, tmp_path) for _ in range(PROCESSES)]
+    try:
+        for racer in racers:
+            assert racer.stdout.readline() == "ready\n"
+        for number in range(ROUNDS):
+            for kind in ("fresh", "resume", "unnamed"):
+                # A resumed run continues what the fresh one has left.
+                name = f"{number}{'-unnamed' if kind == 'unnamed' else ''}"
+                for racer in racers:
+                    say(racer, f"{kind} {name}")
+                answers = [racer.stdout.readline().split(maxsplit=1) for racer in racers]
+                won = [answer[1].strip() for answer in answers if answer[0] == "won"]
+                if kind == "unnamed":
+                    assert sorted(won) == [name, *(f"{name}-{k}" for k in range(2, PROCESSES + 1))]
+                else:
+                    assert won == [name]
+                    lost = [answer[1] for answer in answers if answer[0] == "lost"]
+                    assert all("is in use by process" in message for message in lost)
+                for racer in racers:
+                    say(racer, "go on")
+                assert all(racer.stdout.readline() == "left\n" for racer in racers)
+    finally:
+        for racer in racers:
+            racer.kill()
+            racer.communicate()
+
+
+HELD = """
+import sys
+from cadam3d import cli
+from cadam3d.trainer import Trainer
+train = Trainer.train
+def held(*args):
+    print("training", flush=True)
+    sys.stdin.readline()
+    return train(*args)
+Trainer.train = held
+sys.argv[0] = "cadam3d"
+cli.main()
+"""
+
+
+def test_a_second_run_resume_or_sweep_in_the_folder_of_a_run_names_its_process(type_line, tmp_path):
+    first = start(HELD, tmp_path, "train", *SMALL, "hydra.run.dir=run")
+    try:
+        assert first.stdout.readline() == "training\n"
+        begun = contents(tmp_path / "run")
+        holder = f"run is in use by process {first.pid} on {os.uname().nodename} since "
+        for words, line in (
+            (("train", *SMALL, "hydra.run.dir=run"), "Try: hydra.run.dir=run-2"),
+            (("train", "resume=run"), "&& cadam3d train resume=/"),
+            (("sweep", *SMALL, "seed=0,1", "hydra.sweep.dir=run"), "Try: hydra.sweep.dir=run-2"),
+        ):
+            message = type_line(*words).message
+            if words[0] == "train":
+                assert holder in message
+                assert "(cadam3d train prior=tiny" in message
+            assert line in message
+            assert contents(tmp_path / "run") == begun
+        say(first, "go on")
+        first.communicate(timeout=120)
+        assert first.returncode == 0
+    finally:
+        first.kill()
+        first.communicate()
+    steps = [line for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines() if '"step"' in line]
+    assert len(steps) == 4
+    assert type_line("train", "resume=run", "steps=6").code == 0
+    assert len((tmp_path / "run/metrics.jsonl").read_text().splitlines()) == 6
+
+
+def test_a_job_of_a_sweep_and_no_other_run_uses_the_lock_of_the_sweep(
+    type_line, tmp_path, monkeypatch
+):
+    folder = tmp_path / "job"
+    folder.mkdir()
+    with process._locked(folder, tmp_path / "stop") as lock:
+        message = type_line("train", *SMALL, "hydra.run.dir=job").message
+        assert f"job is in use by process {os.getpid()} on " in message
+        monkeypatch.setenv("CADAM3D_LOCK", str(lock))
+        assert type_line("train", *SMALL, "hydra.run.dir=job").code == 0
+        # outputs/latest is for single runs.
+        assert not (tmp_path / "outputs").exists()
+        monkeypatch.delenv("CADAM3D_LOCK")
+        assert "job is in use by process" in type_line("train", "resume=job").message
+    assert type_line("train", "resume=job", "steps=5").code == 0
+    assert (tmp_path / "outputs/latest").resolve() == folder
+
+
+def contents(folder: Path) -> dict[str, bytes | str]:
+    return {
+        str(path.relative_to(folder)): str(path.readlink()) if path.is_symlink() else path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_symlink() or path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory) -> Path:
+    """Return a folder with everything that a run, its exporters, its callbacks and eval write."""
+    place = tmp_path_factory.mktemp("whole")
+    pictures = [
+        "exporter=[ply,images,preview,turntable]",
+        "callback=[checkpoint,metrics,previews,candidates]",
+    ]
+    sizes = [f"exporter.{name}.size=16" for name in ("images", "preview", "turntable")]
+    sizes += [
+        "callback.previews.every=2",
+        "refine.start=1",
+        "refine.interval=1",
+        "callback.candidates.every=1",
+    ]
+    views = [f"exporter.{name}.views=2" for name in ("images", "preview", "turntable")]
+    code = "import sys; from cadam3d import cli; sys.exit(cli.dispatch(sys.argv[1:]) or cli.dispatch(EVAL))"
+    code = code.replace("EVAL", "['eval', 'run=run', 'metric=[size]']")
+    done = start(code, place, "train", *SMALL, *pictures, *sizes, *views, "hydra.run.dir=run")
+    done.communicate(timeout=120)
+    assert done.returncode == 0
+    return place / "run"
+
+
+def test_every_file_of_a_run_keeps_fresh_runs_out(whole_run, tmp_path):
+    names = {path.name for path in whole_run.iterdir()} - {LOCK}
+    assert len(names) >= 15
+    for name in names:
+        folder = tmp_path / f"with {name}"
+        folder.mkdir()
+        (folder / name).symlink_to("nowhere")
+        assert occupant(folder) == name
+        before = contents(folder)
+        with pytest.raises(UserError) as refused, occupied(folder, is_chosen=True, resume=None):
+            pass
+        assert f"holds {name}, which a run would overwrite" in str(refused.value)
+        assert contents(folder) == before
+        [line] = shlex.split(str(refused.value).rpartition("Try: ")[2])
+        assert not Path(line.partition("=")[2]).exists()
+
+
+def test_a_run_leaves_files_alone_that_no_run_writes(type_line, tmp_path):
+    folder = tmp_path / "mine"
+    (folder / "references").mkdir(parents=True)
+    for name in ("notes.txt", "references/photo.jpg", ".gitignore"):
+        (folder / name).write_text("my own")
+    assert type_line("train", *SMALL, "hydra.run.dir=mine").code == 0
+    assert type_line("train", "resume=mine", "steps=5").code == 0
+    assert all(
+        (folder / name).read_text() == "my own"
+        for name in ("notes.txt", "references/photo.jpg", ".gitignore")
+    )
+
+
+def link(path: Path) -> None:
+    path.symlink_to(path.parents[3] / "victim")
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, link])
+@pytest.mark.parametrize(
+    "name",
+    ["train.log", "metrics.jsonl", ".hydra/config.yaml", "candidates/histograms.jsonl", "checkpoints/x"],
+)
+def test_a_resumed_run_follows_no_links_and_waits_for_no_pipes(make, name, tmp_path, type_line):
+    folder = tmp_path / "deep" / "er" / "run"
+    for kind in (".hydra", "checkpoints", "candidates"):
+        (folder / kind).mkdir(parents=True)
+    (folder / ".hydra/overrides.yaml").write_text("[prompt=a cube]")
+    assert stray(folder) is None
+    make(folder / name)
+    before = sorted(tmp_path.rglob("*"))
+    message = type_line("train", f"resume={folder}").message
+    assert f"got a link or a special file, deep/er/run/{name}. Try: rm deep/er/run/{name} && " in message
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_name_is_claimed_by_one_process(tmp_path, monkeypatch):
+    """Between looking and creating, another process may take the name."""
+    made = []
+    mkdir = Path.mkdir
+
+    def slow(path, *args, **more):
+        if path.name == "run" and not made:
+            made.append(path)
+            mkdir(path)
+        return mkdir(path, *args, **more)
+
+    monkeypatch.setattr(Path, "mkdir", slow)
+    assert claim(tmp_path / "run", "key", is_chosen=False) == tmp_path / "run-2"
