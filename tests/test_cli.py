@@ -1,9 +1,13 @@
 """The command line: commands, quoting, hints, error messages, sweeps, resuming and completion."""
 
 import ast
+import builtins
+import errno
 import json
+import logging
 import os
 import random
+import shlex
 import shutil
 import signal
 import subprocess
@@ -418,6 +422,97 @@ def test_a_refused_line_removes_neither_older_nor_new_files(type_line, jobs, tmp
     monkeypatch.setattr("cadam3d.commands.train.run", run)
     assert type_line("train", "prompt=a cube", "hydra.run.dir=begun").code == 1
     assert (tmp_path / "begun/metrics.jsonl").exists()
+
+
+@pytest.mark.parametrize("is_resumed", [False, True])
+@pytest.mark.parametrize("problem", [UserError("x"), ValueError("a bug"), KeyboardInterrupt(), SystemExit(3)])
+def test_a_run_that_does_not_begin_leaves_the_folder_as_it_was(
+    problem, is_resumed, type_line, jobs, tmp_path, monkeypatch
+):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("my own")
+    words = ["train", "prompt=a cube", "hydra.run.dir=mine"]
+    if is_resumed:
+        type_line(*words)
+        words = ["train", "resume=mine", "steps=20"]
+    before = contents(folder)
+
+    def run(cfg):
+        logging.getLogger("cadam3d").warning("a line in train.log")
+        raise problem
+
+    monkeypatch.setattr("cadam3d.commands.train.run", run)
+    if isinstance(problem, ValueError):
+        with pytest.raises(ValueError, match="a bug"):
+            launch(words[0], words[1:])
+    else:
+        assert type_line(*words).code != 0
+    assert contents(folder) == before
+    assert is_resumed or [path.name for path in folder.iterdir()] == ["notes.txt"]
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_settings_of_a_resumed_run_that_has_begun_are_kept(run_folder, type_line, jobs, monkeypatch):
+    def run(cfg):
+        (run_folder / "config.yaml").write_text("steps: 20")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("cadam3d.commands.train.run", run)
+    assert type_line("train", f"resume={run_folder}", "steps=20").code == 130
+    assert "steps=20" in (run_folder / OVERRIDES).read_text()
+
+
+@pytest.mark.parametrize("name", ["train.log", ".hydra/hydra.yaml"])
+def test_a_file_that_hydra_cannot_write_is_one_message_with_a_line_that_works(
+    name, run_folder, type_line, jobs, monkeypatch
+):
+    original, place = builtins.open, str(run_folder / name)
+
+    def read_only(file, mode="r", *args, **more):
+        if str(file) == place and mode != "rb":
+            raise OSError(errno.EROFS, "Read-only file system", place)
+        return original(file, mode, *args, **more)
+
+    monkeypatch.setattr(builtins, "open", read_only)
+    before = contents(run_folder)
+    message = type_line("train", f"resume={run_folder}", "steps=20").message
+    assert "cannot write to outputs/" in message
+    assert contents(run_folder) == before
+    continue_copy(message, type_line)
+
+
+def test_the_message_for_a_run_on_a_read_only_disk_has_a_line_that_continues_a_copy(
+    run_folder, type_line, jobs, monkeypatch
+):
+    (run_folder / "checkpoints").mkdir()
+    (run_folder / "checkpoints/000010.pt").touch()
+
+    def refuse(folder):
+        if folder == run_folder:
+            raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr("cadam3d.settings.place.require_writable", refuse)
+    message = type_line("train", f"resume={run_folder}/checkpoints/000010.pt").message
+    assert message.startswith("resume: cannot write to outputs/")
+    assert "(Read-only file system). Try: cp -rL " in message
+    continue_copy(message, type_line)
+    [(cfg, copy)] = jobs
+    assert copy != run_folder
+    assert Path(cfg.resume) == copy / "checkpoints/000010.pt"
+
+
+def continue_copy(message: str, type_line) -> None:
+    """Type the line that a message suggests: a copy in a shell, then a command of ours."""
+    copy, _, ours = message.rpartition("Try: ")[2].rpartition(" && ")
+    subprocess.run(["sh", "-c", copy], check=True)
+    try:
+        assert type_line(*shlex.split(ours)[1:]).code == 0
+    finally:
+        shutil.rmtree(shlex.split(copy)[3])
 
 
 def test_two_runs_in_one_second_do_not_share_a_folder(tmp_path):

@@ -124,7 +124,7 @@ def write_outputs(cfg: DictConfig, asset: Asset, name: str) -> list[Path]:
     """
     text = str(asset.folder / name if cfg.output is None else cfg.output)
     target = expanded(text)
-    if not text.strip() or typed_path(text) == Path(target.anchor):
+    if not text.strip() or typed_path(text).parent == typed_path(text):
         raise fail("output", expected="a file or a folder", got=text, example=f"output={name}")
     try:
         if cfg.output is not None and target.suffix and not text.endswith("/") and not target.is_dir():

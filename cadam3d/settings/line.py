@@ -111,16 +111,17 @@ def resumed(overrides: Sequence[str], *, is_sweep: bool) -> list[str]:
 
 
 def exporting(overrides: Sequence[str]) -> list[str]:
-    """Choose the exporter for a file that ``output=`` names by its suffix, unless the line chooses exporters.
+    """Choose the exporter for a file that ``output=`` names by its suffix.
 
-    Any other line does not change.
+    A line that names no such file, or that chooses or sets another exporter, does not change.
     """
     given = {key_of(override): override for override in overrides}
-    if "output" not in given or "exporter" in given:
-        return list(overrides)
-    name = text_of(given["output"])
+    name = text_of(given["output"]) if "output" in given else ""
     exporter = None if name.endswith("/") else EXPORTERS.get(Path(name).suffix.lower())
-    return [*overrides, f"exporter=[{exporter}]"] if exporter else list(overrides)
+    others = [key for key in given if key.partition(".")[0] == "exporter"]
+    if exporter is None or not all(key.startswith(f"exporter.{exporter}.") for key in others):
+        return list(overrides)
+    return [*overrides, f"exporter=[{exporter}]"]
 
 
 def resume_word(place: str | Path) -> str:

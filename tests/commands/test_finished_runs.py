@@ -1,6 +1,10 @@
 """The commands render, export, eval and view, with a run folder, a sweep folder or a single file."""
 
+import errno
 import json
+import shlex
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -8,8 +12,10 @@ import torch
 from omegaconf import OmegaConf
 
 from cadam3d.commands import view
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.io.jsonl import read_json
+from cadam3d.io.image import write_png
+from cadam3d.io.jsonl import read_json, write_json
 from cadam3d.io.ply import read_ply, write_ply
 from cadam3d.settings.compose import compose
 from cadam3d.sweep.folder import Plan, PlannedJob, write_plan
@@ -98,6 +104,98 @@ def test_the_message_of_render_without_an_exporter_suggests_some(run_folder, typ
     code, _, err = type_line("render", f"run={run_folder}", "exporter=[]")
     assert code == 1
     assert "Try: exporter=[images,turntable]" in err
+
+
+TINY = ("exporter.images.size=8", "exporter.turntable.size=8", "exporter.turntable.views=4")
+
+
+def test_render_into_a_used_folder_leaves_no_older_picture_and_no_file_of_the_user_is_removed(
+    run_folder, type_line
+):
+    words = ("render", f"run={run_folder}", "exporter=[images]", "exporter.images.size=8")
+    assert type_line(*words, "exporter.images.views=5", "exporter.images.elevations_deg=[-90,0]").code == 0
+    images = run_folder / "render/images"
+    for name in ("mine.png", "000.png", "000_az000_el+00.png.txt", "notes_000_az000_el+00.png"):
+        (images / name).touch()
+    own = {path.name for path in images.iterdir() if path.stat().st_size == 0}
+    assert type_line(*words, "exporter.images.views=2").code == 0
+    assert {path.name for path in images.iterdir()} == own | {"000_az000_el+20.png", "001_az180_el+20.png"}
+    assert [path.name for path in images.parent.iterdir()] == ["images"]
+
+
+def test_a_render_that_fails_halfway_leaves_the_older_pictures(run_folder, type_line, monkeypatch):
+    words = ("render", f"run={run_folder}", "exporter=[images]", "exporter.images.size=8")
+    type_line(*words, "exporter.images.views=2")
+    before = {path: path.read_bytes() for path in (run_folder / "render").rglob("*.png")}
+
+    def fail(path, rgb):
+        if "002" in path.name:
+            raise KeyboardInterrupt
+        write_png(path, rgb)
+
+    monkeypatch.setattr("cadam3d.exporter.images.write_png", fail)
+    assert type_line(*words, "exporter.images.views=4").code == 130
+    assert {
+        path: path.read_bytes() for path in (run_folder / "render").rglob("*") if path.is_file()
+    } == before
+
+
+def small(output: str) -> tuple[str, ...]:
+    """Return settings that make the pictures for ``output`` small."""
+    if output == "q.png":
+        return TINY[:1]
+    return {".mp4": TINY[1:], ".png": ("exporter.preview.size=8",)}.get(Path(output).suffix.lower(), TINY)
+
+
+@pytest.mark.parametrize("command", ["render", "export", "view"])
+@pytest.mark.parametrize("name", ["big.mp4", "deep/down/a.PNG", "torus.ply", "Torus.Ply"])
+def test_the_suffix_of_a_file_chooses_its_exporter(command, name, run_folder, type_line, tmp_path):
+    words = () if name.lower().endswith(".ply") else small(name)
+    words += ("browser=false",) if command == "view" else ()
+    assert type_line(command, f"run={run_folder}", f"output={name}", *words).code == 0
+    assert (tmp_path / name).stat().st_size > 0
+    assert len(list(tmp_path.rglob("*"))) == 3 + len(Path(name).parts)
+
+
+@pytest.mark.parametrize(
+    "output",
+    [
+        *("", " ", "/", "//", "big.gif", "big.mp4 ", "run.v2", "big.tar.gz", "q.png"),
+        *("a file", "a file/", "a file/x.png", "a file/x/y"),
+        *("/proc/nowhere", "/proc/x.png", "/dev/null", "/dev/null/x.mp4", "x" * 300, "x" * 300 + ".png"),
+    ],
+)
+def test_a_place_that_cannot_be_used_is_one_message_with_a_place_that_works(
+    output, run_folder, type_line, tmp_path
+):
+    (tmp_path / "a file").write_text("my own")
+    before = sorted(tmp_path.rglob("*"))
+    # A single picture file cannot hold the eight views that exporter=images writes.
+    more = ("exporter=[images]",) if output == "q.png" else ()
+    message = type_line("render", f"run={run_folder}", *small(output), *more, f"output={output}").message
+    assert message.startswith("output: ")
+    assert sorted(tmp_path.rglob("*")) == before
+    [word] = shlex.split(message.rpartition("Try: ")[2])
+    place = Path(word.removeprefix("output="))
+    try:
+        assert (
+            type_line(
+                "render", f"run={run_folder}", *(TINY[:1] if more else small(place.name)), *more, word
+            ).code
+            == 0
+        )
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+        place.unlink(missing_ok=True)
+    assert (tmp_path / "a file").read_text() == "my own"
+
+
+@pytest.mark.parametrize("output", ["frames/", "frames.v2/", "frames.mp4/", "there.v2", "~/pictures"])
+def test_a_slash_or_a_folder_that_exists_makes_a_folder(output, run_folder, type_line, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "there.v2").mkdir()
+    assert type_line("render", f"run={run_folder}", *TINY, f"output={output}").code == 0
+    assert (tmp_path / output.removeprefix("~/") / "turntable.mp4").is_file()
 
 
 def test_export_names_its_file_and_turns_its_axes(run_folder, gaussians, type_line, tmp_path):
@@ -190,6 +288,85 @@ def test_view_shows_the_report_of_a_run(run_folder, type_line, monkeypatch):
     assert code == 0
     assert opened == [(run_folder / "report.html").as_uri()]
     assert out.startswith("Opened a run/report.html\n")
+
+
+def test_view_shows_the_report_of_a_sweep_and_writes_it_if_it_is_missing(tmp_path, type_line, monkeypatch):
+    sweep = make_sweep(tmp_path / "sweep", "a")
+    written = []
+
+    def write(folder: Path) -> Path:
+        written.append(folder)
+        (folder / "report.html").touch()
+        return folder / "report.html"
+
+    monkeypatch.setattr("cadam3d.report.write_sweep", write)
+    for _ in range(2):
+        code, out, _ = type_line("view", "run=sweep", "browser=false")
+        assert code == 0
+        assert "sweep/report.html" in out
+    assert written == [sweep]
+
+
+def test_numbers_that_cannot_be_saved_are_printed_with_a_line_that_works(
+    run_folder, type_line, monkeypatch, tmp_path
+):
+    make_sweep(tmp_path / "sweep", "a", "b")
+    for name in ("a", "b"):
+        shutil.copytree(run_folder, tmp_path / "sweep" / name)
+    monkeypatch.setattr("cadam3d.report.write_sweep", lambda folder: folder / "report.html")
+
+    def refuse(path, value):
+        if path.is_relative_to(tmp_path):
+            raise UserError("x") from OSError(errno.EROFS, "Read-only file system")
+        write_json(path, value)
+
+    monkeypatch.setattr("cadam3d.commands.eval.write_json", refuse)
+    for place, printed in (("a run", "psnr   "), ("sweep", " dB  ")):
+        result = type_line("eval", f"run={place}", *SMALL)
+        assert result.code == 1
+        assert printed in result.out
+        assert (
+            f"run: cannot write to {place} (Read-only file system), so the numbers above are not saved"
+            in (result.err)
+        )
+        copy, _, ours = result.message.rpartition("Try: ")[2].rpartition(" && ")
+        subprocess.run(["sh", "-c", copy], check=True)
+        target = Path(shlex.split(copy)[3])
+        try:
+            assert type_line(*shlex.split(ours)[1:], *SMALL).code == 0
+            assert (target / "eval.json").is_file()
+        finally:
+            shutil.rmtree(target)
+
+
+@pytest.mark.parametrize("make", [lambda path: path.write_text("a file"), lambda path: path.mkdir()])
+def test_the_suggested_run_exists(make, type_line, tmp_path):
+    latest = tmp_path / "outputs/latest"
+    run_folder = tmp_path / "outputs/2026-11-22/a run"
+    (run_folder / ".hydra").mkdir(parents=True)
+    for name in ("config.yaml", ".hydra/overrides.yaml", "asset.ply"):
+        (run_folder / name).touch()
+    lines = (
+        *("train resume=outputs/latest", "view run=outputs/latest", "render run=outputs/latest"),
+        *("render", "eval", "eval run=outputs/latest"),
+    )
+    for target in ("nowhere", "latest"):  # the second one is a circle
+        latest.unlink(missing_ok=True)
+        latest.symlink_to(target)
+        for line in lines:
+            check_suggestion(type_line(*line.split()).message, run_folder)
+    latest.unlink()
+    make(latest)
+    for line in lines:
+        check_suggestion(type_line(*line.split()).message, run_folder)
+    shutil.rmtree(run_folder)
+    for line in lines:
+        assert type_line(*line.split()).message.endswith('Try: cadam3d train prompt="a red torus"')
+
+
+def check_suggestion(message: str, run_folder: Path) -> None:
+    suggested = message.rpartition("Try: ")[2]
+    assert Path(shlex.split(suggested)[-1].partition("=")[2]).resolve() == run_folder
 
 
 def test_view_without_a_display_prints_the_path_and_opens_nothing(run_folder, type_line, monkeypatch):

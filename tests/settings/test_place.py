@@ -129,9 +129,7 @@ def test_a_second_run_resume_or_sweep_in_the_folder_of_a_run_names_its_process(t
     assert len((tmp_path / "run/metrics.jsonl").read_text().splitlines()) == 6
 
 
-def test_a_job_of_a_sweep_and_no_other_run_uses_the_lock_of_the_sweep(
-    type_line, tmp_path, monkeypatch
-):
+def test_a_job_of_a_sweep_and_no_other_run_uses_the_lock_of_the_sweep(type_line, tmp_path, monkeypatch):
     folder = tmp_path / "job"
     folder.mkdir()
     with process._locked(folder, tmp_path / "stop") as lock:
