@@ -178,12 +178,8 @@ def test_a_place_that_cannot_be_used_is_one_message_with_a_place_that_works(
     [word] = shlex.split(message.rpartition("Try: ")[2])
     place = Path(word.removeprefix("output="))
     try:
-        assert (
-            type_line(
-                "render", f"run={run_folder}", *(TINY[:1] if more else small(place.name)), *more, word
-            ).code
-            == 0
-        )
+        sizes = TINY[:1] if more else small(place.name)
+        assert type_line("render", f"run={run_folder}", *sizes, *more, word).code == 0
     finally:
         shutil.rmtree(place, ignore_errors=True)
         place.unlink(missing_ok=True)
