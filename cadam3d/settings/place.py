@@ -54,7 +54,10 @@ class Snapshot:
 
     def has_begun(self) -> bool:
         """Return whether a run has written anything of its own, which starts with its configuration."""
-        return _entries(self.folder) != self.entries
+        try:
+            return _entries(self.folder) != self.entries
+        except OSError:  # the folder is gone or cannot be read any more
+            return True
 
     def restore(self) -> None:
         """Undo what Hydra writes before a run begins. What cannot be undone stays."""
@@ -107,7 +110,8 @@ def occupied(wanted: Path, *, is_chosen: bool, resume: Path | None) -> Iterator[
             if snapshot is not None:
                 snapshot.restore()
             if not has_lock_file:
-                (folder / LOCK).unlink(missing_ok=True)
+                with suppress(OSError):
+                    (folder / LOCK).unlink()
             remove_empty(folder, existing)
             if problem := _problem_of(error, folder):
                 raise _not_writable(folder, resume, problem) from error
