@@ -3,6 +3,7 @@
 No other module spells these names. This module does not import torch, so that a sweep is planned quickly.
 """
 
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -46,8 +47,8 @@ ENDED = "job.json"  # exit code and seconds
 # In the folder of a sweep and of each of its jobs.
 LOCK = ".lock"  # held by the process that works there
 
-# The step numbers are zero-padded, so that the newest file sorts last.
-CHECKPOINT_PATTERN = "step_*.pt"
+# The step numbers are zero-padded, so that a list of the files is in the order of the steps.
+CHECKPOINT_PATTERN = r"step_([0-9]{7,12})\.pt"
 
 
 def checkpoint_name(step: int) -> str:
@@ -57,7 +58,19 @@ def checkpoint_name(step: int) -> str:
 
 def has_checkpoint(run: Path) -> bool:
     """Return whether the run in ``run`` can continue from a checkpoint."""
-    return any((run / CHECKPOINTS).glob(CHECKPOINT_PATTERN))
+    return bool(checkpoints(run / CHECKPOINTS))
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """Return the files in ``folder`` with the name of a checkpoint, the newest last; [] without a folder."""
+    steps = {path: step for path in folder.glob("*.pt") if (step := checkpoint_step(path)) is not None}
+    return sorted(steps, key=lambda path: steps[path])
+
+
+def checkpoint_step(path: Path) -> int | None:
+    """Return the step in the name of a checkpoint; None if the file has another name."""
+    found = re.fullmatch(CHECKPOINT_PATTERN, path.name)
+    return int(found.group(1)) if found else None
 
 
 def holds_run(folder: Path) -> bool:
