@@ -42,7 +42,7 @@ LONGEST_NOTE = 10_000  # characters
 
 
 class PayloadError(ValueError):
-    """An entry of a checkpoint is not what training writes. The text names the entry and what was expected."""
+    """An entry of a checkpoint that training cannot have written; the text names it and what was expected."""
 
 
 @dataclass
@@ -267,7 +267,7 @@ def _require_whole(name: str, value: Any, most: int) -> None:
 
 
 def _require_tensor(name: str, value: Any, like: Tensor) -> None:
-    """Raise ``PayloadError`` unless ``value`` is a dense tensor of finite numbers with the form of ``like``."""
+    """Raise ``PayloadError`` unless ``value`` is a tensor of finite numbers with the form of ``like``."""
     wanted = f"{str(like.dtype).removeprefix('torch.')} of shape {tuple(like.shape)}"
     _require(type(value) is Tensor, name, wanted)
     _require(value.layout is torch.strided and value.dtype == like.dtype, name, wanted)

@@ -22,15 +22,15 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn
 from cadam3d.exporter.base import Exporter
-from cadam3d.io.atomic import remove_leftovers
-from cadam3d.io.checkpoint import DamagedCheckpoint, latest_checkpoint, load_checkpoint
-from cadam3d.io.jsonl import read_jsonl, write_json
+from cadam3d.io.atomic import remove_leftovers, replacing
+from cadam3d.io.checkpoint import DamagedCheckpointError, latest_checkpoint, load_checkpoint
+from cadam3d.io.jsonl import write_json
+from cadam3d.io.records import read_metrics
 from cadam3d.io.run_folder import (
     ASSET,
     CHECKPOINTS,
     CONFIG,
     LOCK,
-    METRICS,
     PREVIEW,
     SUMMARY,
     TURNTABLE,
@@ -76,7 +76,8 @@ def run(cfg: DictConfig) -> float | None:
 
     remove_leftovers(folder)
     config_text = OmegaConf.to_yaml(cfg, resolve=True)
-    (folder / CONFIG).write_text(config_text, encoding="utf-8")
+    with replacing(folder / CONFIG) as temporary:
+        temporary.write_text(config_text, encoding="utf-8")
     if not (folder / LOCK).exists():  # a sweep locks the folders of its jobs
         link_latest(folder)
     log.info("prompt %r, seed %d, on %s, from step %d", cfg.prompt, cfg.seed, device, state.step)
@@ -112,7 +113,7 @@ def run(cfg: DictConfig) -> float | None:
         report = write_report(
             folder,
             summary=summary,
-            metrics=read_jsonl(folder / METRICS),
+            metrics=read_metrics(folder),
             config_text=config_text,
             charts=[*trainer.densifier.charts(), *trainer.guidance.charts()],
         )
@@ -203,14 +204,14 @@ def start_or_resume(cfg: DictConfig, trainer: Trainer, device: torch.device, fol
 
 
 def read_state(path: Path, trainer: Trainer, device: torch.device) -> TrainState:
-    """Return the state in a checkpoint. Raises ``DamagedCheckpoint`` unless all of it can be believed."""
+    """Return the state in a checkpoint. Raises ``DamagedCheckpointError`` unless all of it can be believed."""
     payload = load_checkpoint(path)
     try:
         state = TrainState.restore(payload, trainer.optimizer, trainer.densifier, device)
     except PayloadError as error:
-        raise DamagedCheckpoint(path, error) from error
+        raise DamagedCheckpointError(path, error) from error
     if checkpoint_step(path) not in (None, state.step):
-        raise DamagedCheckpoint(path, f"step: expected that of its name, got {state.step}")
+        raise DamagedCheckpointError(path, f"step: expected that of its name, got {state.step}")
     return state
 
 

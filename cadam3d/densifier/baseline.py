@@ -13,9 +13,7 @@ from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.densifier.base import Densifier, GradientSignal
 
 VIEWS = ("sum_norm", "sum_vector", "last")
-
-
-MOST_SIGHTINGS = 10**12  # more than any run has views
+MOST_SIGHTINGS = 1 << 30  # more than any run has views
 
 
 @dataclass

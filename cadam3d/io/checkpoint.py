@@ -55,7 +55,7 @@ OPERATIONS = (
 Content = TypeVar("Content")
 
 
-class DamagedCheckpoint(UserError):
+class DamagedCheckpointError(UserError):
     """A file that is not a sound checkpoint; an older one of the same run may be."""
 
     def __init__(self, path: Path, reason: object) -> None:
@@ -81,7 +81,7 @@ def load_checkpoint(path: Path) -> Any:
     """Return the payload on the CPU, without executing anything from the file.
 
     Only the container is checked here: ``TrainState.restore`` checks the entries. Raises
-    ``DamagedCheckpoint`` if the file is missing, damaged (checksums are verified), not a checkpoint of
+    ``DamagedCheckpointError`` if the file is missing, damaged (checksums are verified), not a checkpoint of
     cadam3d or of another version.
     """
     # A damaged archive or pickle makes the readers of Python raise almost anything.
@@ -89,21 +89,21 @@ def load_checkpoint(path: Path) -> Any:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             content = _read(archive, size=file.seek(0, io.SEEK_END))
     except FileNotFoundError as error:
-        raise DamagedCheckpoint(path, "no such checkpoint") from error
+        raise DamagedCheckpointError(path, "no such checkpoint") from error
     except UserError as error:
-        raise DamagedCheckpoint(path, "it is not a regular file") from error
+        raise DamagedCheckpointError(path, "it is not a regular file") from error
     except Exception as error:
         is_flipped = isinstance(error, zipfile.BadZipFile) and "CRC" in str(error)
         reason = "a checksum does not match" if is_flipped else error
-        raise DamagedCheckpoint(path, reason) from error
+        raise DamagedCheckpointError(path, reason) from error
     if type(content) is not dict or set(content) != {"format", "version", "payload"}:
-        raise DamagedCheckpoint(path, "not a cadam3d checkpoint")
+        raise DamagedCheckpointError(path, "not a cadam3d checkpoint")
     if type(content["format"]) is not str or content["format"] != FORMAT:
-        raise DamagedCheckpoint(path, "not a cadam3d checkpoint")
+        raise DamagedCheckpointError(path, "not a cadam3d checkpoint")
     version = content["version"]
     if type(version) is not int or version != VERSION:
         written = str(version)[:20] if isinstance(version, int) and abs(version) < 10**9 else "unknown"
-        raise DamagedCheckpoint(path, f"version {written}, this cadam3d reads {VERSION}")
+        raise DamagedCheckpointError(path, f"version {written}, this cadam3d reads {VERSION}")
     return content["payload"]
 
 
@@ -112,7 +112,7 @@ def latest_checkpoint(
 ) -> tuple[Path, Content] | None:
     """Return the newest sound checkpoint in ``folder`` and its content; None if there is no checkpoint.
 
-    ``read`` returns the content of a file or raises ``DamagedCheckpoint``, and ``on_damage`` is called with
+    ``read`` returns the content of a file or raises ``DamagedCheckpointError``, and ``on_damage`` is called with
     the error of each file that is left out. Raises ``UserError`` if all files are damaged, because starting
     again silently would hide the loss.
     """
@@ -120,7 +120,7 @@ def latest_checkpoint(
     for path in reversed(checkpoints(folder)):
         try:
             content = read(path)
-        except DamagedCheckpoint as error:
+        except DamagedCheckpointError as error:
             problems.append(error)
         else:
             for problem in problems:

@@ -6,10 +6,8 @@ No other module spells these names. This module does not import torch, so that a
 import re
 import tempfile
 from pathlib import Path
-from typing import Any
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.jsonl import read_json
 
 # Written by training.
 ASSET = "asset.ply"
@@ -76,15 +74,6 @@ def checkpoint_step(path: Path) -> int | None:
 def holds_run(folder: Path) -> bool:
     """Return whether a run has left results or checkpoints in ``folder``."""
     return any((folder / name).exists() for name in (SUMMARY, CHECKPOINTS))
-
-
-def read_summary(run: Path) -> dict[str, Any]:
-    """Return the facts of the run in ``run``; {} if it has no summary or one that cannot be read."""
-    try:
-        summary = read_json(run / SUMMARY)
-    except UserError:
-        return {}
-    return summary if isinstance(summary, dict) else {}
 
 
 def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:

@@ -10,11 +10,13 @@ from typing import Any
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.outcome import Outcome
-from cadam3d.io.jsonl import read_json, write_json
-from cadam3d.io.run_folder import JOBS, has_checkpoint, read_summary
+from cadam3d.io.jsonl import is_whole, read_json, write_json
+from cadam3d.io.records import read_summary
+from cadam3d.io.run_folder import JOBS, has_checkpoint
 
 # The outcome of a job that waits, runs, or has ended without a summary.
 UNFINISHED = "unfinished"
+MOST_THREADS = 1 << 16
 RESULTS = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.VANISHED, Outcome.OUT_OF_MEMORY)
 
 
@@ -101,11 +103,40 @@ def read_plan(sweep: Path) -> Plan:
     """Return the plan of a sweep. Raises ``UserError`` if the folder has none that can be read."""
     content = read_json(sweep / JOBS)
     try:
-        return Plan(**{**content, "jobs": [PlannedJob(**job) for job in content["jobs"]]})
-    except (TypeError, KeyError) as error:
+        plan = Plan(**{**content, "jobs": [PlannedJob(**job) for job in content["jobs"]]})
+        _require_plan(plan)
+    except (TypeError, KeyError, ValueError) as error:
+        reason = " ".join(str(error).split())[:200]
         raise UserError(
-            f"{sweep / JOBS}: not the plan of a sweep ({error}). Try: run the command of the sweep again"
+            f"{sweep / JOBS}: not the plan of a sweep ({reason}). Try: run the command of the sweep again"
         ) from error
+    return plan
+
+
+def _require_plan(plan: Plan) -> None:
+    """Raise ``ValueError`` unless every entry has the type that its class declares."""
+    texts = [plan.cwd, *_texts("flags", plan.flags), *_texts("line", plan.line)]
+    texts += _texts("figures", plan.figures if plan.figures is not None else [])
+    names: list[str] = []
+    for job in plan.jobs:
+        texts += [job.arm, *_texts("overrides", job.overrides)]
+        if not isinstance(job.swept, dict):
+            raise ValueError("swept: expected keys and values")
+        names += _texts("folder", [job.folder])
+    if not all(isinstance(text, str) and "\0" not in text for text in texts):
+        raise ValueError("cwd, arm: expected text")
+    if plan.threads is not None and not (is_whole(plan.threads) and 1 <= plan.threads <= MOST_THREADS):
+        raise ValueError("threads: expected a whole number")
+    # A name that leads elsewhere would let the sweep write there.
+    is_plain = all(name not in ("", ".", "..") and not {"/", "\\", "\0"} & set(name) for name in names)
+    if not is_plain or len(set(names)) < len(names):
+        raise ValueError("folder: expected a different name of a folder in the sweep for each job")
+
+
+def _texts(name: str, value: Any) -> list[str]:
+    if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
+        raise ValueError(f"{name}: expected texts")
+    return value
 
 
 def write_plan(sweep: Path, plan: Plan) -> None:

@@ -14,7 +14,6 @@ from cadam3d.io import checkpoint
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint, prune_checkpoints, save_checkpoint
 
 
-
 def latest(folder: Path) -> Path | None:
     found = latest_checkpoint(folder, load_checkpoint, lambda error: None)
     return None if found is None else found[0]
