@@ -15,6 +15,7 @@ A file with NaN or infinity is refused. Every finite number is accepted, however
 and reading never allocates more than a few times its size.
 """
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -176,20 +177,17 @@ class _Header:
 
 
 def _parse_header(path: Path, file: BinaryIO) -> _Header:
-    up, skip_bytes, has_format = None, 0, False
+    ups: set[str] = set()
+    skip_bytes, has_format = 0, False
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []  # name, count, (property, numpy type)
     for words in _header_lines(path, file):
         match words:
-            case ["format", *version] if not has_format and not elements:
+            case ["format", *version] if not has_format:
                 _require_format(path, " ".join(version))
                 has_format = True
-            case ["comment", "cadam3d", claim] if claim.startswith("up=") and up in (None, claim[3:]):
-                up = _require_up(path, claim.removeprefix("up="))
             case ["comment", "cadam3d", claim] if claim.startswith("up="):
-                raise _unusable(path, "the header has two different up axes")
-            case ["element", name, count] if has_format and _is_count(count):
-                if name in (known for known, *_ in elements):
-                    raise _unusable(path, f"not a Gaussian ply: the element {name} appears twice")
+                ups.add(_require_up(path, claim.removeprefix("up=")))
+            case ["element", name, count] if has_format and count.isdecimal() and len(count) <= MAX_DIGITS:
                 elements.append((name, int(count), []))
             case ["property", kind, name] if elements and kind in NUMPY_TYPES:
                 elements[-1][2].append((name, NUMPY_TYPES[kind]))
@@ -200,11 +198,14 @@ def _parse_header(path: Path, file: BinaryIO) -> _Header:
             case _:
                 line = " ".join(words)[:80]
                 raise _unusable(path, f"not a Gaussian ply: cannot read header line {line!r}")
+    names = [name for name, *_ in elements]
+    if len(ups) > 1 or len(set(names)) < len(names):
+        raise _unusable(path, "not a Gaussian ply: an element or the up axis is in the header twice")
     for position, (name, count, properties) in enumerate(elements, start=1):
         if name == "vertex":
             has_more = position < len(elements)
             record, rest_size = _vertex(path, properties)
-            return _Header(skip_bytes, count, has_more, record, rest_size, up)
+            return _Header(skip_bytes, count, has_more, record, rest_size, ups.pop() if ups else None)
         skip_bytes += count * sum(np.dtype(kind).itemsize for _, kind in properties)
     raise _unusable(path, "not a Gaussian ply: it has no vertices")
 
@@ -242,10 +243,6 @@ def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:
         if words:
             yield words
     raise _unusable(path, "truncated: the header has no end")
-
-
-def _is_count(text: str) -> bool:
-    return text.isdecimal() and len(text) <= MAX_DIGITS
 
 
 def _vertex(path: Path, properties: list[tuple[str, str]]) -> tuple[np.dtype, int]:
@@ -289,11 +286,11 @@ def _read_rows(path: Path, file: BinaryIO, header: _Header) -> np.ndarray:
 
 
 def _require_finite(path: Path, gaussians: Gaussians) -> None:
-    is_finite = torch.ones(len(gaussians), dtype=torch.bool)
-    for tensor in gaussians.tensors().values():
-        is_finite &= (
-            tensor.isfinite().flatten(start_dim=1).all(dim=1) if tensor.ndim > 1 else tensor.isfinite()
-        )
+    finite = [
+        tensor.isfinite().reshape(len(tensor), math.prod(tensor.shape[1:])).all(dim=1)
+        for tensor in gaussians.tensors().values()
+    ]
+    is_finite = torch.stack(finite).all(dim=0)
     if bad := int((~is_finite).sum()):
         problem = f"expected finite numbers, got NaN or infinity in {bad} of {len(gaussians)} Gaussians"
         raise _unusable(path, problem)

@@ -65,8 +65,8 @@ def test_the_round_trip_in_any_axes_returns_the_same_bits_up_to_degree_one(tmp_p
 
 
 def test_extreme_numbers_are_preserved(tmp_path):
-    gaussians = random_gaussians(n=6, degree=0)
-    gaussians.means[:, 0] = torch.tensor([0.0, -0.0, 1e-45, 3e38, float("inf"), float("-inf")])
+    gaussians = random_gaussians(n=4, degree=0)
+    gaussians.means[:, 0] = torch.tensor([0.0, -0.0, 1e-45, 3e38])
     write_ply(tmp_path / "a.ply", gaussians, up="-y", pad_sh=0)
     assert_same_bits(read_ply(tmp_path / "a.ply"), gaussians)
 
