@@ -204,7 +204,7 @@ def start_or_resume(cfg: DictConfig, trainer: Trainer, device: torch.device, fol
 
 
 def read_state(path: Path, trainer: Trainer, device: torch.device) -> TrainState:
-    """Return the state in a checkpoint. Raises ``DamagedCheckpointError`` unless all of it can be believed."""
+    """Return the state in a checkpoint. Raises ``DamagedCheckpointError`` unless it is sound throughout."""
     payload = load_checkpoint(path)
     try:
         state = TrainState.restore(payload, trainer.optimizer, trainer.densifier, device)

@@ -112,9 +112,9 @@ def latest_checkpoint(
 ) -> tuple[Path, Content] | None:
     """Return the newest sound checkpoint in ``folder`` and its content; None if there is no checkpoint.
 
-    ``read`` returns the content of a file or raises ``DamagedCheckpointError``, and ``on_damage`` is called with
-    the error of each file that is left out. Raises ``UserError`` if all files are damaged, because starting
-    again silently would hide the loss.
+    ``read`` returns the content of a file or raises ``DamagedCheckpointError``, and ``on_damage`` is called
+    with the error of each file that is left out. Raises ``UserError`` if all files are damaged, because
+    starting again silently would hide the loss.
     """
     problems: list[UserError] = []
     for path in reversed(checkpoints(folder)):

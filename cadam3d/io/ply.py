@@ -164,6 +164,10 @@ def _header(num_gaussians: int, rest_size: int, up: str) -> str:
     return "\n".join(lines) + "\n"
 
 
+# Name, number of rows, and the name and numpy type of each property.
+_Element = tuple[str, int, list[tuple[str, str]]]
+
+
 @dataclass(frozen=True)
 class _Header:
     """The header of a file."""
@@ -178,8 +182,8 @@ class _Header:
 
 def _parse_header(path: Path, file: BinaryIO) -> _Header:
     ups: set[str] = set()
-    skip_bytes, has_format = 0, False
-    elements: list[tuple[str, int, list[tuple[str, str]]]] = []  # name, count, (property, numpy type)
+    has_format = False
+    elements: list[_Element] = []
     for words in _header_lines(path, file):
         match words:
             case ["format", *version] if not has_format:
@@ -198,14 +202,22 @@ def _parse_header(path: Path, file: BinaryIO) -> _Header:
             case _:
                 line = " ".join(words)[:80]
                 raise _unusable(path, f"not a Gaussian ply: cannot read header line {line!r}")
+    if len(ups) > 1:
+        raise _unusable(path, f"the header has two up axes, {' and '.join(sorted(ups))}")
+    return _located(path, elements, ups.pop() if ups else None)
+
+
+def _located(path: Path, elements: Sequence[_Element], up: str | None) -> _Header:
+    """Return where the vertices are among the elements of a file."""
     names = [name for name, *_ in elements]
-    if len(ups) > 1 or len(set(names)) < len(names):
-        raise _unusable(path, "not a Gaussian ply: an element or the up axis is in the header twice")
+    if len(set(names)) < len(names):
+        raise _unusable(path, "not a Gaussian ply: an element appears twice")
+    skip_bytes = 0
     for position, (name, count, properties) in enumerate(elements, start=1):
         if name == "vertex":
             has_more = position < len(elements)
             record, rest_size = _vertex(path, properties)
-            return _Header(skip_bytes, count, has_more, record, rest_size, ups.pop() if ups else None)
+            return _Header(skip_bytes, count, has_more, record, rest_size, up)
         skip_bytes += count * sum(np.dtype(kind).itemsize for _, kind in properties)
     raise _unusable(path, "not a Gaussian ply: it has no vertices")
 
