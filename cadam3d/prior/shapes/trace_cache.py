@@ -83,12 +83,10 @@ def _read(path: Path, scene: Scene, cameras: Cameras) -> Layers | None:
         words = torch.from_numpy(np.load(path, allow_pickle=False))
         sizes = words[:2].tolist()
         alpha_at, paints_at, alpha, paints = words[2:].split([*sizes, *sizes])
-        return Layers(
-            alpha=_unpacked(shape, alpha_at, alpha).to(cameras.intrinsics.device),
-            paints=_unpacked((*shape, scene.albedo.shape[1]), paints_at, paints).to(
-                cameras.intrinsics.device
-            ),
-        )
+        alpha = _unpacked(shape, alpha_at, alpha)
+        paints = _unpacked((*shape, scene.albedo.shape[1]), paints_at, paints)
+        device = cameras.intrinsics.device
+        return Layers(alpha=alpha.to(device), paints=paints.to(device))
     except (OSError, ValueError, EOFError, RuntimeError, LookupError, TypeError, MemoryError):
         return None
 
