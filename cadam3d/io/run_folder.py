@@ -62,7 +62,7 @@ def has_checkpoint(run: Path) -> bool:
 def checkpoints(folder: Path) -> list[Path]:
     """Return the files in ``folder`` with the name of a checkpoint, the newest last; [] without a folder."""
     steps = {path: step for path in folder.glob("*.pt") if (step := checkpoint_step(path)) is not None}
-    return sorted(steps, key=lambda path: steps[path])
+    return sorted((path for path in steps if not path.is_dir()), key=lambda path: steps[path])
 
 
 def checkpoint_step(path: Path) -> int | None:
