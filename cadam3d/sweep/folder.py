@@ -103,40 +103,48 @@ def read_plan(sweep: Path) -> Plan:
     """Return the plan of a sweep. Raises ``UserError`` if the folder has none that can be read."""
     content = read_json(sweep / JOBS)
     try:
-        plan = Plan(**{**content, "jobs": [PlannedJob(**job) for job in content["jobs"]]})
-        _require_plan(plan)
+        _require_plan(content)
+        return Plan(**{**content, "jobs": [PlannedJob(**job) for job in content["jobs"]]})
     except (TypeError, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(
             f"{sweep / JOBS}: not the plan of a sweep ({reason}). Try: run the command of the sweep again"
         ) from error
-    return plan
 
 
-def _require_plan(plan: Plan) -> None:
-    """Raise ``ValueError`` unless every entry has the type that its class declares."""
-    texts = [plan.cwd, *_texts("flags", plan.flags), *_texts("line", plan.line)]
-    texts += _texts("figures", plan.figures if plan.figures is not None else [])
-    names: list[str] = []
-    for job in plan.jobs:
-        texts += [job.arm, *_texts("overrides", job.overrides)]
-        if not isinstance(job.swept, dict):
-            raise ValueError("swept: expected keys and values")
-        names += _texts("folder", [job.folder])
-    if not all(isinstance(text, str) and "\0" not in text for text in texts):
-        raise ValueError("cwd, arm: expected text")
-    if plan.threads is not None and not (is_whole(plan.threads) and 1 <= plan.threads <= MOST_THREADS):
-        raise ValueError("threads: expected a whole number")
-    # A name that leads elsewhere would let the sweep write there.
-    is_plain = all(name not in ("", ".", "..") and not {"/", "\\", "\0"} & set(name) for name in names)
-    if not is_plain or len(set(names)) < len(names):
-        raise ValueError("folder: expected a different name of a folder in the sweep for each job")
+def _require_plan(content: Any) -> None:
+    """Raise an exception unless every entry of a plan has the type that its class declares."""
+    _require(isinstance(content, dict) and isinstance(content["jobs"], list), "jobs: expected a list")
+    _require(_is_text(content["cwd"]), "cwd: expected a folder")
+    threads, figures = content.get("threads"), content.get("figures")
+    is_count = is_whole(threads) and 1 <= threads <= MOST_THREADS
+    _require(threads is None or is_count, "threads: expected a whole number")
+    _require(figures is None or _are_texts(figures), "figures: expected names")
+    for name in ("flags", "line"):
+        _require(_are_texts(content.get(name, [])), f"{name}: expected words")
+    for job in content["jobs"]:
+        _require(isinstance(job, dict) and _is_text(job["arm"]), "arm: expected a name")
+        _require(_are_texts(job["overrides"]), "overrides: expected a list of key=value")
+        _require(isinstance(job["swept"], dict), "swept: expected keys and values")
+        # A name that leads elsewhere would let the sweep write there.
+        folder = job["folder"]
+        is_inside = _is_text(folder) and folder not in ("", ".", "..") and not set("/\\") & set(folder)
+        _require(is_inside, "folder: expected the name of a folder in that of the sweep")
+    folders = [job["folder"] for job in content["jobs"]]
+    _require(len(set(folders)) == len(folders), "folder: expected a different name for each job")
 
 
-def _texts(name: str, value: Any) -> list[str]:
-    if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
-        raise ValueError(f"{name}: expected texts")
-    return value
+def _require(claim: bool, problem: str) -> None:
+    if not claim:
+        raise ValueError(problem)
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and "\0" not in value
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, list) and all(map(_is_text, value))
 
 
 def write_plan(sweep: Path, plan: Plan) -> None:
