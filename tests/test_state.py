@@ -153,8 +153,7 @@ def test_every_damaged_entry_is_refused_or_restored_as_it_is(trained):
             changed = replaced(payload, path, wrong)
             try:
                 restored = TrainState.restore(changed, optimizer, densifier, CPU)
-            except (PayloadError, UserError) as error:
-                assert len(str(error)) < 400
+            except (PayloadError, UserError):
                 continue
             assert is_same(restored.to_payload(), changed), (path, name)
             accepted.append((".".join(path), name))

@@ -32,7 +32,7 @@ DAMAGES: dict[str, Callable[[Path], None]] = {
     "nested": lambda path: path.write_text("[" * 100_000),
     "another kind": lambda path: path.write_text("[1, null]"),
     "wrong values": lambda path: path.write_text(wrong_values(path.name)),
-    "a pipe": lambda path: os.mkfifo(path),
+    "a pipe": lambda path: os.mkfifo(path, 0o600),
     "a folder": lambda path: path.mkdir(),
     "a device": lambda path: path.symlink_to("/dev/zero"),
     "a circle": lambda path: path.symlink_to(path.name),

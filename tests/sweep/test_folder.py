@@ -31,7 +31,7 @@ def test_no_entry_of_a_plan_has_another_type(tmp_path: Path, key: str):
         if any(type(value) is type(wrong) and value == wrong for value in plausible):
             read_plan(tmp_path)
             continue
-        with pytest.raises(UserError, match=rf"not the plan of a sweep \({name}: expected"):
+        with pytest.raises(UserError, match=rf"not the plan of a sweep \(({name}|arm): expected"):
             read_plan(tmp_path)
 
 
