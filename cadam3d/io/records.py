@@ -75,12 +75,13 @@ def _is_metrics(line: dict[str, Any]) -> bool:
 
 
 def _is_histogram(line: dict[str, Any]) -> bool:
-    per_decade, first, counts = (line.get(key) for key in ("bins_per_decade", "first", "counts"))
+    per_decade, first = line.get("bins_per_decade"), line.get("first")
+    counts: Any = line.get("counts")
+    selected: Any = line.get("selected")
     if not is_whole(line.get("step")) or not _is_text(line.get("score")):
         return False
     if not is_whole(per_decade) or not 0 < per_decade <= MOST_BINS or type(first) is not int:
         return False
-    selected = line.get("selected")
     if not _are(is_whole, counts) or not _are(is_whole, selected) or len(counts) != len(selected):
         return False
     return -DECADES * per_decade <= first <= first + len(counts) <= DECADES * per_decade
