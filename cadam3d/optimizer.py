@@ -63,7 +63,7 @@ class GaussianOptimizer:
 
     def __init__(self, settings: AdamSettings, gaussians: Gaussians) -> None:
         self.settings = settings
-        moments = {kind: _parts(gaussians.map(torch.zeros_like)) for kind in MOMENTS}
+        moments = {kind: parts_of(gaussians.map(torch.zeros_like)) for kind in MOMENTS}
         self._install(gaussians.map(lambda tensor: tensor.detach().clone()), {"steps": 0, **moments})
 
     @property
@@ -81,7 +81,7 @@ class GaussianOptimizer:
         gradients = self._gaussians.map(
             lambda tensor: torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
         )
-        for name, gradient in _parts(gradients).items():
+        for name, gradient in parts_of(gradients).items():
             self._move(name, gradient if bound is None else _clipped(gradient, bound), rates[name])
         self.zero_grad()
 
@@ -146,7 +146,7 @@ class GaussianOptimizer:
 
         Raises ``UserError`` if the moments are of other Gaussians.
         """
-        parts = _parts(self._gaussians.detach())
+        parts = parts_of(self._gaussians.detach())
         moments: dict[str, Any] = {"steps": state["steps"]}
         for kind in MOMENTS:
             for name, part in parts.items():
@@ -187,12 +187,12 @@ class GaussianOptimizer:
     def _install(self, gaussians: Gaussians, moments: Mapping[str, Any]) -> None:
         """Make ``gaussians`` the leaf tensors, and give Adam views into them, so that a step moves both."""
         self._gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
-        self._parts = _parts(self._gaussians.detach())
+        self._parts = parts_of(self._gaussians.detach())
         self._steps = {name: torch.tensor(float(moments["steps"])) for name in PARTS}
         self._moments = {kind: {name: moments[kind][name].contiguous() for name in PARTS} for kind in MOMENTS}
 
 
-def _parts(gaussians: Gaussians) -> dict[str, Tensor]:
+def parts_of(gaussians: Gaussians) -> dict[str, Tensor]:
     """Return the tensors as Adam groups them, in the order of ``PARTS``, as views without copies."""
     tensors = (
         gaussians.means,

@@ -10,7 +10,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.core.schedule import Linear
 from cadam3d.core.sh import rgb_to_sh0
-from cadam3d.optimizer import MOMENTS, PARTS, AdamSettings, GaussianOptimizer, _parts
+from cadam3d.optimizer import MOMENTS, PARTS, AdamSettings, GaussianOptimizer, parts_of
 
 RATES = {
     "means_lr": 0.01,
@@ -58,16 +58,16 @@ def as_named(moments: dict) -> dict[str, torch.Tensor]:
 def test_every_tensor_moves_as_under_the_adam_of_torch():
     start = gaussians(7)
     ours = settings().start(start)
-    parts = _parts(start.map(torch.clone))
+    parts = parts_of(start.map(torch.clone))
     groups = [{"params": [part], "lr": RATES[f"{name}_lr"]} for name, part in parts.items()]
     theirs = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)
     for step in range(20):
         push(ours, seed=step)
-        for part, gradient in zip(parts.values(), _parts(gaussians(7, seed=step)).values(), strict=True):
+        for part, gradient in zip(parts.values(), parts_of(gaussians(7, seed=step)).values(), strict=True):
             part.grad = gradient
         ours.step(step)
         theirs.step()
-    for name, part in _parts(ours.gaussians.detach()).items():
+    for name, part in parts_of(ours.gaussians.detach()).items():
         torch.testing.assert_close(part, parts[name], rtol=0, atol=1e-6)
 
 

@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -23,26 +24,27 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn
 from cadam3d.exporter.base import Exporter
-from cadam3d.io.atomic import remove_leftovers
-from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
-from cadam3d.io.jsonl import read_jsonl, write_json
+from cadam3d.io.atomic import remove_leftovers, replacing
+from cadam3d.io.checkpoint import DamagedCheckpointError, latest_checkpoint, load_checkpoint
+from cadam3d.io.jsonl import write_json
 from cadam3d.io.lock import INHERITED
+from cadam3d.io.records import read_metrics
 from cadam3d.io.run_folder import (
     ASSET,
     CHECKPOINTS,
     CONFIG,
     LATEST,
-    METRICS,
     PREVIEW,
     SUMMARY,
     TURNTABLE,
+    checkpoint_step,
     shown,
 )
 from cadam3d.metric.base import Metric
 from cadam3d.rasterizer.base import Backend
 from cadam3d.report import write_report
 from cadam3d.settings.compose import component, components, flatten, load_config
-from cadam3d.state import Outcome, RunContext, TrainState
+from cadam3d.state import Outcome, PayloadError, RunContext, TrainState
 from cadam3d.trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -76,7 +78,8 @@ def run(cfg: DictConfig) -> float | None:
 
     remove_leftovers(folder)
     config_text = OmegaConf.to_yaml(cfg, resolve=True)
-    (folder / CONFIG).write_text(config_text, encoding="utf-8")
+    with replacing(folder / CONFIG) as temporary:
+        temporary.write_text(config_text, encoding="utf-8")
     # This is for single runs: a sweep locks the folders of its jobs and passes the locks on.
     if INHERITED not in os.environ:
         link_latest(folder)
@@ -113,7 +116,7 @@ def run(cfg: DictConfig) -> float | None:
         report = write_report(
             folder,
             summary=summary,
-            metrics=read_jsonl(folder / METRICS),
+            metrics=read_metrics(folder),
             config_text=config_text,
             charts=[*trainer.densifier.charts(), *trainer.guidance.charts()],
         )
@@ -175,11 +178,14 @@ def start_or_resume(cfg: DictConfig, trainer: Trainer, device: torch.device, fol
     if cfg.resume is None:
         return trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, device)
     named = Path(cfg.resume)
-    path = named if named.is_file() else latest_checkpoint(folder / CHECKPOINTS)
-    if path is None:
+    read = partial(read_state, trainer=trainer, device=device)
+    if not named.is_dir():
+        path, state = named, read(named)
+    elif (found := latest_checkpoint(folder / CHECKPOINTS, read, note_damage)) is not None:
+        path, state = found
+    else:
         print(f"No checkpoint in {folder / CHECKPOINTS} yet: starting at step 0.", file=sys.stderr)
         return trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, device)
-    state = TrainState.restore(load_checkpoint(path), trainer.optimizer, trainer.densifier, device)
     require(
         cfg.seed == state.seed,
         "seed",
@@ -187,10 +193,34 @@ def start_or_resume(cfg: DictConfig, trainer: Trainer, device: torch.device, fol
         got=cfg.seed,
         example="resume without seed=..., or start another run",
     )
+    require(
+        state.step <= trainer.steps,
+        "steps",
+        expected=f"at least {state.step}, which {path.name} has done already",
+        got=trainer.steps,
+        example=f"steps={state.step}",
+    )
     note_changes(cfg, folder)
-    if state.step >= trainer.steps:
+    if state.step == trainer.steps:
         print(f"{path.name} has all {state.step} steps; writing the outputs again.", file=sys.stderr)
     return state
+
+
+def read_state(path: Path, trainer: Trainer, device: torch.device) -> TrainState:
+    """Return the state in a checkpoint. Raises ``DamagedCheckpointError`` unless it is sound throughout."""
+    payload = load_checkpoint(path)
+    try:
+        state = TrainState.restore(payload, trainer.optimizer, trainer.densifier, device)
+    except PayloadError as error:
+        raise DamagedCheckpointError(path, error) from error
+    if checkpoint_step(path) not in (None, state.step):
+        raise DamagedCheckpointError(path, f"step: expected that of its name, got {state.step}")
+    return state
+
+
+def note_damage(error: UserError) -> None:
+    """Print which checkpoint is left out, and why."""
+    print(f"Note: left out {str(error).partition(' Try: ')[0]}", file=sys.stderr)
 
 
 def note_changes(cfg: DictConfig, folder: Path) -> None:

@@ -58,6 +58,10 @@ class RowCount(RowState):
         """Return the state of ``n`` Gaussians."""
         return cls(no_rows=torch.zeros(n, dtype=torch.bool, device=device))
 
+    def is_possible(self, step: int) -> bool:
+        """Return whether the mask marks no Gaussian."""
+        return not bool(self.no_rows.any())
+
 
 class Densifier(ABC, Generic[State]):
     """Frozen hyper-parameters; the per-Gaussian tensors are in a state that the trainer holds.

@@ -35,6 +35,11 @@ class CAdamState(RowState):
     v: Float[Tensor, "n 3"]  # second raw moment
     age: Int[Tensor, "n"]  # updates since birth; the step count of the bias correction
 
+    def is_possible(self, step: int) -> bool:
+        """Return whether squares are not negative and no Gaussian is older than the run."""
+        is_age = (self.age >= 0) & (self.age <= step)
+        return bool((self.v >= 0).all() & is_age.all())
+
 
 @dataclass(frozen=True, kw_only=True)
 class CAdam(Densifier[CAdamState]):

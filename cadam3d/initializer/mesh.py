@@ -28,13 +28,14 @@ from cadam3d.io.frames import points_to_world, turned_points
 
 UPS = ("z", "y")
 EXAMPLE = "/path/to/mesh.glb"
+SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mesh(Initializer):
     """``count`` Gaussians at uniformly random points of a surface; the prompt is not used.
 
-    Reads all formats of trimesh (PLY, OBJ, STL, GLB, OFF, ...), with vertex, face or texture colours.
+    Reads PLY, OBJ, STL, GLB, glTF and OFF files, with vertex, face or texture colours.
     """
 
     path: str
@@ -69,6 +70,12 @@ class Mesh(Initializer):
     def _load(self) -> list[trimesh.Trimesh]:
         """Return the surfaces of the file, each at its place in the scene and with its own colours."""
         path = found_file(self.path, EXAMPLE)
+        # Other formats of trimesh may refer to files elsewhere, or run other programs.
+        if path.suffix.lower() not in SUFFIXES:
+            raise UserError(
+                f"initializer.path: expected a {', '.join(SUFFIXES)} file, got {self.path!r}. "
+                f"Try: initializer.path={EXAMPLE}"
+            )
         # Every format has its own parser, with its own exceptions.
         try:
             parts = [part for part in trimesh.load_scene(path).dump() if isinstance(part, trimesh.Trimesh)]

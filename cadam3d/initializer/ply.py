@@ -1,5 +1,6 @@
 """Ply: starts from a PLY file that holds Gaussians or a cloud of coloured points."""
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,12 +29,14 @@ from cadam3d.initializer.points import (
 )
 from cadam3d.io.frames import UPS, points_to_world, turned, turned_points
 from cadam3d.io.ply import holds_gaussians, read_ply
+from cadam3d.io.reading import read_bytes
 
 # 3DGS takes its axes from COLMAP.
 UP_OF_GAUSSIANS = "-y"
 # Point-E and most scans use this axis.
 UP_OF_POINTS = "+z"
 EXAMPLE = "/path/to/asset.ply"
+LARGEST = 1 << 32  # bytes of a cloud of points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,8 +87,7 @@ class Ply(Initializer):
             example="initializer.replicate=1",
         )
         asset = turned(read_ply(path, up=self.up or UP_OF_GAUSSIANS), self.turn_deg)
-        for name, tensor in asset.tensors().items():
-            _require_finite(path, name, tensor)
+        _require_finite(path, "means", asset.means)
         asset = asset.index(rows_of(len(asset), self.count, generator))
         center, factor = fit(asset.means, self.radius)
         return replace(
@@ -109,7 +111,8 @@ class Ply(Initializer):
         """Return positions in the axes of the file, and RGB in [0, 1]."""
         # The parser has no exceptions of its own.
         try:
-            loaded = trimesh.load(path)
+            content = io.BytesIO(read_bytes(path, largest=LARGEST))
+            loaded = trimesh.load(content, file_type="ply")
         except Exception as error:
             reason = str(error) or type(error).__name__
             raise UserError(

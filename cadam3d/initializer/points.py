@@ -1,6 +1,7 @@
 """From coloured points to Gaussians: functions shared by the initializers that start from a point cloud."""
 
 import math
+import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE, rgb_to_sh0
 from cadam3d.io.frames import TURNS
+from cadam3d.io.reading import KINDS
 
 # As in 3DGS (Kerbl et al. 2023, sec. 5.1).
 NEIGHBOURS = 3
@@ -152,8 +154,13 @@ def fit(points: Float[Tensor, "n 3"], radius: float | None) -> tuple[Float[Tenso
 def found_file(path: str, example: str) -> Path:
     """Return the path that ``initializer.path`` names. Raises ``UserError`` unless it is a file."""
     found = Path(path).expanduser()
-    if not found.is_file():
-        what = "is a folder" if found.is_dir() else "does not exist"
+    # The system refuses some names, such as one that is too long.
+    try:
+        kind = stat.S_IFMT(found.stat().st_mode)
+    except (OSError, ValueError):
+        kind = 0
+    if kind != stat.S_IFREG:
+        what = f"is {KINDS.get(kind, 'no file')}" if kind else "does not exist"
         raise UserError(
             f"initializer.path: expected a file, got {path!r}, which {what}. Try: initializer.path={example}"
         )

@@ -1,6 +1,8 @@
 """Images: writing PNG files, colour maps for depth and alpha, and contact sheets."""
 
 import math
+import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,7 +13,9 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
+from cadam3d.io.reading import read_bytes
 
 # Viridis (van der Walt and Smith, CC0) at ten equal distances. Dark is low, and it stays readable in grey.
 VIRIDIS = (
@@ -19,6 +23,8 @@ VIRIDIS = (
     (31, 158, 137), (53, 183, 121), (110, 206, 88), (181, 222, 43), (253, 231, 37),
 )  # fmt: skip
 LABEL_MARGIN = 4  # pixels
+STEP_PICTURE = re.compile(r"step_([0-9]{6,12})\.png")
+LARGEST_PNG = 1 << 28  # bytes
 
 
 def to_uint8(rgb: Float[Tensor, "*batch h w 3"]) -> UInt8[np.ndarray, "*batch h w 3"]:
@@ -39,7 +45,24 @@ def step_picture(folder: Path, step: int) -> Path:
 
 def step_pictures(folder: Path) -> list[tuple[int, Path]]:
     """Return the step and the path of every such image in ``folder``, in order; none if it does not exist."""
-    return sorted((int(path.stem.removeprefix("step_")), path) for path in folder.glob("step_*.png"))
+    named = [(STEP_PICTURE.fullmatch(path.name), path) for path in folder.glob("step_*.png")]
+    return sorted((int(name.group(1)), path) for name, path in named if name is not None)
+
+
+def read_png(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a picture that :func:`write_png` has written. Raises ``UserError`` if it cannot be read."""
+    content = read_bytes(path, largest=LARGEST_PNG)
+    # Pillow raises many exceptions for damaged files, and one for a picture that would need too much memory.
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            picture = imageio.imread(content, extension=".png")
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise UserError(f"{path}: expected a PNG picture, got {reason}. Try: delete it") from error
+    if picture.ndim != 3 or picture.shape[2] < 3 or picture.dtype != np.uint8:
+        raise UserError(f"{path}: expected a PNG picture in colour, got another one. Try: delete it")
+    return picture[..., :3]
 
 
 def colorize(values: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch h w 3"]:

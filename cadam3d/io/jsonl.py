@@ -2,12 +2,19 @@
 
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
+from cadam3d.io.reading import DEEPEST, LARGEST_TEXT, read_bytes
+
+# Limits of numbers in the files of a run. Nothing real comes near them.
+MOST = 10**12  # steps, Gaussians, bytes
+LARGEST_NUMBER = 1e100  # that charts can draw
+LARGEST_FLOAT = 1e308
 
 
 def append_jsonl(path: Path, line: Mapping[str, Any]) -> None:
@@ -31,15 +38,16 @@ def append_jsonl(path: Path, line: Mapping[str, Any]) -> None:
 def read_jsonl(path: Path) -> list[dict[str, Any]]:
     """Return all objects of a log, oldest first; [] if there is no file yet.
 
-    Lines that a kill has cut are left out without an error, so that the others can be used.
+    Lines that a kill has cut, and lines that are not plain JSON, are left out without an error, so that the
+    others can be used. Raises ``UserError`` if the file cannot be read.
     """
-    if not path.is_file():
+    if not os.path.lexists(path):
         return []
     objects = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in read_bytes(path, largest=LARGEST_TEXT).split(b"\n"):
         try:
-            value = json.loads(line)
-        except json.JSONDecodeError:
+            value = _parsed(line)
+        except (ValueError, RecursionError):
             continue
         if isinstance(value, dict):
             objects.append(value)
@@ -47,13 +55,15 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
 
 
 def truncate_after(path: Path, step: int) -> None:
-    """Remove the lines of steps after ``step`` and lines that were cut; do nothing if there is no file.
+    """Remove the lines of steps after ``step`` and damaged lines; do nothing if there is no file.
 
-    A resumed run calls this first because it will write those lines again.
+    A resumed run calls this first because it will write those lines again. A line whose ``step`` is not a
+    whole number is damaged.
     """
-    if not path.is_file():
+    if not os.path.lexists(path):
         return
-    kept = [line for line in read_jsonl(path) if line.get("step", 0) <= step]
+    lines = [(line.get("step", 0), line) for line in read_jsonl(path)]
+    kept = [line for at, line in lines if is_whole(at) and at <= step]
     with replacing(path) as temporary:
         temporary.write_text("".join(to_json(line) + "\n" for line in kept), encoding="utf-8")
 
@@ -65,23 +75,70 @@ def write_json(path: Path, value: Mapping[str, Any] | Sequence[Any]) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Return the value in a JSON file. Raises ``UserError`` if it is missing or not JSON."""
+    """Return the value in a JSON file.
+
+    Raises ``UserError`` if it is missing, or not plain JSON: UTF-8, without NaN, infinities, numbers beyond
+    those of floating point, keys that appear twice, and more levels than any file of a run has.
+    """
+    content = read_bytes(path, largest=LARGEST_TEXT)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        reason = error.strerror or str(error)
+        return _parsed(content)
+    except (ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:200]
         raise UserError(
-            f"{path}: cannot be read ({reason}). Try: run=RUN with the folder of a run"
+            f"{path}: not valid JSON ({reason}). Try: cadam3d train resume=RUN, which writes it again"
         ) from error
-    except ValueError as error:
-        raise UserError(
-            f"{path}: not valid JSON ({error}). Try: resume=RUN, which writes it again"
-        ) from error
+
+
+def is_whole(value: object) -> TypeGuard[int]:
+    """Return whether ``value`` from a JSON file is a count: a whole number from 0 to 10^12."""
+    return type(value) is int and 0 <= value <= MOST
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Return whether ``value`` from a JSON file is a number that can be drawn: at most 10^100 in size."""
+    return type(value) in (int, float) and abs(value) <= LARGEST_NUMBER  # pyright: ignore[reportArgumentType]
 
 
 def to_json(value: Any, indent: int | None = None) -> str:
     """Return standard JSON, without the NaN and Infinity that Python would write."""
     return json.dumps(_standard(value), indent=indent, ensure_ascii=False, allow_nan=False)
+
+
+def _parsed(content: bytes) -> Any:
+    """Return the value of a JSON text. Raises ``ValueError`` or ``RecursionError`` for any other text."""
+    value = json.loads(content.decode("utf-8"), object_pairs_hook=_object, parse_constant=_refused)
+    _require_plain(value, DEEPEST)
+    return value
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a key appears twice")
+    return found
+
+
+def _refused(name: str) -> None:
+    raise ValueError(f"{name} is not JSON")
+
+
+def _require_plain(value: Any, levels: int) -> None:
+    """Raise ``ValueError`` for what JSON can spell but nothing here can write or calculate with."""
+    if levels < 0:
+        raise ValueError(f"more than {DEEPEST} levels")
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _require_plain(key, levels - 1)
+            _require_plain(item, levels - 1)
+    elif isinstance(value, list):
+        for item in value:
+            _require_plain(item, levels - 1)
+    elif isinstance(value, str):
+        # An escaped half of a character pair cannot be written again.
+        value.encode("utf-8")
+    elif isinstance(value, int | float) and not abs(value) < LARGEST_FLOAT:
+        raise ValueError("a number that floating point cannot hold")
 
 
 def _standard(value: Any) -> Any:

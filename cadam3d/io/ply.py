@@ -8,8 +8,14 @@ channel, stored channel-major (all of red, then green, then blue). Normals are z
 A comment line records the axes, so that files of this project are read back into world axes automatically.
 Reading a file that was written here gives the same bits. The only exceptions are SH bands 2 and 3 in axes
 other than ``+z`` (see ``frames.py``), which are rounded to float32 once when writing and once when reading.
+
+A file with NaN or infinity is refused. Every finite number is accepted, however large: the quaternion (0, 0,
+0, 0) means no rotation (``Gaussians.rotations``), and every rasterizer gives finite images of such Gaussians
+(``tests/rasterizer/test_reference.py``). A file that is longer or shorter than its header claims is refused,
+and reading never allocates more than a few times its size.
 """
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -26,6 +32,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE
 from cadam3d.io.atomic import replacing
 from cadam3d.io.frames import UPS, file_to_world, world_to_file
+from cadam3d.io.reading import open_regular
 
 FORMAT = "binary_little_endian 1.0"
 # The columns of each tensor that is stored without a change of layout.
@@ -42,6 +49,7 @@ SH0 = ["f_dc_0", "f_dc_1", "f_dc_2"]
 GAUSSIANS_ONLY = {"f_dc_0", "scale_0", "rot_0", "packed_position"}
 REST_SIZES = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_DEGREE + 1)]
 MAX_HEADER_BYTES = 1 << 16
+MAX_DIGITS = 15  # of a number of rows
 NUMPY_TYPES = {
     **dict.fromkeys(["char", "int8"], "<i1"),
     **dict.fromkeys(["uchar", "uint8"], "<u1"),
@@ -88,21 +96,24 @@ def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
 
     Properties are found by name, so their order, additional ones and missing normals do not matter. ``up`` is
     the up axis of files that do not record it; files of this project do. Raises ``UserError`` if ``path`` is
-    not such a file.
+    not such a file, or has numbers that are not finite.
     """
     require_choice("up", up, UPS)
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             header = _parse_header(path, file)
             rows = _read_rows(path, file, header)
-    except OSError as error:
-        reason = error.strerror or str(error)
+    # A name with a null byte is a ValueError.
+    except (OSError, ValueError, MemoryError) as error:
+        reason = getattr(error, "strerror", None) or error or "too large"
         raise UserError(
             f"{path}: cannot be read ({reason}). Try: ply=FILE with a file that exists"
         ) from error
 
     def columns(names: Sequence[str]) -> np.ndarray:
-        found = [rows[name].astype(np.float32, copy=False) for name in names]
+        # A double may be too large for a float; the infinity is refused below.
+        with np.errstate(over="ignore"):
+            found = [rows[name].astype(np.float32, copy=False) for name in names]
         return np.stack(found, axis=1) if found else np.zeros((len(rows), 0), dtype=np.float32)
 
     rest = columns([f"f_rest_{i}" for i in range(header.rest_size)])
@@ -115,7 +126,9 @@ def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
         opacity_logits=torch.from_numpy(columns(COLUMNS["opacity_logits"])[:, 0].copy()),
         sh=torch.from_numpy(np.ascontiguousarray(sh)),
     )
-    return file_to_world(local, header.up or up)
+    gaussians = file_to_world(local, header.up or up)
+    _require_finite(path, gaussians)
+    return gaussians
 
 
 def holds_gaussians(path: Path) -> bool:
@@ -124,10 +137,11 @@ def holds_gaussians(path: Path) -> bool:
     Raises ``UserError`` if ``path`` is not a PLY file.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             words = [line for line in _header_lines(path, file) if line[0] == "property"]
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error}). Try: another file") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"{path}: cannot be read ({reason}). Try: another file") from error
     return not GAUSSIANS_ONLY.isdisjoint(line[-1] for line in words)
 
 
@@ -150,27 +164,34 @@ def _header(num_gaussians: int, rest_size: int, up: str) -> str:
     return "\n".join(lines) + "\n"
 
 
+# Name, number of rows, and the name and numpy type of each property.
+_Element = tuple[str, int, list[tuple[str, str]]]
+
+
 @dataclass(frozen=True)
 class _Header:
     """The header of a file."""
 
     skip_bytes: int  # size of the elements before the vertices
     count: int
+    has_more: bool  # whether other elements follow the vertices
     record: np.dtype  # one vertex
     rest_size: int
     up: str | None  # up axis; None unless cadam3d wrote the file
 
 
 def _parse_header(path: Path, file: BinaryIO) -> _Header:
-    up, skip_bytes = None, 0
-    elements: list[tuple[str, int, list[tuple[str, str]]]] = []  # name, count, (property, numpy type)
+    ups: set[str] = set()
+    has_format = False
+    elements: list[_Element] = []
     for words in _header_lines(path, file):
         match words:
-            case ["format", *version]:
+            case ["format", *version] if not has_format:
                 _require_format(path, " ".join(version))
+                has_format = True
             case ["comment", "cadam3d", claim] if claim.startswith("up="):
-                up = _require_up(path, claim.removeprefix("up="))
-            case ["element", name, count] if count.isdecimal():
+                ups.add(_require_up(path, claim.removeprefix("up=")))
+            case ["element", name, count] if has_format and count.isdecimal() and len(count) <= MAX_DIGITS:
                 elements.append((name, int(count), []))
             case ["property", kind, name] if elements and kind in NUMPY_TYPES:
                 elements[-1][2].append((name, NUMPY_TYPES[kind]))
@@ -179,10 +200,24 @@ def _parse_header(path: Path, file: BinaryIO) -> _Header:
             case ["comment" | "obj_info", *_]:
                 pass
             case _:
-                raise _unusable(path, f"not a Gaussian ply: cannot read header line {' '.join(words)!r}")
-    for name, count, properties in elements:
+                line = " ".join(words)[:80]
+                raise _unusable(path, f"not a Gaussian ply: cannot read header line {line!r}")
+    if len(ups) > 1:
+        raise _unusable(path, f"the header has two up axes, {' and '.join(sorted(ups))}")
+    return _located(path, elements, ups.pop() if ups else None)
+
+
+def _located(path: Path, elements: Sequence[_Element], up: str | None) -> _Header:
+    """Return where the vertices are among the elements of a file."""
+    names = [name for name, *_ in elements]
+    if len(set(names)) < len(names):
+        raise _unusable(path, "not a Gaussian ply: an element appears twice")
+    skip_bytes = 0
+    for position, (name, count, properties) in enumerate(elements, start=1):
         if name == "vertex":
-            return _vertex_header(path, skip_bytes, count, properties, up)
+            has_more = position < len(elements)
+            record, rest_size = _vertex(path, properties)
+            return _Header(skip_bytes, count, has_more, record, rest_size, up)
         skip_bytes += count * sum(np.dtype(kind).itemsize for _, kind in properties)
     raise _unusable(path, "not a Gaussian ply: it has no vertices")
 
@@ -222,9 +257,8 @@ def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:
     raise _unusable(path, "truncated: the header has no end")
 
 
-def _vertex_header(
-    path: Path, skip_bytes: int, count: int, properties: list[tuple[str, str]], up: str | None
-) -> _Header:
+def _vertex(path: Path, properties: list[tuple[str, str]]) -> tuple[np.dtype, int]:
+    """Return the record of one vertex, and the number of its rest coefficients."""
     names = [name for name, _ in properties]
     wanted = [*COLUMNS["means"], *SH0, *_names(0)[-8:]]
     missing = [name for name in wanted if name not in names]
@@ -241,7 +275,7 @@ def _vertex_header(
             f"not a Gaussian ply: expected f_rest_0.. for SH degree 0 to {MAX_DEGREE} ({sizes} of them), "
             f"got {rest_size}",
         )
-    return _Header(skip_bytes, count, np.dtype(properties), rest_size, up)
+    return np.dtype(properties), rest_size
 
 
 def _unusable(path: Path, problem: str) -> UserError:
@@ -250,10 +284,25 @@ def _unusable(path: Path, problem: str) -> UserError:
 
 def _read_rows(path: Path, file: BinaryIO, header: _Header) -> np.ndarray:
     start = file.tell() + header.skip_bytes
-    available = max(file.seek(0, 2) - start, 0)
-    whole = available // header.record.itemsize
-    if whole < header.count:
+    available = file.seek(0, 2) - start
+    length = header.count * header.record.itemsize
+    if available < length:
+        whole = max(available, 0) // header.record.itemsize
         problem = f"truncated: the header promises {header.count} Gaussians, the file holds {whole}"
         raise _unusable(path, problem)
+    if available > length and not header.has_more:
+        problem = f"the header promises {header.count} Gaussians, but {available - length} more bytes follow"
+        raise _unusable(path, problem)
     file.seek(start)
-    return np.frombuffer(file.read(header.count * header.record.itemsize), dtype=header.record)
+    return np.frombuffer(file.read(length), dtype=header.record)
+
+
+def _require_finite(path: Path, gaussians: Gaussians) -> None:
+    finite = [
+        tensor.isfinite().reshape(len(tensor), math.prod(tensor.shape[1:])).all(dim=1)
+        for tensor in gaussians.tensors().values()
+    ]
+    is_finite = torch.stack(finite).all(dim=0)
+    if bad := int((~is_finite).sum()):
+        problem = f"expected finite numbers, got NaN or infinity in {bad} of {len(gaussians)} Gaussians"
+        raise _unusable(path, problem)

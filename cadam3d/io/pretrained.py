@@ -16,6 +16,7 @@ import torch
 
 from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
+from cadam3d.io.jsonl import read_json
 
 INDEX = "model_index.json"
 # Parts may only have classes of these libraries, so that no foreign code runs.
@@ -226,9 +227,10 @@ def _module(library: str) -> Any:
 
 def _read_index(key: str, file: Path) -> dict[str, Any]:
     try:
-        index = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UserError(f"{key}: {file} cannot be read ({error}). Try: download the model again") from error
+        index = read_json(file)
+    except UserError as error:
+        reason = str(error).partition(" Try: ")[0]
+        raise UserError(f"{key}: {reason} Try: download the model again") from error
     if not isinstance(index, dict):
         raise UserError(f"{key}: {file} is not the index of a model. Try: download the model again")
     return index

@@ -4,16 +4,15 @@ No other module spells these names. This module does not import torch, so that a
 """
 
 import os
+import re
 import shlex
 import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.jsonl import read_json
 
 # Written by training.
 ASSET = "asset.ply"
@@ -56,8 +55,8 @@ LOCK = ".lock"  # held by the process that works there
 
 LATEST = "outputs/latest"  # a link to the newest run, beside the runs that have no other place
 
-# The step numbers are zero-padded, so that the newest file sorts last.
-CHECKPOINT_PATTERN = "step_*.pt"
+# The step numbers are zero-padded, so that a list of the files is in the order of the steps.
+CHECKPOINT_PATTERN = r"step_([0-9]{7,12})\.pt"
 
 
 def checkpoint_name(step: int) -> str:
@@ -67,21 +66,24 @@ def checkpoint_name(step: int) -> str:
 
 def has_checkpoint(run: Path) -> bool:
     """Return whether the run in ``run`` can continue from a checkpoint."""
-    return any((run / CHECKPOINTS).glob(CHECKPOINT_PATTERN))
+    return bool(checkpoints(run / CHECKPOINTS))
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """Return the files in ``folder`` with the name of a checkpoint, the newest last; [] without a folder."""
+    steps = {path: step for path in folder.glob("*.pt") if (step := checkpoint_step(path)) is not None}
+    return sorted((path for path in steps if not path.is_dir()), key=lambda path: steps[path])
+
+
+def checkpoint_step(path: Path) -> int | None:
+    """Return the step in the name of a checkpoint; None if the file has another name."""
+    found = re.fullmatch(CHECKPOINT_PATTERN, path.name)
+    return int(found.group(1)) if found else None
 
 
 def holds_run(folder: Path) -> bool:
     """Return whether a run has left results or checkpoints in ``folder``."""
     return any((folder / name).exists() for name in (SUMMARY, CHECKPOINTS))
-
-
-def read_summary(run: Path) -> dict[str, Any]:
-    """Return the facts of the run in ``run``; {} if it has no summary or one that cannot be read."""
-    try:
-        summary = read_json(run / SUMMARY)
-    except UserError:
-        return {}
-    return summary if isinstance(summary, dict) else {}
 
 
 def occupant(folder: Path) -> str | None:

@@ -428,9 +428,9 @@ class LatentPrior(DiffusionPrior):
             return None
         try:
             kept = load_file(file)
-        except (OSError, SafetensorError):
+            return Texts(kept["tokens"], kept.get("pooled"))
+        except (OSError, KeyError, SafetensorError):
             return None  # truncated by a crash
-        return Texts(kept["tokens"], kept.get("pooled"))
 
     def _remember(self, text: str, row: Texts) -> None:
         from safetensors.torch import save_file

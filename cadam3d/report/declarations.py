@@ -4,14 +4,14 @@ The report of a sweep reads them from the folders of its jobs. If the file is mi
 damaged or written by another version, there are no declared charts; that is not an error.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from cadam3d.core.chart import Chart, Curve, Level
-from cadam3d.io.jsonl import write_json
+from cadam3d.core.errors import UserError
+from cadam3d.io.jsonl import is_number, read_json, write_json
 from cadam3d.io.run_folder import CHARTS
 
 
@@ -23,8 +23,8 @@ def write_declarations(folder: Path, charts: Sequence[Chart]) -> None:
 def read_declarations(folder: Path) -> tuple[Chart, ...]:
     """Return the charts that the run in ``folder`` declared; those that cannot be read are left out."""
     try:
-        content = json.loads((folder / CHARTS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        content = read_json(folder / CHARTS)
+    except UserError:
         return ()
     found = []
     for entry in content if isinstance(content, list) else []:
@@ -58,10 +58,16 @@ def _chart(entry: Mapping[str, Any]) -> Chart:
         percent=bool(entry.get("percent")),
         score=score,
         levels=tuple(
-            Level(label=_text(level["label"]), value=float(level["value"]))
+            Level(label=_text(level["label"]), value=_number(level["value"]))
             for level in entry.get("levels", ())
         ),
     )
+
+
+def _number(value: object) -> float:
+    if not is_number(value):
+        raise TypeError(f"expected a number, got {value!r}")
+    return value
 
 
 def _text(value: object) -> str:

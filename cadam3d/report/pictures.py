@@ -2,12 +2,13 @@
 
 import textwrap
 from collections.abc import Callable, Hashable, Sequence
+from pathlib import Path
 
-import imageio.v3 as imageio
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cadam3d.io.image import read_png, step_pictures
 from cadam3d.io.run_folder import CANDIDATES, PREVIEW
 from cadam3d.report.claims import by_cell, standard_setting
 from cadam3d.report.figures import arm_of_two_thresholds
@@ -24,6 +25,7 @@ from cadam3d.report.results import (
     measured,
 )
 from cadam3d.report.style import hide_axes, looks, new_figure
+from cadam3d.settings.compose import flatten
 
 MAX_COLUMNS = 7  # pictures in one line
 TITLE_CHARACTERS_PER_INCH = 15  # that surely fit at the size of a title
@@ -47,7 +49,7 @@ def masks_figure(results: Sequence[JobResult]) -> Figure | None:
         chosen = {each.step: (sum(each.selected), sum(each.counts)) for each in histograms(result)}
         for axes, step in zip(line, steps, strict=True):
             if step in found:
-                axes.imshow(mask_of(imageio.imread(found[step])), interpolation="antialiased")
+                axes.imshow(mask_of(read_png(found[step])), interpolation="antialiased")
             if step in chosen:
                 _caption(axes, "{:,} of {:,}".format(*chosen[step]))
         _line_title(line[0], result.arm, style[result.arm].color)
@@ -157,10 +159,9 @@ def standard_results(results: Sequence[JobResult], cell: Cell) -> list[JobResult
     return found
 
 
-def candidate_pictures(result: JobResult) -> dict[int, str]:
+def candidate_pictures(result: JobResult) -> dict[int, Path]:
     """Return the pictures of the candidates callback: step and path."""
-    found = sorted((result.folder / CANDIDATES).glob("step_*.png"))
-    return {int(path.stem.removeprefix("step_")): str(path) for path in found}
+    return dict(step_pictures(result.folder / CANDIDATES))
 
 
 def has_views(result: JobResult) -> bool:
@@ -170,9 +171,11 @@ def has_views(result: JobResult) -> bool:
 
 def views(result: JobResult) -> list[np.ndarray]:
     """Return the single pictures in the first line of ``preview.png``, which must exist."""
-    sheet = imageio.imread(result.folder / PREVIEW)[..., :3]
-    preview = (config(result).get("exporter") or {}).get("preview") or {}
-    size = int(preview.get("size") or sheet.shape[0])
+    sheet = read_png(result.folder / PREVIEW)
+    settings = dict(flatten(config(result)))
+    size = settings.get("exporter.preview.size")
+    if type(size) is not int or not 0 < size <= min(sheet.shape[:2]):
+        size = min(sheet.shape[:2])
     return [sheet[:size, left : left + size] for left in range(0, sheet.shape[1] - size + 1, size)]
 
 

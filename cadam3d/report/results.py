@@ -11,13 +11,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cadam3d.core.outcome import Outcome
-from cadam3d.io.jsonl import read_jsonl
-from cadam3d.io.run_folder import CONFIG, HISTOGRAMS, METRICS
+from cadam3d.io.records import read_config, read_histograms, read_metrics
+from cadam3d.io.run_folder import CONFIG
 from cadam3d.report.formatting import number
 from cadam3d.settings.compose import compose, config_dir, flatten
 from cadam3d.sweep.folder import UNFINISHED, load
@@ -204,7 +203,7 @@ def _pair(line: str) -> tuple[str, Any]:
 def counts(result: JobResult) -> list[tuple[float, float]]:
     """Return steps and Gaussians of a job over time; a refinement is two points at its step."""
     points: list[tuple[float, int, float]] = []
-    for line in read_jsonl(result.folder / METRICS):
+    for line in read_metrics(result.folder):
         step = number(line.get("step"))
         for key, order in (("num_gaussians", 0), ("before", 0), ("after", 1)):
             value = number(line.get(key))
@@ -229,7 +228,7 @@ def histograms(result: JobResult, score: str | None = None) -> list[Histogram]:
 
     ``None`` stands for the first score in the file, because all scores count the same population.
     """
-    lines = read_jsonl(result.folder / HISTOGRAMS)
+    lines = read_histograms(result.folder)
     score = lines[0].get("score") if lines and score is None else score
     return [
         Histogram(*(line[key] for key in ("step", "bins_per_decade", "first", "counts", "selected")))
@@ -241,7 +240,7 @@ def histograms(result: JobResult, score: str | None = None) -> list[Histogram]:
 def config(result: JobResult) -> dict[str, Any]:
     """Return all settings that a job ran with; {} if it failed before they were known."""
     path = result.folder / CONFIG
-    return (yaml.safe_load(path.read_text(encoding="utf-8")) or {}) if path.is_file() else {}
+    return read_config(path) if path.is_file() else {}
 
 
 def arms_of(results: Iterable[JobResult]) -> list[str]:

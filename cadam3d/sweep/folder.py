@@ -10,11 +10,13 @@ from typing import Any
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.outcome import Outcome
-from cadam3d.io.jsonl import read_json, write_json
-from cadam3d.io.run_folder import JOBS, has_checkpoint, read_summary
+from cadam3d.io.jsonl import is_whole, read_json, write_json
+from cadam3d.io.records import read_summary
+from cadam3d.io.run_folder import JOBS, has_checkpoint
 
 # The outcome of a job that waits, runs, or has ended without a summary.
 UNFINISHED = "unfinished"
+MOST_THREADS = 1 << 16
 RESULTS = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.VANISHED, Outcome.OUT_OF_MEMORY)
 
 
@@ -101,11 +103,48 @@ def read_plan(sweep: Path) -> Plan:
     """Return the plan of a sweep. Raises ``UserError`` if the folder has none that can be read."""
     content = read_json(sweep / JOBS)
     try:
+        _require_plan(content)
         return Plan(**{**content, "jobs": [PlannedJob(**job) for job in content["jobs"]]})
-    except (TypeError, KeyError) as error:
+    except (TypeError, KeyError, ValueError) as error:
+        reason = " ".join(str(error).split())[:200]
         raise UserError(
-            f"{sweep / JOBS}: not the plan of a sweep ({error}). Try: run the command of the sweep again"
+            f"{sweep / JOBS}: not the plan of a sweep ({reason}). Try: run the command of the sweep again"
         ) from error
+
+
+def _require_plan(content: Any) -> None:
+    """Raise an exception unless every entry of a plan has the type that its class declares."""
+    _require(isinstance(content, dict) and isinstance(content["jobs"], list), "jobs: expected a list")
+    _require(_is_text(content["cwd"]), "cwd: expected a folder")
+    threads, figures = content.get("threads"), content.get("figures")
+    is_count = is_whole(threads) and 1 <= threads <= MOST_THREADS
+    _require(threads is None or is_count, "threads: expected a whole number")
+    _require(figures is None or _are_texts(figures), "figures: expected names")
+    for name in ("flags", "line"):
+        _require(_are_texts(content.get(name, [])), f"{name}: expected words")
+    for job in content["jobs"]:
+        _require(isinstance(job, dict) and _is_text(job["arm"]), "arm: expected a name")
+        _require(_are_texts(job["overrides"]), "overrides: expected a list of key=value")
+        _require(isinstance(job["swept"], dict), "swept: expected keys and values")
+        # A name that leads elsewhere would let the sweep write there.
+        folder = job["folder"]
+        is_inside = _is_text(folder) and folder not in ("", ".", "..") and not set("/\\") & set(folder)
+        _require(is_inside, "folder: expected the name of a folder in that of the sweep")
+    folders = [job["folder"] for job in content["jobs"]]
+    _require(len(set(folders)) == len(folders), "folder: expected a different name for each job")
+
+
+def _require(claim: bool, problem: str) -> None:
+    if not claim:
+        raise ValueError(problem)
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and "\0" not in value
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, list) and all(map(_is_text, value))
 
 
 def write_plan(sweep: Path, plan: Plan) -> None:

@@ -21,7 +21,8 @@ from cadam3d.core.outcome import Outcome
 from cadam3d.io.cache import TRACES
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.lock import INHERITED, describe_holder, take, unlock
-from cadam3d.io.run_folder import CONSOLE, ENDED, LOCK, SHARED, STOP, SUMMARY, read_summary
+from cadam3d.io.records import read_summary
+from cadam3d.io.run_folder import CONSOLE, ENDED, LOCK, SHARED, STOP, SUMMARY
 from cadam3d.settings.compose import quote
 from cadam3d.settings.line import RUN_FOLDER
 from cadam3d.sweep.folder import Plan, Row, is_complete, read_plan, rows_of

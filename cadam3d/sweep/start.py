@@ -13,14 +13,13 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
-import yaml
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.lock import locked
+from cadam3d.io.records import read_config
 from cadam3d.io.run_folder import (
     CONFIG,
     CONSOLE,
@@ -171,7 +170,7 @@ def _refuse_other_settings(folder: Path, rows: Sequence[Row], composed: Sequence
         config = row.folder / CONFIG
         if not config.is_file() or not (row.has_result or row.has_checkpoint):
             continue
-        before = dict(flatten(_read_yaml(config)))
+        before = dict(flatten(read_config(config)))
         for key in sorted((before.keys() | now.values.keys()) - now.unknown - {"resume"}):
             if before.get(key) != now.values.get(key):
                 raise UserError(
@@ -179,12 +178,6 @@ def _refuse_other_settings(folder: Path, rows: Sequence[Row], composed: Sequence
                     f"Try: {SWEEP_FOLDER}={shown(numbered(folder))}, which is another folder, "
                     "or the earlier settings"
                 )
-
-
-def _read_yaml(path: Path) -> Any:
-    # The loader in C is ten times as fast, but not every build of PyYAML has it.
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    return yaml.load(path.read_text(encoding="utf-8"), loader)
 
 
 def _threads(cfg: DictConfig, pending: int) -> int | None:

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from cadam3d.core.outcome import Outcome
-from cadam3d.io.run_folder import ENDED, read_summary
+from cadam3d.io.records import read_summary
+from cadam3d.io.run_folder import ENDED
 from cadam3d.sweep.folder import Row
 from cadam3d.sweep.table import varying_keys
 

@@ -1,5 +1,7 @@
 """Laws of the functions that initializers share: neighbour distances, and Gaussians at coloured points."""
 
+import os
+
 import pytest
 import torch
 
@@ -154,3 +156,22 @@ def test_a_missing_file_and_a_folder_are_refused_with_the_line_to_type(tmp_path)
         pattern = rf"^initializer\.path: expected a file, got '.*', which {what}\. Try: initializer\.path=a"
         with pytest.raises(UserError, match=pattern):
             found_file(str(path), "a.ply")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [
+        ("pipe", "is a named pipe"),
+        ("/dev/zero", "is a device"),
+        (".", "is a folder"),
+        ("absent", "does not exist"),
+        ("x" * 5000, "does not exist"),
+        ("null\0byte", "does not exist"),
+    ],
+)
+def test_a_path_that_is_no_file_is_one_message(tmp_path, monkeypatch, name, what):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    with pytest.raises(UserError, match=f"initializer.path: expected a file, .* {what}"):
+        found_file(name, "a.ply")

@@ -13,6 +13,12 @@ from cadam3d.core.errors import UserError
 from cadam3d.io import checkpoint
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint, prune_checkpoints, save_checkpoint
 
+
+def latest(folder: Path) -> Path | None:
+    found = latest_checkpoint(folder, load_checkpoint, lambda error: None)
+    return None if found is None else found[0]
+
+
 PAYLOAD = {
     "step": 7,
     "seconds": 1.5,
@@ -131,26 +137,26 @@ def test_a_save_that_fails_leaves_the_old_checkpoint(tmp_path, monkeypatch):
 def test_the_latest_is_the_one_with_the_most_steps(tmp_path):
     for step in (100, 1000, 200):
         save_checkpoint(tmp_path / f"step_{step:07d}.pt", {"step": step})
-    assert latest_checkpoint(tmp_path) == tmp_path / "step_0001000.pt"
+    assert latest(tmp_path) == tmp_path / "step_0001000.pt"
 
 
 def test_a_damaged_latest_falls_back_to_the_one_before(tmp_path):
     for step in (100, 200, 300):
         save_checkpoint(tmp_path / f"step_{step:07d}.pt", {"step": step})
     (tmp_path / "step_0000300.pt").write_bytes(b"")
-    assert latest_checkpoint(tmp_path) == tmp_path / "step_0000200.pt"
+    assert latest(tmp_path) == tmp_path / "step_0000200.pt"
 
 
 def test_without_any_checkpoint_there_is_no_latest(tmp_path):
-    assert latest_checkpoint(tmp_path) is None
-    assert latest_checkpoint(tmp_path / "missing") is None
+    assert latest(tmp_path) is None
+    assert latest(tmp_path / "missing") is None
 
 
 def test_only_damaged_checkpoints_are_an_error_not_a_fresh_start(tmp_path):
     (tmp_path / "step_0000100.pt").write_bytes(b"older")
     (tmp_path / "step_0000200.pt").write_bytes(b"newer")
     with pytest.raises(UserError, match="step_0000200"):
-        latest_checkpoint(tmp_path)
+        latest(tmp_path)
 
 
 def test_pruning_keeps_the_newest_and_removes_leftovers_of_a_kill(tmp_path):

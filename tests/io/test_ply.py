@@ -1,6 +1,7 @@
 """PLY files: the same bits after a round trip, the usual layout, and clear errors for all other files."""
 
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io import ply
 from cadam3d.io.frames import UPS
-from cadam3d.io.ply import read_ply, write_ply
+from cadam3d.io.ply import holds_gaussians, read_ply, write_ply
 
 
 def random_gaussians(n: int = 50, degree: int = 3, seed: int = 0) -> Gaussians:
@@ -65,8 +66,8 @@ def test_the_round_trip_in_any_axes_returns_the_same_bits_up_to_degree_one(tmp_p
 
 
 def test_extreme_numbers_are_preserved(tmp_path):
-    gaussians = random_gaussians(n=6, degree=0)
-    gaussians.means[:, 0] = torch.tensor([0.0, -0.0, 1e-45, 3e38, float("inf"), float("-inf")])
+    gaussians = random_gaussians(n=4, degree=0)
+    gaussians.means[:, 0] = torch.tensor([0.0, -0.0, 1e-45, 3e38])
     write_ply(tmp_path / "a.ply", gaussians, up="-y", pad_sh=0)
     assert_same_bits(read_ply(tmp_path / "a.ply"), gaussians)
 
@@ -320,3 +321,78 @@ def test_gradients_and_double_precision_are_written_as_float32(tmp_path):
     tracked = gaussians.to(torch.float64).map(lambda tensor: tensor.requires_grad_())
     write_ply(tmp_path / "a.ply", tracked, up="-y", pad_sh=0)
     assert_same_bits(read_ply(tmp_path / "a.ply"), gaussians)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+@pytest.mark.parametrize("name", ["means", "log_scales", "quats", "opacity_logits", "sh"])
+@pytest.mark.parametrize("up", ["-y", "+z"])
+def test_numbers_that_are_not_finite_are_refused_with_their_count(tmp_path, name, value, up):
+    gaussians = random_gaussians(n=5, degree=1)
+    gaussians.tensors()[name].view(5, -1)[1:3, -1] = value
+    write_ply(tmp_path / "a.ply", gaussians, up=up, pad_sh=0)
+    with pytest.raises(UserError, match="got NaN or infinity in 2 of 5 Gaussians"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_a_double_that_is_no_float_is_refused_without_a_warning(tmp_path, recwarn):
+    content = hand_made(NAMES, [[float(i) for i in range(14)]]).replace(b"float x\n", b"double x\n")
+    header, body = content.split(b"end_header\n")
+    body = np.float64(1e300).tobytes() + body[4:]
+    (tmp_path / "a.ply").write_bytes(header + b"end_header\n" + body)
+    with pytest.raises(UserError, match="NaN or infinity in 1 of 1"):
+        read_ply(tmp_path / "a.ply")
+    assert not recwarn.list
+
+
+def header_of(*lines: str, body: bytes = b"") -> bytes:
+    return "\n".join(["ply", *lines, "end_header", ""]).encode() + body
+
+
+VERTEX = [f"property float {name}" for name in NAMES]
+FORMAT_LINE = "format binary_little_endian 1.0"
+HOSTILE = {
+    "a count of 5000 digits": header_of(FORMAT_LINE, "element vertex " + "9" * 5000, *VERTEX),
+    "a count of 15 digits": header_of(FORMAT_LINE, "element vertex " + "9" * 15, *VERTEX),
+    "a negative count": header_of(FORMAT_LINE, "element vertex -1", *VERTEX),
+    "a huge element before zero rows": header_of(
+        FORMAT_LINE, "element a " + "9" * 15, "property double t", "element vertex 0", *VERTEX
+    ),
+    "a huge number before one row": header_of(
+        FORMAT_LINE, "element a " + "9" * 5000, "property double t", "element vertex 1", *VERTEX
+    ),
+    "no format": header_of("element vertex 0", *VERTEX),
+    "the format twice": header_of(FORMAT_LINE, FORMAT_LINE, "element vertex 0", *VERTEX),
+    "the format after the elements": header_of("element vertex 0", *VERTEX, FORMAT_LINE),
+    "a property before any element": header_of(FORMAT_LINE, "property float x", "element vertex 0", *VERTEX),
+    "an element twice": header_of(FORMAT_LINE, "element vertex 0", *VERTEX, "element vertex 9"),
+    "a list before the vertices": header_of(
+        FORMAT_LINE, "element face 1", "property list uchar int i", "element vertex 0", *VERTEX
+    ),
+    "two up axes": header_of(
+        FORMAT_LINE, "comment cadam3d up=+y", "comment cadam3d up=-y", "element vertex 0", *VERTEX
+    ),
+    "a line of 64 kB": header_of(FORMAT_LINE, "comment " + "x" * (1 << 16), "element vertex 0", *VERTEX),
+    "bytes after the last row": header_of(FORMAT_LINE, "element vertex 0", *VERTEX, body=b"more"),
+    "a word that is not ASCII": header_of(FORMAT_LINE, "element vertex \u0661", *VERTEX),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_header_is_one_message(tmp_path, name):
+    (tmp_path / "a.ply").write_bytes(HOSTILE[name])
+    with pytest.raises(UserError, match=r"a\.ply") as caught:
+        read_ply(tmp_path / "a.ply")
+    assert len(str(caught.value)) < 300
+
+
+def test_lines_may_end_as_on_windows(tmp_path):
+    content = header_of(FORMAT_LINE, "element vertex 0", *VERTEX).replace(b"\n", b"\r\n")
+    (tmp_path / "a.ply").write_bytes(content)
+    assert len(read_ply(tmp_path / "a.ply")) == 0
+
+
+@pytest.mark.parametrize("path", ["/dev/zero", "x" * 5000, "null\0byte", "."])
+def test_what_is_no_file_is_one_message(path):
+    for read in (read_ply, holds_gaussians):
+        with pytest.raises(UserError):
+            read(Path(path))

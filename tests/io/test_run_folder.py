@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 
 from cadam3d.core.errors import UserError
+from cadam3d.io.records import read_summary
 from cadam3d.io.run_folder import (
     checkpoint_name,
     claim,
     has_checkpoint,
     holds_run,
     numbered,
-    read_summary,
     shown,
 )
 

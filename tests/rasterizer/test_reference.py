@@ -14,6 +14,7 @@ from cadam3d.core.gaussians import FIELDS, Gaussians, concatenate
 from cadam3d.core.render import RenderOutput
 from cadam3d.core.sh import rgb_to_sh0, sh_basis
 from cadam3d.rasterizer import reference
+from cadam3d.rasterizer.cpu import CpuRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
 NAN, INF = math.nan, math.inf
@@ -569,3 +570,30 @@ def test_second_derivatives_are_refused():
     )
     with pytest.raises(RuntimeError, match="once_differentiable"):
         grad.sum().backward()
+
+
+EXTREMES = {
+    "means": (1e3, 1e10, 1e30, -3e38, 0.0),
+    "log_scales": (5.0, 40.0, 90.0, 1e30, -90.0, -1e30),
+    "quats": (0.0, 1e-40, 3e38),
+    "opacity_logits": (90.0, 1e30, -1e30),
+    "sh": (1e10, 3e38, -3e38),
+}
+
+
+@pytest.mark.parametrize("make", [ReferenceRasterizer, lambda: CpuRasterizer(cache_dir=None)])
+@pytest.mark.parametrize(("name", "value"), [(name, v) for name, values in EXTREMES.items() for v in values])
+def test_any_finite_gaussians_give_finite_images(make, name, value):
+    draw = torch.Generator().manual_seed(0)
+    gaussians = Gaussians(
+        means=torch.randn(20, 3, generator=draw) * 0.3,
+        log_scales=torch.full((20, 3), -1.5),
+        quats=torch.randn(20, 4, generator=draw),
+        opacity_logits=torch.randn(20, generator=draw),
+        sh=torch.randn(20, 4, 3, generator=draw),
+    )
+    gaussians.tensors()[name][::2] = value
+    cameras = turntable(2, elevation_deg=15.0, distance=3.0, fov_y_deg=40.0, size=16)
+    image = make().render(gaussians, cameras, torch.zeros(2, 3))
+    assert image.rgb.isfinite().all()
+    assert image.alpha.isfinite().all()

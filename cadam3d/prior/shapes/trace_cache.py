@@ -77,17 +77,18 @@ def _packed(layers: Layers) -> np.ndarray:
 
 def _read(path: Path, scene: Scene, cameras: Cameras) -> Layers | None:
     """Read a trace that :func:`_store` wrote; None if the file is missing or damaged."""
+    shape = (len(cameras), cameras.height, cameras.width)
+    # A damaged file fails when it is read, when it is split, or when its numbers are put in their places.
     try:
         words = torch.from_numpy(np.load(path, allow_pickle=False))
-    except (OSError, ValueError, EOFError):
+        sizes = words[:2].tolist()
+        alpha_at, paints_at, alpha, paints = words[2:].split([*sizes, *sizes])
+        alpha = _unpacked(shape, alpha_at, alpha)
+        paints = _unpacked((*shape, scene.albedo.shape[1]), paints_at, paints)
+        device = cameras.intrinsics.device
+        return Layers(alpha=alpha.to(device), paints=paints.to(device))
+    except (OSError, ValueError, EOFError, RuntimeError, LookupError, TypeError, MemoryError):
         return None
-    sizes = words[:2].tolist()
-    alpha_at, paints_at, alpha, paints = words[2:].split([*sizes, *sizes])
-    shape = (len(cameras), cameras.height, cameras.width)
-    return Layers(
-        alpha=_unpacked(shape, alpha_at, alpha).to(cameras.intrinsics.device),
-        paints=_unpacked((*shape, scene.albedo.shape[1]), paints_at, paints).to(cameras.intrinsics.device),
-    )
 
 
 def _unpacked(shape: tuple[int, ...], places: Tensor, values: Tensor) -> Tensor:

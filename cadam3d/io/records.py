@@ -1,0 +1,122 @@
+"""Records: what a run writes about itself, as text, validated in one place when it is read.
+
+Numbers and text in these files may come from a stranger, and reports calculate with them. Each reader returns
+only entries of the kinds that training writes.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from cadam3d.core.errors import UserError
+from cadam3d.core.outcome import Outcome
+from cadam3d.io.jsonl import is_number, is_whole, read_json, read_jsonl
+from cadam3d.io.reading import read_yaml
+from cadam3d.io.run_folder import HISTOGRAMS, METRICS, SUMMARY
+
+# Limits of a histogram in histograms.jsonl.
+MOST_BINS = 1000  # per decade
+DECADES = 300  # powers of ten below and above 1
+
+
+def read_summary(run: Path) -> dict[str, Any]:
+    """Return the facts of the run in ``run``; {} if it has no summary, or one that cannot be believed."""
+    try:
+        summary = read_json(run / SUMMARY)
+    except UserError:
+        return {}
+    is_summary = isinstance(summary, dict) and all(
+        is_entry(summary[name]) for name, is_entry in SUMMARY_ENTRIES.items() if name in summary
+    )
+    return summary if is_summary else {}
+
+
+def read_metrics(run: Path) -> list[dict[str, Any]]:
+    """Return the lines of ``metrics.jsonl``; lines with entries of another kind are left out.
+
+    Every line has its ``kind`` and its ``step``. All other entries are numbers or None, except for
+    ``statistics``, which is a dict of such entries. Raises ``UserError`` if the file cannot be read.
+    """
+    return [line for line in read_jsonl(run / METRICS) if _is_metrics(line)]
+
+
+def read_histograms(run: Path) -> list[dict[str, Any]]:
+    """Return the lines of ``histograms.jsonl``; lines with entries of another kind are left out.
+
+    The bins of each line are between 10^-300 and 10^300. Raises ``UserError`` if the file cannot be read.
+    """
+    return [line for line in read_jsonl(run / HISTOGRAMS) if _is_histogram(line)]
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """Return the settings that a run has saved. Raises ``UserError`` unless the file is a mapping of keys."""
+    settings = read_yaml(path)
+    if not isinstance(settings, dict) or not _has_text_keys(settings):
+        raise UserError(f"{path}: expected the settings of a run, got something else. Try: another run")
+    return settings
+
+
+def _has_text_keys(value: Any) -> bool:
+    """Return whether every key in nested dicts and lists is text."""
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and _has_text_keys(item) for key, item in value.items())
+    return not isinstance(value, list) or all(map(_has_text_keys, value))
+
+
+def _is_metrics(line: dict[str, Any]) -> bool:
+    rest = {key: value for key, value in line.items() if key not in ("kind", "step", "statistics")}
+    statistics = line.get("statistics", {})
+    return (
+        isinstance(line.get("kind"), str)
+        and is_whole(line.get("step"))
+        and isinstance(statistics, dict)
+        and all(map(_is_number_or_none, [*rest.values(), *statistics.values()]))
+    )
+
+
+def _is_histogram(line: dict[str, Any]) -> bool:
+    per_decade, first = line.get("bins_per_decade"), line.get("first")
+    counts: Any = line.get("counts")
+    selected: Any = line.get("selected")
+    if not is_whole(line.get("step")) or not _is_text(line.get("score")):
+        return False
+    if not is_whole(per_decade) or not 0 < per_decade <= MOST_BINS or type(first) is not int:
+        return False
+    if not _are(is_whole, counts) or not _are(is_whole, selected) or len(counts) != len(selected):
+        return False
+    return -DECADES * per_decade <= first <= first + len(counts) <= DECADES * per_decade
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _is_text_or_none(value: object) -> bool:
+    return value is None or isinstance(value, str)
+
+
+def _is_number_or_none(value: object) -> bool:
+    return value is None or is_number(value)
+
+
+def _are(is_item: Callable[[Any], bool], value: Any) -> bool:
+    """Return whether ``value`` is a list of items of one kind."""
+    return isinstance(value, list) and all(map(is_item, value))
+
+
+# The kinds of the entries of summary.json that other parts calculate with. A summary may have more entries,
+# such as those of a metric from elsewhere.
+SUMMARY_ENTRIES: dict[str, Callable[[Any], bool]] = {
+    "outcome": lambda value: _is_text(value) and value in set(Outcome),
+    "warnings": lambda value: _are(_is_text, value),
+    "seconds": lambda value: is_number(value) and value >= 0,
+    "seed": lambda value: type(value) is int and value >= 0,
+    **dict.fromkeys(("prompt", "message", "device", "backend"), _is_text),
+    **dict.fromkeys(("negative_prompt", "densifier", "guidance", "prior", "initializer"), _is_text_or_none),
+    **dict.fromkeys(("rasterizer", "camera", "refine", "optimizer", "initializer_note"), _is_text_or_none),
+    **dict.fromkeys(("steps", "steps_asked", "num_gaussians", "num_gaussians_initial"), is_whole),
+    **dict.fromkeys(("skipped_steps", "dimmed_steps", "asset_bytes"), is_whole),
+    **dict.fromkeys(("psnr", "psnr_min", "ssim", "asset_mib", "bytes_per_gaussian"), _is_number_or_none),
+    **dict.fromkeys(("median_scale", "median_opacity"), _is_number_or_none),
+    **dict.fromkeys(("memory_estimate_gib", "memory_peak_gib"), _is_number_or_none),
+}

@@ -1,0 +1,175 @@
+"""Each file of a finished run is damaged in each of several ways, and each command still ends by itself.
+
+A command either succeeds or prints one message. It never waits for a pipe and never shows a traceback.
+"""
+
+import json
+import os
+import shutil
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from cadam3d import cli
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+
+SECONDS = 60  # that a command may take on a busy machine
+TINY = ["prompt=a red cube", "prior=tiny", "rasterizer=reference", "camera.size=8", "steps=4", "views=1"]
+TINY += ["initializer.count=7", "metric=[size]", "callback=[checkpoint,metrics,candidates]"]
+TINY += ["callback.checkpoint.every=2", "callback.candidates.every=1", "callback.candidates.size=8"]
+TINY += ["refine.start=0", "refine.end=4", "refine.interval=2", "exporter=[ply]", "hydra.run.dir=run"]
+DAMAGES: dict[str, Callable[[Path], None]] = {
+    "missing": lambda path: None,
+    "empty": lambda path: path.write_bytes(b""),
+    "noise": lambda path: path.write_bytes(bytes(range(256)) * 8),
+    "cut": lambda path: path.write_bytes(SOUND[path.name][: len(SOUND[path.name]) // 2]),
+    "nested": lambda path: path.write_text("[" * 100_000),
+    "another kind": lambda path: path.write_text("[1, null]"),
+    "wrong values": lambda path: path.write_text(wrong_values(path.name)),
+    "a pipe": lambda path: os.mkfifo(path, 0o600),
+    "a folder": lambda path: path.mkdir(),
+    "a device": lambda path: path.symlink_to("/dev/zero"),
+    "a circle": lambda path: path.symlink_to(path.name),
+}
+SOUND: dict[str, bytes] = {}  # the content of each file of the run, by name
+
+
+def wrong_values(name: str) -> str:
+    """Return JSON in the form of the file with every value replaced by text, as a list, and as a number."""
+    if not name.endswith((".json", ".jsonl")):
+        return "prompt: [1]\nprior: 7\nrasterizer: {_target_: [x]}\nsteps: {a: b}\n"
+    lines = SOUND[name].decode().splitlines() if name.endswith("l") else [SOUND[name].decode()]
+    found = []
+    for line in lines:
+        value = json.loads(line)
+        keys = value if isinstance(value, dict) else {}
+        found += [json.dumps(value | {key: wrong}) for key in keys for wrong in ("x", [-1], -1e300, True)]
+    return "\n".join(found)
+
+
+def ended(*words: str) -> int:
+    """Run a command line in this process and return its exit code; an exception is not caught."""
+    sys.argv = ["cadam3d", *words]
+    try:
+        cli.main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    raise AssertionError("the program always exits")
+
+
+@contextmanager
+def guard() -> Iterator[None]:
+    """Raise ``TimeoutError`` in the block if it takes too long."""
+
+    def raise_timeout(*_: object) -> None:
+        raise TimeoutError("the command waits")
+
+    assert threading.current_thread() is threading.main_thread()
+    previous = signal.signal(signal.SIGALRM, raise_timeout)
+    signal.alarm(SECONDS)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, previous)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    """Return the folder of a finished run, which tests copy."""
+    place = tmp_path_factory.mktemp("finished")
+    before, argv = Path.cwd(), sys.argv
+    os.chdir(place)
+    try:
+        assert ended("train", *TINY) == 0
+    finally:
+        os.chdir(before)
+        sys.argv = argv
+    for path in (place / "run").rglob("*"):
+        if path.is_file():
+            SOUND[path.name] = path.read_bytes()
+    return place / "run"
+
+
+# The commands that read or replace each file. Render stands for export, which opens an asset in the same way.
+READERS = {
+    "asset.ply": ("eval", "render"),
+    "charts.json": ("resume",),
+    "config.yaml": ("eval", "resume"),
+    "metrics.jsonl": ("resume",),
+    "summary.json": ("eval", "resume"),
+    "report.html": ("view", "resume"),
+    ".hydra/overrides.yaml": ("resume",),
+    "checkpoints/step_0000004.pt": ("resume",),
+    "candidates/histograms.jsonl": ("resume",),
+}
+COMMANDS = {
+    "eval": ["eval", "run=run", "metric=[size]"],
+    "view": ["view", "run=run", "browser=false"],
+    "render": ["render", "run=run", "exporter=[images]", "exporter.images.size=8", "exporter.images.views=1"],
+    "resume": ["train", "resume=run"],
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_file_is_one_message_or_does_not_matter(
+    name, damage, finished, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    monkeypatch.setattr(sys, "argv", ["cadam3d"])
+    for command in READERS[name]:
+        shutil.rmtree("run", ignore_errors=True)
+        shutil.copytree(finished, "run")
+        path = Path("run", name)
+        assert path.is_file(), name
+        path.unlink()
+        DAMAGES[damage](path)
+        with guard():
+            code = ended(*COMMANDS[command])
+        captured = capsys.readouterr()
+        assert code in (0, 1), captured.err
+        assert "Traceback" not in captured.err
+        messages = [line for line in captured.err.splitlines() if line.startswith("cadam3d: ")]
+        assert len(messages) == code, captured.err
+
+
+def test_a_damaged_newest_checkpoint_is_left_out_with_a_note(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["cadam3d"])
+    shutil.copytree(finished, "run")
+    newest = Path("run/checkpoints/step_0000004.pt")
+    newest.unlink()
+    shutil.copy("run/checkpoints/step_0000002.pt", newest)
+    assert ended("train", "resume=run") == 0
+    notes = [line for line in capsys.readouterr().err.splitlines() if "left out" in line]
+    assert len(notes) == 1
+    assert "step_0000004.pt" in notes[0]
+    assert "step: expected that of its name, got 2" in notes[0]
+    lines = [json.loads(line) for line in Path("run/metrics.jsonl").read_text().splitlines()]
+    assert lines[-1]["step"] == 4
+
+
+def test_only_damaged_checkpoints_end_the_run_with_one_message(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["cadam3d"])
+    shutil.copytree(finished, "run")
+    for path in Path("run/checkpoints").iterdir():
+        path.write_bytes(b"damaged")
+    assert ended("train", "resume=run") == 1
+    assert "No other checkpoint there is sound" in capsys.readouterr().err
+
+
+def test_a_run_cannot_resume_beyond_its_last_step(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["cadam3d"])
+    shutil.copytree(finished, "run")
+    assert ended("train", "resume=run", "steps=3") == 1
+    assert "steps: expected at least 4" in capsys.readouterr().err
