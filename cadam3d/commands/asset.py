@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor
@@ -18,7 +19,8 @@ from cadam3d.exporter.base import Exporter
 from cadam3d.io.ply import read_ply
 from cadam3d.io.run_folder import ASSET, CONFIG, shown
 from cadam3d.rasterizer.base import Rasterizer, render_fn
-from cadam3d.settings.compose import component, components, load_config
+from cadam3d.settings.compose import component, components
+from cadam3d.settings.trust import read_components, refuse_links, search_folders
 from cadam3d.sweep.folder import is_sweep
 
 
@@ -68,9 +70,19 @@ def find_run(text: str) -> Path:
     raise UserError(f"run: expected the folder of a run, got {text!r} ({reason}). Try: {example}")
 
 
-def run_config(folder: Path) -> DictConfig:
-    """Return the settings of the run in ``folder``."""
-    return load_config(folder / CONFIG)
+def run_components(folder: Path, *, is_trusted: bool, retry: str) -> DictConfig:
+    """Return the prompt, the prior and the rasterizer of the run in ``folder``.
+
+    Raises ``UserError`` if they are not of this package or of ``--config-dir``, unless the run is trusted.
+    ``retry`` is the line that trusts it.
+    """
+    return read_components(
+        folder / CONFIG,
+        ("prior", "rasterizer"),
+        search_folders(HydraConfig.get().runtime.config_sources),
+        is_trusted=is_trusted,
+        retry=retry,
+    )
 
 
 def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
@@ -101,4 +113,9 @@ def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
 
 def output_folder(cfg: DictConfig, asset: Asset, name: str) -> Path:
     """Return the folder that ``output=`` names, by default ``name`` beside the asset."""
-    return Path(cfg.output).expanduser() if cfg.output else asset.folder / name
+    if cfg.output:
+        return Path(cfg.output).expanduser()
+    folder = asset.folder / name
+    if folder.is_dir() or folder.is_symlink():
+        refuse_links(folder, "output=DIR with another folder")
+    return folder

@@ -101,8 +101,11 @@ def read_plan(sweep: Path) -> Plan:
     """Return the plan of a sweep. Raises ``UserError`` if the folder has none that can be read."""
     content = read_json(sweep / JOBS)
     try:
-        return Plan(**{**content, "jobs": [PlannedJob(**job) for job in content["jobs"]]})
-    except (TypeError, KeyError) as error:
+        plan = Plan(**{**content, "jobs": [PlannedJob(**job) for job in content["jobs"]]})
+        for job in plan.jobs:
+            _require_inside(job.folder)
+        return plan
+    except (TypeError, KeyError, ValueError) as error:
         raise UserError(
             f"{sweep / JOBS}: not the plan of a sweep ({error}). Try: run the command of the sweep again"
         ) from error
@@ -111,6 +114,12 @@ def read_plan(sweep: Path) -> Plan:
 def write_plan(sweep: Path, plan: Plan) -> None:
     """Write ``jobs.json`` atomically."""
     write_json(sweep / JOBS, asdict(plan))
+
+
+def _require_inside(name: str) -> None:
+    """Raise ``ValueError`` unless ``name`` is that of a folder directly inside the folder of the sweep."""
+    if name in ("", ".", "..") or {"/", "\\", "\0"} & set(name):
+        raise ValueError(f"{name!r} is not the name of a folder")
 
 
 def is_complete(summary: dict[str, Any]) -> bool:
