@@ -14,22 +14,30 @@ def default_cache_dir() -> Path:
     return (Path(root) if root else Path("~/.cache").expanduser()) / "cadam3d"
 
 
+def kernels_dir(chosen: str | None) -> Path:
+    """Return the folder for compiled kernels: the chosen one, else ``kernels`` in the user's cache folder.
+
+    They have a folder of their own, because only the user may write it.
+    """
+    return Path(chosen).expanduser() if chosen else default_cache_dir() / "kernels"
+
+
 def make_private(folder: Path) -> None:
-    """Create a folder of the cache that only this user can open. An existing folder does not change."""
+    """Create a folder that only this user can open. A folder that exists does not change."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     folder.mkdir(mode=0o700, exist_ok=True)
 
 
-def foreign(path: Path) -> str:
+def other_writers(path: Path) -> str:
     """Return why another user may have written a file or folder; "" if only this user and root can.
 
-    Links are followed. Windows has no such owners, so everything there counts as that of the user.
+    Links are followed. On Windows, files have no such owners, and this returns "". Raises ``OSError``.
     """
     if not hasattr(os, "geteuid"):
         return ""
     facts = path.stat()
     if facts.st_uid not in (os.geteuid(), 0):
-        return f"it belongs to another user, number {facts.st_uid}"
+        return f"it belongs to the user with the number {facts.st_uid}"
     if facts.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        return f"other users can write it, mode {stat.S_IMODE(facts.st_mode):o}"
+        return f"its mode is {stat.S_IMODE(facts.st_mode):o}"
     return ""

@@ -13,19 +13,20 @@ import os
 import platform
 import shlex
 import shutil
+import stat
 import subprocess
 import sys
 import sysconfig
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.cache import default_cache_dir, foreign, make_private
+from cadam3d.io.cache import make_private, other_writers
 from cadam3d.rasterizer import base
 
 KERNELS = Path(__file__).parent / "kernels"
@@ -102,7 +103,7 @@ def build(cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAG
     ``machine_flags`` are alternatives, tried in turn. Raises :class:`UserError` if there is neither a cached
     library nor a compiler, if the compiler fails, if the folder cannot be written, or if others can write it.
     """
-    require_own(cache_dir, "cpu")
+    cache_dir = own_folder(cache_dir, "cpu")
     compiler = find_compiler()
     cached = find_cached(cache_dir, compiler) if tuple(machine_flags) == MACHINE_FLAGS else None
     if cached:
@@ -122,28 +123,40 @@ def build(cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAG
     return Build(final, time.perf_counter() - start)
 
 
-def require_own(cache_dir: Path, name: str) -> None:
-    """Raise :class:`UserError` if another user may have put files for rasterizer=``name`` into a folder."""
+def own_folder(cache_dir: Path, name: str) -> Path:
+    """Return ``cache_dir`` without links. It may not exist yet.
+
+    Raises :class:`UserError` if another user may have put files for rasterizer=``name`` there.
+    """
+    folder = cache_dir.resolve()
     try:
-        reason = foreign(cache_dir)
+        reason = other_writers(folder)
     except FileNotFoundError:
-        return
+        reason = ""
     except OSError as error:
-        reason = f"it cannot be read: {error.strerror}"
+        reason = error.strerror or str(error)
     if reason:
-        place = cache_dir.resolve()
-        is_default = place == default_cache_dir().resolve()
-        other = f"rasterizer={name} rasterizer.cache_dir=kernels"
         raise UserError(
             f"rasterizer={name}: expected a folder for compiled kernels that no other user can write, got "
-            f"{place} ({reason}). Try: {f'chmod 700 {shlex.quote(str(place))}' if is_default else other}"
+            f"{folder} ({reason}). Try: {_own_advice(folder, name)}"
         )
+    return folder
+
+
+def _own_advice(folder: Path, name: str) -> str:
+    """Return what to type if others can write a folder: take their permission back, or another folder."""
+    # Folders that are meant for all users, such as /tmp, have the sticky bit.
+    with suppress(OSError):
+        facts = folder.stat()
+        if facts.st_uid == os.geteuid() and not facts.st_mode & stat.S_ISVTX:
+            return f"chmod go-w {shlex.quote(str(folder))}"
+    return f"rasterizer={name} rasterizer.cache_dir=kernels"
 
 
 def find_intact(cache_dir: Path, pattern: str) -> Path | None:
     """Return a file of this user with a name like ``pattern`` that ends in the hash of its bytes, or None."""
     for path in sorted(cache_dir.glob(pattern)):
-        if path.is_file() and not foreign(path) and path.stem.endswith(short_hash(path.read_bytes())):
+        if path.is_file() and not other_writers(path) and path.stem.endswith(short_hash(path.read_bytes())):
             return path
     return None
 

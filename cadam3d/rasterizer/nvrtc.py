@@ -3,9 +3,8 @@
 The result is always a cubin for a real architecture, never PTX, because a driver refuses PTX from a newer
 compiler. The name of a cached file contains the architecture and two hashes: of the sources, constants,
 options and compiler version, and of the file's own bytes. So a new release, another torch or a damaged file
-each lead to a fresh build. The file and its folder must belong to the user, as those of
-``build.py``. No lock is needed: every process renames its finished file into place, and any
-file that matches its name is usable.
+each lead to a fresh build. The file and its folder must belong to the user, as in ``build.py``. No lock is
+needed: every process renames its finished file into place, and any such file that matches its name is usable.
 """
 
 import ctypes
@@ -26,7 +25,7 @@ from cadam3d.rasterizer.build import (
     definitions,
     find_intact,
     keep,
-    require_own,
+    own_folder,
     short_hash,
 )
 
@@ -141,7 +140,7 @@ def build(cache_dir: Path, capability: tuple[int, int]) -> Cubin:
         )
     architecture = choose_architecture(capability, compiler)
     name = f"rasterizer-{_key(compiler)}-sm{architecture}"
-    require_own(cache_dir, "cuda")
+    cache_dir = own_folder(cache_dir, "cuda")
     if cached := find_intact(cache_dir, f"{name}-*.cubin"):
         return Cubin(cached, 0.0)
     start = time.perf_counter()

@@ -16,10 +16,12 @@ With ``trust=true`` in the command line, nothing is judged.
 import inspect
 import os
 import re
+import shlex
 import sys
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,8 @@ from cadam3d.settings.compose import config_dir, escaped
 TARGET = "_target_"
 # The last part of a key that names a folder from which this machine loads what it has computed earlier.
 CACHE = "cache_dir"
+# Characters of all overrides of a run. Hydra's parser needs a second for a thousand brackets.
+LONGEST = 10_000
 # Groups that change how commands run, not what a run does.
 MACHINERY = ("hydra", "launcher", "grid")
 # Settings of a line that a later line does not repeat.
@@ -71,30 +75,39 @@ class Registry:
 
     @classmethod
     def of(cls, folders: Sequence[Path], named: Collection[str] = ()) -> "Registry":
-        """Return the targets in the YAML files of the groups in ``folders``."""
-        found: dict[str, set[str]] = defaultdict(set)
-        references: dict[str, str] = {}
-        for folder in folders:
-            for path in _options(folder):
-                for where, value in _leaves(*_content(path, folder)):
-                    if where[-1] == TARGET and value not in SCHEDULES:
-                        found[".".join(where[:-1])].add(str(value))
-                    elif reference := REFERENCE.fullmatch(str(value)):
-                        references[".".join(where)] = reference.group(1)
-        for slot, other in references.items():
-            if other in found:
-                found[slot] |= found[other]
-        slots: dict[str, set[str]] = defaultdict(set)
-        for slot, targets in found.items():
-            slots[_general(slot, found)] |= targets
-        return cls(slots, named)
+        """Return the targets in the YAML files of the groups in ``folders``, and those ``named`` elsewhere."""
+        return cls(_slots(tuple(folders)), named)
 
     def accepts(self, where: Where, target: object) -> bool:
         """Return whether ``target`` may be built at ``where``."""
+        if not isinstance(target, str):
+            return False
         slot = _general(".".join(where), self.slots)
         if slot not in self.slots and len(where) > 1 and target in SCHEDULES:
             return True
         return target in self.slots.get(slot, ()) or target in self.named
+
+
+@cache  # a sweep has many runs
+def _slots(folders: tuple[Path, ...]) -> dict[str, set[str]]:
+    """Return the targets that the YAML files in ``folders`` name, by place."""
+    found: dict[str, set[str]] = defaultdict(set)
+    references: dict[str, str] = {}
+    for folder in folders:
+        for path in _options(folder):
+            for where, value in _leaves(*_content(path, folder)):
+                if where[-1] == TARGET and value not in SCHEDULES:
+                    found[".".join(where[:-1])].add(str(value))
+                elif reference := REFERENCE.fullmatch(str(value)):
+                    references[".".join(where)] = reference.group(1)
+    # Such as prior.prompting, which refers to the group prompting.
+    for slot, other in references.items():
+        if other in found:
+            found[slot] |= found[other]
+    slots: dict[str, set[str]] = defaultdict(set)
+    for slot, targets in found.items():
+        slots[_general(slot, found)] |= targets
+    return dict(slots)
 
 
 def is_trusted(overrides: Sequence[str]) -> bool:
@@ -152,6 +165,9 @@ def judge_overrides(
     could do more than change a setting.
     """
     kept = []
+    if (length := sum(map(len, lines))) > LONGEST:
+        expected = f"overrides of at most {LONGEST:,} characters together"
+        raise _refusal(path, f"{length:,} characters", expected, retry)
     for line in lines:
         override, expected = _judged(line, folders)
         if override is None or expected:
@@ -183,7 +199,8 @@ def _judged(line: str, folders: Sequence[Path]) -> tuple[Override | None, str]:
     """Parse an override, and return what it should have been; "" if it may be repeated."""
     try:
         override = OverridesParser.create().parse_override(line)
-    except HydraException:
+    # Brackets within brackets can be too deep for the parser.
+    except (HydraException, RecursionError):
         return None, "key=value"
     key = override.key_or_group
     written = OVERRIDE.fullmatch(line)
@@ -288,9 +305,10 @@ def _require_settings(node: Any, key: str, path: Path) -> None:
             try:
                 call.bind(**{name: None for name in node if name != TARGET})
             except TypeError as error:
+                again = shlex.quote(f"resume={path.parent}")
                 raise UserError(
                     f"{path}: {key}: expected the settings of {node[TARGET]} in this version, got others "
-                    f"({error}). Try: cadam3d train resume={path.parent}, which writes the file again"
+                    f"({error}). Try: cadam3d train {again}, which writes the file again"
                 ) from error
         for name, value in node.items():
             _require_settings(value, f"{key}.{name}", path)
@@ -391,8 +409,8 @@ def _content(path: Path, folder: Path) -> tuple[Any, Where]:
 
 def _refusal(path: Path, found: str, expected: str, retry: str) -> UserError:
     return UserError(
-        f"{path}: expected {expected}, got {found!r}. With trust=true, all code that this folder names runs, "
-        f"so use it only if you trust the author of the folder. Try: {retry}"
+        f"{path}: expected {expected}, got {found[:200]!r}. With trust=true, all code that this folder names "
+        f"runs, so use it only if you trust the author of the folder. Try: {retry}"
     )
 
 

@@ -33,7 +33,7 @@ if note["traces"]:
 note["files"] = sorted(path.name for path in folder.iterdir())
 with log.open("a") as file:
     file.write(json.dumps(note) + "\n")
-prompt = given.get("prompt", "'a cube'").strip("'")
+prompt = "a cube" if "resume" in given else given.get("prompt", "'a cube'").strip("'")
 steps, seed = int(given.get("steps", 5)), int(given.get("seed", 0))
 summary = dict(prompt=prompt, seed=seed, num_gaussians_initial=4, num_gaussians=steps, seconds=1.5)
 
