@@ -20,7 +20,7 @@ from cadam3d.io.ply import read_ply
 from cadam3d.io.run_folder import ASSET, CONFIG, shown
 from cadam3d.rasterizer.base import Rasterizer, render_fn
 from cadam3d.settings.compose import component, components
-from cadam3d.settings.trust import read_components, refuse_links, search_folders
+from cadam3d.settings.trust import read_components, require_contained, search_folders
 from cadam3d.sweep.folder import is_sweep
 
 
@@ -117,5 +117,5 @@ def output_folder(cfg: DictConfig, asset: Asset, name: str) -> Path:
         return Path(cfg.output).expanduser()
     folder = asset.folder / name
     if folder.is_dir() or folder.is_symlink():
-        refuse_links(folder, "output=DIR with another folder")
+        require_contained(folder, "output=pictures")
     return folder

@@ -14,7 +14,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.run_folder import EVALUATION, shown
 from cadam3d.settings.compose import component, components
-from cadam3d.settings.trust import refuse_links, require_trust
+from cadam3d.settings.trust import require_contained, require_trust
 from cadam3d.sweep.folder import is_sweep, load
 
 
@@ -24,7 +24,7 @@ def run(cfg: DictConfig) -> None:
         raise UserError("run: expected a finished run or a sweep. Try: cadam3d eval run=outputs/latest")
     folder = Path(cfg.run).expanduser().resolve()
     if folder.is_dir() and not require_trust(cfg.trust):
-        refuse_links(folder, trusting())
+        require_contained(folder, trusting())
     if is_sweep(folder):
         _evaluate_sweep(cfg, folder)
         return

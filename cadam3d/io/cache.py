@@ -6,6 +6,7 @@ from pathlib import Path
 
 # The environment variable with the folder that the jobs of a sweep share.
 TRACES = "CADAM3D_TRACES"
+ROOT = 0  # the number of the user that may write any file
 
 
 def default_cache_dir() -> Path:
@@ -36,7 +37,7 @@ def other_writers(path: Path) -> str:
     if not hasattr(os, "geteuid"):
         return ""
     facts = path.stat()
-    if facts.st_uid not in (os.geteuid(), 0):
+    if facts.st_uid not in (os.geteuid(), ROOT):
         return f"it belongs to the user with the number {facts.st_uid}"
     if facts.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         return f"its mode is {stat.S_IMODE(facts.st_mode):o}"

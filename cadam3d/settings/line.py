@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import OVERRIDES
 from cadam3d.settings.compose import TEXT_KEYS, config_dir, quote
-from cadam3d.settings.trust import is_trusted, judge_overrides, read_overrides, refuse_links
+from cadam3d.settings.trust import is_trusted, judge_overrides, read_overrides, require_contained
 
 RUN_FOLDER = "hydra.run.dir"
 SWEEP_FOLDER = "hydra.sweep.dir"
@@ -104,7 +104,7 @@ def resumed(
         )
     is_judged = not is_trusted(overrides)
     if is_judged:
-        refuse_links(folder, retry)
+        require_contained(folder, retry)
     before = read_overrides(folder / OVERRIDES)
     if is_judged:
         keys = {key_of(override) for override in overrides}

@@ -8,7 +8,7 @@ a folder only what an honest run leaves there:
 - An override must change a setting of training. Nothing from a folder reaches Hydra's own settings.
 - An interpolation may refer to other settings and call ``slug`` and ``span``, which compute from them.
 - Folders of caches are never taken from a run, because compiled kernels are loaded from there.
-- A symbolic link must not lead out of the folder, because a command writes into it.
+- Everything in the folder is a file, a folder, or a link that stays inside, because a command writes there.
 
 With ``trust=true`` in the command line, nothing is judged.
 """
@@ -17,6 +17,7 @@ import inspect
 import os
 import re
 import shlex
+import stat
 import sys
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -34,7 +35,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.core import schedule
 from cadam3d.core.errors import UserError
-from cadam3d.io.reading import read_yaml
+from cadam3d.io.reading import KINDS, read_yaml
 from cadam3d.settings.compose import config_dir, escaped
 
 TARGET = "_target_"
@@ -42,7 +43,7 @@ TARGET = "_target_"
 CACHE = "cache_dir"
 # Characters of all overrides of a run. Hydra's parser needs a second for a thousand brackets.
 LONGEST = 10_000
-# Groups that change how commands run, not what a run does.
+# Groups that change how commands run, not what a run computes.
 MACHINERY = ("hydra", "launcher", "grid")
 # Settings of a line that a later line does not repeat.
 NOT_REPEATED = ("trust", "grid", "launcher")
@@ -75,7 +76,7 @@ class Registry:
 
     @classmethod
     def of(cls, folders: Sequence[Path], named: Collection[str] = ()) -> "Registry":
-        """Return the targets in the YAML files of the groups in ``folders``, and those ``named`` elsewhere."""
+        """Return the targets in the YAML files of the groups in ``folders``, and the ``named`` ones."""
         return cls(_slots(tuple(folders)), named)
 
     def accepts(self, where: Where, target: object) -> bool:
@@ -96,7 +97,7 @@ def _slots(folders: tuple[Path, ...]) -> dict[str, set[str]]:
     for folder in folders:
         for path in _options(folder):
             for where, value in _leaves(*_content(path, folder)):
-                if where[-1] == TARGET and value not in SCHEDULES:
+                if where[-1:] == (TARGET,) and value not in SCHEDULES:
                     found[".".join(where[:-1])].add(str(value))
                 elif reference := REFERENCE.fullmatch(str(value)):
                     references[".".join(where)] = reference.group(1)
@@ -151,7 +152,7 @@ def read_overrides(path: Path) -> list[str]:
     lines = read_yaml(path)
     lines = [] if lines is None else lines
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
-        raise UserError(f"{path}: expected a list of key=value, got something else. Try: another run")
+        raise UserError(f"{path}: expected a list of key=value, got other data. Try: another run")
     return [line for line in lines if _root(line) not in NOT_REPEATED]
 
 
@@ -300,8 +301,9 @@ def _require_settings(node: Any, key: str, path: Path) -> None:
         if TARGET in node:
             try:
                 call = inspect.signature(get_object(node[TARGET]))
+            # Importing it may raise anything, which building the component reports.
             except Exception:
-                return  # whatever it is, building the component reports it
+                return
             try:
                 call.bind(**{name: None for name in node if name != TARGET})
             except TypeError as error:
@@ -317,11 +319,14 @@ def _require_settings(node: Any, key: str, path: Path) -> None:
             _require_settings(value, key, path)
 
 
-# --- links ------------------------------------------------------------------------------------------------
+# --- the folder -------------------------------------------------------------------------------------------
 
 
-def refuse_links(folder: Path, retry: str) -> None:
-    """Raise ``UserError`` for a symbolic link in ``folder`` that leads out of it, at any depth."""
+def require_contained(folder: Path, retry: str) -> None:
+    """Raise ``UserError`` unless ``folder`` holds only files, folders, and links to other places in it.
+
+    A command that writes into the folder would otherwise change a file elsewhere, or wait for a pipe forever.
+    """
     root = folder.resolve()
     waiting = [str(root)]
     try:
@@ -332,6 +337,11 @@ def refuse_links(folder: Path, retry: str) -> None:
                         _require_inside(entry.path, root, retry)
                     elif entry.is_dir():
                         waiting.append(entry.path)
+                    elif not entry.is_file():
+                        kind = KINDS.get(stat.S_IFMT(entry.stat().st_mode), "something else")
+                        raise UserError(
+                            f"{entry.path}: expected a file, got {kind}. Try: rm {shlex.quote(entry.path)}"
+                        )
     except OSError as error:
         reason = error.strerror or error
         raise UserError(
@@ -356,7 +366,7 @@ def _judge_targets(node: Any, where: Where, registry: Registry, path: Path, retr
     if isinstance(node, dict):
         if TARGET in node and not registry.accepts(where, node[TARGET]):
             found = f"{'.'.join(where)}.{TARGET}={node[TARGET]}"
-            raise _refusal(path, found, "a component of cadam3d or of --config-dir", retry)
+            raise _refusal(path, found, "a component of this version of cadam3d or of --config-dir", retry)
         for key, value in node.items():
             _judge_targets(value, (*where, str(key)), registry, path, retry)
     elif isinstance(node, list):

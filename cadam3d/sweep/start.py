@@ -37,7 +37,7 @@ from cadam3d.io.run_folder import (
 from cadam3d.settings.compose import flatten, quote
 from cadam3d.settings.hydra import run_hydra
 from cadam3d.settings.line import SWEEP_FOLDER, key_of
-from cadam3d.settings.trust import is_trusted, refuse_links
+from cadam3d.settings.trust import is_trusted, require_contained
 from cadam3d.sweep import worker
 from cadam3d.sweep.folder import Plan, PlannedJob, Row, outcomes, rows_of, write_plan
 from cadam3d.sweep.grid import sweep_name
@@ -71,7 +71,7 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
     composed = compose_all(sweep, composer)
     folder = _folder(sweep)
     if folder.is_dir() and not is_trusted(overrides):
-        refuse_links(folder, shlex.join(["cadam3d", "sweep", *overrides, *flags, "trust=true"]))
+        require_contained(folder, shlex.join(["cadam3d", "sweep", *overrides, *flags, "trust=true"]))
     jobs = _planned(sweep, composed)
     _refuse_other_settings(folder, rows_of(folder, jobs), composed)
     claim(folder, SWEEP_FOLDER, is_chosen=True)

@@ -21,7 +21,7 @@ from cadam3d.settings.trust import (
     judge_composition,
     judge_overrides,
     read_components,
-    refuse_links,
+    require_contained,
     targets_in,
 )
 
@@ -183,6 +183,7 @@ def test_a_folder_of_this_line_registers_its_components_for_their_groups(tmp_pat
     )
     (tmp_path / "camera").mkdir()
     (tmp_path / "camera/broken.yaml").write_text("a: [")
+    (tmp_path / "camera/empty.yaml").write_text("# @package _global_\n")
     # A run folder in the same place is not a folder of options.
     (tmp_path / "run").mkdir()
     (tmp_path / "run/config.yaml").write_text("# @package _global_\nrasterizer: {_target_: mine.Evil}\n")
@@ -362,7 +363,7 @@ def test_a_file_that_is_not_a_list_of_overrides_is_one_message(text, run_folder)
 
 
 @pytest.fixture
-def config(tmp_path) -> dict[str, Any]:
+def config(tmp_path) -> Any:
     """Return the plain settings of a run."""
     plain = OmegaConf.to_container(compose(["prompt=a red cube", "rasterizer=cpu"]), resolve=True)
     assert isinstance(plain, dict)
@@ -444,26 +445,33 @@ def test_the_cache_of_a_configuration_is_ignored_with_a_note(config, tmp_path, c
 def test_a_link_that_leads_out_of_a_folder_is_refused_at_any_depth(place, target, run_folder, tmp_path):
     (tmp_path / "outside").mkdir()
     (tmp_path / "outside/file").touch()
-    refuse_links(run_folder, RETRY)
+    require_contained(run_folder, RETRY)
     link = run_folder / place
     link.parent.mkdir(parents=True, exist_ok=True)
     link.symlink_to(tmp_path / target)
     with pytest.raises(UserError, match="got one to"):
-        refuse_links(run_folder, RETRY)
+        require_contained(run_folder, RETRY)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no such pipes")
+def test_a_pipe_for_which_a_command_would_wait_is_refused(run_folder, type_line):
+    os.mkfifo(run_folder / ".hydra/config.yaml")
+    result = type_line("train", f"resume={run_folder}")
+    assert "expected a file, got a named pipe. Try: rm " in result.err
 
 
 def test_a_link_that_stays_in_its_folder_is_accepted(run_folder, tmp_path):
     (run_folder / "newest.log").symlink_to("train.log")
     (run_folder / "here").symlink_to(run_folder)
     (tmp_path / "latest").symlink_to(run_folder)
-    refuse_links(tmp_path / "latest", RETRY)
+    require_contained(tmp_path / "latest", RETRY)
 
 
 def test_a_link_through_another_link_is_followed_to_its_end(run_folder, tmp_path):
     (run_folder / "first").symlink_to("second")
     (run_folder / "second").symlink_to(tmp_path)
     with pytest.raises(UserError, match="got one to"):
-        refuse_links(run_folder, RETRY)
+        require_contained(run_folder, RETRY)
 
 
 # --- whole commands ---------------------------------------------------------------------------------------
@@ -560,4 +568,4 @@ def test_a_folder_that_cannot_be_listed_is_one_message(run_folder):
         pytest.skip("root can list any folder")
     (run_folder / "closed").mkdir(mode=0o300)
     with pytest.raises(UserError, match="can be read"):
-        refuse_links(run_folder, RETRY)
+        require_contained(run_folder, RETRY)
