@@ -39,6 +39,7 @@ from cadam3d.io.reading import KINDS, read_yaml
 from cadam3d.settings.compose import config_dir, escaped
 
 TARGET = "_target_"
+LISTS = (list, tuple)  # OmegaConf makes lists of both
 # The last part of a key that names a folder from which this machine loads what it has computed earlier.
 CACHE = "cache_dir"
 # Characters of all overrides of a run. Hydra's parser needs a second for a thousand brackets.
@@ -260,7 +261,7 @@ def _keys(node: Any) -> Iterator[object]:
     """Yield every key in nested dicts and lists."""
     if isinstance(node, dict):
         yield from node
-    for value in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
+    for value in node.values() if isinstance(node, dict) else node if isinstance(node, LISTS) else ():
         yield from _keys(value)
 
 
@@ -369,7 +370,7 @@ def _judge_targets(node: Any, where: Where, registry: Registry, path: Path, retr
             raise _refusal(path, found, "a component of this version of cadam3d or of --config-dir", retry)
         for key, value in node.items():
             _judge_targets(value, (*where, str(key)), registry, path, retry)
-    elif isinstance(node, list):
+    elif isinstance(node, LISTS):
         for value in node:
             _judge_targets(value, (*where, "*"), registry, path, retry)
 
@@ -379,7 +380,7 @@ def _leaves(node: Any, where: Where) -> Iterator[tuple[Where, Any]]:
     if isinstance(node, dict):
         for key, value in node.items():
             yield from _leaves(value, (*where, str(key)))
-    elif isinstance(node, list):
+    elif isinstance(node, LISTS):
         for value in node:
             yield from _leaves(value, (*where, "*"))
     else:

@@ -425,6 +425,31 @@ def test_a_file_that_is_not_the_configuration_of_a_run_is_one_message(plain, tmp
         components_of(plain, tmp_path)
 
 
+@pytest.mark.parametrize(
+    "value",
+    [
+        *("!!pairs [a: {_target_: planted.run}]", "!!omap [a: {_target_: planted.run}]", "!!set {a}"),
+        *("!!binary aGVsbG8=", "!!timestamp 2001-01-01", "!!python/object/apply:planted.run []"),
+        *("!!python/name:planted.run", "!mine x", "[{_target_: planted.run}]", "*anchor"),
+    ],
+)
+def test_only_plain_yaml_is_read(value, config, tmp_path, marker):
+    components_of(config, tmp_path)
+    path = tmp_path / "config.yaml"
+    key = "model_error:"
+    lines = [f"  {key} {value}" if key in line else line for line in path.read_text().splitlines()]
+    path.write_text("\n".join(lines))
+    with pytest.raises(UserError, match=r"config\.yaml: expected"):
+        read_components(path, ("prior", "rasterizer"), [CONFIGS], is_trusted=False, retry=RETRY)
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("payload", [({"_target_": PAYLOAD},), [({"a": ({"_target_": PAYLOAD},)},)]])
+def test_a_payload_in_a_tuple_is_refused_too(payload):
+    with pytest.raises(UserError, match="planted"):
+        trust._judge_targets(payload, ("prior", "x"), Registry.of([CONFIGS]), Path("config.yaml"), RETRY)
+
+
 def test_text_that_looks_like_an_interpolation_stays_text(config, tmp_path):
     config["prompt"] = "a ${oc.env:HOME}"
     assert components_of(config, tmp_path).prompt == "a ${oc.env:HOME}"
