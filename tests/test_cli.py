@@ -16,12 +16,11 @@ import yaml
 from hydra._internal.hydra import Hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import ConfigAttributeError
 
 from cadam3d import cli
 from cadam3d.core.errors import UserError
-from cadam3d.io.reading import read_yaml
 from cadam3d.io.run_folder import OVERRIDES, claim
 from cadam3d.launch import launch
 from cadam3d.settings import advice, hydra
@@ -181,7 +180,7 @@ def test_a_prompt_is_unchanged_in_the_command_and_in_the_config_of_its_run(promp
     assert cfg.prompt == prompt
     path = tmp_path / "config.yaml"
     path.write_text(OmegaConf.to_yaml(cfg, resolve=True), encoding="utf-8")
-    assert DictConfig(settings.escaped(read_yaml(path))).prompt == prompt
+    assert settings.load_config(path).prompt == prompt
 
 
 def test_a_negative_prompt_is_text_too(type_line, jobs):

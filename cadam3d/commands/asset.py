@@ -115,7 +115,6 @@ def output_folder(cfg: DictConfig, asset: Asset, name: str) -> Path:
     """Return the folder that ``output=`` names, by default ``name`` beside the asset."""
     if cfg.output:
         return Path(cfg.output).expanduser()
-    folder = asset.folder / name
-    if folder.is_dir() or folder.is_symlink():
-        require_contained(folder, "output=pictures")
-    return folder
+    if asset.folder.is_dir():
+        require_contained(asset.folder, "output=pictures")
+    return asset.folder / name

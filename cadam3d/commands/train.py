@@ -24,7 +24,6 @@ from cadam3d.exporter.base import Exporter
 from cadam3d.io.atomic import remove_leftovers
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import read_jsonl, write_json
-from cadam3d.io.reading import read_yaml
 from cadam3d.io.run_folder import (
     ASSET,
     CHECKPOINTS,
@@ -39,7 +38,7 @@ from cadam3d.io.run_folder import (
 from cadam3d.metric.base import Metric
 from cadam3d.rasterizer.base import Backend
 from cadam3d.report import write_report
-from cadam3d.settings.compose import component, components, flatten
+from cadam3d.settings.compose import component, components, flatten, load_config
 from cadam3d.state import Outcome, RunContext, TrainState
 from cadam3d.trainer import Trainer
 
@@ -195,7 +194,7 @@ def note_changes(cfg: DictConfig, folder: Path) -> None:
     """Print the settings that have changed, because the run then differs from an uninterrupted one."""
     if not (folder / CONFIG).is_file():
         return
-    before = dict(flatten(read_yaml(folder / CONFIG)))
+    before = dict(flatten(OmegaConf.to_container(load_config(folder / CONFIG), resolve=True)))
     now = dict(flatten(OmegaConf.to_container(cfg, resolve=True)))
     for key in sorted(before.keys() | now.keys()):
         if key not in ("resume", "trust") and before.get(key) != now.get(key):

@@ -18,7 +18,7 @@ def default_cache_dir() -> Path:
 def kernels_dir(chosen: str | None) -> Path:
     """Return the folder for compiled kernels: the chosen one, else ``kernels`` in the user's cache folder.
 
-    They have a folder of their own, because only the user may write it.
+    They are in a separate folder, because no other user may write there.
     """
     return Path(chosen).expanduser() if chosen else default_cache_dir() / "kernels"
 

@@ -18,6 +18,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from cadam3d.core.errors import UserError
+from cadam3d.io.reading import read_yaml
 
 # Hydra behaves like this version even if a newer one is installed.
 VERSION_BASE = "1.3"
@@ -95,6 +96,18 @@ def components(group: DictConfig) -> dict[str, Any]:
     An experiment may tune a member that the line has not chosen; such a node has keys but no ``_target_``.
     """
     return {str(name): component(node) for name, node in group.items() if "_target_" in node}
+
+
+def load_config(path: Path) -> DictConfig:
+    """Return the resolved ``config.yaml`` of a run. Text that looks like an interpolation stays text.
+
+    Raises ``UserError`` if the file cannot be read. What it names must not be built without the checks of
+    ``cadam3d.settings.trust``.
+    """
+    content = read_yaml(path)
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: expected the settings of a run, got other data. Try: another run")
+    return DictConfig(escaped(content))
 
 
 def flatten(node: object, prefix: str = "", *, with_nodes: bool = False) -> Iterator[tuple[str, object]]:

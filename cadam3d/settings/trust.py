@@ -354,8 +354,8 @@ def _require_inside(link: str, root: Path, retry: str) -> None:
     target = os.path.realpath(link)
     if not Path(target).is_relative_to(root):
         raise UserError(
-            f"{link}: expected a link to another place in {root.name}, got one to {target}. Commands that "
-            f"write there would change files elsewhere. With trust=true they may. Try: {retry}"
+            f"{link}: expected a link to another place in {root.name}, got one to {target}. A command "
+            f"that writes there would change files elsewhere. Try: {retry}"
         )
 
 
@@ -388,7 +388,7 @@ def _leaves(node: Any, where: Where) -> Iterator[tuple[Where, Any]]:
 
 
 def _general(slot: str, slots: Collection[str]) -> str:
-    """Return ``exporter.*`` for ``exporter.ply``: a group without a target of its own has named members."""
+    """Return ``exporter.*`` for ``exporter.ply``: members of a group without its own target have names."""
     root, *rest = slot.split(".")
     return ".".join([root, "*", *rest[1:]]) if rest and root not in slots else slot
 

@@ -101,7 +101,7 @@ def _empty(folder: Path) -> None:
 
 def _wait(plan: Plan, row: Row, stop: Path, lock: int) -> int:
     """Start the process, wait for it and return its exit code; minus the signal if one ended it."""
-    # A run does not keep the settings that belong to this machine, so a job that resumes gets all of its own.
+    # A run does not keep the settings that belong to this machine, so a job that resumes gets them all again.
     words = [f"resume={quote(str(row.folder))}"] if row.has_checkpoint else []
     # With -P, modules are not imported from the current folder, where a file may be called yaml.py.
     command = [sys.executable, "-P", "-m", "cadam3d.job", str(os.getpid()), "train", *words]

@@ -195,7 +195,7 @@ def test_the_shared_maths_needs_no_header():
     assert "#include" not in source, "a run-time CUDA compiler has no headers"
 
 
-# --- whose files --------------------------------------------------------------------------------------------
+# --- owners of files --------------------------------------------------------------------------------------
 
 
 @pytest.fixture

@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.core.errors import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.io.ply import write_ply
 from cadam3d.settings import trust
 from cadam3d.settings.compose import compose, config_dir, flatten
 from cadam3d.settings.line import key_of, resumed
@@ -552,6 +555,18 @@ def test_a_link_in_a_run_is_refused_before_anything_is_written(run_folder, tmp_p
         assert (result.code, "train.log" in result.err) == (1, True)
     assert (tmp_path / "precious").read_text() == "precious"
     assert sorted(path.name for path in run_folder.iterdir()) == [".hydra", "config.yaml", "train.log"]
+
+
+@pytest.mark.parametrize("command", ["render", "export", "view"])
+def test_nothing_is_written_through_a_link_of_a_run(command, run_folder, tmp_path, type_line):
+    (run_folder / "config.yaml").write_text("prompt: a")
+    points = Gaussians(*(torch.rand(2, *shape) for shape in ((3,), (3,), (4,), (), (1, 3))))
+    write_ply(run_folder / "asset.ply", points, up="-y", pad_sh=0)
+    (tmp_path / "precious").mkdir()
+    (run_folder / command).symlink_to(tmp_path / "precious")
+    result = type_line(command, f"run={run_folder}")
+    assert (result.code, "Try: output=pictures" in result.err) == (1, True)
+    assert not list((tmp_path / "precious").iterdir())
 
 
 def test_a_pickled_configuration_is_never_loaded(type_line):
