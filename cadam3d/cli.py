@@ -32,6 +32,9 @@ def main() -> None:
     # This must be set before torch loads OpenMP. If idle threads spin instead of sleeping, two busy programs
     # slow each other tenfold.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # Python processes that this one starts, such as the workers of a launcher, would import modules from the
+    # current folder, where a file may be called yaml.py.
+    os.environ["PYTHONSAFEPATH"] = "1"
     # Imports create many objects but no garbage. Searching for it would take a fifth of the start-up time.
     gc.disable()
     try:

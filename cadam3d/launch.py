@@ -15,7 +15,7 @@ from omegaconf.errors import InterpolationResolutionError
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import expanded
 from cadam3d.settings.advice import explain, require_values, reraise_interrupt
-from cadam3d.settings.compose import TEXT_KEYS
+from cadam3d.settings.compose import TEXT_KEYS, config_dir
 from cadam3d.settings.help_page import help_text
 from cadam3d.settings.hydra import (
     compose_line,
@@ -27,6 +27,7 @@ from cadam3d.settings.hydra import (
 )
 from cadam3d.settings.line import RUN_FOLDER, exporting, key_of, quoted, resumed, split
 from cadam3d.settings.place import occupied
+from cadam3d.settings.trust import judge_composition, require_trust, targets_in
 
 TRAINING = ("train", "sweep")  # the commands that have a run folder
 EXPORTING = ("render", "export", "view")  # the commands with output=
@@ -58,6 +59,8 @@ class Line:
     flags: list[str]
     options: Namespace  # the flags, parsed
     is_sweep: bool
+    typed: list[str]  # the overrides without those of a resumed run
+    trusting: str  # what to type to trust the folder of a resumed run
 
 
 def launch(command: str, words: Sequence[str]) -> int:
@@ -73,6 +76,11 @@ def launch(command: str, words: Sequence[str]) -> int:
     try:
         overrides, flags = split(words)
         options = read_flags(flags)
+        if options.experimental_rerun:
+            raise UserError(
+                f"--experimental-rerun: expected a line without it, got {options.experimental_rerun}, which "
+                "may hold any code. Try: cadam3d train resume=outputs/latest"
+            )
         if options.help:
             print(help_text(command, overrides, options))
             return 0
@@ -95,24 +103,31 @@ def launch(command: str, words: Sequence[str]) -> int:
 def read_line(command: str, overrides: list[str], flags: list[str], options: Namespace) -> Line:
     """Parse a line: quote its overrides and, if it resumes a run, add the overrides of that run."""
     _refuse_bare_words(command, overrides)
+    trusting = shlex.join(["cadam3d", command, *overrides, *flags, "trust=true"])
     is_sweep = command == "sweep" or options.multirun or "hydra.mode=MULTIRUN" in overrides
     if is_sweep and command not in TRAINING:
         raise UserError(f"{command}: only training can be swept. Try: cadam3d {command} once for each asset")
-    overrides = [quoted(override, is_sweep=is_sweep) for override in overrides]
+    typed = [quoted(override, is_sweep=is_sweep) for override in overrides]
+    overrides = typed
     if command in TRAINING:
-        overrides = resumed(overrides, is_sweep=is_sweep)
+        folders = [Path(options.config_path) if options.config_path else config_dir()]
+        folders += [Path(options.config_dir)] if options.config_dir else []
+        overrides = resumed(typed, is_sweep=is_sweep, folders=folders, retry=trusting)
     elif command in EXPORTING:
-        overrides = exporting(overrides)
-    return Line(command, overrides, flags, options, is_sweep)
+        overrides = exporting(typed)
+    return Line(command, overrides, flags, options, is_sweep, typed, trusting)
 
 
 def _command(line: Line, task: Task) -> int:
     """Run a command once, or show one of Hydra's pages about it."""
     options = line.options
-    if _wants_page(options) or options.cfg or options.experimental_rerun:
+    if _wants_page(options) or options.cfg:
         run_hydra(line.command, [*line.overrides, *line.flags], task)
         return 0
     cfg = compose_line(line.command, [*line.overrides, "hydra.mode=RUN"], options)
+    if not require_trust(cfg.get("trust", False)) and cfg.get("resume") is not None:
+        overrides = Path(cfg.hydra.run.dir) / OVERRIDES
+        judge_composition(cfg, overrides, targets_in(line.typed), line.trusting)
     require_values(cfg)
     refuse_missing_settings(cfg, line.command, line.overrides)
     if line.command in TRAINING:

@@ -41,6 +41,8 @@ def type_line(monkeypatch, capsys, tmp_path) -> Callable[..., Result]:
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    # The program sets this variable; it is restored after the test.
+    monkeypatch.setenv("PYTHONSAFEPATH", "1")
 
     def run(*words: str) -> Result:
         monkeypatch.setattr(sys, "argv", ["cadam3d", *words])

@@ -595,14 +595,14 @@ def test_a_refused_resume_leaves_the_run_as_it_was(run_folder, type_line, jobs):
 @pytest.mark.parametrize(
     ("before", "anew", "after"),
     [
-        (["~a.b", "+a.b={c:1}"], [], ["~a.b", "+a.b={c:1}"]),
-        (["~a.b", "+a.b={c:1}"], ["a.b={c:2}"], ["~a.b", "+a.b={c:2}"]),
-        (["~a.b", "+a.b={c:1}"], ["~a.b"], ["~a.b"]),
-        (["~a.b"], ["a.b=5"], ["a.b=5"]),
-        (["~a.b"], ["+a.b=5"], ["~a.b", "+a.b=5"]),
-        (["a.b=5"], ["~a.b"], ["~a.b"]),
-        (["+a.b=5"], ["~a.b"], []),
-        (["+a.b=5"], ["a.b=6"], ["+a.b=6"]),
+        (["~refine.b", "+refine.b={c:1}"], [], ["~refine.b", "+refine.b={c:1}"]),
+        (["~refine.b", "+refine.b={c:1}"], ["refine.b={c:2}"], ["~refine.b", "+refine.b={c:2}"]),
+        (["~refine.b", "+refine.b={c:1}"], ["~refine.b"], ["~refine.b"]),
+        (["~refine.b"], ["refine.b=5"], ["refine.b=5"]),
+        (["~refine.b"], ["+refine.b=5"], ["~refine.b", "+refine.b=5"]),
+        (["refine.b=5"], ["~refine.b"], ["~refine.b"]),
+        (["+refine.b=5"], ["~refine.b"], []),
+        (["+refine.b=5"], ["refine.b=6"], ["+refine.b=6"]),
     ],
 )
 def test_a_resumed_run_keeps_removed_and_added_keys(before, anew, after, tmp_path):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor
@@ -34,8 +35,9 @@ from cadam3d.io.run_folder import (
     typed_path,
 )
 from cadam3d.rasterizer.base import Rasterizer, render_fn
-from cadam3d.settings.compose import component, components, load_config
+from cadam3d.settings.compose import component, components
 from cadam3d.settings.line import EXPORTERS, resume_word, setting_word
+from cadam3d.settings.trust import read_components, require_contained, search_folders
 from cadam3d.sweep.folder import is_sweep
 
 LONGEST_NAME = 60  # characters of a name in a suggestion
@@ -90,9 +92,19 @@ def find_run(text: str) -> Path:
     raise UserError(f"run: expected the folder of a run, got {text!r} ({reason}). Try: {example}")
 
 
-def run_config(folder: Path) -> DictConfig:
-    """Return the settings of the run in ``folder``."""
-    return load_config(folder / CONFIG)
+def run_components(folder: Path, *, is_trusted: bool, retry: str) -> DictConfig:
+    """Return the prompt, the prior and the rasterizer of the run in ``folder``.
+
+    Raises ``UserError`` if they are not of this package or of ``--config-dir``, unless the run is trusted.
+    ``retry`` is the line that trusts it.
+    """
+    return read_components(
+        folder / CONFIG,
+        ("prior", "rasterizer"),
+        search_folders(HydraConfig.get().runtime.config_sources),
+        is_trusted=is_trusted,
+        retry=retry,
+    )
 
 
 def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
@@ -122,6 +134,8 @@ def write_outputs(cfg: DictConfig, asset: Asset, name: str) -> list[Path]:
     ``output=`` names a file if it has a suffix, does not end with a slash, and is not a folder that exists.
     Otherwise it names a folder, by default ``name`` beside the asset.
     """
+    if cfg.output is None and asset.folder.is_dir():
+        require_contained(asset.folder, f"output={spare(name)}")
     text = str(asset.folder / name if cfg.output is None else cfg.output)
     target = expanded(text)
     if not text.strip() or typed_path(text).parent == typed_path(text):

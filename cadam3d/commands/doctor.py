@@ -96,7 +96,7 @@ def _torchvision() -> Finding:
         version = metadata.version("torchvision")
     except metadata.PackageNotFoundError:
         return Finding("torchvision", Verdict.OK, "not installed, not needed")
-    code, output = _run_program([sys.executable, "-c", "import torchvision"])
+    code, output = _run_program([sys.executable, "-P", "-c", "import torchvision"])
     if code == 0:
         return Finding("torchvision", Verdict.OK, version)
     reason = output.strip().splitlines()[-1] if output.strip() else "does not import"

@@ -8,7 +8,7 @@ from functools import partial
 import torch
 
 from cadam3d.commands.finding import Finding, Verdict, attempt
-from cadam3d.io.cache import default_cache_dir
+from cadam3d.io.cache import kernels_dir
 from cadam3d.rasterizer import build, nvrtc
 from cadam3d.rasterizer.auto import AutoRasterizer
 from cadam3d.rasterizer.base import Rasterizer
@@ -39,7 +39,7 @@ def check_rasterizers() -> Iterator[Finding]:
 
 
 def _cpu_kernels() -> Finding:
-    built, compiler = build.build(default_cache_dir()), build.find_compiler()
+    built, compiler = build.build(kernels_dir(None)), build.find_compiler()
     instructions = instruction_set(build.load(built))
     version = compiler.version if compiler else None
     facts = {"compiler": version, "instruction_set": instructions, **_kept(built)}
@@ -49,7 +49,7 @@ def _cpu_kernels() -> Finding:
 
 def _cuda_kernels(device: torch.device) -> Finding:
     name, capability = torch.cuda.get_device_name(device), torch.cuda.get_device_capability(device)
-    built, compiler = nvrtc.build(default_cache_dir(), capability), nvrtc.find_compiler()
+    built, compiler = nvrtc.build(kernels_dir(None), capability), nvrtc.find_compiler()
     assert compiler is not None, "build() has just used it"
     facts = {
         "device": name,

@@ -1,18 +1,21 @@
 """``cadam3d eval``: measure the quality of a finished run, or of every run of a sweep."""
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from cadam3d import report
-from cadam3d.commands.asset import find_run, open_run, renderer, run_config
+from cadam3d.commands.asset import find_run, open_run, renderer, run_components
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.run_folder import ASSET, CONFIG, EVALUATION, copying, shown, suggestion, typed_path
 from cadam3d.settings.compose import component, components
 from cadam3d.settings.line import setting_word
+from cadam3d.settings.trust import require_contained, require_trust
 from cadam3d.sweep.folder import is_sweep, load
 
 
@@ -22,6 +25,8 @@ def run(cfg: DictConfig) -> None:
         line = suggestion("cadam3d eval", "run", CONFIG, ASSET)
         raise UserError(f"run: expected a finished run or a sweep, got nothing. Try: {line}")
     folder = typed_path(str(cfg.run))
+    if folder.is_dir():
+        require_contained(folder, None if require_trust(cfg.trust) else trusting())
     if is_sweep(folder):
         _evaluate_sweep(cfg, folder)
         return
@@ -39,9 +44,10 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     """Return what the metrics of ``cfg`` measure of the run in ``folder``, for its ``eval.json``.
 
     The rasterizer and the prior are those of the run. ``psnr`` and ``ssim`` compare with the true images of
-    the prior. If the prior has no true images, a note in the file replaces these two.
+    the prior. If the prior has no true images, a note in the file replaces these two. Raises ``UserError`` if
+    the run names components that must not be built without ``trust=true``.
     """
-    source = run_config(folder)
+    source = run_components(folder, is_trusted=require_trust(cfg.trust), retry=trusting())
     asset = open_run(folder, cfg.device)
     device = asset.gaussians.device
     prior = component(source.prior).to(device)
@@ -53,6 +59,11 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     if truth is None:
         result["note"] = "this prior has no true images, so psnr and ssim are missing"
     return result
+
+
+def trusting() -> str:
+    """Return this command line with ``trust=true``."""
+    return shlex.join(["cadam3d", "eval", *HydraConfig.get().overrides.task, "trust=true"])
 
 
 def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:

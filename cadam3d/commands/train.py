@@ -230,7 +230,7 @@ def note_changes(cfg: DictConfig, folder: Path) -> None:
     before = dict(flatten(OmegaConf.to_container(load_config(folder / CONFIG), resolve=True)))
     now = dict(flatten(OmegaConf.to_container(cfg, resolve=True)))
     for key in sorted(before.keys() | now.keys()):
-        if key != "resume" and before.get(key) != now.get(key):
+        if key not in ("resume", "trust") and before.get(key) != now.get(key):
             print(f"Note: {key} was {before.get(key)!r}, is now {now.get(key)!r}", file=sys.stderr)
 
 

@@ -93,11 +93,14 @@ def read_yaml(path: Path) -> Any:
 
 
 def _require_plain(text: str) -> None:
-    """Raise ``ValueError`` for aliases and for too many levels, before anything is built."""
+    """Raise ``ValueError`` for tags, aliases and too many levels, before anything is built."""
     depth = 0
     for event in yaml.parse(text, _Loader):
         if isinstance(event, yaml.AliasEvent):
             raise ValueError(f"an alias, *{event.anchor}")
+        # Even the tags of YAML itself make sets, tuples and dates, which are not plain data.
+        if (tag := getattr(event, "tag", None)) is not None:
+            raise ValueError(f"a tag, {tag}")
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > DEEPEST:

@@ -6,10 +6,7 @@ No other module spells these names. This module does not import torch, so that a
 import os
 import re
 import shlex
-import stat
 import tempfile
-from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 from cadam3d.core.errors import UserError
@@ -100,30 +97,10 @@ def occupant_of_sweep(folder: Path) -> str | None:
     return next((name for name in names if os.path.lexists(folder / name)), None)
 
 
-def stray(run: Path) -> Path | None:
-    """Return a link or a special file, such as a named pipe, where a resumed run would write.
-
-    A run follows such a file out of its folder, or waits for it. Returns None if there is none.
-    """
-    for name in _written_by_runs():
-        for path in _tree(run / name):
-            with suppress(FileNotFoundError):
-                mode = path.lstat().st_mode
-                if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-                    return path
-    return None
-
-
 def _written_by_runs() -> tuple[str, ...]:
     """Return every name in the folder of a run that training, its exporters, its callbacks or eval write."""
     files = (ASSET, CHARTS, CONFIG, EVALUATION, LOG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE)
     return (*files, CANDIDATES, CHECKPOINTS, HYDRA, IMAGES, PREVIEWS)
-
-
-def _tree(path: Path) -> Iterator[Path]:
-    yield path
-    for folder, folders, files in os.walk(path):
-        yield from (Path(folder, name) for name in (*folders, *files))
 
 
 def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:

@@ -2,27 +2,31 @@
 
 The name of a cached file contains three hashes: of the sources, flags and machine; of the compiler; and of
 the bytes of the file. So a copied home folder, a new release, another compiler or a damaged file each lead to
-a fresh build. No lock is needed: every process renames its finished file into place, and any file that
-matches its name is usable.
+a fresh build. The hashes do not prove the origin of a file, so the file and its folder must belong to the
+user (or to root), and other users must not be able to write them. No lock is needed: every process renames
+its finished file into place, and any such file that matches its name is usable.
 """
 
 import ctypes
 import hashlib
 import os
 import platform
+import shlex
 import shutil
+import stat
 import subprocess
 import sys
 import sysconfig
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
 from cadam3d.core.errors import UserError
+from cadam3d.io.cache import make_private, other_writers
 from cadam3d.rasterizer import base
 
 KERNELS = Path(__file__).parent / "kernels"
@@ -75,7 +79,7 @@ def find_compiler() -> Compiler | None:
     """Return the first that works of ``$CXX``, ``c++``, ``g++``, ``clang++`` and Python's ``ziglang``."""
     commands = [tuple(os.environ.get("CXX", "").split()), ("c++",), ("g++",), ("clang++",)]
     if find_spec("ziglang"):
-        commands.append((sys.executable, "-m", "ziglang", "c++"))
+        commands.append((sys.executable, "-P", "-m", "ziglang", "c++"))
     for command in commands:
         if command and shutil.which(command[0]):
             answer = _run([*command, "--version"])
@@ -90,18 +94,16 @@ def find_cached(cache_dir: Path, compiler: Compiler | None) -> Path | None:
     Only libraries built by ``compiler`` count, or by any compiler if that is ``None``.
     """
     by = short_hash(compiler.version) if compiler else "*"
-    for path in sorted(cache_dir.glob(f"rasterizer-{_key()}-{by}-*{SUFFIX}")):
-        if path.stem.endswith(short_hash(path.read_bytes())):
-            return path
-    return None
+    return find_intact(cache_dir, f"rasterizer-{_key()}-{by}-*{SUFFIX}")
 
 
 def build(cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAGS) -> Build:
     """Return the library in ``cache_dir``, and compile it if it is missing.
 
     ``machine_flags`` are alternatives, tried in turn. Raises :class:`UserError` if there is neither a cached
-    library nor a compiler, if the compiler fails, or if the folder cannot be written.
+    library nor a compiler, if the compiler fails, if the folder cannot be written, or if others can write it.
     """
+    cache_dir = own_folder(cache_dir, "cpu")
     compiler = find_compiler()
     cached = find_cached(cache_dir, compiler) if tuple(machine_flags) == MACHINE_FLAGS else None
     if cached:
@@ -117,8 +119,52 @@ def build(cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAG
         path = _compile(compiler, folder / f"rasterizer{SUFFIX}", machine_flags)
         by, digest = short_hash(compiler.version), short_hash(path.read_bytes())
         final = cache_dir / f"rasterizer-{_key()}-{by}-{digest}{SUFFIX}"
-        path.replace(final)
+        keep(path, final)
     return Build(final, time.perf_counter() - start)
+
+
+def own_folder(cache_dir: Path, name: str) -> Path:
+    """Return ``cache_dir`` without links. It may not exist yet.
+
+    Raises :class:`UserError` if another user may have put files for rasterizer=``name`` there.
+    """
+    folder = cache_dir.resolve()
+    try:
+        reason = other_writers(folder)
+    except FileNotFoundError:
+        reason = ""
+    except OSError as error:
+        reason = error.strerror or str(error)
+    if reason:
+        raise UserError(
+            f"rasterizer={name}: expected a folder for compiled kernels that no other user can write, got "
+            f"{folder} ({reason}). Try: {_own_advice(folder, name)}"
+        )
+    return folder
+
+
+def _own_advice(folder: Path, name: str) -> str:
+    """Return what to type if others can write a folder: take their permission back, or another folder."""
+    # Folders that are meant for all users, such as /tmp, have the sticky bit.
+    with suppress(OSError):
+        facts = folder.stat()
+        if facts.st_uid == os.geteuid() and not facts.st_mode & stat.S_ISVTX:
+            return f"chmod go-w {shlex.quote(str(folder))}"
+    return f"rasterizer={name} rasterizer.cache_dir=kernels"
+
+
+def find_intact(cache_dir: Path, pattern: str) -> Path | None:
+    """Return a file of this user with a name like ``pattern`` that ends in the hash of its bytes, or None."""
+    for path in sorted(cache_dir.glob(pattern)):
+        if path.is_file() and not other_writers(path) and path.stem.endswith(short_hash(path.read_bytes())):
+            return path
+    return None
+
+
+def keep(path: Path, final: Path) -> None:
+    """Move a finished file to its name in the cache, as one that only this user can write."""
+    path.chmod(0o700)
+    path.replace(final)
 
 
 @contextmanager
@@ -128,7 +174,7 @@ def build_folder(cache_dir: Path, name: str) -> Iterator[Path]:
     Raises :class:`UserError` if ``cache_dir`` cannot be written.
     """
     try:
-        cache_dir.mkdir(parents=True, exist_ok=True)
+        make_private(cache_dir)
         with tempfile.TemporaryDirectory(dir=cache_dir, prefix="build-") as folder:
             yield Path(folder)
     except OSError as error:

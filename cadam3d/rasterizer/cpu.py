@@ -4,7 +4,6 @@ import ctypes
 import weakref
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -14,7 +13,7 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
-from cadam3d.io.cache import default_cache_dir
+from cadam3d.io.cache import kernels_dir
 from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.rasterizer.build import build, load
 from cadam3d.rasterizer.native import RenderPass, require_shapes, run_pass
@@ -56,7 +55,7 @@ class CpuRasterizer(Rasterizer):
 @cache
 def load_kernels(cache_dir: str | None) -> ctypes.CDLL:
     """Return the compiled kernels, and compile them if ``cache_dir`` lacks them. Runs once per process."""
-    return load(build(Path(cache_dir).expanduser() if cache_dir else default_cache_dir()))
+    return load(build(kernels_dir(cache_dir)))
 
 
 def instruction_set(kernels: ctypes.CDLL) -> str:

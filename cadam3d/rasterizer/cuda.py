@@ -20,7 +20,6 @@ everything except the projection runs on one group of views after another, with 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -30,7 +29,7 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
-from cadam3d.io.cache import default_cache_dir
+from cadam3d.io.cache import kernels_dir
 from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.rasterizer.driver import Driver
 from cadam3d.rasterizer.launcher import Launch, Launcher
@@ -92,7 +91,7 @@ def _refuse_others(device: torch.device) -> None:
 @cache
 def load_kernels(cache_dir: str | None) -> Launcher:
     """Return the kernels for all CUDA devices; the first use of a device compiles and loads them."""
-    return Driver(Path(cache_dir).expanduser() if cache_dir else default_cache_dir())
+    return Driver(kernels_dir(cache_dir))
 
 
 def rasterize(

@@ -3,8 +3,8 @@
 The result is always a cubin for a real architecture, never PTX, because a driver refuses PTX from a newer
 compiler. The name of a cached file contains the architecture and two hashes: of the sources, constants,
 options and compiler version, and of the file's own bytes. So a new release, another torch or a damaged file
-each lead to a fresh build. No lock is needed: every process renames its finished file into place, and any
-file that matches its name is usable.
+each lead to a fresh build. The file and its folder must belong to the user, as in ``build.py``. No lock is
+needed: every process renames its finished file into place, and any such file that matches its name is usable.
 """
 
 import ctypes
@@ -19,7 +19,15 @@ from pathlib import Path
 import torch
 
 from cadam3d.core.errors import UserError
-from cadam3d.rasterizer.build import KERNELS, build_folder, definitions, short_hash
+from cadam3d.rasterizer.build import (
+    KERNELS,
+    build_folder,
+    definitions,
+    find_intact,
+    keep,
+    own_folder,
+    short_hash,
+)
 
 SOURCE = "cuda.cu"
 HEADERS = ("blend.cuh", "device.cuh", "project.cuh", "sort.cuh", "splat_math.h", "tiles.cuh")
@@ -121,7 +129,8 @@ def choose_architecture(capability: tuple[int, int], compiler: Compiler) -> int:
 def build(cache_dir: Path, capability: tuple[int, int]) -> Cubin:
     """Return the kernels for a compute capability, and compile them if ``cache_dir`` lacks them.
 
-    Raises :class:`UserError` if there is no NVRTC, if it fails, or if the folder cannot be written.
+    Raises :class:`UserError` if there is no NVRTC, if it fails, if the folder cannot be written, or if
+    others can write it.
     """
     compiler = find_compiler()
     if compiler is None:
@@ -131,16 +140,16 @@ def build(cache_dir: Path, capability: tuple[int, int]) -> Cubin:
         )
     architecture = choose_architecture(capability, compiler)
     name = f"rasterizer-{_key(compiler)}-sm{architecture}"
-    for path in sorted(cache_dir.glob(f"{name}-*.cubin")):
-        if path.stem.endswith(short_hash(path.read_bytes())):
-            return Cubin(path, 0.0)
+    cache_dir = own_folder(cache_dir, "cuda")
+    if cached := find_intact(cache_dir, f"{name}-*.cubin"):
+        return Cubin(cached, 0.0)
     start = time.perf_counter()
     code = compile_kernels(compiler, architecture)
     final = cache_dir / f"{name}-{short_hash(code)}.cubin"
     with build_folder(cache_dir, "cuda") as folder:
         path = folder / "rasterizer.cubin"
         path.write_bytes(code)
-        path.replace(final)
+        keep(path, final)
     return Cubin(final, time.perf_counter() - start)
 
 

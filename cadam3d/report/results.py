@@ -289,7 +289,8 @@ def _shipped(arm: str) -> Mapping[str, Any]:
     A setting that has keys, such as a schedule, is there as a whole too: an override may replace it by a
     number.
     """
-    if not arm or not (config_dir() / ARM / f"{arm}.yaml").is_file():
+    # The name of an arm may be any text, also the path of another file.
+    if arm not in {file.stem for file in (config_dir() / ARM).glob("*.yaml")}:
         return {}
     node = compose([f"{ARM}={arm}", "prompt=any"])[ARM]
     plain = OmegaConf.to_container(node, resolve=True)

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml  # comes with OmegaConf
 from hydra import version
 from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path
@@ -19,6 +18,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from cadam3d.core.errors import UserError
+from cadam3d.io.reading import read_yaml
 
 # Hydra behaves like this version even if a newer one is installed.
 VERSION_BASE = "1.3"
@@ -99,8 +99,15 @@ def components(group: DictConfig) -> dict[str, Any]:
 
 
 def load_config(path: Path) -> DictConfig:
-    """Return the resolved ``config.yaml`` of a run. Text that looks like an interpolation stays text."""
-    return DictConfig(_escaped(yaml.safe_load(path.read_text(encoding="utf-8"))))
+    """Return the resolved ``config.yaml`` of a run. Text that looks like an interpolation stays text.
+
+    Raises ``UserError`` if the file cannot be read. What it names must not be built without the checks of
+    ``cadam3d.settings.trust``.
+    """
+    content = read_yaml(path)
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: expected the settings of a run, got other data. Try: another run")
+    return DictConfig(escaped(content))
 
 
 def flatten(node: object, prefix: str = "", *, with_nodes: bool = False) -> Iterator[tuple[str, object]]:
@@ -142,6 +149,15 @@ def escape(text: str) -> str:
     return re.sub(r"(\\*)\$\{", lambda match: match.group(1) * 2 + r"\${", text)
 
 
+def escaped(value: Any) -> Any:
+    """Return plain data in which OmegaConf reads every text literally."""
+    if isinstance(value, dict):
+        return {key: escaped(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [escaped(item) for item in value]
+    return escape(value) if isinstance(value, str) else value
+
+
 def quote(text: str) -> str:
     r"""Return ``text`` as a quoted value of Hydra's override grammar, which reads it as plain text.
 
@@ -166,11 +182,3 @@ def _construction_error(error: InstantiationException) -> BaseException:
         reason = str(cause or error).splitlines()[-1]
         return UserError(f"{where}._target_: cannot be loaded ({reason}). Try: cadam3d doctor")
     return cause
-
-
-def _escaped(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _escaped(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_escaped(item) for item in value]
-    return escape(value) if isinstance(value, str) else value

@@ -6,13 +6,13 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-import yaml  # comes with OmegaConf
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import ASSET, OVERRIDES, PREVIEW, TURNTABLE, has_file, suggestion, typed_path
-from cadam3d.settings.compose import TEXT_KEYS, quote
+from cadam3d.settings.compose import TEXT_KEYS, config_dir, quote
+from cadam3d.settings.trust import is_trusted, judge_overrides, read_overrides, require_contained
 
 RUN_FOLDER = "hydra.run.dir"
 SWEEP_FOLDER = "hydra.sweep.dir"
@@ -78,11 +78,15 @@ def quoted(override: str, *, is_sweep: bool) -> str:
     return override
 
 
-def resumed(overrides: Sequence[str], *, is_sweep: bool) -> list[str]:
+def resumed(
+    overrides: Sequence[str], *, is_sweep: bool, folders: Sequence[Path] = (), retry: str = ""
+) -> list[str]:
     """Replace ``resume=RUN`` by the overrides that RUN was started with, changed by the others in the line.
 
-    A line without ``resume=`` does not change. Raises ``UserError`` if RUN is not the folder of a run, or a
-    checkpoint in one, or if the line asks for another folder or for a sweep.
+    A line without ``resume=`` does not change. ``folders`` have the YAML files of the line, by default those
+    of the package, and ``retry`` is the line with ``trust=true``. Raises ``UserError`` if RUN is not the
+    folder of a run, or a checkpoint in one, if the line asks for another folder or for a sweep, or if the
+    files of RUN may do more than continue it and the line does not trust them.
     """
     given = {_entry(override): override for override in overrides}
     if "resume" not in given or (text := text_of(given["resume"])) in ("null", ""):
@@ -101,8 +105,13 @@ def resumed(overrides: Sequence[str], *, is_sweep: bool) -> list[str]:
         raise UserError(
             f"{RUN_FOLDER}: a resumed run stays in its folder. Try: cadam3d train {resume_word(text)}"
         )
-    before = yaml.safe_load((folder / OVERRIDES).read_text(encoding="utf-8")) or []
-    merged = {_entry(override): override for override in before if key_of(override) != "grid"}
+    is_judged = not is_trusted(overrides)
+    require_contained(folder, retry if is_judged else None)
+    before = read_overrides(folder / OVERRIDES)
+    if is_judged:
+        keys = {key_of(override) for override in overrides}
+        before = judge_overrides(before, folder / OVERRIDES, keys, folders or [config_dir()], retry)
+    merged = {_entry(override): override for override in before}
     for override in given.values():
         _merge(merged, override)
     merged["resume"] = f"resume={quote(str(path))}"

@@ -1,7 +1,6 @@
 """Place: make a folder the place of one run, and leave it as it was if the run is refused."""
 
 import os
-import shlex
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -24,7 +23,6 @@ from cadam3d.io.run_folder import (
     require_writable,
     shown,
     spare,
-    stray,
 )
 from cadam3d.settings.line import RUN_FOLDER, resume_word, setting_word
 
@@ -101,7 +99,8 @@ def occupied(wanted: Path, *, is_chosen: bool, resume: Path | None) -> Iterator[
             raise _not_writable(folder, resume, error) from error
         snapshot = None
         try:
-            _refuse_occupied(folder) if resume is None else _refuse_stray(folder, resume)
+            if resume is None:
+                _refuse_occupied(folder)
             snapshot = Snapshot.of(folder)
             yield folder
         except BaseException as error:
@@ -141,18 +140,6 @@ def _refuse_occupied(folder: Path) -> None:
         f"{RUN_FOLDER}: {shown(folder)} holds {name}, which a run would overwrite. "
         f"Try: {setting_word(RUN_FOLDER, shown(numbered(folder)))}"
     )
-
-
-def _refuse_stray(folder: Path, resume: Path) -> None:
-    """Refuse to resume a run with links or special files where it would write."""
-    path = stray(folder)
-    if path is not None:
-        # The link itself is removed, not what it points to.
-        path = shown(folder) / path.relative_to(folder)
-        raise UserError(
-            f"resume: expected files and folders where the run writes, got a link or a special file, {path}. "
-            f"Try: rm {shlex.quote(str(path))} && cadam3d train {resume_word(shown(resume))}"
-        )
 
 
 def _not_writable(folder: Path, resume: Path | None, error: OSError) -> UserError:

@@ -152,6 +152,12 @@ def write_plan(sweep: Path, plan: Plan) -> None:
     write_json(sweep / JOBS, asdict(plan))
 
 
+def _require_inside(name: str) -> None:
+    """Raise ``ValueError`` unless ``name`` is that of a folder directly inside the folder of the sweep."""
+    if name in ("", ".", "..") or {"/", "\\", "\0"} & set(name):
+        raise ValueError(f"{name!r} is not the name of a folder")
+
+
 def is_complete(summary: dict[str, Any]) -> bool:
     """Return whether training has written its whole summary, of which ``warnings`` is the last entry."""
     return "warnings" in summary

@@ -27,6 +27,8 @@ from cadam3d.settings.compose import quote
 from cadam3d.settings.line import RUN_FOLDER
 from cadam3d.sweep.folder import Plan, Row, is_complete, read_plan, rows_of
 
+# The folder from which this program imports cadam3d.
+PACKAGE_ROOT = Path(__file__).parents[2]
 POLL_SECONDS = 0.2
 IS_WINDOWS = sys.platform == "win32"
 # Exit codes of a process that was asked to stop.
@@ -106,15 +108,20 @@ def _empty(folder: Path) -> None:
 
 def _wait(plan: Plan, row: Row, stop: Path, lock: int) -> int:
     """Start the process, wait for it and return its exit code; minus the signal if one ended it."""
-    words = [f"resume={quote(str(row.folder))}"] if row.has_checkpoint else row.overrides
-    command = [sys.executable, "-m", "cadam3d.job", str(os.getpid()), "train", *words]
-    command += [*plan.flags, f"{RUN_FOLDER}={quote(str(row.folder))}"]
+    # A run does not keep the settings that belong to this machine, so a job that resumes gets them all again.
+    words = [f"resume={quote(str(row.folder))}"] if row.has_checkpoint else []
+    # With -P, modules are not imported from the current folder, where a file may be called yaml.py.
+    command = [sys.executable, "-P", "-m", "cadam3d.job", str(os.getpid()), "train", *words]
+    command += [*row.overrides, *plan.flags, f"{RUN_FOLDER}={quote(str(row.folder))}"]
     environment = dict(os.environ)
     # Hydra's main function sets this in the process of the sweep. A job prints a mistake of the user without
     # a traceback.
     environment.pop("HYDRA_FULL_ERROR", None)
     environment.setdefault(TRACES, str(stop.with_name(SHARED)))
     environment[INHERITED] = str(lock)
+    if Path(plan.cwd) == PACKAGE_ROOT:
+        # A checkout that is not installed is found in the current folder only.
+        environment["PYTHONPATH"] = os.pathsep.join(filter(None, [plan.cwd, environment.get("PYTHONPATH")]))
     if plan.threads is not None:
         environment["OMP_NUM_THREADS"] = str(plan.threads)
     with (row.folder / CONSOLE).open("ab") as console, _signals() as signals:

@@ -4,6 +4,7 @@ The same line always has the same folder, so typing the line again continues the
 """
 
 import os
+import shlex
 import shutil
 import signal
 import sys
@@ -42,6 +43,7 @@ from cadam3d.settings.compose import flatten, quote
 from cadam3d.settings.hydra import run_hydra
 from cadam3d.settings.line import SWEEP_FOLDER, key_of, setting_word
 from cadam3d.settings.place import in_use
+from cadam3d.settings.trust import is_trusted, require_contained
 from cadam3d.sweep import worker
 from cadam3d.sweep.folder import Plan, PlannedJob, Row, is_sweep, outcomes, rows_of, write_plan
 from cadam3d.sweep.grid import sweep_name
@@ -74,6 +76,8 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
     sweep, composer = read_sweep(command, overrides, options)
     composed = compose_all(sweep, composer)
     folder = _folder(sweep)
+    if folder.is_dir() and not is_trusted(overrides):
+        require_contained(folder, shlex.join(["cadam3d", "sweep", *overrides, *flags, "trust=true"]))
     jobs = _planned(sweep, composed)
     _refuse_other_settings(folder, rows_of(folder, jobs), composed)
     claim(folder, SWEEP_FOLDER, is_chosen=True)
@@ -171,7 +175,7 @@ def _refuse_other_settings(folder: Path, rows: Sequence[Row], composed: Sequence
         if not config.is_file() or not (row.has_result or row.has_checkpoint):
             continue
         before = dict(flatten(read_config(config)))
-        for key in sorted((before.keys() | now.values.keys()) - now.unknown - {"resume"}):
+        for key in sorted((before.keys() | now.values.keys()) - now.unknown - {"resume", "trust"}):
             if before.get(key) != now.values.get(key):
                 raise UserError(
                     f"{key}: was {before.get(key)} in {shown(row.folder)}, is {now.values.get(key)} now. "

@@ -13,7 +13,7 @@ from cadam3d.commands import doctor_rasterizers
 from cadam3d.commands.doctor_rasterizers import check_rasterizers
 from cadam3d.commands.finding import Finding, Verdict
 from cadam3d.core.errors import UserError
-from cadam3d.io.cache import default_cache_dir
+from cadam3d.io.cache import kernels_dir
 from cadam3d.rasterizer import auto, build, nvrtc
 from cadam3d.rasterizer.base import Backend
 from cadam3d.rasterizer.build import find_compiler
@@ -59,7 +59,7 @@ def by_topic() -> dict[str, Finding]:
 
 @needs_compiler
 def test_the_native_kernels_are_named_and_tested():
-    cache = default_cache_dir()
+    cache = kernels_dir(None)
     found = by_topic()
     kernels, test, choice = (
         found[topic] for topic in ("kernels for cpu", "rasterizer=cpu", "rasterizer=auto")
@@ -80,7 +80,7 @@ def test_the_native_kernels_are_named_and_tested():
     ("seconds", "words"), [(0.0, "from the cache in "), (1.26, "compiled now in 1.3 s, kept in ")]
 )
 def test_the_finding_states_whether_kernels_were_compiled_now(seconds, words, monkeypatch):
-    built = replace(build.build(default_cache_dir()), seconds=seconds)
+    built = replace(build.build(kernels_dir(None)), seconds=seconds)
     monkeypatch.setattr(build, "build", lambda cache_dir: built)
     finding = doctor_rasterizers._cpu_kernels()
     assert words in finding.found

@@ -1,9 +1,11 @@
 """Building the native kernels. Most tests use a fake compiler, so they compile nothing."""
 
 import multiprocessing
+import os
 import re
 import shlex
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -16,7 +18,10 @@ from cadam3d.rasterizer.build import (
     build,
     find_cached,
     find_compiler,
+    find_intact,
     load,
+    own_folder,
+    short_hash,
 )
 
 pytestmark = [
@@ -188,3 +193,63 @@ def test_environment_variables_choose_the_compiler_and_the_cache(fake_compiler, 
 def test_the_shared_maths_needs_no_header():
     source = (KERNELS / "splat_math.h").read_text()
     assert "#include" not in source, "a run-time CUDA compiler has no headers"
+
+
+# --- owners of files --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cached(tmp_path) -> Path:
+    """Return a file whose name is right, in a folder of this user."""
+    folder = tmp_path / "cache"
+    folder.mkdir(mode=0o700)
+    path = folder / f"rasterizer-{short_hash(b'planted')}.so"
+    path.write_bytes(b"planted")
+    path.chmod(0o700)
+    return path
+
+
+def test_a_file_that_another_user_can_write_is_not_loaded(cached):
+    assert find_intact(cached.parent, "rasterizer-*.so") == cached
+    for mode in (0o720, 0o702, 0o777):
+        cached.chmod(mode)
+        assert find_intact(cached.parent, "rasterizer-*.so") is None
+
+
+@pytest.mark.parametrize("mode", [0o720, 0o702, 0o777, 0o1777])
+def test_a_folder_that_another_user_can_write_is_refused_with_what_to_type(mode, cached):
+    assert own_folder(cached.parent, "cpu") == cached.parent
+    cached.parent.chmod(mode)
+    for call in (lambda: own_folder(cached.parent, "cpu"), lambda: build(cached.parent)):
+        with pytest.raises(UserError, match="no other user can write") as caught:
+            call()
+        advice = "rasterizer.cache_dir=" if mode == 0o1777 else f"chmod go-w {cached.parent}"
+        assert f"Try: {advice}" in str(caught.value).replace("rasterizer=cpu rasterizer.", "rasterizer.")
+
+
+@pytest.mark.parametrize("place", ["folder", "file"])
+def test_files_of_another_user_are_refused_also_behind_a_link(place, cached, tmp_path, monkeypatch):
+    link = tmp_path / "link"
+    link.symlink_to(cached.parent)
+    owner = cached.stat().st_uid
+    if place == "folder":
+        monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
+        monkeypatch.setattr("cadam3d.io.cache.ROOT", -1)
+        with pytest.raises(UserError, match="belongs to the user with the number"):
+            own_folder(link, "cpu")
+    else:
+        assert own_folder(link, "cpu") == cached.parent
+        monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
+        monkeypatch.setattr("cadam3d.io.cache.ROOT", -1)
+        assert find_intact(link, "rasterizer-*.so") is None
+
+
+def test_a_new_folder_and_a_new_library_belong_to_the_user_alone(fake_compiler, tmp_path):
+    fake_compiler()
+    before = os.umask(0o002)
+    try:
+        path = build(tmp_path / "deep/cache").path
+    finally:
+        os.umask(before)
+    assert [place.stat().st_mode & 0o777 for place in (path.parent, path)] == [0o700, 0o700]
+    assert build(tmp_path / "deep/cache").path == path

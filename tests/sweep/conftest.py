@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-# Called as: PROGRAM -m cadam3d.job PARENT train key=value ...
+# Called as: PROGRAM -P -m cadam3d.job PARENT train key=value ...
 # It appends its call to calls.jsonl beside the job folders, and prompt= decides how it ends. "running" lists
 # the processes of earlier calls for the same job that have not ended.
 STAND_IN = r"""#!{python} -S
 import json, os, pathlib, signal, sys, time
-given = dict(word.lstrip("+~").partition("=")[::2] for word in sys.argv[5:] if "=" in word)
+given = dict(word.lstrip("+~").partition("=")[::2] for word in sys.argv[6:] if "=" in word)
 folder = pathlib.Path(given["hydra.run.dir"].strip("'"))
-beside, parent = folder.parent, int(sys.argv[3])
+beside, parent = folder.parent, int(sys.argv[4])
 log = beside / "calls.jsonl"
 earlier = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
 
@@ -23,17 +23,17 @@ def is_running(pid):
     except OSError:
         return False
 
-note = {{"folder": folder.name, "words": sys.argv[4:], "threads": os.environ.get("OMP_NUM_THREADS")}}
+note = {{"folder": folder.name, "words": sys.argv[5:], "threads": os.environ.get("OMP_NUM_THREADS")}}
 note["pid"] = os.getpid()
 same_job = [call["pid"] for call in earlier if call["folder"] == folder.name]
 note["running"] = [pid for pid in same_job if is_running(pid)]
-note["traces"] = os.environ.get("CADAM3D_TRACES")
+note["traces"], note["path"] = os.environ.get("CADAM3D_TRACES"), os.environ.get("PYTHONPATH")
 if note["traces"]:
     os.makedirs(note["traces"], exist_ok=True)
 note["files"] = sorted(path.name for path in folder.iterdir())
 with log.open("a") as file:
     file.write(json.dumps(note) + "\n")
-prompt = given.get("prompt", "'a cube'").strip("'")
+prompt = "a cube" if "resume" in given else given.get("prompt", "'a cube'").strip("'")
 steps, seed = int(given.get("steps", 5)), int(given.get("seed", 0))
 summary = dict(prompt=prompt, seed=seed, num_gaussians_initial=4, num_gaussians=steps, seconds=1.5)
 

@@ -101,6 +101,16 @@ def test_a_plan_without_threads_does_not_change_the_environment(sweep, calls, mo
     assert calls(folder)[0]["threads"] == "7"
 
 
+@pytest.mark.parametrize("is_root", [True, False])
+def test_a_checkout_in_the_current_folder_is_found_by_its_jobs(is_root, sweep, calls, tmp_path, monkeypatch):
+    monkeypatch.setattr(process, "PACKAGE_ROOT", tmp_path if is_root else tmp_path / "elsewhere")
+    monkeypatch.setenv("PYTHONPATH", "mine")
+    folder = sweep("a cube")
+    run_job(folder, 0)
+    [call] = calls(folder)
+    assert call["path"] == (f"{tmp_path}{os.pathsep}mine" if is_root else "mine")
+
+
 def test_a_job_with_a_checkpoint_continues_from_it(sweep, calls):
     folder = sweep("a kill")
     run_job(folder, 0)

@@ -67,6 +67,8 @@ def hydra_sweep(monkeypatch, capfd, tmp_path, small_configs, stand_in):
     """Type ``cadam3d sweep ...`` in an empty folder, in this process and without its report."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    # The program sets this variable; it is restored after the test.
+    monkeypatch.setenv("PYTHONSAFEPATH", "1")
     for module in (settings, hydra, advice):
         monkeypatch.setattr(module, "config_dir", lambda: small_configs)
     monkeypatch.setattr(sys, "executable", str(stand_in))

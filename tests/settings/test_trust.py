@@ -1,0 +1,611 @@
+"""A folder from a stranger is data: no setting, link or cache in it makes a command run its code."""
+
+import json
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from omegaconf import DictConfig, OmegaConf
+
+from cadam3d.core.errors import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.io.ply import write_ply
+from cadam3d.settings import trust
+from cadam3d.settings.compose import compose, config_dir, flatten
+from cadam3d.settings.line import key_of, resumed
+from cadam3d.settings.trust import (
+    Registry,
+    judge_composition,
+    judge_overrides,
+    read_components,
+    require_contained,
+    targets_in,
+)
+
+CONFIGS = config_dir()
+EXPERIMENTS = sorted(path.stem for path in (CONFIGS / "experiment").glob("*.yaml"))
+RETRY = "cadam3d train resume=run trust=true"
+PAYLOAD = "planted.run"
+# The whole of every group of which several can be chosen.
+EVERYTHING = [
+    f"{group}=[{','.join(sorted(path.stem for path in (CONFIGS / group).glob('*.yaml')))}]"
+    for group in ("exporter", "callback", "metric")
+]
+
+
+@pytest.fixture
+def marker(tmp_path, monkeypatch) -> Path:
+    """Put a module on the path whose import and whose call leave a file, and return the path of the file."""
+    place = tmp_path / "importable"
+    place.mkdir()
+    marker = tmp_path / "marker"
+    code = f"open({str(marker)!r}, 'w').close()"
+    call = f"def run(*args, **kwargs):\n    {code}\n    raise SystemExit(3)"
+    (place / "planted.py").write_text(f"{code}\n{call}\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(str(place))
+    monkeypatch.delitem(sys.modules, "planted", raising=False)
+    return marker
+
+
+@pytest.fixture
+def run_folder(tmp_path) -> Path:
+    """Return the folder of an honest run."""
+    folder = tmp_path / "run"
+    (folder / ".hydra").mkdir(parents=True)
+    lines = [
+        "prompt='a red cube'",
+        "rasterizer=reference",
+        "exporter=[]",
+        "callback=[]",
+        "metric=[]",
+        "steps=1",
+    ]
+    (folder / ".hydra/overrides.yaml").write_text(yaml.safe_dump(lines), encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def honest() -> DictConfig:
+    """Return a composition with a component in every group."""
+    words = ["prompt=a", "densifier=cadam_annealed", "camera=progressive", "initializer=luciddreamer"]
+    return compose([*words, "regularizer=[sparsity]", *EVERYTHING], with_hydra=True)
+
+
+def add_override(folder: Path, *lines: str) -> None:
+    path = folder / ".hydra/overrides.yaml"
+    path.write_text(yaml.safe_dump([*yaml.safe_load(path.read_text()), *lines]), encoding="utf-8")
+
+
+def masked(cfg: DictConfig) -> DictConfig:
+    """Return a composition without Hydra's own settings."""
+    return OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
+
+
+def inner_places(node: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield every dict and list in plain data with each of its keys or positions."""
+    keys = list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ()
+    for key in keys:
+        yield from inner_places(node[key])
+        yield node, key
+
+
+def judged(*lines: str) -> list[str]:
+    return judge_overrides(lines, Path("overrides.yaml"), (), [CONFIGS], RETRY)
+
+
+def content(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+# --- components -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_recipe_is_accepted(experiment):
+    cfg = compose(["prompt=a", f"experiment={experiment}", *EVERYTHING], with_hydra=True)
+    judge_composition(cfg, Path("overrides.yaml"), (), RETRY)
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*/**/*.yaml")), ids=lambda path: path.stem)
+def test_every_option_names_only_targets_that_are_accepted_in_its_place(path):
+    registry = Registry.of([CONFIGS])
+    for where, value in trust._leaves(*trust._content(path, CONFIGS)):
+        if where[-1] == "_target_":
+            assert registry.accepts(where[:-1], value)
+
+
+def test_a_payload_is_refused_wherever_it_is_in_a_configuration(honest):
+    plain = OmegaConf.to_container(masked(honest), resolve=True)
+    registry = Registry.of([CONFIGS])
+    trust._judge_targets(plain, (), registry, Path("config.yaml"), RETRY)
+    planted = 0
+    for holder, key in inner_places(plain):
+        before = holder[key]
+        for payload in (
+            {"_target_": PAYLOAD},
+            [[{"_target_": PAYLOAD}]],
+            {"a": {"b": {"_target_": PAYLOAD}}},
+        ):
+            holder[key] = payload
+            with pytest.raises(UserError, match="planted"):
+                trust._judge_targets(plain, (), registry, Path("config.yaml"), RETRY)
+            planted += 1
+        holder[key] = before
+    assert planted > 600
+
+
+def test_a_composed_payload_is_refused(honest):
+    judge_composition(honest, Path("overrides.yaml"), (), RETRY)
+    for key in ("densifier", "exporter.ply", "camera.size", "metric.new", "views", "prior.prompting"):
+        cfg = honest.copy()
+        OmegaConf.update(cfg, key, {"_target_": PAYLOAD}, merge=False, force_add=True)
+        with pytest.raises(UserError, match="planted"):
+            judge_composition(cfg, Path("overrides.yaml"), (), RETRY)
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        *(PAYLOAD, "builtins.eval", "", " cadam3d.camera.orbit.Orbit", "cadam3d.camera.orbit.Orbit\n"),
+        *("cadam3d.camera.orbit", "cadam3d.camera.orbit.math.exp", "cadam3d.camera.\u1d52rbit.Orbit"),
+        *("cadam3d.exporter.ply.PlyExporter", "cadam3d.core.schedule.Linear"),
+        *(None, 3, True, {}, [], {"_target_": "x"}),
+    ],
+)
+def test_a_target_counts_only_as_written_and_only_in_its_place(target):
+    registry = Registry.of([CONFIGS])
+    assert registry.accepts(("camera",), "cadam3d.camera.orbit.Orbit")
+    node = {"_target_": target, "size": 8}
+    with pytest.raises(UserError):
+        trust._judge_targets(node, ("camera",), registry, Path("config.yaml"), RETRY)
+
+
+def test_a_schedule_may_be_anywhere_inside_a_component():
+    registry = Registry.of([CONFIGS])
+    for name in ("Constant", "Linear", "LogLinear", "Steps"):
+        target = f"cadam3d.core.schedule.{name}"
+        assert registry.accepts(("refine", "tau_scale"), target)
+        assert registry.accepts(("published_baseline", "tau_pos"), target)
+        assert not registry.accepts(("refine",), target)
+        assert not registry.accepts(("exporter", "ply"), target)
+        assert not registry.accepts(("prior", "noise_path"), target)
+
+
+def test_a_folder_of_this_line_registers_its_components_for_their_groups(tmp_path):
+    (tmp_path / "exporter").mkdir()
+    (tmp_path / "exporter/xyz.yaml").write_text("# @package exporter.xyz\n_target_: mine.Xyz\n")
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment/x.yaml").write_text(
+        "# @package _global_\nprior: {noise_path: {_target_: mine.P}}\n"
+    )
+    (tmp_path / "camera").mkdir()
+    (tmp_path / "camera/broken.yaml").write_text("a: [")
+    (tmp_path / "camera/empty.yaml").write_text("# @package _global_\n")
+    # A run folder in the same place is not a folder of options.
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/config.yaml").write_text("# @package _global_\nrasterizer: {_target_: mine.Evil}\n")
+    registry = Registry.of([CONFIGS, tmp_path])
+    assert registry.accepts(("exporter", "any_name"), "mine.Xyz")
+    assert registry.accepts(("prior", "noise_path"), "mine.P")
+    assert not registry.accepts(("prior",), "mine.P")
+    assert not registry.accepts(("rasterizer",), "mine.Evil")
+
+
+def test_targets_of_this_line_are_accepted(honest):
+    named = targets_in(["prior._target_=mine.Prior", "+callback.x={_target_: mine.Callback, every: 3}"])
+    assert named == {"mine.Prior", "mine.Callback"}
+    cfg = honest.copy()
+    OmegaConf.update(cfg, "prior._target_", "mine.Prior")
+    judge_composition(cfg, Path("overrides.yaml"), named, RETRY)
+
+
+# --- overrides --------------------------------------------------------------------------------------------
+
+HOSTILE = [
+    "hydra.mode=MULTIRUN",
+    "+hydra.callbacks.x={_target_: planted.run}",
+    "++hydra.callbacks={x: {_target_: planted.run}}",
+    "hydra.searchpath=[file:///tmp/planted]",
+    "+hydra.job.env_set.CXX=planted",
+    "hydra.job.env_set={CXX: planted}",
+    "hydra.job_logging.root.handlers=[file]",
+    "hydra.job_logging.handlers.file.filename=/tmp/planted",
+    "hydra.output_subdir=../../planted",
+    "hydra.run.dir=/tmp/planted",
+    "hydra.launcher._target_=planted.run",
+    "hydra/launcher=joblib",
+    "+hydra/job_logging=default",
+    "hydra@x=default",
+    "hydra=default",
+    "+hydra={mode: MULTIRUN}",
+    "~hydra",
+    "~hydra.job_logging",
+    "~hydra/launcher",
+    "$hydra=x",
+    "hydra$.mode=x",
+    " hydra.mode=MULTIRUN",
+    "@hydra=default",
+    "+_global_={hydra: {mode: MULTIRUN}}",
+    "+defaults=[{hydra: planted}]",
+    "camera@hydra=orbit",
+    "camera@_global_=orbit",
+    "+camera@hydra.job=orbit",
+    "/camera=orbit",
+    "experiment=../../../../tmp/planted",
+    "+experiment=/tmp/planted",
+    "experiment=[smoke,../planted]",
+    "experiment=${oc.env:PLANTED}",
+    "camera={_target_: planted.run}",
+    "+camera={_target_: planted.run}",
+    "rasterizer={cache_dir: /tmp/planted}",
+    "++rasterizer={cache_dir: /tmp/planted}",
+    "initializer/fallback=../../planted",
+    "camera/../hydra=x",
+    "densifier._args_=[planted]",
+    "+densifier._partial_=true",
+    "++densifier._recursive_=false",
+    "+densifier._convert_=none",
+    "+callback.x={a: [{_args_: [planted]}]}",
+    "steps=1,2",
+    "seed=range(3)",
+    "seed=choice(1,2)",
+    "camera.size=glob(*)",
+    "seed=interval(0,1)",
+    "prompt=${oc.env:HOME}",
+    "prompt='a ${oc.decode:planted}'",
+    "prompt='${slug:${oc.env:HOME}}'",
+    r"prompt='a \\${oc.env:HOME}'",
+    r"prompt='\${a}${oc.env:HOME}'",
+    "prompt='${${a}:b}'",
+    "prompt='${sl${a}ug:b}'",
+    "prompt='${hydra:runtime.cwd}'",
+    "prompt='${now:%Y}'",
+    "camera.distance=[1,'${oc.create:planted}']",
+    "+camera.x={y: '${oc.select:a}'}",
+    "mystery=3",
+    "+mystery.key=3",
+    "",
+    "steps",
+    "=3",
+    "steps=[" + "[" * 3000,
+]
+
+
+@pytest.mark.parametrize("line", HOSTILE)
+def test_an_override_that_is_more_than_a_setting_of_training_is_refused(line):
+    with pytest.raises(
+        UserError, match=r"overrides\.yaml: expected .* Try: cadam3d train resume=run trust=true"
+    ):
+        judged("steps=3", line)
+
+
+def test_honest_overrides_are_kept_as_they_are():
+    lines = [
+        "prompt='a corgi, front view'",
+        r"prompt='literally \${oc.env:HOME}'",
+        "negative_prompt=",
+        "+experiment=smoke",
+        "experiment=mine/second.try",
+        "exporter=[ply,turntable]",
+        "regularizer=[]",
+        "camera=null",
+        "initializer/fallback=ball",
+        "initializer.fallback=null",
+        "++densifier.tau_Q='${span:0.43,${refine.start},${refine.end},${steps}}'",
+        "refine.end=${steps}",
+        "~callback.progress",
+        "densifier.tau_Q={_target_: cadam3d.core.schedule.Linear, start: 0.5, end: 0.9, steps: 300}",
+        "camera.distance=[3.0,4.0]",
+    ]
+    assert judged(*lines) == lines
+
+
+def test_accepted_overrides_do_not_change_hydras_own_settings(honest):
+    lines = ["prompt=b", "experiment=smoke", "noise=weak", "exporter=[ply]", "~callback.progress"]
+    cfg = compose(judged(*lines), with_hydra=True)
+    ours, theirs = (dict(flatten(OmegaConf.to_container(each.hydra))) for each in (honest, cfg))
+    changed = {key for key in ours.keys() | theirs.keys() if ours.get(key) != theirs.get(key)}
+    assert {key for key in changed if not key.startswith(("overrides.", "runtime.choices."))} <= {
+        "job.override_dirname"
+    }
+
+
+def test_no_option_that_a_run_can_choose_sets_anything_of_hydra():
+    for path in trust._options(CONFIGS):
+        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+        assert "hydra" not in raw, path
+        assert not any("hydra" in str(entry) for entry in raw.get("defaults", ())), path
+
+
+def test_a_cache_of_the_run_is_ignored_with_a_note_unless_this_line_names_it(run_folder, capsys):
+    add_override(run_folder, "rasterizer=cpu", "rasterizer.cache_dir=/planted", "+prior.cache_dir=/planted")
+    lines = resumed([f"resume='{run_folder}'"], is_sweep=False)
+    assert not [line for line in lines if "cache_dir" in line]
+    err = capsys.readouterr().err
+    assert "rasterizer.cache_dir" in err
+    assert "prior.cache_dir" in err
+    assert "add rasterizer.cache_dir=DIR" in err
+    own = "rasterizer.cache_dir=/mine"
+    assert own in resumed([f"resume='{run_folder}'", own], is_sweep=False)
+    assert "rasterizer" not in capsys.readouterr().err
+
+
+def test_a_job_that_resumes_with_its_own_overrides_gets_the_same_configuration(run_folder):
+    own = yaml.safe_load((run_folder / ".hydra/overrides.yaml").read_text())
+    extra = ["~callback.progress", "+densifier.x=3", "++camera.size=8"]
+    add_override(run_folder, *extra)
+    word = f"resume='{run_folder}'"
+    assert resumed([word, *own, *extra], is_sweep=False) == resumed([word], is_sweep=False)
+    cached = [*own, *extra, "rasterizer.cache_dir=/mine"]
+    assert "rasterizer.cache_dir=/mine" in resumed([word, *cached], is_sweep=False)
+
+
+def test_trust_itself_is_never_taken_from_a_run(run_folder):
+    add_override(run_folder, "trust=true", "+trust=true", "steps=2")
+    lines = resumed([f"resume='{run_folder}'"], is_sweep=False)
+    assert "steps=2" in lines
+    assert not [line for line in lines if key_of(line) == "trust"]
+
+
+@pytest.mark.parametrize(
+    "text", ["a: 1", "[1, 2]", "steps=3", "[{steps: 3}]", "[[steps=3]]", "- !!python/name:os.system"]
+)
+def test_a_file_that_is_not_a_list_of_overrides_is_one_message(text, run_folder):
+    (run_folder / ".hydra/overrides.yaml").write_text(text)
+    with pytest.raises(UserError, match=r"overrides\.yaml: expected"):
+        resumed([f"resume='{run_folder}'"], is_sweep=False)
+
+
+# --- config.yaml ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def config(tmp_path) -> Any:
+    """Return the plain settings of a run."""
+    plain = OmegaConf.to_container(compose(["prompt=a red cube", "rasterizer=cpu"]), resolve=True)
+    assert isinstance(plain, dict)
+    return plain
+
+
+def components_of(plain: object, folder: Path, **options: Any) -> DictConfig:
+    path = folder / "config.yaml"
+    path.write_text(yaml.safe_dump(plain), encoding="utf-8")
+    options = {"is_trusted": False, "retry": "cadam3d eval run=run trust=true", **options}
+    return read_components(path, ("prior", "rasterizer"), [CONFIGS], **options)
+
+
+def test_only_what_is_measured_is_read_from_a_configuration(config, tmp_path):
+    config["densifier"] = {"_target_": PAYLOAD}
+    assert set(components_of(config, tmp_path)) == {"prompt", "prior", "rasterizer"}
+
+
+def test_a_payload_in_a_component_that_is_built_is_refused(config, tmp_path):
+    components_of(config, tmp_path)
+    places = [
+        key for key, _ in flatten({name: config[name] for name in ("prior", "rasterizer")}, with_nodes=True)
+    ]
+    for key in places:
+        for payload in ({"_target_": PAYLOAD}, [{"_target_": PAYLOAD}], {"a": [{"_target_": PAYLOAD}]}):
+            cfg = OmegaConf.create(config)
+            OmegaConf.update(cfg, key, payload, merge=False, force_add=True)
+            with pytest.raises(UserError, match=r"config\.yaml: .*Try: "):
+                components_of(OmegaConf.to_container(cfg), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("_args_", ["x"]), ("_partial_", True), ("_recursive_", False), ("_convert_", "none")),
+        *((3, 4), (None, 1), ("an_old_key", 1), ("${oc.env:HOME}", 1)),
+    ],
+)
+def test_keys_that_a_component_does_not_have_are_refused(key, value, config, tmp_path):
+    for node in (config["prior"], config["prior"]["noise_path"]):
+        node[key] = value
+        with pytest.raises(UserError, match=r"config\.yaml: .*Try: "):
+            components_of(config, tmp_path)
+        del node[key]
+
+
+@pytest.mark.parametrize(
+    "node", [None, 3, "x", [], {}, {"_target_": None}, [{"_target_": PAYLOAD}], {"a": 1}]
+)
+def test_a_run_without_its_components_is_one_message(node, config, tmp_path):
+    for key in ("prior", "rasterizer"):
+        with pytest.raises(UserError, match=r"config\.yaml: .*Try: "):
+            components_of({**config, key: node}, tmp_path)
+
+
+@pytest.mark.parametrize("plain", [None, [], 3, {}, {"prompt": 3}, {"prompt": None}])
+def test_a_file_that_is_not_the_configuration_of_a_run_is_one_message(plain, tmp_path):
+    with pytest.raises(UserError, match=r"config\.yaml: expected the settings of a run.* Try: "):
+        components_of(plain, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        *("!!pairs [a: {_target_: planted.run}]", "!!omap [a: {_target_: planted.run}]", "!!set {a}"),
+        *("!!binary aGVsbG8=", "!!timestamp 2001-01-01", "!!python/object/apply:planted.run []"),
+        *("!!python/name:planted.run", "!mine x", "[{_target_: planted.run}]", "*anchor"),
+    ],
+)
+def test_only_plain_yaml_is_read(value, config, tmp_path, marker):
+    components_of(config, tmp_path)
+    path = tmp_path / "config.yaml"
+    key = "model_error:"
+    lines = [f"  {key} {value}" if key in line else line for line in path.read_text().splitlines()]
+    path.write_text("\n".join(lines))
+    with pytest.raises(UserError, match=r"config\.yaml: expected"):
+        read_components(path, ("prior", "rasterizer"), [CONFIGS], is_trusted=False, retry=RETRY)
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("payload", [({"_target_": PAYLOAD},), [({"a": ({"_target_": PAYLOAD},)},)]])
+def test_a_payload_in_a_tuple_is_refused_too(payload):
+    with pytest.raises(UserError, match="planted"):
+        trust._judge_targets(payload, ("prior", "x"), Registry.of([CONFIGS]), Path("config.yaml"), RETRY)
+
+
+def test_text_that_looks_like_an_interpolation_stays_text(config, tmp_path):
+    config["prompt"] = "a ${oc.env:HOME}"
+    assert components_of(config, tmp_path).prompt == "a ${oc.env:HOME}"
+
+
+def test_the_cache_of_a_configuration_is_ignored_with_a_note(config, tmp_path, capsys):
+    config["rasterizer"]["cache_dir"] = "/planted"
+    assert components_of(config, tmp_path).rasterizer.cache_dir is None
+    assert "rasterizer.cache_dir" in capsys.readouterr().err
+    assert components_of(config, tmp_path, is_trusted=True).rasterizer.cache_dir == "/planted"
+
+
+# --- links ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("place", ["train.log", ".lock", "checkpoints", ".hydra/x.yaml", "a/b/c/eval.json"])
+@pytest.mark.parametrize("target", ["outside/file", "outside/missing", "outside"])
+def test_a_link_that_leads_out_of_a_folder_is_refused_at_any_depth(place, target, run_folder, tmp_path):
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside/file").touch()
+    require_contained(run_folder, RETRY)
+    link = run_folder / place
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.symlink_to(tmp_path / target)
+    with pytest.raises(UserError, match="got one to"):
+        require_contained(run_folder, RETRY)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no such pipes")
+def test_a_pipe_for_which_a_command_would_wait_is_refused(run_folder, type_line):
+    os.mkfifo(run_folder / ".hydra/config.yaml")
+    result = type_line("train", f"resume={run_folder}")
+    assert "expected a file, got a named pipe. Try: rm " in result.err
+
+
+def test_a_link_that_stays_in_its_folder_is_accepted(run_folder, tmp_path):
+    (run_folder / "newest.log").symlink_to("train.log")
+    (run_folder / "here").symlink_to(run_folder)
+    (tmp_path / "latest").symlink_to(run_folder)
+    require_contained(tmp_path / "latest", RETRY)
+
+
+def test_a_link_through_another_link_is_followed_to_its_end(run_folder, tmp_path):
+    (run_folder / "first").symlink_to("second")
+    (run_folder / "second").symlink_to(tmp_path)
+    with pytest.raises(UserError, match="got one to"):
+        require_contained(run_folder, RETRY)
+
+
+# --- whole commands ---------------------------------------------------------------------------------------
+
+ROUTES = [
+    "+callback.x={_target_: planted.run}",
+    "densifier._target_=planted.run",
+    "prior.noise_path._target_=planted.run",
+    "camera.size={_target_: planted.run}",
+    "+metric.x={a: {_target_: planted.run}}",
+    "+regularizer.x={_target_: planted.run}",
+    "+hydra.callbacks.x._target_=planted.run",
+    "hydra.output_subdir=../planted",
+    "hydra.mode=MULTIRUN",
+    "experiment=../../run/evil",
+]
+
+
+@pytest.mark.parametrize("route", ROUTES)
+def test_resuming_a_strangers_run_neither_runs_its_code_nor_changes_it(route, run_folder, marker, type_line):
+    evil = "# @package _global_\nhydra: {callbacks: {x: {_target_: planted.run}}}\n"
+    (run_folder / "evil.yaml").write_text(evil)
+    add_override(run_folder, route)
+    before = content(run_folder)
+    result = type_line("train", f"resume={run_folder}")
+    assert result.code == 1
+    assert "overrides.yaml" in result.err
+    assert f"Try: cadam3d train resume={run_folder} trust=true" in result.err.replace("'", "")
+    assert content(run_folder) == before
+    assert not marker.exists()
+    assert not (run_folder.parent / "planted").exists()
+
+
+def test_a_trusted_run_may_run_its_code(run_folder, marker, type_line):
+    add_override(run_folder, "+callback.x={_target_: planted.run}")
+    assert type_line("train", f"resume={run_folder}", "trust=true").code == 3
+    assert marker.exists()
+
+
+@pytest.mark.parametrize("value", ["yes", "1", "null", "[true]"])
+def test_trust_is_true_or_false(value, run_folder, type_line):
+    assert "trust: expected true or false" in type_line("train", f"resume={run_folder}", f"trust={value}").err
+    assert "trust: expected true or false" in type_line("train", "prompt=a", f"trust={value}").err
+
+
+def test_a_link_in_a_run_is_refused_before_anything_is_written(run_folder, tmp_path, type_line):
+    (tmp_path / "precious").write_text("precious")
+    (run_folder / "train.log").symlink_to(tmp_path / "precious")
+    (run_folder / "config.yaml").write_text("prompt: a")
+    for command in ("train", "eval"):
+        word = "resume" if command == "train" else "run"
+        result = type_line(command, f"{word}={run_folder}")
+        assert (result.code, "train.log" in result.err) == (1, True)
+    assert (tmp_path / "precious").read_text() == "precious"
+    assert sorted(path.name for path in run_folder.iterdir()) == [".hydra", "config.yaml", "train.log"]
+
+
+@pytest.mark.parametrize("command", ["render", "export", "view"])
+def test_nothing_is_written_through_a_link_of_a_run(command, run_folder, tmp_path, type_line):
+    (run_folder / "config.yaml").write_text("prompt: a")
+    points = Gaussians(*(torch.rand(2, *shape) for shape in ((3,), (3,), (4,), (), (1, 3))))
+    write_ply(run_folder / "asset.ply", points, up="-y", pad_sh=0)
+    (tmp_path / "precious").mkdir()
+    (run_folder / command).symlink_to(tmp_path / "precious")
+    result = type_line(command, f"run={run_folder}")
+    assert (result.code, "Try: output=pictures" in result.err) == (1, True)
+    assert not list((tmp_path / "precious").iterdir())
+
+
+def test_a_pickled_configuration_is_never_loaded(type_line):
+    assert "may hold any code" in type_line("train", "--experimental-rerun=config.pickle").err
+
+
+@pytest.mark.parametrize("name", ["..", ".", "", "/tmp", "a/b", "../x", "a\\b", "a\0b"])
+def test_the_job_of_a_sweep_is_inside_the_folder_of_the_sweep(name, tmp_path, type_line):
+    job = {"arm": "", "folder": name, "overrides": [], "swept": {}}
+    plan = {"cwd": "/", "flags": [], "threads": None, "jobs": [job]}
+    (tmp_path / "jobs.json").write_text(json.dumps(plan))
+    result = type_line("eval", f"run={tmp_path}")
+    assert (result.code, "jobs.json: not the plan of a sweep" in result.err) == (1, True)
+
+
+def test_a_component_of_config_dir_is_measured_without_trust(tmp_path, monkeypatch, type_line):
+    shutil.copytree(CONFIGS / "rasterizer", tmp_path / "mine/rasterizer")
+    option = tmp_path / "mine/rasterizer/own.yaml"
+    option.write_text("_target_: own_rasterizer.Own\n")
+    (tmp_path / "own_rasterizer.py").write_text(
+        "from cadam3d.rasterizer.reference import ReferenceRasterizer as Own\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    plain = OmegaConf.to_container(compose(["prompt=a"]), resolve=True)
+    assert isinstance(plain, dict)
+    plain["rasterizer"] = {"_target_": "own_rasterizer.Own"}
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/config.yaml").write_text(yaml.safe_dump(plain))
+    refused = type_line("eval", "run=run").err
+    assert "config.yaml" not in refused.partition("Try:")[2]
+    # The run has no asset, which is the next thing that a command needs.
+    assert "has no asset.ply" in type_line("eval", "run=run", "--config-dir", "mine").err
+    assert "got 'rasterizer._target_=own_rasterizer.Own'" in refused
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="Windows has no modes")
+def test_a_folder_that_cannot_be_listed_is_one_message(run_folder):
+    if os.geteuid() == 0:
+        pytest.skip("root can list any folder")
+    (run_folder / "closed").mkdir(mode=0o300)
+    with pytest.raises(UserError, match="can be read"):
+        require_contained(run_folder, RETRY)
