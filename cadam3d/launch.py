@@ -97,6 +97,12 @@ def read_line(command: str, overrides: list[str], flags: list[str], options: Nam
     is_sweep = command == "sweep" or options.multirun or "hydra.mode=MULTIRUN" in overrides
     if is_sweep and command not in TRAINING:
         raise UserError(f"{command}: only training can be swept. Try: cadam3d {command} once for each asset")
+    if command == "train" and not is_sweep and "dry_run" in map(key_of, overrides):
+        words = [override for override in overrides if key_of(override) != "dry_run"]
+        raise UserError(
+            "dry_run: expected a sweep, whose jobs it lists, got a single run. The settings of a run can be "
+            f"printed instead. Try: {shlex.join(['cadam3d', command, *words, *flags, '--cfg', 'job'])}"
+        )
     overrides = [quoted(override, is_sweep=is_sweep) for override in overrides]
     if command in TRAINING:
         overrides = resumed(overrides, is_sweep=is_sweep)
