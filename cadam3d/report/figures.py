@@ -20,6 +20,7 @@ from cadam3d.report.claims import (
     FrontierPoint,
     Hull,
     Quality,
+    Spread,
     by_cell,
     frontier,
     has_no_growth,
@@ -193,7 +194,7 @@ def _annotate(
 
 
 def _bars(axes: Axes, point: FrontierPoint, look: Look) -> None:
-    """Draw quartiles over cells as thin pale bars and the standard deviation over seeds as thick ones."""
+    """Draw the spread over cells as thin pale bars and the standard deviation over seeds as thick ones."""
     x, y = point.count.median, point.gain.median
     pale = {"color": look.color, "alpha": 0.35, "lw": 0.9, "zorder": 2}
     axes.plot([point.count.low, point.count.high], [y, y], **pale)
@@ -252,16 +253,17 @@ def growth_figure(results: Sequence[JobResult]) -> Figure | None:
         return None
     figure, style = new_figure(len(levels), height=3.2), looks(arms)
     panels = figure.subplots(1, len(levels), squeeze=False, sharey=True)[0]
+    ends = Spread.of({result.cell: 0.0 for result in results}).ends
     for axes, level in zip(panels, levels, strict=True):
         axes.set_yscale("log")
-        ends = {}
+        places = {}
         for arm in chosen:
             if paths := histories.get((level, arm)):
-                steps, low, middle, high = over_time(paths)
+                steps, low, middle, high = over_time(paths, ends)
                 axes.fill_between(steps, low, high, step="post", color=style[arm].color, alpha=0.16, lw=0)
                 axes.step(steps, middle, where="post", color=style[arm].color, lw=1.8)
-                ends[arm] = (steps[-1], middle[-1])
-        _label_ends(axes, ends, style)
+                places[arm] = (steps[-1], middle[-1])
+        _label_ends(axes, places, style)
         axes.set_title(level_title(level))
         axes.set_xlabel("step")
     label_log_axis(panels[0].yaxis)
@@ -275,9 +277,11 @@ def _histories(results: Sequence[JobResult], setting: ArmSetting) -> list[list[t
 
 
 def over_time(
-    histories: Sequence[Sequence[tuple[float, float]]],
+    histories: Sequence[Sequence[tuple[float, float]]], ends: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the steps and the three quartiles of the counts there.
+    """Return the steps and, of the counts there, the low end, the median and the high end.
+
+    ``ends`` are the probabilities of the quantiles at the two ends.
 
     A job keeps its count between records and after its end. Of two records at one step, before and after a
     refinement, the later one counts.
@@ -289,7 +293,7 @@ def over_time(
         at = np.searchsorted(np.array(sorted(last)), steps, side="right") - 1
         ordered = np.array([last[step] for step in sorted(last)])
         values.append(ordered[at.clip(0)])
-    low, middle, high = np.quantile(np.array(values), (0.25, 0.5, 0.75), axis=0)
+    low, middle, high = np.quantile(np.array(values), (ends[0], 0.5, ends[1]), axis=0)
     return steps, low, middle, high
 
 

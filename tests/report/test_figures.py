@@ -109,16 +109,21 @@ def test_a_setting_that_lacks_cells_is_hollow_and_an_early_end_has_a_dagger(jobs
 
 def test_growth_is_the_median_over_cells_at_each_step():
     steps, low, middle, high = figures.over_time(
-        [[(0, 100), (50, 100), (50, 200)], [(0, 100), (50, 100), (50, 400)], [(0, 100), (100, 300)]]
+        [[(0, 100), (50, 100), (50, 200)], [(0, 100), (50, 100), (50, 400)], [(0, 100), (100, 300)]],
+        (0.0, 1.0),
     )
     assert steps.tolist() == [0, 50, 100]
     assert middle.tolist() == [100, 200, 300]
-    assert (low <= middle).all()
-    assert (middle <= high).all()
+    assert low.tolist() == [100, 100, 200]
+    assert high.tolist() == [100, 400, 400]
 
 
 def test_a_job_that_ended_early_keeps_its_count():
-    assert figures.over_time([[(0, 100), (10, 500)], [(0, 100), (20, 100)]])[2].tolist() == [100, 300, 300]
+    assert figures.over_time([[(0, 100), (10, 500)], [(0, 100), (20, 100)]], (0.25, 0.75))[2].tolist() == [
+        100,
+        300,
+        300,
+    ]
 
 
 def test_the_thresholds_of_the_arm_that_varies_two_are_drawn(bench_results):
