@@ -127,7 +127,9 @@ def _frontier_curve(axes: Axes, points: Sequence[FrontierPoint], look: Look) -> 
     pairs = list(zip(points, places, strict=True))
     # A curve of several thresholds has too many settings to label each, so only its ends are labelled.
     shown = pairs if is_line else [pairs[0], pairs[-1]] if len(pairs) > 1 else []
-    values = [Label(point.setting.values + EARLY * (point.early > 0), place) for point, place in shown]
+    values = [
+        Label(point.setting.values + EARLY * (point.early > 0), place, look.color) for point, place in shown
+    ]
     return [Label(points[0].setting.arm, named, look.color, is_name=True), *values]
 
 
