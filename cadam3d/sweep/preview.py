@@ -27,7 +27,7 @@ POLL_SECONDS = 0.2
 
 @dataclass(frozen=True)
 class Pace:
-    """How long a job takes: a part for each step, and a part for its start and its outputs."""
+    """The time that a job takes: a part for each step, and a part for its start and its outputs."""
 
     step_seconds: float
     other_seconds: float
