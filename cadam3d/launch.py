@@ -107,8 +107,13 @@ def read_line(command: str, overrides: list[str], flags: list[str], options: Nam
     is_sweep = command == "sweep" or options.multirun or "hydra.mode=MULTIRUN" in overrides
     if is_sweep and command not in TRAINING:
         raise UserError(f"{command}: only training can be swept. Try: cadam3d {command} once for each asset")
-    typed = [quoted(override, is_sweep=is_sweep) for override in overrides]
-    overrides = typed
+    if command == "train" and not is_sweep and "dry_run" in map(key_of, overrides):
+        words = [override for override in overrides if key_of(override) != "dry_run"]
+        raise UserError(
+            "dry_run: expected a sweep, whose jobs it lists, got a single run. The settings of a run can be "
+            f"printed instead. Try: {shlex.join(['cadam3d', command, *words, *flags, '--cfg', 'job'])}"
+        )
+    overrides = typed = [quoted(override, is_sweep=is_sweep) for override in overrides]
     if command in TRAINING:
         folders = [Path(options.config_path) if options.config_path else config_dir()]
         folders += [Path(options.config_dir)] if options.config_dir else []

@@ -1,5 +1,11 @@
-"""Progress: a bar with step, number of Gaussians, loss, speed, time of the end and peak GPU memory."""
+"""Progress: step, number of Gaussians, loss, speed, time of the end and peak GPU memory.
 
+In a terminal this is a bar. Otherwise, as in a log file or the console of a sweep's job, it is a line every
+few seconds.
+"""
+
+import os
+import sys
 import time
 from dataclasses import dataclass, field
 
@@ -7,61 +13,89 @@ import torch
 from tqdm import tqdm
 
 from cadam3d.callback.base import Callback
+from cadam3d.core.checks import require_range
 from cadam3d.state import Outcome, RunContext, StepReport, TrainState
 
 DAY = 24 * 3600
 GIB = 2**30
+TITLE = 32  # characters of the prompt
 
 
 @dataclass(kw_only=True)
 class Progress(Callback):
-    """A tqdm bar on standard error; plain lines if that is not a terminal.
+    """A tqdm bar on standard error if that is a terminal, else plain lines.
 
     ``done`` is the time of day at which the last step will end if steps keep the average duration that they
     have had since this process started training. ``VRAM``, on a CUDA device only, is the largest amount of
-    memory that tensors have used at once; torch's cache and the driver use more.
+    memory that tensors have used at once; torch's cache and the driver use more. The environment variable
+    ``TQDM_DISABLE`` turns off both the bar and the lines.
     """
 
     refresh_seconds: float
+    line_seconds: float
     _bar: tqdm | None = field(default=None, init=False, repr=False)
     # Step and time, in seconds since the epoch, at which this process started training.
     _begun: tuple[int, float] = field(default=(0, 0.0), init=False, repr=False)
+    # The next line is due at this reading of the monotonic clock, in seconds.
+    _due: float = field(default=0.0, init=False, repr=False)
+    # The line of the last step; empty once it has been printed.
+    _pending: str = field(default="", init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        require_range("callback.progress.refresh_seconds", self.refresh_seconds, low=0, example=0.5)
+        require_range("callback.progress.line_seconds", self.line_seconds, low=0, example=10)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
-        """Open the bar at the current step."""
-        self._begun = state.step, time.time()
-        self._bar = tqdm(
-            total=context.total_steps,
-            initial=state.step,
-            desc=context.prompt[:32],
-            unit="step",
-            mininterval=self.refresh_seconds,
-            dynamic_ncols=True,
-        )
+        """Open the bar at the current step, if standard error is a terminal."""
+        self._begun, self._due, self._pending = (state.step, time.time()), 0.0, ""
+        self._bar = None
+        if sys.stderr.isatty():
+            self._bar = tqdm(
+                total=context.total_steps,
+                initial=state.step,
+                desc=context.prompt[:TITLE],
+                unit="step",
+                mininterval=self.refresh_seconds,
+                dynamic_ncols=True,
+            )
 
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
-        """Advance the bar by one step."""
-        if self._bar is None:
-            return
-        shown = {"N": report.num_gaussians, "loss": f"{report.loss:.3g}"}
+        """Advance the bar by one step, or print a line if one is due."""
+        shown = {"N": str(report.num_gaussians), "loss": f"{report.loss:.3g}"}
         first_step, first_time = self._begun
+        now = time.time()
+        pace = (now - first_time) / max(report.step - first_step, 1)  # seconds per step
         if first_step < report.step < context.total_steps:
-            now = time.time()
-            pace = (now - first_time) / (report.step - first_step)
             shown["done"] = clock(now, pace * (context.total_steps - report.step))
         if (peak := peak_memory(state.gaussians.device)) is not None:
             shown["VRAM"] = f"{peak / GIB:.1f}GiB"
-        self._bar.set_postfix(shown, refresh=False)
-        self._bar.update(1)
+        if self._bar is not None:
+            self._bar.set_postfix(shown, refresh=False)
+            self._bar.update(1)
+            return
+        if pace > 0:
+            shown = {"speed": f"{1 / pace:.3g} steps/s", **shown}
+        facts = ", ".join(f"{name}={value}" for name, value in shown.items())
+        self._pending = f"{context.prompt[:TITLE]}: step {report.step}/{context.total_steps}, {facts}"
+        if time.monotonic() >= self._due or report.step == context.total_steps:
+            self._print()
 
     def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
-        """Close the bar and leave its last line on the screen."""
+        """Close the bar and leave its last line on the screen, or print the line of the last step."""
         self.on_abort(context)
 
     def on_abort(self, context: RunContext) -> None:
-        """Close the bar, so that the next message starts on a new line."""
+        """Do the same, so that the next message starts on a new line."""
         if self._bar is not None:
             self._bar.close()
+        elif self._pending:
+            self._print()
+
+    def _print(self) -> None:
+        """Print the line of the last step. It is flushed, so that a log can be followed."""
+        if not os.environ.get("TQDM_DISABLE"):
+            print(self._pending, file=sys.stderr, flush=True)
+        self._pending, self._due = "", time.monotonic() + self.line_seconds
 
 
 def clock(now: float, seconds: float) -> str:

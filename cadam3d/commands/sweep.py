@@ -12,9 +12,9 @@ from cadam3d.sweep.start import start
 
 
 def run(command: str, overrides: Sequence[str], flags: Sequence[str], options: Namespace) -> int:
-    """Run the sweep of a line and report on it. Return 0 if every job has a result."""
+    """Run the sweep of a line and report on it. Return 0 if every job has a result, or after a dry run."""
     ended = start(command, overrides, flags, options)
-    if not ended.was_stopped:
+    if not (ended.was_stopped or ended.was_dry):
         write_report(ended.folder)
     return ended.code
 

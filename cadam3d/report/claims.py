@@ -24,6 +24,9 @@ BOOTSTRAP_SEED = 0  # the same results give the same interval
 # cases, and 5 cannot pass a sign test.
 LEAST_FOR_INTERVAL = 6
 SIGNIFICANT = 1 - CONFIDENCE  # of the sign test
+# Prompts that quartiles need. Those of fewer would look like an interval, but say no more than the values do.
+LEAST_FOR_QUARTILES = 5
+MOST_LISTED = 4  # values that are listed one by one
 
 
 @dataclass(frozen=True)
@@ -56,17 +59,54 @@ SSIM = Quality("SSIM", "", 4, lambda result: result.ssim)
 
 @dataclass(frozen=True)
 class Spread:
-    """Median and quartiles of numbers, one per cell."""
+    """The median of numbers, one per cell, and how far they differ.
 
-    low: float  # first quartile
-    median: float
-    high: float  # third quartile
+    This is the only place that decides how a page shows that: with quartiles if there are at least
+    ``LEAST_FOR_QUARTILES`` prompts, else with the values themselves or the lowest and the highest.
+    """
+
+    values: tuple[float, ...]  # sorted
+    has_quartiles: bool
 
     @classmethod
-    def of(cls, values: Iterable[float]) -> "Spread":
-        """Return the spread of at least one value."""
-        low, median, high = np.quantile(np.fromiter(values, dtype=float), (0.25, 0.5, 0.75))
-        return cls(float(low), float(median), float(high))
+    def of(cls, values: Mapping[Cell, float]) -> "Spread":
+        """Return the spread of one value per cell, of which there must be at least one."""
+        prompts = {cell[PROMPT] for cell in values}
+        return cls(tuple(sorted(values.values())), len(prompts) >= LEAST_FOR_QUARTILES)
+
+    @property
+    def median(self) -> float:
+        """Return the median."""
+        return float(np.median(self.values))
+
+    @property
+    def low(self) -> float:
+        """Return the first quartile, or the lowest value if there are too few prompts."""
+        return float(np.quantile(self.values, self.ends[0]))
+
+    @property
+    def high(self) -> float:
+        """Return the third quartile, or the highest value if there are too few prompts."""
+        return float(np.quantile(self.values, self.ends[1]))
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Return the probabilities of the quantiles ``low`` and ``high``."""
+        return (0.25, 0.75) if self.has_quartiles else (0.0, 1.0)
+
+    def negated(self) -> "Spread":
+        """Return the spread of the negative values."""
+        return Spread(tuple(-value for value in reversed(self.values)), self.has_quartiles)
+
+    def described(self, written: Callable[[float], str]) -> str:
+        """Return the spread in words; ``written`` turns a number into text."""
+        if self.has_quartiles:
+            return f"quartiles {written(self.low)} to {written(self.high)}"
+        if len(self.values) == 1:
+            return f"value {written(self.values[0])}"
+        if len(self.values) <= MOST_LISTED:
+            return f"values {', '.join(map(written, self.values))}"
+        return f"lowest {written(self.low)}, highest {written(self.high)}"
 
 
 @dataclass(frozen=True)
@@ -171,15 +211,15 @@ def compare(results: Sequence[JobResult], ours: ArmSetting, theirs: ArmSetting) 
     pairs = [Pair(cell, of_ours[cell], of_theirs[cell]) for cell in both]
     if not pairs:
         return None
-    ssims = [pair.ssim for pair in pairs if pair.ssim is not None]
+    ssims = {pair.cell: pair.ssim for pair in pairs if pair.ssim is not None}
     return PairedComparison(
         ours=ours,
         theirs=theirs,
         pairs=pairs,
         only_ours=len(of_ours.keys() - of_theirs.keys()),
         only_theirs=len(of_theirs.keys() - of_ours.keys()),
-        reduction=Spread.of(pair.reduction for pair in pairs),
-        psnr=Spread.of(pair.psnr for pair in pairs),
+        reduction=Spread.of({pair.cell: pair.reduction for pair in pairs}),
+        psnr=Spread.of({pair.cell: pair.psnr for pair in pairs}),
         ssim=Spread.of(ssims) if ssims else None,
         psnr_over_seeds=over_seeds({pair.cell: pair.psnr for pair in pairs}),
         early=sum(pair.ours.ended_early for pair in pairs),
@@ -232,8 +272,8 @@ def frontier(
                 cells=len(cells),
                 early=sum(result.ended_early for result in cells.values()),
                 left_out=len(members) - len(cells),
-                count=Spread.of(counts.values()),
-                gain=Spread.of(gains.values()),
+                count=Spread.of(counts),
+                gain=Spread.of(gains),
                 count_over_seeds=over_seeds({cell: math.log10(n) for cell, n in counts.items()}),
                 gain_over_seeds=over_seeds(gains),
             )

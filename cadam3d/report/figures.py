@@ -5,14 +5,11 @@ everywhere.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Annotation
-from matplotlib.transforms import Bbox, BboxBase
 
 from cadam3d.report.claims import (
     PSNR,
@@ -20,11 +17,13 @@ from cadam3d.report.claims import (
     FrontierPoint,
     Hull,
     Quality,
+    Spread,
     by_cell,
     frontier,
     has_no_growth,
     standard_setting,
 )
+from cadam3d.report.labels import Label, place_labels
 from cadam3d.report.palette import INK, PAPER, SOFT
 from cadam3d.report.results import (
     NO_NOISE,
@@ -50,15 +49,6 @@ from cadam3d.report.style import (
 # A dagger: some jobs of the setting ended before their last step.
 EARLY = "\u2020"
 ROOM = 0.07  # between labels, as a share of the axis
-MARK = 6.0  # half the side of the square that a mark covers, in pixels
-# Possible places for the name of an arm, the best first: alignment, and offset in points.
-SPOTS = (
-    ("center", 0, 8),
-    ("center", 0, -16),
-    *((ha, x, y) for y in (8, -16, 19, -27, 30, -38) for ha, x in (("left", -6), ("right", 6))),
-    ("left", 9, -3),
-    ("right", -9, -3),
-)
 
 
 def frontier_ssim_figure(results: Sequence[JobResult]) -> Figure | None:
@@ -78,15 +68,16 @@ def frontier_figure(results: Sequence[JobResult], quality: Quality = PSNR) -> Fi
     figure = new_figure(len(levels), height=3.5)
     panels = figure.subplots(1, len(levels), squeeze=False, sharey=True)[0]
     gains = all(has_no_growth(at_noise(results, level)) for level in levels)
-    named: dict[str, dict[str, tuple[float, float]]] = {}
+    labels: dict[str, list[Label]] = {}
     for axes, level in zip(panels, levels, strict=True):
         here = at_noise(results, level)
         axes.set_xscale("log")
-        named[level] = {
-            arm: _frontier_curve(axes, points, style[arm])
-            for arm in arms
-            if (points := frontier(here, arm, here if gains else (), quality))
-        }
+        curves = {arm: frontier(here, arm, here if gains else (), quality) for arm in arms}
+        found = [_frontier_curve(axes, curve, style[arm]) for arm, curve in curves.items() if curve]
+        # The names of the arms come first and get the best places.
+        labels[level] = sorted(
+            (label for each in found for label in each), key=lambda label: not label.is_name
+        )
         axes.set_title(level_title(level))
         axes.set_xlabel("Gaussians at the end")
         label_log_axis(axes.xaxis, room=1.25)
@@ -94,22 +85,22 @@ def frontier_figure(results: Sequence[JobResult], quality: Quality = PSNR) -> Fi
     low, high = panels[0].get_ylim()
     panels[0].set_ylim(low - 0.06 * (high - low), high + 0.1 * (high - low))
     for axes, level in zip(panels, levels, strict=True):
-        _upper_curve(axes, results, level, at_noise(results, level) if gains else (), quality)
+        reference = at_noise(results, level) if gains else ()
+        labels[level] += _upper_curve(axes, results, level, reference, quality)
     panels[0].set_ylabel(quality.gain if gains else quality.axis)
     keys = {
         result.arm: ", ".join(key for key, _ in result.setting.thresholds) for result in measured(results)
     }
     legend = [f"{arm}: {keys[arm]}" for arm in arms if keys[arm]]
-    panels[0].text(
-        0.98, 0.03, "\n".join(legend), transform=panels[0].transAxes, ha="right", fontsize=7, color=SOFT
-    )
+    panels[0].set_xlabel("\n".join([panels[0].get_xlabel(), *legend]))
     for axes, level in zip(panels, levels, strict=True):
-        _name_arms(axes, named[level], style)
+        # The names of the arms come first and get the best places.
+        place_labels(axes, sorted(labels[level], key=lambda label: not label.is_name))
     return figure
 
 
-def _frontier_curve(axes: Axes, points: Sequence[FrontierPoint], look: Look) -> tuple[float, float]:
-    """Draw one arm and return the place that its name belongs to.
+def _frontier_curve(axes: Axes, points: Sequence[FrontierPoint], look: Look) -> list[Label]:
+    """Draw one arm and return its labels: its name, and the thresholds of its settings.
 
     With one threshold the curve is a line through all settings; with more it is the hull of their results.
     """
@@ -132,68 +123,18 @@ def _frontier_curve(axes: Axes, points: Sequence[FrontierPoint], look: Look) -> 
             mew=1.1 if is_main or not is_whole else 0.5,
             zorder=5 if is_main else 4,
         )
-        if is_line:
-            _annotate(axes, point.setting.values + EARLY * (point.early > 0), place, (0, -11))
+    named = next((at for point, at in zip(points, places, strict=True) if point.is_standard), places[-1])
+    pairs = list(zip(points, places, strict=True))
     # A curve of several thresholds has too many settings to label each, so only its ends are labelled.
-    if len(points) > 1 and not is_line:
-        _annotate(axes, points[0].setting.values, places[0], (-6, -2), ha="right")
-        _annotate(axes, points[-1].setting.values, places[-1], (6, -2), ha="left")
-    return next((at for point, at in zip(points, places, strict=True) if point.is_standard), places[-1])
-
-
-def _name_arms(axes: Axes, places: Mapping[str, tuple[float, float]], style: Mapping[str, Look]) -> None:
-    """Write the name of each arm next to its place, at the first spot where it covers no mark and no text."""
-    figure = axes.get_figure()
-    assert isinstance(figure, Figure)
-    renderer = FigureCanvasAgg(figure).get_renderer()
-    figure.draw_without_rendering()  # computes the final places
-    taken = [text.get_window_extent(renderer) for text in axes.texts if text.get_text()]
-    for line in axes.lines:
-        if line.get_marker() not in ("", "None", None):
-            marks = axes.transData.transform(np.column_stack(line.get_data()))
-            taken += [Bbox.from_bounds(x - MARK, y - MARK, 2 * MARK, 2 * MARK) for x, y in marks]
-    frame = axes.get_window_extent(renderer)
-    for arm, place in places.items():
-        texts = [_annotate(axes, arm, place, (x, y), ha=ha, look=style[arm]) for ha, x, y in SPOTS]
-        boxes = [text.get_window_extent(renderer) for text in texts]
-        covered = [box.count_overlaps(taken) + 9 * (not _contains(frame, box)) for box in boxes]
-        best = covered.index(min(covered))
-        for text in texts[:best] + texts[best + 1 :]:
-            text.remove()
-        taken.append(boxes[best])
-
-
-def _contains(outer: BboxBase, inner: BboxBase) -> bool:
-    return all(outer.contains(*corner) for corner in inner.corners())
-
-
-def _annotate(
-    axes: Axes,
-    text: str,
-    place: tuple[float, float],
-    offset: tuple[float, float],
-    *,
-    ha: str = "center",
-    look: Look | None = None,
-) -> Annotation:
-    """Write text next to a mark: small and grey, or in the look of an arm."""
-    style = {"fontsize": 6.5, "color": SOFT} if look is None else {"fontsize": 8.5, "color": look.color}
-    weight = "normal" if look is None else "bold"
-    return axes.annotate(
-        text,
-        place,
-        offset,
-        textcoords="offset points",
-        ha=ha,
-        weight=weight,
-        zorder=6,
-        in_layout=False,
-        **style,
-    )
+    shown = pairs if is_line else [pairs[0], pairs[-1]] if len(pairs) > 1 else []
+    values = [
+        Label(point.setting.values + EARLY * (point.early > 0), place, look.color) for point, place in shown
+    ]
+    return [Label(points[0].setting.arm, named, look.color, is_name=True), *values]
 
 
 def _bars(axes: Axes, point: FrontierPoint, look: Look) -> None:
-    """Draw quartiles over cells as thin pale bars and the standard deviation over seeds as thick ones."""
+    """Draw the spread over cells as thin pale bars and the standard deviation over seeds as thick ones."""
     x, y = point.count.median, point.gain.median
     pale = {"color": look.color, "alpha": 0.35, "lw": 0.9, "zorder": 2}
     axes.plot([point.count.low, point.count.high], [y, y], **pale)
@@ -208,34 +149,27 @@ def _bars(axes: Axes, point: FrontierPoint, look: Look) -> None:
 
 def _upper_curve(
     axes: Axes, results: Sequence[JobResult], level: str, reference: Sequence[JobResult], quality: Quality
-) -> None:
-    """Draw what any arm reaches with the same seeds without noise: how much growth could help at all."""
+) -> list[Label]:
+    """Draw what any arm reaches with the same seeds without noise: how much growth could help at all.
+
+    Return the label of the curve, if there is one.
+    """
     clean = next((each for each in levels_of(results) if each == NO_NOISE), None)
     if clean is None or clean == level:
-        return
+        return []
     there = at_noise(results, clean)
     points = [point for arm in arms_of(there) for point in frontier(there, arm, reference, quality)]
     if len(points) < 2:
-        return
+        return []
     corners = Hull((point.count.median, point.gain.median) for point in points).corners
     x, y = [10**a for a, _ in corners], [b for _, b in corners]
-    top = axes.get_ylim()[1]
+    bottom, top = axes.get_ylim()
     line = {"color": SOFT, "lw": 1.1, "ls": (0, (4, 3)), "zorder": 1}
     if min(y) < top:
         axes.plot(x, y, scaley=False, **line)
     ends = [f"{value:.{quality.digits - 1}f}" for value in (y[0], y[-1])]
     text = "without noise" if y[-1] < top else f"without noise: {' to '.join(ends)} {quality.unit}".strip()
-    place = (0.98, min((y[-1] - axes.get_ylim()[0]) / (top - axes.get_ylim()[0]), 0.92))
-    axes.annotate(
-        text,
-        place,
-        (0, 3),
-        xycoords="axes fraction",
-        textcoords="offset points",
-        ha="right",
-        fontsize=7.5,
-        color=SOFT,
-    )
+    return [Label(text, (min(x[-1], axes.get_xlim()[1]), min(y[-1], bottom + 0.92 * (top - bottom))))]
 
 
 def growth_figure(results: Sequence[JobResult]) -> Figure | None:
@@ -252,16 +186,17 @@ def growth_figure(results: Sequence[JobResult]) -> Figure | None:
         return None
     figure, style = new_figure(len(levels), height=3.2), looks(arms)
     panels = figure.subplots(1, len(levels), squeeze=False, sharey=True)[0]
+    ends = Spread.of({result.cell: 0.0 for result in results}).ends
     for axes, level in zip(panels, levels, strict=True):
         axes.set_yscale("log")
-        ends = {}
+        places = {}
         for arm in chosen:
             if paths := histories.get((level, arm)):
-                steps, low, middle, high = over_time(paths)
+                steps, low, middle, high = over_time(paths, ends)
                 axes.fill_between(steps, low, high, step="post", color=style[arm].color, alpha=0.16, lw=0)
                 axes.step(steps, middle, where="post", color=style[arm].color, lw=1.8)
-                ends[arm] = (steps[-1], middle[-1])
-        _label_ends(axes, ends, style)
+                places[arm] = (steps[-1], middle[-1])
+        _label_ends(axes, places, style)
         axes.set_title(level_title(level))
         axes.set_xlabel("step")
     label_log_axis(panels[0].yaxis)
@@ -275,9 +210,11 @@ def _histories(results: Sequence[JobResult], setting: ArmSetting) -> list[list[t
 
 
 def over_time(
-    histories: Sequence[Sequence[tuple[float, float]]],
+    histories: Sequence[Sequence[tuple[float, float]]], ends: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the steps and the three quartiles of the counts there.
+    """Return the steps and, of the counts there, the low end, the median and the high end.
+
+    ``ends`` are the probabilities of the quantiles at the two ends.
 
     A job keeps its count between records and after its end. Of two records at one step, before and after a
     refinement, the later one counts.
@@ -289,7 +226,7 @@ def over_time(
         at = np.searchsorted(np.array(sorted(last)), steps, side="right") - 1
         ordered = np.array([last[step] for step in sorted(last)])
         values.append(ordered[at.clip(0)])
-    low, middle, high = np.quantile(np.array(values), (0.25, 0.5, 0.75), axis=0)
+    low, middle, high = np.quantile(np.array(values), (ends[0], 0.5, ends[1]), axis=0)
     return steps, low, middle, high
 
 

@@ -31,6 +31,7 @@ SPARE_COLORS = ("#56b4e9", "#b07d00", "#6a5acd", "#5c7a00", "#00838f", "#1f2d6b"
 # With eight colours, a pair repeats after 24 arms.
 SPARE_MARKERS = ("<", ">", "p", "*", "d", "h")
 INCH = 2.9  # height of a panel
+LEAST_TEXT = 10.0  # CSS pixels; no text of a figure on a page is smaller, on whatever screen
 TICKS = 5  # approximate number per axis
 # The type is Any, because matplotlib types the names of its settings one by one.
 RC: Any = {
@@ -184,12 +185,17 @@ def inline(svg: str) -> str:
     """Return an SVG file as a part of an HTML page.
 
     Left out is what a page does not need: the prolog, metadata, namespaces, names of groups, fonts (those of
-    the page are used) and decimals beyond a hundredth of a point. Colours become variables of the page.
+    the page are used) and decimals beyond a hundredth of a point. Colours become variables of the page. The
+    variable ``--least`` holds the smallest width at which the text of the drawing is legible.
     """
     text = svg[svg.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>", "", text, flags=re.DOTALL)
+    least = least_width(text)
     text = re.sub(
-        r'(<svg[^>]*?) width="([\d.]+)pt"', r'\1 style="max-width: \2pt; --width: \2pt"', text, count=1
+        r'(<svg[^>]*?) width="([\d.]+)pt"',
+        rf'\1 style="max-width: \2pt; --least: {least:.0f}px"',
+        text,
+        count=1,
     )
     text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
     text = re.sub(r' xmlns(:\w+)?="[^"]*"| version="1.1"', "", text, count=3)
@@ -202,6 +208,16 @@ def inline(svg: str) -> str:
     for color, variable in VARIABLES.items():
         text = text.replace(color, f"var(--{variable}, {color})")
     return text.strip()
+
+
+def least_width(svg: str) -> float:
+    """Return the width in CSS pixels at which a drawing's smallest text has ``LEAST_TEXT``; 0 without text.
+
+    Sizes inside the drawing are in units of its view box, which has as many of them as the width has points.
+    """
+    sizes = [float(size) for size in re.findall(r"font(?:-size)?: (?:[\w ]+ )?([\d.]+)px", svg)]
+    width = re.search(r'<svg[^>]*? width="([\d.]+)pt"', svg)
+    return float(width.group(1)) * LEAST_TEXT / min(sizes) if sizes and width else 0.0
 
 
 def _compact(path: str) -> str:

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 
 from matplotlib.figure import Figure
 
@@ -12,12 +13,13 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.outcome import Outcome
 from cadam3d.io.run_folder import FIGURES, REPORT, TABLE
 from cadam3d.report import figures, pictures, tables, verdicts
-from cadam3d.report.claims import compare, standard_setting
+from cadam3d.report.claims import LEAST_FOR_QUARTILES, compare, standard_setting
 from cadam3d.report.formatting import plural
 from cadam3d.report.pages import Tile, table, write_page
-from cadam3d.report.results import NOISE, PROMPT, SEED, JobResult, arms_of, read, with_noise
+from cadam3d.report.results import ARM, NOISE, PROMPT, SEED, JobResult, arms_of, read, with_noise
 from cadam3d.report.score_maps import declared_scores, score_figure
 from cadam3d.report.style import inline, styled, write_figure
+from cadam3d.settings.line import key_of
 from cadam3d.sweep.folder import Plan, is_sweep, read_plan
 
 
@@ -39,6 +41,10 @@ class ShownFigure:
     svg: str
 
 
+SPREAD = (
+    f"the quartiles over cells or, with fewer than {LEAST_FOR_QUARTILES} prompts, the lowest and the highest "
+    "value"
+)
 # The figures of every sweep. Those of declared scores come after "growth".
 KINDS = {
     "frontier": FigureKind(
@@ -46,7 +52,7 @@ KINDS = {
         "Quality against count",
         "Up and to the left is better: more PSNR from fewer Gaussians. Each mark is the median of one "
         "setting over cells, labelled with its thresholds; the standard setting is ringed. Thick bars show "
-        "the spread over seeds, thin bars the quartiles over cells. A hollow mark lacks some cells, and a "
+        f"the spread over seeds, thin bars {SPREAD}. A hollow mark lacks some cells, and a "
         "dagger means that jobs ended early. The dashed line is the best that any arm reaches with the same "
         "seeds and no noise.",
     ),
@@ -59,7 +65,7 @@ KINDS = {
         figures.growth_figure,
         "Gaussians over time",
         "An arm that stops growing on its own levels off; an arm that does not keeps climbing. Medians over "
-        "cells; the shaded areas are quartiles.",
+        f"cells; the shaded areas show {SPREAD}.",
     ),
     "masks": FigureKind(
         pictures.masks_figure,
@@ -90,6 +96,8 @@ KINDS = {
         "One scene under each objective (lines) and arm (columns), with its final count and PSNR.",
     ),
 }
+MOST_PROMPTS = 3  # in the title of a page
+LONGEST_PROMPT = 60  # characters of a prompt there
 SCORES_AFTER = "growth"
 SCORE_CAPTION = "Darker cells hold more Gaussians; the dashed lines are values to compare with."
 
@@ -121,7 +129,7 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None) -> Path:
     return write_page(
         sweep_folder / REPORT,
         "sweep.html.jinja",
-        title=f"Sweep {sweep_folder.resolve().name}",
+        title=_title(plan, results),
         outcomes=Counter(result.outcome for result in results).most_common(),
         extent=_extent(results),
         warnings=_unknown(names or (), kinds),
@@ -182,6 +190,26 @@ def _drawn(results: Sequence[JobResult], name: str, kind: FigureKind, folder: Pa
         return ShownFigure(kind.title, kind.caption, inline(write_figure(figure, folder, name)))
 
 
+def _title(plan: Plan, results: Sequence[JobResult]) -> str:
+    """Return the name of the grid, or the keys that vary, and the prompts."""
+    grids = [str(word).partition("=")[2].strip("'\"") for word in plan.line if key_of(str(word)) == "grid"]
+    grid = next((name for name in grids if name not in ("", "null")), None)
+    varied = [ARM] if len({result.arm for result in results}) > 1 else []
+    for pairs in (
+        [result.setting.thresholds for result in results],
+        [result.cell.axes for result in results],
+    ):
+        keys = dict.fromkeys(key for each in pairs for key, _ in each if key != PROMPT)
+        varied += [key for key in keys if len({dict(each).get(key) for each in pairs}) > 1]
+    listed = " and ".join(filter(None, [", ".join(varied[:-1]), *varied[-1:]]))
+    name = grid or f"Sweep of {listed}".removesuffix(" of ")
+    texts = dict.fromkeys(result.cell[PROMPT] for result in results)
+    prompts = [shorten(text, LONGEST_PROMPT, placeholder=" ...") for text in texts]
+    shown = list(filter(None, prompts))[:MOST_PROMPTS]
+    more = f" and {len(prompts) - len(shown)} more" if len(prompts) > len(shown) > 0 else ""
+    return f"{name}: {', '.join(shown)}{more}" if shown else name
+
+
 def _extent(results: Sequence[JobResult]) -> list[str]:
     """Return how many prompts, seeds, noise levels and settings the sweep has."""
     texts = []
@@ -199,11 +227,11 @@ def _tiles(results: Sequence[JobResult]) -> list[Tile]:
     if found is None:
         return []
     fewer, psnr, ssim = found.reduction, found.psnr, found.ssim
-    quartiles = f"{psnr.low:+.2f} to {psnr.high:+.2f}"
-    seeds = quartiles if found.psnr_over_seeds is None else f"{found.psnr_over_seeds:.2f} dB over seeds"
+    cells = psnr.described(lambda value: f"{value:+.2f}")
+    seeds = cells if found.psnr_over_seeds is None else f"{found.psnr_over_seeds:.2f} dB over seeds"
     early = plural(found.early + found.theirs_early, "run")
     return [
-        Tile("Fewer Gaussians", f"{fewer.median:.1%}", f"{fewer.low:.1%} to {fewer.high:.1%}"),
+        Tile("Fewer Gaussians", f"{fewer.median:.1%}", fewer.described(lambda value: f"{value:.1%}")),
         Tile("PSNR difference", f"{psnr.median:+.2f} dB", seeds),
         Tile(
             "SSIM difference",

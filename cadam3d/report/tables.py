@@ -58,7 +58,7 @@ def objectives_table(results: Sequence[JobResult]) -> list[Line]:
 
 
 def frontier_table(results: Sequence[JobResult]) -> list[Line]:
-    """Return every setting at every noise level: medians and quartiles over cells, spread over seeds."""
+    """Return every setting at every noise level: medians and spreads over cells and over seeds."""
     lines = []
     for level in levels_of(results):
         here = at_noise(results, level)
@@ -75,9 +75,9 @@ def frontier_table(results: Sequence[JobResult]) -> list[Line]:
                         "cells": point.cells,
                         "ended early": point.early,
                         "Gaussians": round(point.count.median),
-                        "quartiles": f"{point.count.low:.0f} to {point.count.high:.0f}",
+                        "over cells": point.count.described(lambda value: f"{value:.0f}"),
                         f"{quality} (dB)": round(point.gain.median, 2),
-                        f"{quality} quartiles": f"{point.gain.low:.2f} to {point.gain.high:.2f}",
+                        f"{quality} over cells (dB)": point.gain.described(lambda value: f"{value:.2f}"),
                         "over seeds (dB)": _rounded(point.gain_over_seeds, 2),
                         ssim_title: _rounded(ssim.median if ssim else None, SSIM.digits),
                         "left out": point.left_out or None,

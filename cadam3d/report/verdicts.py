@@ -38,11 +38,11 @@ def reduction_sentence(comparison: PairedComparison) -> str:
     """Return the reduction in Gaussians, its cost in PSNR, the number of cells, and how many ended early."""
     fewer, psnr = comparison.reduction, comparison.psnr
     many, sign = ("fewer", 1) if fewer.median >= 0 else ("more", -1)
-    low, high = sorted((sign * fewer.low, sign * fewer.high))
+    spread = (fewer if sign > 0 else fewer.negated()).described(lambda value: f"{value:.1%}")
     sentence = (
         f"{comparison.ours.name} ends with {abs(fewer.median):.1%} {many} Gaussians than "
-        f"{comparison.theirs.name} (median of {_cells(comparison.cells)}; quartiles {low:.1%} to "
-        f"{high:.1%} {many}), at {psnr.median:+.2f} dB PSNR ({psnr.low:+.2f} to {psnr.high:+.2f}), "
+        f"{comparison.theirs.name} (median of {_cells(comparison.cells)}; {spread} {many}), "
+        f"at {psnr.median:+.2f} dB PSNR ({psnr.described(lambda value: f'{value:+.2f}')}), "
         f"no more than {COMPARABLE} dB lower in {comparison.comparable(COMPARABLE)} of them"
     )
     if comparison.psnr_over_seeds is not None:

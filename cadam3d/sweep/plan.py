@@ -12,6 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
+from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
 from cadam3d.settings.advice import RefusedJobError, require_values
 from cadam3d.settings.compose import flatten
@@ -23,6 +24,7 @@ from cadam3d.sweep.grid import ALWAYS_SHOWN, Axes, Grid, Job, expand, read_grid,
 PLAIN_KEY = re.compile(r"[A-Za-z_][\w.]*=")
 LAUNCHER_KEY = re.compile(r"launcher($|\.)|hydra[./]launcher($|\.)")
 GRID_KEY = re.compile(r"grid($|\.)")
+DRY_RUN = "dry_run"
 REFUSED_KEY = re.compile(r"hydra\.run\.dir$|hydra\.sweep\.subdir$|hydra[./]sweeper($|\.)")
 NOTHING_TO_SWEEP = (
     "sweep: nothing to sweep over. Try: cadam3d sweep grid=thresholds ... or densifier=baseline,cadam"
@@ -33,7 +35,7 @@ NOTHING_TO_SWEEP = (
 class Parts:
     """The overrides of a line, sorted by what they change. A search path for YAML files applies to all."""
 
-    grid: list[str]
+    grid: list[str]  # and whether to list the jobs only
     launcher: list[str]
     folder: list[str]
     jobs: list[str]
@@ -53,6 +55,11 @@ class Sweep:
     def grid_name(self) -> str | None:
         """Return the name of the grid in the line; None without one."""
         return self.cfg.hydra.runtime.choices.get("grid")
+
+    @property
+    def is_dry(self) -> bool:
+        """Return whether the jobs are only listed."""
+        return self.cfg[DRY_RUN]
 
 
 @dataclass(frozen=True)
@@ -155,6 +162,8 @@ def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> tu
     # The flag --config-name is for the jobs and not for the sweep itself.
     own = Namespace(**{**vars(options), "config_name": None})
     cfg = compose_line("sweep", [*parts.grid, *parts.launcher, *parts.folder], own)
+    is_answer = isinstance(cfg[DRY_RUN], bool)
+    require(is_answer, DRY_RUN, expected="true or false", got=cfg[DRY_RUN], example=f"{DRY_RUN}=true")
     node = cfg.get("grid")
     grid = read_grid(None if node is None else OmegaConf.to_container(node, resolve=True))
     axes = read_line(parts.jobs)
@@ -176,7 +185,7 @@ def sort_overrides(overrides: Sequence[str]) -> Parts:
             )
         if key == "hydra.mode":
             continue
-        if GRID_KEY.match(key):
+        if GRID_KEY.match(key) or key == DRY_RUN:
             parts.grid.append(override)
         elif LAUNCHER_KEY.match(key):
             parts.launcher.append(override.lstrip("+") if key == "launcher" else override)

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import FrameType
 
 from hydra.errors import HydraException
@@ -44,7 +45,7 @@ from cadam3d.settings.hydra import run_hydra
 from cadam3d.settings.line import SWEEP_FOLDER, key_of, setting_word
 from cadam3d.settings.place import in_use
 from cadam3d.settings.trust import is_trusted, require_contained
-from cadam3d.sweep import worker
+from cadam3d.sweep import preview, worker
 from cadam3d.sweep.folder import Plan, PlannedJob, Row, is_sweep, outcomes, rows_of, write_plan
 from cadam3d.sweep.grid import sweep_name
 from cadam3d.sweep.plan import Composed, Sweep, compose_all, read_sweep, shown_keys
@@ -65,13 +66,14 @@ class Ended:
     folder: Path
     code: int  # exit code; 0 if every job has a result
     was_stopped: bool  # by a signal
+    was_dry: bool = False  # nothing has run, and the folder may not exist
 
 
 def start(command: str, overrides: Sequence[str], flags: Sequence[str], options: Namespace) -> Ended:
     """Run the sweep of a line until all jobs have ended or a signal stops it.
 
-    Raises an exception before anything runs if a job cannot be composed, and ``UserError`` if the folder has
-    results that were made with other settings.
+    With ``dry_run=true`` only list the jobs. Raises an exception before anything runs if a job cannot be
+    composed, and ``UserError`` if the folder has results that were made with other settings.
     """
     sweep, composer = read_sweep(command, overrides, options)
     composed = compose_all(sweep, composer)
@@ -80,6 +82,8 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
         require_contained(folder, shlex.join(["cadam3d", "sweep", *overrides, *flags, "trust=true"]))
     jobs = _planned(sweep, composed)
     _refuse_other_settings(folder, rows_of(folder, jobs), composed)
+    if sweep.is_dry:
+        return _preview(folder, sweep, jobs, composed, flags)
     claim(folder, SWEEP_FOLDER, is_chosen=True)
     with _locked(folder), _stoppable(folder) as stop:
         _refuse_occupied(folder)
@@ -108,6 +112,35 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
     if stop.received is not None:
         return Ended(folder, 128 + stop.received, was_stopped=True)
     return Ended(folder, code, was_stopped=False)
+
+
+def _preview(
+    folder: Path,
+    sweep: Sweep,
+    jobs: list[PlannedJob],
+    composed: Sequence[Composed],
+    flags: Sequence[str],
+) -> Ended:
+    """List the jobs and estimate their time. Nothing is written except in a temporary folder."""
+    rows = rows_of(folder, jobs)
+    pending = sum(not row.has_result for row in rows)
+    done = len(rows) - pending
+    print(f"{_jobs(len(rows))} in {shown(folder)}; {done} already {_has(done)} a result")
+    print(f"\n{preview.listing(rows)}\n", flush=True)
+    plan = Plan(
+        cwd=str(Path.cwd()),
+        flags=_flags_named(flags, JOB_FLAGS),
+        threads=_threads(sweep.cfg, pending),
+        jobs=jobs,
+    )
+    steps = [job.get("steps") for job in composed]
+    # Hydra's own launcher runs one job after another.
+    is_alone = sweep.cfg.hydra.runtime.choices.get("hydra/launcher") == "basic"
+    at_a_time = 1 if is_alone else _side_by_side(sweep.cfg)
+    with TemporaryDirectory(prefix="cadam3d-") as name, _stoppable(Path(name)) as stop:
+        print(preview.estimate(rows, steps, plan, at_a_time, Path(name)))
+    code = 0 if stop.received is None else 128 + stop.received
+    return Ended(folder, code, was_stopped=stop.received is not None, was_dry=True)
 
 
 class Stop:
@@ -188,17 +221,21 @@ def _threads(cfg: DictConfig, pending: int) -> int | None:
     """Return the OpenMP threads of a job: a share of the cores, unless the user has chosen a number."""
     if "OMP_NUM_THREADS" in os.environ:
         return None
-    launcher = cfg.get("launcher") or {}
-    if threads := launcher.get("threads"):
+    if threads := (cfg.get("launcher") or {}).get("threads"):
         return threads
-    side_by_side = OmegaConf.select(cfg, "hydra.launcher.n_jobs") or launcher.get("n_jobs")
-    if side_by_side is None:
-        return None
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    side_by_side = _side_by_side(cfg)
+    return None if side_by_side is None else max(1, _cores() // max(1, min(side_by_side, pending)))
+
+
+def _side_by_side(cfg: DictConfig) -> int | None:
+    """Return how many jobs the launcher runs at a time; None if it has no such setting."""
+    number = OmegaConf.select(cfg, "hydra.launcher.n_jobs") or (cfg.get("launcher") or {}).get("n_jobs")
     # In joblib, -1 means all cores, -2 all except one, and so on.
-    if side_by_side < 0:
-        side_by_side = max(1, cores + 1 + side_by_side)
-    return max(1, cores // max(1, min(side_by_side, pending)))
+    return number if number is None or number >= 0 else max(1, _cores() + 1 + number)
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _flags_named(flags: Sequence[str], names: Sequence[str]) -> list[str]:

@@ -37,9 +37,15 @@ def as_text(rows: Sequence[Row]) -> str:
     for row in rows:
         values = [row.number, *([row.arm] if has_arms else []), *(row.swept.get(key) for key in keys)]
         facts = [row.outcome, *(row.summary.get(name) for name in SHOWN)]
-        lines.append([_cell(value) for value in (*values, *facts)])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    padded = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines]
+        lines.append([*values, *facts])
+    return aligned(lines)
+
+
+def aligned(lines: Sequence[Sequence[Any]]) -> str:
+    """Return lines of equally many values as text, in columns."""
+    texts = [[_cell(value) for value in line] for line in lines]
+    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+    padded = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in texts]
     return "\n".join("  ".join(line).rstrip() for line in padded)
 
 

@@ -115,7 +115,7 @@ def test_lines_of_steps_that_will_be_repeated_are_deleted(tmp_path):
 
 
 def test_the_bar_counts_every_step_and_shows_the_gaussians(tmp_path, capsys):
-    train(tmp_path, [Progress(refresh_seconds=0.0)], steps=3)
+    train(tmp_path, [Progress(refresh_seconds=0.0, line_seconds=10.0)], steps=3)
     shown = capsys.readouterr().err
     assert "3/3" in shown
     assert "N=20" in shown

@@ -1,17 +1,20 @@
-"""The progress bar: current step, time of the end, and peak memory of the GPU."""
+"""Progress: a bar in a terminal and lines elsewhere, with step, time of the end and peak GPU memory."""
 
+import math
 import re
 import time
 from functools import partial
 
 import pytest
 import torch
+from _pytest.capture import CaptureIO
 
 from cadam3d.callback import progress
 from cadam3d.callback.progress import Progress, clock, peak_memory
 from cadam3d.commands.train import build_trainer
+from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import component, compose
-from cadam3d.state import RunContext, StepReport
+from cadam3d.state import Outcome, RunContext, StepReport
 
 CPU = torch.device("cpu")
 NOON = time.mktime((2026, 3, 4, 12, 0, 0, 0, 0, -1))  # local time, a Wednesday
@@ -28,9 +31,25 @@ class Clock:
 
 
 @pytest.fixture
+def bar(monkeypatch, capsys) -> Progress:
+    """Return the progress of a run whose standard error is a terminal."""
+    # The class, because pytest changes the object between the fixtures and the test.
+    monkeypatch.setattr(CaptureIO, "isatty", lambda self: True)
+    return Progress(refresh_seconds=0.0, line_seconds=10.0)
+
+
+@pytest.fixture
+def lines(monkeypatch, capsys) -> Progress:
+    """Return the progress of a run whose standard error is no terminal."""
+    monkeypatch.delenv("TQDM_DISABLE", raising=False)
+    return Progress(refresh_seconds=0.0, line_seconds=10.0)
+
+
+@pytest.fixture
 def at_noon(monkeypatch) -> Clock:
     watch = Clock()
     monkeypatch.setattr(progress.time, "time", watch)
+    monkeypatch.setattr(progress.time, "monotonic", watch)
     monkeypatch.setattr("tqdm.std.time", watch)
     return watch
 
@@ -53,8 +72,7 @@ def last_line(capsys) -> str:
     return re.split(r"[\r\n]", capsys.readouterr().err.rstrip())[-1]
 
 
-def test_the_bar_shows_the_step_and_the_time_of_the_end(at_noon, run, capsys):
-    bar = Progress(refresh_seconds=0.0)
+def test_the_bar_shows_the_step_and_the_time_of_the_end(bar, at_noon, run, capsys):
     bar.on_start(*run)
     for number in range(1, 5):
         at_noon.now += 600  # ten minutes per step, so six more steps take an hour
@@ -65,10 +83,10 @@ def test_the_bar_shows_the_step_and_the_time_of_the_end(at_noon, run, capsys):
     assert "loss=0.5" in line
     assert "done=13:40" in line
     assert "VRAM" not in line  # only on CUDA devices
+    assert "step 4" not in line  # a bar, not a line
 
 
-def test_the_pace_of_a_resumed_run_counts_only_its_own_steps(at_noon, run, capsys):
-    bar = Progress(refresh_seconds=0.0)
+def test_the_pace_of_a_resumed_run_counts_only_its_own_steps(bar, at_noon, run, capsys):
     run[1].step = 6
     bar.on_start(*run)
     at_noon.now += 60
@@ -78,8 +96,7 @@ def test_the_pace_of_a_resumed_run_counts_only_its_own_steps(at_noon, run, capsy
     assert "done=12:04" in line
 
 
-def test_a_finished_run_shows_no_time_of_the_end(at_noon, run, capsys):
-    bar = Progress(refresh_seconds=0.0)
+def test_a_finished_run_shows_no_time_of_the_end(bar, at_noon, run, capsys):
     bar.on_start(*run)
     for number in range(1, 11):
         at_noon.now += 1
@@ -89,19 +106,78 @@ def test_a_finished_run_shows_no_time_of_the_end(at_noon, run, capsys):
     assert "done=" not in line
 
 
-def test_a_disabled_bar_raises_no_error(run, capsys, monkeypatch):
-    """Users and cluster scripts do this with the environment variable TQDM_DISABLE."""
+def test_in_a_terminal_there_are_no_lines(at_noon, run, bar, capsys):
+    bar.on_start(*run)
+    for number in range(1, 11):
+        at_noon.now += 60
+        step(bar, run, number)
+    bar.on_end(*run, Outcome.FINISHED)
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_elsewhere_there_is_a_whole_line_for_the_first_and_last_step_and_every_few_seconds(
+    at_noon, run, lines, capsys
+):
+    lines.on_start(*run)
+    for number in range(1, 11):
+        at_noon.now += 4
+        step(lines, run, number)
+    lines.on_end(*run, Outcome.FINISHED)
+    printed = capsys.readouterr().err
+    assert "\r" not in printed
+    assert printed.endswith("\n")
+    shown = printed.splitlines()
+    assert re.findall(r"step (\d+)/10", printed) == ["1", "4", "7", "10"]
+    assert shown[1] == "a red cube: step 4/10, speed=0.25 steps/s, N=5, loss=0.5, done=12:00"
+    assert shown[3] == "a red cube: step 10/10, speed=0.25 steps/s, N=5, loss=0.5"
+
+
+@pytest.mark.parametrize("end", ["on_end", "on_abort"])
+def test_a_run_that_ends_early_prints_its_last_step(at_noon, run, lines, capsys, end):
+    lines.on_start(*run)
+    for number in (1, 2, 3):
+        step(lines, run, number)
+    arguments = {"on_end": (*run, Outcome.MAX_GAUSSIANS), "on_abort": run[:1]}[end]
+    getattr(lines, end)(*arguments)
+    assert [line.split(",")[0] for line in capsys.readouterr().err.splitlines()] == [
+        "a red cube: step 1/10",
+        "a red cube: step 3/10",
+    ]
+
+
+@pytest.mark.parametrize("end", ["on_end", "on_abort"])
+def test_a_run_without_steps_prints_no_line(run, lines, capsys, end):
+    lines.on_start(*run)
+    getattr(lines, end)(*{"on_end": (*run, Outcome.FINISHED), "on_abort": run[:1]}[end])
+    assert capsys.readouterr().err == ""
+
+
+def test_disabled_progress_prints_nothing(run, lines, capsys, monkeypatch):
+    """Users and cluster scripts use the environment variable of tqdm, which reads it on import."""
+    monkeypatch.setenv("TQDM_DISABLE", "1")
+    lines.on_start(*run)
+    step(lines, run, 1)
+    lines.on_abort(run[0])
+    assert capsys.readouterr().err == ""
+
+
+def test_a_disabled_bar_raises_no_error(run, bar, capsys, monkeypatch):
     monkeypatch.setattr(progress, "tqdm", partial(progress.tqdm, disable=True))
-    bar = Progress(refresh_seconds=0.0)
     bar.on_start(*run)
     step(bar, run, 1)
     bar.on_abort(run[0])
     assert capsys.readouterr().err == ""
 
 
-def test_the_bar_shows_the_peak_of_the_gpu(at_noon, run, capsys, monkeypatch):
+@pytest.mark.parametrize("key", ["refresh_seconds", "line_seconds"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1, True])
+def test_times_that_are_no_numbers_are_refused(key, value):
+    with pytest.raises(UserError, match=rf"^callback\.progress\.{key}: expected a number >= 0, got .* Try: "):
+        Progress(**{"refresh_seconds": 0.5, "line_seconds": 10, key: value})
+
+
+def test_the_bar_shows_the_peak_of_the_gpu(bar, at_noon, run, capsys, monkeypatch):
     monkeypatch.setattr(progress, "peak_memory", lambda device: int(7.26 * 2**30))
-    bar = Progress(refresh_seconds=0.0)
     bar.on_start(*run)
     at_noon.now += 1
     step(bar, run, 1)

@@ -76,8 +76,29 @@ def test_the_spread_over_seeds_leaves_out_that_of_prompts():
     assert over_seeds({cell("a", 0): 1.0, cell("b", 0): 2.0}) is None
 
 
-def test_quartiles_of_one_value_are_that_value():
-    assert Spread.of([3.0]) == Spread(3.0, 3.0, 3.0)
+def test_five_prompts_have_quartiles():
+    spread = Spread.of({cell(prompt, 0): float(i) for i, prompt in enumerate("abcde")})
+    assert (spread.low, spread.median, spread.high) == (1.0, 2.0, 3.0)
+    assert spread.described("{:g}".format) == "quartiles 1 to 3"
+    assert spread.negated().described("{:g}".format) == "quartiles -3 to -1"
+
+
+@pytest.mark.parametrize(
+    ("prompts", "seeds", "expected"),
+    [
+        ("a", 1, "value 0"),
+        ("ab", 1, "values 0, 1"),
+        ("ab", 2, "values 0, 1, 10, 11"),
+        ("ab", 9, "lowest 0, highest 81"),
+        ("abcd", 9, "lowest 0, highest 83"),
+    ],
+)
+def test_few_prompts_have_values_or_named_extremes_whatever_the_number_of_seeds(prompts, seeds, expected):
+    spread = Spread.of(
+        {cell(p, seed): i + 10.0 * seed for i, p in enumerate(prompts) for seed in range(seeds)}
+    )
+    assert spread.described("{:g}".format) == expected
+    assert (spread.low, spread.high) == (min(spread.values), max(spread.values))
 
 
 # Hulls: the best that an arm can reach.
@@ -318,7 +339,7 @@ def test_gains_are_measured_from_the_same_cell_without_growth(jobs):
     results = read(jobs.folder)
     assert has_no_growth(results)
     point = frontier(results, "cadam")[0]
-    assert point.gain == Spread(2.0, 2.0, 2.0)
+    assert point.gain.values == (2.0, 2.0)
     assert (point.count.median, point.cells) == (200, 2)
 
 

@@ -9,9 +9,10 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from cadam3d.report import figures, pictures
+from cadam3d.report.labels import Label, place_labels
 from cadam3d.report.palette import ARMS, DARK, css
 from cadam3d.report.results import read
-from cadam3d.report.style import KNOWN, inline, looks, spread_labels, styled, write_figure
+from cadam3d.report.style import KNOWN, inline, looks, new_figure, spread_labels, styled, write_figure
 from cadam3d.report.sweep_page import KINDS
 
 
@@ -109,16 +110,21 @@ def test_a_setting_that_lacks_cells_is_hollow_and_an_early_end_has_a_dagger(jobs
 
 def test_growth_is_the_median_over_cells_at_each_step():
     steps, low, middle, high = figures.over_time(
-        [[(0, 100), (50, 100), (50, 200)], [(0, 100), (50, 100), (50, 400)], [(0, 100), (100, 300)]]
+        [[(0, 100), (50, 100), (50, 200)], [(0, 100), (50, 100), (50, 400)], [(0, 100), (100, 300)]],
+        (0.0, 1.0),
     )
     assert steps.tolist() == [0, 50, 100]
     assert middle.tolist() == [100, 200, 300]
-    assert (low <= middle).all()
-    assert (middle <= high).all()
+    assert low.tolist() == [100, 100, 200]
+    assert high.tolist() == [100, 400, 400]
 
 
 def test_a_job_that_ended_early_keeps_its_count():
-    assert figures.over_time([[(0, 100), (10, 500)], [(0, 100), (20, 100)]])[2].tolist() == [100, 300, 300]
+    assert figures.over_time([[(0, 100), (10, 500)], [(0, 100), (20, 100)]], (0.25, 0.75))[2].tolist() == [
+        100,
+        300,
+        300,
+    ]
 
 
 def test_the_thresholds_of_the_arm_that_varies_two_are_drawn(bench_results):
@@ -253,3 +259,64 @@ def test_names_of_arms_at_the_same_place_do_not_overlap(jobs):
     assert len(names) == 4
     boxes = [name.get_window_extent(renderer) for name in names]
     assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+
+
+def boxes_of(axes) -> tuple[list, list]:
+    """Return the boxes of all texts in a panel, and the places of its marks in pixels."""
+    figure = axes.get_figure()
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    figure.draw_without_rendering()
+    texts = [text.get_window_extent(renderer) for text in axes.texts if text.get_text()]
+    lines = [line for line in axes.lines if line.get_marker() not in ("", "None", None)]
+    marks = [mark for line in lines for mark in axes.transData.transform(np.column_stack(line.get_data()))]
+    return texts, marks
+
+
+def nasty(name: str, arm: int, i: int, rng) -> tuple[float, float]:
+    """Return count and PSNR of setting ``i`` of an arm."""
+    return {
+        "all at one point": (1000.0, 20.0),
+        "a diagonal": (1000.0 * 1.02 ** (i + 8 * arm), 20.0 + 0.01 * (i + 8 * arm)),
+        "arms side by side": (1000.0 * 2**i, 20.0 + 0.3 * i + 0.001 * arm),
+        "at random": (float(10 ** rng.uniform(2, 4)), float(rng.uniform(18, 22))),
+        "a pile and an outlier": (1e6 if i == arm == 0 else 1000.0 + i, 30.0 if i == arm == 0 else 20.0),
+    }[name]
+
+
+@pytest.mark.parametrize("with_reference", [False, True])
+@pytest.mark.parametrize(
+    "name",
+    ["all at one point", "a diagonal", "arms side by side", "at random", "a pile and an outlier"],
+)
+def test_no_label_of_a_frontier_covers_another_one_or_a_mark(jobs, name, with_reference):
+    rng = np.random.default_rng(0)
+    keys = {"baseline": "tau_pos", "absgrad": "tau_pos", "cadam_no_snr": "tau_Q"}
+    for arm, key in enumerate(keys):
+        for i in range(8):
+            n, psnr = nasty(name, arm, i, rng)
+            words = (f"densifier.{keys[key]}=0.{i + 1}234", "noise=weak")
+            jobs.add(key, *words, n=n, psnr=psnr)
+            if with_reference:
+                jobs.add(key, words[0], "noise=none", n=n, psnr=psnr + 1)
+    for arm in ("cadam", "cadam_calibrated", "mcmc"):
+        jobs.add(arm, "noise=weak", n=1000, psnr=20.0)
+    figure = draw("frontier", read(jobs.folder))
+    assert "absgrad" in texts(figure)
+    for axes in figure.axes:
+        found, marks = boxes_of(axes)
+        assert not any(one.overlaps(other) for one, other in combinations(found, 2))
+        assert not any(box.contains(*mark) for box in found for mark in marks)
+        frame = axes.get_window_extent(FigureCanvasAgg(figure).get_renderer())
+        assert all(frame.x0 <= box.x0 and box.x1 <= frame.x1 for box in found)
+    assert len(boxes_of(figure.axes[-1])[0]) >= 24 + 6  # nothing is left out
+
+
+def test_labels_without_room_are_left_out():
+    with styled():
+        figure = new_figure(1)
+        axes = figure.subplots()
+        axes.plot([1], [1], marker="o")
+        place_labels(axes, [Label(f"{i} and so on and on", (1, 1)) for i in range(400)])
+    found, _ = boxes_of(axes)
+    assert 10 < len(found) < 400
+    assert not any(one.overlaps(other) for one, other in combinations(found, 2))

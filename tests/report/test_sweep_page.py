@@ -96,6 +96,50 @@ def test_nothing_that_a_user_typed_becomes_markup(jobs):
     assert nasty not in report.write_sweep(jobs.folder).read_text(encoding="utf-8")
 
 
+def heading(folder) -> str:
+    """Return the heading of the page of a sweep, which must also be its title."""
+    page = report.write_sweep(folder).read_text(encoding="utf-8")
+    found = re.search(r"<h1>(.*)</h1>", page)
+    assert found is not None
+    assert f"<title>{found.group(1)} - cadam3d</title>" in page
+    return html.unescape(found.group(1))
+
+
+def test_the_title_of_a_grid_is_its_name_with_the_prompts(jobs):
+    jobs.line = ["steps=60", "grid='thresholds'", "prompt=a red torus"]
+    for tau in (0.1, 0.2):
+        jobs.add("cadam", "prompt=a red torus", f"densifier.tau_Q={tau}", n=100, psnr=20.0)
+    assert heading(jobs.folder) == "thresholds: a red torus"
+
+
+def test_the_title_of_a_list_names_the_keys_that_vary_and_some_prompts(jobs):
+    for prompt in ("a red torus", "a blue cube", "a <b>", "a cone", "a very " + "long " * 30 + "prompt"):
+        for arm in ("baseline", "cadam"):
+            for seed in (0, 1):
+                jobs.add(arm, f"prompt='{prompt}'", f"seed={seed}", n=100, psnr=20.0)
+    assert heading(jobs.folder) == "Sweep of densifier and seed: a red torus, a blue cube, a <b> and 2 more"
+
+
+def test_the_title_of_a_list_of_prompts_has_no_other_key(jobs):
+    jobs.add("cadam", "prompt=a cube", n=100, psnr=20.0)
+    jobs.add("cadam", "prompt=" + "long " * 30, n=100, psnr=20.0)
+    assert heading(jobs.folder) == f"Sweep: a cube, {'long ' * 11}..."
+
+
+@pytest.mark.parametrize("prompts", [1, 2, 4, 5])
+def test_a_page_shows_quartiles_only_with_enough_prompts(jobs, prompts):
+    for prompt in range(prompts):
+        for seed in range(3):
+            for arm, n in (("none", 50), ("baseline", 1000), ("cadam", 100)):
+                words = (f"prompt=thing {prompt}", f"seed={seed}")
+                jobs.files(jobs.add(arm, *words, n=n + seed + prompt, psnr=20.0 + seed), n)
+    page = report.write_sweep(jobs.folder).read_text(encoding="utf-8")
+    # The captions state the rule.
+    numbers = text_of(page.replace(html.escape(sweep_page.SPREAD), ""))
+    assert ("quartiles" in numbers) == (prompts == 5)
+    assert ("lowest" in numbers) == (prompts in (2, 4))
+
+
 def test_a_folder_that_is_not_a_sweep_is_refused(tmp_path):
     with pytest.raises(UserError, match="expected a sweep"):
         report.write_sweep(tmp_path)

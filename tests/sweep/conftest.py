@@ -36,6 +36,7 @@ with log.open("a") as file:
 prompt = "a cube" if "resume" in given else given.get("prompt", "'a cube'").strip("'")
 steps, seed = int(given.get("steps", 5)), int(given.get("seed", 0))
 summary = dict(prompt=prompt, seed=seed, num_gaussians_initial=4, num_gaussians=steps, seconds=1.5)
+summary |= dict(steps=steps, steps_asked=steps)
 
 def write(outcome, **more):
     (folder / "summary.json").write_text(json.dumps(dict(summary, outcome=outcome, **more)))

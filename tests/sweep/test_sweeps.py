@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -22,7 +23,7 @@ from cadam3d.io.run_folder import JOBS
 from cadam3d.settings import advice, hydra
 from cadam3d.settings import compose as settings
 from cadam3d.settings.hydra import read_flags
-from cadam3d.sweep import plan, start
+from cadam3d.sweep import plan, preview, start
 from cadam3d.sweep.folder import Row, load, read_plan
 from cadam3d.sweep.process import run_job
 from cadam3d.sweep.table import as_text, varying_keys, write_table
@@ -718,3 +719,79 @@ def test_preparing_a_sweep_needs_no_torch(start_sweep, tmp_path):
 @pytest.mark.parametrize(("seconds", "text"), [(5.4, "5 s"), (240, "4 min"), (30_000, "8.3 h")])
 def test_the_remaining_time_is_rounded(seconds, text):
     assert duration(seconds) == text
+
+
+# A dry run.
+
+
+def contents(folder: Path) -> dict[str, bytes | None]:
+    return {str(path): path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
+
+
+def test_a_dry_run_lists_the_jobs_and_leaves_nothing_behind(sweep, tmp_path):
+    result = sweep("prompt=a cube,a ball", "densifier=baseline,cadam", "dry_run=true")
+    assert result.code == 0
+    lines = result.out.splitlines()
+    assert lines[0].startswith("4 jobs in multirun/")
+    assert lines[0].endswith("; 0 already have a result")
+    assert lines[2].split() == ["job", "prompt", "densifier", "state", "folder"]
+    assert [line.split("  ")[0] for line in lines[3:7]] == ["0", "1", "2", "3"]
+    assert all("to run" in line for line in lines[3:7])
+    assert re.fullmatch(
+        r"About \d+ s for 4 jobs, one after another. Based on 5 of the 5 steps of job 0, which ran alone in "
+        r"a temporary folder; .*",
+        lines[-1],
+    )
+    assert contents(tmp_path) == {}
+
+
+def test_a_dry_run_of_a_sweep_with_results_reads_its_times_from_them(sweep, tmp_path, calls):
+    sweep("prompt=a cube", "seed=0,1")
+    before = contents(tmp_path)
+    [folder] = (tmp_path / "multirun").iterdir()
+    result = sweep("prompt=a cube", "seed=0,1,2", "dry_run=true", f"hydra.sweep.dir={folder}")
+    assert result.code == 0
+    assert result.out.count("has a result: finished") == 2
+    assert result.out.count("to run") == 1
+    assert result.out.endswith("for 1 job, one after another. Based on the 2 jobs with a result.\n")
+    assert len(calls(folder)) == 2
+    assert contents(tmp_path) == before
+    whole = sweep("prompt=a cube", "seed=0,1", "dry_run=true")
+    assert whole.out.endswith("Every job has a result, so there is nothing left to run.\n")
+
+
+def test_a_dry_run_stops_a_measured_job_and_uses_the_steps_that_it_has_done(sweep, tmp_path, monkeypatch):
+    monkeypatch.setattr(preview, "STARTING_SECONDS", 0.5)
+    result = sweep("prompt=a wait", "seed=0,1", "steps=7", "dry_run=true")
+    assert result.code == 0
+    assert "Based on 7 of the 7 steps of job 0" in result.out
+    assert contents(tmp_path) == {}
+
+
+def test_a_dry_run_whose_job_fails_gives_the_reason_in_place_of_an_estimate(sweep):
+    result = sweep("prompt=a mistake", "seed=0,1", "dry_run=true")
+    assert result.code == 0
+    assert result.out.endswith(
+        "No estimate: job 0 has not done a single step (failed: prompt: expected a shape. Try: a cube).\n"
+    )
+
+
+def test_a_dry_run_refuses_results_with_other_settings_like_the_sweep_itself(sweep, tmp_path):
+    sweep("prompt=a cube", "seed=0,1", "hydra.sweep.dir=here")
+    for job in (tmp_path / "here").glob("*/summary.json"):
+        job.with_name("config.yaml").write_text("steps: 5\n")
+    line = ("prompt=a cube", "seed=0,1", "steps=6", "hydra.sweep.dir=here")
+    assert sweep(*line, "dry_run=true").err == sweep(*line).err
+    assert sweep(*line, "dry_run=true").code == 1
+
+
+def test_a_dry_run_is_on_or_off(sweep):
+    result = sweep("prompt=a cube", "seed=0,1", "dry_run=7")
+    assert result.err == "cadam3d: dry_run: expected true or false, got 7. Try: dry_run=true\n"
+    assert sweep("prompt=a cube", "seed=0,1", "dry_run=false").out.count("[") == 2
+
+
+def test_a_dry_run_of_a_single_run_is_answered_with_the_flag_that_prints_its_settings(hydra_sweep):
+    refused = hydra_sweep("prompt=a cube", "dry_run=true", command="train")
+    assert refused.code == 1
+    assert refused.err.endswith("Try: cadam3d train 'prompt=a cube' --cfg job\n")

@@ -5,15 +5,12 @@ relation = "on" | "under" | "above" | "next to" | "in front of" | "behind" | "an
 phrase   = (article | number | size | colour | "and" | pattern)* noun
 """
 
-import difflib
 import math
-import re
-from contextlib import suppress
 from dataclasses import dataclass
 
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
-from cadam3d.prior.shapes.objects import ALIASES, known_objects, known_primitives
+from cadam3d.prior.shapes.suggestion import near_meaning, near_spelling, nearest_prompt
 from cadam3d.prior.shapes.vocabulary import (
     ARTICLES,
     COLOUR_ALIASES,
@@ -25,11 +22,23 @@ from cadam3d.prior.shapes.vocabulary import (
     SIZES,
     STRETCHES,
 )
+from cadam3d.prior.shapes.words import (
+    ADJECTIVES,
+    SHADES,
+    is_known,
+    is_plural,
+    known_words,
+    noun_of,
+    typed_words,
+    words_of,
+)
 
 EXAMPLE = "a red and yellow checkered torus"
 FREE_TEXT = "Other priors read free text; `cadam3d doctor` lists those that are ready to use here."
 MAX_COLOURS = 2
-SHADES = ("dark", "light")
+MAX_OBJECTS = 200  # of one prompt; sentences nest, and Python limits how deeply
+MAX_NAMED = 20  # unknown words in one message
+MAX_SHOWN = 300  # characters of a prompt in a message
 
 
 @dataclass(frozen=True)
@@ -53,45 +62,18 @@ class Sentence:
     others: tuple["Sentence", ...] = ()  # two for "between", one for other relations
 
 
-def known_words() -> dict[str, tuple[str, ...]]:
-    """Return all words that the grammar knows, by part of speech."""
-    return {
-        "primitives": known_primitives(),
-        "objects": known_objects(),
-        "other names": tuple(ALIASES),
-        "colours": (*COLOURS, *COLOUR_ALIASES, *SHADES),
-        "patterns": tuple(PATTERNS),
-        "sizes": (*SIZES, *STRETCHES),
-        "numbers": tuple(NUMBERS),
-        "relations": tuple(dict.fromkeys(" ".join(words) for words, _ in RELATIONS)),
-    }
-
-
 def parse(prompt: str, key: str = "prompt") -> Sentence:
     """Parse the prompt that the setting ``key`` holds.
 
     Raises ``UserError`` that names every unknown word, with the nearest known words, or the missing part of
     the sentence.
     """
-    words = _join_compounds(re.findall(r"[a-z0-9]+", prompt.lower()))
+    words = words_of(prompt)
     _reject_unknown(key, prompt, words)
-    return _Reader(key, prompt, [word for word in words if word not in FILLERS | ARTICLES]).sentence()
-
-
-def noun_of(word: str) -> str | None:
-    """Return the name of the object that a noun, singular or plural, denotes; None for other words."""
-    nouns = {*known_primitives(), *known_objects()}
-    irregular = {"tori": "torus", "boxes": "box", "arches": "arch"}
-    for form in (irregular.get(word, word), word.removesuffix("s"), word.removesuffix("es")):
-        name = ALIASES.get(form, form)
-        if name in nouns:
-            return name
-    return None
-
-
-def is_plural(word: str) -> bool:
-    """Return whether a noun is in the plural."""
-    return word not in ALIASES and word not in {*known_primitives(), *known_objects()}
+    reader = _Reader(key, prompt, [word for word in words if word not in FILLERS | ARTICLES])
+    if sum(noun_of(word) is not None for word in words) > MAX_OBJECTS:
+        raise reader.fail(f"at most {MAX_OBJECTS} objects")
+    return reader.sentence()
 
 
 class _Reader:
@@ -131,9 +113,8 @@ class _Reader:
 
     def colours(self, described: list[str]) -> tuple[str, ...]:
         """Return the colours among the words before a noun. Raises ``UserError`` for misplaced words."""
-        adjectives = {*COLOURS, *COLOUR_ALIASES, *SHADES, *PATTERNS, *SIZES, *STRETCHES, *NUMBERS, "and"}
         for word in described:
-            if word not in adjectives:
+            if word not in ADJECTIVES and word != "and":
                 raise self.fail(f"an object before {word!r}")
         colours = []
         for before, word in zip(["", *described], [*described, "end"], strict=True):
@@ -165,55 +146,38 @@ class _Reader:
         return self.words[self.position] if self.position < len(self.words) else None
 
     def fail(self, expected: str) -> UserError:
-        return fail(self.key, expected=expected, got=self.prompt, example=f'{self.key}="{EXAMPLE}"')
-
-
-def _join_compounds(words: list[str]) -> list[str]:
-    """Join nouns that are often written as two words, such as "light house" or "ice cream"."""
-    pairs = {
-        ("light", "house"): "lighthouse",
-        ("ice", "cream"): "icecream",
-        ("pine", "tree"): "pine",
-        ("fir", "tree"): "pine",
-        ("wind", "mill"): "windmill",
-        ("snow", "man"): "snowman",
-        ("sail", "boat"): "boat",
-    }
-    joined: list[str] = []
-    for word in words:
-        if joined and (joined[-1], word) in pairs:
-            joined[-1] = pairs[joined[-1], word]
-        else:
-            joined.append(word)
-    return joined
+        return fail(
+            self.key, expected=expected, got=_shown(self.prompt), example=_line(self.key, self.prompt)
+        )
 
 
 def _reject_unknown(key: str, prompt: str, words: list[str]) -> None:
-    vocabulary = {part for group in known_words().values() for entry in group for part in entry.split()}
-    vocabulary |= ARTICLES | FILLERS | {"and"}
-    unknown = [word for word in dict.fromkeys(words) if word not in vocabulary and noun_of(word) is None]
+    unknown = [word for word in dict.fromkeys(words) if not is_known(word)]
     if not unknown:
         return
-    # Sorted, since the order of a set differs between processes and decides between equally near words.
-    candidates = sorted(vocabulary - ARTICLES)
-    near = {word: difflib.get_close_matches(word, candidates, n=2, cutoff=0.7) for word in unknown}
-    named = ", ".join(
-        f"{word!r}" + (f" (did you mean {' or '.join(known)}?)" if known else "")
-        for word, known in near.items()
-    )
+    typed = {word.lower(): word for word in typed_words(prompt)}
+    named = ", ".join(_named(typed.get(word, word)) for word in unknown[:MAX_NAMED])
+    if len(unknown) > MAX_NAMED:
+        named += f" and {len(unknown) - MAX_NAMED} more"
     listed = "\n".join(f"  {group}: {', '.join(known)}" for group, known in known_words().items())
     raise UserError(
-        f"{key}: expected words that prior=shapes knows, got {prompt!r}. Unknown: {named}. Known words:\n"
-        f'{listed}\n{FREE_TEXT} Try: {key}="{_corrected(words, near) or EXAMPLE}"'
+        f"{key}: expected words that prior=shapes knows, got {_shown(prompt)!r}. Unknown: {named}. "
+        f"Known words:\n{listed}\n{FREE_TEXT} Try: {_line(key, prompt)}"
     )
 
 
-def _corrected(words: list[str], near: dict[str, list[str]]) -> str | None:
-    """Return the prompt with every unknown word replaced by its nearest known word, if that can be parsed."""
-    if not all(near.values()):
-        return None
-    prompt = " ".join(near[word][0] if word in near else word for word in words)
-    with suppress(UserError):
-        parse(prompt)
-        return prompt
-    return None
+def _named(word: str) -> str:
+    """Return an unknown word with the known words that may be meant."""
+    if meaning := near_meaning(word.lower()):
+        return f"{_shown(word)!r} (nearest: {meaning})"
+    similar = near_spelling(word.lower())
+    return f"{_shown(word)!r}" + (f" (did you mean {' or '.join(similar)}?)" if similar else "")
+
+
+def _line(key: str, prompt: str) -> str:
+    """Return the nearest prompt that can be parsed, as it is typed."""
+    return f'{key}="{nearest_prompt(prompt) or EXAMPLE}"'
+
+
+def _shown(text: str) -> str:
+    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."

@@ -1,4 +1,7 @@
-"""The words of the grammar: colours, patterns, sizes, numbers and relations. Objects are in objects.py."""
+"""The words of the grammar: colours, patterns, sizes, numbers and relations. Objects are in objects.py.
+
+At the end are the words that the grammar does not know but for which it can suggest others.
+"""
 
 # Albedo in [0, 1]. The colours are saturated but never 0 or 1, so that shading and over-saturation stay
 # visible.
@@ -83,3 +86,113 @@ RELATIONS: tuple[tuple[tuple[str, ...], str], ...] = (
 ARTICLES = frozenset({"a", "an", "the", "some"})
 # Words that are common in prompts and do not describe the scene, as in "a 3d model of a ...".
 FILLERS = frozenset({"photo", "picture", "image", "render", "rendering", "model", "3d", "of"})
+
+# Words that the grammar does not know, and the known words that an error message suggests instead. An entry
+# is a common noun of prompts for text-to-3D models with an object of similar shape or use, a word for a
+# relation, or a frequent word of another language. Singular; plurals are derived.
+NEAR_WORDS: dict[str, str] = {
+    "robot": (
+        "animal ant astronaut bear bee bird boy bulldog bunny butterfly cat chicken child corgi cow "
+        "creature crocodile deer dinosaur dog dragon eagle elephant fox frog giraffe girl goat gorilla "
+        "hamster horse human kitten knight lego lion lizard man monkey monster mouse octopus owl panda "
+        "parrot peacock people person pig pony puppy rabbit raccoon rat sheep snake soldier spider "
+        "squirrel statue tiger toy trex turtle tyrannosaurus unicorn warrior wizard wolf woman zebra "
+        "zombie hund katze chien gato roboter"
+    ),
+    "snowman": "baby bust doll duck figure figurine gnome penguin santa teddy buddha",
+    "car": (
+        "ambulance bicycle bike bulldozer bus jeep locomotive lorry motorbike motorcycle scooter tank "
+        "taxi tractor train tram truck van vehicle wagon auto voiture coche carro macchina"
+    ),
+    "boat": "canoe ferry galleon gondola kayak raft submarine vessel yacht schiff bateau barco",
+    "rocket": (
+        "airplane aeroplane aircraft helicopter jet missile plane shuttle spacecraft starship zeppelin"
+    ),
+    "house": (
+        "apartment barn building bungalow cabin church garage hut igloo mansion office pavilion school "
+        "shed shrine temple villa haus maison casa"
+    ),
+    "castle": "chateau citadel fort fortress opera palace burg schloss castillo castello",
+    "lighthouse": "belfry chimney minaret obelisk skyscraper steeple leuchtturm phare faro",
+    "windmill": "fan propeller turbine moulin molino",
+    "chair": "armchair bench couch seat sofa throne stuhl chaise silla sedia",
+    "table": "bed counter shelf stand tisch mesa tavolo",
+    "mug": (
+        "basket beaker bottle bowl bucket glass goblet jar jug kettle pitcher pot teacup teapot vase "
+        "tasse taza"
+    ),
+    "lamp": "bulb chandelier lantern streetlight lampe",
+    "candle": "torch kerze bougie vela",
+    "hammer": (
+        "axe brush drill fork gun guitar key knife racket saw screwdriver shovel spoon sword tool violin "
+        "wrench"
+    ),
+    "cake": (
+        "bread burger cheesecake cupcake food hamburger lasagna loaf muffin pancake pie pizza pudding "
+        "sandwich tart kuchen gateau"
+    ),
+    "donut": "bagel pretzel tire tyre wheel",
+    "icecream": "gelato popsicle sundae",
+    "mushroom": "champignon fungus jellyfish umbrella parasol pilz seta",
+    "flower": "bouquet daisy lily orchid plant rose sunflower tulip blume fleur flor fiore",
+    "tree": "bonsai bush forest oak palm shrub baum arbre arbol albero",
+    "pine": "spruce christmas conifer",
+    "cactus": "aloe succulent kaktus",
+    "planet": "earth jupiter mars moon saturn world",
+    "sphere": (
+        "apple balloon baseball basketball bead berry bomb bubble cannonball football fruit head marble "
+        "melon pearl peach pumpkin skull soccer strawberry sun tomato watermelon kugel boule bola palla "
+        "esfera"
+    ),
+    "cube": "wurfel cubo rubik",
+    "box": (
+        "book cabinet cage camera chest computer console crate cupboard drawer fridge laptop phone piano "
+        "radio refrigerator suitcase television treehouse tv typewriter wardrobe caja boite"
+    ),
+    "cylinder": "barrel battery can column drum log pillar tin zylinder cilindro",
+    "capsule": "banana carrot cucumber hotdog pickle sausage",
+    "cone": "funnel hat horn kegel cono",
+    "pyramid": "hill mountain tent volcano pyramide piramide",
+    "disc": "cookie dish medal pancakes shield turntable wafer",
+    "ring": "anillo anneau band bracelet crown necklace wreath",
+    "ellipsoid": "avocado fish lemon pear pineapple potato seed shark stone rock whale",
+    "octahedron": "crystal emerald jewel ruby sapphire",
+    "arch": "bridge gate rainbow",
+    "star": "asterisk snowflake starfish stern estrella etoile stella",
+    "red": "rot rote roten roter rotes rouge rojo roja rosso rossa scarlet",
+    "blue": "blau blaue blauer blaues bleu bleue azul azure",
+    "green": "grun grune gruner grunes vert verte verde emeralds",
+    "yellow": "gelb gelbe gelber gelbes jaune amarillo giallo",
+    "white": "weiss weisse weisser weisses blanc blanche blanco blanca bianco ivory",
+    "black": "schwarz schwarze schwarzer schwarzes noir noire negro nero",
+    "purple": "lila lavender",
+    "brown": "bronze copper wooden",
+    "silver": "chrome metallic steel",
+    "gold": "brass",
+    "striped": "stripe",
+    "spotted": "dot polka speckled",
+    "small": "klein kleine kleiner kleines miniature petit petite pequeno piccolo",
+    "large": "giant gigantic enormous gross grosse grosser grosses grand grande massive",
+    "long": "elongated stretched",
+    "two": "2 both couple pair zwei deux dos due",
+    "three": "3 few many several drei trois tres tre",
+    "four": "4 vier quatre cuatro quattro",
+    "five": "5 6 7 8 9 10 12 six seven eight nine ten dozen hundred funf cinq cinco cinque",
+    "one": "1 single",
+    "on": "riding upon onto auf sur sobre",
+    "under": "wearing unter sous",
+    "next to": "against alongside around by inside holding neben with",
+    "behind": "hinter derriere detras",
+    "and": "und et y plus",
+}
+# Frequent words of prompts that describe the quality of a picture or a material, and words of other languages
+# without content. The nearest prompt leaves them out.
+_IGNORED = """
+highly detailed detail details photorealistic realistic dslr 8k 4k hd uhd hdr high resolution
+quality best masterpiece award winning cinematic studio lighting trending artstation unreal engine
+octane blender beautiful cute pretty nice ultra very super extremely sharp focus side back view
+angle shot zoomed out zoom isolated background please style made from at as like dressed sitting
+standing planted piled is are that this it its for ein eine einen einem einer eines der die das dem
+den un une le la les el los las il lo uno una de des du del
+"""
+IGNORED_WORDS = frozenset(_IGNORED.split())
