@@ -17,12 +17,14 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import OVERRIDES, claim, holds_run
 from cadam3d.settings.advice import explain, require_values, reraise_interrupt
 from cadam3d.settings.compose import TEXT_KEYS
+from cadam3d.settings.declared import require_settings
 from cadam3d.settings.help_page import help_text
 from cadam3d.settings.hydra import (
     compose_line,
     place_run,
     read_flags,
     refuse_missing_settings,
+    refuse_unread_settings,
     run_composed,
     run_hydra,
 )
@@ -112,6 +114,8 @@ def _command(line: Line, task: Task) -> int:
     cfg = compose_line(line.command, [*line.overrides, "hydra.mode=RUN"], options)
     require_values(cfg)
     refuse_missing_settings(cfg, line.command, line.overrides)
+    refuse_unread_settings(cfg, line.command, line.overrides)
+    require_settings(cfg)
     if line.command in TRAINING:
         _train(cfg, line, task)
     else:

@@ -14,13 +14,23 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import __version__
+from cadam3d.augmentation import Augmentation
+from cadam3d.background import Background
+from cadam3d.callback.base import Callback
+from cadam3d.camera.base import CameraSampler
 from cadam3d.commands.messages import note, note_backend
 from cadam3d.core.checks import require, require_whole
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn
+from cadam3d.densifier.base import Densifier
+from cadam3d.densifier.baseline import Baseline
+from cadam3d.densifier.refine import Refine
 from cadam3d.exporter.base import Exporter
+from cadam3d.exposure import Exposure
+from cadam3d.guidance.base import Guidance
+from cadam3d.initializer.base import Initializer
 from cadam3d.io.atomic import remove_leftovers
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import read_jsonl, write_json
@@ -36,9 +46,14 @@ from cadam3d.io.run_folder import (
     shown,
 )
 from cadam3d.metric.base import Metric
-from cadam3d.rasterizer.base import Backend
+from cadam3d.optimizer import AdamSettings
+from cadam3d.prior.base import DiffusionPrior
+from cadam3d.prior.prompting import Prompting
+from cadam3d.rasterizer.base import Backend, Rasterizer
+from cadam3d.regularizer import Regularizer
 from cadam3d.report import write_report
 from cadam3d.settings.compose import component, components, flatten, load_config
+from cadam3d.settings.declared import TARGET
 from cadam3d.state import Outcome, RunContext, TrainState
 from cadam3d.trainer import Trainer
 
@@ -54,18 +69,19 @@ def run(cfg: DictConfig) -> float | None:
     """Train, export, measure and report. Return the PSNR in dB if the prior has true images."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     device = resolve_device(cfg.device)
-    for key, least in (("seed", 0), ("steps", 1), ("views", 1)):
-        require_whole(key, cfg[key], low=least, example=3)
+    require_whole("seed", cfg.seed, low=0, example=3)
     require_determinism(device)
+    require_unused(cfg)
 
     # Everything that can be refused is refused here, before the folder changes.
     trainer = build_trainer(cfg, device)
     backend = trainer.rasterizer.prepare(device)
-    exporters: dict[str, Exporter] = components(cfg.exporter)
-    metrics: dict[str, Metric] = components(cfg.metric)
+    exporters: dict[str, Exporter] = components(cfg.exporter, Exporter, "exporter")
+    metrics: dict[str, Metric] = components(cfg.metric, Metric, "metric")
+    initializer = component(cfg.initializer, Initializer, "initializer")
     memory = estimate_memory(cfg, trainer)
     embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
-    state = start_or_resume(cfg, trainer, device, folder)
+    state = start_or_resume(cfg, trainer, initializer, device, folder)
     # The prior is loaded last, because an initializer may have needed the memory and has freed it now.
     trainer.prior.load()
     for text in filter(None, (trainer.prior.notice(), state.initial_note)):
@@ -130,23 +146,37 @@ def require_determinism(device: torch.device) -> None:
     torch.set_deterministic_debug_mode("error" if device.type == "cpu" else "default")
 
 
+def require_unused(cfg: DictConfig) -> None:
+    """Raise ``UserError`` for wrong values of settings that some priors or densifiers do not read."""
+    component(cfg.prompting, Prompting, "prompting")
+    key, published = "published_baseline", cfg.published_baseline
+    is_node = OmegaConf.is_dict(published) and not OmegaConf.is_missing(cfg, key) and published is not None
+    example = f"'{key}.views=sum_norm'"
+    require(is_node, key, expected="the keys of a node", got=published, example=example)
+    target = f"{Baseline.__module__}.{Baseline.__name__}"
+    node = OmegaConf.merge({TARGET: target, "screen_px": None}, published)
+    node._set_parent(cfg)
+    node._set_key(key)
+    component(node, Baseline)
+
+
 def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
     """Build the components that ``cfg`` names, and move the prior to ``device``."""
     return Trainer(
         steps=cfg.steps,
         views=cfg.views,
-        camera=component(cfg.camera),
-        background=component(cfg.background),
-        augmentation=component(cfg.augmentation),
-        rasterizer=component(cfg.rasterizer),
-        prior=component(cfg.prior).to(device),
-        guidance=component(cfg.guidance),
-        densifier=component(cfg.densifier),
-        refine=component(cfg.refine),
-        optimizer=component(cfg.optimizer),
-        exposure=component(cfg.exposure),
-        regularizers=components(cfg.regularizer),
-        callbacks=list(components(cfg.callback).values()),
+        camera=component(cfg.camera, CameraSampler, "camera"),
+        background=component(cfg.background, Background, "background"),
+        augmentation=component(cfg.augmentation, Augmentation, "augmentation"),
+        rasterizer=component(cfg.rasterizer, Rasterizer, "rasterizer"),
+        prior=component(cfg.prior, DiffusionPrior, "prior").to(device),
+        guidance=component(cfg.guidance, Guidance, "guidance"),
+        densifier=component(cfg.densifier, Densifier, "densifier"),
+        refine=component(cfg.refine, Refine, "refine"),
+        optimizer=component(cfg.optimizer, AdamSettings, "optimizer"),
+        exposure=component(cfg.exposure, Exposure, "exposure"),
+        regularizers=components(cfg.regularizer, Regularizer, "regularizer"),
+        callbacks=list(components(cfg.callback, Callback, "callback").values()),
     )
 
 
@@ -167,15 +197,17 @@ def measure_memory(device: torch.device) -> dict[str, float]:
     return {"memory_peak_gib": round(torch.cuda.max_memory_allocated(device) / 2**30, 3)}
 
 
-def start_or_resume(cfg: DictConfig, trainer: Trainer, device: torch.device, folder: Path) -> TrainState:
+def start_or_resume(
+    cfg: DictConfig, trainer: Trainer, initializer: Initializer, device: torch.device, folder: Path
+) -> TrainState:
     """Return the state before the first step, or that of a checkpoint if ``resume=`` names a run with one."""
     if cfg.resume is None:
-        return trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, device)
+        return trainer.start(cfg.prompt, initializer, cfg.seed, device)
     named = Path(cfg.resume)
     path = named if named.is_file() else latest_checkpoint(folder / CHECKPOINTS)
     if path is None:
         print(f"No checkpoint in {folder / CHECKPOINTS} yet: starting at step 0.", file=sys.stderr)
-        return trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, device)
+        return trainer.start(cfg.prompt, initializer, cfg.seed, device)
     state = TrainState.restore(load_checkpoint(path), trainer.optimizer, trainer.densifier, device)
     require(
         cfg.seed == state.seed,
