@@ -1,6 +1,6 @@
 """Asset: open the results of a run, as ``render``, ``export``, ``eval`` and ``view`` do first."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor
 
-from cadam3d.commands.messages import note_backend
+from cadam3d.commands.messages import keeping_others, note_backend
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
@@ -75,7 +75,7 @@ def run_config(folder: Path) -> DictConfig:
 
 def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
     """Return a function that renders ``gaussians`` and prepares the configured rasterizer at first use."""
-    built: Rasterizer = component(rasterizer)
+    built: Rasterizer = component(rasterizer, Rasterizer, "rasterizer")
     render = render_fn(built, lambda: gaussians)
 
     def render_with_note(cameras: Cameras, background: Float[Tensor, "v 3"]) -> RenderOutput:
@@ -86,8 +86,11 @@ def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
 
 
 def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
-    """Run every exporter of ``cfg`` on ``asset``, and return the paths of the files in ``folder``."""
-    exporters: Sequence[Exporter] = list(components(cfg.exporter).values())
+    """Run every exporter of ``cfg`` on ``asset``, and return the paths of the files in ``folder``.
+
+    An exporter that fails costs only its own files. Raises ``UserError`` if all of them fail.
+    """
+    exporters: Mapping[str, Exporter] = components(cfg.exporter, Exporter, "exporter")
     if not exporters:
         raise UserError("exporter: expected at least one, got none. Try: exporter=[images,turntable]")
     try:
@@ -96,7 +99,13 @@ def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
         reason = error.strerror or error
         raise UserError(f"output: cannot write to {folder} ({reason}). Try: output=/tmp/cadam3d") from error
     render = renderer(cfg.rasterizer, asset.gaussians)
-    return [path for exporter in exporters for path in exporter.export(asset.gaussians, render, folder)]
+    paths, warnings = [], []
+    for name, exporter in exporters.items():
+        with keeping_others(f"exporter.{name}", warnings):
+            paths += exporter.export(asset.gaussians, render, folder)
+    if len(warnings) == len(exporters):
+        raise UserError(warnings[0])
+    return paths
 
 
 def output_folder(cfg: DictConfig, asset: Asset, name: str) -> Path:

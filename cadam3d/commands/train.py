@@ -18,11 +18,11 @@ from cadam3d.augmentation import Augmentation
 from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
-from cadam3d.commands.messages import note, note_backend
+from cadam3d.commands.messages import keeping_others, note, note_backend
 from cadam3d.core.checks import require, require_whole
 from cadam3d.core.device import resolve_device
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.memory import CAMERA, PIXEL, require_memory
 from cadam3d.core.render import RenderFn
 from cadam3d.densifier.base import Densifier
 from cadam3d.densifier.baseline import Baseline
@@ -78,6 +78,9 @@ def run(cfg: DictConfig) -> float | None:
     backend = trainer.rasterizer.prepare(device)
     exporters: dict[str, Exporter] = components(cfg.exporter, Exporter, "exporter")
     metrics: dict[str, Metric] = components(cfg.metric, Metric, "metric")
+    size = cfg.camera.get("size")
+    rendered = PIXEL * float(size) ** 2 if isinstance(size, int) else PIXEL
+    require_memory("views", cfg.views, unit=CAMERA + rendered, example=2)
     initializer = component(cfg.initializer, Initializer, "initializer")
     memory = estimate_memory(cfg, trainer)
     embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
@@ -115,8 +118,9 @@ def run(cfg: DictConfig) -> float | None:
         written, warnings = export(exporters, gaussians, render, folder)
         asset = folder / ASSET if folder / ASSET in written else None
         truth = trainer.prior.truth(cfg.prompt)
-        for metric in metrics.values():
-            summary |= metric.measure(gaussians, render, truth, asset)
+        for name, metric in metrics.items():
+            with keeping_others(f"metric.{name}", warnings):
+                summary |= metric.measure(gaussians, render, truth, asset)
         if asset is not None:
             summary["asset_bytes"] = asset.stat().st_size
         # This is the last entry of a complete summary.
@@ -282,12 +286,8 @@ def export(
     written: list[Path] = []
     warnings: list[str] = []
     for name, exporter in exporters.items():
-        try:
+        with keeping_others(f"exporter.{name}", warnings):
             written += exporter.export(gaussians, render, folder)
-        except (UserError, MemoryError, torch.OutOfMemoryError) as error:
-            warnings.append(f"exporter.{name}: {error}")
-            log.info("exporter.%s: %s", name, error)
-            print(f"Warning: exporter.{name}: {error}", file=sys.stderr)
     return written, warnings
 
 

@@ -85,9 +85,9 @@ def refuse_missing_settings(cfg: DictConfig, command: str, overrides: Sequence[s
 def refuse_unread_settings(cfg: DictConfig, command: str, overrides: Sequence[str]) -> None:
     """Refuse what changes nothing: unknown top-level settings, ``camera={}``, and settings of unused members.
 
-    An example of the last kind is ``+callback.candidates.every=5`` if that callback is not chosen. The keys of
-    chosen components are checked when these are built. A top-level setting of the user's own YAML is accepted
-    if another setting refers to it.
+    An example of the last kind is ``+callback.candidates.every=5`` if that callback is not chosen. The keys
+    of chosen components are checked when these are built. A top-level setting of the user's own YAML is
+    accepted if another setting refers to it.
     """
     raw = OmegaConf.to_container(cfg, resolve=False)
     assert isinstance(raw, dict)
