@@ -90,6 +90,7 @@ def run(cfg: DictConfig) -> float | None:
     for text in filter(None, (trainer.prior.notice(), state.initial_note)):
         note(text)
     note_backend(backend)
+    note_no_growth(trainer.refine)
 
     remove_leftovers(folder)
     config_text = OmegaConf.to_yaml(cfg, resolve=True)
@@ -192,6 +193,16 @@ def estimate_memory(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
         return {}
     note(f"The prior will need about {estimate}. To reduce this, set vram=low or fewer views.")
     return {"memory_estimate_gib": round(estimate.total / 2**30, 3)}
+
+
+def note_no_growth(refine: Refine) -> None:
+    """Print a note if the schedule has no refinement in a run of any length."""
+    first = (refine.start // refine.interval + 1) * refine.interval
+    if first >= refine.end:
+        note(
+            f"nothing will grow, because refine.start={refine.start} and refine.end={refine.end} have no "
+            f"multiple of refine.interval={refine.interval} between them"
+        )
 
 
 def measure_memory(device: torch.device) -> dict[str, float]:

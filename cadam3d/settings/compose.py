@@ -12,7 +12,7 @@ from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import InstantiationException
+from hydra.errors import HydraException, InstantiationException
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -24,6 +24,8 @@ from cadam3d.settings.declared import require_declared
 
 # Hydra behaves like this version even if a newer one is installed.
 VERSION_BASE = "1.3"
+# The beginning of Hydra's message for a group that is set to a number or to null.
+NO_NAME_COMPLAINT = "Config group override must be a string or a list"
 # Values of these keys are always text, so the user need not quote them for Hydra.
 TEXT_KEYS = ("prompt", "negative_prompt")
 # Characters. At three bytes each they still fit into a file name.
@@ -51,11 +53,11 @@ def compose(
     keeps Hydra's own node. Raises Hydra's exceptions; ``cadam3d.settings.advice`` explains them to the user.
     """
     register_resolvers()
+    require_files(folder or config_dir(), "--config-path")
     places = create_config_search_path(str((folder or config_dir()).resolve()))
     if search_path is not None:
         own = Path(search_path).absolute()
-        if not own.is_dir():
-            raise UserError(f"--config-dir: expected a folder, got {search_path!r}. Try: --config-dir=DIR")
+        require_files(own, "--config-dir")
         places.prepend("command-line", f"file://{own}", anchor=SearchPathQuery(provider="schema"))
     # A command that runs inside Hydra may compose too, so Hydra's global state is restored afterwards.
     outer = GlobalHydra.instance().hydra
@@ -65,12 +67,34 @@ def compose(
         cfg = Hydra.create_main_hydra2("cadam3d", places).compose_config(
             config_name, list(overrides), run_mode=RunMode.RUN, from_shell=False
         )
+    except (HydraException, OmegaConfBaseException, UserError):
+        raise
+    # A wrong YAML file, or a deeply nested value, raises an exception of a parser, of a codec or of Python.
+    except Exception as error:
+        if str(error).startswith(NO_NAME_COMPLAINT):
+            raise
+        reason = " ".join(str(error).split())[:300] or type(error).__name__
+        place = "--config-dir" if search_path is not None else "configuration"
+        raise UserError(f"{place}: cannot be read ({reason}). Try: cadam3d {config_name} --help") from error
     finally:
         GlobalHydra.instance().hydra = outer
     if not with_hydra:
         with open_dict(cfg):
             cfg.pop("hydra", None)
     return cfg
+
+
+def require_files(folder: Path, flag: str) -> None:
+    """Raise ``UserError`` unless ``folder`` is one, and its YAML files are regular files.
+
+    Reading a named pipe would never end. Only the folders of groups are searched.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{flag}: expected a folder, got {str(folder)!r}. Try: cadam3d train --help")
+    groups = [path.relative_to(config_dir()) for path in config_dir().rglob("*") if path.is_dir()]
+    for path in [path for group in (Path(), *groups) for path in (folder / group).glob("*.yaml")]:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise UserError(f"{flag}: {path} is not a regular file. Try: cadam3d train --help")
 
 
 def component(node: Any, kind: type = object, key: str = "") -> Any:

@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import re
+import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice, product
@@ -131,10 +132,11 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
     number = math.prod(map(len, common.values()))
     number *= sum(math.prod(map(len, axes.values())) for axes in arms.values())
     if number > MOST_JOBS:
-        longest = max(common | line, key=lambda key: len((common | line)[key]), default="grid")
+        axes_of = {key: axis for axes in (*arms.values(), common) for key, axis in axes.items()}
+        longest = max(axes_of, key=lambda key: len(axes_of[key]))
         raise UserError(
             f"{longest}: expected at most {MOST_JOBS} jobs in a sweep, got {number}. "
-            f"Try: fewer values of {longest}, or several sweeps"
+            f"Try: {shlex.quote(axes_of[longest][0].line)}"
         )
     named, counted = _named(grid, line), swept_keys(grid, line)
     found: dict[frozenset[str], Job] = {}
