@@ -8,6 +8,8 @@ import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import is_dataclass
+from functools import cache
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -20,6 +22,8 @@ from cadam3d.core.errors import UserError
 Kinds = tuple[type, ...]  # a value must be of one of them
 
 TARGET = "_target_"
+# The parser in C is ten times as fast, if PyYAML has it.
+LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 # Integers beyond this fit into no tensor.
 LARGEST_WHOLE = 2**63 - 1
 # Control characters that a text may have.
@@ -82,8 +86,7 @@ def _require_described(node: DictConfig, kinds: Kinds, key: str) -> None:
     """Check the class of a node, and the keys and values of its settings."""
     target = _plain(node)[TARGET]
     cls = _loaded(target, kinds, key)
-    parameters = inspect.signature(cls).parameters
-    hints = get_type_hints(cls if is_dataclass(cls) else cls.__init__)
+    parameters, hints = _signature(cls)
     names = [name for name in map(str, node) if name != TARGET]
     takes_any = any(each.kind is each.VAR_KEYWORD for each in parameters.values())
     if not takes_any and (unknown := [name for name in names if name not in parameters]):
@@ -104,6 +107,13 @@ def _require_described(node: DictConfig, kinds: Kinds, key: str) -> None:
         value = node[name]
         if not _fits(value, declared, place):
             raise _refusal(place, declared, value, _example(place, target, cls, name, hints))
+
+
+@cache
+def _signature(cls: type) -> tuple[Mapping[str, inspect.Parameter], Mapping[str, Any]]:
+    """Return the parameters of a class and their types."""
+    hints = get_type_hints(cls if is_dataclass(cls) else cls.__init__)
+    return inspect.signature(cls).parameters, hints
 
 
 def _fits(value: Any, declared: Any, key: str) -> bool:
@@ -222,15 +232,24 @@ def _example(key: str, target: str, cls: type, name: str, hints: Mapping[str, An
 
     if (config_dir() / key.replace(".", "/")).is_dir():
         return replacement(key)
-    for path in sorted(config_dir().rglob("*.yaml")):
-        for node in _nodes(yaml.safe_load(path.read_text(encoding="utf-8"))):
-            if node.get(TARGET) == target and name in node:
-                return argument(key, node[name])
+    if (target, name) in (known := _known_values(config_dir())):
+        return argument(key, known[target, name])
     default = inspect.signature(cls).parameters[name].default
     if default is not inspect.Parameter.empty:
         return argument(f"+{key}", default)
     kinds = _alternatives(hints.get(name, float))
     return argument(key, next((SPARE[each] for each in kinds if each in SPARE), [0.5, 0.5]))
+
+
+@cache
+def _known_values(folder: Path) -> dict[tuple[str, str], Any]:
+    """Return a value of each setting in the YAML files of a folder, by the path of its class and its name."""
+    known: dict[tuple[str, str], Any] = {}
+    for path in sorted(folder.rglob("*.yaml")):
+        for node in _nodes(yaml.load(path.read_text(encoding="utf-8"), LOADER)):
+            for name, value in node.items():
+                known.setdefault((str(node.get(TARGET)), name), value)
+    return known
 
 
 def replacement(key: str) -> str:
