@@ -239,16 +239,33 @@ def test_an_integer_is_accepted_as_a_decay_rate():
 
 
 def options() -> Iterator[tuple[str, str]]:
-    """Yield the key and the choice of one option for each class that the YAML files name."""
+    """Yield the place and the file of one option for each class that the YAML files name."""
     seen = set()
     for path in sorted(config_dir().glob("*/*.yaml")):
         group, name = path.parent.name, path.stem
         values = yaml.safe_load(path.read_text(encoding="utf-8"))
         node = values.get(name, values) if group == "regularizer" else values
-        if group in NOT_COMPONENTS or "_target_" not in node or node["_target_"] in seen:
-            continue
-        seen.add(node["_target_"])
-        yield (f"{group}.{name}", f"{group}=[{name}]") if group in SEVERAL else (group, f"{group}={name}")
+        if group not in NOT_COMPONENTS and "_target_" in node and node["_target_"] not in seen:
+            seen.add(node["_target_"])
+            yield f"{group}.{name}" if group in SEVERAL else group, f"{group}/{name}"
+
+
+@cache
+def with_option(node: str, file: str) -> DictConfig:
+    """Return the settings with one option replaced. Only an option that builds on another one is composed."""
+    option = OmegaConf.load(config_dir() / f"{file}.yaml")
+    assert isinstance(option, DictConfig)
+    is_alone = all(entry == "_self_" or OmegaConf.is_dict(entry) for entry in option.get("defaults", []))
+    cfg = composed("camera=orbit" if is_alone else file.replace("/", "=")).copy()
+    OmegaConf.set_struct(cfg, False)
+    if not is_alone:
+        return cfg
+    option = option.get(file.rpartition("/")[2], option)
+    option.pop("defaults", None)
+    if OmegaConf.is_missing(option, "path"):
+        option.path = "a.ply"
+    OmegaConf.update(cfg, node, option, merge=False, force_add=True)
+    return cfg
 
 
 def places(node: DictConfig, prefix: str) -> Iterator[str]:
@@ -269,20 +286,29 @@ def changed(choice: str, key: str, value: Any) -> DictConfig:
     return cfg
 
 
-def refusal(choice: str, node: str, key: str, value: Any) -> str | None:
+def refusal(node: str, file: str, key: str, value: Any) -> str | None:
     """Return the message that refuses a value, or None if the component accepts it."""
+    cfg = with_option(node, file)
+    parent, _, name = key.rpartition(".")
+    holder = OmegaConf.select(cfg, parent)
+    before = holder._get_node(name)
+    OmegaConf.update(cfg, key, value, merge=False, force_add=True)
     try:
-        component(OmegaConf.select(changed(choice, key, value), node))
+        component(OmegaConf.select(cfg, node))
     except UserError as error:
         return str(error)
+    finally:
+        holder.pop(name)
+        if before is not None:
+            holder[name] = before
     return None
 
 
-@pytest.mark.parametrize(("node", "choice"), options())
-def test_every_setting_of_every_component_refuses_what_it_cannot_use(node, choice):
-    for key in places(OmegaConf.select(composed(choice), node), node):
+@pytest.mark.parametrize(("node", "file"), options())
+def test_every_setting_of_every_component_refuses_what_it_cannot_use(node, file):
+    for key in list(places(OmegaConf.select(with_option(node, file), node), node)):
         for value in (*NEVER, *PERHAPS):
-            message = refusal(choice, node, key, value)
+            message = refusal(node, file, key, value)
             assert message is not None or value in PERHAPS, f"{key}={value!r} is accepted"
             if message is not None:
                 assert message.startswith(f"{key.partition('.')[0]}."), message
@@ -290,10 +316,10 @@ def test_every_setting_of_every_component_refuses_what_it_cannot_use(node, choic
                 assert "\n" not in message, message
 
 
-@pytest.mark.parametrize(("node", "choice"), options())
-def test_no_component_accepts_unknown_keys(node, choice):
+@pytest.mark.parametrize(("node", "file"), options())
+def test_no_component_accepts_unknown_keys(node, file):
     for name in ("foo", "_partial_", "_args_", "_recursive_"):
-        assert f"there is no key {name}" in (refusal(choice, node, f"{node}.{name}", True) or "")
+        assert f"there is no key {name}" in (refusal(node, file, f"{node}.{name}", True) or "")
 
 
 SLOTS = ("camera", "background", "augmentation", "rasterizer", "prior", "guidance", "densifier", "refine")

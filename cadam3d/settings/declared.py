@@ -100,7 +100,7 @@ def _require_described(node: DictConfig, kinds: Kinds, key: str) -> None:
     if missing:
         listed = ", ".join(missing)
         raise UserError(
-            f"{key}: no value for {listed}. Try: {_example(f'+{key}', target, cls, missing[0], hints)}"
+            f"{key}: no value for {listed}. Try: {_example(f'+{key}.{missing[0]}', target, cls, missing[0], hints)}"
         )
     for name in names:
         declared, place = hints.get(name, Any), _place(node, name, key)
