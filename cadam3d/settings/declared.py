@@ -99,9 +99,8 @@ def _require_described(node: DictConfig, kinds: Kinds, key: str) -> None:
     ]
     if missing:
         listed = ", ".join(missing)
-        raise UserError(
-            f"{key}: no value for {listed}. Try: {_example(f'+{key}.{missing[0]}', target, cls, missing[0], hints)}"
-        )
+        example = _example(f"+{key}.{missing[0]}", target, cls, missing[0], hints)
+        raise UserError(f"{key}: no value for {listed}. Try: {example}")
     for name in names:
         declared, place = hints.get(name, Any), _place(node, name, key)
         value = node[name]
