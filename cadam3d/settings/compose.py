@@ -20,7 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
-from cadam3d.settings.declared import require_declared
+from cadam3d.settings.declared import config_dir, require_declared
 
 # Hydra behaves like this version even if a newer one is installed.
 VERSION_BASE = "1.3"
@@ -30,13 +30,6 @@ NO_NAME_COMPLAINT = "Config group override must be a string or a list"
 TEXT_KEYS = ("prompt", "negative_prompt")
 # Characters. At three bytes each they still fit into a file name.
 SLUG_LENGTH = 60
-
-
-def config_dir() -> Path:
-    """Return the folder of YAML files: inside the installed package, or ``configs/`` of a checkout."""
-    package = Path(__file__).parent.parent
-    packaged = package / "configs"
-    return packaged if packaged.is_dir() else package.parent / "configs"
 
 
 def compose(

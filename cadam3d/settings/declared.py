@@ -4,6 +4,7 @@ A component declares the type of each of its settings, so that one check serves 
 elsewhere too. The ranges of the values belong to the constructors.
 """
 
+import difflib
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -56,6 +57,13 @@ LISTS, DICTS = (Sequence, list, tuple), (Mapping, dict)
 LIMITS = {int: "below 2^63", str: "without control characters"}
 # A value of each type, for settings of which no file in this package has one.
 SPARE = {int: 1, float: 0.5, str: "text", bool: True, NoneType: None}
+
+
+def config_dir() -> Path:
+    """Return the folder of YAML files: inside the installed package, or ``configs/`` of a checkout."""
+    package = Path(__file__).parent.parent
+    packaged = package / "configs"
+    return packaged if packaged.is_dir() else package.parent / "configs"
 
 
 def require_settings(cfg: DictConfig) -> None:
@@ -194,9 +202,7 @@ def _refusal(key: str, declared: Any, value: Any, example: str) -> UserError:
 
 
 def _unknown(name: str, known: Sequence[str], key: str) -> UserError:
-    from cadam3d.settings.advice import did_you_mean
-
-    near = did_you_mean(name, known)
+    near = difflib.get_close_matches(name, known, n=1)
     meant = f" Did you mean {key}.{near[0]}?" if near else ""
     return UserError(f"{key}: there is no key {name}.{meant} Try: without it; --cfg job lists the keys")
 
@@ -227,8 +233,6 @@ def _plain(value: Any) -> Any:
 
 def _example(key: str, target: str, cls: type, name: str, hints: Mapping[str, Any]) -> str:
     """Return an argument with the value that this package gives to a setting, or one of the right type."""
-    from cadam3d.settings.compose import config_dir
-
     if (config_dir() / key.replace(".", "/")).is_dir():
         return replacement(key)
     if (target, name) in (known := _known_values(config_dir())):
@@ -253,8 +257,6 @@ def _known_values(folder: Path) -> dict[tuple[str, str], Any]:
 
 def replacement(key: str) -> str:
     """Return an argument that chooses an option for the slot ``key``."""
-    from cadam3d.settings.compose import config_dir
-
     folder = config_dir() / key.replace(".", "/")
     options = sorted(path.stem for path in folder.glob("*.yaml"))
     if options:
