@@ -16,12 +16,14 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import expanded
 from cadam3d.settings.advice import explain, require_values, reraise_interrupt
 from cadam3d.settings.compose import TEXT_KEYS, config_dir
+from cadam3d.settings.declared import require_settings
 from cadam3d.settings.help_page import help_text
 from cadam3d.settings.hydra import (
     compose_line,
     place_run,
     read_flags,
     refuse_missing_settings,
+    refuse_unread_settings,
     run_composed,
     run_hydra,
 )
@@ -135,6 +137,8 @@ def _command(line: Line, task: Task) -> int:
         judge_composition(cfg, overrides, targets_in(line.typed), line.trusting)
     require_values(cfg)
     refuse_missing_settings(cfg, line.command, line.overrides)
+    refuse_unread_settings(cfg, line.command, line.overrides)
+    require_settings(cfg)
     if line.command in TRAINING:
         _train(cfg, line, task)
     else:

@@ -14,6 +14,7 @@ from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
 from cadam3d.core.checks import require_range
+from cadam3d.core.memory import is_out_of_memory
 from cadam3d.core.render import RenderFn
 from cadam3d.densifier.base import Densifier, GradientSignal
 from cadam3d.densifier.refine import Refine
@@ -195,7 +196,7 @@ class Trainer:
         try:
             outcome = self._loop(state, embedding, context, stop)
         except BaseException as error:
-            if not _is_out_of_memory(error):
+            if not is_out_of_memory(error):
                 for callback in self.callbacks:
                     callback.on_abort(context)
                 raise
@@ -246,10 +247,3 @@ class Trainer:
     def renderer(self, state: TrainState) -> RenderFn:
         """Return a function that renders the current Gaussians of ``state``, without gradient."""
         return render_fn(self.rasterizer, lambda: state.gaussians)
-
-
-def _is_out_of_memory(error: BaseException) -> bool:
-    """Return whether memory ran out; torch's CPU allocator raises a plain ``RuntimeError``."""
-    if isinstance(error, RuntimeError) and "can't allocate memory" in str(error):
-        return True
-    return isinstance(error, torch.OutOfMemoryError | MemoryError)

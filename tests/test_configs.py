@@ -6,7 +6,8 @@ import inspect
 import math
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -283,13 +284,27 @@ def test_every_experiment_runs_two_steps_on_the_tiny_prior(experiment, tmp_path,
 # --- building ---------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, kw_only=True)
+class Faulty:
+    whole: int
+
+    def __post_init__(self) -> None:
+        assert 1 / self.whole
+
+
+@dataclass(frozen=True, kw_only=True)
+class Holder:
+    numbers: Sequence[int]
+    deep: Mapping[str, Any]
+
+
 def node(target: str, **values: Any):
     return OmegaConf.create({"part": {"_target_": target, **values}}).part
 
 
-def test_a_user_error_in_a_constructor_is_raised_unchanged():
+def test_the_error_of_a_constructor_names_the_place_of_its_node():
     with pytest.raises(
-        UserError, match=r"^schedule.steps: expected a whole number >= 1, got 0. Try: schedule.steps=600$"
+        UserError, match=r"^part.steps: expected a whole number >= 1, got 0. Try: part.steps=600$"
     ):
         component(node("cadam3d.core.schedule.Linear", start=1.0, end=0.0, steps=0))
 
@@ -319,15 +334,15 @@ def test_a_value_that_is_still_missing_is_named():
 
 def test_a_bug_in_a_constructor_keeps_its_exception():
     with pytest.raises(ZeroDivisionError):
-        component(node("operator.truediv", _args_=[1, 0]))
+        component(node(f"{__name__}.Faulty", whole=0))
 
 
 def test_lists_and_inner_nodes_become_plain_objects():
     inner = {"_target_": "cadam3d.core.schedule.Constant", "value": 2.0}
-    built = component(node("builtins.dict", numbers=[1, 2], deep={"schedule": inner}))
-    assert type(built["numbers"]) is list
-    assert type(built["deep"]) is dict
-    assert built["deep"]["schedule"](0) == 2.0
+    built = component(node(f"{__name__}.Holder", numbers=[1, 2], deep={"schedule": inner}))
+    assert type(built.numbers) is list
+    assert type(built.deep) is dict
+    assert built.deep["schedule"](0) == 2.0
 
 
 def test_composing_inside_a_running_command_leaves_it_alone():

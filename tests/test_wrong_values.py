@@ -1,6 +1,11 @@
-"""A value of the wrong type gets a message that names its key, in every component."""
+"""A value of the wrong type gets a message that names its key, in every component and every command."""
 
+import math
+import os
+import sys
+from collections.abc import Iterator
 from functools import cache
+from typing import Any
 
 import jaxtyping
 import pytest
@@ -8,8 +13,14 @@ import torch
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
+from cadam3d import cli
+from cadam3d.commands.messages import keeping_others
+from cadam3d.commands.train import build_trainer, require_unused
 from cadam3d.core.errors import UserError
-from cadam3d.settings.compose import component, compose
+from cadam3d.core.memory import is_out_of_memory, require_memory
+from cadam3d.settings.compose import component, components, compose, config_dir
+from cadam3d.settings.declared import require_settings
+from cadam3d.sweep.grid import MOST_JOBS, expand, read_grid, read_line
 
 # Options, and their keys that count something.
 WHOLE = {
@@ -99,6 +110,15 @@ NULLABLE = {
     "initializer=ply": ("initializer.count", "initializer.sh_degree"),
     "initializer=shap_e": ("initializer.count",),
 }
+EXPORTER = {"_target_": "cadam3d.exporter.ply.PlyExporter", "up": "-y", "pad_sh": 0}
+# Values that no setting of any component has.
+NEVER: tuple[Any, ...] = (math.nan, -math.inf, 10**400, "\udcff", "\x1b[2J", {"a": 1}, [[{}]], EXPORTER)
+NEVER += ({"_target_": "os.getcwd"}, {"_target_": None}, {"_target_": "cadam3d.nowhere.Thing"})
+# Values that some settings have.
+PERHAPS: tuple[Any, ...] = (None, [], "abc", True, 0, -1, 1e23, 2**62, 1e-320, [1, 2])
+# Folders of options that are not components of one class.
+NOT_COMPONENTS = ("hydra", "grid", "launcher", "experiment", "noise", "vram")
+SEVERAL = ("regularizer", "exporter", "callback", "metric")
 NEVER_WHOLE = ("2.5", "16.0", "true", "abc", "[1]", "-1000000000000.5")
 NEVER_A_LIST = ("5", "null", "abc", "[a,b,c]", "[true,true,true]", "[null,null]", "[]")
 NEVER_A_SWITCH = ("0", "1", "1.0", "null", "abc")
@@ -189,7 +209,7 @@ def test_the_number_of_split_children_is_bounded():
 @pytest.mark.parametrize("key", ["steps", "begin"])
 @pytest.mark.parametrize("value", ["2.5", "true", "null", "abc"])
 def test_a_schedule_counts_whole_steps(key, value):
-    with pytest.raises(UserError, match=rf"^schedule\.{key}: expected a whole number"):
+    with pytest.raises(UserError, match=rf"^optimizer\.means_lr\.{key}: expected a whole number"):
         build("optimizer=adam", f"optimizer.means_lr.{key}={value}")
 
 
@@ -197,7 +217,7 @@ def test_a_schedule_counts_whole_steps(key, value):
 @pytest.mark.parametrize("kind", ["Linear", "LogLinear"])
 @pytest.mark.parametrize("value", ["true", "null", "abc"])
 def test_a_schedule_starts_and_ends_at_a_number(key, kind, value):
-    with pytest.raises(UserError, match=rf"^schedule\.{key}: expected a"):
+    with pytest.raises(UserError, match=rf"^optimizer\.means_lr\.{key}: expected a"):
         build(
             "optimizer=adam",
             f"optimizer.means_lr._target_=cadam3d.core.schedule.{kind}",
@@ -213,3 +233,271 @@ def test_an_integer_is_accepted_as_a_decay_rate():
     optimizer = build("optimizer=adam", *lines).start(gaussians)
     optimizer.step(0)
     assert torch.equal(optimizer.gaussians.quats, gaussians.quats)
+
+
+# --- laws over all options -------------------------------------------------------------------------------
+
+
+def options() -> Iterator[tuple[str, str]]:
+    """Yield the place and the file of one option for each class that the YAML files name."""
+    seen = set()
+    for path in sorted(config_dir().glob("*/*.yaml")):
+        group, name = path.parent.name, path.stem
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        node = values.get(name, values) if group == "regularizer" else values
+        if group not in NOT_COMPONENTS and "_target_" in node and node["_target_"] not in seen:
+            seen.add(node["_target_"])
+            yield f"{group}.{name}" if group in SEVERAL else group, f"{group}/{name}"
+
+
+@cache
+def with_option(node: str, file: str) -> DictConfig:
+    """Return the settings with one option replaced. Only an option that builds on another one is composed."""
+    option = OmegaConf.load(config_dir() / f"{file}.yaml")
+    assert isinstance(option, DictConfig)
+    is_alone = all(entry == "_self_" or OmegaConf.is_dict(entry) for entry in option.get("defaults", []))
+    cfg = composed("camera=orbit" if is_alone else file.replace("/", "=")).copy()
+    OmegaConf.set_struct(cfg, False)
+    if not is_alone:
+        return cfg
+    option = option.get(file.rpartition("/")[2], option)
+    option.pop("defaults", None)
+    if OmegaConf.is_missing(option, "path"):
+        option.path = "a.ply"
+    OmegaConf.update(cfg, node, option, merge=False, force_add=True)
+    return cfg
+
+
+def places(node: DictConfig, prefix: str) -> Iterator[str]:
+    """Yield the keys of all settings of a component, also of those inside of other objects."""
+    for name in map(str, node):
+        if name == "_target_":
+            continue
+        yield f"{prefix}.{name}"
+        child = node._get_node(name)
+        if isinstance(child, DictConfig) and not child._is_interpolation() and not child._is_none():
+            yield from places(child, f"{prefix}.{name}")
+
+
+def changed(choice: str, key: str, value: Any) -> DictConfig:
+    cfg = composed(choice).copy()
+    OmegaConf.set_struct(cfg, False)
+    OmegaConf.update(cfg, key, value, merge=False, force_add=True)
+    return cfg
+
+
+def refusal(node: str, file: str, key: str, value: Any) -> str | None:
+    """Return the message that refuses a value, or None if the component accepts it."""
+    cfg = with_option(node, file)
+    parent, _, name = key.rpartition(".")
+    holder = OmegaConf.select(cfg, parent)
+    before = holder._get_node(name)
+    OmegaConf.update(cfg, key, value, merge=False, force_add=True)
+    try:
+        component(OmegaConf.select(cfg, node))
+    except UserError as error:
+        return str(error)
+    finally:
+        holder.pop(name)
+        if before is not None:
+            holder[name] = before
+    return None
+
+
+@pytest.mark.parametrize(("node", "file"), options())
+def test_every_setting_of_every_component_refuses_what_it_cannot_use(node, file):
+    for key in list(places(OmegaConf.select(with_option(node, file), node), node)):
+        for value in (*NEVER, *PERHAPS):
+            message = refusal(node, file, key, value)
+            assert message is not None or value in PERHAPS, f"{key}={value!r} is accepted"
+            if message is not None:
+                assert message.startswith(f"{key.partition('.')[0]}."), message
+                assert "Try: " in message, message
+                assert "\n" not in message, message
+
+
+@pytest.mark.parametrize(("node", "file"), options())
+def test_no_component_accepts_unknown_keys(node, file):
+    for name in ("foo", "_partial_", "_args_", "_recursive_"):
+        assert f"there is no key {name}" in (refusal(node, file, f"{node}.{name}", True) or "")
+
+
+SLOTS = ("camera", "background", "augmentation", "rasterizer", "prior", "guidance", "densifier", "refine")
+SLOTS += ("optimizer", "exposure", "regularizer", "callback")
+
+
+@pytest.mark.parametrize("value", [None, 5, "abc", [1], {"a": 1}, EXPORTER, {"_target_": "builtins.print"}])
+@pytest.mark.parametrize("slot", SLOTS)
+def test_a_slot_of_the_trainer_takes_only_its_own_kind_of_component(slot, value):
+    inner = f"{slot}.mine" if slot in SEVERAL else slot
+    if slot in SEVERAL and value == {"a": 1}:
+        return  # the settings of a member that is not chosen
+    with pytest.raises(UserError, match=rf"^{inner}(\._target_)?: expected .* Try: "):
+        # No other densifier is free of references to the schedule of refinements.
+        build_trainer(changed("densifier=none", inner, value), torch.device("cpu"))
+
+
+@pytest.mark.parametrize("value", [None, 5, "abc", [1]])
+def test_a_list_of_options_is_a_list(value):
+    with pytest.raises(UserError, match=r"^exporter: expected a list of options"):
+        components(OmegaConf.create({"exporter": value}).exporter, key="exporter")
+
+
+@pytest.mark.parametrize("value", [None, True, math.nan, [], {}, "\udcff", EXPORTER])
+def test_settings_that_this_run_does_not_read_are_checked_too(value):
+    for key in ("prompting.front_deg", "published_baseline.tau_pos", "published_baseline.views"):
+        with pytest.raises(UserError, match=rf"^{key}"):
+            require_unused(changed("camera=orbit", key, value))
+
+
+@pytest.mark.parametrize("name", ["prompt", "negative_prompt", "steps", "views", "seed", "device", "resume"])
+@pytest.mark.parametrize("value", [[], {}, 1e23, 10**30, True, math.nan, "\udcff"])
+def test_a_setting_outside_of_components_has_a_value_of_its_type(name, value):
+    with pytest.raises(UserError, match=rf"^{name}: expected .* Try: \S*{name}="):
+        require_settings(changed("camera=orbit", name, value))
+
+
+# --- command lines -----------------------------------------------------------------------------------------
+
+
+def refused_line(capsys, monkeypatch, *words: str) -> str:
+    """Run a command line that must be refused, and return its message."""
+    monkeypatch.setattr(sys, "argv", ["cadam3d", *words])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    message = capsys.readouterr().err
+    assert ended.value.code == 1
+    assert message.startswith("cadam3d: ")
+    assert message.count("\n") == 1
+    assert "Try: " in message
+    return message
+
+
+WRONG_LINES = {
+    "device=null": "device: expected a text",
+    "device=meta": "device: expected a device of this machine",
+    "resume=0": "resume: expected a text or null",
+    "callback={}": "callback: {} changes nothing",
+    "callback.progress=null": "callback.progress: expected an object of class Callback",
+    "+foo=1": "foo: no such setting",
+    "+refine.foo=1": "refine: there is no key foo",
+    "+camera.foo.bar=1": "camera: there is no key foo",
+    "+callback.foo.bar=1": "callback has no option foo",
+    "+callback.candidates.every=5": "callback.candidates: is not chosen",
+    "steps=1e23": "steps: expected a whole number",
+    "callback.progress.refresh_seconds=abc": "callback.progress.refresh_seconds: expected a finite number",
+    "camera.size=10000000": "camera.size: expected at most",
+    "views=100000000000": "views: expected at most",
+    "initializer.count=1000000000000": "initializer.count: expected at most",
+    "exporter.turntable.size=10000000": "exporter.turntable.size: expected at most",
+    "metric.fidelity.views=1000000000000": "metric.fidelity.views: expected at most",
+}
+
+
+@pytest.mark.parametrize("line", WRONG_LINES)
+def test_a_wrong_line_is_refused_before_any_work(line, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    words = ["train", "prompt=a cube", "prior=tiny", "rasterizer=reference", line]
+    assert WRONG_LINES[line] in refused_line(capsys, monkeypatch, *words)
+    assert not list(tmp_path.glob("**/summary.json"))
+
+
+WRONG_FILES = {
+    "broken": b"a: [1\n",
+    "empty": b"",
+    "a_list": b"- 1\n",
+    "other_bytes": b"\xff\xfe\x00",
+    "no_class": b"size: 3\n",
+    "a_function": b"_target_: os.getcwd\n",
+    "another_kind": b"_target_: cadam3d.exporter.ply.PlyExporter\n",
+    "a_number": b"_target_: 5\n",
+    "itself": b"defaults: [itself, _self_]\n",
+    "a_tag": b"a: !!python/object:os.system 1\n",
+    "deep": b"[" * 20_000,
+    "wrong_package": b"# @package a b c\na: 1\n",
+}
+
+
+@pytest.mark.parametrize("name", WRONG_FILES)
+def test_a_wrong_file_of_the_user_is_refused_in_one_line(name, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own" / "camera").mkdir(parents=True)
+    (tmp_path / "own" / "camera" / f"{name}.yaml").write_bytes(WRONG_FILES[name])
+    words = ["train", "--config-dir=own", "prompt=a cube", "prior=tiny", "rasterizer=reference"]
+    refused_line(capsys, monkeypatch, *words, f"camera={name}")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes here")
+def test_a_named_pipe_among_the_files_of_the_user_is_not_read(capsys, monkeypatch, tmp_path):
+    (tmp_path / "camera").mkdir()
+    os.mkfifo(tmp_path / "camera" / "pipe.yaml")
+    words = ["train", f"--config-dir={tmp_path}", "prompt=a cube", "camera=pipe"]
+    assert "is not a regular file" in refused_line(capsys, monkeypatch, *words)
+
+
+def test_an_empty_list_of_regularizers_is_none():
+    assert components(compose(["prompt=a cube", "regularizer=[]"]).regularizer) == {}
+
+
+# --- sweeps ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        *("range(0)", "range(5,1)", "range(0,1,0)", "range(0,nan)", "range(0,inf)", "range(0,1000000000)"),
+        *(
+            "range(0,1,1e-30)",
+            "shuffle(range(0,1000000000))",
+            "glob(*)",
+            "interval(0,1)",
+            "1," * 100_000 + "1",
+        ),
+    ],
+)
+def test_a_sweep_without_values_or_with_too_many_is_refused(values):
+    with pytest.raises(UserError, match=r"^seed: expected .* Try: "):
+        read_line([f"seed={values}"])
+
+
+def test_the_jobs_of_a_sweep_are_counted_before_they_are_made():
+    line = read_line(
+        [f"{key}=range(1,11)" for key in ("seed", "views", "steps", "camera.size", "refine.start")]
+    )
+    with pytest.raises(
+        UserError, match=rf"^seed: expected at most {MOST_JOBS} jobs in a sweep, got 100000\."
+    ):
+        expand(read_grid(None), line)
+
+
+# --- memory ------------------------------------------------------------------------------------------------
+
+
+def test_a_size_is_refused_only_if_it_cannot_work():
+    require_memory("camera.size", 4096, unit=20, power=2, example=128)
+    for value in (10**7, 10**30):
+        with pytest.raises(
+            UserError, match=r"^camera\.size: expected at most \d+, .* Try: camera\.size=128$"
+        ):
+            require_memory("camera.size", value, unit=20, power=2, example=128)
+
+
+@pytest.mark.parametrize("error", [MemoryError(), torch.OutOfMemoryError("out of memory"), UserError("a: b")])
+def test_an_output_that_fails_costs_only_itself(error, capsys):
+    warnings: list[str] = []
+    with keeping_others("exporter.images", warnings):
+        raise error
+    assert len(warnings) == 1
+    assert warnings[0] in capsys.readouterr().err
+
+
+def test_torch_reports_a_failed_allocation_as_running_out_of_memory():
+    for size in (2**45, 2**62):
+        with pytest.raises(RuntimeError) as raised:
+            torch.empty(size)
+        assert is_out_of_memory(raised.value)
+
+
+def test_a_bug_in_an_output_is_raised():
+    with pytest.raises(ZeroDivisionError), keeping_others("exporter.images", []):
+        raise ZeroDivisionError

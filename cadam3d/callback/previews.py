@@ -5,6 +5,7 @@ from typing import ClassVar
 
 from cadam3d.callback.base import Callback
 from cadam3d.core.checks import require_range, require_whole
+from cadam3d.core.memory import PIXEL
 from cadam3d.core.pictures import PictureSettings
 from cadam3d.io.image import contact_sheet, step_picture, step_pictures, write_png
 from cadam3d.io.run_folder import PREVIEWS
@@ -28,7 +29,7 @@ class Previews(PictureSettings, Callback):
         super().__post_init__()
         if self.every is not None:
             require_whole("callback.previews.every", self.every, low=1, example=100)
-        require_whole("callback.previews.views", self.views, low=1, example=4)
+        self.require_views(self.views, example=4, bytes_each=PIXEL * float(self.size) ** 2)
         require_range("callback.previews.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.checks import are_numbers, require, require_choice, require_whole
+from cadam3d.core.memory import PIXEL, require_memory
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 
 ELEVATION_LAWS = ("uniform", "sphere", "mixture")
@@ -44,12 +45,13 @@ def image_size(size: int | Schedule, step: int) -> int:
     return round(as_schedule(size)(step))
 
 
-def require_size(size: object) -> None:
-    """Raise ``UserError`` unless ``size`` is a whole number of pixels or a schedule."""
+def require_size(size: int | Schedule) -> None:
+    """Raise ``UserError`` unless ``size`` is a schedule or a whole number of pixels that fits into memory."""
     if isinstance(size, Schedule):
         require_scheduled("camera.size", size, low=1, example=128)
     else:
         require_whole("camera.size", size, low=1, example=128)
+        require_memory("camera.size", size, unit=PIXEL, power=2, example=128)
 
 
 def require_interval(key: str, interval: object, *, low: float, high: float, example: str) -> None:

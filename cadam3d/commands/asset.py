@@ -2,7 +2,7 @@
 
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor
 
-from cadam3d.commands.messages import note_backend
+from cadam3d.commands.messages import keeping_others, note_backend
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import fail
 from cadam3d.core.device import resolve_device
@@ -109,7 +109,7 @@ def run_components(folder: Path, *, is_trusted: bool, retry: str) -> DictConfig:
 
 def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
     """Return a function that renders ``gaussians`` and prepares the configured rasterizer at first use."""
-    built: Rasterizer = component(rasterizer)
+    built: Rasterizer = component(rasterizer, Rasterizer, "rasterizer")
     render = render_fn(built, lambda: gaussians)
 
     def render_with_note(cameras: Cameras, background: Float[Tensor, "v 3"]) -> RenderOutput:
@@ -120,12 +120,21 @@ def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
 
 
 def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
-    """Run every exporter of ``cfg`` on ``asset``, and return the paths of the files in ``folder``."""
-    exporters: Sequence[Exporter] = list(components(cfg.exporter).values())
+    """Run every exporter of ``cfg`` on ``asset``, and return the paths of the files in ``folder``.
+
+    An exporter that fails costs only its own files. Raises ``UserError`` if all of them fail.
+    """
+    exporters: Mapping[str, Exporter] = components(cfg.exporter, Exporter, "exporter")
     if not exporters:
         raise UserError("exporter: expected at least one, got none. Try: exporter=[images,turntable]")
     render = renderer(cfg.rasterizer, asset.gaussians)
-    return [path for exporter in exporters for path in exporter.export(asset.gaussians, render, folder)]
+    paths, warnings = [], []
+    for name, exporter in exporters.items():
+        with keeping_others(f"exporter.{name}", warnings):
+            paths += exporter.export(asset.gaussians, render, folder)
+    if len(warnings) == len(exporters):
+        raise UserError(warnings[0])
+    return paths
 
 
 def write_outputs(cfg: DictConfig, asset: Asset, name: str) -> list[Path]:

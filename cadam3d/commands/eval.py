@@ -10,9 +10,12 @@ from omegaconf import DictConfig
 
 from cadam3d import report
 from cadam3d.commands.asset import find_run, open_run, renderer, run_components
+from cadam3d.commands.messages import keeping_others
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.run_folder import ASSET, CONFIG, EVALUATION, copying, shown, suggestion, typed_path
+from cadam3d.metric.base import Metric
+from cadam3d.prior.base import DiffusionPrior
 from cadam3d.settings.compose import component, components
 from cadam3d.settings.line import setting_word
 from cadam3d.settings.trust import require_contained, require_trust
@@ -50,12 +53,16 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     source = run_components(folder, is_trusted=require_trust(cfg.trust), retry=trusting())
     asset = open_run(folder, cfg.device)
     device = asset.gaussians.device
-    prior = component(source.prior).to(device)
+    prior = component(source.prior, DiffusionPrior, "prior").to(device)
     truth = prior.truth(source.prompt)
     render = renderer(source.rasterizer, asset.gaussians)
     result: dict[str, Any] = {"run": str(shown(folder)), "prompt": source.prompt}
-    for metric in components(cfg.metric).values():
-        result |= metric.measure(asset.gaussians, render, truth, asset.ply)
+    warnings: list[str] = []
+    for name, metric in components(cfg.metric, Metric, "metric").items():
+        with keeping_others(f"metric.{name}", warnings):
+            result |= metric.measure(asset.gaussians, render, truth, asset.ply)
+    if warnings:
+        result["warnings"] = warnings
     if truth is None:
         result["note"] = "this prior has no true images, so psnr and ssim are missing"
     return result

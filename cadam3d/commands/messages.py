@@ -1,9 +1,37 @@
 """Notes: messages that are neither results nor errors."""
 
+import logging
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 
+from cadam3d.core.errors import UserError
+from cadam3d.core.memory import is_out_of_memory
 from cadam3d.rasterizer.base import Backend
+
+log = logging.getLogger(__name__)
+
+
+@contextmanager
+def keeping_others(name: str, warnings: list[str]) -> Iterator[None]:
+    """Turn the failure of one output into a warning, so that it costs no other output.
+
+    ``name`` is its key, such as ``exporter.turntable``. Only ``UserError`` and running out of memory are
+    failures of this kind; other exceptions are raised.
+    """
+    try:
+        yield
+    except Exception as error:
+        if is_out_of_memory(error):
+            text = f"{name}: not enough memory. Try: smaller settings of {name}"
+        elif isinstance(error, UserError):
+            text = f"{name}: {error}"
+        else:
+            raise
+        warnings.append(text)
+        log.info("%s", text)
+        print(f"Warning: {text}", file=sys.stderr)
 
 
 @cache

@@ -17,13 +17,23 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import __version__
-from cadam3d.commands.messages import note, note_backend
+from cadam3d.augmentation import Augmentation
+from cadam3d.background import Background
+from cadam3d.callback.base import Callback
+from cadam3d.camera.base import CameraSampler
+from cadam3d.commands.messages import keeping_others, note, note_backend
 from cadam3d.core.checks import require, require_whole
 from cadam3d.core.device import resolve_device
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.memory import CAMERA, PIXEL, require_memory
 from cadam3d.core.render import RenderFn
+from cadam3d.densifier.base import Densifier
+from cadam3d.densifier.baseline import Baseline
+from cadam3d.densifier.refine import Refine
 from cadam3d.exporter.base import Exporter
+from cadam3d.exposure import Exposure
+from cadam3d.guidance.base import Guidance
+from cadam3d.initializer.base import Initializer
 from cadam3d.io.atomic import remove_leftovers, replacing
 from cadam3d.io.checkpoint import DamagedCheckpointError, latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import write_json
@@ -41,9 +51,14 @@ from cadam3d.io.run_folder import (
     shown,
 )
 from cadam3d.metric.base import Metric
-from cadam3d.rasterizer.base import Backend
+from cadam3d.optimizer import AdamSettings
+from cadam3d.prior.base import DiffusionPrior
+from cadam3d.prior.prompting import Prompting
+from cadam3d.rasterizer.base import Backend, Rasterizer
+from cadam3d.regularizer import Regularizer
 from cadam3d.report import write_report
 from cadam3d.settings.compose import component, components, flatten, load_config
+from cadam3d.settings.declared import TARGET
 from cadam3d.state import Outcome, PayloadError, RunContext, TrainState
 from cadam3d.trainer import Trainer
 
@@ -58,23 +73,28 @@ def run(cfg: DictConfig) -> float | None:
     """Train, export, measure and report. Return the PSNR in dB if the prior has true images."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     device = resolve_device(cfg.device)
-    for key, least in (("seed", 0), ("steps", 1), ("views", 1)):
-        require_whole(key, cfg[key], low=least, example=3)
+    require_whole("seed", cfg.seed, low=0, example=3)
     require_determinism(device)
+    require_unused(cfg)
 
     # Everything that can be refused is refused here, before the folder changes.
     trainer = build_trainer(cfg, device)
     backend = trainer.rasterizer.prepare(device)
-    exporters: dict[str, Exporter] = components(cfg.exporter)
-    metrics: dict[str, Metric] = components(cfg.metric)
+    exporters: dict[str, Exporter] = components(cfg.exporter, Exporter, "exporter")
+    metrics: dict[str, Metric] = components(cfg.metric, Metric, "metric")
+    size = cfg.camera.get("size")
+    rendered = PIXEL * float(size) ** 2 if isinstance(size, int) else PIXEL
+    require_memory("views", cfg.views, unit=CAMERA + rendered, example=2)
+    initializer = component(cfg.initializer, Initializer, "initializer")
     memory = estimate_memory(cfg, trainer)
     embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
-    state = start_or_resume(cfg, trainer, device, folder)
+    state = start_or_resume(cfg, trainer, initializer, device, folder)
     # The prior is loaded last, because an initializer may have needed the memory and has freed it now.
     trainer.prior.load()
     for text in filter(None, (trainer.prior.notice(), state.initial_note)):
         note(text)
     note_backend(backend)
+    note_no_growth(trainer.refine)
 
     remove_leftovers(folder)
     config_text = OmegaConf.to_yaml(cfg, resolve=True)
@@ -105,8 +125,9 @@ def run(cfg: DictConfig) -> float | None:
         written, warnings = export(exporters, gaussians, render, folder)
         asset = folder / ASSET if folder / ASSET in written else None
         truth = trainer.prior.truth(cfg.prompt)
-        for metric in metrics.values():
-            summary |= metric.measure(gaussians, render, truth, asset)
+        for name, metric in metrics.items():
+            with keeping_others(f"metric.{name}", warnings):
+                summary |= metric.measure(gaussians, render, truth, asset)
         if asset is not None:
             summary["asset_bytes"] = asset.stat().st_size
         # This is the last entry of a complete summary.
@@ -136,23 +157,37 @@ def require_determinism(device: torch.device) -> None:
     torch.set_deterministic_debug_mode("error" if device.type == "cpu" else "default")
 
 
+def require_unused(cfg: DictConfig) -> None:
+    """Raise ``UserError`` for wrong values of settings that some priors or densifiers do not read."""
+    component(cfg.prompting, Prompting, "prompting")
+    key, published = "published_baseline", cfg.published_baseline
+    is_node = OmegaConf.is_dict(published) and not OmegaConf.is_missing(cfg, key) and published is not None
+    example = f"'{key}.views=sum_norm'"
+    require(is_node, key, expected="the keys of a node", got=published, example=example)
+    target = f"{Baseline.__module__}.{Baseline.__name__}"
+    node = OmegaConf.merge({TARGET: target, "screen_px": None}, published)
+    node._set_parent(cfg)
+    node._set_key(key)
+    component(node, Baseline)
+
+
 def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
     """Build the components that ``cfg`` names, and move the prior to ``device``."""
     return Trainer(
         steps=cfg.steps,
         views=cfg.views,
-        camera=component(cfg.camera),
-        background=component(cfg.background),
-        augmentation=component(cfg.augmentation),
-        rasterizer=component(cfg.rasterizer),
-        prior=component(cfg.prior).to(device),
-        guidance=component(cfg.guidance),
-        densifier=component(cfg.densifier),
-        refine=component(cfg.refine),
-        optimizer=component(cfg.optimizer),
-        exposure=component(cfg.exposure),
-        regularizers=components(cfg.regularizer),
-        callbacks=list(components(cfg.callback).values()),
+        camera=component(cfg.camera, CameraSampler, "camera"),
+        background=component(cfg.background, Background, "background"),
+        augmentation=component(cfg.augmentation, Augmentation, "augmentation"),
+        rasterizer=component(cfg.rasterizer, Rasterizer, "rasterizer"),
+        prior=component(cfg.prior, DiffusionPrior, "prior").to(device),
+        guidance=component(cfg.guidance, Guidance, "guidance"),
+        densifier=component(cfg.densifier, Densifier, "densifier"),
+        refine=component(cfg.refine, Refine, "refine"),
+        optimizer=component(cfg.optimizer, AdamSettings, "optimizer"),
+        exposure=component(cfg.exposure, Exposure, "exposure"),
+        regularizers=components(cfg.regularizer, Regularizer, "regularizer"),
+        callbacks=list(components(cfg.callback, Callback, "callback").values()),
     )
 
 
@@ -166,6 +201,16 @@ def estimate_memory(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
     return {"memory_estimate_gib": round(estimate.total / 2**30, 3)}
 
 
+def note_no_growth(refine: Refine) -> None:
+    """Print a note if the schedule has no refinement in a run of any length."""
+    first = (refine.start // refine.interval + 1) * refine.interval
+    if first >= refine.end:
+        note(
+            f"nothing will grow, because refine.start={refine.start} and refine.end={refine.end} have no "
+            f"multiple of refine.interval={refine.interval} between them"
+        )
+
+
 def measure_memory(device: torch.device) -> dict[str, float]:
     """Return the peak memory of a CUDA device so far, in GiB, the Gaussians included."""
     if device.type != "cuda":
@@ -173,10 +218,12 @@ def measure_memory(device: torch.device) -> dict[str, float]:
     return {"memory_peak_gib": round(torch.cuda.max_memory_allocated(device) / 2**30, 3)}
 
 
-def start_or_resume(cfg: DictConfig, trainer: Trainer, device: torch.device, folder: Path) -> TrainState:
+def start_or_resume(
+    cfg: DictConfig, trainer: Trainer, initializer: Initializer, device: torch.device, folder: Path
+) -> TrainState:
     """Return the state before the first step, or that of a checkpoint if ``resume=`` names a run with one."""
     if cfg.resume is None:
-        return trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, device)
+        return trainer.start(cfg.prompt, initializer, cfg.seed, device)
     named = Path(cfg.resume)
     read = partial(read_state, trainer=trainer, device=device)
     if not named.is_dir():
@@ -185,7 +232,7 @@ def start_or_resume(cfg: DictConfig, trainer: Trainer, device: torch.device, fol
         path, state = found
     else:
         print(f"No checkpoint in {folder / CHECKPOINTS} yet: starting at step 0.", file=sys.stderr)
-        return trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, device)
+        return trainer.start(cfg.prompt, initializer, cfg.seed, device)
     require(
         cfg.seed == state.seed,
         "seed",
@@ -286,12 +333,8 @@ def export(
     written: list[Path] = []
     warnings: list[str] = []
     for name, exporter in exporters.items():
-        try:
+        with keeping_others(f"exporter.{name}", warnings):
             written += exporter.export(gaussians, render, folder)
-        except (UserError, MemoryError, torch.OutOfMemoryError) as error:
-            warnings.append(f"exporter.{name}: {error}")
-            log.info("exporter.%s: %s", name, error)
-            print(f"Warning: exporter.{name}: {error}", file=sys.stderr)
     return written, warnings
 
 

@@ -14,8 +14,9 @@ def resolve_device(name: str) -> torch.device:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
+        # Reading a value back also refuses "meta", a device without memory.
+        torch.zeros(1, device=device).item()
+    except (RuntimeError, AssertionError, TypeError) as error:
         reason = str(error).strip().splitlines()[0]
         expected = f"a device of this machine ({reason})"
         raise fail("device", expected=expected, got=name, example="device=cpu") from error

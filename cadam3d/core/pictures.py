@@ -10,6 +10,7 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, orbit, turntable
 from cadam3d.core.checks import are_numbers, require, require_color, require_range, require_whole
+from cadam3d.core.memory import CAMERA, PIXEL, require_memory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +32,7 @@ class PictureSettings:
         require_range(f"{self.node}.distance", self.distance, above=0, example=3.0)
         require_range(f"{self.node}.fov_y_deg", self.fov_y_deg, above=0, below=180, example=40)
         require_whole(f"{self.node}.size", self.size, low=1, example=256)
+        require_memory(f"{self.node}.size", self.size, unit=PIXEL, power=2, example=256)
         require_color(f"{self.node}.background", self.background)
 
     def ring(self, views: int, elevation_deg: float) -> Cameras:
@@ -53,6 +55,14 @@ class PictureSettings:
     def backgrounds(self, views: int) -> Float[Tensor, "v 3"]:
         """Return the background colour once per view."""
         return torch.tensor([[float(channel) for channel in self.background]] * views)
+
+    def require_views(self, views: int, *, example: int, bytes_each: float = 0) -> None:
+        """Raise ``UserError`` unless ``views`` is at least 1 and that many cameras fit into memory.
+
+        ``bytes_each`` is the memory that every view needs until all are done, in addition to its camera.
+        """
+        require_whole(f"{self.node}.views", views, low=1, example=example)
+        require_memory(f"{self.node}.views", views, unit=CAMERA + bytes_each, example=example)
 
     def require_angles(self, name: str, angles_deg: object, *, limit: int, example: int) -> None:
         """Raise ``UserError`` unless setting ``name`` is a list of angles in [-limit, limit] degrees."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from cadam3d.core.checks import require_whole
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.pictures import PictureSettings
 from cadam3d.core.render import RenderFn
@@ -33,7 +32,7 @@ class ImagesExporter(PictureSettings, Exporter):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_whole("exporter.images.views", self.views, low=1, example=8)
+        self.require_views(self.views, example=8)
         self.require_angles("elevations_deg", self.elevations_deg, limit=90, example=15)
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import torch
 
-from cadam3d.core.checks import require_choice, require_whole
+from cadam3d.core.checks import require_choice
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.pictures import PictureSettings
 from cadam3d.core.render import RenderFn
@@ -28,8 +28,10 @@ class PreviewExporter(PictureSettings, Exporter):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_whole("exporter.preview.views", self.views, low=1, example=8)
         self.require_angles("elevations_deg", self.elevations_deg, limit=90, example=15)
+        # All pictures are kept for the sheet, 12 bytes for each pixel.
+        kept = 12 * float(self.size) ** 2 * len(self.elevations_deg)
+        self.require_views(self.views, example=8, bytes_each=kept)
         require_choice("exporter.preview.labels", self.labels, (True, False))
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:

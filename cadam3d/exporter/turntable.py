@@ -35,7 +35,7 @@ class TurntableExporter(PictureSettings, Exporter):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_whole("exporter.turntable.views", self.views, low=1, example=60)
+        self.require_views(self.views, example=60)
         require_range("exporter.turntable.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
         require_whole("exporter.turntable.fps", self.fps, low=1, example=30)
         require_choice("exporter.turntable.beside", self.beside, ("depth", "alpha", "none"))

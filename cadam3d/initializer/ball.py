@@ -8,7 +8,14 @@ import torch
 from cadam3d.core.checks import require_color, require_range
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
-from cadam3d.initializer.points import PointCloud, gaussians_at, one_color, points_in_ball, require_points
+from cadam3d.initializer.points import (
+    PointCloud,
+    gaussians_at,
+    one_color,
+    points_in_ball,
+    require_count,
+    require_points,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +32,7 @@ class Ball(Initializer):
 
     def __post_init__(self) -> None:
         require_points(self.count, self.scale, self.opacity, self.sh_degree)
+        require_count(self.count, self.sh_degree)
         require_range("initializer.radius", self.radius, above=0, high=1, example=0.6)
         require_range("initializer.color_noise", self.color_noise, low=0, high=1, example=0.1)
         require_color("initializer.color", self.color)

@@ -21,6 +21,7 @@ from cadam3d.initializer.points import (
     gaussians_at,
     one_color,
     points_on_surface,
+    require_count,
     require_place,
     require_points,
 )
@@ -50,6 +51,7 @@ class Mesh(Initializer):
 
     def __post_init__(self) -> None:
         require_points(self.count, self.scale, self.opacity, self.sh_degree)
+        require_count(self.count, self.sh_degree)
         require_choice("initializer.up", self.up, UPS)
         require_place(self.turn_deg, self.radius)
         require_color("initializer.color", self.color)

@@ -14,6 +14,7 @@ from torch import Tensor
 from cadam3d.core.checks import require_choice, require_range, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.memory import require_memory
 from cadam3d.core.sh import MAX_DEGREE, rgb_to_sh0
 from cadam3d.io.frames import TURNS
 from cadam3d.io.reading import KINDS
@@ -167,7 +168,7 @@ def found_file(path: str, example: str) -> Path:
     return found
 
 
-def require_points(count: object, scale: object, opacity: object, sh_degree: object) -> None:
+def require_points(count: int, scale: object, opacity: object, sh_degree: object) -> None:
     """Raise ``UserError`` unless these keys of an initializer are in their ranges."""
     require_whole("initializer.count", count, low=1, example=2000)
     if scale is not None:
@@ -183,7 +184,17 @@ def require_place(turn_deg: object, radius: object) -> None:
         require_range("initializer.radius", radius, above=0, high=1, example=0.9)
 
 
-def require_copies(replicate: object, replicate_radius: object) -> None:
+def require_count(count: int, sh_degree: int) -> None:
+    """Raise ``UserError`` unless that many Gaussians can be trained in the memory of this machine.
+
+    Each number of a Gaussian is stored with its gradient and its two moments, in single precision.
+    """
+    numbers = 11 + 3 * (sh_degree + 1) ** 2
+    require_memory("initializer.count", count, unit=16 * numbers, example=2000)
+
+
+def require_copies(replicate: int, replicate_radius: object) -> None:
     """Raise ``UserError`` unless ``replicate`` is at least 1 and ``replicate_radius`` is in (0, 1]."""
     require_whole("initializer.replicate", replicate, low=1, example=20)
+    require_memory("initializer.replicate", replicate, unit=16 * 14, example=20)
     require_range("initializer.replicate_radius", replicate_radius, above=0, high=1, example=0.05)

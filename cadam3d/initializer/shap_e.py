@@ -13,6 +13,7 @@ from torch import Tensor
 from cadam3d.core.checks import require, require_choice, require_range, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.memory import require_memory
 from cadam3d.initializer.base import Beginning, Initializer
 from cadam3d.initializer.points import (
     PointCloud,
@@ -22,6 +23,7 @@ from cadam3d.initializer.points import (
     points_on_surface,
     replicated,
     require_copies,
+    require_count,
     require_place,
     require_points,
 )
@@ -82,9 +84,12 @@ class ShapE(Initializer):
         require_whole("initializer.steps", self.steps, low=1, high=1024, example=64)
         require_range("initializer.guidance_scale", self.guidance_scale, low=1, example=15)
         require_whole("initializer.grid_size", self.grid_size, low=2, example=128)
+        require_memory("initializer.grid_size", self.grid_size, unit=4, power=3, example=128)
         require_place(self.turn_deg, self.radius)
         require_points(1 if self.count is None else self.count, self.scale, self.opacity, self.sh_degree)
+        require_count(1 if self.count is None else self.count, self.sh_degree)
         require_whole("initializer.grow_points", self.grow_points, low=0, example=1000000)
+        require_memory("initializer.grow_points", self.grow_points, unit=12, example=1000000)
         require_range("initializer.grow_distance", self.grow_distance, above=0, example=0.01)
         require_range("initializer.grow_noise", self.grow_noise, low=0, high=1, example=0.2)
         require_copies(self.replicate, self.replicate_radius)

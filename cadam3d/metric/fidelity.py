@@ -39,7 +39,7 @@ class Fidelity(PictureSettings, Metric):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_whole("metric.fidelity.views", self.views, low=1, example=12)
+        self.require_views(self.views, example=12)
         self.require_angles("elevations_deg", self.elevations_deg, limit=90, example=15)
         require_whole("metric.fidelity.size", self.size, low=SSIM_WINDOW, example=128)
 

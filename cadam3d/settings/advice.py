@@ -5,16 +5,16 @@ import re
 import shlex
 from collections.abc import Sequence
 
+import yaml  # comes with OmegaConf
 from hydra.errors import CompactHydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
 from cadam3d.core.errors import UserError
-from cadam3d.settings.compose import compose, config_dir, flatten, quote
+from cadam3d.settings.compose import NO_NAME_COMPLAINT, compose, config_dir, flatten, quote
 from cadam3d.settings.line import key_of
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
-NO_NAME_COMPLAINT = "Config group override must be a string or a list"
 # The package of each option of hydra/launcher that Hydra itself lacks.
 LAUNCHERS = {
     "joblib": "hydra-joblib-launcher",
@@ -72,6 +72,9 @@ def explain(error: BaseException, command: str, words: Sequence[str]) -> UserErr
             reason = _no_name(str(error), words)
         case InterpolationResolutionError():
             reason = _unresolved(error, command)
+        case yaml.YAMLError() | UnicodeDecodeError() | RecursionError():
+            text = " ".join(str(error).split())
+            reason = UserError(f"configuration: cannot be read ({text}). Try: cadam3d {command} --help")
         case CompactHydraException() | OmegaConfBaseException():
             reason = _reworded(error, command, words)
     return reason

@@ -11,30 +11,25 @@ from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import InstantiationException
+from hydra.errors import HydraException, InstantiationException
 from hydra.types import RunMode
 from hydra.utils import instantiate
-from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
+from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_yaml
+from cadam3d.settings.declared import config_dir, require_declared
 
 # Hydra behaves like this version even if a newer one is installed.
 VERSION_BASE = "1.3"
-# Python's wording of the two kinds of wrong calls.
-WRONG_CALL = r"unexpected keyword|missing (?:a|\d+) required"
+# The beginning of Hydra's message for a group that is set to a number or to null.
+NO_NAME_COMPLAINT = "Config group override must be a string or a list"
 # Values of these keys are always text, so the user need not quote them for Hydra.
 TEXT_KEYS = ("prompt", "negative_prompt")
 # Characters. At three bytes each they still fit into a file name.
 SLUG_LENGTH = 60
-
-
-def config_dir() -> Path:
-    """Return the folder of YAML files: inside the installed package, or ``configs/`` of a checkout."""
-    package = Path(__file__).parent.parent
-    packaged = package / "configs"
-    return packaged if packaged.is_dir() else package.parent / "configs"
 
 
 def compose(
@@ -51,11 +46,11 @@ def compose(
     keeps Hydra's own node. Raises Hydra's exceptions; ``cadam3d.settings.advice`` explains them to the user.
     """
     register_resolvers()
+    require_files(folder or config_dir(), "--config-path")
     places = create_config_search_path(str((folder or config_dir()).resolve()))
     if search_path is not None:
         own = Path(search_path).absolute()
-        if not own.is_dir():
-            raise UserError(f"--config-dir: expected a folder, got {search_path!r}. Try: --config-dir=DIR")
+        require_files(own, "--config-dir")
         places.prepend("command-line", f"file://{own}", anchor=SearchPathQuery(provider="schema"))
     # A command that runs inside Hydra may compose too, so Hydra's global state is restored afterwards.
     outer = GlobalHydra.instance().hydra
@@ -65,6 +60,15 @@ def compose(
         cfg = Hydra.create_main_hydra2("cadam3d", places).compose_config(
             config_name, list(overrides), run_mode=RunMode.RUN, from_shell=False
         )
+    except (HydraException, OmegaConfBaseException, UserError):
+        raise
+    # A wrong YAML file, or a deeply nested value, raises an exception of a parser, of a codec or of Python.
+    except Exception as error:
+        if str(error).startswith(NO_NAME_COMPLAINT):
+            raise
+        reason = " ".join(str(error).split())[:300] or type(error).__name__
+        place = "--config-dir" if search_path is not None else "configuration"
+        raise UserError(f"{place}: cannot be read ({reason}). Try: cadam3d {config_name} --help") from error
     finally:
         GlobalHydra.instance().hydra = outer
     if not with_hydra:
@@ -73,13 +77,30 @@ def compose(
     return cfg
 
 
-def component(node: DictConfig | ListConfig | None) -> Any:
+def require_files(folder: Path, flag: str) -> None:
+    """Raise ``UserError`` unless ``folder`` is one, and its YAML files are regular files.
+
+    Reading a named pipe would never end. Only the folders of groups are searched.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{flag}: expected a folder, got {str(folder)!r}. Try: cadam3d train --help")
+    groups = [path.relative_to(config_dir()) for path in config_dir().rglob("*") if path.is_dir()]
+    for path in [path for group in (Path(), *groups) for path in (folder / group).glob("*.yaml")]:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise UserError(f"{flag}: {path} is not a regular file. Try: cadam3d train --help")
+
+
+def component(node: Any, kind: type = object, key: str = "") -> Any:
     """Build the object that ``node._target_`` names, and nested ones; lists and dicts become plain Python.
 
-    Raises ``UserError`` for mistakes in the configuration: values out of range, unknown keys, missing keys, a
-    target that cannot be imported. A bug in a constructor raises its own exception.
+    ``kind`` is the class of the object; ``key`` is the place of the node, in case that it is not a dict.
+    Raises ``UserError`` for mistakes in the configuration: values of a wrong type or out of range, unknown
+    keys, missing keys, a target that cannot be imported or is of another kind. Nothing is built if a type is
+    wrong. A bug in a constructor raises its own exception.
     """
     try:
+        place = node._get_full_key("") if OmegaConf.is_config(node) else ""
+        require_declared(node, kind, place or key or "configuration")
         return instantiate(node, _convert_="all")
     except InstantiationException as error:
         raise _construction_error(error) from error
@@ -90,12 +111,19 @@ def component(node: DictConfig | ListConfig | None) -> Any:
         ) from error
 
 
-def components(group: DictConfig) -> dict[str, Any]:
+def components(group: Any, kind: type = object, key: str = "") -> dict[str, Any]:
     """Build every chosen member of a group of which several can be chosen, by name.
 
     An experiment may tune a member that the line has not chosen; such a node has keys but no ``_target_``.
     """
-    return {str(name): component(node) for name, node in group.items() if "_target_" in node}
+    if not isinstance(group, DictConfig):
+        raise fail(key, expected="a list of options", got=group, example=f"'{key}=[]'")
+    place = group._get_full_key("") or key
+    return {
+        str(name): component(node, kind, f"{place}.{name}")
+        for name, node in group.items()
+        if not isinstance(node, DictConfig) or "_target_" in node
+    }
 
 
 def load_config(path: Path) -> DictConfig:
@@ -173,12 +201,19 @@ def _construction_error(error: InstantiationException) -> BaseException:
     cause = error.__cause__
     key = re.search(r"full_key: (\S+)", str(error))
     where = key.group(1) if key else "configuration"
-    if isinstance(cause, TypeError) and (call := re.search(WRONG_CALL, str(cause))):
-        names = ", ".join(re.findall(r"'(\w+)'", str(cause)))
-        if call.group() == "unexpected keyword":
-            return UserError(f"{where}: there is no key {names}. Try: without it; --cfg job lists the keys")
-        return UserError(f"{where}: no value for {names}. Try: give one; --cfg job lists the keys")
-    if cause is None or isinstance(cause, ImportError):
-        reason = str(cause or error).splitlines()[-1]
-        return UserError(f"{where}._target_: cannot be loaded ({reason}). Try: cadam3d doctor")
+    if isinstance(cause, UserError):
+        return _placed(cause, where)
+    if cause is None:
+        return UserError(f"{where}: {str(error).splitlines()[0]}. Try: --cfg job, which lists the keys")
     return cause
+
+
+def _placed(error: UserError, where: str) -> UserError:
+    """Return the error of a constructor with the place of its node, which the constructor cannot know.
+
+    A schedule, for example, writes ``schedule.steps``, which is ``optimizer.means_lr.steps`` here.
+    """
+    text = str(error)
+    if not (named := re.match(r"([\w.*]+)\.\w+: ", text)) or f"{named.group(1)}.".startswith(f"{where}."):
+        return error
+    return UserError(text.replace(f"{named.group(1)}.", f"{where}."))

@@ -1,12 +1,14 @@
 """Hydra: read its flags, compose the configuration of a line, and run a command as one of its jobs."""
 
 import os
+import re
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+import yaml  # comes with OmegaConf
 from hydra import main as hydra_main
 from hydra._internal.callbacks import Callbacks
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
@@ -17,9 +19,15 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
+from cadam3d.settings.advice import did_you_mean
 from cadam3d.settings.compose import VERSION_BASE, compose, config_dir, quote, register_resolvers
+from cadam3d.settings.declared import TARGET, replacement
 from cadam3d.settings.line import RUN_FOLDER, key_of
 
+# A reference to other settings, such as ${steps}.
+REFERENCE = re.compile(r"\$\{[^}]*")
+# The groups of which several options can be chosen.
+LISTS = ("regularizer", "exporter", "callback", "metric")
 Run = Callable[[DictConfig], Any]  # a command, given its composed configuration
 
 
@@ -74,6 +82,41 @@ def refuse_missing_settings(cfg: DictConfig, command: str, overrides: Sequence[s
             continue  # such as ${hydra:...}, which only a running job can resolve
 
 
+def refuse_unread_settings(cfg: DictConfig, command: str, overrides: Sequence[str]) -> None:
+    """Refuse what changes nothing: unknown top-level settings, ``camera={}``, and settings of unused members.
+
+    An example of the last kind is ``+callback.candidates.every=5`` if that callback is not chosen. The keys
+    of chosen components are checked when these are built. A top-level setting of the user's own YAML is
+    accepted if another setting refers to it.
+    """
+    raw = OmegaConf.to_container(cfg, resolve=False)
+    assert isinstance(raw, dict)
+    references = " ".join(REFERENCE.findall(str(raw)))
+    known = {"hydra", *_declared_names(command)}
+    for name in map(str, raw):
+        if name not in known and not re.search(rf"\b{re.escape(name)}\b", references):
+            near = did_you_mean(name, sorted(known))
+            meant = f" Did you mean {near[0]}?" if near else ""
+            raise UserError(
+                f"{name}: no such setting.{meant} Try: cadam3d {command} --cfg job (it lists all of them)"
+            )
+    folders = [Path(source.path) for source in cfg.hydra.runtime.config_sources if source.schema == "file"]
+    for override in overrides:
+        key = key_of(override)
+        group, _, rest = key.partition(".")
+        node = raw.get(group)
+        if not isinstance(node, dict) or override.startswith("~"):
+            continue
+        if not rest and override.endswith("={}"):
+            raise UserError(f"{key}: {{}} changes nothing. Try: {replacement(key)}")
+        member = rest.partition(".")[0]
+        if group in LISTS and isinstance(node.get(member), dict) and TARGET not in node[member]:
+            if not any((folder / group / f"{member}.yaml").is_file() for folder in folders):
+                raise UserError(f"{key}: {group} has no option {member}. Try: cadam3d {command} --help")
+            chosen = ",".join([*(name for name in node if name != member), member])
+            raise UserError(f"{group}.{member}: is not chosen. Try: '{group}=[{chosen}]'")
+
+
 def place_run(cfg: DictConfig, folder: Path) -> None:
     """Change ``cfg``, in place, as if the line had set ``hydra.run.dir`` to ``folder``."""
     with open_dict(cfg):
@@ -120,6 +163,18 @@ def run_hydra(command: str, arguments: Sequence[str], run: Run) -> None:
     finally:
         sys.argv = arguments_before
         os.environ["HYDRA_FULL_ERROR"] = switch_before or "0"
+
+
+def _declared_names(command: str) -> set[str]:
+    """Return the settings and groups that the YAML of a command declares, with those that it builds on."""
+    page = yaml.safe_load((config_dir() / f"{command}.yaml").read_text(encoding="utf-8"))
+    names = set(page) - {"defaults"}
+    for entry in page["defaults"]:
+        if isinstance(entry, dict):
+            names |= set(entry)
+        elif entry != "_self_":
+            names |= _declared_names(entry)
+    return names
 
 
 def _refuse_flags(message: str) -> NoReturn:

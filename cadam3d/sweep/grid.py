@@ -7,14 +7,16 @@ express this.
 
 import hashlib
 import json
+import math
 import re
+import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import islice, product
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Glob, Override, RangeSweep
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import to_json
@@ -25,6 +27,9 @@ IDENTIFIER = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)
 RESERVED = ("null", "true", "false", "nan", "inf")
 # Keys that are shown in every table and count for the name of every folder.
 ALWAYS_SHOWN = ("prompt", "seed")
+# Each job starts a process, which takes seconds, and is a row of a table. With this many jobs, the starts
+# alone take a day, and the table is too long to read.
+MOST_JOBS = 10_000
 EXAMPLE = "{each: {seed: [0, 1]}, arms: {mine: {densifier: cadam}}}"
 
 
@@ -124,6 +129,15 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
         name: {key: line.get(key, axis) for key, axis in axes.items()} for name, axes in grid.arms.items()
     }
     foreign = _foreign(grid, line, arms, has_setting)
+    number = math.prod(map(len, common.values()))
+    number *= sum(math.prod(map(len, axes.values())) for axes in arms.values())
+    if number > MOST_JOBS:
+        axes_of = {key: axis for axes in (*arms.values(), common) for key, axis in axes.items()}
+        longest = max(axes_of, key=lambda key: len(axes_of[key]))
+        raise UserError(
+            f"{longest}: expected at most {MOST_JOBS} jobs in a sweep, got {number}. "
+            f"Try: {shlex.quote(axes_of[longest][0].line)}"
+        )
     named, counted = _named(grid, line), swept_keys(grid, line)
     found: dict[frozenset[str], Job] = {}
     for shared in product(*common.values()):
@@ -196,13 +210,37 @@ def _grammar(key: str, value: Any) -> str:
 
 
 def _alternatives(line: str) -> list[str]:
+    # Hydra's parser needs a minute for a list of this length.
+    _require_few(line.partition("=")[0], line.count(",") + 1)
     override = _parsed(line)
     if not override.is_sweep_override():
         return [line]
-    key = override.get_key_element()
-    if not override.is_discrete_sweep():
-        raise UserError(f"{key}: expected values one by one, got an interval. Try: {key}=range(0,1,0.25)")
-    return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    key, sweep = override.get_key_element(), override.value()
+    if not override.is_discrete_sweep() or isinstance(sweep, Glob):
+        what = "a pattern" if isinstance(sweep, Glob) else "an interval"
+        raise UserError(f"{key}: expected values one by one, got {what}. Try: {key}=range(0,1,0.25)")
+    if isinstance(sweep, RangeSweep):
+        _require_range(key, sweep)
+    values = [f"{key}={value}" for value in override.sweep_string_iterator()]
+    _require_few(key, len(values))
+    return values
+
+
+def _require_range(key: str, sweep: RangeSweep) -> None:
+    """Raise ``UserError`` unless the range has values, and few enough. At most ``MOST_JOBS`` are made."""
+    numbers = (sweep.start, sweep.stop, sweep.step)
+    is_range = all(number is not None and math.isfinite(number) for number in numbers) and sweep.step != 0
+    count = sum(1 for _ in islice(sweep.range(), MOST_JOBS + 1)) if is_range else 0
+    if count == 0:
+        got = "range({},{},{})".format(*numbers)
+        raise UserError(f"{key}: expected a range with values, got {got}. Try: '{key}=range(0,3)'")
+    _require_few(key, count)
+
+
+def _require_few(key: str, count: int) -> None:
+    if count > MOST_JOBS:
+        many = f"at least {count}" if count == MOST_JOBS + 1 else str(count)
+        raise UserError(f"{key}: expected at most {MOST_JOBS} values, got {many}. Try: '{key}=range(0,3)'")
 
 
 def _setting(line: str) -> AxisValue:

@@ -16,7 +16,8 @@ from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
 from cadam3d.settings.advice import RefusedJobError, require_values
 from cadam3d.settings.compose import flatten
-from cadam3d.settings.hydra import compose_line, refuse_missing_settings
+from cadam3d.settings.declared import require_settings
+from cadam3d.settings.hydra import compose_line, refuse_missing_settings, refuse_unread_settings
 from cadam3d.settings.line import SWEEP_FOLDER, key_of
 from cadam3d.sweep.grid import ALWAYS_SHOWN, Axes, Grid, Job, expand, read_grid, read_line, swept_keys
 
@@ -138,6 +139,8 @@ class Composer:
             base = self._base(overrides)
             require_values(base.cfg)
             refuse_missing_settings(base.cfg, "sweep", overrides)
+            refuse_unread_settings(base.cfg, "sweep", overrides)
+            require_settings(base.cfg)
             self._bases[known] = base
         return self._bases[known].composed(values)
 

@@ -216,9 +216,7 @@ def link(path: Path) -> None:
     "name",
     ["train.log", "metrics.jsonl", ".hydra/config.yaml", "candidates/histograms.jsonl", "checkpoints/x"],
 )
-def test_a_resumed_run_follows_no_link_out_of_its_folder_and_waits_for_no_pipe(
-    make, name, tmp_path, type_line
-):
+def test_a_resumed_run_follows_no_link_out_and_waits_for_no_pipe(make, name, tmp_path, type_line):
     folder = tmp_path / "deep" / "er" / "run"
     for kind in (".hydra", "checkpoints", "candidates"):
         (folder / kind).mkdir(parents=True)
