@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import __version__
 from cadam3d.commands.messages import note, note_backend
+from cadam3d.commands.timetable import describe
 from cadam3d.core.checks import require, require_whole
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
@@ -71,6 +72,8 @@ def run(cfg: DictConfig) -> float | None:
     for text in filter(None, (trainer.prior.notice(), state.initial_note)):
         note(text)
     note_backend(backend)
+    timetable = describe(trainer)
+    print(f"Schedule: {timetable}", file=sys.stderr)
 
     remove_leftovers(folder)
     config_text = OmegaConf.to_yaml(cfg, resolve=True)
@@ -78,6 +81,7 @@ def run(cfg: DictConfig) -> float | None:
     if not (folder / LOCK).exists():  # a sweep locks the folders of its jobs
         link_latest(folder)
     log.info("prompt %r, seed %d, on %s, from step %d", cfg.prompt, cfg.seed, device, state.step)
+    log.info("schedule: %s", timetable)
     log.info("rasterizer=%s; %s", backend.name, backend.reason or "nothing faster is known here")
 
     render = trainer.renderer(state)
@@ -93,6 +97,7 @@ def run(cfg: DictConfig) -> float | None:
         log.info("%s after %d steps: %d Gaussians", outcome, state.step, len(state.gaussians))
 
         summary = summarize(cfg, state, outcome, backend) | memory | measure_memory(device)
+        summary["schedule"] = timetable
         # The summary is written before the exports, which may fail.
         write_json(folder / SUMMARY, summary)
         gaussians = state.gaussians.detach()
@@ -132,6 +137,13 @@ def require_determinism(device: torch.device) -> None:
 
 def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
     """Build the components that ``cfg`` names, and move the prior to ``device``."""
+    require(
+        cfg.refine.steps == cfg.steps,
+        "refine.steps",
+        expected=f"the length of the run, steps={cfg.steps}",
+        got=cfg.refine.steps,
+        example="refine.steps='${steps}'",
+    )
     return Trainer(
         steps=cfg.steps,
         views=cfg.views,
