@@ -21,6 +21,7 @@ from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn
+from cadam3d.core.schedule import FAR_STEP
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.atomic import remove_leftovers
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
@@ -55,7 +56,7 @@ def run(cfg: DictConfig) -> float | None:
     """Train, export, measure and report. Return the PSNR in dB if the prior has true images."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     device = resolve_device(cfg.device)
-    for key, least in (("seed", 0), ("steps", 1), ("views", 1)):
+    for key, least in (("seed", 0), ("views", 1)):
         require_whole(key, cfg[key], low=least, example=3)
     require_determinism(device)
 
@@ -137,6 +138,7 @@ def require_determinism(device: torch.device) -> None:
 
 def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
     """Build the components that ``cfg`` names, and move the prior to ``device``."""
+    require_whole("steps", cfg.steps, low=1, high=FAR_STEP, example=600)
     require(
         cfg.refine.steps == cfg.steps,
         "refine.steps",

@@ -92,7 +92,7 @@ class Refine:
             expected=f"a number below refine.reset_value={self.reset_value:g}, or refine.prune_grace > 0, "
             "because otherwise the next refinement deletes every Gaussian that a reset has lowered",
             got=self.min_opacity,
-            example="refine.prune_grace=100",
+            example=f"refine.min_opacity={self.reset_value / 2:g}",
         )
         require(
             self.prune_grace < self.reset_interval,

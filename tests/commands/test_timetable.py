@@ -1,10 +1,11 @@
 """The line before training says what happens when, and what a recipe of another length misses."""
 
+import pytest
 import torch
 
 from cadam3d.commands.timetable import describe
 from cadam3d.commands.train import build_trainer
-from cadam3d.settings.compose import compose
+from cadam3d.settings.compose import component, compose
 
 CPU = torch.device("cpu")
 
@@ -36,6 +37,14 @@ def test_a_densifier_without_resets_has_none_and_none_that_is_skipped():
         assert "no opacity reset" in text
         assert "skipped" not in text
     assert "1 opacity reset" in line("densifier=cadam_global_reset")
+
+
+@pytest.mark.parametrize("name", ["none", "mcmc", "random", "random_annealed", "cadam_no_reset"])
+def test_a_densifier_that_claims_to_reset_nothing_marks_no_gaussian(name):
+    densifier = component(compose(["prompt=a red cube", f"densifier={name}"]).densifier)
+    assert not densifier.resets
+    state = densifier.init_state(5, CPU)
+    assert not densifier.unreliable(state).any()
 
 
 def test_a_run_in_which_nothing_grows_says_which_settings_change_that():

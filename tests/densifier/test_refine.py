@@ -331,7 +331,7 @@ def test_an_impossible_value_is_refused_by_name(key, value):
 
 
 def test_a_reset_below_the_pruning_threshold_is_refused():
-    with pytest.raises(UserError, match=r"refine\.min_opacity.*refine\.prune_grace=100"):
+    with pytest.raises(UserError, match=r"refine\.min_opacity.*Try: refine\.min_opacity=0\.005$"):
         refine(reset_interval=300, min_opacity=0.05)
 
 
