@@ -3,6 +3,7 @@
 import re
 from functools import cache
 from itertools import pairwise
+from typing import Any
 
 import pytest
 import torch
@@ -33,7 +34,7 @@ WINDOWED = ("sds", "ism", "vfds", "ucm", "sdi", "gcs")
 @cache
 def schedules(*words: str) -> dict[int, Refine]:
     """Return the schedule of refinements for each of LENGTHS. OmegaConf would take a minute for it."""
-    settings = OmegaConf.to_container(compose([PROMPT, *words]).refine)
+    settings: Any = OmegaConf.to_container(compose([PROMPT, *words]).refine)
     settings.pop("_target_")
     return {
         steps: Refine(**{key: evaluated(value, steps) for key, value in settings.items()})

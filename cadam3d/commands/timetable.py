@@ -8,7 +8,7 @@ from cadam3d.densifier.base import Densifier
 from cadam3d.densifier.refine import Refine
 from cadam3d.trainer import Trainer
 
-# The default of ``steps``, with which an example suits every densifier.
+# The default of ``steps``, which is long enough for every densifier with its default settings.
 USUAL_STEPS = 600
 
 
@@ -60,12 +60,12 @@ def _rest(refine: Refine, densifier: Densifier) -> int:
 def _difference(refine: Refine, published: Refine, densifier: Densifier) -> str:
     """Return what a run misses, or adds, compared with the length for which its refinements are published."""
     lengths = (
-        f"The refinements are made for {published.steps} steps "
-        f"and keep their steps, like most schedules of a recipe, in a run of {refine.steps}"
+        f"The refinements are made for {published.steps} steps and, "
+        "like most schedules of a recipe, keep their steps at any length"
     )
     grown = len(refine.refinements) - len(published.refinements)
     if refine.steps > published.steps:
-        return f"{lengths}, which adds {_plural(grown, 'refinement')}."
+        return f"{lengths}: this run adds {_plural(grown, 'refinement')}."
     missed = [
         (-grown, f"of {_plural(len(published.refinements), 'refinement')}"),
         (
@@ -77,7 +77,9 @@ def _difference(refine: Refine, published: Refine, densifier: Densifier) -> str:
             f"of {_plural(_rest(published, densifier), 'step')} after them",
         ),
     ]
-    return f"{lengths}, which misses {', '.join(f'{count} {what}' for count, what in missed if count > 0)}."
+    return (
+        f"{lengths}: this run misses {', '.join(f'{count} {what}' for count, what in missed if count > 0)}."
+    )
 
 
 def _grows(refine: Refine, grows_from: int) -> bool:

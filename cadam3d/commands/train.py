@@ -22,6 +22,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn
 from cadam3d.core.schedule import FAR_STEP
+from cadam3d.densifier.refine import Refine
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.atomic import remove_leftovers
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
@@ -139,11 +140,12 @@ def require_determinism(device: torch.device) -> None:
 def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
     """Build the components that ``cfg`` names, and move the prior to ``device``."""
     require_whole("steps", cfg.steps, low=1, high=FAR_STEP, example=600)
+    refine: Refine = component(cfg.refine)
     require(
-        cfg.refine.steps == cfg.steps,
+        refine.steps == cfg.steps,
         "refine.steps",
         expected=f"the length of the run, steps={cfg.steps}",
-        got=cfg.refine.steps,
+        got=refine.steps,
         example="refine.steps='${steps}'",
     )
     return Trainer(
@@ -156,7 +158,7 @@ def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
         prior=component(cfg.prior).to(device),
         guidance=component(cfg.guidance),
         densifier=component(cfg.densifier),
-        refine=component(cfg.refine),
+        refine=refine,
         optimizer=component(cfg.optimizer),
         exposure=component(cfg.exposure),
         regularizers=components(cfg.regularizer),

@@ -62,7 +62,7 @@ class Refine:
     def __post_init__(self) -> None:
         require_whole("refine.steps", self.steps, low=1, high=FAR_STEP, example="'${steps}'")
         if self.made_for is not None:
-            require_whole("refine.made_for", self.made_for, low=1, example="null")
+            require_whole("refine.made_for", self.made_for, low=1, high=FAR_STEP, example="null")
         require_whole("refine.start", self.start, low=0, example=100)
         require_whole("refine.end", self.end, low=0, example=450)
         require_whole("refine.interval", self.interval, low=1, example=50)
@@ -123,7 +123,7 @@ class Refine:
 
     @property
     def skipped_resets(self) -> range:
-        """Return the steps of the resets that are due but would leave less than ``recovery`` steps."""
+        """Return the steps of the resets that are due but would leave fewer than ``recovery`` steps."""
         return self._due_resets(max(1, self.steps - self.recovery + 1), self.steps)
 
     def _due_resets(self, first: int, last: int) -> range:
