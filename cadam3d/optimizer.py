@@ -13,7 +13,7 @@ from torch.optim.adam import adam
 from cadam3d.core.checks import require, require_range
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled, settled_at
 
 # The tensors as Adam groups them: view-dependent colours are separate, because they learn more slowly.
 PARTS = ("means", "sh_dc", "sh_rest", "opacity", "scale", "quat")
@@ -52,6 +52,10 @@ class AdamSettings:
     def learning_rates(self, step: int) -> dict[str, float]:
         """Return the rate of each part at ``step`` (0 is the first)."""
         return {part: float(as_schedule(getattr(self, f"{part}_lr"))(step)) for part in PARTS}
+
+    def settled_at(self) -> int:
+        """Return the first step from which no learning rate changes; 0 if all are constant."""
+        return max(settled_at(getattr(self, f"{part}_lr")) for part in PARTS)
 
     def largest_norm(self, step: int) -> float | None:
         """Return :attr:`clip_norm` at ``step`` (0 is the first); None if gradients are not clipped."""

@@ -51,8 +51,9 @@ def test_flowdreamer_has_the_lengths_of_luciddreamer():
     ],
 )
 def test_refinements_are_at_the_published_steps(name, calls):
-    refine = build("refine", name)
     steps = STEPS.get(name, 5000)
+    refine = build("refine", name, f"steps={steps}")
+    assert refine.made_for == steps
     assert [step for step in range(1, steps + 1) if refine.refines_at(step)] == list(calls)
 
 
@@ -66,7 +67,7 @@ def test_refinements_are_at_the_published_steps(name, calls):
     ],
 )
 def test_resets_are_at_the_published_steps_after_the_warm_up(name, resets):
-    refine = build("refine", name)
+    refine = build("refine", name, "steps=5000")
     assert [step for step in range(1, 5001) if refine.resets_at(step)] == list(resets)
 
 

@@ -32,6 +32,7 @@ SMALL = [
     "refine.reset_interval=4",
     "refine.reset_from=4",
     "refine.reset_until=100",
+    "refine.recovery=1",
     "callback=[]",
 ]
 

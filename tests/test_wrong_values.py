@@ -48,6 +48,8 @@ WHOLE = {
     "prior=tiny": ["prior.width", "prior.downscale", "prior.seed", "prior.noise_path.train_steps"],
     "guidance=ucm": ["guidance.inversion_steps"],
     "refine=default": [
+        "refine.steps",
+        "refine.made_for",
         "refine.start",
         "refine.end",
         "refine.interval",
@@ -56,6 +58,7 @@ WHOLE = {
         "refine.reset_interval",
         "refine.reset_from",
         "refine.reset_until",
+        "refine.recovery",
         "refine.prune_grace",
         "refine.max_gaussians",
     ],
@@ -106,7 +109,7 @@ SWITCHES = {
 # The keys among them that may be null.
 NULLABLE = {
     "callback=[previews]": ("callback.previews.every",),
-    "refine=default": ("refine.reset_interval", "refine.max_gaussians"),
+    "refine=default": ("refine.made_for", "refine.reset_interval", "refine.max_gaussians"),
     "initializer=ply": ("initializer.count", "initializer.sh_degree"),
     "initializer=shap_e": ("initializer.count",),
 }

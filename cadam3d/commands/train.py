@@ -22,11 +22,13 @@ from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
 from cadam3d.commands.messages import keeping_others, note, note_backend
+from cadam3d.commands.timetable import describe
 from cadam3d.core.checks import require, require_whole
 from cadam3d.core.device import resolve_device
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import CAMERA, PIXEL, require_memory
 from cadam3d.core.render import RenderFn
+from cadam3d.core.schedule import FAR_STEP
 from cadam3d.densifier.base import Densifier
 from cadam3d.densifier.baseline import Baseline
 from cadam3d.densifier.refine import Refine
@@ -94,7 +96,8 @@ def run(cfg: DictConfig) -> float | None:
     for text in filter(None, (trainer.prior.notice(), state.initial_note)):
         note(text)
     note_backend(backend)
-    note_no_growth(trainer.refine)
+    timetable = describe(trainer)
+    print(f"Schedule: {timetable}", file=sys.stderr)
 
     remove_leftovers(folder)
     config_text = OmegaConf.to_yaml(cfg, resolve=True)
@@ -104,6 +107,7 @@ def run(cfg: DictConfig) -> float | None:
     if INHERITED not in os.environ:
         link_latest(folder)
     log.info("prompt %r, seed %d, on %s, from step %d", cfg.prompt, cfg.seed, device, state.step)
+    log.info("schedule: %s", timetable)
     log.info("rasterizer=%s; %s", backend.name, backend.reason or "nothing faster is known here")
 
     render = trainer.renderer(state)
@@ -119,6 +123,7 @@ def run(cfg: DictConfig) -> float | None:
         log.info("%s after %d steps: %d Gaussians", outcome, state.step, len(state.gaussians))
 
         summary = summarize(cfg, state, outcome, backend) | memory | measure_memory(device)
+        summary["schedule"] = timetable
         # The summary is written before the exports, which may fail.
         write_json(folder / SUMMARY, summary)
         gaussians = state.gaussians.detach()
@@ -173,6 +178,15 @@ def require_unused(cfg: DictConfig) -> None:
 
 def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
     """Build the components that ``cfg`` names, and move the prior to ``device``."""
+    require_whole("steps", cfg.steps, low=1, high=FAR_STEP, example=600)
+    refine: Refine = component(cfg.refine, Refine, "refine")
+    require(
+        refine.steps == cfg.steps,
+        "refine.steps",
+        expected=f"the length of the run, steps={cfg.steps}",
+        got=refine.steps,
+        example="refine.steps='${steps}'",
+    )
     return Trainer(
         steps=cfg.steps,
         views=cfg.views,
@@ -183,7 +197,7 @@ def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
         prior=component(cfg.prior, DiffusionPrior, "prior").to(device),
         guidance=component(cfg.guidance, Guidance, "guidance"),
         densifier=component(cfg.densifier, Densifier, "densifier"),
-        refine=component(cfg.refine, Refine, "refine"),
+        refine=refine,
         optimizer=component(cfg.optimizer, AdamSettings, "optimizer"),
         exposure=component(cfg.exposure, Exposure, "exposure"),
         regularizers=components(cfg.regularizer, Regularizer, "regularizer"),
@@ -199,16 +213,6 @@ def estimate_memory(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
         return {}
     note(f"The prior will need about {estimate}. To reduce this, set vram=low or fewer views.")
     return {"memory_estimate_gib": round(estimate.total / 2**30, 3)}
-
-
-def note_no_growth(refine: Refine) -> None:
-    """Print a note if the schedule has no refinement in a run of any length."""
-    first = (refine.start // refine.interval + 1) * refine.interval
-    if first >= refine.end:
-        note(
-            f"nothing will grow, because refine.start={refine.start} and refine.end={refine.end} have no "
-            f"multiple of refine.interval={refine.interval} between them"
-        )
 
 
 def measure_memory(device: torch.device) -> dict[str, float]:

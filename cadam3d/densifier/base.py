@@ -81,6 +81,16 @@ class Densifier(ABC, Generic[State]):
         """Return whether signals must contain ``absgrad``; rasterizers compute it on request only."""
         return False
 
+    @property
+    def grows_from(self) -> int | None:
+        """Return the first step after which a Gaussian may grow; ``None`` if none ever grows."""
+        return 0
+
+    @property
+    def resets(self) -> bool:
+        """Return whether opacity resets may lower any opacity."""
+        return True
+
     @abstractmethod
     def init_state(self, n: int, device: torch.device) -> State:
         """Return the state of ``n`` newborn Gaussians."""
@@ -157,6 +167,11 @@ class Densifier(ABC, Generic[State]):
 @dataclass(frozen=True, kw_only=True)
 class GradientFree(Densifier[RowCount]):
     """Base of densifiers that decide without gradients and reset no opacity."""
+
+    @property
+    def resets(self) -> bool:
+        """Return False, because :meth:`unreliable` marks no Gaussian."""
+        return False
 
     def init_state(self, n: int, device: torch.device) -> RowCount:
         """Return a state without statistics."""

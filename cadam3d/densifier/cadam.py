@@ -70,6 +70,16 @@ class CAdam(Densifier[CAdamState]):
         require_whole("densifier.reset_min_age", self.reset_min_age, low=0, example=50)
         self._check_reset_threshold()
 
+    @property
+    def grows_from(self) -> int:
+        """Return the step at which the initial Gaussians reach the age from which they may grow."""
+        return self.min_age
+
+    @property
+    def resets(self) -> bool:
+        """Return whether resets lower unreliable or all opacities."""
+        return self.reset != "none"
+
     def init_state(self, n: int, device: torch.device) -> CAdamState:
         """Return zero moments and age 0."""
         return CAdamState(

@@ -9,6 +9,7 @@ from torch import Tensor
 from cadam3d.core.checks import require, require_range, require_whole
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians, concatenate
+from cadam3d.core.schedule import FAR_STEP
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,8 @@ class Refine:
     Steps count from 1, and lengths are in world units.
     """
 
+    steps: int  # of the run
+    made_for: int | None  # steps of the run for which the schedule was published
     start: int  # step
     end: int  # step
     interval: int  # steps, the paper's K
@@ -52,10 +55,14 @@ class Refine:
     reset_from: int  # step
     reset_until: int  # step
     reset_value: float  # in (0, 1), opacity
+    recovery: int  # steps
     prune_grace: int  # steps
     max_gaussians: int | None
 
     def __post_init__(self) -> None:
+        require_whole("refine.steps", self.steps, low=1, high=FAR_STEP, example="'${steps}'")
+        if self.made_for is not None:
+            require_whole("refine.made_for", self.made_for, low=1, high=FAR_STEP, example="null")
         require_whole("refine.start", self.start, low=0, example=100)
         require_whole("refine.end", self.end, low=0, example=450)
         require_whole("refine.interval", self.interval, low=1, example=50)
@@ -74,6 +81,7 @@ class Refine:
         require_whole("refine.reset_from", self.reset_from, low=0, example=300)
         require_whole("refine.reset_until", self.reset_until, low=0, example=450)
         require_range("refine.reset_value", self.reset_value, above=0, below=1, example=0.01)
+        require_whole("refine.recovery", self.recovery, low=1, example=96)
         require_whole("refine.prune_grace", self.prune_grace, low=0, example=100)
         if self.reset_interval is None:
             return
@@ -84,7 +92,7 @@ class Refine:
             expected=f"a number below refine.reset_value={self.reset_value:g}, or refine.prune_grace > 0, "
             "because otherwise the next refinement deletes every Gaussian that a reset has lowered",
             got=self.min_opacity,
-            example="refine.prune_grace=100",
+            example=f"refine.min_opacity={self.reset_value / 2:g}",
         )
         require(
             self.prune_grace < self.reset_interval,
@@ -95,18 +103,42 @@ class Refine:
             example=f"refine.prune_grace={self.reset_interval // 2}",
         )
 
-    def refines_at(self, step: int) -> bool:
-        """Return whether step number ``step`` (from 1) ends with a refinement.
+    @property
+    def refinements(self) -> range:
+        """Return the steps of all refinements: multiples of ``interval`` strictly between start and end.
 
         300/900/100 (GaussianDreamer) means 400, 500, ..., 800; 100/3000/100 (LucidDreamer) 200, ..., 2900.
         """
-        return self.start < step < self.end and step % self.interval == 0
+        return _multiples(self.interval, self.start + 1, min(self.steps, self.end - 1))
+
+    @property
+    def resets(self) -> range:
+        """Return the steps of all opacity resets, each of which leaves ``recovery`` steps until the end.
+
+        A Gaussian is almost invisible after a reset. Adam moves its logit by about one learning rate per
+        step, so the way from 0.01 back to 0.5 takes 92 steps at the usual rate of 0.05 (``reset_value``,
+        ``optimizer.opacity_lr``). A reset in the last steps of a run would therefore spoil the result.
+        """
+        return self._due_resets(1, self.steps - self.recovery)
+
+    @property
+    def skipped_resets(self) -> range:
+        """Return the steps of the resets that are due but would leave fewer than ``recovery`` steps."""
+        return self._due_resets(max(1, self.steps - self.recovery + 1), self.steps)
+
+    def _due_resets(self, first: int, last: int) -> range:
+        """Return the steps in ``[first, last]`` at which the schedule has resets, whatever the length."""
+        if self.reset_interval is None:
+            return range(0)
+        return _multiples(self.reset_interval, max(first, self.reset_from), min(last, self.reset_until - 1))
+
+    def refines_at(self, step: int) -> bool:
+        """Return whether step number ``step`` (from 1) ends with a refinement."""
+        return step in self.refinements
 
     def resets_at(self, step: int) -> bool:
         """Return whether step number ``step`` (from 1) ends with an opacity reset, after any refinement."""
-        if self.reset_interval is None:
-            return False
-        return self.reset_from <= step < self.reset_until and step % self.reset_interval == 0
+        return step in self.resets
 
     def plan(
         self,
@@ -180,3 +212,8 @@ class Refine:
     def _spares_faint_at(self, step: int) -> bool:
         """Return whether the last reset was at most ``prune_grace`` steps ago."""
         return any(self.resets_at(earlier) for earlier in range(max(step - self.prune_grace, 1), step))
+
+
+def _multiples(interval: int, first: int, last: int) -> range:
+    """Return the multiples of ``interval`` in ``[first, last]``, without 0."""
+    return range(max(1, -(-first // interval)) * interval, last + 1, interval)

@@ -46,6 +46,7 @@ LABELS = {
     "camera": "Camera",
     "refine": "Refinement",
     "optimizer": "Optimizer",
+    "schedule": "Schedule",
     "device": "Device",
     "memory_estimate_gib": "Memory, estimated (GiB)",
     "memory_peak_gib": "Memory of the GPU at its peak (GiB)",

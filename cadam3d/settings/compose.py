@@ -150,9 +150,22 @@ def flatten(node: object, prefix: str = "", *, with_nodes: bool = False) -> Iter
 
 
 def register_resolvers() -> None:
-    """Register ``${slug:...}`` and ``${span:...}`` with OmegaConf. It is safe to call this again."""
+    """Register the functions that YAML files call, as in ``${parts:9,12,${steps}}``.
+
+    It is safe to call this again.
+    """
+    OmegaConf.register_new_resolver("parts", parts, replace=True)
     OmegaConf.register_new_resolver("slug", slug, replace=True)
     OmegaConf.register_new_resolver("span", span, replace=True)
+
+
+def parts(count: int, pieces: int, steps: object) -> int:
+    """Return the number of steps in ``count`` of ``pieces`` equal parts of a run; a part has at least 1 step.
+
+    Each part is rounded down, so keys that share ``pieces`` keep their order and ratio at any length. Returns
+    ``count`` for non-integers; the command reports the error in ``steps``.
+    """
+    return count * max(1, steps // pieces) if type(steps) is int else count
 
 
 def span(share: float, start: object, *ends: object) -> int:

@@ -167,6 +167,8 @@ def test_the_snr_gate_rejects_strong_but_unsteady_drift():
 
 def test_growth_is_bounded_by_the_quantile_at_every_call():
     refine = Refine(
+        steps=100,
+        made_for=None,
         start=0,
         end=100,
         interval=5,
@@ -180,6 +182,7 @@ def test_growth_is_bounded_by_the_quantile_at_every_call():
         reset_from=0,
         reset_until=0,
         reset_value=0.01,
+        recovery=96,
         prune_grace=0,
         max_gaussians=None,
     )

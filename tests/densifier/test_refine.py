@@ -22,6 +22,8 @@ LATE = 10_000  # a step at which nothing is scheduled
 
 def refine(**changes) -> Refine:
     usual = {
+        "steps": 20_000,
+        "made_for": None,
         "start": 100,
         "end": 3000,
         "interval": 100,
@@ -35,6 +37,7 @@ def refine(**changes) -> Refine:
         "reset_from": 0,
         "reset_until": 3000,
         "reset_value": 0.01,
+        "recovery": 96,
         "prune_grace": 0,
         "max_gaussians": None,
     }
@@ -306,6 +309,8 @@ def test_gaussians_moments_and_densifier_state_stay_in_step_through_many_edits(d
 @pytest.mark.parametrize(
     ("key", "value"),
     [
+        ("steps", 0),
+        ("made_for", 0),
         ("start", -1),
         ("interval", 0),
         ("tau_scale", 0.0),
@@ -315,6 +320,7 @@ def test_gaussians_moments_and_densifier_state_stay_in_step_through_many_edits(d
         ("max_scale", 0.0),
         ("reset_interval", 0),
         ("reset_value", 1.0),
+        ("recovery", 0),
         ("prune_grace", -1),
         ("max_gaussians", 0),
     ],
@@ -325,7 +331,7 @@ def test_an_impossible_value_is_refused_by_name(key, value):
 
 
 def test_a_reset_below_the_pruning_threshold_is_refused():
-    with pytest.raises(UserError, match=r"refine\.min_opacity.*refine\.prune_grace=100"):
+    with pytest.raises(UserError, match=r"refine\.min_opacity.*Try: refine\.min_opacity=0\.005$"):
         refine(reset_interval=300, min_opacity=0.05)
 
 

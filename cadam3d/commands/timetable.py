@@ -1,0 +1,129 @@
+"""Timetable: say before a run when it will grow, reset opacities and only optimise."""
+
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
+
+from cadam3d.core.schedule import Schedule, settled_at
+from cadam3d.densifier.base import Densifier
+from cadam3d.densifier.refine import Refine
+from cadam3d.trainer import Trainer
+
+# The default of ``steps``, which is long enough for every densifier with its default settings.
+USUAL_STEPS = 600
+
+
+def describe(trainer: Trainer) -> str:
+    """Return the timetable of a run in one line: refinements, opacity resets, the steps after them, rates.
+
+    It names resets that are skipped (:attr:`Refine.resets`) and schedules that the run does not complete. If
+    no Gaussian can grow, it says so and which settings change that. If the refinements are published for
+    another number of steps, it says what this run misses or adds.
+    """
+    refine, densifier = trainer.refine, trainer.densifier
+    rest, settled = _rest(refine, densifier), trainer.optimizer.settled_at()
+    parts = [
+        _counted("refinement", refine.refinements),
+        *_resets(refine, densifier),
+        f"the last {rest} of {refine.steps} steps only optimise" if rest else "the last step refines",
+        "constant learning rates"
+        if settled == 0
+        else f"learning rates change until step {min(settled, refine.steps)}",
+    ]
+    sentences = [f"{', '.join(parts)}."]
+    if later := [f"{key} (until step {end})" for key, end in _schedules(trainer) if end > refine.steps]:
+        sentences.append(f"The run ends before these schedules do: {', '.join(later)}.")
+    if refine.made_for not in (None, refine.steps):
+        sentences.append(_difference(refine, replace(refine, steps=refine.made_for), densifier))
+    if densifier.grows_from is not None and not _grows(refine, densifier.grows_from):
+        sentences.append(_nothing_grows(refine, densifier.grows_from))
+    return " ".join(sentences)
+
+
+def _resets(refine: Refine, densifier: Densifier) -> Iterator[str]:
+    """Yield the resets, and those that are skipped."""
+    if not densifier.resets:
+        yield "no opacity reset"
+        return
+    yield _counted("opacity reset", refine.resets)
+    if refine.skipped_resets:
+        verb = "is" if len(refine.skipped_resets) == 1 else "are"
+        reason = f"less than refine.recovery={refine.recovery} steps before the end"
+        yield f"{_counted('reset', refine.skipped_resets)} {verb} skipped ({reason})"
+
+
+def _rest(refine: Refine, densifier: Densifier) -> int:
+    """Return the number of steps after the last refinement and the last reset."""
+    resets = refine.resets if densifier.resets else range(0)
+    return refine.steps - max((*refine.refinements[-1:], *resets[-1:]), default=0)
+
+
+def _difference(refine: Refine, published: Refine, densifier: Densifier) -> str:
+    """Return what a run misses, or adds, compared with the length for which its refinements are published."""
+    lengths = (
+        f"The refinements are made for {published.steps} steps and, "
+        "like most schedules of a recipe, keep their steps at any length"
+    )
+    grown = len(refine.refinements) - len(published.refinements)
+    if refine.steps > published.steps:
+        return f"{lengths}: this run adds {_plural(grown, 'refinement')}."
+    missed = [
+        (-grown, f"of {_plural(len(published.refinements), 'refinement')}"),
+        (
+            densifier.resets * (len(published.resets) - len(refine.resets)),
+            f"of {_plural(len(published.resets), 'opacity reset')}",
+        ),
+        (
+            _rest(published, densifier) - _rest(refine, densifier),
+            f"of {_plural(_rest(published, densifier), 'step')} after them",
+        ),
+    ]
+    return (
+        f"{lengths}: this run misses {', '.join(f'{count} {what}' for count, what in missed if count > 0)}."
+    )
+
+
+def _grows(refine: Refine, grows_from: int) -> bool:
+    return any(step >= grows_from for step in refine.refinements[-1:])
+
+
+def _nothing_grows(refine: Refine, grows_from: int) -> str:
+    """Return that nothing will grow, why, and settings of the default schedule with which Gaussians grow."""
+    why = (
+        f"no Gaussian may grow before step {grows_from}"
+        if refine.refinements
+        else f"no multiple of refine.interval={refine.interval} is above refine.start={refine.start}, below "
+        f"refine.end={refine.end} and within the run"
+    )
+    steps = refine.steps
+    # The last refinement of the default schedule ends the eighth of twelve parts.
+    if steps // 12 * 8 < max(grows_from, 1):
+        steps = max(USUAL_STEPS, 2 * grows_from)
+    part = steps // 12
+    example = f"steps={steps} refine.start={2 * part} refine.end={9 * part} refine.interval={part}"
+    return f"Nothing will grow, because {why}. Try: {example}"
+
+
+def _schedules(trainer: Trainer) -> Iterator[tuple[str, int]]:
+    """Yield the key of every schedule except learning rates, and the step from which it is constant."""
+    parts = [(name, getattr(trainer, name)) for name in ("camera", "guidance", "densifier", "augmentation")]
+    parts += [(f"regularizer.{name}", each) for name, each in trainer.regularizers.items()]
+    for name, part in parts:
+        for field in fields(part) if is_dataclass(part) else ():
+            value = getattr(part, field.name)
+            if isinstance(value, Schedule):
+                yield f"{name}.{field.name}", settled_at(value)
+
+
+def _counted(noun: str, steps: range) -> str:
+    """Return a number of events and their steps, such as "2 resets (steps 300 and 450)"."""
+    if len(steps) == 0:
+        return f"no {noun}"
+    if len(steps) == 1:
+        return f"1 {noun} (step {steps[0]})"
+    if len(steps) == 2:
+        return f"2 {noun}s (steps {steps[0]} and {steps[1]})"
+    return f"{len(steps)} {noun}s (steps {steps[0]} to {steps[-1]}, every {steps.step})"
+
+
+def _plural(count: int, noun: str) -> str:
+    return f"{count or 'no'} {noun}{'' if count == 1 else 's'}"

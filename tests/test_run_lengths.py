@@ -1,0 +1,158 @@
+"""Laws of runs of any length: the default schedule keeps its shape, and resets leave time to recover."""
+
+import re
+from functools import cache
+from itertools import pairwise
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from cadam3d.commands.train import build_trainer
+from cadam3d.core.errors import UserError
+from cadam3d.densifier.refine import Refine
+from cadam3d.io.jsonl import read_json
+from cadam3d.settings.compose import component, compose, parts
+
+PROMPT = "prompt=a red cube"
+LENGTHS = range(1, 5001)
+# What the defaults were when they were absolute numbers.
+AT_600 = {
+    "start": 100,
+    "end": 450,
+    "interval": 50,
+    "prune_from": 300,
+    "reset_interval": 150,
+    "reset_from": 300,
+    "reset_until": 450,
+}
+RECIPES = ("default", "dreamgaussian", "flowdreamer", "gaussiandreamer", "lucid")
+WINDOWED = ("sds", "ism", "vfds", "ucm", "sdi", "gcs")
+
+
+@cache
+def schedules(*words: str) -> dict[int, Refine]:
+    """Return the schedule of refinements for each of LENGTHS. OmegaConf would take a minute for it."""
+    settings: Any = OmegaConf.to_container(compose([PROMPT, *words]).refine)
+    settings.pop("_target_")
+    return {
+        steps: Refine(**{key: evaluated(value, steps) for key, value in settings.items()})
+        for steps in LENGTHS
+    }
+
+
+def evaluated(value, steps: int):
+    """Return what a value of a YAML file is in a run of ``steps`` steps."""
+    if value == "${steps}":
+        return steps
+    call = re.fullmatch(r"\$\{parts:(\d+),(\d+),\$\{steps\}\}", str(value))
+    return parts(int(call[1]), int(call[2]), steps) if call else value
+
+
+@pytest.mark.parametrize("words", [(), ("experiment=bench", "prior=tiny"), ("refine=lucid",)])
+def test_these_tests_evaluate_schedules_as_the_program_does(words):
+    for steps in (7, 290, 600, 4999):
+        composed = component(compose([PROMPT, *words, f"steps={steps}"]).refine)
+        assert composed == schedules(*words)[steps]
+
+
+def test_the_default_schedule_of_600_steps_is_what_it_was():
+    cfg = compose([PROMPT])
+    assert {key: cfg.refine[key] for key in AT_600} == AT_600
+    refine = component(cfg.refine)
+    assert [step for step in range(1, 601) if refine.refines_at(step)] == [150, 200, 250, 300, 350, 400]
+    assert [step for step in range(1, 601) if refine.resets_at(step)] == [300]
+    assert compose([PROMPT, "experiment=bench"]).refine.interval == 20
+    for name in WINDOWED:
+        assert compose([PROMPT, f"guidance={name}"]).guidance.t_max.steps == 500
+
+
+def test_the_default_schedule_has_the_same_shape_at_every_length():
+    for steps, refine in schedules().items():
+        refinements, resets = len(refine.refinements), len(refine.resets)
+        assert refinements == min(max(steps - 2, 0), 6)
+        assert resets == (1 if steps >= 186 else 0)
+        # The last third only optimises.
+        assert all(step <= max(refine.steps * 2 / 3, 8) for step in refine.refinements)
+        if resets:
+            assert refine.resets[0] in refine.refinements
+            assert abs(refine.resets[0] - steps / 2) <= 6
+
+
+def test_the_bench_has_seventeen_refinements_at_every_length():
+    for steps, refine in schedules("experiment=bench", "prior=tiny").items():
+        assert len(refine.refinements) == 17 or steps < 60
+
+
+@pytest.mark.parametrize("name", RECIPES)
+@pytest.mark.parametrize(
+    "resets",
+    [
+        (),
+        (
+            *("refine.reset_interval=1", "refine.reset_from=0", "refine.reset_until=100000"),
+            *("refine.min_opacity=0.001", "refine.prune_grace=0"),
+        ),
+    ],
+)
+def test_no_reset_comes_too_late_to_recover_whatever_the_settings(name, resets):
+    for steps, refine in schedules(f"refine={name}", *resets).items():
+        assert all(step + refine.recovery <= steps for step in refine.resets[-1:])
+        assert all(step + refine.recovery > steps for step in refine.skipped_resets[:1])
+        assert not refine.resets_at(steps)
+    if resets:
+        assert list(refine.resets) == list(range(1, steps - 95))
+        assert list(refine.skipped_resets) == list(range(steps - 95, steps + 1))
+
+
+def test_counts_never_fall_as_a_run_gets_longer():
+    for name in RECIPES:
+        for shorter, longer in pairwise(schedules(f"refine={name}").values()):
+            assert len(shorter.refinements) <= len(longer.refinements)
+            assert len(shorter.resets) <= len(longer.resets)
+
+
+def test_a_value_that_the_user_sets_does_not_follow_the_length():
+    words = ["refine.interval=20", "refine.start=10", "refine.reset_until=77", "guidance.t_max.steps=9"]
+    cfg = compose([PROMPT, "steps=1200", *words])
+    assert (cfg.refine.interval, cfg.refine.start, cfg.refine.reset_until) == (20, 10, 77)
+    assert cfg.guidance.t_max.steps == 9
+    assert cfg.refine.end == 900
+
+
+def test_recovery_is_long_enough_for_a_reset_opacity_to_reach_half():
+    cfg = compose([PROMPT])
+    logit = torch.tensor(cfg.refine.reset_value).logit().item()
+    assert -logit / cfg.optimizer.opacity_lr <= cfg.refine.recovery
+
+
+def test_a_reset_that_the_rule_skips_would_have_spoiled_the_result(type_line, tmp_path):
+    late = ["refine.reset_interval=109", "refine.reset_from=109", "refine.reset_until=110"]
+    small = ["prompt=a red cube", "steps=110", "densifier=cadam_global_reset", "camera.size=24"]
+    small += ["initializer.count=300", "exporter=[]", "callback=[]", "device=cpu"]
+    small += ["metric.fidelity.views=4", "metric.fidelity.size=32"]
+    psnr = {}
+    for name, words in {"usual": [], "forced": ["refine.recovery=1"]}.items():
+        result = type_line("train", *small, *late, *words, f"hydra.run.dir={tmp_path / name}")
+        assert ("1 reset (step 109) is skipped" in result.err) == (name == "usual")
+        summary = read_json(tmp_path / name / "summary.json")
+        assert f"Schedule: {summary['schedule']}\n" in result.err
+        assert summary["schedule"] in (tmp_path / name / "train.log").read_text(encoding="utf-8")
+        psnr[name] = summary["psnr"]
+    assert psnr["usual"] > psnr["forced"] + 1
+
+
+def test_the_schedule_must_be_that_of_the_run():
+    with pytest.raises(
+        UserError, match=r"^refine\.steps: expected the length of the run, steps=600, got 900"
+    ):
+        build_trainer(compose([PROMPT, "prior=tiny", "refine.steps=900"]), torch.device("cpu"))
+
+
+def test_parts_of_a_run_keep_their_ratio_and_accept_any_value_of_steps():
+    assert parts(9, 12, 600) == 450
+    assert parts(9, 12, 290) == 9 * parts(1, 12, 290) == 216
+    assert parts(9, 12, 5) == 9
+    for wrong in (None, "abc", 2.5, True, [1], -5):
+        assert parts(9, 12, wrong) == 9
