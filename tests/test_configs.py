@@ -287,9 +287,9 @@ def node(target: str, **values: Any):
     return OmegaConf.create({"part": {"_target_": target, **values}}).part
 
 
-def test_a_user_error_in_a_constructor_is_raised_unchanged():
+def test_a_message_about_a_schedule_names_the_key_at_which_it_is_used():
     with pytest.raises(
-        UserError, match=r"^schedule.steps: expected a whole number >= 1, got 0. Try: schedule.steps=600$"
+        UserError, match=r"^part.steps: expected a whole number >= 1, got 0. Try: part.steps=600$"
     ):
         component(node("cadam3d.core.schedule.Linear", start=1.0, end=0.0, steps=0))
 

@@ -189,7 +189,7 @@ def test_the_number_of_split_children_is_bounded():
 @pytest.mark.parametrize("key", ["steps", "begin"])
 @pytest.mark.parametrize("value", ["2.5", "true", "null", "abc"])
 def test_a_schedule_counts_whole_steps(key, value):
-    with pytest.raises(UserError, match=rf"^schedule\.{key}: expected a whole number"):
+    with pytest.raises(UserError, match=rf"^optimizer\.means_lr\.{key}: expected a whole number"):
         build("optimizer=adam", f"optimizer.means_lr.{key}={value}")
 
 
@@ -197,7 +197,7 @@ def test_a_schedule_counts_whole_steps(key, value):
 @pytest.mark.parametrize("kind", ["Linear", "LogLinear"])
 @pytest.mark.parametrize("value", ["true", "null", "abc"])
 def test_a_schedule_starts_and_ends_at_a_number(key, kind, value):
-    with pytest.raises(UserError, match=rf"^schedule\.{key}: expected a"):
+    with pytest.raises(UserError, match=rf"^optimizer\.means_lr\.{key}: expected a"):
         build(
             "optimizer=adam",
             f"optimizer.means_lr._target_=cadam3d.core.schedule.{kind}",

@@ -66,7 +66,8 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
         print(f"{quality}  {results[-1].get('num_gaussians', '-'):>8} Gaussians  {job.name}")
     if failures == len(results):
         raise UserError(
-            f"run={cfg.run}: no job of this sweep could be measured. Try: run the command of the sweep again"
+            f"run={cfg.run}: no job of this sweep could be measured, and the reasons are above. "
+            "Run the sweep again, after a look at this machine. Try: cadam3d doctor"
         )
     write_json(folder / EVALUATION, results)
     print(f"\n{len(results)} jobs: {shown(folder / EVALUATION)}\nreport: {shown(report.write_sweep(folder))}")

@@ -87,7 +87,7 @@ def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:
             pass
     except OSError as error:
         raise UserError(
-            f"{key}: cannot write to {free} ({error.strerror}). Try: {key}=/tmp/cadam3d"
+            f"{key}: cannot write to {free} ({error.strerror}). Try: {key}={_temporary()}"
         ) from error
     return free
 
@@ -98,6 +98,11 @@ def numbered(folder: Path, *, first: int = 2) -> Path:
     while (place := folder.with_name(f"{folder.name}-{number}") if number > 1 else folder).exists():
         number += 1
     return place
+
+
+def _temporary() -> Path:
+    """Return a new folder among the temporary files, where almost every user can write."""
+    return numbered(Path(tempfile.gettempdir()) / "cadam3d", first=1)
 
 
 def shown(path: Path) -> Path:

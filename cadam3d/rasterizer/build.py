@@ -10,6 +10,7 @@ import ctypes
 import hashlib
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from cadam3d.core.errors import UserError
+from cadam3d.io.run_folder import numbered
 from cadam3d.rasterizer import base
 
 KERNELS = Path(__file__).parent / "kernels"
@@ -109,8 +111,8 @@ def build(cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAG
     if compiler is None:
         raise UserError(
             "rasterizer=cpu: expected a C++ compiler ($CXX, c++, g++ or clang++) to build the kernels once, "
-            "got none. Try: `apt install g++`, `xcode-select --install`, `pip install 'cadam3d[compiler]'`, "
-            "or rasterizer=reference"
+            "got none. `apt install g++` or `xcode-select --install` installs one, and so does pip. "
+            "Try: pip install 'cadam3d[compiler]'"
         )
     start = time.perf_counter()
     with build_folder(cache_dir, "cpu") as folder:
@@ -134,8 +136,17 @@ def build_folder(cache_dir: Path, name: str) -> Iterator[Path]:
     except OSError as error:
         raise UserError(
             f"rasterizer={name}: expected a folder for compiled kernels that can be written, got {cache_dir} "
-            f"({error}). Try: rasterizer.cache_dir=/tmp/cadam3d"
+            f"({error}). Try: {another_cache(name)}"
         ) from error
+
+
+def another_cache(name: str) -> str:
+    """Return the words that make rasterizer=``name`` keep its kernels in a new folder for temporary files.
+
+    They name the rasterizer too, because ``rasterizer=auto`` has no ``cache_dir``.
+    """
+    folder = numbered(Path(tempfile.gettempdir()) / "cadam3d-kernels", first=1)
+    return f"rasterizer={name} {shlex.quote(f'rasterizer.cache_dir={folder}')}"
 
 
 def definitions() -> list[str]:
@@ -161,7 +172,7 @@ def _compile(compiler: Compiler, target: Path, machine_flags: Sequence[Sequence[
         complaint = answer.stderr.strip()[-2000:] or f"exit code {answer.returncode}"
     raise UserError(
         f"rasterizer=cpu: {' '.join(compiler.command)} ({compiler.version}) could not build the kernels:\n"
-        f"{complaint}\nTry: another compiler in $CXX, or rasterizer=reference"
+        f"{complaint}\nThe variable $CXX chooses another compiler. Try: rasterizer=reference"
     )
 
 

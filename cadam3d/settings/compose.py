@@ -1,6 +1,8 @@
 """Compose: read the YAML files, apply the overrides of a command line, and build the objects."""
 
+import difflib
 import re
+import shlex
 import unicodedata
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -55,7 +57,7 @@ def compose(
     if search_path is not None:
         own = Path(search_path).absolute()
         if not own.is_dir():
-            raise UserError(f"--config-dir: expected a folder, got {search_path!r}. Try: --config-dir=DIR")
+            raise UserError(f"--config-dir: expected a folder, got {search_path!r}. Try: {_folder_like(own)}")
         places.prepend("command-line", f"file://{own}", anchor=SearchPathQuery(provider="schema"))
     # A command that runs inside Hydra may compose too, so Hydra's global state is restored afterwards.
     outer = GlobalHydra.instance().hydra
@@ -73,6 +75,13 @@ def compose(
     return cfg
 
 
+def _folder_like(missing: Path) -> str:
+    """Return the flag for the folder whose name is nearest to ``missing``, or for the current folder."""
+    beside = sorted(place.name for place in missing.parent.glob("*/") if place.is_dir())
+    near = difflib.get_close_matches(missing.name, beside, n=1)
+    return shlex.quote(f"--config-dir={missing.with_name(near[0]) if near else '.'}")
+
+
 def component(node: DictConfig | ListConfig | None) -> Any:
     """Build the object that ``node._target_`` names, and nested ones; lists and dicts become plain Python.
 
@@ -86,7 +95,7 @@ def component(node: DictConfig | ListConfig | None) -> Any:
     except OmegaConfBaseException as error:
         reason = str(error.msg).splitlines()[0]
         raise UserError(
-            f"{error.full_key or 'configuration'}: {reason}. Try: another value; --cfg job lists the keys"
+            f"{error.full_key or 'configuration'}: {reason}. Try: cadam3d train --cfg job"
         ) from error
 
 
@@ -160,11 +169,14 @@ def _construction_error(error: InstantiationException) -> BaseException:
     if isinstance(cause, TypeError) and (call := re.search(WRONG_CALL, str(cause))):
         names = ", ".join(re.findall(r"'(\w+)'", str(cause)))
         if call.group() == "unexpected keyword":
-            return UserError(f"{where}: there is no key {names}. Try: without it; --cfg job lists the keys")
-        return UserError(f"{where}: no value for {names}. Try: give one; --cfg job lists the keys")
+            return UserError(f"{where}: there is no key {names}. Try: cadam3d train --cfg job")
+        return UserError(f"{where}: no value for {names}. Try: cadam3d train --cfg job")
     if cause is None or isinstance(cause, ImportError):
         reason = str(cause or error).splitlines()[-1]
         return UserError(f"{where}._target_: cannot be loaded ({reason}). Try: cadam3d doctor")
+    if isinstance(cause, UserError) and key:
+        # A schedule or a regularizer does not know the key under which it is used.
+        return UserError(re.sub(r"\b(?:schedule|regularizer\.\*)\.", f"{where}.", str(cause)))
     return cause
 
 

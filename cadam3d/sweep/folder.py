@@ -104,7 +104,8 @@ def read_plan(sweep: Path) -> Plan:
         return Plan(**{**content, "jobs": [PlannedJob(**job) for job in content["jobs"]]})
     except (TypeError, KeyError) as error:
         raise UserError(
-            f"{sweep / JOBS}: not the plan of a sweep ({error}). Try: run the command of the sweep again"
+            f"{sweep / JOBS}: not the plan of a sweep ({error}); the command of the sweep writes it again. "
+            "Try: cadam3d sweep --help"
         ) from error
 
 

@@ -4,6 +4,7 @@ The same line always has the same folder, so typing the line again continues the
 """
 
 import os
+import shlex
 import shutil
 import signal
 import sys
@@ -127,14 +128,17 @@ def _folder(sweep: Sweep) -> Path:
     if sweep.parts.folder:
         text = OmegaConf.select(sweep.cfg, SWEEP_FOLDER)
         if not text:
-            example = f"{SWEEP_FOLDER}={place}, or leave it out"
+            example = shlex.quote(f"{SWEEP_FOLDER}={place}")
             raise UserError(f"{SWEEP_FOLDER}: expected a folder, got nothing. Try: {example}")
         place = Path(str(text)).expanduser()
     if holds_run(place):
-        raise UserError(
-            f"{SWEEP_FOLDER}: {place} holds a run. Try: {SWEEP_FOLDER}=multirun/mine, or leave it out"
-        )
+        raise UserError(f"{SWEEP_FOLDER}: {place} holds a run. Try: {_beside(place)}")
     return place.resolve()
+
+
+def _beside(folder: Path) -> str:
+    """Return the words that choose a new folder beside ``folder`` for a sweep."""
+    return shlex.quote(f"{SWEEP_FOLDER}={shown(numbered(folder))}")
 
 
 def _planned(sweep: Sweep, composed: Sequence[Composed]) -> list[PlannedJob]:
@@ -161,8 +165,8 @@ def _refuse_other_settings(folder: Path, rows: Sequence[Row], composed: Sequence
             if before.get(key) != now.values.get(key):
                 raise UserError(
                     f"{key}: was {before.get(key)} in {shown(row.folder)}, is {now.values.get(key)} now. "
-                    f"Try: {SWEEP_FOLDER}={shown(numbered(folder))}, which is another folder, "
-                    "or the earlier settings"
+                    "The earlier settings or another folder are possible. "
+                    f"Try: {_beside(folder)}"
                 )
 
 
@@ -246,7 +250,7 @@ def _locked(folder: Path) -> Iterator[None]:
         if not try_lock(file):
             raise UserError(
                 f"{SWEEP_FOLDER}: another sweep is running in {shown(folder)}. "
-                f"Try: wait until it has ended, or use {SWEEP_FOLDER}={shown(numbered(folder))}"
+                f"Wait until it has ended, or use another folder. Try: {_beside(folder)}"
             )
         yield
 

@@ -302,8 +302,8 @@ def test_other_settings_in_the_same_folder_are_refused_with_the_key(sweep, calls
     assert result.code == 1
     assert result.err.startswith(f"cadam3d: optimizer.steps: was 5 in {folder}/baseline_a-cube_")
     assert result.err.endswith(
-        ", is 9 now. Try: hydra.sweep.dir=multirun/densifiers-2, which is another folder, "
-        "or the earlier settings\n"
+        ", is 9 now. The earlier settings or another folder are possible. "
+        "Try: hydra.sweep.dir=multirun/densifiers-2\n"
     )
     assert (folder / "sweep.csv").read_bytes() == table
     assert not Path("multirun/densifiers-2").exists()
@@ -559,7 +559,7 @@ def test_a_folder_that_holds_a_run_is_refused(sweep):
     Path("run/summary.json").write_text("{}")
     result = sweep("prompt=a cube", "seed=0,1", "hydra.sweep.dir=run")
     assert result.code == 1
-    assert "holds a run. Try: hydra.sweep.dir=multirun/mine" in result.err
+    assert "holds a run. Try: hydra.sweep.dir=run-2" in result.err
 
 
 def test_cfg_job_shows_the_first_job(sweep):
