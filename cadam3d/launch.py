@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.run_folder import OVERRIDES, claim, holds_run, numbered
+from cadam3d.io.run_folder import OVERRIDES, claim, holds_run
 from cadam3d.settings.advice import explain, line_of, require_values, reraise_interrupt
 from cadam3d.settings.compose import TEXT_KEYS
 from cadam3d.settings.help_page import help_text
@@ -143,7 +143,7 @@ def _train(cfg: DictConfig, line: Line, task: Task) -> None:
     """Choose the output folder and train there."""
     text = OmegaConf.select(cfg, RUN_FOLDER)
     if not text:
-        example = f"{RUN_FOLDER}={numbered(Path('outputs/mine'), first=1)}"
+        example = f"{RUN_FOLDER}=outputs/mine, or leave it out"
         raise UserError(f"{RUN_FOLDER}: expected a folder, got nothing. Try: {example}")
     wanted = Path(str(text)).expanduser()
     is_chosen = any(key_of(override) == RUN_FOLDER for override in line.overrides)

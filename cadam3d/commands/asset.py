@@ -34,8 +34,8 @@ class Asset:
 def open_asset(cfg: DictConfig) -> Asset:
     """Return the asset that ``run=`` or ``ply=`` names; exactly one of them must be given."""
     if (cfg.run is None) == (cfg.ply is None):
-        got, example = ("neither", "run=outputs/latest") if cfg.run is None else ("both", "ply=null")
-        raise UserError(f"run, ply: expected one of them, got {got}. Try: {example}")
+        got = "neither" if cfg.run is None else "both"
+        raise UserError(f"run, ply: expected one of them, got {got}. Try: run=outputs/latest")
     if cfg.run is not None:
         return open_run(find_run(cfg.run), cfg.device)
     ply = Path(cfg.ply).expanduser()
@@ -89,7 +89,7 @@ def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
     """Run every exporter of ``cfg`` on ``asset``, and return the paths of the files in ``folder``."""
     exporters: Sequence[Exporter] = list(components(cfg.exporter).values())
     if not exporters:
-        raise UserError("exporter: expected at least one, got none. Try: 'exporter=[images,turntable]'")
+        raise UserError("exporter: expected at least one, got none. Try: exporter=[images,turntable]")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -1,6 +1,5 @@
 """``cadam3d export``: write an asset in the format that another program needs."""
 
-import shlex
 import tempfile
 from pathlib import Path
 
@@ -28,13 +27,13 @@ def _one_file(cfg: DictConfig, asset: Asset, target: Path) -> Path:
             paths = export_all(cfg, asset, Path(folder))
             suffixes = {path.suffix for path in paths}
             if len(paths) != 1 or suffixes != {target.suffix}:
-                folder_word = shlex.quote(f"output={target.with_name(target.name.partition('.')[0])}")
                 raise UserError(
                     f"output={target}: the exporters write {len(paths)} file(s) with suffix "
-                    f"{'|'.join(sorted(suffixes))}, which need a folder. Try: {folder_word}"
+                    f"{'|'.join(sorted(suffixes))}. Try: output={target.with_suffix('')}, a folder"
                 )
             return paths[0].replace(target)
     except OSError as error:
         reason = error.strerror or error
-        example = shlex.quote(f"output={Path(tempfile.gettempdir()) / target.name}")
-        raise UserError(f"output: cannot write {target} ({reason}). Try: {example}") from error
+        raise UserError(
+            f"output: cannot write {target} ({reason}). Try: output=/tmp/{target.name}"
+        ) from error

@@ -132,7 +132,7 @@ class LatentPrior(DiffusionPrior):
             "prior.prompting",
             expected="one of the prompting options",
             got=self.prompting,
-            example="prompting=discrete",
+            example="'prior.prompting=${prompting}'",
         )
         if self.size is not None:
             require_whole("prior.size", self.size, low=FACTOR, example=512)

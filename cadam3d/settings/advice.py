@@ -156,11 +156,10 @@ def _unknown_option(error: MissingConfigException, command: str, words: Sequence
         return UserError(f"{path}: no such configuration in {config_dir()}. Try: cadam3d doctor")
     near = did_you_mean(option, options)
     best = near[0] if near else _default_option(group, command) or options[0]
-    typed = next((word for word in words if key_of(word) == group), "")
-    # The other options of a list stay.
-    listed = re.search(r"\[.*\]", typed)
-    choice = re.sub(rf"\b{re.escape(option)}\b", best, listed.group()) if listed else best
-    example = shlex.quote(f"{group}={choice}")
+    # The other options of a list, or of a sweep, stay.
+    typed = next((word.partition("=")[2] for word in words if key_of(word) == group), option)
+    choice = re.sub(rf"\b{re.escape(option)}\b", best.replace("\\", ""), typed)
+    example = shlex.quote(f"{group}={choice if choice != typed else best}")
     return UserError(f"{group}: expected one of {'|'.join(options)}, got {option!r}. Try: {example}")
 
 
@@ -209,7 +208,9 @@ def _unknown_key(key: str, command: str, words: Sequence[str], settings: Sequenc
     if command in ("train", "sweep") and value is not None and _is_colour(value):
         line = line_of(command, _with_colour(value, [word for word in words if key_of(word) != key]))
         return UserError(f"{key}: no such setting. The prompt describes colours. Try: {line}")
-    return UserError(f"{key}: no such setting. Try: cadam3d {command} --cfg job")
+    # A sweep has such a page only for a line with jobs.
+    page = "train" if command == "sweep" else command
+    return UserError(f"{key}: no such setting. Try: {line_of(page, ['--cfg', 'job'])}")
 
 
 def _is_colour(word: str) -> bool:

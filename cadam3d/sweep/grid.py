@@ -25,8 +25,8 @@ IDENTIFIER = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)
 RESERVED = ("null", "true", "false", "nan", "inf")
 # Keys that are shown in every table and count for the name of every folder.
 ALWAYS_SHOWN = ("prompt", "seed")
-# A grid that is in the package, for messages about one that cannot be read.
-EXAMPLE = "grid=densifiers"
+# Lists the grids of the package, for messages about one that cannot be read.
+EXAMPLE = "cadam3d sweep --help grid"
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,9 @@ def _axes(node: Any, where: str) -> Axes:
     if node is None:
         return {}
     if not isinstance(node, dict):
-        raise UserError(f"{where}: expected keys with values, got {node!r}. Try: '{where}={{seed: [0, 1]}}'")
+        raise UserError(
+            f"{where}: expected keys with values, got {node!r}. Try: '++{where}={{seed: [0, 1]}}'"
+        )
     return {str(key).lstrip("+"): _axis(str(key), value, where) for key, value in node.items()}
 
 
