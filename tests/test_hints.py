@@ -25,19 +25,23 @@ from typing import Any
 import jaxtyping
 import numpy as np
 import pytest
+import torch
 import trimesh
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
+from splats import make_gaussians
 
 import cadam3d
 from cadam3d import cli
 from cadam3d.core.errors import UserError
 from cadam3d.io.ply import write_ply
+from cadam3d.rasterizer import auto
+from cadam3d.rasterizer.build import find_compiler
+from cadam3d.rasterizer.cpu import load_kernels
 from cadam3d.settings.advice import LAUNCHERS
 from cadam3d.settings.compose import component, compose, config_dir, flatten
 from cadam3d.sweep.folder import Plan, write_plan
-from splats import make_gaussians
 
 PACKAGE = Path(cadam3d.__file__).parent
 CHECKS = "core/checks.py"
@@ -129,6 +133,10 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         (*A_CUBE, "exporter.turntable.fps=1000000000000"),
         (*A_CUBE, "exporter.turntable.size=100000"),
         (*A_CUBE, "densifier.reset=everybody"),
+        (*A_CUBE, "camera=multiview", "views=4", "camera.relative_distance=[0.1,0.2]"),
+        (*A_CUBE, "densifier=cadam_open", "densifier.alpha=0.1"),
+        (*A_CUBE, "densifier=cadam_open", "densifier.reset=all", "densifier.tau_reset=1"),
+        (*A_CUBE, "optimizer.means_lr={_target_: cadam3d.core.schedule.Steps, values: [1], milestones: [2]}"),
         (*A_CUBE, "rasterizer=cuda"),
         (*A_CUBE, "rasterizer=cpu", "rasterizer.cache_dir=/dev/null/x"),
     ],
@@ -201,8 +209,38 @@ GAPS = (
 )
 LONGEST_WAY = 4  # messages
 # Code whose messages need what these tests lack. A key is a folder, a file, or FILE::FUNCTION.
+MODEL = "needs a pretrained model; its tests are in tests/prior and tests/initializer"
+LATER = "can only be raised while training, by schedules that its constructor cannot judge"
+GPU = "needs a GPU; its tests are in tests/rasterizer"
 ELSEWHERE: dict[str, str] = {
-    "io/": "needs damaged files; their tests are in tests/io",
+    "io/": "needs damaged files; its tests are in tests/io",
+    "state.py": "needs damaged checkpoints",
+    "optimizer.py::GaussianOptimizer.load_state_dict": "needs damaged checkpoints",
+    "commands/train.py::start_or_resume": "needs a checkpoint",
+    "commands/eval.py::_evaluate_sweep": "needs a sweep whose jobs all fail",
+    "sweep/folder.py": "needs a damaged sweep",
+    "sweep/start.py::_locked": "needs a second process",
+    "sweep/start.py::_refuse_other_settings": "needs the results of a sweep; its tests are in tests/sweep",
+    "report/": "needs the results of a sweep; its tests are in tests/report",
+    "settings/documentation.py": "needs a damaged installation",
+    "settings/advice.py::_job_refused": "passes on the message of a job",
+    "core/checks.py::_nearest": "calls a function of its own module",
+    "core/schedule.py::Constant.__post_init__": "needs a schedule that no option uses",
+    "prior/path.py": "needs a noise path that no option uses",
+    "prior/latent.py": MODEL,
+    "prior/mvdream.py": MODEL,
+    "prior/stable_diffusion_3.py": MODEL,
+    "initializer/shap_e.py": MODEL,
+    "guidance/csd.py::CSD._reference": LATER,
+    "guidance/distill.py::Distillation._bound": LATER,
+    "guidance/gcs.py::GCS.draw_levels": LATER,
+    "guidance/ism.py::ISM._interval": LATER,
+    "rasterizer/auto.py": GPU,
+    "rasterizer/cuda.py": GPU,
+    "rasterizer/driver.py": GPU,
+    "rasterizer/nvrtc.py": GPU,
+    "rasterizer/build.py": "needs a machine without a compiler; its tests are in tests/rasterizer",
+    "rasterizer/cpu.py::CpuRasterizer.prepare": GPU,
 }
 # Options of which several can be chosen.
 LISTS = ("exporter", "callback", "metric", "regularizer")
@@ -530,3 +568,52 @@ def sites_of_errors() -> set[str]:
                 ):
                     found.add(f"{path.relative_to(PACKAGE).as_posix()}::{scope}")
     return found
+
+
+def test_resuming_a_run_with_an_option_of_the_user_suggests_the_folder_of_that_time(type_line, tmp_path):
+    own = tmp_path / "my configs/densifier"
+    own.mkdir(parents=True)
+    for number, sources in enumerate(
+        (
+            [{"path": str(own.parent), "provider": "command-line"}],
+            [{"path": "gone", "provider": "command-line"}],
+        )
+    ):
+        run = tmp_path / f"run-{number}"
+        (run / ".hydra").mkdir(parents=True)
+        (run / ".hydra/overrides.yaml").write_text("['prompt=a red cube', 'densifier=mine']")
+        settings = {"hydra": {"runtime": {"config_sources": sources}}}
+        (run / ".hydra/hydra.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
+        message = type_line("train", f"resume={run}", "steps=5").message
+        folder = "DIR" if number else own.parent
+        line = shlex.join(["cadam3d", "train", f"resume={run}", "steps=5", f"--config-dir={folder}"])
+        assert message.startswith(f"densifier: the run in {run} uses 'mine', an option from a folder that ")
+        assert message.endswith(f"Try: {line}")
+
+
+@pytest.mark.parametrize("rasterizer", ["auto", "cpu"])
+def test_kernels_that_cannot_be_kept_are_explained_with_words_that_work(rasterizer, tmp_path, monkeypatch):
+    if find_compiler() is None:
+        pytest.skip("needs a C++ compiler")
+    (tmp_path / "a file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "a file"))
+    part = component(compose([A_CUBE[1], f"rasterizer={rasterizer}"]).rasterizer)
+    auto._choose.cache_clear()
+    load_kernels.cache_clear()
+    try:
+        if rasterizer == "auto":
+            message = part.prepare(torch.device("cpu")).reason
+        else:
+            with pytest.raises(UserError) as raised:
+                part.prepare(torch.device("cpu"))
+            message = str(raised.value)
+        words = pasted([A_CUBE[1], f"rasterizer={rasterizer}"], hint_of(message))
+        assert str(tmp_path / "a file") in message
+        # The folder that is suggested need not be made: the words choose the kernels, and they compose.
+        chosen = component(compose(words).rasterizer)
+        assert chosen.cache_dir
+        assert not Path(chosen.cache_dir).exists()
+        assert Path(chosen.cache_dir).parent.is_dir()
+    finally:
+        auto._choose.cache_clear()
+        load_kernels.cache_clear()

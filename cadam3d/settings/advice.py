@@ -4,6 +4,7 @@ import difflib
 import re
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 
 import yaml  # comes with OmegaConf
 from hydra.errors import CompactHydraException, MissingConfigException, OverrideParseException
@@ -11,10 +12,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
 from cadam3d.core.errors import UserError
+from cadam3d.io.reading import read_yaml
+from cadam3d.io.run_folder import OVERRIDES
 from cadam3d.settings.compose import compose, config_dir, flatten, quote
-from cadam3d.settings.line import key_of
+from cadam3d.settings.line import key_of, quoted, text_of
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
+# In the folder of a run: how Hydra was set up, with the folders of YAML files.
+HYDRA_SETTINGS = ".hydra/hydra.yaml"
 NO_NAME_COMPLAINT = "Config group override must be a string or a list"
 # The package of each option of hydra/launcher that Hydra itself lacks.
 LAUNCHERS = {
@@ -156,11 +161,38 @@ def _unknown_option(error: MissingConfigException, command: str, words: Sequence
         return UserError(f"{path}: no such configuration in {config_dir()}. Try: cadam3d doctor")
     near = did_you_mean(option, options)
     best = near[0] if near else _default_option(group, command) or options[0]
+    if all(key_of(word) != group for word in words) and (run := _resumed_run(words)):
+        folder = _config_folder(run) or "DIR"
+        return UserError(
+            f"{group}: the run in {run} uses {option!r}, an option from a folder that was given with "
+            f"--config-dir. Try: {line_of(command, [*words, f'--config-dir={folder}'])}"
+        )
     # The other options of a list, or of a sweep, stay.
     typed = next((word.partition("=")[2] for word in words if key_of(word) == group), option)
     choice = re.sub(rf"\b{re.escape(option)}\b", best.replace("\\", ""), typed)
     example = shlex.quote(f"{group}={choice if choice != typed else best}")
     return UserError(f"{group}: expected one of {'|'.join(options)}, got {option!r}. Try: {example}")
+
+
+def _resumed_run(words: Sequence[str]) -> Path | None:
+    """Return the folder of the run that a line resumes, or None."""
+    text = next((text_of(quoted(word, is_sweep=False)) for word in words if key_of(word) == "resume"), "")
+    place = Path(text).expanduser()
+    return next((folder for folder in (place, *place.parents) if (folder / OVERRIDES).is_file()), None)
+
+
+def _config_folder(run: Path) -> str | None:
+    """Return the folder that --config-dir named when a run was started, if its files say so.
+
+    The files may be a stranger's. The folder appears only in a message, which the user judges.
+    """
+    try:
+        sources = read_yaml(run / HYDRA_SETTINGS)["hydra"]["runtime"]["config_sources"]
+        paths = [source["path"] for source in sources if source["provider"] == "command-line"]
+        text = str(paths[0])
+        return text if text.isprintable() and Path(text).is_dir() else None
+    except (UserError, LookupError, TypeError, ValueError, OSError):
+        return None
 
 
 def _no_name(reason: str, command: str, words: Sequence[str]) -> UserError:
