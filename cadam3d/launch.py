@@ -143,7 +143,7 @@ def _train(cfg: DictConfig, line: Line, task: Task) -> None:
     """Choose the output folder and train there."""
     text = OmegaConf.select(cfg, RUN_FOLDER)
     if not text:
-        example = f"{RUN_FOLDER}=outputs/mine, or leave it out"
+        example = f"{RUN_FOLDER}=outputs/mine"
         raise UserError(f"{RUN_FOLDER}: expected a folder, got nothing. Try: {example}")
     wanted = Path(str(text)).expanduser()
     is_chosen = any(key_of(override) == RUN_FOLDER for override in line.overrides)
