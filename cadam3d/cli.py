@@ -22,6 +22,8 @@ COMMANDS = {  # the purpose of each, and a line to paste
     "view": ("show the report of a run, or an asset", "cadam3d view run=outputs/latest"),
     "doctor": ("check this machine, with a hint per failure", "cadam3d doctor"),
 }
+# The command for a line that begins with one of these settings; all other settings are of training.
+COMMAND_OF = {"run": "view", "ply": "view", "grid": "sweep"}
 HELP_FLAGS = ("--help", "-h", "help")
 COMPLETION_FLAGS = ("--shell-completion", "-sc")
 
@@ -94,13 +96,16 @@ def unknown_command(words: Sequence[str]) -> UserError:
 
     first = words[0]
     listed = "|".join(COMMANDS)
+    sentence = [word for word in words if "=" not in word and not word.startswith("-")]
     if "=" in first:
-        line = shlex.join(["cadam3d", "train", *words])
-    elif " " in first:
-        line = f"cadam3d train {shlex.quote('prompt=' + first)}"
+        command = COMMAND_OF.get(first.partition("=")[0], "train")
+        line = shlex.join(["cadam3d", command, *words])
     elif near := did_you_mean(first, list(COMMANDS)):
         line = shlex.join(["cadam3d", near[0], *words[1:]])
         return UserError(f"{first!r} is not a command. Did you mean {near[0]}? Try: {line}")
+    elif not first.startswith("-") and " " in " ".join(sentence):
+        others = [word for word in words if word not in sentence]
+        line = shlex.join(["cadam3d", "train", f"prompt={' '.join(sentence)}", *others])
     else:
         line = "cadam3d --help"
     return UserError(f"{first!r} is not a command: expected one of {listed}. Try: {line}")

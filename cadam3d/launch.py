@@ -14,7 +14,7 @@ from omegaconf.errors import InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import expanded
-from cadam3d.settings.advice import explain, require_values, reraise_interrupt
+from cadam3d.settings.advice import explain, line_of, require_values, reraise_interrupt
 from cadam3d.settings.compose import TEXT_KEYS, config_dir
 from cadam3d.settings.declared import require_settings
 from cadam3d.settings.help_page import help_text
@@ -104,11 +104,12 @@ def launch(command: str, words: Sequence[str]) -> int:
 
 def read_line(command: str, overrides: list[str], flags: list[str], options: Namespace) -> Line:
     """Parse a line: quote its overrides and, if it resumes a run, add the overrides of that run."""
-    _refuse_bare_words(command, overrides)
+    _refuse_bare_words(command, overrides, flags)
     trusting = shlex.join(["cadam3d", command, *overrides, *flags, "trust=true"])
     is_sweep = command == "sweep" or options.multirun or "hydra.mode=MULTIRUN" in overrides
     if is_sweep and command not in TRAINING:
-        raise UserError(f"{command}: only training can be swept. Try: cadam3d {command} once for each asset")
+        kept = [override for override in overrides if override != "hydra.mode=MULTIRUN"]
+        raise UserError(f"{command}: only training can be swept. Try: {line_of(command, kept)}")
     if command == "train" and not is_sweep and "dry_run" in map(key_of, overrides):
         words = [override for override in overrides if key_of(override) != "dry_run"]
         raise UserError(
@@ -169,7 +170,7 @@ def _train(cfg: DictConfig, line: Line, task: Task) -> None:
     """Choose the output folder and train there."""
     text = OmegaConf.select(cfg, RUN_FOLDER)
     if not text:
-        example = f"{RUN_FOLDER}=outputs/mine, or leave it out"
+        example = f"{RUN_FOLDER}=outputs/mine"
         raise UserError(f"{RUN_FOLDER}: expected a folder, got nothing. Try: {example}")
     wanted = expanded(str(text))
     is_chosen = any(key_of(override) == RUN_FOLDER for override in line.overrides)
@@ -184,13 +185,20 @@ def _wants_page(options: Namespace) -> bool:
     return bool(options.hydra_help or options.info or options.shell_completion)
 
 
-def _refuse_bare_words(command: str, overrides: Sequence[str]) -> None:
+def _refuse_bare_words(command: str, overrides: Sequence[str], flags: Sequence[str]) -> None:
     """Refuse words without ``=``, as an unquoted prompt leaves them, with the line to type instead."""
     bare = [override for override in overrides if "=" not in override and not override.startswith("~")]
     if not bare:
         return
     before = [override for override in overrides[: overrides.index(bare[0])] if key_of(override) in TEXT_KEYS]
-    key, _, start = before[-1].partition("=") if before else ("prompt", "", "")
-    whole = " ".join([start, *bare]).strip()
-    example = f"cadam3d {command} {key}={shlex.quote(whole)}" if command in TRAINING else f"run={bare[0]}"
-    raise UserError(f"{bare[0]!r}: expected key=value. Try: {example}")
+    others = [word for word in overrides if word not in (*bare, *before[-1:])] + list(flags)
+    if command in TRAINING:
+        key, _, start = before[-1].partition("=") if before else ("prompt", "", "")
+        whole = " ".join([start, *bare]).strip()
+        line = f"cadam3d {command} {key}={shlex.quote(whole)} {shlex.join(others)}".rstrip()
+    elif command == "doctor":
+        line = "cadam3d doctor"
+    else:
+        key = "ply" if bare[0].endswith(".ply") and command != "eval" else "run"
+        line = line_of(command, [*others, f"{key}={bare[0]}"])
+    raise UserError(f"{bare[0]!r}: expected key=value. Try: {line}")

@@ -8,7 +8,15 @@ from typing import NamedTuple
 import pytest
 
 # Files with whole runs come first, because each is run by one process and should not be the last to end.
-LONG = ("test_end_to_end", "test_configs", "test_cuda", "test_recipes", "test_cuda_sanitizer", "test_cpu")
+LONG = (
+    "test_end_to_end",
+    "test_hints",
+    "test_configs",
+    "test_cuda",
+    "test_recipes",
+    "test_cuda_sanitizer",
+    "test_cpu",
+)
 
 
 def pytest_collection_modifyitems(items):

@@ -295,15 +295,20 @@ def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, 
     assert not list(tmp_path.iterdir())
 
 
+LINE = "cadam3d train 'prompt=a cube'"
+
 # --- did you mean ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("line", "ending"),
     [
-        ("densifier.tau_q=0.5", "Did you mean densifier.tau_Q? Try: densifier.tau_Q=0.5"),
-        ("tau_SNR=0.2", "Did you mean densifier.tau_SNR? Try: densifier.tau_SNR=0.2"),
-        ("densifier.max_gaussians=9", "Did you mean refine.max_gaussians? Try: refine.max_gaussians=9"),
+        ("densifier.tau_q=0.5", f"Did you mean densifier.tau_Q? Try: {LINE} densifier.tau_Q=0.5"),
+        ("tau_SNR=0.2", f"Did you mean densifier.tau_SNR? Try: {LINE} densifier.tau_SNR=0.2"),
+        (
+            "densifier.max_gaussians=9",
+            f"Did you mean refine.max_gaussians? Try: {LINE} refine.max_gaussians=9",
+        ),
         (
             "densifier.child_state=inherit",
             "a setting of densifier=cadam_open, not of the chosen option. "
@@ -315,9 +320,13 @@ def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, 
         ("qqqq.zzzz=5", "no such setting. Try: cadam3d train --cfg job"),
         ("densifier=cadm", f"expected one of {'|'.join(DENSIFIERS)}, got 'cadm'. Try: densifier=cadam"),
         ("prior=shape", "Try: prior=shapes"),
-        ("callback=[metrics,progres]", "got 'progres'. Try: callback=progress"),
+        ("callback=[metrics,progres]", "got 'progres'. Try: 'callback=[metrics,progress]'"),
         ("experiment=smok", "Try: experiment=smoke"),
-        ("steps=1,2", "steps: several values make a sweep. Try: cadam3d sweep steps=1,2"),
+        (
+            "steps=1,2",
+            "several values make a sweep (a list is 'steps=[1,2]'). "
+            "Try: cadam3d sweep 'prompt=a cube' steps=1,2",
+        ),
         ("~steps", "~steps: a setting can be changed but not removed. Try: "),
         ("~densifier", "~densifier: a setting can be changed"),
         ("densifier=null", f"expected one of {'|'.join(DENSIFIERS)}, got null. Try: densifier=none"),
@@ -326,9 +335,9 @@ def test_a_sweep_without_a_prompt_or_without_a_grid_is_refused(type_line, jobs, 
         ("steps=${nope}", "cadam3d: steps: Interpolation key 'nope' not found. Try: "),
         ("hydra.run.dir=o_${seedd}", "hydra.run.dir: Interpolation key 'seedd' not found. Try: "),
         ("hydra.run.dir=", "hydra.run.dir: expected a folder, got nothing. Try: "),
-        ("promt=a b", "Try: 'prompt=a b'"),
-        ("seed=1,2 3", "Try: cadam3d sweep 'seed=1,2 3' ... (a list is 'seed=[1,2 3]')"),
-        ("grid=densifiers", "grids belong to sweeps. Try: cadam3d sweep grid=densifiers ..."),
+        ("promt=a b", f"Try: {LINE} 'prompt=a b'"),
+        ("seed=1,2 3", "Try: cadam3d sweep 'prompt=a cube' 'seed=1,2 3'"),
+        ("grid=densifiers", "grids belong to sweeps. Try: cadam3d sweep 'prompt=a cube' grid=densifiers"),
         ("steps=[1", "steps: cannot read the value"),
         ("+steps=5", "steps"),
         ("hydra.run.dir=/dev/null/x", "hydra.run.dir: cannot write to /dev/null/x (Not a directory). Try: "),
@@ -349,7 +358,7 @@ def test_a_mistake_causes_one_message_with_what_to_type(line, ending, type_line)
         (("train", "--cfg", "nope"), "invalid choice: 'nope'"),
         (("train", "--cfg", "job", "--info", "config"), "cannot be combined"),
         (("eval", "-m", "run=a,b"), "only training can be swept"),
-        (("doctor", "jsn=true"), "Did you mean json? Try: json=true"),
+        (("doctor", "jsn=true"), "Did you mean json? Try: cadam3d doctor json=true"),
         (("-sc",), 'Try: eval "$(cadam3d -sc install=bash)"'),
         (("-sc", "install=nope"), 'Try: eval "$(cadam3d -sc install=bash)"'),
         (("-sc", "foo=bash"), 'Try: eval "$(cadam3d -sc install=bash)"'),

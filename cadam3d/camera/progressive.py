@@ -149,7 +149,7 @@ def _require_motion(key: str, value: Widening) -> None:
     require(
         value.reaches_its_end(),
         f"{key}.factor",
-        expected=f"factors that lead from {value.start} to {value.end}",
+        expected=f"factors that lead from {value.start} to {value.end}, or a fixed range",
         got=value.factor,
-        example=f"'{key}.end=[{value.start[0]:g},{value.start[1]:g}]' for a fixed range, or other factors",
+        example=f"'{key}.end=[{value.start[0]:g},{value.start[1]:g}]' '{key}.factor=[1,1]'",
     )

@@ -94,7 +94,8 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
             problem = problem or error
     if failures == len(results):
         raise UserError(
-            f"run={cfg.run}: no job of this sweep could be measured. Try: run the command of the sweep again"
+            f"run={cfg.run}: no job of this sweep could be measured, and the reasons are above. "
+            "Run the sweep again, after a look at this machine. Try: cadam3d doctor"
         )
     try:
         write_json(folder / EVALUATION, results)

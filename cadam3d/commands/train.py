@@ -81,12 +81,10 @@ def run(cfg: DictConfig) -> float | None:
 
     # Everything that can be refused is refused here, before the folder changes.
     trainer = build_trainer(cfg, device)
+    require_views(cfg)
     backend = trainer.rasterizer.prepare(device)
     exporters: dict[str, Exporter] = components(cfg.exporter, Exporter, "exporter")
     metrics: dict[str, Metric] = components(cfg.metric, Metric, "metric")
-    size = cfg.camera.get("size")
-    rendered = PIXEL * float(size) ** 2 if isinstance(size, int) else PIXEL
-    require_memory("views", cfg.views, unit=CAMERA + rendered, example=2)
     initializer = component(cfg.initializer, Initializer, "initializer")
     memory = estimate_memory(cfg, trainer)
     embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
@@ -174,6 +172,13 @@ def require_unused(cfg: DictConfig) -> None:
     node._set_parent(cfg)
     node._set_key(key)
     component(node, Baseline)
+
+
+def require_views(cfg: DictConfig) -> None:
+    """Raise ``UserError`` if the images of one step cannot fit into memory."""
+    size = cfg.camera.get("size")
+    rendered = PIXEL * float(size) ** 2 if isinstance(size, int) else PIXEL
+    require_memory("views", cfg.views, unit=CAMERA + rendered, example=2)
 
 
 def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:

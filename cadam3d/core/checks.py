@@ -1,5 +1,6 @@
 """Checks of settings; their errors name the key, what was expected, what came, and what to type."""
 
+import difflib
 import math
 from collections.abc import Sequence
 from typing import TypeGuard
@@ -60,11 +61,30 @@ def require_whole(
 
 
 def require_choice(key: str, value: object, choices: Sequence[object]) -> None:
-    """Raise unless ``value`` is one of ``choices``, of the same type; the message lists them."""
+    """Raise unless ``value`` is one of ``choices``, of the same type.
+
+    The message lists the choices. It suggests the nearest one, or the first one if none is near.
+    """
     # The types are compared too, because True == 1 == 1.0.
     if not any(type(value) is type(choice) and value == choice for choice in choices):
-        listed = "|".join(str(choice) for choice in choices)
-        raise fail(key, expected=f"one of {listed}", got=value, example=f"{key}={choices[0]}")
+        listed = "|".join(_written(choice) for choice in choices)
+        example = f"{key}={_nearest(value, choices)}"
+        raise fail(key, expected=f"one of {listed}", got=value, example=example)
+
+
+def _nearest(value: object, choices: Sequence[object]) -> str:
+    """Return the choice nearest to ``value`` as it is typed, or the first one if none is near."""
+    numbers = [choice for choice in choices if isinstance(choice, int | float)]
+    if numbers and isinstance(value, int | float) and math.isfinite(value):
+        return _written(min(numbers, key=lambda number: abs(number - value)))
+    texts = {_written(choice).lower(): _written(choice) for choice in choices}
+    near = difflib.get_close_matches(str(value).lower(), list(texts), n=1)
+    return texts[near[0]] if near else _written(choices[0])
+
+
+def _written(choice: object) -> str:
+    """Return a choice as it is typed."""
+    return str(choice).lower() if isinstance(choice, bool) else str(choice)
 
 
 def require_color(key: str, value: object) -> None:

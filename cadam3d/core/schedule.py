@@ -98,7 +98,7 @@ class Steps(Schedule):
             "schedule.values",
             expected="one value more than milestones, all numbers, milestones ascending",
             got=(self.values, self.milestones),
-            example="{values: [0.98, 0.5], milestones: [500]}",
+            example="'schedule.values=[0.98,0.5]' 'schedule.milestones=[500]'",
         )
 
     def __call__(self, step: int) -> float:

@@ -19,6 +19,11 @@ from cadam3d.io.image import closeness, to_uint8
 from cadam3d.io.run_folder import TURNTABLE
 from cadam3d.io.video import write_video
 
+# Frames per second. Players handle such rates; much larger ones overflow in ffmpeg.
+HIGHEST_FPS = 240
+# With a second picture beside it, such a frame is as wide as libx264 allows.
+LARGEST = 8192  # pixels
+LONGEST = 100_000  # frames
 VIEWS_AT_ONCE = 4  # bounds the memory of rendering for a video of any length
 
 
@@ -28,17 +33,18 @@ class TurntableExporter(PictureSettings, Exporter):
 
     node: ClassVar[str] = "exporter.turntable"
 
-    views: int  # >= 1, frames
+    views: int  # in [1, 100000], frames
     elevation_deg: float  # in [-90, 90]
-    fps: int  # frames per second
+    fps: int  # in [1, 240], frames per second
     beside: str  # depth, alpha or none
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_views(self.views, example=60)
+        require_whole("exporter.turntable.views", self.views, low=1, high=LONGEST, example=60)
         require_range("exporter.turntable.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
-        require_whole("exporter.turntable.fps", self.fps, low=1, example=30)
+        require_whole("exporter.turntable.fps", self.fps, low=1, high=HIGHEST_FPS, example=30)
         require_choice("exporter.turntable.beside", self.beside, ("depth", "alpha", "none"))
+        require_whole("exporter.turntable.size", self.size, low=1, high=LARGEST, example=256)
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
         """Render and encode frame by frame."""

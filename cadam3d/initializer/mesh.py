@@ -1,5 +1,6 @@
 """Mesh: Gaussians on the surface of a mesh file, with its colours."""
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.initializer.points import (
     PointCloud,
+    another_file,
     fit,
     found_file,
     gaussians_at,
@@ -28,7 +30,7 @@ from cadam3d.initializer.points import (
 from cadam3d.io.frames import points_to_world, turned_points
 
 UPS = ("z", "y")
-EXAMPLE = "/path/to/mesh.glb"
+# Other formats of trimesh may refer to files elsewhere, or run other programs.
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 
 
@@ -71,13 +73,7 @@ class Mesh(Initializer):
 
     def _load(self) -> list[trimesh.Trimesh]:
         """Return the surfaces of the file, each at its place in the scene and with its own colours."""
-        path = found_file(self.path, EXAMPLE)
-        # Other formats of trimesh may refer to files elsewhere, or run other programs.
-        if path.suffix.lower() not in SUFFIXES:
-            raise UserError(
-                f"initializer.path: expected a {', '.join(SUFFIXES)} file, got {self.path!r}. "
-                f"Try: initializer.path={EXAMPLE}"
-            )
+        path = found_file(self.path, "mesh", SUFFIXES)
         # Every format has its own parser, with its own exceptions.
         try:
             parts = [part for part in trimesh.load_scene(path).dump() if isinstance(part, trimesh.Trimesh)]
@@ -85,16 +81,18 @@ class Mesh(Initializer):
             reason = str(error) or type(error).__name__
             raise UserError(
                 f"initializer.path: expected a PLY, OBJ, STL, GLB or OFF file, got {self.path!r}, which "
-                f"cannot be read ({reason}). Try: initializer.path={EXAMPLE}"
+                f"cannot be read ({reason}). Try: {another_file(self.path, 'mesh', SUFFIXES)}"
             ) from error
         is_finite = all(np.isfinite(part.vertices).all() for part in parts)
         if not is_finite or sum(float(part.area) for part in parts) <= 0:
             vertices = sum(len(part.vertices) for part in parts)
             faces = sum(len(part.faces) for part in parts)
+            is_cloud = faces == 0 and path.suffix.lower() == ".ply"
+            words = ["initializer=ply", f"initializer.path={self.path}"]
+            example = shlex.join(words) if is_cloud else another_file(self.path, "mesh", SUFFIXES)
             raise UserError(
                 f"initializer.path: expected a mesh with triangles, got {self.path!r}, which has no surface "
-                f"({vertices} vertices, {faces} faces). Try: initializer.path={EXAMPLE}, or initializer=ply "
-                "for a cloud of points"
+                f"({vertices} vertices, {faces} faces). Try: {example}"
             )
         return parts
 

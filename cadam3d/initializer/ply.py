@@ -2,6 +2,7 @@
 
 import io
 import math
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.initializer.points import (
     PointCloud,
+    another_file,
     fit,
     found_file,
     gaussians_at,
@@ -35,8 +37,8 @@ from cadam3d.io.reading import read_bytes
 UP_OF_GAUSSIANS = "-y"
 # Point-E and most scans use this axis.
 UP_OF_POINTS = "+z"
-EXAMPLE = "/path/to/asset.ply"
 LARGEST = 1 << 32  # bytes of a cloud of points
+SUFFIXES = (".ply",)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +75,7 @@ class Ply(Initializer):
 
         Raises ``UserError`` if the file is missing, cannot be read or holds neither.
         """
-        path = found_file(self.path, EXAMPLE)
+        path = found_file(self.path, "ply", SUFFIXES)
         if holds_gaussians(path):
             return self._asset(path, generator).to(device)
         return self._cloud(path, generator, device)
@@ -117,12 +119,12 @@ class Ply(Initializer):
             reason = str(error) or type(error).__name__
             raise UserError(
                 f"initializer.path: expected a PLY file of Gaussians or points, got {self.path!r}, which "
-                f"cannot be read ({reason}). Try: initializer.path={EXAMPLE}"
+                f"cannot be read ({reason}). Try: {another_file(self.path, 'ply', SUFFIXES)}"
             ) from error
         if not isinstance(loaded, trimesh.PointCloud):
             raise UserError(
                 f"initializer.path: expected a PLY file of Gaussians or points, got {self.path!r}, which is "
-                f"a mesh. Try: initializer=mesh 'initializer.path={self.path}'"
+                f"a mesh. Try: {shlex.join(['initializer=mesh', f'initializer.path={self.path}'])}"
             )
         points = torch.as_tensor(np.asarray(loaded.vertices), dtype=torch.float32)
         _require_finite(path, "points", points)
@@ -138,7 +140,7 @@ def _require_finite(path: Path, name: str, rows: Tensor) -> None:
         what = f"has {name} that are not finite ({bad} of {len(rows)})" if bad else "is empty"
         raise UserError(
             f"initializer.path: expected a PLY file of Gaussians or points, got {str(path)!r}, which {what}. "
-            f"Try: initializer.path={EXAMPLE}"
+            f"Try: {another_file(str(path), 'ply', SUFFIXES)}"
         )
 
 

@@ -1,6 +1,8 @@
 """From coloured points to Gaussians: functions shared by the initializers that start from a point cloud."""
 
+import difflib
 import math
+import shlex
 import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -152,7 +154,7 @@ def fit(points: Float[Tensor, "n 3"], radius: float | None) -> tuple[Float[Tenso
     return center, radius / farthest if farthest > 0 else 1.0
 
 
-def found_file(path: str, example: str) -> Path:
+def found_file(path: str, option: str, suffixes: Sequence[str]) -> Path:
     """Return the path that ``initializer.path`` names. Raises ``UserError`` unless it is a file."""
     found = Path(path).expanduser()
     # The system refuses some names, such as one that is too long.
@@ -163,9 +165,30 @@ def found_file(path: str, example: str) -> Path:
     if kind != stat.S_IFREG:
         what = f"is {KINDS.get(kind, 'no file')}" if kind else "does not exist"
         raise UserError(
-            f"initializer.path: expected a file, got {path!r}, which {what}. Try: initializer.path={example}"
+            f"initializer.path: expected a file, got {path!r}, which {what}. "
+            f"Try: {another_file(path, option, suffixes)}"
         )
     return found
+
+
+def another_file(path: str, option: str, suffixes: Sequence[str]) -> str:
+    """Return what to type instead of a file that initializer=``option`` cannot read.
+
+    This is the file with the nearest name and one of ``suffixes``, in the same folder or in the current one.
+    If there is none, it is the help of the option.
+    """
+    wrong = Path(path).expanduser()
+    folders = dict.fromkeys([wrong if wrong.is_dir() else wrong.parent, Path()])
+    files = [file for folder in folders if folder.is_dir() for file in sorted(folder.iterdir())]
+    known = {
+        file.name: file
+        for file in reversed(files)
+        if file.suffix.lower() in suffixes and file != wrong and file.is_file()
+    }
+    near = difflib.get_close_matches(wrong.name, list(known), n=1, cutoff=0.0)
+    if not near:
+        return f"cadam3d train --help initializer={option}"
+    return shlex.quote(f"initializer.path={known[near[0]]}")
 
 
 def require_points(count: int, scale: object, opacity: object, sh_degree: object) -> None:

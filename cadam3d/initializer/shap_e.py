@@ -130,7 +130,7 @@ class ShapE(Initializer):
         except torch.OutOfMemoryError as error:
             raise UserError(
                 f"initializer: Shap-E does not fit into the memory of {device}. "
-                f"Try: initializer.dtype=float16, or initializer.grid_size={max(self.grid_size // 2, 2)}"
+                f"Try: initializer.dtype=float16 initializer.grid_size={max(self.grid_size // 2, 2)}"
             ) from error
         finally:
             _free()
@@ -208,8 +208,8 @@ def _refuse_empty_mesh(_decoder: object, _inputs: object, mesh: Any) -> None:
     """
     if len(mesh.faces) == 0:
         raise UserError(
-            "initializer: Shap-E found no surface for this prompt. Try: another seed, or "
-            "'initializer.prompt=a simpler description'"
+            "initializer: Shap-E found no surface for this prompt. Another seed or a simpler description "
+            "may help. Try: 'initializer.prompt=a chair'"
         )
 
 

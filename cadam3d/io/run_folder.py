@@ -17,6 +17,7 @@ CHARTS = "charts.json"  # the charts that the densifier and the objective declar
 CHECKPOINTS = "checkpoints"  # a folder
 CONFIG = "config.yaml"  # every setting, resolved
 HYDRA = ".hydra"  # a folder: the settings as Hydra has read them
+HYDRA_SETTINGS = ".hydra/hydra.yaml"  # how Hydra was set up, with the folders of YAML files
 LOG = "train.log"
 METRICS = "metrics.jsonl"
 OVERRIDES = ".hydra/overrides.yaml"  # what was typed

@@ -30,7 +30,13 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], *, fps
         finally:
             if writer is not None:
                 writer.close()
-        require(writer is not None, str(path), expected="at least one frame", got=0, example="views=60")
+        require(
+            writer is not None,
+            str(path),
+            expected="at least one frame",
+            got=0,
+            example="exporter.turntable.views=60",
+        )
         if not temporary.is_file() or temporary.stat().st_size == 0:
             raise _ffmpeg_error("it wrote nothing")
 
@@ -69,6 +75,6 @@ def _append(writer, frame: UInt8[np.ndarray, "h w 3"]) -> None:
 def _ffmpeg_error(reason: object) -> UserError:
     first_line = next(iter(str(reason).strip().splitlines()), "unknown reason")
     return UserError(
-        f"video: ffmpeg is missing or does not work ({first_line}). Try: pip install --force-reinstall "
-        "imageio-ffmpeg, or: export IMAGEIO_FFMPEG_EXE=/usr/bin/ffmpeg"
+        f"video: ffmpeg is missing or does not work ({first_line}). The variable $IMAGEIO_FFMPEG_EXE "
+        "chooses another one. Try: pip install --force-reinstall imageio-ffmpeg"
     )

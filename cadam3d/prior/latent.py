@@ -132,7 +132,7 @@ class LatentPrior(DiffusionPrior):
             "prior.prompting",
             expected="one of the prompting options",
             got=self.prompting,
-            example="prompting=discrete",
+            example="'prior.prompting=${prompting}'",
         )
         if self.size is not None:
             require_whole("prior.size", self.size, low=FACTOR, example=512)
@@ -463,7 +463,7 @@ def ddpm_path(scheduler: Mapping[str, Any]) -> NoisePath:
         "prior.path",
         expected="a model with a scaled_linear noise schedule",
         got=kind if kind != "scaled_linear" else "scaled_linear, rescaled to zero terminal SNR",
-        example="prior.path=DIR with another model",
+        example="prior.path=DIR",
     )
     return DDPM(
         train_steps=scheduler["num_train_timesteps"],
@@ -517,7 +517,7 @@ def completion(path: NoisePath, scheduler: Mapping[str, Any]) -> Complete:
         "prior.path",
         expected=f"a model with the prediction type {' or '.join(ways)}",
         got=kind,
-        example="prior.path=DIR with another model",
+        example="prior.path=DIR",
     )
     return ways[kind]
 

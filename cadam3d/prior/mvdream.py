@@ -59,6 +59,15 @@ class MVDream(StableDiffusion):
     kinds: ClassVar = ("MVDreamPipeline", "StableDiffusionPipeline")
 
     def __post_init__(self) -> None:
+        # This comes first because its suggestion also satisfies the check of any prior.
+        require(
+            self.micro_batch is None
+            or (type(self.micro_batch) is int and self.micro_batch > 0 and self.micro_batch % VIEWS == 0),
+            "prior.micro_batch",
+            expected=f"null or a multiple of {VIEWS}, since {VIEWS} views are denoised together",
+            got=self.micro_batch,
+            example=f"prior.micro_batch={VIEWS}",
+        )
         super().__post_init__()
         require_range("prior.rescale", self.rescale, low=0, high=1, example=0.5)
         is_name = isinstance(self.tokenizer, str) and self.tokenizer != ""
@@ -68,13 +77,6 @@ class MVDream(StableDiffusion):
             expected="a folder or a name on the hub",
             got=self.tokenizer,
             example="prior.tokenizer=openai/clip-vit-large-patch14",
-        )
-        require(
-            self.micro_batch is None or self.micro_batch % VIEWS == 0,
-            "prior.micro_batch",
-            expected=f"null or a multiple of {VIEWS}, since {VIEWS} views are denoised together",
-            got=self.micro_batch,
-            example=f"prior.micro_batch={VIEWS}",
         )
 
     @cached_property
@@ -90,7 +92,7 @@ class MVDream(StableDiffusion):
         if found.config("unet").get("projection_class_embeddings_input_dim") != CAMERA:
             raise UserError(
                 f"prior.path: expected an MVDream model, got {found.where!r}, which has no camera input "
-                "in its UNet. Try: prior=stable_diffusion, or prior.path=/path/to/sd-v2.1-base-4view.pt"
+                "in its UNet. Try: prior=stable_diffusion"
             )
         return found
 

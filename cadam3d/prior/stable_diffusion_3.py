@@ -54,7 +54,7 @@ class StableDiffusion3(LatentPrior):
             "prior.path",
             expected="a model with one shift for all image sizes",
             got="dynamic shifting",
-            example="prior.path=DIR with another model",
+            example="prior.path=DIR",
         )
         return RectifiedFlow(shift=float(self.scheduler.get("shift", 1.0)))
 

@@ -18,7 +18,7 @@ from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import self_test
 
-REPORT = "Try: rasterizer=reference, and please report this with the output of `cadam3d doctor`"
+REPORT = "Please report this with the output of `cadam3d doctor`. Try: rasterizer=reference"
 
 
 @dataclass(frozen=True, kw_only=True)

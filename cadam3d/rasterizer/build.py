@@ -27,6 +27,7 @@ from pathlib import Path
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.cache import make_private, other_writers
+from cadam3d.io.run_folder import spare
 from cadam3d.rasterizer import base
 
 KERNELS = Path(__file__).parent / "kernels"
@@ -111,8 +112,8 @@ def build(cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAG
     if compiler is None:
         raise UserError(
             "rasterizer=cpu: expected a C++ compiler ($CXX, c++, g++ or clang++) to build the kernels once, "
-            "got none. Try: `apt install g++`, `xcode-select --install`, `pip install 'cadam3d[compiler]'`, "
-            "or rasterizer=reference"
+            "got none. `apt install g++` or `xcode-select --install` installs one, and so does pip. "
+            "Try: pip install 'cadam3d[compiler]'"
         )
     start = time.perf_counter()
     with build_folder(cache_dir, "cpu") as folder:
@@ -150,7 +151,7 @@ def _own_advice(folder: Path, name: str) -> str:
         facts = folder.stat()
         if facts.st_uid == os.geteuid() and not facts.st_mode & stat.S_ISVTX:
             return f"chmod go-w {shlex.quote(str(folder))}"
-    return f"rasterizer={name} rasterizer.cache_dir=kernels"
+    return another_cache(name)
 
 
 def find_intact(cache_dir: Path, pattern: str) -> Path | None:
@@ -180,8 +181,17 @@ def build_folder(cache_dir: Path, name: str) -> Iterator[Path]:
     except OSError as error:
         raise UserError(
             f"rasterizer={name}: expected a folder for compiled kernels that can be written, got {cache_dir} "
-            f"({error}). Try: rasterizer.cache_dir=/tmp/cadam3d"
+            f"({error}). Try: {another_cache(name)}"
         ) from error
+
+
+def another_cache(name: str) -> str:
+    """Return the words that make rasterizer=``name`` keep its kernels in a new folder for temporary files.
+
+    They name the rasterizer too, because ``rasterizer=auto`` has no ``cache_dir``.
+    """
+    folder = spare("cadam3d-kernels")
+    return f"rasterizer={name} {shlex.quote(f'rasterizer.cache_dir={folder}')}"
 
 
 def definitions() -> list[str]:
@@ -207,7 +217,7 @@ def _compile(compiler: Compiler, target: Path, machine_flags: Sequence[Sequence[
         complaint = answer.stderr.strip()[-2000:] or f"exit code {answer.returncode}"
     raise UserError(
         f"rasterizer=cpu: {' '.join(compiler.command)} ({compiler.version}) could not build the kernels:\n"
-        f"{complaint}\nTry: another compiler in $CXX, or rasterizer=reference"
+        f"{complaint}\nThe variable $CXX chooses another compiler. Try: rasterizer=reference"
     )
 
 

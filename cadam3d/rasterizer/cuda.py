@@ -107,7 +107,7 @@ def rasterize(
     if max(len(gaussians), pixels) > MOST:
         raise UserError(
             f"rasterizer=cuda: expected at most {MOST} Gaussians, and as many pixels in a view, got "
-            f"{len(gaussians)} and {pixels}. Try: a smaller camera.size"
+            f"{len(gaussians)} and {pixels}. Try: camera.size=512"
         )
     return run_pass(_CudaPass(launcher, cameras, gaussians.device, absgrad), gaussians, background)
 
@@ -182,7 +182,7 @@ class _CudaPass(RenderPass):
         if largest > MOST:
             raise UserError(
                 f"rasterizer=cuda: expected at most {MOST} (splat, tile) pairs in a view, got {largest}. "
-                "Try: a smaller camera.size"
+                "Try: camera.size=512"
             )
         record = RECORD + ABSOLUTES * self.absgrad
         most_slots = min(RECORD_MEMORY // (4 * record), MOST)

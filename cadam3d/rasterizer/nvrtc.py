@@ -121,7 +121,7 @@ def choose_architecture(capability: tuple[int, int], compiler: Compiler) -> int:
         version = ".".join(map(str, compiler.version))
         raise UserError(
             f"rasterizer=cuda: the NVRTC of CUDA {version} cannot compile for compute capability "
-            f"{major}.{minor}. Try: a torch built for this GPU, or rasterizer=reference"
+            f"{major}.{minor}; a torch built for this GPU can. Try: rasterizer=reference"
         )
     return max(fitting)
 
@@ -136,7 +136,7 @@ def build(cache_dir: Path, capability: tuple[int, int]) -> Cubin:
     if compiler is None:
         raise UserError(
             "rasterizer=cuda: expected NVRTC, which comes with torch built for CUDA, got none. "
-            "Try: pip install nvidia-cuda-nvrtc, or rasterizer=reference"
+            "Try: pip install nvidia-cuda-nvrtc"
         )
     architecture = choose_architecture(capability, compiler)
     name = f"rasterizer-{_key(compiler)}-sm{architecture}"
@@ -198,10 +198,7 @@ def _fetch(compiler: Compiler, what: str, program: ctypes.c_void_p) -> bytes:
 def _check(library: ctypes.CDLL, status: int, log: str = "") -> None:
     if status != 0:
         reason = library.nvrtcGetErrorString(status).decode()
-        raise UserError(
-            f"rasterizer=cuda: NVRTC reports {reason}. {log}\nTry: pip install --force-reinstall torch, "
-            "or rasterizer=reference"
-        )
+        raise UserError(f"rasterizer=cuda: NVRTC reports {reason}. {log}\nTry: rasterizer=reference")
 
 
 def _key(compiler: Compiler) -> str:

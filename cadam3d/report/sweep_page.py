@@ -110,10 +110,10 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None) -> Path:
     ``UserError`` if the folder holds no sweep and if a file cannot be written.
     """
     if not is_sweep(sweep_folder):
-        raise UserError(f"{sweep_folder}: expected a sweep, got another folder. Try: cadam3d sweep")
+        raise UserError(f"{sweep_folder}: expected a sweep, got another folder. Try: cadam3d sweep --help")
     plan, results = read_plan(sweep_folder), read(sweep_folder)
     if not results:
-        raise UserError(f"{sweep_folder}: expected a sweep with jobs, got none. Try: cadam3d sweep")
+        raise UserError(f"{sweep_folder}: expected a sweep with jobs, got none. Try: cadam3d sweep --help")
     kinds = _kinds(results)
     names = plan.figures if names is None else names
     folder = sweep_folder / FIGURES

@@ -4,6 +4,7 @@ import difflib
 import re
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 
 import yaml  # comes with OmegaConf
 from hydra.errors import CompactHydraException, MissingConfigException, OverrideParseException
@@ -11,8 +12,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
 from cadam3d.core.errors import UserError
+from cadam3d.io.reading import read_yaml
+from cadam3d.io.run_folder import HYDRA_SETTINGS, OVERRIDES
 from cadam3d.settings.compose import NO_NAME_COMPLAINT, compose, config_dir, flatten, quote
-from cadam3d.settings.line import key_of
+from cadam3d.settings.line import key_of, quoted, text_of
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
 # The package of each option of hydra/launcher that Hydra itself lacks.
@@ -51,9 +54,12 @@ def did_you_mean(word: str, known: Sequence[str]) -> list[str]:
     return [by_lower[match] for match in matches]
 
 
-def explain(error: BaseException, command: str, words: Sequence[str]) -> UserError | None:
+def explain(
+    error: BaseException, command: str, words: Sequence[str], settings: Sequence[str] | None = None
+) -> UserError | None:
     """Return the message for an exception that was raised while composing ``cadam3d <command> <words>``.
 
+    ``settings`` are the overrides of the job of a sweep that cannot be composed; None means ``words``.
     Returns None for an exception that neither Hydra nor OmegaConf raises, because that is a bug.
     """
     reason: UserError | None = None
@@ -65,18 +71,18 @@ def explain(error: BaseException, command: str, words: Sequence[str]) -> UserErr
         case MissingValuesError():
             reason = _missing_values(error.keys, command, words)
         case MissingConfigException():
-            reason = _unknown_option(error)
+            reason = _unknown_option(error, command, words)
         case OverrideParseException():
             reason = _unreadable(error.override, str(error).splitlines()[0])
         case ValueError() if str(error).startswith(NO_NAME_COMPLAINT):
-            reason = _no_name(str(error), words)
+            reason = _no_name(str(error), command, words)
         case InterpolationResolutionError():
-            reason = _unresolved(error, command)
+            reason = _unresolved(error, command, words)
         case yaml.YAMLError() | UnicodeDecodeError() | RecursionError():
             text = " ".join(str(error).split())
             reason = UserError(f"configuration: cannot be read ({text}). Try: cadam3d {command} --help")
         case CompactHydraException() | OmegaConfBaseException():
-            reason = _reworded(error, command, words)
+            reason = _reworded(error, command, words, settings)
     return reason
 
 
@@ -97,13 +103,18 @@ def require_values(cfg: DictConfig) -> None:
         raise MissingValuesError(keys)
 
 
+def line_of(command: str, words: Sequence[str]) -> str:
+    """Return ``cadam3d <command> <words>`` as it is typed into a shell."""
+    return shlex.join(["cadam3d", command, *words])
+
+
 def _job_refused(error: RefusedJobError, command: str, words: Sequence[str]) -> UserError | None:
     """Explain why a job is refused, with its arm. Missing values are reported for the line of the sweep."""
     cause = error.__cause__
     assert cause is not None, "this exception is always raised from another one"
     if isinstance(cause, MissingValuesError):
         return _missing_values(cause.keys, command, words)
-    reason = explain(cause, "train", error.overrides)
+    reason = explain(cause, command, words, settings=error.overrides)
     return UserError(f"arm {error.arm}: {reason}") if reason and error.arm else reason
 
 
@@ -115,26 +126,30 @@ def _missing_values(keys: Sequence[str], command: str, words: Sequence[str]) -> 
     return UserError(f"{', '.join(keys)}: no value given. Try: {line}")
 
 
-def _unresolved(error: InterpolationResolutionError, command: str) -> UserError:
-    """Explain that a value refers to a setting that does not exist."""
+def _unresolved(error: InterpolationResolutionError, command: str, words: Sequence[str]) -> UserError:
+    """Explain that a value refers to a setting that does not exist, with the line without that value."""
     key = error.full_key or "a setting"
     reason = str(error).splitlines()[0]
-    return UserError(f"{key}: {reason}. Try: a plain value; cadam3d {command} --cfg job lists the keys")
+    kept = [word for word in words if key_of(word) != key]
+    line = line_of(command, kept if len(kept) < len(words) else ["--cfg", "job"])
+    return UserError(f"{key}: {reason}. Try: {line}")
 
 
-def _reworded(error: Exception, command: str, words: Sequence[str]) -> UserError:
+def _reworded(
+    error: Exception, command: str, words: Sequence[str], settings: Sequence[str] | None
+) -> UserError:
     """Explain an exception of which only the text shows what is wrong."""
     text = str(error).strip() or str(error.__cause__ or "")
     if key := re.search(r"Could not override '([^']+)'", text):
-        return _unknown_key(key.group(1), command, words)
+        return _unknown_key(key.group(1), command, words, settings)
     if sweep := re.search(SWEEP_COMPLAINT, text, re.M):
-        return _several_values(sweep.group(1))
+        return _several_values(sweep.group(1), command, words)
     cause = error.__cause__
     detail = f" ({str(cause).splitlines()[0]})" if isinstance(cause, OmegaConfBaseException) else ""
     return UserError(f"{' '.join(text.split()).rstrip('.')}{detail}. Try: cadam3d {command} --help")
 
 
-def _unknown_option(error: MissingConfigException) -> UserError:
+def _unknown_option(error: MissingConfigException, command: str, words: Sequence[str]) -> UserError:
     """Explain that a group lacks the chosen option, or that the command itself has no YAML."""
     path = error.missing_cfg_file or ""
     group, _, option = path.rpartition("/")
@@ -144,42 +159,117 @@ def _unknown_option(error: MissingConfigException) -> UserError:
     options = sorted(error.options or (file.stem for file in (config_dir() / group).glob("*.yaml")))
     if not group or not options:
         return UserError(f"{path}: no such configuration in {config_dir()}. Try: cadam3d doctor")
-    best = (did_you_mean(option, options) or options)[0]
-    return UserError(f"{group}: expected one of {'|'.join(options)}, got {option!r}. Try: {group}={best}")
+    near = did_you_mean(option, options)
+    best = near[0] if near else _default_option(group, command) or options[0]
+    if all(key_of(word) != group for word in words) and (run := _resumed_run(words)):
+        folder = _config_folder(run) or "DIR"
+        return UserError(
+            f"{group}: the run in {run} uses {option!r}, an option from a folder that was given with "
+            f"--config-dir. Try: {line_of(command, [*words, f'--config-dir={folder}'])}"
+        )
+    # The other options of a list, or of a sweep, stay.
+    typed = next((word.partition("=")[2] for word in words if key_of(word) == group), option)
+    choice = re.sub(rf"\b{re.escape(option)}\b", best.replace("\\", ""), typed)
+    example = shlex.quote(f"{group}={choice if choice != typed else best}")
+    return UserError(f"{group}: expected one of {'|'.join(options)}, got {option!r}. Try: {example}")
 
 
-def _no_name(reason: str, words: Sequence[str]) -> UserError:
+def _resumed_run(words: Sequence[str]) -> Path | None:
+    """Return the folder of the run that a line resumes, or None."""
+    text = next((text_of(quoted(word, is_sweep=False)) for word in words if key_of(word) == "resume"), "")
+    place = Path(text).expanduser()
+    return next((folder for folder in (place, *place.parents) if (folder / OVERRIDES).is_file()), None)
+
+
+def _config_folder(run: Path) -> str | None:
+    """Return the folder that --config-dir named when a run was started, if its files say so.
+
+    The files may be a stranger's. The folder appears only in a message, which the user judges.
+    """
+    try:
+        sources = read_yaml(run / HYDRA_SETTINGS)["hydra"]["runtime"]["config_sources"]
+        paths = [source["path"] for source in sources if source["provider"] == "command-line"]
+        text = str(paths[0])
+        return text if text.isprintable() and Path(text).is_dir() else None
+    except (UserError, LookupError, TypeError, ValueError, OSError):
+        return None
+
+
+def _no_name(reason: str, command: str, words: Sequence[str]) -> UserError:
     """Explain that a group has null, a number or a dict where it needs the name of an option."""
     for word in words:
         key, _, value = word.lstrip("+").partition("=")
         options = sorted(file.stem for file in (config_dir() / key).glob("*.yaml")) if key else []
         if options and value not in options and not value.startswith("["):
-            best = "none" if "none" in options else options[0]
+            best = "none" if "none" in options else _default_option(key, command) or options[0]
             return UserError(f"{key}: expected one of {'|'.join(options)}, got {value}. Try: {key}={best}")
-    return UserError(f"{reason}. Try: the name of an option instead of null")
+    return UserError(f"{reason}. Try: cadam3d {command} --help")
 
 
-def _unknown_key(key: str, command: str, words: Sequence[str]) -> UserError:
-    """Explain that a key does not exist, and look for it in another spelling or another place."""
+def _default_option(group: str, command: str) -> str | None:
+    """Return the option of a group that ``command`` uses by default; ``[]`` if it has a list of them."""
+    path = config_dir() / f"{'train' if command == 'sweep' else command}.yaml"
+    for entry in yaml.safe_load(path.read_text(encoding="utf-8")).get("defaults", []):
+        if isinstance(entry, dict) and group in entry:
+            return "[]" if isinstance(entry[group], list) else entry[group]
+    return None
+
+
+def _unknown_key(key: str, command: str, words: Sequence[str], settings: Sequence[str] | None) -> UserError:
+    """Explain that a key does not exist, and look for it in another spelling or another place.
+
+    ``settings`` are the overrides of the job that lacks the key; None means ``words``.
+    """
     if key == "grid" and command == "train":
-        name = next((word.partition("=")[2] for word in words if word.startswith("grid=")), "thresholds")
-        return UserError(
-            f"grid: grids belong to sweeps. Try: cadam3d sweep {shlex.quote('grid=' + name)} ..."
-        )
-    value = next((word.split("=", 1)[1] for word in words if word.startswith(f"{key}=")), "...")
-    if owners := _options_with(key):
+        return UserError(f"grid: grids belong to sweeps. Try: {line_of('sweep', words)}")
+    value = next((word.partition("=")[2] for word in words if key_of(word) == key), None)
+    if value is not None and (owners := _options_with(key)):
         line = f"{owners[0]} {shlex.quote(f'{key}={value}')}"
         return UserError(f"{key}: a setting of {' and '.join(owners)}, not of the chosen option. Try: {line}")
-    known = _known_keys(key, command, words)
+    known = _known(key, command, words if settings is None else settings)
+    if value is not None:
+        known = {name: node for name, node in known.items() if _fits(value, node)}
     last = key.rpartition(".")[2].lower()
     same_name = [name for name in known if name.rpartition(".")[2].lower() == last]
-    suggestions = same_name or did_you_mean(key, known)
-    if not suggestions:
-        return UserError(f"{key}: no such setting. Try: cadam3d {command} --cfg job (it lists all of them)")
-    meant = " or ".join(suggestions[:3])
-    return UserError(
-        f"{key}: no such setting. Did you mean {meant}? Try: {shlex.quote(f'{suggestions[0]}={value}')}"
-    )
+    suggestions = same_name or did_you_mean(key, list(known))
+    if suggestions and value is not None:
+        meant = " or ".join(suggestions[:3])
+        changed = [f"{suggestions[0]}={value}" if key_of(word) == key else word for word in words]
+        line = line_of(command, changed)
+        return UserError(f"{key}: no such setting. Did you mean {meant}? Try: {line}")
+    if command in ("train", "sweep") and value is not None and _is_colour(value):
+        line = line_of(command, _with_colour(value, [word for word in words if key_of(word) != key]))
+        return UserError(f"{key}: no such setting. The prompt describes colours. Try: {line}")
+    # A sweep has such a page only for a line with jobs.
+    page = "train" if command == "sweep" else command
+    return UserError(f"{key}: no such setting. Try: {line_of(page, ['--cfg', 'job'])}")
+
+
+def _is_colour(word: str) -> bool:
+    """Return whether prompts may use ``word`` as a colour."""
+    # This loads torch, so it is done only for a key that resembles no setting.
+    from cadam3d.prior.shapes.vocabulary import COLOURS
+
+    return word in COLOURS
+
+
+def _with_colour(colour: str, words: Sequence[str]) -> list[str]:
+    """Return ``words`` with a colour in the prompt, after its article if it begins with one."""
+    changed, prompts = list(words), [word for word in words if key_of(word) == "prompt"]
+    if not prompts:
+        return [*changed, f"prompt=a {colour} torus"]
+    text = prompts[0].partition("=")[2]
+    changed[changed.index(prompts[0])] = "prompt=" + re.sub(r"^((?:an? |the )?)", rf"\1{colour} ", text)
+    return changed
+
+
+def _fits(value: str, node: object) -> bool:
+    """Return whether the text ``value`` may be meant for a setting whose present value is ``node``.
+
+    Only a word for a setting that holds numbers or a truth value is refused; all else may be a mistake.
+    """
+    is_word = re.fullmatch(r"[A-Za-z]\w*", value) and value.lower() not in ("true", "false", "null")
+    return not is_word or not isinstance(node, bool | int | float | list | dict)
 
 
 def _options_with(key: str) -> list[str]:
@@ -198,17 +288,20 @@ def _options_with(key: str) -> list[str]:
     return owners
 
 
-def _known_keys(wrong: str, command: str, words: Sequence[str]) -> list[str]:
-    """Return every key of the configuration, with the options that the user has chosen if those compose."""
+def _known(wrong: str, command: str, words: Sequence[str]) -> dict[str, object]:
+    """Return every key of the configuration with its value.
+
+    The options that the user has chosen are taken into account if they compose.
+    """
     choices = [word for word in words if CHOICE.fullmatch(word) and not word.startswith(f"{wrong}=")]
     for attempt in (choices, []):
         try:
-            cfg = compose(attempt, command)
+            cfg = compose(attempt, "train" if command == "sweep" else command)
         except (CompactHydraException, OmegaConfBaseException):
             continue
-        keys = [key for key, _ in flatten(OmegaConf.to_container(cfg, resolve=False), with_nodes=True)]
-        return [key for key in keys if not key.rpartition(".")[2].startswith("_")]
-    return []
+        keys = flatten(OmegaConf.to_container(cfg, resolve=False), with_nodes=True)
+        return {key: value for key, value in keys if not key.rpartition(".")[2].startswith("_")}
+    return {}
 
 
 def _unreadable(override: str, reason: str) -> UserError:
@@ -219,10 +312,14 @@ def _unreadable(override: str, reason: str) -> UserError:
     return UserError(f"{key}: cannot read the value ({reason}). Try: {typed}")
 
 
-def _several_values(override: str) -> UserError:
+def _several_values(override: str, command: str, words: Sequence[str]) -> UserError:
     """Explain that several values need a sweep, or brackets if they are one list."""
     key, _, value = override.partition("=")
-    return UserError(
-        f"{key}: several values make a sweep. Try: cadam3d sweep {shlex.quote(override)} ... "
-        f"(a list is {shlex.quote(f'{key}=[{value}]')})"
-    )
+    example = shlex.quote(f"{key}=[{value}]")
+    if isinstance(_known(key, command, words).get(key), list):
+        return UserError(f"{key}: a list has brackets. Try: {example}")
+    if command not in ("train", "sweep"):
+        first = shlex.quote(f"{key}={value.partition(',')[0]}")
+        return UserError(f"{key}: expected one value, got {value!r}. Try: {first}")
+    line = line_of("sweep", words)
+    return UserError(f"{key}: several values make a sweep (a list is {example}). Try: {line}")

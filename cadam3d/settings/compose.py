@@ -1,6 +1,8 @@
 """Compose: read the YAML files, apply the overrides of a command line, and build the objects."""
 
+import difflib
 import re
+import shlex
 import unicodedata
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -83,11 +85,18 @@ def require_files(folder: Path, flag: str) -> None:
     Reading a named pipe would never end. Only the folders of groups are searched.
     """
     if not folder.is_dir():
-        raise UserError(f"{flag}: expected a folder, got {str(folder)!r}. Try: cadam3d train --help")
+        raise UserError(f"{flag}: expected a folder, got {str(folder)!r}. Try: {_folder_like(flag, folder)}")
     groups = [path.relative_to(config_dir()) for path in config_dir().rglob("*") if path.is_dir()]
     for path in [path for group in (Path(), *groups) for path in (folder / group).glob("*.yaml")]:
         if path.exists() and not path.is_file() and not path.is_dir():
             raise UserError(f"{flag}: {path} is not a regular file. Try: cadam3d train --help")
+
+
+def _folder_like(flag: str, missing: Path) -> str:
+    """Return the flag for the folder whose name is nearest to ``missing``, or for the current folder."""
+    beside = sorted(place.name for place in missing.parent.glob("*/") if place.is_dir())
+    near = difflib.get_close_matches(missing.name, beside, n=1)
+    return shlex.quote(f"{flag}={missing.with_name(near[0]) if near else '.'}")
 
 
 def component(node: Any, kind: type = object, key: str = "") -> Any:
@@ -107,7 +116,7 @@ def component(node: Any, kind: type = object, key: str = "") -> Any:
     except OmegaConfBaseException as error:
         reason = str(error.msg).splitlines()[0]
         raise UserError(
-            f"{error.full_key or 'configuration'}: {reason}. Try: another value; --cfg job lists the keys"
+            f"{error.full_key or 'configuration'}: {reason}. Try: cadam3d train --cfg job"
         ) from error
 
 
@@ -217,7 +226,7 @@ def _construction_error(error: InstantiationException) -> BaseException:
     if isinstance(cause, UserError):
         return _placed(cause, where)
     if cause is None:
-        return UserError(f"{where}: {str(error).splitlines()[0]}. Try: --cfg job, which lists the keys")
+        return UserError(f"{where}: {str(error).splitlines()[0]}. Try: cadam3d train --cfg job")
     return cause
 
 

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
-from cadam3d.settings.advice import did_you_mean
+from cadam3d.settings.advice import did_you_mean, line_of
 from cadam3d.settings.compose import VERSION_BASE, compose, config_dir, quote, register_resolvers
 from cadam3d.settings.declared import TARGET, replacement
 from cadam3d.settings.line import RUN_FOLDER, key_of
@@ -38,7 +38,7 @@ def read_flags(flags: Sequence[str]) -> Namespace:
     options = parser.parse_args(list(flags))
     modes = [options.run, options.multirun and not options.cfg, bool(options.cfg), options.info is not None]
     if sum(map(bool, modes)) > 1:
-        raise UserError(f"{' '.join(flags)}: these flags cannot be combined. Try: only one of them")
+        raise UserError(f"{' '.join(flags)}: these flags cannot be combined. Try: cadam3d --help")
     return options
 
 
@@ -61,10 +61,10 @@ def refuse_missing_settings(cfg: DictConfig, command: str, overrides: Sequence[s
     for override in overrides:
         key = key_of(override)
         if override.startswith("~") and "." not in key and "/" not in key and key not in cfg:
-            raise UserError(
-                f"~{key}: a setting can be changed but not removed. "
-                f"Try: cadam3d {command} without it; cadam3d {command} --help lists the choices"
-            )
+            rest = [other for other in overrides if other != override]
+            # A job of a sweep is also a line of train.
+            line = line_of("train" if command == "sweep" else command, rest)
+            raise UserError(f"~{key}: a setting can be changed but not removed. Try: {line}")
     raw = OmegaConf.to_container(cfg, resolve=False)
     assert isinstance(raw, dict)
     # Plain values come first, so that the message names the wrong value and not a setting that refers to it.

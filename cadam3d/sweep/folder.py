@@ -108,7 +108,8 @@ def read_plan(sweep: Path) -> Plan:
     except (TypeError, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(
-            f"{sweep / JOBS}: not the plan of a sweep ({reason}). Try: run the command of the sweep again"
+            f"{sweep / JOBS}: not the plan of a sweep ({reason}); the command of the sweep writes it again. "
+            "Try: cadam3d sweep --help"
         ) from error
 
 

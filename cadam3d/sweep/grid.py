@@ -30,7 +30,8 @@ ALWAYS_SHOWN = ("prompt", "seed")
 # Each job starts a process, which takes seconds, and is a row of a table. With this many jobs, the starts
 # alone take a day, and the table is too long to read.
 MOST_JOBS = 10_000
-EXAMPLE = "{each: {seed: [0, 1]}, arms: {mine: {densifier: cadam}}}"
+# Lists the grids of the package, for messages about one that cannot be read.
+EXAMPLE = "cadam3d sweep --help grid"
 
 
 @dataclass(frozen=True)
@@ -87,14 +88,16 @@ def read_grid(node: Any) -> Grid:
         return Grid(each={}, arms={"": {}})
     if not isinstance(node, dict) or not node or not node.keys() <= {"each", "arms", "figures"}:
         got = "|".join(map(str, node)) if isinstance(node, dict) else node
-        raise UserError(f"grid: expected each, arms and figures, got {got}. Try: a file with {EXAMPLE}")
+        raise UserError(f"grid: expected each, arms and figures, got {got}. Try: {EXAMPLE}")
     arms = node.get("arms")
     arms = {"": {}} if arms is None else arms
     if not isinstance(arms, dict) or not arms:
-        raise UserError(f"grid.arms: expected named arms, got {arms}. Try: a file with {EXAMPLE}")
+        raise UserError(f"grid.arms: expected named arms, got {arms}. Try: {EXAMPLE}")
     figures = node.get("figures")
     if figures is not None and not (isinstance(figures, list) and all(isinstance(f, str) for f in figures)):
-        raise UserError(f"grid.figures: expected a list of names, got {figures}. Try: figures: [frontier]")
+        raise UserError(
+            f"grid.figures: expected a list of names, got {figures}. Try: 'grid.figures=[frontier]'"
+        )
     return Grid(
         each=_axes(node.get("each"), "grid.each"),
         arms={str(name): _axes(axes, f"grid.arms.{name}") for name, axes in arms.items()},
@@ -154,7 +157,7 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
                 if other.arm != name and (causes := [key for key in axes if key in line]):
                     raise UserError(
                         f"{causes[0]}: the arms {other.arm} and {name} differ in this setting, so the line "
-                        f"cannot set it for both. Try: '~grid.arms.{name}', or without {causes[0]}="
+                        f"cannot set it for both. Leave out {causes[0]} or an arm. Try: '~grid.arms.{name}'"
                     )
     return list(found.values())
 
@@ -184,14 +187,16 @@ def _axes(node: Any, where: str) -> Axes:
     if node is None:
         return {}
     if not isinstance(node, dict):
-        raise UserError(f"{where}: expected keys with values, got {node!r}. Try: {where}={{seed: [0, 1]}}")
+        raise UserError(
+            f"{where}: expected keys with values, got {node!r}. Try: '++{where}={{seed: [0, 1]}}'"
+        )
     return {str(key).lstrip("+"): _axis(str(key), value, where) for key, value in node.items()}
 
 
 def _axis(key: str, value: Any, where: str) -> list[AxisValue]:
     values = value if isinstance(value, list) else [value]
     if not values:
-        raise UserError(f"{where}: {key} has no values. Try: at least one")
+        raise UserError(f"{where}: {key} has no values. Try: {EXAMPLE}")
     return [_setting(f"{key}={_grammar(key, each)}") for each in values]
 
 

@@ -14,7 +14,7 @@ from omegaconf.errors import InterpolationResolutionError
 
 from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
-from cadam3d.settings.advice import RefusedJobError, require_values
+from cadam3d.settings.advice import RefusedJobError, line_of, require_values
 from cadam3d.settings.compose import flatten
 from cadam3d.settings.declared import require_settings
 from cadam3d.settings.hydra import compose_line, refuse_missing_settings, refuse_unread_settings
@@ -27,9 +27,7 @@ LAUNCHER_KEY = re.compile(r"launcher($|\.)|hydra[./]launcher($|\.)")
 GRID_KEY = re.compile(r"grid($|\.)")
 DRY_RUN = "dry_run"
 REFUSED_KEY = re.compile(r"hydra\.run\.dir$|hydra\.sweep\.subdir$|hydra[./]sweeper($|\.)")
-NOTHING_TO_SWEEP = (
-    "sweep: nothing to sweep over. Try: cadam3d sweep grid=thresholds ... or densifier=baseline,cadam"
-)
+NOTHING_TO_SWEEP = "sweep: nothing to sweep over. Try: densifier=baseline,cadam"
 
 
 @dataclass(frozen=True)
@@ -183,9 +181,9 @@ def sort_overrides(overrides: Sequence[str]) -> Parts:
     for override in overrides:
         key = key_of(override)
         if REFUSED_KEY.match(key):
-            raise UserError(
-                f"{key}: not for sweeps. Try: {SWEEP_FOLDER}=multirun/mine, the folder of all jobs"
-            )
+            kept = [other for other in overrides if key_of(other) not in (key, SWEEP_FOLDER)]
+            line = line_of("sweep", [*kept, f"{SWEEP_FOLDER}=multirun/mine"])
+            raise UserError(f"{key}: not for sweeps; their jobs share one folder. Try: {line}")
         if key == "hydra.mode":
             continue
         if GRID_KEY.match(key) or key == DRY_RUN:

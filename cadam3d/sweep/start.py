@@ -171,7 +171,7 @@ def _folder(sweep: Sweep) -> Path:
     if sweep.parts.folder:
         text = OmegaConf.select(sweep.cfg, SWEEP_FOLDER)
         if not text:
-            example = f"{SWEEP_FOLDER}={place}, or leave it out"
+            example = shlex.quote(f"{SWEEP_FOLDER}={place}")
             raise UserError(f"{SWEEP_FOLDER}: expected a folder, got nothing. Try: {example}")
         place = expanded(str(text))
     _refuse_occupied(place)
@@ -184,8 +184,12 @@ def _refuse_occupied(folder: Path) -> None:
     if has_file(folder, OVERRIDES) or holds_run(folder):
         name = "a run"
     if name is not None and not is_sweep(folder):
-        line = setting_word(SWEEP_FOLDER, shown(numbered(folder)))
-        raise UserError(f"{SWEEP_FOLDER}: {shown(folder)} holds {name}. Try: {line}")
+        raise UserError(f"{SWEEP_FOLDER}: {shown(folder)} holds {name}. Try: {_beside(folder)}")
+
+
+def _beside(folder: Path) -> str:
+    """Return the words that choose a new folder beside ``folder`` for a sweep."""
+    return setting_word(SWEEP_FOLDER, shown(numbered(folder)))
 
 
 def _planned(sweep: Sweep, composed: Sequence[Composed]) -> list[PlannedJob]:
@@ -212,8 +216,8 @@ def _refuse_other_settings(folder: Path, rows: Sequence[Row], composed: Sequence
             if before.get(key) != now.values.get(key):
                 raise UserError(
                     f"{key}: was {before.get(key)} in {shown(row.folder)}, is {now.values.get(key)} now. "
-                    f"Try: {SWEEP_FOLDER}={shown(numbered(folder))}, which is another folder, "
-                    "or the earlier settings"
+                    "The earlier settings or another folder are possible. "
+                    f"Try: {_beside(folder)}"
                 )
 
 

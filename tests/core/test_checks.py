@@ -91,8 +91,27 @@ def test_a_value_equal_to_a_choice_but_of_another_type_is_refused(value, choices
 
 def test_a_refused_choice_lists_the_options():
     require_choice("prior", "tiny", ["shapes", "tiny"])
-    with pytest.raises(UserError, match=r"prior: expected one of shapes\|tiny, got 'tin'. Try: prior=shapes"):
+    with pytest.raises(UserError, match=r"prior: expected one of shapes\|tiny, got 'tin'. Try: prior=tiny"):
         require_choice("prior", "tin", ["shapes", "tiny"])
+
+
+@pytest.mark.parametrize(
+    ("value", "choices", "suggested"),
+    [
+        ("tinny", ("shapes", "tiny"), "tiny"),
+        ("everybody", ("unreliable", "all", "none"), "unreliable"),
+        ("nome", ("unreliable", "all", "none"), "none"),
+        (91, (0, 90, 180), "90"),
+        (0, (True, False), "false"),
+        ("no", (True, False), "true"),
+        (float("nan"), range(4), "0"),
+        (None, ("a", "b"), "a"),
+    ],
+)
+def test_a_refused_choice_is_answered_with_the_nearest_one_or_the_first(value, choices, suggested):
+    with pytest.raises(UserError) as raised:
+        require_choice("key", value, choices)
+    assert str(raised.value).endswith(f"Try: key={suggested}")
 
 
 def test_a_colour_is_three_numbers_between_zero_and_one():

@@ -34,7 +34,7 @@ def test_the_file_has_padded_spherical_harmonics(tmp_path):
 
 
 def test_wrong_values_name_their_key():
-    with pytest.raises(UserError, match=r"exporter\.ply\.up=-y"):
+    with pytest.raises(UserError, match=r"exporter\.ply\.up=\+z"):
         PlyExporter(up="z", pad_sh=0)
     with pytest.raises(UserError, match=r"exporter\.ply\.pad_sh: expected one of 0\|1\|2\|3"):
         PlyExporter(up="-y", pad_sh=4)

@@ -153,7 +153,7 @@ def test_an_asset_with_numbers_that_are_not_finite_is_refused(tmp_path, name):
 
 
 def test_an_empty_asset_is_refused(tmp_path):
-    with pytest.raises(UserError, match=r"which is empty\. Try: initializer\.path="):
+    with pytest.raises(UserError, match=r"which is empty\. Try: cadam3d train --help initializer=ply$"):
         build(saved(tmp_path, some_gaussians(n=0)))
 
 
@@ -249,7 +249,7 @@ def test_points_that_are_not_finite_are_refused(tmp_path):
 
 def test_a_mesh_is_refused_with_the_initializer_to_use(tmp_path):
     trimesh.creation.box().export(tmp_path / "box.ply")
-    with pytest.raises(UserError, match=r"which is a mesh\. Try: initializer=mesh 'initializer\.path=.*box"):
+    with pytest.raises(UserError, match=r"which is a mesh\. Try: initializer=mesh initializer\.path=.*box"):
         build(tmp_path / "box.ply")
 
 

@@ -151,11 +151,17 @@ def test_a_surface_is_covered_in_proportion_to_its_area():
     torch.testing.assert_close(weights.mean(dim=0), torch.full((3,), 1 / 3), atol=0.01, rtol=0)
 
 
-def test_a_missing_file_and_a_folder_are_refused_with_the_line_to_type(tmp_path):
+@pytest.mark.parametrize("has_another", [False, True])
+def test_a_missing_file_and_a_folder_are_refused_with_the_line_to_type(has_another, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    hint = r"cadam3d train --help initializer=ply$"
+    if has_another:
+        (tmp_path / "another.ply").touch()
+        hint = r"initializer\.path=.*another\.ply$"
     for path, what in ((tmp_path / "nothing.ply", "does not exist"), (tmp_path, "is a folder")):
-        pattern = rf"^initializer\.path: expected a file, got '.*', which {what}\. Try: initializer\.path=a"
+        pattern = rf"^initializer\.path: expected a file, got '.*', which {what}\. Try: {hint}"
         with pytest.raises(UserError, match=pattern):
-            found_file(str(path), "a.ply")
+            found_file(str(path), "ply", [".ply"])
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
@@ -174,4 +180,4 @@ def test_a_path_that_is_no_file_is_one_message(tmp_path, monkeypatch, name, what
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe")
     with pytest.raises(UserError, match=f"initializer.path: expected a file, .* {what}"):
-        found_file(name, "a.ply")
+        found_file(name, "ply", [".ply"])

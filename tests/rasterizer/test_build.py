@@ -139,7 +139,7 @@ def test_two_processes_that_build_at_once_both_get_a_library(fake_compiler, tmp_
 
 def test_a_missing_compiler_is_reported_with_what_to_install(tmp_path, monkeypatch):
     remove_compilers(monkeypatch)
-    with pytest.raises(UserError, match=r"apt install g\+\+.*'cadam3d\[compiler\]'.*rasterizer=reference"):
+    with pytest.raises(UserError, match=r"apt install g\+\+.*'cadam3d\[compiler\]'"):
         build(tmp_path)
 
 

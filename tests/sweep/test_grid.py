@@ -209,5 +209,5 @@ def test_an_invalid_grid_is_refused(node, expected):
 
 
 def test_an_interval_is_refused():
-    with pytest.raises(UserError, match=r"one by one, got an interval. Try: seed=range"):
+    with pytest.raises(UserError, match=r"one by one, got an interval. Try: 'seed=range"):
         read_line(["seed=interval(0,1)"])

@@ -305,8 +305,8 @@ def test_other_settings_in_the_same_folder_are_refused_with_the_key(sweep, calls
     assert result.code == 1
     assert result.err.startswith(f"cadam3d: optimizer.steps: was 5 in {folder}/baseline_a-cube_")
     assert result.err.endswith(
-        ", is 9 now. Try: hydra.sweep.dir=multirun/densifiers-2, which is another folder, "
-        "or the earlier settings\n"
+        ", is 9 now. The earlier settings or another folder are possible. "
+        "Try: hydra.sweep.dir=multirun/densifiers-2\n"
     )
     assert (folder / "sweep.csv").read_bytes() == table
     assert not Path("multirun/densifiers-2").exists()
