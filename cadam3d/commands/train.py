@@ -25,6 +25,7 @@ from cadam3d.commands.messages import keeping_others, note, note_backend
 from cadam3d.commands.timetable import describe
 from cadam3d.core.checks import require, require_whole
 from cadam3d.core.device import resolve_device
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import CAMERA, PIXEL, require_memory
 from cadam3d.core.render import RenderFn
@@ -81,7 +82,6 @@ def run(cfg: DictConfig) -> float | None:
 
     # Everything that can be refused is refused here, before the folder changes.
     trainer = build_trainer(cfg, device)
-    require_views(cfg)
     backend = trainer.rasterizer.prepare(device)
     exporters: dict[str, Exporter] = components(cfg.exporter, Exporter, "exporter")
     metrics: dict[str, Metric] = components(cfg.metric, Metric, "metric")
@@ -184,6 +184,7 @@ def require_views(cfg: DictConfig) -> None:
 def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
     """Build the components that ``cfg`` names, and move the prior to ``device``."""
     require_whole("steps", cfg.steps, low=1, high=FAR_STEP, example=600)
+    require_views(cfg)
     refine: Refine = component(cfg.refine, Refine, "refine")
     require(
         refine.steps == cfg.steps,
