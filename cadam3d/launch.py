@@ -13,9 +13,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.run_folder import expanded
+from cadam3d.io.run_folder import OVERRIDES, expanded
 from cadam3d.settings.advice import explain, line_of, require_values, reraise_interrupt
-from cadam3d.settings.compose import TEXT_KEYS, config_dir
+from cadam3d.settings.compose import LONGEST_KEY, TEXT_KEYS, config_dir
 from cadam3d.settings.declared import require_settings
 from cadam3d.settings.help_page import help_text
 from cadam3d.settings.hydra import (
@@ -105,6 +105,11 @@ def launch(command: str, words: Sequence[str]) -> int:
 def read_line(command: str, overrides: list[str], flags: list[str], options: Namespace) -> Line:
     """Parse a line: quote its overrides and, if it resumes a run, add the overrides of that run."""
     _refuse_bare_words(command, overrides, flags)
+    for override in overrides:
+        if len(key := key_of(override)) > LONGEST_KEY:
+            expected = f"a key of at most {LONGEST_KEY} characters"
+            line = f"cadam3d {command} --help"
+            raise UserError(f"{key[:40]}...: expected {expected}, got {len(key)} of them. Try: {line}")
     trusting = shlex.join(["cadam3d", command, *overrides, *flags, "trust=true"])
     is_sweep = command == "sweep" or options.multirun or "hydra.mode=MULTIRUN" in overrides
     if is_sweep and command not in TRAINING:

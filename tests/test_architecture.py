@@ -4,6 +4,7 @@
 """
 
 import ast
+import builtins
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
@@ -366,3 +367,28 @@ def test_only_one_module_spells_the_names_of_files_in_a_run_folder(path):
     tree = ast.parse(path.read_text(encoding="utf-8"))
     spelled = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
     assert not spelled & FILE_NAMES
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_every_name_is_defined(path):
+    """The linter cannot check this, because the shapes in type hints look like undefined names."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    known = {*vars(builtins), "__file__"}
+    for node in ast.walk(tree):
+        match node:
+            case ast.Import() | ast.ImportFrom():
+                known |= {(each.asname or each.name).partition(".")[0] for each in node.names}
+            case ast.FunctionDef() | ast.ClassDef():
+                known.add(node.name)
+            case ast.arg():
+                known.add(node.arg)
+            case ast.Name(ctx=ast.Store()):
+                known.add(node.id)
+            case (
+                ast.ExceptHandler(name=str(name))
+                | ast.MatchAs(name=str(name))
+                | ast.MatchStar(name=str(name))
+            ):
+                known.add(name)
+    used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    assert not used - known

@@ -32,6 +32,8 @@ NO_NAME_COMPLAINT = "Config group override must be a string or a list"
 TEXT_KEYS = ("prompt", "negative_prompt")
 # Characters. At three bytes each they still fit into a file name.
 SLUG_LENGTH = 60
+# Characters of a key. Hydra looks for a folder with the name of every key.
+LONGEST_KEY = 200
 
 
 def compose(

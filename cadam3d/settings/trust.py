@@ -36,7 +36,7 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d.core import schedule
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import KINDS, read_yaml
-from cadam3d.settings.compose import config_dir, escaped
+from cadam3d.settings.compose import LONGEST_KEY, config_dir, escaped
 
 TARGET = "_target_"
 LISTS = (list, tuple)  # OmegaConf makes lists of both
@@ -206,6 +206,8 @@ def _judged(line: str, folders: Sequence[Path]) -> tuple[Override | None, str]:
         return None, "key=value"
     key = override.key_or_group
     written = OVERRIDE.fullmatch(line)
+    if len(key) > LONGEST_KEY:
+        return override, f"a key of at most {LONGEST_KEY} characters"
     is_group = any((folder / key).is_dir() for folder in folders)
     expected = ""
     # A package (group@package=option) is not part of this key, so it is refused here too.

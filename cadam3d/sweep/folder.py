@@ -3,6 +3,7 @@
 No state is kept elsewhere. However a sweep ends, its state can be read from this folder.
 """
 
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,6 +17,8 @@ from cadam3d.io.run_folder import JOBS, has_checkpoint
 
 # The outcome of a job that waits, runs, or has ended without a summary.
 UNFINISHED = "unfinished"
+# Bytes of a file name, in almost every file system.
+LONGEST_NAME = 255
 MOST_THREADS = 1 << 16
 RESULTS = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.VANISHED, Outcome.OUT_OF_MEMORY)
 
@@ -130,6 +133,7 @@ def _require_plan(content: Any) -> None:
         # A name that leads elsewhere would let the sweep write there.
         folder = job["folder"]
         is_inside = _is_text(folder) and folder not in ("", ".", "..") and not set("/\\") & set(folder)
+        is_inside = is_inside and len(os.fsencode(folder)) <= LONGEST_NAME
         _require(is_inside, "folder: expected the name of a folder in that of the sweep")
     folders = [job["folder"] for job in content["jobs"]]
     _require(len(set(folders)) == len(folders), "folder: expected a different name for each job")
@@ -151,12 +155,6 @@ def _are_texts(value: Any) -> bool:
 def write_plan(sweep: Path, plan: Plan) -> None:
     """Write ``jobs.json`` atomically."""
     write_json(sweep / JOBS, asdict(plan))
-
-
-def _require_inside(name: str) -> None:
-    """Raise ``ValueError`` unless ``name`` is that of a folder directly inside the folder of the sweep."""
-    if name in ("", ".", "..") or {"/", "\\", "\0"} & set(name):
-        raise ValueError(f"{name!r} is not the name of a folder")
 
 
 def is_complete(summary: dict[str, Any]) -> bool:
