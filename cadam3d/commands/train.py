@@ -184,7 +184,6 @@ def require_views(cfg: DictConfig) -> None:
 def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
     """Build the components that ``cfg`` names, and move the prior to ``device``."""
     require_whole("steps", cfg.steps, low=1, high=FAR_STEP, example=600)
-    require_views(cfg)
     refine: Refine = component(cfg.refine, Refine, "refine")
     require(
         refine.steps == cfg.steps,
