@@ -178,7 +178,8 @@ def _train(cfg: DictConfig, line: Line, task: Task) -> None:
         example = f"{RUN_FOLDER}=outputs/mine"
         raise UserError(f"{RUN_FOLDER}: expected a folder, got nothing. Try: {example}")
     wanted = expanded(str(text))
-    is_chosen = any(key_of(override) == RUN_FOLDER for override in line.overrides)
+    # No numbered folder can be made beside ".", which hydra=tool sets.
+    is_chosen = not wanted.name or any(key_of(override) == RUN_FOLDER for override in line.overrides)
     resume = Path(str(cfg.resume)) if cfg.resume else None
     with occupied(wanted, is_chosen=is_chosen, resume=resume) as folder:
         place_run(cfg, folder)

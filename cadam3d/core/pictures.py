@@ -12,6 +12,9 @@ from cadam3d.core.cameras import Cameras, orbit, turntable
 from cadam3d.core.checks import are_numbers, require, require_color, require_range, require_whole
 from cadam3d.core.memory import CAMERA, PIXEL, require_memory
 
+# Pictures of one asset; far more than anyone looks at.
+MOST_VIEWS = 100_000
+
 
 @dataclass(frozen=True, kw_only=True)
 class PictureSettings:
@@ -61,7 +64,7 @@ class PictureSettings:
 
         ``bytes_each`` is the memory that every view needs until all are done, in addition to its camera.
         """
-        require_whole(f"{self.node}.views", views, low=1, example=example)
+        require_whole(f"{self.node}.views", views, low=1, high=MOST_VIEWS, example=example)
         require_memory(f"{self.node}.views", views, unit=CAMERA + bytes_each, example=example)
 
     def require_angles(self, name: str, angles_deg: object, *, limit: int, example: int) -> None:

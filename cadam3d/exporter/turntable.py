@@ -23,7 +23,6 @@ from cadam3d.io.video import write_video
 HIGHEST_FPS = 240
 # With a second picture beside it, such a frame is as wide as libx264 allows.
 LARGEST = 8192  # pixels
-LONGEST = 100_000  # frames
 VIEWS_AT_ONCE = 4  # bounds the memory of rendering for a video of any length
 
 
@@ -40,7 +39,7 @@ class TurntableExporter(PictureSettings, Exporter):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_whole("exporter.turntable.views", self.views, low=1, high=LONGEST, example=60)
+        self.require_views(self.views, example=60)
         require_range("exporter.turntable.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
         require_whole("exporter.turntable.fps", self.fps, low=1, high=HIGHEST_FPS, example=30)
         require_choice("exporter.turntable.beside", self.beside, ("depth", "alpha", "none"))

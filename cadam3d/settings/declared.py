@@ -18,6 +18,7 @@ import yaml  # comes with OmegaConf
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
+from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 
 Kinds = tuple[type, ...]  # a value must be of one of them
@@ -66,12 +67,18 @@ def config_dir() -> Path:
     return packaged if packaged.is_dir() else package.parent / "configs"
 
 
-def require_settings(cfg: DictConfig) -> None:
-    """Raise ``UserError`` unless all settings outside of components have values of their types."""
-    for name in sorted(SETTINGS.keys() & cfg.keys()):
-        if not _fits(cfg[name], SETTINGS[name], name):
+def require_settings(values: Mapping[Any, Any]) -> None:
+    """Raise ``UserError`` unless all settings outside of components have values of their types.
+
+    ``values`` has the value of each setting by its name. A prompt needs something to make.
+    """
+    for name in sorted(SETTINGS.keys() & values.keys()):
+        if not _fits(values[name], SETTINGS[name], name):
             value = EXAMPLES.get(name, SPARE[_alternatives(SETTINGS[name])[0]])
-            raise _refusal(name, SETTINGS[name], cfg[name], argument(name, value))
+            raise _refusal(name, SETTINGS[name], values[name], argument(name, value))
+    if not values.get("prompt", "unused").strip():
+        example = argument("prompt", EXAMPLES["prompt"])
+        raise fail("prompt", expected="what to make", got=values["prompt"], example=example)
 
 
 def require_declared(node: Any, kind: type, key: str) -> None:

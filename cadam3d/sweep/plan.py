@@ -138,9 +138,10 @@ class Composer:
             require_values(base.cfg)
             refuse_missing_settings(base.cfg, "sweep", overrides)
             refuse_unread_settings(base.cfg, "sweep", overrides)
-            require_settings(base.cfg)
             self._bases[known] = base
-        return self._bases[known].composed(values)
+        composed = self._bases[known].composed(values)
+        require_settings(composed.values)
+        return composed
 
     def has(self, overrides: Sequence[str], key: str) -> bool:
         """Return whether a job under ``overrides`` has a setting or a group called ``key``."""
@@ -163,6 +164,8 @@ def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> tu
     # The flag --config-name is for the jobs and not for the sweep itself.
     own = Namespace(**{**vars(options), "config_name": None})
     cfg = compose_line("sweep", [*parts.grid, *parts.launcher, *parts.folder], own)
+    # A wrong setting of the launcher is found now, and not when the jobs are there.
+    OmegaConf.to_container(cfg.hydra.launcher, resolve=True)
     is_answer = isinstance(cfg[DRY_RUN], bool)
     require(is_answer, DRY_RUN, expected="true or false", got=cfg[DRY_RUN], example=f"{DRY_RUN}=true")
     node = cfg.get("grid")
