@@ -1,5 +1,6 @@
 """The folder of a run: one process at a time, nothing overwritten, and nothing left by a refused run."""
 
+import json
 import os
 import shlex
 import subprocess
@@ -123,10 +124,14 @@ def test_a_second_run_resume_or_sweep_in_the_folder_of_a_run_names_its_process(t
     finally:
         first.kill()
         first.communicate()
-    steps = [line for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines() if '"step"' in line]
-    assert len(steps) == 4
+    assert steps_in(tmp_path / "run") == [1, 2, 3, 4]
     assert type_line("train", "resume=run", "steps=6").code == 0
-    assert len((tmp_path / "run/metrics.jsonl").read_text().splitlines()) == 6
+    assert steps_in(tmp_path / "run") == [1, 2, 3, 4, 5, 6]
+
+
+def steps_in(run: Path) -> list[int]:
+    lines = map(json.loads, (run / "metrics.jsonl").read_text().splitlines())
+    return [line["step"] for line in lines if line["kind"] == "step"]
 
 
 def test_a_job_of_a_sweep_and_no_other_run_uses_the_lock_of_the_sweep(type_line, tmp_path, monkeypatch):
