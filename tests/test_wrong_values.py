@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import cli
 from cadam3d.commands.messages import keeping_others
-from cadam3d.commands.train import build_trainer, require_unused
+from cadam3d.commands.train import build_trainer, require_unused, require_views
 from cadam3d.core.errors import UserError
 from cadam3d.core.memory import is_out_of_memory, require_memory
 from cadam3d.settings.compose import component, components, compose, config_dir
@@ -474,6 +474,16 @@ def test_the_jobs_of_a_sweep_are_counted_before_they_are_made():
 
 
 # --- memory ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("size", "views", "blamed"),
+    [(10**9, 1, "camera.size"), (10**400, 2, "camera.size"), (64, 10**12, "views")],
+)
+def test_the_setting_that_asks_for_too_much_memory_is_named(size, views, blamed):
+    cfg = OmegaConf.create({"camera": {"size": size}, "views": views})
+    with pytest.raises(UserError, match=rf"^{blamed}: .* Try: {blamed}=[1-9]"):
+        require_views(cfg)
 
 
 def test_a_size_is_refused_only_if_it_cannot_work():

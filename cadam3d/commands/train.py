@@ -176,9 +176,11 @@ def require_unused(cfg: DictConfig) -> None:
 
 def require_views(cfg: DictConfig) -> None:
     """Raise ``UserError`` if the images of one step cannot fit into memory."""
+    # A camera from elsewhere may use this key differently, or may have no such key.
     size = cfg.camera.get("size")
-    rendered = PIXEL * float(size) ** 2 if isinstance(size, int) else PIXEL
-    require_memory("views", cfg.views, unit=CAMERA + rendered, example=2)
+    size = size if isinstance(size, int) and size > 0 else 1
+    require_memory("camera.size", size, unit=PIXEL, power=2, example=128)
+    require_memory("views", cfg.views, unit=max(CAMERA, PIXEL * float(size) ** 2), example=2)
 
 
 def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
@@ -192,7 +194,7 @@ def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
         got=refine.steps,
         example="refine.steps='${steps}'",
     )
-    return Trainer(
+    trainer = Trainer(
         steps=cfg.steps,
         views=cfg.views,
         camera=component(cfg.camera, CameraSampler, "camera"),
@@ -208,6 +210,9 @@ def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
         regularizers=components(cfg.regularizer, Regularizer, "regularizer"),
         callbacks=list(components(cfg.callback, Callback, "callback").values()),
     )
+    # The camera has checked its size by now, so that too many views are the only possible reason.
+    require_views(cfg)
+    return trainer
 
 
 def estimate_memory(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:

@@ -367,10 +367,16 @@ def test_a_file_that_is_not_a_list_of_overrides_is_one_message(text, run_folder)
 # --- config.yaml ------------------------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def composed() -> DictConfig:
+    """Return the settings of a run. Tests must not change them."""
+    return compose(["prompt=a red cube", "rasterizer=cpu"])
+
+
 @pytest.fixture
-def config(tmp_path) -> Any:
-    """Return the plain settings of a run."""
-    plain = OmegaConf.to_container(compose(["prompt=a red cube", "rasterizer=cpu"]), resolve=True)
+def config(composed) -> Any:
+    """Return the plain settings of a run, which a test may change."""
+    plain = OmegaConf.to_container(composed, resolve=True)
     assert isinstance(plain, dict)
     return plain
 
