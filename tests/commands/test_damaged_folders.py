@@ -132,22 +132,17 @@ CASES = [
     ("asset.ply", "cut", "eval"),
     ("asset.ply", "a pipe", "render"),
     ("charts.json", "wrong values", "resume"),
-    ("charts.json", "a folder", "resume"),
     ("config.yaml", "nested", "eval"),
-    ("config.yaml", "wrong values", "resume"),
     ("config.yaml", "missing", "resume"),
     ("metrics.jsonl", "wrong values", "resume"),
     ("metrics.jsonl", "a device", "resume"),
     ("summary.json", "a folder", "resume"),
-    ("summary.json", "a pipe", "eval"),
     ("report.html", "a folder", "view"),
     ("report.html", "a pipe", "resume"),
     (".hydra/overrides.yaml", "noise", "resume"),
     (".hydra/overrides.yaml", "a circle", "resume"),
     ("checkpoints/step_0000004.pt", "empty", "resume"),
-    ("checkpoints/step_0000004.pt", "a device", "resume"),
     ("candidates/histograms.jsonl", "another kind", "resume"),
-    ("candidates/histograms.jsonl", "a folder", "resume"),
 ]
 
 
@@ -232,12 +227,11 @@ def test_a_run_cannot_resume_beyond_its_last_step(finished, tmp_path, monkeypatc
     assert "steps: expected at least 4" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("kind", ["ply", "mesh", "shap_e"])
-def test_a_run_resumes_without_the_files_that_it_began_with(kind, finished, tmp_path, monkeypatch, capsys):
+def test_a_run_resumes_without_the_file_that_it_began_with(finished, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["cadam3d"])
     shutil.copytree(finished, "run")
     path = Path("run/.hydra/overrides.yaml")
     words = [word for word in yaml.safe_load(path.read_text()) if not word.startswith("initializer.")]
-    path.write_text(yaml.safe_dump([*words, f"initializer={kind}", "initializer.path=moved"]))
+    path.write_text(yaml.safe_dump([*words, "initializer=ply", "initializer.path=moved.ply"]))
     assert ended("train", "resume=run") == 0, capsys.readouterr().err
