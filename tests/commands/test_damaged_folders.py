@@ -36,7 +36,7 @@ TINY = ["prompt=a red cube", "prior=tiny", "rasterizer=reference", "camera.size=
 TINY += ["initializer.count=7", "metric=[size]", "callback=[checkpoint,metrics,candidates]"]
 TINY += ["callback.checkpoint.every=2", "callback.candidates.every=1", "callback.candidates.size=8"]
 TINY += ["refine.start=0", "refine.end=4", "refine.interval=2", "exporter=[ply]", "hydra.run.dir=run"]
-DAMAGES: dict[str, Callable[[Path], None]] = {
+DAMAGES: dict[str, Callable[[Path], object]] = {
     "missing": lambda path: None,
     "empty": lambda path: path.write_bytes(b""),
     "noise": lambda path: path.write_bytes(bytes(range(256)) * 8),
