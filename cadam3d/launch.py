@@ -14,7 +14,7 @@ from omegaconf.errors import InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import OVERRIDES, expanded
-from cadam3d.settings.advice import explain, line_of, require_values, reraise_interrupt
+from cadam3d.settings.advice import explain, is_refused_path, line_of, require_values, reraise_interrupt
 from cadam3d.settings.compose import LONGEST_KEY, TEXT_KEYS, config_dir
 from cadam3d.settings.declared import require_settings
 from cadam3d.settings.help_page import help_text
@@ -70,7 +70,8 @@ def launch(command: str, words: Sequence[str]) -> int:
 
     Raises ``UserError`` for mistakes of the user. The exceptions of Hydra and OmegaConf are translated here
     and nowhere else. An exception that the running command raises is a bug and keeps its traceback. Only a
-    reference that cannot be resolved is still translated then, because some show up only in a running job.
+    reference that cannot be resolved and a path that the system refuses for its form are still translated
+    then, because some show up only in a running job.
     """
     if command == "doctor":
         words = ["json=true" if word == "--json" else word for word in words]
@@ -93,7 +94,8 @@ def launch(command: str, words: Sequence[str]) -> int:
     except UserError:
         raise
     except Exception as error:
-        if task.has_started and not isinstance(error, InterpolationResolutionError):
+        is_mistake = isinstance(error, InterpolationResolutionError) or is_refused_path(error)
+        if task.has_started and not is_mistake:
             raise
         reraise_interrupt(error)
         advice = explain(error, command, words)

@@ -772,6 +772,48 @@ def test_a_reference_that_only_a_running_command_resolves_is_one_message(type_li
     assert not list(Path("outputs").rglob("*.yaml"))
 
 
+LONG, DEEP, CIRCLE = "x" * 300, "a/" * 3000, "circle"
+
+
+@pytest.mark.parametrize(
+    ("line", "path"),
+    [
+        ("eval run=PATH", LONG),
+        ("eval run=PATH", "ä" * 200),
+        ("eval run=PATH", DEEP),
+        ("eval run=PATH", CIRCLE),
+        ("view run=PATH", LONG),
+        ("render ply=PATH", LONG),
+        ("train resume=PATH", LONG),
+        ("train resume=PATH", CIRCLE),
+        ("train prompt=cube steps=1 initializer=ply initializer.path=PATH", LONG),
+        ("train prompt=cube prior=stable_diffusion prior.path=PATH", DEEP),
+        ("train prompt=cube --config-dir=PATH", LONG),
+        ("train prompt=cube --config-dir PATH", CIRCLE),
+        ("train prompt=cube hydra.run.dir=PATH", LONG),
+        ("sweep prompt=cube seed=0,1 hydra.sweep.dir=PATH", LONG),
+    ],
+)
+def test_a_path_that_the_system_refuses_is_one_message(line, path, type_line, tmp_path):
+    (tmp_path / CIRCLE).symlink_to(CIRCLE)
+    message = type_line(*line.replace("PATH", path).split()).message
+    assert "Try: " in message
+    assert path not in message.partition("Try: ")[2]
+
+
+@pytest.mark.parametrize(
+    ("line", "hint"),
+    [
+        ("train seed=1 prompt=cube initializer=ply initializer.path=PATH", "train seed=1 prompt=cube"),
+        ("train --config-dir PATH prompt=cube", "train prompt=cube"),
+        ("sweep prompt=cube seed=0,1 hydra.sweep.dir=PATH", "sweep prompt=cube seed=0,1"),
+    ],
+)
+def test_the_hint_for_a_refused_path_leaves_its_setting_out(line, hint, type_line):
+    message = type_line(*line.replace("PATH", LONG).split()).message
+    assert message.partition("Try: ")[2] == f"cadam3d {hint}"
+
+
 def test_flags_may_be_anywhere_in_a_line():
     words = ["a=1", "-m", "b=2", "--cfg", "job", "c=3"]
     assert split(words) == (["a=1", "b=2", "c=3"], ["-m", "--cfg", "job"])

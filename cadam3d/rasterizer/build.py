@@ -27,7 +27,7 @@ from pathlib import Path
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.cache import make_private, other_writers
-from cadam3d.io.run_folder import spare
+from cadam3d.io.run_folder import spare, typed_path
 from cadam3d.rasterizer import base
 
 KERNELS = Path(__file__).parent / "kernels"
@@ -129,7 +129,7 @@ def own_folder(cache_dir: Path, name: str) -> Path:
 
     Raises :class:`UserError` if another user may have put files for rasterizer=``name`` there.
     """
-    folder = cache_dir.resolve()
+    folder = typed_path(str(cache_dir))
     try:
         reason = other_writers(folder)
     except FileNotFoundError:

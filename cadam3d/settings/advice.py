@@ -1,6 +1,7 @@
 """Advice: turn exceptions of Hydra and OmegaConf into one message that ends with what to type."""
 
 import difflib
+import errno
 import re
 import shlex
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseExceptio
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_yaml
-from cadam3d.io.run_folder import HYDRA_SETTINGS, OVERRIDES
+from cadam3d.io.run_folder import CONFIG, HYDRA_SETTINGS, OVERRIDES, suggestion
 from cadam3d.settings.compose import NO_NAME_COMPLAINT, compose, config_dir, flatten, quote
 from cadam3d.settings.line import key_of, quoted, text_of
 
@@ -25,6 +26,10 @@ LAUNCHERS = {
     "submitit_local": "hydra-submitit-launcher",
     "ray": "hydra-ray-launcher",
 }
+# Paths that a system refuses for their form: they are too long, or links that form a circle.
+REFUSED_PATHS = (errno.ENAMETOOLONG, errno.ELOOP)
+# The file that the folder named by a setting must have.
+NEEDED = {"run": CONFIG, "resume": OVERRIDES}
 # The choice of an option or of a list of options.
 CHOICE = re.compile(r"\+?[a-z]\w*=(\w+|\[[\w,]*\])")
 PROMPT_WORD = 'prompt="a red and yellow checkered torus"'
@@ -60,12 +65,11 @@ def explain(
     """Return the message for an exception that was raised while composing ``cadam3d <command> <words>``.
 
     ``settings`` are the overrides of the job of a sweep that cannot be composed; None means ``words``.
-    Returns None for an exception that neither Hydra nor OmegaConf raises, because that is a bug.
+    Returns None for an exception that is neither one of Hydra or OmegaConf nor about the form of a path,
+    because that is a bug.
     """
-    reason: UserError | None = None
+    reason = error if isinstance(error, UserError) else None
     match error:
-        case UserError():
-            reason = error
         case RefusedJobError():
             reason = _job_refused(error, command, words)
         case MissingValuesError():
@@ -78,12 +82,19 @@ def explain(
             reason = _no_name(str(error), command, words)
         case InterpolationResolutionError():
             reason = _unresolved(error, command, words)
+        case OSError() if is_refused_path(error):
+            reason = _refused_path(error, command, words)
         case yaml.YAMLError() | UnicodeDecodeError() | RecursionError():
             text = " ".join(str(error).split())
             reason = UserError(f"configuration: cannot be read ({text}). Try: cadam3d {command} --help")
         case CompactHydraException() | OmegaConfBaseException():
             reason = _reworded(error, command, words, settings)
     return reason
+
+
+def is_refused_path(error: BaseException) -> bool:
+    """Return whether the system refuses a path for its form. The program makes no such path by itself."""
+    return isinstance(error, OSError) and error.errno in REFUSED_PATHS
 
 
 def reraise_interrupt(error: BaseException) -> None:
@@ -124,6 +135,31 @@ def _missing_values(keys: Sequence[str], command: str, words: Sequence[str]) -> 
     added = [PROMPT_WORD if key == "prompt" else f"{key}=..." for key in keys]
     line = " ".join(["cadam3d", command, *kept, *added])
     return UserError(f"{', '.join(keys)}: no value given. Try: {line}")
+
+
+def _refused_path(error: OSError, command: str, words: Sequence[str]) -> UserError:
+    """Explain that the system refuses a path for its form, with the line without the setting that has it."""
+    path, reason = str(error.filename), error.strerror
+    wrong = max(
+        (word for word in words if _value(word) in path), key=lambda word: len(_value(word)), default=""
+    )
+    if not wrong:
+        return UserError(f"{path[:60]}: cannot be used ({reason}). Try: cadam3d {command} --help")
+    before = words[: list(words).index(wrong)]
+    flag = before[-1] if "=" not in wrong and before and before[-1].startswith("--") else ""
+    key = flag or key_of(wrong)
+    # Without its path, an option such as initializer=ply cannot be used either.
+    left_out = {key, key.partition(".")[0]}
+    kept = [word for word in words if key_of(word) not in left_out and word not in (wrong, flag)]
+    line = line_of(command, kept)
+    if key in NEEDED or key == "ply":
+        line = suggestion(f"cadam3d {command}", key.replace("ply", "run"), NEEDED.get(key, CONFIG))
+    return UserError(f"{key}: expected a path, got {_value(wrong)[:60]!r} ({reason}). Try: {line}")
+
+
+def _value(word: str) -> str:
+    """Return what a word of the command line assigns, or the word if it assigns nothing."""
+    return word.partition("=")[2] if "=" in word else word
 
 
 def _unresolved(error: InterpolationResolutionError, command: str, words: Sequence[str]) -> UserError:

@@ -1,6 +1,8 @@
 """Each file of a finished run is damaged in each of several ways, and each command still ends by itself.
 
-A command either succeeds or prints one message. It never waits for a pipe and never shows a traceback.
+A command either succeeds or prints one message. It never waits for a pipe and never shows a traceback. The
+readers of the files are tested with all damages. A command takes a third of a second, so it is tested with a
+few damages of each file.
 """
 
 import json
@@ -14,8 +16,18 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import yaml
 
 from cadam3d import cli
+from cadam3d.core.errors import UserError
+from cadam3d.io.checkpoint import load_checkpoint
+from cadam3d.io.jsonl import truncate_after
+from cadam3d.io.ply import holds_gaussians, read_ply
+from cadam3d.io.reading import read_text
+from cadam3d.io.records import read_histograms, read_metrics, read_summary
+from cadam3d.report.declarations import read_declarations
+from cadam3d.settings.compose import load_config
+from cadam3d.settings.trust import read_overrides
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
 
@@ -24,7 +36,7 @@ TINY = ["prompt=a red cube", "prior=tiny", "rasterizer=reference", "camera.size=
 TINY += ["initializer.count=7", "metric=[size]", "callback=[checkpoint,metrics,candidates]"]
 TINY += ["callback.checkpoint.every=2", "callback.candidates.every=1", "callback.candidates.size=8"]
 TINY += ["refine.start=0", "refine.end=4", "refine.interval=2", "exporter=[ply]", "hydra.run.dir=run"]
-DAMAGES: dict[str, Callable[[Path], None]] = {
+DAMAGES: dict[str, Callable[[Path], object]] = {
     "missing": lambda path: None,
     "empty": lambda path: path.write_bytes(b""),
     "noise": lambda path: path.write_bytes(bytes(range(256)) * 8),
@@ -97,17 +109,16 @@ def finished(tmp_path_factory) -> Path:
     return place / "run"
 
 
-# The commands that read or replace each file. Render stands for export, which opens an asset in the same way.
-READERS = {
-    "asset.ply": ("eval", "render"),
-    "charts.json": ("resume",),
-    "config.yaml": ("eval", "resume"),
-    "metrics.jsonl": ("resume",),
-    "summary.json": ("eval", "resume"),
-    "report.html": ("view", "resume"),
-    ".hydra/overrides.yaml": ("resume",),
-    "checkpoints/step_0000004.pt": ("resume",),
-    "candidates/histograms.jsonl": ("resume",),
+READERS: dict[str, Callable[[Path], object]] = {
+    "asset.ply": lambda run: holds_gaussians(run / "asset.ply") and read_ply(run / "asset.ply"),
+    "charts.json": read_declarations,
+    "config.yaml": lambda run: load_config(run / "config.yaml"),
+    "metrics.jsonl": lambda run: (read_metrics(run), truncate_after(run / "metrics.jsonl", 2)),
+    "summary.json": read_summary,
+    "report.html": lambda run: read_text(run / "report.html"),
+    ".hydra/overrides.yaml": lambda run: read_overrides(run / ".hydra/overrides.yaml"),
+    "checkpoints/step_0000004.pt": lambda run: load_checkpoint(run / "checkpoints/step_0000004.pt"),
+    "candidates/histograms.jsonl": read_histograms,
 }
 COMMANDS = {
     "eval": ["eval", "run=run", "metric=[size]"],
@@ -115,30 +126,71 @@ COMMANDS = {
     "render": ["render", "run=run", "exporter=[images]", "exporter.images.size=8", "exporter.images.views=1"],
     "resume": ["train", "resume=run"],
 }
+# Each line is a file, a damage and a command that reads or replaces the file. Render stands for export, which
+# opens an asset in the same way.
+CASES = [
+    ("asset.ply", "cut", "eval"),
+    ("asset.ply", "a pipe", "render"),
+    ("charts.json", "wrong values", "resume"),
+    ("config.yaml", "nested", "eval"),
+    ("config.yaml", "missing", "resume"),
+    ("metrics.jsonl", "wrong values", "resume"),
+    ("metrics.jsonl", "a device", "resume"),
+    ("summary.json", "a folder", "resume"),
+    ("report.html", "a folder", "view"),
+    ("report.html", "a pipe", "resume"),
+    (".hydra/overrides.yaml", "noise", "resume"),
+    (".hydra/overrides.yaml", "a circle", "resume"),
+    ("checkpoints/step_0000004.pt", "empty", "resume"),
+    ("candidates/histograms.jsonl", "another kind", "resume"),
+]
+
+
+def damage_copy(finished: Path, name: str, damage: str) -> None:
+    """Replace the folder ``run`` by a copy of the finished run in which one file is damaged."""
+    shutil.rmtree("run", ignore_errors=True)
+    shutil.copytree(finished, "run")
+    path = Path("run", name)
+    assert path.is_file(), name
+    path.unlink()
+    DAMAGES[damage](path)
 
 
 @pytest.mark.parametrize("name", READERS)
-@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_reader_returns_something_or_raises_a_message(name, finished, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    READERS[name](finished)
+    for damage in DAMAGES:
+        damage_copy(finished, name, damage)
+        message = "Try: "
+        with guard():
+            try:
+                READERS[name](Path("run"))
+            except UserError as error:
+                message = str(error)
+        assert "Try: " in message, damage
+
+
+def test_the_cases_include_each_file_damage_and_command():
+    assert [set(column) for column in zip(*CASES, strict=True)] == [set(READERS), set(DAMAGES), set(COMMANDS)]
+
+
+@pytest.mark.parametrize(("name", "damage", "command"), CASES)
 def test_a_damaged_file_is_one_message_or_does_not_matter(
-    name, damage, finished, tmp_path, monkeypatch, capsys
+    name, damage, command, finished, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     monkeypatch.setattr(sys, "argv", ["cadam3d"])
-    for command in READERS[name]:
-        shutil.rmtree("run", ignore_errors=True)
-        shutil.copytree(finished, "run")
-        path = Path("run", name)
-        assert path.is_file(), name
-        path.unlink()
-        DAMAGES[damage](path)
-        with guard():
-            code = ended(*COMMANDS[command])
-        captured = capsys.readouterr()
-        assert code in (0, 1), captured.err
-        assert "Traceback" not in captured.err
-        messages = [line for line in captured.err.splitlines() if line.startswith("cadam3d: ")]
-        assert len(messages) == code, captured.err
+    damage_copy(finished, name, damage)
+    with guard():
+        code = ended(*COMMANDS[command])
+    captured = capsys.readouterr()
+    assert code in (0, 1), captured.err
+    assert "Traceback" not in captured.err
+    messages = [line for line in captured.err.splitlines() if line.startswith("cadam3d: ")]
+    assert len(messages) == code, captured.err
+    assert all("Try: " in line for line in messages), captured.err
 
 
 def test_a_damaged_newest_checkpoint_is_left_out_with_a_note(finished, tmp_path, monkeypatch, capsys):
@@ -173,3 +225,13 @@ def test_a_run_cannot_resume_beyond_its_last_step(finished, tmp_path, monkeypatc
     shutil.copytree(finished, "run")
     assert ended("train", "resume=run", "steps=3") == 1
     assert "steps: expected at least 4" in capsys.readouterr().err
+
+
+def test_a_run_resumes_without_the_file_that_it_began_with(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["cadam3d"])
+    shutil.copytree(finished, "run")
+    path = Path("run/.hydra/overrides.yaml")
+    words = [word for word in yaml.safe_load(path.read_text()) if not word.startswith("initializer.")]
+    path.write_text(yaml.safe_dump([*words, "initializer=ply", "initializer.path=moved.ply"]))
+    assert ended("train", "resume=run") == 0, capsys.readouterr().err

@@ -244,6 +244,13 @@ def test_files_of_another_user_are_refused_also_behind_a_link(place, cached, tmp
         assert find_intact(link, "rasterizer-*.so") is None
 
 
+@pytest.mark.parametrize("name", ["circle", "x" * 300])
+def test_a_folder_that_the_system_refuses_is_one_message(name, tmp_path):
+    (tmp_path / "circle").symlink_to("circle")
+    with pytest.raises(UserError, match=r"expected a folder for compiled kernels.*Try: rasterizer=cpu"):
+        own_folder(tmp_path / name, "cpu")
+
+
 def test_a_new_folder_and_a_new_library_belong_to_the_user_alone(fake_compiler, tmp_path):
     fake_compiler()
     before = os.umask(0o002)
