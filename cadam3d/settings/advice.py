@@ -293,10 +293,10 @@ def _known(wrong: str, command: str, words: Sequence[str]) -> dict[str, object]:
 
     The options that the user has chosen are taken into account if they compose.
     """
-    choices = [word for word in words if CHOICE.fullmatch(word) and not word.startswith(f"{wrong}=")]
+    choices = [word for word in words if CHOICE.fullmatch(word) and key_of(word) not in (wrong, "grid")]
     for attempt in (choices, []):
         try:
-            cfg = compose(attempt, "train" if command == "sweep" else command)
+            cfg = compose(attempt, command)
         except (CompactHydraException, OmegaConfBaseException):
             continue
         keys = flatten(OmegaConf.to_container(cfg, resolve=False), with_nodes=True)

@@ -219,6 +219,8 @@ def _word(declared: Any) -> str:
     if origin in LISTS:
         items = {int: "whole numbers", float: "numbers", str: "texts"}
         return f"a list of {items.get(arguments[0] if arguments else Any, 'values')}"
+    if declared is object:
+        return "a component"
     return f"an object of class {declared.__name__}" if inspect.isclass(declared) else str(declared)
 
 
