@@ -541,7 +541,7 @@ def test_after_a_failure_of_the_launcher_the_table_is_right(sweep, monkeypatch):
         (("seed=0,1", "launcher=jobli"), "Try: launcher=joblib"),
         (
             ("seed=0,1", "launcher=joblib", "launcher.jobs=2"),
-            "launcher.jobs: no such setting. Did you mean launcher.n_jobs?",
+            "launcher.jobs: no such setting. Did you mean launcher.n_jobs",
         ),
         (
             ("seed=0,1", "hydra.run.dir=x"),
