@@ -223,10 +223,13 @@ def _unknown_key(key: str, command: str, words: Sequence[str], settings: Sequenc
     if key == "grid" and command == "train":
         return UserError(f"grid: grids belong to sweeps. Try: {line_of('sweep', words)}")
     value = next((word.partition("=")[2] for word in words if key_of(word) == key), None)
+    known = _known(key, command, words if settings is None else settings)
+    if value is not None and key in known:
+        line = shlex.join([f"~{key}", f"+{key}={value}"])
+        return UserError(f"{key}: expected the keys of the present value, got others. Try: {line}")
     if value is not None and (owners := _options_with(key)):
         line = f"{owners[0]} {shlex.quote(f'{key}={value}')}"
         return UserError(f"{key}: a setting of {' and '.join(owners)}, not of the chosen option. Try: {line}")
-    known = _known(key, command, words if settings is None else settings)
     if value is not None:
         known = {name: node for name, node in known.items() if _fits(value, node)}
     last = key.rpartition(".")[2].lower()
