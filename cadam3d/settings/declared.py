@@ -242,6 +242,9 @@ def _example(key: str, target: str, cls: type, name: str, hints: Mapping[str, An
     default = inspect.signature(cls).parameters[name].default
     if default is not inspect.Parameter.empty:
         return argument(f"+{key}", default)
+    # A group with its own place in the configuration, to which a setting refers, such as ${prompting}.
+    if (config_dir() / name).is_dir():
+        return argument(key, f"${{{name}}}")
     kinds = _alternatives(hints.get(name, float))
     return argument(key, next((SPARE[each] for each in kinds if each in SPARE), [0.5, 0.5]))
 
@@ -285,4 +288,5 @@ def _grammar(value: Any) -> str:
         return "[" + ",".join(map(_grammar, value)) + "]"
     if value is None or isinstance(value, bool):
         return yaml.safe_dump(value).splitlines()[0]
-    return str(value)
+    # Hydra's grammar reads an interpolation inside another one only between quotation marks.
+    return f'"{value}"' if "${" in str(value) else str(value)
