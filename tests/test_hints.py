@@ -29,6 +29,7 @@ import torch
 import trimesh
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from splats import make_gaussians
 
@@ -101,6 +102,9 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         ("train", "promt=a red cube"),
         (*A_CUBE, "grid=densifiers"),
         (*A_CUBE, "+densifier.nonsense=5"),
+        (*A_CUBE, "+nonsense=5"),
+        (*A_CUBE, "camera={}"),
+        (*A_CUBE, "+callback.candidates.every=5"),
         (*A_CUBE, "~densifier.tau_Q"),
         (*A_CUBE, "~steps"),
         (*A_CUBE, "~densifier"),
@@ -249,7 +253,7 @@ ELSEWHERE: dict[str, str] = {
 }
 # Options of which several can be chosen.
 LISTS = ("exporter", "callback", "metric", "regularizer")
-WRONG_VALUES = ("abc", True, None, -1e12, 1e30, [1], "")
+WRONG_VALUES = ("abc", None, -1e12, 1e30, "")
 
 
 @dataclass(frozen=True)
@@ -377,6 +381,7 @@ def choices() -> Iterator[list[str]]:
 
 
 def answers_to_values() -> Iterator[Answer]:
+    tried: set[tuple[str, str]] = set()
     for line in choices():
         has_file = {"initializer=ply", "initializer=mesh"} & set(line)
         cfg = compose([A_CUBE[1], *(["initializer.path=a.ply"] if has_file else []), *line])
@@ -386,14 +391,24 @@ def answers_to_values() -> Iterator[Answer]:
             members = [f"{group}.{member}" for member in cfg.get(group) or ()]
             for part in members if name.startswith("[") else [group]:
                 if "_target_" in (OmegaConf.select(cfg, part) or ()):
-                    yield from answers_about(cfg, part, line, known)
+                    yield from answers_about(cfg, part, line, known, tried)
 
 
-def answers_about(cfg: DictConfig, part: str, line: Sequence[str], known: set[str]) -> Iterator[Answer]:
-    """Yield the answers to wrong values of each setting of one component, one for each suggestion."""
+def answers_about(
+    cfg: DictConfig, part: str, line: Sequence[str], known: set[str], tried: set[tuple[str, str]]
+) -> Iterator[Answer]:
+    """Yield the answers to wrong values of each setting of one component, one for each suggestion.
+
+    ``tried`` has the checks and keys of earlier components, which are not repeated: classes share both.
+    """
     seen = set()
+    owner = get_class(OmegaConf.select(cfg, part)._target_)
     for name, value in flatten(OmegaConf.to_container(OmegaConf.select(cfg, part), resolve=False)):
         key = f"{part}.{name}"
+        check = (f"{owner.__post_init__.__qualname__} {part}" if hasattr(owner, "__post_init__") else part, name)
+        if check in tried:
+            continue
+        tried.add(check)
         misspelled = (value[:-1],) if isinstance(value, str) and value and "${" not in value else ()
         for wrong in (*WRONG_VALUES, *misspelled) if not name.endswith("_target_") else ():
             first = built(cfg, part, {key: wrong})

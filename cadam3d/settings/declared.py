@@ -204,7 +204,7 @@ def _refusal(key: str, declared: Any, value: Any, example: str) -> UserError:
 def _unknown(name: str, known: Sequence[str], key: str) -> UserError:
     near = difflib.get_close_matches(name, known, n=1)
     meant = f" Did you mean {key}.{near[0]}?" if near else ""
-    return UserError(f"{key}: there is no key {name}.{meant} Try: without it; --cfg job lists the keys")
+    return UserError(f"{key}: there is no key {name}.{meant} Try: cadam3d train --cfg job")
 
 
 def _in_words(alternatives: Sequence[Any]) -> str:
