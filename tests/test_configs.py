@@ -163,7 +163,7 @@ def test_every_option_composes_and_builds(path):
         with pytest.raises(UserError, match=r"(?i)missing"):
             component(node)
     else:
-        assert component(node) is not None
+        assert (component(node) if "_target_" in node else components(node)) is not None
 
 
 @pytest.mark.parametrize("path", NESTED, ids=name_of)
@@ -227,7 +227,11 @@ def test_every_arm_of_a_grid_composes(grid, monkeypatch):
         k: v for k, v in yaml.safe_load(text).get("each", {}).items() if isinstance(v, list) and len(v) > 1
     }
     axes = {key: values for key, values in shared.items() if key in ("seed", "noise", "prompt")}
-    line = [f"grid={grid}", *(f"{key}={quote(str(values[0]))}" for key, values in axes.items())]
+    firsts = {key: values[0] for key, values in axes.items()}
+    line = [
+        f"grid={grid}",
+        *(f"{key}={quote(first) if isinstance(first, str) else first}" for key, first in firsts.items()),
+    ]
     line += [] if "prompt" in axes else [PROMPT]
     sweep, composer = read_sweep("sweep", line, NO_FLAGS)
     assert len(sweep.jobs) > 1

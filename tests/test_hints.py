@@ -29,6 +29,7 @@ import torch
 import trimesh
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from splats import make_gaussians
 
@@ -56,7 +57,6 @@ LINES: dict[str, list[tuple[str, ...]]] = {
     "the command": [
         ("trian", "prompt=a red cube"),
         ("a red cube",),
-        ("a", "red", "cube"),
         ("a", "red", "cube", "steps=5"),
         ("prompt=a red cube",),
         ("run=a run",),
@@ -71,7 +71,6 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         (*A_CUBE, "--cfg", "job", "--info", "config"),
         (*A_CUBE, "--cfg", "nonsense"),
         (*A_CUBE, "--config-dir=configz"),
-        (*A_CUBE, "--config-dir=/nowhere/at/all"),
         ("train", "--help", "densifier=cadamm"),
         ("train", "--help", "densifer"),
         ("doctor", "--help", "densifier"),
@@ -85,7 +84,7 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         ("eval", "-m", "run=a run,a run"),
         ("eval", "run=a run,b"),
     ],
-    "missing values": [("train",), ("train", "seed=1"), ("sweep", "grid=densifiers")],
+    "missing values": [("train", "seed=1"), ("sweep", "grid=densifiers")],
     "keys": [
         (*A_CUBE, "densifier.tau_q=0.5"),
         (*A_CUBE, "tau_SNR=0.2"),
@@ -93,10 +92,16 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         (*A_CUBE, "step=5"),
         (*A_CUBE, "nonsense.key=5"),
         (*A_CUBE, "color=red"),
-        (*A_CUBE, "colour=green"),
+        (
+            *A_CUBE,
+            "optimizer.means_lr={_target_: cadam3d.core.schedule.Steps, values: [0.1, 0.2], milestones: [5]}",
+        ),
         ("train", "promt=a red cube"),
         (*A_CUBE, "grid=densifiers"),
         (*A_CUBE, "+densifier.nonsense=5"),
+        (*A_CUBE, "+nonsense=5"),
+        (*A_CUBE, "camera={}"),
+        (*A_CUBE, "+callback.candidates.every=5"),
         (*A_CUBE, "~densifier.tau_Q"),
         (*A_CUBE, "~steps"),
         (*A_CUBE, "~densifier"),
@@ -105,10 +110,7 @@ LINES: dict[str, list[tuple[str, ...]]] = {
     ],
     "options": [
         (*A_CUBE, "densifier=cadm"),
-        (*A_CUBE, "camera=nonsense"),
-        (*A_CUBE, "prior=nonsense"),
         (*A_CUBE, "densifier=null"),
-        (*A_CUBE, "camera=null"),
         (*A_CUBE, "exporter=null"),
         (*A_CUBE, "callback=[metrics,progres]"),
         (*A_CUBE, "experiment=smok"),
@@ -120,7 +122,6 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         (*A_CUBE, "steps=[1"),
         (*A_CUBE, "steps=${nonsense}"),
         (*A_CUBE, "steps=0"),
-        (*A_CUBE, "views=0"),
         (*A_CUBE, "seed=-1"),
         (*A_CUBE, "device=toaster"),
         (*A_CUBE, "camera=multiview", "views=3"),
@@ -130,7 +131,6 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         (*A_CUBE, "hydra.run.dir=a run"),
         (*A_CUBE, "guidance.t_min=0.9", "guidance.t_max=0.1"),
         (*A_CUBE, "exporter.turntable.fps=1e12"),
-        (*A_CUBE, "exporter.turntable.fps=1000000000000"),
         (*A_CUBE, "exporter.turntable.size=100000"),
         (*A_CUBE, "densifier.reset=everybody"),
         (*A_CUBE, "camera=multiview", "views=4", "camera.relative_distance=[0.1,0.2]"),
@@ -145,9 +145,7 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         ("train", "prompt="),
         ("train", "prompt=red"),
         ("train", "prompt=a cube red"),
-        ("train", "prompt=a red and"),
         ("train", "prompt=a red and blue and green cube"),
-        ("train", "prompt=a cube on"),
         ("train", "prompt=a cube between a torus"),
         ("train", "prompt=a cube a torus"),
     ],
@@ -170,9 +168,13 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         ("render",),
         ("render", "run=nowhere"),
         ("render", "run=a run", "exporter=[]"),
+        ("render", "run=a run", "ply=asset.ply"),
+        ("render", "run=a sweep"),
+        ("render", "ply=nothing.ply"),
         ("render", "run=a run", "output=/dev/null/x"),
         ("export", "run=a run", "output=/dev/null/x.ply"),
         ("export", "run=new"),
+        ("export", "run=a run", "output=a.b.obj"),
         ("eval",),
         ("view", "run=nowhere"),
     ],
@@ -241,7 +243,7 @@ ELSEWHERE: dict[str, str] = {
 }
 # Options of which several can be chosen.
 LISTS = ("exporter", "callback", "metric", "regularizer")
-WRONG_VALUES = ("abc", True, None, -1e12, 1e30, [1], "")
+WRONG_VALUES = ("abc", None, -1e12, 1e30, "")
 
 
 @dataclass(frozen=True)
@@ -369,6 +371,7 @@ def choices() -> Iterator[list[str]]:
 
 
 def answers_to_values() -> Iterator[Answer]:
+    tried: set[tuple[str, str]] = set()
     for line in choices():
         has_file = {"initializer=ply", "initializer=mesh"} & set(line)
         cfg = compose([A_CUBE[1], *(["initializer.path=a.ply"] if has_file else []), *line])
@@ -378,14 +381,25 @@ def answers_to_values() -> Iterator[Answer]:
             members = [f"{group}.{member}" for member in cfg.get(group) or ()]
             for part in members if name.startswith("[") else [group]:
                 if "_target_" in (OmegaConf.select(cfg, part) or ()):
-                    yield from answers_about(cfg, part, line, known)
+                    yield from answers_about(cfg, part, line, known, tried)
 
 
-def answers_about(cfg: DictConfig, part: str, line: Sequence[str], known: set[str]) -> Iterator[Answer]:
-    """Yield the answers to wrong values of each setting of one component, one for each suggestion."""
+def answers_about(
+    cfg: DictConfig, part: str, line: Sequence[str], known: set[str], tried: set[tuple[str, str]]
+) -> Iterator[Answer]:
+    """Yield the answers to wrong values of each setting of one component, one for each suggestion.
+
+    ``tried`` has the checks and keys of earlier components, which are not repeated: classes share both.
+    """
     seen = set()
+    owner = get_class(OmegaConf.select(cfg, part)._target_)
     for name, value in flatten(OmegaConf.to_container(OmegaConf.select(cfg, part), resolve=False)):
         key = f"{part}.{name}"
+        judge = owner.__post_init__.__qualname__ if hasattr(owner, "__post_init__") else ""
+        check = (f"{judge} {part}", name)
+        if check in tried:
+            continue
+        tried.add(check)
         misspelled = (value[:-1],) if isinstance(value, str) and value and "${" not in value else ()
         for wrong in (*WRONG_VALUES, *misspelled) if not name.endswith("_target_") else ():
             first = built(cfg, part, {key: wrong})

@@ -178,8 +178,7 @@ def another_file(path: str, option: str, suffixes: Sequence[str]) -> str:
     If there is none, it is the help of the option.
     """
     wrong = Path(path).expanduser()
-    folders = dict.fromkeys([wrong if wrong.is_dir() else wrong.parent, Path()])
-    files = [file for folder in folders if folder.is_dir() for file in sorted(folder.iterdir())]
+    files = [*(_content(wrong) or _content(wrong.parent)), *_content(Path())]
     known = {
         file.name: file
         for file in reversed(files)
@@ -189,6 +188,15 @@ def another_file(path: str, option: str, suffixes: Sequence[str]) -> str:
     if not near:
         return f"cadam3d train --help initializer={option}"
     return shlex.quote(f"initializer.path={known[near[0]]}")
+
+
+def _content(folder: Path) -> list[Path]:
+    """Return the sorted content of a folder; nothing for a path that the system cannot list as a folder."""
+    try:
+        return sorted(folder.iterdir())
+    # ValueError: the path has a null byte.
+    except (OSError, ValueError):
+        return []
 
 
 def require_points(count: int, scale: object, opacity: object, sh_degree: object) -> None:

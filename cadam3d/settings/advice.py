@@ -259,10 +259,13 @@ def _unknown_key(key: str, command: str, words: Sequence[str], settings: Sequenc
     if key == "grid" and command == "train":
         return UserError(f"grid: grids belong to sweeps. Try: {line_of('sweep', words)}")
     value = next((word.partition("=")[2] for word in words if key_of(word) == key), None)
+    known = _known(key, command, words if settings is None else settings)
+    if value is not None and key in known:
+        line = shlex.join([f"~{key}", f"+{key}={value}"])
+        return UserError(f"{key}: expected the keys of the present value, got others. Try: {line}")
     if value is not None and (owners := _options_with(key)):
         line = f"{owners[0]} {shlex.quote(f'{key}={value}')}"
         return UserError(f"{key}: a setting of {' and '.join(owners)}, not of the chosen option. Try: {line}")
-    known = _known(key, command, words if settings is None else settings)
     if value is not None:
         known = {name: node for name, node in known.items() if _fits(value, node)}
     last = key.rpartition(".")[2].lower()
@@ -329,10 +332,10 @@ def _known(wrong: str, command: str, words: Sequence[str]) -> dict[str, object]:
 
     The options that the user has chosen are taken into account if they compose.
     """
-    choices = [word for word in words if CHOICE.fullmatch(word) and not word.startswith(f"{wrong}=")]
+    choices = [word for word in words if CHOICE.fullmatch(word) and key_of(word) not in (wrong, "grid")]
     for attempt in (choices, []):
         try:
-            cfg = compose(attempt, "train" if command == "sweep" else command)
+            cfg = compose(attempt, command)
         except (CompactHydraException, OmegaConfBaseException):
             continue
         keys = flatten(OmegaConf.to_container(cfg, resolve=False), with_nodes=True)

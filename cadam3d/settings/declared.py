@@ -211,7 +211,7 @@ def _refusal(key: str, declared: Any, value: Any, example: str) -> UserError:
 def _unknown(name: str, known: Sequence[str], key: str) -> UserError:
     near = difflib.get_close_matches(name, known, n=1)
     meant = f" Did you mean {key}.{near[0]}?" if near else ""
-    return UserError(f"{key}: there is no key {name}.{meant} Try: without it; --cfg job lists the keys")
+    return UserError(f"{key}: there is no key {name}.{meant} Try: cadam3d train --cfg job")
 
 
 def _in_words(alternatives: Sequence[Any]) -> str:
@@ -226,6 +226,8 @@ def _word(declared: Any) -> str:
     if origin in LISTS:
         items = {int: "whole numbers", float: "numbers", str: "texts"}
         return f"a list of {items.get(arguments[0] if arguments else Any, 'values')}"
+    if declared is object:
+        return "a component"
     return f"an object of class {declared.__name__}" if inspect.isclass(declared) else str(declared)
 
 
@@ -247,6 +249,9 @@ def _example(key: str, target: str, cls: type, name: str, hints: Mapping[str, An
     default = inspect.signature(cls).parameters[name].default
     if default is not inspect.Parameter.empty:
         return argument(f"+{key}", default)
+    # A group with its own place in the configuration, to which a setting refers, such as ${prompting}.
+    if (config_dir() / name).is_dir():
+        return argument(key, f"${{{name}}}")
     kinds = _alternatives(hints.get(name, float))
     return argument(key, next((SPARE[each] for each in kinds if each in SPARE), [0.5, 0.5]))
 
@@ -290,4 +295,5 @@ def _grammar(value: Any) -> str:
         return "[" + ",".join(map(_grammar, value)) + "]"
     if value is None or isinstance(value, bool):
         return yaml.safe_dump(value).splitlines()[0]
-    return str(value)
+    # Hydra's grammar reads an interpolation inside another one only between quotation marks.
+    return f'"{value}"' if "${" in str(value) else str(value)

@@ -97,9 +97,9 @@ def refuse_unread_settings(cfg: DictConfig, command: str, overrides: Sequence[st
         if name not in known and not re.search(rf"\b{re.escape(name)}\b", references):
             near = did_you_mean(name, sorted(known))
             meant = f" Did you mean {near[0]}?" if near else ""
-            raise UserError(
-                f"{name}: no such setting.{meant} Try: cadam3d {command} --cfg job (it lists all of them)"
-            )
+            # A sweep has such a page only for a line with jobs.
+            page = "train" if command == "sweep" else command
+            raise UserError(f"{name}: no such setting.{meant} Try: cadam3d {page} --cfg job")
     folders = [Path(source.path) for source in cfg.hydra.runtime.config_sources if source.schema == "file"]
     for override in overrides:
         key = key_of(override)

@@ -223,7 +223,7 @@ def _alternatives(line: str) -> list[str]:
     key, sweep = override.get_key_element(), override.value()
     if not override.is_discrete_sweep() or isinstance(sweep, Glob):
         what = "a pattern" if isinstance(sweep, Glob) else "an interval"
-        raise UserError(f"{key}: expected values one by one, got {what}. Try: {key}=range(0,1,0.25)")
+        raise UserError(f"{key}: expected values one by one, got {what}. Try: '{key}=range(0,1,0.25)'")
     if isinstance(sweep, RangeSweep):
         _require_range(key, sweep)
     values = [f"{key}={value}" for value in override.sweep_string_iterator()]
