@@ -817,3 +817,20 @@ def test_the_hint_for_a_refused_path_leaves_its_setting_out(line, hint, type_lin
 def test_flags_may_be_anywhere_in_a_line():
     words = ["a=1", "-m", "b=2", "--cfg", "job", "c=3"]
     assert split(words) == (["a=1", "b=2", "c=3"], ["-m", "--cfg", "job"])
+
+
+def test_a_group_of_one_option_has_no_empty_list(type_line):
+    for group, option in (("augmentation", "none"), ("camera", "orbit"), ("prompting", "discrete")):
+        message = type_line("train", "prompt=a cube", f"{group}=[]").message
+        assert message == f"{group}: expected the name of an option, got []. Try: {group}={option}"
+
+
+def test_a_prompt_without_words_is_refused_before_a_sweep_starts(type_line):
+    assert "prompt: expected what to make" in type_line("sweep", "prompt=", "seed=0,1").message
+    assert not Path("multirun").exists()
+
+
+def test_a_wrong_setting_of_a_launcher_is_refused_before_a_sweep_starts(type_line):
+    line = ("sweep", "prompt=a cube", "seed=0,1", "launcher=joblib", "launcher.n_jobs=abc")
+    assert "hydra.launcher.n_jobs: " in type_line(*line).message
+    assert not Path("multirun").exists()

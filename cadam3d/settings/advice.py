@@ -196,7 +196,7 @@ def _unknown_option(error: MissingConfigException, command: str, words: Sequence
     if not group or not options:
         return UserError(f"{path}: no such configuration in {config_dir()}. Try: cadam3d doctor")
     near = did_you_mean(option, options)
-    best = near[0] if near else _default_option(group, command) or options[0]
+    best = near[0] if near else default_option(group, command) or options[0]
     if all(key_of(word) != group for word in words) and (run := _resumed_run(words)):
         folder = _config_folder(run) or "DIR"
         return UserError(
@@ -237,12 +237,15 @@ def _no_name(reason: str, command: str, words: Sequence[str]) -> UserError:
         key, _, value = word.lstrip("+").partition("=")
         options = sorted(file.stem for file in (config_dir() / key).glob("*.yaml")) if key else []
         if options and value not in options and not value.startswith("["):
-            best = "none" if "none" in options else _default_option(key, command) or options[0]
-            return UserError(f"{key}: expected one of {'|'.join(options)}, got {value}. Try: {key}={best}")
+            best = "none" if "none" in options else default_option(key, command)
+            # Without a default, such as that of experiment, leaving the word out is what null means.
+            rest = [other for other in words if other != word]
+            line = f"{key}={best}" if best else line_of(command, rest)
+            return UserError(f"{key}: expected one of {'|'.join(options)}, got {value}. Try: {line}")
     return UserError(f"{reason}. Try: cadam3d {command} --help")
 
 
-def _default_option(group: str, command: str) -> str | None:
+def default_option(group: str, command: str) -> str | None:
     """Return the option of a group that ``command`` uses by default; ``[]`` if it has a list of them."""
     path = config_dir() / f"{'train' if command == 'sweep' else command}.yaml"
     for entry in yaml.safe_load(path.read_text(encoding="utf-8")).get("defaults", []):

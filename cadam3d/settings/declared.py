@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
+from cadam3d.io.run_folder import LATEST
 
 Kinds = tuple[type, ...]  # a value must be of one of them
 
@@ -37,7 +38,7 @@ SETTINGS: dict[str, Any] = {
     **dict.fromkeys(("steps", "views", "seed"), int),
     **dict.fromkeys(("browser", "json"), bool),
 }
-EXAMPLES = {"prompt": "a cube", "steps": 600, "run": "outputs/latest", "resume": "outputs/latest"}
+EXAMPLES = {"prompt": "a cube", "steps": 600, "run": LATEST, "resume": LATEST}
 EXAMPLES |= {"negative_prompt": "", "device": "auto", "ply_up": "-y", "views": 2, "seed": 0}
 WORDS = {
     int: "a whole number",
@@ -48,8 +49,11 @@ WORDS = {
 }
 PLAIN: dict[Any, Callable[[Any], bool]] = {
     int: lambda value: type(value) is int and abs(value) <= LARGEST_WHOLE,
-    # NaN and infinity are refused, and so are integers that no float can hold.
-    float: lambda value: type(value) in (int, float) and abs(value) <= sys.float_info.max,
+    # NaN and infinity are refused, and so are integers that torch does not read.
+    float: lambda value: (
+        (type(value) is float and abs(value) <= sys.float_info.max)
+        or (type(value) is int and abs(value) <= LARGEST_WHOLE)
+    ),
     str: lambda value: isinstance(value, str) and _is_readable(value),
     bool: lambda value: isinstance(value, bool),
     NoneType: lambda value: value is None,

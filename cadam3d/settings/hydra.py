@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
-from cadam3d.settings.advice import did_you_mean, line_of
+from cadam3d.settings.advice import default_option, did_you_mean, line_of
 from cadam3d.settings.compose import VERSION_BASE, compose, config_dir, quote, register_resolvers
 from cadam3d.settings.declared import TARGET, replacement
 from cadam3d.settings.line import RUN_FOLDER, key_of
@@ -65,6 +65,8 @@ def refuse_missing_settings(cfg: DictConfig, command: str, overrides: Sequence[s
             # A job of a sweep is also a line of train.
             line = line_of("train" if command == "sweep" else command, rest)
             raise UserError(f"~{key}: a setting can be changed but not removed. Try: {line}")
+        if override.endswith("=[]") and key not in cfg and default_option(key, command):
+            raise UserError(f"{key}: expected the name of an option, got []. Try: {replacement(key)}")
     raw = OmegaConf.to_container(cfg, resolve=False)
     assert isinstance(raw, dict)
     # Plain values come first, so that the message names the wrong value and not a setting that refers to it.
