@@ -1,5 +1,6 @@
 """Shared fixtures (the command line in this process, small real pipelines), and the order of test files."""
 
+import gc
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +25,12 @@ def pytest_collection_modifyitems(items):
         return LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG)
 
     items.sort(key=place)
+
+
+def pytest_collection_finish():
+    # Imported modules and collected tests stay in memory, so the garbage collector need not scan them.
+    gc.collect()
+    gc.freeze()
 
 
 class Result(NamedTuple):

@@ -106,9 +106,7 @@ def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
     # A name with a null byte is a ValueError.
     except (OSError, ValueError, MemoryError) as error:
         reason = getattr(error, "strerror", None) or error or "too large"
-        raise UserError(
-            f"{path}: cannot be read ({reason}). Try: ply=FILE with a file that exists"
-        ) from error
+        raise UserError(f"{path}: cannot be read ({reason}). Try: another file") from error
 
     def columns(names: Sequence[str]) -> np.ndarray:
         # A double may be too large for a float; the infinity is refused below.
