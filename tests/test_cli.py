@@ -804,7 +804,6 @@ def test_a_path_that_the_system_refuses_is_one_message(line, path, type_line, tm
 @pytest.mark.parametrize(
     ("line", "hint"),
     [
-        ("train seed=1 prompt=cube hydra.run.dir=PATH", "train seed=1 prompt=cube"),
         ("train --config-dir PATH prompt=cube", "train prompt=cube"),
         ("sweep prompt=cube seed=0,1 hydra.sweep.dir=PATH", "sweep prompt=cube seed=0,1"),
     ],

@@ -55,8 +55,8 @@ class Asset:
 def open_asset(cfg: DictConfig) -> Asset:
     """Return the asset that ``run=`` or ``ply=`` names; exactly one of them must be given."""
     if (cfg.run is None) == (cfg.ply is None):
-        got = "neither" if cfg.run is None else "both"
-        raise UserError(f"run, ply: expected one of them, got {got}. Try: {suggestion('', 'run', ASSET)}")
+        got, line = ("neither", suggestion("", "run", ASSET)) if cfg.run is None else ("both", "ply=null")
+        raise UserError(f"run, ply: expected one of them, got {got}. Try: {line}")
     if cfg.run is not None:
         return open_run(find_run(str(cfg.run)), cfg.device)
     ply = expanded(str(cfg.ply))

@@ -210,7 +210,7 @@ def test_the_advice_for_any_words_in_any_order_can_be_parsed() -> None:
         "\x00",
         "\u0130",
     ]
-    for _ in range(3000):
+    for _ in range(1000):
         words = rng.choices([*known, *near, *sorted(IGNORED_WORDS), *rare * 8], k=rng.randrange(12))
         if rng.random() < 0.3:
             words.append("".join(rng.choices(string.printable, k=6)))
@@ -236,7 +236,7 @@ def test_a_sentence_that_can_be_parsed_is_its_own_nearest_sentence() -> None:
         "big flat gold striped",
     )
     joints = (*(" ".join(words) for words, _ in RELATIONS), "between a cube and")
-    for _ in range(500):
+    for _ in range(200):
         phrases = [f"a {rng.choice(described)} {rng.choice(NOUNS)}" for _ in range(rng.randrange(1, 5))]
         prompt = phrases[0]
         for phrase in phrases[1:]:
@@ -271,7 +271,7 @@ def test_a_prompt_of_too_many_objects_is_refused(joint: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "prompt", ["x" * 100_000, " ".join(f"word{i}" for i in range(20_000)), "\u00e9 " * 50_000]
+    "prompt", ["x" * 30_000, " ".join(f"word{i}" for i in range(5_000)), "\u00e9 " * 15_000]
 )
 def test_the_message_for_a_long_prompt_is_short(prompt: str) -> None:
     assert len(refusal(prompt)) < 4000
