@@ -119,7 +119,7 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         (*A_CUBE, "hydra.run.dir=a run"),
         (*A_CUBE, "guidance.t_min=0.9", "guidance.t_max=0.1"),
         (*A_CUBE, "exporter.turntable.fps=1e12"),
-        (*A_CUBE, "densifier.reset=everybody"),
+        (*A_CUBE, "densifier.reset=everything"),
         (*A_CUBE, "densifier=cadam_open", "densifier.reset=all", "densifier.tau_reset=1"),
         (*A_CUBE, "rasterizer=cuda"),
     ],

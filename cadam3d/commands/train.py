@@ -252,7 +252,7 @@ def start_or_resume(
         "seed",
         expected=f"{state.seed}, with which this run was started",
         got=cfg.seed,
-        example="resume without seed=..., or start another run",
+        example=f"seed={state.seed}",
     )
     require(
         state.step <= trainer.steps,

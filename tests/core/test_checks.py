@@ -99,7 +99,7 @@ def test_a_refused_choice_lists_the_options():
     ("value", "choices", "suggested"),
     [
         ("tinny", ("shapes", "tiny"), "tiny"),
-        ("everybody", ("unreliable", "all", "none"), "unreliable"),
+        ("everything", ("unreliable", "all", "none"), "unreliable"),
         ("nome", ("unreliable", "all", "none"), "none"),
         (91, (0, 90, 180), "90"),
         (0, (True, False), "false"),
