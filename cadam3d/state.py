@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.core.checks import require
-from cadam3d.core.edit import RowState
+from cadam3d.core.edit import RowEdit, RowState
 from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.core.outcome import Outcome
 from cadam3d.core.render import RenderFn
@@ -166,6 +166,7 @@ class RefineReport:
     reset: int  # opacities lowered
     statistics: dict[str, float]  # of the densifier
     population: Population  # before the edit
+    edit: RowEdit | None  # what happened to the rows; None if none was added or removed
 
 
 @dataclass(frozen=True)

@@ -126,6 +126,7 @@ class Trainer:
         statistics, scores = self.densifier.statistics(seen, step), self.densifier.scores(seen)
         is_selected = torch.zeros(len(before), dtype=torch.bool, device=before.device)
         cloned = split = pruned = reset = 0
+        edit = None
 
         if refines:
             generator = state.generators["refine"]
@@ -140,6 +141,7 @@ class Trainer:
                 carried = self.densifier.carry(state.densifier, plan.edit)
                 state.optimizer.apply(plan.edit)
                 state.densifier = carried
+                edit = plan.edit
                 cloned, split, pruned = plan.cloned, plan.split, plan.pruned
 
         if resets and not state.refused:
@@ -158,6 +160,7 @@ class Trainer:
             reset=reset,
             statistics=statistics,
             population=Population(gaussians=before, is_selected=is_selected, scores=scores),
+            edit=edit,
         )
 
     def start(self, prompt: str, initializer: Initializer, seed: int, device: torch.device) -> TrainState:

@@ -1,10 +1,14 @@
 """Exporter: writes an asset, or pictures of it, into a folder."""
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
+from cadam3d.core.checks import require_choice
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn
+from cadam3d.io.frames import UPS
 
 
 class Exporter(ABC):
@@ -15,4 +19,31 @@ class Exporter(ABC):
         """Write into ``folder``, which exists, and return the paths of the files.
 
         ``render`` shows the same ``gaussians``. Raises ``UserError`` if a file cannot be written.
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssetExporter(Exporter):
+    """Write the object itself as one file, in the axes that the user chooses, without rendering anything."""
+
+    # Node of the configuration, such as "exporter.spz", with which error messages begin.
+    node: ClassVar[str]
+    file_name: ClassVar[str]
+
+    up: str  # up axis of the file, one of UPS
+
+    def __post_init__(self) -> None:
+        require_choice(f"{self.node}.up", self.up, UPS)
+
+    def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
+        """Write the file and return its path."""
+        path = folder / self.file_name
+        self.write(path, gaussians)
+        return [path]
+
+    @abstractmethod
+    def write(self, path: Path, gaussians: Gaussians) -> None:
+        """Write ``gaussians`` (in world axes) into ``path``, atomically.
+
+        Raises ``UserError`` if the file cannot be written.
         """

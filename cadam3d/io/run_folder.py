@@ -24,12 +24,28 @@ OVERRIDES = ".hydra/overrides.yaml"  # what was typed
 SUMMARY = "summary.json"
 
 # Written by exporters and callbacks.
+ASSET_COMPRESSED_PLY = "asset.compressed.ply"
+ASSET_GLB = "asset.glb"
+ASSET_KSPLAT = "asset.ksplat"
+ASSET_MESH_GLB = "asset_mesh.glb"
+ASSET_MESH_OBJ = "asset_mesh.obj"
+ASSET_MESH_PLY = "asset_mesh.ply"
+ASSET_SOG = "asset.sog"
+ASSET_SPLAT = "asset.splat"
+ASSET_SPZ = "asset.spz"
 CANDIDATES = "candidates"  # a folder
 HISTOGRAMS = "candidates/histograms.jsonl"
 IMAGES = "images"  # a folder
 PREVIEW = "preview.png"
 PREVIEWS = "previews"  # a folder
+LIVE = "live"  # a folder: what a running training and a page that watches it tell each other
+SAVED = "saved"  # a folder: assets that a user has saved during training
 TURNTABLE = "turntable.mp4"
+VIEWER = "viewer.html"
+
+# Written by ``cadam3d export``.
+ASSET_RECORD = "asset.json"
+EXPORTS = "exports"  # a folder
 
 # Written after training, for a run or for a sweep.
 EVALUATION = "eval.json"
@@ -100,8 +116,10 @@ def occupant_of_sweep(folder: Path) -> str | None:
 
 def _written_by_runs() -> tuple[str, ...]:
     """Return every name in the folder of a run that training, its exporters, its callbacks or eval write."""
-    files = (ASSET, CHARTS, CONFIG, EVALUATION, LOG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE)
-    return (*files, CANDIDATES, CHECKPOINTS, HYDRA, IMAGES, PREVIEWS)
+    files = (ASSET, CHARTS, CONFIG, EVALUATION, LOG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE, VIEWER)
+    formats = (ASSET_COMPRESSED_PLY, ASSET_GLB, ASSET_KSPLAT, ASSET_SOG, ASSET_SPLAT, ASSET_SPZ)
+    meshes = (ASSET_MESH_GLB, ASSET_MESH_OBJ, ASSET_MESH_PLY)
+    return (*files, *formats, *meshes, CANDIDATES, CHECKPOINTS, HYDRA, IMAGES, LIVE, PREVIEWS, SAVED)
 
 
 def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:
