@@ -144,9 +144,8 @@ def test_wrong_values_name_their_key(settings, message):
 def in_node(program: str, *inputs: bytes) -> object:
     """Return what ``program`` prints as JSON; it has ``SplatView`` and the ``inputs`` as array buffers."""
     buffers = json.dumps([base64.b64encode(data).decode() for data in inputs])
-    start = (
-        f"""const inputs = {buffers}.map((text) => Uint8Array.from(Buffer.from(text, "base64")).buffer);"""
-    )
+    read = '(text) => Uint8Array.from(Buffer.from(text, "base64")).buffer'
+    text = f"{script()}\nconst inputs = {buffers}.map({read});\n{program}"
     done = subprocess.run(
         [str(NODE), "-"], input=text, capture_output=True, text=True, check=False, timeout=60
     )
