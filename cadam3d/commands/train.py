@@ -21,6 +21,7 @@ from cadam3d.augmentation import Augmentation
 from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
+from cadam3d.commands.control import Control
 from cadam3d.commands.messages import keeping_others, note, note_backend
 from cadam3d.commands.timetable import describe
 from cadam3d.core.checks import require, require_whole
@@ -60,6 +61,7 @@ from cadam3d.prior.prompting import Prompting
 from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.regularizer import Regularizer
 from cadam3d.report import write_report
+from cadam3d.report.declarations import write_declarations
 from cadam3d.settings.compose import component, components, flatten, load_config
 from cadam3d.settings.declared import TARGET
 from cadam3d.state import Outcome, PayloadError, RunContext, TrainState
@@ -115,9 +117,15 @@ def run(cfg: DictConfig) -> float | None:
         total_steps=trainer.steps,
         render=render,
         rasterizer=trainer.rasterizer,
+        densifier=trainer.densifier,
     )
-    with StopOnSignal() as stop:
-        outcome = trainer.train(state, embedding, context, stop)
+    charts = [*trainer.densifier.charts(), *trainer.guidance.charts()]
+    write_declarations(folder, charts)
+    with (
+        StopOnSignal() as stop,
+        Control(folder, state, stop, partial(trainer.wait, context, state)) as control,
+    ):
+        outcome = trainer.train(state, embedding, context, control)
         log.info("%s after %d steps: %d Gaussians", outcome, state.step, len(state.gaussians))
 
         summary = summarize(cfg, state, outcome, backend) | memory | measure_memory(device)
@@ -142,7 +150,7 @@ def run(cfg: DictConfig) -> float | None:
             summary=summary,
             metrics=read_metrics(folder),
             config_text=config_text,
-            charts=[*trainer.densifier.charts(), *trainer.guidance.charts()],
+            charts=charts,
         )
     print_result(folder, summary, report)
     # This also applies if all steps were done already, so that a loop in a shell script ends.
