@@ -26,9 +26,9 @@ class Progress(Callback):
     """A tqdm bar on standard error if that is a terminal, else plain lines.
 
     ``done`` is the time of day at which the last step will end if steps keep the average duration that they
-    have had since this process started training. Time in which the run was paused does not count. ``VRAM``, on a CUDA device only, is the largest amount of
-    memory that tensors have used at once; torch's cache and the driver use more. The environment variable
-    ``TQDM_DISABLE`` turns off both the bar and the lines.
+    have had since this process started training, without the time in which the run was paused. ``VRAM``, on a
+    CUDA device only, is the largest amount of memory that tensors have used at once; torch's cache and the
+    driver use more. The environment variable ``TQDM_DISABLE`` turns off both the bar and the lines.
     """
 
     refresh_seconds: float

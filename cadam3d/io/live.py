@@ -1,7 +1,7 @@
 """Live: the files through which a run that trains and the pages that show it talk to each other.
 
 They work across processes, and for all users of one file system. The folder ``live/`` exists while its run
-trains. A request to the run is an empty file: its name is the whole message. There is no content that could be
+trains. A request to the run is an empty file: its name is the whole message. It has no content that could be
 damaged, any number of pages can ask at once, and so can a shell (``touch RUN/live/pause``).
 """
 

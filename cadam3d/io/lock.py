@@ -115,22 +115,23 @@ def unlock(file: IO[Any]) -> None:
 
 
 def is_held(path: Path) -> bool:
-    """Return whether a process holds the lock file ``path``. On a file system without locks, its note decides.
+    """Return whether a process holds the lock file ``path``.
 
-    A process removes its note when it ends, so a file without a note is free. Only after a kill is there a
-    note without a process. The lock itself is then tried for an instant, which :func:`take` waits for.
+    A process removes its note when it ends, so a file without a note is free, and only after a kill is there
+    a note without a process. If there is a note, the lock is held for an instant to find out; :func:`take`
+    waits for that.
     """
     if _read_note(path) is None:
         return False
     try:
-        with _open(path, os.O_RDONLY if fcntl is not None else os.O_RDWR) as file:
+        # A shared lock needs no right to write, so that other users can look too.
+        with _open(path, os.O_RDWR if fcntl is None else os.O_RDONLY) as file:
             if fcntl is None:
                 return not try_lock(file)
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
+    # Either another process holds the lock, or the file system has no locks, and then the note decides.
     except (OSError, UserError):
-        return fcntl is not None
+        return True
     return False
 
 

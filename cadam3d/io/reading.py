@@ -70,7 +70,7 @@ def open_contained(folder: Path, name: str) -> BinaryIO:
 
 
 def signature(file: BinaryIO) -> tuple[int, int, int, int]:
-    """Return device, number, size in bytes and time (in ns) of an open file: another content differs in one."""
+    """Return device, number, size (bytes) and time (ns) of an open file; a changed file differs in these."""
     status = os.fstat(file.fileno())
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 

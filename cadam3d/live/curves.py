@@ -1,4 +1,4 @@
-"""Curves: the numbers of ``metrics.jsonl`` as curves over the steps, read piece by piece while a run writes."""
+"""Curves: the numbers of ``metrics.jsonl`` over the steps, read piece by piece while a run writes them."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -66,15 +66,13 @@ class Curves:
         return max((points[-1][0] for points in self._points.values()), default=0)
 
     def drawn(self, charts: Iterable[Chart]) -> list[dict[str, Any]]:
-        """Return the common charts, then those of ``charts`` that have numbers, as plain data for the page."""
+        """Return the common charts and ``charts``, with their numbers so far, as plain data."""
         found = []
         for chart in (*COMMON, *charts):
-            band = [self._sent(key) for key in chart.band or ()]
+            facts = {name: getattr(chart, name) for name in ("title", "caption", "log_y", "percent")}
+            bounds = [{"key": key, "points": self._sent(key)} for key in chart.band or ()]
             curves = [{**vars(curve), "points": self._sent(curve.key)} for curve in chart.curves]
-            if any(band) or any(curve["points"] for curve in curves):
-                facts = {name: getattr(chart, name) for name in ("title", "caption", "log_y", "percent")}
-                label = {"band_label": chart.band_label, "band_keys": chart.band or ()}
-                found.append({**facts, **label, "curves": curves, "band": band})
+            found.append({**facts, "curves": curves, "band": bounds, "band_label": chart.band_label})
         return found
 
     def _sent(self, key: str) -> Points:

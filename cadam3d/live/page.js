@@ -3,18 +3,19 @@
 "use strict";
 
 const POLL_MS = 700, RETRY_MS = 2000, TIMEOUT_MS = 60000;
-const ORDER = ["rgb", "depth", "opacity", "snr", "age", "selected"];
 const STATUS = {
   training: "training", paused: "paused", ending: "writing the outputs", busy: "busy", idle: "not running",
 };
 const SPEED_SAMPLES = 20;
 
 const $ = (id) => document.getElementById(id);
-const view = new SplatView($("view"), {});
+const isDark = matchMedia("(prefers-color-scheme: dark)").matches;
+const view = new SplatView($("view"), { background: isDark ? [0.07, 0.075, 0.085] : [1, 1, 1] });
+view.controls($("controls"));
 let state = null;
 let charts = [];
 let recent = []; // states of this process, oldest first: the newest numbers of the charts, and the speed
-let shown = { picture: null, charts: null, layers: "" };
+const shown = { picture: null, charts: null };
 let loading = false;
 let savedBefore = null; // the saved steps at the time of the last click on "Save now"
 
@@ -74,7 +75,6 @@ async function showPicture() {
   try {
     await view.load(await (await get("picture")).arrayBuffer());
     shown.picture = name;
-    drawLayers();
   } catch (error) {
     message(`The picture cannot be shown: ${error.message}`);
   } finally {
@@ -184,24 +184,6 @@ function link(text, address, file) {
   return item;
 }
 
-function drawLayers() {
-  const names = [...view.layers];
-  const place = (name) => (ORDER.indexOf(name) + 1 || ORDER.length + 1);
-  names.sort((a, b) => place(a) - place(b));
-  if (names.join() !== shown.layers) {
-    shown.layers = names.join();
-    $("layers").replaceChildren(...names.map((name) => {
-      const button = element("button", name);
-      Object.assign(button, { type: "button", onclick: () => { view.show(name); drawLayers(); } });
-      button.dataset.layer = name;
-      button.setAttribute("role", "radio");
-      return button;
-    }));
-  }
-  for (const button of $("layers").children) button.setAttribute("aria-checked", button.dataset.layer === view.layer);
-  $("legend").replaceChildren(view.legend());
-}
-
 // --- charts ---------------------------------------------------------------------------------------------------
 
 const SVG = "http://www.w3.org/2000/svg";
@@ -209,17 +191,16 @@ const [WIDTH, HEIGHT, LEFT, BOTTOM, TOP] = [330, 112, 44, 16, 8];
 
 function drawChart(chart) {
   const lines = chart.curves.map((curve) => ({ ...curve, points: extended(curve.points, curve.key) }));
-  const band = chart.band.map((points, index) => extended(points, chart.band_keys[index]));
+  const band = chart.band.map((bound) => extended(bound.points, bound.key));
   const all = [...lines.flatMap((line) => line.points), ...band.flat()];
-  const figure = document.createElement("figure");
-  if (!all.length) return figure;
+  if (!all.length) return "";
   const values = all.map((point) => point[1]);
   const isLog = chart.log_y && Math.min(...values) > 0;
   const scale = isLog ? Math.log10 : (value) => value;
   const [lowX, highX] = [0, Math.max(state.total_steps || 0, ...all.map((point) => point[0]), 1)];
   let [low, high] = [Math.min(...values.map(scale)), Math.max(...values.map(scale))];
   if (!isLog && low > 0 && low < 0.6 * high) low = 0;
-  if (high === low) [low, high] = [low - 0.5, high + 0.5];
+  if (high === low) [low, high] = isLog || low <= 0 ? [low - 1, high + 1] : [0, 1.25 * high];
   const x = (step) => LEFT + ((step - lowX) / (highX - lowX)) * (WIDTH - LEFT - 4);
   const y = (value) => HEIGHT - BOTTOM - ((scale(value) - low) / (high - low)) * (HEIGHT - BOTTOM - TOP);
   const text = (value) => (chart.percent ? `${short(100 * value)} %` : short(value));
@@ -243,6 +224,7 @@ function drawChart(chart) {
   const caption = element("figcaption", chart.title);
   const last = lines[0].points.at(-1);
   if (last) caption.append(element("span", chart.percent ? text(last[1]) : short(last[1])));
+  const figure = document.createElement("figure");
   figure.title = chart.caption;
   figure.append(caption, svg);
   const keys = [...lines.map((line) => line.label), chart.band_label].filter(Boolean);
@@ -277,7 +259,7 @@ function short(value) {
   for (const [factor, suffix] of [[1e9, "G"], [1e6, "M"], [1e4, "k"]]) {
     if (size >= factor) return `${+(value / (suffix === "k" ? 1e3 : factor)).toPrecision(3)}${suffix}`;
   }
-  return size !== 0 && size < 1e-3 ? value.toExponential(1) : `${+value.toPrecision(4)}`;
+  return size !== 0 && size < 1e-3 ? value.toExponential(1) : `${+value.toPrecision(size < 1e3 ? 3 : 4)}`;
 }
 
 function duration(seconds) {
@@ -289,5 +271,4 @@ function duration(seconds) {
 $("pause").onclick = () => ask($("pause").dataset.request);
 $("save").onclick = () => ask("save");
 $("stop").onclick = () => ask("stop");
-view.onchange = () => drawLayers();
 poll();

@@ -1,4 +1,4 @@
-"""Server: gives a page to the browsers of this machine, and what the page asks for. SECURITY.md has the promise.
+"""Server: gives a page to browsers on this machine, and what the page asks for; see ``SECURITY.md``.
 
 Only a program that knows the token in the address gets anything. The answers are a fixed list; no path from a
 request leads to a file.
@@ -21,8 +21,8 @@ from cadam3d.live.subject import Subject
 from cadam3d.viewer import page as viewer
 
 HOST = "127.0.0.1"
-# The names by which a browser on this machine may call it. With any other name, somebody else's page was made to
-# lead here (DNS rebinding).
+# The names by which a browser on this machine calls it. Any other name may belong to a foreign page that was
+# made to lead here (DNS rebinding).
 OWN_NAMES = ("127.0.0.1", "localhost")
 REQUESTS = ("pause", "resume", "save", "stop")
 LONGEST_BODY = 1000  # bytes of a request
@@ -43,8 +43,8 @@ POLICY = (
     "default-src 'none'; script-src 'self'; worker-src blob:; style-src 'self'; connect-src 'self'; "
     "img-src 'self' data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-# The report is a page by the author of the run. In a sandbox it belongs to no origin, so it can neither read what
-# this server answers nor press a button.
+# The report is a page by the author of the run. In a sandbox it belongs to no origin, so it can neither read
+# what this server answers nor press a button.
 REPORT_POLICY = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "worker-src blob:; img-src data: blob:; media-src data:; font-src data:; frame-ancestors 'none'"

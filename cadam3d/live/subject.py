@@ -1,7 +1,7 @@
 """Subject: what a page shows, which is a run (finished, training, or neither) or a single file.
 
-Every answer is read from the files at the moment of the question, so a run that begins or ends while its page is
-open is followed. A stranger may have written the folder: no link in it is followed, and every number is checked.
+Every answer is read from the files at the moment of the question, so a page follows a run that begins or ends
+while it is open. A stranger may have written the folder: no link in it is followed, and numbers are checked.
 """
 
 import re
@@ -185,7 +185,7 @@ class Run(Subject):
         return live.ask(self.place, request)
 
     def offered(self, name: str) -> BinaryIO | None:
-        """Open ``asset``, ``report`` or ``saved/STEP``; None if it is missing, or a link is on the way to it."""
+        """Open ``asset``, ``report`` or ``saved/STEP``; None if it is missing or behind a link."""
         step = re.fullmatch(r"saved/([0-9]{1,12})", name)
         fixed = {"asset": ASSET, "report": REPORT}
         if step is None and name not in fixed:

@@ -122,7 +122,7 @@ READERS: dict[str, Callable[[Path], object]] = {
 }
 COMMANDS = {
     "eval": ["eval", "run=run", "metric=[size]"],
-    "view": ["view", "run=run", "browser=false"],
+    "view": ["view", "run=run", "open=false"],
     "render": ["render", "run=run", "exporter=[images]", "exporter.images.size=8", "exporter.images.views=1"],
     "resume": ["train", "resume=run"],
 }
