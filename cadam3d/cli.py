@@ -19,7 +19,7 @@ COMMANDS = {  # the purpose of each, and a line to paste
     "render": ("make pictures or a turntable of an asset", "cadam3d render run=outputs/latest"),
     "export": ("write an asset in another format", "cadam3d export run=outputs/latest"),
     "eval": ("measure a finished run or sweep", "cadam3d eval run=outputs/latest"),
-    "view": ("show the report of a run, or an asset", "cadam3d view run=outputs/latest"),
+    "view": ("show a run in a browser, also while it trains", "cadam3d view run=outputs/latest"),
     "doctor": ("check this machine, with a hint per failure", "cadam3d doctor"),
 }
 # The command for a line that begins with one of these settings; all other settings are of training.

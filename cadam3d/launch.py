@@ -32,7 +32,7 @@ from cadam3d.settings.place import occupied
 from cadam3d.settings.trust import judge_composition, require_trust, targets_in
 
 TRAINING = ("train", "sweep")  # the commands that have a run folder
-EXPORTING = ("render", "export", "view")  # the commands with output=
+EXPORTING = ("render", "export")  # the commands with output=
 
 
 @dataclass

@@ -179,6 +179,8 @@ class RunContext:
     render: RenderFn  # renders the current Gaussians, without gradient
     # Renders other Gaussians, such as those before a refinement.
     rasterizer: Rasterizer
+    # Computes scores and statistics from the state of the densifier.
+    densifier: Densifier
 
 
 def start_generators(seed: int) -> dict[str, torch.Generator]:

@@ -191,8 +191,10 @@ class Trainer:
     ) -> Outcome:
         """Advance ``state`` in place until ``steps`` are done or another outcome ends the run.
 
-        ``stop()`` is called after every step and interrupts the run if it returns True. Running out of memory
-        is an outcome. Any other exception is raised again after ``on_abort`` of the callbacks.
+        ``stop()`` is called after every step and interrupts the run if it returns True. While the run is
+        paused it does not return, and calls :meth:`wait` instead; this time is not part of
+        ``state.seconds``. Running out of memory is an outcome. Any other exception is raised again after
+        ``on_abort`` of the callbacks.
         """
         for callback in self.callbacks:
             callback.on_start(context, state)
@@ -207,6 +209,11 @@ class Trainer:
         for callback in self.callbacks:
             callback.on_end(context, state, outcome)
         return outcome
+
+    def wait(self, context: RunContext, state: TrainState) -> None:
+        """Call the callbacks between two steps of a run that is paused."""
+        for callback in self.callbacks:
+            callback.on_pause(context, state)
 
     def _loop(
         self, state: TrainState, embedding: PromptEmbedding, context: RunContext, stop: Callable[[], bool]

@@ -176,7 +176,14 @@ def measure(recipe: str, model: Path, args: argparse.Namespace) -> dict[str, Any
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     with tempfile.TemporaryDirectory() as folder:
-        context = RunContext(Path(folder), cfg.prompt, cfg.steps, trainer.renderer(state), trainer.rasterizer)
+        context = RunContext(
+            Path(folder),
+            cfg.prompt,
+            cfg.steps,
+            trainer.renderer(state),
+            trainer.rasterizer,
+            trainer.densifier,
+        )
         warm: Trainer = replace(trainer, steps=args.warmup)
         warm.train(state, embedding, context)
         watch.seconds.clear()

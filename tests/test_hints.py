@@ -152,6 +152,9 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         ("export", "run=a run", "output=a.b.obj"),
         ("eval",),
         ("view", "run=nowhere"),
+        ("view", "run=new"),
+        ("view", "run=a run", "port=99999"),
+        ("view", "run=a run", "browser=false"),
     ],
     "sweeps": [
         ("sweep", "prompt=a red cube"),
@@ -176,6 +179,7 @@ LONGEST_WAY = 4  # messages
 ELSEWHERE: dict[str, str] = {
     "commands/eval.py::_evaluate_sweep": "needs a sweep whose jobs all fail",
     "commands/eval.py::_not_saved": "needs a folder that cannot be written; see tests/commands",
+    "commands/view.py::_listening": "needs a port that is in use; see tests/commands/test_view.py",
     "commands/train.py::build_trainer": "needs other steps in refine than in the run",
     "commands/train.py::require_unused": "see test_wrong_values.py",
     "commands/train.py::start_or_resume": "needs a checkpoint",
@@ -460,6 +464,7 @@ def answers(tmp_path_factory) -> Iterator[Answers]:
         patch.setattr("cadam3d.sweep.start.write_plan", accept)
         patch.setattr("cadam3d.commands.doctor.run", accept)
         patch.setattr("webbrowser.open", lambda _: True)
+        patch.setattr("cadam3d.live.server.Server.serve_forever", accept)
         for exporter in ("images.ImagesExporter", "turntable.TurntableExporter", "preview.PreviewExporter"):
             patch.setattr(f"cadam3d.exporter.{exporter}.export", lambda *_: [folder / "a run"])
         # Otherwise the suite would refuse a wrong type before the component does.

@@ -65,7 +65,9 @@ def make(overrides: Sequence[str] = ()) -> tuple[Trainer, TrainState]:
 
 def go(trainer: Trainer, state: TrainState, tmp_path: Path, **kwargs) -> Outcome:
     embedding = trainer.prior.embed("a red cube", "")
-    context = RunContext(tmp_path, "a red cube", trainer.steps, trainer.renderer(state), trainer.rasterizer)
+    context = RunContext(
+        tmp_path, "a red cube", trainer.steps, trainer.renderer(state), trainer.rasterizer, trainer.densifier
+    )
     return trainer.train(state, embedding, context, **kwargs)
 
 

@@ -6,7 +6,7 @@ from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainSt
 
 
 class Callback(ABC):  # noqa: B024 (every hook has a sensible default: do nothing)
-    """Override the hooks that you need; the order of calls is start, (refine?, step)*, end."""
+    """Override the hooks that you need; the order of calls is start, (refine?, step, pause*)*, end."""
 
     def on_start(self, context: RunContext, state: TrainState) -> None:  # noqa: B027
         """Called before the first step, also after a resume (then ``state.step`` > 0)."""
@@ -16,6 +16,9 @@ class Callback(ABC):  # noqa: B024 (every hook has a sensible default: do nothin
 
     def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:  # noqa: B027
         """Called after every refinement or opacity reset, before ``on_step`` of the same step."""
+
+    def on_pause(self, context: RunContext, state: TrainState) -> None:  # noqa: B027
+        """Called several times a second while the run waits between two steps, because a user paused it."""
 
     def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:  # noqa: B027
         """Called after the last step, whatever the outcome."""

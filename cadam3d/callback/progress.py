@@ -26,16 +26,19 @@ class Progress(Callback):
     """A tqdm bar on standard error if that is a terminal, else plain lines.
 
     ``done`` is the time of day at which the last step will end if steps keep the average duration that they
-    have had since this process started training. ``VRAM``, on a CUDA device only, is the largest amount of
-    memory that tensors have used at once; torch's cache and the driver use more. The environment variable
-    ``TQDM_DISABLE`` turns off both the bar and the lines.
+    have had since this process started training, without the time in which the run was paused. ``VRAM``, on a
+    CUDA device only, is the largest amount of memory that tensors have used at once; torch's cache and the
+    driver use more. The environment variable ``TQDM_DISABLE`` turns off both the bar and the lines.
     """
 
     refresh_seconds: float
     line_seconds: float
     _bar: tqdm | None = field(default=None, init=False, repr=False)
-    # Step and time, in seconds since the epoch, at which this process started training.
+    # Step and time, in seconds since the epoch, at which this process started training. A pause moves the
+    # time by its length.
     _begun: tuple[int, float] = field(default=(0, 0.0), init=False, repr=False)
+    # Time of the last call, in seconds since the epoch.
+    _called: float = field(default=0.0, init=False, repr=False)
     # The next line is due at this reading of the monotonic clock, in seconds.
     _due: float = field(default=0.0, init=False, repr=False)
     # The line of the last step; empty once it has been printed.
@@ -63,7 +66,7 @@ class Progress(Callback):
         """Advance the bar by one step, or print a line if one is due."""
         shown = {"N": str(report.num_gaussians), "loss": f"{report.loss:.3g}"}
         first_step, first_time = self._begun
-        now = time.time()
+        now = self._called = time.time()
         pace = (now - first_time) / max(report.step - first_step, 1)  # seconds per step
         if first_step < report.step < context.total_steps:
             shown["done"] = clock(now, pace * (context.total_steps - report.step))
@@ -79,6 +82,14 @@ class Progress(Callback):
         self._pending = f"{context.prompt[:TITLE]}: step {report.step}/{context.total_steps}, {facts}"
         if time.monotonic() >= self._due or report.step == context.total_steps:
             self._print()
+
+    def on_pause(self, context: RunContext, state: TrainState) -> None:
+        """Leave the time since the last call out of all averages."""
+        now = time.time()
+        self._begun = (self._begun[0], self._begun[1] + now - self._called)
+        self._called = now
+        if self._bar is not None:
+            self._bar.unpause()
 
     def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
         """Close the bar and leave its last line on the screen, or print the line of the last step."""

@@ -1,4 +1,4 @@
-"""Asset: open the results of a run, as ``render``, ``export``, ``eval`` and ``view`` do first."""
+"""Asset: open the results of a run, as ``render``, ``export`` and ``eval`` do first."""
 
 import os
 import tempfile
@@ -54,9 +54,7 @@ class Asset:
 
 def open_asset(cfg: DictConfig) -> Asset:
     """Return the asset that ``run=`` or ``ply=`` names; exactly one of them must be given."""
-    if (cfg.run is None) == (cfg.ply is None):
-        got, line = ("neither", suggestion("", "run", ASSET)) if cfg.run is None else ("both", "ply=null")
-        raise UserError(f"run, ply: expected one of them, got {got}. Try: {line}")
+    require_one(cfg)
     if cfg.run is not None:
         return open_run(find_run(str(cfg.run)), cfg.device)
     ply = expanded(str(cfg.ply))
@@ -64,12 +62,25 @@ def open_asset(cfg: DictConfig) -> Asset:
     return Asset(gaussians=gaussians, ply=ply, folder=ply.with_suffix(""))
 
 
-def open_run(folder: Path, device: str) -> Asset:
-    """Return the asset of the run in ``folder``."""
+def require_one(cfg: DictConfig) -> None:
+    """Raise ``UserError`` unless exactly one of ``run=`` and ``ply=`` is given."""
+    if (cfg.run is None) == (cfg.ply is None):
+        got, line = ("neither", suggestion("", "run", ASSET)) if cfg.run is None else ("both", "ply=null")
+        raise UserError(f"run, ply: expected one of them, got {got}. Try: {line}")
+
+
+def find_asset(folder: Path) -> Path:
+    """Return the path of the asset of the run in ``folder``. Raises ``UserError`` if it has none yet."""
     ply = folder / ASSET
     if not has_file(ply):
         line = f"cadam3d train {resume_word(shown(folder))}"
         raise UserError(f"{shown(folder)}: has no {ASSET} yet. Try: {line}")
+    return ply
+
+
+def open_run(folder: Path, device: str) -> Asset:
+    """Return the asset of the run in ``folder``."""
+    ply = find_asset(folder)
     return Asset(gaussians=read_ply(ply).to(resolve_device(device)), ply=ply, folder=folder)
 
 

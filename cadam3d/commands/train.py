@@ -21,8 +21,10 @@ from cadam3d.augmentation import Augmentation
 from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
+from cadam3d.commands.control import Control
 from cadam3d.commands.messages import keeping_others, note, note_backend
 from cadam3d.commands.timetable import describe
+from cadam3d.core.chart import Chart
 from cadam3d.core.checks import require, require_whole
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
@@ -60,6 +62,7 @@ from cadam3d.prior.prompting import Prompting
 from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.regularizer import Regularizer
 from cadam3d.report import write_report
+from cadam3d.report.declarations import write_declarations
 from cadam3d.settings.compose import component, components, flatten, load_config
 from cadam3d.settings.declared import TARGET
 from cadam3d.state import Outcome, PayloadError, RunContext, TrainState
@@ -108,16 +111,13 @@ def run(cfg: DictConfig) -> float | None:
     log.info("schedule: %s", timetable)
     log.info("rasterizer=%s; %s", backend.name, backend.reason or "nothing faster is known here")
 
-    render = trainer.renderer(state)
-    context = RunContext(
-        folder=folder,
-        prompt=cfg.prompt,
-        total_steps=trainer.steps,
-        render=render,
-        rasterizer=trainer.rasterizer,
-    )
-    with StopOnSignal() as stop:
-        outcome = trainer.train(state, embedding, context, stop)
+    charts = declare_charts(trainer, folder)
+    context = run_context(cfg.prompt, trainer, state, folder)
+    with (
+        StopOnSignal() as stop,
+        Control(folder, state, stop, partial(trainer.wait, context, state)) as control,
+    ):
+        outcome = trainer.train(state, embedding, context, control)
         log.info("%s after %d steps: %d Gaussians", outcome, state.step, len(state.gaussians))
 
         summary = summarize(cfg, state, outcome, backend) | memory | measure_memory(device)
@@ -125,12 +125,12 @@ def run(cfg: DictConfig) -> float | None:
         # The summary is written before the exports, which may fail.
         write_json(folder / SUMMARY, summary)
         gaussians = state.gaussians.detach()
-        written, warnings = export(exporters, gaussians, render, folder)
+        written, warnings = export(exporters, gaussians, context.render, folder)
         asset = folder / ASSET if folder / ASSET in written else None
         truth = trainer.prior.truth(cfg.prompt)
         for name, metric in metrics.items():
             with keeping_others(f"metric.{name}", warnings):
-                summary |= metric.measure(gaussians, render, truth, asset)
+                summary |= metric.measure(gaussians, context.render, truth, asset)
         if asset is not None:
             summary["asset_bytes"] = asset.stat().st_size
         # This is the last entry of a complete summary.
@@ -142,7 +142,7 @@ def run(cfg: DictConfig) -> float | None:
             summary=summary,
             metrics=read_metrics(folder),
             config_text=config_text,
-            charts=[*trainer.densifier.charts(), *trainer.guidance.charts()],
+            charts=charts,
         )
     print_result(folder, summary, report)
     # This also applies if all steps were done already, so that a loop in a shell script ends.
@@ -213,6 +213,25 @@ def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
     # The camera has checked its size by now, so that too many views are the only possible reason.
     require_views(cfg)
     return trainer
+
+
+def declare_charts(trainer: Trainer, folder: Path) -> list[Chart]:
+    """Return the charts that the components declare, and write them for pages that show the run live."""
+    charts = [*trainer.densifier.charts(), *trainer.guidance.charts()]
+    write_declarations(folder, charts)
+    return charts
+
+
+def run_context(prompt: str, trainer: Trainer, state: TrainState, folder: Path) -> RunContext:
+    """Return what callbacks may use of a run in ``folder``."""
+    return RunContext(
+        folder=folder,
+        prompt=prompt,
+        total_steps=trainer.steps,
+        render=trainer.renderer(state),
+        rasterizer=trainer.rasterizer,
+        densifier=trainer.densifier,
+    )
 
 
 def estimate_memory(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:

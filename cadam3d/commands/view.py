@@ -1,24 +1,46 @@
-"""``cadam3d view``: show the report of a run or a sweep, or a picture of a file. There is no live viewer."""
+"""``cadam3d view``: show a run or a file in a browser, and control a run that trains."""
 
+import errno
+import getpass
 import os
+import shlex
+import socket
 import sys
 import webbrowser
-from pathlib import Path
 
 from omegaconf import DictConfig
 
 from cadam3d import report
-from cadam3d.commands.asset import find_run, open_asset, write_outputs
-from cadam3d.io.run_folder import REPORT, has_file, shown, typed_path
+from cadam3d.commands.asset import find_asset, find_run, require_one
+from cadam3d.core.checks import require_whole
+from cadam3d.core.errors import UserError
+from cadam3d.io.ply import read_ply
+from cadam3d.io.run_folder import REPORT, expanded, has_file, shown, typed_path
+from cadam3d.live.server import HOST, Server
+from cadam3d.live.subject import Run, Subject
 from cadam3d.sweep.folder import is_sweep
 
 
 def run(cfg: DictConfig) -> None:
-    """Show the report of ``run=``; for ``ply=``, or for a run without a report, show a picture."""
-    page = _page(cfg)
-    is_open = cfg.browser and has_display() and webbrowser.open(page.resolve().as_uri())
-    print(f"{'Opened' if is_open else 'Open this in a browser:'} {shown(page)}")
-    print("(This version has no live viewer; asset.ply opens in any 3D Gaussian splatting viewer.)")
+    """Serve the page of ``run=`` or ``ply=`` until Ctrl-C. For a sweep, show its report instead."""
+    require_whole("port", cfg.port, low=0, high=65535, example=0)
+    require_one(cfg)
+    if cfg.run is not None and is_sweep(folder := typed_path(str(cfg.run))):
+        page = folder / REPORT if has_file(folder, REPORT) else report.write_sweep(folder)
+        is_open = cfg.open and has_display() and webbrowser.open(page.resolve().as_uri())
+        print(f"{'Opened' if is_open else 'Open this in a browser:'} {shown(page)}")
+        return
+    subject = _subject(cfg)
+    subject.load()
+    with _listening(subject, cfg.port) as server:
+        print(server.address)
+        print(_hint(server.server_port), flush=True)
+        if cfg.open and has_display():
+            webbrowser.open(server.address)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            print()
 
 
 def has_display() -> bool:
@@ -27,11 +49,29 @@ def has_display() -> bool:
     return not is_unix or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def _page(cfg: DictConfig) -> Path:
-    if cfg.run is not None and cfg.ply is None:
-        folder = typed_path(str(cfg.run))
-        if is_sweep(folder):
-            return folder / REPORT if has_file(folder, REPORT) else report.write_sweep(folder)
-        if has_file(find_run(str(cfg.run)), REPORT):
-            return folder / REPORT
-    return write_outputs(cfg, open_asset(cfg), "view")[0]
+def _subject(cfg: DictConfig) -> Subject:
+    if cfg.ply is not None:
+        file = expanded(str(cfg.ply))
+        return Subject(file, lambda: read_ply(file, up=cfg.ply_up))
+    folder = find_run(str(cfg.run))
+    return Run(folder, lambda: read_ply(find_asset(folder)))
+
+
+def _listening(subject: Subject, port: int) -> Server:
+    """Return a server that listens. Raises ``UserError`` if the port is not free."""
+    try:
+        return Server(subject, port)
+    except OSError as error:
+        used = "which another program uses" if error.errno == errno.EADDRINUSE else error.strerror or error
+        raise UserError(f"port: expected a free port, got {port} ({used}). Try: port=0") from error
+
+
+def _hint(port: int) -> str:
+    """Return how to reach the page from another machine, and how to end the server."""
+    try:
+        user = getpass.getuser()
+    except (OSError, KeyError, ImportError):  # no name of this user is known
+        user = "USER"
+    place = shlex.quote(f"{user}@{socket.gethostname()}")
+    tunnel = f"ssh -L {port}:{HOST}:{port} {place}"
+    return f"Ctrl-C ends this. To open the address on another machine, run this there first: {tunnel}"

@@ -46,7 +46,7 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
     objects = []
     for line in read_bytes(path, largest=LARGEST_TEXT).split(b"\n"):
         try:
-            value = _parsed(line)
+            value = parse_json(line)
         except (ValueError, RecursionError):
             continue
         if isinstance(value, dict):
@@ -82,7 +82,7 @@ def read_json(path: Path) -> Any:
     """
     content = read_bytes(path, largest=LARGEST_TEXT)
     try:
-        return _parsed(content)
+        return parse_json(content)
     except (ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(
@@ -105,7 +105,7 @@ def to_json(value: Any, indent: int | None = None) -> str:
     return json.dumps(_standard(value), indent=indent, ensure_ascii=False, allow_nan=False)
 
 
-def _parsed(content: bytes) -> Any:
+def parse_json(content: bytes) -> Any:
     """Return the value of a JSON text. Raises ``ValueError`` or ``RecursionError`` for any other text."""
     value = json.loads(content.decode("utf-8"), object_pairs_hook=_object, parse_constant=_refused)
     _require_plain(value, DEEPEST)

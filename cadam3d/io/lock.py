@@ -65,7 +65,7 @@ def take(path: Path) -> IO[bytes] | None:
         file = _inherited(path) or _open(path)
         # Windows does not pass on the lock of the parent process, so there the variable is believed.
         is_passed_on = fcntl is None and INHERITED in os.environ
-        if not is_passed_on and not try_lock(file):
+        if not is_passed_on and not _lock(file):
             file.close()
             return None
         # A run that was refused removes its lock file, and locking a removed file has no effect.
@@ -94,6 +94,14 @@ def try_lock(file: IO[Any]) -> bool:
     return True
 
 
+def _lock(file: IO[Any]) -> bool:
+    """Lock an open file, and try twice, because :func:`is_held` may hold the lock for an instant."""
+    if try_lock(file):
+        return True
+    time.sleep(READING_SECONDS)
+    return try_lock(file)
+
+
 def unlock(file: IO[Any]) -> None:
     """Release the lock of an open file, even if a child process has inherited the file."""
     try:
@@ -104,6 +112,38 @@ def unlock(file: IO[Any]) -> None:
             msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
     except OSError:  # a file system without locks
         pass
+
+
+def is_held(path: Path) -> bool:
+    """Return whether a process holds the lock file ``path``.
+
+    A process removes its note when it ends, so a file without a note is free, and only after a kill is there
+    a note without a process. If there is a note, the lock is held for an instant to find out; :func:`take`
+    waits for that.
+    """
+    if _read_note(path) is None:
+        return False
+    try:
+        # A shared lock needs no right to write, so that other users can look too.
+        with _open(path, os.O_RDWR if fcntl is None else os.O_RDONLY) as file:
+            if fcntl is None:
+                return not try_lock(file)
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    # Either another process holds the lock, or the file system has no locks, and then the note decides.
+    except (OSError, UserError):
+        return True
+    return False
+
+
+def process_name() -> str:
+    """Return a name of this process that no other process on any machine has at the same time."""
+    return f"{os.getpid()} on {socket.gethostname()}"
+
+
+def holder_name(path: Path) -> str | None:
+    """Return the :func:`process_name` in the note of the lock file ``path``; None without a note."""
+    note = _read_note(path)
+    return None if note is None else f"{note[0]} on {note[1]}"
 
 
 def describe_holder(path: Path) -> str:

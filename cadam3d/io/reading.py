@@ -56,6 +56,25 @@ def open_regular(path: Path) -> BinaryIO:
     return os.fdopen(descriptor, "rb")
 
 
+def open_contained(folder: Path, name: str) -> BinaryIO:
+    """Open the file ``name`` in ``folder`` for reading bytes, unless a link is on the way to it.
+
+    ``name`` is a relative path that this package has chosen. Raises the exceptions of :func:`open_regular`.
+    """
+    path = folder
+    for part in Path(name).parts:
+        path /= part
+        if path.is_symlink():
+            raise UserError(f"{path}: expected a file, got a link. Try: another file")
+    return open_regular(path)
+
+
+def signature(file: BinaryIO) -> tuple[int, int, int, int]:
+    """Return device, number, size (bytes) and time (ns) of an open file; a changed file differs in these."""
+    status = os.fstat(file.fileno())
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
+
+
 def read_bytes(path: Path, *, largest: int) -> bytes:
     """Return the content of a regular file of at most ``largest`` bytes. Raises ``UserError`` on failure."""
     try:

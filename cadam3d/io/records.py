@@ -37,7 +37,7 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     Every line has its ``kind`` and its ``step``. All other entries are numbers or None, except for
     ``statistics``, which is a dict of such entries. Raises ``UserError`` if the file cannot be read.
     """
-    return [line for line in read_jsonl(run / METRICS) if _is_metrics(line)]
+    return [line for line in read_jsonl(run / METRICS) if is_metrics(line)]
 
 
 def read_histograms(run: Path) -> list[dict[str, Any]]:
@@ -63,7 +63,8 @@ def _has_text_keys(value: Any) -> bool:
     return not isinstance(value, list) or all(map(_has_text_keys, value))
 
 
-def _is_metrics(line: dict[str, Any]) -> bool:
+def is_metrics(line: dict[str, Any]) -> bool:
+    """Return whether a line of ``metrics.jsonl`` has only entries of the kinds that training writes."""
     rest = {key: value for key, value in line.items() if key not in ("kind", "step", "statistics")}
     statistics = line.get("statistics", {})
     return (

@@ -38,8 +38,14 @@ HISTOGRAMS = "candidates/histograms.jsonl"
 IMAGES = "images"  # a folder
 PREVIEW = "preview.png"
 PREVIEWS = "previews"  # a folder
-LIVE = "live"  # a folder: what a running training and a page that watches it tell each other
-SAVED = "saved"  # a folder: assets that a user has saved during training
+LIVE = "live"  # a folder, removed when training ends: what a run and a page that shows it tell each other
+LIVE_PAUSE = "live/pause"  # while this file exists, training waits
+LIVE_SAVE = "live/save"  # training removes this file and saves
+LIVE_SNAPSHOT = "live/snapshot.bin"  # the Gaussians, packed for the page
+LIVE_STATE = "live/state.json"  # the numbers beside them
+LIVE_STOP = "live/stop"  # training removes this file, saves and ends
+LIVE_WATCHED = "live/watched"  # touched by every page that shows the run
+SAVED = "saved"  # a folder: assets and states that a user has saved during training
 TURNTABLE = "turntable.mp4"
 VIEWER = "viewer.html"
 
@@ -71,11 +77,17 @@ LATEST = "outputs/latest"  # a link to the newest run, beside the runs that have
 
 # The step numbers are zero-padded, so that a list of the files is in the order of the steps.
 CHECKPOINT_PATTERN = r"step_([0-9]{7,12})\.pt"
+SAVED_PATTERN = r"step_([0-9]{7,12})\.ply"
 
 
 def checkpoint_name(step: int) -> str:
     """Return the file name of the checkpoint of ``step``; names sort as steps do."""
     return f"step_{step:07d}.pt"
+
+
+def saved_name(step: int) -> str:
+    """Return the file name of the asset that a user has saved after ``step``; names sort as steps do."""
+    return f"step_{step:07d}.ply"
 
 
 def has_checkpoint(run: Path) -> bool:

@@ -37,11 +37,11 @@ BLANKS = "\n\t\r"
 SETTINGS: dict[str, Any] = {
     **dict.fromkeys(("prompt", "negative_prompt", "device", "ply_up"), str),
     **dict.fromkeys(("resume", "run", "ply", "output"), str | None),
-    **dict.fromkeys(("steps", "views", "seed"), int),
-    **dict.fromkeys(("browser", "json"), bool),
+    **dict.fromkeys(("steps", "views", "seed", "port"), int),
+    **dict.fromkeys(("open", "json"), bool),
 }
 EXAMPLES = {"prompt": "a cube", "steps": 600, "run": LATEST, "resume": LATEST}
-EXAMPLES |= {"negative_prompt": "", "device": "auto", "ply_up": "-y", "views": 2, "seed": 0}
+EXAMPLES |= {"negative_prompt": "", "device": "auto", "ply_up": "-y", "views": 2, "seed": 0, "port": 0}
 WORDS = {
     int: "a whole number",
     float: "a finite number",

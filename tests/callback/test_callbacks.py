@@ -36,7 +36,9 @@ def train(tmp_path, callbacks, steps: int = 7, outcome: Outcome = Outcome.FINISH
     )
     trainer = replace(build_trainer(cfg, CPU), callbacks=callbacks)
     state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
-    context = RunContext(tmp_path, cfg.prompt, trainer.steps, trainer.renderer(state), trainer.rasterizer)
+    context = RunContext(
+        tmp_path, cfg.prompt, trainer.steps, trainer.renderer(state), trainer.rasterizer, trainer.densifier
+    )
     assert trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context) is outcome
     return state
 

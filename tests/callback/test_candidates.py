@@ -42,7 +42,9 @@ def train(folder, *, with_callback: bool):
     if not with_callback:
         trainer = replace(trainer, callbacks=[])
     state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
-    context = RunContext(folder, cfg.prompt, trainer.steps, trainer.renderer(state), trainer.rasterizer)
+    context = RunContext(
+        folder, cfg.prompt, trainer.steps, trainer.renderer(state), trainer.rasterizer, trainer.densifier
+    )
     assert trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context) is Outcome.FINISHED
     return state
 

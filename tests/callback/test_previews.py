@@ -32,7 +32,9 @@ def train(folder, *lines: str) -> TrainState:
     cfg = compose([*LINE, *lines])
     trainer = build_trainer(cfg, CPU)
     state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
-    context = RunContext(folder, cfg.prompt, trainer.steps, trainer.renderer(state), trainer.rasterizer)
+    context = RunContext(
+        folder, cfg.prompt, trainer.steps, trainer.renderer(state), trainer.rasterizer, trainer.densifier
+    )
     assert trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context) is Outcome.FINISHED
     return state
 

@@ -59,7 +59,9 @@ def run(tmp_path):
     cfg = compose(["prompt=a red cube", "prior=tiny", "rasterizer=reference", "initializer.count=5"])
     trainer = build_trainer(cfg, CPU)
     state = trainer.start(cfg.prompt, component(cfg.initializer), 0, CPU)
-    return RunContext(tmp_path, cfg.prompt, 10, trainer.renderer(state), trainer.rasterizer), state
+    return RunContext(
+        tmp_path, cfg.prompt, 10, trainer.renderer(state), trainer.rasterizer, trainer.densifier
+    ), state
 
 
 def step(bar: Progress, run, number: int) -> None:

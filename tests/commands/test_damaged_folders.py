@@ -122,7 +122,7 @@ READERS: dict[str, Callable[[Path], object]] = {
 }
 COMMANDS = {
     "eval": ["eval", "run=run", "metric=[size]"],
-    "view": ["view", "run=run", "browser=false"],
+    "view": ["view", "run=run", "open=false"],
     "render": ["render", "run=run", "exporter=[images]", "exporter.images.size=8", "exporter.images.views=1"],
     "resume": ["train", "resume=run"],
 }
@@ -182,6 +182,7 @@ def test_a_damaged_file_is_one_message_or_does_not_matter(
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     monkeypatch.setattr(sys, "argv", ["cadam3d"])
+    monkeypatch.setattr("cadam3d.live.server.Server.serve_forever", lambda self: None)
     damage_copy(finished, name, damage)
     with guard():
         code = ended(*COMMANDS[command])

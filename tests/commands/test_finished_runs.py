@@ -150,11 +150,10 @@ def small(output: str) -> tuple[str, ...]:
     return {".mp4": TINY[1:], ".png": ("exporter.preview.size=8",)}.get(Path(output).suffix.lower(), TINY)
 
 
-@pytest.mark.parametrize("command", ["render", "export", "view"])
+@pytest.mark.parametrize("command", ["render", "export"])
 @pytest.mark.parametrize("name", ["big.mp4", "deep/down/a.PNG", "torus.ply", "Torus.Ply"])
 def test_the_suffix_of_a_file_chooses_its_exporter(command, name, run_folder, type_line, tmp_path):
     words = () if name.lower().endswith(".ply") else small(name)
-    words += ("browser=false",) if command == "view" else ()
     assert type_line(command, f"run={run_folder}", f"output={name}", *words).code == 0
     assert (tmp_path / name).stat().st_size > 0
     assert len(list(tmp_path.rglob("*"))) == 3 + len(Path(name).parts)
@@ -278,15 +277,23 @@ def test_other_commands_suggest_a_job_of_a_sweep(tmp_path, gaussians, type_line)
     assert "it is a sweep, which has many runs). Try: run=sweep/0_job" in err
 
 
-def test_view_shows_the_report_of_a_run(run_folder, type_line, monkeypatch):
-    (run_folder / "report.html").write_text("<p>report</p>", encoding="utf-8")
+@pytest.mark.parametrize("has_display", [True, False])
+def test_view_opens_its_address_if_there_is_a_display(run_folder, type_line, monkeypatch, has_display):
     opened = []
-    monkeypatch.setattr(view, "has_display", lambda: True)
+    monkeypatch.setattr(view, "has_display", lambda: has_display)
     monkeypatch.setattr("webbrowser.open", lambda address: opened.append(address) or True)
+    monkeypatch.setattr("cadam3d.live.server.Server.serve_forever", lambda self: None)
     code, out, _ = type_line("view", f"run={run_folder}")
     assert code == 0
-    assert opened == [(run_folder / "report.html").as_uri()]
-    assert out.startswith("Opened a run/report.html\n")
+    assert opened == out.splitlines()[:1] * has_display
+    assert type_line("view", f"run={run_folder}", "open=false").code == 0
+    assert len(opened) == has_display
+
+
+def test_view_of_a_run_that_has_nothing_to_show_suggests_finishing_it(run_folder, type_line):
+    (run_folder / "asset.ply").unlink()
+    message = type_line("view", f"run={run_folder}").message
+    assert message.endswith("has no asset.ply yet. Try: cadam3d train 'resume=a run'")
 
 
 def test_view_shows_the_report_of_a_sweep_and_writes_it_if_it_is_missing(tmp_path, type_line, monkeypatch):
@@ -300,7 +307,7 @@ def test_view_shows_the_report_of_a_sweep_and_writes_it_if_it_is_missing(tmp_pat
 
     monkeypatch.setattr("cadam3d.report.write_sweep", write)
     for _ in range(2):
-        code, out, _ = type_line("view", "run=sweep", "browser=false")
+        code, out, _ = type_line("view", "run=sweep", "open=false")
         assert code == 0
         assert "sweep/report.html" in out
     assert written == [sweep]
@@ -366,25 +373,6 @@ def test_the_suggested_run_exists(make, type_line, tmp_path):
 def check_suggestion(message: str, run_folder: Path) -> None:
     suggested = message.rpartition("Try: ")[2]
     assert Path(shlex.split(suggested)[-1].partition("=")[2]).resolve() == run_folder
-
-
-def test_view_without_a_display_prints_the_path_and_opens_nothing(run_folder, type_line, monkeypatch):
-    (run_folder / "report.html").touch()
-    monkeypatch.setattr(view, "has_display", lambda: False)
-    monkeypatch.setattr("webbrowser.open", lambda address: pytest.fail("a browser was started"))
-    code, out, _ = type_line("view", f"run={run_folder}")
-    assert code == 0
-    assert "Open this in a browser: a run/report.html" in out
-    assert "no live viewer" in out
-
-
-def test_view_of_a_file_makes_a_picture(run_folder, type_line, tmp_path):
-    (run_folder / "asset.ply").rename(tmp_path / "thing.ply")
-    words = ("browser=false", "exporter.preview.size=16", "exporter.preview.views=2")
-    code, out, _ = type_line("view", "ply=thing.ply", *words)
-    assert code == 0
-    assert (tmp_path / "thing/view/preview.png").stat().st_size > 0
-    assert "thing/view/preview.png" in out
 
 
 def test_the_json_of_eval_is_strict(run_folder, type_line):

@@ -57,7 +57,9 @@ def run(overrides: Sequence[str], folder: Path) -> tuple[TrainState, Recorder, O
     recorder = Recorder()
     trainer = replace(build_trainer(cfg, CPU), callbacks=[recorder])
     state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
-    context = RunContext(folder, cfg.prompt, trainer.steps, trainer.renderer(state), trainer.rasterizer)
+    context = RunContext(
+        folder, cfg.prompt, trainer.steps, trainer.renderer(state), trainer.rasterizer, trainer.densifier
+    )
     outcome = trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context)
     return state, recorder, outcome
 

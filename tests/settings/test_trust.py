@@ -565,7 +565,7 @@ def test_a_link_in_a_run_is_refused_before_anything_is_written(run_folder, tmp_p
     assert sorted(path.name for path in run_folder.iterdir()) == [".hydra", "config.yaml", "train.log"]
 
 
-@pytest.mark.parametrize("command", ["render", "export", "view"])
+@pytest.mark.parametrize("command", ["render", "export"])
 def test_nothing_is_written_through_a_link_of_a_run(command, run_folder, tmp_path, type_line):
     (run_folder / "config.yaml").write_text("prompt: a")
     points = Gaussians(*(torch.rand(2, *shape) for shape in ((3,), (3,), (4,), (), (1, 3))))

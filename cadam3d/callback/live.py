@@ -1,0 +1,149 @@
+"""Live: writes the current Gaussians and a few numbers for the page of ``cadam3d view``, while one is open.
+
+Every other part of a live view is elsewhere: ``io/live.py`` has the files, ``commands/control.py`` obeys the
+buttons, and ``cadam3d/live/`` has the server and the page.
+"""
+
+import logging
+import math
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from cadam3d.callback.base import Callback
+from cadam3d.core.checks import require_range
+from cadam3d.io.live import Watch, begin, publish, publish_state
+from cadam3d.io.run_folder import LIVE_SNAPSHOT
+from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState
+from cadam3d.viewer.pack import pack
+
+log = logging.getLogger(__name__)
+
+LOOK_SECONDS = 0.25  # between two looks at whether a page is open
+
+
+@dataclass(kw_only=True)
+class Live(Callback):
+    """Write ``live/snapshot.bin`` and ``live/state.json`` while a page shows the run, and nothing otherwise.
+
+    A snapshot has these numbers per Gaussian, by which the page can colour it: the ``scores`` of the
+    densifier, ``age`` (steps since birth, or since this process started training), and ``selected`` (1 for
+    the children and the surviving parents of the last refinement, else 0). This callback never draws a random
+    number, and a disk that is full ends the live view but not the run.
+    """
+
+    seconds: float  # >= 0.1
+    share: float  # in (0, 1]
+    # Files can be written. Becomes False after the first failure.
+    _works: bool = field(default=False, init=False, repr=False)
+    _watch: Watch = field(default_factory=lambda: Watch(Path()), init=False, repr=False)
+    # Readings of the monotonic clock at which the next look and the next snapshot are due.
+    _look_at: float = field(default=0.0, init=False, repr=False)
+    _due: float = field(default=0.0, init=False, repr=False)
+    # The step of the last snapshot, and whether the run was paused then.
+    _shown: tuple[int, bool] = field(default=(-1, False), init=False, repr=False)
+    _loss: float | None = field(default=None, init=False, repr=False)
+    # For each Gaussian, the step after which it was born, and whether the last refinement selected it.
+    _born: Int[Tensor, "n"] = field(default_factory=lambda: torch.zeros(0).long(), init=False, repr=False)
+    _selected: Bool[Tensor, "n"] = field(
+        default_factory=lambda: torch.zeros(0).bool(), init=False, repr=False
+    )
+
+    def __post_init__(self) -> None:
+        require_range("callback.live.seconds", self.seconds, low=0.1, example=1)
+        require_range("callback.live.share", self.share, above=0, high=1, example=0.05)
+
+    def on_start(self, context: RunContext, state: TrainState) -> None:
+        """Create ``live/`` and write the first numbers, so that a page finds them."""
+        shape, device = (len(state.gaussians),), state.gaussians.device
+        self._born = torch.full(shape, state.step, dtype=torch.int64, device=device)
+        self._selected = torch.zeros(shape, dtype=torch.bool, device=device)
+        self._watch, self._works = Watch(context.folder), True
+        self._look_at = self._due = 0.0
+        self._shown, self._loss = (-1, False), None
+        try:
+            begin(context.folder)
+            self._write_state(context, state)
+        except OSError as error:
+            self._give_up(error)
+
+    def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
+        """Follow the rows, and mark the survivors and the children of the selected ones."""
+        edit = report.edit
+        if edit is None:
+            return
+        newborn = self._born.new_full((len(edit.children),), report.step)
+        self._born = torch.cat([self._born[edit.keep], newborn])
+        is_selected = report.population.is_selected
+        self._selected = torch.cat([is_selected[edit.keep], is_selected[edit.parents]])
+
+    def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
+        """Write a snapshot if a page is open and one is due."""
+        self._loss = report.loss
+        self._show(context, state, is_paused=False)
+
+    def on_pause(self, context: RunContext, state: TrainState) -> None:
+        """Write a snapshot of the step at which the run waits, once for each page that comes."""
+        self._show(context, state, is_paused=True)
+
+    def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
+        """Write the last numbers; a page then knows that the outputs are being written."""
+        if self._works and outcome is not Outcome.OUT_OF_MEMORY:
+            try:
+                self._write_state(context, state, has_ended=True)
+            except OSError as error:
+                self._give_up(error)
+
+    def _show(self, context: RunContext, state: TrainState, *, is_paused: bool) -> None:
+        now = time.monotonic()
+        is_news = is_paused != self._shown[1]
+        if not self._works or (now < self._look_at and not is_news):
+            return
+        self._look_at = now + LOOK_SECONDS
+        if not self._watch.is_watched() or (now < self._due and not is_news):
+            return
+        try:
+            if state.step != self._shown[0]:
+                publish(context.folder / LIVE_SNAPSHOT, self._packed(context, state))
+            self._write_state(context, state, is_paused=is_paused)
+        except OSError as error:
+            self._give_up(error)
+        self._shown = (state.step, is_paused)
+        ended = time.monotonic()
+        # A snapshot that took long is followed by a long time without one.
+        self._due = max(now + self.seconds, ended + (ended - now) / self.share)
+
+    def _packed(self, context: RunContext, state: TrainState) -> bytes:
+        layers = {
+            **context.densifier.scores(state.densifier),
+            "age": state.step - self._born,
+            "selected": self._selected,
+        }
+        cpu = torch.device("cpu")
+        shown = {name: values.detach().to(cpu, torch.float32) for name, values in layers.items()}
+        return pack(state.gaussians.detach().to(cpu), shown)
+
+    def _write_state(
+        self, context: RunContext, state: TrainState, *, is_paused: bool = False, has_ended: bool = False
+    ) -> None:
+        statistics = context.densifier.statistics(state.densifier, state.step)
+        entries: dict[str, Any] = {
+            "step": state.step,
+            "total_steps": context.total_steps,
+            "num_gaussians": len(state.gaussians),
+            "seconds": round(state.seconds, 3),
+            "loss": self._loss,
+            "is_paused": is_paused,
+            "has_ended": has_ended,
+            "statistics": {name: number for name, number in statistics.items() if math.isfinite(number)},
+        }
+        publish_state(context.folder, entries)
+
+    def _give_up(self, error: OSError) -> None:
+        self._works = False
+        log.warning("there is no live view any more: %s", error)

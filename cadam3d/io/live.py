@@ -1,0 +1,192 @@
+"""Live: the files through which a run that trains and the pages that show it talk to each other.
+
+They work across processes, and for all users of one file system. The folder ``live/`` exists while its run
+trains. A request to the run is an empty file: its name is the whole message. It has no content that could be
+damaged, any number of pages can ask at once, and so can a shell (``touch RUN/live/pause``).
+"""
+
+import os
+import stat
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from cadam3d.core.errors import UserError
+from cadam3d.io.atomic import TEMPORARY
+from cadam3d.io.jsonl import is_number, is_whole, parse_json, to_json
+from cadam3d.io.lock import process_name
+from cadam3d.io.reading import read_bytes
+from cadam3d.io.run_folder import (
+    LIVE,
+    LIVE_PAUSE,
+    LIVE_SAVE,
+    LIVE_SNAPSHOT,
+    LIVE_STATE,
+    LIVE_STOP,
+    LIVE_WATCHED,
+)
+
+REQUESTS = {"pause": LIVE_PAUSE, "save": LIVE_SAVE, "stop": LIVE_STOP}
+FILES = (*REQUESTS.values(), LIVE_SNAPSHOT, LIVE_STATE, LIVE_WATCHED)
+LARGEST_STATE = 1 << 16  # bytes
+# A page that is open asks about twice a second, so after this time it is closed.
+WATCHED_SECONDS = 5.0
+# The entries of state.json.
+ENTRIES = {
+    "process": lambda value: isinstance(value, str),
+    "step": is_whole,
+    "total_steps": is_whole,
+    "num_gaussians": is_whole,
+    "seconds": is_number,
+    "loss": lambda value: value is None or is_number(value),
+    "is_paused": lambda value: isinstance(value, bool),
+    "has_ended": lambda value: isinstance(value, bool),
+    "statistics": lambda value: isinstance(value, dict) and all(map(is_number, value.values())),
+}
+
+
+# --- what training does ----------------------------------------------------------------------------------
+
+
+def begin(run: Path) -> None:
+    """Create the empty folder ``live/`` of a run. Raises ``OSError`` if that is impossible."""
+    clear(run)
+    (run / LIVE).mkdir(exist_ok=True)
+
+
+def clear(run: Path) -> None:
+    """Remove the files of this module, and ``live/`` if it is empty then. Files with other names stay."""
+    folder = run / LIVE
+    with suppress(OSError):
+        if is_own_folder(run):
+            for path in [*(run / name for name in FILES), *folder.glob(f"{TEMPORARY}*")]:
+                with suppress(OSError):
+                    path.unlink()
+            folder.rmdir()
+
+
+def publish(path: Path, content: bytes) -> None:
+    """Replace a file of ``live/`` in a single step. Raises ``OSError`` if that is impossible.
+
+    The content need not survive a power cut, so this does not wait for the disk.
+    """
+    temporary = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
+    try:
+        temporary.write_bytes(content)
+        temporary.replace(path)
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def publish_state(run: Path, entries: Mapping[str, Any]) -> None:
+    """Write ``state.json`` with ``entries`` and the name of this process. Raises ``OSError``."""
+    publish(run / LIVE_STATE, to_json({"process": process_name(), **entries}).encode())
+
+
+def is_asked(run: Path, request: str) -> bool:
+    """Return whether the file of a request exists; links, folders and the like do not count."""
+    try:
+        return stat.S_ISREG((run / REQUESTS[request]).lstat().st_mode)
+    except OSError:
+        return False
+
+
+def take_request(run: Path, request: str) -> bool:
+    """Return whether the file of a request existed, and remove it."""
+    if not is_asked(run, request):
+        return False
+    try:
+        (run / REQUESTS[request]).unlink()
+    # If it cannot be removed, obeying it would not end.
+    except OSError:
+        return False
+    return True
+
+
+@dataclass
+class Watch:
+    """Knows whether a page shows the run, by the changes of the time of one file.
+
+    Only changes count, because the clock of another machine may differ.
+    """
+
+    run: Path
+    _touched: int | None = field(default=None, init=False)  # nanoseconds
+    _changed_at: float = field(default=float("-inf"), init=False)  # of the monotonic clock
+
+    def is_watched(self) -> bool:
+        """Return whether a page has touched the file within the last few seconds."""
+        try:
+            touched = (self.run / LIVE_WATCHED).lstat().st_mtime_ns
+        except OSError:
+            return False
+        now = time.monotonic()
+        if touched != self._touched:
+            self._touched, self._changed_at = touched, now
+        return now - self._changed_at < WATCHED_SECONDS
+
+
+# --- what a page does ------------------------------------------------------------------------------------
+
+
+def is_own_folder(run: Path) -> bool:
+    """Return whether ``live/`` is a folder in the folder of the run, and not a link."""
+    try:
+        return stat.S_ISDIR((run / LIVE).lstat().st_mode)
+    except OSError:
+        return False
+
+
+def touch_watched(run: Path) -> None:
+    """Let a run that trains know that a page shows it. Without ``live/``, nothing is written."""
+    _touch(run / LIVE_WATCHED) if is_own_folder(run) else None
+
+
+def ask(run: Path, request: str) -> bool:
+    """Make the file of a request. Return False if that is impossible."""
+    return is_own_folder(run) and _touch(run / REQUESTS[request])
+
+
+def withdraw(run: Path, request: str) -> bool:
+    """Remove the file of a request. Return False if that is impossible."""
+    if not is_own_folder(run):
+        return False
+    try:
+        (run / REQUESTS[request]).unlink(missing_ok=True)
+    except OSError:
+        return False
+    return True
+
+
+def read_state(run: Path) -> dict[str, Any] | None:
+    """Return the entries of ``state.json``; None if there is no such file, or not a sound one."""
+    path = run / LIVE_STATE
+    if not is_own_folder(run) or path.is_symlink():
+        return None
+    try:
+        state = parse_json(read_bytes(path, largest=LARGEST_STATE))
+    except (UserError, ValueError, RecursionError):
+        return None
+    if not isinstance(state, dict) or not all(name in state for name in ENTRIES):
+        return None
+    return state if all(is_sound(state[name]) for name, is_sound in ENTRIES.items()) else None
+
+
+def _touch(path: Path) -> bool:
+    """Create a file if it is missing, and set its time to now, without following a link."""
+    flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    try:
+        descriptor = os.open(path, flags, 0o666)
+        try:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                return False
+            os.utime(descriptor if os.utime in os.supports_fd else path)
+        finally:
+            os.close(descriptor)
+    except OSError:
+        return False
+    return True

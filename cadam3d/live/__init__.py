@@ -1,0 +1,1 @@
+"""Live: the page of ``cadam3d view``, the server behind it, and what both show of a run or a file."""

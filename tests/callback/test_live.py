@@ -1,0 +1,130 @@
+"""The snapshots and numbers that a run writes while a page is open."""
+
+import os
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from cadam3d.callback import live as module
+from cadam3d.callback.base import Callback
+from cadam3d.callback.live import Live
+from cadam3d.commands.train import build_trainer, run_context
+from cadam3d.io import live
+from cadam3d.settings.compose import component, compose
+
+CPU = torch.device("cpu")
+STEPS = 12
+
+
+@dataclass
+class Page(Callback):
+    """Touches the file of a page before every step, and keeps what the run has written."""
+
+    live: Live
+    folder: Path
+    is_open: bool
+
+    def __post_init__(self):
+        self.snapshots, self.rows = [], []
+
+    def on_start(self, context, state):
+        self._touch(0)
+
+    def on_step(self, context, state, report):
+        path = self.folder / "live/snapshot.bin"
+        self.snapshots.append(path.read_bytes() if path.exists() else None)
+        self.rows.append(
+            (state.step, self.live._born.clone(), self.live._selected.clone(), len(state.gaussians))
+        )
+        self._touch(state.step)
+
+    def _touch(self, step):
+        if self.is_open:
+            live.touch_watched(self.folder)
+            os.utime(self.folder / "live/watched", (step, step))
+
+
+def train(folder: Path, monkeypatch, *overrides: str, with_live=True, is_open=True, share=1.0):
+    """Train a few steps, with an open page or without, and return the state and the page."""
+    monkeypatch.setattr(module, "LOOK_SECONDS", 0.0)
+    small = ("prompt=a red cube", "prior=tiny", "rasterizer=reference", f"steps={STEPS}", "camera.size=12")
+    schedule = ("refine.start=0", "refine.end=100", "refine.interval=4", "initializer.count=30")
+    cfg = compose([*small, *schedule, "callback=[]", *overrides])
+    trainer = build_trainer(cfg, CPU)
+    callback = Live(seconds=0.1, share=share)
+    callback.seconds = 0.0
+    page = Page(callback, folder, is_open)
+    if with_live:
+        trainer.callbacks.extend([callback, page])
+    state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
+    trainer.train(state, trainer.prior.embed(cfg.prompt, ""), run_context(cfg.prompt, trainer, state, folder))
+    return state, page
+
+
+def test_the_run_is_the_same_with_and_without_live_and_with_an_open_page(tmp_path, monkeypatch):
+    states = [
+        train(tmp_path / name, monkeypatch, with_live=name != "off", is_open=name == "open")[0]
+        for name in ("off", "closed", "open")
+        if (tmp_path / name).mkdir() is None
+    ]
+    for other in states[1:]:
+        assert torch.equal(other.gaussians.means, states[0].gaussians.means)
+        assert torch.equal(other.gaussians.sh, states[0].gaussians.sh)
+        for name, generator in other.generators.items():
+            assert torch.equal(generator.get_state(), states[0].generators[name].get_state())
+
+
+def test_without_a_page_no_snapshot_is_written(tmp_path, monkeypatch):
+    _, page = train(tmp_path, monkeypatch, is_open=False)
+    assert page.snapshots == [None] * STEPS
+    assert sorted(path.name for path in (tmp_path / "live").iterdir()) == ["state.json"]
+
+
+def test_an_open_page_gets_snapshots_that_change_with_the_layers_of_the_densifier(tmp_path, monkeypatch):
+    state, page = train(tmp_path, monkeypatch)
+    assert len(set(page.snapshots)) > STEPS // 2
+    assert struct.unpack_from("<I", page.snapshots[-1], 12) == (len(state.gaussians),)
+    for layer in (b"snr", b"drift", b"age", b"selected"):
+        assert layer in page.snapshots[-1]
+
+
+def test_age_counts_the_steps_since_the_birth_of_each_row(tmp_path, monkeypatch):
+    _, page = train(tmp_path, monkeypatch, "densifier=random")
+    for step, born, selected, n in page.rows:
+        assert len(born) == len(selected) == n
+        # Newborns are the last rows, and no row is older than the run.
+        assert born.equal(born.sort().values)
+        assert set(born.tolist()) <= {0, *range(4, step + 1, 4)}
+    assert {0, 4, 8, 12} == set(page.rows[-1][1].tolist())
+
+
+def test_the_children_and_the_surviving_parents_of_the_last_refinement_are_selected(tmp_path, monkeypatch):
+    # The scale above which a parent is replaced is so large that each one survives.
+    _, page = train(tmp_path, monkeypatch, "densifier=random", "refine.tau_scale=100")
+    _, born, selected, _ = page.rows[-1]
+    assert selected[born == STEPS].all()
+    assert int(selected.sum()) == 2 * int((born == STEPS).sum()) > 0
+
+
+def test_the_last_numbers_say_that_training_has_ended(tmp_path, monkeypatch):
+    state, _ = train(tmp_path, monkeypatch)
+    written = live.read_state(tmp_path)
+    assert written is not None
+    assert written["has_ended"]
+    assert (written["step"], written["num_gaussians"]) == (STEPS, len(state.gaussians))
+    assert "snr_p50" in written["statistics"]
+
+
+def test_a_snapshot_that_takes_long_is_followed_by_a_long_time_without_one(tmp_path, monkeypatch):
+    _, page = train(tmp_path, monkeypatch, share=1e-6)
+    assert len(set(page.snapshots)) <= 2
+
+
+def test_a_folder_that_cannot_be_written_ends_the_live_view_and_not_the_run(tmp_path, monkeypatch):
+    (tmp_path / "live").write_text("in the way")
+    monkeypatch.setattr(live, "touch_watched", lambda run: None)
+    state, page = train(tmp_path, monkeypatch, is_open=False)
+    assert state.step == STEPS
+    assert not page.live._works

@@ -1,0 +1,212 @@
+"""``cadam3d view`` as its users see it: two processes, one folder, and a browser or HTTP between them."""
+
+import http.client
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+from splats import make_gaussians
+
+from cadam3d.io.ply import read_ply, write_ply
+
+PYTHON = (sys.executable, "-m", "cadam3d")
+SMALL = ("prompt=a red cube", "prior=tiny", "rasterizer=reference", "camera.size=8", "views=1")
+SMALL += (
+    "initializer.count=40",
+    "exporter=[ply]",
+    "metric=[]",
+    "hydra.run.dir=run",
+    "callback.live.seconds=0.1",
+)
+ENDLESS = 1_000_000  # steps
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+FLAGS += ("--ignore-gpu-blocklist", "--disable-quic", "--no-first-run", "--disable-background-networking")
+PATIENCE = 60  # seconds, for a machine that is busy
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs signals")
+
+
+@contextmanager
+def process(folder: Path, *words: str) -> Iterator[subprocess.Popen]:
+    """Run ``cadam3d`` in another process, and end it."""
+    # The tests import the package from here, and so do its processes.
+    root = str(Path(__file__).parents[2])
+    path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    started = subprocess.Popen(
+        [*PYTHON, *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=(folder / f"{words[0]}.err").open("w"),
+        text=True,
+    )
+    with started:
+        try:
+            yield started
+        finally:
+            started.kill()
+
+
+def until(is_done: Callable[[], object]) -> None:
+    """Wait for something that another process does."""
+    end = time.monotonic() + PATIENCE
+    while not is_done():
+        assert time.monotonic() < end, "this takes too long"
+        time.sleep(0.1)
+
+
+class Page:
+    """Does what the page does, without a browser."""
+
+    def __init__(self, viewer: subprocess.Popen) -> None:
+        assert viewer.stdout is not None
+        self.address = viewer.stdout.readline().strip()
+        self.hint = viewer.stdout.readline().strip()
+        self.url = urlsplit(self.address)
+
+    def ask(self, name: str, body: str | None = None) -> tuple[int, bytes]:
+        connection = http.client.HTTPConnection(self.url.netloc, timeout=PATIENCE)
+        headers = {} if body is None else {"Origin": f"http://{self.url.netloc}"}
+        connection.request("GET" if body is None else "POST", self.url.path + name, body, headers)
+        answer = connection.getresponse()
+        content = answer.read()
+        connection.close()
+        return answer.status, content
+
+    @property
+    def state(self) -> dict:
+        return json.loads(self.ask("state")[1])
+
+    def press(self, button: str) -> None:
+        assert self.ask(button, self.state["process"])[0] == 200
+
+    def picture(self) -> bytes:
+        return self.ask("picture")[1]
+
+
+@pytest.mark.slow
+def test_a_run_that_trains_is_shown_paused_resumed_saved_stopped_and_continued(tmp_path):
+    with process(tmp_path, "train", *SMALL, f"steps={ENDLESS}") as training:
+        until((tmp_path / "run/live/state.json").exists)
+        with process(tmp_path, "view", "run=run", "open=false") as viewer:
+            page = Page(viewer)
+            assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]+/", page.address)
+            assert f"ssh -L {page.url.port}:127.0.0.1:{page.url.port} " in page.hint
+            until(lambda: page.state["picture"])
+            first = page.picture()
+            until(lambda: page.state["picture"] and page.picture() != first)
+            assert page.state["status"] == "training"
+
+            page.press("pause")
+            until(lambda: page.state["status"] == "paused")
+            paused = page.state
+            page.press("save")
+            until(lambda: page.state["saved"] and not page.state["asked"].count("save"))
+            assert (page.state["saved"], page.state["step"]) == ([paused["step"]], paused["step"])
+            saved = tmp_path / f"run/saved/step_{paused['step']:07d}.ply"
+            assert len(read_ply(saved)) == paused["num_gaussians"]
+            # Ctrl-C of the page does not end the run, nor its pause.
+            viewer.send_signal(signal.SIGINT)
+            assert viewer.wait(PATIENCE) == 0
+            assert "Traceback" not in (tmp_path / "view.err").read_text()
+        with process(tmp_path, "view", "run=run", "open=false") as viewer:
+            page = Page(viewer)
+            assert page.state["status"] == "paused"
+            page.press("resume")
+            until(lambda: page.state["status"] == "training" and page.state["step"] > paused["step"])
+            # The time of the pause is not time of training.
+            assert page.state["seconds"] < paused["seconds"] + PATIENCE
+            page.press("stop")
+            assert training.wait(PATIENCE) == 0
+            state = page.state
+            assert (state["status"], state["outcome"]) == ("idle", "interrupted")
+            assert page.picture() != first
+    messages = (tmp_path / "train.err").read_text()
+    assert "rm run/live/pause" in messages
+    assert not (tmp_path / "run/live").exists()
+
+    steps = state["step"] + 3
+    with process(tmp_path, "train", "resume=run", f"steps={steps}") as continued:
+        assert f"finished after {steps} steps" in continued.communicate(timeout=PATIENCE)[0]
+
+
+def test_a_single_file_is_served_and_a_port_that_is_in_use_is_named(tmp_path, type_line, monkeypatch):
+    write_ply(tmp_path / "thing.ply", make_gaussians(5), up="-y", pad_sh=0)
+    monkeypatch.setattr("cadam3d.live.server.Server.serve_forever", lambda self: None)
+    code, out, err = type_line("view", "ply=thing.ply", "open=false")
+    assert (code, err) == (0, "")
+    assert re.match(r"http://127\.0\.0\.1:\d+/[\w-]{20,}/\nCtrl-C ends this\.", out)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        message = type_line("view", "ply=thing.ply", "open=false", f"port={port}").message
+    assert message == f"port: expected a free port, got {port} (which another program uses). Try: port=0"
+
+
+@pytest.mark.parametrize("port", ["-1", "65536", "1.5", "true", "null", "abc"])
+def test_a_port_that_does_not_exist_is_refused(port, type_line):
+    message = type_line("view", "ply=thing.ply", f"port={port}").message
+    assert message.startswith("port: expected a whole number")
+    assert message.endswith("Try: port=0")
+
+
+@pytest.fixture
+def browser() -> Iterator:
+    """Return a page of a real browser, or skip the test."""
+    api = pytest.importorskip("playwright.sync_api")
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium here")
+    with api.sync_playwright() as play:
+        try:
+            started = play.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        except api.Error as error:
+            pytest.skip(f"the browser does not run here: {str(error)[:200]}")
+        yield started.new_page(viewport={"width": 1100, "height": 700})
+        started.close()
+
+
+@pytest.mark.slow
+def test_the_page_in_a_browser_follows_the_run_and_its_buttons_work(tmp_path, browser):
+    problems = []
+    browser.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
+    browser.on("pageerror", lambda error: problems.append(str(error)))
+    with process(tmp_path, "train", *SMALL, f"steps={ENDLESS}") as training:
+        until((tmp_path / "run/live/state.json").exists)
+        with process(tmp_path, "view", "run=run", "open=false") as viewer:
+            browser.goto(Page(viewer).address)
+            browser.wait_for_selector("#charts figure:nth-of-type(3)", timeout=60_000)
+            browser.wait_for_selector("#controls option[value=age]", state="attached", timeout=60_000)
+            canvas = browser.locator("#view canvas")
+            first = canvas.screenshot()
+            until(lambda: canvas.screenshot() != first)
+            names = browser.eval_on_selector_all("#controls option", "options => options.map(o => o.value)")
+            assert {"rgb", "depth", "opacity", "snr", "age", "selected"} <= set(names)
+            assert browser.inner_text("#title") == "a red cube"
+
+            browser.click("text=Pause")
+            browser.wait_for_selector("text=Resume", timeout=60_000)
+            browser.click("text=Save now")
+            browser.wait_for_selector("#files a[download]", timeout=60_000)
+            assert list((tmp_path / "run/saved").glob("*.ply"))
+            browser.set_viewport_size({"width": 390, "height": 800})
+            assert browser.evaluate("document.documentElement.scrollWidth") <= 390
+            browser.click("text=Resume")
+            browser.wait_for_selector("text=Pause", timeout=60_000)
+            browser.click("text=Stop")
+            assert training.wait(PATIENCE) == 0
+            browser.wait_for_selector("text=not running", timeout=60_000)
+            assert browser.is_disabled("#pause")
+            assert not problems
+            viewer.kill()
+            browser.wait_for_selector("text=The connection is lost", timeout=60_000)
