@@ -11,16 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
-from jaxtyping import Bool, Int
-from torch import Tensor
-
 from cadam3d.callback.base import Callback
+from cadam3d.callback.layers import Layers
 from cadam3d.core.checks import require_range
 from cadam3d.io.live import Watch, begin, publish, publish_state
 from cadam3d.io.run_folder import LIVE_SNAPSHOT
 from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState
-from cadam3d.viewer.pack import pack
 
 log = logging.getLogger(__name__)
 
@@ -48,11 +44,7 @@ class Live(Callback):
     # The step of the last snapshot, and whether the run was paused then.
     _shown: tuple[int, bool] = field(default=(-1, False), init=False, repr=False)
     _loss: float | None = field(default=None, init=False, repr=False)
-    # For each Gaussian, the step after which it was born, and whether the last refinement selected it.
-    _born: Int[Tensor, "n"] = field(default_factory=lambda: torch.zeros(0).long(), init=False, repr=False)
-    _selected: Bool[Tensor, "n"] = field(
-        default_factory=lambda: torch.zeros(0).bool(), init=False, repr=False
-    )
+    _layers: Layers = field(default_factory=Layers, init=False, repr=False)
 
     def __post_init__(self) -> None:
         require_range("callback.live.seconds", self.seconds, low=0.1, example=1)
@@ -60,9 +52,7 @@ class Live(Callback):
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Create ``live/`` and write the first numbers, so that a page finds them."""
-        shape, device = (len(state.gaussians),), state.gaussians.device
-        self._born = torch.full(shape, state.step, dtype=torch.int64, device=device)
-        self._selected = torch.zeros(shape, dtype=torch.bool, device=device)
+        self._layers.start(state)
         self._watch, self._works = Watch(context.folder), True
         self._look_at = self._due = 0.0
         self._shown, self._loss = (-1, False), None
@@ -73,14 +63,8 @@ class Live(Callback):
             self._give_up(error)
 
     def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
-        """Follow the rows, and mark the survivors and the children of the selected ones."""
-        edit = report.edit
-        if edit is None:
-            return
-        newborn = self._born.new_full((len(edit.children),), report.step)
-        self._born = torch.cat([self._born[edit.keep], newborn])
-        is_selected = report.population.is_selected
-        self._selected = torch.cat([is_selected[edit.keep], is_selected[edit.parents]])
+        """Follow the rows."""
+        self._layers.follow(report)
 
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
         """Write a snapshot if a page is open and one is due."""
@@ -109,7 +93,7 @@ class Live(Callback):
             return
         try:
             if state.step != self._shown[0]:
-                publish(context.folder / LIVE_SNAPSHOT, self._packed(context, state))
+                publish(context.folder / LIVE_SNAPSHOT, self._layers.snapshot(context, state))
             self._write_state(context, state, is_paused=is_paused)
         except OSError as error:
             self._give_up(error)
@@ -117,16 +101,6 @@ class Live(Callback):
         ended = time.monotonic()
         # A snapshot that took long is followed by a long time without one.
         self._due = max(now + self.seconds, ended + (ended - now) / self.share)
-
-    def _packed(self, context: RunContext, state: TrainState) -> bytes:
-        layers = {
-            **context.densifier.scores(state.densifier),
-            "age": state.step - self._born,
-            "selected": self._selected,
-        }
-        cpu = torch.device("cpu")
-        shown = {name: values.detach().to(cpu, torch.float32) for name, values in layers.items()}
-        return pack(state.gaussians.detach().to(cpu), shown)
 
     def _write_state(
         self, context: RunContext, state: TrainState, *, is_paused: bool = False, has_ended: bool = False

@@ -45,6 +45,7 @@ LIVE_SNAPSHOT = "live/snapshot.bin"  # the Gaussians, packed for the page
 LIVE_STATE = "live/state.json"  # the numbers beside them
 LIVE_STOP = "live/stop"  # training removes this file, saves and ends
 LIVE_WATCHED = "live/watched"  # touched by every page that shows the run
+SNAPSHOTS = "snapshots"  # a folder: the Gaussians at some steps, packed for the report
 SAVED = "saved"  # a folder: assets and states that a user has saved during training
 TURNTABLE = "turntable.mp4"
 VIEWER = "viewer.html"
@@ -78,6 +79,7 @@ LATEST = "outputs/latest"  # a link to the newest run, beside the runs that have
 # The step numbers are zero-padded, so that a list of the files is in the order of the steps.
 CHECKPOINT_PATTERN = r"step_([0-9]{7,12})\.pt"
 SAVED_PATTERN = r"step_([0-9]{7,12})\.ply"
+SNAPSHOT_PATTERN = r"step_([0-9]{7,12})\.bin"
 
 
 def checkpoint_name(step: int) -> str:
@@ -88,6 +90,11 @@ def checkpoint_name(step: int) -> str:
 def saved_name(step: int) -> str:
     """Return the file name of the asset that a user has saved after ``step``; names sort as steps do."""
     return f"step_{step:07d}.ply"
+
+
+def snapshot_name(step: int) -> str:
+    """Return the file name of the snapshot of ``step``; names sort as steps do."""
+    return f"step_{step:07d}.bin"
 
 
 def has_checkpoint(run: Path) -> bool:
@@ -105,6 +112,12 @@ def checkpoint_step(path: Path) -> int | None:
     """Return the step in the name of a checkpoint; None if the file has another name."""
     found = re.fullmatch(CHECKPOINT_PATTERN, path.name)
     return int(found.group(1)) if found else None
+
+
+def snapshots(run: Path) -> dict[int, Path]:
+    """Return the path of every snapshot in the folder ``run`` by its step, in order."""
+    named = [(re.fullmatch(SNAPSHOT_PATTERN, path.name), path) for path in (run / SNAPSHOTS).glob("*.bin")]
+    return dict(sorted((int(name.group(1)), path) for name, path in named if name is not None))
 
 
 def holds_run(folder: Path) -> bool:
@@ -131,7 +144,19 @@ def _written_by_runs() -> tuple[str, ...]:
     files = (ASSET, CHARTS, CONFIG, EVALUATION, LOG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE, VIEWER)
     formats = (ASSET_COMPRESSED_PLY, ASSET_GLB, ASSET_KSPLAT, ASSET_SOG, ASSET_SPLAT, ASSET_SPZ)
     meshes = (ASSET_MESH_GLB, ASSET_MESH_OBJ, ASSET_MESH_PLY)
-    return (*files, *formats, *meshes, CANDIDATES, CHECKPOINTS, HYDRA, IMAGES, LIVE, PREVIEWS, SAVED)
+    return (
+        *files,
+        *formats,
+        *meshes,
+        CANDIDATES,
+        CHECKPOINTS,
+        HYDRA,
+        IMAGES,
+        LIVE,
+        PREVIEWS,
+        SAVED,
+        SNAPSHOTS,
+    )
 
 
 def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:

@@ -1,7 +1,7 @@
-"""HTML pages made from the templates beside this module. No scripts, and nothing is fetched.
+"""HTML pages made from the templates beside this module. Nothing is fetched.
 
-Autoescape is always on: whatever a user typed reaches a page as text, never as markup. Only drawings and the
-colours of the page are marked as safe, in the templates.
+Autoescape is always on: whatever a user typed reaches a page as text, never as markup. Only drawings, the
+styles and the program of the 3D view are marked as safe, in the templates.
 """
 
 import base64

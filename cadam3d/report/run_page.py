@@ -1,6 +1,7 @@
 """report.html of a run: one file with its result, its charts and its settings."""
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,9 @@ from cadam3d.io.run_folder import ASSET, CONFIG, METRICS, PREVIEW, REPORT, SUMMA
 from cadam3d.report.charts import other_plots, sections
 from cadam3d.report.declarations import write_declarations
 from cadam3d.report.formatting import elapsed, number, shown_bytes
-from cadam3d.report.pages import Tile, data_url, table, write_page
+from cadam3d.report.growth import frames
+from cadam3d.report.pages import TEMPLATES, Tile, data_url, table, write_page
+from cadam3d.viewer.page import script, style
 
 EMBED_BYTES = 8 << 20  # a larger video is linked, not embedded
 FILES = (ASSET, TURNTABLE, PREVIEW, SUMMARY, METRICS, CONFIG)
@@ -85,6 +88,9 @@ def write(
         video=_video_source(video) if video.is_file() else "",
         video_name=TURNTABLE,
         preview=data_url(preview, "image/png") if preview.is_file() else "",
+        frames=frames(folder, int(number(summary.get("steps")) or 0)),
+        view_style=style(),
+        view_script=f"{script()}{_source()}",
         sections=sections(steps, refinements, charts),
         other_plots=other_plots(steps, refinements, charts),
         facts=_facts(summary),
@@ -92,6 +98,11 @@ def write(
         config_text=config_text,
         files=[name for name in FILES if (folder / name).is_file()],
     )
+
+
+@cache
+def _source() -> str:
+    return (TEMPLATES / "growth.js").read_text(encoding="utf-8")
 
 
 def _tiles(summary: Mapping[str, Any]) -> list[Tile]:

@@ -36,7 +36,12 @@ class Page(Callback):
         path = self.folder / "live/snapshot.bin"
         self.snapshots.append(path.read_bytes() if path.exists() else None)
         self.rows.append(
-            (state.step, self.live._born.clone(), self.live._selected.clone(), len(state.gaussians))
+            (
+                state.step,
+                self.live._layers.born.clone(),
+                self.live._layers.is_selected.clone(),
+                len(state.gaussians),
+            )
         )
         self._touch(state.step)
 

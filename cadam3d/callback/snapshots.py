@@ -1,0 +1,51 @@
+"""Snapshots: records the Gaussians at some steps, so that the report can show how the object grows."""
+
+from dataclasses import dataclass, field
+
+from cadam3d.callback.base import Callback
+from cadam3d.callback.layers import Layers
+from cadam3d.core.checks import require_whole
+from cadam3d.io.atomic import replacing
+from cadam3d.io.run_folder import SNAPSHOTS, snapshot_name, snapshots
+from cadam3d.state import RefineReport, RunContext, StepReport, TrainState
+
+
+@dataclass(kw_only=True)
+class Snapshots(Callback):
+    """Write ``snapshots/step_0000050.bin`` and so on, in the format of ``viewer/pack.py``.
+
+    The start, multiples of ``every`` and the last step are recorded. Nothing is rendered, so a snapshot of a
+    few thousand Gaussians takes a few milliseconds. Populations above ``largest`` are left out.
+    """
+
+    every: int  # steps
+    largest: int  # Gaussians
+    _layers: Layers = field(default_factory=Layers, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        require_whole("callback.snapshots.every", self.every, low=1, example=50)
+        require_whole("callback.snapshots.largest", self.largest, low=0, example=20000)
+
+    def on_start(self, context: RunContext, state: TrainState) -> None:
+        """Record the start. Delete what a killed run recorded after its last checkpoint."""
+        for step, path in snapshots(context.folder).items():
+            if step > state.step:
+                path.unlink()
+        self._layers.start(state)
+        if state.step == 0:
+            self._record(context, state)
+
+    def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
+        """Follow the rows."""
+        self._layers.follow(report)
+
+    def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
+        """Record the current Gaussians at multiples of ``every`` and after the last step."""
+        if report.step % self.every == 0 or report.step == context.total_steps:
+            self._record(context, state)
+
+    def _record(self, context: RunContext, state: TrainState) -> None:
+        if len(state.gaussians) > self.largest:
+            return
+        with replacing(context.folder / SNAPSHOTS / snapshot_name(state.step)) as temporary:
+            temporary.write_bytes(self._layers.snapshot(context, state))

@@ -1,0 +1,83 @@
+"""The Gaussians that a run records, for the slider of its report."""
+
+import struct
+from pathlib import Path
+
+import pytest
+import torch
+
+from cadam3d.callback.snapshots import Snapshots
+from cadam3d.commands.train import build_trainer, run_context
+from cadam3d.core.errors import UserError
+from cadam3d.initializer.base import Initializer
+from cadam3d.io.run_folder import snapshots
+from cadam3d.settings.compose import component, compose
+
+CPU = torch.device("cpu")
+SMALL = ("prompt=a red cube", "prior=tiny", "rasterizer=reference", "camera.size=12", "initializer.count=30")
+GROWING = ("steps=10", "refine.start=0", "refine.end=100", "refine.interval=4", "callback=[]")
+
+
+def train(folder: Path, callback: Snapshots | None, *overrides: str):
+    """Train a few steps and return the state."""
+    cfg = compose([*SMALL, *GROWING, *overrides])
+    trainer = build_trainer(cfg, CPU)
+    if callback is not None:
+        trainer.callbacks.append(callback)
+    embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
+    state = trainer.start(cfg.prompt, component(cfg.initializer, Initializer, "initializer"), cfg.seed, CPU)
+    trainer.train(state, embedding, run_context(cfg.prompt, trainer, state, folder))
+    return state
+
+
+def count(path: Path) -> int:
+    """Return the number of Gaussians in a snapshot, as its header states it."""
+    return struct.unpack("<I", path.read_bytes()[12:16])[0]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    return folder, train(folder, Snapshots(every=4, largest=1000))
+
+
+def test_the_start_the_multiples_and_the_last_step_are_recorded(recorded):
+    folder, state = recorded
+    paths = snapshots(folder)
+    assert list(paths) == [0, 4, 8, 10]
+    assert count(paths[0]) == 30
+    assert count(paths[10]) == len(state.gaussians)
+
+
+def test_a_snapshot_has_the_scores_of_the_densifier_and_the_age(recorded):
+    content = snapshots(recorded[0])[10].read_bytes()
+    for name in (b"drift", b"noise", b"snr", b"age", b"selected"):
+        assert name in content
+
+
+def test_recording_does_not_change_the_run(recorded, tmp_path):
+    alone = train(tmp_path, None)
+    for name, tensor in alone.gaussians.tensors().items():
+        assert torch.equal(tensor, recorded[1].gaussians.tensors()[name]), name
+
+
+def test_a_large_population_is_not_recorded(tmp_path):
+    train(tmp_path, Snapshots(every=4, largest=29), "steps=4")
+    assert snapshots(tmp_path) == {}
+
+
+def test_a_resumed_run_removes_what_was_recorded_after_its_checkpoint(tmp_path):
+    train(tmp_path, Snapshots(every=2, largest=1000), "steps=4")
+    stale = tmp_path / "snapshots/step_0000900.bin"
+    stale.write_bytes(b"")
+    (tmp_path / "snapshots/notes.txt").write_text("mine")
+    train(tmp_path, Snapshots(every=2, largest=1000), "steps=4")
+    assert not stale.exists()
+    assert (tmp_path / "snapshots/notes.txt").exists()
+
+
+def test_wrong_values_name_their_key():
+    with pytest.raises(UserError, match=r"callback\.snapshots\.every=50"):
+        Snapshots(every=0, largest=1)
+    with pytest.raises(UserError, match=r"callback\.snapshots\.largest"):
+        Snapshots(every=1, largest=-1)
