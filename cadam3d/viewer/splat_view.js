@@ -794,8 +794,14 @@ globalThis.SplatView = (() => {
 
     /* Draw soon, or now. Drawing now works in a hidden page too, where no frames are requested. */
     #draw(isNow = false) {
-      if (isNow) this.#paint();
-      else this.#request ||= requestAnimationFrame((time) => this.#tick(time));
+      if (isNow) {
+        // Whatever was going to be drawn soon is drawn now, except the next picture of a rotation.
+        if (!this.#rotating) {
+          cancelAnimationFrame(this.#request);
+          this.#request = 0;
+        }
+        this.#paint();
+      } else this.#request ||= requestAnimationFrame((time) => this.#tick(time));
     }
 
     #tick(time) {
