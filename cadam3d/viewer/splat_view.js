@@ -178,6 +178,22 @@ globalThis.SplatView = (() => {
     }
   }
 
+  // The basis functions of degree 1 to 3, in the order of 3DGS files, and lines that add them to a sum.
+  const BASIS = [
+    "-0.4886025119029199 * y", "0.4886025119029199 * z", "-0.4886025119029199 * x",
+    "1.0925484305920792 * x * y", "-1.0925484305920792 * y * z", "0.31539156525252005 * (2. * zz - xx - yy)",
+    "-1.0925484305920792 * x * z", "0.5462742152960396 * (xx - yy)",
+    "-0.5900435899266435 * y * (3. * xx - yy)", "2.890611442640554 * x * y * z",
+    "-0.4570457994644658 * y * (4. * zz - xx - yy)", "0.3731763325901154 * z * (2. * zz - 3. * xx - 3. * yy)",
+    "-0.4570457994644658 * x * (4. * zz - xx - yy)", "1.445305721320277 * z * (xx - yy)",
+    "-0.5900435899266435 * x * (xx - 3. * yy)",
+  ];
+  const byte = (j) => `whole(int(${["four", "more", "most"][j >> 4]}.${"xyzw"[(j >> 2) % 4]}), ${j % 4})`;
+  const terms = (first, end) => BASIS.slice(first, end).map((basis, i) => {
+    const j = 3 * (first + i);
+    return `sum += ${basis} * vec3(${byte(j)}, ${byte(j + 1)}, ${byte(j + 2)});`;
+  }).join("\n      ");
+
   const VERTEX = `#version 300 es
     precision highp float;
     precision highp int;
@@ -221,36 +237,15 @@ globalThis.SplatView = (() => {
 
     // What the coefficients of degree 1 and above add along a direction from the camera.
     vec3 harmonics(int index, vec3 d) {
-      uint word[12];
-      for (int i = 0; i < degree; i++) {
-        uvec4 four = texel(rest, index * degree + i);
-        word[4 * i] = four.x; word[4 * i + 1] = four.y; word[4 * i + 2] = four.z; word[4 * i + 3] = four.w;
-      }
       float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
-      float basis[15];
-      basis[0] = -0.4886025119029199 * y;
-      basis[1] = 0.4886025119029199 * z;
-      basis[2] = -0.4886025119029199 * x;
-      basis[3] = 1.0925484305920792 * x * y;
-      basis[4] = -1.0925484305920792 * y * z;
-      basis[5] = 0.31539156525252005 * (2. * zz - xx - yy);
-      basis[6] = -1.0925484305920792 * x * z;
-      basis[7] = 0.5462742152960396 * (xx - yy);
-      basis[8] = -0.5900435899266435 * y * (3. * xx - yy);
-      basis[9] = 2.890611442640554 * x * y * z;
-      basis[10] = -0.4570457994644658 * y * (4. * zz - xx - yy);
-      basis[11] = 0.3731763325901154 * z * (2. * zz - 3. * xx - 3. * yy);
-      basis[12] = -0.4570457994644658 * x * (4. * zz - xx - yy);
-      basis[13] = 1.445305721320277 * z * (xx - yy);
-      basis[14] = -0.5900435899266435 * x * (xx - 3. * yy);
       vec3 sum = vec3(0);
-      int terms = degree * (degree + 2);
-      for (int i = 0; i < terms; i++) {
-        int j = 3 * i;
-        sum += basis[i] * vec3(whole(int(word[j >> 2]), j & 3), whole(int(word[(j + 1) >> 2]), (j + 1) & 3),
-          whole(int(word[(j + 2) >> 2]), (j + 2) & 3));
-      }
-      return sum * unpackHalf2x16(word[4 * degree - 1]).y / 127.;
+      uvec4 four = texel(rest, index * degree), last = four;
+      uvec4 more = degree > 1 ? (last = texel(rest, index * degree + 1)) : four;
+      uvec4 most = degree > 2 ? (last = texel(rest, index * degree + 2)) : four;
+      ${terms(0, 3)}
+      if (degree > 1) { ${terms(3, 8)} }
+      if (degree > 2) { ${terms(8, 15)} }
+      return sum * unpackHalf2x16(last.w).y / 127.;
     }
 
     void main() {
@@ -573,6 +568,7 @@ globalThis.SplatView = (() => {
       };
       const [count, low, high] = ["splat-count", "", ""].map((className) => make("span", { className }));
       const choice = make("select", { title: "What the colours show (keys 1 to 9)" });
+      choice.setAttribute("aria-label", "What the colours show");
       const ramp = make("i");
       ramp.style.background = SplatView.gradient;
       const legend = make("span", { className: "splat-legend" }, low, ramp, high);
@@ -589,9 +585,10 @@ globalThis.SplatView = (() => {
       backgrounds.setAttribute("role", "group");
       backgrounds.setAttribute("aria-label", "Background");
       element.classList.add("splat-controls");
-      element.replaceChildren(count, make("label", {}, "Show ", choice), legend, backgrounds, turn,
-        button("Reset", "Back to the first view (r)", () => this.reset()),
-        button("Save PNG", "Save this picture", () => this.#save()));
+      element.replaceChildren(count, make("label", {}, make("span", {}, "Show"), choice), legend,
+        make("span", { className: "splat-tools" }, backgrounds, turn,
+          button("Reset", "Back to the first view (r)", () => this.reset()),
+          button("Save PNG", "Save this picture", () => this.#save())));
       choice.onchange = () => this.show(choice.value);
       const refresh = () => {
         count.textContent = `${this.count.toLocaleString("en")} Gaussian${this.count === 1 ? "" : "s"}`;
@@ -607,8 +604,10 @@ globalThis.SplatView = (() => {
           high.textContent = short(ends.high);
           legend.title = ends.isLog ? "logarithmic colours" : "linear colours";
         }
-        for (const [swatch, color] of swatches) swatch.ariaPressed = String(color.every((v, i) => v === this.#background[i]));
-        turn.ariaPressed = String(this.#rotating);
+        for (const [swatch, color] of swatches) {
+          swatch.setAttribute("aria-pressed", color.every((value, i) => value === this.#background[i]));
+        }
+        turn.setAttribute("aria-pressed", this.#rotating);
       };
       this.#refreshers.push(refresh);
       refresh();
