@@ -75,8 +75,8 @@ globalThis.SplatView = (() => {
     return { count, degree, low, high, focus, radius, layers, records, rest };
   }
 
-  /* Return an object that sorts points by their depth. Its text also is the program of the worker, so it uses nothing
-   * from outside. Two passes over 16 bits each sort the bits of float32 exactly. Equal depths keep the order of rows. */
+  /* Return an object that sorts points by their depth. Its text is also the program of the worker, so it refers to
+   * nothing outside of itself. Two passes over 16 bits each sort the bits of float32 exactly. Equal depths keep the order of rows. */
   function makeSorter() {
     const starts = [new Uint32Array(65536), new Uint32Array(65536)];
     let points = new Float32Array(0); // x, y, z of each
@@ -135,14 +135,14 @@ globalThis.SplatView = (() => {
       try {
         this.url = URL.createObjectURL(new Blob([program], { type: "text/javascript" }));
         this.worker = new Worker(this.url);
-        this.worker.onerror = (event) => { event.preventDefault(); this.stayHere(); };
+        this.worker.onerror = (event) => { event.preventDefault(); this.sortInThisThread(); };
         this.worker.onmessage = ({ data }) => this.finish(data.generation, data.order);
       } catch {
-        this.stayHere();
+        this.sortInThisThread();
       }
     }
 
-    stayHere() {
+    sortInThisThread() {
       this.worker?.terminate();
       this.worker = null;
       this.local = makeSorter();
@@ -411,14 +411,14 @@ globalThis.SplatView = (() => {
       this.#gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, stencil: false,
         powerPreference: "high-performance" });
       if (!this.#gl) {
-        this.#say("This browser does not offer WebGL2, which the 3D view needs. A current version of Chrome, Edge, "
+        this.#showMessage("This browser does not offer WebGL2, which the 3D view needs. A current version of Chrome, Edge, "
           + "Firefox or Safari shows it, with hardware acceleration switched on in the settings.");
         return;
       }
       try {
         this.#build();
       } catch (error) {
-        this.#say(error.message);
+        this.#showMessage(error.message);
         this.#gl = null;
         return;
       }
@@ -444,11 +444,11 @@ globalThis.SplatView = (() => {
             .toLocaleString("en")} of these Gaussians, and there are ${data.count.toLocaleString("en")}.`);
         }
       } catch (error) {
-        this.#say(error.message);
+        this.#showMessage(error.message);
         return Promise.reject(error);
       }
       data.generation = ++this.#generation;
-      // A snapshot that was not drawn yet is replaced by this one, and so are those that wait for it.
+      // This snapshot replaces one that is not drawn yet. The promises of both resolve when this one is drawn.
       data.waiting = this.#next ? this.#next.waiting : [];
       if (this.#next) this.#release(this.#next);
       this.#next = data;
@@ -629,7 +629,7 @@ globalThis.SplatView = (() => {
 
     #build() {
       const gl = this.#gl;
-      // Halves keep sums of many faint Gaussians and of colours above 1. Bytes are the second best.
+      // 16-bit floats hold sums of many faint Gaussians and colours above 1. Bytes are the fallback.
       this.#isHalf = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
       this.#splats = compile(gl, VERTEX, FRAGMENT);
       this.#screen = compile(gl, SCREEN_VERTEX, SCREEN_FRAGMENT);
@@ -749,17 +749,17 @@ globalThis.SplatView = (() => {
       this.#fill(ORDER_UNIT, gl.RED_INTEGER, gl.UNSIGNED_INT, order, 1);
     }
 
-    /* The next data becomes the shown data. */
+    /* Make the next data the shown data, and resolve the promises of its load. */
     #accept() {
       const [before, data] = [this.#shown, this.#next];
       this.#shown = data;
       this.#next = null;
       if (before) this.#release(before);
       this.#useLayer();
-      this.#hush();
+      this.#removeMessage();
       if (!before?.count) this.#frameObject(data);
       const waiting = data.waiting.splice(0);
-      queueMicrotask(() => { waiting.forEach((resolve) => resolve()); this.#announce(); });
+      queueMicrotask(() => { waiting.forEach((resolve) => resolve()); this.#notify(); });
     }
 
     /* Move the camera to where the whole object is visible, unless the page has placed it. */
@@ -783,10 +783,10 @@ globalThis.SplatView = (() => {
 
     #changed() {
       this.#draw();
-      this.#announce();
+      this.#notify();
     }
 
-    #announce() {
+    #notify() {
       this.#refreshers.forEach((refresh) => refresh());
       this.onchange?.();
     }
@@ -794,7 +794,7 @@ globalThis.SplatView = (() => {
     /* Draw soon, or now. Drawing now works in a hidden page too, where no frames are requested. */
     #draw(isNow = false) {
       if (isNow) {
-        // Whatever was going to be drawn soon is drawn now, except the next picture of a rotation.
+        // This picture replaces one that is due soon, but not the next one of a rotation.
         if (!this.#rotating) {
           cancelAnimationFrame(this.#request);
           this.#request = 0;
@@ -919,8 +919,8 @@ globalThis.SplatView = (() => {
 
     /* ---- messages ---- */
 
-    #say(text) {
-      this.#hush();
+    #showMessage(text) {
+      this.#removeMessage();
       const message = document.createElement("p");
       message.className = "splat-message";
       message.setAttribute("role", "alert");
@@ -934,7 +934,7 @@ globalThis.SplatView = (() => {
       this.#message = message;
     }
 
-    #hush() {
+    #removeMessage() {
       this.#message?.remove();
       this.#message = null;
     }
@@ -956,7 +956,7 @@ globalThis.SplatView = (() => {
       if (keyboard) on(keyboard === true ? canvas : keyboard, "keydown", (event) => this.#key(event));
     }
 
-    /* After a reset of the graphics card nothing of ours is left on it. */
+    /* Build and upload everything again: a reset of the graphics card has removed it. */
     #restore() {
       this.#build();
       for (const data of [this.#shown, this.#next]) if (data) this.#upload(data);
