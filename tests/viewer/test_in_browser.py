@@ -18,7 +18,9 @@ from snapshots import some_gaussians
 
 from cadam3d.core.cameras import orbit
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.io.run_folder import SNAPSHOTS, snapshot_name
 from cadam3d.rasterizer.reference import ReferenceRasterizer
+from cadam3d.report import write_report
 from cadam3d.viewer.pack import pack
 from cadam3d.viewer.page import script, style, viewer_page
 
@@ -409,3 +411,22 @@ def test_an_object_in_other_units_fills_the_picture(visit):
     page = bare(visit, pack(theirs))
     assert page.evaluate("() => view.camera.distance") < 0.01
     assert 0.02 < (picture(page).min(axis=2) < 0.9).mean() < 0.8
+
+
+@pytest.mark.slow
+def test_the_slider_of_a_report_shows_the_steps_of_the_training(visit, tmp_path):
+    counts = {0: 30, 50: 60, 100: 45}
+    for step, count in counts.items():
+        path = tmp_path / SNAPSHOTS / snapshot_name(step)
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(pack(some_gaussians(count)))
+    report = write_report(tmp_path, summary={"prompt": "a cube", "steps": 100}, metrics=[], config_text="")
+    page = visit(report.read_text(encoding="utf-8"), width=900, height=900)
+    page.wait_for_function("() => view.count === 45")
+    page.get_by_label("Step of the training").fill("1")
+    page.wait_for_function("() => view.count === 60")
+    assert page.locator("#shown").text_content() == "step 50"
+    # From the middle, the rest is played up to the finished object.
+    page.get_by_role("button", name="Play").click()
+    page.wait_for_function("() => view.count === 45")
+    page.wait_for_function("() => document.getElementById('play').textContent === 'Play'")
