@@ -149,7 +149,7 @@ function drawFacts() {
     ["Training time", state.seconds ? duration(state.seconds) : ""],
     ["Outcome", isLive ? "" : (outcome || "").replaceAll("_", " ")],
     ["PSNR", !isLive && state.psnr ? `${state.psnr.toFixed(2)} dB` : ""],
-    ["Continue with", state.status === "idle" && outcome !== "finished" && step < total ? `cadam3d train resume=${state.folder}` : ""],
+    ["Continue with", state.status === "idle" && outcome !== "finished" && step < total ? state.resume : ""],
   ];
   $("facts").replaceChildren(...facts.filter(([, text]) => text).flatMap(([name, text]) => [element("dt", name), element("dd", text)]));
   $("progress").hidden = !total;
@@ -166,7 +166,7 @@ function speed() {
 function drawFiles() {
   const files = [];
   if (state.has_report) files.push(link("Report of the run", "report"));
-  if (state.has_asset) files.push(link("asset.ply", "asset", "asset.ply"));
+  if (state.has_asset) files.push(link("asset.ply", "asset.ply", "asset.ply"));
   for (const step of [...state.saved].reverse()) {
     const name = `step_${String(step).padStart(7, "0")}.ply`;
     files.push(link(`saved/${name}`, `saved/${step}`, name));

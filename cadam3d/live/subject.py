@@ -25,19 +25,26 @@ from cadam3d.io.run_folder import (
     CONFIG,
     LIVE_SNAPSHOT,
     LOCK,
+    METRICS,
+    PREVIEW,
     REPORT,
     SAVED,
     SAVED_PATTERN,
     SUMMARY,
+    TURNTABLE,
     saved_name,
     shown,
 )
 from cadam3d.live.curves import Curves
 from cadam3d.report.declarations import read_declarations
+from cadam3d.settings.line import resume_word
 from cadam3d.viewer.pack import pack
 
 LARGEST_SNAPSHOT = 1 << 30  # bytes; ten million Gaussians of SH degree 3 have less
 MOST_SAVED = 100  # files that a page lists
+LONGEST_TITLE = 500  # characters
+# Files of a run that the page, or the report, offers under their own names.
+OFFERED = (ASSET, CONFIG, METRICS, PREVIEW, SUMMARY, TURNTABLE)
 
 Version = tuple[int, int, int, int]
 Value = TypeVar("Value")
@@ -138,8 +145,8 @@ class Run(Subject):
         title, total = config.get("prompt"), config.get("steps")
         facts = {
             "kind": "run",
-            "title": title if isinstance(title, str) else self.place.name,
-            "folder": str(shown(self.place)),
+            "title": title[:LONGEST_TITLE] if isinstance(title, str) else self.place.name,
+            "resume": f"cadam3d train {resume_word(shown(self.place))}",
             "picture": _name(self._version(LIVE_SNAPSHOT if self._shows_snapshot(now) else ASSET)),
             "charts": f"{self._curves.version} {_name(self._declared.version())}",
             "saved": self._saved(),
@@ -185,13 +192,13 @@ class Run(Subject):
         return live.ask(self.place, request)
 
     def offered(self, name: str) -> BinaryIO | None:
-        """Open ``asset``, ``report`` or ``saved/STEP``; None if it is missing or behind a link."""
+        """Open ``report``, ``saved/STEP`` or one of ``OFFERED``; None if it is missing or behind a link."""
         step = re.fullmatch(r"saved/([0-9]{1,12})", name)
-        fixed = {"asset": ASSET, "report": REPORT}
-        if step is None and name not in fixed:
-            return None
+        files = {"report": REPORT, **{each: each for each in OFFERED}}
+        if step is not None:
+            files[name] = f"{SAVED}/{saved_name(int(step.group(1)))}"
         try:
-            return self._open(fixed[name] if step is None else f"{SAVED}/{saved_name(int(step.group(1)))}")
+            return self._open(files[name]) if name in files else None
         except (OSError, UserError):
             return None
 

@@ -1,4 +1,4 @@
-"""What the server of ``cadam3d view`` gives to whom, over plain HTTP."""
+"""What the server of ``cadam3d view`` answers and what it refuses, over plain HTTP."""
 
 import http.client
 import json
@@ -124,7 +124,7 @@ def test_the_page_and_its_parts_are_served(browser):
 
 
 def test_every_answer_has_the_headers_that_keep_others_out(browser):
-    for path in ("", "state", "picture", "asset", "report", "nothing"):
+    for path in ("", "state", "picture", "asset.ply", "report", "nothing"):
         _, headers, _ = browser.get(path)
         assert headers["Cache-Control"] == "no-store"
         assert headers["X-Content-Type-Options"] == "nosniff"
@@ -144,7 +144,7 @@ def test_a_finished_run_is_shown_with_its_asset_and_its_numbers(browser, run):
     assert browser.get("picture")[2] == pack(read_ply(run / "asset.ply"))
     charts = {chart["title"]: chart for chart in browser.json("charts")}
     assert charts["Loss"]["curves"][0]["points"] == [[1, 1.0], [5, 0.2], [9, 1 / 9]]
-    assert browser.get("asset")[2] == (run / "asset.ply").read_bytes()
+    assert browser.get("asset.ply")[2] == (run / "asset.ply").read_bytes()
     assert browser.get("saved/4")[2] == (run / "saved/step_0000004.ply").read_bytes()
     assert not (run / "live").exists()
 
@@ -175,7 +175,7 @@ def test_a_log_that_grows_or_is_replaced_is_followed(browser, run):
 def test_a_report_is_in_a_sandbox(browser):
     _, headers, content = browser.get("report")
     assert content == b"<script>alert(1)</script>"
-    assert headers["Content-Security-Policy"].startswith("sandbox allow-scripts;")
+    assert headers["Content-Security-Policy"].startswith("sandbox allow-scripts allow-downloads;")
     assert "allow-same-origin" not in headers["Content-Security-Policy"]
 
 
@@ -271,17 +271,9 @@ def test_only_the_page_itself_presses_buttons(browser, run, origin):
 @pytest.mark.parametrize(
     "path",
     [
-        *("../../etc/passwd", "..%2f..%2fetc/passwd", "//etc/passwd", "saved/../config.yaml", "config.yaml"),
-        *(
-            "saved/4.ply",
-            "saved/step_0000004.ply",
-            "saved/-4",
-            "saved/",
-            "saved/9",
-            "saved/٤",
-            ".lock",
-            "live",
-        ),
+        *("../../etc/passwd", "..%2f..%2fetc/passwd", "//etc/passwd", "saved/../config.yaml", "charts.json"),
+        *("saved/4.ply", "saved/step_0000004.ply", "saved/-4", "saved/", "saved/9", "saved/%D9%A4"),
+        *(".lock", "live", "live/state.json"),
     ],
 )
 def test_no_path_leads_to_a_file(browser, path):
@@ -291,7 +283,7 @@ def test_no_path_leads_to_a_file(browser, path):
 @pytest.mark.parametrize(
     ("name", "offered"),
     [
-        ("asset.ply", "asset"),
+        ("asset.ply", "asset.ply"),
         ("report.html", "report"),
         ("saved", "saved/4"),
         ("live/snapshot.bin", "picture"),
