@@ -9,11 +9,12 @@ compiled code that makes no promise about such files.
 | ksplat, level 0 | float32, with 8-bit colours and opacities | colours outside of [0, 1] |
 | SPZ version 4 | the encodings of version 3 (see ``spz.py``) as zstd streams | positions have 12 bits |
 
-Measured facts about gaussforge 0.6.0, which the code below takes into account: it never changes axes; it expects quaternions w, x, y, z, and in SOG they must have length 1; coefficients of a Gaussian are stored
+Measured facts about gaussforge 0.6.0, which the code below takes into account: it never changes axes; it
+expects quaternions w, x, y, z, and in SOG they must have length 1; the coefficients of a Gaussian are stored
 together, red, green and blue of the first one first; positions beyond 2,048 wrap around in SPZ; scales whose
 exponential is infinite stay infinite in ksplat; one extreme colour takes all precision from the code book of
-SOG; SOG and ksplat need at least one Gaussian. The same Gaussians give the same bytes. Only reading prints to
-standard output, and reading files of SH degree 0 into Python fails.
+SOG; SOG and ksplat need at least one Gaussian. The same Gaussians give the same bytes. Reading prints to
+standard output, and reading a file of SH degree 0 into Python fails.
 
 Sources: the metadata of gaussforge 0.6.0 on pypi.org, and measurements (``tests/io/test_gaussforge.py``).
 """
