@@ -37,5 +37,5 @@ class Metrics(Callback):
 
     def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
         """Write a line for every refinement and reset, without the Gaussians themselves."""
-        numbers = {name: value for name, value in vars(report).items() if name != "population"}
+        numbers = {name: each for name, each in vars(report).items() if name not in ("population", "edit")}
         append_jsonl(context.folder / METRICS, {"kind": "refine", **numbers})
