@@ -155,7 +155,19 @@ def samples(tmp_path_factory) -> dict[str, bytes]:
 Random = np.random.Generator
 HUGE = [b"0", b"1", b"21", b"-1", b"4294967295", b"999999999", b"999999999999999", b"9" * 40, b"1e9", b"x"]
 TEXTS = [b"nan", b"-inf", b"1e999", b"-1e-999", b"0x1p3", b"9" * 400, b"1_0", b"--1", b"1,5", b"1e", b"'1'"]
-TEXTS += [b"\xff\xfe", b"", b"\0", b"1 2 3", b"\n", b"\r", b"." * 5000, b"1" + b"0" * 308, b"\x0b", b"\x1c", b"#"]
+TEXTS += [
+    b"\xff\xfe",
+    b"",
+    b"\0",
+    b"1 2 3",
+    b"\n",
+    b"\r",
+    b"." * 5000,
+    b"1" + b"0" * 308,
+    b"\x0b",
+    b"\x1c",
+    b"#",
+]
 LINES = [
     b"property list uchar int vertex_indices",
     b"property float x",
