@@ -1,4 +1,4 @@
-"""Every reader of Gaussians survives damaged files: finite Gaussians or one message, in bounded time and memory.
+"""Damaged files of every format: finite Gaussians or one message, in bounded time and memory.
 
 The suite reads a small sample. To read 10,000 mutated files per format, type
 
@@ -281,7 +281,7 @@ def at_most(seconds: float):
 
 
 def outcome(read: Callable[[Path], Gaussians], path: Path) -> tuple[Gaussians | None, int]:
-    """Read a file and check the laws. Return the Gaussians, if it is valid, and the bytes allocated at most."""
+    """Read a file and check the laws. Return the Gaussians, if valid, and the peak of memory."""
     made, message = None, ""
     tracemalloc.reset_peak()
     before = tracemalloc.get_traced_memory()[0]
