@@ -14,7 +14,7 @@ from cadam3d import report
 from cadam3d.commands.asset import find_asset, find_run, require_one
 from cadam3d.core.checks import require_whole
 from cadam3d.core.errors import UserError
-from cadam3d.io.ply import read_ply
+from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.run_folder import REPORT, expanded, has_file, shown, typed_path
 from cadam3d.live.server import HOST, Server
 from cadam3d.live.subject import Run, Subject
@@ -52,9 +52,9 @@ def has_display() -> bool:
 def _subject(cfg: DictConfig) -> Subject:
     if cfg.ply is not None:
         file = expanded(str(cfg.ply))
-        return Subject(file, lambda: read_ply(file, up=cfg.ply_up))
+        return Subject(file, lambda: read_gaussians(file, up=cfg.ply_up))
     folder = find_run(str(cfg.run))
-    return Run(folder, lambda: read_ply(find_asset(folder)))
+    return Run(folder, lambda: read_gaussians(find_asset(folder)))
 
 
 def _listening(subject: Subject, port: int) -> Server:
