@@ -64,7 +64,7 @@ def open_asset(cfg: DictConfig) -> Asset:
 
 
 def require_one(cfg: DictConfig) -> None:
-    """Raise ``UserError`` unless exactly one of ``run=`` and ``ply=`` is given, and ``ply_up=`` is an axis."""
+    """Raise ``UserError`` unless exactly one of ``run=`` and ``ply=`` is given and ``ply_up=`` is an axis."""
     if (cfg.run is None) == (cfg.ply is None):
         got, line = ("neither", suggestion("", "run", ASSET)) if cfg.run is None else ("both", "ply=null")
         raise UserError(f"run, ply: expected one of them, got {got}. Try: {line}")

@@ -103,7 +103,8 @@ class Curves:
         if key not in self._points and len(self._points) >= MOST_KEYS:
             return
         points = self._points.setdefault(key, [])
-        if points and points[-1][0] > step:
+        # A step counts the Gaussians before its refinement, whose line comes first.
+        if points and points[-1][0] >= step:
             return
         points.append((step, value))
         # Older points become sparser, and the length stays bounded.

@@ -163,9 +163,13 @@ def test_a_run_that_begins_while_the_page_is_open_becomes_live_and_ends_again(br
 
 def test_a_log_that_grows_or_is_replaced_is_followed(browser, run):
     first = browser.json("state")["charts"]
-    append_jsonl(run / "metrics.jsonl", {"kind": "refine", "step": 9, "after": 33, "statistics": {}})
+    append_jsonl(
+        run / "metrics.jsonl", {"kind": "refine", "step": 10, "after": 33, "statistics": {"snr_p50": 1}}
+    )
+    # A step counts the Gaussians before its refinement.
+    append_jsonl(run / "metrics.jsonl", {"kind": "step", "step": 10, "num_gaussians": 20})
     assert browser.json("state")["charts"] != first
-    assert browser.json("charts")[0]["curves"][0]["points"][-1] == [9, 33]
+    assert browser.json("charts")[0]["curves"][0]["points"][-2:] == [[9, 20], [10, 33]]
     (run / "metrics.jsonl").unlink()
     append_jsonl(run / "metrics.jsonl", {"kind": "step", "step": 1, "loss": 3.0})
     browser.json("state")

@@ -195,7 +195,9 @@ class Browser:
             pytest.skip("no chromium")
         folders = {"packages": packages(), "pages": PAGES}
         with _serve(folders) as origin, playwright.sync_playwright() as start:
-            chromium = start.chromium.launch(executable_path=executable, args=["--no-sandbox", *CHROMIUM_FLAGS])
+            chromium = start.chromium.launch(
+                executable_path=executable, args=["--no-sandbox", *CHROMIUM_FLAGS]
+            )
             try:
                 yield cls(chromium, origin, folders)
             finally:

@@ -14,7 +14,12 @@ from cadam3d.core.gaussians import Gaussians, concatenate
 from cadam3d.core.sh import sh_basis
 
 WHITE, CARROT, COAL, RED = (0.93, 0.94, 0.97), (0.92, 0.45, 0.1), (0.08, 0.08, 0.1), (0.75, 0.1, 0.12)
-NEEDLES, DARK_NEEDLES, BARK, HONEY = (0.15, 0.45, 0.2), (0.08, 0.32, 0.16), (0.4, 0.26, 0.15), (0.9, 0.75, 0.2)
+NEEDLES, DARK_NEEDLES, BARK, HONEY = (
+    (0.15, 0.45, 0.2),
+    (0.08, 0.32, 0.16),
+    (0.4, 0.26, 0.15),
+    (0.9, 0.75, 0.2),
+)
 # Standard deviations of the SH coefficients of bands 1 to 3, as trained assets of degree 3 have them.
 SH_SPREAD = (0.20, 0.14, 0.10)
 
