@@ -50,7 +50,6 @@ async function poll() {
 }
 
 function lost(text) {
-  document.body.classList.toggle("lost", text !== "");
   if (text) state = state && { ...state, status: "lost" };
   notice(text);
 }
