@@ -4,9 +4,12 @@ import errno
 import getpass
 import os
 import shlex
+import signal
 import socket
 import sys
 import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from omegaconf import DictConfig
 
@@ -32,21 +35,32 @@ def run(cfg: DictConfig) -> None:
         return
     subject = _subject(cfg)
     subject.load()
-    with _listening(subject, cfg.port) as server:
+    with _ended_by_signals(), _listening(subject, cfg.port) as server:
         print(server.address)
         print(_hint(server.server_port), flush=True)
         if cfg.open and has_display():
             webbrowser.open(server.address)
-        try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            print()
+        server.serve_forever()
 
 
 def has_display() -> bool:
     """Return whether a window can appear; without one, a text browser would take over the terminal."""
     is_unix = sys.platform.startswith(("linux", "freebsd"))
     return not is_unix or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """End the block without an error at Ctrl-C and at SIGTERM, also in a background job of a shell script."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    previous = [signal.signal(number, signal.default_int_handler) for number in numbers]
+    try:
+        yield
+    except KeyboardInterrupt:
+        print()
+    finally:
+        for number, handler in zip(numbers, previous, strict=True):
+            signal.signal(number, handler)
 
 
 def _subject(cfg: DictConfig) -> Subject:

@@ -106,6 +106,7 @@ function draw() {
   $("buttons").hidden = !isRun;
   if (!isRun) return;
   if (state.status === "busy") notice("A process works in the folder of this run. It is starting, or trains without callback=live.");
+  if (state.is_writable === false) notice("You cannot write into the folder of this run, so it neither shows its Gaussians nor obeys the buttons.");
   drawButtons();
   drawFacts();
   drawFiles();
@@ -113,7 +114,7 @@ function draw() {
 }
 
 function drawButtons() {
-  const isLive = state.status === "training" || state.status === "paused";
+  const isLive = (state.status === "training" || state.status === "paused") && state.is_writable !== false;
   const asked = isLive ? state.asked || [] : [];
   const isPaused = state.status === "paused";
   const [pause, save, stop] = ["pause", "save", "stop"].map($);

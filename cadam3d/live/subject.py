@@ -43,6 +43,7 @@ from cadam3d.viewer.pack import pack
 LARGEST_SNAPSHOT = 1 << 30  # bytes; ten million Gaussians of SH degree 3 have less
 MOST_SAVED = 100  # files that a page lists
 LONGEST_TITLE = 500  # characters
+CURVES = ("step", "num_gaussians", "seconds", "loss")  # what the log and the process both know
 # Files of a run that the page, or the report, offers under their own names.
 OFFERED = (ASSET, CONFIG, METRICS, PREVIEW, SUMMARY, TURNTABLE)
 
@@ -139,7 +140,7 @@ class Run(Subject):
 
     def state(self) -> dict[str, Any]:
         """Return what the page shows beside the picture. This lets the run know that a page is open."""
-        live.touch_watched(self.place)
+        is_writable = live.touch_watched(self.place)
         self._curves.update()
         config, now = self._config.get() or {}, self._live()
         title, total = config.get("prompt"), config.get("steps")
@@ -154,12 +155,14 @@ class Run(Subject):
             "has_report": self._version(REPORT) is not None,
             "total_steps": total if is_whole(total) else None,
             "step": self._curves.last_step,
-            **{key: self._curves.last(key) for key in ("num_gaussians", "seconds", "loss")},
+            **{key: self._curves.last(key) for key in CURVES if key != "step"},
         }
         if now is not None:
             status = "ending" if now["has_ended"] else "paused" if now["is_paused"] else "training"
             asked = [request for request in live.REQUESTS if live.is_asked(self.place, request)]
-            return facts | now | {"status": status, "asked": asked}
+            # The log may be ahead, because the process writes its numbers for open pages only.
+            log = {key: facts[key] for key in CURVES} if self._curves.last_step > now["step"] else {}
+            return facts | now | log | {"status": status, "asked": asked, "is_writable": is_writable}
         if is_held(self.place / LOCK):
             return facts | {"status": "busy"}
         summary = self._summary.get() or {}

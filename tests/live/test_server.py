@@ -151,9 +151,10 @@ def test_a_finished_run_is_shown_with_its_asset_and_its_numbers(browser, run):
 
 def test_a_run_that_begins_while_the_page_is_open_becomes_live_and_ends_again(browser, run):
     before = browser.json("state")["picture"]
-    with training(run):
+    with training(run, step=11):
         state = browser.json("state")
-        assert (state["status"], state["step"], state["num_gaussians"]) == ("training", 3, 5)
+        assert (state["status"], state["step"], state["num_gaussians"]) == ("training", 11, 5)
+        assert state["is_writable"]
         assert state["picture"] != before
         assert browser.get("picture")[2] == pack(make_gaussians(5))
         assert (run / "live/watched").exists()
@@ -208,6 +209,12 @@ def test_the_state_that_a_killed_process_has_left_is_not_that_of_the_next_one(br
         (run / "live/state.json").write_text(json.dumps({**state, "process": "1 on another machine"}))
         assert browser.json("state")["status"] == "busy"
         assert browser.post("stop", b"1 on another machine") == 409
+
+
+def test_the_log_is_believed_where_it_is_ahead_of_the_state(browser, run):
+    with training(run, step=3):
+        state = browser.json("state")
+        assert (state["step"], state["num_gaussians"], state["statistics"]) == (9, 20, {"snr_p50": 0.1})
 
 
 # --- the buttons -------------------------------------------------------------------------------------------
