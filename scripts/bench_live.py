@@ -2,73 +2,88 @@
 
     python scripts/bench_live.py --counts 4000 50000
 
-Blocks of steps take turns: without the callback and the control (off), with both (closed), and with both
-while a thread does what an open page does (open). Other load on the machine affects all of them alike. The
-numbers are medians over the blocks, in milliseconds of wall clock per step and in percent of the block "off".
+Everything is measured in one process and in CPU time, so that other load on the machine matters little: a
+step, a look at whether a page is open and what it asks for, and a snapshot for an open page. A run looks four
+times a second and writes one snapshot a second, or fewer if these would take more than their share.
 """
 
 import argparse
 import statistics
 import tempfile
-import threading
 import time
-from contextlib import nullcontext
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
+from cadam3d.callback import live as callback
 from cadam3d.callback.live import Live
+from cadam3d.commands import control
 from cadam3d.commands.control import Control
 from cadam3d.commands.train import build_trainer, run_context
 from cadam3d.io.live import touch_watched
 from cadam3d.settings.compose import component, compose
-from cadam3d.state import TrainState
-from cadam3d.trainer import Trainer
+from cadam3d.state import StepReport
 
-POLL_SECONDS = 0.7  # as in the page
-MODES = ("off", "closed", "open")
+LOOKS = 1 / callback.LOOK_SECONDS  # per second
 
 
-class Block:
-    """Lets a number of steps pass and measures the seconds between the first and the last one."""
-
-    def __init__(self, steps: int, control) -> None:
-        self.left, self.control, self.times = steps, control, []
-
-    def __call__(self) -> bool:
-        stops = self.control()
-        self.times.append(time.perf_counter())
-        self.left -= 1
-        return stops or self.left < 0
-
-    @property
-    def milliseconds(self) -> float:
-        return 1000 * (self.times[-1] - self.times[0]) / (len(self.times) - 1)
+def milliseconds(work: Callable[[], object], times: int, repeats: int) -> float:
+    """Return the median CPU time of ``work``, over ``repeats`` measurements of ``times`` calls."""
+    measured = []
+    for _ in range(repeats + 1):
+        began = time.process_time()
+        for _ in range(times):
+            work()
+        measured.append(1000 * (time.process_time() - began) / times)
+    return statistics.median(measured[1:])
 
 
-def measure(trainer: Trainer, state: TrainState, embedding, folder: Path, mode: str, steps: int) -> float:
-    context = run_context("bench", trainer, state, folder)
-    callbacks = [] if mode == "off" else [Live(seconds=1.0, share=0.03)]
-    control = (
-        nullcontext(lambda: False) if mode == "off" else Control(folder, state, lambda: False, lambda: None)
-    )
-    closed = threading.Event()
+def measure(count: int, share: float, folder: Path, device: torch.device) -> str:
+    """Return one line of the table."""
+    words = ["prompt=a snowman next to a pine", f"initializer.count={count}", "callback=[]"]
+    cfg = compose([*words, "steps=1000000", "refine.start=900000"])
+    trainer = build_trainer(cfg, device)
+    trainer.rasterizer.prepare(device)
+    embedding = trainer.prior.embed(cfg.prompt, "")
+    state = trainer.start(cfg.prompt, component(cfg.initializer), 0, device)
+    context = run_context(cfg.prompt, trainer, state, folder)
+    step = milliseconds(lambda: trainer._step(state, embedding), times=3, repeats=5)
 
-    def watch() -> None:
-        while mode == "open" and not closed.wait(POLL_SECONDS):
-            touch_watched(folder)
+    report = StepReport(step=state.step, loss=1.0, log={}, num_gaussians=count)
+    live = Live(seconds=0.1, share=share)
+    stop = Control(folder, state, lambda: False, lambda: None)
+    live.on_start(context, state)
 
-    page = threading.Thread(target=watch)
-    page.start()
-    try:
-        with control as asked:
-            block = Block(steps, asked)
-            replace(trainer, callbacks=callbacks).train(state, embedding, context, block)
-    finally:
-        closed.set()
-        page.join()
-    return block.milliseconds
+    def after_step() -> None:
+        live.on_step(context, state, report)
+        stop()
+
+    between = milliseconds(after_step, times=2000, repeats=5)
+    # From here on, every call looks.
+    callback.LOOK_SECONDS = control.LOOK_SECONDS = live._look_at = stop._look_at = 0.0
+    look = milliseconds(after_step, times=500, repeats=5)
+    closed = between / step + LOOKS * look / 1000
+
+    def snapshot() -> None:
+        touch_watched(folder)
+        state.step += 1
+        live._due = 0.0
+        live.on_step(context, state, report)
+
+    shown = milliseconds(snapshot, times=1, repeats=7)
+    size = (folder / "live/snapshot.bin").stat().st_size
+    callback.LOOK_SECONDS = control.LOOK_SECONDS = 1 / LOOKS
+    every = max(1.0, shown / 1000 / share)
+    cells = [
+        f"{count:,}",
+        f"{step:.1f}",
+        f"{closed:.3%}",
+        f"{shown:.1f}",
+        f"{size / 1e6:.2f}",
+        f"{every:.1f}",
+    ]
+    return f"| {' | '.join(cells)} | {shown / 1000 / every:.1%} |"
 
 
 def main() -> None:
@@ -76,39 +91,15 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--counts", type=int, nargs="+", default=[4000, 50000], help="Gaussians")
-    parser.add_argument("--seconds", type=float, default=8, help="of each block, about")
-    parser.add_argument("--blocks", type=int, default=7, help="of each kind")
     options = parser.parse_args()
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    share = compose(["prompt=a red cube"]).callback.live.share
     torch.set_num_threads(1)
-    print("| Gaussians | off, ms per step | closed | open |\n|---|---|---|---|")
+    print("| Gaussians | step, ms | no page | snapshot, ms | MB | seconds between | open page |")
+    print("|---|---|---|---|---|---|---|")
     for count in options.counts:
-        prompt = "prompt=a snowman next to a pine"
-        cfg = compose(
-            [prompt, f"initializer.count={count}", "steps=1000000", "refine.start=900000", "callback=[]"]
-        )
-        trainer = build_trainer(cfg, device)
-        trainer.rasterizer.prepare(device)
-        embedding = trainer.prior.embed(cfg.prompt, "")
-        state = trainer.start(cfg.prompt, component(cfg.initializer), 0, device)
-        times: dict[str, list[float]] = {mode: [] for mode in MODES}
         with tempfile.TemporaryDirectory() as folder:
-            place = Path(folder)
-            pace = measure(trainer, state, embedding, place, "off", 5)
-            steps = max(5, round(1000 * options.seconds / pace))
-            for _ in range(options.blocks):
-                for mode in MODES:
-                    times[mode].append(measure(trainer, state, embedding, place, mode, steps))
-        middle = {mode: statistics.median(each) for mode, each in times.items()}
-        ratios = [
-            statistics.median(b / a - 1 for a, b in zip(times["off"], times[mode], strict=True))
-            for mode in ("closed", "open")
-        ]
-        cells = [
-            f"{middle[mode]:.1f} ({ratio:+.1%})"
-            for mode, ratio in zip(("closed", "open"), ratios, strict=True)
-        ]
-        print(f"| {count:,} | {middle['off']:.1f} | {' | '.join(cells)} |", flush=True)
+            print(measure(count, share, Path(folder), device), flush=True)
 
 
 if __name__ == "__main__":

@@ -13,13 +13,14 @@ from torch import Tensor
 
 from cadam3d.commands.messages import keeping_others, note_backend
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import fail
+from cadam3d.core.checks import fail, require_choice
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.exporter.base import Exporter
-from cadam3d.io.ply import read_ply
+from cadam3d.io.asset_file import read_gaussians
+from cadam3d.io.frames import UPS
 from cadam3d.io.run_folder import (
     ASSET,
     CONFIG,
@@ -58,15 +59,17 @@ def open_asset(cfg: DictConfig) -> Asset:
     if cfg.run is not None:
         return open_run(find_run(str(cfg.run)), cfg.device)
     ply = expanded(str(cfg.ply))
-    gaussians = read_ply(ply, up=cfg.ply_up).to(resolve_device(cfg.device))
+    gaussians = read_gaussians(ply, up=cfg.ply_up).to(resolve_device(cfg.device))
     return Asset(gaussians=gaussians, ply=ply, folder=ply.with_suffix(""))
 
 
 def require_one(cfg: DictConfig) -> None:
-    """Raise ``UserError`` unless exactly one of ``run=`` and ``ply=`` is given."""
+    """Raise ``UserError`` unless exactly one of ``run=`` and ``ply=`` is given and ``ply_up=`` is an axis."""
     if (cfg.run is None) == (cfg.ply is None):
         got, line = ("neither", suggestion("", "run", ASSET)) if cfg.run is None else ("both", "ply=null")
         raise UserError(f"run, ply: expected one of them, got {got}. Try: {line}")
+    if cfg.ply_up is not None:
+        require_choice("ply_up", cfg.ply_up, UPS)
 
 
 def find_asset(folder: Path) -> Path:
@@ -81,7 +84,7 @@ def find_asset(folder: Path) -> Path:
 def open_run(folder: Path, device: str) -> Asset:
     """Return the asset of the run in ``folder``."""
     ply = find_asset(folder)
-    return Asset(gaussians=read_ply(ply).to(resolve_device(device)), ply=ply, folder=folder)
+    return Asset(gaussians=read_gaussians(ply).to(resolve_device(device)), ply=ply, folder=folder)
 
 
 def find_run(text: str) -> Path:

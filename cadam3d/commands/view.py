@@ -4,9 +4,12 @@ import errno
 import getpass
 import os
 import shlex
+import signal
 import socket
 import sys
 import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from omegaconf import DictConfig
 
@@ -14,7 +17,7 @@ from cadam3d import report
 from cadam3d.commands.asset import find_asset, find_run, require_one
 from cadam3d.core.checks import require_whole
 from cadam3d.core.errors import UserError
-from cadam3d.io.ply import read_ply
+from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.run_folder import REPORT, expanded, has_file, shown, typed_path
 from cadam3d.live.server import HOST, Server
 from cadam3d.live.subject import Run, Subject
@@ -32,15 +35,12 @@ def run(cfg: DictConfig) -> None:
         return
     subject = _subject(cfg)
     subject.load()
-    with _listening(subject, cfg.port) as server:
+    with _ended_by_signals(), _listening(subject, cfg.port) as server:
         print(server.address)
         print(_hint(server.server_port), flush=True)
         if cfg.open and has_display():
             webbrowser.open(server.address)
-        try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            print()
+        server.serve_forever()
 
 
 def has_display() -> bool:
@@ -49,12 +49,26 @@ def has_display() -> bool:
     return not is_unix or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """End the block without an error at Ctrl-C and at SIGTERM, also in a background job of a shell script."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    previous = [signal.signal(number, signal.default_int_handler) for number in numbers]
+    try:
+        yield
+    except KeyboardInterrupt:
+        print()
+    finally:
+        for number, handler in zip(numbers, previous, strict=True):
+            signal.signal(number, handler)
+
+
 def _subject(cfg: DictConfig) -> Subject:
     if cfg.ply is not None:
         file = expanded(str(cfg.ply))
-        return Subject(file, lambda: read_ply(file, up=cfg.ply_up))
+        return Subject(file, lambda: read_gaussians(file, up=cfg.ply_up))
     folder = find_run(str(cfg.run))
-    return Run(folder, lambda: read_ply(find_asset(folder)))
+    return Run(folder, lambda: read_gaussians(find_asset(folder)))
 
 
 def _listening(subject: Subject, port: int) -> Server:

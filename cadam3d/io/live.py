@@ -141,9 +141,12 @@ def is_own_folder(run: Path) -> bool:
         return False
 
 
-def touch_watched(run: Path) -> None:
-    """Let a run that trains know that a page shows it. Without ``live/``, nothing is written."""
-    _touch(run / LIVE_WATCHED) if is_own_folder(run) else None
+def touch_watched(run: Path) -> bool:
+    """Let a run that trains know that a page shows it.
+
+    Return False if that is impossible, and without ``live/``, where nothing is written.
+    """
+    return is_own_folder(run) and _touch(run / LIVE_WATCHED)
 
 
 def ask(run: Path, request: str) -> bool:

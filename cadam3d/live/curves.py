@@ -14,6 +14,7 @@ from cadam3d.io.run_folder import METRICS
 
 # Limits of what is kept in memory and of what is sent to a page.
 MOST_KEYS, MOST_POINTS, MOST_SENT = 200, 4096, 500
+MOST_CHARTS, MOST_CURVES = 20, 8
 LARGEST_PIECE = 1 << 24  # bytes that are read at once; what remains is read at the next call
 LONGEST_LINE = 1 << 20  # bytes
 # The charts that every run has.
@@ -68,10 +69,12 @@ class Curves:
     def drawn(self, charts: Iterable[Chart]) -> list[dict[str, Any]]:
         """Return the common charts and ``charts``, with their numbers so far, as plain data."""
         found = []
-        for chart in (*COMMON, *charts):
+        for chart in (*COMMON, *charts)[:MOST_CHARTS]:
             facts = {name: getattr(chart, name) for name in ("title", "caption", "log_y", "percent")}
             bounds = [{"key": key, "points": self._sent(key)} for key in chart.band or ()]
-            curves = [{**vars(curve), "points": self._sent(curve.key)} for curve in chart.curves]
+            curves = [
+                {**vars(curve), "points": self._sent(curve.key)} for curve in chart.curves[:MOST_CURVES]
+            ]
             found.append({**facts, "curves": curves, "band": bounds, "band_label": chart.band_label})
         return found
 
@@ -100,7 +103,8 @@ class Curves:
         if key not in self._points and len(self._points) >= MOST_KEYS:
             return
         points = self._points.setdefault(key, [])
-        if points and points[-1][0] > step:
+        # A step counts the Gaussians before its refinement, whose line comes first.
+        if points and points[-1][0] >= step:
             return
         points.append((step, value))
         # Older points become sparser, and the length stays bounded.

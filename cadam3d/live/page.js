@@ -50,7 +50,6 @@ async function poll() {
 }
 
 function lost(text) {
-  document.body.classList.toggle("lost", text !== "");
   if (text) state = state && { ...state, status: "lost" };
   notice(text);
 }
@@ -107,6 +106,7 @@ function draw() {
   $("buttons").hidden = !isRun;
   if (!isRun) return;
   if (state.status === "busy") notice("A process works in the folder of this run. It is starting, or trains without callback=live.");
+  if (state.is_writable === false) notice("You cannot write into the folder of this run, so it neither shows its Gaussians nor obeys the buttons.");
   drawButtons();
   drawFacts();
   drawFiles();
@@ -114,7 +114,7 @@ function draw() {
 }
 
 function drawButtons() {
-  const isLive = state.status === "training" || state.status === "paused";
+  const isLive = (state.status === "training" || state.status === "paused") && state.is_writable !== false;
   const asked = isLive ? state.asked || [] : [];
   const isPaused = state.status === "paused";
   const [pause, save, stop] = ["pause", "save", "stop"].map($);
@@ -149,7 +149,7 @@ function drawFacts() {
     ["Training time", state.seconds ? duration(state.seconds) : ""],
     ["Outcome", isLive ? "" : (outcome || "").replaceAll("_", " ")],
     ["PSNR", !isLive && state.psnr ? `${state.psnr.toFixed(2)} dB` : ""],
-    ["Continue with", state.status === "idle" && outcome !== "finished" && step < total ? `cadam3d train resume=${state.folder}` : ""],
+    ["Continue with", state.status === "idle" && outcome !== "finished" && step < total ? state.resume : ""],
   ];
   $("facts").replaceChildren(...facts.filter(([, text]) => text).flatMap(([name, text]) => [element("dt", name), element("dd", text)]));
   $("progress").hidden = !total;
@@ -166,7 +166,7 @@ function speed() {
 function drawFiles() {
   const files = [];
   if (state.has_report) files.push(link("Report of the run", "report"));
-  if (state.has_asset) files.push(link("asset.ply", "asset", "asset.ply"));
+  if (state.has_asset) files.push(link("asset.ply", "asset.ply", "asset.ply"));
   for (const step of [...state.saved].reverse()) {
     const name = `step_${String(step).padStart(7, "0")}.ply`;
     files.push(link(`saved/${name}`, `saved/${step}`, name));

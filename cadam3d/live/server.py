@@ -46,13 +46,19 @@ POLICY = (
 # The report is a page by the author of the run. In a sandbox it belongs to no origin, so it can neither read
 # what this server answers nor press a button.
 REPORT_POLICY = (
-    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-    "worker-src blob:; img-src data: blob:; media-src data:; font-src data:; frame-ancestors 'none'"
+    "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; worker-src blob:; img-src data: blob:; media-src data:; font-src data:; "
+    "frame-ancestors 'none'"
 )
 
 
 def _own(name: str) -> bytes:
     return (FOLDER / name).read_bytes()
+
+
+def _json(value: Any) -> bytes:
+    # The names of folders, and text in YAML, may hold characters that UTF-8 does not have.
+    return to_json(value).encode(errors="replace")
 
 
 # What is the same for every page: the name in the address, the type, and the content.
@@ -65,8 +71,8 @@ FIXED: dict[str, tuple[str, Callable[[], bytes]]] = {
 }
 # What depends on the run or the file. None means that there is nothing yet.
 CURRENT: dict[str, tuple[str, Callable[[Subject], bytes | None]]] = {
-    "state": (JSON, lambda subject: to_json(subject.state()).encode()),
-    "charts": (JSON, lambda subject: to_json(subject.charts()).encode()),
+    "state": (JSON, lambda subject: _json(subject.state())),
+    "charts": (JSON, lambda subject: _json(subject.charts())),
     "picture": (BYTES, lambda subject: subject.picture()),
 }
 

@@ -25,19 +25,27 @@ from cadam3d.io.run_folder import (
     CONFIG,
     LIVE_SNAPSHOT,
     LOCK,
+    METRICS,
+    PREVIEW,
     REPORT,
     SAVED,
     SAVED_PATTERN,
     SUMMARY,
+    TURNTABLE,
     saved_name,
     shown,
 )
 from cadam3d.live.curves import Curves
 from cadam3d.report.declarations import read_declarations
+from cadam3d.settings.line import resume_word
 from cadam3d.viewer.pack import pack
 
 LARGEST_SNAPSHOT = 1 << 30  # bytes; ten million Gaussians of SH degree 3 have less
 MOST_SAVED = 100  # files that a page lists
+LONGEST_TITLE = 500  # characters
+CURVES = ("step", "num_gaussians", "seconds", "loss")  # what the log and the process both know
+# Files of a run that the page, or the report, offers under their own names.
+OFFERED = (ASSET, CONFIG, METRICS, PREVIEW, SUMMARY, TURNTABLE)
 
 Version = tuple[int, int, int, int]
 Value = TypeVar("Value")
@@ -132,14 +140,14 @@ class Run(Subject):
 
     def state(self) -> dict[str, Any]:
         """Return what the page shows beside the picture. This lets the run know that a page is open."""
-        live.touch_watched(self.place)
+        is_writable = live.touch_watched(self.place)
         self._curves.update()
         config, now = self._config.get() or {}, self._live()
         title, total = config.get("prompt"), config.get("steps")
         facts = {
             "kind": "run",
-            "title": title if isinstance(title, str) else self.place.name,
-            "folder": str(shown(self.place)),
+            "title": title[:LONGEST_TITLE] if isinstance(title, str) else self.place.name,
+            "resume": f"cadam3d train {resume_word(shown(self.place))}",
             "picture": _name(self._version(LIVE_SNAPSHOT if self._shows_snapshot(now) else ASSET)),
             "charts": f"{self._curves.version} {_name(self._declared.version())}",
             "saved": self._saved(),
@@ -147,12 +155,14 @@ class Run(Subject):
             "has_report": self._version(REPORT) is not None,
             "total_steps": total if is_whole(total) else None,
             "step": self._curves.last_step,
-            **{key: self._curves.last(key) for key in ("num_gaussians", "seconds", "loss")},
+            **{key: self._curves.last(key) for key in CURVES if key != "step"},
         }
         if now is not None:
             status = "ending" if now["has_ended"] else "paused" if now["is_paused"] else "training"
             asked = [request for request in live.REQUESTS if live.is_asked(self.place, request)]
-            return facts | now | {"status": status, "asked": asked}
+            # The log may be ahead, because the process writes its numbers for open pages only.
+            log = {key: facts[key] for key in CURVES} if self._curves.last_step > now["step"] else {}
+            return facts | now | log | {"status": status, "asked": asked, "is_writable": is_writable}
         if is_held(self.place / LOCK):
             return facts | {"status": "busy"}
         summary = self._summary.get() or {}
@@ -185,13 +195,13 @@ class Run(Subject):
         return live.ask(self.place, request)
 
     def offered(self, name: str) -> BinaryIO | None:
-        """Open ``asset``, ``report`` or ``saved/STEP``; None if it is missing or behind a link."""
+        """Open ``report``, ``saved/STEP`` or one of ``OFFERED``; None if it is missing or behind a link."""
         step = re.fullmatch(r"saved/([0-9]{1,12})", name)
-        fixed = {"asset": ASSET, "report": REPORT}
-        if step is None and name not in fixed:
-            return None
+        files = {"report": REPORT, **{each: each for each in OFFERED}}
+        if step is not None:
+            files[name] = f"{SAVED}/{saved_name(int(step.group(1)))}"
         try:
-            return self._open(fixed[name] if step is None else f"{SAVED}/{saved_name(int(step.group(1)))}")
+            return self._open(files[name]) if name in files else None
         except (OSError, UserError):
             return None
 

@@ -35,8 +35,8 @@ CALL = re.compile(r"\$\{[\w.]+:")  # an interpolation that calls a function
 BLANKS = "\n\t\r"
 # The settings outside of all components, over all commands.
 SETTINGS: dict[str, Any] = {
-    **dict.fromkeys(("prompt", "negative_prompt", "device", "ply_up"), str),
-    **dict.fromkeys(("resume", "run", "ply", "output"), str | None),
+    **dict.fromkeys(("prompt", "negative_prompt", "device"), str),
+    **dict.fromkeys(("resume", "run", "ply", "ply_up", "output"), str | None),
     **dict.fromkeys(("steps", "views", "seed", "port"), int),
     **dict.fromkeys(("open", "json"), bool),
 }

@@ -98,6 +98,32 @@ def test_the_pace_of_a_resumed_run_counts_only_its_own_steps(bar, at_noon, run, 
     assert "done=12:04" in line
 
 
+def pause_for_an_hour(shown: Progress, at_noon, run, capsys) -> str:
+    """Take a minute for each of two steps, with an hour between them, and return the last line."""
+    shown.on_start(*run)
+    at_noon.now += 60
+    step(shown, run, 1)
+    for _ in range(4):
+        at_noon.now += 900
+        shown.on_pause(*run)
+    at_noon.now += 60
+    step(shown, run, 2)
+    shown.on_end(*run, Outcome.INTERRUPTED)
+    return last_line(capsys)
+
+
+def test_the_bar_leaves_a_pause_out(bar, at_noon, run, capsys):
+    line = pause_for_an_hour(bar, at_noon, run, capsys)
+    assert "[02:00<" in line
+    assert "done=13:10" in line
+
+
+def test_the_lines_leave_a_pause_out(lines, at_noon, run, capsys):
+    line = pause_for_an_hour(lines, at_noon, run, capsys)
+    assert "speed=0.0167 steps/s" in line
+    assert "done=13:10" in line
+
+
 def test_a_finished_run_shows_no_time_of_the_end(bar, at_noon, run, capsys):
     bar.on_start(*run)
     for number in range(1, 11):

@@ -1,5 +1,6 @@
 """The lock: one process at a time, a note about that process, and safe handling of the file itself."""
 
+import fcntl
 import json
 import os
 import subprocess
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.lock import INHERITED, describe_holder, locked, take
+from cadam3d.io.lock import INHERITED, describe_holder, holder_name, is_held, locked, process_name, take
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -125,3 +126,29 @@ def test_a_file_system_without_locks_does_not_stop_the_work(tmp_path, monkeypatc
     monkeypatch.setattr("fcntl.flock", fail)
     with locked(tmp_path / ".lock", refuse), locked(tmp_path / ".lock", refuse):
         pass
+
+
+def test_looking_at_a_lock_changes_nothing(tmp_path):
+    path = tmp_path / ".lock"
+    assert not is_held(path)
+    assert not path.exists()
+    with locked(path, refuse):
+        note = path.read_text()
+        assert is_held(path)
+        assert holder_name(path) == process_name()
+        assert path.read_text() == note
+    assert not is_held(path)
+    # A killed process leaves its note behind.
+    path.write_text(note)
+    assert not is_held(path)
+    with locked(path, refuse):
+        pass
+
+
+def test_a_lock_that_is_only_looked_at_does_not_stop_a_process(tmp_path, monkeypatch):
+    (tmp_path / ".lock").touch()
+    with (tmp_path / ".lock").open() as looking:
+        fcntl.flock(looking, fcntl.LOCK_SH)
+        monkeypatch.setattr("time.sleep", lambda seconds: fcntl.flock(looking, fcntl.LOCK_UN))
+        with locked(tmp_path / ".lock", refuse):
+            pass

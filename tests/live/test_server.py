@@ -1,4 +1,4 @@
-"""What the server of ``cadam3d view`` gives to whom, over plain HTTP."""
+"""What the server of ``cadam3d view`` answers and what it refuses, over plain HTTP."""
 
 import http.client
 import json
@@ -124,7 +124,7 @@ def test_the_page_and_its_parts_are_served(browser):
 
 
 def test_every_answer_has_the_headers_that_keep_others_out(browser):
-    for path in ("", "state", "picture", "asset", "report", "nothing"):
+    for path in ("", "state", "picture", "asset.ply", "report", "nothing"):
         _, headers, _ = browser.get(path)
         assert headers["Cache-Control"] == "no-store"
         assert headers["X-Content-Type-Options"] == "nosniff"
@@ -144,16 +144,17 @@ def test_a_finished_run_is_shown_with_its_asset_and_its_numbers(browser, run):
     assert browser.get("picture")[2] == pack(read_ply(run / "asset.ply"))
     charts = {chart["title"]: chart for chart in browser.json("charts")}
     assert charts["Loss"]["curves"][0]["points"] == [[1, 1.0], [5, 0.2], [9, 1 / 9]]
-    assert browser.get("asset")[2] == (run / "asset.ply").read_bytes()
+    assert browser.get("asset.ply")[2] == (run / "asset.ply").read_bytes()
     assert browser.get("saved/4")[2] == (run / "saved/step_0000004.ply").read_bytes()
     assert not (run / "live").exists()
 
 
 def test_a_run_that_begins_while_the_page_is_open_becomes_live_and_ends_again(browser, run):
     before = browser.json("state")["picture"]
-    with training(run):
+    with training(run, step=11):
         state = browser.json("state")
-        assert (state["status"], state["step"], state["num_gaussians"]) == ("training", 3, 5)
+        assert (state["status"], state["step"], state["num_gaussians"]) == ("training", 11, 5)
+        assert state["is_writable"]
         assert state["picture"] != before
         assert browser.get("picture")[2] == pack(make_gaussians(5))
         assert (run / "live/watched").exists()
@@ -163,9 +164,13 @@ def test_a_run_that_begins_while_the_page_is_open_becomes_live_and_ends_again(br
 
 def test_a_log_that_grows_or_is_replaced_is_followed(browser, run):
     first = browser.json("state")["charts"]
-    append_jsonl(run / "metrics.jsonl", {"kind": "refine", "step": 9, "after": 33, "statistics": {}})
+    append_jsonl(
+        run / "metrics.jsonl", {"kind": "refine", "step": 10, "after": 33, "statistics": {"snr_p50": 1}}
+    )
+    # A step counts the Gaussians before its refinement.
+    append_jsonl(run / "metrics.jsonl", {"kind": "step", "step": 10, "num_gaussians": 20})
     assert browser.json("state")["charts"] != first
-    assert browser.json("charts")[0]["curves"][0]["points"][-1] == [9, 33]
+    assert browser.json("charts")[0]["curves"][0]["points"][-2:] == [[9, 20], [10, 33]]
     (run / "metrics.jsonl").unlink()
     append_jsonl(run / "metrics.jsonl", {"kind": "step", "step": 1, "loss": 3.0})
     browser.json("state")
@@ -175,7 +180,7 @@ def test_a_log_that_grows_or_is_replaced_is_followed(browser, run):
 def test_a_report_is_in_a_sandbox(browser):
     _, headers, content = browser.get("report")
     assert content == b"<script>alert(1)</script>"
-    assert headers["Content-Security-Policy"].startswith("sandbox allow-scripts;")
+    assert headers["Content-Security-Policy"].startswith("sandbox allow-scripts allow-downloads;")
     assert "allow-same-origin" not in headers["Content-Security-Policy"]
 
 
@@ -204,6 +209,12 @@ def test_the_state_that_a_killed_process_has_left_is_not_that_of_the_next_one(br
         (run / "live/state.json").write_text(json.dumps({**state, "process": "1 on another machine"}))
         assert browser.json("state")["status"] == "busy"
         assert browser.post("stop", b"1 on another machine") == 409
+
+
+def test_the_log_is_believed_where_it_is_ahead_of_the_state(browser, run):
+    with training(run, step=3):
+        state = browser.json("state")
+        assert (state["step"], state["num_gaussians"], state["statistics"]) == (9, 20, {"snr_p50": 0.1})
 
 
 # --- the buttons -------------------------------------------------------------------------------------------
@@ -271,17 +282,9 @@ def test_only_the_page_itself_presses_buttons(browser, run, origin):
 @pytest.mark.parametrize(
     "path",
     [
-        *("../../etc/passwd", "..%2f..%2fetc/passwd", "//etc/passwd", "saved/../config.yaml", "config.yaml"),
-        *(
-            "saved/4.ply",
-            "saved/step_0000004.ply",
-            "saved/-4",
-            "saved/",
-            "saved/9",
-            "saved/٤",
-            ".lock",
-            "live",
-        ),
+        *("../../etc/passwd", "..%2f..%2fetc/passwd", "//etc/passwd", "saved/../config.yaml", "charts.json"),
+        *("saved/4.ply", "saved/step_0000004.ply", "saved/-4", "saved/", "saved/9", "saved/%D9%A4"),
+        *(".lock", "live", "live/state.json"),
     ],
 )
 def test_no_path_leads_to_a_file(browser, path):
@@ -291,7 +294,7 @@ def test_no_path_leads_to_a_file(browser, path):
 @pytest.mark.parametrize(
     ("name", "offered"),
     [
-        ("asset.ply", "asset"),
+        ("asset.ply", "asset.ply"),
         ("report.html", "report"),
         ("saved", "saved/4"),
         ("live/snapshot.bin", "picture"),
