@@ -1,4 +1,4 @@
-"""SPZ files of Niantic, versions 2 and 3: a tenth of the size of a PLY, by rounding and gzip.
+"""SPZ files of Niantic, versions 2 and 3: rounded numbers and gzip, a quarter to a seventh of a PLY.
 
 A gzip stream holds a header of 16 bytes, and then one block for each kind of number. All are little endian.
 
@@ -61,6 +61,7 @@ MOST_FRACTIONAL_BITS = 16
 LARGEST_FIXED = (1 << 23) - 1
 COLOR_SCALE = 0.15
 SH_STEPS = (8, 16)  # of the byte of a coefficient: of degree 1, and of higher degrees
+GZIP_LEVEL = 6  # 9 gives files that are 1 % smaller, in three to five times the time
 LARGEST_OF_SMALLEST = 0.5**0.5  # the second largest component of a unit quaternion is at most this
 
 # Bounds of the memory of a reader: this many times the size of the file, and these bytes.
@@ -92,7 +93,7 @@ def write_spz(path: Path, gaussians: Gaussians, *, up: str) -> None:
         replacing(path) as temporary,
         temporary.open("wb") as raw,
         # Without a name and a time, the stream depends on nothing except its content.
-        gzip.GzipFile(filename="", mode="wb", fileobj=raw, mtime=0) as file,
+        gzip.GzipFile(filename="", mode="wb", compresslevel=GZIP_LEVEL, fileobj=raw, mtime=0) as file,
     ):
         file.write(header)
         for block in blocks:
