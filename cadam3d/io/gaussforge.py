@@ -96,7 +96,9 @@ def write_spz4(path: Path, gaussians: Gaussians, *, up: str) -> None:
 
 def _write(path: Path, gaussians: Gaussians, *, up: str, kind: str) -> None:
     if not len(gaussians) and kind != "spz":
-        raise UserError(f"{path}: expected at least one Gaussian, which {kind} requires. Try: exporter=[ply]")
+        raise UserError(
+            f"{path}: expected at least one Gaussian, which {kind} requires. Try: 'exporter=[ply]'"
+        )
     local = in_file_axes(gaussians, up)
     sh = local.sh.clamp(-LARGEST_SH, LARGEST_SH)
     rest = sh[:, 1:]
@@ -116,7 +118,7 @@ def _write(path: Path, gaussians: Gaussians, *, up: str, kind: str) -> None:
     result = _imported(f"exporter.{kind}").GaussForge().write(cloud, kind, spz_version=4)
     if "error" in result:
         reason = str(result["error"])
-        raise UserError(f"{path}: gaussforge cannot write it ({reason}). Try: exporter=[ply]")
+        raise UserError(f"{path}: gaussforge cannot write it ({reason}). Try: 'exporter=[ply]'")
     with replacing(path) as temporary:
         temporary.write_bytes(result["data"])
 
