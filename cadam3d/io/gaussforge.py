@@ -96,9 +96,7 @@ def write_spz4(path: Path, gaussians: Gaussians, *, up: str) -> None:
 
 def _write(path: Path, gaussians: Gaussians, *, up: str, kind: str) -> None:
     if not len(gaussians) and kind != "spz":
-        raise UserError(
-            f"{path}: expected at least one Gaussian, which {kind} requires. Try: 'exporter=[ply]'"
-        )
+        raise UserError(f"{path}: expected a Gaussian, which {kind} requires. Try: 'exporter=[ply]'")
     local = in_file_axes(gaussians, up)
     sh = local.sh.clamp(-LARGEST_SH, LARGEST_SH)
     rest = sh[:, 1:]

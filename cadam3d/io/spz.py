@@ -19,8 +19,8 @@ in this order: a sign, and the magnitude in nine bits, where 511 means 1/sqrt(2)
 
 The specification calls the axes "right, up, back", so files are +y up. Other programs write the numbers of a
 PLY unchanged, which is -y up; the file does not tell them apart, and ``up`` chooses. Bit 0 of the flags means
-that the Gaussians were trained with an antialiasing filter; it is not read, and written as 0. Bit 1 means that
-extensions of vendors follow the Gaussians; they are skipped.
+that the Gaussians were trained with an antialiasing filter; it is not read, and written as 0. Bit 1 means
+that extensions of vendors follow the Gaussians; they are skipped.
 
 :func:`write_spz` rounds to the nearest value of each encoding. The errors are at most half a step: 2^-17 of
 a position within the unit ball, 1/32 of the logarithm of a scale (3 % of the scale), 0.0007 of a quaternion's

@@ -94,7 +94,7 @@ def test_the_same_gaussians_give_the_same_bytes(tmp_path, kind):
 
 @pytest.mark.parametrize("kind", ["sog", "ksplat"])
 def test_no_gaussians_are_one_message(tmp_path, kind):
-    with pytest.raises(UserError, match=rf"at least one Gaussian, which {kind} requires"):
+    with pytest.raises(UserError, match=rf"expected a Gaussian, which {kind} requires"):
         WRITERS[kind](tmp_path / "a", random_gaussians(0), up="-y")
     assert not list(tmp_path.iterdir())
 
