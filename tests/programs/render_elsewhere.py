@@ -1,12 +1,12 @@
 """Pictures of a file in programs that are not ours, from one camera, and their distance from our own render.
 
-The programs come from npm; ``package.json`` pins their versions. ``CADAM3D_PROGRAMS`` names the folder in which they
-are installed, and without it they are looked for beside this file:
+The programs come from npm, and ``package.json`` pins their versions. The environment variable
+``CADAM3D_PROGRAMS`` names the folder in which they are installed. Without it, that is the folder of this file:
 
     npm install --prefix tests/programs
 
-Everything is skipped where Node, Chromium, playwright or the packages are absent. Nothing here uses a network: the pages
-are served on loopback, from three folders, and a request for any other address fails the test.
+Tests skip themselves where Node, Chromium, playwright or the packages are absent. Nothing here uses a network:
+the pages are served on loopback, from three folders, and a request for any other address fails the test.
 """
 
 import json
@@ -85,7 +85,7 @@ def ours(gaussians: Gaussians, view: View) -> Picture:
 
 
 def turned(gaussians: Gaussians, written: str, shown: str) -> Gaussians:
-    """Return the object as a program shows it that takes a file with the up axis ``written`` for one with ``shown``."""
+    """Return the object as it appears if a file with the up axis ``written`` is taken for one with ``shown``."""
     return file_to_world(world_to_file(gaussians, written), shown)
 
 
@@ -107,7 +107,7 @@ def overlap(first: Picture, second: Picture) -> float:
 
 
 def packages() -> Path:
-    """Return the folder ``node_modules``; skip the test if it or a package of the pinned version is absent."""
+    """Return the folder ``node_modules``; skip the test if a package of the pinned version is absent."""
     folder = Path(os.environ.get("CADAM3D_PROGRAMS", HERE)) / "node_modules"
     for name, version in pinned().items():
         found = folder / name / "package.json"
@@ -123,7 +123,7 @@ def pinned() -> dict[str, str]:
     return json.loads((HERE / "package.json").read_text(encoding="utf-8"))["dependencies"]
 
 
-class Refused(AssertionError):
+class RefusedError(AssertionError):
     """A program did not open a file; the text is its message."""
 
 
@@ -160,7 +160,7 @@ class SplatTransform:
         )
 
     def picture(self, path: Path, view: View) -> Picture:
-        """Return its picture of a file. Raises ``Refused`` with its message if it does not open it."""
+        """Return its picture of a file. Raises ``RefusedError`` with its message if it does not open it."""
         target = path.with_name(path.name + ".webp")
         words = {
             "--camera-pos": ",".join(map(str, view.eye)),
@@ -172,13 +172,13 @@ class SplatTransform:
         options = [word for pair in words.items() for word in pair]
         done = self.run("-q", "-w", str(path), *options, str(target))
         if done.returncode != 0 or not target.is_file():
-            raise Refused(done.stderr)
+            raise RefusedError(done.stderr)
         return np.asarray(Image.open(target).convert("RGB"))
 
 
 @dataclass
 class Browser:
-    """Headless Chromium with a server on loopback for the packages, the pages of this folder, and the files to show."""
+    """Headless Chromium, and a server on loopback for the packages, our pages and the files to show."""
 
     chromium: object  # playwright's browser
     origin: str
@@ -195,7 +195,9 @@ class Browser:
             pytest.skip("no chromium")
         folders = {"packages": packages(), "pages": PAGES}
         with _serve(folders) as origin, playwright.sync_playwright() as start:
-            chromium = start.chromium.launch(executable_path=executable, args=["--no-sandbox", *CHROMIUM_FLAGS])
+            chromium = start.chromium.launch(
+                executable_path=executable, args=["--no-sandbox", *CHROMIUM_FLAGS]
+            )
             try:
                 yield cls(chromium, origin, folders)
             finally:
@@ -204,7 +206,7 @@ class Browser:
     def picture(self, page: str, path: Path, view: View, **options: str) -> Picture:
         """Return the picture of a file on one of our pages, such as ``"spark.html"``.
 
-        Raises ``Refused`` with the program's message if it does not open the file.
+        Raises ``RefusedError`` with the program's message if it does not open the file.
         """
         self.folders["files"] = path.parent
         numbers = {"eye": ",".join(map(str, view.eye)), "fov": str(view.fov_y_deg), "size": str(view.size)}
@@ -212,7 +214,7 @@ class Browser:
         with self.open(f"{self.origin}/pages/{page}?{query}", view.size, view.size) as opened:
             opened.wait_for_function("window.result !== undefined", timeout=1000 * PATIENCE_S)
             if (result := opened.evaluate("window.result")) != "drawn":
-                raise Refused(result)
+                raise RefusedError(result)
             return np.asarray(Image.open(BytesIO(opened.screenshot())).convert("RGB"))
 
     @contextmanager
@@ -236,8 +238,6 @@ def _serve(folders: dict[str, Path]) -> Iterator[str]:
     """Serve the folders on loopback under their names, and return the address."""
 
     class Handler(SimpleHTTPRequestHandler):
-        extensions_map = {**SimpleHTTPRequestHandler.extensions_map, ".js": "text/javascript"}
-
         def translate_path(self, path: str) -> str:
             name, _, rest = urlsplit(path).path.lstrip("/").partition("/")
             self.directory = str(folders.get(name, HERE / "absent"))
