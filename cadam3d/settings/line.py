@@ -10,7 +10,16 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.run_folder import ASSET, OVERRIDES, PREVIEW, TURNTABLE, has_file, suggestion, typed_path
+from cadam3d.io.run_folder import (
+    ASSET,
+    OVERRIDES,
+    PREVIEW,
+    TURNTABLE,
+    VIEWER,
+    has_file,
+    suggestion,
+    typed_path,
+)
 from cadam3d.settings.compose import TEXT_KEYS, config_dir, quote
 from cadam3d.settings.trust import is_trusted, judge_overrides, read_overrides, require_contained
 
@@ -28,7 +37,12 @@ SWEEP_CALL = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)", 
 # The text up to a comma that is not followed by a space.
 PIECE = re.compile(r"(?:[^,]|,(?=\s|$))*", re.DOTALL)
 # The exporter that writes a single file with this suffix.
-EXPORTERS = {Path(ASSET).suffix: "ply", Path(PREVIEW).suffix: "preview", Path(TURNTABLE).suffix: "turntable"}
+EXPORTERS = {
+    Path(ASSET).suffix: "ply",
+    Path(PREVIEW).suffix: "preview",
+    Path(TURNTABLE).suffix: "turntable",
+    Path(VIEWER).suffix: "html",
+}
 FLAGS_WITH_VALUE = (
     *("--cfg", "-c", "--package", "-p", "--info", "-i", "--experimental-rerun"),
     *("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
