@@ -1,12 +1,12 @@
 """Pictures of a file in programs that are not ours, from one camera, and their distance from our own render.
 
-The programs come from npm, and ``package.json`` pins their versions. The environment variable
-``CADAM3D_PROGRAMS`` names the folder in which they are installed. Without it, that is the folder of this file:
+The programs come from npm, and ``package.json`` pins their versions. They are installed in the folder that
+the environment variable ``CADAM3D_PROGRAMS`` names, or else beside this file:
 
     npm install --prefix tests/programs
 
-Tests skip themselves where Node, Chromium, playwright or the packages are absent. Nothing here uses a network:
-the pages are served on loopback, from three folders, and a request for any other address fails the test.
+Tests skip themselves where Node, Chromium, playwright or the packages are absent. Nothing here uses a
+network: the pages are served on loopback, and a request for any other address fails the test.
 """
 
 import json
@@ -14,6 +14,7 @@ import os
 import shutil
 import subprocess
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -85,7 +86,7 @@ def ours(gaussians: Gaussians, view: View) -> Picture:
 
 
 def turned(gaussians: Gaussians, written: str, shown: str) -> Gaussians:
-    """Return the object as it appears if a file with the up axis ``written`` is taken for one with ``shown``."""
+    """Return the object as a program shows it that takes the up axis ``written`` for ``shown``."""
     return file_to_world(world_to_file(gaussians, written), shown)
 
 
@@ -186,14 +187,14 @@ class Browser:
 
     @classmethod
     @contextmanager
-    def start(cls) -> Iterator["Browser"]:
+    def start(cls, *, needs_packages: bool = True) -> Iterator["Browser"]:
         """Start the browser and the server; skip the test where something is absent."""
         playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
         names = ("chromium", "chromium-browser", "google-chrome")
         executable = next((found for name in names if (found := shutil.which(name))), None)
         if executable is None:
             pytest.skip("no chromium")
-        folders = {"packages": packages(), "pages": PAGES}
+        folders = {"pages": PAGES, **({"packages": packages()} if needs_packages else {})}
         with _serve(folders) as origin, playwright.sync_playwright() as start:
             chromium = start.chromium.launch(
                 executable_path=executable, args=["--no-sandbox", *CHROMIUM_FLAGS]
@@ -215,7 +216,24 @@ class Browser:
             opened.wait_for_function("window.result !== undefined", timeout=1000 * PATIENCE_S)
             if (result := opened.evaluate("window.result")) != "drawn":
                 raise RefusedError(result)
-            return np.asarray(Image.open(BytesIO(opened.screenshot())).convert("RGB"))
+            return _settled(opened)
+
+    def picture_of_viewer(self, path: Path, view: View) -> Picture:
+        """Return the picture of our own page ``viewer.html``, opened as a file."""
+        with self.open(path.as_uri(), view.size, view.size) as opened:
+            opened.wait_for_selector("#loading", state="detached", timeout=1000 * PATIENCE_S)
+            camera = {
+                "azimuth": view.azimuth_deg,
+                "elevation": view.elevation_deg,
+                "distance": view.distance,
+                "fov": view.fov_y_deg,
+                "target": [0, 0, 0],
+            }
+            # Without the line of controls, the picture fills the window.
+            opened.evaluate(
+                "(camera) => { document.querySelector('footer').remove(); view.camera = camera; }", camera
+            )
+            return _settled(opened)
 
     @contextmanager
     def open(self, address: str, width: int, height: int) -> Iterator[object]:
@@ -229,8 +247,18 @@ class Browser:
             yield page
         finally:
             context.close()
-        local = (self.origin + "/", "data:", "blob:")
+        local = (self.origin + "/", "data:", "blob:", *([address] if address.startswith("file:") else []))
         assert not [url for url in requests if not url.startswith(local)]
+
+
+def _settled(page: object) -> Picture:
+    """Return the picture of a page after it has stopped changing."""
+    last, deadline = b"", time.monotonic() + PATIENCE_S
+    while (now := page.screenshot()) != last:
+        assert time.monotonic() < deadline, "the picture keeps changing"
+        last = now
+        page.wait_for_timeout(300)
+    return np.asarray(Image.open(BytesIO(now)).convert("RGB"))
 
 
 @contextmanager

@@ -1,7 +1,8 @@
 """An object that cannot hide a wrong axis: a snowman next to a pine, as Gaussians, without training.
 
-It has no symmetry. Up and down, left and right, front and back all differ, and so do its colours at SH degree 3.
-The Gaussians resemble trained ones: flat discs of uneven size on the surfaces, partly transparent and overlapping.
+It has no symmetry. Up and down, left and right, front and back all differ, and so do its colours at SH degree
+3. The Gaussians resemble trained ones: flat discs of uneven size on the surfaces, partly transparent and
+overlapping.
 """
 
 import math

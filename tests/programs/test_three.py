@@ -1,8 +1,8 @@
 """The addons of three.js show our files as we do, as far as their renderer allows.
 
-It cuts Gaussians off at two standard deviations, where we cut at an alpha of 1/255, and lowers the opacity of
-small ones. This limits the PSNR to 31 dB. Its pictures of two files of the same object must therefore equal *each
-other*, which is a stricter test of a file.
+It cuts Gaussians off at two standard deviations, where we cut at an alpha of 1/255, and lowers the opacity
+of small ones. This limits the PSNR to 31 dB. Its pictures of two files of the same object must therefore
+equal *each other*, which is a stricter test of a file.
 """
 
 import pytest
