@@ -9,6 +9,7 @@ from PIL import Image
 from programs.render_elsewhere import Picture, View, ours, psnr, turned
 from programs.snowman import snowman_and_pine
 
+from cadam3d.io.compressed_ply import write_compressed_ply
 from cadam3d.io.ply import write_ply
 from cadam3d.io.splat import write_splat
 from cadam3d.io.spz import write_spz
@@ -27,6 +28,7 @@ class Format:
 
 
 FORMATS = {
+    "compressed_ply": Format(".compressed.ply", write_compressed_ply),
     "ply": Format(".ply", lambda path, gaussians, up: write_ply(path, gaussians, up=up, pad_sh=0)),
     "splat": Format(".splat", write_splat, max_degree=0),
     "spz": Format(".spz", write_spz),
@@ -73,9 +75,15 @@ def assert_wrong_axes_fail(draw: Callable[[Path], Picture], case: Case, folder: 
 
 
 def assert_equal(picture: Picture, wanted: Picture, floor_db: float, path: Path) -> None:
-    """Check the PSNR of two pictures; if it is too low, keep both beside the file, ours on the right."""
+    """Check the PSNR of two pictures; if it is too low, keep both beside the file."""
     found = psnr(picture, wanted)
     if found < floor_db:
-        both = path.with_name(path.name + ".png")
-        Image.fromarray(np.hstack([picture, wanted])).save(both)
-        raise AssertionError(f"{path.name}: {found:.1f} dB, expected at least {floor_db}; see {both}")
+        kept = keep(picture, wanted, path)
+        raise AssertionError(f"{path.name}: {found:.1f} dB, expected at least {floor_db}; see {kept}")
+
+
+def keep(picture: Picture, wanted: Picture, path: Path) -> Path:
+    """Keep two pictures side by side, the wanted one on the right, beside the file ``path``."""
+    kept = path.with_name(path.name + ".png")
+    Image.fromarray(np.hstack([picture, wanted])).save(kept)
+    return kept

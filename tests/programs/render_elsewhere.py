@@ -96,17 +96,6 @@ def psnr(first: Picture, second: Picture) -> float:
     return float("inf") if error == 0 else float(10 * np.log10(255**2 / error))
 
 
-def silhouette(picture: Picture) -> np.ndarray:
-    """Return the mask [h w] of pixels that are not white."""
-    return (picture < 250).any(axis=2)
-
-
-def overlap(first: Picture, second: Picture) -> float:
-    """Return the intersection of two silhouettes over their union."""
-    a, b = silhouette(first), silhouette(second)
-    return float((a & b).sum() / (a | b).sum())
-
-
 def packages() -> Path:
     """Return the folder ``node_modules``; skip the test if a package of the pinned version is absent."""
     folder = Path(os.environ.get("CADAM3D_PROGRAMS", HERE)) / "node_modules"

@@ -10,6 +10,8 @@ pytestmark = [pytest.mark.oracle, pytest.mark.slow]
 CASES = [
     Case("ply", 0, "+y", 38),
     Case("ply", 3, "+y", 38),
+    Case("compressed_ply", 0, "+y", 38),
+    Case("compressed_ply", 3, "+y", 37),
     Case("splat", 0, "+y", 38),
     Case("spz", 0, "+y", 38),
     Case("spz", 3, "+y", 35),
