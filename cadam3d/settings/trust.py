@@ -6,7 +6,7 @@ a folder only what an honest run leaves there:
 - A ``_target_`` must be one that the YAML files of this call (those of the package and of ``--config-dir``)
   name for the same place. Schedules may be anywhere inside a component.
 - An override must change a setting of training. Nothing from a folder reaches Hydra's own settings.
-- An interpolation may refer to other settings and call ``slug`` and ``span``, which compute from them.
+- An interpolation may refer to other settings and call ``slug``, ``span`` and ``oc.select``, which read them.
 - Folders of caches are never taken from a run, because compiled kernels are loaded from there.
 - Everything in the folder is a file, a folder, or a link that stays inside, because a command writes there.
 
@@ -57,7 +57,7 @@ OVERRIDE = re.compile(r"(?:\+{0,2}|~)([^=+~]*)(?:=.*)?", re.DOTALL)
 PACKAGE = re.compile(r"#\s*@package\s+(\S+)")
 REFERENCE = re.compile(r"\$\{([\w.]+)\}", re.ASCII)
 # An interpolation without another one inside it, of the kinds that only read other settings.
-HARMLESS = re.compile(r"\$\{(?:[\w.]+|(?:slug|span):[^${}]*)\}", re.ASCII)
+HARMLESS = re.compile(r"\$\{(?:[\w.]+|(?:slug|span|oc\.select):[^${}]*)\}", re.ASCII)
 INTERPOLATION = re.compile(r"(?<!\\)(?:\\\\)*\$\{")
 SCHEDULES = frozenset(
     f"{kind.__module__}.{kind.__qualname__}"
