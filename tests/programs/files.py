@@ -10,6 +10,8 @@ from programs.render_elsewhere import Picture, View, ours, psnr, turned
 from programs.snowman import snowman_and_pine
 
 from cadam3d.io.compressed_ply import write_compressed_ply
+from cadam3d.io.gaussforge import write_ksplat, write_sog, write_spz4
+from cadam3d.io.glb import write_glb
 from cadam3d.io.ply import write_ply
 from cadam3d.io.splat import write_splat
 from cadam3d.io.spz import write_spz
@@ -32,6 +34,10 @@ FORMATS = {
     "ply": Format(".ply", lambda path, gaussians, up: write_ply(path, gaussians, up=up, pad_sh=0)),
     "splat": Format(".splat", write_splat, max_degree=0),
     "spz": Format(".spz", write_spz),
+    "spz4": Format(".spz", write_spz4),
+    "sog": Format(".sog", write_sog),
+    "ksplat": Format(".ksplat", write_ksplat),
+    "glb": Format(".glb", write_glb),
 }
 
 

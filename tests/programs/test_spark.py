@@ -14,7 +14,11 @@ CASES = [
     Case("compressed_ply", 3, "+y", 37),
     Case("splat", 0, "+y", 38),
     Case("spz", 0, "+y", 38),
-    Case("spz", 3, "+y", 35),
+    Case("spz", 3, "+y", 36),
+    Case("sog", 0, "+y", 38),
+    Case("sog", 3, "+y", 38),
+    Case("ksplat", 0, "+y", 38),
+    Case("ksplat", 3, "+y", 38),
 ]
 
 

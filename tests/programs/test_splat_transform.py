@@ -14,6 +14,12 @@ CASES = [
     Case("splat", 0, "-y", 38),
     Case("spz", 0, "-y", 38),
     Case("spz", 3, "-y", 36),
+    Case("spz4", 0, "-y", 38),
+    Case("spz4", 3, "-y", 36),
+    Case("sog", 0, "-y", 38),
+    Case("sog", 3, "-y", 38),
+    Case("ksplat", 0, "-y", 38),
+    Case("ksplat", 3, "-y", 38),
 ]
 
 

@@ -14,12 +14,21 @@ pytestmark = [pytest.mark.oracle, pytest.mark.slow]
 PLY = {degree: Case("ply", degree, "+y", 30) for degree in (0, 3)}
 CASES = [
     *PLY.values(),
+    Case("glb", 0, "+y", 30),
+    Case("glb", 3, "+y", 30),
     Case("splat", 0, "+y", 30),
     Case("spz", 0, "+y", 30),
     Case("spz", 3, "+y", 30),
+    Case("spz4", 0, "+y", 30),
+    Case("spz4", 3, "+y", 30),
+    Case("ksplat", 0, "+y", 30),
+    Case("ksplat", 3, "+y", 30),
 ]
 # PSNR against three's own picture of our PLY; what the formats lose decides.
-AGAINST_PLY_DB = {"splat-sh0": 42, "spz-sh0": 42, "spz-sh3": 36}
+AGAINST_PLY_DB = {
+    **{"glb-sh0": 45, "glb-sh3": 45, "splat-sh0": 42, "spz-sh0": 42, "spz-sh3": 36},
+    **{"spz4-sh0": 42, "spz4-sh3": 36, "ksplat-sh0": 42, "ksplat-sh3": 42},
+}
 
 
 @pytest.fixture(scope="module")
