@@ -90,9 +90,10 @@ def write_compressed_ply(path: Path, gaussians: Gaussians, *, up: str) -> None:
         words[rows, 2] = _packed(shares[1], VECTOR_BITS)
         words[rows, 3] = _packed(shares[2], (8, 8, 8)) << 8 | alphas[rows]
 
-    rest = local.sh[:, 1:].numpy().transpose(0, 2, 1).reshape(len(local), -1)
+    size = REST_SIZES[local.sh_degree]
+    rest = local.sh[:, 1:].numpy().transpose(0, 2, 1).reshape(len(local), size)
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(len(starts), len(local), rest.shape[1], up).encode("ascii"))
+        file.write(_header(len(starts), len(local), size, up).encode("ascii"))
         for block in (bounds, words, _sh_bytes(rest)):
             file.write(block.tobytes())
 
@@ -113,7 +114,7 @@ def read_compressed_ply(path: Path, *, up: str = "-y") -> Gaussians:
         header, {"chunk": limits, VERTEX: PACKED} | ({"sh": rest_names} if rest_names else {})
     )
     vertices, count = tables[VERTEX], len(tables[VERTEX])
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         chunks = np.stack([tables["chunk"][name].astype(np.float32) for name in limits], axis=1)
     if not has_colors:
         chunks = np.pad(chunks, ((0, 0), (0, 6)))

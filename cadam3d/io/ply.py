@@ -113,8 +113,8 @@ def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
 
 def _columns(table: np.ndarray, names: Sequence[str]) -> np.ndarray:
     """Return properties as columns of float32."""
-    # A double may be too large for a float; the infinity is refused later.
-    with np.errstate(over="ignore"):
+    # A double may be too large for a float, and a NaN may warn; both are refused later.
+    with np.errstate(over="ignore", invalid="ignore"):
         found = [table[name].astype(np.float32, copy=False) for name in names]
     return np.stack(found, axis=1) if found else np.zeros((len(table), 0), dtype=np.float32)
 
@@ -157,7 +157,7 @@ def read_points(header: PlyHeader) -> tuple[np.ndarray, np.ndarray | None]:
 
 def _color_bytes(values: np.ndarray) -> np.ndarray:
     largest = {"u2": 65535, "f4": 1, "f8": 1}.get(values.dtype.str[1:], 255)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         scaled = np.rint(values * (255 / largest))
     return np.nan_to_num(np.clip(scaled, 0, 255)).astype(np.uint8)
 

@@ -305,7 +305,7 @@ def _typed(path: Path, numbers: np.ndarray, name: str, kind: str) -> np.ndarray:
         if not is_valid.all():
             problem = f"expected {limits.min} to {limits.max} in property {name}"
             raise unusable(path, f"{problem}, got {numbers[~is_valid][0]:g}")
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         return numbers.astype(kind)
 
 

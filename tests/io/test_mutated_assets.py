@@ -1,4 +1,4 @@
-"""Every reader of Gaussians survives damaged files: finite Gaussians or one message, in bounded time and memory.
+"""Damaged files of every format: finite Gaussians or one message, in bounded time and memory.
 
 The suite reads a small sample. To read 10,000 mutated files per format, type
 
@@ -155,7 +155,19 @@ def samples(tmp_path_factory) -> dict[str, bytes]:
 Random = np.random.Generator
 HUGE = [b"0", b"1", b"21", b"-1", b"4294967295", b"999999999", b"999999999999999", b"9" * 40, b"1e9", b"x"]
 TEXTS = [b"nan", b"-inf", b"1e999", b"-1e-999", b"0x1p3", b"9" * 400, b"1_0", b"--1", b"1,5", b"1e", b"'1'"]
-TEXTS += [b"\xff\xfe", b"", b"\0", b"1 2 3", b"\n", b"\r", b"." * 5000, b"1" + b"0" * 308, b"\x0b", b"\x1c", b"#"]
+TEXTS += [
+    b"\xff\xfe",
+    b"",
+    b"\0",
+    b"1 2 3",
+    b"\n",
+    b"\r",
+    b"." * 5000,
+    b"1" + b"0" * 308,
+    b"\x0b",
+    b"\x1c",
+    b"#",
+]
 LINES = [
     b"property list uchar int vertex_indices",
     b"property float x",
@@ -269,7 +281,7 @@ def at_most(seconds: float):
 
 
 def outcome(read: Callable[[Path], Gaussians], path: Path) -> tuple[Gaussians | None, int]:
-    """Read a file and check the laws. Return the Gaussians, if it is valid, and the bytes allocated at most."""
+    """Read a file and check the laws. Return the Gaussians, if valid, and the peak of memory."""
     made, message = None, ""
     tracemalloc.reset_peak()
     before = tracemalloc.get_traced_memory()[0]
