@@ -26,6 +26,7 @@ def main() -> None:
         programs = {
             "splat-transform": lambda path: transform.picture(path, VIEW),
             "Spark": lambda path: browser.picture("spark.html", path, VIEW),
+            "Babylon.js": lambda path: browser.picture("babylon.html", path, VIEW),
             "three.js": lambda path: browser.picture("three.html", path, VIEW, colours="linear"),
             "three.js, default colours": lambda path: browser.picture("three.html", path, VIEW),
         }
@@ -47,7 +48,7 @@ def row(draw, name: str, folder: Path) -> list[str]:
 
 
 def shown(draw, case: Case, folder: Path) -> tuple[str, float]:
-    """Return the up axis that the program takes a file with ``case.upright`` for, and the PSNR against that."""
+    """Return the up axis that a program takes a file for, and the PSNR against our render of that."""
     picture = draw(case.write(folder, case.upright))
     gaussians = snowman_and_pine(min(case.degree, FORMATS[case.format].max_degree))
     found = {up: psnr(picture, ours(turned(gaussians, case.upright, up), VIEW)) for up in ("-y", "+y")}
