@@ -1,7 +1,6 @@
 """Babylon.js shows our files as we do."""
 
 import pytest
-
 from programs.files import VIEW, Case, assert_upright, assert_wrong_axes_fail
 from programs.render_elsewhere import Browser
 
