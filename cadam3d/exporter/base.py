@@ -21,6 +21,10 @@ class Exporter(ABC):
         ``render`` shows the same ``gaussians``. Raises ``UserError`` if a file cannot be written.
         """
 
+    def omission(self, gaussians: Gaussians) -> str | None:
+        """Return what of ``gaussians`` the files cannot hold, as a note for the user; None if nothing."""
+        return None
+
 
 @dataclass(frozen=True, kw_only=True)
 class AssetExporter(Exporter):
