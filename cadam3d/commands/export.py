@@ -15,6 +15,7 @@ from cadam3d.io.lock import taking_turns
 from cadam3d.io.run_folder import ASSET_RECORD, CONFIG, EXPORTS, has_file, shown
 
 INDENT = "  "
+MESH_SUFFIXES = (".glb", ".obj", ".ply")
 
 
 def run(cfg: DictConfig) -> None:
@@ -93,6 +94,8 @@ def described(cfg: DictConfig, asset: Asset, output: Output) -> list[str]:
     count, unit = len(asset.gaussians), "Gaussians"
     if format_.is_mesh:
         count, unit = triangles_in(output.path), "triangles"
+    if count is None:
+        return [f"{first}, belongs to the mesh"]
     first = f"{first}, {count:,} {unit}" + (f", {up} up" if up is not None else "")
     verdicts = [] if up is None else views_in_words(output.exporter, str(up))
     notes = [*losses(output.exporter, asset.gaussians.sh_degree), *([format_.hint] if format_.hint else [])]
@@ -123,5 +126,13 @@ def size_in_words(size: int) -> str:
     return f"{size / 1e6:,.2f} MB" if size >= 100_000 else f"{size / 1e3:.1f} kB"
 
 
-def triangles_in(path: Path) -> int:
-    raise NotImplementedError
+def triangles_in(path: Path) -> int | None:
+    """Return the number of triangles in a file of the mesh exporter; None for its texture or material."""
+    if path.suffix not in MESH_SUFFIXES:
+        return None
+    # Loading it takes more than a second, and most exports write no mesh.
+    import trimesh
+
+    mesh = trimesh.load(path, force="mesh", process=False)
+    assert isinstance(mesh, trimesh.Trimesh), "the exporter writes triangles"
+    return len(mesh.faces)
