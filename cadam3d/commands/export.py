@@ -9,13 +9,18 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d import __version__
 from cadam3d.commands.asset import Asset, Output, export_all, open_asset, write_files
 from cadam3d.commands.messages import note
-from cadam3d.exporter.programs import FORMATS, Format, Program, judge, losses
+from cadam3d.core.surface import SurfaceFacts
+from cadam3d.exporter.programs import FORMATS, Format, Program, hint_of, judge, loss_of
 from cadam3d.io.asset_record import FileEntry, Frame, Source, require_own_record, sha256_of, write_record
 from cadam3d.io.lock import taking_turns
+from cadam3d.io.mesh import FORMATS as MESH_FORMATS
+from cadam3d.io.mesh import mesh_facts
 from cadam3d.io.run_folder import ASSET_RECORD, CONFIG, EXPORTS, has_file, shown
+from cadam3d.settings.line import MESH
 
 INDENT = "  "
-MESH_SUFFIXES = (".glb", ".obj", ".ply")
+# Values of ``format`` (mesh) and ``version`` (spz) that other programs were tested with; "" for neither.
+USUAL_VARIANTS = ("", "glb", "3")
 
 
 def run(cfg: DictConfig) -> None:
@@ -63,17 +68,18 @@ def setting(cfg: DictConfig, output: Output, name: str) -> object:
 
 def entry_of(cfg: DictConfig, asset: Asset, output: Output) -> FileEntry:
     """Return the description of a file for asset.json."""
-    format_ = FORMATS.get(output.exporter, Format())
     up = setting(cfg, output, "up")
+    is_mesh = output.exporter == MESH
+    facts = mesh_in(output) if is_mesh else None
     return FileEntry(
         name=output.path.name,
         format=output.exporter,
         bytes=output.path.stat().st_size,
         sha256=sha256_of(output.path),
-        frame=None if up is None else Frame.of(str(up)),
-        sh_degree=None if format_.is_mesh else degree_of(cfg, asset, output),
-        gaussians=None if format_.is_mesh else len(asset.gaussians),
-        triangles=triangles_in(output.path) if format_.is_mesh else None,
+        frame=None if up is None or (is_mesh and facts is None) else Frame.of(str(up)),
+        sh_degree=None if is_mesh else degree_of(cfg, asset, output),
+        gaussians=None if is_mesh else len(asset.gaussians),
+        triangles=facts.triangles if facts else None,
     )
 
 
@@ -86,20 +92,28 @@ def degree_of(cfg: DictConfig, asset: Asset, output: Output) -> int:
 
 def described(cfg: DictConfig, asset: Asset, output: Output) -> list[str]:
     """Return the lines that are printed about a file: its content, and how other programs show it."""
-    first = f"{shown(output.path)}  {size_in_words(output.path.stat().st_size)}"
+    parts = [f"{shown(output.path)}  {size_in_words(output.path.stat().st_size)}"]
     if not is_asset(cfg, output):
-        return [f"{first}, describes these files" if output.exporter == ASSET_RECORD else first]
-    format_ = FORMATS.get(output.exporter, Format())
+        return [f"{parts[0]}, describes these files" if output.exporter == ASSET_RECORD else parts[0]]
+    if output.exporter != MESH:
+        parts.append(f"{len(asset.gaussians):,} Gaussians")
+    elif facts := mesh_in(output):
+        parts.append(f"{facts.triangles:,} triangles, {'' if facts.watertight else 'not '}watertight")
+    else:
+        return [f"{parts[0]}, belongs to the mesh"]
     up = setting(cfg, output, "up")
-    count, unit = len(asset.gaussians), "Gaussians"
-    if format_.is_mesh:
-        count, unit = triangles_in(output.path), "triangles"
-    if count is None:
-        return [f"{first}, belongs to the mesh"]
-    first = f"{first}, {count:,} {unit}" + (f", {up} up" if up is not None else "")
-    verdicts = [] if up is None else views_in_words(output.exporter, str(up))
-    notes = [*losses(output.exporter, asset.gaussians.sh_degree), *([format_.hint] if format_.hint else [])]
-    return [first, *(INDENT + "; ".join(parts) for parts in (verdicts, notes) if parts)]
+    views = []
+    if up is not None:
+        parts.append(f"{up} up")
+        views = views_in_words(kind_of(cfg, output), str(up))
+    notes = [loss_of(output.exporter, asset.gaussians.sh_degree), hint_of(output.exporter)]
+    return [", ".join(parts), *(INDENT + text for text in ("; ".join(views), *notes) if text)]
+
+
+def kind_of(cfg: DictConfig, output: Output) -> str:
+    """Return the name under which the table of programs has a file: its exporter, or a variant of it."""
+    variant = str(setting(cfg, output, "format") or setting(cfg, output, "version") or "")
+    return output.exporter if variant in USUAL_VARIANTS else f"{output.exporter}.{variant}"
 
 
 def views_in_words(exporter: str, up: str) -> list[str]:
@@ -126,13 +140,7 @@ def size_in_words(size: int) -> str:
     return f"{size / 1e6:,.2f} MB" if size >= 100_000 else f"{size / 1e3:.1f} kB"
 
 
-def triangles_in(path: Path) -> int | None:
-    """Return the number of triangles in a file of the mesh exporter; None for its texture or material."""
-    if path.suffix not in MESH_SUFFIXES:
-        return None
-    # Loading it takes more than a second, and most exports write no mesh.
-    import trimesh
-
-    mesh = trimesh.load(path, force="mesh", process=False)
-    assert isinstance(mesh, trimesh.Trimesh), "the exporter writes triangles"
-    return len(mesh.faces)
+def mesh_in(output: Output) -> SurfaceFacts | None:
+    """Return numbers about a file of the mesh exporter; None for its texture or material."""
+    is_mesh = output.path.suffix.removeprefix(".") in MESH_FORMATS
+    return mesh_facts(output.path) if is_mesh else None

@@ -33,10 +33,9 @@ class Program:
 class Format:
     """What a file of one exporter holds, compared with the Gaussians in memory."""
 
-    is_mesh: bool = False
-    has_axes: bool = True  # whether other programs read the numbers of the file
     max_degree: int = MAX_DEGREE  # largest SH degree that the format can hold
-    loss: str = ""  # numbers that are rounded or left out; "" for none
+    loss: str = ""  # what is rounded or left out; "" if nothing is
+    sh_loss: str = ""  # the same for SH degrees above 0, as a continuation of the sentence
     hint: str = ""  # printed with the file
 
 
@@ -46,7 +45,7 @@ PROGRAMS: tuple[Program, ...] = (
     Program(
         name="SuperSplat",
         version="splat-transform 3.7.0",
-        upright={"ply": "-y"},
+        upright={"ply": "-y", "splat": "-y", "spz": "-y"},
         is_measured=True,
         source="github.com/playcanvas/supersplat/issues/451: PLY files are turned by 180 degrees about z",
         target="supersplat",
@@ -62,7 +61,7 @@ PROGRAMS: tuple[Program, ...] = (
     Program(
         name="Spark",
         version="2.2.0",
-        upright={"ply": "+y", "compressed_ply": "+y", "spz": "+y"},
+        upright={"ply": "+y", "splat": "+y", "spz": "+y"},
         is_measured=True,
         source="SplatMesh shows the numbers of the file unchanged, in the +y up world of three.js",
         target="spark",
@@ -70,9 +69,9 @@ PROGRAMS: tuple[Program, ...] = (
     Program(
         name="three.js",
         version="r187",
-        upright={"ply": "+y", "spz": "+y", "glb": "+y", "mesh": "+y"},
+        upright={"ply": "+y", "splat": "+y", "spz": "+y", "glb": "+y", "mesh": "+y"},
         is_measured=True,
-        source="addons of the core: GLTFLoader, PLYLoader and SPZLoader",
+        source="addons of the core",
         target="three",
     ),
     Program(
@@ -111,14 +110,29 @@ PROGRAMS: tuple[Program, ...] = (
 
 FORMATS: Mapping[str, Format] = {
     "ply": Format(),
-    "compressed_ply": Format(loss="rounds positions, scales and rotations to 10 or 11 bits, colours to 8"),
-    "splat": Format(max_degree=0, loss="rounds colours, opacities and rotations to 8 bits"),
-    "spz": Format(loss="rounds positions to 24 bits, rotations to 10, the rest to 8 or fewer"),
-    "glb": Format(hint="needs a reader of KHR_gaussian_splatting; triangles are exporter=[mesh]"),
-    "sog": Format(loss="rounds positions to 16 bits, the rest to 8"),
-    "ksplat": Format(loss="rounds positions, scales and rotations to 16 bits, colours to 8"),
-    "mesh": Format(is_mesh=True, loss="a closed surface with one colour per vertex, nothing transparent"),
-    "html": Format(has_axes=False, hint="opens in any browser, without a network"),
+    "compressed_ply": Format(
+        loss="rounds positions, scales and rotations to 10 or 11 bits, colours and opacities to 8",
+        sh_loss="and how colours change with the view to 8",
+    ),
+    "splat": Format(
+        max_degree=0,
+        loss="rounds colours, opacities and rotations to 8 bits",
+        sh_loss="and leaves out how colours change with the view",
+    ),
+    "spz": Format(
+        loss="rounds positions to 24 bits, rotations to 10, colours, opacities and scales to 8",
+        sh_loss="and how colours change with the view to 4 or 5",
+    ),
+    "glb": Format(
+        hint="needs a program that knows KHR_gaussian_splatting; for triangles type exporter=[mesh]"
+    ),
+    "sog": Format(loss="rounds positions to 16 bits, and the rest to code books of 256 values"),
+    "ksplat": Format(loss="rounds colours and opacities to 8 bits"),
+    "mesh": Format(
+        loss="a closed surface in place of Gaussians",
+        sh_loss="without how colours change with the view",
+    ),
+    "html": Format(hint="opens in any browser, without a network"),
 }
 
 
@@ -173,10 +187,12 @@ def judge(exporter: str, up: str) -> Verdict:
     return verdict
 
 
-def losses(exporter: str, sh_degree: int) -> list[str]:
-    """Return what a file of ``exporter`` loses of Gaussians with colours of degree ``sh_degree``."""
+def loss_of(exporter: str, sh_degree: int) -> str:
+    """Return what a file of ``exporter`` loses of Gaussians with SH degree ``sh_degree``; "" if nothing."""
     format_ = FORMATS.get(exporter, Format())
-    lost = [format_.loss] if format_.loss else []
-    if sh_degree > format_.max_degree and not format_.is_mesh:
-        lost.append("leaves out how colours change with the direction of view")
-    return lost
+    return ", ".join(part for part in (format_.loss, format_.sh_loss if sh_degree else "") if part)
+
+
+def hint_of(exporter: str) -> str:
+    """Return what else to know about a file of ``exporter``; "" if nothing."""
+    return FORMATS.get(exporter, Format()).hint

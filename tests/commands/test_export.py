@@ -12,7 +12,8 @@ import yaml
 from omegaconf import OmegaConf
 from splats import make_gaussians
 
-from cadam3d.exporter.programs import FORMATS, PROGRAMS, UNKNOWN, judge, losses
+from cadam3d.commands.export import views_in_words
+from cadam3d.exporter.programs import FORMATS, PROGRAMS, UNKNOWN, judge, loss_of
 from cadam3d.io.asset_record import Frame
 from cadam3d.io.frames import AXES, UPS
 from cadam3d.io.jsonl import read_json, write_json
@@ -335,7 +336,12 @@ def test_a_program_shows_a_file_in_one_way(exporter):
 
 
 def test_only_what_an_asset_has_can_be_lost():
-    assert not losses("ply", 3)
-    assert "leaves out how colours change with the direction of view" in losses("splat", 1)
-    assert "leaves out how colours change with the direction of view" not in losses("splat", 0)
-    assert not losses("an exporter from elsewhere", 3)
+    assert not loss_of("ply", 3)
+    assert loss_of("splat", 1) == loss_of("splat", 0) + ", and leaves out how colours change with the view"
+    assert not loss_of("an exporter from elsewhere", 3)
+
+
+def test_each_line_about_a_file_is_short():
+    for exporter in FORMATS:
+        assert len(loss_of(exporter, 3)) < 120
+        assert max((len(line) for up in UPS for line in views_in_words(exporter, up)), default=0) < 150
