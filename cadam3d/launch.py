@@ -210,6 +210,6 @@ def _refuse_bare_words(command: str, overrides: Sequence[str], flags: Sequence[s
     elif command == "doctor":
         line = "cadam3d doctor"
     else:
-        key = "ply" if bare[0].endswith(".ply") and command != "eval" else "run"
+        key = "ply" if bare[0].endswith((".ply", ".splat", ".spz")) and command != "eval" else "run"
         line = line_of(command, [*others, f"{key}={bare[0]}"])
     raise UserError(f"{bare[0]!r}: expected key=value. Try: {line}")

@@ -13,13 +13,14 @@ from torch import Tensor
 
 from cadam3d.commands.messages import keeping_others, note_backend
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import fail
+from cadam3d.core.checks import fail, require_choice
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.exporter.base import Exporter
-from cadam3d.io.ply import read_ply
+from cadam3d.io.asset_file import read_gaussians
+from cadam3d.io.frames import UPS
 from cadam3d.io.run_folder import (
     ASSET,
     CONFIG,
@@ -67,8 +68,10 @@ def open_asset(cfg: DictConfig) -> Asset:
         raise UserError(f"run, ply: expected one of them, got {got}. Try: {line}")
     if cfg.run is not None:
         return open_run(find_run(str(cfg.run)), cfg.device)
+    if cfg.ply_up is not None:
+        require_choice("ply_up", cfg.ply_up, UPS)
     ply = expanded(str(cfg.ply))
-    gaussians = read_ply(ply, up=cfg.ply_up).to(resolve_device(cfg.device))
+    gaussians = read_gaussians(ply, up=cfg.ply_up).to(resolve_device(cfg.device))
     return Asset(gaussians=gaussians, ply=ply, folder=ply.with_suffix(""))
 
 
@@ -78,7 +81,7 @@ def open_run(folder: Path, device: str) -> Asset:
     if not has_file(ply):
         line = f"cadam3d train {resume_word(shown(folder))}"
         raise UserError(f"{shown(folder)}: has no {ASSET} yet. Try: {line}")
-    return Asset(gaussians=read_ply(ply).to(resolve_device(device)), ply=ply, folder=folder)
+    return Asset(gaussians=read_gaussians(ply).to(resolve_device(device)), ply=ply, folder=folder)
 
 
 def find_run(text: str) -> Path:

@@ -1,15 +1,12 @@
-"""Ply: starts from a PLY file that holds Gaussians or a cloud of coloured points."""
+"""Ply: starts from a file of Gaussians, or from a PLY file with a cloud of coloured points."""
 
-import io
 import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
-import trimesh
 from torch import Tensor
 
 from cadam3d.core.checks import require, require_choice, require_color
@@ -29,24 +26,24 @@ from cadam3d.initializer.points import (
     require_points,
     rows_of,
 )
+from cadam3d.io.asset_file import PLY, SUFFIXES, file_format, read_gaussians
 from cadam3d.io.frames import UPS, points_to_world, turned, turned_points
-from cadam3d.io.ply import holds_gaussians, read_ply
-from cadam3d.io.reading import read_bytes
+from cadam3d.io.ply import holds_gaussians, read_points
+from cadam3d.io.ply_tables import read_header
 
-# 3DGS takes its axes from COLMAP.
-UP_OF_GAUSSIANS = "-y"
 # Point-E and most scans use this axis.
 UP_OF_POINTS = "+z"
-LARGEST = 1 << 32  # bytes of a cloud of points
-SUFFIXES = (".ply",)
+# Elements of a PLY that make a mesh of its vertices.
+SURFACES = ("face", "tristrips")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ply(Initializer):
-    """The Gaussians or points of a PLY file; the prompt is not used.
+    """The Gaussians of a file, or the points of a PLY file; the prompt is not used.
 
-    Gaussians (3DGS layout, any SH degree, written by any program) keep their shapes, colours and opacities.
-    Points (ASCII or binary, such as those of Point-E or a scan) become round Gaussians with their colours.
+    Gaussians (PLY, compressed PLY, .splat or SPZ, any SH degree, written by any program) keep their shapes,
+    colours and opacities. Points (text or binary, such as those of Point-E or a scan) become round Gaussians
+    with their colours.
     """
 
     path: str
@@ -76,9 +73,9 @@ class Ply(Initializer):
         Raises ``UserError`` if the file is missing, cannot be read or holds neither.
         """
         path = found_file(self.path, "ply", SUFFIXES)
-        if holds_gaussians(path):
-            return self._asset(path, generator).to(device)
-        return self._cloud(path, generator, device)
+        if file_format(path) == PLY and not holds_gaussians(path):
+            return self._cloud(path, generator, device)
+        return self._asset(path, generator).to(device)
 
     def _asset(self, path: Path, generator: torch.Generator) -> Gaussians:
         require(
@@ -88,7 +85,7 @@ class Ply(Initializer):
             got=self.replicate,
             example="initializer.replicate=1",
         )
-        asset = turned(read_ply(path, up=self.up or UP_OF_GAUSSIANS), self.turn_deg)
+        asset = turned(read_gaussians(path, up=self.up), self.turn_deg)
         _require_finite(path, "means", asset.means)
         asset = asset.index(rows_of(len(asset), self.count, generator))
         center, factor = fit(asset.means, self.radius)
@@ -111,27 +108,16 @@ class Ply(Initializer):
 
     def _read_points(self, path: Path) -> tuple[Tensor, Tensor]:
         """Return positions in the axes of the file, and RGB in [0, 1]."""
-        # The parser has no exceptions of its own.
-        try:
-            content = io.BytesIO(read_bytes(path, largest=LARGEST))
-            loaded = trimesh.load(content, file_type="ply")
-        except Exception as error:
-            reason = str(error) or type(error).__name__
+        header = read_header(path)
+        if any(element.name in SURFACES and element.count for element in header.elements):
             raise UserError(
-                f"initializer.path: expected a PLY file of Gaussians or points, got {self.path!r}, which "
-                f"cannot be read ({reason}). Try: {another_file(self.path, 'ply', SUFFIXES)}"
-            ) from error
-        if not isinstance(loaded, trimesh.PointCloud):
-            raise UserError(
-                f"initializer.path: expected a PLY file of Gaussians or points, got {self.path!r}, which is "
-                f"a mesh. Try: {shlex.join(['initializer=mesh', f'initializer.path={self.path}'])}"
+                f"initializer.path: expected a file of Gaussians or points, got {self.path!r}, which is a "
+                f"mesh. Try: {shlex.join(['initializer=mesh', f'initializer.path={self.path}'])}"
             )
-        points = torch.as_tensor(np.asarray(loaded.vertices), dtype=torch.float32)
+        positions, rgb = read_points(header)
+        points = torch.from_numpy(positions)
         _require_finite(path, "points", points)
-        colors = np.asarray(loaded.colors)
-        if len(colors) == 0:
-            return points, one_color(self.color, len(points))
-        return points, torch.as_tensor(colors[:, :3] / 255.0, dtype=torch.float32)
+        return points, one_color(self.color, len(points)) if rgb is None else torch.from_numpy(rgb)
 
 
 def _require_finite(path: Path, name: str, rows: Tensor) -> None:
@@ -139,7 +125,7 @@ def _require_finite(path: Path, name: str, rows: Tensor) -> None:
     if bad or len(rows) == 0:
         what = f"has {name} that are not finite ({bad} of {len(rows)})" if bad else "is empty"
         raise UserError(
-            f"initializer.path: expected a PLY file of Gaussians or points, got {str(path)!r}, which {what}. "
+            f"initializer.path: expected a file of Gaussians or points, got {str(path)!r}, which {what}. "
             f"Try: {another_file(str(path), 'ply', SUFFIXES)}"
         )
 

@@ -27,10 +27,11 @@ READERS = {PLY: read_ply, COMPRESSED_PLY: read_compressed_ply, SPLAT: read_splat
 # Up axes of files that do not record them.
 USUAL_UP = {PLY: "-y", COMPRESSED_PLY: "-y", SPLAT: "-y", SPZ: "+y"}
 SUFFIXES = (".ply", ".splat", ".spz")
-GZIP = b"\x1f\x8b"
-# First bytes of formats that hold Gaussians or meshes but have no reader here.
-OTHER_FORMATS = {b"glTF": "a glb", b"PK\x03\x04": "a zip archive, such as sog"}
-OTHER_SUFFIXES = {".ksplat": "ksplat", ".sog": "sog", ".glb": "glb", ".gltf": "gltf", ".obj": "obj"}
+GZIP = b"\x1f\x8b\x08"
+SPZ_4 = b"NGSP"
+GLB = b"glTF"
+# Formats that the package gaussforge converts into a PLY, by suffix.
+CONVERTIBLE = {".sog": "sog", ".ksplat": "ksplat"}
 
 
 def read_gaussians(path: Path, *, up: str | None = None) -> Gaussians:
@@ -51,17 +52,29 @@ def file_format(path: Path) -> str:
         begin = file.read(4)
     if begin[:3] == b"ply":
         return COMPRESSED_PLY if is_compressed(read_header(path)) else PLY
-    if begin[:2] == GZIP or begin == b"NGSP":
+    if begin[:3] == GZIP or begin == SPZ_4:
         return SPZ
     suffix = path.suffix.lower()
-    if found := OTHER_FORMATS.get(begin) or OTHER_SUFFIXES.get(suffix):
-        output = shlex.quote(str(path.with_suffix(".ply")))
+    if suffix in CONVERTIBLE:
         raise UserError(
-            f"{path}: expected {'|'.join(SUFFIXES)}, got {found}, which this program does not read. "
-            f"Try: npx @playcanvas/splat-transform@3.7.0 {shlex.quote(str(path))} {output}"
+            f"{path}: expected {'|'.join(SUFFIXES)}, got {suffix}. "
+            f"Try: pip install gaussforge && {_conversion(path, CONVERTIBLE[suffix])}"
         )
+    if begin == GLB:
+        raise UserError(f"{path}: expected {'|'.join(SUFFIXES)}, got glb. Try: another file")
     if suffix == ".splat":
         return SPLAT
     raise UserError(
-        f"{path}: expected {'|'.join(SUFFIXES)}, got a file that begins with {begin!r}. Try: another file"
+        f"{path}: not a ply file, nor another one of {'|'.join(SUFFIXES)}: it begins with {begin!r}. "
+        "Try: another file"
     )
+
+
+def _conversion(path: Path, kind: str) -> str:
+    """Return a shell command that makes a PLY of a file whose format gaussforge calls ``kind``."""
+    code = (
+        "from gaussforge import GaussForge; from pathlib import Path; "
+        f"new = GaussForge().convert(Path({str(path)!r}).read_bytes(), {kind!r}, 'ply'); "
+        f"Path({str(path.with_suffix('.ply'))!r}).write_bytes(new['data'])"
+    )
+    return shlex.join(["python", "-c", code])

@@ -1,4 +1,4 @@
-"""Gathering: build the Gaussians of a file in small blocks, so that reading needs little more than the result.
+"""Gathering: build the Gaussians of a file in small blocks, so that reading needs little more memory.
 
 Unpacking numbers and turning them into world axes needs several times the memory of the numbers. A reader
 therefore does both for some rows at a time.

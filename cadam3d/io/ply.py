@@ -50,6 +50,7 @@ REQUIRED = [*COLUMNS["means"], *SH0, *COLUMNS["opacity_logits"], *COLUMNS["log_s
 # Properties that Gaussians have and plain points do not have.
 GAUSSIANS_ONLY = {"f_dc_0", "scale_0", "rot_0", "packed_position"}
 REST_SIZES = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_DEGREE + 1)]
+COLORS = ["red", "green", "blue"]  # of plain points
 INFINITE_LOGIT = 20.0  # its opacity is 1 in float32
 
 
@@ -133,6 +134,32 @@ def holds_gaussians(path: Path) -> bool:
     """
     elements = read_header(path).elements
     return any(not GAUSSIANS_ONLY.isdisjoint(element.names) for element in elements)
+
+
+def read_points(header: PlyHeader) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the positions of the vertices, float32 [n 3], and their RGB in [0, 1] if the file has colours.
+
+    Colours are ``red green blue`` in 0 to 255, 0 to 65535 (ushort) or 0 to 1 (float), and are rounded to 8
+    bits. Raises ``UserError`` if the file has no vertices with positions, or is damaged.
+    """
+    vertex = header.element(VERTEX)
+    names = vertex.names if vertex else []
+    if missing := [name for name in COLUMNS["means"] if name not in names]:
+        raise unusable(header.path, f"cannot be read as points: its vertices have no {', '.join(missing)}")
+    colors = COLORS if set(COLORS) <= set(names) else []
+    table = read_tables(header, {VERTEX: [*COLUMNS["means"], *colors]})[VERTEX]
+    points = _columns(table, COLUMNS["means"])
+    if not colors:
+        return points, None
+    rgb = np.stack([_color_bytes(table[name]) for name in colors], axis=1)
+    return points, (rgb / 255.0).astype(np.float32)
+
+
+def _color_bytes(values: np.ndarray) -> np.ndarray:
+    largest = {"u2": 65535, "f4": 1, "f8": 1}.get(values.dtype.str[1:], 255)
+    with np.errstate(over="ignore"):
+        scaled = np.rint(values * (255 / largest))
+    return np.nan_to_num(np.clip(scaled, 0, 255)).astype(np.uint8)
 
 
 def _names(rest_size: int) -> list[str]:

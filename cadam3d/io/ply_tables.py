@@ -137,22 +137,19 @@ def _parse_header(path: Path, file: BinaryIO) -> PlyHeader:
                 ups.add(_require_up(path, claim.removeprefix("up=")))
             case ["element", name, count] if encoding and count.isdecimal() and len(count) <= MAX_DIGITS:
                 elements.append((name, int(count), []))
-            case ["property", "list", _, _, name] if elements:
-                elements[-1][2].append((name, LIST))
-            case ["property", kind, name] if elements and kind in NUMPY_TYPES:
-                elements[-1][2].append((name, NUMPY_TYPES[kind]))
+            case ["property", *kind, name] if elements and (found := _kind(kind)):
+                elements[-1][2].append((name, found))
             case ["comment" | "obj_info", *_]:
                 pass
             case _:
                 line = " ".join(words)[:80]
                 raise unusable(path, f"not a readable ply file: cannot read header line {line!r}")
-    if encoding is None:
-        raise unusable(path, "not a readable ply file: its header has no format")
     if len(ups) > 1:
         raise unusable(path, f"the header has two up axes, {' and '.join(sorted(ups))}")
     names = [name for name, *_ in elements]
-    if len(set(names)) < len(names):
-        raise unusable(path, "not a readable ply file: an element appears twice")
+    if encoding is None or len(set(names)) < len(names):
+        problem = "an element appears twice" if encoding else "its header has no format"
+        raise unusable(path, f"not a readable ply file: {problem}")
     return PlyHeader(
         path=path,
         encoding=encoding,
@@ -160,6 +157,14 @@ def _parse_header(path: Path, file: BinaryIO) -> PlyHeader:
         up=ups.pop() if ups else None,
         size=file.tell(),
     )
+
+
+def _kind(words: Sequence[str]) -> str | None:
+    """Return the numpy type that the words before the name of a property declare, or LIST, or None."""
+    if words[:1] == ["list"]:
+        # The types of the length and of the items follow.
+        return LIST if len(words) == 3 else None
+    return NUMPY_TYPES.get(words[0]) if len(words) == 1 else None
 
 
 def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:

@@ -33,8 +33,8 @@ LARGEST_WHOLE = 2**63 - 1
 BLANKS = "\n\t\r"
 # The settings outside of all components, over all commands.
 SETTINGS: dict[str, Any] = {
-    **dict.fromkeys(("prompt", "negative_prompt", "device", "ply_up"), str),
-    **dict.fromkeys(("resume", "run", "ply", "output"), str | None),
+    **dict.fromkeys(("prompt", "negative_prompt", "device"), str),
+    **dict.fromkeys(("resume", "run", "ply", "ply_up", "output"), str | None),
     **dict.fromkeys(("steps", "views", "seed"), int),
     **dict.fromkeys(("browser", "json"), bool),
 }
