@@ -11,7 +11,7 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor
 
-from cadam3d.commands.messages import keeping_others, note_backend
+from cadam3d.commands.messages import keeping_others, note_backend, note_omission
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import fail, require_choice
 from cadam3d.core.device import resolve_device
@@ -144,6 +144,7 @@ def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Output]:
         with keeping_others(f"exporter.{name}", warnings):
             paths = exporter.export(asset.gaussians, render, folder)
             outputs += [Output(path, name) for path in paths]
+            note_omission(f"exporter.{name}", exporter.omission(asset.gaussians))
     if len(warnings) == len(exporters):
         raise UserError(warnings[0])
     return outputs

@@ -44,3 +44,9 @@ def note_backend(backend: Backend) -> None:
     """Print a note if a slow backend renders because a faster one is not available."""
     if backend.reason:
         note(f"rendering with rasterizer={backend.name}, which is slow: {backend.reason}")
+
+
+def note_omission(name: str, omission: str | None) -> None:
+    """Print a note if the files of an exporter cannot hold everything; ``name`` is its key."""
+    if omission:
+        note(f"{name}: {omission}")

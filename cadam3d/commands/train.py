@@ -21,7 +21,7 @@ from cadam3d.augmentation import Augmentation
 from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
-from cadam3d.commands.messages import keeping_others, note, note_backend
+from cadam3d.commands.messages import keeping_others, note, note_backend, note_omission
 from cadam3d.commands.timetable import describe
 from cadam3d.core.checks import require, require_whole
 from cadam3d.core.device import resolve_device
@@ -349,6 +349,7 @@ def export(
     for name, exporter in exporters.items():
         with keeping_others(f"exporter.{name}", warnings):
             written += exporter.export(gaussians, render, folder)
+            note_omission(f"exporter.{name}", exporter.omission(gaussians))
     return written, warnings
 
 

@@ -5,12 +5,15 @@ quaternions, often in one byte each. Every function accepts all finite float32 n
 returns finite ones.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.io.frames import world_to_file
 
 SMALLEST = float(np.finfo(np.float32).tiny)
 LARGEST = float(np.finfo(np.float32).max)
@@ -55,9 +58,13 @@ def unit_quats(gaussians: Gaussians) -> Float[np.ndarray, "n 4"]:
     return np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1), [1.0, 0.0, 0.0, 0.0])
 
 
-def float32_cpu(gaussians: Gaussians) -> Gaussians:
-    """Return the Gaussians as they are written: float32, on the CPU, without gradients."""
-    return gaussians.detach().to("cpu").to(torch.float32)
+def in_file_axes(gaussians: Gaussians, up: str) -> Gaussians:
+    """Return the Gaussians as they are written: float32, on the CPU, with the up axis ``up``.
+
+    Turning mixes SH coefficients, so the largest ones might become infinite; they are clamped.
+    """
+    local = world_to_file(gaussians.detach().to("cpu").to(torch.float32), up)
+    return replace(local, sh=local.sh.clamp(-LARGEST, LARGEST))
 
 
 def as_tensor(values: Float[np.ndarray, "*shape"]) -> Tensor:

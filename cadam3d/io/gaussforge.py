@@ -5,18 +5,25 @@ compiled code that makes no promise about such files.
 
 | format | content | lost |
 |---|---|---|
-| SOG version 2 | a ZIP of WebP pictures, with code books of 256 scales and colours | see the tests |
-| ksplat, level 0 | float32, with 8-bit colours and opacities | colours outside of [0, 1] |
+| SOG version 2 | a ZIP of WebP pictures, with code books of 256 scales and colours | a little of everything |
+| ksplat, level 0 | float32, with 8-bit colours and opacities | colours outside of [0, 1], SH degree 3 |
 | SPZ version 4 | the encodings of version 3 (see ``spz.py``) as zstd streams | positions have 12 bits |
 
-Measured facts about gaussforge 0.6.0, which the code below takes into account: it never changes axes; it
-expects quaternions w, x, y, z, and in SOG they must have length 1; the coefficients of a Gaussian are stored
-together, red, green and blue of the first one first; positions beyond 2,048 wrap around in SPZ; scales whose
-exponential is infinite stay infinite in ksplat; one extreme colour takes all precision from the code book of
-SOG; SOG and ksplat need at least one Gaussian. The same Gaussians give the same bytes. Reading prints to
-standard output, and reading a file of SH degree 0 into Python fails.
+Measured facts about gaussforge 0.6.0, which the code below takes into account. It
 
-Sources: the metadata of gaussforge 0.6.0 on pypi.org, and measurements (``tests/io/test_gaussforge.py``).
+* never changes axes, and gives the same bytes for the same Gaussians;
+* expects quaternions w, x, y, z, and in SOG they must have length 1, or most rotations are wrong;
+* stores positions beyond 2,048 wrongly in SPZ, and scales as infinite in ksplat if their exponential is;
+* lets one extreme colour take the precision of all others in the code book of SOG;
+* refuses to write SOG and ksplat without a Gaussian;
+* writes the SH coefficients of ksplat in another order than GaussianSplats3D, Spark, three.js and splat-
+  transform read them, which changes degree 2 and higher;
+* prints to standard output when it reads, and cannot return a file of SH degree 0 to Python.
+
+GaussianSplats3D, whose format ksplat is, knows SH degree 0 to 2 (its README and its issue 259).
+
+Sources: the metadata of gaussforge 0.6.0 on pypi.org, and comparisons of its files with what splat-transform
+3.7.0, Spark 2.2.0 and three.js r187 read.
 """
 
 from importlib import import_module
@@ -24,19 +31,21 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.atomic import replacing
-from cadam3d.io.encoding import float32_cpu, unit_quats
-from cadam3d.io.frames import world_to_file
+from cadam3d.io.encoding import in_file_axes, unit_quats
 
 PACKAGE = "gaussforge"
 # Numbers beyond these show no difference, but could cost the precision of the others.
 LARGEST_LOG = 20.0  # of scales and opacities
 LARGEST_SH = 20.0
 FARTHEST_SPZ4 = 2047.0  # 24 bits, of which 12 are fractional
+KSPLAT_SH_DEGREE = 2
 
 
 def require_gaussforge(key: str) -> None:
@@ -57,7 +66,7 @@ def write_sog(path: Path, gaussians: Gaussians, *, up: str) -> None:
 
 
 def write_ksplat(path: Path, gaussians: Gaussians, *, up: str) -> None:
-    """Write ``gaussians`` as ksplat; see :func:`write_sog`."""
+    """Write ``gaussians`` as ksplat, with SH degree 2 at most; see :func:`write_sog`."""
     _write(path, gaussians, up=up, kind="ksplat")
 
 
@@ -79,17 +88,21 @@ def _write(path: Path, gaussians: Gaussians, *, up: str, kind: str) -> None:
     require_gaussforge(f"exporter.{kind}")
     if not len(gaussians) and kind != "spz":
         raise UserError(f"{path}: expected at least one Gaussian, which {kind} requires. Try: exporter=[ply]")
-    local = world_to_file(float32_cpu(gaussians), up)
+    local = in_file_axes(gaussians, up)
+    sh = local.sh.clamp(-LARGEST_SH, LARGEST_SH)
+    rest = sh[:, 1:]
+    if kind == "ksplat":
+        rest = _by_bands(sh[:, 1 : (KSPLAT_SH_DEGREE + 1) ** 2])
     cloud = {
         "numPoints": len(local),
         "positions": _bytes(local.means),
         "scales": _bytes(local.log_scales.clamp(-LARGEST_LOG, LARGEST_LOG)),
         "rotations": unit_quats(local).astype(np.float32).tobytes(),
         "alphas": _bytes(local.opacity_logits.clamp(-LARGEST_LOG, LARGEST_LOG)),
-        "colors": _bytes(local.sh[:, 0].clamp(-LARGEST_SH, LARGEST_SH)),
-        "sh": _bytes(local.sh[:, 1:].clamp(-LARGEST_SH, LARGEST_SH)),
+        "colors": _bytes(sh[:, 0]),
+        "sh": _bytes(rest),
         "extras": {},
-        "meta": {"shDegree": local.sh_degree, "sourceFormat": "ply"},
+        "meta": {"shDegree": round((rest.shape[1] + 1) ** 0.5) - 1, "sourceFormat": "ply"},
     }
     result = import_module(PACKAGE).GaussForge().write(cloud, kind, spz_version=4)
     if "error" in result:
@@ -97,6 +110,20 @@ def _write(path: Path, gaussians: Gaussians, *, up: str, kind: str) -> None:
         raise UserError(f"{path}: gaussforge cannot write it ({reason}). Try: exporter=[ply]")
     with replacing(path) as temporary:
         temporary.write_bytes(result["data"])
+
+
+def _by_bands(rest: Float[Tensor, "n r 3"]) -> Float[Tensor, "n r 3"]:
+    """Return coefficients of degree 1 and higher, arranged so that gaussforge writes a correct ksplat file.
+
+    The format has one block for each degree, and in it all of red, then green, then blue. gaussforge writes
+    a single block: all of red, then green, then blue.
+    """
+    bands, first = [], 0
+    while first < rest.shape[1]:
+        size = 2 * len(bands) + 3
+        bands.append(rest[:, first : first + size].mT.flatten(1))
+        first += size
+    return torch.cat([rest[:, :0, 0], *bands], dim=1).reshape(len(rest), 3, rest.shape[1]).mT
 
 
 def _bytes(tensor: Tensor) -> bytes:

@@ -38,8 +38,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0
 from cadam3d.io.atomic import replacing
-from cadam3d.io.encoding import float32_cpu, linear_scales, opacities, to_bytes, unit_quats
-from cadam3d.io.frames import world_to_file
+from cadam3d.io.encoding import in_file_axes, linear_scales, opacities, to_bytes, unit_quats
 
 EXTENSION = "KHR_gaussian_splatting"
 LARGEST_FILE = (1 << 32) - 1  # bytes; GLB stores its length in 32 bits
@@ -58,7 +57,7 @@ def write_glb(path: Path, gaussians: Gaussians, *, up: str) -> None:
     The node is named after the file. Raises ``UserError`` if the file cannot be written, or would be larger
     than 4 GB, which is the limit of the format.
     """
-    local = world_to_file(float32_cpu(gaussians), up)
+    local = in_file_axes(gaussians, up)
     arrays = _attributes(local) if len(local) else {}
     binary_bytes = sum(array.nbytes for array in arrays.values())
     text = json.dumps(_document(path.stem, arrays), separators=(",", ":")).encode("ascii")

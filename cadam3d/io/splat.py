@@ -31,14 +31,14 @@ from cadam3d.io.atomic import replacing
 from cadam3d.io.encoding import (
     as_tensor,
     byte_logits,
-    float32_cpu,
+    in_file_axes,
     linear_scales,
     opacities,
     scale_logarithms,
     to_bytes,
     unit_quats,
 )
-from cadam3d.io.frames import UPS, file_to_world, world_to_file
+from cadam3d.io.frames import UPS, file_to_world
 from cadam3d.io.reading import open_regular
 
 RECORD = np.dtype(
@@ -51,7 +51,7 @@ def write_splat(path: Path, gaussians: Gaussians, *, up: str) -> None:
 
     Only degree 0 of the spherical harmonics is written. Raises ``UserError`` if the file cannot be written.
     """
-    local = world_to_file(float32_cpu(gaussians), up)
+    local = in_file_axes(gaussians, up)
     records = np.zeros(len(local), dtype=RECORD)
     records["position"] = local.means.numpy()
     records["scale"] = linear_scales(local)

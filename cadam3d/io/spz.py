@@ -47,8 +47,8 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE
 from cadam3d.io.atomic import replacing
-from cadam3d.io.encoding import as_tensor, byte_logits, float32_cpu, opacities, to_bytes, unit_quats
-from cadam3d.io.frames import UPS, file_to_world, world_to_file
+from cadam3d.io.encoding import as_tensor, byte_logits, in_file_axes, opacities, to_bytes, unit_quats
+from cadam3d.io.frames import UPS, file_to_world
 from cadam3d.io.reading import open_regular
 
 MAGIC = b"NGSP"
@@ -76,7 +76,7 @@ def write_spz(path: Path, gaussians: Gaussians, *, up: str) -> None:
     The same Gaussians give the same bytes. Raises ``UserError`` if the file cannot be written, or if a
     position is too far away for the format.
     """
-    local = world_to_file(float32_cpu(gaussians), up)
+    local = in_file_axes(gaussians, up)
     bits = _fractional_bits(path, local)
     header = HEADER.pack(MAGIC, 3, len(local), local.sh_degree, bits, 0, 0)
     fixed = np.rint(np.ldexp(local.means.double().numpy(), bits)).astype("<i4")

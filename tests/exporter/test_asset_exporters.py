@@ -1,0 +1,98 @@
+"""Exporters of splat, spz, glb, sog and ksplat: file names, axes, and wrong values that name their key."""
+
+import pytest
+from formats import asset, errors, gaussforge_reads, likeness_db, random_gaussians
+
+from cadam3d.core.errors import UserError
+from cadam3d.exporter.base import AssetExporter
+from cadam3d.exporter.glb import GlbExporter
+from cadam3d.exporter.ksplat import KsplatExporter
+from cadam3d.exporter.sog import SogExporter
+from cadam3d.exporter.splat import SplatExporter
+from cadam3d.exporter.spz import SpzExporter
+from cadam3d.io import gaussforge
+from cadam3d.io.frames import file_to_world
+from cadam3d.io.splat import read_splat
+from cadam3d.io.spz import read_spz
+
+EXPORTERS = {
+    "asset.splat": (SplatExporter, {}),
+    "asset.spz": (SpzExporter, {"version": 3}),
+    "asset.glb": (GlbExporter, {}),
+    "asset.sog": (SogExporter, {}),
+    "asset.ksplat": (KsplatExporter, {}),
+}
+
+
+def never_renders(cameras, background):
+    raise AssertionError("a file of Gaussians needs no picture")
+
+
+def built(name: str, up: str = "-y", **changed) -> AssetExporter:
+    kind, settings = EXPORTERS[name]
+    return kind(up=up, **{**settings, **changed})
+
+
+@pytest.mark.parametrize("name", EXPORTERS)
+def test_each_exporter_writes_its_file_and_nothing_else(tmp_path, name):
+    assert built(name).export(random_gaussians(5), never_renders, tmp_path) == [tmp_path / name]
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", EXPORTERS)
+def test_a_wrong_axis_names_its_key(name):
+    with pytest.raises(UserError, match=rf"^exporter\.{name.removeprefix('asset.')}\.up: .*Try: exporter\."):
+        built(name, up="up")
+
+
+@pytest.mark.parametrize("up", ["-y", "+y"])
+def test_the_file_has_the_chosen_axes(tmp_path, up):
+    built("asset.splat", up).export(asset(), never_renders, tmp_path)
+    built("asset.spz", up).export(asset(), never_renders, tmp_path)
+    assert likeness_db(read_splat(tmp_path / "asset.splat", up=up)) > 38
+    assert likeness_db(read_spz(tmp_path / "asset.spz", up=up)) > 38
+
+
+def test_spz_has_the_chosen_version(tmp_path):
+    gaussians = random_gaussians(20)
+    built("asset.spz", version=3).export(gaussians, never_renders, tmp_path)
+    assert (tmp_path / "asset.spz").read_bytes()[:2] == b"\x1f\x8b"
+    pytest.importorskip("gaussforge")
+    built("asset.spz", "+z", version=4).export(gaussians, never_renders, tmp_path)
+    content = (tmp_path / "asset.spz").read_bytes()
+    assert content[:8] == b"NGSP\4\0\0\0"
+    assert errors(file_to_world(gaussforge_reads(content, "spz"), "+z"), gaussians)["means"] < 2e-4
+
+
+def test_another_version_of_spz_names_its_key():
+    with pytest.raises(UserError, match=r"exporter\.spz\.version: expected one of 3\|4, got 2"):
+        built("asset.spz", version=2)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "key"),
+    [
+        ("asset.sog", {}, "exporter.sog"),
+        ("asset.ksplat", {}, "exporter.ksplat"),
+        ("asset.spz", {"version": 4}, "exporter.spz.version"),
+    ],
+)
+def test_a_missing_package_is_reported_before_anything_runs(monkeypatch, name, settings, key):
+    monkeypatch.setattr(gaussforge, "find_spec", lambda _: None)
+    with pytest.raises(UserError) as caught:
+        built(name, **settings)
+    assert (
+        str(caught.value)
+        == f"{key}: needs gaussforge, which is not installed. Try: pip install 'cadam3d[formats]'"
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "highest"), [("asset.splat", 0), ("asset.ksplat", 2), ("asset.spz", 3), ("asset.glb", 3)]
+)
+def test_what_a_format_cannot_hold_is_said(name, highest):
+    for degree in range(4):
+        omission = built(name).omission(random_gaussians(2, degree=degree))
+        assert (omission is None) == (degree <= highest)
+    if highest < 3:
+        assert f"{name} has SH degree {highest}" in omission

@@ -1,0 +1,115 @@
+"""SOG, ksplat and SPZ version 4 through gaussforge: the same object, the expected layout, clear refusals."""
+
+import numpy as np
+import pytest
+import torch
+from formats import (
+    ENOUGH_DB,
+    WRONG_DB,
+    asset,
+    errors,
+    extreme_gaussians,
+    gaussforge_reads,
+    is_finite,
+    likeness_db,
+    matched,
+    random_gaussians,
+)
+
+from cadam3d.core.errors import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.io import gaussforge
+from cadam3d.io.frames import file_to_world, world_to_file
+from cadam3d.io.gaussforge import write_ksplat, write_sog, write_spz4
+
+pytest.importorskip("gaussforge")
+WRITERS = {"sog": write_sog, "ksplat": write_ksplat, "spz": write_spz4}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_the_picture_stays_and_a_wrong_up_axis_shows(tmp_path, kind):
+    WRITERS[kind](tmp_path / "a", asset(), up="+y")
+    read = gaussforge_reads((tmp_path / "a").read_bytes(), kind)
+    assert likeness_db(file_to_world(read, "+y")) > ENOUGH_DB
+    assert likeness_db(file_to_world(read, "-y")) < WRONG_DB
+
+
+@pytest.mark.parametrize("kind", ["sog", "spz"])
+def test_view_dependent_colours_stay(tmp_path, kind):
+    WRITERS[kind](tmp_path / "a", asset(3), up="+z")
+    assert likeness_db(gaussforge_reads((tmp_path / "a").read_bytes(), kind), degree=3) > ENOUGH_DB
+
+
+@pytest.mark.parametrize(("degree", "kept"), [(1, 1), (2, 2), (3, 2)])
+def test_ksplat_has_a_block_for_each_degree_and_in_it_one_for_each_channel(tmp_path, degree, kept):
+    gaussians = random_gaussians(40, degree=degree)
+    write_ksplat(tmp_path / "a.ksplat", gaussians, up="-y")
+    # At the end of the file: 3 + 3 + 4 floats, 4 bytes and the coefficients of each Gaussian.
+    coefficients = 3 * ((kept + 1) ** 2 - 1)
+    content = (tmp_path / "a.ksplat").read_bytes()
+    record = np.dtype([("means", "<f4", 3), ("other", "u1", 32), ("sh", "<f4", coefficients)])
+    rows = np.frombuffer(content[-40 * record.itemsize :], dtype=record)
+    local = world_to_file(gaussians, "-y")
+    order = torch.cdist(local.means, torch.from_numpy(rows["means"].copy())).argmin(dim=1)
+    bands = [local.sh[:, d**2 : (d + 1) ** 2].mT.flatten(1) for d in range(1, kept + 1)]
+    assert np.array_equal(rows["sh"][order.numpy()], torch.cat(bands, dim=1).numpy())
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_the_length_of_quaternions_does_not_matter(tmp_path, kind):
+    gaussians = random_gaussians(50)
+    longer = Gaussians(**{**gaussians.tensors(), "quats": -7 * gaussians.quats})
+    for name, each in (("a", gaussians), ("b", longer)):
+        WRITERS[kind](tmp_path / name, each, up="+z")
+        back = matched(gaussforge_reads((tmp_path / name).read_bytes(), kind), gaussians)
+        assert errors(back, gaussians)["angle_deg"] < 1
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_one_extreme_gaussian_harms_no_other(tmp_path, kind):
+    gaussians = random_gaussians(100)
+    gaussians.log_scales[0], gaussians.opacity_logits[0], gaussians.sh[0] = 3e38, -3e38, 3e38
+    WRITERS[kind](tmp_path / "a", gaussians, up="+z")
+    back = gaussforge_reads((tmp_path / "a").read_bytes(), kind)
+    assert is_finite(back)
+    others = slice(1, None)
+    restored = errors(matched(back, gaussians).index(others), gaussians.index(others))
+    assert restored["log_scales"] < 0.3
+    assert restored["opacities"] < 0.005
+    assert restored["sh0"] < 0.5
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_extreme_numbers_are_written_as_finite_ones(tmp_path, kind):
+    WRITERS[kind](tmp_path / "a", extreme_gaussians(1), up="-y")
+    assert is_finite(gaussforge_reads((tmp_path / "a").read_bytes(), kind))
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_the_same_gaussians_give_the_same_bytes(tmp_path, kind):
+    for name in ("a", "b"):
+        WRITERS[kind](tmp_path / name, random_gaussians(300, degree=1), up="-y")
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["sog", "ksplat"])
+def test_no_gaussians_are_one_message(tmp_path, kind):
+    with pytest.raises(UserError, match=rf"at least one Gaussian, which {kind} requires"):
+        WRITERS[kind](tmp_path / "a", random_gaussians(0), up="-y")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_position_beyond_spz_4_is_one_message(tmp_path):
+    gaussians = random_gaussians(3)
+    gaussians.means[1, 2] = -2048
+    with pytest.raises(UserError, match=r"up to 2,047.*got 2048. Try: exporter.spz.version=3$"):
+        write_spz4(tmp_path / "a.spz", gaussians, up="+y")
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_without_the_package_the_message_names_the_extra(tmp_path, monkeypatch, kind):
+    monkeypatch.setattr(gaussforge, "find_spec", lambda _: None)
+    hint = r"Try: pip install 'cadam3d\[formats\]'$"
+    message = rf"exporter\.{kind}: needs gaussforge, which is not installed\. {hint}"
+    with pytest.raises(UserError, match=message):
+        WRITERS[kind](tmp_path / "a", random_gaussians(3), up="-y")
