@@ -32,7 +32,8 @@ EXTENT_PASSES = 40
 NODE_BYTES = 24
 # Densities are clipped to this factor below and above the level before their logarithm is interpolated.
 MOST_CONTRAST = 20.0
-LEAST_HEIGHT = 1e-3  # of the logarithm
+# Heights closer to zero are moved away from it, in cells or in logarithms of the density.
+LEAST_HEIGHT = 1e-3
 # A simplification that is not watertight is repeated with these settings, and then with more triangles.
 AGGRESSIVENESS = (7.0, 5.0, 4.0, 8.0)
 MORE_TRIANGLES = 1.3
@@ -98,7 +99,9 @@ class SurfaceSettings:
         """
         some = blobs(gaussians)
         grid = grid_around(*self._extent(some), self.resolution)
-        vertices, faces = outer_shell(density(some, grid), self.level)
+        # Between two nodes, the logarithm of the density is closer to a line than the density is.
+        contrast = (density(some, grid) / self.level).clamp(1 / MOST_CONTRAST, MOST_CONTRAST)
+        vertices, faces = outer_shell(contrast.log())
         if len(faces) == 0:
             raise self._nothing(some)
         vertices = vertices * grid.cell + grid.origin.numpy()
@@ -173,30 +176,28 @@ def _large_regions(
 
 
 def outer_shell(
-    field: Float[Tensor, "x y z"], level: float
+    height: Float[Tensor, "x y z"],
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """Return the closed surface, in units of nodes, that separates ``field >= level`` from the outside.
+    """Return the closed surface, in units of nodes, where ``height`` is 0 between inside (> 0) and outside (< 0).
 
-    Nodes on the border of the grid count as outside. Hollows without a way out are filled. There are no vertices if the
-    field is below the level everywhere.
+    Nodes on the border of the grid count as outside. Hollows without a way out are filled. There are no triangles if
+    nothing is inside.
     """
     from scipy import ndimage
     from skimage.measure import marching_cubes  # both are slow to import
 
-    values = field.numpy().astype(np.float32)
+    values = height.numpy().astype(np.float32)
     for axis in range(3):
         border = np.moveaxis(values, axis, 0)
-        border[0] = border[-1] = 0.0
-    is_empty = values < level
+        border[0] = border[-1] = np.minimum(border[[0, -1]], -LEAST_HEIGHT).min()
+    is_empty = values < 0
     labels, _ = ndimage.label(is_empty)
-    values[is_empty & (labels != labels[0, 0, 0])] = 2 * level
-    if values.max() <= level:
+    values[is_empty & (labels != labels[0, 0, 0])] = 1.0
+    # A node exactly on the surface would collapse the triangles around it to a point.
+    values[np.abs(values) < LEAST_HEIGHT] = LEAST_HEIGHT
+    if values.max() < 0:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
-    # Between two nodes, the logarithm of the density is closer to a line than the density is.
-    height = np.log(np.clip(values / level, 1 / MOST_CONTRAST, MOST_CONTRAST))
-    # A node exactly at the level would collapse the triangles around it to a point.
-    height[np.abs(height) < LEAST_HEIGHT] = LEAST_HEIGHT
-    vertices, faces, _, _ = marching_cubes(height, 0.0, allow_degenerate=False)
+    vertices, faces, _, _ = marching_cubes(values, 0.0, allow_degenerate=False)
     # scikit-image returns triangles clockwise seen from outside.
     return vertices.astype(np.float64), faces[:, ::-1].astype(np.int64)
 
