@@ -17,7 +17,7 @@ ODD = re.compile(
 )
 # Old values of densifier.reset, which are refused; the changelog and the test of the refusal name them.
 OLD_VALUES = re.compile(r"reset=(?:everybody|nobody)|\"(?:everybody|nobody)\"")
-PROSE = (".md", ".yaml", ".html", ".jinja", ".css", ".toml", ".txt", ".svg")
+PROSE = (".md", ".yaml", ".html", ".jinja", ".css", ".js", ".toml", ".txt", ".svg")
 KERNELS = (".cpp", ".h", ".cu", ".cuh")
 
 

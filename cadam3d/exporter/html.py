@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cadam3d.core.checks import require, require_color, require_range
+from cadam3d.core.checks import require_color, require_range
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn
 from cadam3d.exporter.base import Exporter
@@ -20,19 +20,12 @@ UNTITLED = "3D Gaussians"
 class HtmlExporter(Exporter):
     """Write ``viewer.html``, which contains the asset and everything that draws it."""
 
-    title: str | float | None  # None = UNTITLED; a prompt such as 2026 is a number in YAML
+    title: str | None  # None = UNTITLED
     azimuth_deg: float  # 0 = front
     elevation_deg: float  # in [-90, 90]
     background: Sequence[float] | None  # RGB in [0, 1]; None = as light or dark as the reader's other pages
 
     def __post_init__(self) -> None:
-        require(
-            isinstance(self.title, str | int | float | None),
-            "exporter.html.title",
-            expected="a text or null",
-            got=self.title,
-            example="exporter.html.title=null",
-        )
         require_range("exporter.html.azimuth_deg", self.azimuth_deg, low=-360, high=360, example=30)
         require_range("exporter.html.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
         if self.background is not None:
@@ -42,7 +35,7 @@ class HtmlExporter(Exporter):
         """Write the page and return its path."""
         page = viewer_page(
             pack(gaussians),
-            title=UNTITLED if self.title is None else str(self.title),
+            title=UNTITLED if self.title is None else self.title,
             azimuth_deg=self.azimuth_deg,
             elevation_deg=self.elevation_deg,
             background=self.background,

@@ -17,13 +17,16 @@ globalThis.SplatView = (() => {
   const RECORD = 32; // bytes per Gaussian
   const LAYERS_LIMIT = 64;
   const BUILT_IN = ["rgb", "depth", "opacity"];
-  const NEAR = 0.01; // world units
+  const NEAR = 0.01; // times the radius of the object, but at most world units: as near as the rasterizers draw
   const FAR = 1e15; // world units
   const PIXELS_LIMIT = 4e6; // pixels of the picture, so that large screens of high density stay fluid
   const DENSITY_LIMIT = 2; // device pixels per CSS pixel
   const SLOW = 45; // milliseconds per frame above which moving pictures become coarser
+  const COARSEST = 4; // times as coarse along each side
   const HOME = { azimuth: 30, elevation: 15, fov: 40 }; // degrees
   const DEGREE = Math.PI / 180;
+  // Gaussians per instance. An instance of a single quad would leave most of a graphics card idle.
+  const BATCH = 128;
   // The colours of layers, from the low to the high end, and of Gaussians without a value.
   const GRADIENT = [[0.21, 0.12, 0.43], [0.19, 0.37, 0.66], [0.11, 0.6, 0.62], [0.42, 0.79, 0.42], [0.99, 0.91, 0.34]];
   const BACKGROUNDS = [["White", [1, 1, 1]], ["Grey", [0.5, 0.5, 0.5]], ["Dark", [0.07, 0.075, 0.085]]];
@@ -179,18 +182,17 @@ globalThis.SplatView = (() => {
     precision highp float;
     precision highp int;
     precision highp usampler2D;
-    uniform usampler2D records, rest, levels;
-    uniform int degree, mode, layerWidth, texels;
+    uniform usampler2D records, rest, levels, order;
+    uniform int count, degree, mode, width;
     uniform mat3 rotation;
     uniform vec3 eye;
     uniform vec2 size, range;
-    uniform float focal;
+    uniform float focal, near;
     uniform vec3 gradient[${GRADIENT.length}];
-    layout(location = 0) in uint row;
     out vec2 offset;
     flat out vec4 paint;
 
-    uvec4 texel(usampler2D data, int index) { return texelFetch(data, ivec2(index % texels, index / texels), 0); }
+    uvec4 texel(usampler2D data, int index) { return texelFetch(data, ivec2(index % width, index / width), 0); }
 
     float whole(int value, int place) { return float((value << (24 - 8 * place)) >> 24); }
 
@@ -253,12 +255,14 @@ globalThis.SplatView = (() => {
 
     void main() {
       gl_Position = vec4(0, 0, 2, 1);  // outside of the picture, unless the Gaussian is visible
-      int index = int(row);
+      int place = gl_InstanceID * ${BATCH} + gl_VertexID / 4;
+      if (place >= count) return;
+      int index = int(texel(order, place).x);
       uvec4 first = texel(records, 2 * index), second = texel(records, 2 * index + 1);
       vec3 mean = uintBitsToFloat(first.xyz), away = mean - eye;
       float opacity = float(second.y >> 16) / 65535.;
       vec3 p = rotation * away;
-      if (!(p.z > ${NEAR.toFixed(3)} && p.z < ${FAR.toExponential()} && opacity > 1. / 255.)) return;
+      if (!(p.z > near && p.z < ${FAR.toExponential()} && opacity > 1. / 255.)) return;
 
       vec3 scales = exp(vec3(second.x & 0xffffu, second.x >> 16, second.y & 0xffffu) * (32. / 65535.) - 16.);
       mat3 turn = axes(first.w, second.w >> 16);
@@ -275,7 +279,7 @@ globalThis.SplatView = (() => {
       if (!(determinant < 1e30)) return;
 
       // The corners of a square around the circle of 1/255 in standard deviations, and their places in pixels.
-      vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2. - 1.;
+      vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2. - 1.;
       offset = corner * sqrt(2. * log(255. * opacity));
       vec2 shift = vec2(sqrt(varianceX) * offset.x,
         covariance / sqrt(varianceX) * offset.x + sqrt(determinant / varianceX) * offset.y);
@@ -287,13 +291,13 @@ globalThis.SplatView = (() => {
         vec2 redGreen = unpackHalf2x16(second.z);
         color = vec3(redGreen, unpackHalf2x16(second.w).x);
         if (degree > 0) color += harmonics(index, normalize(away));
-        color = max(color, 0.);
+        color = min(max(color, 0.), 1000.);
       } else if (mode == 1) {
         color = ramp((p.z - range.x) / (range.y - range.x));
       } else if (mode == 2) {
         color = ramp(opacity);
       } else {
-        uint level = texelFetch(levels, ivec2(index % layerWidth, index / layerWidth), 0).x;
+        uint level = texel(levels, index).x;
         color = level == 0u ? vec3(${NO_VALUE.join(", ")}) : ramp(float(level - 1u) / 254.);
       }
       paint = vec4(color, opacity);
@@ -326,7 +330,7 @@ globalThis.SplatView = (() => {
       result = vec4(color.rgb + (1. - color.a) * background, 1);
     }`;
 
-  const RECORD_UNIT = 0, REST_UNIT = 1, LEVEL_UNIT = 2, PICTURE_UNIT = 3;
+  const RECORD_UNIT = 0, REST_UNIT = 1, LEVEL_UNIT = 2, ORDER_UNIT = 3, PICTURE_UNIT = 4;
 
   const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
   const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
@@ -378,11 +382,11 @@ globalThis.SplatView = (() => {
       (color) => `rgb(${color.map((value) => Math.round(255 * value)).join(" ")})`).join(", ")})`;
 
     #element; #canvas; #gl = null; #options;
-    #splats; #screen; #vertices; #orders; #picture; #frame; #pictureSize = [0, 0]; #isHalf = false;
+    #splats; #screen; #order; #orderRows = 0; #picture; #frame; #pictureSize = [0, 0]; #isHalf = false;
     #sorting = null; #isSorting = false; #sortedAlong = null; #generation = 0;
     #shown = null; #next = null; #spare = null; #layer = "rgb"; #levels = null;
     #camera; #home; #background; #rotating = false; #isPlaced = false;
-    #request = 0; #lastTime = 0; #coarseness = 1; #isMoving = false; #restTimer = 0; #interval = 0;
+    #request = 0; #lastTime = 0; #coarseness = 1; #isMoving = false; #restTimer = 0; #interval = 16; #wasMoving = false;
     #abort = new AbortController(); #observer = null; #message = null; #pointers = new Map();
     #refreshers = []; // of the controls
     onchange = null;
@@ -405,8 +409,8 @@ globalThis.SplatView = (() => {
       Object.assign(canvas.style, { display: "block", width: "100%", height: "100%", outlineOffset: "-2px",
         touchAction: this.#options.embedded ? "pan-y" : "none", cursor: "grab", userSelect: "none" });
       canvas.tabIndex = 0;
-      canvas.setAttribute("role", "img");
-      canvas.setAttribute("aria-label", this.#options.label);
+      canvas.setAttribute("role", "application");
+      canvas.setAttribute("aria-label", `${this.#options.label}. Arrow keys turn it, plus and minus zoom.`);
       element.append(canvas);
       this.camera = options.camera ?? {};
       this.#gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, stencil: false,
@@ -540,7 +544,7 @@ globalThis.SplatView = (() => {
 
     /* Return the picture as a PNG. */
     snapshot() {
-      this.#coarseness = 1;
+      this.#isMoving = false;
       this.#paint();
       return new Promise((resolve) => this.#canvas.toBlob(resolve, "image/png"));
     }
@@ -635,51 +639,58 @@ globalThis.SplatView = (() => {
       gl.uniform1i(uniforms.records, RECORD_UNIT);
       gl.uniform1i(uniforms.rest, REST_UNIT);
       gl.uniform1i(uniforms.levels, LEVEL_UNIT);
-      gl.uniform1i(uniforms.texels, this.#textureWidth());
-      gl.uniform1i(uniforms.layerWidth, this.#textureWidth());
+      gl.uniform1i(uniforms.order, ORDER_UNIT);
+      gl.uniform1i(uniforms.width, this.#textureWidth());
       gl.uniform3fv(uniforms.gradient, GRADIENT.flat());
       gl.useProgram(this.#screen.program);
       gl.uniform1i(this.#screen.uniforms.picture, PICTURE_UNIT);
-      this.#vertices = gl.createVertexArray();
-      gl.bindVertexArray(this.#vertices);
-      this.#orders = gl.createBuffer();
-      gl.bindBuffer(gl.ARRAY_BUFFER, this.#orders);
-      gl.enableVertexAttribArray(0);
-      gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-      gl.vertexAttribDivisor(0, 1);
+      // The two triangles of each quad of a batch.
+      const corners = [0, 1, 2, 2, 1, 3];
+      const indices = Uint16Array.from({ length: 6 * BATCH }, (_, i) => 4 * Math.floor(i / 6) + corners[i % 6]);
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
       gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
       gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
       this.#frame = gl.createFramebuffer();
-      this.#picture = null;
+      this.#picture = this.#order = this.#levels = null;
       this.#pictureSize = [0, 0];
-      this.#levels = null;
     }
 
     #textureWidth() {
       return Math.min(4096, this.#gl.getParameter(this.#gl.MAX_TEXTURE_SIZE));
     }
 
-    /* Return a texture with one texel per group of values; at least one texel, because none cannot exist. */
-    #texture(unit, kind, format, type, array, perTexel) {
+    /* Return a texture for so many texels; at least one, because a texture without any cannot exist. */
+    #texture(unit, kind, texels) {
       const gl = this.#gl;
-      const [width, texels] = [this.#textureWidth(), array.length / perTexel];
-      const rows = Math.floor(texels / width);
       const texture = gl.createTexture();
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture);
       for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+      const width = this.#textureWidth();
       gl.texStorage2D(gl.TEXTURE_2D, 1, kind, texels ? width : 1, Math.max(1, Math.ceil(texels / width)));
-      const put = (row, across, down, first) => gl.texSubImage2D(
-        gl.TEXTURE_2D, 0, 0, row, across, down, format, type, array.subarray(first * perTexel));
-      if (rows) put(0, width, rows, 0);
-      if (texels % width) put(rows, texels % width, 1, rows * width);
       return texture;
+    }
+
+    /* Fill the texture that is bound to a unit, row by row, with so many numbers per texel. */
+    #fill(unit, format, type, array, perTexel) {
+      const gl = this.#gl;
+      const [width, texels] = [this.#textureWidth(), array.length / perTexel];
+      const rows = Math.floor(texels / width);
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      const put = (row, across, down) => gl.texSubImage2D(
+        gl.TEXTURE_2D, 0, 0, row, across, down, format, type, array.subarray(row * width * perTexel));
+      if (rows) put(0, width, rows);
+      if (texels % width) put(rows, texels % width, 1);
     }
 
     #upload(data) {
       const gl = this.#gl;
-      const four = [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT];
-      data.textures = [this.#texture(RECORD_UNIT, ...four, data.records, 4), this.#texture(REST_UNIT, ...four, data.rest, 4)];
+      data.textures = [[RECORD_UNIT, data.records], [REST_UNIT, data.rest]].map(([unit, array]) => {
+        const texture = this.#texture(unit, gl.RGBA32UI, array.length / 4);
+        this.#fill(unit, gl.RGBA_INTEGER, gl.UNSIGNED_INT, array, 4);
+        return texture;
+      });
     }
 
     #release(data) {
@@ -694,7 +705,8 @@ globalThis.SplatView = (() => {
       const found = this.#shown?.layers.find((layer) => layer.name === this.#layer);
       if (!this.#gl || !found || BUILT_IN.includes(this.#layer)) return;
       const gl = this.#gl;
-      this.#levels = this.#texture(LEVEL_UNIT, gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE, found.levels, 1);
+      this.#levels = this.#texture(LEVEL_UNIT, gl.R8UI, found.levels.length);
+      this.#fill(LEVEL_UNIT, gl.RED_INTEGER, gl.UNSIGNED_BYTE, found.levels, 1);
     }
 
     /* ---- depth order ---- */
@@ -716,13 +728,26 @@ globalThis.SplatView = (() => {
       const gl = this.#gl;
       const isNext = this.#next?.generation === generation;
       if (gl && (isNext || this.#shown?.generation === generation)) {
-        gl.bindBuffer(gl.ARRAY_BUFFER, this.#orders);
-        gl.bufferData(gl.ARRAY_BUFFER, order, gl.STREAM_DRAW);
+        this.#useOrder(order);
         if (isNext) this.#accept();
         this.#draw(isNext);
       }
       this.#spare = order;
       this.#sort();
+    }
+
+    /* Put an order on the graphics card, where it needs one texture that grows and shrinks with the data. */
+    #useOrder(order) {
+      const gl = this.#gl;
+      const rows = Math.ceil(order.length / this.#textureWidth());
+      if (!this.#order || rows !== this.#orderRows) {
+        if (this.#order) gl.deleteTexture(this.#order);
+        this.#order = this.#texture(ORDER_UNIT, gl.R32UI, rows * this.#textureWidth());
+        this.#orderRows = rows;
+      }
+      gl.activeTexture(gl.TEXTURE0 + ORDER_UNIT);
+      gl.bindTexture(gl.TEXTURE_2D, this.#order);
+      this.#fill(ORDER_UNIT, gl.RED_INTEGER, gl.UNSIGNED_INT, order, 1);
     }
 
     /* The next data becomes the shown data. */
@@ -733,14 +758,14 @@ globalThis.SplatView = (() => {
       if (before) this.#release(before);
       this.#useLayer();
       this.#hush();
-      if (!before) this.#frameObject(data);
+      if (!before?.count) this.#frameObject(data);
       const waiting = data.waiting.splice(0);
       queueMicrotask(() => { waiting.forEach((resolve) => resolve()); this.#announce(); });
     }
 
     /* Move the camera to where the whole object is visible, unless the page has placed it. */
     #frameObject({ focus, radius }) {
-      const fov = this.#options.camera?.fov ?? HOME.fov;
+      const { fov } = this.#camera;
       const fitting = Number((1.026 * radius / Math.sin(fov * DEGREE / 2)).toPrecision(3));
       this.#home = { ...HOME, fov, distance: fitting, target: [...focus] };
       if (!this.#isPlaced) Object.assign(this.#camera, { distance: this.#home.distance, target: [...focus] });
@@ -751,7 +776,7 @@ globalThis.SplatView = (() => {
       const { eye, forward } = pose(this.#camera);
       const { focus, radius } = data ?? { focus: [0, 0, 0], radius: 1 };
       const center = focus.reduce((sum, value, i) => sum + forward[i] * (value - eye[i]), 0);
-      const low = Math.max(center - radius, NEAR);
+      const low = Math.max(center - radius, NEAR * Math.min(1, radius));
       return [low, Math.max(center + radius, low + 1e-3 * radius)];
     }
 
@@ -777,22 +802,22 @@ globalThis.SplatView = (() => {
       this.#request = 0;
       const passed = time - this.#lastTime;
       this.#lastTime = time;
-      this.#adapt(passed);
+      if (this.#isMoving && this.#wasMoving) this.#adapt(passed);
+      this.#wasMoving = this.#isMoving;
       if (this.#rotating) {
-        this.#camera.azimuth = (this.#camera.azimuth + 0.02 * Math.min(passed, 100)) % 360;
-        this.#sort();
         this.#moved();
+        this.camera = { azimuth: this.#camera.azimuth + 0.02 * Math.min(passed, 100) };
       }
       this.#paint();
-      if (this.#rotating) this.#draw();
     }
 
     /* Make moving pictures coarser on slow machines. When the camera rests, the picture is sharp again. */
     #adapt(passed) {
-      if (!this.#isMoving || passed > 1000) { this.#interval = 0; return; }
-      this.#interval = this.#interval ? 0.7 * this.#interval + 0.3 * passed : Math.min(passed, SLOW);
-      if (this.#interval > SLOW && this.#coarseness < 3) this.#coarseness = Math.min(3, this.#coarseness * 1.3);
-      else if (this.#interval < SLOW / 2 && this.#coarseness > 1) this.#coarseness = Math.max(1, this.#coarseness / 1.1);
+      this.#interval = (this.#interval + passed) / 2;
+      // The time of a picture is about proportional to its pixels.
+      const change = this.#interval > SLOW ? Math.min(2, Math.sqrt(this.#interval / SLOW))
+        : this.#interval < SLOW / 2 ? 0.9 : 1;
+      this.#coarseness = clamp(this.#coarseness * change, 1, COARSEST);
     }
 
     #moved() {
@@ -801,7 +826,7 @@ globalThis.SplatView = (() => {
       this.#restTimer = setTimeout(() => {
         this.#isMoving = false;
         this.#draw();
-      }, 200);
+      }, 200 + 2 * this.#interval);
     }
 
     #resize() {
@@ -816,17 +841,27 @@ globalThis.SplatView = (() => {
       const small = size.map((length) => Math.max(1, Math.round(length / coarse)));
       if (small[0] !== this.#pictureSize[0] || small[1] !== this.#pictureSize[1]) {
         this.#pictureSize = small;
-        if (this.#picture) gl.deleteTexture(this.#picture);
-        this.#picture = gl.createTexture();
-        gl.activeTexture(gl.TEXTURE0 + PICTURE_UNIT);
-        gl.bindTexture(gl.TEXTURE_2D, this.#picture);
-        gl.texStorage2D(gl.TEXTURE_2D, 1, this.#isHalf ? gl.RGBA16F : gl.RGBA8, ...small);
-        for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
-        for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
-        gl.bindFramebuffer(gl.FRAMEBUFFER, this.#frame);
-        gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.#picture, 0);
+        this.#attach();
       }
       return small;
+    }
+
+    /* Make the picture that the Gaussians are drawn into. */
+    #attach() {
+      const gl = this.#gl;
+      if (this.#picture) gl.deleteTexture(this.#picture);
+      this.#picture = gl.createTexture();
+      gl.activeTexture(gl.TEXTURE0 + PICTURE_UNIT);
+      gl.bindTexture(gl.TEXTURE_2D, this.#picture);
+      gl.texStorage2D(gl.TEXTURE_2D, 1, this.#isHalf ? gl.RGBA16F : gl.RGBA8, ...this.#pictureSize);
+      for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
+      for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, this.#frame);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.#picture, 0);
+      if (this.#isHalf && gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE && !gl.isContextLost()) {
+        this.#isHalf = false;
+        this.#attach();
+      }
     }
 
     #paint() {
@@ -857,21 +892,23 @@ globalThis.SplatView = (() => {
       const { eye, right, down, forward } = pose(this.#camera);
       gl.useProgram(program);
       const bound = [[RECORD_UNIT, textures[0]], [REST_UNIT, textures[1]], [LEVEL_UNIT, this.#levels ?? textures[1]],
-        [PICTURE_UNIT, null]];
+        [ORDER_UNIT, this.#order], [PICTURE_UNIT, null]];
       for (const [unit, texture] of bound) {
         gl.activeTexture(gl.TEXTURE0 + unit);
         gl.bindTexture(gl.TEXTURE_2D, texture);
       }
       const mode = BUILT_IN.indexOf(this.#layer);
       gl.uniform1i(uniforms.mode, mode >= 0 ? mode : this.#levels ? 3 : 0);
+      gl.uniform1i(uniforms.count, count);
       gl.uniform1i(uniforms.degree, degree);
       gl.uniformMatrix3fv(uniforms.rotation, true, [...right, ...down, ...forward]);
       gl.uniform3fv(uniforms.eye, eye);
       gl.uniform2fv(uniforms.size, size);
       gl.uniform2fv(uniforms.range, this.#depthRange());
+      gl.uniform1f(uniforms.near, NEAR * Math.min(1, this.#shown.radius));
       gl.uniform1f(uniforms.focal, 0.5 * Math.min(...size) / Math.tan(this.#camera.fov * DEGREE / 2));
       gl.enable(gl.BLEND);
-      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
+      gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(count / BATCH));
       gl.disable(gl.BLEND);
     }
 
@@ -928,7 +965,7 @@ globalThis.SplatView = (() => {
       this.#canvas.setPointerCapture(event.pointerId);
       this.#canvas.focus({ preventScroll: true });
       this.#canvas.style.cursor = "grabbing";
-      this.#rotating = false;
+      if (this.#rotating) this.rotating = false;
     }
 
     #lift(event) {
@@ -963,7 +1000,8 @@ globalThis.SplatView = (() => {
     }
 
     #zoom(factor) {
-      this.camera = { distance: this.#camera.distance * clamp(factor, 0.2, 5) };
+      const radius = this.#latest?.radius ?? 1;
+      this.camera = { distance: clamp(this.#camera.distance * factor, 0.02 * radius, 100 * radius) };
     }
 
     /* Move the object with the pointer: dx, dy are in CSS pixels. */
@@ -987,7 +1025,8 @@ globalThis.SplatView = (() => {
 
     #key(event) {
       if (event.ctrlKey || event.metaKey || event.altKey) return;
-      if (event.target?.closest?.("input, select, textarea, button, summary, a") && !/^[0-9r+=-]$/.test(event.key)) return;
+      const isIn = (names) => event.target instanceof Element && event.target.closest(names);
+      if (isIn("input, select, textarea") || (event.key === " " && isIn("button, summary, a"))) return;
       const step = event.shiftKey ? 2.5 : 12; // CSS pixels of a drag
       const moves = { ArrowLeft: [step, 0], ArrowRight: [-step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] };
       const layer = this.layers[Number(event.key) - 1];
