@@ -85,7 +85,8 @@ def entry_of(cfg: DictConfig, asset: Asset, output: Output) -> FileEntry:
 
 def degree_of(cfg: DictConfig, asset: Asset, output: Output) -> int:
     """Return the SH degree of a file of Gaussians."""
-    degree = min(asset.gaussians.sh_degree, FORMATS.get(output.exporter, Format()).max_degree)
+    degree, largest = asset.gaussians.sh_degree, FORMATS.get(output.exporter, Format()).max_degree
+    degree = degree if largest is None else min(degree, largest)
     padded = setting(cfg, output, "pad_sh")
     return max(degree, padded) if isinstance(padded, int) else degree
 

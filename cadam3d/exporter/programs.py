@@ -8,8 +8,6 @@ documents about itself. This module is the only place with such facts. ``docs/ex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from cadam3d.core.sh import MAX_DEGREE
-
 GLTF = "glTF 2.0, section 3.4: +Y is up"
 # Pairs of up axes that are half a turn apart.
 OPPOSITE = {("-y", "+y"), ("+y", "-y")}
@@ -33,19 +31,20 @@ class Program:
 class Format:
     """What a file of one exporter holds, compared with the Gaussians in memory."""
 
-    max_degree: int = MAX_DEGREE  # largest SH degree that the format can hold
+    max_degree: int | None = None  # largest SH degree that the format can hold; None = all
     loss: str = ""  # what is rounded or left out; "" if nothing is
     sh_loss: str = ""  # the same for SH degrees above 0, as a continuation of the sentence
     hint: str = ""  # printed with the file
 
 
-# Measured in headless Chromium or Node, with an asset that is not symmetric, against our own render from the
-# same camera.
+# Measured means that the program has drawn an object without symmetry, in Node or in headless Chromium, and
+# that the picture equals our own render from the same camera. ``tests/programs/`` repeats this for
+# splat-transform, Spark and three.js.
 PROGRAMS: tuple[Program, ...] = (
     Program(
         name="SuperSplat",
         version="splat-transform 3.7.0",
-        upright={"ply": "-y", "splat": "-y", "spz": "-y"},
+        upright={"ply": "-y", "compressed_ply": "-y", "splat": "-y", "spz": "-y"},
         is_measured=True,
         source="github.com/playcanvas/supersplat/issues/451: PLY files are turned by 180 degrees about z",
         target="supersplat",
@@ -61,7 +60,7 @@ PROGRAMS: tuple[Program, ...] = (
     Program(
         name="Spark",
         version="2.2.0",
-        upright={"ply": "+y", "splat": "+y", "spz": "+y"},
+        upright={"ply": "+y", "compressed_ply": "+y", "splat": "+y", "spz": "+y"},
         is_measured=True,
         source="SplatMesh shows the numbers of the file unchanged, in the +y up world of three.js",
         target="spark",
@@ -114,11 +113,7 @@ FORMATS: Mapping[str, Format] = {
         loss="rounds positions, scales and rotations to 10 or 11 bits, colours and opacities to 8",
         sh_loss="and how colours change with the view to 8",
     ),
-    "splat": Format(
-        max_degree=0,
-        loss="rounds colours, opacities and rotations to 8 bits",
-        sh_loss="and leaves out how colours change with the view",
-    ),
+    "splat": Format(max_degree=0, loss="rounds colours, opacities and rotations to 8 bits"),
     "spz": Format(
         loss="rounds positions to 24 bits, rotations to 10, colours, opacities and scales to 8",
         sh_loss="and how colours change with the view to 4 or 5",
@@ -127,7 +122,7 @@ FORMATS: Mapping[str, Format] = {
         hint="needs a program that knows KHR_gaussian_splatting; for triangles type exporter=[mesh]"
     ),
     "sog": Format(loss="rounds positions to 16 bits, and the rest to code books of 256 values"),
-    "ksplat": Format(loss="rounds colours and opacities to 8 bits"),
+    "ksplat": Format(max_degree=2, loss="rounds colours and opacities to 8 bits"),
     "mesh": Format(
         loss="a closed surface in place of Gaussians",
         sh_loss="without how colours change with the view",
@@ -155,7 +150,7 @@ UNKNOWN: Mapping[str, Unknown] = {
     ),
     "unity": Unknown(
         reason="packages for Unity differ in their axes, and some mirror the object",
-        words=("exporter=[ply]", "exporter.ply.up=+y", f"exporter.ply.pad_sh={MAX_DEGREE}"),
+        words=("exporter=[ply]", "exporter.ply.up=+y", "exporter.ply.pad_sh=3"),
     ),
     "unreal": Unknown(
         reason="Epic documents which formats it imports, but not their axes",

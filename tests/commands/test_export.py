@@ -4,6 +4,7 @@ import hashlib
 import json
 import shlex
 import threading
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -14,10 +15,13 @@ from splats import make_gaussians
 
 from cadam3d.commands.export import views_in_words
 from cadam3d.exporter.programs import FORMATS, PROGRAMS, UNKNOWN, judge, loss_of
+from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.asset_record import Frame
 from cadam3d.io.frames import AXES, UPS
+from cadam3d.io.gaussforge import KSPLAT_SH_DEGREE
 from cadam3d.io.jsonl import read_json, write_json
 from cadam3d.io.lock import taking_turns
+from cadam3d.io.mesh import mesh_facts
 from cadam3d.io.ply import read_ply, write_ply
 from cadam3d.settings.compose import compose, config_dir
 from cadam3d.settings.line import EXPORTERS, exporting, suffix_of
@@ -148,6 +152,24 @@ def test_a_run_of_a_stranger_adds_nothing_but_short_texts_and_counts(run_folder,
     assert record["trained_with"] == {"cadam3d": None, "torch": None}
 
 
+def test_every_format_is_written_and_described_as_it_is_read_back(run_folder, type_line):
+    names = [name for name in FORMATS if name not in ("sog", "ksplat")]
+    words = (f"exporter=[{','.join(names)}]", "exporter.mesh.resolution=16", "exporter.mesh.level=0.1")
+    assert type_line("export", f"run={run_folder}", *words).code == 0
+    files = files_in(run_folder / "exports/asset.json")
+    assert list(files) == [
+        *("asset.compressed.ply", "asset.glb", "asset.ply", "asset.splat", "asset.spz"),
+        *("asset_mesh.glb", "viewer.html"),
+    ]
+    for name in ("asset.compressed.ply", "asset.ply", "asset.splat", "asset.spz"):
+        read = read_gaussians(run_folder / "exports" / name, up=files[name]["frame"]["up"])
+        assert (len(read), read.sh_degree) == (files[name]["gaussians"], files[name]["sh_degree"])
+    assert files["asset.splat"]["sh_degree"] == 0
+    assert files["asset_mesh.glb"]["triangles"] == mesh_facts(run_folder / "exports/asset_mesh.glb").triangles
+    assert (files["asset_mesh.glb"]["gaussians"], files["viewer.html"]["frame"]) == (None, None)
+    assert FORMATS["ksplat"].max_degree == KSPLAT_SH_DEGREE
+
+
 def test_a_failed_exporter_costs_only_its_own_file(run_folder, type_line):
     (run_folder / "exports/preview.png").mkdir(parents=True)
     code, out, err = type_line(
@@ -201,6 +223,18 @@ def test_every_target_is_a_program_with_known_axes():
         assert program.version
         assert set(program.upright) <= FORMATS.keys()
         assert set(program.upright.values()) <= set(UPS)
+
+
+@pytest.mark.parametrize(
+    ("module", "name"),
+    [("test_splat_transform", "SuperSplat"), ("test_spark", "Spark"), ("test_three", "three.js")],
+)
+def test_the_table_states_what_the_tests_with_other_programs_measure(module, name):
+    [program] = [program for program in PROGRAMS if program.name == name]
+    assert program.is_measured
+    measured = {case.format: case.upright for case in import_module(f"programs.{module}").CASES}
+    assert measured
+    assert measured.items() <= program.upright.items()
 
 
 @pytest.mark.parametrize("target", TARGETS)
@@ -337,7 +371,7 @@ def test_a_program_shows_a_file_in_one_way(exporter):
 
 def test_only_what_an_asset_has_can_be_lost():
     assert not loss_of("ply", 3)
-    assert loss_of("splat", 1) == loss_of("splat", 0) + ", and leaves out how colours change with the view"
+    assert loss_of("spz", 1) == loss_of("spz", 0) + ", and how colours change with the view to 4 or 5"
     assert not loss_of("an exporter from elsewhere", 3)
 
 
