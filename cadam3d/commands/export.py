@@ -11,7 +11,15 @@ from cadam3d.commands.asset import Asset, Output, export_all, open_asset, write_
 from cadam3d.commands.messages import note
 from cadam3d.core.surface import SurfaceFacts
 from cadam3d.exporter.programs import FORMATS, Format, Program, hint_of, judge, loss_of
-from cadam3d.io.asset_record import FileEntry, Frame, Source, require_own_record, sha256_of, write_record
+from cadam3d.io.asset_record import (
+    FileEntry,
+    Frame,
+    Source,
+    facts_of,
+    require_own_record,
+    sha256_of,
+    write_record,
+)
 from cadam3d.io.lock import taking_turns
 from cadam3d.io.mesh import FORMATS as MESH_FORMATS
 from cadam3d.io.mesh import mesh_facts
@@ -29,8 +37,25 @@ def run(cfg: DictConfig) -> None:
     Print a few lines about each file.
     """
     asset = open_asset(cfg)
+    entitle(cfg, asset)
     for output in write_files(cfg, asset, EXPORTS, export_recorded):
         print("\n".join(described(cfg, asset, output)))
+
+
+def entitle(cfg: DictConfig, asset: Asset) -> None:
+    """Give a page without a title the prompt of its run, in place."""
+    key = "exporter.html.title"
+    run_folder = run_of(asset)
+    if "html" in cfg.exporter and run_folder is not None and OmegaConf.select(cfg, key) is None:
+        prompt = facts_of(run_folder)["prompt"]
+        # Hydra resolves a text twice, so no escape would keep an interpolation of a stranger from it.
+        if prompt is not None and "$" not in prompt:
+            OmegaConf.update(cfg, key, prompt)
+
+
+def run_of(asset: Asset) -> Path | None:
+    """Return the folder of the run that has made an asset; None for a file that is not the asset of a run."""
+    return asset.folder if has_file(asset.folder, CONFIG) else None
 
 
 def export_recorded(cfg: DictConfig, asset: Asset, folder: Path) -> list[Output]:
@@ -46,7 +71,7 @@ def export_recorded(cfg: DictConfig, asset: Asset, folder: Path) -> list[Output]
         if entries:
             source = Source(
                 file=asset.ply,
-                run=asset.folder if has_file(asset.folder, CONFIG) else None,
+                run=run_of(asset),
                 gaussians=len(asset.gaussians),
                 sh_degree=asset.gaussians.sh_degree,
             )

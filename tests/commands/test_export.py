@@ -170,6 +170,20 @@ def test_every_format_is_written_and_described_as_it_is_read_back(run_folder, ty
     assert FORMATS["ksplat"].max_degree == KSPLAT_SH_DEGREE
 
 
+@pytest.mark.parametrize(
+    ("prompt", "words", "title"),
+    [
+        ("a </title><b>cube", (), "a &lt;/title&gt;&lt;b&gt;cube"),
+        ("a ${oc.env:HOME} cube", (), "3D Gaussians"),
+        ("a cube", ("exporter.html.title=mine",), "mine"),
+    ],
+)
+def test_a_page_has_the_prompt_of_its_run_as_its_title(prompt, words, title, run_folder, type_line):
+    write_json(run_folder / "summary.json", SUMMARY | {"prompt": prompt})
+    assert type_line("export", f"run={run_folder}", "output=page.html", *words).code == 0
+    assert f"<title>{title}</title>" in Path("page.html").read_text(encoding="utf-8")
+
+
 def test_a_failed_exporter_costs_only_its_own_file(run_folder, type_line):
     (run_folder / "exports/preview.png").mkdir(parents=True)
     code, out, err = type_line(
