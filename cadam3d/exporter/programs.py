@@ -29,7 +29,7 @@ class Program:
 
 @dataclass(frozen=True, kw_only=True)
 class Format:
-    """What a file of one exporter holds, compared with the Gaussians in memory."""
+    """Properties of the files of one exporter."""
 
     max_degree: int | None = None  # largest SH degree that the format can hold; None = all
     loss: str = ""  # what is rounded or left out; "" if nothing is
@@ -161,7 +161,7 @@ UNKNOWN: Mapping[str, Unknown] = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """How known programs show a file."""
+    """The known programs that read a file, by the way in which they show it."""
 
     upright: list[Program] = field(default_factory=list)
     upside_down: list[Program] = field(default_factory=list)
