@@ -151,6 +151,8 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         ("export", "run=new"),
         ("export", "run=a run", "output=a.b.fbx"),
         ("export", "run=a run", "output=taken"),
+        ("export", "run=a run", "output=a run"),
+        ("export", "ply=asset.ply", "output=asset.ply"),
         ("export", "run=a run", "for=unity", "output=a.ply"),
         ("export", "run=a run", "for=sparc"),
         ("export", "run=a run", "for=spark", "exporter=[ply]"),

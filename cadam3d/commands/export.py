@@ -9,8 +9,9 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d import __version__
 from cadam3d.commands.asset import Asset, Output, export_all, open_asset, write_files
 from cadam3d.commands.messages import note
+from cadam3d.core.errors import UserError
 from cadam3d.core.surface import SurfaceFacts
-from cadam3d.exporter.programs import FORMATS, Format, Program, hint_of, judge, loss_of
+from cadam3d.exporter.programs import FORMATS, OTHER, Program, hint_of, judge, loss_of
 from cadam3d.io.asset_record import (
     FileEntry,
     Frame,
@@ -23,8 +24,17 @@ from cadam3d.io.asset_record import (
 from cadam3d.io.lock import taking_turns
 from cadam3d.io.mesh import FORMATS as MESH_FORMATS
 from cadam3d.io.mesh import mesh_facts
-from cadam3d.io.run_folder import ASSET_RECORD, CONFIG, EXPORTS, has_file, shown
-from cadam3d.settings.line import MESH
+from cadam3d.io.run_folder import (
+    ASSET_RECORD,
+    CONFIG,
+    EXPORTS,
+    expanded,
+    has_file,
+    numbered,
+    shown,
+    typed_path,
+)
+from cadam3d.settings.line import MESH, setting_word
 
 INDENT = "  "
 # Values of ``format`` (mesh) and ``version`` (spz) that other programs were tested with; "" for neither.
@@ -38,6 +48,7 @@ def run(cfg: DictConfig) -> None:
     """
     asset = open_asset(cfg)
     entitle(cfg, asset)
+    require_apart(asset, [] if cfg.output is None else [expanded(str(cfg.output))])
     for output in write_files(cfg, asset, EXPORTS, export_recorded):
         print("\n".join(described(cfg, asset, output)))
 
@@ -66,19 +77,33 @@ def export_recorded(cfg: DictConfig, asset: Asset, folder: Path) -> list[Output]
     """
     with taking_turns(folder, lambda: note(f"waiting for another export into {shown(folder)}")):
         require_own_record(folder)
+        names = [FORMATS[name].file for name in cfg.exporter if name in FORMATS]
+        require_apart(asset, [folder / name for name in names])
+        source = Source(
+            name=asset.ply.name,
+            sha256=sha256_of(asset.ply),
+            gaussians=len(asset.gaussians),
+            sh_degree=asset.gaussians.sh_degree,
+            run=run_of(asset),
+        )
         outputs = export_all(cfg, asset, folder)
         entries = [entry_of(cfg, asset, output) for output in outputs if is_asset(cfg, output)]
         if entries:
-            source = Source(
-                file=asset.ply,
-                run=run_of(asset),
-                gaussians=len(asset.gaussians),
-                sh_degree=asset.gaussians.sh_degree,
-            )
             versions = {"cadam3d": __version__, "torch": torch.__version__}
             record = write_record(folder, source, entries, exported_with=versions)
             outputs.append(Output(record, ASSET_RECORD))
         return outputs
+
+
+def require_apart(asset: Asset, paths: Sequence[Path]) -> None:
+    """Raise ``UserError`` if one of ``paths`` is the file that is exported, which would be overwritten."""
+    source = typed_path(str(asset.ply))
+    if any(typed_path(str(path)) == source for path in paths):
+        free = numbered(asset.ply.with_name(EXPORTS), first=1)
+        raise UserError(
+            f"output: expected another place than {shown(asset.ply)}, the file that is exported, got the same. "
+            f"Try: {setting_word('output', shown(free))}"
+        )
 
 
 def is_asset(cfg: DictConfig, output: Output) -> bool:
@@ -110,7 +135,7 @@ def entry_of(cfg: DictConfig, asset: Asset, output: Output) -> FileEntry:
 
 def degree_of(cfg: DictConfig, asset: Asset, output: Output) -> int:
     """Return the SH degree of a file of Gaussians."""
-    degree, largest = asset.gaussians.sh_degree, FORMATS.get(output.exporter, Format()).max_degree
+    degree, largest = asset.gaussians.sh_degree, FORMATS.get(output.exporter, OTHER).max_degree
     degree = degree if largest is None else min(degree, largest)
     padded = setting(cfg, output, "pad_sh")
     return max(degree, padded) if isinstance(padded, int) else degree

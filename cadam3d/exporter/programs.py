@@ -8,6 +8,18 @@ documents about itself. This module is the only place with such facts. ``docs/ex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from cadam3d.io.run_folder import (
+    ASSET,
+    ASSET_COMPRESSED_PLY,
+    ASSET_GLB,
+    ASSET_KSPLAT,
+    ASSET_MESH_GLB,
+    ASSET_SOG,
+    ASSET_SPLAT,
+    ASSET_SPZ,
+    VIEWER,
+)
+
 GLTF = "glTF 2.0, section 3.4: +Y is up"
 # Pairs of up axes that are half a turn apart.
 OPPOSITE = {("-y", "+y"), ("+y", "-y")}
@@ -31,6 +43,7 @@ class Program:
 class Format:
     """Properties of the files of one exporter."""
 
+    file: str  # its usual name
     max_degree: int | None = None  # largest SH degree that the format can hold; None = all
     loss: str = ""  # what is rounded or left out; "" if nothing is
     sh_loss: str = ""  # the same for SH degrees above 0, as a continuation of the sentence
@@ -108,27 +121,39 @@ PROGRAMS: tuple[Program, ...] = (
 )
 
 FORMATS: Mapping[str, Format] = {
-    "ply": Format(),
-    "compressed_ply": Format(
-        loss="rounds positions, scales and rotations to 10 or 11 bits, colours and opacities to 8",
-        sh_loss="and how colours change with the view to 8",
+    "ply": Format(
+        file=ASSET,
     ),
-    "splat": Format(max_degree=0, loss="rounds colours, opacities and rotations to 8 bits"),
+    "compressed_ply": Format(
+        file=ASSET_COMPRESSED_PLY,
+        loss="rounds positions, scales and rotations to 10 or 11 bits, colours and opacities to 8",
+        sh_loss="view-dependent colours to 8",
+    ),
+    "splat": Format(file=ASSET_SPLAT, max_degree=0, loss="rounds colours, opacities and rotations to 8 bits"),
     "spz": Format(
+        file=ASSET_SPZ,
         loss="rounds positions to 24 bits, rotations to 10, colours, opacities and scales to 8",
-        sh_loss="and how colours change with the view to 4 or 5",
+        sh_loss="view-dependent colours to 4 or 5",
     ),
     "glb": Format(
-        hint="needs a program that knows KHR_gaussian_splatting; for triangles type exporter=[mesh]"
+        file=ASSET_GLB,
+        hint="needs a program that knows KHR_gaussian_splatting; for triangles type exporter=[mesh]",
     ),
-    "sog": Format(loss="rounds positions to 16 bits, and the rest to code books of 256 values"),
-    "ksplat": Format(max_degree=2, loss="rounds colours and opacities to 8 bits"),
+    "sog": Format(
+        file=ASSET_SOG, loss="rounds positions to 16 bits, and the rest to code books of 256 values"
+    ),
+    "ksplat": Format(file=ASSET_KSPLAT, max_degree=2, loss="rounds colours and opacities to 8 bits"),
     "mesh": Format(
+        file=ASSET_MESH_GLB,
         loss="a closed surface in place of Gaussians",
-        sh_loss="without how colours change with the view",
+        sh_loss="without view-dependent colours",
     ),
-    "html": Format(hint="opens in any browser, without a network"),
+    "html": Format(file=VIEWER, hint="opens in any browser, without a network"),
 }
+
+
+# Files of an exporter from elsewhere.
+OTHER = Format(file="")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,10 +209,10 @@ def judge(exporter: str, up: str) -> Verdict:
 
 def loss_of(exporter: str, sh_degree: int) -> str:
     """Return what a file of ``exporter`` loses of Gaussians with SH degree ``sh_degree``; "" if nothing."""
-    format_ = FORMATS.get(exporter, Format())
+    format_ = FORMATS.get(exporter, OTHER)
     return ", ".join(part for part in (format_.loss, format_.sh_loss if sh_degree else "") if part)
 
 
 def hint_of(exporter: str) -> str:
     """Return what else to know about a file of ``exporter``; "" if nothing."""
-    return FORMATS.get(exporter, Format()).hint
+    return FORMATS.get(exporter, OTHER).hint

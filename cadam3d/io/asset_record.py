@@ -33,6 +33,7 @@ from cadam3d.io.run_folder import ASSET_RECORD, CONFIG, numbered, shown
 SCHEMA = 1
 LONGEST_TEXT = 10_000  # characters of a prompt
 LONGEST_NAME = 255  # bytes of a file name
+LONGEST_WORD = 100  # characters of a format or a hash
 MOST_FILES = 1000
 CHUNK_BYTES = 1 << 20
 # Entries of the record, and the names under which a summary has them.
@@ -78,10 +79,11 @@ class FileEntry:
 class Source:
     """The asset that was exported."""
 
-    file: Path
-    run: Path | None  # the folder of its run
+    name: str
+    sha256: str
     gaussians: int
     sh_degree: int
+    run: Path | None  # the folder of its run
 
 
 def sha256_of(path: Path) -> str:
@@ -114,12 +116,7 @@ def write_record(
     Raises ``UserError`` if a file cannot be read or written.
     """
     path = folder / ASSET_RECORD
-    read = {
-        "name": source.file.name,
-        "sha256": sha256_of(source.file),
-        "gaussians": source.gaussians,
-        "sh_degree": source.sh_degree,
-    }
+    read = {name: getattr(source, name) for name in ("name", "sha256", "gaussians", "sh_degree")}
     files = {entry.name: asdict(entry) for entry in entries}
     before = _read(path) or {}
     if before.get("source", {}).get("sha256") == read["sha256"]:
@@ -180,10 +177,11 @@ def _is_entry(entry: Any) -> bool:
     names = FileEntry.__dataclass_fields__
     if not isinstance(entry, dict) or entry.keys() != names.keys():
         return False
-    name, frame = entry["name"], entry["frame"]
+    name, frame, words = entry["name"], entry["frame"], (entry["format"], entry["sha256"])
     counts = [entry[key] for key in ("sh_degree", "gaussians", "triangles")]
     return (
-        all(isinstance(entry[key], str) for key in ("name", "format", "sha256"))
+        isinstance(name, str)
+        and all(isinstance(word, str) and len(word) <= LONGEST_WORD for word in words)
         and is_whole(entry["bytes"])
         and all(count is None or is_whole(count) for count in counts)
         and (frame is None or any(frame == asdict(Frame.of(up)) for up in UPS))

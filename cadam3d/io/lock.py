@@ -111,12 +111,15 @@ def taking_turns(folder: Path, on_wait: Callable[[], None]) -> Iterator[None]:
     """Wait until no other process holds ``folder`` in this way, and hold it while the block runs.
 
     The lock belongs to the folder itself, so it leaves no file. ``on_wait`` is called before a wait. Without
-    locks on folders, as on Windows, the block runs at once.
+    locks on folders, as on Windows, or if the folder cannot be opened, the block runs at once.
     """
-    if fcntl is None:
+    try:
+        descriptor = None if fcntl is None else os.open(folder, os.O_RDONLY)
+    except OSError:
+        descriptor = None
+    if fcntl is None or descriptor is None:
         yield
         return
-    descriptor = os.open(folder, os.O_RDONLY)
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

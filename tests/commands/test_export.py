@@ -105,6 +105,7 @@ def test_a_second_export_keeps_the_entries_of_unchanged_files_only(run_folder, t
         entry | {"name": name} for name in ("kept.ply", "changed.ply", "gone.ply", "link.ply")
     ]
     record["files"] += [entry | {"name": "../asset.ply"}, entry | {"up": "-y"}, 5, {"name": "kept.ply"}]
+    record["files"] += [entry | {"name": "kept.ply", "format": "x" * 1000}]
     write_json(folder / "asset.json", record)
     (folder / "changed.ply").write_bytes(b"another file")
     (folder / "gone.ply").unlink()
@@ -139,6 +140,18 @@ def test_an_asset_json_of_another_origin_is_never_overwritten(content, run_folde
     )
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["asset.json"]
     assert (tmp_path / "mine/asset.json").read_text() == content
+
+
+@pytest.mark.parametrize("output", ["a run", "a run/", "a run/asset.ply", "a run/../a run/asset.ply"])
+def test_the_exported_file_itself_is_never_overwritten(output, run_folder, type_line):
+    before = (run_folder / "asset.ply").read_bytes()
+    message = type_line("export", f"run={run_folder}", f"output={output}", "exporter.ply.up=+z").message
+    assert message == (
+        "output: expected another place than a run/asset.ply, the file that is exported, got the same. "
+        "Try: 'output=a run/exports'"
+    )
+    assert (run_folder / "asset.ply").read_bytes() == before
+    assert type_line("export", f"run={run_folder}", f"output={output[:5]}", "exporter=[splat]").code == 0
 
 
 def test_a_run_of_a_stranger_adds_nothing_but_short_texts_and_counts(run_folder, type_line):
@@ -385,7 +398,7 @@ def test_a_program_shows_a_file_in_one_way(exporter):
 
 def test_only_what_an_asset_has_can_be_lost():
     assert not loss_of("ply", 3)
-    assert loss_of("spz", 1) == loss_of("spz", 0) + ", and how colours change with the view to 4 or 5"
+    assert loss_of("spz", 1) == loss_of("spz", 0) + ", view-dependent colours to 4 or 5"
     assert not loss_of("an exporter from elsewhere", 3)
 
 
