@@ -101,7 +101,7 @@ def require_apart(asset: Asset, paths: Sequence[Path]) -> None:
     if any(typed_path(str(path)) == source for path in paths):
         free = numbered(asset.ply.with_name(EXPORTS), first=1)
         raise UserError(
-            f"output: expected another place than {shown(asset.ply)}, the file that is exported, got the same. "
+            f"output: expected another place than {shown(asset.ply)}, which is exported, got the same. "
             f"Try: {setting_word('output', shown(free))}"
         )
 
