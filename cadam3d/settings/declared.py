@@ -6,6 +6,7 @@ elsewhere too. The ranges of the values belong to the constructors.
 
 import difflib
 import inspect
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import is_dataclass
@@ -29,6 +30,7 @@ TARGET = "_target_"
 LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 # Integers beyond this fit into no tensor.
 LARGEST_WHOLE = 2**63 - 1
+CALL = re.compile(r"\$\{[\w.]+:")  # an interpolation that calls a function
 # Control characters that a text may have.
 BLANKS = "\n\t\r"
 # The settings outside of all components, over all commands.
@@ -267,7 +269,9 @@ def _known_values(folder: Path) -> dict[tuple[str, str], Any]:
     for path in sorted(folder.rglob("*.yaml")):
         for node in _nodes(yaml.load(path.read_text(encoding="utf-8"), LOADER)):
             for name, value in node.items():
-                known.setdefault((str(node.get(TARGET)), name), value)
+                # A call such as ${oc.select:prompt,null} is not a value that a user types.
+                if not CALL.search(str(value)):
+                    known.setdefault((str(node.get(TARGET)), name), value)
     return known
 
 

@@ -6,7 +6,7 @@ a folder only what an honest run leaves there:
 - A ``_target_`` must be one that the YAML files of this call (those of the package and of ``--config-dir``)
   name for the same place. Schedules may be anywhere inside a component.
 - An override must change a setting of training. Nothing from a folder reaches Hydra's own settings.
-- An interpolation may refer to other settings and call ``slug``, ``span`` and ``oc.select``, which read them.
+- An interpolation may refer to other settings and call ``slug`` and ``span``, which compute from them.
 - Folders of caches are never taken from a run, because compiled kernels are loaded from there.
 - Everything in the folder is a file, a folder, or a link that stays inside, because a command writes there.
 
@@ -45,7 +45,7 @@ CACHE = "cache_dir"
 # Characters of all overrides of a run. Hydra's parser needs a second for a thousand brackets.
 LONGEST = 10_000
 # Groups that change how commands run, not what a run computes.
-MACHINERY = ("hydra", "launcher", "grid")
+MACHINERY = ("hydra", "launcher", "grid", "for")
 # Settings of a line that a later line does not repeat.
 NOT_REPEATED = ("trust", "grid", "launcher")
 PLAIN_NAMES = f"names without an underscore in front, except {TARGET}"
@@ -57,7 +57,7 @@ OVERRIDE = re.compile(r"(?:\+{0,2}|~)([^=+~]*)(?:=.*)?", re.DOTALL)
 PACKAGE = re.compile(r"#\s*@package\s+(\S+)")
 REFERENCE = re.compile(r"\$\{([\w.]+)\}", re.ASCII)
 # An interpolation without another one inside it, of the kinds that only read other settings.
-HARMLESS = re.compile(r"\$\{(?:[\w.]+|(?:slug|span|oc\.select):[^${}]*)\}", re.ASCII)
+HARMLESS = re.compile(r"\$\{(?:[\w.]+|(?:slug|span):[^${}]*)\}", re.ASCII)
 INTERPOLATION = re.compile(r"(?<!\\)(?:\\\\)*\$\{")
 SCHEDULES = frozenset(
     f"{kind.__module__}.{kind.__qualname__}"
