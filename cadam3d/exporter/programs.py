@@ -57,7 +57,7 @@ PROGRAMS: tuple[Program, ...] = (
     Program(
         name="SuperSplat",
         version="splat-transform 3.7.0",
-        upright={"ply": "-y", "compressed_ply": "-y", "splat": "-y", "spz": "-y"},
+        upright=dict.fromkeys(("ply", "compressed_ply", "splat", "spz", "sog", "ksplat"), "-y"),
         is_measured=True,
         source="github.com/playcanvas/supersplat/issues/451: PLY files are turned by 180 degrees about z",
         target="supersplat",
@@ -73,7 +73,7 @@ PROGRAMS: tuple[Program, ...] = (
     Program(
         name="Spark",
         version="2.2.0",
-        upright={"ply": "+y", "compressed_ply": "+y", "splat": "+y", "spz": "+y"},
+        upright=dict.fromkeys(("ply", "compressed_ply", "splat", "spz", "sog", "ksplat"), "+y"),
         is_measured=True,
         source="SplatMesh shows the numbers of the file unchanged, in the +y up world of three.js",
         target="spark",
@@ -81,25 +81,27 @@ PROGRAMS: tuple[Program, ...] = (
     Program(
         name="three.js",
         version="r187",
-        upright={"ply": "+y", "splat": "+y", "spz": "+y", "glb": "+y", "mesh": "+y"},
+        upright=dict.fromkeys(("ply", "splat", "spz", "ksplat", "glb", "mesh"), "+y"),
         is_measured=True,
         source="addons of the core",
         target="three",
     ),
     Program(
         name="Babylon.js",
-        version="November 2026",
-        upright={"glb": "+y", "mesh": "+y"},
-        is_measured=False,
-        source="doc.babylonjs.com/features/featuresDeepDive/mesh/gaussianSplatting; " + GLTF,
+        version="9.28.0",
+        # In its usual left-handed scenes. In a right-handed one, only glb is not mirrored.
+        upright={"ply": "-y", "compressed_ply": "-y", "splat": "-y", "glb": "+y", "mesh": "+y"},
+        is_measured=True,
+        source="AppendSceneAsync with default settings; the mesh: " + GLTF,
         target="babylon",
     ),
     Program(
         name="PlayCanvas",
-        version="November 2026",
-        upright={"glb": "+y", "mesh": "+y"},
-        is_measured=False,
-        source="developer.playcanvas.com/user-manual/gaussian-splatting/formats/glb; " + GLTF,
+        version="engine 2.23.3",
+        # The engine shows the numbers of a file unchanged; only SuperSplat turns them.
+        upright={"ply": "+y", "compressed_ply": "+y", "sog": "+y", "glb": "+y", "mesh": "+y"},
+        is_measured=True,
+        source="assets of the types gsplat and container; the mesh: " + GLTF,
         target="playcanvas",
     ),
     Program(

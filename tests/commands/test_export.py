@@ -254,12 +254,18 @@ def test_every_target_is_a_program_with_known_axes():
 
 @pytest.mark.parametrize(
     ("module", "name"),
-    [("test_splat_transform", "SuperSplat"), ("test_spark", "Spark"), ("test_three", "three.js")],
+    [
+        ("test_babylon", "Babylon.js"),
+        ("test_playcanvas", "PlayCanvas"),
+        ("test_spark", "Spark"),
+        ("test_splat_transform", "SuperSplat"),
+        ("test_three", "three.js"),
+    ],
 )
 def test_the_table_states_what_the_tests_with_other_programs_measure(module, name):
     [program] = [program for program in PROGRAMS if program.name == name]
     assert program.is_measured
-    measured = {case.format: case.upright for case in import_module(f"programs.{module}").CASES}
+    measured = {case.exporter: case.upright for case in import_module(f"programs.{module}").CASES}
     assert measured
     assert measured.items() <= program.upright.items()
 

@@ -36,7 +36,7 @@ FORMATS = {
     "spz": Format(".spz", write_spz),
     "spz4": Format(".spz", write_spz4),
     "sog": Format(".sog", write_sog),
-    "ksplat": Format(".ksplat", write_ksplat),
+    "ksplat": Format(".ksplat", write_ksplat, max_degree=2),
     "glb": Format(".glb", write_glb),
 }
 
@@ -45,13 +45,18 @@ FORMATS = {
 class Case:
     """A file of one format and SH degree in a program that shows it upright if its up axis is ``upright``."""
 
-    format: str
+    format: str  # one of FORMATS
     degree: int
     upright: str
     floor_db: float  # PSNR against our own render of the object
 
     def __str__(self) -> str:
         return f"{self.format}-sh{self.degree}"
+
+    @property
+    def exporter(self) -> str:
+        """Return the name of the exporter; ``spz4`` is ``exporter=spz`` with ``version=4``."""
+        return self.format.removesuffix("4")
 
     def write(self, folder: Path, up: str) -> Path:
         """Write the object with the up axis ``up`` and return the path of the file."""

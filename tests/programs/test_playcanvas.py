@@ -6,8 +6,8 @@ from programs.render_elsewhere import Browser
 
 pytestmark = [pytest.mark.oracle, pytest.mark.slow]
 
-# The engine shows the numbers of every file unchanged in a world with +y up. SuperSplat, which is built on it,
-# turns them by half a turn first. Like three.js, it cuts the faint ends of Gaussians off.
+# The engine shows the numbers of every file unchanged in a world with +y up. SuperSplat, which is built on
+# it, turns them by half a turn first. Like three.js, the engine cuts the faint ends of Gaussians off.
 CASES = [
     Case("ply", 0, "+y", 35),
     Case("ply", 3, "+y", 35),
