@@ -16,18 +16,18 @@ def browser():
         yield started
 
 
-@pytest.mark.parametrize(
-    ("target", "page", "options", "floor_db"),
-    [
-        ("babylon", "babylon.html", {}, 38),
-        ("playcanvas", "playcanvas.html", {}, 35),
-        ("spark", "spark.html", {}, 38),
-        ("three", "three.html", {"colours": "linear"}, 30),
-    ],
-)
-def test_the_file_for_a_program_is_upright_there(
-    browser, target, page, options, floor_db, type_line, tmp_path
-):
+# For each program its page, the options of the page, and the floor of the PSNR in dB.
+PAGES = {
+    "babylon": ("babylon.html", {}, 38),
+    "playcanvas": ("playcanvas.html", {}, 35),
+    "spark": ("spark.html", {}, 38),
+    "three": ("three.html", {"colours": "linear"}, 30),
+}
+
+
+@pytest.mark.parametrize("target", PAGES)
+def test_the_file_for_a_program_is_upright_there(browser, target, type_line, tmp_path):
+    page, options, floor_db = PAGES[target]
     [path] = export_for(target, type_line, tmp_path)
     picture = browser.picture(page, path, VIEW, **options)
     assert_equal(picture, ours(snowman_and_pine(3), VIEW), floor_db, path)
