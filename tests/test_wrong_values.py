@@ -73,6 +73,7 @@ WHOLE = {
         "exporter.turntable.fps",
     ],
     "exporter=[ply]": ["exporter.ply.pad_sh"],
+    "exporter=[spz]": ["exporter.spz.version"],
     "metric=[fidelity]": ["metric.fidelity.views", "metric.fidelity.size"],
     "callback=[metrics]": ["callback.metrics.every"],
     "callback=[previews]": ["callback.previews.every", "callback.previews.views", "callback.previews.size"],

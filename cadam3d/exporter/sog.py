@@ -1,4 +1,4 @@
-"""SogExporter: the asset as SOG of PlayCanvas, the smallest format."""
+"""SogExporter: the asset as SOG, PlayCanvas's compressed format for the web."""
 
 from dataclasses import dataclass
 from pathlib import Path

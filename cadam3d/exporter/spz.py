@@ -1,4 +1,4 @@
-"""SpzExporter: the asset as an SPZ file of Niantic, a tenth of the size of a PLY."""
+"""SpzExporter: the asset as an SPZ file of Niantic, compressed and widely read."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -29,6 +29,7 @@ Sources: the metadata of gaussforge 0.6.0 on pypi.org, and comparisons of its fi
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,6 +55,15 @@ def require_gaussforge(key: str) -> None:
         raise UserError(
             f"{key}: needs {PACKAGE}, which is not installed. Try: pip install 'cadam3d[formats]'"
         )
+
+
+def _imported(key: str) -> Any:
+    require_gaussforge(key)
+    try:
+        return import_module(PACKAGE)
+    except ImportError as error:
+        problem = f"{key}: {PACKAGE} is installed but cannot be imported ({error})"
+        raise UserError(f"{problem}. Try: pip install --force-reinstall {PACKAGE}") from error
 
 
 def write_sog(path: Path, gaussians: Gaussians, *, up: str) -> None:
@@ -85,9 +95,8 @@ def write_spz4(path: Path, gaussians: Gaussians, *, up: str) -> None:
 
 
 def _write(path: Path, gaussians: Gaussians, *, up: str, kind: str) -> None:
-    require_gaussforge(f"exporter.{kind}")
     if not len(gaussians) and kind != "spz":
-        raise UserError(f"{path}: expected at least one Gaussian, which {kind} requires. Try: exporter=[ply]")
+        raise UserError(f"{path}: expected a Gaussian, which {kind} requires. Try: 'exporter=[ply]'")
     local = in_file_axes(gaussians, up)
     sh = local.sh.clamp(-LARGEST_SH, LARGEST_SH)
     rest = sh[:, 1:]
@@ -104,10 +113,10 @@ def _write(path: Path, gaussians: Gaussians, *, up: str, kind: str) -> None:
         "extras": {},
         "meta": {"shDegree": round((rest.shape[1] + 1) ** 0.5) - 1, "sourceFormat": "ply"},
     }
-    result = import_module(PACKAGE).GaussForge().write(cloud, kind, spz_version=4)
+    result = _imported(f"exporter.{kind}").GaussForge().write(cloud, kind, spz_version=4)
     if "error" in result:
         reason = str(result["error"])
-        raise UserError(f"{path}: gaussforge cannot write it ({reason}). Try: exporter=[ply]")
+        raise UserError(f"{path}: gaussforge cannot write it ({reason}). Try: 'exporter=[ply]'")
     with replacing(path) as temporary:
         temporary.write_bytes(result["data"])
 

@@ -66,7 +66,7 @@ def write_glb(path: Path, gaussians: Gaussians, *, up: str) -> None:
     if length > LARGEST_FILE:
         raise UserError(
             f"{path}: expected at most {LARGEST_FILE:,} bytes, which is the limit of glb, got {length:,}. "
-            "Try: exporter=[ply]"
+            "Try: 'exporter=[ply]'"
         )
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(HEADER.pack(b"glTF", 2, length))

@@ -90,7 +90,7 @@ def test_a_missing_package_is_reported_before_anything_runs(monkeypatch, name, s
 @pytest.mark.parametrize(
     ("name", "highest"), [("asset.splat", 0), ("asset.ksplat", 2), ("asset.spz", 3), ("asset.glb", 3)]
 )
-def test_what_a_format_cannot_hold_is_said(name, highest):
+def test_what_a_format_cannot_hold_becomes_a_note(name, highest):
     for degree in range(4):
         omission = built(name).omission(random_gaussians(2, degree=degree))
         assert (omission is None) == (degree <= highest)

@@ -94,7 +94,7 @@ def test_the_same_gaussians_give_the_same_bytes(tmp_path, kind):
 
 @pytest.mark.parametrize("kind", ["sog", "ksplat"])
 def test_no_gaussians_are_one_message(tmp_path, kind):
-    with pytest.raises(UserError, match=rf"at least one Gaussian, which {kind} requires"):
+    with pytest.raises(UserError, match=rf"expected a Gaussian, which {kind} requires"):
         WRITERS[kind](tmp_path / "a", random_gaussians(0), up="-y")
     assert not list(tmp_path.iterdir())
 
@@ -113,3 +113,15 @@ def test_without_the_package_the_message_names_the_extra(tmp_path, monkeypatch, 
     message = rf"exporter\.{kind}: needs gaussforge, which is not installed\. {hint}"
     with pytest.raises(UserError, match=message):
         WRITERS[kind](tmp_path / "a", random_gaussians(3), up="-y")
+
+
+def test_a_broken_installation_is_one_message(tmp_path, monkeypatch):
+    def fails(name):
+        raise ImportError("no symbol")
+
+    monkeypatch.setattr(gaussforge, "import_module", fails)
+    message = (
+        r"^exporter\.sog: gaussforge is installed but cannot be imported \(no symbol\)\. Try: pip install "
+    )
+    with pytest.raises(UserError, match=message):
+        write_sog(tmp_path / "a", random_gaussians(3), up="-y")
