@@ -71,14 +71,11 @@ class MeshMetric(SurfaceSettings, Metric):
             to_true, to_mesh = distances_between(
                 (surface.vertices, surface.faces), (vertices, faces), self.samples, self.seed
             )
-            precision, recall = (
-                float((to_true <= self.threshold).mean()),
-                float((to_mesh <= self.threshold).mean()),
-            )
+            score, precision, recall = f_score(to_true, to_mesh, self.threshold)
             results.append(
                 {
                     "mesh_chamfer": float((to_true.mean() + to_mesh.mean()) / 2),
-                    "mesh_fscore": 2 * precision * recall / max(precision + recall, 1e-12),
+                    "mesh_fscore": score,
                     "mesh_precision": precision,
                     "mesh_recall": recall,
                 }
@@ -99,6 +96,15 @@ def true_surfaces(distance: Callable[[Tensor], Tensor]) -> list[Triangles]:
         vertices, faces = outer_shell(inside.clamp(-1, 1))
         found.append(((vertices + 0.5) * CELL - 1, faces))
     return found
+
+
+def f_score(
+    to_true: Float[np.ndarray, "a"], to_mesh: Float[np.ndarray, "b"], threshold: float
+) -> tuple[float, float, float]:
+    """Return F-score, precision and recall for the distances of both directions (see :class:`MeshMetric`)."""
+    precision, recall = float((to_true <= threshold).mean()), float((to_mesh <= threshold).mean())
+    total = precision + recall
+    return (2 * precision * recall / total if total > 0 else 0.0), precision, recall
 
 
 def _sampled(distance: Callable[[Tensor], Tensor]) -> Float[Tensor, "x y z"]:

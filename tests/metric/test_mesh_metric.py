@@ -44,9 +44,10 @@ def never_renders(cameras, background):
 
 
 def gaussian_ball() -> Gaussians:
-    means = torch.nn.functional.normalize(
-        torch.randn(800, 3, generator=torch.Generator().manual_seed(0)), dim=1
-    )
+    index = torch.arange(800) + 0.5
+    z, angle = 1 - index / 400, math.pi * (1 + math.sqrt(5)) * index
+    across = (1 - z * z).sqrt()
+    means = torch.stack([across * angle.cos(), across * angle.sin(), z], dim=1)  # evenly on a sphere
     return Gaussians(
         means=0.5 * means,
         log_scales=torch.full((800, 3), math.log(0.02)),
