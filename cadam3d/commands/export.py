@@ -11,7 +11,7 @@ from cadam3d.commands.asset import Asset, Output, export_all, open_asset, write_
 from cadam3d.commands.messages import note
 from cadam3d.core.errors import UserError
 from cadam3d.core.surface import SurfaceFacts
-from cadam3d.exporter.programs import FORMATS, OTHER, Program, hint_of, judge, loss_of
+from cadam3d.exporter.programs import FORMATS, OTHER, hint_of, judge, loss_of
 from cadam3d.io.asset_record import (
     FileEntry,
     Frame,
@@ -158,7 +158,7 @@ def described(cfg: DictConfig, asset: Asset, output: Output) -> list[str]:
         parts.append(f"{up} up")
         views = views_in_words(kind_of(cfg, output), str(up))
     notes = [loss_of(output.exporter, asset.gaussians.sh_degree), hint_of(output.exporter)]
-    return [", ".join(parts), *(INDENT + text for text in ("; ".join(views), *notes) if text)]
+    return [", ".join(parts), *(INDENT + text for text in (*views, *notes) if text)]
 
 
 def kind_of(cfg: DictConfig, output: Output) -> str:
@@ -168,22 +168,14 @@ def kind_of(cfg: DictConfig, output: Output) -> str:
 
 
 def views_in_words(exporter: str, up: str) -> list[str]:
-    """Return in which programs a file is upright, and in which it is not, with the ``for=`` that helps."""
+    """Return in which programs a file is upright, and in which upside down (with the ``for=`` that helps)."""
     verdict = judge(exporter, up)
     groups = (
-        ("upright in", verdict.upright, False),
-        ("upside down in", verdict.upside_down, True),
-        ("on its side in", verdict.on_its_side, True),
+        ("upright in", [program.name for program in verdict.upright]),
+        ("upside down in", [f"{program.name} (for={program.target})" for program in verdict.upside_down]),
+        ("on its side in", [program.name for program in verdict.on_its_side]),
     )
-    return [f"{words} {listed(programs, is_wrong)}" for words, programs, is_wrong in groups if programs]
-
-
-def listed(programs: Sequence[Program], is_wrong: bool) -> str:
-    """Return the names of programs, each with its ``for=`` if the file is wrong there."""
-    return ", ".join(
-        f"{program.name} (for={program.target})" if is_wrong and program.target else program.name
-        for program in programs
-    )
+    return [f"{words} {', '.join(names)}" for words, names in groups if names]
 
 
 def size_in_words(size: int) -> str:

@@ -1,13 +1,15 @@
 """Density: the sum of the opacities of Gaussians on a grid, and the Gaussians near given points.
 
-The density at x is ``sum_i o_i exp(-d_i(x)^2 / 2)``, with the opacity ``o_i`` and the Mahalanobis distance ``d_i`` of
-each Gaussian. A Gaussian ends at ``d_i = CUTOFF``. Every Gaussian is blurred by ``BLUR`` cells without a change of its
-opacity, so that one that is thinner than a cell still reaches a node of the grid, and a thin wall has no holes.
+The density at x is ``sum_i o_i exp(-d_i(x)^2 / 2)``, with the opacity ``o_i`` and the Mahalanobis distance
+``d_i`` of each Gaussian. A Gaussian ends at ``d_i = CUTOFF``. Every Gaussian is blurred by ``BLUR`` cells
+without a change of its opacity, so that one that is thinner than a cell still reaches a node of the grid, and
+a thin wall has no holes.
 
-The work is done in columns: the nodes that a Gaussian reaches are intervals along z, one for each (x, y) of its
-bounding box, and the ends of each interval follow from the conditional mean and variance of z. The memory is therefore
-bounded, however many Gaussians there are, and a long, thin Gaussian costs no more than the nodes that it covers.
-Gaussians that are large in all directions are added to coarser grids, which are then interpolated.
+The work is done in columns: the nodes that a Gaussian reaches are intervals along z, one for each (x, y) of
+its bounding box, and the ends of each interval follow from the conditional mean and variance of z. The memory
+is therefore bounded, however many Gaussians there are, and a long, thin Gaussian costs no more than the nodes
+that it covers. Gaussians that are large in all directions are added to coarser grids, which are then
+interpolated.
 """
 
 import math
@@ -22,8 +24,9 @@ from cadam3d.core.gaussians import Gaussians
 
 CUTOFF = 3.0  # standard deviations
 BLUR = 0.5  # cells, standard deviation
-# A grid has LEVELS coarser ones, each with half as many cells. A Gaussian belongs to the coarsest one on which its
-# smallest standard deviation is at least COARSE cells; the error of linear interpolation is then below one percent.
+# A grid has LEVELS coarser ones, each with half as many cells. A Gaussian belongs to the coarsest one on
+# which its smallest standard deviation is at least COARSE cells; the error of linear interpolation is then
+# below one percent.
 LEVELS = 3
 COARSE = 4.0  # cells
 # Numbers per temporary array; this bounds the memory.
@@ -36,7 +39,7 @@ LARGEST = 1e30  # world units
 
 @dataclass(frozen=True)
 class Grid:
-    """Nodes at ``origin + cell * (i, j, k)``; the number of cells along each axis is a multiple of 2**LEVELS."""
+    """Nodes at ``origin + cell * (i, j, k)``; each axis has a multiple of 2**LEVELS cells."""
 
     origin: Float[Tensor, "3"]  # float64, world units
     cell: float  # world units
@@ -54,7 +57,7 @@ class Grid:
 
 
 def grid_around(low: Float[Tensor, "3"], high: Float[Tensor, "3"], resolution: int) -> Grid:
-    """Return the grid around a box, with ``resolution`` cells along its longest side and a margin of two cells."""
+    """Return a grid with ``resolution`` cells along the longest side of a box and its margin of two cells."""
     low, high = low.double(), high.double()
     cell = max(float((high - low).max()) / max(resolution - 4, 1), 1e-30)
     unit = 2**LEVELS
@@ -83,7 +86,7 @@ class Blobs:
         return CUTOFF * self.covariances.diagonal(dim1=1, dim2=2).sqrt()
 
     def area(self) -> Float[Tensor, "n"]:
-        """Return a rough measure of the area that each one covers, times its opacity, in world units squared."""
+        """Return a rough measure of the area of each one, times its opacity, in world units squared."""
         return self.opacities * self.covariances.diagonal(dim1=1, dim2=2).sum(1)
 
 
@@ -211,7 +214,7 @@ def _expand(lengths: Int[Tensor, "r"]) -> tuple[Int[Tensor, "e"], Int[Tensor, "e
 def near(
     some: Blobs, grid: Grid, points: Float[Tensor, "p 3"]
 ) -> Iterator[tuple[Int[Tensor, "pairs"], Int[Tensor, "pairs"]]]:
-    """Yield pairs (blob, point), such that the blurred Gaussian reaches the node of the grid nearest to the point.
+    """Yield pairs (blob, point) in which the blurred Gaussian reaches the node nearest to the point.
 
     All pairs of a point are in the same batch. Points outside the grid count as on its border.
     """

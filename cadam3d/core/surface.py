@@ -1,13 +1,13 @@
 """Surface: a closed triangle mesh around Gaussians, coloured like their renders.
 
-The surface is where the density (``density.py``) has a given level, found by marching cubes (Lorensen and Cline 1987, in
-the variant of Lewiner et al. 2003). Only the outer shell is kept: whatever cannot be reached from outside is filled
-before the cubes are marched. Small separate parts are removed, and the rest is simplified with quadric errors (Garland
-and Heckbert 1997) as far as it stays watertight.
+The surface is where the density (``density.py``) has a given level, found by marching cubes (Lorensen and
+Cline 1987, in the variant of Lewiner et al. 2003). Only the outer shell is kept: whatever cannot be reached
+from outside is filled before the cubes are marched. Small separate parts are removed, and the rest is
+simplified with quadric errors (Garland and Heckbert 1997) as far as it stays watertight.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -21,7 +21,8 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import require_memory
 from cadam3d.core.sh import evaluate_sh
 
-# The extent of the object is found on coarse grids, blurred by a whole cell, so that nothing is missed between nodes.
+# The extent of the object is found on coarse grids, blurred by a whole cell, so that nothing is missed
+# between nodes.
 EXTENT_RESOLUTION = 48
 EXTENT_BLUR = 1.0  # cells
 EXTENT_LEVEL = 0.5  # share of the level that a node next to the surface has at least
@@ -30,13 +31,13 @@ SHRINKS = 0.75
 EXTENT_PASSES = 40
 # Bytes per node of the grid, for the density, the labels and marching cubes.
 NODE_BYTES = 24
-# Densities are clipped to this factor below and above the level before their logarithm is interpolated.
-MOST_CONTRAST = 20.0
-# Heights closer to zero are moved away from it, in cells or in logarithms of the density.
+# Heights closer to zero are moved away from it.
 LEAST_HEIGHT = 1e-3
 # A simplification that is not watertight is repeated with these settings, and then with more triangles.
 AGGRESSIVENESS = (7.0, 5.0, 4.0, 8.0)
 MORE_TRIANGLES = 1.3
+# Copies of a vertex move towards the triangles around them by this share of the way.
+APART = 0.02
 # The opacity of a single Gaussian in the colour of a point, at most, as in the rasterizers.
 MOST_OPAQUE = 0.99
 COLORS_AT_ONCE = 1 << 18
@@ -99,9 +100,7 @@ class SurfaceSettings:
         """
         some = blobs(gaussians)
         grid = grid_around(*self._extent(some), self.resolution)
-        # Between two nodes, the logarithm of the density is closer to a line than the density is.
-        contrast = (density(some, grid) / self.level).clamp(1 / MOST_CONTRAST, MOST_CONTRAST)
-        vertices, faces = outer_shell(contrast.log())
+        vertices, faces = outer_shell(density(some, grid) / self.level - 1)
         if len(faces) == 0:
             raise self._nothing(some)
         vertices = vertices * grid.cell + grid.origin.numpy()
@@ -115,8 +114,8 @@ class SurfaceSettings:
     def _extent(self, some: Blobs) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
         """Return the corners of a box around everything except specks.
 
-        The first box holds all Gaussians. Far away or huge faint ones can make it much larger than the object, so it
-        shrinks to what is dense in it, until it hardly changes.
+        The first box holds all Gaussians. Far away or huge faint ones can make it much larger than the
+        object, so it shrinks to what is dense in it, until it hardly changes.
         """
         if len(some.rows) == 0:
             raise self._nothing(some)
@@ -139,17 +138,16 @@ class SurfaceSettings:
     def _nothing(self, some: Blobs) -> UserError:
         """Return the error for an asset without a surface."""
         key = f"{self.node}.level"
-        group, _, name = self.node.partition(".")
         if len(some.rows) == 0:
-            other = {"exporter": "exporter=[ply]"}.get(group, f"{group}=[size]")
+            line = "exporter=[ply]" if self.node.startswith("exporter.") else "metric=[size]"
             return UserError(
-                f"{self.node}: expected an asset with a surface, got one in which no Gaussian is visible. Try: {other}"
+                f"{self.node}: expected an asset with a surface, got no visible Gaussian. Try: {line}"
             )
         # Between the nodes of the grid, the density may be up to five times higher than at them.
         reached = float(f"{float(some.opacities.max()) / 5:.1g}")
         return UserError(
-            f"{key}: expected a level that the density of the asset reaches, got {self.level:g}, which it reaches "
-            f"nowhere. Try: {key}={min(reached, self.level / 2):g}"
+            f"{key}: expected a level that the density of the asset reaches, got {self.level:g}, "
+            f"which it reaches nowhere. Try: {key}={min(reached, self.level / 2):g}"
         )
 
 
@@ -158,12 +156,10 @@ def _large_regions(
 ) -> Int[np.ndarray, "k 3"]:
     """Return the nodes of all connected regions except specks.
 
-    The sizes of regions are compared by the area of the Gaussians whose centres are in them, because a region that is
-    only a few cells large has no other measure.
+    The sizes of regions are compared by the area of the Gaussians whose centres are in them, because a region
+    that is only a few cells large has no other measure.
     """
-    from scipy import ndimage  # slow to import
-
-    labels, count = ndimage.label(is_dense)
+    labels, count = _labelled(is_dense)
     if count <= 1:
         return np.argwhere(is_dense)
     node = ((some.means - grid.origin) / grid.cell).round()
@@ -178,20 +174,19 @@ def _large_regions(
 def outer_shell(
     height: Float[Tensor, "x y z"],
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """Return the closed surface, in units of nodes, where ``height`` is 0 between inside (> 0) and outside (< 0).
+    """Return the closed surface, in units of nodes, between inside (``height`` > 0) and outside (< 0).
 
-    Nodes on the border of the grid count as outside. Hollows without a way out are filled. There are no triangles if
-    nothing is inside.
+    Nodes on the border of the grid count as outside. Hollows without a way out are filled. There are no
+    triangles if nothing is inside.
     """
-    from scipy import ndimage
-    from skimage.measure import marching_cubes  # both are slow to import
+    from skimage.measure import marching_cubes  # slow to import
 
     values = height.numpy().astype(np.float32)
     for axis in range(3):
         border = np.moveaxis(values, axis, 0)
         border[0] = border[-1] = np.minimum(border[[0, -1]], -LEAST_HEIGHT).min()
     is_empty = values < 0
-    labels, _ = ndimage.label(is_empty)
+    labels, _ = _labelled(is_empty)
     values[is_empty & (labels != labels[0, 0, 0])] = 1.0
     # A node exactly on the surface would collapse the triangles around it to a point.
     values[np.abs(values) < LEAST_HEIGHT] = LEAST_HEIGHT
@@ -202,10 +197,18 @@ def outer_shell(
     return vertices.astype(np.float64), faces[:, ::-1].astype(np.int64)
 
 
+def _labelled(mask: Bool[np.ndarray, "x y z"]) -> tuple[Int[np.ndarray, "x y z"], int]:
+    """Return the number of the region of each node, 0 where the mask is False, and the number of regions."""
+    from scipy import ndimage  # slow to import
+
+    result: Any = ndimage.label(mask)
+    return result
+
+
 def without_specks(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], smallest: float
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
-    """Return the mesh without parts whose area is less than ``smallest`` of the whole; the largest part stays."""
+    """Return the mesh without parts of less than ``smallest`` of the whole area; the largest part stays."""
     part = parts_of(len(vertices), faces)[faces[:, 0]]
     area = np.bincount(part, weights=areas(vertices, faces))
     is_kept = area >= min(smallest * area.sum(), area.max())
@@ -225,16 +228,58 @@ def simplified(
     while target < len(faces):
         # The order in which edges collapse depends on the aggressiveness, and so does whether a hole appears.
         for aggressiveness in AGGRESSIVENESS:
-            points, corners = fast_simplification.simplify(
+            points, corners, *_ = fast_simplification.simplify(
                 vertices, faces.astype(np.int32), target_count=int(target), agg=aggressiveness
             )
-            points, corners = compacted(
+            points, corners = separated(
                 np.asarray(points, dtype=np.float64), np.asarray(corners, dtype=np.int64)
             )
             if len(corners) and is_watertight(corners):
                 return points, corners
         target *= MORE_TRIANGLES
     return vertices, faces
+
+
+def separated(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+    """Return the mesh without folds, with a copy of a vertex for each sheet that touches another one there.
+
+    Collapsing the edges of a closed mesh leaves every edge with as many triangles in one direction as in the
+    other, but it can fold two triangles onto each other, or let an edge have four. The triangles of such an
+    edge are paired (Gueziec et al. 2001), and the copies of its vertices move apart a little.
+    """
+    is_flat = (faces == np.roll(faces, 1, axis=1)).any(1)
+    faces = faces[~is_flat]
+    # Triangles with the same corners in opposite directions cancel each other.
+    order = np.argsort(faces, axis=1)
+    turn = np.where((order[:, 1] - order[:, 0]) % 3 == 1, 1, -1)
+    _, first, same = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True)
+    net = np.bincount(same.reshape(-1), weights=turn, minlength=len(first)).astype(np.int64)
+    faces = np.where((net == turn[first])[:, None], faces[first], faces[first][:, ::-1])[net != 0]
+    corner = np.arange(faces.size).reshape(faces.shape)
+    begin, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
+    first, second = corner.reshape(-1), np.roll(corner, -1, axis=1).reshape(-1)
+    is_up = begin < end
+    up, down = np.flatnonzero(is_up), np.flatnonzero(~is_up)
+    up, down = up[np.lexsort([end[up], begin[up]])], down[np.lexsort([begin[down], end[down]])]
+    if len(up) != len(down) or (begin[up] != end[down]).any() or (end[up] != begin[down]).any():
+        return compacted(vertices, faces)
+    links = np.stack(
+        [np.concatenate([first[up], second[up]]), np.concatenate([second[down], first[down]])], axis=1
+    )
+    copy = parts_of(faces.size, links)
+    source = np.zeros(int(copy.max(initial=-1)) + 1, dtype=np.int64)
+    source[copy] = begin
+    places = vertices[source]
+    is_copied = np.bincount(source, minlength=len(vertices))[source] > 1
+    middle = np.repeat(vertices[faces].mean(axis=1), 3, axis=0)
+    count = np.bincount(copy, minlength=len(source))[:, None]
+    summed = np.stack(
+        [np.bincount(copy, weights=middle[:, axis], minlength=len(source)) for axis in range(3)], 1
+    )
+    places[is_copied] += APART * (summed / np.maximum(count, 1) - places)[is_copied]
+    return compacted(places, copy.reshape(faces.shape))
 
 
 def compacted(
@@ -270,13 +315,12 @@ def is_watertight(faces: Int[np.ndarray, "f 3"]) -> bool:
     return bool((np.diff(there) > 0).all() and (there == back).all())
 
 
-def parts_of(count: int, faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "count"]:
+def parts_of(count: int, faces: Int[np.ndarray, "f corners"]) -> Int[np.ndarray, "count"]:
     """Return the number of the connected part of each of ``count`` vertices."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    rows = np.concatenate([faces[:, 0], faces[:, 1]])
-    columns = np.concatenate([faces[:, 1], faces[:, 2]])
+    rows, columns = faces[:, :-1].reshape(-1), faces[:, 1:].reshape(-1)
     links = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(count, count))
     return connected_components(links, directed=False)[1].astype(np.int64)
 
@@ -289,7 +333,7 @@ def areas(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> 
 def vertex_normals(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "v 3"]:
-    """Return unit vectors, the means of the normals of the triangles around each vertex, weighted with their areas."""
+    """Return the directions of the sums of the triangles' normals around each vertex, weighted by area."""
     cross = _crosses(vertices, faces)
     corners, count = faces.reshape(-1), len(vertices)
     summed = [
@@ -319,15 +363,17 @@ class Painter:
     ) -> Float[np.ndarray, "p 3"]:
         """Return the sRGB colour, in [0, 1], that each point shows to a camera in front of it.
 
-        Each colour is a render of one ray against the normal, with the image formation model of 3DGS: the opacity of a
-        Gaussian is its own times the falloff where the ray is nearest to its centre, and the Gaussians are composited
-        in the order of their centres. Only Gaussians that reach the point take part, so that nothing else hides it.
+        Each colour is a render of one ray against the normal, with the image formation model of 3DGS: the
+        opacity of a Gaussian is its own times the falloff where the ray is nearest to its centre, and the
+        Gaussians are composited in the order of their centres. Only Gaussians that reach the point take part,
+        so that nothing else hides it.
         """
         place, outwards = torch.from_numpy(points), torch.from_numpy(normals)
         blur = (BLUR * self.grid.cell) ** 2 * torch.eye(3, dtype=torch.float64)
         precision = torch.linalg.inv(self.some.covariances + blur)
         total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
-        for blob, point in near(self.some, self.grid, place):
+        for pairs in near(self.some, self.grid, place):
+            blob, point = pairs
             away, normal = place[point] - self.some.means[blob], outwards[point]
             pulled = torch.einsum("pij,pj->pi", precision[blob], normal)
             straight = torch.einsum("pij,pj->pi", precision[blob], away)
@@ -345,19 +391,15 @@ class Painter:
         # Simplification may have moved a vertex away from all Gaussians.
         lost = (weight < FAINT).nonzero()[:, 0]
         if len(lost):
-            nearest = torch.from_numpy(_tree(self.some.means.numpy()).query(points[lost.numpy()])[1])
+            from scipy.spatial import KDTree  # slow to import
+
+            nearest = torch.from_numpy(KDTree(self.some.means.numpy()).query(points[lost.numpy()])[1])
             colors[lost] = evaluate_sh(self.sh[nearest], -outwards[lost].float())
         return colors.clamp(0, 1).double().numpy()
 
 
-def _tree(points: Float[np.ndarray, "n 3"]):
-    from scipy.spatial import cKDTree
-
-    return cKDTree(points)
-
-
 def _transmitted(alpha: Float[Tensor, "pairs"], point: Int[Tensor, "pairs"]) -> Float[Tensor, "pairs"]:
-    """Return the product of ``1 - alpha`` of all earlier pairs of the same point; pairs are sorted by point."""
+    """Return the product of ``1 - alpha`` over earlier pairs of the same point; pairs are sorted by point."""
     passed = torch.log1p(-alpha).cumsum(0) - torch.log1p(-alpha)
     is_first = torch.ones_like(point, dtype=torch.bool)
     is_first[1:] = point[1:] != point[:-1]

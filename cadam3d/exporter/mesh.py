@@ -15,12 +15,12 @@ from cadam3d.io.frames import UPS
 from cadam3d.io.mesh import FORMATS, write_glb, write_mesh_ply, write_obj
 from cadam3d.io.run_folder import ASSET_MESH_GLB, ASSET_MESH_OBJ, ASSET_MESH_PLY
 
-NAMES = dict(zip(FORMATS, (ASSET_MESH_GLB, ASSET_MESH_OBJ, ASSET_MESH_PLY), strict=True))
+NAMES: dict[str, str] = dict(zip(FORMATS, (ASSET_MESH_GLB, ASSET_MESH_OBJ, ASSET_MESH_PLY), strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeshExporter(SurfaceSettings, Exporter):
-    """Write ``asset_mesh.glb``, ``.obj`` or ``.ply``: the outer surface with its colours (``core/surface.py``)."""
+    """Write ``asset_mesh.glb``, ``.obj`` or ``.ply``: the outer surface with its colours."""
 
     node: ClassVar[str] = "exporter.mesh"
 

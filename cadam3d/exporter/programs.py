@@ -36,7 +36,7 @@ class Program:
     upright: Mapping[str, str]
     is_measured: bool  # else documented by the program itself
     source: str
-    target: str = ""  # the option of for= that writes for this program
+    target: str  # the option of for= that writes for this program
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +52,7 @@ class Format:
 
 # Measured means that the program has drawn an object without symmetry, in Node or in headless Chromium, and
 # that the picture equals our own render from the same camera. ``tests/programs/`` repeats this for
-# splat-transform, Spark and three.js.
+# every one but viser.
 PROGRAMS: tuple[Program, ...] = (
     Program(
         name="SuperSplat",

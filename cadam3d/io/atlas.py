@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -26,7 +27,7 @@ def require_xatlas() -> None:
 
 
 def paint(surface: Surface, colors: ColorFn, size: int) -> Texture:
-    """Return a texture of ``size`` x ``size`` pixels for ``surface``, with the colour of ``colors`` at each texel."""
+    """Return a texture of ``size`` x ``size`` pixels, in which ``colors`` gives the colour of each texel."""
     vertices, faces, uv = _unwrapped(surface, size)
     texel, face, weights = _covered(uv[faces] * size, size)
     corners = vertices[faces[face]]
@@ -45,7 +46,7 @@ def paint(surface: Surface, colors: ColorFn, size: int) -> Texture:
 def _unwrapped(
     surface: Surface, size: int
 ) -> tuple[Int[np.ndarray, "w"], Int[np.ndarray, "f 3"], Float[np.ndarray, "w 2"]]:
-    """Return the vertices of the surface, repeated where charts are cut, the triangles, and their places in [0, 1]."""
+    """Return the vertices, repeated where charts are cut, the triangles, and the places in [0, 1]."""
     import xatlas  # optional, and slow to import
 
     atlas = xatlas.Atlas()
@@ -55,7 +56,8 @@ def _unwrapped(
         surface.normals.astype(np.float32),
     )
     charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
-    # xatlas chooses the number of texels per world unit such that all charts fit into one picture of this size.
+    # xatlas chooses the number of texels per world unit such that all charts fit into one picture of this
+    # size.
     packing.resolution, packing.padding, packing.bilinear = size, PADDING, True
     atlas.generate(charts, packing)
     vertices, faces, uv = atlas[0]
@@ -67,7 +69,7 @@ def _unwrapped(
 def _covered(
     corners: Float[np.ndarray, "f 3 2"], size: int
 ) -> tuple[Int[np.ndarray, "t"], Int[np.ndarray, "t"], Float[np.ndarray, "t 3"]]:
-    """Return the texels whose centres are in a triangle, the triangle of each, and the weights of its corners.
+    """Return the texels with their centres in a triangle, their triangles, and the weights of the corners.
 
     ``corners`` are in texels.
     """
@@ -110,5 +112,6 @@ def _padded(picture: np.ndarray, is_painted: Bool[np.ndarray, "h w"]) -> np.ndar
     """Return the picture with every other texel in the colour of the nearest painted one."""
     from scipy import ndimage  # slow to import
 
-    row, column = ndimage.distance_transform_edt(~is_painted, return_distances=False, return_indices=True)
+    nearest: Any = ndimage.distance_transform_edt(~is_painted, return_distances=False, return_indices=True)
+    row, column = nearest
     return picture[row, column]

@@ -1,9 +1,10 @@
 """Files of triangle meshes: glb, obj and ply, with vertex colours or a texture.
 
-All three are written so that other programs show the colours of our renders. glTF multiplies colours with light and
-defines vertex colours as linear (glTF 2.0, sec. 3.9.2), so the material of a glb is unlit (``KHR_materials_unlit``) and
-its vertex colours are converted from sRGB, as 16-bit numbers, which keeps dark colours apart. A texture is sRGB in every
-format. Vertex colours of obj (``v x y z r g b``) and ply (``uchar red green blue``) are sRGB by convention.
+All three are written so that other programs show the colours of our renders. glTF multiplies colours with
+light and defines vertex colours as linear (glTF 2.0, sec. 3.9.2), so the material of a glb is unlit
+(``KHR_materials_unlit``) and its vertex colours are converted from sRGB, as 16-bit numbers, which keeps dark
+colours apart. A texture is sRGB in every format. Vertex colours of obj (``v x y z r g b``) and ply (``uchar
+red green blue``) are sRGB by convention.
 """
 
 import json
@@ -37,9 +38,9 @@ NAME = "cadam3d"
 class Texture:
     """A picture for a surface; vertices are repeated where the picture is cut."""
 
-    vertices: Int[np.ndarray, "w"]  # vertex of the surface for each vertex of the textured mesh
+    vertices: Int[np.ndarray, "t"]  # vertex of the surface for each vertex of the textured mesh
     faces: Int[np.ndarray, "f 3"]  # of the textured mesh
-    uv: Float[np.ndarray, "w 2"]  # in [0, 1], from the lower left corner of the picture
+    uv: Float[np.ndarray, "t 2"]  # in [0, 1], from the lower left corner of the picture
     picture: UInt8[np.ndarray, "h w 3"]  # sRGB
 
 
@@ -57,8 +58,8 @@ class _Mesh:
 def write_glb(path: Path, surface: Surface, *, up: str, texture: Texture | None = None) -> None:
     """Write one binary glTF file with an unlit material, atomically.
 
-    glTF defines ``+y`` as up; another ``up`` turns the numbers and not the definition. Raises ``UserError`` if the file
-    cannot be written.
+    glTF defines ``+y`` as up; another ``up`` turns the numbers and not the definition. Raises ``UserError``
+    if the file cannot be written.
     """
     content = _glb(_in_file(surface, up, texture))
     with replacing(path) as temporary:
@@ -92,11 +93,11 @@ def write_mesh_ply(path: Path, surface: Surface, *, up: str) -> None:
 
 
 def write_obj(path: Path, surface: Surface, *, up: str, texture: Texture | None = None) -> list[Path]:
-    """Write an obj file, with its material and picture beside it if there is a texture, and return their paths.
+    """Write an obj file, for a texture also its material and picture, and return the paths.
 
-    The files have the name of ``path`` with the suffixes ``.obj``, ``.mtl`` and ``.png``. Each one appears whole or not
-    at all, and the obj comes last, so that it never refers to something that is missing. Raises ``UserError`` if a file
-    cannot be written.
+    The files have the name of ``path`` with the suffixes ``.obj``, ``.mtl`` and ``.png``. Each one appears
+    whole or not at all, and the obj comes last, so that it never refers to something that is missing. Raises
+    ``UserError`` if a file cannot be written.
     """
     mesh = _in_file(surface, up, texture)
     if texture is None:
@@ -123,8 +124,8 @@ def write_obj(path: Path, surface: Surface, *, up: str, texture: Texture | None 
 def mesh_facts(path: Path) -> SurfaceFacts:
     """Return numbers about the mesh in a file of any of the three formats, computed from its triangles.
 
-    Vertices at the same place count as one, because a texture repeats them. Raises ``UserError`` if the file cannot be
-    read.
+    Vertices at the same place count as one, because a texture repeats them. Raises ``UserError`` if the file
+    cannot be read.
     """
     import trimesh  # slow to import
 

@@ -17,13 +17,13 @@ from cadam3d.core.render import RenderFn, Truth
 from cadam3d.core.surface import SurfaceSettings, areas, outer_shell
 from cadam3d.metric.base import Metric
 
-# The true surface is marched in the cube [-1, 1]^3, which holds every object, with this many nodes per side. It is
-# off by up to a third of a cell (0.003 world units) at sharp edges, and by less than 0.0002 elsewhere.
+# The true surface is marched in the cube [-1, 1]^3, which holds every object, with this many nodes per side.
+# It is off by up to a third of a cell (0.003 world units) at sharp edges, and by less than 0.0002 elsewhere.
 TRUE_NODES = 256
 CELL = 2.0 / TRUE_NODES  # world units
 COARSE_NODES = 32
-# Samples of a surface that lead to the triangles near a point, for each sample that is measured.
-GUIDES = 4
+# Samples of a surface that lead to the triangles near a point.
+GUIDES = 200_000
 NEIGHBOURS = 8
 
 
@@ -31,13 +31,15 @@ NEIGHBOURS = 8
 class MeshMetric(SurfaceSettings, Metric):
     """Chamfer distance and F-score between the mesh of an asset and the true surface.
 
-    Both surfaces are the parts that can be reached from outside. ``samples`` points are drawn on each, uniformly by
-    area, and their distances to the other surface are exact distances to its triangles. With the distances ``a`` of
-    the samples of the mesh and the distances ``b`` of the samples of the true surface:
+    Both surfaces are the parts that can be reached from outside. ``samples`` points are drawn on each,
+    uniformly by area, and their distances to the other surface are exact distances to its triangles. With the
+    distances ``a`` of the samples of the mesh and the distances ``b`` of the samples of the true surface:
 
     * ``mesh_chamfer = (mean(a) + mean(b)) / 2``, in world units,
-    * ``mesh_precision`` and ``mesh_recall`` are the shares of ``a`` and of ``b`` that are at most ``threshold``,
-    * ``mesh_fscore = 2 precision recall / (precision + recall)``, and 0 if both are 0 (Knapitsch et al. 2017).
+    * ``mesh_precision`` and ``mesh_recall`` are the shares of ``a`` and of ``b`` that are at most
+      ``threshold``,
+    * ``mesh_fscore = 2 precision recall / (precision + recall)``, and 0 if both are 0 (Knapitsch et al.
+      2017).
 
     If the modes of a prior have different shapes, the one with the smallest Chamfer distance counts.
     """
@@ -69,11 +71,11 @@ class MeshMetric(SurfaceSettings, Metric):
             to_true, to_mesh = distances_between(
                 (surface.vertices, surface.faces), (vertices, faces), self.samples, self.seed
             )
-            precision, recall = float((to_true <= self.threshold).mean()), float((to_mesh <= self.threshold).mean())
+            score, precision, recall = f_score(to_true, to_mesh, self.threshold)
             results.append(
                 {
                     "mesh_chamfer": float((to_true.mean() + to_mesh.mean()) / 2),
-                    "mesh_fscore": 2 * precision * recall / max(precision + recall, 1e-12),
+                    "mesh_fscore": score,
                     "mesh_precision": precision,
                     "mesh_recall": recall,
                 }
@@ -96,11 +98,21 @@ def true_surfaces(distance: Callable[[Tensor], Tensor]) -> list[Triangles]:
     return found
 
 
+def f_score(
+    to_true: Float[np.ndarray, "a"], to_mesh: Float[np.ndarray, "b"], threshold: float
+) -> tuple[float, float, float]:
+    """Return F-score, precision and recall for the distances of both directions (see :class:`MeshMetric`)."""
+    precision, recall = float((to_true <= threshold).mean()), float((to_mesh <= threshold).mean())
+    total = precision + recall
+    return (2 * precision * recall / total if total > 0 else 0.0), precision, recall
+
+
 def _sampled(distance: Callable[[Tensor], Tensor]) -> Float[Tensor, "x y z"]:
     """Return signed distances at the centres of ``TRUE_NODES``^3 cells, exact next to the surface.
 
-    Elsewhere they are those of the centre of a larger cell that the surface does not reach. A distance function is
-    never larger than the distance, so a cell with a larger one at its centre than its radius can be left whole.
+    Elsewhere they are those of the centre of a larger cell that the surface does not reach. A distance
+    function is never larger than the distance, so a cell with a larger one at its centre than its radius can
+    be left whole.
     """
     size, nodes = 2.0 / COARSE_NODES, COARSE_NODES
     axis = torch.arange(nodes)
@@ -125,7 +137,7 @@ def distances_between(
     """Return the distances of random points of ``ours`` to ``theirs``, and of ``theirs`` to ``ours``."""
     draw = np.random.default_rng(seed)
     (our_points, our_faces), (their_points, their_faces) = (
-        _sample(mesh, GUIDES * samples, draw) for mesh in (ours, theirs)
+        _sample(mesh, max(GUIDES, samples), draw) for mesh in (ours, theirs)
     )
     return (
         _distances(our_points[:samples], theirs, their_points, their_faces),
@@ -152,11 +164,11 @@ def _distances(
     guides: Float[np.ndarray, "g 3"],
     guide_faces: Int[np.ndarray, "g"],
 ) -> Float[np.ndarray, "p"]:
-    """Return the distances of points to the triangles of a mesh that contain the nearest of its sampled points."""
-    from scipy.spatial import cKDTree  # slow to import
+    """Return the distances of points to a mesh, whose sampled points find the triangles near each."""
+    from scipy.spatial import KDTree  # slow to import
 
     vertices, faces = mesh
-    _, nearest = cKDTree(guides).query(points, k=NEIGHBOURS)
+    _, nearest = KDTree(guides).query(points, k=NEIGHBOURS)
     best = np.full(len(points), np.inf)
     for column in guide_faces[nearest].T:
         np.minimum(best, _to_triangles(points, vertices[faces[column]]), out=best)

@@ -21,7 +21,7 @@ def require_target(overrides: Sequence[str]) -> None:
         return
     target = text_of(given[TARGET])
     if target in UNKNOWN:
-        known = "|".join(sorted(program.target for program in PROGRAMS if program.target))
+        known = "|".join(sorted(program.target for program in PROGRAMS))
         rest = [word for word in overrides if key_of(word) != TARGET and not is_export(word)]
         line = line_of("export", [*rest, *UNKNOWN[target].words])
         raise UserError(

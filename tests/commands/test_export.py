@@ -13,6 +13,7 @@ import yaml
 from omegaconf import OmegaConf
 from splats import make_gaussians
 
+import cadam3d
 from cadam3d.commands.export import views_in_words
 from cadam3d.exporter.programs import FORMATS, PROGRAMS, UNKNOWN, judge, loss_of
 from cadam3d.io.asset_file import read_gaussians
@@ -243,7 +244,7 @@ def test_two_exports_into_one_folder_take_turns(tmp_path):
 
 
 def test_every_target_is_a_program_with_known_axes():
-    assert sorted(program.target for program in PROGRAMS if program.target) == TARGETS
+    assert sorted(program.target for program in PROGRAMS) == TARGETS
     assert not UNKNOWN.keys() & set(TARGETS)
     for program in PROGRAMS:
         assert program.source
@@ -268,6 +269,19 @@ def test_the_table_states_what_the_tests_with_other_programs_measure(module, nam
     measured = {case.exporter: case.upright for case in import_module(f"programs.{module}").CASES}
     assert measured
     assert measured.items() <= program.upright.items()
+
+
+def test_the_page_about_exporting_has_every_program_and_its_version():
+    page = (Path(cadam3d.__file__).parent.parent / "docs/exporting.md").read_text(encoding="utf-8")
+    for program in PROGRAMS:
+        [row] = [line for line in page.splitlines() if line.startswith(f"| {program.name} |")]
+        [(name, node)] = compose([f"for={program.target}"], "export").exporter.items()
+        assert f"`for={program.target}` | `{FORMATS[name].file}`" in row
+        assert f"{node.up} up" in row or name == "mesh"
+        assert program.version.split()[-1] in row
+        assert ("measured: " if program.is_measured else "documented: ") in row
+    for name, unknown in UNKNOWN.items():
+        assert any(name in row.lower() and unknown.words[0] in row for row in page.splitlines())
 
 
 @pytest.mark.parametrize("target", TARGETS)
@@ -379,17 +393,16 @@ def test_every_suffix_belongs_to_exporters_that_exist():
 
 
 def test_the_lines_about_a_file_name_its_axes_and_the_programs(run_folder, type_line):
-    lines = type_line("export", f"run={run_folder}", "output=out").out.splitlines()
-    assert (
-        lines[0]
-        == f"out/asset.ply  {(Path('out/asset.ply').stat().st_size) / 1e3:.1f} kB, 6 Gaussians, -y up"
-    )
-    assert lines[1].startswith(
-        "  upright in SuperSplat, viser; upside down in Spark (for=spark), three.js (for="
-    )
-    assert lines[2].endswith("describes these files")
+    first, upright, upside_down, last = type_line(
+        "export", f"run={run_folder}", "output=out"
+    ).out.splitlines()
+    size = Path("out/asset.ply").stat().st_size
+    assert first == f"out/asset.ply  {size / 1e3:.1f} kB, 6 Gaussians, -y up"
+    assert upright.startswith("  upright in SuperSplat, viser")
+    assert upside_down.startswith("  upside down in Spark (for=spark), three.js (for=three)")
+    assert last.endswith("describes these files")
     sideways = type_line("export", f"run={run_folder}", "output=a.ply", "exporter.ply.up=+z").out.splitlines()
-    assert sideways[1].startswith("  on its side in SuperSplat (for=supersplat), ")
+    assert sideways[1].startswith("  on its side in SuperSplat, viser")
 
 
 @pytest.mark.parametrize("exporter", sorted(FORMATS))

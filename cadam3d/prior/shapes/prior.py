@@ -175,7 +175,7 @@ class ShapesPrior(DiffusionPrior):
         return Prediction(clean=clean, noise=noise, velocity=self.noise_path.velocity(clean, noise, t))
 
     def truth(self, prompt: str) -> Truth:
-        """Return the images of all modes of ``prompt``, which differ only in colour, and their common shape."""
+        """Return the images of all modes of ``prompt``, and their shape: they differ in colour only."""
         scene = build(prompt)
 
         def images(cameras: Cameras, background: Tensor) -> Tensor:
