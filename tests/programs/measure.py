@@ -28,9 +28,8 @@ Draw = Callable[[Path], Picture]
 
 
 def main() -> None:
-    versions = ", ".join(f"{name} {version}" for name, version in pinned().items())
-    print(f"Measured on {datetime.date.today()} with {versions}.\n")
-    print("| program | format | upright with | PSNR at SH 0 | PSNR at SH 3 |\n|---|---|---|---|---|")
+    print(f"Measured on {datetime.date.today()} with")
+    print(", ".join(f"{name} {version}" for name, version in pinned().items()) + ".\n")
     with Browser.start() as browser, tempfile.TemporaryDirectory() as folder:
         transform = SplatTransform.find()
         programs: dict[str, Draw] = {
@@ -39,21 +38,22 @@ def main() -> None:
             "Babylon.js": lambda path: browser.picture("babylon.html", path, VIEW),
             "PlayCanvas": lambda path: browser.picture("playcanvas.html", path, VIEW),
             "three.js": lambda path: browser.picture("three.html", path, VIEW, colours="linear"),
-            "three.js, default colours": lambda path: browser.picture("three.html", path, VIEW),
         }
-        for program, draw in programs.items():
-            for name in FORMATS:
-                print(f"| {program} | {name} | {row(draw, name, Path(folder))} |", flush=True)
+        print("| format |", " | ".join(programs), "|")
+        print("|" + "---|" * (1 + len(programs)))
+        for name in FORMATS:
+            cells = (cell(draw, name, Path(folder)) for draw in programs.values())
+            print(f"| {name} |", " | ".join(cells), "|", flush=True)
 
 
-def row(draw: Draw, name: str, folder: Path) -> str:
-    """Return the last three cells of one format in one program."""
+def cell(draw: Draw, name: str, folder: Path) -> str:
+    """Return the up axis with which a file is upright, and its PSNR at SH degree 0 and 3."""
     try:
         upright, db = shown(draw, Case(name, 0, "+y", 0), folder)
     except RefusedError:
-        return "refused | |"
+        return "refused"
     _, at_three = shown(draw, Case(name, 3, upright, 0), folder)
-    return f"{upright} | {db:.1f} | {at_three:.1f}"
+    return f"{upright}: {db:.1f} / {at_three:.1f}"
 
 
 def shown(draw: Draw, case: Case, folder: Path) -> tuple[str, float]:
