@@ -29,6 +29,7 @@ from cadam3d.settings.hydra import (
 )
 from cadam3d.settings.line import RUN_FOLDER, exporting, key_of, quoted, resumed, split
 from cadam3d.settings.place import occupied
+from cadam3d.settings.target import require_target
 from cadam3d.settings.trust import judge_composition, require_trust, targets_in
 
 TRAINING = ("train", "sweep")  # the commands that have a run folder
@@ -123,6 +124,8 @@ def read_line(command: str, overrides: list[str], flags: list[str], options: Nam
             "dry_run: expected a sweep, whose jobs it lists, got a single run. The settings of a run can be "
             f"printed instead. Try: {shlex.join(['cadam3d', command, *words, *flags, '--cfg', 'job'])}"
         )
+    if command == "export":
+        require_target(overrides)
     overrides = typed = [quoted(override, is_sweep=is_sweep) for override in overrides]
     if command in TRAINING:
         folders = [Path(options.config_path) if options.config_path else config_dir()]

@@ -1,4 +1,4 @@
-"""RenderOutput: the result of every rasterizer. RenderFn: a function that renders given Gaussians."""
+"""RenderOutput: the result of every rasterizer. RenderFn: renders Gaussians. Truth: the true object."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -53,5 +53,17 @@ class RenderOutput:
 # From cameras and one RGB background per view (in [0, 1]) to images of given Gaussians, without gradients.
 RenderFn = Callable[[Cameras, Tensor], RenderOutput]
 
-# From cameras and one background per view to the true images of each mode, "m v h w 3". Few priors have them.
-TruthFn = Callable[[Cameras, Tensor], Tensor]
+
+@dataclass(frozen=True)
+class Truth:
+    """The true object of a prompt, which few priors know.
+
+    It has ``m`` modes, more than one if the prompt leaves something open.
+    """
+
+    # From cameras and one background per view, "v 3", to the true images of each mode, "m v h w 3" in [0, 1].
+    images: Callable[[Cameras, Tensor], Tensor]
+    # From points "n 3" to signed distances "g n", one row for each of the ``g`` shapes of the modes; one row
+    # if all modes have the same shape. A distance is negative inside. Its sign is exact, and its size is at
+    # most the distance to the surface, in world units. None if the shape is not known.
+    distance: Callable[[Tensor], Tensor] | None = None

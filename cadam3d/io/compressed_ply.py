@@ -40,8 +40,8 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0
 from cadam3d.io.atomic import replacing
-from cadam3d.io.encoding import as_tensor, byte_logits, float32_cpu, opacities, to_bytes, unit_quats
-from cadam3d.io.frames import UPS, world_to_file
+from cadam3d.io.encoding import as_tensor, byte_logits, in_file_axes, opacities, to_bytes, unit_quats
+from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
 from cadam3d.io.ply import REST_SIZES, VERTEX, rest_size
 from cadam3d.io.ply_tables import LITTLE, PlyHeader, read_header, read_tables, unusable
@@ -67,7 +67,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians, *, up: str) -> None:
     The same Gaussians give the same bytes. Raises ``UserError`` if the file cannot be written, or if a number
     is NaN or infinite.
     """
-    local = world_to_file(float32_cpu(gaussians), up)
+    local = in_file_axes(gaussians, up)
     _require_finite(path, local)
     local = local.index(torch.from_numpy(morton_order(local.means.numpy())))
     starts = range(0, len(local), CHUNK_ROWS)

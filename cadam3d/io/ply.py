@@ -30,8 +30,8 @@ from cadam3d.core.checks import require_choice
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE
 from cadam3d.io.atomic import replacing
-from cadam3d.io.encoding import as_tensor, float32_cpu
-from cadam3d.io.frames import UPS, world_to_file
+from cadam3d.io.encoding import as_tensor, in_file_axes
+from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
 from cadam3d.io.ply_tables import LITTLE, PlyHeader, read_header, read_tables, unusable
 
@@ -62,7 +62,7 @@ def write_ply(path: Path, gaussians: Gaussians, *, up: str, pad_sh: int) -> None
     cannot be written.
     """
     require_choice("pad_sh", pad_sh, range(MAX_DEGREE + 1))
-    local = world_to_file(float32_cpu(gaussians), up)
+    local = in_file_axes(gaussians, up)
     arrays = {name: tensor.numpy() for name, tensor in local.tensors().items()}
     rest_size = REST_SIZES[max(pad_sh, local.sh_degree)]
     rest = np.zeros((len(local), 3, rest_size // 3), dtype=np.float32)

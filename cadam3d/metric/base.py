@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderFn, TruthFn
+from cadam3d.core.render import RenderFn, Truth
 
 
 class Metric(ABC):
@@ -12,10 +12,10 @@ class Metric(ABC):
 
     @abstractmethod
     def measure(
-        self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None, asset: Path | None
+        self, gaussians: Gaussians, render: RenderFn, truth: Truth | None, asset: Path | None
     ) -> dict[str, float]:
         """Return named numbers.
 
-        ``truth`` gives the true images if the prior has them, and ``asset`` is the file with these
+        ``truth`` is the true object if the prior knows it, and ``asset`` is the file with these
         Gaussians if one was written. Numbers that need one of them are left out if it is ``None``.
         """

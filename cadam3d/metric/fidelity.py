@@ -13,7 +13,7 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require_whole
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.pictures import PictureSettings
-from cadam3d.core.render import RenderFn, TruthFn
+from cadam3d.core.render import RenderFn, Truth
 from cadam3d.metric.base import Metric
 
 SSIM_WINDOW = 11  # pixels (Wang et al. 2004)
@@ -60,7 +60,7 @@ class Fidelity(PictureSettings, Metric):
         return self.cameras_at(azimuth, elevation)
 
     def measure(
-        self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None, asset: Path | None
+        self, gaussians: Gaussians, render: RenderFn, truth: Truth | None, asset: Path | None
     ) -> dict[str, float]:
         """Return PSNR, SSIM and the mode that they belong to; {} if there are no true images.
 
@@ -75,7 +75,7 @@ class Fidelity(PictureSettings, Metric):
             some = cameras.index(slice(first, first + VIEWS_AT_ONCE))
             background = self.backgrounds(len(some))
             images = render(some, background).rgb.detach().float().cpu().clamp(0, 1)
-            modes = truth(some, background).detach().float().cpu()
+            modes = truth.images(some, background).detach().float().cpu()
             psnrs.append(_psnr(images, modes))
             ssims.append(_ssim(images, modes))
         psnr_db, similarity = torch.cat(psnrs, dim=1), torch.cat(ssims, dim=1)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderFn, TruthFn
+from cadam3d.core.render import RenderFn, Truth
 from cadam3d.metric.base import Metric
 
 MIB = 1 << 20  # bytes
@@ -15,7 +15,7 @@ class Size(Metric):
     """Number of Gaussians, and size of the written file including any padding."""
 
     def measure(
-        self, gaussians: Gaussians, render: RenderFn, truth: TruthFn | None, asset: Path | None
+        self, gaussians: Gaussians, render: RenderFn, truth: Truth | None, asset: Path | None
     ) -> dict[str, int | float]:
         """Return counts, sizes and medians.
 

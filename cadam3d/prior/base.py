@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.render import TruthFn
+from cadam3d.core.render import Truth
 from cadam3d.prior.path import NoisePath, Prediction
 
 
@@ -92,8 +92,8 @@ class DiffusionPrior(ABC):
         one). A scale below 0 leads away from the prompt, as in the inversion of SDI.
         """
 
-    def truth(self, prompt: str) -> TruthFn | None:
-        """Return the function that renders the true images of ``prompt``, or None if they are not known."""
+    def truth(self, prompt: str) -> Truth | None:
+        """Return the true images and the true shape of ``prompt``, or None if they are not known."""
         return None
 
     def memory(self, prompt: str, negative: str, views: int, size: int | None) -> MemoryEstimate | None:

@@ -10,16 +10,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.run_folder import (
-    ASSET,
-    OVERRIDES,
-    PREVIEW,
-    TURNTABLE,
-    VIEWER,
-    has_file,
-    suggestion,
-    typed_path,
-)
+from cadam3d.io.run_folder import OVERRIDES, has_file, suggestion, typed_path
 from cadam3d.settings.compose import TEXT_KEYS, config_dir, quote
 from cadam3d.settings.trust import is_trusted, judge_overrides, read_overrides, require_contained
 
@@ -36,13 +27,22 @@ QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
 SWEEP_CALL = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)", re.DOTALL)
 # The text up to a comma that is not followed by a space.
 PIECE = re.compile(r"(?:[^,]|,(?=\s|$))*", re.DOTALL)
-# The exporter that writes a single file with this suffix.
-EXPORTERS = {
-    Path(ASSET).suffix: "ply",
-    Path(PREVIEW).suffix: "preview",
-    Path(TURNTABLE).suffix: "turntable",
-    Path(VIEWER).suffix: "html",
+# The exporters that write a single file with this suffix. The first one is chosen if the line names none.
+EXPORTERS: dict[str, tuple[str, ...]] = {
+    ".compressed.ply": ("compressed_ply",),
+    ".glb": ("glb", "mesh"),
+    ".html": ("html",),
+    ".ksplat": ("ksplat",),
+    ".mp4": ("turntable",),
+    ".obj": ("mesh",),
+    ".ply": ("ply", "mesh"),
+    ".png": ("preview",),
+    ".sog": ("sog",),
+    ".splat": ("splat",),
+    ".spz": ("spz",),
 }
+# The exporter whose setting ``format`` is the suffix of its file.
+MESH = "mesh"
 FLAGS_WITH_VALUE = (
     *("--cfg", "-c", "--package", "-p", "--info", "-i", "--experimental-rerun"),
     *("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
@@ -133,18 +133,33 @@ def resumed(
     return list(merged.values())
 
 
+def suffix_of(name: str) -> str:
+    """Return the suffix of a file in lower case: the longest one in ``EXPORTERS``, or else the last one."""
+    name = Path(name).name.lower()
+    known = [suffix for suffix in EXPORTERS if name.endswith(suffix) and name != suffix]
+    return max(known, key=len, default=Path(name).suffix)
+
+
 def exporting(overrides: Sequence[str]) -> list[str]:
     """Choose the exporter for a file that ``output=`` names by its suffix.
 
-    A line that names no such file, or that chooses or sets another exporter, does not change.
+    A line does not change if it names no such file, or if it chooses the exporter in another way: with
+    ``for=``, with ``exporter=``, or by setting an exporter that writes no such file.
     """
     given = {key_of(override): override for override in overrides}
     name = text_of(given["output"]) if "output" in given else ""
-    exporter = None if name.endswith("/") else EXPORTERS.get(Path(name).suffix.lower())
-    others = [key for key in given if key.partition(".")[0] == "exporter"]
-    if exporter is None or not all(key.startswith(f"exporter.{exporter}.") for key in others):
+    suffix = suffix_of(name)
+    if name.endswith("/") or suffix not in EXPORTERS or "for" in given:
         return list(overrides)
-    return [*overrides, f"exporter=[{exporter}]"]
+    named = {key.split(".")[1] for key in given if key.startswith("exporter.")}
+    named |= _options(given["exporter"]) if "exporter" in given else set()
+    chosen = next((each for each in EXPORTERS[suffix] if named <= {each}), None)
+    if chosen is None or given.get("exporter", "").endswith("=[]"):
+        return list(overrides)
+    words = [] if "exporter" in given else [f"exporter=[{chosen}]"]
+    if chosen == MESH and f"exporter.{MESH}.format" not in given:
+        words.append(f"exporter.{MESH}.format={suffix.removeprefix('.')}")
+    return [*overrides, *words]
 
 
 def resume_word(place: str | Path) -> str:
@@ -155,6 +170,12 @@ def resume_word(place: str | Path) -> str:
 def setting_word(key: str, value: object) -> str:
     """Return ``KEY=VALUE`` as it is typed into a shell."""
     return shlex.quote(f"{key}={value}")
+
+
+def _options(override: str) -> set[str]:
+    """Return the options that an override chooses."""
+    value = OverridesParser.create().parse_override(override).value()
+    return set(map(str, value)) if isinstance(value, list) else {str(value)}
 
 
 def _entry(override: str) -> str:

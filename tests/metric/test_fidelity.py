@@ -6,7 +6,7 @@ import torch
 from cadam3d.core.cameras import turntable
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.render import RenderOutput, Truth
 from cadam3d.metric.fidelity import Fidelity
 
 SETTINGS = {
@@ -53,7 +53,9 @@ def truths(*shifts):
 
 
 def measure(render, truth, **changes):
-    return Fidelity(**{**SETTINGS, **changes}).measure(no_gaussians(), render, truth, None)
+    return Fidelity(**{**SETTINGS, **changes}).measure(
+        no_gaussians(), render, None if truth is None else Truth(truth), None
+    )
 
 
 @pytest.mark.parametrize(("error", "psnr"), [(0.1, 20.0), (-0.1, 20.0), (0.01, 40.0)])

@@ -170,7 +170,7 @@ def test_empty_prompt_has_the_moments_of_the_world() -> None:
     background = torch.tensor([0.3, 0.6, 0.9]).expand(CENSUS_VIEWS, 3)
     means, squares = [], []
     for name in (*known_primitives(), *known_objects()):
-        images = 2 * model.truth(name)(cameras, background).double() - 1
+        images = 2 * model.truth(name).images(cameras, background).double() - 1
         means.append(images.mean(dim=(0, 1)))
         squares.append(images.square().mean(dim=(0, 1)))
     mean = torch.stack(means).mean(0)
@@ -183,7 +183,7 @@ def test_empty_prompt_has_the_moments_of_the_world() -> None:
 def test_truth_equals_the_means_of_the_modes() -> None:
     model = prior()
     cameras, background = views(3), torch.rand(3, 3, generator=torch.Generator().manual_seed(0))
-    images = model.truth("a spotted torus")(cameras, background)
+    images = model.truth("a spotted torus").images(cameras, background)
     assert images.shape == (8, 3, SIZE, SIZE, 3)
     assert 0 <= float(images.min()) <= float(images.max()) <= 1 + 1e-6
     modes = model.embed("a spotted torus", "").at(cameras, background).positive.means

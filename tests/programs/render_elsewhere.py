@@ -1,12 +1,12 @@
 """Pictures of a file in programs that are not ours, from one camera, and their distance from our own render.
 
-The programs come from npm; ``package.json`` pins their versions. ``CADAM3D_PROGRAMS`` names the folder in which they
-are installed, and without it they are looked for beside this file:
+The programs come from npm, and ``package.json`` pins their versions. They are installed in the folder that
+the environment variable ``CADAM3D_PROGRAMS`` names, or else beside this file:
 
     npm install --prefix tests/programs
 
-Everything is skipped where Node, Chromium, playwright or the packages are absent. Nothing here uses a network: the pages
-are served on loopback, from three folders, and a request for any other address fails the test.
+Tests skip themselves where Node, Chromium, playwright or the packages are absent. Nothing here uses a
+network: the pages are served on loopback, and a request for any other address fails the test.
 """
 
 import json
@@ -14,6 +14,7 @@ import os
 import shutil
 import subprocess
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -85,7 +86,7 @@ def ours(gaussians: Gaussians, view: View) -> Picture:
 
 
 def turned(gaussians: Gaussians, written: str, shown: str) -> Gaussians:
-    """Return the object as a program shows it that takes a file with the up axis ``written`` for one with ``shown``."""
+    """Return the object as a program shows it that takes the up axis ``written`` for ``shown``."""
     return file_to_world(world_to_file(gaussians, written), shown)
 
 
@@ -95,19 +96,8 @@ def psnr(first: Picture, second: Picture) -> float:
     return float("inf") if error == 0 else float(10 * np.log10(255**2 / error))
 
 
-def silhouette(picture: Picture) -> np.ndarray:
-    """Return the mask [h w] of pixels that are not white."""
-    return (picture < 250).any(axis=2)
-
-
-def overlap(first: Picture, second: Picture) -> float:
-    """Return the intersection of two silhouettes over their union."""
-    a, b = silhouette(first), silhouette(second)
-    return float((a & b).sum() / (a | b).sum())
-
-
 def packages() -> Path:
-    """Return the folder ``node_modules``; skip the test if it or a package of the pinned version is absent."""
+    """Return the folder ``node_modules``; skip the test if a package of the pinned version is absent."""
     folder = Path(os.environ.get("CADAM3D_PROGRAMS", HERE)) / "node_modules"
     for name, version in pinned().items():
         found = folder / name / "package.json"
@@ -123,7 +113,7 @@ def pinned() -> dict[str, str]:
     return json.loads((HERE / "package.json").read_text(encoding="utf-8"))["dependencies"]
 
 
-class Refused(AssertionError):
+class RefusedError(AssertionError):
     """A program did not open a file; the text is its message."""
 
 
@@ -160,7 +150,7 @@ class SplatTransform:
         )
 
     def picture(self, path: Path, view: View) -> Picture:
-        """Return its picture of a file. Raises ``Refused`` with its message if it does not open it."""
+        """Return its picture of a file. Raises ``RefusedError`` with its message if it does not open it."""
         target = path.with_name(path.name + ".webp")
         words = {
             "--camera-pos": ",".join(map(str, view.eye)),
@@ -172,13 +162,13 @@ class SplatTransform:
         options = [word for pair in words.items() for word in pair]
         done = self.run("-q", "-w", str(path), *options, str(target))
         if done.returncode != 0 or not target.is_file():
-            raise Refused(done.stderr)
+            raise RefusedError(done.stderr)
         return np.asarray(Image.open(target).convert("RGB"))
 
 
 @dataclass
 class Browser:
-    """Headless Chromium with a server on loopback for the packages, the pages of this folder, and the files to show."""
+    """Headless Chromium, and a server on loopback for the packages, our pages and the files to show."""
 
     chromium: object  # playwright's browser
     origin: str
@@ -186,14 +176,14 @@ class Browser:
 
     @classmethod
     @contextmanager
-    def start(cls) -> Iterator["Browser"]:
+    def start(cls, *, needs_packages: bool = True) -> Iterator["Browser"]:
         """Start the browser and the server; skip the test where something is absent."""
         playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
         names = ("chromium", "chromium-browser", "google-chrome")
         executable = next((found for name in names if (found := shutil.which(name))), None)
         if executable is None:
             pytest.skip("no chromium")
-        folders = {"packages": packages(), "pages": PAGES}
+        folders = {"pages": PAGES, **({"packages": packages()} if needs_packages else {})}
         with _serve(folders) as origin, playwright.sync_playwright() as start:
             chromium = start.chromium.launch(
                 executable_path=executable, args=["--no-sandbox", *CHROMIUM_FLAGS]
@@ -206,7 +196,7 @@ class Browser:
     def picture(self, page: str, path: Path, view: View, **options: str) -> Picture:
         """Return the picture of a file on one of our pages, such as ``"spark.html"``.
 
-        Raises ``Refused`` with the program's message if it does not open the file.
+        Raises ``RefusedError`` with the program's message if it does not open the file.
         """
         self.folders["files"] = path.parent
         numbers = {"eye": ",".join(map(str, view.eye)), "fov": str(view.fov_y_deg), "size": str(view.size)}
@@ -214,8 +204,25 @@ class Browser:
         with self.open(f"{self.origin}/pages/{page}?{query}", view.size, view.size) as opened:
             opened.wait_for_function("window.result !== undefined", timeout=1000 * PATIENCE_S)
             if (result := opened.evaluate("window.result")) != "drawn":
-                raise Refused(result)
-            return np.asarray(Image.open(BytesIO(opened.screenshot())).convert("RGB"))
+                raise RefusedError(result)
+            return _settled(opened)
+
+    def picture_of_viewer(self, path: Path, view: View) -> Picture:
+        """Return the picture of our own page ``viewer.html``, opened as a file."""
+        with self.open(path.as_uri(), view.size, view.size) as opened:
+            opened.wait_for_selector("#loading", state="detached", timeout=1000 * PATIENCE_S)
+            camera = {
+                "azimuth": view.azimuth_deg,
+                "elevation": view.elevation_deg,
+                "distance": view.distance,
+                "fov": view.fov_y_deg,
+                "target": [0, 0, 0],
+            }
+            # Without the line of controls, the picture fills the window.
+            opened.evaluate(
+                "(camera) => { document.querySelector('footer').remove(); view.camera = camera; }", camera
+            )
+            return _settled(opened)
 
     @contextmanager
     def open(self, address: str, width: int, height: int) -> Iterator[object]:
@@ -229,8 +236,18 @@ class Browser:
             yield page
         finally:
             context.close()
-        local = (self.origin + "/", "data:", "blob:")
+        local = (self.origin + "/", "data:", "blob:", *([address] if address.startswith("file:") else []))
         assert not [url for url in requests if not url.startswith(local)]
+
+
+def _settled(page: object) -> Picture:
+    """Return the picture of a page after it has stopped changing."""
+    last, deadline = b"", time.monotonic() + PATIENCE_S
+    while (now := page.screenshot()) != last:
+        assert time.monotonic() < deadline, "the picture keeps changing"
+        last = now
+        page.wait_for_timeout(300)
+    return np.asarray(Image.open(BytesIO(now)).convert("RGB"))
 
 
 @contextmanager
@@ -238,8 +255,6 @@ def _serve(folders: dict[str, Path]) -> Iterator[str]:
     """Serve the folders on loopback under their names, and return the address."""
 
     class Handler(SimpleHTTPRequestHandler):
-        extensions_map = {**SimpleHTTPRequestHandler.extensions_map, ".js": "text/javascript"}
-
         def translate_path(self, path: str) -> str:
             name, _, rest = urlsplit(path).path.lstrip("/").partition("/")
             self.directory = str(folders.get(name, HERE / "absent"))

@@ -1,7 +1,8 @@
 """An object that cannot hide a wrong axis: a snowman next to a pine, as Gaussians, without training.
 
-It has no symmetry. Up and down, left and right, front and back all differ, and so do its colours at SH degree 3. The
-Gaussians resemble trained ones: flat discs of uneven size on the surfaces, partly transparent and overlapping.
+It has no symmetry. Up and down, left and right, front and back all differ, and so do its colours at SH degree
+3. The Gaussians resemble trained ones: flat discs of uneven size on the surfaces, partly transparent and
+overlapping.
 """
 
 import math
@@ -20,12 +21,12 @@ NEEDLES, DARK_NEEDLES, BARK, HONEY = (
     (0.4, 0.26, 0.15),
     (0.9, 0.75, 0.2),
 )
-# Standard deviations of the SH coefficients of bands 1 to 3, as trained assets of degree 3 have them.
+# Standard deviations of the SH coefficients of bands 1 to 3. Without one band, at most 32 dB are left.
 SH_SPREAD = (0.20, 0.14, 0.10)
 
 
 def snowman_and_pine(degree: int) -> Gaussians:
-    """Return the object in world axes (+z up, front at +x); the positions are the same for every ``degree``."""
+    """Return the object in world axes (+z up, front at +x); degrees differ in their coefficients only."""
     draw = torch.Generator().manual_seed(13)
     # The snowman is on the left of a viewer in front of it, which is -y, and the pine on the right.
     parts = [
@@ -84,7 +85,7 @@ def _discs(
     area: float,
     colour: tuple[float, float, float],
 ) -> Gaussians:
-    """Return flat Gaussians at ``points`` that cover a surface of this ``area`` and face along ``normals``."""
+    """Return flat Gaussians at ``points`` that cover a surface of ``area`` and face along ``normals``."""
     n = len(points)
     width = 0.8 * math.sqrt(area / n)
     scales = width * torch.tensor([1.0, 0.6, 0.2]) * (0.25 * torch.randn(n, 3, generator=draw)).exp()

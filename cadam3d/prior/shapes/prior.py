@@ -10,14 +10,14 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
 from cadam3d.core.checks import fail, require_range, require_whole
-from cadam3d.core.render import TruthFn
+from cadam3d.core.render import Truth
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import NoisePath, Prediction, per_view
 from cadam3d.prior.shapes.array_cache import cached_arrays
 from cadam3d.prior.shapes.grammar import EXAMPLE
 from cadam3d.prior.shapes.mixture import Mixture
 from cadam3d.prior.shapes.objects import known_objects, known_primitives
-from cadam3d.prior.shapes.scene import Scene, build
+from cadam3d.prior.shapes.scene import Scene, build, signed_distance
 from cadam3d.prior.shapes.trace_cache import shared_trace
 from cadam3d.prior.shapes.tracer import Layers
 
@@ -174,18 +174,18 @@ class ShapesPrior(DiffusionPrior):
             clean, noise = clean + share * guess_clean, noise + share * guess_noise
         return Prediction(clean=clean, noise=noise, velocity=self.noise_path.velocity(clean, noise, t))
 
-    def truth(self, prompt: str) -> TruthFn:
-        """Return a function of cameras and background "v 3" that renders all m modes of ``prompt``.
-
-        Its images have shape "m v h w 3" and are in [0, 1].
-        """
+    def truth(self, prompt: str) -> Truth:
+        """Return the images of all modes of ``prompt``, and their shape: they differ in colour only."""
         scene = build(prompt)
 
         def images(cameras: Cameras, background: Tensor) -> Tensor:
             layers, sized = self._layers(scene, cameras)
             return layers.images(sized.albedo, background).permute(1, 0, 3, 4, 2)
 
-        return images
+        def distance(points: Tensor) -> Tensor:
+            return signed_distance(scene.to(points.device, points.dtype), points)[None]
+
+        return Truth(images, distance)
 
     def _layers(self, scene: Scene, cameras: Cameras) -> tuple[Layers, Scene]:
         scene = scene.to(cameras.intrinsics.device, cameras.intrinsics.dtype)

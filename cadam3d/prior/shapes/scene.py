@@ -131,6 +131,23 @@ def compile_scene(parts: tuple[Part, ...]) -> Scene:
     )
 
 
+def signed_distance(scene: Scene, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """Return the signed distance to the surface of the scene, negative inside, or less.
+
+    The sign is exact. The size is at most the distance in world units, and smaller than it near edges and for
+    stretched solids (``solids.py``).
+    """
+    nearest = points.new_full((len(points),), torch.inf)
+    first = 0
+    for kind, count in scene.kinds:
+        for part in range(first, first + count):
+            local = scene.to_local[part] @ (points - scene.offsets[part]).T
+            own = kind.sdf(local, scene.sizes[part][:, None].expand(-1, len(points)))
+            nearest = torch.minimum(nearest, own / torch.linalg.matrix_norm(scene.to_local[part], ord=2))
+        first += count
+    return nearest
+
+
 def sphere_directions(count: int) -> Float[Tensor, "count 3"]:
     """Return nearly uniform unit vectors (a Fibonacci lattice)."""
     index = torch.arange(count, dtype=torch.float64) + 0.5

@@ -5,11 +5,13 @@ const settings = new URLSearchParams(location.search);
 export const file = settings.get("file");
 export const option = (name) => settings.get(name);
 export const size = Number(settings.get("size"));
+export const eye = settings.get("eye").split(",").map(Number);
+export const fov = Number(settings.get("fov"));
 
 // Return a camera of three.js at the place that the test chose, looking at the origin, with +y up.
 export function makeCamera(THREE) {
-  const camera = new THREE.PerspectiveCamera(Number(settings.get("fov")), 1, 0.01, 100);
-  camera.position.set(...settings.get("eye").split(",").map(Number));
+  const camera = new THREE.PerspectiveCamera(fov, 1, 0.01, 100);
+  camera.position.set(...eye);
   camera.lookAt(0, 0, 0);
   camera.updateMatrixWorld();
   return camera;

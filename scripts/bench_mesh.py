@@ -1,0 +1,76 @@
+"""Measure meshes of trained assets of the shapes prior: their errors, their triangles and the seconds.
+
+    cadam3d train prompt="a snowman" hydra.run.dir=runs/snowman
+    python scripts/bench_mesh.py runs/snowman
+
+The settings are those of configs/exporter/mesh.yaml and configs/metric/mesh.yaml. The seconds are CPU time of
+the exporter on one thread, writing the glb included. The prompt is read from the run.
+"""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from cadam3d.core.cameras import Cameras
+from cadam3d.core.render import RenderOutput
+from cadam3d.exporter.base import Exporter
+from cadam3d.io.mesh import mesh_facts
+from cadam3d.io.ply import read_ply
+from cadam3d.io.run_folder import ASSET, CONFIG
+from cadam3d.metric.mesh import MeshMetric, distances_between, f_score, true_surfaces
+from cadam3d.prior.shapes.scene import build, signed_distance
+from cadam3d.settings.compose import component, compose
+
+HEADER = "| prompt | triangles | parts | watertight | Chamfer | F at 0.01 | F at 0.02 | seconds |"
+
+
+def no_pictures(cameras: Cameras, background: Tensor) -> RenderOutput:
+    """Refuse to render, because a mesh needs no picture."""
+    raise NotImplementedError
+
+
+def measure(run: Path, exporter: Exporter, metric: MeshMetric) -> str:
+    """Return the row of the table for one run."""
+    prompt = OmegaConf.load(run / CONFIG).prompt
+    gaussians = read_ply(run / ASSET)
+    with tempfile.TemporaryDirectory() as folder:
+        begin = time.process_time()
+        [path] = exporter.export(gaussians, no_pictures, Path(folder))
+        seconds = time.process_time() - begin
+        facts = mesh_facts(path)
+    surface, _ = metric.surface(gaussians)
+    scene = build(prompt).to(torch.device("cpu"), torch.float64)
+    [truth] = true_surfaces(lambda points: signed_distance(scene, points)[None])
+    to_true, to_mesh = distances_between(
+        (surface.vertices, surface.faces), truth, metric.samples, metric.seed
+    )
+    chamfer = (to_true.mean() + to_mesh.mean()) / 2
+    scores = [f"{f_score(to_true, to_mesh, limit)[0]:.3f}" for limit in (0.01, 0.02)]
+    closed = "yes" if facts.watertight else "no"
+    cells = [prompt, facts.triangles, facts.parts, closed, f"{chamfer:.4f}", *scores, f"{seconds:.1f}"]
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("runs", nargs="+", type=Path, help="folders of runs with prior=shapes")
+    runs = parser.parse_args().runs
+    torch.set_num_threads(1)
+    cfg = compose(["prompt=a cube", "exporter=[mesh]", "metric=[mesh]"])
+    exporter = component(cfg.exporter.mesh, Exporter, "exporter.mesh")
+    metric = component(cfg.metric.mesh, MeshMetric, "metric.mesh")
+    print(f"{HEADER}\n|---|---|---|---|---|---|---|---|")
+    for run in runs:
+        print(measure(run, exporter, metric), flush=True)
+
+
+if __name__ == "__main__":
+    main()

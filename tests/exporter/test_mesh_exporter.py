@@ -1,0 +1,113 @@
+"""MeshExporter: its files, its formats and its textures."""
+
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from cadam3d.core.errors import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.sh import rgb_to_sh0
+from cadam3d.exporter.mesh import MeshExporter
+from cadam3d.io.mesh import mesh_facts
+
+SETTINGS = {
+    "format": "glb",
+    "up": "+y",
+    "resolution": 24,
+    "level": 0.3,
+    "smallest_part": 0.01,
+    "triangles": 2000,
+    "texture": None,
+}
+BELOW, ABOVE = (0.1, 0.2, 0.9), (0.9, 0.1, 0.1)
+
+
+def two_coloured_ball() -> Gaussians:
+    """Return a ball, red above z = 0 and blue below."""
+    means = torch.nn.functional.normalize(
+        torch.randn(800, 3, generator=torch.Generator().manual_seed(0)), dim=1
+    )
+    rgb = torch.where(means[:, 2:] > 0, torch.tensor(ABOVE), torch.tensor(BELOW))
+    return Gaussians(
+        means=0.5 * means,
+        log_scales=torch.full((800, 3), math.log(0.04)),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(800, 4),
+        opacity_logits=torch.full((800,), 3.0),
+        sh=rgb_to_sh0(rgb)[:, None],
+    )
+
+
+def never_renders(cameras, background):
+    raise AssertionError("a mesh needs no picture")
+
+
+def export(folder, **changes):
+    return MeshExporter(**{**SETTINGS, **changes}).export(two_coloured_ball(), never_renders, folder)
+
+
+@pytest.mark.parametrize("format", ["glb", "obj", "ply"])
+def test_every_format_is_one_upright_watertight_file(tmp_path, format):
+    [path] = export(tmp_path, format=format)
+    assert path == tmp_path / f"asset_mesh.{format}"
+    facts = mesh_facts(path)
+    assert facts.watertight
+    assert facts.parts == 1
+    assert facts.triangles <= 2000
+    mesh = trimesh.load_mesh(path, process=False)
+    if format != "glb":  # trimesh does not read the colours of a glb that has a material
+        top = mesh.visual.vertex_colors[mesh.vertices[:, 1].argmax()].astype(float)
+        assert top[0] > 2 * top[2]  # red is above, so +y is up
+
+
+def test_the_same_asset_gives_the_same_bytes(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    [first], [second] = export(tmp_path / "a"), export(tmp_path / "b")
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_a_texture_has_the_colours_of_the_surface_and_no_empty_texels(tmp_path):
+    pytest.importorskip("xatlas")
+    paths = export(tmp_path, format="obj", triangles=400, texture=64)
+    assert [path.name for path in paths] == ["asset_mesh.obj", "asset_mesh.mtl", "asset_mesh.png"]
+    mesh = trimesh.load_mesh(paths[0], process=False)
+    colors = mesh.visual.to_color().vertex_colors[:, :3].astype(float)
+    red, blue = 255 * np.array(ABOVE), 255 * np.array(BELOW)
+    above, below = mesh.vertices[:, 1] > 0.15, mesh.vertices[:, 1] < -0.15
+    assert np.abs(colors[above] - red).max() < 30
+    assert np.abs(colors[below] - blue).max() < 30
+    picture = np.asarray(mesh.visual.material.image.convert("RGB"))
+    assert picture.shape == (64, 64, 3)
+    assert picture.max(axis=2).min() > 0
+
+
+def test_a_glb_with_a_texture_is_one_file(tmp_path):
+    pytest.importorskip("xatlas")
+    [path] = export(tmp_path, triangles=400, texture=64)
+    assert mesh_facts(path).watertight
+    document = json.loads(path.read_bytes()[20:].split(b"\0", 1)[0].rpartition(b"}")[0] + b"}")
+    assert "COLOR_0" not in document["meshes"][0]["primitives"][0]["attributes"]
+
+
+def test_a_texture_without_xatlas_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "xatlas", None)
+    with pytest.raises(UserError, match=r"needs xatlas\. Try: pip install 'cadam3d\[texture\]'"):
+        MeshExporter(**{**SETTINGS, "texture": 64})
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("format", "fbx"), ("up", "z"), ("texture", 16), ("level", -1.0), ("resolution", 2)]
+)
+def test_wrong_values_name_their_key(key, value):
+    with pytest.raises(UserError, match=rf"exporter\.mesh\.{key}"):
+        MeshExporter(**{**SETTINGS, key: value})
+
+
+def test_a_ply_has_no_texture():
+    with pytest.raises(UserError, match=r"exporter\.mesh\.texture: .*Try: exporter\.mesh\.format=glb"):
+        MeshExporter(**{**SETTINGS, "format": "ply", "texture": 512})
