@@ -16,8 +16,8 @@ Measured facts about gaussforge 0.6.0, which the code below takes into account. 
 * stores positions beyond 2,048 wrongly in SPZ, and scales as infinite in ksplat if their exponential is;
 * lets one extreme colour take the precision of all others in the code book of SOG;
 * refuses to write SOG and ksplat without a Gaussian;
-* writes the SH coefficients of ksplat in another order than GaussianSplats3D, Spark, three.js and splat-
-  transform read them, which changes degree 2 and higher;
+* writes the SH coefficients of ksplat in another order than Spark, three.js and splat-transform read them,
+  which changes degree 2 and higher;
 * prints to standard output when it reads, and cannot return a file of SH degree 0 to Python.
 
 GaussianSplats3D, whose format ksplat is, knows SH degree 0 to 2 (its README and its issue 259).
