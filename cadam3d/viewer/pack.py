@@ -124,13 +124,14 @@ def _focus(means: Float[np.ndarray, "m 3"]) -> tuple[Float[np.ndarray, "3"], flo
     This is the unit ball if the object fits into it roughly, as our own objects do. For files in other units
     it is the ball around the median that contains 98 of 100 centres, and a margin.
     """
-    origin = np.zeros(3)
     if len(means) == 0:
-        return origin, 1.0
-    if 0.25 <= np.quantile(np.linalg.norm(means, axis=1), 0.98) <= 1.25:
-        return origin, 1.0
+        return np.zeros(3), 1.0
     center = np.median(means, axis=0)
-    radius = float(np.quantile(np.linalg.norm(means - center, axis=1), 0.98))
+    reach, radius = (
+        float(np.quantile(np.linalg.norm(means - point, axis=1), 0.98)) for point in (np.zeros(3), center)
+    )
+    if reach < 1.25 and radius > 0.2:
+        return np.zeros(3), 1.0
     return center, max(1.2 * radius, 1e-3)
 
 

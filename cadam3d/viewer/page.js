@@ -12,9 +12,10 @@
   });
   view.controls(find("controls"));
   // Nothing but the text of the page is decoded, so that it also works from a file.
-  const text = find("snapshot").textContent;
-  const bytes = Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
+  const text = atob(find("snapshot").textContent);
+  const bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
   const isDone = () => find("loading").remove();
   view.load(bytes.buffer).then(isDone, isDone);
-  globalThis.view = view;
+  globalThis.view = view; // for the console of the browser
 })();

@@ -75,8 +75,8 @@ globalThis.SplatView = (() => {
     return { count, degree, low, high, focus, radius, layers, records, rest };
   }
 
-  /* Return an object that sorts points by their depth. Its text also is the program of the worker, so it uses nothing
-   * from outside. Two passes over 16 bits each sort the bits of float32 exactly. Equal depths keep the order of rows. */
+  /* Return an object that sorts points by their depth. Its text is also the program of the worker, so it refers to
+   * nothing outside of itself. Two passes over 16 bits each sort the bits of float32 exactly. Equal depths keep the order of rows. */
   function makeSorter() {
     const starts = [new Uint32Array(65536), new Uint32Array(65536)];
     let points = new Float32Array(0); // x, y, z of each
@@ -135,14 +135,14 @@ globalThis.SplatView = (() => {
       try {
         this.url = URL.createObjectURL(new Blob([program], { type: "text/javascript" }));
         this.worker = new Worker(this.url);
-        this.worker.onerror = (event) => { event.preventDefault(); this.stayHere(); };
+        this.worker.onerror = (event) => { event.preventDefault(); this.sortInThisThread(); };
         this.worker.onmessage = ({ data }) => this.finish(data.generation, data.order);
       } catch {
-        this.stayHere();
+        this.sortInThisThread();
       }
     }
 
-    stayHere() {
+    sortInThisThread() {
       this.worker?.terminate();
       this.worker = null;
       this.local = makeSorter();
@@ -177,6 +177,22 @@ globalThis.SplatView = (() => {
       if (this.url) URL.revokeObjectURL(this.url);
     }
   }
+
+  // The basis functions of degree 1 to 3, in the order of 3DGS files, and lines that add them to a sum.
+  const BASIS = [
+    "-0.4886025119029199 * y", "0.4886025119029199 * z", "-0.4886025119029199 * x",
+    "1.0925484305920792 * x * y", "-1.0925484305920792 * y * z", "0.31539156525252005 * (2. * zz - xx - yy)",
+    "-1.0925484305920792 * x * z", "0.5462742152960396 * (xx - yy)",
+    "-0.5900435899266435 * y * (3. * xx - yy)", "2.890611442640554 * x * y * z",
+    "-0.4570457994644658 * y * (4. * zz - xx - yy)", "0.3731763325901154 * z * (2. * zz - 3. * xx - 3. * yy)",
+    "-0.4570457994644658 * x * (4. * zz - xx - yy)", "1.445305721320277 * z * (xx - yy)",
+    "-0.5900435899266435 * x * (xx - 3. * yy)",
+  ];
+  const byte = (j) => `whole(int(${["four", "more", "most"][j >> 4]}.${"xyzw"[(j >> 2) % 4]}), ${j % 4})`;
+  const terms = (first, end) => BASIS.slice(first, end).map((basis, i) => {
+    const j = 3 * (first + i);
+    return `sum += ${basis} * vec3(${byte(j)}, ${byte(j + 1)}, ${byte(j + 2)});`;
+  }).join("\n      ");
 
   const VERTEX = `#version 300 es
     precision highp float;
@@ -221,36 +237,15 @@ globalThis.SplatView = (() => {
 
     // What the coefficients of degree 1 and above add along a direction from the camera.
     vec3 harmonics(int index, vec3 d) {
-      uint word[12];
-      for (int i = 0; i < degree; i++) {
-        uvec4 four = texel(rest, index * degree + i);
-        word[4 * i] = four.x; word[4 * i + 1] = four.y; word[4 * i + 2] = four.z; word[4 * i + 3] = four.w;
-      }
       float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
-      float basis[15];
-      basis[0] = -0.4886025119029199 * y;
-      basis[1] = 0.4886025119029199 * z;
-      basis[2] = -0.4886025119029199 * x;
-      basis[3] = 1.0925484305920792 * x * y;
-      basis[4] = -1.0925484305920792 * y * z;
-      basis[5] = 0.31539156525252005 * (2. * zz - xx - yy);
-      basis[6] = -1.0925484305920792 * x * z;
-      basis[7] = 0.5462742152960396 * (xx - yy);
-      basis[8] = -0.5900435899266435 * y * (3. * xx - yy);
-      basis[9] = 2.890611442640554 * x * y * z;
-      basis[10] = -0.4570457994644658 * y * (4. * zz - xx - yy);
-      basis[11] = 0.3731763325901154 * z * (2. * zz - 3. * xx - 3. * yy);
-      basis[12] = -0.4570457994644658 * x * (4. * zz - xx - yy);
-      basis[13] = 1.445305721320277 * z * (xx - yy);
-      basis[14] = -0.5900435899266435 * x * (xx - 3. * yy);
       vec3 sum = vec3(0);
-      int terms = degree * (degree + 2);
-      for (int i = 0; i < terms; i++) {
-        int j = 3 * i;
-        sum += basis[i] * vec3(whole(int(word[j >> 2]), j & 3), whole(int(word[(j + 1) >> 2]), (j + 1) & 3),
-          whole(int(word[(j + 2) >> 2]), (j + 2) & 3));
-      }
-      return sum * unpackHalf2x16(word[4 * degree - 1]).y / 127.;
+      uvec4 four = texel(rest, index * degree), last = four;
+      uvec4 more = degree > 1 ? (last = texel(rest, index * degree + 1)) : four;
+      uvec4 most = degree > 2 ? (last = texel(rest, index * degree + 2)) : four;
+      ${terms(0, 3)}
+      if (degree > 1) { ${terms(3, 8)} }
+      if (degree > 2) { ${terms(8, 15)} }
+      return sum * unpackHalf2x16(last.w).y / 127.;
     }
 
     void main() {
@@ -416,14 +411,14 @@ globalThis.SplatView = (() => {
       this.#gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, stencil: false,
         powerPreference: "high-performance" });
       if (!this.#gl) {
-        this.#say("This browser does not offer WebGL2, which the 3D view needs. A current version of Chrome, Edge, "
+        this.#showMessage("This browser does not offer WebGL2, which the 3D view needs. A current version of Chrome, Edge, "
           + "Firefox or Safari shows it, with hardware acceleration switched on in the settings.");
         return;
       }
       try {
         this.#build();
       } catch (error) {
-        this.#say(error.message);
+        this.#showMessage(error.message);
         this.#gl = null;
         return;
       }
@@ -449,11 +444,11 @@ globalThis.SplatView = (() => {
             .toLocaleString("en")} of these Gaussians, and there are ${data.count.toLocaleString("en")}.`);
         }
       } catch (error) {
-        this.#say(error.message);
+        this.#showMessage(error.message);
         return Promise.reject(error);
       }
       data.generation = ++this.#generation;
-      // A snapshot that was not drawn yet is replaced by this one, and so are those that wait for it.
+      // This snapshot replaces one that is not drawn yet. The promises of both resolve when this one is drawn.
       data.waiting = this.#next ? this.#next.waiting : [];
       if (this.#next) this.#release(this.#next);
       this.#next = data;
@@ -573,6 +568,7 @@ globalThis.SplatView = (() => {
       };
       const [count, low, high] = ["splat-count", "", ""].map((className) => make("span", { className }));
       const choice = make("select", { title: "What the colours show (keys 1 to 9)" });
+      choice.setAttribute("aria-label", "What the colours show");
       const ramp = make("i");
       ramp.style.background = SplatView.gradient;
       const legend = make("span", { className: "splat-legend" }, low, ramp, high);
@@ -589,9 +585,10 @@ globalThis.SplatView = (() => {
       backgrounds.setAttribute("role", "group");
       backgrounds.setAttribute("aria-label", "Background");
       element.classList.add("splat-controls");
-      element.replaceChildren(count, make("label", {}, "Show ", choice), legend, backgrounds, turn,
-        button("Reset", "Back to the first view (r)", () => this.reset()),
-        button("Save PNG", "Save this picture", () => this.#save()));
+      element.replaceChildren(count, make("label", {}, make("span", {}, "Show"), choice), legend,
+        make("span", { className: "splat-tools" }, backgrounds, turn,
+          button("Reset", "Back to the first view (r)", () => this.reset()),
+          button("Save PNG", "Save this picture", () => this.#save())));
       choice.onchange = () => this.show(choice.value);
       const refresh = () => {
         count.textContent = `${this.count.toLocaleString("en")} Gaussian${this.count === 1 ? "" : "s"}`;
@@ -607,8 +604,10 @@ globalThis.SplatView = (() => {
           high.textContent = short(ends.high);
           legend.title = ends.isLog ? "logarithmic colours" : "linear colours";
         }
-        for (const [swatch, color] of swatches) swatch.ariaPressed = String(color.every((v, i) => v === this.#background[i]));
-        turn.ariaPressed = String(this.#rotating);
+        for (const [swatch, color] of swatches) {
+          swatch.setAttribute("aria-pressed", color.every((value, i) => value === this.#background[i]));
+        }
+        turn.setAttribute("aria-pressed", this.#rotating);
       };
       this.#refreshers.push(refresh);
       refresh();
@@ -630,7 +629,7 @@ globalThis.SplatView = (() => {
 
     #build() {
       const gl = this.#gl;
-      // Halves keep sums of many faint Gaussians and of colours above 1. Bytes are the second best.
+      // 16-bit floats hold sums of many faint Gaussians and colours above 1. Bytes are the fallback.
       this.#isHalf = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
       this.#splats = compile(gl, VERTEX, FRAGMENT);
       this.#screen = compile(gl, SCREEN_VERTEX, SCREEN_FRAGMENT);
@@ -750,17 +749,17 @@ globalThis.SplatView = (() => {
       this.#fill(ORDER_UNIT, gl.RED_INTEGER, gl.UNSIGNED_INT, order, 1);
     }
 
-    /* The next data becomes the shown data. */
+    /* Make the next data the shown data, and resolve the promises of its load. */
     #accept() {
       const [before, data] = [this.#shown, this.#next];
       this.#shown = data;
       this.#next = null;
       if (before) this.#release(before);
       this.#useLayer();
-      this.#hush();
+      this.#removeMessage();
       if (!before?.count) this.#frameObject(data);
       const waiting = data.waiting.splice(0);
-      queueMicrotask(() => { waiting.forEach((resolve) => resolve()); this.#announce(); });
+      queueMicrotask(() => { waiting.forEach((resolve) => resolve()); this.#notify(); });
     }
 
     /* Move the camera to where the whole object is visible, unless the page has placed it. */
@@ -784,18 +783,24 @@ globalThis.SplatView = (() => {
 
     #changed() {
       this.#draw();
-      this.#announce();
+      this.#notify();
     }
 
-    #announce() {
+    #notify() {
       this.#refreshers.forEach((refresh) => refresh());
       this.onchange?.();
     }
 
     /* Draw soon, or now. Drawing now works in a hidden page too, where no frames are requested. */
     #draw(isNow = false) {
-      if (isNow) this.#paint();
-      else this.#request ||= requestAnimationFrame((time) => this.#tick(time));
+      if (isNow) {
+        // This picture replaces one that is due soon, but not the next one of a rotation.
+        if (!this.#rotating) {
+          cancelAnimationFrame(this.#request);
+          this.#request = 0;
+        }
+        this.#paint();
+      } else this.#request ||= requestAnimationFrame((time) => this.#tick(time));
     }
 
     #tick(time) {
@@ -914,8 +919,8 @@ globalThis.SplatView = (() => {
 
     /* ---- messages ---- */
 
-    #say(text) {
-      this.#hush();
+    #showMessage(text) {
+      this.#removeMessage();
       const message = document.createElement("p");
       message.className = "splat-message";
       message.setAttribute("role", "alert");
@@ -929,7 +934,7 @@ globalThis.SplatView = (() => {
       this.#message = message;
     }
 
-    #hush() {
+    #removeMessage() {
       this.#message?.remove();
       this.#message = null;
     }
@@ -951,7 +956,7 @@ globalThis.SplatView = (() => {
       if (keyboard) on(keyboard === true ? canvas : keyboard, "keydown", (event) => this.#key(event));
     }
 
-    /* After a reset of the graphics card nothing of ours is left on it. */
+    /* Build and upload everything again: a reset of the graphics card has removed it. */
     #restore() {
       this.#build();
       for (const data of [this.#shown, this.#next]) if (data) this.#upload(data);

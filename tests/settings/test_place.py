@@ -163,7 +163,7 @@ def whole_run(tmp_path_factory) -> Path:
     """Return a folder with everything that a run, its exporters, its callbacks and eval write."""
     place = tmp_path_factory.mktemp("whole")
     pictures = [
-        "exporter=[ply,images,preview,turntable]",
+        "exporter=[ply,images,preview,turntable,html]",
         "callback=[checkpoint,metrics,previews,candidates]",
     ]
     sizes = [f"exporter.{name}.size=16" for name in ("images", "preview", "turntable")]
