@@ -25,8 +25,8 @@ for y), of a quaternion's component 0.0007, of a colour 1/510 of the range in it
 and 1/64 of a higher SH coefficient.
 
 Sources: blog.playcanvas.com, "Compressing Gaussian Splats"; the header shown in pull request 82 of
-github.com/sparkjsdev/spark (both layouts); and measurements of the files that splat-transform 3.7.0 writes
-and reads, which :mod:`tests.io.test_compressed_ply` repeats with gaussforge 0.6.0.
+github.com/sparkjsdev/spark (both layouts); and measurements. splat-transform 3.7.0 reads from a file written
+here the same numbers as this module, to the bit, and the other way round.
 """
 
 from pathlib import Path

@@ -10,7 +10,10 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0, evaluate_sh
 from cadam3d.initializer.ply import Ply
+from cadam3d.io.compressed_ply import write_compressed_ply
 from cadam3d.io.ply import write_ply
+from cadam3d.io.splat import write_splat
+from cadam3d.io.spz import write_spz
 
 CPU = torch.device("cpu")
 
@@ -91,6 +94,17 @@ def test_assets_of_any_degree_are_read_back_up_to_rounding(tmp_path, degree):
 def test_the_up_axis_of_other_programs_assets_can_be_given(tmp_path, written, asked):
     asset = some_gaussians()
     assert_equal(build(without_our_comments(saved(tmp_path, asset, written)), up=asked), asset)
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [("a.compressed.ply", write_compressed_ply), ("a.splat", write_splat), ("a.spz", write_spz)],
+)
+def test_assets_of_other_formats_are_upright_once_their_axis_is_given(tmp_path, name, write):
+    write(tmp_path / name, some_gaussians(degree=0), up="+z")
+    made = build(tmp_path / name, up="+z")
+    assert len(made) == 60
+    torch.testing.assert_close(made.means.mean(dim=0), some_gaussians().means.mean(dim=0), atol=0.01, rtol=0)
 
 
 @pytest.mark.parametrize("turn_deg", [0, 90, 180, 270])
