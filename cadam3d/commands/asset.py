@@ -112,9 +112,11 @@ def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
     built: Rasterizer = component(rasterizer, Rasterizer, "rasterizer")
     render = render_fn(built, lambda: gaussians)
 
-    def render_with_note(cameras: Cameras, background: Float[Tensor, "v 3"]) -> RenderOutput:
+    def render_with_note(
+        cameras: Cameras, background: Float[Tensor, "v 3"], shown: Gaussians | None = None
+    ) -> RenderOutput:
         note_backend(built.prepare(gaussians.device))
-        return render(cameras, background)
+        return render(cameras, background, shown)
 
     return render_with_note
 
