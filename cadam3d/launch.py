@@ -29,10 +29,12 @@ from cadam3d.settings.hydra import (
 )
 from cadam3d.settings.line import RUN_FOLDER, exporting, key_of, quoted, resumed, split
 from cadam3d.settings.place import occupied
+from cadam3d.settings.target import require_target
 from cadam3d.settings.trust import judge_composition, require_trust, targets_in
 
 TRAINING = ("train", "sweep")  # the commands that have a run folder
 EXPORTING = ("render", "export", "view")  # the commands with output=
+COMPARING = "render"  # the command that accepts several runs
 
 
 @dataclass
@@ -123,6 +125,8 @@ def read_line(command: str, overrides: list[str], flags: list[str], options: Nam
             "dry_run: expected a sweep, whose jobs it lists, got a single run. The settings of a run can be "
             f"printed instead. Try: {shlex.join(['cadam3d', command, *words, *flags, '--cfg', 'job'])}"
         )
+    if command == "export":
+        require_target(overrides)
     overrides = typed = [quoted(override, is_sweep=is_sweep) for override in overrides]
     if command in TRAINING:
         folders = [Path(options.config_path) if options.config_path else config_dir()]
@@ -147,6 +151,7 @@ def _command(line: Line, task: Task) -> int:
     refuse_missing_settings(cfg, line.command, line.overrides)
     refuse_unread_settings(cfg, line.command, line.overrides)
     require_settings(cfg)
+    _refuse_several_runs(cfg, line)
     if line.command in TRAINING:
         _train(cfg, line, task)
     else:
@@ -186,6 +191,17 @@ def _train(cfg: DictConfig, line: Line, task: Task) -> None:
     with occupied(wanted, is_chosen=is_chosen, resume=resume) as folder:
         place_run(cfg, folder)
         run_composed(cfg, task)
+
+
+def _refuse_several_runs(cfg: DictConfig, line: Line) -> None:
+    """Raise ``UserError`` if a line names several runs and its command does not compare them."""
+    runs = cfg.get("run")
+    if line.command != COMPARING and OmegaConf.is_list(runs):
+        typed = next(word for word in line.overrides if key_of(word) == "run")
+        raise UserError(
+            f"run: expected one run, got a list of {len(runs)}, which only cadam3d {COMPARING} compares. "
+            f"Try: {shlex.join(['cadam3d', COMPARING, typed])}"
+        )
 
 
 def _wants_page(options: Namespace) -> bool:

@@ -92,14 +92,18 @@ def recorded(arm: str, work: Path) -> Growth:
     path = work / f"{arm}.npz"
     if not path.is_file():
         growth = train(arm, work)
-        np.savez_compressed(path, steps=growth.steps, counts=growth.counts, pictures=np.stack(growth.pictures))
+        np.savez_compressed(
+            path, steps=growth.steps, counts=growth.counts, pictures=np.stack(growth.pictures)
+        )
     data = np.load(path)
     return Growth(data["steps"].tolist(), data["counts"].tolist(), list(data["pictures"]))
 
 
 def main() -> None:
     """Train both, draw, and write the animation."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--work", type=Path, help="folder that keeps the pictures between calls")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as spare:

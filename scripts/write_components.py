@@ -17,7 +17,7 @@ PART = re.compile(r"(<!-- begin generated: (\S+) -->\n).*?(<!-- end generated --
 # Options of these groups are lists of runs and have no settings.
 LISTED_ONLY = ("grid",)
 # Options of these groups change settings of other groups, which are documented there.
-RECIPES = ("experiment", "noise", "vram")
+RECIPES = ("experiment", "noise", "vram", "for")
 
 
 def main() -> None:

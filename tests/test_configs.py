@@ -28,7 +28,7 @@ from cadam3d.sweep.plan import compose_all, read_sweep
 
 CONFIGS = config_dir()
 SEVERAL = ("exporter", "callback", "metric")  # groups with several choices
-NO_COMPONENTS = ("hydra", "grid", "launcher", "experiment", "noise", "vram")
+NO_COMPONENTS = ("hydra", "grid", "launcher", "experiment", "noise", "vram", "for")
 GROUPS = {
     path.name: sorted(file.stem for file in path.glob("*.yaml"))
     for path in sorted(CONFIGS.iterdir())

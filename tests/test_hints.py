@@ -149,7 +149,13 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         ("render", "run=a run", "output=/dev/null/x"),
         ("export", "run=a run", "output=/dev/null/x.ply"),
         ("export", "run=new"),
-        ("export", "run=a run", "output=a.b.obj"),
+        ("export", "run=a run", "output=a.b.fbx"),
+        ("export", "run=a run", "output=taken"),
+        ("export", "run=a run", "for=unity", "output=a.ply"),
+        ("export", "run=a run", "for=sparc"),
+        ("export", "run=a run", "for=spark", "exporter=[ply]"),
+        ("export", "run=a run", "for=spark", "output=a.glb"),
+        ("render", "run=a run", "for=spark"),
         ("eval",),
         ("view", "run=nowhere"),
     ],
@@ -427,6 +433,8 @@ def make_places(folder: Path) -> None:
     trimesh.PointCloud(points).export(folder / "points.ply")
     trimesh.PointCloud(points * np.nan).export(folder / "nan.ply")
     (folder / "configs").mkdir()
+    (folder / "taken").mkdir()
+    (folder / "taken/asset.json").write_text("{}")
     (folder / "text").mkdir()
     (folder / "text/broken.ply").write_text("no PLY file")
 

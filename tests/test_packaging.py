@@ -71,6 +71,13 @@ def test_the_wheel_carries_the_report_templates(wheel):
     assert {str(path.relative_to(REPOSITORY)) for path in templates} <= names
 
 
+def test_the_wheel_carries_the_pages_of_the_viewer(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
+    sources = {path for pattern in ("*.js", "*.css", "*.jinja") for path in find("cadam3d/viewer", pattern)}
+    assert sources
+    assert {str(path.relative_to(REPOSITORY)) for path in sources} <= names
+
+
 def test_the_source_archive_carries_what_its_own_tests_read(tmp_path):
     command = [sys.executable, "-m", "build", "--sdist", "--no-isolation", "--outdir", str(tmp_path)]
     subprocess.run([*command, str(REPOSITORY)], check=True, capture_output=True)

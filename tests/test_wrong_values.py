@@ -120,7 +120,7 @@ NEVER += ({"_target_": "os.getcwd"}, {"_target_": None}, {"_target_": "cadam3d.n
 # Values that some settings have.
 PERHAPS: tuple[Any, ...] = (None, [], "abc", True, 0, -1, 1e23, 2**62, 1e-320, [1, 2])
 # Folders of options that are not components of one class.
-NOT_COMPONENTS = ("hydra", "grid", "launcher", "experiment", "noise", "vram")
+NOT_COMPONENTS = ("hydra", "grid", "launcher", "experiment", "noise", "vram", "for")
 SEVERAL = ("regularizer", "exporter", "callback", "metric")
 NEVER_WHOLE = ("2.5", "16.0", "true", "abc", "[1]", "-1000000000000.5")
 NEVER_A_LIST = ("5", "null", "abc", "[a,b,c]", "[true,true,true]", "[null,null]", "[]")

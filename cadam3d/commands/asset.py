@@ -2,7 +2,7 @@
 
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,7 +36,7 @@ from cadam3d.io.run_folder import (
 )
 from cadam3d.rasterizer.base import Rasterizer, render_fn
 from cadam3d.settings.compose import component, components
-from cadam3d.settings.line import EXPORTERS, resume_word, setting_word
+from cadam3d.settings.line import EXPORTERS, resume_word, setting_word, suffix_of
 from cadam3d.settings.trust import read_components, require_contained, search_folders
 from cadam3d.sweep.folder import is_sweep
 
@@ -50,6 +50,18 @@ class Asset:
     gaussians: Gaussians
     ply: Path
     folder: Path  # of the run, or named after a single file
+
+
+@dataclass(frozen=True)
+class Output:
+    """A file that an exporter has written."""
+
+    path: Path
+    exporter: str  # its name, such as "ply"
+
+
+# Writes files of an asset into a folder.
+ExportFn = Callable[[DictConfig, Asset, Path], list[Output]]
 
 
 def open_asset(cfg: DictConfig) -> Asset:
@@ -121,29 +133,49 @@ def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
     return render_with_note
 
 
-def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Path]:
-    """Run every exporter of ``cfg`` on ``asset``, and return the paths of the files in ``folder``.
+def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Output]:
+    """Run every exporter of ``cfg`` on ``asset``, and return the files that they have written in ``folder``.
+
+    An exporter that fails costs only its own files. Raises ``UserError`` if all of them fail.
+    """
+    render = renderer(cfg.rasterizer, asset.gaussians)
+    return run_exporters(cfg, lambda exporter: exporter.export(asset.gaussians, render, folder))
+
+
+def run_exporters(cfg: DictConfig, write: Callable[[Exporter], list[Path]]) -> list[Output]:
+    """Call ``write`` with every exporter of ``cfg``, and return the files that it has written.
 
     An exporter that fails costs only its own files. Raises ``UserError`` if all of them fail.
     """
     exporters: Mapping[str, Exporter] = components(cfg.exporter, Exporter, "exporter")
     if not exporters:
         raise UserError("exporter: expected at least one, got none. Try: exporter=[images,turntable]")
-    render = renderer(cfg.rasterizer, asset.gaussians)
-    paths, warnings = [], []
+    outputs, warnings = [], []
     for name, exporter in exporters.items():
         with keeping_others(f"exporter.{name}", warnings):
-            paths += exporter.export(asset.gaussians, render, folder)
+            outputs += [Output(path, name) for path in write(exporter)]
     if len(warnings) == len(exporters):
         raise UserError(warnings[0])
-    return paths
+    return outputs
 
 
 def write_outputs(cfg: DictConfig, asset: Asset, name: str) -> list[Path]:
-    """Run the exporters of ``cfg`` on ``asset``, and return the paths of the files that they have written.
+    """Run the exporters of ``cfg`` on ``asset``, and return the paths of the files; see ``write_files``."""
+    return [output.path for output in write_files(cfg, asset, name)]
+
+
+def write_files(
+    cfg: DictConfig,
+    asset: Asset,
+    name: str,
+    into_folder: ExportFn = export_all,
+    into_file: ExportFn = export_all,
+) -> list[Output]:
+    """Run the exporters of ``cfg`` on ``asset``, and return the files that they have written.
 
     ``output=`` names a file if it has a suffix, does not end with a slash, and is not a folder that exists.
-    Otherwise it names a folder, by default ``name`` beside the asset.
+    Then ``into_file`` writes it into a temporary folder, from which it is moved. Otherwise it names a folder,
+    by default ``name`` beside the asset, into which ``into_folder`` writes.
     """
     if cfg.output is None and asset.folder.is_dir():
         require_contained(asset.folder, f"output={spare(name)}")
@@ -153,7 +185,7 @@ def write_outputs(cfg: DictConfig, asset: Asset, name: str) -> list[Path]:
         raise fail("output", expected="a file or a folder", got=text, example=f"output={name}")
     try:
         if cfg.output is not None and target.suffix and not text.endswith("/") and not target.is_dir():
-            return [_one_file(cfg, asset, target)]
+            return [_one_file(cfg, asset, target, into_file)]
         if os.path.lexists(target) and not target.is_dir():
             line = setting_word("output", numbered(target))
             raise UserError(f"output: expected a folder, got {text!r}, which is a file. Try: {line}")
@@ -163,16 +195,16 @@ def write_outputs(cfg: DictConfig, asset: Asset, name: str) -> list[Path]:
     except OSError as error:
         reason = error.strerror or error
         # A long name loses its suffix here, and an unknown suffix would be refused: both become folders.
-        is_file = target.suffix.lower() in EXPORTERS and len(target.name) <= LONGEST_NAME
+        is_file = suffix_of(target.name) in EXPORTERS and len(target.name) <= LONGEST_NAME
         line = setting_word("output", spare(target.name if is_file else target.stem[:LONGEST_NAME] or name))
         raise UserError(f"output: cannot write to {target} ({reason}). Try: {line}") from error
     try:
-        return export_all(cfg, asset, target)
+        return into_folder(cfg, asset, target)
     finally:
         remove_empty(target, existing)
 
 
-def _one_file(cfg: DictConfig, asset: Asset, target: Path) -> Path:
+def _one_file(cfg: DictConfig, asset: Asset, target: Path, export: ExportFn) -> Output:
     """Export into a folder beside ``target``, then move the file to its final name in a single step.
 
     Raises ``OSError`` if ``target`` cannot be written.
@@ -181,15 +213,16 @@ def _one_file(cfg: DictConfig, asset: Asset, target: Path) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".export-") as folder:
-            paths = export_all(cfg, asset, Path(folder))
-            suffixes = {path.suffix for path in paths}
-            if len(paths) != 1 or suffixes != {target.suffix.lower()}:
-                line = setting_word("output", f"{numbered(target.with_suffix(''), first=1)}/")
+            outputs = export(cfg, asset, Path(folder))
+            suffixes = {suffix_of(output.path.name) for output in outputs}
+            if len(outputs) != 1 or suffixes != {suffix_of(target.name)}:
+                stem = target.name[: -len(suffix_of(target.name))]
+                line = setting_word("output", f"{numbered(target.with_name(stem), first=1)}/")
                 raise UserError(
                     f"output: expected the name of a folder, got {str(target)!r}, because "
-                    f"exporter=[{','.join(cfg.exporter)}] writes {len(paths)} file(s) with suffix "
+                    f"exporter=[{','.join(cfg.exporter)}] writes {len(outputs)} file(s) with suffix "
                     f"{'|'.join(sorted(suffixes))}. Try: {line}"
                 )
-            return paths[0].replace(target)
+            return Output(outputs[0].path.replace(target), outputs[0].exporter)
     finally:
         remove_empty(target.parent, existing)

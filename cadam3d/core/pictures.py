@@ -102,7 +102,8 @@ class CutoutSettings(ViewSettings):
         super().__post_init__()
         key = f"{self.node}.background"
         require(
-            self.is_transparent or (are_numbers(self.background, low=0, high=1) and len(self.background) == 3),
+            self.is_transparent
+            or (are_numbers(self.background, low=0, high=1) and len(self.background) == 3),
             key,
             expected=f"three numbers in [0, 1] or {TRANSPARENT}",
             got=self.background,

@@ -52,7 +52,6 @@ class RenderOutput:
         return ((inverse - farthest) / spread).clamp(0, 1)
 
 
-
 class RenderFn(Protocol):
     """A function that renders given Gaussians, without gradients."""
 
@@ -64,6 +63,15 @@ class RenderFn(Protocol):
         ``shown`` replaces the given Gaussians, for example by the same ones in other colours.
         """
         ...
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One asset of a picture that shows several."""
+
+    gaussians: Gaussians
+    render: RenderFn  # shows these Gaussians
+    label: str = ""  # written under it
 
 
 # From cameras and one background per view to the true images of each mode, "m v h w 3". Few priors have them.

@@ -8,7 +8,8 @@ from typing import ClassVar
 
 from cadam3d.core.checks import require
 from cadam3d.core.pictures import CutoutSettings
-from cadam3d.exporter.pictures import KINDS, PictureExporter, Subject, captions_of, paint, paper_of
+from cadam3d.core.render import Subject
+from cadam3d.exporter.pictures import KINDS, PictureExporter, captions_of, paint, paper_of
 from cadam3d.io.atomic import replacing_series
 from cadam3d.io.caption import side_by_side
 from cadam3d.io.image import to_uint8, write_png_bytes
@@ -38,14 +39,16 @@ class ImagesExporter(CutoutSettings, PictureExporter):
         self.require_angles("elevations_deg", self.elevations_deg, limit=90, example=15)
         is_list = not isinstance(self.kinds, str) and isinstance(self.kinds, Sequence)
         require(
-            is_list and 0 < len(self.kinds) == len(set(map(str, self.kinds))) and set(self.kinds) <= set(KINDS),
+            is_list
+            and 0 < len(self.kinds) == len(set(map(str, self.kinds)))
+            and set(self.kinds) <= set(KINDS),
             "exporter.images.kinds",
             expected=f"one or more of {'|'.join(KINDS)}, each once",
             got=self.kinds,
             example="'exporter.images.kinds=[rgb,normal]'",
         )
 
-    def draw(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
+    def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Render and write view by view, so that memory does not grow with the number of views."""
         names: list[str] = []
         target, number = folder / IMAGES, 0

@@ -1,6 +1,5 @@
 """PictureExporter: pictures of one asset, or of several assets side by side from the same cameras."""
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from torch import Tensor
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.normals import unit_normals, with_normals
-from cadam3d.core.render import RenderFn
+from cadam3d.core.render import RenderFn, Subject
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.caption import PAPER, Caption, Color
 from cadam3d.io.image import closeness, cutout
@@ -20,40 +19,19 @@ from cadam3d.io.image import closeness, cutout
 KINDS = ("rgb", "depth", "alpha", "normal")
 
 
-@dataclass(frozen=True)
-class Subject:
-    """One asset in a picture."""
-
-    gaussians: Gaussians
-    render: RenderFn  # shows these Gaussians
-    label: str = ""  # written under it if there are several
-
-    @property
-    def caption(self) -> Caption:
-        """Return the text under this asset beside others: its label and its number of Gaussians."""
-        return Caption(self.label, f"{len(self.gaussians):,} Gaussians")
-
-
 @dataclass(frozen=True, kw_only=True)
 class PictureExporter(Exporter):
-    """Draw pictures of one asset or of several."""
+    """Draw pictures of one asset or of several; a subclass defines ``compare``."""
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
         """Draw a single asset, without a caption."""
-        return self.draw([Subject(gaussians, render)], folder)
-
-    @abstractmethod
-    def draw(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
-        """Write pictures of all ``subjects`` into ``folder``, which exists, and return their paths.
-
-        Several subjects are side by side in every picture, seen from the same cameras and with a caption under
-        each. Raises ``UserError`` if a file cannot be written.
-        """
+        return self.compare([Subject(gaussians, render)], folder)
 
 
 def captions_of(subjects: Sequence[Subject]) -> list[Caption]:
-    """Return the captions of several subjects; none for a single one."""
-    return [subject.caption for subject in subjects] if len(subjects) > 1 else []
+    """Return the label and the number of Gaussians of each of several subjects; nothing for a single one."""
+    captions = [Caption(subject.label, f"{len(subject.gaussians):,} Gaussians") for subject in subjects]
+    return captions if len(subjects) > 1 else []
 
 
 def paper_of(background: Sequence[float] | str) -> Color:

@@ -11,7 +11,8 @@ from jaxtyping import UInt8
 
 from cadam3d.core.checks import require_choice
 from cadam3d.core.pictures import PictureSettings
-from cadam3d.exporter.pictures import PictureExporter, Subject, captions_of, paper_of
+from cadam3d.core.render import Subject
+from cadam3d.exporter.pictures import PictureExporter, captions_of, paper_of
 from cadam3d.io.caption import side_by_side
 from cadam3d.io.image import contact_sheet, to_uint8, write_png_bytes
 from cadam3d.io.run_folder import PREVIEW
@@ -38,7 +39,7 @@ class PreviewExporter(PictureSettings, PictureExporter):
         self.require_views(self.views, example=8, bytes_each=kept)
         require_choice("exporter.preview.labels", self.labels, (True, False))
 
-    def draw(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
+    def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Render row by row and write the sheet."""
         path = folder / PREVIEW
         columns = self.views if len(subjects) == 1 else self._columns()

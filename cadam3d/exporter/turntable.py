@@ -12,7 +12,8 @@ from jaxtyping import UInt8
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import fail, require, require_choice, require_range, require_whole
 from cadam3d.core.pictures import CutoutSettings
-from cadam3d.exporter.pictures import PictureExporter, Subject, captions_of, paint, paper_of
+from cadam3d.core.render import Subject
+from cadam3d.exporter.pictures import PictureExporter, captions_of, paint, paper_of
 from cadam3d.io.caption import side_by_side
 from cadam3d.io.image import to_uint8
 from cadam3d.io.run_folder import TURNTABLES
@@ -52,7 +53,7 @@ class TurntableExporter(CutoutSettings, PictureExporter):
             expected, example = "webm, because the background is transparent", "exporter.turntable.codec=webm"
             raise fail("exporter.turntable.codec", expected=expected, got=self.codec, example=example)
 
-    def draw(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
+    def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Render and encode frame by frame."""
         pictures = len(subjects) * len(self._kinds())
         # The gaps between pictures are narrower than a sixteenth of them.
@@ -73,9 +74,7 @@ class TurntableExporter(CutoutSettings, PictureExporter):
         azimuths_deg = torch.arange(self.views, dtype=torch.float32) * (360.0 * self.turns / self.views)
         return self.cameras_at(azimuths_deg, torch.full_like(azimuths_deg, self.elevation_deg))
 
-    def _frames(
-        self, cameras: Cameras, subjects: Sequence[Subject]
-    ) -> Iterator[UInt8[np.ndarray, "h w c"]]:
+    def _frames(self, cameras: Cameras, subjects: Sequence[Subject]) -> Iterator[UInt8[np.ndarray, "h w c"]]:
         captions, paper = captions_of(subjects), paper_of(self.background)
         for first in range(0, self.views, VIEWS_AT_ONCE):
             some = cameras.index(slice(first, first + VIEWS_AT_ONCE))

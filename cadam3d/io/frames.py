@@ -48,6 +48,11 @@ def file_to_world(gaussians: Gaussians, up: str) -> Gaussians:
     return _rotate(gaussians, _axes(up).T)
 
 
+def points_to_file(points: Float[Tensor, "n 3"], up: str) -> Float[Tensor, "n 3"]:
+    """Return world positions in the axes of a file, exact to the bit; ``up`` is the up axis of the file."""
+    return _permute(points, _axes(up))
+
+
 def points_to_world(points: Float[Tensor, "n 3"], up: str) -> Float[Tensor, "n 3"]:
     """Return positions of a file in world axes, exact to the bit; ``up`` is the up axis of the file."""
     return _permute(points, _axes(up).T)

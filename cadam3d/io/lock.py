@@ -106,6 +106,33 @@ def unlock(file: IO[Any]) -> None:
         pass
 
 
+@contextmanager
+def taking_turns(folder: Path, on_wait: Callable[[], None]) -> Iterator[None]:
+    """Wait until no other process holds ``folder`` in this way, and hold it while the block runs.
+
+    The lock belongs to the folder itself, so it leaves no file. ``on_wait`` is called before a wait. Without
+    locks on folders, as on Windows, the block runs at once.
+    """
+    if fcntl is None:
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            on_wait()
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        except OSError:  # a file system without locks
+            pass
+        yield
+    finally:
+        # Closing would not release the lock if a child process had inherited the descriptor.
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_UN)
+        os.close(descriptor)
+
+
 def describe_holder(path: Path) -> str:
     """Describe the process that holds the lock file ``path``, as far as its note can be read."""
     # A process that has just locked the file needs a moment to write its note.

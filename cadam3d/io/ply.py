@@ -5,36 +5,37 @@ f_rest_0..(3r-1) opacity scale_0..2 rot_0..3``. The numbers are raw: logits of o
 scales, and quaternions wxyz of any length. There are ``r = (degree + 1)^2 - 1`` rest coefficients per
 channel, stored channel-major (all of red, then green, then blue). Normals are zeros.
 
+Files of other programs are read in all three encodings of PLY (little-endian, big-endian, text), with their
+properties in any order and of any numeric type, without normals, and with other properties and elements.
+
 A comment line records the axes, so that files of this project are read back into world axes automatically.
 Reading a file that was written here gives the same bits. The only exceptions are SH bands 2 and 3 in axes
 other than ``+z`` (see ``frames.py``), which are rounded to float32 once when writing and once when reading.
 
-A file with NaN or infinity is refused. Every finite number is accepted, however large: the quaternion (0, 0,
+A file with NaN or infinity is refused, except for an infinite ``opacity`` of another program, which means 0
+or 1. Every finite number is accepted, however large: the quaternion (0, 0,
 0, 0) means no rotation (``Gaussians.rotations``), and every rasterizer gives finite images of such Gaussians
 (``tests/rasterizer/test_reference.py``). A file that is longer or shorter than its header claims is refused,
 and reading never allocates more than a few times its size.
 """
 
-import math
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
-import torch
 
 from cadam3d import __version__
 from cadam3d.core.checks import require_choice
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE
 from cadam3d.io.atomic import replacing
-from cadam3d.io.frames import UPS, file_to_world, world_to_file
-from cadam3d.io.reading import open_regular
+from cadam3d.io.encoding import as_tensor, float32_cpu
+from cadam3d.io.frames import UPS, world_to_file
+from cadam3d.io.gathering import gathered
+from cadam3d.io.ply_tables import LITTLE, PlyHeader, read_header, read_tables, unusable
 
-FORMAT = "binary_little_endian 1.0"
+VERTEX = "vertex"
 # The columns of each tensor that is stored without a change of layout.
 COLUMNS = {
     "means": ["x", "y", "z"],
@@ -45,21 +46,11 @@ COLUMNS = {
 # No reader uses the normals, but readers with a fixed record size expect them.
 NORMALS = ["nx", "ny", "nz"]
 SH0 = ["f_dc_0", "f_dc_1", "f_dc_2"]
+REQUIRED = [*COLUMNS["means"], *SH0, *COLUMNS["opacity_logits"], *COLUMNS["log_scales"], *COLUMNS["quats"]]
 # Properties that Gaussians have and plain points do not have.
 GAUSSIANS_ONLY = {"f_dc_0", "scale_0", "rot_0", "packed_position"}
 REST_SIZES = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_DEGREE + 1)]
-MAX_HEADER_BYTES = 1 << 16
-MAX_DIGITS = 15  # of a number of rows
-NUMPY_TYPES = {
-    **dict.fromkeys(["char", "int8"], "<i1"),
-    **dict.fromkeys(["uchar", "uint8"], "<u1"),
-    **dict.fromkeys(["short", "int16"], "<i2"),
-    **dict.fromkeys(["ushort", "uint16"], "<u2"),
-    **dict.fromkeys(["int", "int32"], "<i4"),
-    **dict.fromkeys(["uint", "uint32"], "<u4"),
-    **dict.fromkeys(["float", "float32"], "<f4"),
-    **dict.fromkeys(["double", "float64"], "<f8"),
-}
+INFINITE_LOGIT = 20.0  # its opacity is 1 in float32
 
 
 def write_ply(path: Path, gaussians: Gaussians, *, up: str, pad_sh: int) -> None:
@@ -70,7 +61,7 @@ def write_ply(path: Path, gaussians: Gaussians, *, up: str, pad_sh: int) -> None
     cannot be written.
     """
     require_choice("pad_sh", pad_sh, range(MAX_DEGREE + 1))
-    local = world_to_file(gaussians.detach().to("cpu").to(torch.float32), up)
+    local = world_to_file(float32_cpu(gaussians), up)
     arrays = {name: tensor.numpy() for name, tensor in local.tensors().items()}
     rest_size = REST_SIZES[max(pad_sh, local.sh_degree)]
     rest = np.zeros((len(local), 3, rest_size // 3), dtype=np.float32)
@@ -99,34 +90,40 @@ def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
     not such a file, or has numbers that are not finite.
     """
     require_choice("up", up, UPS)
-    try:
-        with open_regular(path) as file:
-            header = _parse_header(path, file)
-            rows = _read_rows(path, file, header)
-    # A name with a null byte is a ValueError.
-    except (OSError, ValueError, MemoryError) as error:
-        reason = getattr(error, "strerror", None) or error or "too large"
-        raise UserError(f"{path}: cannot be read ({reason}). Try: another file") from error
+    header = read_header(path)
+    size = _rest_size(header)
+    rest = [f"f_rest_{i}" for i in range(size)]
+    table = read_tables(header, {VERTEX: [*REQUIRED, *rest]})[VERTEX]
 
-    def columns(names: Sequence[str]) -> np.ndarray:
-        # A double may be too large for a float; the infinity is refused below.
-        with np.errstate(over="ignore"):
-            found = [rows[name].astype(np.float32, copy=False) for name in names]
-        return np.stack(found, axis=1) if found else np.zeros((len(rows), 0), dtype=np.float32)
+    def local(rows: slice) -> Gaussians:
+        some = table[rows]
+        higher = _columns(some, rest).reshape(len(some), 3, size // 3).transpose(0, 2, 1)
+        opacities = _columns(some, COLUMNS["opacity_logits"])[:, 0]
+        return Gaussians(
+            means=as_tensor(_columns(some, COLUMNS["means"])),
+            log_scales=as_tensor(_columns(some, COLUMNS["log_scales"])),
+            quats=as_tensor(_columns(some, COLUMNS["quats"])),
+            opacity_logits=as_tensor(opacities if header.up else _finite_logits(opacities)),
+            sh=as_tensor(np.concatenate([_columns(some, SH0)[:, None], higher], axis=1)),
+        )
 
-    rest = columns([f"f_rest_{i}" for i in range(header.rest_size)])
-    rest = rest.reshape(len(rows), 3, header.rest_size // 3)
-    sh = np.concatenate([columns(SH0)[:, None], rest.transpose(0, 2, 1)], axis=1)
-    local = Gaussians(
-        means=torch.from_numpy(columns(COLUMNS["means"])),
-        log_scales=torch.from_numpy(columns(COLUMNS["log_scales"])),
-        quats=torch.from_numpy(columns(COLUMNS["quats"])),
-        opacity_logits=torch.from_numpy(columns(COLUMNS["opacity_logits"])[:, 0].copy()),
-        sh=torch.from_numpy(np.ascontiguousarray(sh)),
-    )
-    gaussians = file_to_world(local, header.up or up)
-    _require_finite(path, gaussians)
-    return gaussians
+    return gathered(path, len(table), REST_SIZES.index(size), header.up or up, local)
+
+
+def _columns(table: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Return properties as columns of float32."""
+    # A double may be too large for a float; the infinity is refused later.
+    with np.errstate(over="ignore"):
+        found = [table[name].astype(np.float32, copy=False) for name in names]
+    return np.stack(found, axis=1) if found else np.zeros((len(table), 0), dtype=np.float32)
+
+
+def _finite_logits(logits: np.ndarray) -> np.ndarray:
+    """Return logits in which infinity, which means an opacity of 0 or 1, is a number with that meaning.
+
+    splat-transform 3.7.0 writes infinity when it unpacks the opacities 0 and 255 of a compressed PLY.
+    """
+    return np.where(np.isinf(logits), np.copysign(np.float32(INFINITE_LOGIT), logits), logits)
 
 
 def holds_gaussians(path: Path) -> bool:
@@ -134,13 +131,8 @@ def holds_gaussians(path: Path) -> bool:
 
     Raises ``UserError`` if ``path`` is not a PLY file.
     """
-    try:
-        with open_regular(path) as file:
-            words = [line for line in _header_lines(path, file) if line[0] == "property"]
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{path}: cannot be read ({reason}). Try: another file") from error
-    return not GAUSSIANS_ONLY.isdisjoint(line[-1] for line in words)
+    elements = read_header(path).elements
+    return any(not GAUSSIANS_ONLY.isdisjoint(element.names) for element in elements)
 
 
 def _names(rest_size: int) -> list[str]:
@@ -152,7 +144,7 @@ def _names(rest_size: int) -> list[str]:
 def _header(num_gaussians: int, rest_size: int, up: str) -> str:
     lines = [
         "ply",
-        f"format {FORMAT}",
+        f"format {LITTLE}",
         f"comment cadam3d {__version__}",
         f"comment cadam3d up={up}",
         f"element vertex {num_gaussians}",
@@ -162,145 +154,28 @@ def _header(num_gaussians: int, rest_size: int, up: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-# Name, number of rows, and the name and numpy type of each property.
-_Element = tuple[str, int, list[tuple[str, str]]]
+def _rest_size(header: PlyHeader) -> int:
+    """Return the number of rest coefficients. Raises ``UserError`` if the file does not hold Gaussians."""
+    vertex = header.element(VERTEX)
+    if vertex is None:
+        raise unusable(header.path, "not a Gaussian ply: it has no vertices")
+    names = vertex.names
+    if missing := [name for name in REQUIRED if name not in names]:
+        raise unusable(header.path, f"not a Gaussian ply: properties missing: {', '.join(missing)}")
+    return rest_size(header.path, names)
 
 
-@dataclass(frozen=True)
-class _Header:
-    """The header of a file."""
+def rest_size(path: Path, names: Sequence[str]) -> int:
+    """Return how many of the properties ``names`` are rest coefficients.
 
-    skip_bytes: int  # size of the elements before the vertices
-    count: int
-    has_more: bool  # whether other elements follow the vertices
-    record: np.dtype  # one vertex
-    rest_size: int
-    up: str | None  # up axis; None unless cadam3d wrote the file
-
-
-def _parse_header(path: Path, file: BinaryIO) -> _Header:
-    ups: set[str] = set()
-    has_format = False
-    elements: list[_Element] = []
-    for words in _header_lines(path, file):
-        match words:
-            case ["format", *version] if not has_format:
-                _require_format(path, " ".join(version))
-                has_format = True
-            case ["comment", "cadam3d", claim] if claim.startswith("up="):
-                ups.add(_require_up(path, claim.removeprefix("up=")))
-            case ["element", name, count] if has_format and count.isdecimal() and len(count) <= MAX_DIGITS:
-                elements.append((name, int(count), []))
-            case ["property", kind, name] if elements and kind in NUMPY_TYPES:
-                elements[-1][2].append((name, NUMPY_TYPES[kind]))
-            case ["property", "list", *_] if elements and any(e[0] == "vertex" for e in elements[:-1]):
-                pass  # faces after the vertices are never read
-            case ["comment" | "obj_info", *_]:
-                pass
-            case _:
-                line = " ".join(words)[:80]
-                raise _unusable(path, f"not a Gaussian ply: cannot read header line {line!r}")
-    if len(ups) > 1:
-        raise _unusable(path, f"the header has two up axes, {' and '.join(sorted(ups))}")
-    return _located(path, elements, ups.pop() if ups else None)
-
-
-def _located(path: Path, elements: Sequence[_Element], up: str | None) -> _Header:
-    """Return where the vertices are among the elements of a file."""
-    names = [name for name, *_ in elements]
-    if len(set(names)) < len(names):
-        raise _unusable(path, "not a Gaussian ply: an element appears twice")
-    skip_bytes = 0
-    for position, (name, count, properties) in enumerate(elements, start=1):
-        if name == "vertex":
-            has_more = position < len(elements)
-            record, rest_size = _vertex(path, properties)
-            return _Header(skip_bytes, count, has_more, record, rest_size, up)
-        skip_bytes += count * sum(np.dtype(kind).itemsize for _, kind in properties)
-    raise _unusable(path, "not a Gaussian ply: it has no vertices")
-
-
-def _require_format(path: Path, version: str) -> None:
-    convert = (
-        f"from plyfile import PlyData; ply = PlyData.read('{path}'); "
-        "ply.text = False; ply.byte_order = '<'; ply.write('binary.ply')"
-    )
-    if version != FORMAT:
-        raise UserError(
-            f"{path}: expected format {FORMAT}, got {version}. "
-            f'Try: pip install plyfile && python -c "{convert}"'
-        )
-
-
-def _require_up(path: Path, up: str) -> str:
-    if up not in UPS:
-        raise _unusable(path, f"expected up={'|'.join(UPS)} in the header, got up={up}")
-    return up
-
-
-def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:
-    """Yield the words of each line between ``ply`` and ``end_header``."""
-    line = file.readline(MAX_HEADER_BYTES)
-    if line.strip() != b"ply":
-        raise _unusable(path, f"not a ply file: it begins with {line[:16]!r}")
-    while file.tell() < MAX_HEADER_BYTES:
-        line = file.readline(MAX_HEADER_BYTES)
-        if not line.endswith(b"\n"):
-            break
-        words = line.decode("ascii", errors="replace").split()
-        if words == ["end_header"]:
-            return
-        if words:
-            yield words
-    raise _unusable(path, "truncated: the header has no end")
-
-
-def _vertex(path: Path, properties: list[tuple[str, str]]) -> tuple[np.dtype, int]:
-    """Return the record of one vertex, and the number of its rest coefficients."""
-    names = [name for name, _ in properties]
-    wanted = [*COLUMNS["means"], *SH0, *_names(0)[-8:]]
-    missing = [name for name in wanted if name not in names]
-    if missing:
-        compressed = " (a compressed ply: decompress it first)" if "packed_position" in names else ""
-        raise _unusable(path, f"not a Gaussian ply: properties missing: {', '.join(missing)}{compressed}")
-    if len(set(names)) < len(names):
-        raise _unusable(path, "not a Gaussian ply: a property appears twice")
-    rest_size = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
-    if rest_size not in REST_SIZES or any(f"f_rest_{i}" not in names for i in range(rest_size)):
+    Raises ``UserError`` if their number fits no SH degree.
+    """
+    size = sum(re.fullmatch(r"f_rest_[0-9]+", name) is not None for name in names)
+    if size not in REST_SIZES or any(f"f_rest_{i}" not in names for i in range(size)):
         sizes = ", ".join(map(str, REST_SIZES))
-        raise _unusable(
+        raise unusable(
             path,
             f"not a Gaussian ply: expected f_rest_0.. for SH degree 0 to {MAX_DEGREE} ({sizes} of them), "
-            f"got {rest_size}",
+            f"got {size}",
         )
-    return np.dtype(properties), rest_size
-
-
-def _unusable(path: Path, problem: str) -> UserError:
-    return UserError(f"{path}: {problem}. Try: another file")
-
-
-def _read_rows(path: Path, file: BinaryIO, header: _Header) -> np.ndarray:
-    start = file.tell() + header.skip_bytes
-    available = file.seek(0, 2) - start
-    length = header.count * header.record.itemsize
-    if available < length:
-        whole = max(available, 0) // header.record.itemsize
-        problem = f"truncated: the header promises {header.count} Gaussians, the file holds {whole}"
-        raise _unusable(path, problem)
-    if available > length and not header.has_more:
-        problem = f"the header promises {header.count} Gaussians, but {available - length} more bytes follow"
-        raise _unusable(path, problem)
-    file.seek(start)
-    return np.frombuffer(file.read(length), dtype=header.record)
-
-
-def _require_finite(path: Path, gaussians: Gaussians) -> None:
-    finite = [
-        tensor.isfinite().reshape(len(tensor), math.prod(tensor.shape[1:])).all(dim=1)
-        for tensor in gaussians.tensors().values()
-    ]
-    is_finite = torch.stack(finite).all(dim=0)
-    if bad := int((~is_finite).sum()):
-        problem = f"expected finite numbers, got NaN or infinity in {bad} of {len(gaussians)} Gaussians"
-        raise _unusable(path, problem)
+    return size

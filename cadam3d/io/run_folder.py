@@ -28,8 +28,10 @@ ASSET_COMPRESSED_PLY = "asset.compressed.ply"
 ASSET_GLB = "asset.glb"
 ASSET_KSPLAT = "asset.ksplat"
 ASSET_MESH_GLB = "asset_mesh.glb"
+ASSET_MESH_MTL = "asset_mesh.mtl"  # beside the obj, if that has a texture
 ASSET_MESH_OBJ = "asset_mesh.obj"
 ASSET_MESH_PLY = "asset_mesh.ply"
+ASSET_MESH_PNG = "asset_mesh.png"  # the texture of the obj
 ASSET_SOG = "asset.sog"
 ASSET_SPLAT = "asset.splat"
 ASSET_SPZ = "asset.spz"
@@ -121,7 +123,7 @@ def _written_by_runs() -> tuple[str, ...]:
     files = (ASSET, CHARTS, CONFIG, EVALUATION, LOG, METRICS, PREVIEW, REPORT, SUMMARY, VIEWER)
     videos = (*TURNTABLES.values(), *PROGRESS.values())
     formats = (ASSET_COMPRESSED_PLY, ASSET_GLB, ASSET_KSPLAT, ASSET_SOG, ASSET_SPLAT, ASSET_SPZ)
-    meshes = (ASSET_MESH_GLB, ASSET_MESH_OBJ, ASSET_MESH_PLY)
+    meshes = (ASSET_MESH_GLB, ASSET_MESH_MTL, ASSET_MESH_OBJ, ASSET_MESH_PLY, ASSET_MESH_PNG)
     return (*files, *videos, *formats, *meshes, CANDIDATES, CHECKPOINTS, HYDRA, IMAGES, LIVE, PREVIEWS, SAVED)
 
 

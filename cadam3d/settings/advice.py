@@ -32,6 +32,11 @@ REFUSED_PATHS = (errno.ENAMETOOLONG, errno.ELOOP)
 NEEDED = {"run": CONFIG, "resume": OVERRIDES}
 # The choice of an option or of a list of options.
 CHOICE = re.compile(r"\+?[a-z]\w*=(\w+|\[[\w,]*\])")
+# The command that has a key, and the reason, by the key and the command that lacks it.
+MISPLACED = {
+    ("grid", "train"): ("sweep", "grids belong to sweeps"),
+    **{("for", command): ("export", "belongs to cadam3d export") for command in ("render", "view")},
+}
 PROMPT_WORD = 'prompt="a red and yellow checkered torus"'
 
 
@@ -259,8 +264,9 @@ def _unknown_key(key: str, command: str, words: Sequence[str], settings: Sequenc
 
     ``settings`` are the overrides of the job that lacks the key; None means ``words``.
     """
-    if key == "grid" and command == "train":
-        return UserError(f"grid: grids belong to sweeps. Try: {line_of('sweep', words)}")
+    if (key, command) in MISPLACED:
+        owner, reason = MISPLACED[key, command]
+        return UserError(f"{key}: {reason}. Try: {line_of(owner, words)}")
     value = next((word.partition("=")[2] for word in words if key_of(word) == key), None)
     known = _known(key, command, words if settings is None else settings)
     if value is not None and key in known:

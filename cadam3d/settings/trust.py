@@ -45,7 +45,7 @@ CACHE = "cache_dir"
 # Characters of all overrides of a run. Hydra's parser needs a second for a thousand brackets.
 LONGEST = 10_000
 # Groups that change how commands run, not what a run computes.
-MACHINERY = ("hydra", "launcher", "grid")
+MACHINERY = ("hydra", "launcher", "grid", "for")
 # Settings of a line that a later line does not repeat.
 NOT_REPEATED = ("trust", "grid", "launcher")
 PLAIN_NAMES = f"names without an underscore in front, except {TARGET}"

@@ -1,0 +1,365 @@
+"""Surface: a closed triangle mesh around Gaussians, coloured like their renders.
+
+The surface is where the density (``density.py``) has a given level, found by marching cubes (Lorensen and Cline 1987, in
+the variant of Lewiner et al. 2003). Only the outer shell is kept: whatever cannot be reached from outside is filled
+before the cubes are marched. Small separate parts are removed, and the rest is simplified with quadric errors (Garland
+and Heckbert 1997) as far as it stays watertight.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from cadam3d.core.checks import require_range, require_whole
+from cadam3d.core.density import BLUR, Blobs, Grid, blobs, density, grid_around, near
+from cadam3d.core.errors import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.memory import require_memory
+from cadam3d.core.sh import evaluate_sh
+
+# The extent of the object is found on coarse grids, blurred by a whole cell, so that nothing is missed between nodes.
+EXTENT_RESOLUTION = 48
+EXTENT_BLUR = 1.0  # cells
+EXTENT_LEVEL = 0.5  # share of the level that a node next to the surface has at least
+# A box that becomes smaller than this share of the one before may become still smaller.
+SHRINKS = 0.75
+EXTENT_PASSES = 40
+# Bytes per node of the grid, for the density, the labels and marching cubes.
+NODE_BYTES = 24
+# Densities are clipped to this factor below and above the level before their logarithm is interpolated.
+MOST_CONTRAST = 20.0
+# Heights closer to zero are moved away from it, in cells or in logarithms of the density.
+LEAST_HEIGHT = 1e-3
+# A simplification that is not watertight is repeated with these settings, and then with more triangles.
+AGGRESSIVENESS = (7.0, 5.0, 4.0, 8.0)
+MORE_TRIANGLES = 1.3
+# The opacity of a single Gaussian in the colour of a point, at most, as in the rasterizers.
+MOST_OPAQUE = 0.99
+COLORS_AT_ONCE = 1 << 18
+# Light from all Gaussians together below which a point has no colour of its own.
+FAINT = 1e-6
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A triangle mesh in world axes, counterclockwise seen from outside."""
+
+    vertices: Float[np.ndarray, "v 3"]  # world units
+    faces: Int[np.ndarray, "f 3"]
+    normals: Float[np.ndarray, "v 3"]  # of unit length, outwards
+    colors: Float[np.ndarray, "v 3"]  # sRGB in [0, 1]
+
+
+@dataclass(frozen=True)
+class SurfaceFacts:
+    """Numbers about a mesh whose vertices are shared between its triangles."""
+
+    triangles: int
+    parts: int  # connected ones
+    watertight: bool  # every edge belongs to two triangles, which agree about its direction
+    area: float  # world units squared
+    volume: float  # world units cubed; meaningless unless watertight
+
+    def __str__(self) -> str:
+        closed = "watertight" if self.watertight else "not watertight"
+        parts = "1 part" if self.parts == 1 else f"{self.parts} parts"
+        return (
+            f"{self.triangles} triangles, {parts}, {closed}, area {self.area:.3g}, volume {self.volume:.3g}"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceSettings:
+    """How the surface of an asset is found; exporters and metrics of meshes inherit these settings."""
+
+    # Node of the configuration, such as "exporter.mesh", with which error messages begin.
+    node: ClassVar[str]
+
+    resolution: int  # cells along the longest side
+    level: float  # density at the surface
+    smallest_part: float  # share of the whole area, in [0, 1)
+    triangles: int | None  # None = no simplification
+
+    def __post_init__(self) -> None:
+        require_whole(f"{self.node}.resolution", self.resolution, low=16, high=1024, example=128)
+        require_memory(f"{self.node}.resolution", self.resolution, unit=NODE_BYTES, power=3, example=128)
+        require_range(f"{self.node}.level", self.level, above=0, high=1000, example=0.3)
+        require_range(f"{self.node}.smallest_part", self.smallest_part, low=0, below=1, example=0.01)
+        if self.triangles is not None:
+            require_whole(f"{self.node}.triangles", self.triangles, low=100, high=2**31, example=50000)
+
+    def surface(self, gaussians: Gaussians) -> tuple[Surface, "Painter"]:
+        """Return the outer surface of ``gaussians``, and what knows the colours between its vertices.
+
+        Raises ``UserError`` if the density does not reach the level anywhere.
+        """
+        some = blobs(gaussians)
+        grid = grid_around(*self._extent(some), self.resolution)
+        # Between two nodes, the logarithm of the density is closer to a line than the density is.
+        contrast = (density(some, grid) / self.level).clamp(1 / MOST_CONTRAST, MOST_CONTRAST)
+        vertices, faces = outer_shell(contrast.log())
+        if len(faces) == 0:
+            raise self._nothing(some)
+        vertices = vertices * grid.cell + grid.origin.numpy()
+        vertices, faces = without_specks(vertices, faces, self.smallest_part)
+        if self.triangles is not None:
+            vertices, faces = simplified(vertices, faces, self.triangles)
+        normals = vertex_normals(vertices, faces)
+        painter = Painter(gaussians.sh.detach().to("cpu").float()[some.rows], some, grid)
+        return Surface(vertices, faces, normals, painter.colors(vertices, normals)), painter
+
+    def _extent(self, some: Blobs) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+        """Return the corners of a box around everything except specks.
+
+        The first box holds all Gaussians. Far away or huge faint ones can make it much larger than the object, so it
+        shrinks to what is dense in it, until it hardly changes.
+        """
+        if len(some.rows) == 0:
+            raise self._nothing(some)
+        reach = some.reach()
+        low, high = (some.means - reach).amin(0), (some.means + reach).amax(0)
+        for _ in range(EXTENT_PASSES):
+            grid = grid_around(low, high, EXTENT_RESOLUTION)
+            is_dense = density(some, grid, EXTENT_BLUR) >= EXTENT_LEVEL * self.level
+            node = _large_regions(is_dense.numpy(), some, grid, self.smallest_part)
+            if len(node) == 0:
+                raise self._nothing(some)
+            old = float((high - low).max())
+            first, last = torch.from_numpy(node.min(0) - 1.0), torch.from_numpy(node.max(0) + 1.0)
+            low = torch.maximum(low, grid.origin + grid.cell * first)
+            high = torch.minimum(high, grid.origin + grid.cell * last)
+            if float((high - low).max()) > SHRINKS * old:
+                break
+        return low, high
+
+    def _nothing(self, some: Blobs) -> UserError:
+        """Return the error for an asset without a surface."""
+        key = f"{self.node}.level"
+        group, _, name = self.node.partition(".")
+        if len(some.rows) == 0:
+            other = {"exporter": "exporter=[ply]"}.get(group, f"{group}=[size]")
+            return UserError(
+                f"{self.node}: expected an asset with a surface, got one in which no Gaussian is visible. Try: {other}"
+            )
+        # Between the nodes of the grid, the density may be up to five times higher than at them.
+        reached = float(f"{float(some.opacities.max()) / 5:.1g}")
+        return UserError(
+            f"{key}: expected a level that the density of the asset reaches, got {self.level:g}, which it reaches "
+            f"nowhere. Try: {key}={min(reached, self.level / 2):g}"
+        )
+
+
+def _large_regions(
+    is_dense: Bool[np.ndarray, "x y z"], some: Blobs, grid: Grid, smallest: float
+) -> Int[np.ndarray, "k 3"]:
+    """Return the nodes of all connected regions except specks.
+
+    The sizes of regions are compared by the area of the Gaussians whose centres are in them, because a region that is
+    only a few cells large has no other measure.
+    """
+    from scipy import ndimage  # slow to import
+
+    labels, count = ndimage.label(is_dense)
+    if count <= 1:
+        return np.argwhere(is_dense)
+    node = ((some.means - grid.origin) / grid.cell).round()
+    is_inside = ((node >= 0) & (node < torch.tensor(grid.nodes))).all(1)
+    x, y, z = node[is_inside].long().numpy().T
+    area = np.bincount(labels[x, y, z], weights=some.area()[is_inside].numpy(), minlength=count + 1)[1:]
+    # The area of Gaussians is a rough measure, so a region that may be large enough is kept.
+    is_kept = area >= min(smallest / 4 * area.sum(), area.max())
+    return np.argwhere(np.concatenate([[False], is_kept])[labels])
+
+
+def outer_shell(
+    height: Float[Tensor, "x y z"],
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """Return the closed surface, in units of nodes, where ``height`` is 0 between inside (> 0) and outside (< 0).
+
+    Nodes on the border of the grid count as outside. Hollows without a way out are filled. There are no triangles if
+    nothing is inside.
+    """
+    from scipy import ndimage
+    from skimage.measure import marching_cubes  # both are slow to import
+
+    values = height.numpy().astype(np.float32)
+    for axis in range(3):
+        border = np.moveaxis(values, axis, 0)
+        border[0] = border[-1] = np.minimum(border[[0, -1]], -LEAST_HEIGHT).min()
+    is_empty = values < 0
+    labels, _ = ndimage.label(is_empty)
+    values[is_empty & (labels != labels[0, 0, 0])] = 1.0
+    # A node exactly on the surface would collapse the triangles around it to a point.
+    values[np.abs(values) < LEAST_HEIGHT] = LEAST_HEIGHT
+    if values.max() < 0:
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    vertices, faces, _, _ = marching_cubes(values, 0.0, allow_degenerate=False)
+    # scikit-image returns triangles clockwise seen from outside.
+    return vertices.astype(np.float64), faces[:, ::-1].astype(np.int64)
+
+
+def without_specks(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], smallest: float
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+    """Return the mesh without parts whose area is less than ``smallest`` of the whole; the largest part stays."""
+    part = parts_of(len(vertices), faces)[faces[:, 0]]
+    area = np.bincount(part, weights=areas(vertices, faces))
+    is_kept = area >= min(smallest * area.sum(), area.max())
+    return compacted(vertices, faces[is_kept[part]])
+
+
+def simplified(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], triangles: int
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+    """Return a watertight mesh with at most ``triangles`` triangles, or with as few more as stay watertight.
+
+    A mesh with fewer triangles is returned unchanged.
+    """
+    import fast_simplification  # slow to import
+
+    target = float(triangles)
+    while target < len(faces):
+        # The order in which edges collapse depends on the aggressiveness, and so does whether a hole appears.
+        for aggressiveness in AGGRESSIVENESS:
+            points, corners = fast_simplification.simplify(
+                vertices, faces.astype(np.int32), target_count=int(target), agg=aggressiveness
+            )
+            points, corners = compacted(
+                np.asarray(points, dtype=np.float64), np.asarray(corners, dtype=np.int64)
+            )
+            if len(corners) and is_watertight(corners):
+                return points, corners
+        target *= MORE_TRIANGLES
+    return vertices, faces
+
+
+def compacted(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f 3"]]:
+    """Return the mesh without vertices that no triangle uses."""
+    used = np.unique(faces)
+    position = np.zeros(len(vertices), dtype=np.int64)
+    position[used] = np.arange(len(used))
+    return vertices[used], position[faces]
+
+
+def facts(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> SurfaceFacts:
+    """Return numbers about a mesh whose vertices are shared between its triangles."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return SurfaceFacts(
+        triangles=len(faces),
+        parts=len(np.unique(parts_of(len(vertices), faces)[faces[:, 0]])),
+        watertight=is_watertight(faces),
+        area=float(areas(vertices, faces).sum()),
+        volume=float((a * np.cross(b, c)).sum() / 6),
+    )
+
+
+def is_watertight(faces: Int[np.ndarray, "f 3"]) -> bool:
+    """Return whether each edge belongs to two triangles, which run through it in opposite directions."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    if len(edges) == 0 or bool((edges[:, 0] == edges[:, 1]).any()):
+        return False
+    size = int(faces.max()) + 1
+    there = np.sort(edges[:, 0] * size + edges[:, 1])
+    back = np.sort(edges[:, 1] * size + edges[:, 0])
+    return bool((np.diff(there) > 0).all() and (there == back).all())
+
+
+def parts_of(count: int, faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "count"]:
+    """Return the number of the connected part of each of ``count`` vertices."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    rows = np.concatenate([faces[:, 0], faces[:, 1]])
+    columns = np.concatenate([faces[:, 1], faces[:, 2]])
+    links = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(count, count))
+    return connected_components(links, directed=False)[1].astype(np.int64)
+
+
+def areas(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f"]:
+    """Return the area of each triangle."""
+    return np.linalg.norm(_crosses(vertices, faces), axis=1) / 2
+
+
+def vertex_normals(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, "v 3"]:
+    """Return unit vectors, the means of the normals of the triangles around each vertex, weighted with their areas."""
+    cross = _crosses(vertices, faces)
+    corners, count = faces.reshape(-1), len(vertices)
+    summed = [
+        np.bincount(corners, weights=np.repeat(cross[:, axis], 3), minlength=count) for axis in range(3)
+    ]
+    normals = np.stack(summed, axis=1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    # The triangles around a vertex may cancel each other. Any direction is right there.
+    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+
+
+def _crosses(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return np.cross(b - a, c - a)
+
+
+@dataclass(frozen=True)
+class Painter:
+    """The colours that an asset shows at points of its surface."""
+
+    sh: Float[Tensor, "n k 3"]  # of the Gaussians in ``some``
+    some: Blobs
+    grid: Grid
+
+    def colors(
+        self, points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"]
+    ) -> Float[np.ndarray, "p 3"]:
+        """Return the sRGB colour, in [0, 1], that each point shows to a camera in front of it.
+
+        Each colour is a render of one ray against the normal, with the image formation model of 3DGS: the opacity of a
+        Gaussian is its own times the falloff where the ray is nearest to its centre, and the Gaussians are composited
+        in the order of their centres. Only Gaussians that reach the point take part, so that nothing else hides it.
+        """
+        place, outwards = torch.from_numpy(points), torch.from_numpy(normals)
+        blur = (BLUR * self.grid.cell) ** 2 * torch.eye(3, dtype=torch.float64)
+        precision = torch.linalg.inv(self.some.covariances + blur)
+        total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
+        for blob, point in near(self.some, self.grid, place):
+            away, normal = place[point] - self.some.means[blob], outwards[point]
+            pulled = torch.einsum("pij,pj->pi", precision[blob], normal)
+            straight = torch.einsum("pij,pj->pi", precision[blob], away)
+            distance = (away * straight).sum(1) - (away * pulled).sum(1) ** 2 / (normal * pulled).sum(1)
+            alpha = self.some.opacities[blob] * (-0.5 * distance.clamp_min(0)).exp()
+            depth = (away * normal).sum(1)
+            order = torch.from_numpy(np.lexsort([depth.numpy(), point.numpy()]))
+            blob, point, alpha = blob[order], point[order], alpha[order].clamp_max(MOST_OPAQUE)
+            light = (_transmitted(alpha, point) * alpha).float()
+            for part in torch.arange(len(blob)).split(COLORS_AT_ONCE):
+                rgb = evaluate_sh(self.sh[blob[part]], -outwards[point[part]].float())
+                total.index_add_(0, point[part], light[part, None] * rgb)
+            weight.index_add_(0, point, light)
+        colors = total / weight.clamp_min(FAINT)[:, None]
+        # Simplification may have moved a vertex away from all Gaussians.
+        lost = (weight < FAINT).nonzero()[:, 0]
+        if len(lost):
+            nearest = torch.from_numpy(_tree(self.some.means.numpy()).query(points[lost.numpy()])[1])
+            colors[lost] = evaluate_sh(self.sh[nearest], -outwards[lost].float())
+        return colors.clamp(0, 1).double().numpy()
+
+
+def _tree(points: Float[np.ndarray, "n 3"]):
+    from scipy.spatial import cKDTree
+
+    return cKDTree(points)
+
+
+def _transmitted(alpha: Float[Tensor, "pairs"], point: Int[Tensor, "pairs"]) -> Float[Tensor, "pairs"]:
+    """Return the product of ``1 - alpha`` of all earlier pairs of the same point; pairs are sorted by point."""
+    passed = torch.log1p(-alpha).cumsum(0) - torch.log1p(-alpha)
+    is_first = torch.ones_like(point, dtype=torch.bool)
+    is_first[1:] = point[1:] != point[:-1]
+    run = is_first.cumsum(0) - 1
+    return (passed - passed[is_first][run]).exp()

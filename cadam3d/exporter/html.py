@@ -1,0 +1,53 @@
+"""HtmlExporter: one page that shows the asset in any browser, without a network."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from cadam3d.core.checks import require, require_color, require_range
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.render import RenderFn
+from cadam3d.exporter.base import Exporter
+from cadam3d.io.atomic import replacing
+from cadam3d.io.run_folder import VIEWER
+from cadam3d.viewer.pack import pack
+from cadam3d.viewer.page import viewer_page
+
+UNTITLED = "3D Gaussians"
+
+
+@dataclass(frozen=True, kw_only=True)
+class HtmlExporter(Exporter):
+    """Write ``viewer.html``, which contains the asset and everything that draws it."""
+
+    title: str | float | None  # None = UNTITLED; a prompt such as 2026 is a number in YAML
+    azimuth_deg: float  # 0 = front
+    elevation_deg: float  # in [-90, 90]
+    background: Sequence[float] | None  # RGB in [0, 1]; None = as light or dark as the reader's other pages
+
+    def __post_init__(self) -> None:
+        require(
+            isinstance(self.title, str | int | float | None),
+            "exporter.html.title",
+            expected="a text or null",
+            got=self.title,
+            example="exporter.html.title=null",
+        )
+        require_range("exporter.html.azimuth_deg", self.azimuth_deg, low=-360, high=360, example=30)
+        require_range("exporter.html.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
+        if self.background is not None:
+            require_color("exporter.html.background", self.background)
+
+    def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
+        """Write the page and return its path."""
+        page = viewer_page(
+            pack(gaussians),
+            title=UNTITLED if self.title is None else str(self.title),
+            azimuth_deg=self.azimuth_deg,
+            elevation_deg=self.elevation_deg,
+            background=self.background,
+        )
+        path = folder / VIEWER
+        with replacing(path) as temporary:
+            temporary.write_text(page, encoding="utf-8")
+        return [path]

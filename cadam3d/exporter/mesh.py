@@ -1,0 +1,59 @@
+"""MeshExporter: the surface of the asset as triangles, for programs that do not read Gaussians."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from cadam3d.core.checks import require_choice, require_whole
+from cadam3d.core.errors import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.render import RenderFn
+from cadam3d.core.surface import SurfaceSettings
+from cadam3d.exporter.base import Exporter
+from cadam3d.io.atlas import paint, require_xatlas
+from cadam3d.io.frames import UPS
+from cadam3d.io.mesh import FORMATS, write_glb, write_mesh_ply, write_obj
+from cadam3d.io.run_folder import ASSET_MESH_GLB, ASSET_MESH_OBJ, ASSET_MESH_PLY
+
+NAMES = dict(zip(FORMATS, (ASSET_MESH_GLB, ASSET_MESH_OBJ, ASSET_MESH_PLY), strict=True))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshExporter(SurfaceSettings, Exporter):
+    """Write ``asset_mesh.glb``, ``.obj`` or ``.ply``: the outer surface with its colours (``core/surface.py``)."""
+
+    node: ClassVar[str] = "exporter.mesh"
+
+    format: str  # one of FORMATS
+    up: str  # up axis of the file, one of UPS
+    texture: int | None  # pixels per side; None = vertex colours
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_choice("exporter.mesh.format", self.format, FORMATS)
+        require_choice("exporter.mesh.up", self.up, UPS)
+        if self.texture is None:
+            return
+        require_whole("exporter.mesh.texture", self.texture, low=64, high=8192, example=1024)
+        if self.format == "ply":
+            raise UserError(
+                "exporter.mesh.texture: expected null with format=ply, which has no textures, "
+                f"got {self.texture}. Try: exporter.mesh.format=glb"
+            )
+        require_xatlas()
+
+    def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
+        """Write the mesh, and return the paths of its files; only an obj with a texture has several.
+
+        Raises ``UserError`` if the asset has no surface or if a file cannot be written.
+        """
+        surface, painter = self.surface(gaussians)
+        texture = None if self.texture is None else paint(surface, painter.colors, self.texture)
+        path = folder / NAMES[self.format]
+        if self.format == "obj":
+            return write_obj(path, surface, up=self.up, texture=texture)
+        if self.format == "ply":
+            write_mesh_ply(path, surface, up=self.up)
+        else:
+            write_glb(path, surface, up=self.up, texture=texture)
+        return [path]

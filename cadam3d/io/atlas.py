@@ -1,0 +1,114 @@
+"""Atlas: unwraps a surface onto a picture with xatlas, and paints the picture texel by texel."""
+
+from collections.abc import Callable
+from importlib.util import find_spec
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from cadam3d.core.errors import UserError
+from cadam3d.core.surface import Surface
+from cadam3d.io.mesh import Texture
+
+# From points of a surface and its normals there to sRGB colours in [0, 1].
+ColorFn = Callable[[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]], Float[np.ndarray, "p 3"]]
+
+# Texels between charts. They are painted with the nearest colour, so that interpolation never shows a seam.
+PADDING = 4
+# Candidate texels that are tested at once; this bounds the memory.
+AT_ONCE = 1 << 20
+
+
+def require_xatlas() -> None:
+    """Raise ``UserError`` unless xatlas is installed, which only textures need."""
+    if find_spec("xatlas") is None:
+        raise UserError("exporter.mesh.texture: needs xatlas. Try: pip install 'cadam3d[texture]'")
+
+
+def paint(surface: Surface, colors: ColorFn, size: int) -> Texture:
+    """Return a texture of ``size`` x ``size`` pixels for ``surface``, with the colour of ``colors`` at each texel."""
+    vertices, faces, uv = _unwrapped(surface, size)
+    texel, face, weights = _covered(uv[faces] * size, size)
+    corners = vertices[faces[face]]
+    points = (weights[..., None] * surface.vertices[corners]).sum(1)
+    normals = (weights[..., None] * surface.normals[corners]).sum(1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    picture = np.zeros((size * size, 3), dtype=np.uint8)
+    is_painted = np.zeros(size * size, dtype=bool)
+    is_painted[texel] = True
+    picture[texel] = np.rint(colors(points, normals / np.maximum(length, 1e-12)) * 255).astype(np.uint8)
+    filled = _padded(picture.reshape(size, size, 3), is_painted.reshape(size, size))
+    # The rows of the picture begin at the upper edge, v at the lower one.
+    return Texture(vertices, faces, uv, np.ascontiguousarray(filled[::-1]))
+
+
+def _unwrapped(
+    surface: Surface, size: int
+) -> tuple[Int[np.ndarray, "w"], Int[np.ndarray, "f 3"], Float[np.ndarray, "w 2"]]:
+    """Return the vertices of the surface, repeated where charts are cut, the triangles, and their places in [0, 1]."""
+    import xatlas  # optional, and slow to import
+
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(
+        surface.vertices.astype(np.float32),
+        surface.faces.astype(np.uint32),
+        surface.normals.astype(np.float32),
+    )
+    charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
+    # xatlas chooses the number of texels per world unit such that all charts fit into one picture of this size.
+    packing.resolution, packing.padding, packing.bilinear = size, PADDING, True
+    atlas.generate(charts, packing)
+    vertices, faces, uv = atlas[0]
+    # The packing may be larger than asked for, and is then scaled down.
+    scale = np.array([atlas.width, atlas.height]) / max(atlas.width, atlas.height)
+    return vertices.astype(np.int64), faces.astype(np.int64), uv.astype(np.float64) * scale
+
+
+def _covered(
+    corners: Float[np.ndarray, "f 3 2"], size: int
+) -> tuple[Int[np.ndarray, "t"], Int[np.ndarray, "t"], Float[np.ndarray, "t 3"]]:
+    """Return the texels whose centres are in a triangle, the triangle of each, and the weights of its corners.
+
+    ``corners`` are in texels.
+    """
+    low = np.clip(np.floor(corners.min(1) - 0.5), 0, size - 1).astype(np.int64)
+    high = np.clip(np.ceil(corners.max(1) - 0.5), 0, size - 1).astype(np.int64)
+    wide = high - low + 1
+    counts = wide[:, 0] * wide[:, 1]
+    ends = counts.cumsum()
+    found = []
+    cuts = np.searchsorted(ends, np.arange(0, ends[-1], AT_ONCE), side="right")
+    for some in np.split(np.arange(len(corners)), cuts[1:]):
+        face = np.repeat(some, counts[some])
+        step = np.arange(len(face)) - np.repeat(counts[some].cumsum() - counts[some], counts[some])
+        column, row = low[face, 0] + step % wide[face, 0], low[face, 1] + step // wide[face, 0]
+        weights = _barycentric(corners[face], np.stack([column, row], axis=1) + 0.5)
+        inside = (weights >= -1e-9).all(1)
+        found.append((row[inside] * size + column[inside], face[inside], weights[inside]))
+    texel, face, weights = (np.concatenate(values) for values in zip(*found, strict=True))
+    texel, first = np.unique(texel, return_index=True)
+    return texel, face[first], weights[first]
+
+
+def _barycentric(
+    corners: Float[np.ndarray, "t 3 2"], points: Float[np.ndarray, "t 2"]
+) -> Float[np.ndarray, "t 3"]:
+    """Return the weights of the corners that make each point; -1 for triangles without an area."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    along, across, away = b - a, c - a, points - a
+    area = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
+    is_flat = np.abs(area) < 1e-12
+    safe = np.where(is_flat, 1.0, area)
+    second = (away[:, 0] * across[:, 1] - away[:, 1] * across[:, 0]) / safe
+    third = (along[:, 0] * away[:, 1] - along[:, 1] * away[:, 0]) / safe
+    weights = np.stack([1 - second - third, second, third], axis=1)
+    weights[is_flat] = -1.0
+    return weights
+
+
+def _padded(picture: np.ndarray, is_painted: Bool[np.ndarray, "h w"]) -> np.ndarray:
+    """Return the picture with every other texel in the colour of the nearest painted one."""
+    from scipy import ndimage  # slow to import
+
+    row, column = ndimage.distance_transform_edt(~is_painted, return_distances=False, return_indices=True)
+    return picture[row, column]

@@ -1,0 +1,150 @@
+"""Binary glTF 2.0 with the extension ``KHR_gaussian_splatting``: Gaussians as points with attributes.
+
+A header of 12 bytes is followed by a JSON chunk, which describes the arrays, and a binary chunk, which holds
+them one after the other, little endian:
+
+| attribute | type | content |
+|---|---|---|
+| ``POSITION`` | float32 x 3 | position |
+| ``KHR_gaussian_splatting:ROTATION`` | float32 x 4 | unit quaternion x, y, z, w |
+| ``KHR_gaussian_splatting:SCALE`` | float32 x 3 | standard deviations, linear |
+| ``KHR_gaussian_splatting:OPACITY`` | float32 | opacity in [0, 1] |
+| ``KHR_gaussian_splatting:SH_DEGREE_l_COEF_n`` | float32 x 3 | SH coefficient ``l^2 + n``, red, green, blue |
+| ``COLOR_0`` | uint8 x 4, normalized | linear colour and opacity, for programs without the extension |
+
+The extension has the kernel ``ellipse``, the colour space ``srgb_rec709_display`` (colours are blended as
+they are displayed, as in 3DGS), the projection ``perspective`` and the sorting method ``cameraDistance``. It
+is listed as used but not as required, so other programs show coloured points. glTF defines +y as up.
+
+Nothing is lost except a few bits of float32: scales are at least 1.2e-38 and at most 3.4e38, and logits of
+opacities beyond about 17 become an opacity of 1. glTF does not permit empty arrays, so a file without
+Gaussians has an empty scene.
+
+Sources: the glTF 2.0 specification, section 4 (GLB) and 3.6 (accessors), and the text of
+KHR_gaussian_splatting (github.com/KhronosGroup/glTF, extensions/2.0/Khronos), which the Khronos Group has
+ratified. Drafts stored the logarithms of scales; the ratified text has "linear" scales that "must not be
+negative".
+"""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cadam3d import __version__
+from cadam3d.core.errors import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.sh import SH_C0
+from cadam3d.io.atomic import replacing
+from cadam3d.io.encoding import float32_cpu, linear_scales, opacities, to_bytes, unit_quats
+from cadam3d.io.frames import world_to_file
+
+EXTENSION = "KHR_gaussian_splatting"
+LARGEST_FILE = (1 << 32) - 1  # bytes; GLB stores its length in 32 bits
+HEADER = struct.Struct("<4sII")  # "glTF", version, length of the file
+CHUNK = struct.Struct("<I4s")  # length, kind
+# Constants of glTF.
+FLOAT, UNSIGNED_BYTE = 5126, 5121
+ARRAY_BUFFER = 34962
+POINTS = 0
+TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+
+
+def write_glb(path: Path, gaussians: Gaussians, *, up: str) -> None:
+    """Write ``gaussians`` atomically, in the axes with up axis ``up`` (see ``frames.py``).
+
+    The node is named after the file. Raises ``UserError`` if the file cannot be written, or would be larger
+    than 4 GB, which is the limit of the format.
+    """
+    local = world_to_file(float32_cpu(gaussians), up)
+    arrays = _attributes(local) if len(local) else {}
+    binary_bytes = sum(array.nbytes for array in arrays.values())
+    text = json.dumps(_document(path.stem, arrays), separators=(",", ":")).encode("ascii")
+    text += b" " * (-len(text) % 4)
+    length = HEADER.size + CHUNK.size + len(text) + (CHUNK.size + binary_bytes if arrays else 0)
+    if length > LARGEST_FILE:
+        raise UserError(
+            f"{path}: expected at most {LARGEST_FILE:,} bytes, which is the limit of glb, got {length:,}. "
+            "Try: exporter=[ply]"
+        )
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(HEADER.pack(b"glTF", 2, length))
+        file.write(CHUNK.pack(len(text), b"JSON") + text)
+        if arrays:
+            file.write(CHUNK.pack(binary_bytes, b"BIN\0"))
+        for array in arrays.values():
+            file.write(array.tobytes())
+
+
+def _attributes(local: Gaussians) -> dict[str, np.ndarray]:
+    """Return the arrays of the attributes; the bytes of each row are a multiple of four."""
+    quats, alphas = unit_quats(local), opacities(local)
+    sh = local.sh.numpy()
+    diffuse = np.clip(0.5 + SH_C0 * sh[:, 0].astype(np.float64), 0, 1)
+    floats = {
+        "POSITION": local.means.numpy(),
+        f"{EXTENSION}:ROTATION": quats[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": linear_scales(local),
+        f"{EXTENSION}:OPACITY": alphas[:, None],
+    }
+    for degree in range(local.sh_degree + 1):
+        for order in range(2 * degree + 1):
+            floats[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = sh[:, degree**2 + order]
+    color = np.concatenate([_linear(diffuse), alphas[:, None]], axis=1)
+    return {name: np.ascontiguousarray(array, dtype="<f4") for name, array in floats.items()} | {
+        "COLOR_0": to_bytes(255 * color)
+    }
+
+
+def _linear(srgb: np.ndarray) -> np.ndarray:
+    """Return linear values of sRGB values, both in [0, 1] (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def _document(name: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Return the JSON of a scene with one node and, if there are arrays, one mesh of points."""
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": f"cadam3d {__version__}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": name}],
+    }
+    if not arrays:
+        return document
+    accessors, views, offset = [], [], 0
+    for index, (attribute, array) in enumerate(arrays.items()):
+        is_float = array.dtype.kind == "f"
+        accessor = {
+            "bufferView": index,
+            "componentType": FLOAT if is_float else UNSIGNED_BYTE,
+            "count": len(array),
+            "type": TYPES[array.shape[1]],
+        }
+        if not is_float:
+            accessor["normalized"] = True
+        if attribute == "POSITION":
+            accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+        accessors.append(accessor)
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": ARRAY_BUFFER})
+        offset += array.nbytes
+    splatting = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    primitive = {
+        "attributes": {attribute: index for index, attribute in enumerate(arrays)},
+        "mode": POINTS,
+        "extensions": {EXTENSION: splatting},
+    }
+    document["nodes"] = [{"name": name, "mesh": 0}]
+    return document | {
+        "meshes": [{"name": name, "primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+        "extensionsUsed": [EXTENSION],
+    }

@@ -1,0 +1,259 @@
+"""Files of triangle meshes: glb, obj and ply, with vertex colours or a texture.
+
+All three are written so that other programs show the colours of our renders. glTF multiplies colours with light and
+defines vertex colours as linear (glTF 2.0, sec. 3.9.2), so the material of a glb is unlit (``KHR_materials_unlit``) and
+its vertex colours are converted from sRGB, as 16-bit numbers, which keeps dark colours apart. A texture is sRGB in every
+format. Vertex colours of obj (``v x y z r g b``) and ply (``uchar red green blue``) are sRGB by convention.
+"""
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+
+from cadam3d import __version__
+from cadam3d.core.errors import UserError
+from cadam3d.core.surface import Surface, SurfaceFacts, facts
+from cadam3d.io.atomic import replacing
+from cadam3d.io.frames import points_to_file
+
+FORMATS = ("glb", "obj", "ply")
+# glTF 2.0, sec. 4.4 and 5.
+GLB_MAGIC, GLB_VERSION = 0x46546C67, 2
+JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125
+VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
+LINEAR_MIPMAP, LINEAR, CLAMP = 9987, 9729, 33071
+NAME = "cadam3d"
+
+
+@dataclass(frozen=True)
+class Texture:
+    """A picture for a surface; vertices are repeated where the picture is cut."""
+
+    vertices: Int[np.ndarray, "w"]  # vertex of the surface for each vertex of the textured mesh
+    faces: Int[np.ndarray, "f 3"]  # of the textured mesh
+    uv: Float[np.ndarray, "w 2"]  # in [0, 1], from the lower left corner of the picture
+    picture: UInt8[np.ndarray, "h w 3"]  # sRGB
+
+
+@dataclass(frozen=True)
+class _Mesh:
+    """The numbers of a file, in its axes."""
+
+    positions: Float[np.ndarray, "w 3"]
+    normals: Float[np.ndarray, "w 3"]
+    colors: Float[np.ndarray, "w 3"]
+    faces: Int[np.ndarray, "f 3"]
+    texture: Texture | None
+
+
+def write_glb(path: Path, surface: Surface, *, up: str, texture: Texture | None = None) -> None:
+    """Write one binary glTF file with an unlit material, atomically.
+
+    glTF defines ``+y`` as up; another ``up`` turns the numbers and not the definition. Raises ``UserError`` if the file
+    cannot be written.
+    """
+    content = _glb(_in_file(surface, up, texture))
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def write_mesh_ply(path: Path, surface: Surface, *, up: str) -> None:
+    """Write a binary ply with normals and vertex colours, atomically.
+
+    Raises ``UserError`` if the file cannot be written.
+    """
+    mesh = _in_file(surface, up, None)
+    vertex = np.zeros(len(mesh.positions), dtype=[("place", "<f4", 6), ("rgb", "u1", 3)])
+    vertex["place"] = np.concatenate([mesh.positions, mesh.normals], axis=1)
+    vertex["rgb"] = _bytes(mesh.colors)
+    face = np.zeros(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    face["count"], face["corners"] = 3, mesh.faces
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment cadam3d {__version__}",
+        f"element vertex {len(vertex)}",
+        *(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")),
+        *(f"property uchar {name}" for name in ("red", "green", "blue")),
+        f"element face {len(face)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    with replacing(path) as temporary:
+        temporary.write_bytes(("\n".join(lines) + "\n").encode("ascii") + vertex.tobytes() + face.tobytes())
+
+
+def write_obj(path: Path, surface: Surface, *, up: str, texture: Texture | None = None) -> list[Path]:
+    """Write an obj file, with its material and picture beside it if there is a texture, and return their paths.
+
+    The files have the name of ``path`` with the suffixes ``.obj``, ``.mtl`` and ``.png``. Each one appears whole or not
+    at all, and the obj comes last, so that it never refers to something that is missing. Raises ``UserError`` if a file
+    cannot be written.
+    """
+    mesh = _in_file(surface, up, texture)
+    if texture is None:
+        lines = _rows("v", np.concatenate([mesh.positions, mesh.colors], axis=1)) + _rows("vn", mesh.normals)
+        lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in (mesh.faces + 1).tolist()]
+        with replacing(path) as temporary:
+            temporary.write_text("\n".join([f"# {NAME} {__version__}", *lines]) + "\n", encoding="ascii")
+        return [path]
+    material, picture = path.with_suffix(".mtl"), path.with_suffix(".png")
+    with replacing(picture) as temporary:
+        temporary.write_bytes(_png(texture))
+    # Colour from the picture alone: white diffuse, no ambient and no highlight (illumination model 1).
+    shading = [f"newmtl {NAME}", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "illum 1", f"map_Kd {picture.name}"]
+    with replacing(material) as temporary:
+        temporary.write_text("\n".join(shading) + "\n", encoding="utf-8")
+    lines = _rows("v", mesh.positions) + _rows("vn", mesh.normals) + _rows("vt", texture.uv)
+    lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in (mesh.faces + 1).tolist()]
+    head = [f"# {NAME} {__version__}", f"mtllib {material.name}", f"usemtl {NAME}"]
+    with replacing(path) as temporary:
+        temporary.write_text("\n".join([*head, *lines]) + "\n", encoding="utf-8")
+    return [path, material, picture]
+
+
+def mesh_facts(path: Path) -> SurfaceFacts:
+    """Return numbers about the mesh in a file of any of the three formats, computed from its triangles.
+
+    Vertices at the same place count as one, because a texture repeats them. Raises ``UserError`` if the file cannot be
+    read.
+    """
+    import trimesh  # slow to import
+
+    # Every format has its own parser, with its own exceptions.
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+        vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+        if len(faces) == 0:
+            raise ValueError("it has no triangles")
+    except Exception as error:
+        reason = str(error) or type(error).__name__
+        raise UserError(
+            f"{path}: expected a mesh, got a file that cannot be read ({reason}). Try: another file"
+        ) from error
+    places, position = np.unique(vertices, axis=0, return_inverse=True)
+    return facts(places, position.reshape(-1)[faces])
+
+
+def _in_file(surface: Surface, up: str, texture: Texture | None) -> _Mesh:
+    """Return the numbers of the surface in the axes of a file."""
+    rows = np.arange(len(surface.vertices)) if texture is None else texture.vertices
+    positions, normals = (
+        points_to_file(torch.from_numpy(vectors[rows]), up).numpy().astype(np.float32)
+        for vectors in (surface.vertices, surface.normals)
+    )
+    faces = surface.faces if texture is None else texture.faces
+    return _Mesh(positions, normals, surface.colors[rows], faces, texture)
+
+
+def _glb(mesh: _Mesh) -> bytes:
+    """Return the bytes of a binary glTF file with one mesh."""
+    columns: list[tuple[str, np.ndarray, int, str, bool]] = [
+        ("POSITION", mesh.positions, FLOAT, "VEC3", False),
+        ("NORMAL", mesh.normals, FLOAT, "VEC3", False),
+    ]
+    if mesh.texture is None:
+        # Four numbers instead of three, because every element has to begin at a multiple of four bytes.
+        rgba = np.concatenate([linear(mesh.colors), np.ones((len(mesh.colors), 1))], axis=1)
+        columns.append(("COLOR_0", np.rint(rgba * 65535).astype("<u2"), UNSIGNED_SHORT, "VEC4", True))
+    else:
+        # glTF measures v from the upper edge.
+        flipped = np.stack([mesh.texture.uv[:, 0], 1 - mesh.texture.uv[:, 1]], axis=1)
+        columns.append(("TEXCOORD_0", flipped.astype("<f4"), FLOAT, "VEC2", False))
+    blocks = [mesh.faces.astype("<u4").tobytes(), *(array.tobytes() for _, array, *_ in columns)]
+    targets: list[int | None] = [INDEX_BUFFER, *(VERTEX_BUFFER for _ in columns)]
+    accessors: list[dict[str, object]] = [
+        {"bufferView": 0, "componentType": UNSIGNED_INT, "count": mesh.faces.size, "type": "SCALAR"}
+    ]
+    for view, (name, array, kind, shape, is_normalized) in enumerate(columns, start=1):
+        accessor: dict[str, object] = {
+            "bufferView": view,
+            "componentType": kind,
+            "count": len(array),
+            "type": shape,
+        }
+        if is_normalized:
+            accessor["normalized"] = True
+        if name == "POSITION":
+            accessor |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
+        accessors.append(accessor)
+    surface: dict[str, object] = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}
+    document: dict[str, object] = {
+        "asset": {"version": "2.0", "generator": f"{NAME} {__version__}"},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": NAME}],
+    }
+    if mesh.texture is not None:
+        surface["baseColorTexture"] = {"index": 0}
+        document |= {
+            "textures": [{"sampler": 0, "source": 0}],
+            "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP, "wrapS": CLAMP, "wrapT": CLAMP}],
+            "images": [{"bufferView": len(blocks), "mimeType": "image/png"}],
+        }
+        blocks.append(_png(mesh.texture))
+        targets.append(None)
+    attributes = {name: number for number, (name, *_) in enumerate(columns, start=1)}
+    material = {
+        "name": NAME,
+        "pbrMetallicRoughness": surface,
+        "doubleSided": False,
+        "extensions": {"KHR_materials_unlit": {}},
+    }
+    document |= {
+        "meshes": [{"name": NAME, "primitives": [{"attributes": attributes, "indices": 0, "material": 0}]}],
+        "materials": [material],
+        "accessors": accessors,
+    }
+    return _binary(document, blocks, targets)
+
+
+def _binary(document: Mapping[str, object], blocks: Sequence[bytes], targets: Sequence[int | None]) -> bytes:
+    """Return a glb with one buffer, in which each block is a buffer view."""
+    views, body = [], b""
+    for block, target in zip(blocks, targets, strict=True):
+        view = {"buffer": 0, "byteOffset": len(body), "byteLength": len(block)}
+        views.append(view if target is None else {**view, "target": target})
+        body += block + b"\0" * (-len(block) % 4)
+    whole = {**document, "bufferViews": views, "buffers": [{"byteLength": len(body)}]}
+    text = json.dumps(whole, separators=(",", ":")).encode("utf-8")
+    text += b" " * (-len(text) % 4)
+    size = 12 + 8 + len(text) + 8 + len(body)
+    head = struct.pack("<III", GLB_MAGIC, GLB_VERSION, size)
+    return b"".join(
+        [
+            head,
+            struct.pack("<II", len(text), JSON_CHUNK),
+            text,
+            struct.pack("<II", len(body), BINARY_CHUNK),
+            body,
+        ]
+    )
+
+
+def linear(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """Return linear light for sRGB colours, both in [0, 1] (IEC 61966-2-1)."""
+    return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+
+
+def _bytes(rgb: Float[np.ndarray, "*batch 3"]) -> UInt8[np.ndarray, "*batch 3"]:
+    return np.rint(rgb * 255).astype(np.uint8)
+
+
+def _png(texture: Texture) -> bytes:
+    return imageio.imwrite("<bytes>", texture.picture, extension=".png")
+
+
+def _rows(word: str, values: Float[np.ndarray, "r c"]) -> list[str]:
+    """Return one line of an obj file for each row."""
+    row = f"{word} " + " ".join(["%.6g"] * values.shape[1])
+    return [row % tuple(numbers) for numbers in values.tolist()]

@@ -1,0 +1,326 @@
+"""PLY container: the header of a PLY file, and the numbers of its elements in any of its three encodings.
+
+A PLY file has a header in ASCII, which declares elements ("vertex", "face"). An element has a number of rows
+and a list of properties, each with a name and a numeric type. The rows follow the header as text, one row on
+each line, or as little-endian or big-endian binary records (G. Turk, "The PLY Polygon File Format", 1994).
+
+Nothing is allocated because of a count in a header: the rows must be in the file first. Text is read in
+blocks of lines, so the memory needed is a few times the size of the file, whatever the file contains.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from cadam3d.core.errors import UserError
+from cadam3d.io.frames import UPS
+from cadam3d.io.reading import open_regular
+
+ASCII = "ascii 1.0"
+LITTLE = "binary_little_endian 1.0"
+BIG = "binary_big_endian 1.0"
+ENCODINGS = (ASCII, LITTLE, BIG)
+MAX_HEADER_BYTES = 1 << 16
+MAX_LINE_BYTES = 1 << 20  # of text after the header
+MAX_BLOCK_BYTES = 1 << 19  # of text that is parsed at once
+MAX_DIGITS = 15  # of a number of rows
+# Numpy types without their byte order.
+NUMPY_TYPES = {
+    **dict.fromkeys(["char", "int8"], "i1"),
+    **dict.fromkeys(["uchar", "uint8"], "u1"),
+    **dict.fromkeys(["short", "int16"], "i2"),
+    **dict.fromkeys(["ushort", "uint16"], "u2"),
+    **dict.fromkeys(["int", "int32"], "i4"),
+    **dict.fromkeys(["uint", "uint32"], "u4"),
+    **dict.fromkeys(["float", "float32"], "f4"),
+    **dict.fromkeys(["double", "float64"], "f8"),
+}
+# Stands for a list in place of a numpy type.
+LIST = "list"
+
+
+@dataclass(frozen=True)
+class Element:
+    """One kind of row of a PLY file."""
+
+    name: str
+    count: int  # rows that the header promises
+    properties: tuple[tuple[str, str], ...]  # name, and numpy type without byte order or LIST
+
+    @property
+    def names(self) -> list[str]:
+        """Return the names of the properties, in their order in the file."""
+        return [name for name, _ in self.properties]
+
+    @property
+    def row_bytes(self) -> int:
+        """Return the size of one binary row. The properties must not be lists."""
+        return sum(np.dtype(kind).itemsize for _, kind in self.properties)
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """The header of a PLY file."""
+
+    path: Path
+    encoding: str  # one of ENCODINGS
+    elements: tuple[Element, ...]
+    up: str | None  # up axis that cadam3d has recorded; None in files of other programs
+    size: int  # bytes
+
+    def element(self, name: str) -> Element | None:
+        """Return the element called ``name``, or None."""
+        return next((element for element in self.elements if element.name == name), None)
+
+
+def read_header(path: Path) -> PlyHeader:
+    """Return the header of a PLY file. Raises ``UserError`` if ``path`` is not one."""
+    with opened(path) as file:
+        return _parse_header(path, file)
+
+
+def read_tables(header: PlyHeader, wanted: Mapping[str, Sequence[str]]) -> dict[str, np.ndarray]:
+    """Return the ``wanted`` properties of elements as structured arrays, in the types that the file declares.
+
+    Each element in ``wanted`` must be in the file. Raises ``UserError`` if the file has fewer rows than its
+    header promises, has something after them that the header does not mention, or has text that is no number.
+    """
+    _require_readable(header, wanted)
+    tables: dict[str, np.ndarray] = {}
+    with opened(header.path) as file:
+        file.seek(header.size)
+        for element in header.elements:
+            if tables.keys() == wanted.keys():
+                return tables
+            names = wanted.get(element.name)
+            if header.encoding == ASCII:
+                table = _read_text(header.path, file, element, names)
+            else:
+                table = _read_records(header, file, element, names)
+            if table is not None:
+                tables[element.name] = table
+        _require_end(header, file)
+    return tables
+
+
+def unusable(path: Path, problem: str) -> UserError:
+    """Return the message about a file that cannot be used."""
+    return UserError(f"{path}: {problem}. Try: another file")
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """Open a regular file for reading. Every failure of the system becomes one ``UserError``."""
+    try:
+        with open_regular(path) as file:
+            yield file
+    # A name with a null byte is a ValueError.
+    except (OSError, ValueError, MemoryError) as error:
+        reason = getattr(error, "strerror", None) or error or "too large"
+        raise unusable(path, f"cannot be read ({reason})") from error
+
+
+def _parse_header(path: Path, file: BinaryIO) -> PlyHeader:
+    encoding: str | None = None
+    ups: set[str] = set()
+    elements: list[tuple[str, int, list[tuple[str, str]]]] = []
+    for words in _header_lines(path, file):
+        match words:
+            case ["format", *version] if encoding is None:
+                encoding = _require_encoding(path, " ".join(version))
+            case ["comment", "cadam3d", claim] if claim.startswith("up="):
+                ups.add(_require_up(path, claim.removeprefix("up=")))
+            case ["element", name, count] if encoding and count.isdecimal() and len(count) <= MAX_DIGITS:
+                elements.append((name, int(count), []))
+            case ["property", "list", _, _, name] if elements:
+                elements[-1][2].append((name, LIST))
+            case ["property", kind, name] if elements and kind in NUMPY_TYPES:
+                elements[-1][2].append((name, NUMPY_TYPES[kind]))
+            case ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                line = " ".join(words)[:80]
+                raise unusable(path, f"not a readable ply file: cannot read header line {line!r}")
+    if encoding is None:
+        raise unusable(path, "not a readable ply file: its header has no format")
+    if len(ups) > 1:
+        raise unusable(path, f"the header has two up axes, {' and '.join(sorted(ups))}")
+    names = [name for name, *_ in elements]
+    if len(set(names)) < len(names):
+        raise unusable(path, "not a readable ply file: an element appears twice")
+    return PlyHeader(
+        path=path,
+        encoding=encoding,
+        elements=tuple(Element(name, count, tuple(properties)) for name, count, properties in elements),
+        up=ups.pop() if ups else None,
+        size=file.tell(),
+    )
+
+
+def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:
+    """Yield the words of each line between ``ply`` and ``end_header``."""
+    line = file.readline(MAX_HEADER_BYTES)
+    if line.strip() != b"ply":
+        raise unusable(path, f"not a ply file: it begins with {line[:16]!r}")
+    while file.tell() < MAX_HEADER_BYTES:
+        line = file.readline(MAX_HEADER_BYTES)
+        if not line.endswith(b"\n"):
+            break
+        words = line.decode("ascii", errors="replace").split()
+        if words == ["end_header"]:
+            return
+        if words:
+            yield words
+    raise unusable(path, "truncated: the header has no end")
+
+
+def _require_encoding(path: Path, version: str) -> str:
+    if version not in ENCODINGS:
+        raise unusable(path, f"expected format {' | '.join(ENCODINGS)}, got {version[:40]}")
+    return version
+
+
+def _require_up(path: Path, up: str) -> str:
+    if up not in UPS:
+        raise unusable(path, f"expected up={'|'.join(UPS)} in the header, got up={up[:40]}")
+    return up
+
+
+def _require_readable(header: PlyHeader, wanted: Mapping[str, Sequence[str]]) -> None:
+    """Check that every element up to the last of ``wanted`` has rows of a fixed size."""
+    missing = set(wanted)
+    for element in header.elements:
+        if not missing:
+            return
+        missing.discard(element.name)
+        names = element.names
+        if LIST in (kind for _, kind in element.properties):
+            raise unusable(header.path, f"expected numbers in element {element.name[:40]}, got a list")
+        if element.name in wanted and len(set(names)) < len(names):
+            raise unusable(header.path, f"a property of element {element.name} appears twice")
+
+
+def _read_records(
+    header: PlyHeader, file: BinaryIO, element: Element, names: Sequence[str] | None
+) -> np.ndarray | None:
+    """Return the rows of a binary element and move to its end; None if nothing of it is wanted."""
+    length = element.count * element.row_bytes
+    start = file.tell()
+    available = max(file.seek(0, 2) - start, 0)
+    if available < length:
+        raise _truncated(header.path, element, available // element.row_bytes)
+    if names is None:
+        file.seek(start + length)
+        return None
+    file.seek(start)
+    order = ">" if header.encoding == BIG else "<"
+    record = np.dtype([(name, order + kind) for name, kind in element.properties])
+    return np.frombuffer(file.read(length), dtype=record)
+
+
+def _read_text(
+    path: Path, file: BinaryIO, element: Element, names: Sequence[str] | None
+) -> np.ndarray | None:
+    """Return the rows of an element in text and move to its end; None if nothing of it is wanted."""
+    lines = _lines(path, file)
+    # An element without properties has empty lines, which are skipped everywhere.
+    count = element.count if element.properties else 0
+    if names is None:
+        found = sum(1 for _ in islice(lines, count))
+        if found < count:
+            raise _truncated(path, element, found)
+        return None
+    kinds = dict(element.properties)
+    record = np.dtype([(name, kinds[name]) for name in names])
+    blocks: list[np.ndarray] = []
+    found = 0
+    while found < count:
+        block = list(_block(lines, count - found))
+        if not block:
+            raise _truncated(path, element, found)
+        numbers = _parsed(path, block, element, found)
+        table = np.empty(len(block), dtype=record)
+        for name in names:
+            table[name] = _typed(path, numbers[:, element.names.index(name)], name, kinds[name])
+        blocks.append(table)
+        found += len(block)
+    return np.concatenate(blocks) if blocks else np.empty(0, dtype=record)
+
+
+def _lines(path: Path, file: BinaryIO) -> Iterator[str]:
+    """Yield the lines that are not empty."""
+    while line := file.readline(MAX_LINE_BYTES):
+        if not line.endswith(b"\n") and len(line) == MAX_LINE_BYTES:
+            raise unusable(path, f"expected lines of at most {MAX_LINE_BYTES:,} bytes, got a longer one")
+        if text := line.decode("ascii", errors="replace").strip():
+            yield text
+
+
+def _block(lines: Iterator[str], count: int) -> Iterator[str]:
+    """Yield at most ``count`` lines, and no more than are worth parsing at once."""
+    size = 0
+    for line in islice(lines, count):
+        yield line
+        size += len(line) + 1
+        if size > MAX_BLOCK_BYTES:
+            return
+
+
+def _parsed(path: Path, lines: Sequence[str], element: Element, found: int) -> np.ndarray:
+    """Return the numbers of ``lines`` as a matrix of float64, one row for each line."""
+    try:
+        numbers = np.loadtxt(lines, dtype=np.float64, comments=None, ndmin=2)
+    except ValueError as error:
+        raise unusable(path, f"rows {found:,} to {found + len(lines):,}: {_short(error)}") from error
+    if numbers.shape != (len(lines), len(element.properties)):
+        raise unusable(
+            path,
+            f"expected {len(element.properties)} numbers in each row of element {element.name}, "
+            f"got {numbers.size / len(lines):g}",
+        )
+    return numbers
+
+
+def _short(error: Exception) -> str:
+    # The rest is advice to programmers.
+    return str(error).split(";")[0][:120]
+
+
+def _typed(path: Path, numbers: np.ndarray, name: str, kind: str) -> np.ndarray:
+    """Return a column in its declared type. A float64 that is too large for float32 becomes infinite."""
+    if kind[0] in "iu":
+        limits = np.iinfo(kind)
+        # A comparison with NaN is false.
+        is_valid = (numbers >= limits.min) & (numbers <= limits.max) & (numbers == np.floor(numbers))
+        if not is_valid.all():
+            problem = f"expected {limits.min} to {limits.max} in property {name}"
+            raise unusable(path, f"{problem}, got {numbers[~is_valid][0]:g}")
+    with np.errstate(over="ignore"):
+        return numbers.astype(kind)
+
+
+def _require_end(header: PlyHeader, file: BinaryIO) -> None:
+    last = header.elements[-1]
+    what = _rows(last)
+    if header.encoding == ASCII:
+        if next(_lines(header.path, file), None) is not None:
+            raise unusable(header.path, f"the header promises {last.count} {what}, but more lines follow")
+        return
+    start = file.tell()
+    if extra := file.seek(0, 2) - start:
+        raise unusable(header.path, f"the header promises {last.count} {what}, but {extra} more bytes follow")
+
+
+def _truncated(path: Path, element: Element, found: int) -> UserError:
+    return unusable(
+        path, f"truncated: the header promises {element.count} {_rows(element)}, the file holds {found}"
+    )
+
+
+def _rows(element: Element) -> str:
+    return "Gaussians" if element.name == "vertex" else f"rows of element {element.name[:40]}"

@@ -1,0 +1,323 @@
+"""SPZ files of Niantic, versions 2 and 3: a tenth of the size of a PLY, by rounding and gzip.
+
+A gzip stream holds a header of 16 bytes, and then one block for each kind of number. All are little endian.
+
+| bytes per Gaussian | block | encoding |
+|---|---|---|
+| (16 once) | header | "NGSP", version u32, count u32, SH degree u8, fractional bits u8, flags u8, 0 |
+| 9 | positions | x, y, z as 24-bit integers, which are the position times 2^(fractional bits) |
+| 1 | opacities | ``255 opacity`` |
+| 3 | colours | ``255 (0.15 f + 0.5)`` of the SH coefficients f of degree 0 |
+| 3 | scales | ``16 (s + 10)`` of the natural logarithms s of standard deviations |
+| 4 | rotations, version 3 | the three smallest components of a unit quaternion, see below |
+| 3 | rotations, version 2 | ``127.5 (q + 1)`` of x, y, z, where w >= 0 is the remainder |
+| 9, 24, 45 | SH of degree 1, 2, 3 | ``128 (f + 1)``, the three channels of a coefficient together |
+
+The quaternion of version 3 is a 32-bit integer. Its highest two bits are the index of the largest component
+in the order x, y, z, w, which is positive (or all signs change). Ten bits for each of the other three follow
+in this order: a sign, and the magnitude in nine bits, where 511 means 1/sqrt(2).
+
+The specification calls the axes "right, up, back", so files are +y up. Other programs write the numbers of a
+PLY unchanged, which is -y up; the file does not tell them apart, and ``up`` chooses.
+
+:func:`write_spz` rounds to the nearest value of each encoding. The errors are at most half a step: 2^-17 of
+a position within the unit ball, 1/32 of the logarithm of a scale (3 % of the scale), 0.0007 of a quaternion's
+component, 1/510 of an opacity, and 0.0037 of a colour. Coefficients of SH degree 1 have 5 bits and the others
+4, as the reference writes them by default, so their errors are at most 1/32 and 1/16. Clamped are scales
+outside of [4.5e-5, 380], colours outside of [-0.44, 1.44], and SH coefficients outside of [-1, 1].
+
+Sources: the README of github.com/nianticlabs/spz, its issue 42 (details of the encodings), and measurements
+of the files that gaussforge 0.6.0 writes.
+"""
+
+import gzip
+import shlex
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+
+from cadam3d.core.checks import require_choice
+from cadam3d.core.errors import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.sh import MAX_DEGREE
+from cadam3d.io.atomic import replacing
+from cadam3d.io.encoding import as_tensor, byte_logits, float32_cpu, opacities, to_bytes, unit_quats
+from cadam3d.io.frames import UPS, file_to_world, world_to_file
+from cadam3d.io.reading import open_regular
+
+MAGIC = b"NGSP"
+GZIP_MAGIC = b"\x1f\x8b"
+HEADER = struct.Struct("<4sIIBBBB")
+VERSIONS = (2, 3)
+HAS_EXTENSIONS = 2  # flag: other data follow the Gaussians
+# Positions within the unit ball then have steps of 2^-16. The reference writes 12 bits.
+MOST_FRACTIONAL_BITS = 16
+LARGEST_FIXED = (1 << 23) - 1
+COLOR_SCALE = 0.15
+SH_STEPS = (8, 16)  # of the byte of a coefficient: of degree 1, and of higher degrees
+LARGEST_OF_SMALLEST = 0.5**0.5  # the second largest component of a unit quaternion is at most this
+
+# Bounds of the memory of a reader: this many times the size of the file, and these bytes.
+MOST_EXPANSION = 20
+SPARE_BYTES = 32 << 20
+PIECE_BYTES = 1 << 18  # read or decompressed at once
+ROWS_AT_ONCE = 1 << 13  # decoded at once
+
+
+def write_spz(path: Path, gaussians: Gaussians, *, up: str) -> None:
+    """Write ``gaussians`` as SPZ version 3, atomically, in the axes with up axis ``up`` (see ``frames.py``).
+
+    The same Gaussians give the same bytes. Raises ``UserError`` if the file cannot be written, or if a
+    position is too far away for the format.
+    """
+    local = world_to_file(float32_cpu(gaussians), up)
+    bits = _fractional_bits(path, local)
+    header = HEADER.pack(MAGIC, 3, len(local), local.sh_degree, bits, 0, 0)
+    fixed = np.rint(np.ldexp(local.means.double().numpy(), bits)).astype("<i4")
+    blocks = [
+        np.ascontiguousarray(fixed)[..., None].view(np.uint8)[..., :3],
+        to_bytes(255 * opacities(local)),
+        to_bytes(255 * (COLOR_SCALE * local.sh[:, 0].double().numpy() + 0.5)),
+        to_bytes(16 * (local.log_scales.double().numpy() + 10)),
+        _smallest_three(unit_quats(local)),
+        _sh_bytes(local.sh[:, 1:].double().numpy()),
+    ]
+    with (
+        replacing(path) as temporary,
+        temporary.open("wb") as raw,
+        # Without a name and a time, the stream depends on nothing except its content.
+        gzip.GzipFile(filename="", mode="wb", fileobj=raw, mtime=0) as file,
+    ):
+        file.write(header)
+        for block in blocks:
+            file.write(block.tobytes())
+
+
+def read_spz(path: Path, *, up: str = "+y") -> Gaussians:
+    """Read Gaussians of a file of version 2 or 3 into world axes, on the CPU, as float32.
+
+    ``up`` is the up axis of the file. Never allocates more than 20 times the size of the file and 64 MB.
+    Raises ``UserError`` if ``path`` is not such a file, or would need more memory.
+    """
+    require_choice("up", up, UPS)
+    try:
+        with open_regular(path) as file:
+            header, packed = _unzipped(path, file)
+    # A name with a null byte is a ValueError.
+    except (OSError, ValueError, MemoryError) as error:
+        reason = getattr(error, "strerror", None) or error or "too large"
+        raise UserError(f"{path}: cannot be read ({reason}). Try: another file") from error
+    except zlib.error as error:
+        raise _unusable(path, f"a damaged gzip stream ({error})") from error
+    count, coefficients = header.count, (header.degree + 1) ** 2
+    gaussians = Gaussians(
+        means=torch.empty(count, 3),
+        log_scales=torch.empty(count, 3),
+        quats=torch.empty(count, 4),
+        opacity_logits=torch.empty(count),
+        sh=torch.empty(count, coefficients, 3),
+    )
+    # In small blocks, because the conversion of axes needs several times the memory of its result.
+    for rows, local in _decoded(header, packed):
+        for name, tensor in file_to_world(local, up).tensors().items():
+            gaussians.tensors()[name][rows] = tensor
+    return gaussians
+
+
+@dataclass(frozen=True)
+class _Header:
+    """The header of a file."""
+
+    version: int
+    count: int  # of Gaussians
+    degree: int  # of SH
+    fractional_bits: int
+    has_extensions: bool
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Return the bytes per Gaussian of each block."""
+        return (9, 1, 3, 3, 4 if self.version == 3 else 3, 3 * ((self.degree + 1) ** 2 - 1))
+
+    @property
+    def packed_bytes(self) -> int:
+        """Return the bytes of all blocks."""
+        return self.count * sum(self.sizes)
+
+    @property
+    def unpacked_bytes(self) -> int:
+        """Return the bytes of the Gaussians in memory."""
+        return 4 * self.count * (11 + 3 * (self.degree + 1) ** 2)
+
+
+class _Stream:
+    """A gzip stream that is decompressed only as far as it is asked for."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._inflate = zlib.decompressobj(wbits=31)  # gzip, whose checksum is verified
+        self._pending = b""
+
+    def read_into(self, target: memoryview) -> int:
+        """Fill ``target``, and return the number of bytes, which is less at the end of the stream."""
+        filled = 0
+        while filled < len(target) and not self._inflate.eof:
+            piece = self._pending or self._file.read(PIECE_BYTES)
+            out = self._inflate.decompress(piece, min(len(target) - filled, PIECE_BYTES))
+            self._pending = self._inflate.unconsumed_tail
+            if not piece and not out:
+                break
+            target[filled : filled + len(out)] = out
+            filled += len(out)
+        return filled
+
+    def ends_here(self) -> bool:
+        """Return whether the stream is complete, and the file has nothing after it."""
+        is_empty = self.read_into(memoryview(bytearray(1))) == 0
+        return is_empty and self._inflate.eof and not self._inflate.unused_data and not self._file.read(1)
+
+
+def _unzipped(path: Path, file: BinaryIO) -> tuple[_Header, bytearray]:
+    """Return the header and the bytes of all blocks."""
+    begin = file.read(len(MAGIC))
+    if begin == MAGIC:
+        raise UserError(
+            f"{path}: expected SPZ version 2 or 3, got version 4 or later. "
+            f"Try: pip install gaussforge && {_to_version_3(path)}"
+        )
+    if begin[: len(GZIP_MAGIC)] != GZIP_MAGIC:
+        raise _unusable(path, f"not an spz file: it begins with {begin!r}")
+    size = file.seek(0, 2)
+    file.seek(0)
+    stream = _Stream(file)
+    start = bytearray(HEADER.size)
+    if stream.read_into(memoryview(start)) < len(start):
+        raise _unusable(path, "truncated: the header has no end")
+    header = _parsed(path, bytes(start))
+    if header.packed_bytes + header.unpacked_bytes > MOST_EXPANSION * size + SPARE_BYTES:
+        problem = f"its header promises {header.count:,} Gaussians, too many for {size:,} bytes"
+        raise _unusable(path, problem)
+    packed = bytearray(header.packed_bytes)
+    if (length := stream.read_into(memoryview(packed))) < len(packed):
+        problem = f"truncated: the header promises {len(packed):,} bytes, the stream holds {length:,}"
+        raise _unusable(path, problem)
+    if not header.has_extensions and not stream.ends_here():
+        raise _unusable(path, f"the stream does not end after the {header.count:,} Gaussians of its header")
+    return header, packed
+
+
+def _to_version_3(path: Path) -> str:
+    """Return a shell command that converts a newer file with gaussforge."""
+    code = (
+        "from gaussforge import GaussForge; from pathlib import Path; "
+        f"old = Path({str(path)!r}).read_bytes(); "
+        "new = GaussForge().convert(old, 'spz', 'spz', spz_version=3); "
+        f"Path({str(path.with_stem(f'{path.stem}_v3'))!r}).write_bytes(new['data'])"
+    )
+    return shlex.join(["python", "-c", code])
+
+
+def _parsed(path: Path, start: bytes) -> _Header:
+    magic, version, count, degree, fractional_bits, flags, _ = HEADER.unpack(start)
+    if magic != MAGIC:
+        raise _unusable(path, f"not an spz file: the gzip stream begins with {magic!r}")
+    if version not in VERSIONS:
+        raise _unusable(path, f"expected SPZ version 2 or 3, got {version}")
+    if degree > MAX_DEGREE:
+        raise _unusable(path, f"expected SH degree 0 to {MAX_DEGREE}, got {degree}")
+    return _Header(version, count, degree, fractional_bits, bool(flags & HAS_EXTENSIONS))
+
+
+def _decoded(header: _Header, packed: bytearray) -> Iterator[tuple[slice, Gaussians]]:
+    """Yield Gaussians in the axes of the file, some rows at a time."""
+    blocks, start = [], 0
+    for size in header.sizes:
+        block = np.frombuffer(packed, np.uint8, count=header.count * size, offset=start)
+        blocks.append(block.reshape(header.count, size))
+        start += block.size
+    for first in range(0, header.count, ROWS_AT_ONCE):
+        rows = slice(first, first + ROWS_AT_ONCE)
+        positions, alphas, colors, scales, rotations, rest = (block[rows] for block in blocks)
+        digits = positions.reshape(-1, 3, 3).astype(np.int32)
+        fixed = digits[..., 0] | digits[..., 1] << 8 | digits[..., 2] << 16
+        signed = (fixed ^ 1 << 23) - (1 << 23)
+        unpack = _from_smallest_three if header.version == 3 else _from_first_three
+        dc = (colors.astype(np.float64) / 255 - 0.5) / COLOR_SCALE
+        sh = np.concatenate([dc[:, None], rest.reshape(len(rest), -1, 3) / 128.0 - 1], axis=1)
+        yield (
+            rows,
+            Gaussians(
+                means=as_tensor(np.ldexp(signed.astype(np.float64), -header.fractional_bits)),
+                log_scales=as_tensor(scales / 16.0 - 10),
+                quats=as_tensor(unpack(rotations)),
+                opacity_logits=as_tensor(byte_logits(alphas[:, 0])),
+                sh=as_tensor(sh),
+            ),
+        )
+
+
+def _fractional_bits(path: Path, local: Gaussians) -> int:
+    """Return the number of fractional bits with which all positions fit into 24 bits."""
+    extent = float(local.means.abs().max()) if len(local) else 0.0
+    for bits in range(MOST_FRACTIONAL_BITS, -1, -1):
+        if extent * 2**bits <= LARGEST_FIXED:
+            return bits
+    raise UserError(
+        f"{path}: expected positions up to {LARGEST_FIXED:,}, which is the range of SPZ, got {extent:g}. "
+        "Try: exporter=[ply]"
+    )
+
+
+def _smallest_three(quats: np.ndarray) -> np.ndarray:
+    """Return the rotations [n 4 bytes] of unit quaternions (w, x, y, z) in version 3."""
+    xyzw = quats[:, [1, 2, 3, 0]]
+    largest = np.abs(xyzw).argmax(axis=1)
+    xyzw = xyzw * np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1, 1)
+    magnitudes = np.minimum(np.rint(np.abs(xyzw) / LARGEST_OF_SMALLEST * 511), 511).astype(np.uint32)
+    fields = magnitudes | (xyzw < 0).astype(np.uint32) << 9
+    words = largest.astype(np.uint32)
+    for component in range(4):
+        words = np.where(component == largest, words, words << 10 | fields[:, component])
+    return words.astype("<u4")[:, None].view(np.uint8)
+
+
+def _from_smallest_three(packed: np.ndarray) -> np.ndarray:
+    """Return the quaternions (w, x, y, z) of rotations in version 3; the inverse of _smallest_three."""
+    words = np.ascontiguousarray(packed).view("<u4")[:, 0]
+    largest = words >> 30
+    xyzw = np.zeros((len(words), 4))
+    for component in (3, 2, 1, 0):
+        sign = np.where(words >> 9 & 1, -1.0, 1.0)
+        value = sign * (words & 511) * (LARGEST_OF_SMALLEST / 511)
+        xyzw[:, component] = np.where(component == largest, 0, value)
+        words = np.where(component == largest, words, words >> 10)
+    return _with_remainder(xyzw, largest)[:, [3, 0, 1, 2]]
+
+
+def _from_first_three(packed: np.ndarray) -> np.ndarray:
+    """Return the quaternions (w, x, y, z) of rotations in version 2."""
+    xyzw = np.zeros((len(packed), 4))
+    xyzw[:, :3] = packed / 127.5 - 1
+    return _with_remainder(xyzw, np.full(len(packed), 3))[:, [3, 0, 1, 2]]
+
+
+def _with_remainder(quats: np.ndarray, missing: np.ndarray) -> np.ndarray:
+    """Return unit quaternions whose component ``missing``, which is zero, is computed from the others."""
+    rest = np.sqrt(np.maximum(1 - (quats**2).sum(axis=1), 0))
+    return np.where(np.arange(4) == missing[:, None], rest[:, None], quats)
+
+
+def _sh_bytes(rest: np.ndarray) -> np.ndarray:
+    """Return SH coefficients [n r 3] of degree 1 and higher as bytes of few bits, which compress well."""
+    steps = np.where(np.arange(rest.shape[1]) < 3, *SH_STEPS)[:, None]
+    return to_bytes(steps * np.rint(128 * (np.clip(rest, -1, 1) + 1) / steps))
+
+
+def _unusable(path: Path, problem: str) -> UserError:
+    return UserError(f"{path}: {problem}. Try: another file")

@@ -1,0 +1,341 @@
+"""``cadam3d export``: names of files, asset.json, for=, suffixes, and the printed facts about programs."""
+
+import hashlib
+import json
+import shlex
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from omegaconf import OmegaConf
+from splats import make_gaussians
+
+from cadam3d.exporter.programs import FORMATS, PROGRAMS, UNKNOWN, judge, losses
+from cadam3d.io.asset_record import Frame
+from cadam3d.io.frames import AXES, UPS
+from cadam3d.io.jsonl import read_json, write_json
+from cadam3d.io.lock import taking_turns
+from cadam3d.io.ply import read_ply, write_ply
+from cadam3d.settings.compose import compose, config_dir
+from cadam3d.settings.line import EXPORTERS, exporting, suffix_of
+
+TARGETS = sorted(path.stem for path in (config_dir() / "for").glob("*.yaml"))
+SUMMARY = {"prompt": "a red cube", "seed": 3, "steps": 40, "densifier": "cadam", "guidance": "sds"}
+SUMMARY |= {"prior": "shapes", "cadam3d": "0.0.1", "torch": "2.9"}
+
+
+@pytest.fixture
+def run_folder(tmp_path) -> Path:
+    folder = tmp_path / "a run"
+    folder.mkdir()
+    cfg = compose(["prompt=a red cube", "rasterizer=reference"])
+    (folder / "config.yaml").write_text(OmegaConf.to_yaml(cfg, resolve=True), encoding="utf-8")
+    write_ply(folder / "asset.ply", make_gaussians(6, degree=1), up="-y", pad_sh=0)
+    write_json(folder / "summary.json", SUMMARY)
+    return folder
+
+
+def files_in(record: Path) -> dict[str, dict]:
+    """Return the entries of an asset.json by the name of the file, after comparing them with the files."""
+    found = {entry["name"]: entry for entry in read_json(record)["files"]}
+    for name, entry in found.items():
+        content = (record.parent / name).read_bytes()
+        assert (entry["bytes"], entry["sha256"]) == (len(content), hashlib.sha256(content).hexdigest())
+    return found
+
+
+# --- asset.json -------------------------------------------------------------------------------------------
+
+
+def test_the_files_of_a_run_are_in_exports_and_described_there(run_folder, type_line):
+    code, out, _ = type_line("export", f"run={run_folder}", "exporter.ply.pad_sh=2")
+    assert code == 0
+    assert out.splitlines()[-1].startswith("a run/exports/asset.json")
+    record = read_json(run_folder / "exports/asset.json")
+    assert list(record) == [
+        *("schema", "source", "prompt", "seed", "steps", "densifier", "objective", "prior"),
+        *("trained_with", "exported_with", "files"),
+    ]
+    assert (record["prompt"], record["seed"], record["steps"]) == ("a red cube", 3, 40)
+    assert (record["densifier"], record["objective"]) == ("cadam", "sds")
+    assert record["trained_with"] == {"cadam3d": "0.0.1", "torch": "2.9"}
+    assert record["exported_with"]["torch"] == torch.__version__
+    assert record["source"] == {
+        "name": "asset.ply",
+        "sha256": hashlib.sha256((run_folder / "asset.ply").read_bytes()).hexdigest(),
+        "gaussians": 6,
+        "sh_degree": 1,
+    }
+    entry = files_in(run_folder / "exports/asset.json")["asset.ply"]
+    assert entry["frame"] == {"up": "-y", "front": "+z", "handedness": "right"}
+    assert (entry["format"], entry["gaussians"], entry["sh_degree"], entry["triangles"]) == (
+        "ply",
+        6,
+        2,
+        None,
+    )
+
+
+def test_the_same_export_writes_the_same_record(run_folder, type_line):
+    records = []
+    for _ in range(2):
+        type_line("export", f"run={run_folder}")
+        records.append((run_folder / "exports/asset.json").read_bytes())
+    assert records[0] == records[1]
+
+
+def test_a_second_export_keeps_the_entries_of_unchanged_files_only(run_folder, type_line):
+    write_ply(run_folder / "old.ply", read_ply(run_folder / "asset.ply"), up="+z", pad_sh=0)
+    folder = run_folder / "exports"
+    type_line("export", f"run={run_folder}")
+    record = read_json(folder / "asset.json")
+    [entry] = record["files"]
+    for name in ("kept.ply", "changed.ply", "gone.ply", "link.ply"):
+        (folder / name).write_bytes((folder / "asset.ply").read_bytes())
+    (folder / "link.ply").unlink()
+    (folder / "link.ply").symlink_to(folder / "asset.ply")
+    record["files"] += [
+        entry | {"name": name} for name in ("kept.ply", "changed.ply", "gone.ply", "link.ply")
+    ]
+    record["files"] += [entry | {"name": "../asset.ply"}, entry | {"up": "-y"}, 5, {"name": "kept.ply"}]
+    write_json(folder / "asset.json", record)
+    (folder / "changed.ply").write_bytes(b"another file")
+    (folder / "gone.ply").unlink()
+    assert type_line("export", f"run={run_folder}", "exporter.ply.up=+z").code == 0
+    files = files_in(folder / "asset.json")
+    assert list(files) == ["asset.ply", "kept.ply"]
+    assert files["kept.ply"] == entry | {"name": "kept.ply"}
+    assert files["asset.ply"]["frame"]["up"] == "+z"
+
+
+def test_a_record_describes_one_asset(run_folder, type_line, tmp_path):
+    type_line("export", f"run={run_folder}", "output=here")
+    (tmp_path / "here/asset.ply").rename(tmp_path / "here/first.ply")
+    record = read_json(tmp_path / "here/asset.json")
+    record["files"][0]["name"] = "first.ply"
+    write_json(tmp_path / "here/asset.json", record)
+    write_ply(tmp_path / "other.ply", make_gaussians(4), up="+y", pad_sh=0)
+    assert type_line("export", "ply=other.ply", "output=here").code == 0
+    record = read_json(tmp_path / "here/asset.json")
+    assert list(files_in(tmp_path / "here/asset.json")) == ["asset.ply"]
+    assert record["source"]["name"] == "other.ply"
+    assert {record[name] for name in ("prompt", "seed", "steps", "densifier", "objective")} == {None}
+
+
+@pytest.mark.parametrize("content", ["my own", "{}", '{"schema": 2, "source": {}, "files": []}', "[]"])
+def test_an_asset_json_of_another_origin_is_never_overwritten(content, run_folder, type_line, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/asset.json").write_text(content)
+    message = type_line("export", f"run={run_folder}", "output=mine").message
+    assert message == (
+        "output: mine holds an asset.json that cadam3d export has not written. Try: output=mine-2"
+    )
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["asset.json"]
+    assert (tmp_path / "mine/asset.json").read_text() == content
+
+
+def test_a_run_of_a_stranger_adds_nothing_but_short_texts_and_counts(run_folder, type_line):
+    (run_folder / "summary.json").unlink()
+    settings = {"prompt": "\u202e" + "x" * 100_000, "seed": [1, {"a": 2}]}
+    (run_folder / "config.yaml").write_text(json.dumps(settings))
+    assert type_line("export", f"run={run_folder}").code == 0
+    record = read_json(run_folder / "exports/asset.json")
+    assert record["prompt"] == ("\u202e" + "x" * 100_000)[:10_000]
+    assert record["seed"] is None
+    assert record["trained_with"] == {"cadam3d": None, "torch": None}
+
+
+def test_a_failed_exporter_costs_only_its_own_file(run_folder, type_line):
+    (run_folder / "exports/preview.png").mkdir(parents=True)
+    code, out, err = type_line(
+        "export", f"run={run_folder}", "exporter=[preview,ply]", "exporter.preview.size=8"
+    )
+    assert code == 0
+    assert err.startswith("Warning: exporter.preview: ")
+    assert "asset.ply" in out
+    assert list(files_in(run_folder / "exports/asset.json")) == ["asset.ply"]
+
+
+def test_a_single_file_comes_alone(run_folder, type_line, tmp_path):
+    assert type_line("export", f"run={run_folder}", "output=alone/thing.ply").code == 0
+    assert [path.name for path in (tmp_path / "alone").iterdir()] == ["thing.ply"]
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_the_frame_says_where_the_object_looks(up):
+    frame = Frame.of(up)
+    axes = torch.tensor(AXES[up])
+    for name, direction in ((frame.up, [0, 0, 1]), (frame.front, [1, 0, 0])):
+        unit = torch.eye(3, dtype=torch.int64)["xyz".index(name[1])] * int(f"{name[0]}1")
+        assert (axes @ torch.tensor(direction)).tolist() == unit.tolist()
+    assert torch.linalg.det(axes.double()) == 1
+
+
+def test_two_exports_into_one_folder_take_turns(tmp_path):
+    waits = threading.Event()
+
+    def second() -> None:
+        with taking_turns(tmp_path, waits.set):
+            (tmp_path / "second").touch()
+
+    thread = threading.Thread(target=second)
+    with taking_turns(tmp_path, lambda: None):
+        thread.start()
+        assert waits.wait(60)
+        assert not list(tmp_path.iterdir())
+    thread.join(60)
+    assert [path.name for path in tmp_path.iterdir()] == ["second"]
+
+
+# --- for= -------------------------------------------------------------------------------------------------
+
+
+def test_every_target_is_a_program_with_known_axes():
+    assert sorted(program.target for program in PROGRAMS if program.target) == TARGETS
+    assert not UNKNOWN.keys() & set(TARGETS)
+    for program in PROGRAMS:
+        assert program.source
+        assert program.version
+        assert set(program.upright) <= FORMATS.keys()
+        assert set(program.upright.values()) <= set(UPS)
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_target_chooses_an_exporter_whose_file_is_upright_there(target, run_folder, type_line):
+    [program] = [program for program in PROGRAMS if program.target == target]
+    chosen = compose([f"for={target}"], "export").exporter
+    [(name, node)] = chosen.items()
+    assert program.upright[name] == node.up
+    code, out, _ = type_line("export", f"run={run_folder}", f"for={target}", "device=cpu")
+    assert code == 0
+    [entry] = files_in(run_folder / "exports/asset.json").values()
+    assert (entry["format"], entry["frame"]["up"]) == (name, node.up)
+    assert f"upright in {', '.join(each.name for each in judge(name, node.up).upright)}" in out
+    if name == "ply":
+        # The comment in the header is ignored, so that the numbers themselves are judged.
+        path = run_folder / "exports/asset.ply"
+        path.write_bytes(path.read_bytes().replace(b"comment cadam3d up=", b"comment somebody up="))
+        means = read_ply(path, up=program.upright["ply"]).means
+        torch.testing.assert_close(means, read_ply(run_folder / "asset.ply").means)
+
+
+def test_each_page_of_help_names_every_target(type_line):
+    out = type_line("export", "--help").out
+    assert all(f"  {target} " in out for target in TARGETS)
+    texts = [(config_dir() / f"for/{name}.yaml").read_text(encoding="utf-8") for name in TARGETS]
+    measured = {program.target: program.is_measured for program in PROGRAMS}
+    for name, text in zip(TARGETS, texts, strict=True):
+        assert ("Measured." in text) == measured[name]
+        assert yaml.safe_load(text).keys() == {"defaults", "exporter"}
+
+
+@pytest.mark.parametrize("target", sorted(UNKNOWN))
+def test_a_program_with_unknown_axes_is_refused_with_a_line_to_try(target, run_folder, type_line):
+    typed = ("export", f"run={run_folder}", f"for={target}", "output=x.splat")
+    message = type_line(*typed).message
+    assert message.startswith("for: expected a program whose axes are known (")
+    assert f"got {target!r}: {UNKNOWN[target].reason}." in message
+    line = shlex.split(message.rpartition("Try: ")[2])
+    assert line[:3] == ["cadam3d", "export", f"run={run_folder}"]
+    assert type_line(*line[1:]).code == 0
+
+
+def test_an_unknown_target_lists_the_known_ones(run_folder, type_line):
+    message = type_line("export", f"run={run_folder}", "for=sparc").message
+    assert message == f"for: expected one of {'|'.join(TARGETS)}, got 'sparc'. Try: for=spark"
+
+
+def test_a_target_and_an_exporter_are_refused_but_a_setting_of_the_exporter_wins(run_folder, type_line):
+    message = type_line("export", f"run={run_folder}", "for=spark", "exporter=[ply]").message
+    assert message == (
+        "exporter: expected for=spark alone, which chooses the exporter, got both. "
+        f"Try: cadam3d export 'run={run_folder}' for=spark"
+    )
+    assert type_line("export", f"run={run_folder}", "for=spark", "exporter.ply.up=-y").code == 0
+    [entry] = files_in(run_folder / "exports/asset.json").values()
+    assert entry["frame"]["up"] == "-y"
+
+
+def test_a_target_decides_the_format_of_a_named_file(run_folder, type_line, tmp_path):
+    assert type_line("export", f"run={run_folder}", "for=spark", "output=a.ply").code == 0
+    assert b"up=+y" in (tmp_path / "a.ply").read_bytes()[:200]
+    message = type_line("export", f"run={run_folder}", "for=spark", "output=a.glb").message
+    assert "exporter=[ply] writes 1 file(s) with suffix .ply" in message
+
+
+@pytest.mark.parametrize("command", ["render", "view"])
+def test_a_target_of_another_command_leads_to_export(command, run_folder, type_line):
+    message = type_line(command, f"run={run_folder}", "for=spark").message
+    assert message == f"for: belongs to cadam3d export. Try: cadam3d export 'run={run_folder}' for=spark"
+
+
+# --- suffixes ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "added"),
+    [
+        (["output=a.ply"], ["exporter=[ply]"]),
+        (["output=a.COMPRESSED.ply"], ["exporter=[compressed_ply]"]),
+        (["output=compressed.ply"], ["exporter=[ply]"]),
+        (["output=.compressed.ply"], ["exporter=[ply]"]),
+        (["output=a.glb"], ["exporter=[glb]"]),
+        (["output=a.glb", "exporter.mesh.up=+z"], ["exporter=[mesh]", "exporter.mesh.format=glb"]),
+        (["output=a.obj"], ["exporter=[mesh]", "exporter.mesh.format=obj"]),
+        (["output=a.obj", "exporter=[mesh]"], ["exporter.mesh.format=obj"]),
+        (["output=a.ply", "exporter=[mesh]"], ["exporter.mesh.format=ply"]),
+        (["output=a.ply", "exporter=[mesh]", "exporter.mesh.format=obj"], []),
+        (["output=a.glb", "for=three"], []),
+        (["output=a.glb", "exporter=[ply]"], []),
+        (["output=a.glb", "exporter=[]"], []),
+        (["output=a.glb/"], []),
+        (["output=.ply"], []),
+        (["output=a"], []),
+        (["run=a.ply"], []),
+    ],
+)
+def test_a_suffix_chooses_the_exporter_unless_the_line_does(words, added):
+    assert exporting(words) == words + added
+
+
+def test_every_suffix_belongs_to_exporters_that_exist():
+    names = {path.stem for path in (config_dir() / "exporter").glob("*.yaml")}
+    for suffix, exporters in EXPORTERS.items():
+        assert suffix_of(f"x{suffix.upper()}") == suffix
+        assert set(exporters) <= names
+
+
+# --- what is printed --------------------------------------------------------------------------------------
+
+
+def test_the_lines_about_a_file_name_its_axes_and_the_programs(run_folder, type_line):
+    lines = type_line("export", f"run={run_folder}", "output=out").out.splitlines()
+    assert (
+        lines[0]
+        == f"out/asset.ply  {(Path('out/asset.ply').stat().st_size) / 1e3:.1f} kB, 6 Gaussians, -y up"
+    )
+    assert lines[1].startswith(
+        "  upright in SuperSplat, viser; upside down in Spark (for=spark), three.js (for="
+    )
+    assert lines[2].endswith("describes these files")
+    sideways = type_line("export", f"run={run_folder}", "output=a.ply", "exporter.ply.up=+z").out.splitlines()
+    assert sideways[1].startswith("  on its side in SuperSplat (for=supersplat), ")
+
+
+@pytest.mark.parametrize("exporter", sorted(FORMATS))
+def test_a_program_shows_a_file_in_one_way(exporter):
+    for up in UPS:
+        verdict = judge(exporter, up)
+        shown = [*verdict.upright, *verdict.upside_down, *verdict.on_its_side]
+        assert len(shown) == len(set(map(id, shown)))
+        assert {id(each) for each in shown} == {id(each) for each in PROGRAMS if exporter in each.upright}
+        assert not verdict.upside_down or up != "+z"
+
+
+def test_only_what_an_asset_has_can_be_lost():
+    assert not losses("ply", 3)
+    assert "leaves out how colours change with the direction of view" in losses("splat", 1)
+    assert "leaves out how colours change with the direction of view" not in losses("splat", 0)
+    assert not losses("an exporter from elsewhere", 3)

@@ -1,0 +1,70 @@
+"""The mesh of an asset opens in three.js upright, with the outline and the colours of our render."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from programs.files import VIEW, keep
+from programs.render_elsewhere import Browser, ours
+from programs.snowman import snowman_and_pine
+
+from cadam3d.exporter.mesh import MeshExporter
+from cadam3d.rasterizer.cpu import CpuRasterizer
+
+pytestmark = [pytest.mark.oracle, pytest.mark.slow]
+
+SETTINGS = Path(__file__).parents[2] / "configs" / "exporter" / "mesh.yaml"
+# The surface is about where a ray that grazes the object collects this alpha.
+EDGE = 0.2
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with Browser.start() as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """Return our picture and its alpha."""
+    gaussians = snowman_and_pine(0)
+    with torch.no_grad():
+        output = CpuRasterizer(cache_dir=None).render(gaussians, VIEW.cameras(), torch.ones(1, 3))
+    return ours(gaussians, VIEW), output.alpha[0].numpy()
+
+
+def write(folder: Path, **changes) -> Path:
+    settings = yaml.safe_load(SETTINGS.read_text(encoding="utf-8"))
+    del settings["_target_"]
+    exporter = MeshExporter(**{**settings, "triangles": 20_000, **changes})
+
+    def never(cameras, background):
+        raise AssertionError("a mesh needs no picture")
+
+    return exporter.export(snowman_and_pine(0), never, folder)[0]
+
+
+def overlap(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the intersection of two masks over their union."""
+    return float((first & second).sum() / (first | second).sum())
+
+
+@pytest.mark.parametrize("changes", [{}, {"format": "obj"}], ids=["glb", "obj"])
+def test_the_mesh_has_the_outline_and_the_colours_of_our_render(browser, seen, changes, tmp_path):
+    path = write(tmp_path, **changes)
+    picture, (ours_, alpha) = browser.picture("mesh.html", path, VIEW), seen
+    kept = keep(picture, ours_, path)
+    outline = (picture < 250).any(axis=2)
+    assert overlap(outline, alpha > EDGE) >= 0.95, kept
+    difference = (picture.astype(float) - ours_)[outline & (alpha > 0.9)]
+    assert np.abs(difference).mean() <= 10, kept  # of 255
+    # Colours that were converted once too often or too seldom are all too bright or too dark.
+    assert np.abs(difference.mean(axis=0)).max() <= 4, kept
+
+
+def test_a_mesh_with_the_wrong_axes_is_noticed(browser, seen, tmp_path):
+    path = write(tmp_path, up="-y")
+    outline = (browser.picture("mesh.html", path, VIEW) < 250).any(axis=2)
+    assert overlap(outline, seen[1] > EDGE) < 0.6
