@@ -197,7 +197,7 @@ def _refuse_several_runs(cfg: DictConfig, line: Line) -> None:
     """Raise ``UserError`` if a line names several runs and its command does not compare them."""
     runs = cfg.get("run")
     if line.command != COMPARING and OmegaConf.is_list(runs):
-        typed = next(word for word in line.overrides if key_of(word) == "run")
+        typed = f"run=[{','.join(map(str, runs))}]"
         raise UserError(
             f"run: expected one run, got a list of {len(runs)}, which only cadam3d {COMPARING} compares. "
             f"Try: {shlex.join(['cadam3d', COMPARING, typed])}"

@@ -22,7 +22,7 @@ from cadam3d.core.render import Subject
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.caption import plain
 from cadam3d.io.records import read_summary
-from cadam3d.io.run_folder import shown
+from cadam3d.io.run_folder import LATEST, shown
 
 # Runs side by side. The pictures of more would be too small for their captions.
 MOST_RUNS = 12
@@ -54,19 +54,18 @@ def _compare(cfg: DictConfig) -> tuple[list[Output], list[Subject]]:
     if cfg.ply is not None:
         raise UserError("run, ply: expected one of them, got both. Try: ply=null")
     if not 2 <= len(cfg.run) <= MOST_RUNS:
-        line = (
-            shlex.quote(f"run=[{','.join(list(cfg.run)[:MOST_RUNS])}]") if cfg.run else "run=outputs/latest"
+        some = [str(text) for text in cfg.run[:MOST_RUNS]]
+        line = f"run=[{','.join(some)}]" if len(some) > 1 else f"run={(some or [LATEST])[0]}"
+        raise fail(
+            "run", expected=f"2 to {MOST_RUNS} runs in a list", got=len(cfg.run), example=shlex.quote(line)
         )
-        if len(cfg.run) == 1:
-            line = shlex.quote(f"run={cfg.run[0]}")
-        raise fail("run", expected=f"2 to {MOST_RUNS} runs in a list", got=len(cfg.run), example=line)
     folders = [find_run(str(text)) for text in cfg.run]
     labels = default_labels(folders) if cfg.labels is None else [plain(label) for label in cfg.labels]
     if len(labels) != len(folders) or not all(0 < len(label) <= LONGEST_LABEL for label in labels):
         raise fail(
             "labels",
             expected=f"one text of 1 to {LONGEST_LABEL} characters for each of the {len(folders)} runs",
-            got=list(cfg.labels),
+            got=labels,
             example="labels=null",
         )
     assets = [open_run(folder, cfg.device) for folder in folders]
@@ -86,10 +85,10 @@ def _compare(cfg: DictConfig) -> tuple[list[Output], list[Subject]]:
 
 
 def default_labels(folders: Sequence[Path]) -> list[str]:
-    """Return a label for each run: its densifier, its folder or its path, whichever is the first to differ."""
+    """Return a label for each run: its densifier, or its folder or path if densifiers are equal."""
     densifiers = [str(read_summary(folder).get("densifier") or "") for folder in folders]
-    for labels in (densifiers, [folder.name for folder in folders]):
-        labels = [plain(label) for label in labels]
+    for names in (densifiers, [folder.name for folder in folders]):
+        labels = [plain(name) for name in names]
         if all(labels) and len(set(labels)) == len(labels):
             return [label[:LONGEST_LABEL] for label in labels]
     return [plain(str(shown(folder)))[-LONGEST_LABEL:] for folder in folders]

@@ -1,7 +1,7 @@
 """Normals: the direction in which the surface of Gaussians faces, as colours.
 
-A Gaussian is part of a surface, and flattest across it. Its normal is therefore its shortest axis, turned towards
-the camera. On trained assets, a blend of these axes is much smoother than the derivative of the rendered depth.
+A Gaussian is part of a surface, and flattest across it. Its normal is therefore its shortest axis, turned
+towards the camera. On trained assets, a blend of these axes is much smoother than the derivative of depth.
 """
 
 from dataclasses import replace
@@ -21,7 +21,10 @@ SHORTEST = 1e-4
 
 
 def facing_normals(gaussians: Gaussians, camera: Cameras) -> Float[Tensor, "n 3"]:
-    """Return the unit normal of each Gaussian, turned towards a single camera: right, up, towards the camera."""
+    """Return the unit normal of each Gaussian, turned towards a single camera.
+
+    Its axes are those of normal maps: right, up, towards the camera.
+    """
     shortest = gaussians.log_scales.argmin(dim=1)
     axes = gaussians.rotations.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
     towards = camera.positions - gaussians.means

@@ -101,14 +101,11 @@ class CutoutSettings(ViewSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         key = f"{self.node}.background"
-        require(
-            self.is_transparent
-            or (are_numbers(self.background, low=0, high=1) and len(self.background) == 3),
-            key,
-            expected=f"three numbers in [0, 1] or {TRANSPARENT}",
-            got=self.background,
-            example=f"{key}={TRANSPARENT}" if isinstance(self.background, str) else f"'{key}=[0.5,0.5,0.5]'",
-        )
+        is_color = are_numbers(self.background, low=0, high=1) and len(self.background) == 3
+        expected = f"three numbers in [0, 1] or {TRANSPARENT}"
+        example = f"{key}={TRANSPARENT}" if isinstance(self.background, str) else f"'{key}=[0.5,0.5,0.5]'"
+        is_known = is_color or self.is_transparent
+        require(is_known, key, expected=expected, got=self.background, example=example)
 
     @property
     def is_transparent(self) -> bool:

@@ -24,10 +24,10 @@ class Exporter(ABC):
         """
 
     def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
-        """Write pictures of all ``subjects`` into ``folder``, which exists, and return the paths of the files.
+        """Write pictures of all ``subjects`` into ``folder``, which exists, and return the paths.
 
-        They are side by side in every picture, seen from the same cameras and with a caption under each. Raises
-        ``UserError`` if a file cannot be written, or if this exporter makes no pictures.
+        They are side by side in every picture, seen from the same cameras and with a caption under each.
+        Raises ``UserError`` if a file cannot be written, or if this exporter makes no pictures.
         """
         raise UserError(
             "it writes one asset, so it cannot compare several. Try: 'exporter=[preview,turntable]'"

@@ -23,8 +23,8 @@ NAME = re.compile(r"\d{3,}_az\d{3}_el[+-]\d{2}(_depth|_alpha|_normal)?\.png")
 class ImagesExporter(CutoutSettings, PictureExporter):
     """Write ``images/000_az000_el+20.png`` and so on: numbered, with azimuth and elevation in degrees.
 
-    The pictures of other kinds have the same number and, for example, ``_normal`` at the end of their names. All
-    pictures with such names in ``images`` are replaced, so that none of an earlier export is left.
+    The pictures of other kinds have the same number and, for example, ``_normal`` at the end of their names.
+    All pictures with such names in ``images`` are replaced, so that none of an earlier export is left.
     """
 
     node: ClassVar[str] = "exporter.images"

@@ -56,8 +56,8 @@ def paint(
     - rgb: the colours over ``background``, which is black for transparent pictures.
     - depth: closeness, as in ``io/image.py``, over black; ``distance`` is that of the cameras.
     - alpha: opacity in grey. It has no transparent parts.
-    - normal: (n + 1) / 2 over ``background``, where n is the unit normal in the axes of normal maps: right, up,
-      towards the camera.
+    - normal: (n + 1) / 2 over ``background``, where n is the unit normal in the axes of normal maps: right,
+      up, towards the camera.
     """
     output = subject.render(cameras, background)
     alpha = output.alpha
@@ -78,7 +78,10 @@ def paint(
 
 
 def _normals(subject: Subject, cameras: Cameras) -> Float[Tensor, "v h w 3"]:
-    """Return unit normals as colours. Each view is rendered alone, because its colours depend on the camera."""
+    """Return unit normals as colours.
+
+    Each view is rendered alone, because the colours of the Gaussians depend on its camera.
+    """
     gaussians, views = subject.gaussians.detach(), []
     for view in range(len(cameras)):
         camera = cameras.index(slice(view, view + 1))

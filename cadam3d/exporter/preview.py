@@ -22,7 +22,8 @@ from cadam3d.io.run_folder import PREVIEW
 class PreviewExporter(PictureSettings, PictureExporter):
     """Write ``preview.png``: a row of azimuths for each elevation, starting at the front.
 
-    Of several assets, the sheets are side by side, and their rows are broken so that each sheet is nearly square.
+    Of several assets, the sheets are side by side, and their rows are broken so that each sheet is nearly
+    square.
     """
 
     node: ClassVar[str] = "exporter.preview"

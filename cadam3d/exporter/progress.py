@@ -24,7 +24,7 @@ LONGEST_HOLD = 60  # seconds
 
 @dataclass(frozen=True, kw_only=True)
 class ProgressExporter(Exporter):
-    """Write ``progress.mp4``, ``.webm`` or ``.gif``: the previews of a run, with step and count under each."""
+    """Write ``progress.mp4``, ``.webm`` or ``.gif``: the previews of a run with the step and the count."""
 
     run: str | None  # the folder of the run; None: the folder to which this exporter writes
     fps: int  # previews per second, in [1, 240]; for gif in [1, 50]
@@ -84,7 +84,7 @@ def count_at(step: int, counts: Sequence[tuple[int, int]]) -> str:
 
 
 def fitted(picture: UInt8[np.ndarray, "h w 3"], shape: tuple[int, ...]) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Return ``picture`` cut and padded with white, to the right and below, to the height and width ``shape``."""
+    """Return ``picture`` cut, or padded with white on the right and below, to the size ``shape``."""
     height, width = shape[:2]
     cut = picture[:height, :width]
     rest = ((0, height - cut.shape[0]), (0, width - cut.shape[1]), (0, 0))

@@ -28,7 +28,7 @@ VIEWS_AT_ONCE = 4  # bounds the memory of rendering for a video of any length
 
 @dataclass(frozen=True, kw_only=True)
 class TurntableExporter(CutoutSettings, PictureExporter):
-    """Write ``turntable.mp4``, ``.webm`` or ``.gif``: the camera circles the object, starting at its front."""
+    """Write ``turntable.mp4``, ``.webm`` or ``.gif``: the camera circles the object, first at its front."""
 
     node: ClassVar[str] = "exporter.turntable"
 

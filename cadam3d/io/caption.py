@@ -35,8 +35,9 @@ def side_by_side(
 ) -> UInt8[np.ndarray, "tall wide c"]:
     """Return one picture with ``pictures``, which have one size, from left to right on ``paper``.
 
-    Under each is its caption, whose letters grow with the pictures. A line that is too long for its picture gets
-    smaller letters and then ends with an ellipsis. Without captions, the pictures are joined without margins.
+    Under each is its caption, with letters that grow with the pictures. A line that is too long for its
+    picture gets smaller letters, and then ends with an ellipsis. Without captions, the pictures are joined
+    without margins.
     """
     if not captions:
         return np.concatenate(pictures, axis=1)

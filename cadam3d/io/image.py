@@ -37,9 +37,9 @@ def cutout(
 ) -> Float[Tensor, "*batch h w 4"]:
     """Return images with straight alpha, from renders over black and their alpha, for 8-bit files.
 
-    After :func:`to_uint8`, each pixel over any colour, ``a * rgb + (1 - a) * colour``, is the render over that
-    colour to within 1/255, unless the Gaussians are brighter than white. Colours are divided by the rounded
-    alpha, because that is the one in the file.
+    After :func:`to_uint8`, each pixel over any colour, ``a * rgb + (1 - a) * colour``, is the render over
+    that colour to within 1/255, unless the Gaussians are brighter than white. Colours are divided by the
+    rounded alpha, because that is the one in the file.
     """
     rounded = (alpha.nan_to_num(nan=0.0).clamp(0, 1) * 255).round() / 255
     straight = torch.where(rounded[..., None] > 0, over_black / rounded[..., None], 0.0)

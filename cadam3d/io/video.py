@@ -1,6 +1,7 @@
 """Videos: H.264 in MP4, VP9 in WebM and animated GIF. The suffix of the file chooses the format.
 
-MP4 with yuv420p plays in every browser and player. WebM may be transparent. GIF plays wherever pictures are shown.
+MP4 with yuv420p plays in every browser and player. WebM may be transparent. GIF plays wherever pictures are
+shown.
 """
 
 from collections.abc import Iterable
@@ -36,8 +37,8 @@ FORMATS = {
     # handle rates up to 240; much larger ones overflow in ffmpeg. With faststart, a browser plays the video
     # while it loads.
     ".mp4": Format("libx264", "yuv420p", ("-crf", "18", "-movflags", "+faststart"), None, 240, True),
-    # VP9's factors have another scale. With a bit rate of 0, the factor alone decides. Frames that are not shown
-    # (auto-alt-ref) cannot be transparent.
+    # VP9's factors have another scale. With a bit rate of 0, the factor alone decides. Frames that are not
+    # shown (auto-alt-ref) cannot be transparent.
     ".webm": Format(
         "libvpx-vp9",
         "yuv420p",
@@ -55,10 +56,10 @@ CODECS = tuple(suffix.removeprefix(".") for suffix in FORMATS)
 def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w c"]], *, fps: int) -> None:
     """Write video frames atomically, one at a time, so that a generator needs memory for one frame only.
 
-    ``path`` ends with one of the suffixes in ``FORMATS``. Frames have three channels, or four in a format that
-    can be transparent (straight alpha). Colours of MP4 and WebM have half the resolution, so odd sizes are
-    padded there by repeating the last row or column. Raises ``UserError`` if there is no frame, if the file
-    cannot be written, or if ffmpeg is missing or fails.
+    ``path`` ends with one of the suffixes in ``FORMATS``. Frames have three channels, or four (straight
+    alpha) in a format that can be transparent. Colours of MP4 and WebM have half the resolution, so odd sizes
+    are padded there by repeating the last row or column. Raises ``UserError`` if there is no frame, if the
+    file cannot be written, or if ffmpeg is missing or fails.
     """
     kind = FORMATS[path.suffix]
     with replacing(path) as temporary:
@@ -101,7 +102,7 @@ def _open(path: Path, kind: Format, fps: int, frame: UInt8[np.ndarray, "h w c"])
             fps=fps,
             codec=kind.codec,
             # The options choose the quality.
-            quality=None,
+            quality=None,  # pyright: ignore[reportArgumentType]  (its default is a number)
             # The frames already have even sizes. The default of 16 would rescale them.
             macro_block_size=1,
             # Palettes have equal colours in flat pictures, of which ffmpeg would warn.
