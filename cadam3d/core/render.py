@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -52,6 +52,7 @@ class RenderOutput:
         return ((inverse - farthest) / spread).clamp(0, 1)
 
 
+@runtime_checkable
 class RenderFn(Protocol):
     """A function that renders given Gaussians, without gradients."""
 

@@ -163,7 +163,7 @@ def test_the_suffix_of_a_file_chooses_its_exporter(command, name, run_folder, ty
 @pytest.mark.parametrize(
     "output",
     [
-        *("", " ", "/", "//", "big.gif", "big.mp4 ", "run.v2", "big.tar.gz", "q.png"),
+        *("", " ", "/", "//", "big.bmp", "big.mp4 ", "run.v2", "big.tar.gz", "q.png"),
         *("a file", "a file/", "a file/x.png", "a file/x/y"),
         *("/proc/nowhere", "/proc/x.png", "/dev/null", "/dev/null/x.mp4", "x" * 300, "x" * 300 + ".png"),
     ],
