@@ -16,7 +16,7 @@ from cadam3d.exporter.base import Exporter
 from cadam3d.io.caption import Caption, side_by_side
 from cadam3d.io.image import read_png, step_pictures
 from cadam3d.io.records import read_metrics, read_summary
-from cadam3d.io.run_folder import PREVIEWS, PROGRESS, shown, typed_path
+from cadam3d.io.run_folder import PREVIEWS, PROGRESS, shown, typed_path, video_name
 from cadam3d.io.video import CODECS, FORMATS, write_video
 
 LONGEST_HOLD = 60  # seconds
@@ -43,7 +43,7 @@ class ProgressExporter(Exporter):
         pictures = step_pictures(run / PREVIEWS)
         if not pictures:
             raise UserError(f"{shown(run)}: has no {PREVIEWS}/. Try: {training_with_previews(run)}")
-        path = folder / PROGRESS[self.codec]
+        path = folder / video_name(PROGRESS, self.codec)
         write_video(path, self._frames(pictures, counts_in(run)), fps=self.fps)
         return [path]
 

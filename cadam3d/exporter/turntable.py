@@ -16,7 +16,7 @@ from cadam3d.core.render import Subject
 from cadam3d.exporter.pictures import PictureExporter, captions_of, paint, paper_of
 from cadam3d.io.caption import side_by_side
 from cadam3d.io.image import to_uint8
-from cadam3d.io.run_folder import TURNTABLES
+from cadam3d.io.run_folder import TURNTABLE, video_name
 from cadam3d.io.video import CODECS, FORMATS, write_video
 
 # A frame may be as wide as the codecs allow. With a second picture beside it, the largest size just fits.
@@ -65,7 +65,7 @@ class TurntableExporter(CutoutSettings, PictureExporter):
             got=self.size,
             example=f"exporter.turntable.size={min(256, most)}",
         )
-        path = folder / TURNTABLES[self.codec]
+        path = folder / video_name(TURNTABLE, self.codec)
         write_video(path, self._frames(self.cameras(), subjects), fps=self.fps)
         return [path]
 

@@ -42,9 +42,8 @@ PREVIEW = "preview.png"
 PREVIEWS = "previews"  # a folder
 LIVE = "live"  # a folder: what a running training and a page that watches it tell each other
 SAVED = "saved"  # a folder: assets that a user has saved during training
-PROGRESS = {"mp4": "progress.mp4", "webm": "progress.webm", "gif": "progress.gif"}  # by codec
-TURNTABLE = "turntable.mp4"
-TURNTABLES = {"mp4": TURNTABLE, "webm": "turntable.webm", "gif": "turntable.gif"}  # by codec
+PROGRESS = "progress.mp4"  # or .webm or .gif
+TURNTABLE = "turntable.mp4"  # or .webm or .gif
 VIEWER = "viewer.html"
 
 # Written by ``cadam3d export``.
@@ -121,10 +120,15 @@ def occupant_of_sweep(folder: Path) -> str | None:
 def _written_by_runs() -> tuple[str, ...]:
     """Return every name in the folder of a run that training, its exporters, its callbacks or eval write."""
     files = (ASSET, CHARTS, CONFIG, EVALUATION, LOG, METRICS, PREVIEW, REPORT, SUMMARY, VIEWER)
-    videos = (*TURNTABLES.values(), *PROGRESS.values())
+    videos = [video_name(name, codec) for name in (TURNTABLE, PROGRESS) for codec in ("mp4", "webm", "gif")]
     formats = (ASSET_COMPRESSED_PLY, ASSET_GLB, ASSET_KSPLAT, ASSET_SOG, ASSET_SPLAT, ASSET_SPZ)
     meshes = (ASSET_MESH_GLB, ASSET_MESH_MTL, ASSET_MESH_OBJ, ASSET_MESH_PLY, ASSET_MESH_PNG)
     return (*files, *videos, *formats, *meshes, CANDIDATES, CHECKPOINTS, HYDRA, IMAGES, LIVE, PREVIEWS, SAVED)
+
+
+def video_name(name: str, codec: str) -> str:
+    """Return the name of a video in the format ``codec``, such as turntable.webm."""
+    return str(Path(name).with_suffix(f".{codec}"))
 
 
 def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:
