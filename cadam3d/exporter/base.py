@@ -29,9 +29,7 @@ class Exporter(ABC):
         They are side by side in every picture, seen from the same cameras and with a caption under each.
         Raises ``UserError`` if a file cannot be written, or if this exporter makes no pictures.
         """
-        raise UserError(
-            "it writes one asset, so it cannot compare several. Try: 'exporter=[preview,turntable]'"
-        )
+        raise UserError("it cannot show several assets side by side. Try: 'exporter=[preview,turntable]'")
 
     def omission(self, gaussians: Gaussians) -> str | None:
         """Return what of ``gaussians`` the files cannot hold, as a note for the user; None if nothing."""

@@ -26,7 +26,9 @@ LONGEST_HOLD = 60  # seconds
 class ProgressExporter(Exporter):
     """Write ``progress.mp4``, ``.webm`` or ``.gif``: the previews of a run with the step and the count."""
 
-    run: str | None  # the folder of the run; None: the folder to which this exporter writes
+    # The folder of the run; None: the folder to which this exporter writes. A list of runs, which render
+    # compares, has no single folder, and ``compare`` refuses it.
+    run: str | Sequence[str] | None
     fps: int  # previews per second, in [1, 240]; for gif in [1, 50]
     hold: float  # seconds that the last preview stays, in [0, 60]
     codec: str  # one of CODECS
@@ -39,7 +41,7 @@ class ProgressExporter(Exporter):
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
         """Read the previews one by one and encode them; the Gaussians are not rendered."""
-        run = folder if self.run is None else typed_path(self.run)
+        run = typed_path(self.run) if isinstance(self.run, str) else folder
         pictures = step_pictures(run / PREVIEWS)
         if not pictures:
             raise UserError(f"{shown(run)}: has no {PREVIEWS}/. Try: {training_with_previews(run)}")

@@ -474,4 +474,4 @@ def test_commands_for_one_run_refuse_several_and_suggest_to_compare_them(command
 def test_a_comparison_of_files_that_are_no_pictures_is_refused(two_runs, type_line):
     code, _, err = type_line("render", "run=[b,b]", "output=x.ply")
     assert code == 1
-    assert "exporter.ply: it writes one asset, so it cannot compare several. Try: 'exporter=[preview" in err
+    assert "exporter.ply: it cannot show several assets side by side. Try: 'exporter=[preview" in err
