@@ -145,6 +145,7 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         ("render", "run=a run", "exporter=[]"),
         ("render", "run=a run", "ply=asset.ply"),
         ("render", "run=a sweep"),
+        ("render", "run=a run", "labels=[one]"),
         ("render", "run=[a run]"),
         ("render", "run=[a run,nowhere]"),
         ("render", "run=[a run,a run]", "labels=[one]"),
@@ -477,7 +478,8 @@ def answers(tmp_path_factory) -> Iterator[Answers]:
         patch.setattr("cadam3d.commands.doctor.run", accept)
         patch.setattr("webbrowser.open", lambda _: True)
         for exporter in ("images.ImagesExporter", "turntable.TurntableExporter", "preview.PreviewExporter"):
-            patch.setattr(f"cadam3d.exporter.{exporter}.export", lambda *_: [folder / "a run"])
+            for method in ("export", "compare"):
+                patch.setattr(f"cadam3d.exporter.{exporter}.{method}", lambda *_: [folder / "a run"])
         # Otherwise the suite would refuse a wrong type before the component does.
         jaxtyping.config.update("jaxtyping_disable", True)
         make_places(folder)
