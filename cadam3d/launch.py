@@ -34,6 +34,7 @@ from cadam3d.settings.trust import judge_composition, require_trust, targets_in
 
 TRAINING = ("train", "sweep")  # the commands that have a run folder
 EXPORTING = ("render", "export")  # the commands with output=
+COMPARING = "render"  # the command that accepts several runs
 
 
 @dataclass
@@ -150,6 +151,7 @@ def _command(line: Line, task: Task) -> int:
     refuse_missing_settings(cfg, line.command, line.overrides)
     refuse_unread_settings(cfg, line.command, line.overrides)
     require_settings(cfg)
+    _refuse_several_runs(cfg, line)
     if line.command in TRAINING:
         _train(cfg, line, task)
     else:
@@ -189,6 +191,17 @@ def _train(cfg: DictConfig, line: Line, task: Task) -> None:
     with occupied(wanted, is_chosen=is_chosen, resume=resume) as folder:
         place_run(cfg, folder)
         run_composed(cfg, task)
+
+
+def _refuse_several_runs(cfg: DictConfig, line: Line) -> None:
+    """Raise ``UserError`` if a line names several runs and its command does not compare them."""
+    runs = cfg.get("run")
+    if line.command != COMPARING and OmegaConf.is_list(runs):
+        typed = f"run=[{','.join(map(str, runs))}]"
+        raise UserError(
+            f"run: expected one run, got a list of {len(runs)}, which only cadam3d {COMPARING} compares. "
+            f"Try: {shlex.join(['cadam3d', COMPARING, typed])}"
+        )
 
 
 def _wants_page(options: Namespace) -> bool:

@@ -145,6 +145,15 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         ("render", "run=a run", "exporter=[]"),
         ("render", "run=a run", "ply=asset.ply"),
         ("render", "run=a sweep"),
+        ("render", "run=a run", "labels=[one]"),
+        ("render", "run=[a run]"),
+        ("render", "run=[a run,nowhere]"),
+        ("render", "run=[a run,a run]", "labels=[one]"),
+        ("render", "run=[a run,a run]", "ply=asset.ply"),
+        ("render", "run=[a run,a run]", "exporter=[ply]"),
+        ("render", "run=a run", "exporter.turntable.background=transparent"),
+        ("render", "run=a run", "exporter=[progress]"),
+        ("export", "run=[a run,a run]"),
         ("render", "ply=nothing.ply"),
         ("render", "run=a run", "output=/dev/null/x"),
         ("export", "run=a run", "output=/dev/null/x.ply"),
@@ -476,7 +485,8 @@ def answers(tmp_path_factory) -> Iterator[Answers]:
         patch.setattr("webbrowser.open", lambda _: True)
         patch.setattr("cadam3d.live.server.Server.serve_forever", accept)
         for exporter in ("images.ImagesExporter", "turntable.TurntableExporter", "preview.PreviewExporter"):
-            patch.setattr(f"cadam3d.exporter.{exporter}.export", lambda *_: [folder / "a run"])
+            for method in ("export", "compare"):
+                patch.setattr(f"cadam3d.exporter.{exporter}.{method}", lambda *_: [folder / "a run"])
         # Otherwise the suite would refuse a wrong type before the component does.
         jaxtyping.config.update("jaxtyping_disable", True)
         make_places(folder)

@@ -72,6 +72,7 @@ WHOLE = {
         "exporter.turntable.size",
         "exporter.turntable.fps",
     ],
+    "exporter=[progress]": ["exporter.progress.fps"],
     "exporter=[ply]": ["exporter.ply.pad_sh"],
     "exporter=[spz]": ["exporter.spz.version"],
     "metric=[fidelity]": ["metric.fidelity.views", "metric.fidelity.size"],

@@ -61,6 +61,10 @@ class Output:
     exporter: str  # its name, such as "ply"
 
 
+# Writes files of an asset into a folder.
+ExportFn = Callable[[DictConfig, Asset, Path], list[Output]]
+
+
 def open_asset(cfg: DictConfig) -> Asset:
     """Return the asset that ``run=`` or ``ply=`` names; exactly one of them must be given."""
     require_one(cfg)
@@ -134,9 +138,11 @@ def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
     built: Rasterizer = component(rasterizer, Rasterizer, "rasterizer")
     render = render_fn(built, lambda: gaussians)
 
-    def render_with_note(cameras: Cameras, background: Float[Tensor, "v 3"]) -> RenderOutput:
+    def render_with_note(
+        cameras: Cameras, background: Float[Tensor, "v 3"], shown: Gaussians | None = None
+    ) -> RenderOutput:
         note_backend(built.prepare(gaussians.device))
-        return render(cameras, background)
+        return render(cameras, background, shown)
 
     return render_with_note
 
@@ -146,16 +152,28 @@ def export_all(cfg: DictConfig, asset: Asset, folder: Path) -> list[Output]:
 
     An exporter that fails costs only its own files. Raises ``UserError`` if all of them fail.
     """
+    render = renderer(cfg.rasterizer, asset.gaussians)
+
+    def write(name: str, exporter: Exporter) -> list[Path]:
+        paths = exporter.export(asset.gaussians, render, folder)
+        note_omission(f"exporter.{name}", exporter.omission(asset.gaussians))
+        return paths
+
+    return run_exporters(cfg, write)
+
+
+def run_exporters(cfg: DictConfig, write: Callable[[str, Exporter], list[Path]]) -> list[Output]:
+    """Call ``write`` with the name and every exporter of ``cfg``, and return the files that it has written.
+
+    An exporter that fails costs only its own files. Raises ``UserError`` if all of them fail.
+    """
     exporters: Mapping[str, Exporter] = components(cfg.exporter, Exporter, "exporter")
     if not exporters:
         raise UserError("exporter: expected at least one, got none. Try: exporter=[images,turntable]")
-    render = renderer(cfg.rasterizer, asset.gaussians)
     outputs, warnings = [], []
     for name, exporter in exporters.items():
         with keeping_others(f"exporter.{name}", warnings):
-            paths = exporter.export(asset.gaussians, render, folder)
-            outputs += [Output(path, name) for path in paths]
-            note_omission(f"exporter.{name}", exporter.omission(asset.gaussians))
+            outputs += [Output(path, name) for path in write(name, exporter)]
     if len(warnings) == len(exporters):
         raise UserError(warnings[0])
     return outputs
@@ -170,12 +188,14 @@ def write_files(
     cfg: DictConfig,
     asset: Asset,
     name: str,
-    into_folder: Callable[[DictConfig, Asset, Path], list[Output]] = export_all,
+    into_folder: ExportFn = export_all,
+    into_file: ExportFn = export_all,
 ) -> list[Output]:
     """Run the exporters of ``cfg`` on ``asset``, and return the files that they have written.
 
     ``output=`` names a file if it has a suffix, does not end with a slash, and is not a folder that exists.
-    Otherwise it names a folder, by default ``name`` beside the asset, into which ``into_folder`` writes.
+    Then ``into_file`` writes it into a temporary folder, from which it is moved. Otherwise it names a folder,
+    by default ``name`` beside the asset, into which ``into_folder`` writes.
     """
     if cfg.output is None and asset.folder.is_dir():
         require_contained(asset.folder, f"output={spare(name)}")
@@ -185,7 +205,7 @@ def write_files(
         raise fail("output", expected="a file or a folder", got=text, example=f"output={name}")
     try:
         if cfg.output is not None and target.suffix and not text.endswith("/") and not target.is_dir():
-            return [_one_file(cfg, asset, target)]
+            return [_one_file(cfg, asset, target, into_file)]
         if os.path.lexists(target) and not target.is_dir():
             line = setting_word("output", numbered(target))
             raise UserError(f"output: expected a folder, got {text!r}, which is a file. Try: {line}")
@@ -204,7 +224,7 @@ def write_files(
         remove_empty(target, existing)
 
 
-def _one_file(cfg: DictConfig, asset: Asset, target: Path) -> Output:
+def _one_file(cfg: DictConfig, asset: Asset, target: Path, export: ExportFn) -> Output:
     """Export into a folder beside ``target``, then move the file to its final name in a single step.
 
     Raises ``OSError`` if ``target`` cannot be written.
@@ -213,7 +233,7 @@ def _one_file(cfg: DictConfig, asset: Asset, target: Path) -> Output:
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".export-") as folder:
-            outputs = export_all(cfg, asset, Path(folder))
+            outputs = export(cfg, asset, Path(folder))
             suffixes = {suffix_of(output.path.name) for output in outputs}
             if len(outputs) != 1 or suffixes != {suffix_of(target.name)}:
                 stem = target.name[: -len(suffix_of(target.name))]

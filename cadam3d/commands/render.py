@@ -1,16 +1,94 @@
-"""``cadam3d render``: make pictures or videos of an asset."""
+"""``cadam3d render``: make pictures or videos of an asset, or of several runs side by side."""
 
-from omegaconf import DictConfig
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
 
-from cadam3d.commands.asset import open_asset, write_outputs
-from cadam3d.io.run_folder import shown
+from omegaconf import DictConfig, OmegaConf
+
+from cadam3d.commands.asset import (
+    Asset,
+    Output,
+    find_run,
+    open_asset,
+    open_run,
+    renderer,
+    run_exporters,
+    write_files,
+)
+from cadam3d.core.checks import fail
+from cadam3d.core.errors import UserError
+from cadam3d.core.render import Subject
+from cadam3d.exporter.base import Exporter
+from cadam3d.io.caption import plain
+from cadam3d.io.records import read_summary
+from cadam3d.io.run_folder import LATEST, shown
+
+# Runs side by side. The pictures of more would be too small for their captions.
+MOST_RUNS = 12
+LONGEST_LABEL = 80  # characters
+LONGEST_NAME = 120  # characters of the folder of a comparison
 
 
 def run(cfg: DictConfig) -> None:
-    """Write ``output``: a file if it has a suffix, else a folder (by default ``render`` beside the asset)."""
-    asset = open_asset(cfg)
-    paths = write_outputs(cfg, asset, "render")
-    files = "1 file" if len(paths) == 1 else f"{len(paths)} files"
-    print(f"{files} of {len(asset.gaussians)} Gaussians:")
-    for path in paths:
-        print(f"  {shown(path)}")
+    """Write ``output``: a file if it has a suffix, else a folder (by default ``render`` beside the asset).
+
+    The pictures of several runs are by default in the folder ``compare`` of the first one.
+    """
+    if OmegaConf.is_list(cfg.run):
+        outputs, subjects = _compare(cfg)
+        of = "; ".join(f"{each.label}: {len(each.gaussians)} Gaussians" for each in subjects)
+    else:
+        if cfg.labels is not None:
+            raise UserError("labels: expected null for a single asset, which has no label. Try: labels=null")
+        asset = open_asset(cfg)
+        outputs, of = write_files(cfg, asset, "render"), f"{len(asset.gaussians)} Gaussians"
+    files = "1 file" if len(outputs) == 1 else f"{len(outputs)} files"
+    print(f"{files} of {of}" if OmegaConf.is_list(cfg.run) else f"{files} of {of}:")
+    for output in outputs:
+        print(f"  {shown(output.path)}")
+
+
+def _compare(cfg: DictConfig) -> tuple[list[Output], list[Subject]]:
+    """Draw the runs in ``run=[...]`` side by side, and return the files and the runs."""
+    if cfg.ply is not None:
+        raise UserError("run, ply: expected one of them, got both. Try: ply=null")
+    if not 2 <= len(cfg.run) <= MOST_RUNS:
+        some = [str(text) for text in cfg.run[:MOST_RUNS]]
+        line = f"run=[{','.join(some)}]" if len(some) > 1 else f"run={(some or [LATEST])[0]}"
+        raise fail(
+            "run", expected=f"2 to {MOST_RUNS} runs in a list", got=len(cfg.run), example=shlex.quote(line)
+        )
+    folders = [find_run(str(text)) for text in cfg.run]
+    labels = default_labels(folders) if cfg.labels is None else [plain(label) for label in cfg.labels]
+    if len(labels) != len(folders) or not all(0 < len(label) <= LONGEST_LABEL for label in labels):
+        raise fail(
+            "labels",
+            expected=f"one text of 1 to {LONGEST_LABEL} characters for each of the {len(folders)} runs",
+            got=labels,
+            example="labels=null",
+        )
+    assets = [open_run(folder, cfg.device) for folder in folders]
+    subjects = [
+        Subject(asset.gaussians, renderer(cfg.rasterizer, asset.gaussians), label)
+        for asset, label in zip(assets, labels, strict=True)
+    ]
+
+    def write(cfg: DictConfig, _: Asset, folder: Path) -> list[Output]:
+        def compare(_: str, exporter: Exporter) -> list[Path]:
+            return exporter.compare(subjects, folder)
+
+        return run_exporters(cfg, compare)
+
+    name = f"compare/{'+'.join(folder.name for folder in folders[1:])[:LONGEST_NAME]}"
+    return write_files(cfg, assets[0], name, into_folder=write, into_file=write), subjects
+
+
+def default_labels(folders: Sequence[Path]) -> list[str]:
+    """Return a label for each run: its densifier, or its folder or path if densifiers are equal."""
+    densifiers = [str(read_summary(folder).get("densifier") or "") for folder in folders]
+    for names in (densifiers, [folder.name for folder in folders]):
+        labels = [plain(name) for name in names]
+        if all(labels) and len(set(labels)) == len(labels):
+            return [label[:LONGEST_LABEL] for label in labels]
+    return [plain(str(shown(folder)))[-LONGEST_LABEL:] for folder in folders]

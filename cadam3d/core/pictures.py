@@ -1,4 +1,7 @@
-"""PictureSettings: the settings that all pictures of Gaussians share, with their checks and cameras."""
+"""The settings that all pictures of Gaussians share, with their checks and cameras.
+
+``PictureSettings`` have a background colour. ``CutoutSettings`` may have a transparent background instead.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,14 +17,12 @@ from cadam3d.core.memory import CAMERA, PIXEL, require_memory
 
 # Pictures of one asset; far more than anyone looks at.
 MOST_VIEWS = 100_000
+TRANSPARENT = "transparent"
 
 
 @dataclass(frozen=True, kw_only=True)
-class PictureSettings:
-    """Distance, field of view, size and background of square pictures of an asset.
-
-    Exporters, callbacks and metrics that render inherit these four settings and add their own angles.
-    """
+class ViewSettings:
+    """Distance, field of view and size of square pictures of an asset."""
 
     # Node of the configuration, such as "exporter.preview", with which error messages begin.
     node: ClassVar[str]
@@ -29,14 +30,12 @@ class PictureSettings:
     distance: float  # > 0, world units
     fov_y_deg: float  # in (0, 180)
     size: int  # >= 1, pixels
-    background: Sequence[float]  # RGB in [0, 1]
 
     def __post_init__(self) -> None:
         require_range(f"{self.node}.distance", self.distance, above=0, example=3.0)
         require_range(f"{self.node}.fov_y_deg", self.fov_y_deg, above=0, below=180, example=40)
         require_whole(f"{self.node}.size", self.size, low=1, example=256)
         require_memory(f"{self.node}.size", self.size, unit=PIXEL, power=2, example=256)
-        require_color(f"{self.node}.background", self.background)
 
     def ring(self, views: int, elevation_deg: float) -> Cameras:
         """Return ``views`` cameras evenly spaced over one full turn, starting at the front."""
@@ -54,10 +53,6 @@ class PictureSettings:
         return orbit(
             azimuths_deg, elevations_deg, full * self.distance, full * self.fov_y_deg, self.size, self.size
         )
-
-    def backgrounds(self, views: int) -> Float[Tensor, "v 3"]:
-        """Return the background colour once per view."""
-        return torch.tensor([[float(channel) for channel in self.background]] * views)
 
     def require_views(self, views: int, *, example: int, bytes_each: float = 0) -> None:
         """Raise ``UserError`` unless ``views`` is at least 1 and that many cameras fit into memory.
@@ -77,3 +72,47 @@ class PictureSettings:
             got=angles_deg,
             example=f"'{key}=[{example}]'",
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureSettings(ViewSettings):
+    """Distance, field of view, size and background of square pictures of an asset.
+
+    Exporters, callbacks and metrics that render inherit these four settings and add their own angles.
+    """
+
+    background: Sequence[float]  # RGB in [0, 1]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_color(f"{self.node}.background", self.background)
+
+    def backgrounds(self, views: int) -> Float[Tensor, "v 3"]:
+        """Return the background colour once per view."""
+        return torch.tensor([[float(channel) for channel in self.background]] * views)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CutoutSettings(ViewSettings):
+    """The same four settings for pictures that may be transparent where there is no object."""
+
+    background: Sequence[float] | str  # RGB in [0, 1], or TRANSPARENT
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        key = f"{self.node}.background"
+        is_color = are_numbers(self.background, low=0, high=1) and len(self.background) == 3
+        expected = f"three numbers in [0, 1] or {TRANSPARENT}"
+        example = f"{key}={TRANSPARENT}" if isinstance(self.background, str) else f"'{key}=[0.5,0.5,0.5]'"
+        is_known = is_color or self.is_transparent
+        require(is_known, key, expected=expected, got=self.background, example=example)
+
+    @property
+    def is_transparent(self) -> bool:
+        """Return whether the pictures have a fourth channel instead of a background."""
+        return isinstance(self.background, str) and self.background == TRANSPARENT
+
+    def backgrounds(self, views: int) -> Float[Tensor, "v 3"]:
+        """Return the background colour once per view; black if the pictures are transparent."""
+        color = (0.0, 0.0, 0.0) if isinstance(self.background, str) else self.background
+        return torch.tensor([[float(channel) for channel in color]] * views)

@@ -2,12 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
+from cadam3d.core.gaussians import Gaussians
 
 # Alpha from which a pixel counts as object when disparities are stretched to [0, 1].
 SOLID = 0.9
@@ -50,8 +52,27 @@ class RenderOutput:
         return ((inverse - farthest) / spread).clamp(0, 1)
 
 
-# From cameras and one RGB background per view (in [0, 1]) to images of given Gaussians, without gradients.
-RenderFn = Callable[[Cameras, Tensor], RenderOutput]
+@runtime_checkable
+class RenderFn(Protocol):
+    """A function that renders given Gaussians, without gradients."""
+
+    def __call__(
+        self, cameras: Cameras, background: Float[Tensor, "v 3"], shown: Gaussians | None = None
+    ) -> RenderOutput:
+        """Return images with one RGB background per view, in [0, 1].
+
+        ``shown`` replaces the given Gaussians, for example by the same ones in other colours.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One asset of a picture that shows several."""
+
+    gaussians: Gaussians
+    render: RenderFn  # shows these Gaussians
+    label: str = ""  # written under it
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,15 @@
 """Exporter: writes an asset, or pictures of it, into a folder."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 from cadam3d.core.checks import require_choice
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderFn
+from cadam3d.core.render import RenderFn, Subject
 from cadam3d.io.frames import UPS
 
 
@@ -20,6 +22,14 @@ class Exporter(ABC):
 
         ``render`` shows the same ``gaussians``. Raises ``UserError`` if a file cannot be written.
         """
+
+    def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
+        """Write pictures of all ``subjects`` into ``folder``, which exists, and return the paths.
+
+        They are side by side in every picture, seen from the same cameras and with a caption under each.
+        Raises ``UserError`` if a file cannot be written, or if this exporter makes no pictures.
+        """
+        raise UserError("it cannot show several assets side by side. Try: 'exporter=[preview,turntable]'")
 
     def omission(self, gaussians: Gaussians) -> str | None:
         """Return what of ``gaussians`` the files cannot hold, as a note for the user; None if nothing."""

@@ -6,22 +6,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.pictures import PictureSettings
-from cadam3d.core.render import RenderFn
-from cadam3d.exporter.base import Exporter
+from cadam3d.core.checks import require
+from cadam3d.core.pictures import CutoutSettings
+from cadam3d.core.render import Subject
+from cadam3d.exporter.pictures import KINDS, PictureExporter, captions_of, paint, paper_of
 from cadam3d.io.atomic import replacing_series
-from cadam3d.io.image import write_png
+from cadam3d.io.caption import side_by_side
+from cadam3d.io.image import to_uint8, write_png_bytes
 from cadam3d.io.run_folder import IMAGES
 
-# The names of the pictures: number, azimuth and elevation.
-NAME = re.compile(r"\d{3,}_az\d{3}_el[+-]\d{2}\.png")
+# The names of the pictures: number, azimuth and elevation, and the kind unless it is rgb.
+NAME = re.compile(r"\d{3,}_az\d{3}_el[+-]\d{2}(_depth|_alpha|_normal)?\.png")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImagesExporter(PictureSettings, Exporter):
+class ImagesExporter(CutoutSettings, PictureExporter):
     """Write ``images/000_az000_el+20.png`` and so on: numbered, with azimuth and elevation in degrees.
 
+    The pictures of other kinds have the same number and, for example, ``_normal`` at the end of their names.
     All pictures with such names in ``images`` are replaced, so that none of an earlier export is left.
     """
 
@@ -29,23 +31,50 @@ class ImagesExporter(PictureSettings, Exporter):
 
     views: int  # >= 1, per elevation
     elevations_deg: Sequence[float]  # in [-90, 90]
+    kinds: Sequence[str]  # of KINDS
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.require_views(self.views, example=8)
         self.require_angles("elevations_deg", self.elevations_deg, limit=90, example=15)
+        is_list = not isinstance(self.kinds, str) and isinstance(self.kinds, Sequence)
+        require(
+            is_list
+            and 0 < len(self.kinds) == len(set(map(str, self.kinds)))
+            and set(self.kinds) <= set(KINDS),
+            "exporter.images.kinds",
+            expected=f"one or more of {'|'.join(KINDS)}, each once",
+            got=self.kinds,
+            example="'exporter.images.kinds=[rgb,normal]'",
+        )
 
-    def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
+    def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Render and write view by view, so that memory does not grow with the number of views."""
         names: list[str] = []
-        target = folder / IMAGES
+        target, number = folder / IMAGES, 0
+        captions, paper = captions_of(subjects), paper_of(self.background)
         with replacing_series(target, lambda name: NAME.fullmatch(name) is not None) as temporary:
             for elevation_deg in self.elevations_deg:
                 ring = self.ring(self.views, elevation_deg)
                 for view in range(self.views):
                     camera = ring.index(slice(view, view + 1))
                     azimuth = round(float(camera.azimuth_deg[0]) % 360)
-                    name = f"{len(names):03d}_az{azimuth:03d}_el{elevation_deg:+03.0f}.png"
-                    write_png(temporary / name, render(camera, self.backgrounds(1)).rgb[0].cpu())
-                    names.append(name)
+                    stem = f"{number:03d}_az{azimuth:03d}_el{elevation_deg:+03.0f}"
+                    painted = [
+                        paint(
+                            subject,
+                            camera,
+                            self.backgrounds(1),
+                            self.kinds,
+                            distance=self.distance,
+                            is_transparent=self.is_transparent,
+                        )
+                        for subject in subjects
+                    ]
+                    for kind, pictures in zip(self.kinds, zip(*painted, strict=True), strict=True):
+                        name = f"{stem}.png" if kind == "rgb" else f"{stem}_{kind}.png"
+                        sheet = side_by_side([to_uint8(each[0]) for each in pictures], captions, paper)
+                        write_png_bytes(temporary / name, sheet)
+                        names.append(name)
+                    number += 1
         return [target / name for name in names]

@@ -5,20 +5,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
 import torch
+from jaxtyping import UInt8
 
 from cadam3d.core.checks import require_choice
-from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.pictures import PictureSettings
-from cadam3d.core.render import RenderFn
-from cadam3d.exporter.base import Exporter
-from cadam3d.io.image import contact_sheet, write_png
+from cadam3d.core.render import Subject
+from cadam3d.exporter.pictures import PictureExporter, captions_of, paper_of
+from cadam3d.io.caption import side_by_side
+from cadam3d.io.image import contact_sheet, to_uint8, write_png_bytes
 from cadam3d.io.run_folder import PREVIEW
 
 
 @dataclass(frozen=True, kw_only=True)
-class PreviewExporter(PictureSettings, Exporter):
-    """Write ``preview.png``: a row of azimuths for each elevation, starting at the front."""
+class PreviewExporter(PictureSettings, PictureExporter):
+    """Write ``preview.png``: a row of azimuths for each elevation, starting at the front.
+
+    Of several assets, the sheets are side by side, and their rows are broken so that each sheet is nearly
+    square.
+    """
 
     node: ClassVar[str] = "exporter.preview"
 
@@ -34,14 +40,25 @@ class PreviewExporter(PictureSettings, Exporter):
         self.require_views(self.views, example=8, bytes_each=kept)
         require_choice("exporter.preview.labels", self.labels, (True, False))
 
-    def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
+    def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Render row by row and write the sheet."""
+        path = folder / PREVIEW
+        columns = self.views if len(subjects) == 1 else self._columns()
+        sheets = [self._sheet(subject, columns) for subject in subjects]
+        write_png_bytes(path, side_by_side(sheets, captions_of(subjects), paper_of(self.background)))
+        return [path]
+
+    def _columns(self) -> int:
+        """Return the divisor of ``views`` with which the sheet is nearest to a square."""
+        side = (self.views * len(self.elevations_deg)) ** 0.5
+        divisors = [number for number in range(1, self.views + 1) if self.views % number == 0]
+        return min(divisors, key=lambda number: abs(number - side))
+
+    def _sheet(self, subject: Subject, columns: int) -> UInt8[np.ndarray, "h w 3"]:
         rows, labels = [], []
         for elevation_deg in self.elevations_deg:
             cameras = self.ring(self.views, elevation_deg)
-            rows.append(render(cameras, self.backgrounds(self.views)).rgb.cpu())
+            rows.append(subject.render(cameras, self.backgrounds(self.views)).rgb.cpu())
             labels += [f"{azimuth % 360:.0f}, {elevation_deg:g}" for azimuth in cameras.azimuth_deg.tolist()]
-        path = folder / PREVIEW
         images = torch.cat(rows).clamp(0, 1)
-        write_png(path, contact_sheet(images, columns=self.views, labels=labels if self.labels else []))
-        return [path]
+        return to_uint8(contact_sheet(images, columns=columns, labels=labels if self.labels else []))

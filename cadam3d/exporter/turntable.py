@@ -1,6 +1,6 @@
-"""TurntableExporter: one full turn around the object, colour beside depth or alpha."""
+"""TurntableExporter: turns around the object, colour beside depth, alpha or normals."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -10,59 +10,88 @@ import torch
 from jaxtyping import UInt8
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import require_choice, require_range, require_whole
-from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.pictures import PictureSettings
-from cadam3d.core.render import RenderFn, RenderOutput
-from cadam3d.exporter.base import Exporter
-from cadam3d.io.image import closeness, to_uint8
-from cadam3d.io.run_folder import TURNTABLE
-from cadam3d.io.video import write_video
+from cadam3d.core.checks import fail, require, require_choice, require_range, require_whole
+from cadam3d.core.pictures import CutoutSettings
+from cadam3d.core.render import Subject
+from cadam3d.exporter.pictures import PictureExporter, captions_of, paint, paper_of
+from cadam3d.io.caption import side_by_side
+from cadam3d.io.image import to_uint8
+from cadam3d.io.run_folder import TURNTABLE, video_name
+from cadam3d.io.video import CODECS, FORMATS, write_video
 
-# Frames per second. Players handle such rates; much larger ones overflow in ffmpeg.
-HIGHEST_FPS = 240
-# With a second picture beside it, such a frame is as wide as libx264 allows.
-LARGEST = 8192  # pixels
+# A frame may be as wide as the codecs allow. With a second picture beside it, the largest size just fits.
+WIDEST = 16384  # pixels
+LARGEST = WIDEST // 2  # pixels
+MOST_TURNS = 100
 VIEWS_AT_ONCE = 4  # bounds the memory of rendering for a video of any length
 
 
 @dataclass(frozen=True, kw_only=True)
-class TurntableExporter(PictureSettings, Exporter):
-    """Write ``turntable.mp4``: the camera circles the object once, starting at its front."""
+class TurntableExporter(CutoutSettings, PictureExporter):
+    """Write ``turntable.mp4``, ``.webm`` or ``.gif``: the camera circles the object, first at its front."""
 
     node: ClassVar[str] = "exporter.turntable"
 
     views: int  # in [1, 100000], frames
+    turns: float  # in [-100, 100]; negative = the other way round
     elevation_deg: float  # in [-90, 90]
-    fps: int  # in [1, 240], frames per second
-    beside: str  # depth, alpha or none
+    fps: int  # frames per second, in [1, 240]; for gif in [1, 50]
+    codec: str  # one of CODECS
+    beside: str  # depth, alpha, normal or none
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.require_views(self.views, example=60)
+        require_range("exporter.turntable.turns", self.turns, low=-MOST_TURNS, high=MOST_TURNS, example=1)
         require_range("exporter.turntable.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
-        require_whole("exporter.turntable.fps", self.fps, low=1, high=HIGHEST_FPS, example=30)
-        require_choice("exporter.turntable.beside", self.beside, ("depth", "alpha", "none"))
+        require_choice("exporter.turntable.codec", self.codec, CODECS)
+        kind = FORMATS[f".{self.codec}"]
+        require_whole("exporter.turntable.fps", self.fps, low=1, high=kind.most_fps, example=20)
+        require_choice("exporter.turntable.beside", self.beside, ("depth", "alpha", "normal", "none"))
         require_whole("exporter.turntable.size", self.size, low=1, high=LARGEST, example=256)
+        if self.is_transparent and kind.transparent_pixels is None:
+            expected, example = "webm, because the background is transparent", "exporter.turntable.codec=webm"
+            raise fail("exporter.turntable.codec", expected=expected, got=self.codec, example=example)
 
-    def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
+    def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Render and encode frame by frame."""
-        path = folder / TURNTABLE
-        cameras = self.ring(self.views, self.elevation_deg)
-        write_video(path, self._frames(cameras, render), fps=self.fps)
+        pictures = len(subjects) * len(self._kinds())
+        # The gaps between pictures are narrower than a sixteenth of them.
+        most = int(WIDEST / pictures / (1.0 if len(subjects) == 1 else 1.0625))
+        require(
+            self.size <= most,
+            "exporter.turntable.size",
+            expected=f"at most {most}, because {pictures} pictures are side by side",
+            got=self.size,
+            example=f"exporter.turntable.size={min(256, most)}",
+        )
+        path = folder / video_name(TURNTABLE, self.codec)
+        write_video(path, self._frames(self.cameras(), subjects), fps=self.fps)
         return [path]
 
-    def _frames(self, cameras: Cameras, render: RenderFn) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    def cameras(self) -> Cameras:
+        """Return the cameras of all frames."""
+        azimuths_deg = torch.arange(self.views, dtype=torch.float32) * (360.0 * self.turns / self.views)
+        return self.cameras_at(azimuths_deg, torch.full_like(azimuths_deg, self.elevation_deg))
+
+    def _frames(self, cameras: Cameras, subjects: Sequence[Subject]) -> Iterator[UInt8[np.ndarray, "h w c"]]:
+        captions, paper = captions_of(subjects), paper_of(self.background)
         for first in range(0, self.views, VIEWS_AT_ONCE):
             some = cameras.index(slice(first, first + VIEWS_AT_ONCE))
-            output = render(some, self.backgrounds(len(some)))
-            yield from to_uint8(self._pictures(output))
+            panels = [to_uint8(self._panel(subject, some)) for subject in subjects]
+            for pictures in zip(*panels, strict=True):
+                yield side_by_side(pictures, captions, paper)
 
-    def _pictures(self, output: RenderOutput) -> torch.Tensor:
-        if self.beside == "none":
-            return output.rgb
-        if self.beside == "alpha":
-            second = output.alpha[..., None].expand_as(output.rgb)
-        else:
-            second = closeness(output.depth, output.alpha, self.distance)
-        return torch.cat([output.rgb, second], dim=2)
+    def _kinds(self) -> tuple[str, ...]:
+        return ("rgb",) if self.beside == "none" else ("rgb", self.beside)
+
+    def _panel(self, subject: Subject, cameras: Cameras) -> torch.Tensor:
+        pictures = paint(
+            subject,
+            cameras,
+            self.backgrounds(len(cameras)),
+            self._kinds(),
+            distance=self.distance,
+            is_transparent=self.is_transparent,
+        )
+        return torch.cat(pictures, dim=2)

@@ -27,15 +27,37 @@ STEP_PICTURE = re.compile(r"step_([0-9]{6,12})\.png")
 LARGEST_PNG = 1 << 28  # bytes
 
 
-def to_uint8(rgb: Float[Tensor, "*batch h w 3"]) -> UInt8[np.ndarray, "*batch h w 3"]:
+def to_uint8(images: Float[Tensor, "*batch h w c"]) -> UInt8[np.ndarray, "*batch h w c"]:
     """Return images in [0, 1] as bytes, rounded to the nearest; values outside are clamped, NaN is black."""
-    return (rgb.detach().nan_to_num(nan=0.0).clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    return (images.detach().nan_to_num(nan=0.0).clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
-def write_png(path: Path, rgb: Float[Tensor, "h w 3"]) -> None:
-    """Write one image in [0, 1] as 8-bit sRGB, atomically. Raises ``UserError`` if it cannot be written."""
+def cutout(
+    over_black: Float[Tensor, "*batch h w 3"], alpha: Float[Tensor, "*batch h w"]
+) -> Float[Tensor, "*batch h w 4"]:
+    """Return images with straight alpha, from renders over black and their alpha, for 8-bit files.
+
+    After :func:`to_uint8`, each pixel over any colour, ``a * rgb + (1 - a) * colour``, is the render over
+    that colour to within 1/255, unless the Gaussians are brighter than white. Colours are divided by the
+    rounded alpha, because that is the one in the file.
+    """
+    rounded = (alpha.nan_to_num(nan=0.0).clamp(0, 1) * 255).round() / 255
+    straight = torch.where(rounded[..., None] > 0, over_black / rounded[..., None], 0.0)
+    return torch.cat([straight, rounded[..., None]], dim=-1)
+
+
+def write_png(path: Path, image: Float[Tensor, "h w c"]) -> None:
+    """Write one image in [0, 1] as 8-bit sRGB, atomically; a fourth channel is straight alpha.
+
+    Raises ``UserError`` if the file cannot be written.
+    """
+    write_png_bytes(path, to_uint8(image))
+
+
+def write_png_bytes(path: Path, image: UInt8[np.ndarray, "h w c"]) -> None:
+    """Write one 8-bit image, atomically. Raises ``UserError`` if it cannot be written."""
     with replacing(path) as temporary:
-        temporary.write_bytes(imageio.imwrite("<bytes>", to_uint8(rgb), extension=".png"))
+        temporary.write_bytes(imageio.imwrite("<bytes>", image, extension=".png"))
 
 
 def step_picture(folder: Path, step: int) -> Path:

@@ -49,7 +49,8 @@ LIVE_STOP = "live/stop"  # training removes this file, saves and ends
 LIVE_WATCHED = "live/watched"  # touched by every page that shows the run
 SNAPSHOTS = "snapshots"  # a folder: the Gaussians at some steps, packed for the report
 SAVED = "saved"  # a folder: assets and states that a user has saved during training
-TURNTABLE = "turntable.mp4"
+PROGRESS = "progress.mp4"  # or .webm or .gif
+TURNTABLE = "turntable.mp4"  # or .webm or .gif
 VIEWER = "viewer.html"
 
 # Written by ``cadam3d export``.
@@ -143,11 +144,17 @@ def occupant_of_sweep(folder: Path) -> str | None:
 
 def _written_by_runs() -> tuple[str, ...]:
     """Return every name in the folder of a run that training, its exporters, its callbacks or eval write."""
-    files = (ASSET, CHARTS, CONFIG, EVALUATION, LOG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE, VIEWER)
+    files = (ASSET, CHARTS, CONFIG, EVALUATION, LOG, METRICS, PREVIEW, REPORT, SUMMARY, VIEWER)
+    videos = [video_name(name, codec) for name in (TURNTABLE, PROGRESS) for codec in ("mp4", "webm", "gif")]
     formats = (ASSET_COMPRESSED_PLY, ASSET_GLB, ASSET_KSPLAT, ASSET_SOG, ASSET_SPLAT, ASSET_SPZ)
     meshes = (ASSET_MESH_GLB, ASSET_MESH_MTL, ASSET_MESH_OBJ, ASSET_MESH_PLY, ASSET_MESH_PNG)
     folders = (CANDIDATES, CHECKPOINTS, HYDRA, IMAGES, LIVE, PREVIEWS, SAVED, SNAPSHOTS)
-    return (*files, *formats, *meshes, *folders)
+    return (*files, *videos, *formats, *meshes, *folders)
+
+
+def video_name(name: str, codec: str) -> str:
+    """Return the name of a video in the format ``codec``, such as turntable.webm."""
+    return str(Path(name).with_suffix(f".{codec}"))
 
 
 def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:

@@ -80,8 +80,10 @@ def render_fn(rasterizer: Rasterizer, gaussians: Callable[[], Gaussians]) -> Ren
     carry no gradient.
     """
 
-    def render(cameras: Cameras, background: Float[Tensor, "v 3"]) -> RenderOutput:
-        current = gaussians().detach()
+    def render(
+        cameras: Cameras, background: Float[Tensor, "v 3"], shown: Gaussians | None = None
+    ) -> RenderOutput:
+        current = (gaussians() if shown is None else shown).detach()
         with torch.no_grad():
             return rasterizer.render(current, cameras.to(current.device), background.to(current.device))
 

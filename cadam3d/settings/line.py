@@ -21,6 +21,8 @@ PATH_KEYS = (
     *("run", "ply", "output", "resume", RUN_FOLDER, SWEEP_FOLDER),
     *("initializer.path", "initializer.prompt", "rasterizer.cache_dir"),
 )
+# Keys whose value may be a list of paths or of texts, such as run=[A,B].
+LIST_KEYS = ("run", "labels")
 # A path that Hydra's grammar reads without quotes. It cannot read "~".
 PLAIN_PATH = re.compile(r"[\w./+-]*", re.ASCII)
 QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
@@ -31,18 +33,22 @@ PIECE = re.compile(r"(?:[^,]|,(?=\s|$))*", re.DOTALL)
 EXPORTERS: dict[str, tuple[str, ...]] = {
     ".compressed.ply": ("compressed_ply",),
     ".glb": ("glb", "mesh"),
+    ".gif": ("turntable", "progress"),
     ".html": ("html",),
     ".ksplat": ("ksplat",),
-    ".mp4": ("turntable",),
+    ".mp4": ("turntable", "progress"),
     ".obj": ("mesh",),
     ".ply": ("ply", "mesh"),
     ".png": ("preview",),
     ".sog": ("sog",),
     ".splat": ("splat",),
     ".spz": ("spz",),
+    ".webm": ("turntable", "progress"),
 }
-# The exporter whose setting ``format`` is the suffix of its file.
-MESH = "mesh"
+# The setting of an exporter that is the suffix of its file.
+SUFFIX_SETTINGS = {"mesh": "format", "turntable": "codec", "progress": "codec"}
+# What render writes of several runs, if the line names no exporter: one picture and one video.
+COMPARING = ("preview", "turntable")
 FLAGS_WITH_VALUE = (
     *("--cfg", "-c", "--package", "-p", "--info", "-i", "--experimental-rerun"),
     *("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
@@ -84,6 +90,8 @@ def quoted(override: str, *, is_sweep: bool) -> str:
     name = key.lstrip("+")
     if not equals or QUOTED.fullmatch(value):
         return override
+    if name in LIST_KEYS and is_list(override) and "${" not in value:
+        return f"{key}=[{','.join(map(_item, _items(value[1:-1])))}]"
     if name in PATH_KEYS and not PLAIN_PATH.fullmatch(value) and "${" not in value:
         return f"{key}={quote(value)}"
     if name in TEXT_KEYS and not (is_sweep and SWEEP_CALL.fullmatch(value)):
@@ -140,6 +148,12 @@ def suffix_of(name: str) -> str:
     return max(known, key=len, default=Path(name).suffix)
 
 
+def is_list(override: str) -> bool:
+    """Return whether the value of an override is a list in brackets, not the path of such a name."""
+    _, _, value = override.partition("=")
+    return value.startswith("[") and value.endswith("]") and not os.path.lexists(value)
+
+
 def exporting(overrides: Sequence[str]) -> list[str]:
     """Choose the exporter for a file that ``output=`` names by its suffix.
 
@@ -149,16 +163,18 @@ def exporting(overrides: Sequence[str]) -> list[str]:
     given = {key_of(override): override for override in overrides}
     name = text_of(given["output"]) if "output" in given else ""
     suffix = suffix_of(name)
-    if name.endswith("/") or suffix not in EXPORTERS or "for" in given:
-        return list(overrides)
     named = {key.split(".")[1] for key in given if key.startswith("exporter.")}
+    if name.endswith("/") or suffix not in EXPORTERS or "for" in given:
+        is_comparison = is_list(given.get("run", "")) and "exporter" not in given and named <= set(COMPARING)
+        return [*overrides, *([f"exporter=[{','.join(COMPARING)}]"] if is_comparison else [])]
     named |= _options(given["exporter"]) if "exporter" in given else set()
     chosen = next((each for each in EXPORTERS[suffix] if named <= {each}), None)
     if chosen is None or given.get("exporter", "").endswith("=[]"):
         return list(overrides)
     words = [] if "exporter" in given else [f"exporter=[{chosen}]"]
-    if chosen == MESH and f"exporter.{MESH}.format" not in given:
-        words.append(f"exporter.{MESH}.format={suffix.removeprefix('.')}")
+    key = f"exporter.{chosen}.{SUFFIX_SETTINGS.get(chosen)}"
+    if chosen in SUFFIX_SETTINGS and key not in given:
+        words.append(f"{key}={suffix.removeprefix('.')}")
     return [*overrides, *words]
 
 
@@ -170,6 +186,24 @@ def resume_word(place: str | Path) -> str:
 def setting_word(key: str, value: object) -> str:
     """Return ``KEY=VALUE`` as it is typed into a shell."""
     return shlex.quote(f"{key}={value}")
+
+
+def _items(text: str) -> list[str]:
+    """Split the items of a list at the commas outside of quotation marks."""
+    items, rest = [], text
+    while rest := rest.lstrip():
+        match = QUOTED.match(rest)
+        end = match.end() if match is not None and rest[match.end() :].lstrip()[:1] in ("", ",") else 0
+        end = rest.find(",", end)
+        items.append(rest if end < 0 else rest[:end])
+        rest = "" if end < 0 else rest[end + 1 :]
+    return items
+
+
+def _item(text: str) -> str:
+    """Return one item of a list, quoted for Hydra if it is not quoted already."""
+    text = text.strip()
+    return text if QUOTED.fullmatch(text) else quote(text)
 
 
 def _options(override: str) -> set[str]:

@@ -12,9 +12,12 @@ import torch
 from omegaconf import OmegaConf
 
 from cadam3d.commands import view
+from cadam3d.commands.render import default_labels
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.io.image import write_png
+from cadam3d.io import caption
+from cadam3d.io.caption import Caption
+from cadam3d.io.image import write_png_bytes
 from cadam3d.io.jsonl import read_json, write_json
 from cadam3d.io.ply import read_ply, write_ply
 from cadam3d.settings.compose import compose
@@ -131,12 +134,12 @@ def test_a_render_that_fails_halfway_leaves_the_older_pictures(run_folder, type_
     type_line(*words, "exporter.images.views=2")
     before = {path: path.read_bytes() for path in (run_folder / "render").rglob("*.png")}
 
-    def fail(path, rgb):
+    def fail(path, image):
         if "002" in path.name:
             raise KeyboardInterrupt
-        write_png(path, rgb)
+        write_png_bytes(path, image)
 
-    monkeypatch.setattr("cadam3d.exporter.images.write_png", fail)
+    monkeypatch.setattr("cadam3d.exporter.images.write_png_bytes", fail)
     assert type_line(*words, "exporter.images.views=4").code == 130
     assert {
         path: path.read_bytes() for path in (run_folder / "render").rglob("*") if path.is_file()
@@ -162,7 +165,7 @@ def test_the_suffix_of_a_file_chooses_its_exporter(command, name, run_folder, ty
 @pytest.mark.parametrize(
     "output",
     [
-        *("", " ", "/", "//", "big.gif", "big.mp4 ", "run.v2", "big.tar.gz", "q.png"),
+        *("", " ", "/", "//", "big.bmp", "big.mp4 ", "run.v2", "big.tar.gz", "q.png"),
         *("a file", "a file/", "a file/x.png", "a file/x/y"),
         *("/proc/nowhere", "/proc/x.png", "/dev/null", "/dev/null/x.mp4", "x" * 300, "x" * 300 + ".png"),
     ],
@@ -379,3 +382,84 @@ def test_the_json_of_eval_is_strict(run_folder, type_line):
     type_line("eval", f"run={run_folder}", *SMALL)
     text = (run_folder / "eval.json").read_text(encoding="utf-8")
     assert json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+
+
+# --- several runs side by side -----------------------------------------------------------------------------
+
+SIDE = ("exporter.preview.size=32", "exporter.preview.views=2", "exporter.turntable.size=32")
+SIDE += ("exporter.turntable.views=3", "exporter.turntable.beside=none")
+
+
+@pytest.fixture
+def two_runs(tmp_path, gaussians) -> tuple[Path, Path]:
+    """Return a run of 6 Gaussians and one of 2, trained by different densifiers."""
+    first = make_run(tmp_path / "a, [run]", gaussians)
+    second = make_run(tmp_path / "b", gaussians.index(slice(0, 2)))
+    write_json(first / "summary.json", {"densifier": "baseline"})
+    write_json(second / "summary.json", {"densifier": "cadam"})
+    return first, second
+
+
+def test_several_runs_are_one_picture_and_one_video_with_the_counts_of_their_files(
+    two_runs, type_line, monkeypatch
+):
+    drawn = []
+    draw = caption.side_by_side
+    for module in ("preview", "turntable"):
+        monkeypatch.setattr(
+            f"cadam3d.exporter.{module}.side_by_side",
+            lambda pictures, captions, paper: drawn.append(captions) or draw(pictures, captions, paper),
+        )
+    code, out, _ = type_line("render", "run=['a, [run]', b]", *SIDE)
+    assert code == 0
+    folder = two_runs[0] / "compare/b"
+    assert sorted(path.name for path in folder.iterdir()) == ["preview.png", "turntable.mp4"]
+    expected = [Caption("baseline", "6 Gaussians"), Caption("cadam", "2 Gaussians")]
+    assert drawn == [expected] * 4
+    assert "baseline: 6 Gaussians; cadam: 2 Gaussians" in out
+
+
+def test_the_suffix_of_a_file_and_the_labels_of_the_user_hold_for_several_runs(two_runs, type_line, tmp_path):
+    words = ("run=[b,b]", "labels=[Ours (new), the baseline]", "exporter.turntable.views=2", *SIDE[2:3])
+    assert type_line("render", *words, "output=both.webm").code == 0
+    assert (tmp_path / "both.webm").stat().st_size > 0
+
+
+def test_runs_with_equal_densifiers_are_labelled_by_their_folders_and_equal_folders_by_their_paths(two_runs):
+    first, second = two_runs
+    assert default_labels([first, second]) == ["baseline", "cadam"]
+    write_json(first / "summary.json", {"densifier": "cadam"})
+    assert default_labels([first, second]) == ["a, [run]", "b"]
+    assert default_labels([second, second]) == [str(second)] * 2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("run=[b]",), "run: expected 2 to 12 runs in a list, got 1. Try: run=b"),
+        (("run=[]",), "run: expected 2 to 12 runs in a list, got 0. Try: run=outputs/latest"),
+        (("run=[b,nowhere]",), "run: expected the folder of a run, got 'nowhere' (no such folder). Try: "),
+        (
+            ("run=[b,b]", "labels=[a]"),
+            "labels: expected one text of 1 to 80 characters for each of the 2 runs",
+        ),
+        (("run=[b,b]", "labels=[a,'']"), "labels: expected one text of 1 to 80 characters"),
+        (("run=[b,b]", "ply=a.ply"), "run, ply: expected one of them, got both. Try: ply=null"),
+        (("run=b", "labels=[a]"), "labels: expected null for a single asset"),
+    ],
+)
+def test_runs_that_cannot_be_compared_are_one_message(words, message, two_runs, type_line):
+    assert type_line("render", *words).message.startswith(message)
+
+
+@pytest.mark.parametrize("command", ["export", "eval", "view"])
+def test_commands_for_one_run_refuse_several_and_suggest_to_compare_them(command, two_runs, type_line):
+    message = type_line(command, "run=[a x,b]").message
+    assert message.startswith("run: expected one run, got a list of 2, which only cadam3d render compares.")
+    assert message.endswith("Try: cadam3d render 'run=[a x,b]'")
+
+
+def test_a_comparison_of_files_that_are_no_pictures_is_refused(two_runs, type_line):
+    code, _, err = type_line("render", "run=[b,b]", "output=x.ply")
+    assert code == 1
+    assert "exporter.ply: it cannot show several assets side by side. Try: 'exporter=[preview" in err

@@ -11,7 +11,7 @@ from cadam3d.core.render import RenderOutput
 from cadam3d.exporter.images import ImagesExporter
 
 VALUES = {"views": 4, "elevations_deg": [0.0, 30.0], "distance": 3.0, "fov_y_deg": 40.0, "size": 6}
-VALUES |= {"background": [1.0, 0.5, 0.0]}
+VALUES |= {"background": [1.0, 0.5, 0.0], "kinds": ["rgb"]}
 EMPTY = Gaussians(
     means=torch.zeros(0, 3),
     log_scales=torch.zeros(0, 3),
@@ -50,7 +50,10 @@ def test_names_sort_in_the_order_of_the_views(tmp_path):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("views", 0), ("elevations_deg", [100.0]), ("distance", 0.0), ("size", 0), ("background", [2.0])],
+    [
+        *(("views", 0), ("elevations_deg", [100.0]), ("distance", 0.0), ("size", 0), ("background", [2.0])),
+        *(("background", "clear"), ("kinds", []), ("kinds", ["rgb", "rgb"]), ("kinds", ["rgb", "x"])),
+    ],
 )
 def test_values_out_of_range_are_refused(key, value):
     with pytest.raises(UserError, match=f"exporter.images.{key}"):

@@ -1,17 +1,20 @@
 """TurntableExporter: one turn, with every picture in its place."""
 
 import imageio.v3 as imageio
+import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.render import RenderOutput, Subject
 from cadam3d.exporter.turntable import TurntableExporter
 
 SETTINGS = {
     "views": 9,
+    "turns": 1.0,
+    "codec": "mp4",
     "elevation_deg": 10.0,
     "distance": 3.0,
     "fov_y_deg": 40.0,
@@ -34,7 +37,7 @@ class Recorder:
     def __init__(self) -> None:
         self.cameras = []
 
-    def __call__(self, cameras, background):
+    def __call__(self, cameras, background, shown=None):
         self.cameras.append(cameras)
         views, size = len(cameras), cameras.height
         shade = (cameras.azimuth_deg % 360 / 360)[:, None, None, None].expand(views, size, size, 3)
@@ -88,6 +91,74 @@ def test_odd_sizes_are_padded_not_refused(tmp_path):
     assert frames.shape == (9, 34, 34, 3)
 
 
+@pytest.mark.parametrize(("codec", "side"), [("mp4", 34), ("webm", 34), ("gif", 33)])
+def test_every_codec_writes_a_file_with_all_frames(tmp_path, codec, side):
+    render = Recorder()
+    settings = {**SETTINGS, "codec": codec, "beside": "none", "size": 33}
+    [path] = TurntableExporter(**settings).export(no_gaussians(), render, tmp_path)
+    assert path.name == f"turntable.{codec}"
+    frames = imageio.imread(path).astype(float) / 255
+    assert frames.shape[:3] == (9, side, side)
+    shades = frames[..., :3].mean(axis=(1, 2, 3))
+    assert np.abs(shades - np.arange(9) / 9).max() < 0.03
+
+
+def test_a_gif_repeats_for_ever_at_the_chosen_rate(tmp_path):
+    settings = {**SETTINGS, "codec": "gif", "beside": "none"}
+    [path] = TurntableExporter(**settings).export(no_gaussians(), Recorder(), tmp_path)
+    facts = imageio.immeta(path)
+    assert (facts["loop"], facts["duration"]) == (0, 100)
+
+
+def test_a_transparent_webm_has_the_alpha_of_the_render(tmp_path):
+    settings = {**SETTINGS, "codec": "webm", "beside": "none", "background": "transparent"}
+    [path] = TurntableExporter(**settings).export(no_gaussians(), Recorder(), tmp_path)
+    # Only this decoder reads the fourth channel.
+    frames = imageio_ffmpeg.read_frames(
+        path, pix_fmt="rgba", bits_per_pixel=32, input_params=["-c:v", "libvpx-vp9"]
+    )
+    assert next(frames)["size"] == (32, 32)
+    alpha = np.frombuffer(next(frames), np.uint8).reshape(32, 32, 4)[..., 3]
+    frames.close()
+    assert alpha[16, 16] == 255
+    assert alpha[2, 2] == 0
+
+
+def test_other_codecs_refuse_a_transparent_background():
+    for codec in ("mp4", "gif"):
+        with pytest.raises(UserError, match=r"^exporter\.turntable\.codec: expected webm, .*codec=webm$"):
+            TurntableExporter(**{**SETTINGS, "codec": codec, "background": "transparent"})
+    with pytest.raises(UserError, match=r"^exporter\.turntable\.fps: .* <= 50"):
+        TurntableExporter(**{**SETTINGS, "codec": "gif", "fps": 60})
+
+
+def test_negative_turns_go_the_other_way_round():
+    azimuths = TurntableExporter(**{**SETTINGS, "turns": -2.0}).cameras().azimuth_deg % 360
+    torch.testing.assert_close(azimuths, torch.arange(9) * -80.0 % 360)
+
+
+def test_assets_are_side_by_side_under_the_same_cameras_with_room_for_captions(tmp_path):
+    first, second = Recorder(), Recorder()
+    subjects = [Subject(no_gaussians(), render, "a") for render in (first, second)]
+    settings = {**SETTINGS, "beside": "none", "size": 64}
+    [path] = TurntableExporter(**settings).compare(subjects, tmp_path)
+    frames = imageio.imread(path).astype(float) / 255
+    height, width = frames.shape[1:3]
+    assert height > 64
+    assert width > 128
+    np.testing.assert_allclose(frames[:, 8:56, 8:56], frames[:, 8:56, width - 56 : width - 8], atol=0.05)
+    for left, right in zip(first.cameras, second.cameras, strict=True):
+        assert torch.equal(left.world_to_camera, right.world_to_camera)
+
+
+def test_a_frame_that_is_too_wide_for_the_codecs_is_refused_before_it_is_rendered(tmp_path):
+    subjects = [Subject(no_gaussians(), Recorder(), "a")] * 3
+    with pytest.raises(
+        UserError, match=r"^exporter\.turntable\.size: expected at most \d+, .* Try: .*size=256"
+    ):
+        TurntableExporter(**{**SETTINGS, "size": 4096}).compare(subjects, tmp_path)
+
+
 @pytest.mark.parametrize(
     ("key", "value"),
     [
@@ -100,6 +171,9 @@ def test_odd_sizes_are_padded_not_refused(tmp_path):
         ("background", [1.0, 1.0]),
         ("background", [0.0, 0.0, 2.0]),
         ("beside", "normals"),
+        ("turns", 101),
+        ("codec", "avi"),
+        ("background", "clear"),
     ],
 )
 def test_wrong_values_name_their_key(key, value):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from cadam3d.io.image import VIRIDIS, closeness, colorize, contact_sheet, to_uint8, write_png
+from cadam3d.io.image import VIRIDIS, closeness, colorize, contact_sheet, cutout, to_uint8, write_png
 
 
 def test_bytes_are_rounded_and_clamped():
@@ -59,3 +59,17 @@ def test_labels_are_legible_on_dark_and_light_and_stay_in_the_corner(shade):
     assert not changed[20:].any()
     assert not changed[:, 64:].any()
     assert (images == shade).all()
+
+
+def test_a_transparent_picture_over_any_colour_is_the_render_over_that_colour(tmp_path):
+    draw = torch.Generator().manual_seed(0)
+    alpha = torch.rand(32, 32, generator=draw) ** 4
+    alpha[:4], alpha[-4:] = 0.0, 0.9999
+    over_black = torch.rand(32, 32, 3, generator=draw) * alpha[..., None]
+    write_png(tmp_path / "a.png", cutout(over_black, alpha))
+    pixels = torch.from_numpy(imageio.imread(tmp_path / "a.png")) / 255
+    assert pixels.shape == (32, 32, 4)
+    for shade in (0.0, 0.3, 1.0):
+        composited = pixels[..., :3] * pixels[..., 3:] + (1 - pixels[..., 3:]) * shade
+        rendered = over_black + (1 - alpha[..., None]) * shade
+        assert (composited - rendered).abs().max() <= 1.001 / 255

@@ -1,0 +1,99 @@
+"""ProgressExporter: a video of a training, from the pictures that it has left."""
+
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from cadam3d.core.checks import require_choice, require_range, require_whole
+from cadam3d.core.errors import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.render import RenderFn
+from cadam3d.exporter.base import Exporter
+from cadam3d.io.caption import Caption, side_by_side
+from cadam3d.io.image import read_png, step_pictures
+from cadam3d.io.records import read_metrics, read_summary
+from cadam3d.io.run_folder import PREVIEWS, PROGRESS, shown, typed_path, video_name
+from cadam3d.io.video import CODECS, FORMATS, write_video
+
+LONGEST_HOLD = 60  # seconds
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProgressExporter(Exporter):
+    """Write ``progress.mp4``, ``.webm`` or ``.gif``: the previews of a run with the step and the count."""
+
+    # The folder of the run; None: the folder to which this exporter writes. A list of runs, which render
+    # compares, has no single folder, and ``compare`` refuses it.
+    run: str | Sequence[str] | None
+    fps: int  # previews per second, in [1, 240]; for gif in [1, 50]
+    hold: float  # seconds that the last preview stays, in [0, 60]
+    codec: str  # one of CODECS
+
+    def __post_init__(self) -> None:
+        require_choice("exporter.progress.codec", self.codec, CODECS)
+        high = FORMATS[f".{self.codec}"].most_fps
+        require_whole("exporter.progress.fps", self.fps, low=1, high=high, example=8)
+        require_range("exporter.progress.hold", self.hold, low=0, high=LONGEST_HOLD, example=1)
+
+    def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
+        """Read the previews one by one and encode them; the Gaussians are not rendered."""
+        run = typed_path(self.run) if isinstance(self.run, str) else folder
+        pictures = step_pictures(run / PREVIEWS)
+        if not pictures:
+            raise UserError(f"{shown(run)}: has no {PREVIEWS}/. Try: {training_with_previews(run)}")
+        path = folder / video_name(PROGRESS, self.codec)
+        write_video(path, self._frames(pictures, counts_in(run)), fps=self.fps)
+        return [path]
+
+    def _frames(
+        self, pictures: Sequence[tuple[int, Path]], counts: Sequence[tuple[int, int]]
+    ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+        frame = None
+        for step, path in pictures:
+            picture = read_png(path)
+            if frame is None:
+                shape = picture.shape
+            # The size of previews may differ if the run was resumed with another one.
+            caption = Caption(f"step {step:,}", count_at(step, counts))
+            frame = side_by_side([fitted(picture, shape)], [caption])
+            yield frame
+        assert frame is not None, "there is at least one picture"
+        for _ in range(round(self.hold * self.fps)):
+            yield frame
+
+
+def counts_in(run: Path) -> list[tuple[int, int]]:
+    """Return steps and the numbers of Gaussians after them, in order, from the log of the run in ``run``."""
+    counts = []
+    for line in read_metrics(run):
+        count = line.get("after" if line["kind"] == "refine" else "num_gaussians")
+        if isinstance(count, int):
+            counts.append((line["step"], count))
+    return sorted(counts, key=lambda each: each[0])
+
+
+def count_at(step: int, counts: Sequence[tuple[int, int]]) -> str:
+    """Return the number of Gaussians after ``step`` as text; "" if the log does not have it.
+
+    Only refinements change the number, and each of them has a line of its own.
+    """
+    earlier = [count for at, count in counts if at <= step]
+    return f"{earlier[-1]:,} Gaussians" if earlier else ""
+
+
+def fitted(picture: UInt8[np.ndarray, "h w 3"], shape: tuple[int, ...]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Return ``picture`` cut, or padded with white on the right and below, to the size ``shape``."""
+    height, width = shape[:2]
+    cut = picture[:height, :width]
+    rest = ((0, height - cut.shape[0]), (0, width - cut.shape[1]), (0, 0))
+    return np.pad(cut, rest, constant_values=255)
+
+
+def training_with_previews(run: Path) -> str:
+    """Return a line that trains the prompt of ``run`` again and draws previews."""
+    prompt = read_summary(run).get("prompt") or "a red torus"
+    return f"cadam3d train {shlex.quote(f'prompt={prompt}')} callback.previews.every=20"
