@@ -75,7 +75,14 @@ WHOLE = {
     "exporter=[progress]": ["exporter.progress.fps"],
     "exporter=[ply]": ["exporter.ply.pad_sh"],
     "exporter=[spz]": ["exporter.spz.version"],
+    "exporter=[mesh]": ["exporter.mesh.resolution", "exporter.mesh.triangles", "exporter.mesh.texture"],
     "metric=[fidelity]": ["metric.fidelity.views", "metric.fidelity.size"],
+    "metric=[mesh]": [
+        "metric.mesh.resolution",
+        "metric.mesh.triangles",
+        "metric.mesh.samples",
+        "metric.mesh.seed",
+    ],
     "callback=[metrics]": ["callback.metrics.every"],
     "callback=[previews]": ["callback.previews.every", "callback.previews.views", "callback.previews.size"],
     "callback=[checkpoint]": ["callback.checkpoint.every", "callback.checkpoint.keep"],
@@ -113,6 +120,8 @@ NULLABLE = {
     "callback=[previews]": ("callback.previews.every",),
     "refine=default": ("refine.made_for", "refine.reset_interval", "refine.max_gaussians"),
     "initializer=ply": ("initializer.count", "initializer.sh_degree"),
+    "exporter=[mesh]": ("exporter.mesh.triangles", "exporter.mesh.texture"),
+    "metric=[mesh]": ("metric.mesh.triangles",),
     "initializer=shap_e": ("initializer.count",),
 }
 EXPORTER = {"_target_": "cadam3d.exporter.ply.PlyExporter", "up": "-y", "pad_sh": 0}

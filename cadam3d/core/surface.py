@@ -75,7 +75,7 @@ class SurfaceFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceSettings:
-    """How the surface of an asset is found; exporters and metrics of meshes inherit these settings."""
+    """Settings of the surface of an asset, which exporters and metrics of meshes inherit."""
 
     # Node of the configuration, such as "exporter.mesh", with which error messages begin.
     node: ClassVar[str]
