@@ -120,6 +120,8 @@ def read_compressed_ply(path: Path, *, up: str = "-y") -> Gaussians:
         chunks = np.pad(chunks, ((0, 0), (0, 6)))
         chunks[:, 15:] = 1
 
+    # Bounds may be infinite, or differ by more than a float32 can hold; both are refused later.
+    @np.errstate(over="ignore", invalid="ignore")
     def local(rows: slice) -> Gaussians:
         some = vertices[rows]
         # In float64, the difference of two bounds cannot overflow.
@@ -135,14 +137,13 @@ def read_compressed_ply(path: Path, *, up: str = "-y") -> Gaussians:
         if rest_names:
             stored = np.stack([tables["sh"][rows][name] for name in rest_names], axis=1)
             sh[:, 1:] = _sh_values(stored).reshape(len(some), 3, size // 3).transpose(0, 2, 1)
-        with np.errstate(over="ignore", invalid="ignore"):
-            return Gaussians(
-                means=as_tensor(within("packed_position", 0)),
-                log_scales=as_tensor(within("packed_scale", 1)),
-                quats=as_tensor(_unpacked_rotations(some["packed_rotation"])),
-                opacity_logits=as_tensor(byte_logits((some["packed_color"] & 255).astype(np.uint8))),
-                sh=as_tensor(sh),
-            )
+        return Gaussians(
+            means=as_tensor(within("packed_position", 0)),
+            log_scales=as_tensor(within("packed_scale", 1)),
+            quats=as_tensor(_unpacked_rotations(some["packed_rotation"])),
+            opacity_logits=as_tensor(byte_logits((some["packed_color"] & 255).astype(np.uint8))),
+            sh=as_tensor(sh),
+        )
 
     return gathered(path, count, REST_SIZES.index(size), header.up or up, local)
 

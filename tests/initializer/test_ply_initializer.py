@@ -101,10 +101,12 @@ def test_the_up_axis_of_other_programs_assets_can_be_given(tmp_path, written, as
     [("a.compressed.ply", write_compressed_ply), ("a.splat", write_splat), ("a.spz", write_spz)],
 )
 def test_assets_of_other_formats_are_upright_once_their_axis_is_given(tmp_path, name, write):
-    write(tmp_path / name, some_gaussians(degree=0), up="+z")
+    asset = some_gaussians(degree=0)
+    write(tmp_path / name, asset, up="+z")
     made = build(tmp_path / name, up="+z")
     assert len(made) == 60
-    torch.testing.assert_close(made.means.mean(dim=0), some_gaussians().means.mean(dim=0), atol=0.01, rtol=0)
+    # Formats change the order of the rows.
+    torch.testing.assert_close(made.means.mean(dim=0), asset.means.mean(dim=0), atol=0.001, rtol=0)
 
 
 @pytest.mark.parametrize("turn_deg", [0, 90, 180, 270])
