@@ -357,3 +357,12 @@ def test_composing_inside_a_running_command_leaves_it_alone():
         outer = GlobalHydra.instance().hydra
         compose([PROMPT])
         assert GlobalHydra.instance().hydra is outer
+
+
+@pytest.mark.parametrize(
+    "text", ["a ${oc.env:HOME}", r"a \${prompt}", r"a \\${steps} b", "${", "$5", "a\\", "${a} '${b}'"]
+)
+def test_a_prompt_reaches_a_component_as_it_is_whatever_it_looks_like(text):
+    cfg = compose([f"prompt={quote(text)}", "exporter=[html]"])
+    assert cfg.prompt == text
+    assert component(cfg.exporter.html).title == text

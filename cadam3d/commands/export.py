@@ -34,9 +34,11 @@ from cadam3d.io.run_folder import (
     shown,
     typed_path,
 )
-from cadam3d.settings.line import MESH, setting_word
+from cadam3d.settings.compose import escape
+from cadam3d.settings.line import setting_word
 
 INDENT = "  "
+MESH = "mesh"  # the exporter of triangles
 # Values of ``format`` (mesh) and ``version`` (spz) that other programs were tested with; "" for neither.
 USUAL_VARIANTS = ("", "glb", "3")
 
@@ -59,9 +61,8 @@ def entitle(cfg: DictConfig, asset: Asset) -> None:
     run_folder = run_of(asset)
     if "html" in cfg.exporter and run_folder is not None and OmegaConf.select(cfg, key) is None:
         prompt = facts_of(run_folder)["prompt"]
-        # Hydra resolves a text twice, so no escape would keep an interpolation of a stranger from it.
-        if prompt is not None and "$" not in prompt:
-            OmegaConf.update(cfg, key, prompt)
+        if prompt is not None:
+            OmegaConf.update(cfg, key, escape(prompt))
 
 
 def run_of(asset: Asset) -> Path | None:

@@ -112,7 +112,7 @@ def component(node: Any, kind: type = object, key: str = "") -> Any:
     try:
         place = node._get_full_key("") if OmegaConf.is_config(node) else ""
         require_declared(node, kind, place or key or "configuration")
-        return instantiate(node, _convert_="all")
+        return instantiate(_resolved(node), _convert_="all")
     except InstantiationException as error:
         raise _construction_error(error) from error
     except OmegaConfBaseException as error:
@@ -120,6 +120,32 @@ def component(node: Any, kind: type = object, key: str = "") -> Any:
         raise UserError(
             f"{error.full_key or 'configuration'}: {reason}. Try: cadam3d train --cfg job"
         ) from error
+
+
+def _resolved(node: Any) -> Any:
+    """Return ``node``, or a copy of it if a text in it would become an interpolation once it is resolved.
+
+    Hydra resolves a component twice. A prompt such as ``${oc.env:HOME}``, which is plain text after the first
+    time, would be replaced the second time, so the copy is escaped twice.
+    """
+    if not OmegaConf.is_config(node):
+        return node
+    content = OmegaConf.to_container(node, resolve=True)
+    if not any(isinstance(value, str) and "${" in value for value in _values(content)):
+        return node
+    copy = OmegaConf.create(escaped(escaped(content)))
+    copy._set_parent(node._get_parent())
+    copy._set_key(node._key())
+    return copy
+
+
+def _values(content: Any) -> Iterator[Any]:
+    """Yield every value of nested dicts and lists."""
+    inner = content.values() if isinstance(content, dict) else content if isinstance(content, list) else None
+    if inner is None:
+        yield content
+    for item in inner or ():
+        yield from _values(item)
 
 
 def components(group: Any, kind: type = object, key: str = "") -> dict[str, Any]:
