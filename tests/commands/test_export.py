@@ -188,7 +188,7 @@ def test_every_format_is_written_and_described_as_it_is_read_back(run_folder, ty
     ("prompt", "words", "title"),
     [
         ("a </title><b>cube", (), "a &lt;/title&gt;&lt;b&gt;cube"),
-        ("a ${oc.env:HOME} cube", (), "3D Gaussians"),
+        ("a ${oc.env:HOME} cube", (), "a ${oc.env:HOME} cube"),
         ("a cube", ("exporter.html.title=mine",), "mine"),
     ],
 )
