@@ -231,8 +231,8 @@ def with_count(content: bytes, draw: Random) -> bytes:
 
 
 def with_text(content: bytes, draw: Random) -> bytes:
-    """Replace a word."""
-    words = list(re.finditer(rb"[^\s]+", content[:20000]))
+    """Replace a word, or everything if there is no word."""
+    words = list(re.finditer(rb"[^\s]+", content[:20000])) or list(re.finditer(rb"(?s).+", content))
     found = words[draw.integers(len(words))]
     return content[: found.start()] + TEXTS[draw.integers(len(TEXTS))] + content[found.end() :]
 
