@@ -9,7 +9,6 @@
 Only files of this project record their axes, in a comment of a PLY.
 """
 
-import shlex
 from pathlib import Path
 
 from cadam3d.core.checks import require_choice
@@ -17,18 +16,18 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.compressed_ply import is_compressed, read_compressed_ply
 from cadam3d.io.frames import UPS
+from cadam3d.io.gaussforge import conversion
 from cadam3d.io.ply import read_ply
-from cadam3d.io.ply_tables import opened, read_header
+from cadam3d.io.ply_tables import read_header
+from cadam3d.io.reading import opened, unusable
 from cadam3d.io.splat import read_splat
-from cadam3d.io.spz import read_spz
+from cadam3d.io.spz import GZIP_MAGIC, MAGIC, read_spz
 
 PLY, COMPRESSED_PLY, SPLAT, SPZ = "ply", "compressed ply", "splat", "spz"
 READERS = {PLY: read_ply, COMPRESSED_PLY: read_compressed_ply, SPLAT: read_splat, SPZ: read_spz}
 # Up axes of files that do not record them.
 USUAL_UP = {PLY: "-y", COMPRESSED_PLY: "-y", SPLAT: "-y", SPZ: "+y"}
 SUFFIXES = (".ply", ".splat", ".spz")
-GZIP = b"\x1f\x8b\x08"
-SPZ_4 = b"NGSP"
 GLB = b"glTF"
 # Formats that the package gaussforge converts into a PLY, by suffix.
 CONVERTIBLE = {".sog": "sog", ".ksplat": "ksplat"}
@@ -52,29 +51,16 @@ def file_format(path: Path) -> str:
         begin = file.read(4)
     if begin[:3] == b"ply":
         return COMPRESSED_PLY if is_compressed(read_header(path)) else PLY
-    if begin[:3] == GZIP or begin == SPZ_4:
+    if begin.startswith((GZIP_MAGIC, MAGIC)):
         return SPZ
     suffix = path.suffix.lower()
     if suffix in CONVERTIBLE:
         raise UserError(
             f"{path}: expected {'|'.join(SUFFIXES)}, got {suffix}. "
-            f"Try: pip install gaussforge && {_conversion(path, CONVERTIBLE[suffix])}"
+            f"Try: {conversion(path, path.with_suffix('.ply'), CONVERTIBLE[suffix], 'ply')}"
         )
     if begin == GLB:
-        raise UserError(f"{path}: expected {'|'.join(SUFFIXES)}, got glb. Try: another file")
+        raise unusable(path, f"expected {'|'.join(SUFFIXES)}, got glb")
     if suffix == ".splat":
         return SPLAT
-    raise UserError(
-        f"{path}: not a ply file, nor another one of {'|'.join(SUFFIXES)}: it begins with {begin!r}. "
-        "Try: another file"
-    )
-
-
-def _conversion(path: Path, kind: str) -> str:
-    """Return a shell command that makes a PLY of a file whose format gaussforge calls ``kind``."""
-    code = (
-        "from gaussforge import GaussForge; from pathlib import Path; "
-        f"new = GaussForge().convert(Path({str(path)!r}).read_bytes(), {kind!r}, 'ply'); "
-        f"Path({str(path.with_suffix('.ply'))!r}).write_bytes(new['data'])"
-    )
-    return shlex.join(["python", "-c", code])
+    raise unusable(path, f"not a ply file, nor another one of {'|'.join(SUFFIXES)}: it begins with {begin!r}")

@@ -26,7 +26,7 @@ from typing import Any
 from cadam3d.core.errors import UserError
 from cadam3d.io.frames import AXES, UPS
 from cadam3d.io.jsonl import is_whole, read_json, write_json
-from cadam3d.io.reading import open_regular
+from cadam3d.io.reading import opened
 from cadam3d.io.records import read_config, read_summary
 from cadam3d.io.run_folder import ASSET_RECORD, CONFIG, numbered, shown
 
@@ -89,12 +89,9 @@ class Source:
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal. Raises ``UserError`` if it cannot be read."""
     digest = hashlib.sha256()
-    try:
-        with open_regular(path) as file:
-            while chunk := file.read(CHUNK_BYTES):
-                digest.update(chunk)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error}). Try: another file") from error
+    with opened(path) as file:
+        while chunk := file.read(CHUNK_BYTES):
+            digest.update(chunk)
     return digest.hexdigest()
 
 

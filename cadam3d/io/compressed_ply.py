@@ -40,11 +40,20 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0
 from cadam3d.io.atomic import replacing
-from cadam3d.io.encoding import as_tensor, byte_logits, in_file_axes, opacities, to_bytes, unit_quats
+from cadam3d.io.encoding import (
+    LARGEST_OF_SMALLEST,
+    as_tensor,
+    byte_logits,
+    in_file_axes,
+    opacities,
+    to_bytes,
+    unit_quats,
+)
 from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
 from cadam3d.io.ply import REST_SIZES, VERTEX, rest_size
-from cadam3d.io.ply_tables import LITTLE, PlyHeader, read_header, read_tables, unusable
+from cadam3d.io.ply_tables import LITTLE, PlyHeader, read_header, read_tables
+from cadam3d.io.reading import unusable
 
 CHUNK_ROWS = 256
 POSITION_BOUNDS = ["min_x", "min_y", "min_z", "max_x", "max_y", "max_z"]
@@ -55,7 +64,6 @@ PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 VECTOR_BITS = (11, 10, 11)
 COLOR_BITS = (8, 8, 8, 8)
 ROTATION_BITS = (10, 10, 10)
-LARGEST_OF_SMALLEST = 0.5**0.5  # the second largest component of a unit quaternion is at most this
 LARGEST_LOG_SCALE = 20.0
 SH_RANGE = 8.0  # of coefficients, symmetric about 0
 MORTON_BITS = 21  # per axis, so that three axes fit into 63 bits

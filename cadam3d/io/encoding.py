@@ -17,6 +17,8 @@ from cadam3d.io.frames import world_to_file
 
 SMALLEST = float(np.finfo(np.float32).tiny)
 LARGEST = float(np.finfo(np.float32).max)
+# The second largest component of a unit quaternion is at most this.
+LARGEST_OF_SMALLEST = 0.5**0.5
 
 
 def to_bytes(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
@@ -61,10 +63,13 @@ def unit_quats(gaussians: Gaussians) -> Float[np.ndarray, "n 4"]:
 def in_file_axes(gaussians: Gaussians, up: str) -> Gaussians:
     """Return the Gaussians as they are written: float32, on the CPU, with the up axis ``up``.
 
-    Turning mixes SH coefficients, so the largest ones might become infinite; they are clamped.
+    Turning mixes SH coefficients, so the largest ones might become infinite; they are clamped. Numbers that
+    were not finite before stay so.
     """
-    local = world_to_file(gaussians.detach().to("cpu").to(torch.float32), up)
-    return replace(local, sh=local.sh.clamp(-LARGEST, LARGEST))
+    plain = gaussians.detach().to("cpu").to(torch.float32)
+    local = world_to_file(plain, up)
+    was_finite = plain.sh.isfinite().all(dim=2).all(dim=1)[:, None, None]
+    return replace(local, sh=torch.where(was_finite, local.sh.clamp(-LARGEST, LARGEST), local.sh))
 
 
 def as_tensor(values: Float[np.ndarray, "*shape"]) -> Tensor:

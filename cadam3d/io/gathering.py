@@ -11,9 +11,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.frames import file_to_world
+from cadam3d.io.reading import unusable
 
 ROWS_AT_ONCE = 1 << 13
 
@@ -41,10 +41,7 @@ def gathered(
         for name, tensor in part.tensors().items():
             whole.tensors()[name][rows] = tensor
     if bad:
-        raise UserError(
-            f"{path}: expected finite numbers, got NaN or infinity in {bad} of {count} Gaussians. "
-            "Try: another file"
-        )
+        raise unusable(path, f"expected finite numbers, got NaN or infinity in {bad} of {count} Gaussians")
     return whole
 
 

@@ -1,7 +1,7 @@
 """SOG, ksplat and SPZ version 4, written by the optional package gaussforge (Apache-2.0, compiled C++).
 
-cadam3d only writes with gaussforge. It does not read with it, because a hostile file would then reach
-compiled code that makes no promise about such files.
+cadam3d only writes with gaussforge. It does not read with it, because gaussforge is compiled code that makes
+no promise about hostile files.
 
 | format | content | lost |
 |---|---|---|
@@ -20,12 +20,13 @@ Measured facts about gaussforge 0.6.0, which the code below takes into account. 
   which changes degree 2 and higher;
 * prints to standard output when it reads, and cannot return a file of SH degree 0 to Python.
 
-GaussianSplats3D, whose format ksplat is, knows SH degree 0 to 2 (its README and its issue 259).
+ksplat is the format of GaussianSplats3D, which has SH degree 0 to 2 (its README and its issue 259).
 
 Sources: the metadata of gaussforge 0.6.0 on pypi.org, and comparisons of its files with what splat-transform
 3.7.0, Spark 2.2.0 and three.js r187 read.
 """
 
+import shlex
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -57,6 +58,21 @@ def require_gaussforge(key: str) -> None:
         )
 
 
+def conversion(source: Path, target: Path, kind: str, new_kind: str, **options: int) -> str:
+    """Return a shell command with which a user installs gaussforge and converts a file.
+
+    ``kind`` and ``new_kind`` are gaussforge's names of the formats, and ``options`` those of its ``convert``.
+    """
+    more = "".join(f", {name}={value!r}" for name, value in options.items())
+    code = (
+        "from gaussforge import GaussForge; from pathlib import Path; "
+        f"old = Path({str(source)!r}).read_bytes(); "
+        f"new = GaussForge().convert(old, {kind!r}, {new_kind!r}{more}); "
+        f"Path({str(target)!r}).write_bytes(new['data'])"
+    )
+    return f"pip install {PACKAGE} && {shlex.join(['python', '-c', code])}"
+
+
 def _imported(key: str) -> Any:
     require_gaussforge(key)
     try:
@@ -69,8 +85,8 @@ def _imported(key: str) -> Any:
 def write_sog(path: Path, gaussians: Gaussians, *, up: str) -> None:
     """Write ``gaussians`` as SOG version 2, atomically, in the axes with up axis ``up``.
 
-    Raises ``UserError`` if there are none, if gaussforge is not installed or fails, or if the file cannot be
-    written. So do the other two functions.
+    Raises ``UserError`` if there are no Gaussians, if gaussforge is not installed or fails, or if the file
+    cannot be written. The other two functions do the same.
     """
     _write(path, gaussians, up=up, kind="sog")
 
@@ -81,7 +97,7 @@ def write_ksplat(path: Path, gaussians: Gaussians, *, up: str) -> None:
 
 
 def write_spz4(path: Path, gaussians: Gaussians, *, up: str) -> None:
-    """Write ``gaussians`` as SPZ version 4; see :func:`write_sog`.
+    """Write ``gaussians`` as SPZ version 4, which may be empty; see :func:`write_sog`.
 
     Raises ``UserError`` also for positions beyond 2,047.
     """

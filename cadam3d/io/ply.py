@@ -13,8 +13,8 @@ Reading a file that was written here gives the same bits. The only exceptions ar
 other than ``+z`` (see ``frames.py``), which are rounded to float32 once when writing and once when reading.
 
 A file with NaN or infinity is refused, except for an infinite ``opacity`` of another program, which means 0
-or 1. Every finite number is accepted, however large: the quaternion (0, 0,
-0, 0) means no rotation (``Gaussians.rotations``), and every rasterizer gives finite images of such Gaussians
+or 1. Every finite number is accepted, however large: the quaternion (0, 0, 0, 0) means no rotation
+(``Gaussians.rotations``), and every rasterizer gives finite images of such Gaussians
 (``tests/rasterizer/test_reference.py``). A file that is longer or shorter than its header claims is refused,
 and reading never allocates more than a few times its size.
 """
@@ -33,7 +33,8 @@ from cadam3d.io.atomic import replacing
 from cadam3d.io.encoding import as_tensor, in_file_axes
 from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
-from cadam3d.io.ply_tables import LITTLE, PlyHeader, read_header, read_tables, unusable
+from cadam3d.io.ply_tables import LITTLE, PlyHeader, read_header, read_tables
+from cadam3d.io.reading import unusable
 
 VERTEX = "vertex"
 # The columns of each tensor that is stored without a change of layout.

@@ -9,7 +9,6 @@ blocks of lines, so the memory needed is a few times the size of the file, whate
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.frames import UPS
-from cadam3d.io.reading import open_regular
+from cadam3d.io.reading import opened, unusable
 
 ASCII = "ascii 1.0"
 LITTLE = "binary_little_endian 1.0"
@@ -106,23 +105,6 @@ def read_tables(header: PlyHeader, wanted: Mapping[str, Sequence[str]]) -> dict[
                 tables[element.name] = table
         _require_end(header, file)
     return tables
-
-
-def unusable(path: Path, problem: str) -> UserError:
-    """Return the message about a file that cannot be used."""
-    return UserError(f"{path}: {problem}. Try: another file")
-
-
-@contextmanager
-def opened(path: Path) -> Iterator[BinaryIO]:
-    """Open a regular file for reading. Every failure of the system becomes one ``UserError``."""
-    try:
-        with open_regular(path) as file:
-            yield file
-    # A name with a null byte is a ValueError.
-    except (OSError, ValueError, MemoryError) as error:
-        reason = getattr(error, "strerror", None) or error or "too large"
-        raise unusable(path, f"cannot be read ({reason})") from error
 
 
 def _parse_header(path: Path, file: BinaryIO) -> PlyHeader:

@@ -7,6 +7,8 @@ can describe gigabytes), and with a limited depth.
 
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
 
@@ -40,6 +42,11 @@ class _Loader(_SAFE):
     }
 
 
+def unusable(path: Path, problem: str) -> UserError:
+    """Return the message about a file that cannot be used."""
+    return UserError(f"{path}: {problem}. Try: another file")
+
+
 def open_regular(path: Path) -> BinaryIO:
     """Open a file for reading bytes.
 
@@ -52,7 +59,7 @@ def open_regular(path: Path) -> BinaryIO:
     if not stat.S_ISREG(mode):
         os.close(descriptor)
         kind = KINDS.get(stat.S_IFMT(mode), "something else")
-        raise UserError(f"{path}: expected a file, got {kind}. Try: another file")
+        raise unusable(path, f"expected a file, got {kind}")
     return os.fdopen(descriptor, "rb")
 
 
@@ -65,8 +72,20 @@ def open_contained(folder: Path, name: str) -> BinaryIO:
     for part in Path(name).parts:
         path /= part
         if path.is_symlink():
-            raise UserError(f"{path}: expected a file, got a link. Try: another file")
+            raise unusable(path, "expected a file, got a link")
     return open_regular(path)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """Open a regular file for reading bytes. Every failure of the system becomes one ``UserError``."""
+    try:
+        with open_regular(path) as file:
+            yield file
+    # A name with a null byte is a ValueError.
+    except (OSError, ValueError, MemoryError) as error:
+        reason = getattr(error, "strerror", None) or error or "too large"
+        raise unusable(path, f"cannot be read ({reason})") from error
 
 
 def signature(file: BinaryIO) -> tuple[int, int, int, int]:
@@ -77,14 +96,10 @@ def signature(file: BinaryIO) -> tuple[int, int, int, int]:
 
 def read_bytes(path: Path, *, largest: int) -> bytes:
     """Return the content of a regular file of at most ``largest`` bytes. Raises ``UserError`` on failure."""
-    try:
-        with open_regular(path) as file:
-            content = file.read(largest + 1)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{path}: cannot be read ({reason}). Try: another file") from error
+    with opened(path) as file:
+        content = file.read(largest + 1)
     if len(content) > largest:
-        raise UserError(f"{path}: expected at most {largest:,} bytes, got more. Try: another file")
+        raise unusable(path, f"expected at most {largest:,} bytes, got more")
     return content
 
 
@@ -93,7 +108,7 @@ def read_text(path: Path, *, largest: int = LARGEST_TEXT) -> str:
     try:
         return read_bytes(path, largest=largest).decode("utf-8")
     except UnicodeDecodeError as error:
-        raise UserError(f"{path}: expected UTF-8 text, got other bytes. Try: another file") from error
+        raise unusable(path, "expected UTF-8 text, got other bytes") from error
 
 
 def read_yaml(path: Path) -> Any:
@@ -108,7 +123,7 @@ def read_yaml(path: Path) -> Any:
     # A number with thousands of digits raises ValueError.
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{path}: expected plain YAML, got {reason}. Try: another file") from error
+        raise unusable(path, f"expected plain YAML, got {reason}") from error
 
 
 def _require_plain(text: str) -> None:

@@ -24,7 +24,6 @@ from pathlib import Path
 import numpy as np
 
 from cadam3d.core.checks import require_choice
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0
 from cadam3d.io.atomic import replacing
@@ -39,7 +38,7 @@ from cadam3d.io.encoding import (
     unit_quats,
 )
 from cadam3d.io.frames import UPS, file_to_world
-from cadam3d.io.reading import open_regular
+from cadam3d.io.reading import opened, unusable
 
 RECORD = np.dtype(
     [("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 3), ("opacity", "u1"), ("quat", "u1", 4)]
@@ -72,20 +71,15 @@ def read_splat(path: Path, *, up: str = "-y") -> Gaussians:
     bytes, or if a position or a scale is not a possible one.
     """
     require_choice("up", up, UPS)
-    try:
-        with open_regular(path) as file:
-            content = file.read()
-    # A name with a null byte is a ValueError.
-    except (OSError, ValueError, MemoryError) as error:
-        reason = getattr(error, "strerror", None) or error or "too large"
-        raise UserError(f"{path}: cannot be read ({reason}). Try: another file") from error
+    with opened(path) as file:
+        content = file.read()
     if len(content) % RECORD.itemsize:
-        raise _unusable(path, f"expected records of {RECORD.itemsize} bytes, got {len(content)} bytes")
+        raise unusable(path, f"expected records of {RECORD.itemsize} bytes, got {len(content)} bytes")
     records = np.frombuffer(content, dtype=RECORD)
     possible = np.isfinite(records["position"]) & np.isfinite(records["scale"]) & (records["scale"] >= 0)
     if bad := int((~possible.all(axis=1)).sum()):
         problem = f"not a .splat file: {bad} of {len(records)} records have no possible position or scale"
-        raise _unusable(path, problem)
+        raise unusable(path, problem)
     local = Gaussians(
         means=as_tensor(records["position"]),
         log_scales=as_tensor(scale_logarithms(records["scale"])),
@@ -94,7 +88,3 @@ def read_splat(path: Path, *, up: str = "-y") -> Gaussians:
         sh=as_tensor((records["color"][:, None].astype(np.float64) / 255 - 0.5) / SH_C0),
     )
     return file_to_world(local, up)
-
-
-def _unusable(path: Path, problem: str) -> UserError:
-    return UserError(f"{path}: {problem}. Try: another file")

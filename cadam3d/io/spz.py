@@ -33,28 +33,36 @@ gaussforge 0.6.0 writes and reads (``tests/io/test_spz.py`` compares every numbe
 """
 
 import gzip
-import shlex
 import struct
 import zlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-import torch
 
 from cadam3d.core.checks import require_choice
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE
 from cadam3d.io.atomic import replacing
-from cadam3d.io.encoding import as_tensor, byte_logits, in_file_axes, opacities, to_bytes, unit_quats
-from cadam3d.io.frames import UPS, file_to_world
-from cadam3d.io.reading import open_regular
+from cadam3d.io.encoding import (
+    LARGEST_OF_SMALLEST,
+    as_tensor,
+    byte_logits,
+    in_file_axes,
+    opacities,
+    to_bytes,
+    unit_quats,
+)
+from cadam3d.io.frames import UPS
+from cadam3d.io.gathering import gathered
+from cadam3d.io.gaussforge import conversion
+from cadam3d.io.reading import opened, unusable
 
+# The first bytes of the unzipped header. Version 4 is not a gzip stream, and begins with them directly.
 MAGIC = b"NGSP"
-GZIP_MAGIC = b"\x1f\x8b"
+GZIP_MAGIC = b"\x1f\x8b\x08"
 HEADER = struct.Struct("<4sIIBBBB")
 VERSIONS = (2, 3)
 HAS_EXTENSIONS = 2  # flag: other data follow the Gaussians
@@ -64,14 +72,12 @@ LARGEST_FIXED = (1 << 23) - 1
 COLOR_SCALE = 0.15
 SH_STEPS = (8, 16)  # of the byte of a coefficient: of degree 1, and of higher degrees
 GZIP_LEVEL = 6  # 9 gives files that are 1 % smaller, in three to five times the time
-LARGEST_OF_SMALLEST = 0.5**0.5  # the second largest component of a unit quaternion is at most this
 
 # The file and the result may need this many times the size of the file, and these bytes. The rest of the
-# promised 64 MB is for decoding a block of rows (measured: 30 MB at SH degree 3).
+# promised 64 MB is for decoding a block of rows (measured: 36 MB at SH degree 3).
 MOST_EXPANSION = 20
 SPARE_BYTES = 24 << 20
 PIECE_BYTES = 1 << 18  # read or decompressed at once
-ROWS_AT_ONCE = 1 << 11  # decoded at once
 
 
 def write_spz(path: Path, gaussians: Gaussians, *, up: str) -> None:
@@ -111,27 +117,12 @@ def read_spz(path: Path, *, up: str = "+y") -> Gaussians:
     """
     require_choice("up", up, UPS)
     try:
-        with open_regular(path) as file:
+        with opened(path) as file:
             header, packed = _unzipped(path, file)
-    # A name with a null byte is a ValueError.
-    except (OSError, ValueError, MemoryError) as error:
-        reason = getattr(error, "strerror", None) or error or "too large"
-        raise UserError(f"{path}: cannot be read ({reason}). Try: another file") from error
     except zlib.error as error:
-        raise _unusable(path, f"a damaged gzip stream ({error})") from error
-    count, coefficients = header.count, (header.degree + 1) ** 2
-    gaussians = Gaussians(
-        means=torch.empty(count, 3),
-        log_scales=torch.empty(count, 3),
-        quats=torch.empty(count, 4),
-        opacity_logits=torch.empty(count),
-        sh=torch.empty(count, coefficients, 3),
-    )
-    # In small blocks, because the conversion of axes needs several times the memory of its result.
-    for rows, local in _decoded(header, packed):
-        for name, tensor in file_to_world(local, up).tensors().items():
-            gaussians.tensors()[name][rows] = tensor
-    return gaussians
+        raise unusable(path, f"a damaged gzip stream ({error})") from error
+    blocks = _blocks(header, packed)
+    return gathered(path, header.count, header.degree, up, lambda rows: _decoded(header, blocks, rows))
 
 
 @dataclass(frozen=True)
@@ -161,7 +152,7 @@ class _Header:
 
 
 class _Stream:
-    """A gzip stream that is decompressed only as far as it is asked for."""
+    """A gzip stream that is decompressed only as far as it is read."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -193,77 +184,66 @@ def _unzipped(path: Path, file: BinaryIO) -> tuple[_Header, bytearray]:
     if begin == MAGIC:
         raise UserError(
             f"{path}: expected SPZ version 2 or 3, got version 4 or later. "
-            f"Try: pip install gaussforge && {_to_version_3(path)}"
+            f"Try: {conversion(path, path.with_stem(f'{path.stem}_v3'), 'spz', 'spz', spz_version=3)}"
         )
     if begin[: len(GZIP_MAGIC)] != GZIP_MAGIC:
-        raise _unusable(path, f"not an spz file: it begins with {begin!r}")
+        raise unusable(path, f"not an spz file: it begins with {begin!r}")
     size = file.seek(0, 2)
     file.seek(0)
     stream = _Stream(file)
     start = bytearray(HEADER.size)
     if stream.read_into(memoryview(start)) < len(start):
-        raise _unusable(path, "truncated: the header has no end")
+        raise unusable(path, "truncated: the header has no end")
     header = _parsed(path, bytes(start))
     if header.packed_bytes + header.unpacked_bytes > MOST_EXPANSION * size + SPARE_BYTES:
         problem = f"its header promises {header.count:,} Gaussians, too many for {size:,} bytes"
-        raise _unusable(path, problem)
+        raise unusable(path, problem)
     packed = bytearray(header.packed_bytes)
     if (length := stream.read_into(memoryview(packed))) < len(packed):
         problem = f"truncated: the header promises {len(packed):,} bytes, the stream holds {length:,}"
-        raise _unusable(path, problem)
+        raise unusable(path, problem)
     if not header.has_extensions and not stream.ends_here():
-        raise _unusable(path, f"the stream does not end after the {header.count:,} Gaussians of its header")
+        raise unusable(path, f"the stream does not end after the {header.count:,} Gaussians of its header")
     return header, packed
-
-
-def _to_version_3(path: Path) -> str:
-    """Return a shell command that converts a newer file with gaussforge."""
-    code = (
-        "from gaussforge import GaussForge; from pathlib import Path; "
-        f"old = Path({str(path)!r}).read_bytes(); "
-        "new = GaussForge().convert(old, 'spz', 'spz', spz_version=3); "
-        f"Path({str(path.with_stem(f'{path.stem}_v3'))!r}).write_bytes(new['data'])"
-    )
-    return shlex.join(["python", "-c", code])
 
 
 def _parsed(path: Path, start: bytes) -> _Header:
     magic, version, count, degree, fractional_bits, flags, _ = HEADER.unpack(start)
     if magic != MAGIC:
-        raise _unusable(path, f"not an spz file: the gzip stream begins with {magic!r}")
+        raise unusable(path, f"not an spz file: the gzip stream begins with {magic!r}")
     if version not in VERSIONS:
-        raise _unusable(path, f"expected SPZ version 2 or 3, got {version}")
+        raise unusable(path, f"expected SPZ version 2 or 3, got {version}")
     if degree > MAX_DEGREE:
-        raise _unusable(path, f"expected SH degree 0 to {MAX_DEGREE}, got {degree}")
+        raise unusable(path, f"expected SH degree 0 to {MAX_DEGREE}, got {degree}")
     return _Header(version, count, degree, fractional_bits, bool(flags & HAS_EXTENSIONS))
 
 
-def _decoded(header: _Header, packed: bytearray) -> Iterator[tuple[slice, Gaussians]]:
-    """Yield Gaussians in the axes of the file, some rows at a time."""
+def _blocks(header: _Header, packed: bytearray) -> list[np.ndarray]:
+    """Return the blocks of a file as bytes, one row for each Gaussian."""
     blocks, start = [], 0
     for size in header.sizes:
         block = np.frombuffer(packed, np.uint8, count=header.count * size, offset=start)
         blocks.append(block.reshape(header.count, size))
         start += block.size
-    for first in range(0, header.count, ROWS_AT_ONCE):
-        rows = slice(first, first + ROWS_AT_ONCE)
-        positions, alphas, colors, scales, rotations, rest = (block[rows] for block in blocks)
-        digits = positions.reshape(-1, 3, 3).astype(np.int32)
-        fixed = digits[..., 0] | digits[..., 1] << 8 | digits[..., 2] << 16
-        signed = (fixed ^ 1 << 23) - (1 << 23)
-        unpack = _from_smallest_three if header.version == 3 else _from_first_three
-        dc = (colors.astype(np.float64) / 255 - 0.5) / COLOR_SCALE
-        sh = np.concatenate([dc[:, None], rest.reshape(len(rest), -1, 3) / 128.0 - 1], axis=1)
-        yield (
-            rows,
-            Gaussians(
-                means=as_tensor(np.ldexp(signed.astype(np.float64), -header.fractional_bits)),
-                log_scales=as_tensor(scales / 16.0 - 10),
-                quats=as_tensor(unpack(rotations)),
-                opacity_logits=as_tensor(byte_logits(alphas[:, 0])),
-                sh=as_tensor(sh),
-            ),
-        )
+    return blocks
+
+
+def _decoded(header: _Header, blocks: list[np.ndarray], rows: slice) -> Gaussians:
+    """Return some rows of the blocks as Gaussians in the axes of the file."""
+    positions, alphas, colors, scales, rotations, rest = (block[rows] for block in blocks)
+    digits = positions.reshape(-1, 3, 3).astype(np.int32)
+    fixed = digits[..., 0] | digits[..., 1] << 8 | digits[..., 2] << 16
+    signed = (fixed ^ 1 << 23) - (1 << 23)
+    unpack = _from_smallest_three if header.version == 3 else _from_first_three
+    dc = (colors.astype(np.float64) / 255 - 0.5) / COLOR_SCALE
+    sh = np.concatenate([dc[:, None], rest.reshape(len(rest), -1, 3) / 128.0 - 1], axis=1)
+    return Gaussians(
+        means=as_tensor(np.ldexp(signed.astype(np.float64), -header.fractional_bits)),
+        log_scales=as_tensor(scales / 16.0 - 10),
+        quats=as_tensor(unpack(rotations)),
+        opacity_logits=as_tensor(byte_logits(alphas[:, 0])),
+        sh=as_tensor(sh),
+    )
 
 
 def _fractional_bits(path: Path, local: Gaussians) -> int:
@@ -321,7 +301,3 @@ def _sh_bytes(rest: np.ndarray) -> np.ndarray:
     """Return SH coefficients [n r 3] of degree 1 and higher as bytes of few bits, which compress well."""
     steps = np.where(np.arange(rest.shape[1]) < 3, *SH_STEPS)[:, None]
     return to_bytes(steps * np.rint(128 * (np.clip(rest, -1, 1) + 1) / steps))
-
-
-def _unusable(path: Path, problem: str) -> UserError:
-    return UserError(f"{path}: {problem}. Try: another file")
