@@ -17,7 +17,7 @@ COMMANDS = {  # the purpose of each, and a line to paste
     "train": ("optimise an asset for a prompt", 'cadam3d train prompt="a red torus"'),
     "sweep": ("train many times, one table of results", 'cadam3d sweep prompt="a red torus" grid=densifiers'),
     "render": ("make pictures or a turntable of an asset", "cadam3d render run=outputs/latest"),
-    "export": ("write an asset in another format", "cadam3d export run=outputs/latest"),
+    "export": ("write an asset for other programs", "cadam3d export run=outputs/latest"),
     "eval": ("measure a finished run or sweep", "cadam3d eval run=outputs/latest"),
     "view": ("show a run in a browser, also while it trains", "cadam3d view run=outputs/latest"),
     "doctor": ("check this machine, with a hint per failure", "cadam3d doctor"),

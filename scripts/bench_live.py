@@ -3,8 +3,8 @@
     python scripts/bench_live.py --counts 4000 50000
 
 Everything is measured in one process and in CPU time, so that other load on the machine matters little: a
-step, a look at whether a page is open and what it asks for, and a snapshot for an open page. A run looks four
-times a second and writes one snapshot a second, or fewer if these would take more than their share.
+step, a look for requests and for an open page, and a snapshot for an open page. A run looks four times a
+second and writes one snapshot a second, or fewer if these would take more than their share.
 """
 
 import argparse

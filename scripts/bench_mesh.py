@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
+from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.mesh import mesh_facts
@@ -29,7 +30,7 @@ from cadam3d.settings.compose import component, compose
 HEADER = "| prompt | triangles | parts | watertight | Chamfer | F at 0.01 | F at 0.02 | seconds |"
 
 
-def no_pictures(cameras: Cameras, background: Tensor) -> RenderOutput:
+def no_pictures(cameras: Cameras, background: Tensor, shown: Gaussians | None = None) -> RenderOutput:
     """Refuse to render, because a mesh needs no picture."""
     raise NotImplementedError
 

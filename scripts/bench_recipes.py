@@ -20,11 +20,10 @@ from typing import Any
 
 import torch
 
-from cadam3d.commands.train import build_trainer
+from cadam3d.commands.train import build_trainer, run_context
 from cadam3d.core.device import resolve_device
 from cadam3d.prior.base import amount
 from cadam3d.settings.compose import component, compose
-from cadam3d.state import RunContext
 from cadam3d.trainer import Trainer
 
 RECIPES = {"luciddreamer": "stable_diffusion", "flowdreamer": "stable_diffusion_3"}
@@ -176,14 +175,7 @@ def measure(recipe: str, model: Path, args: argparse.Namespace) -> dict[str, Any
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     with tempfile.TemporaryDirectory() as folder:
-        context = RunContext(
-            Path(folder),
-            cfg.prompt,
-            cfg.steps,
-            trainer.renderer(state),
-            trainer.rasterizer,
-            trainer.densifier,
-        )
+        context = run_context(cfg.prompt, trainer, state, Path(folder))
         warm: Trainer = replace(trainer, steps=args.warmup)
         warm.train(state, embedding, context)
         watch.seconds.clear()

@@ -13,17 +13,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 import torch
 from jaxtyping import UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from cadam3d.callback.base import Callback
-from cadam3d.commands.train import build_trainer
+from cadam3d.commands.train import build_trainer, run_context
 from cadam3d.core.cameras import orbit
 from cadam3d.core.render import RenderFn
 from cadam3d.io.atomic import replacing
+from cadam3d.io.caption import BOLD, REGULAR, font
 from cadam3d.io.image import to_uint8
 from cadam3d.report.palette import INK, LINE, PAPER, SOFT
 from cadam3d.report.style import looks
@@ -53,11 +53,11 @@ FIRST_MS, GROWTH_MS, GROWN_MS, TURN_MS = 700, 90, 1500, 75
 
 @dataclass
 class Growth:
-    """What the recorder has seen of one run."""
+    """The records of one run, and pictures of its result from all sides."""
 
     steps: list[int] = field(default_factory=list)
-    counts: list[int] = field(default_factory=list)
-    pictures: list[np.ndarray] = field(default_factory=list)
+    counts: list[int] = field(default_factory=list)  # Gaussians after each of these steps
+    pictures: list[np.ndarray] = field(default_factory=list)  # one per step, then those of the turn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,22 +90,21 @@ def picture(render: RenderFn, azimuth_deg: float) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def train(arm: str, folder: Path) -> Growth:
-    """Train with the densifier ``arm``, and return what it looked like, a turn of the result included."""
+    """Train with the densifier ``arm``, and return its records and a turn of the result."""
     cfg = compose([f"prompt={PROMPT}", f"densifier={arm}", f"steps={STEPS}", "camera.size=160"])
     growth = Growth()
     trainer = replace(build_trainer(cfg, CPU), callbacks=[Recorder(growth=growth)])
     trainer.prior.load()
     state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
-    render = trainer.renderer(state)
-    context = RunContext(folder, cfg.prompt, trainer.steps, render, trainer.rasterizer)
+    context = run_context(cfg.prompt, trainer, state, folder)
     trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context)
     for view in range(1, TURN + 1):
-        growth.pictures.append(picture(render, DRIFT_DEG[1] + 360 * view / TURN))
+        growth.pictures.append(picture(context.render, DRIFT_DEG[1] + 360 * view / TURN))
     return growth
 
 
 def recorded(arm: str, work: Path) -> Growth:
-    """Return the growth of ``arm``, from ``work`` if it is there, else by training."""
+    """Return the growth of ``arm`` from the folder ``work``, or train if it is not there."""
     path = work / f"{arm}.npz"
     if not path.is_file():
         growth = train(arm, work)
@@ -164,9 +163,8 @@ def write(
     anchor: str = "ma",
 ) -> None:
     """Write one line; ``anchor`` is the part of it that is at ``place``, in Pillow's letters."""
-    face = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
-    font = ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", face), size)
-    ImageDraw.Draw(frame).text(place, text, fill=color, font=font, anchor=anchor)
+    letters = font(BOLD if bold else REGULAR, size)
+    ImageDraw.Draw(frame).text(place, text, fill=color, font=letters, anchor=anchor)
 
 
 def main() -> None:

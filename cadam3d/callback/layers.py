@@ -1,4 +1,4 @@
-"""Layers: numbers per Gaussian, such as its age, by which a page can colour a snapshot of a run."""
+"""Layers: numbers per Gaussian, such as the age, by which a page can colour a snapshot of a run."""
 
 import torch
 from jaxtyping import Bool, Int
@@ -9,7 +9,7 @@ from cadam3d.viewer.pack import pack
 
 
 class Layers:
-    """The numbers that a callback must follow through refinements, because no other part keeps them."""
+    """Ages and selections. A callback updates them at every refinement, because nothing else keeps them."""
 
     def __init__(self) -> None:
         # For each Gaussian, the step after which it was born, and whether the last refinement selected it.
@@ -23,7 +23,7 @@ class Layers:
         self.is_selected = torch.zeros(shape, dtype=torch.bool, device=device)
 
     def follow(self, report: RefineReport) -> None:
-        """Follow the rows, and mark the survivors and the children of the selected ones."""
+        """Apply the edit of a refinement, and mark the children and the surviving parents as selected."""
         edit = report.edit
         if edit is None:
             return
@@ -33,7 +33,7 @@ class Layers:
         self.is_selected = torch.cat([is_selected[edit.keep], is_selected[edit.parents]])
 
     def snapshot(self, context: RunContext, state: TrainState) -> bytes:
-        """Return a snapshot of the Gaussians with the densifier's scores, ``age`` and ``selected``.
+        """Return a snapshot (``viewer/pack.py``) with the densifier's scores, ``age`` and ``selected``.
 
         ``age`` is in steps, since birth or since :meth:`start`. ``selected`` is 1 for the children and the
         surviving parents of the last refinement, else 0.

@@ -1,7 +1,7 @@
 """Live: writes the current Gaussians and a few numbers for the page of ``cadam3d view``, while one is open.
 
-Every other part of a live view is elsewhere: ``io/live.py`` has the files, ``commands/control.py`` obeys the
-buttons, and ``cadam3d/live/`` has the server and the page.
+The other parts of a live view are elsewhere: ``io/live.py`` has the files, ``commands/control.py`` carries
+out what the buttons request, and ``cadam3d/live/`` has the server and the page.
 """
 
 import logging
@@ -27,15 +27,13 @@ LOOK_SECONDS = 0.25  # between two looks at whether a page is open
 class Live(Callback):
     """Write ``live/snapshot.bin`` and ``live/state.json`` while a page shows the run, and nothing otherwise.
 
-    A snapshot has these numbers per Gaussian, by which the page can colour it: the ``scores`` of the
-    densifier, ``age`` (steps since birth, or since this process started training), and ``selected`` (1 for
-    the children and the surviving parents of the last refinement, else 0). This callback never draws a random
-    number, and a disk that is full ends the live view but not the run.
+    A snapshot has the layers of ``callback/layers.py``. This callback never draws a random number, and a full
+    disk ends the live view but not the run.
     """
 
-    seconds: float  # >= 0.1
-    share: float  # in (0, 1]
-    # Files can be written. Becomes False after the first failure.
+    seconds: float  # >= 0.1, between two snapshots
+    share: float  # in (0, 1], of the time of training
+    # Whether files can be written. Becomes False after the first failure.
     _works: bool = field(default=False, init=False, repr=False)
     _watch: Watch = field(default_factory=lambda: Watch(Path()), init=False, repr=False)
     # Readings of the monotonic clock at which the next look and the next snapshot are due.
@@ -63,7 +61,7 @@ class Live(Callback):
             self._give_up(error)
 
     def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
-        """Follow the rows."""
+        """Follow the rows through the refinement."""
         self._layers.follow(report)
 
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
@@ -72,11 +70,11 @@ class Live(Callback):
         self._show(context, state, is_paused=False)
 
     def on_pause(self, context: RunContext, state: TrainState) -> None:
-        """Write a snapshot of the step at which the run waits, once for each page that comes."""
+        """Write a snapshot of the step after which the run is paused."""
         self._show(context, state, is_paused=True)
 
     def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
-        """Write the last numbers; a page then knows that the outputs are being written."""
+        """Write the last numbers, with which a page can show that the outputs are being written."""
         if self._works and outcome is not Outcome.OUT_OF_MEMORY:
             try:
                 self._write_state(context, state, has_ended=True)
@@ -120,4 +118,4 @@ class Live(Callback):
 
     def _give_up(self, error: OSError) -> None:
         self._works = False
-        log.warning("there is no live view any more: %s", error)
+        log.warning("the live view has ended, because its files cannot be written: %s", error)

@@ -36,7 +36,7 @@ class Snapshots(Callback):
             self._record(context, state)
 
     def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
-        """Follow the rows."""
+        """Follow the rows through the refinement."""
         self._layers.follow(report)
 
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:

@@ -1,4 +1,4 @@
-"""Asset: open the results of a run, as ``render``, ``export`` and ``eval`` do first."""
+"""Asset: open the results of a run, and write files of them, for all commands that use a finished run."""
 
 import os
 import tempfile
@@ -46,10 +46,10 @@ LONGEST_NAME = 60  # characters of a name in a suggestion
 
 @dataclass(frozen=True)
 class Asset:
-    """Gaussians from a file, on the requested device."""
+    """Gaussians from a file of any format, on the requested device."""
 
     gaussians: Gaussians
-    ply: Path
+    ply: Path  # the file, which is called so even if it has another format
     folder: Path  # of the run, or named after a single file
 
 
@@ -177,11 +177,6 @@ def run_exporters(cfg: DictConfig, write: Callable[[str, Exporter], list[Path]])
     if len(warnings) == len(exporters):
         raise UserError(warnings[0])
     return outputs
-
-
-def write_outputs(cfg: DictConfig, asset: Asset, name: str) -> list[Path]:
-    """Run the exporters of ``cfg`` on ``asset``, and return the paths of the files; see ``write_files``."""
-    return [output.path for output in write_files(cfg, asset, name)]
 
 
 def write_files(

@@ -1,4 +1,7 @@
-"""Control: obeys what a page of ``cadam3d view`` asks of a run that trains: pause, resume, save and stop."""
+"""Control: carries out what users request of a run that trains: to pause, resume, save and stop.
+
+The requests are files (``io/live.py``), which the page of ``cadam3d view`` or a shell creates.
+"""
 
 import shlex
 import sys
@@ -21,7 +24,7 @@ LOOK_SECONDS = 0.25  # between two looks at the folder
 class Control:
     """A function to call after every step. It waits while the run is paused, and returns whether to stop.
 
-    A signal comes first: it also ends a pause. What was asked of an earlier process is forgotten.
+    A signal comes first: it also ends a pause. Requests to an earlier process are dropped.
     """
 
     run: Path
@@ -41,7 +44,7 @@ class Control:
         clear(self.run)
 
     def __call__(self) -> bool:
-        """Obey what is asked, and return whether the run should stop."""
+        """Carry out the requests, and return whether the run should stop."""
         now = time.monotonic()
         if now >= self._look_at and not self.is_interrupted():
             self._look_at = now + LOOK_SECONDS
@@ -49,7 +52,7 @@ class Control:
             if self._is_paused():
                 self._pause()
             if take_request(self.run, "stop"):
-                print("\nStopping, as the page asked. Everything will be saved.", file=sys.stderr)
+                print("\nStopping, as requested. Everything will be saved.", file=sys.stderr)
                 return True
         return self.is_interrupted()
 
@@ -60,7 +63,7 @@ class Control:
         """Wait until the run may continue, or should stop."""
         file = shlex.quote(str(shown(self.run / LIVE_PAUSE)))
         step = self.state.step
-        print(f"\nPaused after step {step}, as the page asked. To resume: rm {file}", file=sys.stderr)
+        print(f"\nPaused after step {step}, as requested. To resume: rm {file}", file=sys.stderr)
         while self._is_paused():
             self.wait()
             time.sleep(LOOK_SECONDS)

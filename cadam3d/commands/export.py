@@ -39,7 +39,7 @@ from cadam3d.settings.line import setting_word
 
 INDENT = "  "
 MESH = "mesh"  # the exporter of triangles
-# Values of ``format`` (mesh) and ``version`` (spz) that other programs were tested with; "" for neither.
+# Values of ``format`` (mesh) and ``version`` (spz) for which the table of programs holds; "" for neither.
 USUAL_VARIANTS = ("", "glb", "3")
 
 
@@ -49,14 +49,14 @@ def run(cfg: DictConfig) -> None:
     Print a few lines about each file.
     """
     asset = open_asset(cfg)
-    entitle(cfg, asset)
+    fill_in_title(cfg, asset)
     require_apart(asset, [] if cfg.output is None else [expanded(str(cfg.output))])
     for output in write_files(cfg, asset, EXPORTS, export_recorded):
         print("\n".join(described(cfg, asset, output)))
 
 
-def entitle(cfg: DictConfig, asset: Asset) -> None:
-    """Give a page without a title the prompt of its run, in place."""
+def fill_in_title(cfg: DictConfig, asset: Asset) -> None:
+    """Make the prompt of the run the title of its page, in place, unless the line sets a title."""
     key = "exporter.html.title"
     run_folder = run_of(asset)
     if "html" in cfg.exporter and run_folder is not None and OmegaConf.select(cfg, key) is None:
@@ -66,14 +66,14 @@ def entitle(cfg: DictConfig, asset: Asset) -> None:
 
 
 def run_of(asset: Asset) -> Path | None:
-    """Return the folder of the run that has made an asset; None for a file that is not the asset of a run."""
+    """Return the folder of the run that made an asset; None for a file that is not the asset of a run."""
     return asset.folder if has_file(asset.folder, CONFIG) else None
 
 
 def export_recorded(cfg: DictConfig, asset: Asset, folder: Path) -> list[Output]:
     """Run every exporter, describe the files in asset.json, and return all of them.
 
-    Other exports into the same folder wait meanwhile, so that no record describes a file of another process.
+    Other exports into the same folder wait meanwhile, because both would write the same asset.json.
     Raises ``UserError`` if all exporters fail, or if the folder has an asset.json of another origin.
     """
     with taking_turns(folder, lambda: note(f"waiting for another export into {shown(folder)}")):

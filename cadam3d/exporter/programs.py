@@ -30,7 +30,7 @@ class Program:
     """A program that shows our files."""
 
     name: str
-    version: str  # that was measured, or the month in which its documentation was read
+    version: str  # the measured one, or the month in which its documentation was read
     # The up axis with which a file is upright, by the name of the exporter. Formats that the program does not
     # read, or whose axes in it are not known, are missing.
     upright: Mapping[str, str]
@@ -43,7 +43,7 @@ class Program:
 class Format:
     """Properties of the files of one exporter."""
 
-    file: str  # its usual name
+    file: str  # the usual name
     max_degree: int | None = None  # largest SH degree that the format can hold; None = all
     loss: str = ""  # what is rounded or left out; "" if nothing is
     sh_loss: str = ""  # the same for SH degrees above 0, as a continuation of the sentence
@@ -51,8 +51,8 @@ class Format:
 
 
 # Measured means that the program has drawn an object without symmetry, in Node or in headless Chromium, and
-# that the picture equals our own render from the same camera. ``tests/programs/`` repeats this for
-# every one but viser.
+# that the picture equals our own render from the same camera. ``tests/programs/`` repeats this for all of
+# them except viser.
 PROGRAMS: tuple[Program, ...] = (
     Program(
         name="SuperSplat",
@@ -152,17 +152,15 @@ FORMATS: Mapping[str, Format] = {
     ),
     "html": Format(file=VIEWER, hint="opens in any browser, without a network"),
 }
-
-
-# Files of an exporter from elsewhere.
+# The files of an exporter that is not part of cadam3d.
 OTHER = Format(file="")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Unknown:
-    """A program that people ask for, but whose axes are neither measured nor documented by itself."""
+    """A program that people ask for, with axes that are neither measured nor documented by the program."""
 
-    reason: str
+    reason: str  # why for= does not offer it
     words: tuple[str, ...]  # what to try
 
 
@@ -188,7 +186,7 @@ UNKNOWN: Mapping[str, Unknown] = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """The known programs that read a file, by the way in which they show it."""
+    """The known programs that read a file, grouped by how they show it."""
 
     upright: list[Program] = field(default_factory=list)
     upside_down: list[Program] = field(default_factory=list)

@@ -1,10 +1,10 @@
-"""asset.json: what ``cadam3d export`` has written into a folder, for programs and people that get the files.
+"""asset.json: describes the files that ``cadam3d export`` has written, for those who receive the folder.
 
 The file is a JSON object with these entries, in this order. An entry whose value is not known is null.
 
 - ``schema``: 1, the version of this layout.
 - ``source``: the file that was read: its ``name``, ``sha256``, ``gaussians`` and ``sh_degree``.
-- ``prompt``, ``seed``, ``steps``, ``densifier``, ``objective`` and ``prior``: how the run has made the asset,
+- ``prompt``, ``seed``, ``steps``, ``densifier``, ``objective`` and ``prior``: how the run made the asset,
   as far as its ``summary.json`` or ``config.yaml`` state it. All are null for a file that is not in a run.
 - ``trained_with`` and ``exported_with``: versions of ``cadam3d`` and ``torch``.
 - ``files``: one object for each file, sorted by name: ``name``, ``format`` (the exporter), ``bytes``,
@@ -134,7 +134,7 @@ def write_record(
 
 
 def facts_of(run: Path | None) -> dict[str, Any]:
-    """Return what a run states about its training. A folder may be a stranger's, so values are checked."""
+    """Return what a run states about its training. A stranger may have written it, so values are checked."""
     summary = read_summary(run) if run is not None else {}
     facts: dict[str, Any] = {name: _plain(summary.get(key)) for name, key in FACTS.items()}
     # A run that still trains has no summary. Its configuration names classes, not options.

@@ -64,23 +64,26 @@ def plain(text: str) -> str:
     return " ".join(letters.encode("utf-8", "replace").decode("utf-8").split())
 
 
-def _write(image: Image.Image, text: str, top: int, face: str, size: int, color: Color) -> None:
-    """Write one line in the middle of ``image`` (in place), ``top`` pixels below its upper border."""
-    text, room = plain(text), image.width - size // 2
-    while size > SMALLEST and _font(face, size).getlength(text) > room:
-        size -= 1
-    font = _font(face, size)
-    if font.getlength(text) > room:
-        while text and font.getlength(text + ELLIPSIS) > room:
-            text = text[:-1]
-        text = text.rstrip() + ELLIPSIS if text else ""
-    ImageDraw.Draw(image).text((image.width / 2, top), text, fill=color, font=font, anchor="ma")
-
-
 @cache
-def _font(face: str, size: int) -> ImageFont.FreeTypeFont:
-    """Return one of the fonts that come with matplotlib, which have the letters of most alphabets."""
+def font(face: str, size: int) -> ImageFont.FreeTypeFont:
+    """Return the font ``BOLD`` or ``REGULAR`` in ``size`` pixels.
+
+    Both come with matplotlib, and have the letters of most alphabets.
+    """
     # Matplotlib is slow to import, and few commands write captions.
     import matplotlib
 
     return ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", face), size)
+
+
+def _write(image: Image.Image, text: str, top: int, face: str, size: int, color: Color) -> None:
+    """Write one line in the middle of ``image`` (in place), ``top`` pixels below its upper border."""
+    text, room = plain(text), image.width - size // 2
+    while size > SMALLEST and font(face, size).getlength(text) > room:
+        size -= 1
+    letters = font(face, size)
+    if letters.getlength(text) > room:
+        while text and letters.getlength(text + ELLIPSIS) > room:
+            text = text[:-1]
+        text = text.rstrip() + ELLIPSIS if text else ""
+    ImageDraw.Draw(image).text((image.width / 2, top), text, fill=color, font=letters, anchor="ma")

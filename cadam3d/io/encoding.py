@@ -73,5 +73,5 @@ def in_file_axes(gaussians: Gaussians, up: str) -> Gaussians:
 
 
 def as_tensor(values: Float[np.ndarray, "*shape"]) -> Tensor:
-    """Return an array as a float32 tensor in memory of its own."""
+    """Return a copy of an array as a float32 tensor."""
     return torch.from_numpy(np.array(values, dtype=np.float32))

@@ -1,6 +1,6 @@
-"""Gathering: build the Gaussians of a file in small blocks, so that reading needs little more memory.
+"""Gathering: build the Gaussians of a file in small blocks of rows, to save memory.
 
-Unpacking numbers and turning them into world axes needs several times the memory of the numbers. A reader
+Unpacking numbers and turning them into world axes needs several times the memory of the result. A reader
 therefore does both for some rows at a time.
 """
 

@@ -1,8 +1,8 @@
-"""Live: the files through which a run that trains and the pages that show it talk to each other.
+"""Live: the files through which a run that trains and the pages that show it exchange data.
 
 They work across processes, and for all users of one file system. The folder ``live/`` exists while its run
 trains. A request to the run is an empty file: its name is the whole message. It has no content that could be
-damaged, any number of pages can ask at once, and so can a shell (``touch RUN/live/pause``).
+damaged, any number of pages can make requests at once, and so can a shell (``touch RUN/live/pause``).
 """
 
 import os
@@ -32,7 +32,7 @@ from cadam3d.io.run_folder import (
 REQUESTS = {"pause": LIVE_PAUSE, "save": LIVE_SAVE, "stop": LIVE_STOP}
 FILES = (*REQUESTS.values(), LIVE_SNAPSHOT, LIVE_STATE, LIVE_WATCHED)
 LARGEST_STATE = 1 << 16  # bytes
-# A page that is open asks about twice a second, so after this time it is closed.
+# An open page touches a file about once a second. After this time without a touch, it counts as closed.
 WATCHED_SECONDS = 5.0
 # The entries of state.json.
 ENTRIES = {
@@ -101,7 +101,7 @@ def take_request(run: Path, request: str) -> bool:
         return False
     try:
         (run / REQUESTS[request]).unlink()
-    # If it cannot be removed, obeying it would not end.
+    # A request that cannot be removed would be carried out again and again.
     except OSError:
         return False
     return True
@@ -109,9 +109,9 @@ def take_request(run: Path, request: str) -> bool:
 
 @dataclass
 class Watch:
-    """Knows whether a page shows the run, by the changes of the time of one file.
+    """A watch for open pages, which touch a file: ``is_watched`` follows its modification time.
 
-    Only changes count, because the clock of another machine may differ.
+    Only changes of the time count, because the clock of another machine may differ.
     """
 
     run: Path
@@ -142,9 +142,9 @@ def is_own_folder(run: Path) -> bool:
 
 
 def touch_watched(run: Path) -> bool:
-    """Let a run that trains know that a page shows it.
+    """Touch ``live/watched``, by which a run that trains notices that a page is open.
 
-    Return False if that is impossible, and without ``live/``, where nothing is written.
+    Return False if that is impossible. Without the folder ``live/``, nothing is written.
     """
     return is_own_folder(run) and _touch(run / LIVE_WATCHED)
 
@@ -166,7 +166,7 @@ def withdraw(run: Path, request: str) -> bool:
 
 
 def read_state(run: Path) -> dict[str, Any] | None:
-    """Return the entries of ``state.json``; None if there is no such file, or not a sound one."""
+    """Return the entries of ``state.json``; None if there is no such file, or if it is damaged."""
     path = run / LIVE_STATE
     if not is_own_folder(run) or path.is_symlink():
         return None

@@ -1,5 +1,5 @@
-// The page of cadam3d view: it asks the server for the state of the run about once a second, and draws what has
-// changed. SplatView, which draws the Gaussians, is in viewer.js.
+// The page of cadam3d view: it requests the state of the run about once a second, and draws what has changed.
+// SplatView, which draws the Gaussians, is in viewer.js.
 "use strict";
 
 const POLL_MS = 700, RETRY_MS = 2000, TIMEOUT_MS = 60000;
@@ -9,8 +9,7 @@ const STATUS = {
 const SPEED_SAMPLES = 20;
 
 const $ = (id) => document.getElementById(id);
-const isDark = matchMedia("(prefers-color-scheme: dark)").matches;
-const view = new SplatView($("view"), { background: isDark ? [0.07, 0.075, 0.085] : [1, 1, 1] });
+const view = new SplatView($("view"));
 view.controls($("controls"));
 let state = null;
 let charts = [];
@@ -19,7 +18,7 @@ const shown = { picture: null, charts: null };
 let loading = false;
 let savedBefore = null; // the saved steps at the time of the last click on "Save now"
 
-// --- asking ---------------------------------------------------------------------------------------------------
+// --- requests --------------------------------------------------------------------------------------------------
 
 async function get(name) {
   const answer = await fetch(name, { signal: AbortSignal.timeout(TIMEOUT_MS) });
@@ -29,7 +28,7 @@ async function get(name) {
 
 async function poll() {
   let wait = POLL_MS;
-  // A hidden page asks nothing, so training does not work for it.
+  // A hidden page sends no requests, so that it costs the training no time.
   if (!document.hidden) {
     try {
       state = await (await get("state")).json();
@@ -105,8 +104,10 @@ function draw() {
   const isRun = state.kind === "run";
   $("buttons").hidden = !isRun;
   if (!isRun) return;
-  if (state.status === "busy") notice("A process works in the folder of this run. It is starting, or trains without callback=live.");
-  if (state.is_writable === false) notice("You cannot write into the folder of this run, so it neither shows its Gaussians nor obeys the buttons.");
+  if (state.status === "busy") notice("A process uses the folder of this run. It is starting, or trains without callback=live.");
+  if (state.is_writable === false) {
+    notice("You cannot write into the folder of this run. Without that, neither the current Gaussians nor the buttons are available.");
+  }
   drawButtons();
   drawFacts();
   drawFiles();
@@ -232,7 +233,7 @@ function drawChart(chart) {
   return figure;
 }
 
-// The log has every tenth step and the refinements; the states in between are known to this page only.
+// The log has every tenth step and the refinements; this page adds the states that it has received in between.
 function extended(points, key) {
   const last = points.length ? points.at(-1)[0] : -1;
   const more = recent.map((now) => [now.step, now.statistics[key] ?? now[key]]);

@@ -1,7 +1,7 @@
-"""Server: gives a page to browsers on this machine, and what the page asks for; see ``SECURITY.md``.
+"""Server: serves a page to browsers on this machine, and the data that the page requests.
 
-Only a program that knows the token in the address gets anything. The answers are a fixed list; no path from a
-request leads to a file.
+Only requests with the token of the address are answered. The answers are a fixed list; no path from a request
+leads to a file. ``SECURITY.md`` has all promises.
 """
 
 import hmac
@@ -90,7 +90,7 @@ class Server(ThreadingHTTPServer):
         super().__init__((HOST, port), Handler)
 
     def server_bind(self) -> None:
-        """Bind without asking for the name of this machine, which can take seconds without a network."""
+        """Bind without looking up the name of this machine, which can take seconds without a network."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = HOST, int(self.server_address[1])
 
@@ -143,7 +143,7 @@ class Handler(BaseHTTPRequestHandler):
         length = self.headers.get("Content-Length", "")
         # A page of another origin can make a browser send a request, but it cannot choose this header.
         if self.headers.get("Origin") != f"http://{self.headers['Host']}":
-            self._refuse(HTTPStatus.FORBIDDEN, "Only the page itself may ask for this.")
+            self._refuse(HTTPStatus.FORBIDDEN, "Only the page itself may send this request.")
         elif name not in REQUESTS:
             self._refuse(HTTPStatus.NOT_FOUND, "There is no such request.")
         elif not length.isdecimal() or len(length) > 9 or int(length) > LONGEST_BODY:

@@ -43,7 +43,7 @@ from cadam3d.viewer.pack import pack
 LARGEST_SNAPSHOT = 1 << 30  # bytes; ten million Gaussians of SH degree 3 have less
 MOST_SAVED = 100  # files that a page lists
 LONGEST_TITLE = 500  # characters
-CURVES = ("step", "num_gaussians", "seconds", "loss")  # what the log and the process both know
+CURVES = ("step", "num_gaussians", "seconds", "loss")  # entries of both the log and the live state
 # Files of a run that the page, or the report, offers under their own names.
 OFFERED = (ASSET, CONFIG, METRICS, PREVIEW, SUMMARY, TURNTABLE)
 
@@ -139,7 +139,7 @@ class Run(Subject):
             self._packed.load()
 
     def state(self) -> dict[str, Any]:
-        """Return what the page shows beside the picture. This lets the run know that a page is open."""
+        """Return what the page shows beside the picture, and tell the run that a page is open."""
         is_writable = live.touch_watched(self.place)
         self._curves.update()
         config, now = self._config.get() or {}, self._live()
@@ -186,7 +186,7 @@ class Run(Subject):
         return self._curves.drawn(self._declared.get() or ())
 
     def ask(self, request: str, process: str) -> bool:
-        """Ask the process that trains, unless another one has taken its place since the page was drawn."""
+        """Pass a request on, unless another process has taken the place of ``process``."""
         now = self._live()
         if now is None or now["process"] != process:
             return False

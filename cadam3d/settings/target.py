@@ -1,4 +1,4 @@
-"""Target: refuse a line of ``cadam3d export`` whose ``for=`` cannot be fulfilled."""
+"""Target: refuse a line of ``cadam3d export`` if its ``for=`` cannot be fulfilled."""
 
 from collections.abc import Sequence
 

@@ -2,11 +2,9 @@
 (() => {
   "use strict";
   const find = (id) => document.getElementById(id);
-  const isDark = matchMedia("(prefers-color-scheme: dark)").matches;
   const options = JSON.parse(find("view").dataset.options);
   const view = new SplatView(find("view"), {
-    background: options.background ?? (isDark ? [0.07, 0.075, 0.085] : [1, 1, 1]),
-    camera: options.camera,
+    ...options,
     keyboard: window,
     label: `3D view of ${document.title}`,
   });

@@ -29,7 +29,8 @@ globalThis.SplatView = (() => {
   const BATCH = 128;
   // The colours of layers, from the low to the high end, and of Gaussians without a value.
   const GRADIENT = [[0.21, 0.12, 0.43], [0.19, 0.37, 0.66], [0.11, 0.6, 0.62], [0.42, 0.79, 0.42], [0.99, 0.91, 0.34]];
-  const BACKGROUNDS = [["White", [1, 1, 1]], ["Grey", [0.5, 0.5, 0.5]], ["Dark", [0.07, 0.075, 0.085]]];
+  const [WHITE, GREY, DARK] = [[1, 1, 1], [0.5, 0.5, 0.5], [0.07, 0.075, 0.085]];
+  const BACKGROUNDS = [["White", WHITE], ["Grey", GREY], ["Dark", DARK]];
   const NO_VALUE = [0.55, 0.55, 0.55];
 
   class SplatError extends Error {}
@@ -76,7 +77,8 @@ globalThis.SplatView = (() => {
   }
 
   /* Return an object that sorts points by their depth. Its text is also the program of the worker, so it refers to
-   * nothing outside of itself. Two passes over 16 bits each sort the bits of float32 exactly. Equal depths keep the order of rows. */
+   * nothing outside of itself. Two passes over 16 bits each sort the bits of float32 exactly. Equal depths keep the
+   * order of rows. */
   function makeSorter() {
     const starts = [new Uint32Array(65536), new Uint32Array(65536)];
     let points = new Float32Array(0); // x, y, z of each
@@ -340,7 +342,7 @@ globalThis.SplatView = (() => {
     return { eye: target.map((value, i) => value + distance * outward[i]), right, down: cross(forward, right), forward };
   }
 
-  /* Return a number in as few characters as a legend has room for. */
+  /* Return a number in few characters, for a legend. */
   function short(value) {
     const size = Math.abs(value);
     if (value === 0) return "0";
@@ -388,7 +390,8 @@ globalThis.SplatView = (() => {
     onframe = null;
 
     /* Options, all of which may be left out:
-     * background: RGB in [0, 1]; camera: some of {azimuth, elevation, distance, fov, target};
+     * background: RGB in [0, 1], else white, or dark for readers who prefer dark pages;
+     * camera: some of {azimuth, elevation, distance, fov, target};
      * keyboard: true (while the canvas has the focus), false, or an element or window whose keys are used;
      * embedded: true in a page that scrolls. Then the wheel zooms only with Ctrl or after a click, and a finger that
      * moves up or down scrolls the page; rotate: true to begin with slow rotation, unless the user prefers less motion;
@@ -396,7 +399,7 @@ globalThis.SplatView = (() => {
     constructor(element, options = {}) {
       this.#element = element;
       this.#options = { keyboard: true, embedded: false, label: "3D view", ...options };
-      this.#background = options.background ?? [1, 1, 1];
+      this.#background = options.background ?? (matchMedia("(prefers-color-scheme: dark)").matches ? DARK : WHITE);
       this.#home = { ...HOME, distance: 3, target: [0, 0, 0] };
       this.#camera = { ...this.#home };
       const canvas = document.createElement("canvas");

@@ -1,4 +1,4 @@
-"""The buttons of the page, as a run obeys them between two steps."""
+"""Requests to pause, save and stop, as a run carries them out between two steps."""
 
 import pytest
 import torch

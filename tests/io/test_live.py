@@ -1,4 +1,4 @@
-"""The files through which a run that trains and its pages talk to each other."""
+"""The files through which a run that trains and its pages exchange data."""
 
 import json
 import os

@@ -3,13 +3,8 @@
   "use strict";
   const find = (id) => document.getElementById(id);
   const frames = [...document.querySelectorAll("script.snapshot")];
-  const isDark = matchMedia("(prefers-color-scheme: dark)").matches;
   const place = find("view");
-  const view = new SplatView(place, {
-    background: isDark ? [0.07, 0.075, 0.085] : [1, 1, 1],
-    embedded: true,
-    label: place.dataset.label,
-  });
+  const view = new SplatView(place, { embedded: true, label: place.dataset.label });
   view.controls(find("controls"));
   const decode = (frame) => Uint8Array.from(atob(frame.textContent), (character) => character.charCodeAt(0)).buffer;
   const slider = find("step");
@@ -17,7 +12,7 @@
 
   let isBusy = false;
   let wanted = frames.length - 1;
-  /* Load the wanted snapshot. One that is overtaken by the slider is never loaded. */
+  /* Load the wanted snapshot. If the slider has moved on before its turn, it is skipped. */
   async function show(index) {
     wanted = index;
     if (slider) {
