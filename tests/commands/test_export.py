@@ -4,13 +4,13 @@ import hashlib
 import json
 import shlex
 import threading
-from importlib import import_module
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
 from omegaconf import OmegaConf
+from programs.files import CASES
 from splats import make_gaussians
 
 import cadam3d
@@ -253,20 +253,11 @@ def test_every_target_is_a_program_with_known_axes():
         assert set(program.upright.values()) <= set(UPS)
 
 
-@pytest.mark.parametrize(
-    ("module", "name"),
-    [
-        ("test_babylon", "Babylon.js"),
-        ("test_playcanvas", "PlayCanvas"),
-        ("test_spark", "Spark"),
-        ("test_splat_transform", "SuperSplat"),
-        ("test_three", "three.js"),
-    ],
-)
-def test_the_table_states_what_the_tests_with_other_programs_measure(module, name):
+@pytest.mark.parametrize("name", CASES)
+def test_the_table_states_what_the_tests_with_other_programs_measure(name):
     [program] = [program for program in PROGRAMS if program.name == name]
     assert program.is_measured
-    measured = {case.exporter: case.upright for case in import_module(f"programs.{module}").CASES}
+    measured = {case.exporter: case.upright for case in CASES[name]}
     assert measured
     assert measured.items() <= program.upright.items()
 

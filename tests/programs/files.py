@@ -1,12 +1,12 @@
-"""Files of the object in every format, and what a program must make of them."""
+"""Files of the object in every format, and the pictures that other programs must draw of them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from programs.render_elsewhere import Picture, View, ours, psnr, turned
+from programs.render_elsewhere import Browser, Picture, View, ours, psnr, turned
 from programs.snowman import snowman_and_pine
 
 from cadam3d.io.compressed_ply import write_compressed_ply
@@ -18,6 +18,22 @@ from cadam3d.io.spz import write_spz
 
 VIEW = View()
 OPPOSITE = {"-y": "+y", "+y": "-y"}
+# Opens a file in a program.
+Draw = Callable[[Path], Picture]
+# The page that shows a file in each program that runs in a browser, and its options.
+PAGES = {
+    "Babylon.js": ("babylon.html", {}),
+    "PlayCanvas": ("playcanvas.html", {}),
+    "Spark": ("spark.html", {}),
+    # Files hold colours for the display. By default three.js takes them for linear and brightens them.
+    "three.js": ("three.html", {"colours": "linear"}),
+}
+
+
+def in_browser(browser: Browser, program: str) -> Draw:
+    """Return a function that opens a file in one of the programs of ``PAGES``."""
+    page, options = PAGES[program]
+    return lambda path: browser.picture(page, path, VIEW, **options)
 
 
 @dataclass(frozen=True)
@@ -71,13 +87,61 @@ class Case:
         return ours(turned(gaussians, up, self.upright), VIEW)
 
 
-def assert_upright(draw: Callable[[Path], Picture], case: Case, folder: Path) -> None:
+def cases(up: str, floors_db: Mapping[str, Sequence[float]]) -> list[Case]:
+    """Return cases with the up axis ``up``: for each format the floors at SH degree 0 and 3, or only at 0."""
+    return [
+        Case(name, degree, up, floor_db)
+        for name, floors in floors_db.items()
+        for degree, floor_db in zip((0, 3), floors, strict=False)
+    ]
+
+
+# The files that programs of ``exporter/programs.py`` show upright. SPZ has a lower floor at SH degree 3,
+# because its coefficients have few bits.
+CASES = {
+    # Babylon.js takes -y for up, except in glTF, which defines its axes. It needs a network for SPZ and SOG.
+    "Babylon.js": [
+        *cases("-y", {"ply": (38, 38), "compressed_ply": (38, 37), "splat": (38,)}),
+        *cases("+y", {"glb": (38, 38)}),
+    ],
+    # The engine shows the numbers of every file unchanged in a world with +y up, whereas SuperSplat, which is
+    # built on it, turns them by half a turn. Like three.js, it cuts off the faint ends of Gaussians.
+    "PlayCanvas": cases("+y", {"ply": (35, 35), "compressed_ply": (35, 35), "sog": (35,), "glb": (35, 35)}),
+    # Spark shows the numbers of every file unchanged in a world with +y up.
+    "Spark": cases(
+        "+y",
+        {
+            **{"ply": (38, 38), "compressed_ply": (38, 37), "splat": (38,), "spz": (38, 36)},
+            **{"sog": (38, 38), "ksplat": (38, 38)},
+        },
+    ),
+    # The program is splat-transform, which has SuperSplat's readers and its own renderer.
+    "SuperSplat": cases(
+        "-y",
+        {
+            **{"ply": (40, 40), "compressed_ply": (38, 38), "splat": (38,), "spz": (38, 36)},
+            **{"spz4": (38, 36), "sog": (38, 38), "ksplat": (38, 38)},
+        },
+    ),
+    # three.js cuts Gaussians off at two standard deviations, where we cut at an alpha of 1/255, and lowers
+    # the opacity of small ones. This limits the PSNR to 31 dB.
+    "three.js": cases(
+        "+y",
+        {
+            **{"ply": (30, 30), "glb": (30, 30), "splat": (30,), "spz": (30, 30)},
+            **{"spz4": (30, 30), "ksplat": (30, 30)},
+        },
+    ),
+}
+
+
+def assert_upright(draw: Draw, case: Case, folder: Path) -> None:
     """Check that ``draw``, which opens a file in a program, gives our picture of the object."""
     path = case.write(folder, case.upright)
     assert_equal(draw(path), case.wanted(case.upright), case.floor_db, path)
 
 
-def assert_wrong_axes_fail(draw: Callable[[Path], Picture], case: Case, folder: Path) -> None:
+def assert_wrong_axes_fail(draw: Draw, case: Case, folder: Path) -> None:
     """Check that the file with the opposite up axis shows the object upside down, and that we notice it."""
     path = case.write(folder, OPPOSITE[case.upright])
     picture = draw(path)

@@ -6,15 +6,13 @@ python tests/programs/measure.py
 import datetime
 import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from programs.files import FORMATS, VIEW, Case
+from programs.files import FORMATS, PAGES, VIEW, Case, Draw, in_browser
 from programs.render_elsewhere import (
     Browser,
-    Picture,
     RefusedError,
     SplatTransform,
     ours,
@@ -24,8 +22,6 @@ from programs.render_elsewhere import (
 )
 from programs.snowman import snowman_and_pine
 
-Draw = Callable[[Path], Picture]
-
 
 def main() -> None:
     print(f"Measured on {datetime.date.today()} with")
@@ -34,10 +30,7 @@ def main() -> None:
         transform = SplatTransform.find()
         programs: dict[str, Draw] = {
             "splat-transform": lambda path: transform.picture(path, VIEW),
-            "Spark": lambda path: browser.picture("spark.html", path, VIEW),
-            "Babylon.js": lambda path: browser.picture("babylon.html", path, VIEW),
-            "PlayCanvas": lambda path: browser.picture("playcanvas.html", path, VIEW),
-            "three.js": lambda path: browser.picture("three.html", path, VIEW, colours="linear"),
+            **{name: in_browser(browser, name) for name in PAGES},
         }
         print("| format |", " | ".join(programs), "|")
         print("|" + "---|" * (1 + len(programs)))

@@ -1,7 +1,7 @@
 """``cadam3d export ply=... for=PROGRAM`` writes a file that this program shows upright, as we render it."""
 
 import pytest
-from programs.files import VIEW, assert_equal
+from programs.files import VIEW, assert_equal, in_browser
 from programs.render_elsewhere import Browser, SplatTransform, ours
 from programs.snowman import snowman_and_pine
 
@@ -16,20 +16,20 @@ def browser():
         yield started
 
 
-# For each program its page, the options of the page, and the floor of the PSNR in dB.
-PAGES = {
-    "babylon": ("babylon.html", {}, 38),
-    "playcanvas": ("playcanvas.html", {}, 35),
-    "spark": ("spark.html", {}, 38),
-    "three": ("three.html", {"colours": "linear"}, 30),
+# For each target the program, and the floor of the PSNR in dB.
+TARGETS = {
+    "babylon": ("Babylon.js", 38),
+    "playcanvas": ("PlayCanvas", 35),
+    "spark": ("Spark", 38),
+    "three": ("three.js", 30),
 }
 
 
-@pytest.mark.parametrize("target", PAGES)
+@pytest.mark.parametrize("target", TARGETS)
 def test_the_file_for_a_program_is_upright_there(browser, target, type_line, tmp_path):
-    page, options, floor_db = PAGES[target]
+    program, floor_db = TARGETS[target]
     [path] = export_for(target, type_line, tmp_path)
-    picture = browser.picture(page, path, VIEW, **options)
+    picture = in_browser(browser, program)(path)
     assert_equal(picture, ours(snowman_and_pine(3), VIEW), floor_db, path)
 
 
