@@ -4,7 +4,6 @@ import http.client
 import json
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -16,6 +15,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+from chromium import headless
 from splats import make_gaussians
 
 from cadam3d.io.ply import read_ply, write_ply
@@ -30,9 +30,6 @@ SMALL += (
     "callback.live.seconds=0.1",
 )
 ENDLESS = 1_000_000  # steps
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-FLAGS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-FLAGS += ("--ignore-gpu-blocklist", "--disable-quic", "--no-first-run", "--disable-background-networking")
 PATIENCE = 60  # seconds, for a machine that is busy
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs signals")
@@ -164,16 +161,8 @@ def test_a_port_that_does_not_exist_is_refused(port, type_line):
 @pytest.fixture
 def browser() -> Iterator:
     """Return a page of a real browser, or skip the test."""
-    api = pytest.importorskip("playwright.sync_api")
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium here")
-    with api.sync_playwright() as play:
-        try:
-            started = play.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
-        except api.Error as error:
-            pytest.skip(f"the browser does not run here: {str(error)[:200]}")
+    with headless() as started:
         yield started.new_page(viewport={"width": 1100, "height": 700})
-        started.close()
 
 
 @pytest.mark.slow

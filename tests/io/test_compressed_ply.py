@@ -1,32 +1,18 @@
 """Compressed PLY: bounded errors, two layouts, and the same numbers as gaussforge in both directions."""
 
-import math
 import struct
 
 import numpy as np
 import pytest
 import torch
-from programs.snowman import snowman_and_pine
+from formats import WRONG_DB, asset, likeness_db, random_gaussians
 
-from cadam3d.core.cameras import turntable
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0
 from cadam3d.io.compressed_ply import morton_order, read_compressed_ply, write_compressed_ply
 from cadam3d.io.frames import UPS
 from cadam3d.io.ply import read_ply, write_ply
-from cadam3d.rasterizer.reference import ReferenceRasterizer
-
-
-def random_gaussians(n: int, degree: int = 0, seed: int = 0) -> Gaussians:
-    draw = torch.Generator().manual_seed(seed)
-
-    def normal(*shape):
-        return torch.randn(*shape, generator=draw)
-
-    return Gaussians(
-        normal(n, 3), normal(n, 3) - 3, normal(n, 4), 3 * normal(n), 0.5 * normal(n, (degree + 1) ** 2, 3)
-    )
 
 
 def read_back(folder, gaussians: Gaussians, up: str = "-y") -> Gaussians:
@@ -63,20 +49,10 @@ def test_errors_are_at_most_half_a_step(tmp_path, up, degree):
 
 @pytest.mark.parametrize(("degree", "least_db"), [(0, 50), (3, 45)])
 def test_the_picture_of_the_file_is_the_picture_of_the_asset(tmp_path, degree, least_db):
-    cameras = turntable(2, elevation_deg=15.0, distance=3.0, fov_y_deg=49.1, size=100)
-
-    def picture(gaussians: Gaussians) -> torch.Tensor:
-        return ReferenceRasterizer().render(gaussians, cameras, torch.ones(2, 3)).rgb.detach()
-
-    def psnr(other: Gaussians) -> float:
-        return -10 * math.log10((picture(other) - expected).square().mean().item())
-
-    made = snowman_and_pine(degree)
-    expected = picture(made)
-    back = read_back(tmp_path, made)
-    assert psnr(back) > least_db
-    # A wrong axis fails the same test.
-    assert psnr(Gaussians(**{**back.tensors(), "means": back.means * torch.tensor([1.0, -1.0, -1.0])})) < 20
+    back = read_back(tmp_path, asset(degree))
+    assert likeness_db(back, degree) > least_db
+    turned_over = Gaussians(**{**back.tensors(), "means": back.means * torch.tensor([1.0, -1.0, -1.0])})
+    assert likeness_db(turned_over, degree) < WRONG_DB
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

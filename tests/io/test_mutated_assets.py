@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from formats import random_gaussians
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -37,17 +38,6 @@ FIRST = int(os.environ.get("CADAM3D_FIRST_MUTATION", "0"))
 MOST_SECONDS = 20.0  # of one file, on a busy machine
 MOST_EXPANSION = 20  # times the size of the file
 SPARE_BYTES = 64 << 20
-
-
-def some_gaussians(n: int, degree: int, seed: int = 0) -> Gaussians:
-    draw = torch.Generator().manual_seed(seed)
-
-    def normal(*shape):
-        return torch.randn(*shape, generator=draw)
-
-    return Gaussians(
-        normal(n, 3), normal(n, 3) - 3, normal(n, 4), normal(n), 0.3 * normal(n, (degree + 1) ** 2, 3)
-    )
 
 
 def table_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
@@ -89,7 +79,7 @@ def plain_ply(columns: dict[str, np.ndarray], encoding: str, before: bytes = b""
 
 def written(write: Callable, degree: int, name: str, folder: Path, n: int = 20) -> bytes:
     extra = {"pad_sh": 0} if write is write_ply else {}
-    write(folder / name, some_gaussians(n, degree), up="-y", **extra)
+    write(folder / name, random_gaussians(n, degree), up="-y", **extra)
     return (folder / name).read_bytes()
 
 
@@ -112,7 +102,7 @@ def read_cloud(path: Path) -> Gaussians:
     """Read plain points, as far as a reader does it."""
     points, rgb = read_points(read_header(path))
     assert rgb is None or (rgb.min(initial=0) >= 0 and rgb.max(initial=1) <= 1)
-    return some_gaussians(min(len(points), 1000), 0)
+    return random_gaussians(min(len(points), 1000), 0)
 
 
 CAMERA = b"element camera 1\nproperty double t\nproperty uchar id\n"
@@ -133,7 +123,7 @@ READERS: dict[str, tuple[Callable[[Path], Gaussians], str]] = {
 def samples(tmp_path_factory) -> dict[str, bytes]:
     """Return a small valid file of each format."""
     folder = tmp_path_factory.mktemp("samples")
-    columns = table_of(some_gaussians(20, 1))
+    columns = table_of(random_gaussians(20, 1))
     points = {name: columns[name] for name in ("z", "x", "y")}
     colors = {name: np.arange(20, dtype=np.uint8) for name in ("red", "green", "blue")}
     doubles = {name: values.astype(np.float64) for name, values in reversed(columns.items())}
@@ -347,7 +337,7 @@ def test_a_mutated_file_is_read_or_refused_with_one_message(name, samples, tmp_p
 
 def repeated(rows: int, kind: str) -> bytes:
     """Return a PLY of degree 3 with equal rows of one-byte numbers, or of one-digit numbers in text."""
-    columns = {name: np.ones(rows, dtype=np.int8) for name in table_of(some_gaussians(1, 3))}
+    columns = {name: np.ones(rows, dtype=np.int8) for name in table_of(random_gaussians(1, 3))}
     if kind == "binary":
         return plain_ply(columns, "binary_little_endian")
     header = plain_ply({name: values[:0].astype(np.float64) for name, values in columns.items()}, "ascii")

@@ -26,6 +26,7 @@ from urllib.parse import urlencode, urlsplit
 import numpy as np
 import pytest
 import torch
+from chromium import headless
 from PIL import Image
 
 from cadam3d.core.cameras import Cameras, orbit
@@ -40,16 +41,6 @@ VULKAN_DRIVERS = (
     "/usr/lib/chromium/vk_swiftshader_icd.json",
     "/usr/lib64/chromium-browser/vk_swiftshader_icd.json",
     "/opt/google/chrome/vk_swiftshader_icd.json",
-)
-CHROMIUM_FLAGS = (
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
 )
 PATIENCE_S = 120  # for one picture; a busy machine with two cores needs up to 30
 
@@ -178,20 +169,9 @@ class Browser:
     @contextmanager
     def start(cls, *, needs_packages: bool = True) -> Iterator["Browser"]:
         """Start the browser and the server; skip the test where something is absent."""
-        playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
-        names = ("chromium", "chromium-browser", "google-chrome")
-        executable = next((found for name in names if (found := shutil.which(name))), None)
-        if executable is None:
-            pytest.skip("no chromium")
         folders = {"pages": PAGES, **({"packages": packages()} if needs_packages else {})}
-        with _serve(folders) as origin, playwright.sync_playwright() as start:
-            chromium = start.chromium.launch(
-                executable_path=executable, args=["--no-sandbox", *CHROMIUM_FLAGS]
-            )
-            try:
-                yield cls(chromium, origin, folders)
-            finally:
-                chromium.close()
+        with _serve(folders) as origin, headless() as chromium:
+            yield cls(chromium, origin, folders)
 
     def picture(self, page: str, path: Path, view: View, **options: str) -> Picture:
         """Return the picture of a file on one of our pages, such as ``"spark.html"``.

@@ -6,13 +6,13 @@ These tests skip themselves without playwright or without Chromium. They share o
 import base64
 import io
 import math
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from chromium import headless
 from PIL import Image
 from snapshots import some_gaussians
 
@@ -24,13 +24,6 @@ from cadam3d.report import write_report
 from cadam3d.viewer.pack import pack
 from cadam3d.viewer.page import script, style, viewer_page
 
-playwright = pytest.importorskip("playwright.sync_api")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-if CHROMIUM is None:
-    pytest.skip("needs Chromium", allow_module_level=True)
-
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-FLAGS += ["--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update"]
 SIZE = 480  # pixels
 DISTANCE, FOV = 2.6, 45.0
 # A page with views of different options and no policy.
@@ -45,13 +38,8 @@ const failure = (promise) => promise.then(() => "loaded", (error) => error.messa
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator:
-    with playwright.sync_playwright() as driver:
-        try:
-            started = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        except playwright.Error as error:
-            pytest.skip(f"the browser does not run here: {error}")
+    with headless() as started:
         yield started
-        started.close()
 
 
 @pytest.fixture
