@@ -25,7 +25,7 @@ from cadam3d.sweep.folder import is_sweep
 
 
 def run(cfg: DictConfig) -> None:
-    """Serve the page of ``run=`` or ``ply=`` until Ctrl-C. For a sweep, show its report instead."""
+    """Serve the page of ``run=`` or ``ply=`` until Ctrl-C. For a sweep, open its report instead."""
     require_whole("port", cfg.port, low=0, high=65535, example=0)
     require_one(cfg)
     if cfg.run is not None and is_sweep(folder := typed_path(str(cfg.run))):
@@ -88,4 +88,4 @@ def _hint(port: int) -> str:
         user = "USER"
     place = shlex.quote(f"{user}@{socket.gethostname()}")
     tunnel = f"ssh -L {port}:{HOST}:{port} {place}"
-    return f"Ctrl-C ends this. To open the address on another machine, run this there first: {tunnel}"
+    return f"Ctrl-C ends the server. To open the address on another machine, first type there: {tunnel}"

@@ -144,7 +144,7 @@ def test_a_single_file_is_served_and_a_port_that_is_in_use_is_named(tmp_path, ty
     monkeypatch.setattr("cadam3d.live.server.Server.serve_forever", lambda self: None)
     code, out, err = type_line("view", "ply=thing.ply", "open=false")
     assert (code, err) == (0, "")
-    assert re.match(r"http://127\.0\.0\.1:\d+/[\w-]{20,}/\nCtrl-C ends this\.", out)
+    assert re.match(r"http://127\.0\.0\.1:\d+/[\w-]{20,}/\nCtrl-C ends the server\.", out)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         message = type_line("view", "ply=thing.ply", "open=false", f"port={port}").message
