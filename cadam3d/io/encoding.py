@@ -61,10 +61,13 @@ def unit_quats(gaussians: Gaussians) -> Float[np.ndarray, "n 4"]:
 def in_file_axes(gaussians: Gaussians, up: str) -> Gaussians:
     """Return the Gaussians as they are written: float32, on the CPU, with the up axis ``up``.
 
-    Turning mixes SH coefficients, so the largest ones might become infinite; they are clamped.
+    Turning mixes SH coefficients, so the largest ones might become infinite; they are clamped. A coefficient
+    that is infinite before stays so.
     """
-    local = world_to_file(gaussians.detach().to("cpu").to(torch.float32), up)
-    return replace(local, sh=local.sh.clamp(-LARGEST, LARGEST))
+    world = gaussians.detach().to("cpu").to(torch.float32)
+    local = world_to_file(world, up)
+    is_sound = world.sh.isfinite().all(dim=1, keepdim=True)
+    return replace(local, sh=torch.where(is_sound, local.sh.clamp(-LARGEST, LARGEST), local.sh))
 
 
 def as_tensor(values: Float[np.ndarray, "*shape"]) -> Tensor:
