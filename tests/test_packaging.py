@@ -115,7 +115,7 @@ def test_every_imported_package_is_declared():
         undeclared = {
             name
             for name in foreign
-            if not {each.lower().replace("_", "-") for each in provides.get(name, [])} & declared
+            if not {each.lower().replace("_", "-") for each in provides.get(name, [name])} & declared
         }
         assert not undeclared
 
