@@ -20,9 +20,11 @@ from cadam3d import __version__
 from cadam3d.commands.finding import Finding, Verdict, attempt
 from cadam3d.settings.compose import component, compose, config_dir
 
-PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "imageio", "imageio-ffmpeg", "jaxtyping", "kornia")
-PACKAGES += ("jinja2", "matplotlib", "pillow", "pyyaml", "scipy", "tqdm", "trimesh")
+PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "fast-simplification", "imageio", "imageio-ffmpeg")
+PACKAGES += ("jaxtyping", "jinja2", "kornia", "matplotlib", "pillow", "pyyaml", "scikit-image", "scipy")
+PACKAGES += ("tqdm", "trimesh")
 IMPORT_NAMES = {"hydra-core": "hydra", "imageio-ffmpeg": "imageio_ffmpeg", "pillow": "PIL", "pyyaml": "yaml"}
+IMPORT_NAMES |= {"fast-simplification": "fast_simplification", "scikit-image": "skimage"}
 # The messages for compilers that are missing.
 COMPILERS = {
     **dict.fromkeys(("c++", "g++", "clang++"), "not found; one C++ compiler is enough"),

@@ -63,13 +63,13 @@ def unit_quats(gaussians: Gaussians) -> Float[np.ndarray, "n 4"]:
 def in_file_axes(gaussians: Gaussians, up: str) -> Gaussians:
     """Return the Gaussians as they are written: float32, on the CPU, with the up axis ``up``.
 
-    Turning mixes SH coefficients, so the largest ones might become infinite; they are clamped. Numbers that
-    were not finite before stay so.
+    Turning mixes SH coefficients, so the largest ones might become infinite; they are clamped. A coefficient
+    that is infinite before stays so.
     """
-    plain = gaussians.detach().to("cpu").to(torch.float32)
-    local = world_to_file(plain, up)
-    was_finite = plain.sh.isfinite().all(dim=2).all(dim=1)[:, None, None]
-    return replace(local, sh=torch.where(was_finite, local.sh.clamp(-LARGEST, LARGEST), local.sh))
+    world = gaussians.detach().to("cpu").to(torch.float32)
+    local = world_to_file(world, up)
+    is_finite = world.sh.isfinite().all(dim=1, keepdim=True)
+    return replace(local, sh=torch.where(is_finite, local.sh.clamp(-LARGEST, LARGEST), local.sh))
 
 
 def as_tensor(values: Float[np.ndarray, "*shape"]) -> Tensor:
