@@ -115,7 +115,7 @@ def test_an_unknown_axis_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["nothing.ply", ".", "null\0byte.ply"])
-def test_what_is_no_file_is_one_message(tmp_path, name):
+def test_a_path_that_is_not_a_file_is_one_message(tmp_path, name):
     with pytest.raises(UserError):
         read_gaussians(tmp_path / name)
 

@@ -66,7 +66,7 @@ def test_the_length_of_quaternions_does_not_matter(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_one_extreme_gaussian_harms_no_other(tmp_path, kind):
+def test_one_extreme_gaussian_costs_the_others_no_precision(tmp_path, kind):
     gaussians = random_gaussians(100)
     gaussians.log_scales[0], gaussians.opacity_logits[0], gaussians.sh[0] = 3e38, -3e38, 3e38
     WRITERS[kind](tmp_path / "a", gaussians, up="+z")

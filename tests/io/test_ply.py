@@ -483,7 +483,7 @@ def test_lines_may_end_as_on_windows(tmp_path):
 
 
 @pytest.mark.parametrize("path", ["/dev/zero", "x" * 5000, "null\0byte", "."])
-def test_what_is_no_file_is_one_message(path):
+def test_a_path_that_is_not_a_file_is_one_message(path):
     for read in (read_ply, holds_gaussians):
         with pytest.raises(UserError):
             read(Path(path))

@@ -211,7 +211,7 @@ def test_the_state_that_a_killed_process_has_left_is_not_that_of_the_next_one(br
         assert browser.post("stop", b"1 on another machine") == 409
 
 
-def test_the_log_is_believed_where_it_is_ahead_of_the_state(browser, run):
+def test_the_log_decides_where_it_is_ahead_of_the_state(browser, run):
     with training(run, step=3):
         state = browser.json("state")
         assert (state["step"], state["num_gaussians"], state["statistics"]) == (9, 20, {"snr_p50": 0.1})
@@ -247,7 +247,7 @@ def test_two_pages_work_at_once(run):
         assert one.json("state")["asked"] == []
 
 
-# --- who is kept out ---------------------------------------------------------------------------------------
+# --- what is refused ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("token", ["", "x", "..", "%2e%2e", "%00"])

@@ -1,4 +1,4 @@
-"""The object of these tests notices every mistake that a file or a program could make."""
+"""The object of these tests shows every mistake that a file or a program could make."""
 
 from dataclasses import replace
 
