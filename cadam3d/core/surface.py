@@ -41,6 +41,8 @@ APART = 0.02
 # The opacity of a single Gaussian in the colour of a point, at most, as in the rasterizers.
 MOST_OPAQUE = 0.99
 COLORS_AT_ONCE = 1 << 18
+# Gaussians with less opacity on a ray do not change its colour by one step of 255, not even all of them together.
+UNSEEN = 1e-4
 # Light from all Gaussians together below which a point has no colour of its own.
 FAINT = 1e-6
 
@@ -369,22 +371,18 @@ class Painter:
         so that nothing else hides it.
         """
         place, outwards = torch.from_numpy(points), torch.from_numpy(normals)
-        blur = (BLUR * self.grid.cell) ** 2 * torch.eye(3, dtype=torch.float64)
-        precision = torch.linalg.inv(self.some.covariances + blur)
+        rays = torch.cat([place - self.grid.origin, outwards], dim=1).float()
+        table = self._table()
         total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
-        for pairs in near(self.some, self.grid, place):
-            blob, point = pairs
-            away, normal = place[point] - self.some.means[blob], outwards[point]
-            pulled = torch.einsum("pij,pj->pi", precision[blob], normal)
-            straight = torch.einsum("pij,pj->pi", precision[blob], away)
-            distance = (away * straight).sum(1) - (away * pulled).sum(1) ** 2 / (normal * pulled).sum(1)
-            alpha = self.some.opacities[blob] * (-0.5 * distance.clamp_min(0)).exp()
-            depth = (away * normal).sum(1)
-            order = torch.from_numpy(np.lexsort([depth.numpy(), point.numpy()]))
-            blob, point, alpha = blob[order], point[order], alpha[order].clamp_max(MOST_OPAQUE)
-            light = (_transmitted(alpha, point) * alpha).float()
+        for blob, point in near(self.some, self.grid, place):
+            alpha, depth = _met(table.index_select(0, blob), rays.index_select(0, point))
+            seen = (alpha >= UNSEEN).nonzero()[:, 0]
+            blob, point, alpha, depth = blob[seen], point[seen], alpha[seen], depth[seen]
+            order = _by_depth(point, depth)
+            blob, point, alpha = blob[order], point[order], alpha[order]
+            light = (_transmitted(alpha.double(), point) * alpha).float()
             for part in torch.arange(len(blob)).split(COLORS_AT_ONCE):
-                rgb = evaluate_sh(self.sh[blob[part]], -outwards[point[part]].float())
+                rgb = evaluate_sh(self.sh[blob[part]], -rays[point[part], 3:])
                 total.index_add_(0, point[part], light[part, None] * rgb)
             weight.index_add_(0, point, light)
         colors = total / weight.clamp_min(FAINT)[:, None]
@@ -396,6 +394,44 @@ class Painter:
             nearest = torch.from_numpy(KDTree(self.some.means.numpy()).query(points[lost.numpy()])[1])
             colors[lost] = evaluate_sh(self.sh[nearest], -outwards[lost].float())
         return colors.clamp(0, 1).double().numpy()
+
+    def _table(self) -> Float[Tensor, "n 10"]:
+        """Return of each Gaussian its centre, the upper half of its inverse covariance, and its opacity."""
+        blur = (BLUR * self.grid.cell) ** 2 * torch.eye(3, dtype=torch.float64)
+        precision = torch.linalg.inv(self.some.covariances + blur)
+        rows, columns = torch.triu_indices(3, 3)
+        centres, opacities = self.some.means - self.grid.origin, self.some.opacities[:, None]
+        return torch.cat([centres, precision[:, rows, columns], opacities], dim=1).float()
+
+
+def _met(
+    table: Float[Tensor, "pairs 10"], rays: Float[Tensor, "pairs 6"]
+) -> tuple[Float[Tensor, "pairs"], Float[Tensor, "pairs"]]:
+    """Return the opacity of each Gaussian on its ray, and the height of its centre below the point.
+
+    A ray is a point and its normal, along which the camera looks back. The falloff is that of the place on
+    the ray that is nearest to the centre.
+    """
+    mx, my, mz, xx, xy, xz, yy, yz, zz, opacity = table.T.contiguous()
+    x, y, z, u, v, w = rays.T.contiguous()
+    x, y, z = x - mx, y - my, z - mz
+    # The inverse covariance times the normal.
+    a, b, c = xx * u + xy * v + xz * w, xy * u + yy * v + yz * w, xz * u + yz * v + zz * w
+    across = a * x + b * y + c * z
+    along = a * u + b * v + c * w
+    away = x * (xx * x + 2 * (xy * y + xz * z)) + y * (yy * y + 2 * yz * z) + zz * z * z
+    # A huge Gaussian has an inverse covariance of zero in float32, and is the same everywhere.
+    distance = (away - across * across / along).nan_to_num(0.0).clamp_min(0)
+    return (opacity * (-0.5 * distance).exp()).clamp_max(MOST_OPAQUE), x * u + y * v + z * w
+
+
+def _by_depth(point: Int[Tensor, "pairs"], depth: Float[Tensor, "pairs"]) -> Int[Tensor, "pairs"]:
+    """Return the order of the pairs by their points, and by depth at the same point."""
+    if len(depth) == 0:
+        return point
+    low, high = depth.min().double(), depth.max().double()
+    share = 0.5 * (depth.double() - low) / (high - low).clamp_min(1e-30)
+    return torch.from_numpy(np.argsort((point + share).numpy()))
 
 
 def _transmitted(alpha: Float[Tensor, "pairs"], point: Int[Tensor, "pairs"]) -> Float[Tensor, "pairs"]:

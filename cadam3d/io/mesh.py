@@ -30,7 +30,7 @@ GLB_MAGIC, GLB_VERSION = 0x46546C67, 2
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125
 VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
-LINEAR_MIPMAP, LINEAR, CLAMP = 9987, 9729, 33071
+LINEAR, CLAMP = 9729, 33071
 NAME = "cadam3d"
 
 
@@ -198,7 +198,7 @@ def _glb(mesh: _Mesh) -> bytes:
         surface["baseColorTexture"] = {"index": 0}
         document |= {
             "textures": [{"sampler": 0, "source": 0}],
-            "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP, "wrapS": CLAMP, "wrapT": CLAMP}],
+            "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP, "wrapT": CLAMP}],
             "images": [{"bufferView": len(blocks), "mimeType": "image/png"}],
         }
         blocks.append(_png(mesh.texture))
