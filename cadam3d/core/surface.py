@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cadam3d.core.checks import require_range, require_whole
-from cadam3d.core.density import BLUR, Blobs, Grid, blobs, density, grid_around, near
+from cadam3d.core.density import BLUR, CUTOFF, Blobs, Grid, blobs, density, grid_around, near
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import require_memory
@@ -41,7 +41,8 @@ APART = 0.02
 # The opacity of a single Gaussian in the colour of a point, at most, as in the rasterizers.
 MOST_OPAQUE = 0.99
 COLORS_AT_ONCE = 1 << 18
-# Gaussians with less opacity on a ray do not change its colour by one step of 255, not even all of them together.
+# Gaussians with less opacity on a ray are left out; all of them together change its colour by less than one of
+# 255.
 UNSEEN = 1e-4
 # Light from all Gaussians together below which a point has no colour of its own.
 FAINT = 1e-6
@@ -91,9 +92,13 @@ class SurfaceSettings:
         require_whole(f"{self.node}.resolution", self.resolution, low=16, high=1024, example=128)
         require_memory(f"{self.node}.resolution", self.resolution, unit=NODE_BYTES, power=3, example=128)
         require_range(f"{self.node}.level", self.level, above=0, high=1000, example=0.3)
-        require_range(f"{self.node}.smallest_part", self.smallest_part, low=0, below=1, example=0.01)
+        require_range(f"{self.node}.smallest_part", self.smallest_part, low=0, below=1, example=0.002)
         if self.triangles is not None:
             require_whole(f"{self.node}.triangles", self.triangles, low=100, high=2**31, example=50000)
+
+    def most_triangles(self) -> int | None:
+        """Return the most triangles that the surface may have, or None for no limit."""
+        return self.triangles
 
     def surface(self, gaussians: Gaussians) -> tuple[Surface, "Painter"]:
         """Return the outer surface of ``gaussians``, and what knows the colours between its vertices.
@@ -107,8 +112,9 @@ class SurfaceSettings:
             raise self._nothing(some)
         vertices = vertices * grid.cell + grid.origin.numpy()
         vertices, faces = without_specks(vertices, faces, self.smallest_part)
-        if self.triangles is not None:
-            vertices, faces = simplified(vertices, faces, self.triangles)
+        triangles = self.most_triangles()
+        if triangles is not None:
+            vertices, faces = simplified(vertices, faces, triangles)
         normals = vertex_normals(vertices, faces)
         painter = Painter(gaussians.sh.detach().to("cpu").float()[some.rows], some, grid)
         return Surface(vertices, faces, normals, painter.colors(vertices, normals)), painter
@@ -422,7 +428,9 @@ def _met(
     away = x * (xx * x + 2 * (xy * y + xz * z)) + y * (yy * y + 2 * yz * z) + zz * z * z
     # A huge Gaussian has an inverse covariance of zero in float32, and is the same everywhere.
     distance = (away - across * across / along).nan_to_num(0.0).clamp_min(0)
-    return (opacity * (-0.5 * distance).exp()).clamp_max(MOST_OPAQUE), x * u + y * v + z * w
+    # Without the fade, colours would jump where a point enters the reach of a Gaussian.
+    fade = (CUTOFF - away.nan_to_num(0.0).clamp_min(0).sqrt()).clamp(0, 1)
+    return (opacity * fade * (-0.5 * distance).exp()).clamp_max(MOST_OPAQUE), x * u + y * v + z * w
 
 
 def _by_depth(point: Int[Tensor, "pairs"], depth: Float[Tensor, "pairs"]) -> Int[Tensor, "pairs"]:

@@ -27,11 +27,15 @@ class MeshExporter(SurfaceSettings, Exporter):
     format: str  # one of FORMATS
     up: str  # up axis of the file, one of UPS
     texture: int | None  # pixels per side; None = vertex colours
+    textured_triangles: int  # at most, with a texture
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_choice("exporter.mesh.format", self.format, FORMATS)
         require_choice("exporter.mesh.up", self.up, UPS)
+        require_whole(
+            "exporter.mesh.textured_triangles", self.textured_triangles, low=100, high=2**31, example=10000
+        )
         if self.texture is None:
             return
         require_whole("exporter.mesh.texture", self.texture, low=64, high=8192, example=1024)
@@ -41,6 +45,16 @@ class MeshExporter(SurfaceSettings, Exporter):
                 f"got {self.texture}. Try: exporter.mesh.format=glb"
             )
         require_xatlas()
+
+    def most_triangles(self) -> int | None:
+        """Return the most triangles that the surface may have.
+
+        A texture has the details of the colours, so it needs fewer of them, and large ones. Many small
+        triangles are slow to unwrap, and some get no texel of their own.
+        """
+        if self.texture is None:
+            return self.triangles
+        return min(self.textured_triangles, self.triangles or self.textured_triangles)
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
         """Write the mesh, and return the paths of its files; only an obj with a texture has several.

@@ -246,6 +246,11 @@ def linear(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
     return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
 
 
+def srgb(light: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """Return sRGB colours for linear light, the inverse of ``linear``."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0) ** (1 / 2.4) - 0.055)
+
+
 def _bytes(rgb: Float[np.ndarray, "*batch 3"]) -> UInt8[np.ndarray, "*batch 3"]:
     return np.rint(rgb * 255).astype(np.uint8)
 
