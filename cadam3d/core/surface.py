@@ -41,8 +41,8 @@ APART = 0.02
 # The opacity of a single Gaussian in the colour of a point, at most, as in the rasterizers.
 MOST_OPAQUE = 0.99
 COLORS_AT_ONCE = 1 << 18
-# Gaussians with less opacity on a ray are left out; all of them together change its colour by less than one of
-# 255.
+# Gaussians with less opacity on a ray are left out; all of them together change its colour by less than
+# 1/255.
 UNSEEN = 1e-4
 # Light from all Gaussians together below which a point has no colour of its own.
 FAINT = 1e-6
@@ -374,17 +374,17 @@ class Painter:
         Each colour is a render of one ray against the normal, with the image formation model of 3DGS: the
         opacity of a Gaussian is its own times the falloff where the ray is nearest to its centre, and the
         Gaussians are composited in the order of their centres. Only Gaussians that reach the point take part,
-        so that nothing else hides it.
+        so that nothing else hides it, and they fade out towards the end of their reach.
         """
         place, outwards = torch.from_numpy(points), torch.from_numpy(normals)
         rays = torch.cat([place - self.grid.origin, outwards], dim=1).float()
         table = self._table()
         total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
-        for blob, point in near(self.some, self.grid, place):
+        for pairs in near(self.some, self.grid, place):
+            blob, point = pairs
             alpha, depth = _met(table.index_select(0, blob), rays.index_select(0, point))
             seen = (alpha >= UNSEEN).nonzero()[:, 0]
-            blob, point, alpha, depth = blob[seen], point[seen], alpha[seen], depth[seen]
-            order = _by_depth(point, depth)
+            order = seen[_by_depth(point[seen], depth[seen])]
             blob, point, alpha = blob[order], point[order], alpha[order]
             light = (_transmitted(alpha.double(), point) * alpha).float()
             for part in torch.arange(len(blob)).split(COLORS_AT_ONCE):
@@ -413,10 +413,11 @@ class Painter:
 def _met(
     table: Float[Tensor, "pairs 10"], rays: Float[Tensor, "pairs 6"]
 ) -> tuple[Float[Tensor, "pairs"], Float[Tensor, "pairs"]]:
-    """Return the opacity of each Gaussian on its ray, and the height of its centre below the point.
+    """Return the opacity of each Gaussian on its ray, and the depth of its centre below the point.
 
-    A ray is a point and its normal, along which the camera looks back. The falloff is that of the place on
-    the ray that is nearest to the centre.
+    A ray is a point and the normal there, and the camera looks against the normal. The opacity is the one at
+    the place on the ray that is nearest to the centre. It fades out where the point itself is between
+    ``CUTOFF - 1`` and ``CUTOFF`` standard deviations away.
     """
     mx, my, mz, xx, xy, xz, yy, yz, zz, opacity = table.T.contiguous()
     x, y, z, u, v, w = rays.T.contiguous()

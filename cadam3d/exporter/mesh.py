@@ -7,6 +7,7 @@ from typing import ClassVar
 from cadam3d.core.checks import require_choice, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.memory import require_memory
 from cadam3d.core.render import RenderFn
 from cadam3d.core.surface import SurfaceSettings
 from cadam3d.exporter.base import Exporter
@@ -16,6 +17,8 @@ from cadam3d.io.mesh import FORMATS, write_glb, write_mesh_ply, write_obj
 from cadam3d.io.run_folder import ASSET_MESH_GLB, ASSET_MESH_OBJ, ASSET_MESH_PLY
 
 NAMES: dict[str, str] = dict(zip(FORMATS, (ASSET_MESH_GLB, ASSET_MESH_OBJ, ASSET_MESH_PLY), strict=True))
+# Bytes for each texel while a texture is painted, at least.
+TEXEL_BYTES = 40
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +42,7 @@ class MeshExporter(SurfaceSettings, Exporter):
         if self.texture is None:
             return
         require_whole("exporter.mesh.texture", self.texture, low=64, high=8192, example=1024)
+        require_memory("exporter.mesh.texture", self.texture, unit=TEXEL_BYTES, power=2, example=1024)
         if self.format == "ply":
             raise UserError(
                 "exporter.mesh.texture: expected null with format=ply, which has no textures, "

@@ -33,8 +33,8 @@ from cadam3d.io.mesh import linear, srgb
 UPS = ("z", "y")
 # Other formats of trimesh may refer to files elsewhere, or run other programs.
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
-# Colours of vertices and materials in these files are linear, those of textures are sRGB (glTF 2.0, sec. 3.9.2).
-# Other formats have sRGB colours only.
+# Colours of vertices are linear in these files, and those of textures are sRGB (glTF 2.0, sec. 3.9.2). Other
+# formats have sRGB colours only.
 LINEAR_SUFFIXES = (".glb", ".gltf")
 # Linear colours of vertices, among the attributes of a part.
 VERTEX_LIGHT = "vertex light"

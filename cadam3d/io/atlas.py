@@ -14,12 +14,12 @@ from cadam3d.io.mesh import Texture
 # From points of a surface and its normals there to sRGB colours in [0, 1].
 ColorFn = Callable[[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]], Float[np.ndarray, "p 3"]]
 
-# Texels between charts.
+# Texels between charts, the pieces that the surface is cut into.
 PADDING = 4
 # Texels at most this far from a triangle belong to it too. Interpolation between texels reads those that are
 # less than one row and one column away.
 REACH = 1.5
-# Candidate texels that are tested at once; this bounds the memory.
+# Texels that are tested or painted at once; this bounds the memory.
 AT_ONCE = 1 << 20
 
 
@@ -33,14 +33,16 @@ def paint(surface: Surface, colors: ColorFn, size: int) -> Texture:
     """Return a texture of ``size`` x ``size`` pixels, in which ``colors`` gives the colour of each texel."""
     vertices, faces, uv = _unwrapped(surface, size)
     texel, face, weights = nearest_points(uv[faces] * size, size)
-    corners = vertices[faces[face]]
-    points = (weights[..., None] * surface.vertices[corners]).sum(1)
-    normals = (weights[..., None] * surface.normals[corners]).sum(1)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
     picture = np.zeros((size * size, 3), dtype=np.uint8)
     is_painted = np.zeros(size * size, dtype=bool)
     is_painted[texel] = True
-    picture[texel] = np.rint(colors(points, normals / np.maximum(length, 1e-12)) * 255).astype(np.uint8)
+    for first in range(0, len(texel), AT_ONCE):
+        some = slice(first, first + AT_ONCE)
+        corners = vertices[faces[face[some]]]
+        points = (weights[some, :, None] * surface.vertices[corners]).sum(1)
+        normals = (weights[some, :, None] * surface.normals[corners]).sum(1)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        picture[texel[some]] = np.rint(colors(points, normals) * 255).astype(np.uint8)
     filled = _filled(picture.reshape(size, size, 3), is_painted.reshape(size, size))
     # The rows of the picture begin at the upper edge, v at the lower one.
     return Texture(vertices, faces, uv, np.ascontiguousarray(filled[::-1]))
@@ -74,8 +76,8 @@ def nearest_points(
 ) -> tuple[Int[np.ndarray, "t"], Int[np.ndarray, "t"], Float[np.ndarray, "t 3"]]:
     """Return the texels near any triangle, the nearest triangle of each, and the weights of its corners.
 
-    ``corners`` are in texels. The weights make the point of the triangle that is nearest to the centre of the
-    texel. So a triangle without the centre of a texel has texels too, unless others are nearer to all of them.
+    ``corners`` are in texels. The weights make the point of the triangle that is nearest to the texel's
+    centre. So a triangle without the centre of a texel has texels too, unless other triangles are nearer.
     """
     low = np.clip(np.floor(corners.min(1) - 0.5 - REACH), 0, size - 1).astype(np.int64)
     high = np.clip(np.ceil(corners.max(1) - 0.5 + REACH), 0, size - 1).astype(np.int64)

@@ -139,7 +139,7 @@ def test_textures_are_read_at_each_point(tmp_path):
 
 
 def test_a_mesh_that_we_exported_has_its_colors(tmp_path):
-    """Its material must not hide the colours of its vertices, which are linear in a glb and sRGB elsewhere."""
+    """The material must not hide the colours of the vertices, which are linear in a glb."""
     sphere = trimesh.creation.icosphere(subdivisions=3)
     colors = 0.5 + 0.45 * sphere.vertices
     surface = Surface(sphere.vertices, sphere.faces, sphere.vertices, colors)
