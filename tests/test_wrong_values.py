@@ -75,7 +75,12 @@ WHOLE = {
     "exporter=[progress]": ["exporter.progress.fps"],
     "exporter=[ply]": ["exporter.ply.pad_sh"],
     "exporter=[spz]": ["exporter.spz.version"],
-    "exporter=[mesh]": ["exporter.mesh.resolution", "exporter.mesh.triangles", "exporter.mesh.texture"],
+    "exporter=[mesh]": [
+        "exporter.mesh.resolution",
+        "exporter.mesh.triangles",
+        "exporter.mesh.texture",
+        "exporter.mesh.textured_triangles",
+    ],
     "metric=[fidelity]": ["metric.fidelity.views", "metric.fidelity.size"],
     "metric=[mesh]": [
         "metric.mesh.resolution",

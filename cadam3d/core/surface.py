@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cadam3d.core.checks import require_range, require_whole
-from cadam3d.core.density import BLUR, Blobs, Grid, blobs, density, grid_around, near
+from cadam3d.core.density import BLUR, CUTOFF, Blobs, Grid, blobs, density, grid_around, near
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import require_memory
@@ -41,6 +41,9 @@ APART = 0.02
 # The opacity of a single Gaussian in the colour of a point, at most, as in the rasterizers.
 MOST_OPAQUE = 0.99
 COLORS_AT_ONCE = 1 << 18
+# Gaussians with less opacity on a ray are left out; all of them together change its colour by less than
+# 1/255.
+UNSEEN = 1e-4
 # Light from all Gaussians together below which a point has no colour of its own.
 FAINT = 1e-6
 
@@ -89,9 +92,13 @@ class SurfaceSettings:
         require_whole(f"{self.node}.resolution", self.resolution, low=16, high=1024, example=128)
         require_memory(f"{self.node}.resolution", self.resolution, unit=NODE_BYTES, power=3, example=128)
         require_range(f"{self.node}.level", self.level, above=0, high=1000, example=0.3)
-        require_range(f"{self.node}.smallest_part", self.smallest_part, low=0, below=1, example=0.01)
+        require_range(f"{self.node}.smallest_part", self.smallest_part, low=0, below=1, example=0.002)
         if self.triangles is not None:
             require_whole(f"{self.node}.triangles", self.triangles, low=100, high=2**31, example=50000)
+
+    def most_triangles(self) -> int | None:
+        """Return the most triangles that the surface may have, or None for no limit."""
+        return self.triangles
 
     def surface(self, gaussians: Gaussians) -> tuple[Surface, "Painter"]:
         """Return the outer surface of ``gaussians``, and what knows the colours between its vertices.
@@ -105,8 +112,9 @@ class SurfaceSettings:
             raise self._nothing(some)
         vertices = vertices * grid.cell + grid.origin.numpy()
         vertices, faces = without_specks(vertices, faces, self.smallest_part)
-        if self.triangles is not None:
-            vertices, faces = simplified(vertices, faces, self.triangles)
+        triangles = self.most_triangles()
+        if triangles is not None:
+            vertices, faces = simplified(vertices, faces, triangles)
         normals = vertex_normals(vertices, faces)
         painter = Painter(gaussians.sh.detach().to("cpu").float()[some.rows], some, grid)
         return Surface(vertices, faces, normals, painter.colors(vertices, normals)), painter
@@ -366,25 +374,21 @@ class Painter:
         Each colour is a render of one ray against the normal, with the image formation model of 3DGS: the
         opacity of a Gaussian is its own times the falloff where the ray is nearest to its centre, and the
         Gaussians are composited in the order of their centres. Only Gaussians that reach the point take part,
-        so that nothing else hides it.
+        so that nothing else hides it, and they fade out towards the end of their reach.
         """
         place, outwards = torch.from_numpy(points), torch.from_numpy(normals)
-        blur = (BLUR * self.grid.cell) ** 2 * torch.eye(3, dtype=torch.float64)
-        precision = torch.linalg.inv(self.some.covariances + blur)
+        rays = torch.cat([place - self.grid.origin, outwards], dim=1).float()
+        table = self._table()
         total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
         for pairs in near(self.some, self.grid, place):
             blob, point = pairs
-            away, normal = place[point] - self.some.means[blob], outwards[point]
-            pulled = torch.einsum("pij,pj->pi", precision[blob], normal)
-            straight = torch.einsum("pij,pj->pi", precision[blob], away)
-            distance = (away * straight).sum(1) - (away * pulled).sum(1) ** 2 / (normal * pulled).sum(1)
-            alpha = self.some.opacities[blob] * (-0.5 * distance.clamp_min(0)).exp()
-            depth = (away * normal).sum(1)
-            order = torch.from_numpy(np.lexsort([depth.numpy(), point.numpy()]))
-            blob, point, alpha = blob[order], point[order], alpha[order].clamp_max(MOST_OPAQUE)
-            light = (_transmitted(alpha, point) * alpha).float()
+            alpha, depth = _met(table.index_select(0, blob), rays.index_select(0, point))
+            seen = (alpha >= UNSEEN).nonzero()[:, 0]
+            order = seen[_by_depth(point[seen], depth[seen])]
+            blob, point, alpha = blob[order], point[order], alpha[order]
+            light = (_transmitted(alpha.double(), point) * alpha).float()
             for part in torch.arange(len(blob)).split(COLORS_AT_ONCE):
-                rgb = evaluate_sh(self.sh[blob[part]], -outwards[point[part]].float())
+                rgb = evaluate_sh(self.sh[blob[part]], -rays[point[part], 3:])
                 total.index_add_(0, point[part], light[part, None] * rgb)
             weight.index_add_(0, point, light)
         colors = total / weight.clamp_min(FAINT)[:, None]
@@ -396,6 +400,47 @@ class Painter:
             nearest = torch.from_numpy(KDTree(self.some.means.numpy()).query(points[lost.numpy()])[1])
             colors[lost] = evaluate_sh(self.sh[nearest], -outwards[lost].float())
         return colors.clamp(0, 1).double().numpy()
+
+    def _table(self) -> Float[Tensor, "n 10"]:
+        """Return of each Gaussian its centre, the upper half of its inverse covariance, and its opacity."""
+        blur = (BLUR * self.grid.cell) ** 2 * torch.eye(3, dtype=torch.float64)
+        precision = torch.linalg.inv(self.some.covariances + blur)
+        rows, columns = torch.triu_indices(3, 3)
+        centres, opacities = self.some.means - self.grid.origin, self.some.opacities[:, None]
+        return torch.cat([centres, precision[:, rows, columns], opacities], dim=1).float()
+
+
+def _met(
+    table: Float[Tensor, "pairs 10"], rays: Float[Tensor, "pairs 6"]
+) -> tuple[Float[Tensor, "pairs"], Float[Tensor, "pairs"]]:
+    """Return the opacity of each Gaussian on its ray, and the depth of its centre below the point.
+
+    A ray is a point and the normal there, and the camera looks against the normal. The opacity is the one at
+    the place on the ray that is nearest to the centre. It fades out where the point itself is between
+    ``CUTOFF - 1`` and ``CUTOFF`` standard deviations away.
+    """
+    mx, my, mz, xx, xy, xz, yy, yz, zz, opacity = table.T.contiguous()
+    x, y, z, u, v, w = rays.T.contiguous()
+    x, y, z = x - mx, y - my, z - mz
+    # The inverse covariance times the normal.
+    a, b, c = xx * u + xy * v + xz * w, xy * u + yy * v + yz * w, xz * u + yz * v + zz * w
+    across = a * x + b * y + c * z
+    along = a * u + b * v + c * w
+    away = x * (xx * x + 2 * (xy * y + xz * z)) + y * (yy * y + 2 * yz * z) + zz * z * z
+    # A huge Gaussian has an inverse covariance of zero in float32, and is the same everywhere.
+    distance = (away - across * across / along).nan_to_num(0.0).clamp_min(0)
+    # Without the fade, colours would jump where a point enters the reach of a Gaussian.
+    fade = (CUTOFF - away.nan_to_num(0.0).clamp_min(0).sqrt()).clamp(0, 1)
+    return (opacity * fade * (-0.5 * distance).exp()).clamp_max(MOST_OPAQUE), x * u + y * v + z * w
+
+
+def _by_depth(point: Int[Tensor, "pairs"], depth: Float[Tensor, "pairs"]) -> Int[Tensor, "pairs"]:
+    """Return the order of the pairs by their points, and by depth at the same point."""
+    if len(depth) == 0:
+        return point
+    low, high = depth.min().double(), depth.max().double()
+    share = 0.5 * (depth.double() - low) / (high - low).clamp_min(1e-30)
+    return torch.from_numpy(np.argsort((point + share).numpy()))
 
 
 def _transmitted(alpha: Float[Tensor, "pairs"], point: Int[Tensor, "pairs"]) -> Float[Tensor, "pairs"]:

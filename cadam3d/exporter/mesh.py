@@ -7,6 +7,7 @@ from typing import ClassVar
 from cadam3d.core.checks import require_choice, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.memory import require_memory
 from cadam3d.core.render import RenderFn
 from cadam3d.core.surface import SurfaceSettings
 from cadam3d.exporter.base import Exporter
@@ -16,6 +17,8 @@ from cadam3d.io.mesh import FORMATS, write_glb, write_mesh_ply, write_obj
 from cadam3d.io.run_folder import ASSET_MESH_GLB, ASSET_MESH_OBJ, ASSET_MESH_PLY
 
 NAMES: dict[str, str] = dict(zip(FORMATS, (ASSET_MESH_GLB, ASSET_MESH_OBJ, ASSET_MESH_PLY), strict=True))
+# Bytes for each texel while a texture is painted, at least.
+TEXEL_BYTES = 40
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,20 +30,35 @@ class MeshExporter(SurfaceSettings, Exporter):
     format: str  # one of FORMATS
     up: str  # up axis of the file, one of UPS
     texture: int | None  # pixels per side; None = vertex colours
+    textured_triangles: int  # at most, with a texture
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_choice("exporter.mesh.format", self.format, FORMATS)
         require_choice("exporter.mesh.up", self.up, UPS)
+        require_whole(
+            "exporter.mesh.textured_triangles", self.textured_triangles, low=100, high=2**31, example=10000
+        )
         if self.texture is None:
             return
         require_whole("exporter.mesh.texture", self.texture, low=64, high=8192, example=1024)
+        require_memory("exporter.mesh.texture", self.texture, unit=TEXEL_BYTES, power=2, example=1024)
         if self.format == "ply":
             raise UserError(
                 "exporter.mesh.texture: expected null with format=ply, which has no textures, "
                 f"got {self.texture}. Try: exporter.mesh.format=glb"
             )
         require_xatlas()
+
+    def most_triangles(self) -> int | None:
+        """Return the most triangles that the surface may have.
+
+        A texture has the details of the colours, so it needs fewer of them, and large ones. Many small
+        triangles are slow to unwrap, and some get no texel of their own.
+        """
+        if self.texture is None:
+            return self.triangles
+        return min(self.textured_triangles, self.triangles or self.textured_triangles)
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
         """Write the mesh, and return the paths of its files; only an obj with a texture has several.

@@ -28,10 +28,16 @@ from cadam3d.initializer.points import (
     require_points,
 )
 from cadam3d.io.frames import points_to_world, turned_points
+from cadam3d.io.mesh import linear, srgb
 
 UPS = ("z", "y")
 # Other formats of trimesh may refer to files elsewhere, or run other programs.
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+# Colours of vertices are linear in these files, and those of textures are sRGB (glTF 2.0, sec. 3.9.2). Other
+# formats have sRGB colours only.
+LINEAR_SUFFIXES = (".glb", ".gltf")
+# Linear colours of vertices, among the attributes of a part.
+VERTEX_LIGHT = "vertex light"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +82,11 @@ class Mesh(Initializer):
         path = found_file(self.path, "mesh", SUFFIXES)
         # Every format has its own parser, with its own exceptions.
         try:
-            parts = [part for part in trimesh.load_scene(path).dump() if isinstance(part, trimesh.Trimesh)]
+            scene = trimesh.load_scene(path)
+            if path.suffix.lower() in LINEAR_SUFFIXES:
+                for geometry in scene.geometry.values():
+                    _keep_vertex_light(geometry)
+            parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
         except Exception as error:
             reason = str(error) or type(error).__name__
             raise UserError(
@@ -121,10 +131,35 @@ def _corners(part: trimesh.Trimesh) -> Float[Tensor, "f 3 3"]:
     return torch.as_tensor(np.asarray(part.vertices)[np.asarray(part.faces)], dtype=torch.float32)
 
 
+def _keep_vertex_light(geometry: Any) -> None:
+    """Store the vertex colours of a mesh from a glTF file where a copy of the mesh keeps them.
+
+    trimesh drops the vertex colours of a mesh with a material when it copies the mesh.
+    """
+    if not isinstance(geometry, trimesh.Trimesh):
+        return
+    visual: Any = geometry.visual
+    colors = visual.vertex_colors if visual.kind == "vertex" else None
+    if visual.kind == "texture":
+        colors = visual.vertex_attributes.get("color")
+    if colors is None or len(colors) != len(geometry.vertices):
+        return
+    most = np.iinfo(colors.dtype).max if colors.dtype.kind in "ui" else 1.0
+    light = np.asarray(colors, dtype=np.float64)[:, :3] / most
+    geometry.vertex_attributes[VERTEX_LIGHT] = light.clip(0, 1)
+
+
 def _colors_of(part: trimesh.Trimesh, faces: np.ndarray, barycentric: np.ndarray) -> np.ndarray | None:
-    """Return RGBA at points of ``faces``, 0 to 255, or None if the part has no colours."""
+    """Return RGB at points of ``faces``, 0 to 255, or None if the part has no colours."""
     visual: Any = part.visual
     rows = np.asarray(part.faces)[faces]
+    light = part.vertex_attributes.get(VERTEX_LIGHT)
+    if light is not None:
+        # The colour of the material multiplies that of the vertices.
+        at_points = (barycentric * light[rows]).sum(axis=1)
+        if visual.kind == "texture":
+            at_points = at_points * _material_light(visual, rows, barycentric)
+        return 255 * srgb(at_points)
     if visual.kind == "vertex":
         return (barycentric * visual.vertex_colors[rows]).sum(axis=1)
     if visual.kind == "face":
@@ -134,3 +169,13 @@ def _colors_of(part: trimesh.Trimesh, faces: np.ndarray, barycentric: np.ndarray
     if visual.kind == "texture":
         return np.tile(visual.material.main_color, (len(faces), 1))
     return None
+
+
+def _material_light(visual: Any, rows: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
+    """Return the linear RGB by which a material of a glTF file multiplies other colours, in [0, 1]."""
+    factor, picture = visual.material.baseColorFactor, visual.material.baseColorTexture
+    light = np.ones(3) if factor is None else np.asarray(factor)[:3] / 255
+    if picture is None or visual.uv is None:
+        return light
+    found = np.asarray(visual.material.to_color((barycentric * visual.uv[rows]).sum(axis=1)))
+    return light * linear(found[:, :3] / 255)

@@ -14,9 +14,12 @@ from cadam3d.io.mesh import Texture
 # From points of a surface and its normals there to sRGB colours in [0, 1].
 ColorFn = Callable[[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]], Float[np.ndarray, "p 3"]]
 
-# Texels between charts. They are painted with the nearest colour, so that interpolation never shows a seam.
+# Texels between charts, the pieces that the surface is cut into.
 PADDING = 4
-# Candidate texels that are tested at once; this bounds the memory.
+# Texels at most this far from a triangle belong to it too. Interpolation between texels reads those that are
+# less than one row and one column away.
+REACH = 1.5
+# Texels that are tested or painted at once; this bounds the memory.
 AT_ONCE = 1 << 20
 
 
@@ -29,16 +32,18 @@ def require_xatlas() -> None:
 def paint(surface: Surface, colors: ColorFn, size: int) -> Texture:
     """Return a texture of ``size`` x ``size`` pixels, in which ``colors`` gives the colour of each texel."""
     vertices, faces, uv = _unwrapped(surface, size)
-    texel, face, weights = _covered(uv[faces] * size, size)
-    corners = vertices[faces[face]]
-    points = (weights[..., None] * surface.vertices[corners]).sum(1)
-    normals = (weights[..., None] * surface.normals[corners]).sum(1)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    texel, face, weights = nearest_points(uv[faces] * size, size)
     picture = np.zeros((size * size, 3), dtype=np.uint8)
     is_painted = np.zeros(size * size, dtype=bool)
     is_painted[texel] = True
-    picture[texel] = np.rint(colors(points, normals / np.maximum(length, 1e-12)) * 255).astype(np.uint8)
-    filled = _padded(picture.reshape(size, size, 3), is_painted.reshape(size, size))
+    for first in range(0, len(texel), AT_ONCE):
+        some = slice(first, first + AT_ONCE)
+        corners = vertices[faces[face[some]]]
+        points = (weights[some, :, None] * surface.vertices[corners]).sum(1)
+        normals = (weights[some, :, None] * surface.normals[corners]).sum(1)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        picture[texel[some]] = np.rint(colors(points, normals) * 255).astype(np.uint8)
+    filled = _filled(picture.reshape(size, size, 3), is_painted.reshape(size, size))
     # The rows of the picture begin at the upper edge, v at the lower one.
     return Texture(vertices, faces, uv, np.ascontiguousarray(filled[::-1]))
 
@@ -66,15 +71,16 @@ def _unwrapped(
     return vertices.astype(np.int64), faces.astype(np.int64), uv.astype(np.float64) * scale
 
 
-def _covered(
+def nearest_points(
     corners: Float[np.ndarray, "f 3 2"], size: int
 ) -> tuple[Int[np.ndarray, "t"], Int[np.ndarray, "t"], Float[np.ndarray, "t 3"]]:
-    """Return the texels with their centres in a triangle, their triangles, and the weights of the corners.
+    """Return the texels near any triangle, the nearest triangle of each, and the weights of its corners.
 
-    ``corners`` are in texels.
+    ``corners`` are in texels. The weights make the point of the triangle that is nearest to the texel's
+    centre. So a triangle without the centre of a texel has texels too, unless other triangles are nearer.
     """
-    low = np.clip(np.floor(corners.min(1) - 0.5), 0, size - 1).astype(np.int64)
-    high = np.clip(np.ceil(corners.max(1) - 0.5), 0, size - 1).astype(np.int64)
+    low = np.clip(np.floor(corners.min(1) - 0.5 - REACH), 0, size - 1).astype(np.int64)
+    high = np.clip(np.ceil(corners.max(1) - 0.5 + REACH), 0, size - 1).astype(np.int64)
     wide = high - low + 1
     counts = wide[:, 0] * wide[:, 1]
     ends = counts.cumsum()
@@ -84,12 +90,39 @@ def _covered(
         face = np.repeat(some, counts[some])
         step = np.arange(len(face)) - np.repeat(counts[some].cumsum() - counts[some], counts[some])
         column, row = low[face, 0] + step % wide[face, 0], low[face, 1] + step // wide[face, 0]
-        weights = _barycentric(corners[face], np.stack([column, row], axis=1) + 0.5)
-        inside = (weights >= -1e-9).all(1)
-        found.append((row[inside] * size + column[inside], face[inside], weights[inside]))
-    texel, face, weights = (np.concatenate(values) for values in zip(*found, strict=True))
-    texel, first = np.unique(texel, return_index=True)
-    return texel, face[first], weights[first]
+        weights, distance = _nearest(corners[face], np.stack([column, row], axis=1) + 0.5)
+        kept = distance <= REACH
+        found.append((row[kept] * size + column[kept], face[kept], weights[kept], distance[kept]))
+    texel, face, weights, distance = (np.concatenate(values) for values in zip(*found, strict=True))
+    order = np.lexsort([distance, texel])
+    texel, first = np.unique(texel[order], return_index=True)
+    return texel, face[order[first]], weights[order[first]]
+
+
+def _nearest(
+    corners: Float[np.ndarray, "t 3 2"], points: Float[np.ndarray, "t 2"]
+) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t"]]:
+    """Return the weights of the corners at the place of each triangle that is nearest to its point.
+
+    The second array has the distances, 0 inside a triangle.
+    """
+    weights = _barycentric(corners, points)
+    outside = np.flatnonzero((weights < 0).any(1))
+    corners, points = corners[outside], points[outside]
+    nearest, distance = np.zeros((len(outside), 3)), np.full(len(outside), np.inf)
+    for first, second in ((0, 1), (1, 2), (2, 0)):
+        begin, along = corners[:, first], corners[:, second] - corners[:, first]
+        length = np.maximum((along * along).sum(1), 1e-30)
+        share = np.clip(((points - begin) * along).sum(1) / length, 0, 1)
+        gap = np.linalg.norm(points - begin - share[:, None] * along, axis=1)
+        nearer = gap < distance
+        distance[nearer] = gap[nearer]
+        nearest[nearer] = 0
+        nearest[nearer, first], nearest[nearer, second] = 1 - share[nearer], share[nearer]
+    weights[outside] = nearest
+    every = np.zeros(len(weights))
+    every[outside] = distance
+    return weights, every
 
 
 def _barycentric(
@@ -108,7 +141,7 @@ def _barycentric(
     return weights
 
 
-def _padded(picture: np.ndarray, is_painted: Bool[np.ndarray, "h w"]) -> np.ndarray:
+def _filled(picture: np.ndarray, is_painted: Bool[np.ndarray, "h w"]) -> np.ndarray:
     """Return the picture with every other texel in the colour of the nearest painted one."""
     from scipy import ndimage  # slow to import
 

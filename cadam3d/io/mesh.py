@@ -30,7 +30,7 @@ GLB_MAGIC, GLB_VERSION = 0x46546C67, 2
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125
 VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
-LINEAR_MIPMAP, LINEAR, CLAMP = 9987, 9729, 33071
+LINEAR, CLAMP = 9729, 33071
 NAME = "cadam3d"
 
 
@@ -198,7 +198,7 @@ def _glb(mesh: _Mesh) -> bytes:
         surface["baseColorTexture"] = {"index": 0}
         document |= {
             "textures": [{"sampler": 0, "source": 0}],
-            "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP, "wrapS": CLAMP, "wrapT": CLAMP}],
+            "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP, "wrapT": CLAMP}],
             "images": [{"bufferView": len(blocks), "mimeType": "image/png"}],
         }
         blocks.append(_png(mesh.texture))
@@ -244,6 +244,11 @@ def _binary(document: Mapping[str, object], blocks: Sequence[bytes], targets: Se
 def linear(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
     """Return linear light for sRGB colours, both in [0, 1] (IEC 61966-2-1)."""
     return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+
+
+def srgb(light: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """Return sRGB colours for linear light, the inverse of ``linear``."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0) ** (1 / 2.4) - 0.055)
 
 
 def _bytes(rgb: Float[np.ndarray, "*batch 3"]) -> UInt8[np.ndarray, "*batch 3"]:

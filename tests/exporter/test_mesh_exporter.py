@@ -20,9 +20,10 @@ SETTINGS = {
     "up": "+y",
     "resolution": 24,
     "level": 0.3,
-    "smallest_part": 0.01,
+    "smallest_part": 0.002,
     "triangles": 2000,
     "texture": None,
+    "textured_triangles": 10_000,
 }
 BELOW, ABOVE = (0.1, 0.2, 0.9), (0.9, 0.1, 0.1)
 
@@ -94,6 +95,32 @@ def test_a_glb_with_a_texture_is_one_file(tmp_path):
     assert "COLOR_0" not in document["meshes"][0]["primitives"][0]["attributes"]
 
 
+def test_a_texture_needs_fewer_triangles_for_the_same_colours(tmp_path):
+    pytest.importorskip("xatlas")
+    for folder in ("colors", "texture"):
+        (tmp_path / folder).mkdir()
+    [fine] = export(tmp_path / "colors", format="ply", resolution=48, triangles=None)
+    textured, *_ = export(tmp_path / "texture", format="obj", texture=128, textured_triangles=300)
+    assert mesh_facts(textured).triangles <= 300
+    many, few = (trimesh.load_mesh(path, process=False) for path in (fine, textured))
+    points, faces = trimesh.sample.sample_surface(few, 2000, seed=0)
+    weights = trimesh.triangles.points_to_barycentric(few.triangles[faces], points)
+    uv = (weights[..., None] * few.visual.uv[few.faces[faces]]).sum(axis=1)
+    nearest = many.kdtree.query(points)[1]
+    found = few.visual.material.to_color(uv)[:, :3].astype(float)
+    error = np.abs(found - many.visual.vertex_colors[nearest, :3])
+    assert error.mean() < 6  # of 255
+
+
+def test_fewer_triangles_than_a_texture_may_have_stay_fewer(tmp_path):
+    settings = {**SETTINGS, "triangles": 500}
+    assert MeshExporter(**settings).most_triangles() == 500
+    pytest.importorskip("xatlas")
+    for triangles, most in ((500, 500), (20_000, 10_000), (None, 10_000)):
+        exporter = MeshExporter(**{**settings, "texture": 64, "triangles": triangles})
+        assert exporter.most_triangles() == most
+
+
 def test_a_texture_without_xatlas_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "xatlas", None)
     with pytest.raises(UserError, match=r"needs xatlas\. Try: pip install 'cadam3d\[texture\]'"):
@@ -101,7 +128,15 @@ def test_a_texture_without_xatlas_names_the_extra(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("format", "fbx"), ("up", "z"), ("texture", 16), ("level", -1.0), ("resolution", 2)]
+    ("key", "value"),
+    [
+        ("format", "fbx"),
+        ("up", "z"),
+        ("texture", 16),
+        ("textured_triangles", 3),
+        ("level", -1.0),
+        ("resolution", 2),
+    ],
 )
 def test_wrong_values_name_their_key(key, value):
     with pytest.raises(UserError, match=rf"exporter\.mesh\.{key}"):

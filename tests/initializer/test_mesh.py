@@ -9,7 +9,9 @@ from PIL import Image
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0
+from cadam3d.core.surface import Surface
 from cadam3d.initializer.mesh import Mesh
+from cadam3d.io.mesh import Texture, write_glb, write_mesh_ply, write_obj
 
 CPU = torch.device("cpu")
 GREY = [0.5, 0.5, 0.5]
@@ -134,6 +136,48 @@ def test_textures_are_read_at_each_point(tmp_path):
     assert torch.equal(is_blue[inner], made.means[inner, 0] > 0)
     assert is_blue.any()
     assert not is_blue.all()
+
+
+def test_a_mesh_that_we_exported_has_its_colors(tmp_path):
+    """The material must not hide the colours of the vertices, which are linear in a glb."""
+    sphere = trimesh.creation.icosphere(subdivisions=3)
+    colors = 0.5 + 0.45 * sphere.vertices
+    surface = Surface(sphere.vertices, sphere.faces, sphere.vertices, colors)
+    write_glb(tmp_path / "m.glb", surface, up="+y")
+    write_obj(tmp_path / "m.obj", surface, up="+y")
+    write_mesh_ply(tmp_path / "m.ply", surface, up="+y")
+    for path in sorted(tmp_path.iterdir()):
+        made = build(path, up="y", radius=1.0)
+        expected = 0.5 + 0.45 * made.means
+        torch.testing.assert_close(rgb(made), expected, atol=0.02, rtol=0, msg=path.name)
+
+
+def test_a_texture_that_we_exported_has_its_colors(tmp_path):
+    square = np.array([[0.0, 0, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1]])
+    faces, picture = np.array([[0, 1, 2], [0, 2, 3]]), np.full((8, 8, 3), (200, 30, 90), dtype=np.uint8)
+    surface = Surface(square, faces, np.tile([1.0, 0, 0], (4, 1)), np.zeros((4, 3)))
+    write_glb(
+        tmp_path / "m.glb",
+        surface,
+        up="+y",
+        texture=Texture(np.arange(4), faces, square[:, 1:], picture),
+    )
+    expected = torch.tensor([[200, 30, 90]]).expand(2000, 3) / 255
+    torch.testing.assert_close(rgb(build(tmp_path / "m.glb", up="y")), expected)
+
+
+def test_the_material_of_a_glb_multiplies_the_colors_of_its_vertices(tmp_path):
+    picture = Image.new("RGB", (4, 4), (188, 255, 255))  # half of the light in red
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorFactor=[255, 128, 255, 255], baseColorTexture=picture
+    )
+    visual = trimesh.visual.TextureVisuals(uv=np.full((8, 2), 0.5), material=material)
+    visual.vertex_attributes["color"] = np.tile(np.uint8([128, 255, 255, 255]), (8, 1))
+    box = trimesh.creation.box()
+    mesh = trimesh.Trimesh(box.vertices, box.faces, visual=visual, process=False)
+    made = rgb(build(save(mesh, tmp_path / "m.glb"), count=50))
+    expected = torch.tensor([[137, 188, 255]]).expand(50, 3) / 255
+    torch.testing.assert_close(made, expected, atol=0.01, rtol=0)
 
 
 QUAD = "v 0 0 0{0}\nv 1 0 0{0}\nv 1 1 0{0}\nv 0 1 0{0}\n"
