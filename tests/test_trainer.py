@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from omegaconf import DictConfig
 
 from cadam3d.augmentation import LucidAugmentation
 from cadam3d.callback.base import Callback
@@ -56,9 +58,14 @@ class Recorder(Callback):
         self.ends.append(outcome)
 
 
+@cache
+def composed(*lines: str) -> DictConfig:
+    return compose(lines)
+
+
 def make(overrides: Sequence[str] = ()) -> tuple[Trainer, TrainState]:
     is_cadam = not any(line.startswith("densifier=") and line != "densifier=cadam" for line in overrides)
-    cfg = compose([*SMALL, *(["densifier.min_age=0"] if is_cadam else []), *overrides])
+    cfg = composed(*SMALL, *(["densifier.min_age=0"] if is_cadam else []), *overrides)
     trainer = build_trainer(cfg, CPU)
     return trainer, trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
 
