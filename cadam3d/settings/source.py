@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import yaml  # comes with OmegaConf
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.core_plugins import file_config_source
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
@@ -22,11 +22,14 @@ class _Loader(LOADER):
     yaml_implicit_resolvers: ClassVar = get_yaml_loader().yaml_implicit_resolvers
 
 
-class Files(FileConfigSource):
+class FileConfigSource(file_config_source.FileConfigSource):
     """Folders of YAML files. Hydra asks for them by paths without a scheme, or with ``file://``.
 
     A file of this package is parsed once in a process, by the parser in C. The files of users are read by
     Hydra itself, because the parser in C ends the process when data is nested too deeply.
+
+    The class has the name of the one that it replaces: the workers of a launcher receive the table of sources
+    and then register Hydra's own ones, which is an error if the class of a scheme has another name.
     """
 
     def load_config(self, config_path: str) -> ConfigResult:
@@ -45,10 +48,10 @@ class Files(FileConfigSource):
 
 
 def register_source() -> None:
-    """Let Hydra read files with :class:`Files`. It is safe to call this again."""
+    """Let Hydra read files with :class:`FileConfigSource`. It is safe to call this again."""
     # Hydra registers its own sources when it finds its plugins, once in a process.
     Plugins.instance()
-    SourcesRegistry.instance().types[Files.scheme()] = Files
+    SourcesRegistry.instance().types[FileConfigSource.scheme()] = FileConfigSource
 
 
 @lru_cache(maxsize=1024)

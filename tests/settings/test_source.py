@@ -1,13 +1,13 @@
 """Hydra's view of the YAML files of this package does not depend on how they are parsed."""
 
 import pytest
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.core_plugins import file_config_source
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.errors import HydraException
 
 from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import compose, config_dir
-from cadam3d.settings.source import Files
+from cadam3d.settings.source import FileConfigSource
 
 FOLDER = str(config_dir())
 
@@ -17,7 +17,8 @@ def options() -> list[str]:
 
 
 def test_every_file_is_read_as_hydra_reads_it_and_a_caller_can_change_what_it_gets():
-    own, plain = Files("main", FOLDER), FileConfigSource("main", FOLDER)
+    own = FileConfigSource("main", FOLDER)
+    plain = file_config_source.FileConfigSource("main", FOLDER)
     assert len(options()) > 100
     for option in options():
         expected = plain.load_config(option)
@@ -34,7 +35,7 @@ def test_a_changed_file_of_the_package_is_read_again(tmp_path, monkeypatch):
     monkeypatch.setattr("cadam3d.settings.source.config_dir", lambda: tmp_path)
     for number in (1, 2):
         (tmp_path / "a.yaml").write_text(f"key: {number}")
-        assert Files("main", str(tmp_path)).load_config("a").config.key == number
+        assert FileConfigSource("main", str(tmp_path)).load_config("a").config.key == number
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "a: [1", "a: 1\na: 2", "5"])
@@ -47,4 +48,10 @@ def test_a_damaged_file_of_the_user_is_refused(text, tmp_path):
 
 def test_composition_reads_files_with_this_source():
     compose(["prompt=a"])
-    assert SourcesRegistry.instance().resolve("file") is Files
+    assert SourcesRegistry.instance().resolve("file") is FileConfigSource
+
+
+def test_a_worker_of_a_launcher_registers_its_plugins_after_receiving_this_source():
+    compose(["prompt=a"])
+    SourcesRegistry.instance().register(file_config_source.FileConfigSource)
+    assert SourcesRegistry.instance().resolve("file") is FileConfigSource
