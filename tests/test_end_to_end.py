@@ -51,6 +51,7 @@ def type_in(monkeypatch, capfd) -> Callable[..., tuple[str, str]]:
 
     def run_here(folder: Path, *words: str, code: int = 0) -> tuple[str, str]:
         monkeypatch.chdir(folder)
+        monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
         monkeypatch.setenv("PYTHONSAFEPATH", "1")
         monkeypatch.setattr(sys, "argv", ["cadam3d", *words])
         with pytest.raises(SystemExit) as ended:

@@ -2,13 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from omegaconf import DictConfig
+from composed import composed
 
 from cadam3d.augmentation import LucidAugmentation
 from cadam3d.callback.base import Callback
@@ -56,11 +55,6 @@ class Recorder(Callback):
 
     def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
         self.ends.append(outcome)
-
-
-@cache
-def composed(*lines: str) -> DictConfig:
-    return compose(lines)
 
 
 def make(overrides: Sequence[str] = ()) -> tuple[Trainer, TrainState]:
