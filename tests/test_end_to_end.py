@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -19,6 +20,8 @@ from cadam3d.io.ply import read_ply
 pytestmark = pytest.mark.slow
 
 SMALL = ["prompt=a red cube", "experiment=smoke", "rasterizer=reference"]
+# The pictures are tested once; they take more time than the training.
+BARE = [*SMALL, "exporter=[ply]"]
 IMPORTED = "imported.txt"  # lists the modules that a training has loaded
 SECONDS = 240  # longest wait for one process
 
@@ -40,6 +43,24 @@ def run(folder: Path, *words: str, code: int = 0, **more: str) -> tuple[str, str
     out, err = process.communicate(timeout=SECONDS)
     assert process.returncode == code, f"exit {process.returncode}\n{out}\n{err}"
     return out, err
+
+
+@pytest.fixture
+def type_in(monkeypatch, capfd) -> Callable[..., tuple[str, str]]:
+    """Return a function that runs a line in a folder, in this process."""
+
+    def run_here(folder: Path, *words: str, code: int = 0) -> tuple[str, str]:
+        monkeypatch.chdir(folder)
+        monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+        monkeypatch.setenv("PYTHONSAFEPATH", "1")
+        monkeypatch.setattr(sys, "argv", ["cadam3d", *words])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        out, err = capfd.readouterr()
+        assert int(ended.value.code or 0) == code, f"exit {ended.value.code}\n{out}\n{err}"
+        return out, err
+
+    return run_here
 
 
 def wait_for(path: Path, process: subprocess.Popen) -> None:
@@ -80,8 +101,8 @@ def test_a_run_leaves_everything_that_the_readme_promises(finished):
     assert read_jsonl(latest / "metrics.jsonl")[-1]["step"] == summary["steps"]
 
 
-def test_eval_measures_what_train_measured(finished):
-    run(finished, "eval", "run=outputs/latest", "metric.fidelity.views=4", "metric.fidelity.size=48")
+def test_eval_measures_what_train_measured(finished, type_in):
+    type_in(finished, "eval", "run=outputs/latest", "metric.fidelity.views=4", "metric.fidelity.size=48")
     latest = finished / "outputs" / "latest"
     evaluation = json.loads((latest / "eval.json").read_text())
     summary = json.loads((latest / "summary.json").read_text())
@@ -91,7 +112,7 @@ def test_eval_measures_what_train_measured(finished):
 
 def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(finished, tmp_path):
     run_folder = tmp_path / "run"
-    words = [*SMALL, f"hydra.run.dir={run_folder}", "callback.checkpoint.every=7", "callback.metrics.every=1"]
+    words = [*BARE, f"hydra.run.dir={run_folder}", "callback.checkpoint.every=7", "callback.metrics.every=1"]
     process = start(tmp_path, "train", *words)
     wait_for(run_folder / "checkpoints" / "step_0000014.pt", process)
     process.kill()  # SIGKILL: the process cannot clean up
@@ -108,12 +129,12 @@ def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(finished, tmp_path
     assert without_time(logged) == without_time(read_jsonl(whole / "metrics.jsonl"))
 
 
-def test_a_run_is_refused_in_a_folder_that_holds_another_one(finished):
+def test_a_run_is_refused_in_a_folder_that_holds_another_one(finished, type_in):
     latest = (finished / "outputs" / "latest").resolve()
     before = (latest / "asset.ply").read_bytes()
-    _, err = run(finished, "train", *SMALL, f"hydra.run.dir={latest}", "seed=1", code=1)
+    _, err = type_in(finished, "train", *SMALL, f"hydra.run.dir={latest}", "seed=1", code=1)
     assert "holds a run already" in err
-    _, err = run(finished, "train", f"resume={latest}", "seed=1", code=1)
+    _, err = type_in(finished, "train", f"resume={latest}", "seed=1", code=1)
     assert "seed: expected 0" in err
     assert (latest / "asset.ply").read_bytes() == before
 
@@ -121,7 +142,6 @@ def test_a_run_is_refused_in_a_folder_that_holds_another_one(finished):
 def test_a_run_starts_without_slow_imports(finished):
     imported = (finished / IMPORTED).read_text()
     assert "torch.optim" in imported
-    # The progress bar shows this text at step 0.
     # Progress prints this text after the first step.
     before_second_step = imported.partition(": step 1/")[0]
     assert before_second_step != imported
@@ -130,9 +150,9 @@ def test_a_run_starts_without_slow_imports(finished):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_everything_and_prints_how_to_continue(finished, tmp_path, number):
+def test_a_signal_saves_everything_and_prints_how_to_continue(finished, tmp_path, number, type_in):
     run_folder = tmp_path / "run"
-    process = start(tmp_path, "train", *SMALL, f"hydra.run.dir={run_folder}", "callback.checkpoint.every=5")
+    process = start(tmp_path, "train", *BARE, f"hydra.run.dir={run_folder}", "callback.checkpoint.every=5")
     wait_for(run_folder / "checkpoints" / "step_0000005.pt", process)
     process.send_signal(number)
     out, err = process.communicate(timeout=SECONDS)
@@ -146,34 +166,34 @@ def test_a_signal_saves_everything_and_prints_how_to_continue(finished, tmp_path
 
     if number == signal.SIGTERM:
         return  # resuming is tested once
-    run(tmp_path, "train", f"resume={run_folder}")
+    type_in(tmp_path, "train", f"resume={run_folder}")
     whole = finished / "outputs" / "latest"
     assert (run_folder / "asset.ply").read_bytes() == (whole / "asset.ply").read_bytes()
 
 
 @pytest.mark.parametrize(("guidance", "densifier"), [("ism", "none"), ("gcs", "mcmc")])
-def test_objectives_and_densifiers_train(tmp_path, guidance, densifier):
-    words = [*SMALL, f"guidance={guidance}", f"densifier={densifier}", "steps=12", "exporter=[ply]"]
-    out, _ = run(tmp_path, "train", *words)
+def test_objectives_and_densifiers_train(tmp_path, guidance, densifier, type_in):
+    words = [*BARE, f"guidance={guidance}", f"densifier={densifier}", "steps=12"]
+    out, _ = type_in(tmp_path, "train", *words)
     summary = json.loads((tmp_path / "outputs" / "latest" / "summary.json").read_text())
     assert (summary["guidance"], summary["densifier"]) == (guidance, densifier)
     assert "PSNR" in out
 
 
-def test_a_dry_run_on_the_tiny_prior_prints_that_its_result_is_meaningless(tmp_path):
-    words = [*SMALL, "prior=tiny", "prompt=anything at all", "steps=2", "exporter=[ply]"]
-    out, err = run(tmp_path, "train", *words)
+def test_a_dry_run_on_the_tiny_prior_prints_that_its_result_is_meaningless(tmp_path, type_in):
+    words = [*BARE, "prior=tiny", "prompt=anything at all", "steps=2"]
+    out, err = type_in(tmp_path, "train", *words)
     assert "Note:" in err
     assert "PSNR" not in out
-    run(tmp_path, "eval", "run=outputs/latest")
+    type_in(tmp_path, "eval", "run=outputs/latest")
     evaluation = json.loads((tmp_path / "outputs" / "latest" / "eval.json").read_text())
     assert "psnr" not in evaluation
     assert evaluation["num_gaussians"] > 0
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the process of a job in /proc")
-def test_a_sweep_continues_after_a_killed_job_and_the_same_line_completes_it(finished, tmp_path):
-    words = [*SMALL, "densifier=cadam,none", "callback.checkpoint.every=7", "hydra.sweep.dir=table"]
+def test_a_sweep_continues_after_a_killed_job_and_the_same_line_completes_it(finished, tmp_path, type_in):
+    words = [*BARE, "densifier=cadam,none", "callback.checkpoint.every=7", "hydra.sweep.dir=table"]
     table = tmp_path / "table"
     process = start(tmp_path, "sweep", *words)
     wait_for(table / "jobs.json", process)
@@ -195,7 +215,7 @@ def test_a_sweep_continues_after_a_killed_job_and_the_same_line_completes_it(fin
     assert {row["prompt"] for row in rows_of(table)} == {"a red cube"}
     assert all(float(row["psnr"]) > 5 and int(row["num_gaussians"]) > 0 for row in rows_of(table))
 
-    _, err = run(tmp_path, "sweep", *words, "views=2", code=1)
+    _, err = type_in(tmp_path, "sweep", *words, "views=2", code=1)
     assert err.startswith("cadam3d: views: was 1 in table/")
     assert err.endswith("Try: hydra.sweep.dir=table-2\n")
     assert not (tmp_path / "outputs").exists()  # outputs/latest is for single runs
@@ -220,17 +240,10 @@ def rows_of(sweep: Path) -> list[dict[str, str]]:
         (["resume=nowhere"], "resume"),
     ],
 )
-def test_a_mistake_is_one_message_and_exit_code_1(tmp_path, words, expected, monkeypatch, capfd):
+def test_a_mistake_is_one_message_and_exit_code_1(tmp_path, words, expected, type_in):
     # One of them is tested in a separate process, the others in this one, which is faster.
-    if expected == "florb":
-        _, err = run(tmp_path, "train", *words, code=1)
-    else:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["cadam3d", "train", *words])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        assert ended.value.code == 1
-        err = capfd.readouterr().err
+    type_line = run if expected == "florb" else type_in
+    _, err = type_line(tmp_path, "train", *words, code=1)
     assert expected in err
     assert "Traceback" not in err
     assert "HYDRA_FULL_ERROR" not in err

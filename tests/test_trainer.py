@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from composed import composed
 
 from cadam3d.augmentation import LucidAugmentation
 from cadam3d.callback.base import Callback
@@ -58,7 +59,7 @@ class Recorder(Callback):
 
 def make(overrides: Sequence[str] = ()) -> tuple[Trainer, TrainState]:
     is_cadam = not any(line.startswith("densifier=") and line != "densifier=cadam" for line in overrides)
-    cfg = compose([*SMALL, *(["densifier.min_age=0"] if is_cadam else []), *overrides])
+    cfg = composed(*SMALL, *(["densifier.min_age=0"] if is_cadam else []), *overrides)
     trainer = build_trainer(cfg, CPU)
     return trainer, trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
 

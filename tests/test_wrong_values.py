@@ -1,5 +1,6 @@
 """A value of the wrong type gets a message that names its key, in every component and every command."""
 
+import copy
 import math
 import os
 import sys
@@ -160,11 +161,15 @@ def composed(choice: str) -> DictConfig:
 def build(choice: str, *lines: str):
     """Build the component of ``choice`` after setting the YAML values of ``lines``."""
     group, _, name = choice.partition("=")
-    cfg = composed(choice).copy()
+    whole = composed(choice)
+    # A copy of the group takes a tenth of the time of a copy of all settings.
+    node = copy.deepcopy(whole[group])
+    node._set_parent(whole)
     for line in lines:
         key, _, value = line.partition("=")
-        OmegaConf.update(cfg, key, yaml.safe_load(value), merge=False, force_add=True)
-    return component(cfg[group][name.strip("[]")] if name.startswith("[") else cfg[group])
+        own = key.removeprefix(f"{group}.")
+        OmegaConf.update(node, own, yaml.safe_load(value), merge=False, force_add=True)
+    return component(node[name.strip("[]")] if name.startswith("[") else node)
 
 
 def pairs(table: dict[str, list[str]]) -> list[tuple[str, str]]:

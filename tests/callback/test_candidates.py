@@ -6,6 +6,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
+from composed import composed
 
 from cadam3d.callback.candidates import OTHERS, SELECTED, Candidates, histogram, marked, pictures
 from cadam3d.commands.train import build_trainer
@@ -14,7 +15,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.jsonl import append_jsonl, read_jsonl
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import component
 from cadam3d.state import Outcome, RunContext
 
 CPU = torch.device("cpu")
@@ -37,7 +38,7 @@ CALLBACK = {
 
 
 def train(folder, *, with_callback: bool):
-    cfg = compose([*LINE])
+    cfg = composed(*LINE)
     trainer = build_trainer(cfg, CPU)
     if not with_callback:
         trainer = replace(trainer, callbacks=[])

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from composed import composed
 
 from cadam3d.callback import live as module
 from cadam3d.callback.base import Callback
 from cadam3d.callback.live import Live
 from cadam3d.commands.train import build_trainer, run_context
 from cadam3d.io import live
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import component
 
 CPU = torch.device("cpu")
 STEPS = 12
@@ -56,7 +57,7 @@ def train(folder: Path, monkeypatch, *overrides: str, with_live=True, is_open=Tr
     monkeypatch.setattr(module, "LOOK_SECONDS", 0.0)
     small = ("prompt=a red cube", "prior=tiny", "rasterizer=reference", f"steps={STEPS}", "camera.size=12")
     schedule = ("refine.start=0", "refine.end=100", "refine.interval=4", "initializer.count=30")
-    cfg = compose([*small, *schedule, "callback=[]", *overrides])
+    cfg = composed(*small, *schedule, "callback=[]", *overrides)
     trainer = build_trainer(cfg, CPU)
     callback = Live(seconds=0.1, share=share)
     callback.seconds = 0.0

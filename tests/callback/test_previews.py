@@ -4,6 +4,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
+from composed import composed
 
 from cadam3d.callback.previews import Previews
 from cadam3d.commands.train import build_trainer
@@ -29,7 +30,7 @@ SETTINGS = {
 
 
 def train(folder, *lines: str) -> TrainState:
-    cfg = compose([*LINE, *lines])
+    cfg = composed(*LINE, *lines)
     trainer = build_trainer(cfg, CPU)
     state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
     context = RunContext(

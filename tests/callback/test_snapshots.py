@@ -5,13 +5,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from composed import composed
 
 from cadam3d.callback.snapshots import Snapshots
 from cadam3d.commands.train import build_trainer, run_context
 from cadam3d.core.errors import UserError
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.run_folder import snapshots
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import component
 
 CPU = torch.device("cpu")
 SMALL = ("prompt=a red cube", "prior=tiny", "rasterizer=reference", "camera.size=12", "initializer.count=30")
@@ -20,7 +21,7 @@ GROWING = ("steps=10", "refine.start=0", "refine.end=100", "refine.interval=4", 
 
 def train(folder: Path, callback: Snapshots | None, *overrides: str):
     """Train a few steps and return the state."""
-    cfg = compose([*SMALL, *GROWING, *overrides])
+    cfg = composed(*SMALL, *GROWING, *overrides)
     trainer = build_trainer(cfg, CPU)
     if callback is not None:
         trainer.callbacks.append(callback)

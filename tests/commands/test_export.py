@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from omegaconf import OmegaConf
+from composed import as_yaml
 from programs.files import CASES
 from splats import make_gaussians
 
@@ -36,8 +36,8 @@ SUMMARY |= {"prior": "shapes", "cadam3d": "0.0.1", "torch": "2.9"}
 def run_folder(tmp_path) -> Path:
     folder = tmp_path / "a run"
     folder.mkdir()
-    cfg = compose(["prompt=a red cube", "rasterizer=reference"])
-    (folder / "config.yaml").write_text(OmegaConf.to_yaml(cfg, resolve=True), encoding="utf-8")
+    settings = as_yaml("prompt=a red cube", "rasterizer=reference")
+    (folder / "config.yaml").write_text(settings, encoding="utf-8")
     write_ply(folder / "asset.ply", make_gaussians(6, degree=1), up="-y", pad_sh=0)
     write_json(folder / "summary.json", SUMMARY)
     return folder

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from omegaconf import OmegaConf
+from composed import as_yaml
 
 from cadam3d.commands import view
 from cadam3d.commands.render import default_labels
@@ -20,7 +20,6 @@ from cadam3d.io.caption import Caption
 from cadam3d.io.image import write_png_bytes
 from cadam3d.io.jsonl import read_json, write_json
 from cadam3d.io.ply import read_ply, write_ply
-from cadam3d.settings.compose import compose
 from cadam3d.sweep.folder import Plan, PlannedJob, write_plan
 
 SMALL = ("metric.fidelity.views=2", "metric.fidelity.elevations_deg=[0]", "metric.fidelity.size=24")
@@ -40,8 +39,8 @@ def gaussians() -> Gaussians:
 
 def make_run(folder: Path, gaussians: Gaussians, *overrides: str) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
-    cfg = compose(["prompt=a red cube", "rasterizer=reference", *overrides])
-    (folder / "config.yaml").write_text(OmegaConf.to_yaml(cfg, resolve=True), encoding="utf-8")
+    settings = as_yaml("prompt=a red cube", "rasterizer=reference", *overrides)
+    (folder / "config.yaml").write_text(settings, encoding="utf-8")
     write_ply(folder / "asset.ply", gaussians, up="-y", pad_sh=0)
     return folder
 

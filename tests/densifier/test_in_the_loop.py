@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from composed import composed
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from cadam3d.callback.base import Callback
@@ -53,7 +54,7 @@ class Recorder(Callback):
 
 def run(overrides: Sequence[str], folder: Path) -> tuple[TrainState, Recorder, Outcome]:
     is_cadam = not any(line.startswith("densifier=") and "cadam" not in line for line in overrides)
-    cfg = compose([*SMALL, *(["densifier.min_age=0"] if is_cadam else []), *overrides])
+    cfg = composed(*SMALL, *(["densifier.min_age=0"] if is_cadam else []), *overrides)
     recorder = Recorder()
     trainer = replace(build_trainer(cfg, CPU), callbacks=[recorder])
     state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
@@ -229,7 +230,7 @@ def test_the_densifier_decides_which_opacities_are_reset(choice, is_global, tmp_
 def test_noise_moves_the_means_after_the_optimizer_step_and_nothing_else(tmp_path):
     still, _, _ = run(["densifier=mcmc", "densifier.noise_lr=0", "steps=1"], tmp_path)
     moved, _, _ = run(["densifier=mcmc", "densifier.noise_lr=1e5", "steps=1"], tmp_path)
-    cfg = compose([*SMALL, "densifier=mcmc", "densifier.noise_lr=1e5"])
+    cfg = composed(*SMALL, "densifier=mcmc", "densifier.noise_lr=1e5")
     trainer = build_trainer(cfg, CPU)
     draws = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU).generators["densifier"]
     lr = trainer.optimizer.learning_rates(0)["means"]

@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from composed import composed
 
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.cadam import CAdam, CAdamState
@@ -26,15 +27,8 @@ AGES = (5, 10, 20, 50, 100, 300, 1000)
 
 
 def cadam(**changes) -> CAdam:
-    return component(
-        compose(
-            [
-                "prompt=noise",
-                "densifier=cadam_open",
-                *(f"densifier.{key}={value}" for key, value in changes.items()),
-            ]
-        ).densifier
-    )
+    lines = (f"densifier.{key}={value}" for key, value in changes.items())
+    return component(composed("prompt=noise", "densifier=cadam_open", *lines).densifier)
 
 
 def isotropic(draw: torch.Generator) -> torch.Tensor:
