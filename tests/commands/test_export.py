@@ -425,3 +425,29 @@ def test_each_line_about_a_file_is_short():
     for exporter in FORMATS:
         assert len(loss_of(exporter, 3)) < 120
         assert max((len(line) for up in UPS for line in views_in_words(exporter, up)), default=0) < 150
+
+
+# --- wrong places -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("output", "reason"),
+    [
+        ("output=a.jpg", "expected a file with suffix .compressed.ply|"),
+        ("output=file/a.ply", "cannot write to file/a.ply (file is a file)"),
+        ("output=thing.ply/", "expected a folder, got 'thing.ply/', which is a file"),
+    ],
+)
+def test_a_wrong_place_is_explained_with_one_that_works(run_folder, type_line, output, reason):
+    for name in ("file", "thing.ply"):
+        Path(name).touch()
+    message = type_line("export", f"run={run_folder}", output).message
+    assert reason in message
+    assert type_line("export", f"run={run_folder}", message.partition("Try: ")[2]).code == 0
+
+
+@pytest.mark.parametrize("typed", ["foo", "[foo]", "[spz,foo]"])
+def test_an_unknown_exporter_is_explained_with_the_usual_one(run_folder, type_line, typed):
+    message = type_line("export", f"run={run_folder}", f"exporter={typed}", "output=out").message
+    suggested = shlex.split(message.partition("Try: ")[2])
+    assert type_line("export", f"run={run_folder}", *suggested, "output=out").code == 0
