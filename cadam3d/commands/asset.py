@@ -169,10 +169,10 @@ def run_exporters(cfg: DictConfig, write: Callable[[str, Exporter], list[Path]])
     """
     exporters: Mapping[str, Exporter] = components(cfg.exporter, Exporter, "exporter")
     if not exporters:
-        raise UserError("exporter: expected at least one, got none. Try: exporter=[images,turntable]")
+        raise UserError("exporter: expected at least one, got none. Try: 'exporter=[ply]'")
     outputs, warnings = [], []
     for name, exporter in exporters.items():
-        with keeping_others(f"exporter.{name}", warnings):
+        with keeping_others(f"exporter.{name}", warnings, is_only=len(exporters) == 1):
             outputs += [Output(path, name) for path in write(name, exporter)]
     if len(warnings) == len(exporters):
         raise UserError(warnings[0])

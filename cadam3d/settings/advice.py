@@ -245,7 +245,7 @@ def _no_name(reason: str, command: str, words: Sequence[str]) -> UserError:
             best = "none" if "none" in options else default_option(key, command)
             # Without a default, such as that of experiment, leaving the word out is what null means.
             rest = [other for other in words if other != word]
-            line = f"{key}={best}" if best else line_of(command, rest)
+            line = shlex.quote(f"{key}={best}") if best else line_of(command, rest)
             return UserError(f"{key}: expected one of {'|'.join(options)}, got {value}. Try: {line}")
     return UserError(f"{reason}. Try: cadam3d {command} --help")
 

@@ -189,6 +189,8 @@ def test_every_format_is_written_and_described_as_it_is_read_back(run_folder, ty
     [
         ("a </title><b>cube", (), "a &lt;/title&gt;&lt;b&gt;cube"),
         ("a ${oc.env:HOME} cube", (), "a ${oc.env:HOME} cube"),
+        ("a\x1b[31m\ncube", (), "a [31m cube"),
+        (7, (), "a red cube"),
         ("a cube", ("exporter.html.title=mine",), "mine"),
     ],
 )
@@ -207,6 +209,14 @@ def test_a_failed_exporter_costs_only_its_own_file(run_folder, type_line):
     assert err.startswith("Warning: exporter.preview: ")
     assert "asset.ply" in out
     assert list(files_in(run_folder / "exports/asset.json")) == ["asset.ply"]
+
+
+def test_the_failure_of_the_only_exporter_is_one_message(run_folder, type_line):
+    words = ("exporter=[mesh]", "exporter.mesh.level=0.999")
+    code, out, err = type_line("export", f"run={run_folder}", *words)
+    assert (code, out) == (1, "")
+    assert err.startswith("cadam3d: exporter.mesh.level: expected ")
+    assert err.count("\n") == 1
 
 
 def test_a_single_file_comes_alone(run_folder, type_line, tmp_path):

@@ -109,7 +109,7 @@ def test_render_accepts_a_file_and_an_output_folder(run_folder, type_line, tmp_p
 def test_the_message_of_render_without_an_exporter_suggests_some(run_folder, type_line):
     code, _, err = type_line("render", f"run={run_folder}", "exporter=[]")
     assert code == 1
-    assert "Try: exporter=[images,turntable]" in err
+    assert "Try: 'exporter=[ply]'" in err
 
 
 TINY = ("exporter.images.size=8", "exporter.turntable.size=8", "exporter.turntable.views=4")
