@@ -222,7 +222,7 @@ def test_export_to_an_unknown_format_lists_those_that_exist(run_folder, type_lin
     assert "|ply|" in err
     code, _, err = type_line("export", f"run={run_folder}", "output=thing.fbx")
     assert code == 1
-    assert "suffix .ply" in err
+    assert "|.ply|" in err
 
 
 def test_eval_measures_against_the_truth_of_the_shapes_prior(run_folder, type_line):
