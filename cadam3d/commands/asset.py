@@ -169,10 +169,10 @@ def run_exporters(cfg: DictConfig, write: Callable[[str, Exporter], list[Path]])
     """
     exporters: Mapping[str, Exporter] = components(cfg.exporter, Exporter, "exporter")
     if not exporters:
-        raise UserError("exporter: expected at least one, got none. Try: exporter=[images,turntable]")
+        raise UserError("exporter: expected at least one, got none. Try: 'exporter=[ply]'")
     outputs, warnings = [], []
     for name, exporter in exporters.items():
-        with keeping_others(f"exporter.{name}", warnings):
+        with keeping_others(f"exporter.{name}", warnings, is_only=len(exporters) == 1):
             outputs += [Output(path, name) for path in write(name, exporter)]
     if len(warnings) == len(exporters):
         raise UserError(warnings[0])
@@ -202,16 +202,19 @@ def write_files(
         if cfg.output is not None and target.suffix and not text.endswith("/") and not target.is_dir():
             return [_one_file(cfg, asset, target, into_file)]
         if os.path.lexists(target) and not target.is_dir():
-            line = setting_word("output", numbered(target))
+            line = setting_word("output", numbered(target.with_name(target.stem), first=1))
             raise UserError(f"output: expected a folder, got {text!r}, which is a file. Try: {line}")
         existing = nearest_existing(target)
         target.mkdir(parents=True, exist_ok=True)
         require_writable(target)
     except OSError as error:
-        reason = error.strerror or error
+        place = nearest_existing(target.parent)
+        reason = f"{shown(place)} is a file" if has_file(place) else error.strerror or error
         # A long name loses its suffix here, and an unknown suffix would be refused: both become folders.
-        is_file = suffix_of(target.name) in EXPORTERS and len(target.name) <= LONGEST_NAME
-        line = setting_word("output", spare(target.name if is_file else target.stem[:LONGEST_NAME] or name))
+        suffix = suffix_of(target.name)
+        is_file = suffix in EXPORTERS and len(target.name) <= LONGEST_NAME
+        free = spare(target.name, suffix=target.name[-len(suffix) :]) if is_file else None
+        line = setting_word("output", free or spare(target.stem[:LONGEST_NAME] or name))
         raise UserError(f"output: cannot write to {target} ({reason}). Try: {line}") from error
     try:
         return into_folder(cfg, asset, target)
@@ -231,8 +234,12 @@ def _one_file(cfg: DictConfig, asset: Asset, target: Path, export: ExportFn) -> 
             outputs = export(cfg, asset, Path(folder))
             suffixes = {suffix_of(output.path.name) for output in outputs}
             if len(outputs) != 1 or suffixes != {suffix_of(target.name)}:
-                stem = target.name[: -len(suffix_of(target.name))]
+                suffix = suffix_of(target.name)
+                stem = target.name[: -len(suffix)]
                 line = setting_word("output", f"{numbered(target.with_name(stem), first=1)}/")
+                if suffix not in EXPORTERS:
+                    expected = f"a file with suffix {'|'.join(EXPORTERS)}, or a folder"
+                    raise UserError(f"output: expected {expected}, got {str(target)!r}. Try: {line}")
                 raise UserError(
                     f"output: expected the name of a folder, got {str(target)!r}, because "
                     f"exporter=[{','.join(cfg.exporter)}] writes {len(outputs)} file(s) with suffix "

@@ -1,5 +1,6 @@
 """``cadam3d export``: write an asset in the formats that other programs read."""
 
+import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -61,8 +62,10 @@ def fill_in_title(cfg: DictConfig, asset: Asset) -> None:
     run_folder = run_of(asset)
     if "html" in cfg.exporter and run_folder is not None and OmegaConf.select(cfg, key) is None:
         prompt = facts_of(run_folder)["prompt"]
-        if prompt is not None:
-            OmegaConf.update(cfg, key, escape(prompt))
+        if isinstance(prompt, str):
+            # The folder may be a stranger's, and a title has no control characters.
+            title = "".join(" " if unicodedata.category(each) == "Cc" else each for each in prompt)
+            OmegaConf.update(cfg, key, escape(title))
 
 
 def run_of(asset: Asset) -> Path | None:
@@ -148,7 +151,8 @@ def described(cfg: DictConfig, asset: Asset, output: Output) -> list[str]:
     if not is_asset(cfg, output):
         return [f"{parts[0]}, describes these files" if output.exporter == ASSET_RECORD else parts[0]]
     if output.exporter != MESH:
-        parts.append(f"{len(asset.gaussians):,} Gaussians")
+        count = len(asset.gaussians)
+        parts.append(f"{count:,} Gaussian{'' if count == 1 else 's'}")
     elif facts := mesh_in(output):
         parts.append(f"{facts.triangles:,} triangles, {'' if facts.watertight else 'not '}watertight")
     else:

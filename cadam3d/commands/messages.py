@@ -14,11 +14,12 @@ log = logging.getLogger(__name__)
 
 
 @contextmanager
-def keeping_others(name: str, warnings: list[str]) -> Iterator[None]:
+def keeping_others(name: str, warnings: list[str], *, is_only: bool = False) -> Iterator[None]:
     """Turn the failure of one output into a warning, so that it costs no other output.
 
     ``name`` is its key, such as ``exporter.turntable``. Only ``UserError`` and running out of memory are
-    failures of this kind; other exceptions are raised.
+    failures of this kind; other exceptions are raised. If it is the only output that the command makes
+    (``is_only``), its failure is a ``UserError``.
     """
     try:
         yield
@@ -26,9 +27,11 @@ def keeping_others(name: str, warnings: list[str]) -> Iterator[None]:
         if is_out_of_memory(error):
             text = f"{name}: not enough memory. Try: smaller settings of {name}"
         elif isinstance(error, UserError):
-            text = f"{name}: {error}"
+            text = str(error) if str(error).startswith(name) else f"{name}: {error}"
         else:
             raise
+        if is_only:
+            raise UserError(text) from error
         warnings.append(text)
         log.info("%s", text)
         print(f"Warning: {text}", file=sys.stderr)

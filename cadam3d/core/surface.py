@@ -147,7 +147,7 @@ class SurfaceSettings:
         """Return the error for an asset without a surface."""
         key = f"{self.node}.level"
         if len(some.rows) == 0:
-            line = "exporter=[ply]" if self.node.startswith("exporter.") else "metric=[size]"
+            line = "'exporter=[ply]'" if self.node.startswith("exporter.") else "'metric=[size]'"
             return UserError(
                 f"{self.node}: expected an asset with a surface, got no visible Gaussian. Try: {line}"
             )

@@ -139,7 +139,7 @@ FORMATS: Mapping[str, Format] = {
     ),
     "glb": Format(
         file=ASSET_GLB,
-        hint="needs a program that knows KHR_gaussian_splatting; for triangles type exporter=[mesh]",
+        hint="needs a program that knows KHR_gaussian_splatting; for triangles type 'exporter=[mesh]'",
     ),
     "sog": Format(
         file=ASSET_SOG, loss="rounds positions to 16 bits, and the rest to code books of 256 values"

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from cadam3d.core.checks import require_choice, require_range, require_whole
+from cadam3d.core.checks import require, require_choice, require_range, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import require_memory
@@ -145,12 +145,20 @@ def grown(
 def fit(points: Float[Tensor, "n 3"], radius: float | None) -> tuple[Float[Tensor, "3"], float]:
     """Return the centre of the bounding box, and the factor that then moves the farthest point to ``radius``.
 
-    Returns the origin and 1 if ``radius`` is None, so that position and size do not change.
+    Returns the origin and 1 if ``radius`` is None, so that position and size do not change. Raises
+    ``UserError`` if the distances have no number in float32.
     """
     if radius is None:
         return torch.zeros_like(points[0]), 1.0
     center = (points.amin(dim=0) + points.amax(dim=0)) / 2
     farthest = float((points - center).norm(dim=-1).max())
+    require(
+        math.isfinite(farthest),
+        "initializer.path",
+        expected="points at distances below 1e19",
+        got=float(points.abs().max()),
+        example="initializer.radius=null",
+    )
     return center, radius / farthest if farthest > 0 else 1.0
 
 

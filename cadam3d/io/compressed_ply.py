@@ -220,7 +220,7 @@ def _header(num_chunks: int, num_gaussians: int, num_rest: int, up: str) -> str:
 
 def _require_finite(path: Path, gaussians: Gaussians) -> None:
     if not all(bool(tensor.isfinite().all()) for tensor in gaussians.tensors().values()):
-        raise UserError(f"{path}: expected finite numbers, got NaN or infinity. Try: exporter=[ply]")
+        raise UserError(f"{path}: expected finite numbers, got NaN or infinity. Try: 'exporter=[ply]'")
 
 
 def morton_order(positions: np.ndarray) -> np.ndarray:

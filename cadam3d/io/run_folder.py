@@ -205,17 +205,20 @@ def remove_empty(folder: Path, existing: Path) -> None:
             return
 
 
-def numbered(folder: Path, *, first: int = 2) -> Path:
-    """Return the first of ``folder`` (as number 1), ``folder-2``, ``folder-3``, ... that does not exist."""
-    number = first
-    while os.path.lexists(place := folder.with_name(f"{folder.name}-{number}") if number > 1 else folder):
+def numbered(path: Path, *, first: int = 2, suffix: str = "") -> Path:
+    """Return the first of ``path`` (as number 1), ``path-2``, ``path-3``, ... that does not exist.
+
+    The number is in front of ``suffix``, with which the name of a file ends.
+    """
+    number, stem = first, path.name.removesuffix(suffix)
+    while os.path.lexists(place := path.with_name(f"{stem}-{number}{suffix}") if number > 1 else path):
         number += 1
     return place
 
 
-def spare(name: str) -> Path:
+def spare(name: str, *, suffix: str = "") -> Path:
     """Return a path in the folder for temporary files that does not exist yet, to suggest it to the user."""
-    return numbered(Path(tempfile.gettempdir(), name), first=1)
+    return numbered(Path(tempfile.gettempdir(), name), first=1, suffix=suffix)
 
 
 def copying(run: Path) -> tuple[str, Path]:

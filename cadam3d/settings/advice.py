@@ -201,15 +201,15 @@ def _unknown_option(error: MissingConfigException, command: str, words: Sequence
     if not group or not options:
         return UserError(f"{path}: no such configuration in {config_dir()}. Try: cadam3d doctor")
     near = did_you_mean(option, options)
-    best = near[0] if near else default_option(group, command) or options[0]
+    # The other options of a list, or of a sweep, stay.
+    typed = next((word.partition("=")[2] for word in words if key_of(word) == group), option)
+    best = near[0] if near else default_option(group, command, is_item=typed != option) or options[0]
     if all(key_of(word) != group for word in words) and (run := _resumed_run(words)):
         folder = _config_folder(run) or "DIR"
         return UserError(
             f"{group}: the run in {run} uses {option!r}, an option from a folder that was given with "
             f"--config-dir. Try: {line_of(command, [*words, f'--config-dir={folder}'])}"
         )
-    # The other options of a list, or of a sweep, stay.
-    typed = next((word.partition("=")[2] for word in words if key_of(word) == group), option)
     choice = re.sub(rf"\b{re.escape(option)}\b", best.replace("\\", ""), typed)
     example = shlex.quote(f"{group}={choice if choice != typed else best}")
     return UserError(f"{group}: expected one of {'|'.join(options)}, got {option!r}. Try: {example}")
@@ -245,17 +245,23 @@ def _no_name(reason: str, command: str, words: Sequence[str]) -> UserError:
             best = "none" if "none" in options else default_option(key, command)
             # Without a default, such as that of experiment, leaving the word out is what null means.
             rest = [other for other in words if other != word]
-            line = f"{key}={best}" if best else line_of(command, rest)
+            line = shlex.quote(f"{key}={best}") if best else line_of(command, rest)
             return UserError(f"{key}: expected one of {'|'.join(options)}, got {value}. Try: {line}")
     return UserError(f"{reason}. Try: cadam3d {command} --help")
 
 
-def default_option(group: str, command: str) -> str | None:
-    """Return the option of a group that ``command`` uses by default; ``[]`` if it has a list of them."""
+def default_option(group: str, command: str, *, is_item: bool = False) -> str | None:
+    """Return the option of a group that ``command`` uses by default, as it is typed.
+
+    This may be a list in brackets; ``is_item`` asks for the first option of such a list.
+    """
     path = config_dir() / f"{'train' if command == 'sweep' else command}.yaml"
     for entry in yaml.safe_load(path.read_text(encoding="utf-8")).get("defaults", []):
         if isinstance(entry, dict) and group in entry:
-            return "[]" if isinstance(entry[group], list) else entry[group]
+            chosen = entry[group]
+            if not isinstance(chosen, list):
+                return chosen
+            return str(chosen[0]) if is_item else f"[{','.join(chosen)}]"
     return None
 
 

@@ -184,7 +184,9 @@ def _rest(sh: Float32[np.ndarray, "n k 3"], visible: Bool[np.ndarray, "n"]) -> U
     largest = np.clip(np.abs(rest).max(axis=1), 0, HALF_MAX).astype("<f2")
     # The divisor is what the reader will multiply by. Where it is 0, all coefficients are nearly 0.
     divisor = np.where(largest > 0, largest, 1).astype(np.float32)[:, None]
-    levels = np.rint(np.clip(127 * rest / divisor, -127, 127)).astype(np.int8)
+    # A product that is too large for float32 is clipped like every coefficient above the largest half.
+    with np.errstate(over="ignore"):
+        levels = np.rint(np.clip(127 * rest / divisor, -127, 127)).astype(np.int8)
     block[:, : rest.shape[1]] = levels.view(np.uint8)
     block[:, -2:] = largest[:, None].view(np.uint8)
     return block

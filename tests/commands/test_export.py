@@ -189,6 +189,8 @@ def test_every_format_is_written_and_described_as_it_is_read_back(run_folder, ty
     [
         ("a </title><b>cube", (), "a &lt;/title&gt;&lt;b&gt;cube"),
         ("a ${oc.env:HOME} cube", (), "a ${oc.env:HOME} cube"),
+        ("a\x1b[31m\ncube", (), "a [31m cube"),
+        (7, (), "a red cube"),
         ("a cube", ("exporter.html.title=mine",), "mine"),
     ],
 )
@@ -207,6 +209,14 @@ def test_a_failed_exporter_costs_only_its_own_file(run_folder, type_line):
     assert err.startswith("Warning: exporter.preview: ")
     assert "asset.ply" in out
     assert list(files_in(run_folder / "exports/asset.json")) == ["asset.ply"]
+
+
+def test_the_failure_of_the_only_exporter_is_one_message(run_folder, type_line):
+    words = ("exporter=[mesh]", "exporter.mesh.level=0.999")
+    code, out, err = type_line("export", f"run={run_folder}", *words)
+    assert (code, out) == (1, "")
+    assert err.startswith("cadam3d: exporter.mesh.level: expected ")
+    assert err.count("\n") == 1
 
 
 def test_a_single_file_comes_alone(run_folder, type_line, tmp_path):
@@ -416,3 +426,29 @@ def test_each_line_about_a_file_is_short():
     for exporter in FORMATS:
         assert len(loss_of(exporter, 3)) < 120
         assert max((len(line) for up in UPS for line in views_in_words(exporter, up)), default=0) < 150
+
+
+# --- wrong places -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("output", "reason"),
+    [
+        ("output=a.jpg", "expected a file with suffix .compressed.ply|"),
+        ("output=file/a.ply", "cannot write to file/a.ply (file is a file)"),
+        ("output=thing.ply/", "expected a folder, got 'thing.ply/', which is a file"),
+    ],
+)
+def test_a_wrong_place_is_explained_with_one_that_works(run_folder, type_line, output, reason):
+    for name in ("file", "thing.ply"):
+        Path(name).touch()
+    message = type_line("export", f"run={run_folder}", output).message
+    assert reason in message
+    assert type_line("export", f"run={run_folder}", message.partition("Try: ")[2]).code == 0
+
+
+@pytest.mark.parametrize("typed", ["foo", "[foo]", "[spz,foo]"])
+def test_an_unknown_exporter_is_explained_with_the_usual_one(run_folder, type_line, typed):
+    message = type_line("export", f"run={run_folder}", f"exporter={typed}", "output=out").message
+    suggested = shlex.split(message.partition("Try: ")[2])
+    assert type_line("export", f"run={run_folder}", *suggested, "output=out").code == 0

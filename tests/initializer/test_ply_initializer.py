@@ -306,3 +306,14 @@ def test_a_missing_file_is_reported(tmp_path):
 def test_an_impossible_value_is_refused_by_name(key, value):
     with pytest.raises(UserError, match=rf"initializer\.{key}: expected"):
         ply("a.ply", **{key: value})
+
+
+@pytest.mark.parametrize("far", [1e25, 3e38])
+def test_an_asset_too_large_to_be_measured_is_refused_only_if_it_is_scaled(tmp_path, far):
+    huge = some_gaussians(3)
+    huge.means[0] = -far
+    huge.means[1] = far
+    write_ply(tmp_path / "a.ply", huge, up="-y", pad_sh=0)
+    assert len(build(tmp_path / "a.ply")) == 3
+    with pytest.raises(UserError, match=r"distances below 1e19.*Try: initializer.radius=null$"):
+        build(tmp_path / "a.ply", radius=0.5)

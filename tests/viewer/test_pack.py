@@ -1,5 +1,6 @@
 """Snapshots for the browser: the bytes hold what the Gaussians are, and nothing that a page cannot draw."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -162,3 +163,11 @@ def test_a_snapshot_needs_no_gradient_of_trained_tensors():
     gaussians = some_gaussians(5).map(lambda tensor: tensor.requires_grad_())
     assert pack(gaussians) == pack(some_gaussians(5))
     assert isinstance(gaussians, Gaussians)
+
+
+def test_coefficients_too_large_for_a_product_are_limited_without_a_warning():
+    gaussians = some_gaussians(2, degree=1)
+    gaussians.sh[:, 1:] = 3e38
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pack(gaussians)
