@@ -38,6 +38,18 @@ def test_a_changed_file_of_the_package_is_read_again(tmp_path, monkeypatch):
         assert FileConfigSource("main", str(tmp_path)).load_config("a").config.key == number
 
 
+@pytest.mark.parametrize(
+    "text",
+    ["1e-3", "1e5", "2024-01-01", ".inf", "1_000", "0x1f", "0o17", "017", "12:30", "on", "'1'", "~", "${a}"],
+)
+def test_a_value_has_the_type_that_omegaconf_gives_it(text, tmp_path, monkeypatch):
+    monkeypatch.setattr("cadam3d.settings.source.config_dir", lambda: tmp_path)
+    (tmp_path / "a.yaml").write_text(f"key: {text}")
+    found = FileConfigSource("main", str(tmp_path)).load_config("a").config
+    expected = file_config_source.FileConfigSource("main", str(tmp_path)).load_config("a").config
+    assert repr(found) == repr(expected)
+
+
 @pytest.mark.parametrize("text", ["[" * 100_000, "a: [1", "a: 1\na: 2", "5"])
 def test_a_damaged_file_of_the_user_is_refused(text, tmp_path):
     (tmp_path / "densifier").mkdir()
