@@ -23,7 +23,6 @@ from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_yaml
 from cadam3d.settings.declared import config_dir, require_declared
-from cadam3d.settings.source import register_source
 
 # Hydra behaves like this version even if a newer one is installed.
 VERSION_BASE = "1.3"
@@ -50,7 +49,7 @@ def compose(
     ``folder`` replaces :func:`config_dir`, ``search_path`` is one more folder of YAML files, ``with_hydra``
     keeps Hydra's own node. Raises Hydra's exceptions; ``cadam3d.settings.advice`` explains them to the user.
     """
-    register_with_hydra()
+    register_resolvers()
     require_files(folder or config_dir(), "--config-path")
     places = create_config_search_path(str((folder or config_dir()).resolve()))
     if search_path is not None:
@@ -187,12 +186,11 @@ def flatten(node: object, prefix: str = "", *, with_nodes: bool = False) -> Iter
         yield from flatten(value, f"{prefix}.{key}" if prefix else str(key), with_nodes=with_nodes)
 
 
-def register_with_hydra() -> None:
-    """Register how YAML files are read, and the functions that they call, as in ``${parts:9,12,${steps}}``.
+def register_resolvers() -> None:
+    """Register the functions that YAML files call, as in ``${parts:9,12,${steps}}``.
 
     It is safe to call this again.
     """
-    register_source()
     OmegaConf.register_new_resolver("parts", parts, replace=True)
     OmegaConf.register_new_resolver("slug", slug, replace=True)
     OmegaConf.register_new_resolver("span", span, replace=True)

@@ -20,7 +20,7 @@ from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
 from cadam3d.settings.advice import default_option, did_you_mean, line_of
-from cadam3d.settings.compose import VERSION_BASE, compose, config_dir, quote, register_with_hydra
+from cadam3d.settings.compose import VERSION_BASE, compose, config_dir, quote, register_resolvers
 from cadam3d.settings.declared import TARGET, replacement
 from cadam3d.settings.line import RUN_FOLDER, key_of
 
@@ -155,7 +155,7 @@ def run_hydra(command: str, arguments: Sequence[str], run: Run) -> None:
 
     Raises Hydra's exceptions.
     """
-    register_with_hydra()
+    register_resolvers()
     arguments_before, switch_before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     sys.argv = [sys.argv[0], *arguments]
     # Otherwise Hydra would print exceptions and exit.
