@@ -155,6 +155,7 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         ("render", "run=a run", "exporter=[progress]"),
         ("export", "run=[a run,a run]"),
         ("render", "ply=nothing.ply"),
+        ("export", "ply=a run"),
         ("render", "run=a run", "output=/dev/null/x"),
         ("export", "run=a run", "output=/dev/null/x.ply"),
         ("export", "run=new"),

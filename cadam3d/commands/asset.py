@@ -76,10 +76,16 @@ def open_asset(cfg: DictConfig) -> Asset:
 
 
 def require_one(cfg: DictConfig) -> None:
-    """Raise ``UserError`` unless exactly one of ``run=`` and ``ply=`` is given and ``ply_up=`` is an axis."""
+    """Raise ``UserError`` unless exactly one of ``run=`` and ``ply=`` is given.
+
+    The value of ``ply=`` must not be the folder of a run, and that of ``ply_up=`` must be an axis or null.
+    """
     if (cfg.run is None) == (cfg.ply is None):
         got, line = ("neither", suggestion("", "run", ASSET)) if cfg.run is None else ("both", "ply=null")
         raise UserError(f"run, ply: expected one of them, got {got}. Try: {line}")
+    if cfg.ply is not None and has_file(expanded(str(cfg.ply)), CONFIG):
+        line = f"ply=null {setting_word('run', cfg.ply)}"
+        raise UserError(f"ply: expected a file, got {str(cfg.ply)!r}, the folder of a run. Try: {line}")
     if cfg.ply_up is not None:
         require_choice("ply_up", cfg.ply_up, UPS)
 
