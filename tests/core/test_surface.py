@@ -217,7 +217,7 @@ def test_watertight_means_that_every_edge_has_two_triangles_in_opposite_directio
 
 
 def test_an_asset_without_a_surface_gets_a_message_that_works():
-    with pytest.raises(UserError, match=r"got no visible Gaussian\. Try: exporter=\[ply\]"):
+    with pytest.raises(UserError, match=r"got no visible Gaussian\. Try: 'exporter=\[ply\]'"):
         surface(at(torch.zeros(0, 3)))
     faint = at(0.1 * torch.randn(5, 3, generator=torch.Generator().manual_seed(0)), logit=-3.0)
     with pytest.raises(UserError, match=r"exporter\.mesh\.level: .* got 0\.3") as caught:
