@@ -1,5 +1,6 @@
 """Shared fixtures (the command line in this process, small real pipelines), and the order of test files."""
 
+import copy
 import gc
 import sys
 from collections.abc import Callable
@@ -45,6 +46,30 @@ def pytest_collection_finish():
     # Composing a configuration makes tens of thousands of objects and hardly any cycles among them.
     gc.set_threshold(50_000, 20, 20)
     _skip_unused_maps()
+    _read_settings_once()
+
+
+def _read_settings_once() -> None:
+    """Let Hydra parse each YAML file of the package once. Other files are read as always."""
+    from hydra._internal.sources_registry import SourcesRegistry
+    from hydra.core.plugins import Plugins
+
+    from cadam3d.settings.compose import config_dir
+
+    Plugins.instance()
+    reader: Any = SourcesRegistry.instance().types["file"]
+    load, folder = reader.load_config, str(config_dir().resolve())
+    parsed = {}
+
+    def load_once(source, config_path):
+        if source.path != folder:
+            return load(source, config_path)
+        if config_path not in parsed:
+            parsed[config_path] = load(source, config_path)
+        # Hydra changes what it gets.
+        return copy.deepcopy(parsed[config_path])
+
+    reader.load_config = load_once
 
 
 def _skip_unused_maps() -> None:
