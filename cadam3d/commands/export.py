@@ -154,7 +154,7 @@ def described(cfg: DictConfig, asset: Asset, output: Output) -> list[str]:
         count = len(asset.gaussians)
         parts.append(f"{count:,} Gaussian{'' if count == 1 else 's'}")
     elif facts := mesh_in(output):
-        parts.append(f"{facts.triangles:,} triangles, {'' if facts.watertight else 'not '}watertight")
+        parts.append(str(facts))
     else:
         return [f"{parts[0]}, belongs to the mesh"]
     up = setting(cfg, output, "up")

@@ -72,7 +72,7 @@ class SurfaceFacts:
         closed = "watertight" if self.watertight else "not watertight"
         parts = "1 part" if self.parts == 1 else f"{self.parts} parts"
         return (
-            f"{self.triangles} triangles, {parts}, {closed}, area {self.area:.3g}, volume {self.volume:.3g}"
+            f"{self.triangles:,} triangles, {parts}, {closed}, area {self.area:.3g}, volume {self.volume:.3g}"
         )
 
 
