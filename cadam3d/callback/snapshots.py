@@ -1,13 +1,17 @@
 """Snapshots: records the Gaussians at some steps, so that the report can show how the object grows."""
 
+import logging
 from dataclasses import dataclass, field
 
 from cadam3d.callback.base import Callback
 from cadam3d.callback.layers import Layers
 from cadam3d.core.checks import require_whole
+from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
 from cadam3d.io.run_folder import SNAPSHOTS, snapshot_name, snapshots
 from cadam3d.state import RefineReport, RunContext, StepReport, TrainState
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(kw_only=True)
@@ -15,7 +19,8 @@ class Snapshots(Callback):
     """Write ``snapshots/step_0000050.bin`` and so on, in the format of ``viewer/pack.py``.
 
     The start, multiples of ``every`` and the last step are recorded. Nothing is rendered, so a snapshot of a
-    few thousand Gaussians takes a few milliseconds. Populations above ``largest`` are left out.
+    few thousand Gaussians takes a few milliseconds. Populations above ``largest`` are left out. A snapshot
+    that cannot be written costs the run nothing except this snapshot.
     """
 
     every: int  # steps
@@ -47,5 +52,8 @@ class Snapshots(Callback):
     def _record(self, context: RunContext, state: TrainState) -> None:
         if len(state.gaussians) > self.largest:
             return
-        with replacing(context.folder / SNAPSHOTS / snapshot_name(state.step)) as temporary:
-            temporary.write_bytes(self._layers.snapshot(context, state))
+        try:
+            with replacing(context.folder / SNAPSHOTS / snapshot_name(state.step)) as temporary:
+                temporary.write_bytes(self._layers.snapshot(context, state))
+        except UserError as error:
+            log.warning("no snapshot of step %d: %s", state.step, error)

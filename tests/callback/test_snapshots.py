@@ -67,6 +67,12 @@ def test_a_large_population_is_not_recorded(tmp_path):
     assert snapshots(tmp_path) == {}
 
 
+def test_a_folder_that_cannot_be_written_costs_the_snapshots_and_not_the_run(tmp_path, caplog):
+    (tmp_path / "snapshots").write_text("a file")
+    assert train(tmp_path, Snapshots(every=4, largest=1000), "steps=4").step == 4
+    assert "no snapshot of step 4" in caplog.text
+
+
 def test_a_resumed_run_removes_what_was_recorded_after_its_checkpoint(tmp_path):
     train(tmp_path, Snapshots(every=2, largest=1000), "steps=4")
     stale = tmp_path / "snapshots/step_0000900.bin"
