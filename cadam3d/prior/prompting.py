@@ -17,8 +17,14 @@ from cadam3d.core.checks import require, require_choice, require_range
 
 FRONT, SIDE, BACK, OVERHEAD = range(4)
 SUFFIXES = (", front view", ", side view", ", back view", ", overhead view")
+# Eight sides of the object, an eighth of a turn apart, from the front on. Left and right are those of a viewer in
+# front of the object.
+SIDES = ("front", "front right", "right", "back right", "back", "back left", "left", "front left")
+# From below, at the height of the object, and from above.
+HEIGHTS = (" from below", "", " from above")
 # The angle between front, side and back. Embeddings are interpolated within it.
 QUARTER = 90.0  # degrees
+EIGHTH = 45.0  # degrees
 
 
 @dataclass(frozen=True)
@@ -90,6 +96,37 @@ class Discrete(Prompting):
         which[turned > 180 - self.back_deg] = BACK
         which[cameras.elevation_deg > self.overhead_deg] = OVERHEAD
         return _attract(_one_hot(which, len(SUFFIXES), cameras.azimuth_deg))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compass(Prompting):
+    """One of 24 texts per view: eight sides, each from below, at the height of the object, and from above."""
+
+    below_deg: float
+    above_deg: float
+
+    def __post_init__(self) -> None:
+        require_range("prompting.below_deg", self.below_deg, low=-90, high=90, example=-5)
+        require_range("prompting.above_deg", self.above_deg, low=-90, high=90, example=35)
+        require(
+            self.below_deg <= self.above_deg,
+            "prompting.above_deg",
+            expected=f"at least prompting.below_deg, {self.below_deg:g}",
+            got=self.above_deg,
+            example="prompting.above_deg=35",
+        )
+
+    def texts(self, prompt: str) -> list[str]:
+        """Return the prompt with the words of every side and height."""
+        return [f"{prompt}, {side} view{height}" for height in HEIGHTS for side in SIDES]
+
+    def mix(self, cameras: Cameras) -> Mix:
+        """Return one-hot rows, for the nearest side and the height of each view."""
+        eighths = (cameras.azimuth_deg / EIGHTH).round().long() % len(SIDES)
+        elevation = cameras.elevation_deg
+        height = (elevation >= self.below_deg).long() + (elevation > self.above_deg).long()
+        which = height * len(SIDES) + eighths
+        return _attract(_one_hot(which, len(SIDES) * len(HEIGHTS), cameras.azimuth_deg))
 
 
 @dataclass(frozen=True, kw_only=True)
