@@ -13,7 +13,7 @@ pytest.importorskip("diffusers")
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 import train_prior
-from prior_training import autoencoder, formats, loop, stages, text, views, world
+from prior_training import autoencoder, card, formats, loop, samples, stages, text, views, world
 
 from cadam3d.core.cameras import orbit
 from cadam3d.prior.mvdream import camera_numbers
@@ -201,6 +201,15 @@ def test_the_learning_rate_rises_and_then_falls():
 # --- the program
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_samples():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(samples, "STEPS", 2)
+        patch.setattr(card, "SHOWN", card.SHOWN[:2])
+        patch.setattr(card, "SHOWN_HELD_OUT", 2)
+        yield
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A Stable Diffusion of a few steps, as the command writes it."""
@@ -212,8 +221,6 @@ def trained(tmp_path_factory):
 
 @pytest.mark.slow
 def test_the_command_writes_a_model_that_a_prior_reads(trained):
-    from prior_training.samples import draw, four_cameras
-
     index = json.loads((trained / "model_index.json").read_text())
     assert index["_class_name"] == "StableDiffusionPipeline"
     card = (trained / "README.md").read_text()
@@ -224,7 +231,7 @@ def test_the_command_writes_a_model_that_a_prior_reads(trained):
     plan = stages.Plan(
         trained, trained, 4, stages.format_of("stable_diffusion", SIZE, "epsilon"), 0, 1, "cpu", None
     )
-    images = draw(stages.prior_of(plan), "a red cube", four_cameras(SIZE), 4, seed=0)
+    images = samples.draw(stages.prior_of(plan), "a red cube", samples.four_cameras(SIZE), 4, seed=0)
     assert images.shape == (4, SIZE, SIZE, 3)
     assert images.isfinite().all()
 

@@ -130,6 +130,7 @@ def prior_of(plan: Plan) -> DiffusionPrior:
         f"prior={plan.kind.name}",
         f"prior.path={plan.out.resolve()}",
         f"prior.size={plan.kind.size}",
+        f"prior.cache_dir={(plan.work / 'cache').resolve()}",
         f"prompting={plan.kind.prompting}",
     ]
     return component(compose([*typed, "prompt=cube"]).prior, DiffusionPrior, "prior")
