@@ -67,8 +67,9 @@ class GCS(WindowedGuidance):
     Guidance has the conventional form, negative + scale * (positive - negative); the authors' repository
     calls ``weight`` lambda_guidance. The second term of each difference and the networks are constants. The
     slope of the chain of DDIM steps that carries x0 into the first term telescopes to a(e) for CC and to 1
-    for GC. CP applies its difference to the pixels of the render directly, without the encoder. The
-    gradients, before D, are
+    for GC. CP applies its difference to the pixels of the render directly, without the encoder. If the render
+    shows disparity, CP moves the disparity, where the released code moves the colours. The gradients, before
+    D, are
 
         2 weight (a(e) w_cc [CC's difference] + w_gc [GC's])  on x0,    2 weight w_cp [CP's]  on the render.
 
