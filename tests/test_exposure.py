@@ -83,7 +83,7 @@ def test_brightness_is_that_of_the_picture_over_black():
 
 @pytest.mark.parametrize(("level", "backdrop"), [(0.2, 1.0), (0.95, 0.3)])
 def test_a_coloured_background_does_not_decide(level, backdrop):
-    """The published rule, which counts every pixel that is not black, decides both cases by the background."""
+    """The published rule counts every pixel that is not black, so the background decides both cases."""
     alpha = torch.zeros(2, 8, 8)
     alpha[:, 3:5, 3:5] = 1.0
     color, behind = torch.full((2, 8, 8, 3), level), torch.full((2, 3), backdrop)

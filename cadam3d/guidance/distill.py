@@ -193,7 +193,7 @@ def standard_normal(like: Float[Tensor, "v c h w"], generator: torch.Generator) 
 def offset_normal(
     like: Float[Tensor, "v c h w"], generator: torch.Generator, offset: float
 ) -> Float[Tensor, "v c h w"]:
-    """Draw noise as :func:`standard_normal` does, and add ``offset`` * N(0, 1) to each channel of all views."""
+    """Draw noise as :func:`standard_normal` does, plus ``offset`` * N(0, 1) per channel for all views."""
     noise = standard_normal(like, generator)
     return noise if offset == 0 else noise + offset * standard_normal(like[:1, :, :1, :1], generator)
 

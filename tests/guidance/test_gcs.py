@@ -185,8 +185,8 @@ def test_the_noise_has_an_offset_per_channel_that_all_views_share(make, gaussian
     clean = rgb.detach().permute(0, 3, 1, 2)
 
     def noise_of(guidance):
-        t = torch.full((3,), 0.5, dtype=torch.float64)
-        return guidance.draw_noise(Case(clean, t, means, gaussian(DDPM()), 0, torch.Generator().manual_seed(7)))
+        t, generator = torch.full((3,), 0.5, dtype=torch.float64), torch.Generator().manual_seed(7)
+        return guidance.draw_noise(Case(clean, t, means, gaussian(DDPM()), 0, generator))
 
     for fixed, seed in ((True, 8), (False, 7)):
         generator = torch.Generator().manual_seed(seed)
