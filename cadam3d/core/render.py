@@ -44,7 +44,7 @@ class RenderOutput:
         does not depend on the unit of length.
 
         LucidDreamer stretches 1 / (alpha depth + 10 (1 - alpha)), which puts the background at a depth of 10
-        in its units. The two pictures are equal where alpha is 0 or 1.
+        in its units. The two pictures are equal if every alpha is 0 or 1.
         """
         is_hit = self.alpha > 0
         inverse = torch.where(is_hit, self.alpha / torch.where(is_hit, self.depth, 1.0), 0.0)

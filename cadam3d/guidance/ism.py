@@ -24,7 +24,7 @@ class ISM(GuidedDistillation):
 
     In the paper the inversion starts at t0 = 0 from the render x0 itself. LucidDreamer's code starts at
     t0 = ``initial_noise`` = 0.002 from a x0 + b n, where n is N(0, I) plus ``noise_offset`` * N(0, 1) per
-    channel. Neither s nor x_s is cleaner than that. If t is below ``initial_noise``, t0 = s = t.
+    channel. For t <= t0 + delta the inversion stays there, and for t < ``initial_noise`` t0 = s = t.
 
     A step makes ceil((s - t0) / inversion_stride) + 1 predictions without guidance and one with it; without
     ``shared_t`` the longest inversion of the batch sets the number.

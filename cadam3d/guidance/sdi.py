@@ -11,7 +11,7 @@ from cadam3d.guidance.distill import Case, Comparison, GuidedDistillation
 from cadam3d.guidance.trajectory import ROW, ddim, strides
 from cadam3d.prior.path import per_view
 
-# Positions of the levels of the inversion, by name.
+# Where the levels of the inversion are, by name.
 GRIDS = ("even", "rows")
 
 
@@ -33,14 +33,15 @@ class SDI(GuidedDistillation):
     invert best.
 
     With the ``inversion_grid`` "even", the levels of the inversion are 0, ``inversion_stride``, twice that,
-    and so on to t', and a step makes ceil(t' / inversion_stride) + 1 predictions, all under guidance. "rows"
-    has the levels of the released code: 0.001, then every ``inversion_stride`` from 0.002 as long as it is
-    below t, and t' directly after the last of these. That is at most one prediction more.
+    and so on to t', and a step makes ceil(t' / inversion_stride) + 1 predictions, all under guidance.
 
-    The released code differs from the paper in more points, which are not options here:
+    The released code, in threestudio, differs from the paper in its numbers, which
+    ``guidance=sdi_threestudio`` has: t falls from 0.98 to 0.25, tau is below 0.1, and the inversion has the
+    levels that are called "rows" here. It takes x0 to be at the first row of the noise table, t = 0.001.
+    Then come 0.002 and every further ``inversion_stride`` below t, and t' directly after the last of these.
+    It also differs in four points for which there is no option:
 
-    - It draws tau from [0, 0.1) and t from 0.98 to 0.25. ``guidance=sdi_threestudio`` has these numbers.
-    - It informs the network of timestep -99 at the first level of the inversion, where ours is 0.
+    - At the first level it gives the network the timestep -99. Ours is 0.
     - It adds its noise at every step of the inversion. Over ten steps the sum in x_t' agrees with the
       eta b(t')^2 used here to within 7 %.
     - It passes x_t' itself to the last prediction as if its level were t, where the paper goes back to t.
