@@ -198,13 +198,14 @@ def register_resolvers() -> None:
     OmegaConf.register_new_resolver("span", span, replace=True)
 
 
-def parts(count: int, pieces: int, steps: object) -> int:
+def parts(count: int, pieces: int, steps: object, least: int = 1) -> int:
     """Return the number of steps in ``count`` of ``pieces`` equal parts of a run; a part has at least 1 step.
 
-    Each part is rounded down, so keys that share ``pieces`` keep their order and ratio at any length. Returns
-    ``count`` for non-integers; the command reports the error in ``steps``.
+    Each part is rounded down, so keys that share ``pieces`` keep their order and ratio at any length. The
+    result is at least ``least``. Returns ``count`` for non-integers; the command reports the error in
+    ``steps``.
     """
-    return count * max(1, steps // pieces) if type(steps) is int else count
+    return max(least, count * max(1, steps // pieces)) if type(steps) is int else count
 
 
 def copies(count: object, times: object, usual: int) -> int:
