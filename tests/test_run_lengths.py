@@ -70,6 +70,18 @@ def test_the_default_schedule_of_600_steps_is_what_it_was():
         assert evaluated(OmegaConf.to_container(window)["t_max"]["steps"], 600) == 500
 
 
+@pytest.mark.parametrize(("name", "end"), [("sds_mvdream", (0.02, 0.5)), ("sdi_threestudio", (0.25, 0.25))])
+def test_the_windows_of_published_runs_of_10000_steps_end_with_a_run_of_any_length(name, end):
+    for steps in (100, 1200, 10_000):
+        guidance = component(compose([PROMPT, f"guidance={name}", f"steps={steps}"]).guidance)
+        assert guidance.window(0) == (0.98, 0.98)
+        assert guidance.window(steps - 1) == pytest.approx(end, abs=0.01)
+        if name == "sds_mvdream":
+            # Published: the windows move during the first 8000 steps.
+            assert guidance.window(steps * 4 // 5) == pytest.approx(end)
+            assert guidance.window(steps * 4 // 5 - 1) != pytest.approx(end)
+
+
 def test_the_default_schedule_has_the_same_shape_at_every_length():
     for steps, refine in schedules().items():
         refinements, resets = len(refine.refinements), len(refine.resets)
