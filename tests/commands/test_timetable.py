@@ -96,9 +96,10 @@ RECIPES = (
 
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_every_schedule_of_a_recipe_follows_its_length(recipe):
-    for steps in (60, 400):
+    for steps in (100, 400):
         text = line(f"experiment={recipe}", f"steps={steps}")
         assert "made for" not in text
+        # GaussianDreamer's rates, which this sentence leaves out, fall over 25 times the run, as published.
         assert "ends before" not in text
         assert "Nothing will grow" not in text
         assert "refinements (steps" in text
@@ -119,4 +120,4 @@ def test_a_recipe_of_its_published_length_misses_nothing():
 def test_constant_learning_rates_are_called_constant():
     rates = [f"optimizer.{part}_lr=0.01" for part in ("means", "sh_dc", "scale", "quat")]
     assert line(*rates).endswith("constant learning rates.")
-    assert "learning rates change until step 300." in line("optimizer=dreamgaussian")
+    assert "learning rates change until step 360." in line("optimizer=dreamgaussian")
