@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 from cadam3d.commands.train import build_trainer
 from cadam3d.core.errors import UserError
+from cadam3d.core.schedule import as_schedule
 from cadam3d.densifier.refine import Refine
 from cadam3d.io.jsonl import read_json
 from cadam3d.settings.compose import component, compose, config_dir, parts
@@ -70,16 +71,40 @@ def test_the_default_schedule_of_600_steps_is_what_it_was():
         assert evaluated(OmegaConf.to_container(window)["t_max"]["steps"], 600) == 500
 
 
-@pytest.mark.parametrize(("name", "end"), [("sds_mvdream", (0.02, 0.5)), ("sdi_threestudio", (0.25, 0.25))])
-def test_the_windows_of_published_runs_of_10000_steps_end_with_a_run_of_any_length(name, end):
-    for steps in (100, 1200, 10_000):
-        guidance = component(compose([PROMPT, f"guidance={name}", f"steps={steps}"]).guidance)
-        assert guidance.window(0) == (0.98, 0.98)
-        assert guidance.window(steps - 1) == pytest.approx(end, abs=0.01)
-        if name == "sds_mvdream":
-            # Published: the windows move during the first 8000 steps.
-            assert guidance.window(steps * 4 // 5) == pytest.approx(end)
-            assert guidance.window(steps * 4 // 5 - 1) != pytest.approx(end)
+@pytest.mark.parametrize(
+    ("name", "end"),
+    [
+        ("sds_gaussiandreamer", (0.02, 0.55)),
+        ("ism_luciddreamer", (0.02, 0.5)),
+        ("vfds_flowdreamer", (0.02, 0.5)),
+        ("ucm_flowdreamer", (0.02, 0.5)),
+        ("gcs_beg", (0.02, 0.5)),
+        ("sds_dreamgaussian", (0.02, 0.02)),
+        ("sds_mvdream", (0.02, 0.5)),
+        ("sdi_threestudio", (0.25, 0.25)),
+    ],
+)
+def test_published_windows_follow_the_length_of_the_run_and_reach_their_ends(name, end):
+    def at(steps):
+        return component(compose([PROMPT, f"guidance={name}", f"steps={steps}"]).guidance)
+
+    short, long = at(300), at(3000)
+    for tenths in range(10):
+        assert short.window(30 * tenths) == pytest.approx(long.window(300 * tenths))
+        for key in ("delta", "clip"):
+            values = [getattr(guidance, key, None) for guidance in (short, long)]
+            if None not in values:
+                values = [as_schedule(v)(n * tenths) for v, n in zip(values, (30, 300), strict=True)]
+                assert values[0] == pytest.approx(values[1])
+    assert long.window(2999) == pytest.approx(end, abs=1e-3)
+
+
+def test_mvdreams_windows_move_during_four_fifths_of_a_run_as_published():
+    guidance = component(compose([PROMPT, "guidance=sds_mvdream", "steps=10000"]).guidance)
+    assert guidance.window(0) == (0.98, 0.98)
+    assert guidance.window(4000) == pytest.approx((0.5, 0.74))
+    assert guidance.window(7999)[0] > 0.02
+    assert guidance.window(8000) == pytest.approx((0.02, 0.5))
 
 
 def test_the_default_schedule_has_the_same_shape_at_every_length():
