@@ -125,7 +125,8 @@ def test_the_command_line_can_replace_every_group_of_a_recipe(recipe):
 def test_a_recipe_trains_through_a_real_pipeline(recipe, densifier, pipelines, tmp_path, monkeypatch):
     folder = pipelines(PIPELINES.get(recipe, "stable_diffusion"))
     lines = [f"experiment={recipe}", "prompt=a corgi", f"prior.path={folder}", f"densifier={densifier}"]
-    lines += ["steps=2", "initializer=ball", "initializer.count=50", "camera.size=16", "prior.size=32"]
+    lines += ["steps=2", "initializer=ball", "initializer.count=50", "initializer.scale=0.05"]
+    lines += ["camera.size=16", "prior.size=32"]
     lines += [
         "exporter=[ply]",
         "metric=[size]",
