@@ -36,7 +36,8 @@ class BrightnessGuard(Exposure):
     """Dims colours when the bright parts of most views are too bright (GCS-BEG's over-exposure guard).
 
     The brightness of a pixel is the mean of its channels without the contribution of the background. Over
-    black this equals the published code, which counts a background of any other colour as part of the object.
+    black this equals the published code. A background of any other colour counts as part of the object there,
+    so that a random colour decides whether the object is dimmed. Here it has no influence.
     """
 
     begin: int  # step

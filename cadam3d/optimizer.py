@@ -35,6 +35,7 @@ class AdamSettings:
     beta2: float  # in [0, 1)
     eps: float  # > 0
     clip_norm: float | Schedule | None  # > 0, of each part
+    clip_unit: float  # > 0, world units
 
     def __post_init__(self) -> None:
         for part in PARTS:
@@ -44,6 +45,7 @@ class AdamSettings:
         require_range("optimizer.eps", self.eps, above=0, example=1e-15)
         if self.clip_norm is not None:
             require_scheduled("optimizer.clip_norm", self.clip_norm, above=0, example="null")
+        require_range("optimizer.clip_unit", self.clip_unit, above=0, example=1.0)
 
     def start(self, gaussians: Gaussians) -> "GaussianOptimizer":
         """Return an optimizer that owns a copy of ``gaussians``, with zero moments."""
@@ -57,9 +59,15 @@ class AdamSettings:
         """Return the first step from which no learning rate changes; 0 if all are constant."""
         return max(settled_at(getattr(self, f"{part}_lr")) for part in PARTS)
 
-    def largest_norm(self, step: int) -> float | None:
-        """Return :attr:`clip_norm` at ``step`` (0 is the first); None if gradients are not clipped."""
-        return None if self.clip_norm is None else float(as_schedule(self.clip_norm)(step))
+    def largest_norm(self, part: str, step: int) -> float | None:
+        """Return the bound of a part at ``step`` (0 is the first); None if gradients are not clipped.
+
+        The gradient of positions is per :attr:`clip_unit`, a length; the others have no unit of length.
+        """
+        if self.clip_norm is None:
+            return None
+        bound = float(as_schedule(self.clip_norm)(step))
+        return bound / self.clip_unit if part == "means" else bound
 
 
 class GaussianOptimizer:
@@ -81,11 +89,12 @@ class GaussianOptimizer:
         A tensor without a gradient has the gradient zero, so its moments decay like all others. With a
         ``clip_norm``, only Adam sees clipped gradients, because densifiers observe them before this step.
         """
-        rates, bound = self.settings.learning_rates(step), self.settings.largest_norm(step)
+        rates = self.settings.learning_rates(step)
         gradients = self._gaussians.map(
             lambda tensor: torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
         )
         for name, gradient in parts_of(gradients).items():
+            bound = self.settings.largest_norm(name, step)
             self._move(name, gradient if bound is None else _clipped(gradient, bound), rates[name])
         self.zero_grad()
 

@@ -114,13 +114,16 @@ class Trainer:
     def _refine(self, state: TrainState, step: int) -> RefineReport | None:
         """Grow, prune and reset opacities if the schedule says so after step number ``step`` (from 1).
 
+        The last step of a run may only prune (``refine.last_max_scale``).
+
         A refinement is decided first and then applied to all three owners of rows: Gaussians, optimizer
         moments and densifier state. One that would exceed ``max_gaussians`` changes nothing except
         ``state.refused``.
         """
         refines, resets = self.refine.refines_at(step), self.refine.resets_at(step)
+        prunes = self.refine.prunes_at(step)
         state.refused = False
-        if not (refines or resets):
+        if not (refines or resets or prunes):
             return None
         before, seen = state.gaussians.detach(), state.densifier
         statistics, scores = self.densifier.statistics(seen, step), self.densifier.scores(seen)
@@ -128,10 +131,13 @@ class Trainer:
         cloned = split = pruned = reset = 0
         edit = None
 
-        if refines:
+        if refines or prunes:
             generator = state.generators["refine"]
             draws_before = generator.get_state()
-            plan = self.densifier.plan(state.densifier, state.gaussians, step, self.refine, generator)
+            if refines:
+                plan = self.densifier.plan(state.densifier, state.gaussians, step, self.refine, generator)
+            else:
+                plan = self.refine.plan(state.gaussians, is_selected, step, generator)
             is_selected = plan.is_selected
             state.refused = self.refine.exceeds(plan)
             if state.refused:

@@ -97,7 +97,8 @@ def some_gaussians(n: int) -> Gaussians:
 
 def adam() -> AdamSettings:
     rates = ("means_lr", "sh_dc_lr", "sh_rest_lr", "opacity_lr", "scale_lr", "quat_lr")
-    return AdamSettings(**dict.fromkeys(rates, 0.01), beta1=0.9, beta2=0.999, eps=1e-15, clip_norm=None)
+    constants = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-15, "clip_norm": None, "clip_unit": 1.0}
+    return AdamSettings(**dict.fromkeys(rates, 0.01), **constants)
 
 
 def edit_of(n: int, keep: list[int], parents: list[int]) -> RowEdit:

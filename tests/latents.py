@@ -16,6 +16,7 @@ KEYS = {
     "variant": None,
     "prompting": Discrete(front_deg=45.0, back_deg=45.0, overhead_deg=60.0),
     "size": 64,
+    "noise_levels": "table",
     "dtype": "float32",
     "micro_batch": None,
     "tiling": False,

@@ -81,6 +81,19 @@ def test_brightness_is_that_of_the_picture_over_black():
     torch.testing.assert_close(seen[0], published, atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize(("level", "backdrop"), [(0.2, 1.0), (0.95, 0.3)])
+def test_a_coloured_background_does_not_decide(level, backdrop):
+    """The published rule counts every pixel that is not black, so the background decides both cases."""
+    alpha = torch.zeros(2, 8, 8)
+    alpha[:, 3:5, 3:5] = 1.0
+    color, behind = torch.full((2, 8, 8, 3), level), torch.full((2, 3), backdrop)
+    output = over(behind, color, alpha)
+    assert (guard().dimming(output, behind, 2000) is not None) == (level > 0.9)
+    grey = output.rgb.mean(dim=-1)
+    published = torch.stack([view[view > 0].quantile(0.85) for view in grey]).quantile(0.85)
+    assert (published > 0.9) == (backdrop > 0.9)
+
+
 def test_a_brightness_is_the_mean_of_the_channels():
     alpha = torch.ones(1, 4, 4)
     red = torch.tensor([1.0, 0.0, 0.0]).expand(1, 4, 4, 3)

@@ -23,7 +23,8 @@ RATES = {
 
 
 def settings(**changes) -> AdamSettings:
-    return AdamSettings(**{**RATES, "beta1": 0.9, "beta2": 0.999, "eps": 1e-15, "clip_norm": None, **changes})
+    constants = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-15, "clip_norm": None, "clip_unit": 1.0}
+    return AdamSettings(**{**RATES, **constants, **changes})
 
 
 def gaussians(n: int, seed: int = 0, k: int = 4) -> Gaussians:
@@ -152,11 +153,20 @@ def test_a_long_gradient_is_shortened_to_the_bound_and_keeps_its_direction():
 
 def test_the_bound_follows_its_schedule_as_published():
     bound = settings(clip_norm=Linear(start=2.0, end=8.0, steps=1000))
-    assert [bound.largest_norm(step) for step in (0, 500, 1000, 4000)] == pytest.approx([2.0, 5.0, 8.0, 8.0])
+    bounds = [bound.largest_norm("quat", step) for step in (0, 500, 1000, 4000)]
+    assert bounds == pytest.approx([2.0, 5.0, 8.0, 8.0])
     optimizer = bound.start(gaussians(200))
     push(optimizer, seed=0)
     optimizer.step(500)
     assert norms(optimizer)["means"] == pytest.approx(5.0, rel=1e-5)
+
+
+def test_only_the_gradient_of_positions_depends_on_the_unit_of_length():
+    optimizer = settings(clip_norm=2.0, clip_unit=4.0).start(gaussians(200))
+    push(optimizer, seed=0)
+    optimizer.step(0)
+    bounds = {name: 0.5 if name == "means" else 2.0 for name in PARTS}
+    assert norms(optimizer) == pytest.approx(bounds, rel=1e-5)
 
 
 def test_a_bound_that_no_gradient_reaches_changes_no_bit():
@@ -348,7 +358,7 @@ def test_moments_of_other_gaussians_are_refused():
         settings().start(gaussians(4)).load_state_dict(settings().start(gaussians(5)).state_dict())
 
 
-@pytest.mark.parametrize("key", [*RATES, "beta1", "beta2", "eps", "clip_norm"])
+@pytest.mark.parametrize("key", [*RATES, "beta1", "beta2", "eps", "clip_norm", "clip_unit"])
 def test_an_impossible_number_is_refused_by_name(key):
     with pytest.raises(UserError, match=rf"optimizer\.{key}"):
         settings(**{key: -1.0})

@@ -35,6 +35,8 @@ RECIPES = {
         "reduction": "sum",
         "t": {0: (0.02, 0.98), 750: (0.02, 0.74), 1500: (0.02, 0.5)},
         "delta": {0: 0.1, 1500: 0.08},
+        "initial_noise": 0.002,
+        "noise_offset": 0.1,
         "disparity": 0.2,
     },
     "flowdreamer": FLOW,
@@ -47,6 +49,7 @@ RECIPES = {
         "reduction": "sum_per_view",
         "t": {0: (0.5, 0.98), 750: (0.26, 0.74), 1500: (0.02, 0.5)},
         "delta": {0: 0.1, 1500: 0.08},
+        "noise_offset": 0.1,
         "disparity": 0.2,
     },
     "dreamgaussian": {
@@ -66,7 +69,7 @@ RECIPES = {
         "scale": 50,
         "weight": 1,
         "reduction": "sum_per_view",
-        "t": {0: (0.98, 0.98), 4000: (0.5, 0.74), 8000: (0.02, 0.5)},
+        "t": {0: (0.98, 0.98), 480: (0.5, 0.74), 960: (0.02, 0.5), 1199: (0.02, 0.5)},
         "tau_pos": 2e-4,
         "stats": "sum_norm",
         "calls": (400, 800),
@@ -90,6 +93,8 @@ def test_a_recipe_has_the_published_numbers(recipe):
     for step, window in wanted["t"].items():
         low, high = as_schedule(guidance.t_min)(step), as_schedule(guidance.t_max)(step)
         assert (low, high) == pytest.approx(window)
+    for name in ("initial_noise", "noise_offset"):
+        assert getattr(guidance, name, None) == wanted.get(name)
     for name in ("clip", "delta"):
         for step, value in wanted.get(name, {}).items():
             assert as_schedule(getattr(guidance, name))(step) == pytest.approx(value)
@@ -120,7 +125,8 @@ def test_the_command_line_can_replace_every_group_of_a_recipe(recipe):
 def test_a_recipe_trains_through_a_real_pipeline(recipe, densifier, pipelines, tmp_path, monkeypatch):
     folder = pipelines(PIPELINES.get(recipe, "stable_diffusion"))
     lines = [f"experiment={recipe}", "prompt=a corgi", f"prior.path={folder}", f"densifier={densifier}"]
-    lines += ["steps=2", "initializer=ball", "initializer.count=50", "camera.size=16", "prior.size=32"]
+    lines += ["steps=2", "initializer=ball", "initializer.count=50", "initializer.scale=0.05"]
+    lines += ["camera.size=16", "prior.size=32"]
     lines += [
         "exporter=[ply]",
         "metric=[size]",

@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 from cadam3d.commands.train import build_trainer
 from cadam3d.core.errors import UserError
+from cadam3d.core.schedule import as_schedule
 from cadam3d.densifier.refine import Refine
 from cadam3d.io.jsonl import read_json
 from cadam3d.settings.compose import component, compose, config_dir, parts
@@ -47,8 +48,8 @@ def evaluated(value, steps: int):
     """Return what a value of a YAML file is in a run of ``steps`` steps."""
     if value == "${steps}":
         return steps
-    call = re.fullmatch(r"\$\{parts:(\d+),(\d+),\$\{steps\}\}", str(value))
-    return parts(int(call[1]), int(call[2]), steps) if call else value
+    call = re.fullmatch(r"\$\{parts:(\d+),(\d+),\$\{steps\}(?:,(\d+))?\}", str(value))
+    return parts(int(call[1]), int(call[2]), steps, int(call[3] or 1)) if call else value
 
 
 @pytest.mark.parametrize("words", [(), ("experiment=bench", "prior=tiny"), ("refine=lucid",)])
@@ -68,6 +69,42 @@ def test_the_default_schedule_of_600_steps_is_what_it_was():
     for name in WINDOWED:
         window = OmegaConf.load(config_dir() / "guidance" / f"{name}.yaml")
         assert evaluated(OmegaConf.to_container(window)["t_max"]["steps"], 600) == 500
+
+
+@pytest.mark.parametrize(
+    ("name", "end"),
+    [
+        ("sds_gaussiandreamer", (0.02, 0.55)),
+        ("ism_luciddreamer", (0.02, 0.5)),
+        ("vfds_flowdreamer", (0.02, 0.5)),
+        ("ucm_flowdreamer", (0.02, 0.5)),
+        ("gcs_beg", (0.02, 0.5)),
+        ("sds_dreamgaussian", (0.02, 0.02)),
+        ("sds_mvdream", (0.02, 0.5)),
+        ("sdi_threestudio", (0.25, 0.25)),
+    ],
+)
+def test_published_windows_follow_the_length_of_the_run_and_reach_their_ends(name, end):
+    def at(steps):
+        return component(compose([PROMPT, f"guidance={name}", f"steps={steps}"]).guidance)
+
+    short, long = at(300), at(3000)
+    for tenths in range(10):
+        assert short.window(30 * tenths) == pytest.approx(long.window(300 * tenths))
+        for key in ("delta", "clip"):
+            values = [getattr(guidance, key, None) for guidance in (short, long)]
+            if None not in values:
+                values = [as_schedule(v)(n * tenths) for v, n in zip(values, (30, 300), strict=True)]
+                assert values[0] == pytest.approx(values[1])
+    assert long.window(2999) == pytest.approx(end, abs=1e-3)
+
+
+def test_mvdreams_windows_move_during_four_fifths_of_a_run_as_published():
+    guidance = component(compose([PROMPT, "guidance=sds_mvdream", "steps=10000"]).guidance)
+    assert guidance.window(0) == (0.98, 0.98)
+    assert guidance.window(4000) == pytest.approx((0.5, 0.74))
+    assert guidance.window(7999)[0] > 0.02
+    assert guidance.window(8000) == pytest.approx((0.02, 0.5))
 
 
 def test_the_default_schedule_has_the_same_shape_at_every_length():
@@ -108,8 +145,22 @@ def test_no_reset_comes_too_late_to_recover_whatever_the_settings(name, resets):
         assert list(refine.skipped_resets) == list(range(steps - 95, steps + 1))
 
 
+@pytest.mark.parametrize(
+    ("name", "refinements", "pieces"),
+    [("lucid", 28, 50), ("flowdreamer", 13, 50), ("gaussiandreamer", 5, 12), ("dreamgaussian", 10, 10)],
+)
+def test_a_recipe_of_any_length_has_the_published_number_of_refinements(name, refinements, pieces):
+    for steps, refine in schedules(f"refine={name}").items():
+        if steps >= pieces:
+            # DreamGaussian refines to the end. A run that is no multiple of its parts holds some more parts.
+            more = steps // (steps // pieces) - pieces if name == "dreamgaussian" else 0
+            assert len(refine.refinements) == refinements + more
+        # Between two resets an opacity can recover.
+        assert refine.reset_interval is None or refine.reset_interval >= refine.recovery
+
+
 def test_counts_never_fall_as_a_run_gets_longer():
-    for name in RECIPES:
+    for name in ("default", "flowdreamer", "gaussiandreamer", "lucid"):
         for shorter, longer in pairwise(schedules(f"refine={name}").values()):
             assert len(shorter.refinements) <= len(longer.refinements)
             assert len(shorter.resets) <= len(longer.resets)

@@ -283,6 +283,26 @@ def test_rows_of_all_three_owners_agree_after_every_refinement(tmp_path):
     assert any(report.cloned + report.split for report in recorder.refinements)
 
 
+@pytest.mark.parametrize("end", [5, 100])
+@pytest.mark.parametrize("densifier", ["cadam", "mcmc"])
+def test_the_last_pruning_leaves_no_large_gaussian_whether_the_last_step_refines_or_not(
+    tmp_path, end, densifier
+):
+    limit = 0.19
+    words = [f"refine.last_max_scale={limit}", f"refine.end={end}", f"densifier={densifier}"]
+    trainer, state = make(words)
+    recorder = Recorder()
+    assert go(replace(trainer, callbacks=[recorder]), state, tmp_path) is Outcome.FINISHED
+    [*earlier, last] = recorder.refinements
+    assert last.step == 8
+    assert last.pruned > 0 or densifier == "mcmc"
+    assert all(float(each.population.gaussians.scales.max()) > limit for each in earlier)
+    assert float(state.gaussians.scales.max()) <= limit
+    if end == 5:
+        assert (last.selected, last.cloned, last.split) == (0, 0, 0)
+        assert last.pruned > 0
+
+
 def test_callbacks_see_every_step_once_and_the_end(tmp_path):
     trainer, state = make()
     recorder = Recorder()

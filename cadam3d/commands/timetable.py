@@ -24,6 +24,7 @@ def describe(trainer: Trainer) -> str:
     parts = [
         _counted("refinement", refine.refinements),
         *_resets(refine, densifier),
+        *(["a last pruning"] if refine.last_max_scale is not None else []),
         f"the last {rest} of {refine.steps} steps only optimise" if rest else "the last step refines",
         "constant learning rates"
         if settled == 0

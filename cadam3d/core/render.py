@@ -40,8 +40,11 @@ class RenderOutput:
         """Return closeness as a grey image in [0, 1], with gradient; the nearest point of the object is 1.
 
         This is inverse depth times alpha, which puts the background infinitely far away, stretched per view:
-        the farthest solid pixel (alpha from 0.9 on) becomes 0, and everything farther stays 0. It is
-        LucidDreamer's picture of depth, whose background is far behind the object.
+        the farthest solid pixel (alpha from 0.9 on) becomes 0, and everything farther stays 0. The result
+        does not depend on the unit of length.
+
+        LucidDreamer stretches 1 / (alpha depth + 10 (1 - alpha)), which puts the background at a depth of 10
+        in its units. The two pictures are equal if every alpha is 0 or 1.
         """
         is_hit = self.alpha > 0
         inverse = torch.where(is_hit, self.alpha / torch.where(is_hit, self.depth, 1.0), 0.0)

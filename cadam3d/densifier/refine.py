@@ -50,6 +50,7 @@ class Refine:
     split_shrink: float  # >= 1
     min_opacity: float  # in [0, 1)
     max_scale: float | None  # > 0
+    last_max_scale: float | None  # > 0
     prune_from: int  # step
     reset_interval: int | None  # steps
     reset_from: int  # step
@@ -72,6 +73,8 @@ class Refine:
         require_range("refine.min_opacity", self.min_opacity, low=0, below=1, example=0.005)
         if self.max_scale is not None:
             require_range("refine.max_scale", self.max_scale, above=0, example=0.35)
+        if self.last_max_scale is not None:
+            require_range("refine.last_max_scale", self.last_max_scale, above=0, example=0.1)
         require_whole("refine.prune_from", self.prune_from, low=0, example=300)
         if self.max_gaussians is not None:
             require_whole("refine.max_gaussians", self.max_gaussians, low=1, example=500_000)
@@ -136,6 +139,10 @@ class Refine:
         """Return whether step number ``step`` (from 1) ends with a refinement."""
         return step in self.refinements
 
+    def prunes_at(self, step: int) -> bool:
+        """Return whether step number ``step`` (from 1) ends with the last pruning of the run."""
+        return self.last_max_scale is not None and step == self.steps
+
     def resets_at(self, step: int) -> bool:
         """Return whether step number ``step`` (from 1) ends with an opacity reset, after any refinement."""
         return step in self.resets
@@ -187,6 +194,8 @@ class Refine:
             keeps &= gaussians.opacities >= self.min_opacity
         if self.max_scale is not None and step > self.prune_from:
             keeps &= gaussians.scales.amax(dim=-1) <= self.max_scale
+        if self.last_max_scale is not None and step == self.steps:
+            keeps &= gaussians.scales.amax(dim=-1) <= self.last_max_scale
         return keeps
 
     def exceeds(self, plan: RefinePlan) -> bool:

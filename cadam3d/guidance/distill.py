@@ -190,6 +190,14 @@ def standard_normal(like: Float[Tensor, "v c h w"], generator: torch.Generator) 
     return noise.to(like)
 
 
+def offset_normal(
+    like: Float[Tensor, "v c h w"], generator: torch.Generator, offset: float
+) -> Float[Tensor, "v c h w"]:
+    """Draw noise as :func:`standard_normal` does, plus ``offset`` * N(0, 1) per channel for all views."""
+    noise = standard_normal(like, generator)
+    return noise if offset == 0 else noise + offset * standard_normal(like[:1, :, :1, :1], generator)
+
+
 def finite(gradient: Tensor) -> tuple[Tensor, int]:
     """Replace elements of ``gradient`` that are not finite by 0; return the result and their number."""
     is_finite = gradient.isfinite()

@@ -10,14 +10,12 @@ from cadam3d.core.chart import Chart, Curve
 from cadam3d.core.checks import require, require_choice, require_range
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.guidance.base import GuidanceOutput
-from cadam3d.guidance.distill import DIVISORS, RESIDUAL, Case, finite, rms, standard_normal, surrogate
-from cadam3d.guidance.trajectory import UNGUIDED
+from cadam3d.guidance.distill import DIVISORS, RESIDUAL, Case, finite, offset_normal, rms, surrogate
+from cadam3d.guidance.trajectory import ROW, UNGUIDED
 from cadam3d.guidance.window import WindowedGuidance
 from cadam3d.prior.base import Condition, DiffusionPrior
 from cadam3d.prior.path import Prediction, per_view
 
-# One of the thousand rows of Stable Diffusion's noise table, in units of t; the smallest e.
-ROW = 0.001
 # The smallest distance between e and s.
 GAP = 10 * ROW
 TERMS = Chart(
@@ -69,8 +67,9 @@ class GCS(WindowedGuidance):
     Guidance has the conventional form, negative + scale * (positive - negative); the authors' repository
     calls ``weight`` lambda_guidance. The second term of each difference and the networks are constants. The
     slope of the chain of DDIM steps that carries x0 into the first term telescopes to a(e) for CC and to 1
-    for GC. CP applies its difference to the pixels of the render directly, without the encoder. The
-    gradients, before D, are
+    for GC. CP applies its difference to the pixels of the render directly, without the encoder. If the render
+    shows disparity, CP moves the disparity, where the released code moves the colours. The gradients, before
+    D, are
 
         2 weight (a(e) w_cc [CC's difference] + w_gc [GC's])  on x0,    2 weight w_cp [CP's]  on the render.
 
@@ -78,9 +77,10 @@ class GCS(WindowedGuidance):
     each part by its own number of elements, latents or pixels. The value of the returned loss is half the
     squared norm of the gradients.
 
-    With ``fixed_noise`` every step uses the same n. It is derived from the seed of the guidance's generator,
-    which a checkpoint keeps, so a resumed run continues with the same noise. A different number of views
-    gives different noise.
+    n is N(0, I) plus ``noise_offset`` * N(0, 1) per channel, an offset that all views share. With
+    ``fixed_noise`` every step uses the same n. It is derived from the seed of the guidance's generator, which
+    a checkpoint keeps, so a resumed run continues with the same noise. A different number of views gives
+    different noise.
 
     A step makes six predictions, four of them without guidance, and fewer if a weight is 0. CP decodes twice.
 
@@ -96,6 +96,7 @@ class GCS(WindowedGuidance):
     w_cp: float  # >= 0
     delta: float | Schedule  # in t; in (0.01, 0.5]
     fixed_noise: bool
+    noise_offset: float  # >= 0
     reduction: str  # one of DIVISORS
 
     def __post_init__(self) -> None:
@@ -114,6 +115,7 @@ class GCS(WindowedGuidance):
         )
         require_scheduled("guidance.delta", self.delta, above=GAP, high=0.5, example=0.08)
         require_choice("guidance.fixed_noise", self.fixed_noise, (True, False))
+        require_range("guidance.noise_offset", self.noise_offset, low=0, example=0.1)
         require_choice("guidance.reduction", self.reduction, list(DIVISORS))
 
     def __call__(
@@ -171,11 +173,11 @@ class GCS(WindowedGuidance):
 
     def draw_noise(self, case: Case) -> Float[Tensor, "v c h w"]:
         """Return the noise n: the same at every step with ``fixed_noise``, otherwise drawn anew."""
-        if not self.fixed_noise:
-            return case.draw_noise()
-        # Add 1, so that the noise does not repeat the random numbers from which t is drawn.
-        seed = (case.generator.initial_seed() + 1) % 2**63
-        return standard_normal(case.clean, torch.Generator().manual_seed(seed))
+        generator = case.generator
+        if self.fixed_noise:
+            # Add 1, so that the noise does not repeat the random numbers from which t is drawn.
+            generator = torch.Generator().manual_seed((generator.initial_seed() + 1) % 2**63)
+        return offset_normal(case.clean, generator, self.noise_offset)
 
     def terms(self, case: Case, levels: Levels, rgb: Float[Tensor, "v h w 3"]) -> Terms:
         """Follow the prior to t without the prompt and back with it, and return the differences."""

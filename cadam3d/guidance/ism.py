@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 
+import torch
+
 from cadam3d.core.checks import require_range
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
-from cadam3d.guidance.distill import Case, Comparison, GuidedDistillation
+from cadam3d.guidance.distill import Case, Comparison, GuidedDistillation, offset_normal
 from cadam3d.guidance.trajectory import UNGUIDED, ddim, strides
 
 
@@ -12,36 +14,43 @@ from cadam3d.guidance.trajectory import UNGUIDED, ddim, strides
 class ISM(GuidedDistillation):
     """Interval score matching (Liang et al. 2024, LucidDreamer).
 
-    DDIM inversion without a prompt takes x0 to x_s, s = max(t - delta, 0), and one more step to x_t. Then
+    DDIM inversion without a prompt takes the render from t0 to x_s, s = max(t - delta, t0), and one more
+    step takes it to x_t. Then
 
         G = weight * w(t) * (eps_hat(x_t, t, prompt) - eps(x_s, s, no prompt))
 
     with eps_hat under classifier-free guidance in the conventional form. The published w(t) is
     gamma(t) = b / a: 0.13 at t = 0.02 and 13 at 0.98 on the DDPM path, and infinite on a flow path at t = 1.
 
-    A step makes ceil(s / inversion_stride) + 1 predictions without guidance and one with it; without
-    ``shared_t`` the longest inversion of the batch sets the number. ``initial_noise`` adds noise to the
-    render before it is inverted, as LucidDreamer's code does; the paper does not.
+    In the paper the inversion starts at t0 = 0 from the render x0 itself. LucidDreamer's code starts at
+    t0 = ``initial_noise`` = 0.002 from a x0 + b n, where n is N(0, I) plus ``noise_offset`` * N(0, 1) per
+    channel. For t <= t0 + delta the inversion stays there, and for t < ``initial_noise`` t0 = s = t.
+
+    A step makes ceil((s - t0) / inversion_stride) + 1 predictions without guidance and one with it; without
+    ``shared_t`` the longest inversion of the batch sets the number.
     """
 
     delta: float | Schedule  # in t; in (0, 1]
     inversion_stride: float  # in t; in (0, 1]
     initial_noise: float  # in t; in [0, 1)
+    noise_offset: float  # >= 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_range("guidance.inversion_stride", self.inversion_stride, above=0, high=1, example=0.2)
         require_range("guidance.initial_noise", self.initial_noise, low=0, below=1, example=0.0)
+        require_range("guidance.noise_offset", self.noise_offset, low=0, example=0.1)
         require_scheduled("guidance.delta", self.delta, above=0, high=1, example=0.05)
 
     def compare(self, case: Case) -> Comparison:
         """Subtract the noise at s without a prompt from the guided noise at t, on one trajectory."""
         prior, path, unprompted = case.prior, case.prior.noise_path, case.condition.unprompted()
-        s = (case.t - self._interval(case.step)).clamp_min(0)
-        start = s.clamp_max(self.initial_noise)
+        start = case.t.clamp_max(self.initial_noise)
+        s = torch.maximum(case.t - self._interval(case.step), start)
         at_start = case.clean
         if self.initial_noise > 0:
-            at_start = path.mix(case.clean, case.draw_noise(), start)
+            noise = offset_normal(case.clean, case.generator, self.noise_offset)
+            at_start = path.mix(case.clean, noise, start)
         at_s = ddim(at_start, strides(start, s, self.inversion_stride), unprompted, prior)
         before = prior.predict(at_s, s, unprompted, UNGUIDED)
         at_t = path.mix(before.clean, before.noise, case.t)

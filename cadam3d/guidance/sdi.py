@@ -6,10 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require_range
+from cadam3d.core.checks import require_choice, require_range
 from cadam3d.guidance.distill import Case, Comparison, GuidedDistillation
-from cadam3d.guidance.trajectory import ddim, strides
+from cadam3d.guidance.trajectory import ROW, ddim, strides
 from cadam3d.prior.path import per_view
+
+# Where the levels of the inversion are, by name.
+GRIDS = ("even", "rows")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,14 +32,25 @@ class SDI(GuidedDistillation):
     without a weight. The published inversion scale is the negative guidance scale, which the paper finds to
     invert best.
 
-    The released code differs in two places. It adds its noise at every step of the inversion; over its ten
-    steps the sum in x_t' agrees with the eta b(t')^2 used here to within 7 %. It also passes x_t' itself to
-    the last prediction as if its level were t, where the paper goes back to t.
+    With the ``inversion_grid`` "even", the levels of the inversion are 0, ``inversion_stride``, twice that,
+    and so on to t', and a step makes ceil(t' / inversion_stride) + 1 predictions, all under guidance.
 
-    A step makes ceil(t' / inversion_stride) + 1 predictions, all under guidance.
+    The released code, in threestudio, differs from the paper in its numbers, which
+    ``guidance=sdi_threestudio`` has: t falls from 0.98 to 0.25, tau is below 0.1, and the inversion has the
+    levels that are called "rows" here. It takes x0 to be at the first row of the noise table, t = 0.001.
+    Then come 0.002 and every further ``inversion_stride`` below t, and t' directly after the last of these.
+    It also differs in four points for which there is no option:
+
+    - At the first level it gives the network the timestep -99. Ours is 0.
+    - It adds its noise at every step of the inversion. Over ten steps the sum in x_t' agrees with the
+      eta b(t')^2 used here to within 7 %.
+    - It passes x_t' itself to the last prediction as if its level were t, where the paper goes back to t.
+    - Without Perp-Neg it counts guidance from the prompt: its scales 7.5 and -7.5 are 8.5 and -6.5 in the
+      conventional form. Its configuration uses Perp-Neg, which has the conventional form.
     """
 
     inversion_scale: float
+    inversion_grid: str  # one of GRIDS
     inversion_stride: float  # in t; in (0, 1]
     overshoot: float  # in t; in [0, 1)
     eta: float  # >= 0
@@ -44,6 +58,7 @@ class SDI(GuidedDistillation):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_range("guidance.inversion_scale", self.inversion_scale, example=-7.5)
+        require_choice("guidance.inversion_grid", self.inversion_grid, GRIDS)
         require_range("guidance.inversion_stride", self.inversion_stride, above=0, high=1, example=0.1)
         require_range("guidance.overshoot", self.overshoot, low=0, below=1, example=0.033)
         require_range("guidance.eta", self.eta, low=0, example=0.3)
@@ -58,7 +73,15 @@ class SDI(GuidedDistillation):
         """Return the noise kappa of every render."""
         path, tau = case.prior.noise_path, self.overshoot * self.uniform(case.clean, case.generator)
         beyond = (case.t + tau).clamp_max(1)
-        levels = strides(torch.zeros_like(beyond), beyond, self.inversion_stride)
+        levels = self._levels(case.t, beyond)
         inverted = ddim(case.clean, levels, case.condition, case.prior, self.inversion_scale)
         noise = path.from_clean(inverted, case.clean, beyond).noise
         return noise + per_view(self.eta * path.b(beyond)) * case.draw_noise()
+
+    def _levels(self, t: Float[Tensor, "v"], beyond: Float[Tensor, "v"]) -> list[Float[Tensor, "v"]]:
+        """Return the levels of the inversion, which ends at ``beyond``."""
+        if self.inversion_grid == "even":
+            return strides(torch.zeros_like(t), beyond, self.inversion_stride)
+        below = strides(t.clamp_max(2 * ROW), t, self.inversion_stride)[:-1]
+        # A view that is already at its t takes its last step.
+        return [beyond.clamp_max(ROW), *(torch.where(now < t, now, beyond) for now in below), beyond]

@@ -13,6 +13,8 @@ from cadam3d.prior.path import per_view
 
 # Both halves of an unprompted condition are empty. At scale 1 a prior needs to evaluate only one of them.
 UNGUIDED = 1.0
+# Distance in t between two of the thousand rows of Stable Diffusion's noise table. The first is at t = ROW.
+ROW = 0.001
 # Tolerance in strides, so that 0.6 / 0.2 gives three steps in spite of rounding.
 TIE = 1e-4
 

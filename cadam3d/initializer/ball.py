@@ -25,13 +25,14 @@ class Ball(Initializer):
     count: int
     radius: float  # world units
     scale: float | None  # world units
+    scale_law: str  # one of SCALE_LAWS
     opacity: float  # in (0, 1)
     sh_degree: int  # 0 to 3
     color: Sequence[float]  # mean RGB, in [0, 1]
     color_noise: float  # in [0, 1]
 
     def __post_init__(self) -> None:
-        require_points(self.count, self.scale, self.opacity, self.sh_degree)
+        require_points(self.count, self.scale, self.scale_law, self.opacity, self.sh_degree)
         require_count(self.count, self.sh_degree)
         require_range("initializer.radius", self.radius, above=0, high=1, example=0.6)
         require_range("initializer.color_noise", self.color_noise, low=0, high=1, example=0.1)
@@ -43,4 +44,6 @@ class Ball(Initializer):
         deviation = self.color_noise * (2 * torch.rand(self.count, 3, generator=generator) - 1)
         rgb = (one_color(self.color, self.count) + deviation).clamp(0, 1)
         cloud = PointCloud(points, rgb).to(device)
-        return gaussians_at(cloud, scale=self.scale, opacity=self.opacity, sh_degree=self.sh_degree)
+        return gaussians_at(
+            cloud, scale=self.scale, opacity=self.opacity, sh_degree=self.sh_degree, law=self.scale_law
+        )

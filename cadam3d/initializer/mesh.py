@@ -18,10 +18,10 @@ from cadam3d.initializer.base import Initializer
 from cadam3d.initializer.points import (
     PointCloud,
     another_file,
-    fit,
     found_file,
     gaussians_at,
     one_color,
+    placement,
     points_on_surface,
     require_count,
     require_place,
@@ -51,17 +51,20 @@ class Mesh(Initializer):
     up: str  # one of UPS
     turn_deg: int  # one of TURNS
     radius: float | None  # world units
+    factor: float | None  # world units per unit of the file
+    lift: float  # world units
     count: int
     scale: float | None  # world units
+    scale_law: str  # one of SCALE_LAWS
     opacity: float  # in (0, 1)
     sh_degree: int  # 0 to 3
     color: Sequence[float]  # RGB in [0, 1]
 
     def __post_init__(self) -> None:
-        require_points(self.count, self.scale, self.opacity, self.sh_degree)
+        require_points(self.count, self.scale, self.scale_law, self.opacity, self.sh_degree)
         require_count(self.count, self.sh_degree)
         require_choice("initializer.up", self.up, UPS)
-        require_place(self.turn_deg, self.radius)
+        require_place(self.turn_deg, self.radius, self.factor, self.lift)
         require_color("initializer.color", self.color)
 
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
@@ -75,7 +78,9 @@ class Mesh(Initializer):
         faces, weights = points_on_surface(corners, self.count, generator)
         points = (weights[..., None] * corners[faces]).sum(dim=1)
         cloud = PointCloud(points, self._colors(parts, faces, weights)).to(device)
-        return gaussians_at(cloud, scale=self.scale, opacity=self.opacity, sh_degree=self.sh_degree)
+        return gaussians_at(
+            cloud, scale=self.scale, opacity=self.opacity, sh_degree=self.sh_degree, law=self.scale_law
+        )
 
     def _load(self) -> list[trimesh.Trimesh]:
         """Return the surfaces of the file, each at its place in the scene and with its own colours."""
@@ -109,8 +114,7 @@ class Mesh(Initializer):
     def _place(self, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
         """Return the world positions of points of the file."""
         upright = turned_points(points_to_world(points, f"+{self.up}"), self.turn_deg)
-        center, factor = fit(upright, self.radius)
-        return (upright - center) * factor
+        return placement(upright, self.radius, self.factor, self.lift).of(upright)
 
     def _colors(
         self, parts: Sequence[trimesh.Trimesh], faces: Int[Tensor, "n"], weights: Float[Tensor, "n 3"]

@@ -16,10 +16,10 @@ from cadam3d.initializer.base import Initializer
 from cadam3d.initializer.points import (
     PointCloud,
     another_file,
-    fit,
     found_file,
     gaussians_at,
     one_color,
+    placement,
     replicated,
     require_copies,
     require_place,
@@ -50,21 +50,25 @@ class Ply(Initializer):
     up: str | None  # one of UPS
     turn_deg: int  # one of TURNS
     radius: float | None  # world units
+    factor: float | None  # world units per unit of the file
+    lift: float  # world units
     count: int | None  # largest number of rows
     sh_degree: int | None  # 0 to 3
     replicate: int  # Gaussians per point
     replicate_radius: float  # world units
+    replicate_law: str  # one of REPLICATE_LAWS
     scale: float | None  # world units
+    scale_law: str  # one of SCALE_LAWS
     opacity: float  # in (0, 1)
     color: Sequence[float]  # RGB in [0, 1]
 
     def __post_init__(self) -> None:
         count = 1 if self.count is None else self.count
-        require_points(count, self.scale, self.opacity, self.sh_degree or 0)
+        require_points(count, self.scale, self.scale_law, self.opacity, self.sh_degree or 0)
         if self.up is not None:
             require_choice("initializer.up", self.up, UPS)
-        require_place(self.turn_deg, self.radius)
-        require_copies(self.replicate, self.replicate_radius)
+        require_place(self.turn_deg, self.radius, self.factor, self.lift)
+        require_copies(self.replicate, self.replicate_radius, self.replicate_law)
         require_color("initializer.color", self.color)
 
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
@@ -88,11 +92,11 @@ class Ply(Initializer):
         asset = turned(read_gaussians(path, up=self.up), self.turn_deg)
         _require_finite(path, "means", asset.means)
         asset = asset.index(rows_of(len(asset), self.count, generator))
-        center, factor = fit(asset.means, self.radius)
+        place = placement(asset.means, self.radius, self.factor, self.lift)
         return replace(
             asset,
-            means=(asset.means - center) * factor,
-            log_scales=asset.log_scales + math.log(factor),
+            means=place.of(asset.means),
+            log_scales=asset.log_scales + math.log(place.factor),
             sh=asset.sh if self.sh_degree is None else _with_degree(asset.sh, self.sh_degree),
         )
 
@@ -100,11 +104,17 @@ class Ply(Initializer):
         points, rgb = self._read_points(path)
         points = turned_points(points_to_world(points, self.up or UP_OF_POINTS), self.turn_deg)
         rows = rows_of(len(points), self.count, generator)
-        center, factor = fit(points[rows], self.radius)
-        cloud = PointCloud((points[rows] - center) * factor, rgb[rows])
-        cloud = replicated(cloud, self.replicate, self.replicate_radius, generator).to(device)
-        degree = self.sh_degree or 0
-        return gaussians_at(cloud, scale=self.scale, opacity=self.opacity, sh_degree=degree)
+        points = points[rows]
+        place = placement(points, self.radius, self.factor, self.lift)
+        cloud = PointCloud(place.of(points), rgb[rows])
+        cloud = replicated(cloud, self.replicate, self.replicate_radius, generator, self.replicate_law)
+        return gaussians_at(
+            cloud.to(device),
+            scale=self.scale,
+            opacity=self.opacity,
+            sh_degree=self.sh_degree or 0,
+            law=self.scale_law,
+        )
 
     def _read_points(self, path: Path) -> tuple[Tensor, Tensor]:
         """Return positions in the axes of the file, and RGB in [0, 1]."""

@@ -25,6 +25,10 @@ from cadam3d.io.reading import KINDS
 NEIGHBOURS = 3
 # Keeps the size of coincident points above zero.
 SMALLEST = 1e-4  # world units
+# How distances to neighbours are combined. rms is the law of the 3DGS code, and of all published recipes.
+SCALE_LAWS = ("mean", "rms")
+# How points are drawn in a ball, see :func:`replicated`.
+REPLICATE_LAWS = ("even", "polar")
 
 
 @dataclass(frozen=True)
@@ -42,14 +46,32 @@ class PointCloud:
         return PointCloud(self.points.to(device), self.rgb.to(device))
 
 
-def gaussians_at(cloud: PointCloud, *, scale: float | None, opacity: float, sh_degree: int) -> Gaussians:
+@dataclass(frozen=True)
+class Placement:
+    """Moves points without turning them: the centre to the origin, then larger or smaller, then up."""
+
+    center: Float[Tensor, "3"]
+    factor: float
+    lift: float  # world units
+
+    def of(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Return the moved points, in world units."""
+        moved = (points - self.center) * self.factor
+        if self.lift:
+            moved[:, 2] += self.lift
+        return moved
+
+
+def gaussians_at(
+    cloud: PointCloud, *, scale: float | None, opacity: float, sh_degree: int, law: str = "mean"
+) -> Gaussians:
     """Return round Gaussians at the points (world units) that have the same colour from every side.
 
-    ``scale`` is their standard deviation in world units. None gives each Gaussian the mean distance to its
-    three nearest neighbours, so that neighbours just overlap.
+    ``scale`` is their standard deviation in world units. None gives each Gaussian the distance to its three
+    nearest neighbours, combined by ``law`` (one of ``SCALE_LAWS``), so that neighbours just overlap.
     """
     points, n = cloud.points, len(cloud)
-    scales = neighbour_distance(points) if scale is None else points.new_full((n,), scale)
+    scales = neighbour_distance(points, law) if scale is None else points.new_full((n,), scale)
     sh = points.new_zeros(n, (sh_degree + 1) ** 2, 3)
     sh[:, 0] = rgb_to_sh0(cloud.rgb)
     return Gaussians(
@@ -61,10 +83,11 @@ def gaussians_at(cloud: PointCloud, *, scale: float | None, opacity: float, sh_d
     )
 
 
-def neighbour_distance(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+def neighbour_distance(points: Float[Tensor, "n 3"], law: str = "mean") -> Float[Tensor, "n"]:
     """Return the mean distance of each point to its three nearest neighbours, or to all if there are fewer.
 
-    The neighbours are exact. A single point gets 1, and no point gets less than 1e-4.
+    With the ``law`` "rms" it is the root of the mean squared distance. The neighbours are exact. A single
+    point gets 1, and no point gets less than 1e-4.
     """
     count = min(NEIGHBOURS, len(points) - 1)
     if count < 1:
@@ -72,7 +95,9 @@ def neighbour_distance(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     array = points.cpu().numpy()
     # The nearest neighbour that the tree finds is the point itself.
     distances, _ = KDTree(array).query(array, k=count + 1)
-    return torch.from_numpy(distances[:, 1:].mean(axis=1)).to(points).clamp_min(SMALLEST)
+    power = {"mean": 1, "rms": 2}[law]
+    combined = (distances[:, 1:] ** power).mean(axis=1) ** (1 / power)
+    return torch.from_numpy(combined).to(points).clamp_min(SMALLEST)
 
 
 def one_color(color: Sequence[float], count: int) -> Float[Tensor, "count 3"]:
@@ -112,14 +137,30 @@ def rows_of(n: int, count: int | None, generator: torch.Generator) -> Int[Tensor
     return torch.randperm(n, generator=generator)[:count].sort().values
 
 
-def replicated(cloud: PointCloud, times: int, radius: float, generator: torch.Generator) -> PointCloud:
+def polar_points_in_ball(count: int, radius: float, generator: torch.Generator) -> Float[Tensor, "count 3"]:
+    """Draw points in a ball with a uniform distance from the centre and two uniform angles.
+
+    They are denser near the centre and near the vertical axis.
+    """
+    distance, inclination, turn = torch.rand(3, count, generator=generator)
+    inclination, turn = math.pi * inclination, 2 * math.pi * turn
+    flat = inclination.sin()
+    directions = torch.stack([flat * turn.cos(), flat * turn.sin(), inclination.cos()], dim=1)
+    return radius * distance[:, None] * directions
+
+
+def replicated(
+    cloud: PointCloud, times: int, radius: float, generator: torch.Generator, law: str = "even"
+) -> PointCloud:
     """Repeat each point ``times`` times, with the same random offsets within a ball (LucidDreamer).
 
-    With ``times`` 1 the cloud is returned unchanged, without any random draw.
+    The ``law`` "even" draws offsets with equal density everywhere in the ball. "polar" draws distance and
+    angles uniformly, as LucidDreamer's code does. With ``times`` 1 the cloud is returned unchanged, without
+    any random draw.
     """
     if times == 1:
         return cloud
-    offsets = points_in_ball(times, radius, generator)
+    offsets = {"even": points_in_ball, "polar": polar_points_in_ball}[law](times, radius, generator)
     points = cloud.points.repeat_interleave(times, dim=0) + offsets.repeat(len(cloud), 1)
     return PointCloud(points, cloud.rgb.repeat_interleave(times, dim=0))
 
@@ -160,6 +201,19 @@ def fit(points: Float[Tensor, "n 3"], radius: float | None) -> tuple[Float[Tenso
         example="initializer.radius=null",
     )
     return center, radius / farthest if farthest > 0 else 1.0
+
+
+def placement(
+    points: Float[Tensor, "n 3"], radius: float | None, factor: float | None, lift: float
+) -> Placement:
+    """Return how to move the points of an object into the world.
+
+    They are fitted to ``radius`` (:func:`fit`). With a ``factor`` they are multiplied by it instead, and not
+    centred. Then they are lifted.
+    """
+    if factor is not None:
+        return Placement(torch.zeros_like(points[0]), factor, lift)
+    return Placement(*fit(points, radius), lift)
 
 
 def found_file(path: str, option: str, suffixes: Sequence[str]) -> Path:
@@ -207,20 +261,35 @@ def _content(folder: Path) -> list[Path]:
         return []
 
 
-def require_points(count: int, scale: object, opacity: object, sh_degree: object) -> None:
+def require_points(count: int, scale: object, scale_law: object, opacity: object, sh_degree: object) -> None:
     """Raise ``UserError`` unless these keys of an initializer are in their ranges."""
     require_whole("initializer.count", count, low=1, example=2000)
     if scale is not None:
         require_range("initializer.scale", scale, above=0, example=0.03)
+    require_choice("initializer.scale_law", scale_law, SCALE_LAWS)
     require_range("initializer.opacity", opacity, above=0, below=1, example=0.1)
     require_whole("initializer.sh_degree", sh_degree, low=0, high=MAX_DEGREE, example=0)
 
 
-def require_place(turn_deg: object, radius: object) -> None:
-    """Raise ``UserError`` unless the turn is a multiple of 90 degrees and the radius is None or in (0, 1]."""
+def require_place(turn_deg: object, radius: object, factor: object, lift: object) -> None:
+    """Raise ``UserError`` unless the keys that place an object are in their ranges.
+
+    The turn is a multiple of 90 degrees, the radius None or in (0, 1], the factor None or in (0, 1000], and
+    the lift in [-1, 1]. Of radius and factor at least one is None.
+    """
     require_choice("initializer.turn_deg", turn_deg, TURNS)
     if radius is not None:
         require_range("initializer.radius", radius, above=0, high=1, example=0.9)
+    if factor is not None:
+        require_range("initializer.factor", factor, above=0, high=1000, example="null")
+        require(
+            radius is None,
+            "initializer.radius",
+            expected=f"null, since initializer.factor={factor} sets the size too",
+            got=radius,
+            example="initializer.radius=null, or initializer.factor=null",
+        )
+    require_range("initializer.lift", lift, low=-1, high=1, example=0)
 
 
 def require_count(count: int, sh_degree: int) -> None:
@@ -232,8 +301,9 @@ def require_count(count: int, sh_degree: int) -> None:
     require_memory("initializer.count", count, unit=16 * numbers, example=2000)
 
 
-def require_copies(replicate: int, replicate_radius: object) -> None:
-    """Raise ``UserError`` unless ``replicate`` is at least 1 and ``replicate_radius`` is in (0, 1]."""
+def require_copies(replicate: int, replicate_radius: object, replicate_law: object) -> None:
+    """Raise ``UserError`` unless ``replicate`` is at least 1, its radius in (0, 1] and its law known."""
     require_whole("initializer.replicate", replicate, low=1, example=20)
     require_memory("initializer.replicate", replicate, unit=16 * 14, example=20)
     require_range("initializer.replicate_radius", replicate_radius, above=0, high=1, example=0.05)
+    require_choice("initializer.replicate_law", replicate_law, REPLICATE_LAWS)

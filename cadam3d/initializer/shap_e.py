@@ -10,16 +10,17 @@ from jaxtyping import Float, Int
 from kornia.color import linear_rgb_to_rgb
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_choice, require_range, require_whole
+from cadam3d.core.checks import require, require_choice, require_color, require_range, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import require_memory
 from cadam3d.initializer.base import Beginning, Initializer
 from cadam3d.initializer.points import (
     PointCloud,
-    fit,
     gaussians_at,
     grown,
+    one_color,
+    placement,
     points_on_surface,
     replicated,
     require_copies,
@@ -31,6 +32,8 @@ from cadam3d.io.frames import turned_points
 from cadam3d.io.pretrained import DTYPES, Pretrained, Source
 
 KIND = "ShapEPipeline"
+# Colours of the model: as in its own pictures, or in linear light, as its decoder returns them.
+TONES = ("srgb", "linear")
 # What to type instead of a pipeline that cannot be used.
 OTHERS = {"ShapEImg2ImgPipeline": "'initializer.ids=[openai/shap-e]', which reads text instead of images"}
 
@@ -64,13 +67,19 @@ class ShapE(Initializer):
     grid_size: int  # cells per side
     turn_deg: int  # one of TURNS
     radius: float | None  # world units
+    factor: float | None  # world units per unit of Shap-E
+    lift: float  # world units
     count: int | None
     grow_points: int  # candidates
     grow_distance: float  # Shap-E's units
     grow_noise: float  # in [0, 1]
+    tone: str  # one of TONES
+    color: Sequence[float] | None  # RGB in [0, 1]
     replicate: int  # Gaussians per point
     replicate_radius: float  # world units
+    replicate_law: str  # one of REPLICATE_LAWS
     scale: float | None  # world units
+    scale_law: str  # one of SCALE_LAWS
     opacity: float  # in (0, 1)
     sh_degree: int  # 0 to 3
     fallback: Initializer | None
@@ -85,14 +94,18 @@ class ShapE(Initializer):
         require_range("initializer.guidance_scale", self.guidance_scale, low=1, example=15)
         require_whole("initializer.grid_size", self.grid_size, low=2, example=128)
         require_memory("initializer.grid_size", self.grid_size, unit=4, power=3, example=128)
-        require_place(self.turn_deg, self.radius)
-        require_points(1 if self.count is None else self.count, self.scale, self.opacity, self.sh_degree)
-        require_count(1 if self.count is None else self.count, self.sh_degree)
+        require_place(self.turn_deg, self.radius, self.factor, self.lift)
+        count = 1 if self.count is None else self.count
+        require_points(count, self.scale, self.scale_law, self.opacity, self.sh_degree)
+        require_count(count, self.sh_degree)
         require_whole("initializer.grow_points", self.grow_points, low=0, example=1000000)
         require_memory("initializer.grow_points", self.grow_points, unit=12, example=1000000)
         require_range("initializer.grow_distance", self.grow_distance, above=0, example=0.01)
         require_range("initializer.grow_noise", self.grow_noise, low=0, high=1, example=0.2)
-        require_copies(self.replicate, self.replicate_radius)
+        require_choice("initializer.tone", self.tone, TONES)
+        if self.color is not None:
+            require_color("initializer.color", self.color)
+        require_copies(self.replicate, self.replicate_radius, self.replicate_law)
         require(
             self.fallback is None or hasattr(self.fallback, "begin"),
             "initializer.fallback",
@@ -173,10 +186,11 @@ class ShapE(Initializer):
         renderer = found.part("shap_e_renderer", torch.float32).to(latent.device)
         renderer.mesh_decoder.register_forward_hook(_refuse_empty_mesh)
         mesh = renderer.decode_to_mesh(latent, latent.device, grid_size=self.grid_size)
-        linear = torch.stack([mesh.vertex_channels[channel] for channel in "RGB"])
         # The decoder returns colours in linear light.
-        rgb = linear_rgb_to_rgb(linear[..., None])[..., 0].T
-        return ColoredMesh(mesh.verts.cpu(), mesh.faces.cpu(), rgb.clamp(0, 1).cpu())
+        rgb = torch.stack([mesh.vertex_channels[channel] for channel in "RGB"])
+        if self.tone == "srgb":
+            rgb = linear_rgb_to_rgb(rgb[..., None])[..., 0]
+        return ColoredMesh(mesh.verts.cpu(), mesh.faces.cpu(), rgb.T.clamp(0, 1).cpu())
 
     def settle(self, mesh: ColoredMesh, generator: torch.Generator, device: torch.device) -> Gaussians:
         """Return Gaussians on ``device`` at points of a mesh that Shap-E decoded."""
@@ -184,10 +198,16 @@ class ShapE(Initializer):
         if self.grow_points > 0:
             cloud = grown(cloud, self.grow_points, self.grow_distance, self.grow_noise, generator)
         upright = turned_points(cloud.points, self.turn_deg)
-        center, factor = fit(upright, self.radius)
-        cloud = PointCloud((upright - center) * factor, cloud.rgb)
-        cloud = replicated(cloud, self.replicate, self.replicate_radius, generator).to(device)
-        return gaussians_at(cloud, scale=self.scale, opacity=self.opacity, sh_degree=self.sh_degree)
+        rgb = cloud.rgb if self.color is None else one_color(self.color, len(cloud))
+        cloud = PointCloud(placement(upright, self.radius, self.factor, self.lift).of(upright), rgb)
+        cloud = replicated(cloud, self.replicate, self.replicate_radius, generator, self.replicate_law)
+        return gaussians_at(
+            cloud.to(device),
+            scale=self.scale,
+            opacity=self.opacity,
+            sh_degree=self.sh_degree,
+            law=self.scale_law,
+        )
 
     def _points(self, mesh: ColoredMesh, generator: torch.Generator) -> PointCloud:
         if self.count is None:

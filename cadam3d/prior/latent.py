@@ -27,7 +27,7 @@ from cadam3d.io.cache import default_cache_dir
 from cadam3d.io.pretrained import DTYPES, Pretrained, Source
 from cadam3d.prior.base import Condition, DiffusionPrior, MemoryEstimate, PromptEmbedding
 from cadam3d.prior.memory import working_bytes
-from cadam3d.prior.path import DDPM, NoisePath, Prediction
+from cadam3d.prior.path import DDPM, NoisePath, Prediction, Rows
 from cadam3d.prior.prompting import Mix, Prompting, guide
 
 # What to type for a model of each pipeline class.
@@ -41,6 +41,8 @@ PRIORS = {
 TOKENS, T5_TOKENS = 77, 256
 # Every model of this family has this factor between an image and its latents.
 FACTOR = 8  # pixels per side
+# The levels at which a network is used: those of the table that it was trained on, or any.
+LEVELS = ("table", "any")
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,7 @@ class LatentPrior(DiffusionPrior):
     variant: str | None  # of weight files
     prompting: Prompting
     size: int | None  # pixels per side
+    noise_levels: str  # one of LEVELS
     dtype: str  # auto or one of DTYPES
     micro_batch: int | None  # images
     tiling: bool
@@ -144,6 +147,7 @@ class LatentPrior(DiffusionPrior):
                 got=self.size,
                 example="prior.size=512",
             )
+        require_choice("prior.noise_levels", self.noise_levels, LEVELS)
         require_choice("prior.dtype", self.dtype, ("auto", *DTYPES))
         if self.micro_batch is not None:
             require_whole("prior.micro_batch", self.micro_batch, low=1, example=1)
@@ -312,6 +316,12 @@ class LatentPrior(DiffusionPrior):
     def scheduler(self) -> Mapping[str, Any]:
         """Return the configuration of the model's noise schedule."""
         return self.found.config("scheduler")
+
+    def at_levels(self, path: NoisePath) -> NoisePath:
+        """Return ``path`` at the rows of the model's table only, or unchanged if any level is used."""
+        if self.noise_levels == "any":
+            return path
+        return Rows(path=path, rows=self.scheduler["num_train_timesteps"])
 
     @cached_property
     def vae(self) -> Any:

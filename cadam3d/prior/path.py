@@ -192,6 +192,50 @@ class RectifiedFlow(NoisePath):
         return 1000 * self.b(t)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Rows(NoisePath):
+    """Another path at the rows of a table only: every ``t`` counts as the nearest multiple of 1 / ``rows``.
+
+    Networks are trained at these levels. The shares of image and noise are rounded together with the input of
+    the network, so the two always belong to the same level.
+    """
+
+    path: NoisePath
+    rows: int
+
+    def a(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        """Return the share of the clean image at the nearest row."""
+        return self.path.a(self._at_row(t))
+
+    def b(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        """Return the share of the noise at the nearest row."""
+        return self.path.b(self._at_row(t))
+
+    def velocity(
+        self, clean: Float[Tensor, "v c h w"], noise: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
+    ) -> Float[Tensor, "v c h w"]:
+        """Return the velocity of a pair at the nearest row."""
+        return self.path.velocity(clean, noise, self._at_row(t))
+
+    def from_velocity(
+        self, noisy: Float[Tensor, "v c h w"], velocity: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
+    ) -> Prediction:
+        """Complete a prediction of the velocity at the nearest row."""
+        return self.path.from_velocity(noisy, velocity, self._at_row(t))
+
+    def timestep(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        """Return the input of the network at the nearest row, which is a whole number on a DDPM path."""
+        # In double precision, so that the whole number is exact after rounding to float32.
+        return self.path.timestep(self._at_row(t.double())).to(t.dtype)
+
+    def t_at(self, b: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        """Return the ``t`` at which the path between the rows has the share of noise ``b``."""
+        return self.path.t_at(b)
+
+    def _at_row(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        return (t * self.rows).round() / self.rows
+
+
 @lru_cache(maxsize=8)
 def _log_alpha_bars(train_steps: int, beta_start: float, beta_end: float) -> np.ndarray:
     """Return log(alpha_bar) at k = 0 ... train_steps.

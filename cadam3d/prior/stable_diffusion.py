@@ -31,7 +31,7 @@ class StableDiffusion(LatentPrior):
     @cached_property
     def noise_path(self) -> NoisePath:
         """Return the noise path of the model's scheduler."""
-        return ddpm_path(self.scheduler)
+        return self.at_levels(ddpm_path(self.scheduler))
 
     def complete(
         self, noisy: Float[Tensor, "v c h w"], output: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]

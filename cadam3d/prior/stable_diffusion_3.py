@@ -63,7 +63,7 @@ class StableDiffusion3(LatentPrior):
             got="dynamic shifting",
             example="prior.path=DIR",
         )
-        return RectifiedFlow(shift=float(self.scheduler.get("shift", 1.0)))
+        return self.at_levels(RectifiedFlow(shift=float(self.scheduler.get("shift", 1.0))))
 
     def complete(
         self, noisy: Float[Tensor, "v c h w"], output: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]

@@ -1,6 +1,7 @@
 """Compose: read the YAML files, apply the overrides of a command line, and build the objects."""
 
 import difflib
+import math
 import re
 import shlex
 import unicodedata
@@ -191,18 +192,29 @@ def register_resolvers() -> None:
 
     It is safe to call this again.
     """
+    OmegaConf.register_new_resolver("copies", copies, replace=True)
     OmegaConf.register_new_resolver("parts", parts, replace=True)
     OmegaConf.register_new_resolver("slug", slug, replace=True)
     OmegaConf.register_new_resolver("span", span, replace=True)
 
 
-def parts(count: int, pieces: int, steps: object) -> int:
+def parts(count: int, pieces: int, steps: object, least: int = 1) -> int:
     """Return the number of steps in ``count`` of ``pieces`` equal parts of a run; a part has at least 1 step.
 
-    Each part is rounded down, so keys that share ``pieces`` keep their order and ratio at any length. Returns
-    ``count`` for non-integers; the command reports the error in ``steps``.
+    Each part is rounded down, so keys that share ``pieces`` keep their order and ratio at any length. The
+    result is at least ``least``. Returns ``count`` for non-integers; the command reports the error in
+    ``steps``.
     """
-    return count * max(1, steps // pieces) if type(steps) is int else count
+    return max(least, count * max(1, steps // pieces)) if type(steps) is int else count
+
+
+def copies(count: object, times: object, usual: int) -> int:
+    """Return ``count`` times ``times``; ``usual`` replaces a count that is null.
+
+    A factor that is not an integer counts as 1; the component that owns the key reports the error.
+    """
+    numbers = [usual if count is None else count, times]
+    return math.prod(number if type(number) is int else 1 for number in numbers)
 
 
 def span(share: float, start: object, *ends: object) -> int:

@@ -45,6 +45,18 @@ def test_disparity_does_not_depend_on_the_unit_of_length():
     torch.testing.assert_close(output(alpha, 7 * depth).disparity(), output(alpha, depth).disparity())
 
 
+@pytest.mark.parametrize(("solid", "largest"), [(1.0, 1e-5), (0.99, 0.03)])
+def test_disparity_of_an_opaque_object_is_luciddreamers(solid, largest):
+    """Its background is at a depth of 10 of its units, which are 2 of ours; its cameras are at 5 of them."""
+    alpha, depth = scene()
+    alpha[alpha < 0.9], alpha[alpha >= 0.9] = 0.0, solid
+    depth = 7 + depth  # 9 to 11
+    inverse = 1 / (alpha * depth + 20 * (1 - alpha))
+    farthest = inverse.masked_fill(alpha < 0.9, torch.inf).amin(dim=(1, 2), keepdim=True)
+    theirs = ((inverse - farthest) / (inverse.amax(dim=(1, 2), keepdim=True) - farthest)).clamp(0, 1)
+    assert (output(alpha, depth).disparity() - theirs).abs().max() < largest
+
+
 def test_each_view_is_stretched_independently():
     alpha, depth = scene()
     both = output(alpha, depth).disparity()

@@ -1,5 +1,6 @@
 """Laws of refinement: its steps, cloning, splitting and pruning, and the agreement of all owners of rows."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -24,6 +25,7 @@ def refine(**changes) -> Refine:
     usual = {
         "steps": 20_000,
         "made_for": None,
+        "last_max_scale": None,
         "start": 100,
         "end": 3000,
         "interval": 100,
@@ -203,6 +205,17 @@ def test_large_gaussians_are_pruned_only_after_prune_from():
     assert schedule.plan(scene, no_rows, 501, draw()).edit.keep.tolist() == [0, 1, 2]
 
 
+def test_the_last_pruning_is_at_the_last_step_only():
+    """DreamGaussian prunes scales above 0.4 while it refines, and above 0.1 at the end."""
+    scene = gaussians(4)
+    scene.log_scales[2, 0], scene.log_scales[3, 0] = math.log(0.2), 0.0
+    schedule, no_rows = refine(steps=450, max_scale=0.4, last_max_scale=0.1), torch.zeros(4, dtype=torch.bool)
+    assert schedule.plan(scene, no_rows, 400, draw()).edit.keep.tolist() == [0, 1, 2]
+    assert schedule.plan(scene, no_rows, 450, draw()).edit.keep.tolist() == [0, 1]
+    assert [step for step in range(1, 451) if schedule.prunes_at(step)] == [450]
+    assert not refine(steps=450).prunes_at(450)
+
+
 def test_the_children_of_a_split_are_judged_by_their_own_scale():
     scene = gaussians(1)
     scene.log_scales[:] = torch.tensor(0.6).log()
@@ -280,7 +293,7 @@ def test_unwanted_gaussians_are_pruned_when_large_ones_are_but_their_children_ar
 def test_gaussians_moments_and_densifier_state_stay_in_step_through_many_edits(densifier):
     rates = ("means_lr", "sh_dc_lr", "sh_rest_lr", "opacity_lr", "scale_lr", "quat_lr")
     optimizer = AdamSettings(
-        **dict.fromkeys(rates, 0.01), beta1=0.9, beta2=0.999, eps=1e-15, clip_norm=None
+        **dict.fromkeys(rates, 0.01), beta1=0.9, beta2=0.999, eps=1e-15, clip_norm=None, clip_unit=1.0
     ).start(gaussians(30))
     state, noise = densifier.init_state(30, CPU), draw(5)
     for step in range(1, 40):
@@ -318,6 +331,7 @@ def test_gaussians_moments_and_densifier_state_stay_in_step_through_many_edits(d
         ("split_shrink", 0.5),
         ("min_opacity", 1.0),
         ("max_scale", 0.0),
+        ("last_max_scale", 0.0),
         ("reset_interval", 0),
         ("reset_value", 1.0),
         ("recovery", 0),

@@ -19,15 +19,34 @@ SHARED = {"weight": 1.0, "t_min": 0.02, "t_max": 0.98, "shared_t": False, "reduc
 # Distillations that predict under classifier-free guidance.
 GUIDED = {
     "sds": (SDS, {}),
-    "ism": (ISM, {"delta": 0.05, "inversion_stride": 0.2, "initial_noise": 0.0}),
+    "ism": (ISM, {"delta": 0.05, "inversion_stride": 0.2, "initial_noise": 0.0, "noise_offset": 0.0}),
     "vfds": (VFDS, {}),
-    "sdi": (SDI, {"inversion_scale": -2.0, "inversion_stride": 0.25, "overshoot": 0.03, "eta": 0.3}),
+    "sdi": (
+        SDI,
+        {
+            "inversion_scale": -2.0,
+            "inversion_grid": "even",
+            "inversion_stride": 0.25,
+            "overshoot": 0.03,
+            "eta": 0.3,
+        },
+    ),
     "ucm": (UCM, {"inversion_steps": 3, "inversion_grid": "t", "fresh_noise": 0.0}),
 }
 # Weighted differences of two predictions.
 DISTILLATIONS = GUIDED | {"csd": (CSD, {"empty_share": 0.0})}
 OBJECTIVES = DISTILLATIONS | {
-    "gcs": (GCS, {"w_cc": 1.0, "w_gc": 0.5, "w_cp": 0.5, "delta": 0.05, "fixed_noise": False})
+    "gcs": (
+        GCS,
+        {
+            "w_cc": 1.0,
+            "w_gc": 0.5,
+            "w_cp": 0.5,
+            "delta": 0.05,
+            "fixed_noise": False,
+            "noise_offset": 0.0,
+        },
+    )
 }
 PATHS = {"ddpm": DDPM(), "flow": RectifiedFlow(), "flow-3": RectifiedFlow(shift=3.0)}
 

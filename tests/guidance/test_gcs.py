@@ -180,6 +180,23 @@ def test_fixed_noise_is_the_same_at_every_step_and_after_a_restart(make, run, ga
     assert float(first.std()) == pytest.approx(1, abs=0.2)
 
 
+def test_the_noise_has_an_offset_per_channel_that_all_views_share(make, gaussian, means, rgb):
+    """As in the released code, the offset is part of the noise that is kept for the whole run."""
+    clean = rgb.detach().permute(0, 3, 1, 2)
+
+    def noise_of(guidance):
+        t, generator = torch.full((3,), 0.5, dtype=torch.float64), torch.Generator().manual_seed(7)
+        return guidance.draw_noise(Case(clean, t, means, gaussian(DDPM()), 0, generator))
+
+    for fixed, seed in ((True, 8), (False, 7)):
+        generator = torch.Generator().manual_seed(seed)
+        plain = torch.randn(3, 3, 4, 5, generator=generator).double()
+        offset = torch.randn(1, 3, 1, 1, generator=generator).double()
+        moved = noise_of(make("gcs", fixed_noise=fixed, noise_offset=0.1))
+        torch.testing.assert_close(moved, plain + 0.1 * offset)
+        assert torch.equal(noise_of(make("gcs", fixed_noise=fixed)), plain)
+
+
 def test_with_fixed_noise_only_the_levels_are_drawn(make, means, gaussian, rgb):
     generator, levels_only = (torch.Generator().manual_seed(3) for _ in range(2))
     make("gcs", fixed_noise=True)(rgb, means, gaussian(DDPM()), 0, generator)
@@ -279,6 +296,7 @@ def test_numbers_that_are_not_finite_become_zero_and_are_counted(make, run, prio
         ("delta", 0.6),
         ("delta", Linear(start=0.1, end=0.0, steps=10)),
         ("fixed_noise", "yes"),
+        ("noise_offset", -0.1),
     ],
 )
 def test_wrong_values_are_refused_by_key(key, value, make, monkeypatch):

@@ -1,5 +1,7 @@
 """ISM compared with its closed form on a Gaussian prior."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 
@@ -81,22 +83,56 @@ def test_without_initial_noise_the_gradient_is_a_function_of_t(make, run, prior,
 
 
 def test_initial_noise_is_on_the_path(path, make, run, gaussian, means, rgb):
-    """The inversion starts on a x0 + b n at t = initial_noise, or at s if that is smaller."""
+    """The inversion starts on a x0 + b n at t = initial_noise, or at t itself if that is smaller."""
     guidance = make("ism", initial_noise=0.2, t_min=0.051, t_max=0.5, delta=0.05, inversion_stride=1.0)
     prior = gaussian(path, spread=SPREAD)
     gradient, _ = run(guidance, rgb, means, prior, seed=4)
-    starts = prior.calls[0].t
-    s = drawn_t(3, 0.051, 0.5, seed=4) - 0.05
-    assert s.min() < 0.2 < s.max()
-    torch.testing.assert_close(starts, s.clamp_max(0.2))
+    t = drawn_t(3, 0.051, 0.5, seed=4)
+    starts = t.clamp_max(0.2)
+    assert t.min() < 0.2 < t.max() - 0.05
+    torch.testing.assert_close(prior.calls[0].t, starts)
 
     clean, generator = rgb.detach().permute(0, 3, 1, 2), torch.Generator().manual_seed(4)
     torch.rand(3, generator=generator)
     noise = torch.randn(clean.shape, generator=generator).double()
+    s = torch.maximum(t - 0.05, starts)
     at_s = ddim(path.mix(clean, noise, starts), strides(starts, s, 1.0), means.unprompted(), prior)
     before = prior.predict(at_s, s, means.unprompted(), 1.0)
-    after = prior.predict(path.mix(before.clean, before.noise, s + 0.05), s + 0.05, means, guidance.scale)
+    after = prior.predict(path.mix(before.clean, before.noise, t), t, means, guidance.scale)
     torch.testing.assert_close(gradient, after.noise - before.noise, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("t", [0.001, 0.002, 0.02, 0.08, 0.1, 0.15, 0.9])
+def test_gradient_equals_luciddreamers_for_every_t(t, make, run, gaussian, means, rgb):
+    """No prediction is made for an image that is cleaner than row 1, also where t is within delta of it.
+
+    x0 gets noise at row 1 (t = 0.002), with an offset per channel that all views share. From there DDIM in
+    strides of 200 rows leads to s = t - delta, or nowhere if that is below row 1, and one more step to t.
+    """
+    path, delta, lowest = DDPM(), 0.1, 0.002
+    keys = {"t_min": t, "t_max": t, "delta": delta, "initial_noise": lowest, "noise_offset": 0.1}
+    guidance = make("ism", scale=7.5, weighting="gamma", weight=0.1, **keys)
+    gradient, _ = run(guidance, rgb, means, gaussian(path, spread=SPREAD), seed=4)
+
+    clean, generator = rgb.detach().permute(0, 3, 1, 2), torch.Generator().manual_seed(4)
+    torch.rand(3, generator=generator)
+    noise = torch.randn(3, 3, 4, 5, generator=generator) + 0.1 * torch.randn(1, 3, 1, 1, generator=generator)
+    first = min(lowest, t)
+    levels = [first, *(k for k in (lowest + 0.2 * i for i in range(1, 5)) if k < t - delta - 1e-9)]
+    levels += [t - delta] if t - delta > first else []
+    every = [torch.full((3,), level, dtype=torch.float64) for level in (*levels, t)]
+    # Here off is x - a * mean of the empty prompt, of which each exact step is a multiple.
+    a, b = per_view(path.a(every[0])), per_view(path.b(every[0]))
+    off = a * (clean - means.empty) + b * noise.double()
+    for now, then in pairwise(every[:-1]):
+        off = off * step_factor(path, now, then, SPREAD)
+    a, b = per_view(path.a(every[-2])), per_view(path.b(every[-2]))
+    noise_at_s = b * off / (a**2 * SPREAD**2 + b**2)
+    off = off * step_factor(path, every[-2], every[-1], SPREAD)
+    a, b = per_view(path.a(every[-1])), per_view(path.b(every[-1]))
+    mean = means.negative + 7.5 * (means.positive - means.negative)
+    noise_at_t = b * (off + a * (means.empty - mean)) / (a**2 * SPREAD**2 + b**2)
+    torch.testing.assert_close(gradient, 0.1 * b / a * (noise_at_t - noise_at_s), rtol=1e-5, atol=1e-7)
 
 
 def test_an_infinite_gamma_at_the_end_of_a_flow_gives_zero_gradients(make, run, gaussian, means, rgb):
@@ -117,6 +153,7 @@ def test_an_infinite_gamma_at_the_end_of_a_flow_gives_zero_gradients(make, run, 
         ("inversion_stride", 2.0),
         ("initial_noise", -0.1),
         ("initial_noise", 1.0),
+        ("noise_offset", -0.1),
     ],
 )
 def test_wrong_values_are_refused_by_key(key, value, make):

@@ -1,5 +1,7 @@
 """SDI compared with its closed form on a Gaussian prior."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 
@@ -75,6 +77,30 @@ def test_predictions_follow_the_published_method(make, run, prior, means, rgb):
     assert (last.scale, float(last.t[0])) == (7.5, pytest.approx(0.35))
 
 
+def test_the_rows_of_the_released_code(make, run, gaussian, means, rgb):
+    """They are 0, 1, 101, ..., as long as they are before t; the last step ends at t' and may be longer."""
+    prior, keys = gaussian(DDPM()), {"inversion_grid": "rows", "inversion_stride": 0.1, "overshoot": 0.1}
+    t = torch.tensor([0.002, 0.395, 0.98], dtype=torch.float64)
+    clean = rgb.detach().permute(0, 3, 1, 2)
+    guidance = make("sdi", eta=0.0, **keys)
+    noise = invert(guidance, clean, t, means, prior, seed=5)
+    beyond = (t + 0.1 * torch.rand(3, generator=torch.Generator().manual_seed(5)).double()).clamp_max(1)
+    assert beyond[1] > 0.402  # beyond a row that it must not visit
+    for view, rows in enumerate(([0], [0, 1, 101, 201, 301], [0, 1, *range(101, 902, 100)])):
+        asked = [float(call.t[view]) for call in prior.calls]
+        levels = [(row + 1) / 1000 for row in rows]
+        assert asked == pytest.approx([*levels, *[float(beyond[view])] * (len(asked) - len(levels))])
+        # Each exact step multiplies x - a * mean.
+        mean = means.negative + guidance.inversion_scale * (means.positive - means.negative)
+        every = [torch.full((3,), level, dtype=torch.float64) for level in (*levels, float(beyond[view]))]
+        off = clean - per_view(prior.noise_path.a(every[0])) * mean
+        for now, then in pairwise(every):
+            off = off * step_factor(prior.noise_path, now, then)
+        a, b = per_view(prior.noise_path.a(every[-1])), per_view(prior.noise_path.b(every[-1]))
+        expected = (off + a * mean - a * clean) / b
+        torch.testing.assert_close(noise[view], expected[view], rtol=1e-6, atol=1e-6)
+
+
 def test_the_inversion_overshoots_but_never_leaves_the_path(make, run, gaussian, means, rgb):
     """With a stride of 1 there is one step from the render, and the next prediction is at t again."""
     prior, path = gaussian(RectifiedFlow()), RectifiedFlow()
@@ -117,6 +143,7 @@ def test_only_the_scale_of_the_inversion_may_be_negative(make):
     [
         ("inversion_scale", float("nan")),
         ("inversion_scale", float("-inf")),
+        ("inversion_grid", "sigma"),
         ("inversion_stride", 0.0),
         ("inversion_stride", 1.5),
         ("overshoot", -0.1),

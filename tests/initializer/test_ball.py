@@ -16,6 +16,7 @@ def ball(**changes) -> Ball:
         "count": 500,
         "radius": 0.5,
         "scale": None,
+        "scale_law": "mean",
         "opacity": 0.1,
         "sh_degree": 1,
         "color": [0.5, 0.4, 0.3],

@@ -23,8 +23,11 @@ def build(path, seed: int = 0, **changes) -> Gaussians:
         "up": "z",
         "turn_deg": 0,
         "radius": 0.9,
+        "factor": None,
+        "lift": 0.0,
         "count": 2000,
         "scale": 0.02,
+        "scale_law": "mean",
         "opacity": 0.1,
         "sh_degree": 0,
         "color": GREY,
@@ -99,6 +102,8 @@ def test_without_a_radius_position_and_size_are_those_of_the_file(tmp_path):
     means = build(save(mesh, tmp_path / "box.ply"), radius=None).means
     torch.testing.assert_close(means.amin(dim=0), torch.tensor([0.0, 0.4, -0.1]), atol=0.01, rtol=0)
     torch.testing.assert_close(means.amax(dim=0), torch.tensor([0.2, 0.6, 0.1]), atol=0.01, rtol=0)
+    twice = build(tmp_path / "box.ply", radius=None, factor=2.0, lift=0.3).means
+    torch.testing.assert_close(twice, 2 * means + torch.tensor([0.0, 0.0, 0.3]))
 
 
 def test_vertex_colors_are_interpolated(tmp_path):

@@ -28,11 +28,15 @@ def ply(path, **changes) -> Ply:
         "up": None,
         "turn_deg": 0,
         "radius": None,
+        "factor": None,
+        "lift": 0.0,
         "count": None,
         "sh_degree": None,
         "replicate": 1,
         "replicate_radius": 0.05,
+        "replicate_law": "even",
         "scale": 0.02,
+        "scale_law": "mean",
         "opacity": 0.1,
         "color": [0.2, 0.4, 0.6],
     }
@@ -134,6 +138,9 @@ def test_an_asset_is_scaled_as_a_whole(tmp_path):
     torch.testing.assert_close(sizes, ratio.expand(60, 3))
     assert torch.equal(made.sh, asset.sh)
     assert torch.equal(made.opacity_logits, asset.opacity_logits)
+    twice = build(saved(tmp_path, asset), factor=2.0, lift=0.3)
+    torch.testing.assert_close(twice.means, 2 * asset.means + torch.tensor([0.0, 0.0, 0.3]))
+    torch.testing.assert_close(twice.scales, 2 * asset.scales)
 
 
 def test_a_cap_selects_random_rows_of_an_asset(tmp_path):
@@ -233,6 +240,12 @@ def test_points_of_point_e_face_the_front_after_a_quarter_turn(tmp_path):
     made = build(point_cloud(tmp_path), turn_deg=90)  # theirs is -y, ours +x
     torch.testing.assert_close(made.means[:, 0], -POINTS[:, 1])
     torch.testing.assert_close(made.means[:, 1], POINTS[:, 0])
+
+
+def test_a_cloud_of_point_e_gets_luciddreamers_size_and_height(tmp_path):
+    made = build(point_cloud(tmp_path), turn_deg=90, factor=2.0, lift=0.3)
+    torch.testing.assert_close(made.means[:, 2], 2 * POINTS[:, 2] + 0.3)
+    torch.testing.assert_close(made.means[:, 0], -2 * POINTS[:, 1])
 
 
 def test_points_are_scaled_before_they_are_replicated(tmp_path):

@@ -37,6 +37,14 @@ def by_hand(points: torch.Tensor) -> torch.Tensor:
     return distances.sort(dim=1).values[:, 1:4].mean(dim=1)
 
 
+def test_the_law_of_3dgs_is_the_root_of_the_mean_squared_distance():
+    points = cloud(100)
+    distances = (points[:, None] - points[None]).norm(dim=-1).sort(dim=1).values[:, 1:4]
+    torch.testing.assert_close(neighbour_distance(points, "rms"), distances.square().mean(dim=1).sqrt())
+    made = gaussians_at(PointCloud(points, points), scale=None, opacity=0.1, sh_degree=0, law="rms")
+    torch.testing.assert_close(made.scales[:, 0], neighbour_distance(points, "rms"))
+
+
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 256, 1000])
 def test_neighbour_distances_are_those_of_an_exhaustive_search(n):
     torch.testing.assert_close(neighbour_distance(cloud(n)), by_hand(cloud(n)))
@@ -96,6 +104,20 @@ def test_every_point_is_replicated_at_the_same_offsets():
     assert offsets.norm(dim=-1).min() > 0
     assert offsets.norm(dim=-1).max() <= 0.05 + 1e-6
     assert torch.equal(made.rgb.view(50, 20, 3), original.rgb[:, None].expand(50, 20, 3))
+
+
+def test_polar_offsets_have_uniform_distances_and_angles():
+    """LucidDreamer's mean distance is half the radius; with equal density it would be three quarters."""
+    origin = PointCloud(torch.zeros(1, 3), torch.zeros(1, 3))
+    offsets = replicated(origin, 20_000, 0.1, seeded(), "polar").points
+    distances = offsets.norm(dim=-1)
+    inclinations = (offsets[:, 2] / distances).acos()
+    turns = torch.atan2(offsets[:, 1], offsets[:, 0]) % (2 * torch.pi)
+    for value, most in ((distances, 0.1), (inclinations, torch.pi), (turns, 2 * torch.pi)):
+        quantiles = torch.tensor([0.25, 0.5, 0.75])
+        torch.testing.assert_close(value.quantile(quantiles) / most, quantiles, atol=0.01, rtol=0)
+    even = replicated(origin, 20_000, 0.1, seeded()).points.norm(dim=-1)
+    assert float(even.mean() / distances.mean()) == pytest.approx(1.5, abs=0.02)
 
 
 def test_one_copy_of_each_point_is_the_cloud_itself_without_random_draws():

@@ -11,7 +11,16 @@ from cadam3d.initializer.ball import Ball
 from cadam3d.initializer.shap_e import KIND, OTHERS, ColoredMesh, ShapE
 
 CPU = torch.device("cpu")
-BALL = Ball(count=30, radius=0.5, scale=0.1, opacity=0.1, sh_degree=0, color=[0.5, 0.5, 0.5], color_noise=0.1)
+BALL = Ball(
+    count=30,
+    radius=0.5,
+    scale=0.1,
+    scale_law="mean",
+    opacity=0.1,
+    sh_degree=0,
+    color=[0.5, 0.5, 0.5],
+    color_noise=0.1,
+)
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -31,13 +40,19 @@ def shap_e(path: object = "nowhere", **changes) -> ShapE:
         "grid_size": 8,
         "turn_deg": 0,
         "radius": 0.9,
+        "factor": None,
+        "lift": 0.0,
         "count": None,
         "grow_points": 0,
         "grow_distance": 0.01,
         "grow_noise": 0.2,
+        "tone": "srgb",
+        "color": None,
         "replicate": 1,
         "replicate_radius": 0.05,
+        "replicate_law": "even",
         "scale": 0.02,
+        "scale_law": "mean",
         "opacity": 0.1,
         "sh_degree": 0,
         "fallback": None,
@@ -74,6 +89,18 @@ def test_the_mesh_is_centred_and_scaled():
     means = settle(radius=0.9).means
     assert float(means.norm(dim=-1).max()) == pytest.approx(0.9)
     torch.testing.assert_close(means.amin(dim=0), -means.amax(dim=0))
+
+
+def test_a_factor_keeps_the_origin_of_the_mesh_and_a_lift_raises_it():
+    made = settle(radius=None, factor=2.0, lift=0.3)
+    torch.testing.assert_close(made.means, 2 * a_mesh().vertices + torch.tensor([0.0, 0.0, 0.3]))
+    centred = settle(radius=0.9).means
+    torch.testing.assert_close(settle(radius=0.9, lift=-0.2).means, centred - torch.tensor([0.0, 0.0, 0.2]))
+
+
+def test_one_color_can_replace_those_of_the_model():
+    made = settle(color=[0.1, 0.2, 0.3], grow_points=100)
+    torch.testing.assert_close(rgb_of(made), torch.tensor([0.1, 0.2, 0.3]).expand(len(made), 3))
 
 
 def test_a_quarter_turn_moves_the_front_of_shap_e_to_our_front():
@@ -221,6 +248,10 @@ def test_colors_are_those_that_the_model_paints_with(models):
         position=mesh.vertices[None], direction=None, ts=None, nerf_level="fine", rendering_mode="stf"
     ).channels[0]
     torch.testing.assert_close(mesh.rgb, painted, atol=1e-4, rtol=0)
+    # Linear light is that of the decoder, unchanged.
+    decoded = renderer.decode_to_mesh(described, CPU, grid_size=8).vertex_channels
+    unchanged = torch.stack([decoded[channel] for channel in "RGB"], dim=1)
+    assert torch.equal(shap_e(models[True], tone="linear").decode(found, described).rgb, unchanged)
 
 
 def test_a_missing_surface_is_reported(models):
@@ -300,6 +331,12 @@ def test_a_mistake_in_the_fallback_is_an_error():
         ("grid_size", 1),
         ("turn_deg", 45),
         ("radius", 2.0),
+        ("factor", 0.0),
+        ("lift", 2.0),
+        ("tone", "dark"),
+        ("color", [2, 0, 0]),
+        ("replicate_law", "shell"),
+        ("scale_law", "median"),
         ("count", 0),
         ("grow_points", -1),
         ("grow_distance", 0.0),
@@ -312,3 +349,10 @@ def test_a_mistake_in_the_fallback_is_an_error():
 def test_an_impossible_value_is_refused_by_name(key, value):
     with pytest.raises(UserError, match=rf"^initializer\.{key}: expected"):
         shap_e(**{key: value})
+
+
+def test_the_size_has_one_setting():
+    with pytest.raises(
+        UserError, match=r"^initializer\.radius: expected null, since initializer\.factor=2\.0 sets"
+    ):
+        shap_e(factor=2.0)

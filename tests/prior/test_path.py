@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from cadam3d.core.errors import UserError
-from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
+from cadam3d.prior.path import DDPM, RectifiedFlow, Rows, per_view
 
 PATHS = {
     "ddpm": DDPM(),
@@ -252,3 +252,25 @@ def test_equal_paths_are_equal():
 def test_impossible_paths_are_refused_by_key(build, key):
     with pytest.raises(UserError, match=key):
         build()
+
+
+@every_path
+def test_a_path_at_rows_equals_the_path_at_the_nearest_row_of_its_table(path):
+    rows, t = Rows(path=path, rows=1000), inner_levels(50)
+    nearest = (1000 * t).round() / 1000
+    clean, noise = pairs(50)
+    noisy = path.mix(clean, noise, nearest)
+    torch.testing.assert_close(rows.mix(clean, noise, t), noisy)
+    torch.testing.assert_close(rows.timestep(t), path.timestep(nearest))
+    for name in ("from_noise", "from_clean", "from_velocity"):
+        found, wanted = (getattr(each, name)(noisy, noise, at) for each, at in ((rows, t), (path, nearest)))
+        torch.testing.assert_close(found.clean, wanted.clean)
+        torch.testing.assert_close(found.velocity, wanted.velocity)
+    torch.testing.assert_close(rows.b(rows.t_at(path.b(nearest))), path.b(nearest))
+
+
+def test_timesteps_at_rows_are_whole_numbers():
+    t = torch.rand(1000, generator=torch.Generator().manual_seed(0))
+    steps = Rows(path=DDPM(), rows=1000).timestep(t)
+    assert torch.equal(steps, steps.round())
+    assert (DDPM().timestep(t) - steps).abs().max() <= 0.501

@@ -35,6 +35,7 @@ def make(pipelines, cache):
             "tiling": False,
             "compile": False,
             "text_device": "auto",
+            "noise_levels": "table",
             "cache_dir": str(cache),
         }
         return StableDiffusion(**keys | changes)
@@ -75,6 +76,18 @@ def random(*shape, seed=0):
 
 
 LEVELS = torch.tensor([0.3, 0.8])
+
+
+def test_the_network_is_used_at_the_levels_of_its_table_unless_any_is_asked_for(make):
+    table, between = make("epsilon"), torch.tensor([0.3004, 0.7996])
+    anywhere, noisy = make("epsilon", noise_levels="any"), random(2, 4, 8, 8)
+    at_rows, beside = (
+        prior.predict(noisy, between, condition_of(prior, 0, 90), 7.5) for prior in (table, anywhere)
+    )
+    nearest = anywhere.predict(noisy, torch.tensor([0.3, 0.8]), condition_of(anywhere, 0, 90), 7.5)
+    for form in ("clean", "noise", "velocity"):
+        torch.testing.assert_close(getattr(at_rows, form), getattr(nearest, form))
+        assert not torch.allclose(getattr(beside, form), getattr(nearest, form), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
@@ -311,6 +324,7 @@ def test_a_model_that_is_not_on_disk_is_lacking_and_the_hub_is_not_queried(make,
         ({"dtype": "int8"}, "prior.dtype"),
         ({"micro_batch": 0}, "prior.micro_batch"),
         ({"text_device": "moon"}, "prior.text_device"),
+        ({"noise_levels": "whole"}, "prior.noise_levels"),
     ],
 )
 def test_wrong_values_are_named(make, changes, key):
