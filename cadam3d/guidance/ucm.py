@@ -9,13 +9,26 @@ from torch import Tensor
 
 from cadam3d.core.checks import require_choice, require_range, require_whole
 from cadam3d.guidance.distill import Case, Comparison, GuidedDistillation
-from cadam3d.guidance.trajectory import ddim
+from cadam3d.guidance.trajectory import ROW, ddim
 from cadam3d.prior.path import NoisePath, per_view
 
-# Positions of the inversion steps, by name: a function from shares of the way, 0 to 1, to levels in t.
+
+def listed(shares: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Return as many levels of FlowDreamer's "original" schedule as there are ``shares``.
+
+    They begin with 0 and end with 1. In between are the entries 1, 2, ... times (1000 // steps - 1) of a list
+    of a thousand levels, in which entry i, counted from 0, is at t = (i + 1) / 1000.
+    """
+    steps = len(shares) - 1
+    entries = torch.arange(1, steps, dtype=shares.dtype) * (round(1 / ROW) // steps - 1)
+    return torch.cat([shares[:1], (entries + 1) * ROW, shares[-1:]])
+
+
+# Levels of the inversion, by name: a function from even shares of the way, 0 to 1, to levels in t.
 GRIDS: dict[str, Callable[[NoisePath, Tensor], Tensor]] = {
     "sigma": lambda path, shares: path.t_at(shares * path.b(torch.ones_like(shares))),
     "t": lambda path, shares: shares,
+    "rows": lambda path, shares: listed(shares),
 }
 
 

@@ -210,7 +210,15 @@ def test_vfds(make, still, clean, flow):
     close(gradient, guided(noisy, timestep) - (noise - clean))
 
 
-@pytest.mark.parametrize(("grid", "sigmas"), [("sigma", [0, 1 / 3, 2 / 3]), ("t", [0, 0.5, 0.75, 0.9])])
+@pytest.mark.parametrize(
+    ("grid", "sigmas"),
+    [
+        ("sigma", [0, 1 / 3, 2 / 3]),
+        ("t", [0, 0.5, 0.75, 0.9]),
+        # Entries 249, 498 and 747 of the thousand levels, in ascending order.
+        ("rows", [0, *(3 * row / (1000 + 2 * row) for row in (250, 499, 748))]),
+    ],
+)
 def test_ucm(grid, sigmas, make, still, clean, flow):
     """The scheduler takes its Euler steps upwards, from the image to the noise."""
     keys = {"inversion_grid": grid, "inversion_steps": len(sigmas), "weight": 0.1}

@@ -62,9 +62,21 @@ def test_on_a_flow_the_noise_is_the_end_of_the_euler_steps(make, run, gaussian, 
     torch.testing.assert_close(gradient, guess.velocity - (noise - clean), rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize(("grid", "sigmas"), [("sigma", [0, 1 / 3, 2 / 3]), ("t", [0, 0.5, 0.75, 0.9])])
+@pytest.mark.parametrize(
+    ("grid", "sigmas"),
+    [
+        ("sigma", [0, 1 / 3, 2 / 3]),
+        ("t", [0, 0.5, 0.75, 0.9]),
+        ("rows", [0, *(3 * t / (1 + 2 * t) for t in (0.25, 0.499, 0.748))]),
+        ("rows", [0, *(3 * t / (1 + 2 * t) for t in (0.333, 0.665))]),
+        ("rows", [0]),
+    ],
+)
 def test_the_published_grids(grid, sigmas, make, run, gaussian, means, rgb):
-    """The second grid is even in t, to which Stable Diffusion 3 applies the shift 3."""
+    """The second grid is even in t, to which Stable Diffusion 3 applies the shift 3.
+
+    The third has the entries 249, 498 and 747 of a list of the levels 0.001, 0.002, ..., 1, or 332 and 664.
+    """
     path = RectifiedFlow(shift=3.0)
     prior = gaussian(path)
     run(make("ucm", inversion_grid=grid, inversion_steps=len(sigmas)), rgb, means, prior)
