@@ -153,6 +153,40 @@ def test_higher_coefficients_learn_twenty_times_as_slowly_as_in_3dgs(family):
     assert rates["sh_rest"] == pytest.approx(rates["sh_dc"] / 20)
 
 
+def test_cameras_change_at_the_same_share_of_a_run_of_any_length():
+    lucid = {steps: build("camera", "progressive", f"steps={steps}") for steps in (5000, 400)}
+    assert (lucid[5000].begin, lucid[5000].every) == (500, 500)
+    assert [lucid[400].widenings(step * 400 // 5000) for step in range(0, 5000, 500)] == list(range(10))
+    for steps, milestones in ((500, [150, 300]), (60, [18, 36])):
+        size = build("camera", "dreamgaussian", f"steps={steps}").size
+        assert list(size.milestones) == milestones
+        assert [size(step) for step in (0, *milestones)] == [128, 256, 512]
+
+
+def test_the_stages_of_dreamgaussians_images_can_be_smaller():
+    small = build("camera", "dreamgaussian", "steps=100", "camera.size.values=[16,32,64]")
+    assert [small.sample(step, 1, torch.Generator()).height for step in (0, 30, 60)] == [16, 32, 64]
+    assert build("camera", "dreamgaussian", "camera.size=64").size == 64
+
+
+def test_flowdreamers_cameras_are_its_codes_defaults_and_its_head_can_be_typed():
+    cfg = compose(["prompt=a red cube", "experiment=flowdreamer"])
+    camera = component(cfg.camera)
+    assert camera.azimuth_deg.at(0) == (-180, 180)
+    assert camera.elevation_deg.at(0) == (-15, 45)
+    assert camera.gamma == 1
+    head = ["camera.azimuth_deg.start=[-80,80]", "camera.gamma=1.5"]
+    head += ["camera.elevation_deg.start=[0,45]", "camera.elevation_deg.end=[0,45]"]
+    camera = component(compose(["prompt=a head", "experiment=flowdreamer", *head]).camera)
+    assert [camera.azimuth_deg.at(count) for count in (0, 1, 2)] == [(-80, 80), (-120, 120), (-180, 180)]
+    assert camera.elevation_deg.at(9) == (0, 45)
+
+
+def test_the_guard_checks_the_published_share_of_a_run():
+    guard = build("exposure", "beg", "steps=5000")
+    assert (guard.begin, guard.end) == (1000, 4500)
+
+
 def test_gcs_beg_clips_gradients_in_its_own_unit_of_length():
     optimizer = build("optimizer", "gcs_beg", "steps=5000")
     steps = (0, 500, 1000, 3000)

@@ -16,8 +16,8 @@ def describe(trainer: Trainer) -> str:
     """Return the timetable of a run in one line: refinements, opacity resets, the steps after them, rates.
 
     It names resets that are skipped (:attr:`Refine.resets`) and schedules that the run does not complete. If
-    no Gaussian can grow, it says so and which settings change that. If the refinements are published for
-    another number of steps, it says what this run misses or adds.
+    no Gaussian can grow, it says so and which settings change that. If the refinements are made for another
+    number of steps, it says what this run misses or adds.
     """
     refine, densifier = trainer.refine, trainer.densifier
     rest, settled = _rest(refine, densifier), trainer.optimizer.settled_at()
@@ -59,11 +59,8 @@ def _rest(refine: Refine, densifier: Densifier) -> int:
 
 
 def _difference(refine: Refine, published: Refine, densifier: Densifier) -> str:
-    """Return what a run misses, or adds, compared with the length for which its refinements are published."""
-    lengths = (
-        f"The refinements are made for {published.steps} steps and, "
-        "like most schedules of a recipe, keep their steps at any length"
-    )
+    """Return what a run misses, or adds, compared with the length for which its refinements are made."""
+    lengths = f"The refinements are made for {published.steps} steps and do not follow the length of the run"
     grown = len(refine.refinements) - len(published.refinements)
     if refine.steps > published.steps:
         return f"{lengths}: this run adds {_plural(grown, 'refinement')}."

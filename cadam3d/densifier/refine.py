@@ -41,7 +41,7 @@ class Refine:
     """
 
     steps: int  # of the run
-    made_for: int | None  # steps of the run for which the schedule was published
+    made_for: int | None  # steps of the run for which the schedule is made
     start: int  # step
     end: int  # step
     interval: int  # steps, the paper's K

@@ -285,9 +285,9 @@ def require_place(turn_deg: object, radius: object, factor: object, lift: object
         require(
             radius is None,
             "initializer.radius",
-            expected=f"null, since initializer.factor={factor} sets the size too",
+            expected=f"null or initializer.factor=null, since the factor {factor:g} sets the size too",
             got=radius,
-            example="initializer.radius=null, or initializer.factor=null",
+            example="initializer.radius=null",
         )
     require_range("initializer.lift", lift, low=-1, high=1, example=0)
 
