@@ -22,6 +22,7 @@ from prior_training.views import GROUPS
 
 # Of --minutes: the shares of the autoencoder and of the denoiser. The rest is for views and latents.
 AUTOENCODER, DENOISER = 0.27, 0.6
+MOST_GROUPS = 100 * GROUPS
 GROUPS_PER_MINUTE = 300  # that are rendered in a small part of the time, per process
 
 
@@ -57,10 +58,10 @@ def _budget(steps: int, minutes: float | None) -> loop.Budget:
 
 
 def _groups(arguments: argparse.Namespace) -> int:
-    if arguments.minutes is None:
-        return arguments.groups
+    if arguments.groups is not None or arguments.minutes is None:
+        return arguments.groups or MOST_GROUPS
     share = GROUPS_PER_MINUTE * arguments.processes * arguments.minutes
-    return min(arguments.groups, max(GROUPS, round(share)))
+    return min(MOST_GROUPS, max(GROUPS, round(share)))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -83,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--views", type=Path, help="folder of rendered views, to share them between models")
     parser.add_argument(
-        "--groups", type=int, default=51_200, help="of four views; above 512 a multiple of 512"
+        "--groups", type=int, help="of four views; above 512 a multiple of 512 (default: up to 51200)"
     )
     parser.add_argument("--size", type=int, default=64, help="pixels per side")
     parser.add_argument("--prediction", choices=("v_prediction", "epsilon"), default="v_prediction")
