@@ -86,11 +86,11 @@ class LatentEmbedding(PromptEmbedding):
 
     texts: Texts
     prompting: Prompting
-    hint: str | None  # a better wording of the prompt
+    hints: Sequence[str]  # sentences about the prompt and the size of the images
 
     def notice(self) -> str | None:
-        """Return a sentence about a better wording of the prompt, if the model has learned other ones."""
-        return self.hint
+        """Return what the user should know about the prompt and the size of the images, or None."""
+        return " ".join(self.hints) or None
 
     def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> TextCondition:
         """Return the condition of these views; the background is not used."""
@@ -196,8 +196,10 @@ class LatentPrior(DiffusionPrior):
         """
         self._require_readable(prompt, negative)
         texts = self._embedded(self._listed(prompt, negative))
-        hint = self.lexicon.hint(prompt) if self.lexicon is not None else None
-        return LatentEmbedding(texts=texts.to(self.device), prompting=self.prompting, hint=hint)
+        hints = [self._size_hint(), self.lexicon.hint(prompt) if self.lexicon is not None else None]
+        return LatentEmbedding(
+            texts=texts.to(self.device), prompting=self.prompting, hints=[hint for hint in hints if hint]
+        )
 
     def encode(self, rgb: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v c lh lw"]:
         """Convert images in [0, 1] to scaled latents; differentiable."""
@@ -287,16 +289,6 @@ class LatentPrior(DiffusionPrior):
             return f"no model on this disk; the first run would download one of {', '.join(self.ids)}"
         return None
 
-    def notice(self) -> str | None:
-        """Return a warning if the images have another size than those that the model was trained with."""
-        size, trained = self.size, self.trained_size
-        if size is None or trained is None or trained / 2 <= size <= trained:
-            return None
-        return (
-            f"The model was trained with images of {trained} pixels per side, and prior.size={size} is far "
-            f"from that. prior.size={trained} usually looks better."
-        )
-
     def load(self) -> None:
         """Load the autoencoder and the denoiser."""
         _ = self.vae, self.network
@@ -384,6 +376,16 @@ class LatentPrior(DiffusionPrior):
         for key, text in (("prompt", prompt), ("negative_prompt", negative)):
             if self.lexicon is not None:
                 self.lexicon.require_known(key, text)
+
+    def _size_hint(self) -> str | None:
+        """Return a warning if the images have another size than those that the model was trained with."""
+        size, trained = self.size, self.trained_size
+        if size is None or trained is None or trained / 2 <= size <= trained:
+            return None
+        return (
+            f"The model was trained with images of {trained} pixels per side, and prior.size={size} is far "
+            f"from that. prior.size={trained} usually looks better."
+        )
 
     def _require_size(self, key: str, size: int) -> None:
         trained = self.trained_size

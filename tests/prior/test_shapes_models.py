@@ -131,8 +131,9 @@ def test_renders_that_are_not_resized_are_compared_with_the_training_too(models)
 
 
 @pytest.mark.parametrize(("size", "is_far"), [(16, True), (32, False), (64, False), (80, True), (128, True)])
-def test_a_size_far_from_that_of_the_training_gets_a_note(size, is_far, models):
-    notice = built("prior=shapes_sd", f"prior.size={size}").notice()
+def test_a_size_far_from_that_of_the_training_gets_a_note(size, is_far, models, tmp_path):
+    prior = built("prior=shapes_mvdream", f"prior.size={size}", f"prior.cache_dir={tmp_path}")
+    notice = prior.embed("a red cube", "").notice()
     assert (notice is not None) == is_far
     assert notice is None or "prior.size=64" in notice
 
@@ -144,8 +145,7 @@ def test_a_model_that_does_not_say_its_size_is_used_at_any(models, tmp_path):
     del config["sample_size"]
     (copy / "unet" / "config.json").write_text(json.dumps(config), encoding="utf-8")
     prior = built("prior=stable_diffusion", f"prior.path={copy}", f"prior.cache_dir={tmp_path}")
-    assert prior.notice() is None
-    prior.embed("a red cube", "")
+    assert prior.embed("a red cube", "").notice() is None
 
 
 def test_a_model_that_is_not_in_the_package_is_named(models):
