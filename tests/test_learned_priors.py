@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 
 # An object whose outline is far from that of the ball of points at the start.
 COLOUR, NOUN = "red", "capsule"
-STEPS = 48
+STEPS = 40
 SIZE = 64
 NAMES = ("red", "green", "blue", "yellow", "white", "black")
 
