@@ -257,7 +257,7 @@ class LatentPrior(DiffusionPrior):
 
         The working memory is that of the denoiser or of the autoencoder, whichever is larger. Renders have
         ``size`` pixels per side (512 if that is None too) unless the prior resizes them. Raises ``UserError``
-        in the cases in which :meth:`embed` does, since this is called before.
+        in the cases in which :meth:`embed` does, since training calls this first.
         """
         self._require_readable(prompt, negative)
         pixels = self.size or size or 512

@@ -196,5 +196,5 @@ def _line(key: str, prompt: str) -> str:
 
 
 def shown(text: str) -> str:
-    """Return a text as messages show it, which cut a long one."""
+    """Return a text as messages show it: cut if it is long."""
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."

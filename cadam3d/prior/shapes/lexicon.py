@@ -29,9 +29,9 @@ from cadam3d.prior.shapes.words import is_known, noun_of, typed_words
 NEEDED = ("nouns", "colours")
 KINDS = (*NEEDED, "patterns", "relations", "views", "qualities")
 ABOUT_PICTURES = ("views", "qualities")
-# The words that any caption may have.
+# Words that every model knows.
 JOINTS = frozenset({"a", "an", "and"})
-# What the captions of a model can say, in addition to letters.
+# Signs that no caption has.
 PUNCTUATION = re.compile(r"[^\w\s,]|_")
 
 
