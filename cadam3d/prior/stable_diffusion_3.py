@@ -1,9 +1,10 @@
 """Stable Diffusion 3 and 3.5: a transformer on the straight path, which reads up to three text encoders."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -46,6 +47,12 @@ class StableDiffusion3(LatentPrior):
         return ("text_encoder", "text_encoder_2", *third)
 
     @cached_property
+    def network(self) -> Any:
+        """Return the denoiser, frozen and on the device."""
+        network = super().network
+        return network if T5 in self.encoders else counting_zeros(network)
+
+    @cached_property
     def noise_path(self) -> NoisePath:
         """Return the straight path with the model's shift. Raises ``UserError`` for a dynamic shift."""
         is_shifted = not self.scheduler.get("use_dynamic_shifting")
@@ -66,12 +73,12 @@ class StableDiffusion3(LatentPrior):
 
     @torch.no_grad()
     def embed_texts(self, found: Pretrained, texts: Sequence[str], device: torch.device) -> Texts:
-        """Concatenate both CLIP encoders' states, padded to T5's width, and append T5's tokens or zeros."""
+        """Concatenate both CLIP encoders' states, padded to T5's width, and append T5's tokens or a zero."""
         dtype = self.torch_dtype
         clip = [penultimate(found, part, texts, dtype, device) for part in ("text_encoder", "text_encoder_2")]
         both = torch.cat([each.tokens for each in clip], dim=-1)
         width = found.config(self.network_part)["joint_attention_dim"]
-        long = both.new_zeros(len(texts), T5_TOKENS, width)
+        long = both.new_zeros(len(texts), 1, width)
         if T5 in self.encoders:
             numbers = tokenize(found.part("tokenizer_3"), texts, T5_TOKENS).to(device)
             long = found.part(T5, dtype).to(device)(numbers)[0].to(dtype)
@@ -88,3 +95,60 @@ class StableDiffusion3(LatentPrior):
             encoder_hidden_states=texts.tokens,
             pooled_projections=texts.pooled,
         ).sample
+
+    @property
+    def _identity(self) -> tuple[str, ...]:
+        """Return everything that an embedded text depends on; without T5, it ends in a single zero token."""
+        return super()._identity if T5 in self.encoders else (*super()._identity, "one zero token")
+
+
+class CountingZeros:
+    """An attention processor that counts the last text token as often as T5 has tokens.
+
+    Without T5, Stable Diffusion 3 reads ``T5_TOKENS`` zeros in its place. Text tokens have no positions, so
+    all of them have the same states in every layer, and one is enough: an attention weight that is multiplied
+    with their number before the normalisation is the sum of theirs. The output stays the same.
+    """
+
+    def __init__(self, processor: Any) -> None:
+        self.processor = processor
+
+    def __call__(
+        self,
+        attention: Any,
+        hidden_states: Float[Tensor, "b n c"],
+        encoder_hidden_states: Float[Tensor, "b m c"] | None = None,
+        *args: Any,
+        **kwargs: Any,
+    ) -> Any:
+        """Return the output of the layer, for images or for images and texts."""
+        if encoder_hidden_states is None:
+            return self.processor(attention, hidden_states, None, *args, **kwargs)
+        image, text = hidden_states, encoder_hidden_states
+
+        def heads(states: Tensor, layer: Any, norm: Any) -> Tensor:
+            split = layer(states).unflatten(-1, (attention.heads, -1)).transpose(1, 2)
+            return split if norm is None else norm(split)
+
+        query, key, value = (
+            torch.cat([heads(image, *ours), heads(text, *theirs)], dim=2)
+            for ours, theirs in (
+                ((attention.to_q, attention.norm_q), (attention.add_q_proj, attention.norm_added_q)),
+                ((attention.to_k, attention.norm_k), (attention.add_k_proj, attention.norm_added_k)),
+                ((attention.to_v, None), (attention.add_v_proj, None)),
+            )
+        )
+        counts = query.new_zeros(key.shape[2])
+        counts[-1] = math.log(T5_TOKENS)
+        mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=counts.expand(1, 1, 1, -1))
+        both = mixed.transpose(1, 2).flatten(2).to(query.dtype)
+        image, text = both.split([image.shape[1], text.shape[1]], dim=1)
+        image = attention.to_out[1](attention.to_out[0](image))
+        return image, text if attention.context_pre_only else attention.to_add_out(text)
+
+
+def counting_zeros(network: Any) -> Any:
+    """Make ``network`` count the last text token as T5's zeros; changes and returns ``network``."""
+    processors = {name: CountingZeros(each) for name, each in network.attn_processors.items()}
+    network.set_attn_processor(processors)
+    return network
