@@ -17,7 +17,7 @@ from cadam3d.core.checks import require, require_choice, require_range
 
 FRONT, SIDE, BACK, OVERHEAD = range(4)
 SUFFIXES = (", front view", ", side view", ", back view", ", overhead view")
-# Eight sides of the object, an eighth of a turn apart, from the front on. Left and right are those of a viewer
+# Eight sides of the object, an eighth of a turn apart, from the front on. Left and right are those of someone
 # in front of the object.
 SIDES = ("front", "front right", "right", "back right", "back", "back left", "left", "front left")
 # From below, at the height of the object, and from above.
