@@ -62,7 +62,9 @@ def settings(name: str, option: Option) -> str:
     if option.base:
         title += f", otherwise as <code>{option.base}</code>"
     prefix = name.replace("/", ".") + "."
-    body = table(own, prefix) if name not in RECIPES else changes(own)
+    # Some options, such as prior=shapes_sd, change settings of other groups too.
+    is_recipe = name in RECIPES or not all(each.key.startswith(prefix) for each in own)
+    body = changes(own) if is_recipe else table(own, prefix)
     return f"<details><summary>{title}</summary>\n\n{body}\n\n</details>"
 
 

@@ -5,6 +5,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import torch
+from safetensors.torch import load_file, save_file
 
 WORDS = "a corgi red cube blue sphere front side back overhead view ugly blurry of the on table small big cat"
 WIDTH = 32  # of every text encoder
@@ -22,7 +23,7 @@ def clip_tokenizer(folder: Path, **options):
     pieces += ["<|startoftext|>", "<|endoftext|>"]
     (folder / "vocab.json").write_text(json.dumps({piece: i for i, piece in enumerate(pieces)}))
     (folder / "merges.txt").write_text("#version: 0.2\n" + "\n".join(merges) + "\n")
-    return CLIPTokenizer.from_pretrained(folder, model_max_length=77, **options)
+    return CLIPTokenizer.from_pretrained(folder, **{"model_max_length": 77, **options})
 
 
 def t5_tokenizer():
@@ -111,16 +112,16 @@ def ddim(prediction: str = "epsilon"):
     )
 
 
-def stable_diffusion(folder: Path, prediction: str = "epsilon") -> Path:
+def stable_diffusion(folder: Path, prediction: str = "epsilon", tokens: int = 77) -> Path:
     """Save a small Stable Diffusion 1.5 or 2.1."""
     from diffusers import StableDiffusionPipeline
 
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        tokenizer = clip_tokenizer(folder / "tokens")
+        tokenizer = clip_tokenizer(folder / "tokens", model_max_length=tokens)
         StableDiffusionPipeline(
             vae=vae(4, 0.18215),
-            text_encoder=clip_text(tokenizer),
+            text_encoder=clip_text(tokenizer, max_position_embeddings=tokens),
             tokenizer=tokenizer,
             unet=unet(WIDTH),
             scheduler=ddim(prediction),
@@ -204,6 +205,37 @@ def stable_diffusion_3(folder: Path, t5: bool = True) -> Path:
             text_encoder_3=third,
             tokenizer_3=words,
         ).save_pretrained(folder)
+    return folder
+
+
+# What the models that come with the package know, as the file of such a model lists it.
+VOCABULARY = {
+    "nouns": ["sphere", "cube", "torus", "cone", "star", "house", "mushroom", "car", "tree", "snowman"],
+    "colours": ["red", "orange", "yellow", "green", "cyan", "blue", "white", "black", "grey"],
+    "patterns": ["striped", "checkered", "spotted"],
+    "relations": ["on", "next to"],
+    "views": ["front", "side", "back", "overhead", "right", "left", "view", "from", "below", "above"],
+    "qualities": ["ugly", "blurry", "low quality"],
+    "held_out": [["red", "mushroom"]],
+}
+
+
+def shapes(folder: Path, kind: str) -> Path:
+    """Save a small model of one of the kinds above in half precision, with the words that it knows.
+
+    Like the models that come with the package, a Stable Diffusion reads 32 tokens.
+    """
+    if kind == "stable_diffusion":
+        stable_diffusion(folder, "v_prediction", tokens=32)
+    else:
+        {"mvdream": mvdream, "stable_diffusion_3": stable_diffusion_3}[kind](folder)
+    for file in folder.rglob("*.safetensors"):
+        save_file({name: each.half() for name, each in load_file(file).items()}, file, {"format": "pt"})
+    if kind == "mvdream":
+        index = json.loads((folder / "model_index.json").read_text(encoding="utf-8"))
+        text = json.dumps(index | {"_class_name": "MVDreamPipeline"})
+        (folder / "model_index.json").write_text(text, encoding="utf-8")
+    (folder / "vocabulary.json").write_text(json.dumps(VOCABULARY), encoding="utf-8")
     return folder
 
 

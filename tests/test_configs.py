@@ -62,12 +62,26 @@ def read(path: Path) -> Any:
 
 def nested_groups(path: Path) -> set[str]:
     """Return the keys that a group inside this group sets, such as ``fallback`` of an initializer."""
+    return {name for name in chosen_groups(path) if not name.startswith("override ")}
+
+
+def chosen_groups(path: Path) -> dict[str, str]:
+    """Return the option of each group in the list of defaults of a file."""
     entries = read(path).get("defaults", [])
-    return {name for entry in entries if isinstance(entry, dict) for name in entry}
+    return {name: option for entry in entries if isinstance(entry, dict) for name, option in entry.items()}
+
+
+def with_base(path: Path) -> dict[str, Any]:
+    """Return the keys of a file and of the files that it builds on."""
+    content = read(path)
+    bases = [entry for entry in content.pop("defaults", []) if isinstance(entry, str) and entry != "_self_"]
+    return {key: value for base in bases for key, value in with_base(path.with_stem(base)).items()} | content
 
 
 NESTED = sorted((CONFIGS / "initializer").glob("*/*.yaml"))  # of groups inside a group
 VARIANTS = [path for path in FILES if "defaults" in read(path) and not nested_groups(path)]
+# Options that also choose options of other groups and set values outside of their own node.
+GLOBAL = [path for path in FILES if path.read_text(encoding="utf-8").startswith("# @package _global_\n")]
 
 
 @cache
@@ -123,8 +137,12 @@ def test_a_node_has_exactly_the_keys_of_its_class(path):
 @pytest.mark.parametrize("path", VARIANTS, ids=name_of)
 def test_a_variant_changes_values_of_what_it_builds_on(path):
     changes = read(path)
-    base, itself = changes.pop("defaults")
-    original = read(path.with_stem(base))
+    base, *_, itself = changes.pop("defaults")
+    group = path.parent.name
+    if path in GLOBAL:
+        changes = changes[group]
+        base = base.removesuffix(f"@{group}")
+    original = with_base(path.with_stem(base))
     assert itself == "_self_"
     # A variant with another class may have further keys.
     assert set(changes) < set(original) or "_target_" in changes
@@ -148,7 +166,27 @@ def test_a_component_declares_no_default_values(path):
         assert not [field.name for field in settings if field.default is not dataclasses.MISSING]
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
+@pytest.mark.parametrize("path", GLOBAL, ids=name_of)
+def test_an_option_that_chooses_others_sets_nothing_inside_their_groups(path):
+    """A value there would remain if the command line or a recipe chose another option of that group."""
+    choices, changes = chosen_groups(path), set(read(path)) - {"defaults", path.parent.name}
+    assert all(name.startswith("override /") for name in choices)
+    assert not changes & set(GROUPS)
+    cfg = compose([PROMPT, f"{path.parent.name}={path.stem}"], with_hydra=True)
+    chosen = cfg.hydra.runtime.choices
+    assert all(chosen[name.removeprefix("override /")] == option for name, option in choices.items())
+    # Whatever else is typed, or chosen by a recipe, wins.
+    other = compose(
+        [PROMPT, f"{path.parent.name}={path.stem}", "experiment=mvdream", "camera=sphere", "views=8"],
+        with_hydra=True,
+    )
+    chosen = other.hydra.runtime.choices
+    assert (chosen.prior, chosen.camera, chosen.guidance) == (path.stem, "sphere", "sds_mvdream")
+    assert (other.views, other.steps, other.guidance.scale) == (8, 1200, 50.0)
+    assert "relative_distance" not in other.camera
+
+
+@pytest.mark.parametrize("path", [path for path in FILES if path not in GLOBAL], ids=name_of)
 def test_an_option_of_a_group_with_several_choices_has_its_own_node(path):
     header = path.read_text(encoding="utf-8").splitlines()[0]
     wanted = f"# @package {path.parent.name}.{path.stem}"

@@ -80,6 +80,35 @@ def test_the_wheel_carries_the_pages_of(wheel, part):
     assert {str(path.relative_to(REPOSITORY)) for path in sources} <= names
 
 
+def models() -> dict[str, list[Path]]:
+    """Return the files of each trained model that comes with the package."""
+    folders = sorted(path for path in (REPOSITORY / "cadam3d/models").glob("*") if path.is_dir())
+    return {
+        folder.name: [path for path in folder.rglob("*") if path.is_file()]
+        for folder in folders
+        if (folder / "model_index.json").is_file()
+    }
+
+
+@pytest.mark.skipif(not models(), reason="the trained models are not in cadam3d/models yet")
+def test_the_wheel_carries_the_trained_models(wheel):
+    sizes = {each.filename: each.file_size for each in zipfile.ZipFile(wheel).infolist()}
+    named = {path.stem for path in find("configs/prior", "*.yaml") if "package:" in path.read_text("utf-8")}
+    assert set(models()) == named
+    for name, files in models().items():
+        inside = {str(path.relative_to(REPOSITORY)) for path in files}
+        folder = f"cadam3d/models/{name}"
+        assert {f"{folder}/{file}" for file in ("README.md", "vocabulary.json", "model_index.json")} <= inside
+        assert inside == {path for path in sizes if path.startswith(f"{folder}/")}
+        assert sum(sizes[path] for path in inside) <= 12e6
+
+
+def test_the_installed_package_looks_for_its_models_in_itself(installed, tmp_path):
+    code = "from cadam3d.io.pretrained import MODELS; print(MODELS)"
+    done = run(installed, tmp_path, sys.executable, "-c", code)
+    assert Path(done.stdout.strip()) == installed / "cadam3d" / "models", done.stderr
+
+
 def test_the_source_archive_carries_what_its_own_tests_read(tmp_path):
     command = [sys.executable, "-m", "build", "--sdist", "--no-isolation", "--outdir", str(tmp_path)]
     subprocess.run([*command, str(REPOSITORY)], check=True, capture_output=True)
@@ -88,6 +117,7 @@ def test_the_source_archive_carries_what_its_own_tests_read(tmp_path):
         modes = {member.name.partition("/")[2]: member.mode for member in archive.getmembers()}
     everything = [*find("cadam3d", "*.py"), *find("configs", "*.yaml"), *find("docs", "*.md")]
     everything += [*find("tests", "*.py"), *REPOSITORY.glob("*.md")]
+    everything += [path for files in models().values() for path in files]
     names = {str(path.relative_to(REPOSITORY)) for path in everything}
     assert names | {"Makefile", "LICENSE", "pyproject.toml", "constraints.txt", ".ci/run"} <= set(modes)
     assert modes[".ci/run"] & 0o100

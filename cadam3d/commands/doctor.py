@@ -186,9 +186,7 @@ def _diffusers() -> Finding:
     try:
         return Finding("diffusers", Verdict.OK, metadata.version("diffusers"))
     except metadata.PackageNotFoundError:
-        return Finding(
-            "diffusers", Verdict.NOTE, "not installed; only priors with downloaded weights need it"
-        )
+        return Finding("diffusers", Verdict.NOTE, "not installed; only priors that are networks need it")
 
 
 def _models() -> Finding:

@@ -94,7 +94,7 @@ def run(cfg: DictConfig) -> float | None:
     state = start_or_resume(cfg, trainer, initializer, device, folder)
     # The prior is loaded last, because an initializer may have needed the memory and has freed it now.
     trainer.prior.load()
-    for text in filter(None, (trainer.prior.notice(), state.initial_note)):
+    for text in filter(None, (trainer.prior.notice(), embedding.notice(), state.initial_note)):
         note(text)
     note_backend(backend)
     timetable = describe(trainer)

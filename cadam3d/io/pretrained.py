@@ -19,6 +19,11 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json
 
 INDEX = "model_index.json"
+VOCABULARY = "vocabulary.json"  # in the folder of a model that knows only some words
+# The models that come with this package, and the beginning of a path that names one of them. Such a path is
+# the same on every machine, so the folder of a run can be moved.
+MODELS = Path(__file__).parent.parent / "models"
+PACKAGE = "package:"
 # Parts may only have classes of these libraries, so that no foreign code runs.
 LIBRARIES = ("diffusers", "transformers")
 EXTRA = ("diffusers", "transformers", "safetensors")
@@ -30,7 +35,7 @@ class Source:
     """The places to search for a model. ``key`` is their node in the configuration, for messages."""
 
     key: str  # such as "prior"
-    path: str | None  # a folder
+    path: str | None  # a folder, or PACKAGE and a name
     ids: Sequence[str]  # on the Hugging Face hub
     revision: str | None  # on the hub
     variant: str | None  # of the weight files
@@ -72,17 +77,32 @@ class Source:
         return found
 
     def _local(self) -> "Pretrained":
-        folder = Path(str(self.path)).expanduser()
+        folder = self._folder()
         if not (folder / INDEX).is_file():
             what = "nothing there"
             if folder.exists():
                 what = f"no {INDEX} in it" if folder.is_dir() else "that is a file"
+            hub = f", or {self.key}.path=null for {' or '.join(self.ids)}" if self.ids else ""
             raise UserError(
                 f"{self.key}.path: expected a folder with a {INDEX} (a model in the layout of diffusers), "
-                f"got {str(self.path)!r}: {what}. Try: {self.key}.path=DIR, "
-                f"or {self.key}.path=null for {' or '.join(self.ids) or 'the ids (there are none)'}"
+                f"got {str(self.path)!r}: {what}. Try: {self.key}.path=DIR{hub}"
             )
         return Pretrained(self, str(folder), None, folder / INDEX, _read_index(self.key, folder / INDEX))
+
+    def _folder(self) -> Path:
+        """Return the folder that ``path`` names. Raises ``UserError`` for a model that the package lacks."""
+        path = str(self.path)
+        if not path.startswith(PACKAGE):
+            return Path(path).expanduser()
+        name = path.removeprefix(PACKAGE)
+        here = sorted(index.parent.name for index in MODELS.glob(f"*/{INDEX}"))
+        if name in here:
+            return MODELS / name
+        known = " or ".join(f"{PACKAGE}{each}" for each in here)
+        raise UserError(
+            f"{self.key}.path: expected {known or 'a folder, since no model comes with this installation'}, "
+            f"got {path!r}. Try: {self.key}.path={f'{PACKAGE}{here[0]}' if here else 'DIR'}"
+        )
 
     def _remote(self, can_ask: bool) -> "Pretrained":
         require(
@@ -173,6 +193,19 @@ class Pretrained:
         finally:
             torch.set_default_dtype(usual)
         return network.requires_grad_(False).eval()
+
+    @property
+    def name(self) -> str:
+        """Return the name of the model for messages, such as ``prior=shapes_sd`` for one of this package."""
+        key, path = self.source.key, str(self.source.path)
+        return (
+            f"{key}={path.removeprefix(PACKAGE)}" if path.startswith(PACKAGE) else f"the model {self.where}"
+        )
+
+    def vocabulary(self) -> dict[str, Any] | None:
+        """Return the words that the model knows, as it lists them; None for models that read free text."""
+        file = self.file.parent / VOCABULARY
+        return _read_index(self.source.key, file) if file.is_file() else None
 
     @property
     def identity(self) -> str:

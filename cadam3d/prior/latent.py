@@ -29,6 +29,7 @@ from cadam3d.prior.base import Condition, DiffusionPrior, MemoryEstimate, Prompt
 from cadam3d.prior.memory import working_bytes
 from cadam3d.prior.path import DDPM, NoisePath, Prediction, Rows
 from cadam3d.prior.prompting import Mix, Prompting, guide
+from cadam3d.prior.shapes.lexicon import Lexicon
 
 # What to type for a model of each pipeline class.
 PRIORS = {
@@ -43,6 +44,8 @@ TOKENS, T5_TOKENS = 77, 256
 FACTOR = 8  # pixels per side
 # The levels at which a network is used: those of the table that it was trained on, or any.
 LEVELS = ("table", "any")
+# A network recognises nothing in images of more than this many times the size of those in its training.
+LARGEST = 2
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,11 @@ class LatentEmbedding(PromptEmbedding):
 
     texts: Texts
     prompting: Prompting
+    hints: Sequence[str]  # sentences about the prompt and the size of the images
+
+    def notice(self) -> str | None:
+        """Return what the user should know about the prompt and the size of the images, or None."""
+        return " ".join(self.hints) or None
 
     def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> TextCondition:
         """Return the condition of these views; the background is not used."""
@@ -108,7 +116,7 @@ class LatentPrior(DiffusionPrior):
     float32 elsewhere.
     """
 
-    path: str | None  # folder
+    path: str | None  # folder, or package: and a name
     ids: Sequence[str]  # on the hub
     revision: str | None  # on the hub
     variant: str | None  # of weight files
@@ -186,9 +194,16 @@ class LatentPrior(DiffusionPrior):
     # --- the interface of a prior --------------------------------------------------------------------------
 
     def embed(self, prompt: str, negative: str) -> LatentEmbedding:
-        """Embed the texts of the prompt, the negative prompt and the empty text, using the cache."""
+        """Embed the texts of the prompt, the negative prompt and the empty text, using the cache.
+
+        Raises ``UserError`` for images too large for the network, and for words that it does not know.
+        """
+        self._require_readable(prompt, negative)
         texts = self._embedded(self._listed(prompt, negative))
-        return LatentEmbedding(texts=texts.to(self.device), prompting=self.prompting)
+        hints = [self._size_hint(), self.lexicon.hint(prompt) if self.lexicon is not None else None]
+        return LatentEmbedding(
+            texts=texts.to(self.device), prompting=self.prompting, hints=[hint for hint in hints if hint]
+        )
 
     def encode(self, rgb: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v c lh lw"]:
         """Convert images in [0, 1] to scaled latents; differentiable."""
@@ -245,8 +260,10 @@ class LatentPrior(DiffusionPrior):
         """Estimate the memory of training from the configuration of the model alone.
 
         The working memory is that of the denoiser or of the autoencoder, whichever is larger. Renders have
-        ``size`` pixels per side (512 if that is None too) unless the prior resizes them.
+        ``size`` pixels per side (512 if that is None too) unless the prior resizes them. Raises ``UserError``
+        in the cases in which :meth:`embed` does, since training calls this first.
         """
+        self._require_readable(prompt, negative)
         pixels = self.size or size or 512
         branches = 2 + self.prompting.mix(_views(1)).repelled.shape[1]
         vae = self.found.skeleton("vae", self._vae_dtype)
@@ -313,6 +330,18 @@ class LatentPrior(DiffusionPrior):
         return self.source.find(self.kinds, PRIORS)
 
     @cached_property
+    def lexicon(self) -> Lexicon | None:
+        """Return the words that the model knows; None for models that read free text."""
+        content = self.found.vocabulary()
+        return None if content is None else Lexicon.read(content, self.found.name, "prior.path")
+
+    @cached_property
+    def trained_size(self) -> int | None:
+        """Return the pixels per side of the images in training; None if the model does not say it."""
+        latents = self.found.config(self.network_part).get("sample_size")
+        return latents * FACTOR if type(latents) is int else None
+
+    @cached_property
     def scheduler(self) -> Mapping[str, Any]:
         """Return the configuration of the model's noise schedule."""
         return self.found.config("scheduler")
@@ -350,8 +379,38 @@ class LatentPrior(DiffusionPrior):
 
     # --- work ----------------------------------------------------------------------------------------------
 
+    def _require_readable(self, prompt: str, negative: str) -> None:
+        """Raise ``UserError`` for images that are too large, and for words that the model does not know."""
+        if self.size is not None:
+            self._require_size("prior.size", self.size)
+        for key, text in (("prompt", prompt), ("negative_prompt", negative)):
+            if self.lexicon is not None:
+                self.lexicon.require_known(key, text)
+
+    def _size_hint(self) -> str | None:
+        """Return a warning if the images have another size than those that the model was trained with."""
+        size, trained = self.size, self.trained_size
+        if size is None or trained is None or trained / 2 <= size <= trained:
+            return None
+        return (
+            f"The model was trained with images of {trained} pixels per side, and prior.size={size} is far "
+            f"from that. prior.size={trained} usually looks better."
+        )
+
+    def _require_size(self, key: str, size: int) -> None:
+        trained = self.trained_size
+        require(
+            trained is None or size <= LARGEST * trained,
+            key,
+            expected=f"about {trained} pixels, the size with which the model was trained",
+            got=size,
+            example=f"{key}={trained}",
+        )
+
     def _resized(self, images: Float[Tensor, "v 3 h w"]) -> Float[Tensor, "v 3 s s2"]:
         size = (self.size, self.size) if self.size is not None else images.shape[2:]
+        if self.size is None:
+            self._require_size("camera.size", max(size))
         require(
             all(side % FACTOR == 0 and side >= FACTOR for side in size),
             "camera.size",

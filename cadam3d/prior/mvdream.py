@@ -104,7 +104,7 @@ class MVDream(StableDiffusion):
     def embed(self, prompt: str, negative: str) -> MultiviewEmbedding:
         """Embed the texts of the prompt, the negative prompt and the empty text."""
         embedding = super().embed(prompt, negative)
-        return MultiviewEmbedding(texts=embedding.texts, prompting=embedding.prompting)
+        return MultiviewEmbedding(texts=embedding.texts, prompting=embedding.prompting, hints=embedding.hints)
 
     def denoise(
         self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras

@@ -48,7 +48,7 @@ class Option:
     target: str  # the class, such as "cadam3d.camera.orbit.Orbit", or ""
     base: str  # the option of the same group that this one builds on, or ""
     settings: tuple[Setting, ...]
-    own_keys: frozenset[str]  # keys to which the file itself gives a value, not its base
+    own_keys: frozenset[str]  # keys and groups to which the file itself gives a value, not its base
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +144,12 @@ class Library:
             target=target if isinstance(target, str) else "",
             base=next((base for base in page.bases if "/" not in base), ""),
             settings=tuple(settings),
-            own_keys=frozenset(f"{prefix}.{key}".lstrip(".") for key, *_ in _flat(page.values)),
+            own_keys=frozenset(
+                [
+                    *(f"{prefix}.{key}".lstrip(".") for key, *_ in _flat(page.values)),
+                    *(each.name for each in page.groups),
+                ]
+            ),
         )
 
     def _find(self, name: str) -> Path:
@@ -161,6 +166,9 @@ class Library:
         for base in page.bases:
             place, _, base_name = base.rpartition("/")
             base_values, base_words = self._resolved(place or group, base_name)
+            if page.package == "_global_":
+                base_values = {group: base_values}
+                base_words = {f"{group}.{key}": each for key, each in base_words.items()}
             values = _merged(base_values, values)
             notes = {key: _with_note(base_words.get(key, ""), note) for key, note in words.items()}
             words = base_words | notes
@@ -190,8 +198,10 @@ class Library:
         for group in {_head(each.key) for each in settings} & set(self.options):
             wanted = {each.key for each in settings if _head(each.key) == group}
             for name in dict.fromkeys([*chosen.get(group, ()), *self.options[group]]):
-                if wanted <= set(known) or self.page(f"{group}/{name}").package == "_global_":
+                if wanted <= set(known):
                     break
+                if self.page(f"{group}/{name}").package == "_global_":
+                    continue
                 known = {each.key: each.words for each in self.option(group, name).settings} | known
         choices = [
             Setting(

@@ -10,8 +10,11 @@ from cadam3d.core.errors import UserError
 from cadam3d.prior.prompting import (
     BACK,
     FRONT,
+    HEIGHTS,
     OVERHEAD,
     SIDE,
+    SIDES,
+    Compass,
     Discrete,
     Interpolated,
     PerpNeg,
@@ -64,6 +67,64 @@ def test_weights_are_valid_and_the_same_on_both_sides(prompting):
 )
 def test_discrete_rules_with_precedence_for_overhead(azimuth, elevation, text):
     assert DISCRETE.mix(views(azimuth, elevation)).positive.argmax() == text
+
+
+COMPASS = Compass(below_deg=-5, above_deg=35)
+
+
+def named(azimuth, elevation=0.0):
+    """Return the text of each view under ``COMPASS``."""
+    rows = COMPASS.mix(views(azimuth, elevation)).positive
+    assert ((rows == 0) | (rows == 1)).all()
+    assert (rows.sum(dim=1) == 1).all()
+    return [COMPASS.texts("a corgi")[i] for i in rows.argmax(dim=1)]
+
+
+def test_the_compass_has_a_text_for_every_side_at_every_height():
+    texts = COMPASS.texts("a corgi")
+    assert len(set(texts)) == len(texts) == len(SIDES) * len(HEIGHTS) == 24
+    azimuth = torch.arange(-180.0, 180.0, 45.0)
+    assert {text for elevation in (-10, 0, 50) for text in named(azimuth, elevation)} == set(texts)
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "words"),
+    [
+        (0, 0, "front view"),
+        (22.4, 0, "front view"),
+        (22.6, 0, "front right view"),
+        (90, 0, "right view"),
+        (-90, 0, "left view"),
+        (180, 0, "back view"),
+        (-157.6, 0, "back view"),
+        (-135, 0, "back left view"),
+        (0, -5, "front view"),
+        (0, -5.1, "front view from below"),
+        (0, 35, "front view"),
+        (90, 35.1, "right view from above"),
+        (0, 89, "front view from above"),
+    ],
+)
+def test_the_compass_names_the_nearest_side_and_the_height(azimuth, elevation, words):
+    assert named(azimuth, elevation) == [f"a corgi, {words}"]
+
+
+def test_the_opposite_camera_sees_the_opposite_side():
+    azimuth = torch.linspace(-180, 179, 24)
+    opposite = dict(zip(SIDES, [*SIDES[4:], *SIDES[:4]], strict=True))
+    pairs = zip(named(azimuth, 20), named((azimuth + 360) % 360 - 180, 20), strict=True)
+    for here, there in pairs:
+        side = here.removeprefix("a corgi, ").removesuffix(" view")
+        assert there == f"a corgi, {opposite[side]} view"
+
+
+def test_the_right_side_is_at_plus_y():
+    """In the picture of a camera at the front, the point +y is to the right of the origin."""
+    front = views(0)
+    to_camera = front.world_to_camera[0, :3, :3]
+    assert (to_camera @ torch.tensor([0.0, 1.0, 0.0]))[0] > 0.99
+    assert views(90).positions[0, 1] > 2.9
+    assert named(90) == ["a corgi, right view"]
 
 
 @pytest.mark.parametrize(
@@ -148,6 +209,8 @@ def test_the_component_along_the_prompt_is_not_repelled():
     [
         (lambda: Discrete(front_deg=100, back_deg=100, overhead_deg=60), "prompting.back_deg"),
         (lambda: Discrete(front_deg=-1, back_deg=45, overhead_deg=60), "prompting.front_deg"),
+        (lambda: Compass(below_deg=-91, above_deg=35), "prompting.below_deg"),
+        (lambda: Compass(below_deg=40, above_deg=35), "prompting.above_deg"),
         (lambda: PerpNeg(curve="other", overhead_deg=None), "prompting.curve"),
         (lambda: PerpNeg(curve="lucid", overhead_deg=100), "prompting.overhead_deg"),
     ],

@@ -6,6 +6,7 @@ phrase   = (article | number | size | colour | "and" | pattern)* noun
 """
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from cadam3d.core.checks import fail
@@ -146,32 +147,47 @@ class _Reader:
         return self.words[self.position] if self.position < len(self.words) else None
 
     def fail(self, expected: str) -> UserError:
-        return fail(
-            self.key, expected=expected, got=_shown(self.prompt), example=_line(self.key, self.prompt)
-        )
+        return fail(self.key, expected=expected, got=shown(self.prompt), example=_line(self.key, self.prompt))
 
 
 def _reject_unknown(key: str, prompt: str, words: list[str]) -> None:
     unknown = [word for word in dict.fromkeys(words) if not is_known(word)]
-    if not unknown:
-        return
-    typed = {word.lower(): word for word in typed_words(prompt)}
-    named = ", ".join(_named(typed.get(word, word)) for word in unknown[:MAX_NAMED])
+    if unknown:
+        typed = {word.lower(): word for word in typed_words(prompt)}
+        unknown = [typed.get(word, word) for word in unknown]
+        raise unknown_words(key, prompt, unknown, "prior=shapes", known_words(), _named, _line(key, prompt))
+
+
+def unknown_words(
+    key: str,
+    prompt: str,
+    unknown: Sequence[str],
+    reader: str,
+    known: Mapping[str, Sequence[str]],
+    named: Callable[[str], str],
+    line: str,
+) -> UserError:
+    """Return the error for words of a prompt that ``reader``, such as ``prior=shapes``, does not know.
+
+    ``known`` are all known words by part of speech, ``named`` returns an unknown word with the nearest known
+    one, and ``line`` is what to type.
+    """
+    names = ", ".join(map(named, unknown[:MAX_NAMED]))
     if len(unknown) > MAX_NAMED:
-        named += f" and {len(unknown) - MAX_NAMED} more"
-    listed = "\n".join(f"  {group}: {', '.join(known)}" for group, known in known_words().items())
-    raise UserError(
-        f"{key}: expected words that prior=shapes knows, got {_shown(prompt)!r}. Unknown: {named}. "
-        f"Known words:\n{listed}\n{FREE_TEXT} Try: {_line(key, prompt)}"
+        names += f" and {len(unknown) - MAX_NAMED} more"
+    listed = "\n".join(f"  {group}: {', '.join(words)}" for group, words in known.items())
+    return UserError(
+        f"{key}: expected words that {reader} knows, got {shown(prompt)!r}. Unknown: {names}. "
+        f"Known words:\n{listed}\n{FREE_TEXT} Try: {line}"
     )
 
 
 def _named(word: str) -> str:
     """Return an unknown word with the known words that may be meant."""
     if meaning := near_meaning(word.lower()):
-        return f"{_shown(word)!r} (nearest: {meaning})"
+        return f"{shown(word)!r} (nearest: {meaning})"
     similar = near_spelling(word.lower())
-    return f"{_shown(word)!r}" + (f" (did you mean {' or '.join(similar)}?)" if similar else "")
+    return f"{shown(word)!r}" + (f" (did you mean {' or '.join(similar)}?)" if similar else "")
 
 
 def _line(key: str, prompt: str) -> str:
@@ -179,5 +195,6 @@ def _line(key: str, prompt: str) -> str:
     return f'{key}="{nearest_prompt(prompt) or EXAMPLE}"'
 
 
-def _shown(text: str) -> str:
+def shown(text: str) -> str:
+    """Return a text as messages show it: cut if it is long."""
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."

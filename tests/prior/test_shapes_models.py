@@ -1,0 +1,185 @@
+"""The priors that come with the package: found there, with what suits them, on small random models."""
+
+import importlib.util
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from pipelines import VOCABULARY
+
+from cadam3d.commands import doctor
+from cadam3d.core.errors import UserError
+from cadam3d.io import pretrained
+from cadam3d.io.jsonl import read_json
+from cadam3d.io.reading import read_yaml
+from cadam3d.settings.compose import component, compose, config_dir
+from cadam3d.settings.hydra import read_flags
+from cadam3d.sweep.plan import compose_all, read_sweep
+
+KINDS = {"shapes_sd": "stable_diffusion", "shapes_mvdream": "mvdream", "shapes_sd3": "stable_diffusion_3"}
+FEW = ("steps=2", "initializer.count=50", "exporter=[ply]", "metric=[size]", "callback=[checkpoint]")
+
+
+@pytest.fixture
+def models(pipelines, tmp_path_factory, monkeypatch) -> Path:
+    """Let small random models take the place of those in the package."""
+    folder = tmp_path_factory.mktemp("models")
+    for name, kind in KINDS.items():
+        (folder / name).symlink_to(pipelines("shapes", kind=kind))
+    monkeypatch.setattr(pretrained, "MODELS", folder)
+    return folder
+
+
+def built(*line):
+    return component(compose(["prompt=a red cube", *line]).prior)
+
+
+def test_the_packaged_models_are_those_that_the_options_name():
+    files = {path.stem: path.read_text(encoding="utf-8") for path in (config_dir() / "prior").glob("*.yaml")}
+    named = {name: re.findall(rf"{pretrained.PACKAGE}(\w+)", text) for name, text in files.items()}
+    assert {name: found for name, found in named.items() if found} == {name: [name] for name in KINDS}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", KINDS)
+def test_a_prior_of_the_package_trains_with_nothing_but_its_name(name, models, type_line, tmp_path):
+    line = ("train", f"prior={name}", "prompt=a red mushroom", *FEW, f"prior.cache_dir={tmp_path}/c")
+    done = type_line(*line, "hydra.run.dir=first")
+    assert done.code == 0, done.err
+    assert read_json(tmp_path / "first" / "summary.json")["outcome"] == "finished"
+    assert read_yaml(tmp_path / "first" / "config.yaml")["prior"]["path"] == f"package:{name}"
+
+
+@pytest.mark.slow
+def test_a_moved_run_continues_with_the_model_of_the_package_there(
+    models, type_line, tmp_path, tmp_path_factory, monkeypatch
+):
+    cache = f"prior.cache_dir={tmp_path}/c"
+    line = ("train", "prior=shapes_mvdream", "prompt=a red mushroom", *FEW, "seed=3", cache)
+    assert type_line(*line, "hydra.run.dir=first").code == 0
+    (tmp_path / "first").rename(tmp_path / "moved")
+    elsewhere = tmp_path_factory.mktemp("site") / "models"
+    shutil.copytree(models, elsewhere)
+    shutil.rmtree(models)
+    monkeypatch.setattr(pretrained, "MODELS", elsewhere)
+    done = type_line("train", "resume=moved", "steps=3", cache)
+    assert done.code == 0, done.err
+    summary = read_json(tmp_path / "moved" / "summary.json")
+    assert (summary["steps"], summary["seed"]) == (3, 3)
+
+
+def test_the_networks_compute_in_float32_on_the_cpu_although_the_files_are_smaller(models):
+    prior = built("prior=shapes_sd", "device=cpu")
+    file = models / "shapes_sd" / "unet" / "diffusion_pytorch_model.safetensors"
+    from safetensors.torch import load_file
+
+    assert {each.dtype for each in load_file(file).values()} == {torch.float16}
+    assert {each.dtype for each in (*prior.network.parameters(), *prior.vae.parameters())} == {torch.float32}
+
+
+def test_texts_have_the_length_of_the_model(models, tmp_path):
+    embedding = built("prior=shapes_sd", f"prior.cache_dir={tmp_path}").embed("a red cube", "")
+    # 24 texts of the compass, the negative prompt and the empty text.
+    assert embedding.texts.tokens.shape[:2] == (26, 32)
+
+
+def test_unknown_words_are_refused_before_anything_is_written(models, type_line, tmp_path):
+    line = ("train", "prior=shapes_sd", *FEW, f"prior.cache_dir={tmp_path}/c")
+    message = type_line(*line, "prompt=a gray ball").err
+    assert message.startswith(
+        "cadam3d: prompt: expected words that prior=shapes_sd knows, got 'a gray ball'."
+    )
+    assert "Unknown: 'gray' (nearest: grey), 'ball' (nearest: sphere)" in message
+    assert message.endswith('Try: prompt="a grey sphere"\n')
+    message = type_line(*line, "prompt=a red cube", "negative_prompt=ugly, bad").err
+    assert message.startswith("cadam3d: negative_prompt: expected words that prior=shapes_sd knows")
+    assert message.endswith('Try: negative_prompt="ugly"\n')
+    assert not list(tmp_path.glob("outputs/*/*"))
+
+
+def test_a_folder_of_the_user_with_words_is_checked_in_the_same_way(models, tmp_path):
+    folder = models / "shapes_sd"
+    prior = built("prior=stable_diffusion", f"prior.path={folder}", "prior.size=64")
+    with pytest.raises(UserError, match=rf"^prompt: expected words that the model {folder} knows"):
+        prior.embed("a corgi", "")
+    assert prior.lexicon.entries["nouns"] == VOCABULARY["nouns"]
+
+
+def test_a_sentence_unlike_the_captions_gets_a_note(models, tmp_path):
+    prior = built("prior=shapes_sd", f"prior.cache_dir={tmp_path}")
+    assert 'prompt="a red sphere"' in prior.embed("sphere red", "").notice()
+    assert prior.embed("a red sphere", "").notice() is None
+
+
+@pytest.mark.parametrize("size", [144, 512])
+def test_images_far_larger_than_those_of_the_training_are_refused(size, models):
+    prior = built("prior=shapes_sd", f"prior.size={size}")
+    message = rf"^prior\.size: expected about 64 pixels.*, got {size}\. Try: prior\.size=64$"
+    for ask in (lambda: prior.embed("a red cube", ""), lambda: prior.memory("a red cube", "", 2, 64)):
+        with pytest.raises(UserError, match=message):
+            ask()
+
+
+def test_renders_that_are_not_resized_are_compared_with_the_training_too(models):
+    prior = built("prior=shapes_sd", "prior.size=null")
+    assert prior.encode(torch.rand(1, 64, 64, 3)).shape == (1, 4, 8, 8)
+    with pytest.raises(UserError, match=r"^camera\.size: expected about 64 pixels"):
+        prior.encode(torch.rand(1, 256, 256, 3))
+
+
+@pytest.mark.parametrize(("size", "is_far"), [(16, True), (32, False), (64, False), (80, True), (128, True)])
+def test_a_size_far_from_that_of_the_training_gets_a_note(size, is_far, models, tmp_path):
+    prior = built("prior=shapes_mvdream", f"prior.size={size}", f"prior.cache_dir={tmp_path}")
+    notice = prior.embed("a red cube", "").notice()
+    assert (notice is not None) == is_far
+    assert notice is None or "prior.size=64" in notice
+
+
+def test_a_model_that_does_not_say_its_size_is_used_at_any(models, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(models / "shapes_sd", copy)
+    config = json.loads((copy / "unet" / "config.json").read_text(encoding="utf-8"))
+    del config["sample_size"]
+    (copy / "unet" / "config.json").write_text(json.dumps(config), encoding="utf-8")
+    prior = built("prior=stable_diffusion", f"prior.path={copy}", f"prior.cache_dir={tmp_path}")
+    assert prior.embed("a red cube", "").notice() is None
+
+
+def test_a_model_that_is_not_in_the_package_is_named(models):
+    lacking = built("prior=stable_diffusion", "prior.path=package:shapes_xl").lacks()
+    assert lacking.startswith("prior.path: expected package:shapes_mvdream or package:shapes_sd or package:")
+    assert lacking.endswith("got 'package:shapes_xl'. Try: prior.path=package:shapes_mvdream")
+    # The name of a model is not a path.
+    assert "expected package:" in built("prior=stable_diffusion", "prior.path=package:../models").lacks()
+
+
+def test_a_package_without_models_is_reported(tmp_path, monkeypatch):
+    pytest.importorskip("diffusers")
+    monkeypatch.setattr(pretrained, "MODELS", tmp_path)
+    assert "no model comes with this installation" in built("prior=shapes_sd").lacks()
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_without_the_extra_the_message_says_what_to_install(name, models, monkeypatch, type_line):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(pretrained, "find_spec", lambda each: None if each == "diffusers" else found(each))
+    done = type_line("train", f"prior={name}", "prompt=a red cube")
+    assert done.message == "prior: needs diffusers. Try: pip install 'cadam3d[diffusers]'"
+    assert doctor._prior(f"prior={name}").hint == ""
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_doctor_lists_the_models_of_the_package_as_ready(name, models):
+    finding = doctor._prior(f"prior={name}")
+    assert (str(finding.verdict), finding.found) == ("ok", "ready")
+
+
+def test_a_sweep_compares_an_exact_and_a_learned_prior():
+    words = ["prompt=a red cube", "prior=shapes,shapes_mvdream", "densifier=none,cadam"]
+    sweep, composer = read_sweep("sweep", words, read_flags([]))
+    jobs = compose_all(sweep, composer)
+    seen = [(job.get("prior"), job.get("camera"), job.get("views")) for job in jobs]
+    assert seen[::2] == seen[1::2] == [("shapes", "orbit", 2), ("shapes_mvdream", "shapes_mvdream", 4)]
