@@ -2,9 +2,11 @@
 
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
@@ -56,8 +58,10 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     the run names components that must not be built without ``trust=true``, and for a prompt that the truth
     cannot read.
     """
-    trust = {"is_trusted": require_trust(cfg.trust), "retry": trusting()}
-    own = run_components(folder, "prior", "rasterizer", "truth", **trust, optional=("truth",))
+    is_trusted = require_trust(cfg.trust)
+    own = run_components(
+        folder, "prior", "rasterizer", "truth", is_trusted=is_trusted, retry=trusting(), optional=("truth",)
+    )
     asset = open_run(folder, cfg.device)
     device = asset.gaussians.device
     prior = component(own.prior, DiffusionPrior, "prior").to(device)
@@ -65,12 +69,6 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     # Runs of earlier versions name none.
     source = PriorTruth() if node is None else component(node, TruthSource, "truth")
     truth = source.of(own.prompt, prior)
-
-    def start() -> Gaussians:
-        initial = run_components(folder, "initializer", **trust)
-        require_whole("seed", initial.seed, low=0, example=3)
-        built = component(initial.initializer, Initializer, "initializer")
-        return rebuild_start(initial.prompt, built, initial.seed, device)
 
     warnings: list[str] = []
     metrics: dict[str, Metric] = components(cfg.metric, Metric, "metric")
@@ -81,7 +79,7 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
         renderer(own.rasterizer, asset.gaussians),
         truth,
         asset.ply,
-        start if source.measures_start else None,
+        partial(start_of, folder, device, is_trusted=is_trusted) if source.measures_start else None,
         warnings,
     )
     if warnings:
@@ -92,6 +90,14 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
             "add truth=shapes"
         )
     return result
+
+
+def start_of(folder: Path, device: torch.device, *, is_trusted: bool) -> Gaussians:
+    """Return the Gaussians that the run in ``folder`` has started from, built again from its settings."""
+    source = run_components(folder, "initializer", is_trusted=is_trusted, retry=trusting())
+    require_whole("seed", source.seed, low=0, example=3)
+    initializer: Initializer = component(source.initializer, Initializer, "initializer")
+    return rebuild_start(source.prompt, initializer, source.seed, device)
 
 
 def trusting() -> str:

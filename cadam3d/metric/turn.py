@@ -57,7 +57,7 @@ def facing(truth: Truth, render: RenderFn) -> Truth:
         known |= {best + offset * step: quality(best + offset * step) for offset in offsets}
         best = max(known, key=lambda turn_deg: known[turn_deg])
     is_gain = known[best] - quality(0.0) >= LEAST_GAIN
-    return replace(truth, turn_deg=180.0 - (180.0 - round(best, 6)) % 360.0 if is_gain else 0.0)
+    return replace(truth, turn_deg=round(180.0 - (180.0 - best) % 360.0, 3) if is_gain else 0.0)
 
 
 def _rings(views: int) -> Cameras:

@@ -40,9 +40,10 @@ class ShapesTruth(TruthSource):
         try:
             scene = build(prompt)
         except UserError as error:
-            # The first line, without the lists of words that may follow it.
-            reason = str(error).splitlines()[0].rpartition(" Try: ")[0] or str(error).splitlines()[0]
-            reason = reason.removeprefix("prompt: ").removesuffix("Known words:").strip().rstrip(".")
+            # The reason ends where the lists of known words begin, or else with the suggestion.
+            first, *others = str(error).splitlines()
+            reason = first.removesuffix(". Known words:") if others else first.rpartition(". Try: ")[0]
+            reason = reason.removeprefix("prompt: ")
             raise UserError(
                 f"truth: expected a prompt of the embedded world, which truth=shapes draws, got another one "
                 f"({reason}). Try: truth=prior"
