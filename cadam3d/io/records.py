@@ -28,6 +28,7 @@ QUALITY = (
     "turn_deg",
     "psnr_start",
     "iou",
+    "iou_start",
     "colour_error",
 )
 

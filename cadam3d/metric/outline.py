@@ -42,7 +42,16 @@ class Outline(HeldOutSettings, Metric):
         ``colour_error`` is left out if the silhouettes meet in no view.
         """
         true = truth and truth.turned()
-        if true is None or true.alpha is None:
+        return {} if true is None else self._compare(render, true)
+
+    def measure_start(self, gaussians: Gaussians, render: RenderFn, truth: Truth) -> dict[str, float]:
+        """Return ``iou_start``, against the outlines with which ``iou`` compares the asset."""
+        numbers = self._compare(render, truth.turned())
+        return {"iou_start": numbers["iou"]} if numbers else {}
+
+    def _compare(self, render: RenderFn, true: Truth) -> dict[str, float]:
+        """Return the numbers of :meth:`measure` for a truth that faces as the asset does."""
+        if true.alpha is None:
             return {}
         overlaps, differences, meetings = [], [], []
         for cameras, background in self.parts():

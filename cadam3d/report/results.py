@@ -94,6 +94,7 @@ class JobResult:
     is_turned: bool  # the asset may face any side, and PSNR and SSIM are those at the best turn
     psnr_start: float | None  # dB; of the Gaussians at the start
     iou: float | None
+    iou_start: float | None
     colour_error: float | None
     mib: float | None  # size of asset.ply
     seconds: float | None
@@ -180,6 +181,7 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
         is_turned=numbers.get("psnr_turned") is not None,
         psnr_start=numbers.get("psnr_start"),
         iou=numbers.get("iou"),
+        iou_start=numbers.get("iou_start"),
         colour_error=numbers.get("colour_error"),
         mib=size / (1 << 20) if size is not None else None,
         seconds=numbers.get("seconds"),

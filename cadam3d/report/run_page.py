@@ -39,6 +39,7 @@ LABELS = {
     "turn_deg": "Best turn about the vertical axis (degrees)",
     "psnr_start": "PSNR of the Gaussians at the start (dB)",
     "iou": "Overlap of the outlines (IoU)",
+    "iou_start": "Overlap of the outlines at the start (IoU)",
     "colour_error": "Colour error (delta E)",
     "mesh_chamfer": "Chamfer distance of the mesh (world units)",
     "mesh_fscore": "F-score of the mesh",

@@ -48,6 +48,7 @@ def objectives_table(results: Sequence[JobResult]) -> list[Line]:
                         "SSIM": _median([result.ssim for result in members], 4),
                         "PSNR at the start (dB)": _median([result.psnr_start for result in members], 2),
                         "IoU": _median([result.iou for result in members], 3),
+                        "IoU at the start": _median([result.iou_start for result in members], 3),
                         "colour error": _median([result.colour_error for result in members], 1),
                         "Gaussians": _median([result.count for result in members], 0),
                         "MiB": _median([result.mib for result in members], 3),
@@ -125,6 +126,7 @@ def jobs_table(results: Sequence[JobResult]) -> list[Line]:
     of_truth = {
         "PSNR at the start (dB)": lambda result: _rounded(result.psnr_start, 2),
         "IoU": lambda result: _rounded(result.iou, 3),
+        "IoU at the start": lambda result: _rounded(result.iou_start, 3),
         "colour error": lambda result: _rounded(result.colour_error, 1),
     }
     more = {

@@ -101,6 +101,12 @@ def test_an_asset_that_shows_nothing_has_no_overlap_and_no_colour():
     assert measure(renders(0.0), truth_of((20.0, RED))) == {"iou": 0.0}
 
 
+def test_the_start_has_an_overlap_of_its_own():
+    outline = Outline(**SETTINGS)
+    start = outline.measure_start(no_gaussians(), renders(14.0), truth_of((20.0, RED)))
+    assert start == {"iou_start": measure(renders(14.0), truth_of((20.0, RED)))["iou"]}
+
+
 def test_without_true_outlines_there_are_no_numbers():
     def never(cameras, background):
         raise AssertionError("rendered although there are no true outlines")
