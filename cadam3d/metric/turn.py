@@ -52,11 +52,11 @@ def facing(truth: Truth, render: RenderFn) -> Truth:
     def quality(turn_deg: float) -> float:
         return float(_psnr(asset, _true_images(truth, fine.turned(-turn_deg))))
 
-    known = {best: quality(best)}
+    known = {turn_deg: quality(turn_deg) for turn_deg in {0.0, best}}
     for offsets in REFINEMENTS:
         known |= {best + offset * step: quality(best + offset * step) for offset in offsets}
         best = max(known, key=lambda turn_deg: known[turn_deg])
-    is_gain = known[best] - quality(0.0) >= LEAST_GAIN
+    is_gain = known[best] - known[0.0] >= LEAST_GAIN
     return replace(truth, turn_deg=round(180.0 - (180.0 - best) % 360.0, 3) if is_gain else 0.0)
 
 

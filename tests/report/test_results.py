@@ -6,6 +6,7 @@ import pytest
 
 from cadam3d.core.errors import UserError
 from cadam3d.report.results import ArmSetting, at_noise, counts, histograms, in_noise_order, measured, read
+from cadam3d.sweep.table import as_text, write_table
 
 
 def test_a_threshold_that_varies_within_an_arm_makes_settings(jobs):
@@ -64,6 +65,20 @@ def test_a_job_that_may_face_any_side_is_judged_at_its_best_turn(jobs):
     assert (cadam.psnr_start, cadam.iou, cadam.iou_start, cadam.colour_error) == (12.0, 0.8, 0.6, 9.0)
     assert (baseline.psnr, baseline.ssim, baseline.is_turned) == (12.5, 0.5, False)
     assert baseline.psnr_start is baseline.iou is baseline.colour_error is None
+
+
+def test_the_table_of_a_sweep_has_the_columns_of_a_truth_only_if_a_job_names_one(jobs):
+    jobs.add("cadam", n=100, psnr=12.5)
+    table = jobs.folder / "sweep.csv"
+    write_table(jobs.folder)
+    assert "psnr_turned" not in table.read_text(encoding="utf-8")
+    jobs.add("cadam", "seed=1", n=100, psnr=12.5, psnr_turned=15.5, iou=0.8)
+    rows = write_table(jobs.folder)
+    header, before, turned = table.read_text(encoding="utf-8").splitlines()
+    assert header.endswith("message,psnr_turned,iou,folder")
+    assert ",15.5,0.8," in turned
+    assert ",,," in before
+    assert [line.split()[-2] for line in as_text(rows).splitlines()] == ["psnr", "12.5", "15.5"]
 
 
 def test_a_job_without_a_psnr_has_that_of_its_evaluation(jobs):

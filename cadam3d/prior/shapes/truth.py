@@ -15,7 +15,7 @@ from cadam3d.prior.shapes.trace_cache import shared_trace
 from cadam3d.prior.shapes.tracer import Layers
 from cadam3d.prior.truth import TruthSource
 
-MOST_TURNS = 360
+MOST_TURNS = 72
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +45,7 @@ class ShapesTruth(TruthSource):
             reason = first.removesuffix(". Known words:") if others else first.rpartition(". Try: ")[0]
             reason = reason.removeprefix("prompt: ")
             raise UserError(
-                f"truth: expected a prompt of the embedded world, which truth=shapes draws, got another one "
+                "truth: expected a prompt of the embedded world, which truth=shapes draws, got another one "
                 f"({reason}). Try: truth=prior"
             ) from error
         return true_scene(scene, self.samples_per_pixel, self.turns)
