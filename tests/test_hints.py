@@ -128,6 +128,7 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         ("train", "prompt="),
         ("train", "prompt=a cube red"),
         ("train", "prompt=a red and blue and green cube"),
+        ("train", "prompt=a corgi", "prior=tiny", "truth=shapes"),
     ],
     "files": [
         (*A_CUBE, "initializer=ply", "initializer.path=aset.ply"),
@@ -196,6 +197,7 @@ LONGEST_WAY = 4  # messages
 # Code whose messages need what these tests lack. A key is a folder, a file, or FILE::FUNCTION.
 ELSEWHERE: dict[str, str] = {
     "commands/eval.py::_evaluate_sweep": "needs a sweep whose jobs all fail",
+    "commands/eval.py::start_of": "needs the folder of a stranger",
     "commands/eval.py::_not_saved": "needs a folder that cannot be written; see tests/commands",
     "commands/view.py::_listening": "needs a port that is in use; see tests/commands/test_view.py",
     "commands/train.py::build_trainer": "needs other steps in refine than in the run",

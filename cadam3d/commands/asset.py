@@ -2,7 +2,7 @@
 
 import os
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -124,18 +124,21 @@ def find_run(text: str) -> Path:
     raise UserError(f"run: expected the folder of a run, got {text!r} ({reason}). Try: {example}")
 
 
-def run_components(folder: Path, *, is_trusted: bool, retry: str) -> DictConfig:
-    """Return the prompt, the prior and the rasterizer of the run in ``folder``.
+def run_components(
+    folder: Path, *names: str, is_trusted: bool, retry: str, optional: Collection[str] = ()
+) -> DictConfig:
+    """Return the prompt, the seed and the components ``names`` of the run in ``folder``.
 
-    Raises ``UserError`` if they are not of this package or of ``--config-dir``, unless the run is trusted.
-    ``retry`` is the line that trusts it.
+    Those of ``optional`` may be missing. Raises ``UserError`` if they are not of this package or of
+    ``--config-dir``, unless the run is trusted. ``retry`` is the line that trusts it.
     """
     return read_components(
         folder / CONFIG,
-        ("prior", "rasterizer"),
+        names,
         search_folders(HydraConfig.get().runtime.config_sources),
         is_trusted=is_trusted,
         retry=retry,
+        optional=optional,
     )
 
 

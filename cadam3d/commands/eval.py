@@ -2,20 +2,27 @@
 
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from cadam3d import report
 from cadam3d.commands.asset import find_run, open_run, renderer, run_components
-from cadam3d.commands.messages import keeping_others
+from cadam3d.commands.measuring import measure, rebuild_start
+from cadam3d.core.checks import require_whole
 from cadam3d.core.errors import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.initializer.base import Initializer
 from cadam3d.io.jsonl import write_json
+from cadam3d.io.records import psnr_of
 from cadam3d.io.run_folder import ASSET, CONFIG, EVALUATION, copying, shown, suggestion, typed_path
 from cadam3d.metric.base import Metric
 from cadam3d.prior.base import DiffusionPrior
+from cadam3d.prior.truth import PriorTruth, TruthSource
 from cadam3d.settings.compose import component, components
 from cadam3d.settings.line import setting_word
 from cadam3d.settings.trust import require_contained, require_trust
@@ -46,26 +53,51 @@ def run(cfg: DictConfig) -> None:
 def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     """Return what the metrics of ``cfg`` measure of the run in ``folder``, for its ``eval.json``.
 
-    The rasterizer and the prior are those of the run. ``psnr`` and ``ssim`` compare with the true images of
-    the prior. If the prior has no true images, a note in the file replaces these two. Raises ``UserError`` if
-    the run names components that must not be built without ``trust=true``.
+    The rasterizer and the prior are those of the run, and so is the truth unless ``cfg`` names another one.
+    If there are no true images, a note in the file replaces ``psnr`` and ``ssim``. Raises ``UserError`` if
+    the run names components that must not be built without ``trust=true``, and for a prompt that the truth
+    cannot read.
     """
-    source = run_components(folder, is_trusted=require_trust(cfg.trust), retry=trusting())
+    is_trusted = require_trust(cfg.trust)
+    own = run_components(
+        folder, "prior", "rasterizer", "truth", is_trusted=is_trusted, retry=trusting(), optional=("truth",)
+    )
     asset = open_run(folder, cfg.device)
     device = asset.gaussians.device
-    prior = component(source.prior, DiffusionPrior, "prior").to(device)
-    truth = prior.truth(source.prompt)
-    render = renderer(source.rasterizer, asset.gaussians)
-    result: dict[str, Any] = {"run": str(shown(folder)), "prompt": source.prompt}
+    prior = component(own.prior, DiffusionPrior, "prior").to(device)
+    node = cfg.get("truth", own.get("truth"))
+    # Runs of earlier versions name none.
+    source = PriorTruth() if node is None else component(node, TruthSource, "truth")
+    truth = source.of(own.prompt, prior)
+
     warnings: list[str] = []
-    for name, metric in components(cfg.metric, Metric, "metric").items():
-        with keeping_others(f"metric.{name}", warnings):
-            result |= metric.measure(asset.gaussians, render, truth, asset.ply)
+    metrics: dict[str, Metric] = components(cfg.metric, Metric, "metric")
+    result: dict[str, Any] = {"run": str(shown(folder)), "prompt": own.prompt}
+    result |= measure(
+        metrics,
+        asset.gaussians,
+        renderer(own.rasterizer, asset.gaussians),
+        truth,
+        asset.ply,
+        partial(start_of, folder, device, is_trusted=is_trusted) if source.measures_start else None,
+        warnings,
+    )
     if warnings:
         result["warnings"] = warnings
     if truth is None:
-        result["note"] = "this prior has no true images, so psnr and ssim are missing"
+        result["note"] = (
+            "this run has no true images, so psnr and ssim are missing. For a prompt of the embedded world, "
+            "add truth=shapes"
+        )
     return result
+
+
+def start_of(folder: Path, device: torch.device, *, is_trusted: bool) -> Gaussians:
+    """Return the Gaussians that the run in ``folder`` has started from, built again from its settings."""
+    source = run_components(folder, "initializer", is_trusted=is_trusted, retry=trusting())
+    require_whole("seed", source.seed, low=0, example=3)
+    initializer: Initializer = component(source.initializer, Initializer, "initializer")
+    return rebuild_start(source.prompt, initializer, source.seed, device)
 
 
 def trusting() -> str:
@@ -85,7 +117,7 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
             results.append({"run": str(shown(job)), "message": str(error)})
             print(f"cadam3d: {job.name}: {error}", file=sys.stderr)
             continue
-        psnr = results[-1].get("psnr")
+        psnr = psnr_of(results[-1])
         quality = "no psnr" if psnr is None else f"{psnr:6.2f} dB"
         print(f"{quality}  {results[-1].get('num_gaussians', '-'):>8} Gaussians  {job.name}", flush=True)
         try:

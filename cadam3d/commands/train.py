@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 
 from cadam3d import __version__
 from cadam3d.augmentation import Augmentation
@@ -22,6 +23,7 @@ from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
 from cadam3d.commands.control import Control
+from cadam3d.commands.measuring import measure, rebuild_start
 from cadam3d.commands.messages import keeping_others, note, note_backend, note_omission
 from cadam3d.commands.timetable import describe
 from cadam3d.core.chart import Chart
@@ -43,7 +45,7 @@ from cadam3d.io.atomic import remove_leftovers, replacing
 from cadam3d.io.checkpoint import DamagedCheckpointError, latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.lock import INHERITED
-from cadam3d.io.records import read_metrics
+from cadam3d.io.records import psnr_of, read_metrics
 from cadam3d.io.run_folder import (
     ASSET,
     CHECKPOINTS,
@@ -59,6 +61,7 @@ from cadam3d.metric.base import Metric
 from cadam3d.optimizer import AdamSettings
 from cadam3d.prior.base import DiffusionPrior
 from cadam3d.prior.prompting import Prompting
+from cadam3d.prior.truth import TruthSource
 from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.regularizer import Regularizer
 from cadam3d.report import write_report
@@ -76,7 +79,7 @@ COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "ca
 
 
 def run(cfg: DictConfig) -> float | None:
-    """Train, export, measure and report. Return the PSNR in dB if the prior has true images."""
+    """Train, export, measure and report. Return the PSNR in dB if there are true images."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     device = resolve_device(cfg.device)
     require_whole("seed", cfg.seed, low=0, example=3)
@@ -90,13 +93,14 @@ def run(cfg: DictConfig) -> float | None:
     metrics: dict[str, Metric] = components(cfg.metric, Metric, "metric")
     initializer = component(cfg.initializer, Initializer, "initializer")
     memory = estimate_memory(cfg, trainer)
+    source: TruthSource = component(cfg.truth, TruthSource, "truth")
+    truth = source.of(cfg.prompt, trainer.prior)
     embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
     state = start_or_resume(cfg, trainer, initializer, device, folder)
+    start = keep_start(cfg, state, initializer, device) if source.measures_start else None
     # The prior is loaded last, because an initializer may have needed the memory and has freed it now.
     trainer.prior.load()
-    for text in filter(None, (trainer.prior.notice(), embedding.notice(), state.initial_note)):
-        note(text)
-    note_backend(backend)
+    note_beginning((trainer.prior.notice(), embedding.notice(), state.initial_note), backend)
     timetable = describe(trainer)
     print(f"Schedule: {timetable}", file=sys.stderr)
 
@@ -127,10 +131,7 @@ def run(cfg: DictConfig) -> float | None:
         gaussians = state.gaussians.detach()
         written, warnings = export(exporters, gaussians, context.render, folder)
         asset = folder / ASSET if folder / ASSET in written else None
-        truth = trainer.prior.truth(cfg.prompt)
-        for name, metric in metrics.items():
-            with keeping_others(f"metric.{name}", warnings):
-                summary |= metric.measure(gaussians, context.render, truth, asset)
+        summary |= measure(metrics, gaussians, context.render, truth, asset, start, warnings)
         if asset is not None:
             summary["asset_bytes"] = asset.stat().st_size
         # This is the last entry of a complete summary.
@@ -148,7 +149,14 @@ def run(cfg: DictConfig) -> float | None:
     # This also applies if all steps were done already, so that a loop in a shell script ends.
     if stop.received is not None:
         sys.exit(128 + stop.received)
-    return summary.get("psnr")
+    return psnr_of(summary)
+
+
+def note_beginning(notes: Iterable[str | None], backend: Backend) -> None:
+    """Print what the user must know of the prior, the prompt, the start and the rasterizer before training."""
+    for text in filter(None, notes):
+        note(text)
+    note_backend(backend)
 
 
 def require_determinism(device: torch.device) -> None:
@@ -286,6 +294,19 @@ def start_or_resume(
     return state
 
 
+def keep_start(
+    cfg: DictConfig, state: TrainState, initializer: Initializer, device: torch.device
+) -> Callable[[], Gaussians]:
+    """Return a function that returns the Gaussians at the start of the run, also after training.
+
+    They are copied now, or built again if the run is resumed.
+    """
+    if state.step > 0:
+        return partial(rebuild_start, cfg.prompt, initializer, cfg.seed, device)
+    copy = state.gaussians.detach().map(Tensor.clone)
+    return lambda: copy
+
+
 def read_state(path: Path, trainer: Trainer, device: torch.device) -> TrainState:
     """Return the state in a checkpoint. Raises ``DamagedCheckpointError`` unless it is sound throughout."""
     payload = load_checkpoint(path)
@@ -349,6 +370,7 @@ def summarize(cfg: DictConfig, state: TrainState, outcome: Outcome, backend: Bac
         "skipped_steps": state.skipped,
         "dimmed_steps": state.dimmed,
         **{name: choices.get(name) for name in COMPONENTS},
+        **({"truth": choices["truth"]} if choices.get("truth", "prior") != "prior" else {}),
         **({"initializer_note": state.initial_note} if state.initial_note else {}),
         "device": str(state.gaussians.device),
         "cadam3d": __version__,
@@ -374,7 +396,10 @@ def export(
 
 def print_result(folder: Path, summary: Mapping[str, Any], report: Path) -> None:
     """Print how the run ended, where its files are, and how to continue it if it was interrupted."""
-    quality = f", PSNR {summary['psnr']:.2f} dB" if summary.get("psnr") is not None else ""
+    psnr = psnr_of(summary)
+    quality = "" if psnr is None else f", PSNR {psnr:.2f} dB"
+    if turn := summary.get("turn_deg"):
+        quality += f" at a turn of {turn:.0f} degrees"
     print(
         f"{summary['outcome']} after {summary['steps']} steps, {summary['seconds']:.0f} s: "
         f"{summary['num_gaussians']} Gaussians{quality}"

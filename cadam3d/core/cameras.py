@@ -62,6 +62,17 @@ class Cameras:
             elevation_deg=self.elevation_deg,
         )
 
+    def turned(self, turn_deg: float) -> "Cameras":
+        """Return the views from cameras that are carried around the vertical axis, to larger azimuths."""
+        return Cameras(
+            world_to_camera=self.world_to_camera @ vertical_turn(-turn_deg, self.world_to_camera),
+            intrinsics=self.intrinsics,
+            height=self.height,
+            width=self.width,
+            azimuth_deg=wrapped(self.azimuth_deg + turn_deg),
+            elevation_deg=self.elevation_deg,
+        )
+
     def rays(self) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "v h w 3"]]:
         """Return world-space ray origins, and unit directions through every pixel centre."""
         kwargs = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
@@ -72,6 +83,17 @@ class Cameras:
         to_world = self.world_to_camera[:, :3, :3].transpose(1, 2) @ torch.linalg.inv(self.intrinsics)
         directions = torch.einsum("vij,hwj->vhwi", to_world, pixels)
         return self.positions, torch.nn.functional.normalize(directions, dim=-1)
+
+
+def vertical_turn(turn_deg: float, like: Tensor) -> Float[Tensor, "4 4"]:
+    """Return the matrix that turns points around the world's +z, counterclockwise seen from above.
+
+    It has the device and the dtype of ``like``.
+    """
+    matrix = torch.eye(4, dtype=torch.float64)
+    cosine, sine = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
+    matrix[:2, :2] = torch.tensor([[cosine, -sine], [sine, cosine]], dtype=torch.float64)
+    return matrix.to(like)
 
 
 def look_at(

@@ -1,14 +1,14 @@
 """RenderOutput: the result of every rasterizer. RenderFn: renders Gaussians. Truth: the true object."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cadam3d.core.cameras import Cameras
+from cadam3d.core.cameras import Cameras, vertical_turn
 from cadam3d.core.gaussians import Gaussians
 
 # Alpha from which a pixel counts as object when disparities are stretched to [0, 1].
@@ -80,7 +80,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Truth:
-    """The true object of a prompt, which few priors know.
+    """The true object of a prompt, with which an asset is compared.
 
     It has ``m`` modes, more than one if the prompt leaves something open.
     """
@@ -91,3 +91,35 @@ class Truth:
     # if all modes have the same shape. A distance is negative inside. Its sign is exact, and its size is at
     # most the distance to the surface, in world units. None if the shape is not known.
     distance: Callable[[Tensor], Tensor] | None = None
+    # From cameras to the alpha of each mode, "m v h w" in [0, 1]. None if the outlines are not known.
+    alpha: Callable[[Cameras], Tensor] | None = None
+    # The asset may face any side, and this many turns about the vertical axis are tried, evenly spaced. None
+    # if the front of the asset is known to be at azimuth 0.
+    turns: int | None = None
+    # The turn at which the object fits the asset best, in (-180, 180] degrees, counterclockwise seen from
+    # above. None until it has been searched (``metric/turn.py``), and if the front is known.
+    turn_deg: float | None = None
+
+    def turned(self) -> "Truth":
+        """Return the object as the asset faces, turned by ``turn_deg``."""
+        if not self.turn_deg:
+            return self
+        images, distance, alpha, turn_deg = self.images, self.distance, self.alpha, self.turn_deg
+
+        def distance_there(points: Tensor) -> Tensor:
+            assert distance is not None
+            # The transposed matrix of the turn back is the matrix of the turn, and the points are rows.
+            return distance(points @ vertical_turn(turn_deg, points)[:3, :3])
+
+        def alpha_there(cameras: Cameras) -> Tensor:
+            assert alpha is not None
+            return alpha(cameras.turned(-turn_deg))
+
+        return replace(
+            self,
+            images=lambda cameras, background: images(cameras.turned(-turn_deg), background),
+            distance=None if distance is None else distance_there,
+            alpha=None if alpha is None else alpha_there,
+            turns=None,
+            turn_deg=None,
+        )

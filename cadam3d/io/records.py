@@ -4,7 +4,7 @@ Numbers and text in these files may come from a stranger, and reports calculate 
 only entries of the kinds that training writes.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,25 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.outcome import Outcome
 from cadam3d.io.jsonl import is_number, is_whole, read_json, read_jsonl
 from cadam3d.io.reading import read_yaml
-from cadam3d.io.run_folder import HISTOGRAMS, METRICS, SUMMARY
+from cadam3d.io.run_folder import EVALUATION, HISTOGRAMS, METRICS, SUMMARY
 
 # Limits of a histogram in histograms.jsonl.
 MOST_BINS = 1000  # per decade
 DECADES = 300  # powers of ten below and above 1
+
+# Entries of summary.json and of eval.json that compare an asset with the true object.
+QUALITY = (
+    "psnr",
+    "psnr_min",
+    "ssim",
+    "psnr_turned",
+    "ssim_turned",
+    "turn_deg",
+    "psnr_start",
+    "iou",
+    "iou_start",
+    "colour_error",
+)
 
 
 def read_summary(run: Path) -> dict[str, Any]:
@@ -29,6 +43,35 @@ def read_summary(run: Path) -> dict[str, Any]:
         is_entry(summary[name]) for name, is_entry in SUMMARY_ENTRIES.items() if name in summary
     )
     return summary if is_summary else {}
+
+
+def psnr_of(summary: Mapping[str, Any]) -> float | None:
+    """Return the PSNR by which an asset is judged, in dB: at the best turn, if it may face any side."""
+    turned = summary.get("psnr_turned")
+    return summary.get("psnr") if turned is None else turned
+
+
+def ssim_of(summary: Mapping[str, Any]) -> float | None:
+    """Return the SSIM by which an asset is judged: at the best turn, if it may face any side."""
+    turned = summary.get("ssim_turned")
+    return summary.get("ssim") if turned is None else turned
+
+
+def read_quality(run: Path, summary: Mapping[str, Any]) -> dict[str, float]:
+    """Return the quality in ``eval.json`` of a run that has measured none itself.
+
+    Returns {} if the summary has a PSNR, or if the evaluation is of another asset or cannot be believed.
+    """
+    try:
+        evaluation = read_json(run / EVALUATION)
+    except UserError:
+        return {}
+    is_of_run = isinstance(evaluation, dict) and evaluation.get("num_gaussians") == summary.get(
+        "num_gaussians"
+    )
+    if not is_of_run or psnr_of(summary) is not None:
+        return {}
+    return {name: evaluation[name] for name in QUALITY if is_number(evaluation.get(name))}
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
@@ -117,7 +160,8 @@ SUMMARY_ENTRIES: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("rasterizer", "camera", "refine", "optimizer", "initializer_note"), _is_text_or_none),
     **dict.fromkeys(("steps", "steps_asked", "num_gaussians", "num_gaussians_initial"), is_whole),
     **dict.fromkeys(("skipped_steps", "dimmed_steps", "asset_bytes"), is_whole),
-    **dict.fromkeys(("psnr", "psnr_min", "ssim", "asset_mib", "bytes_per_gaussian"), _is_number_or_none),
+    **dict.fromkeys((*QUALITY, "asset_mib", "bytes_per_gaussian"), _is_number_or_none),
+    "truth": _is_text_or_none,
     **dict.fromkeys(("median_scale", "median_opacity"), _is_number_or_none),
     **dict.fromkeys(("memory_estimate_gib", "memory_peak_gib"), _is_number_or_none),
 }

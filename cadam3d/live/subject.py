@@ -18,7 +18,7 @@ from cadam3d.io import live
 from cadam3d.io.jsonl import is_whole
 from cadam3d.io.lock import holder_name, is_held
 from cadam3d.io.reading import open_contained, open_regular, signature
-from cadam3d.io.records import read_config, read_summary
+from cadam3d.io.records import psnr_of, read_config, read_summary
 from cadam3d.io.run_folder import (
     ASSET,
     CHARTS,
@@ -166,8 +166,9 @@ class Run(Subject):
         if is_held(self.place / LOCK):
             return facts | {"status": "busy"}
         summary = self._summary.get() or {}
-        done = {"step": "steps", **{key: key for key in ("num_gaussians", "seconds", "outcome", "psnr")}}
-        known = {key: summary[name] for key, name in done.items() if summary.get(name) is not None}
+        done = {key: summary.get(key) for key in ("num_gaussians", "seconds", "outcome")}
+        done |= {"step": summary.get("steps"), "psnr": psnr_of(summary)}
+        known = {key: value for key, value in done.items() if value is not None}
         return facts | {"status": "idle"} | known
 
     def picture(self) -> bytes | None:

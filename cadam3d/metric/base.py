@@ -16,6 +16,15 @@ class Metric(ABC):
     ) -> dict[str, float]:
         """Return named numbers.
 
-        ``truth`` is the true object if the prior knows it, and ``asset`` is the file with these
-        Gaussians if one was written. Numbers that need one of them are left out if it is ``None``.
+        ``truth`` is the true object if it is known, and ``asset`` is the file with these Gaussians if one was
+        written. Numbers that need one of them are left out if it is ``None``. If the asset may face any side,
+        ``truth.turned()`` faces as the asset does.
         """
+
+    def measure_start(self, gaussians: Gaussians, render: RenderFn, truth: Truth) -> dict[str, float]:
+        """Return named numbers about the Gaussians at the start of the run, as a baseline; {} by default.
+
+        This is called only if the run names a truth. ``render`` shows these Gaussians, and ``truth`` is that
+        of :meth:`measure`, with the turn of the asset.
+        """
+        return {}

@@ -1,4 +1,4 @@
-"""Fidelity: how close the renders are to the true images, if the prior knows those."""
+"""Fidelity: how close the renders are to the true images, if those are known."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,22 +9,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require_whole
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.pictures import PictureSettings
 from cadam3d.core.render import RenderFn, Truth
 from cadam3d.metric.base import Metric
+from cadam3d.metric.held_out import HeldOutSettings
 
 SSIM_WINDOW = 11  # pixels (Wang et al. 2004)
 # In dB. The PSNR of equal images is infinite, which can neither be averaged nor written as JSON.
 PSNR_MAX = 100.0
-# Views that are compared at once. This bounds the memory, because there is a true image per mode and view.
-VIEWS_AT_ONCE = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fidelity(PictureSettings, Metric):
+class Fidelity(HeldOutSettings, Metric):
     """PSNR and SSIM of held-out views against the true images.
 
     Each view's PSNR comes from the mean squared error over all its pixels and channels, renders clamped to
@@ -34,30 +31,9 @@ class Fidelity(PictureSettings, Metric):
 
     node: ClassVar[str] = "metric.fidelity"
 
-    views: int  # >= 1, per elevation
-    elevations_deg: Sequence[float]  # in [-90, 90]
-
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_views(self.views, example=12)
-        self.require_angles("elevations_deg", self.elevations_deg, limit=90, example=15)
         require_whole("metric.fidelity.size", self.size, low=SSIM_WINDOW, example=128)
-
-    def cameras(self) -> Cameras:
-        """Return the held-out views.
-
-        Their azimuths are half a step off those of a turntable. Each elevation is shifted a little more, so
-        that no two rings look from the same side.
-        """
-        step = 360.0 / self.views
-        rings = len(self.elevations_deg)
-        azimuth = torch.tensor(
-            [(view + 0.5 + ring / (2 * rings)) * step for ring in range(rings) for view in range(self.views)]
-        )
-        elevation = torch.tensor([float(angle) for angle in self.elevations_deg]).repeat_interleave(
-            self.views
-        )
-        return self.cameras_at(azimuth, elevation)
 
     def measure(
         self, gaussians: Gaussians, render: RenderFn, truth: Truth | None, asset: Path | None
@@ -65,27 +41,47 @@ class Fidelity(PictureSettings, Metric):
         """Return PSNR, SSIM and the mode that they belong to; {} if there are no true images.
 
         ``psnr`` (dB) and ``ssim`` are means over the views, ``psnr_min`` (dB) is that of the worst view, and
-        ``mode`` is the index of the mode.
+        ``mode`` is the index of the mode. If the asset may face any side, ``psnr_turned`` and ``ssim_turned``
+        compare with the object turned by ``turn_deg``, in (-180, 180] degrees, counterclockwise seen from
+        above.
         """
         if truth is None:
             return {}
-        cameras = self.cameras()
-        psnrs, ssims = [], []
-        for first in range(0, len(cameras), VIEWS_AT_ONCE):
-            some = cameras.index(slice(first, first + VIEWS_AT_ONCE))
-            background = self.backgrounds(len(some))
-            images = render(some, background).rgb.detach().float().cpu().clamp(0, 1)
-            modes = truth.images(some, background).detach().float().cpu()
-            psnrs.append(_psnr(images, modes))
-            ssims.append(_ssim(images, modes))
-        psnr_db, similarity = torch.cat(psnrs, dim=1), torch.cat(ssims, dim=1)
-        best = int(psnr_db.mean(dim=1).argmax())
-        return {
-            "psnr": float(psnr_db[best].mean()),
-            "psnr_min": float(psnr_db[best].min()),
-            "ssim": float(similarity[best].mean()),
-            "mode": float(best),
-        }
+        unturned, *others = self._compare(render, [truth, truth.turned()] if truth.turn_deg else [truth])
+        if truth.turn_deg is None:
+            return unturned
+        turned = others[0] if others else unturned
+        at_turn = {"psnr_turned": turned["psnr"], "ssim_turned": turned["ssim"], "turn_deg": truth.turn_deg}
+        return unturned | at_turn
+
+    def measure_start(self, gaussians: Gaussians, render: RenderFn, truth: Truth) -> dict[str, float]:
+        """Return ``psnr_start`` (dB), against the images with which ``psnr_turned`` compares the asset."""
+        return {"psnr_start": self._compare(render, [truth.turned()])[0]["psnr"]}
+
+    def _compare(self, render: RenderFn, truths: Sequence[Truth]) -> list[dict[str, float]]:
+        """Return the four numbers of every truth. Each view is rendered once."""
+        psnrs: list[list[Tensor]] = [[] for _ in truths]
+        ssims: list[list[Tensor]] = [[] for _ in truths]
+        for cameras, background in self.parts():
+            images = render(cameras, background).rgb.detach().float().cpu().clamp(0, 1)
+            for number, truth in enumerate(truths):
+                modes = truth.images(cameras, background).detach().float().cpu()
+                psnrs[number].append(_psnr(images, modes))
+                ssims[number].append(_ssim(images, modes))
+        return [
+            _best_mode(torch.cat(psnr_db, dim=1), torch.cat(similarity, dim=1))
+            for psnr_db, similarity in zip(psnrs, ssims, strict=True)
+        ]
+
+
+def _best_mode(psnr_db: Float[Tensor, "m v"], similarity: Float[Tensor, "m v"]) -> dict[str, float]:
+    best = int(psnr_db.mean(dim=1).argmax())
+    return {
+        "psnr": float(psnr_db[best].mean()),
+        "psnr_min": float(psnr_db[best].min()),
+        "ssim": float(similarity[best].mean()),
+        "mode": float(best),
+    }
 
 
 def _psnr(images: Float[Tensor, "v h w 3"], modes: Float[Tensor, "m v h w 3"]) -> Float[Tensor, "m v"]:

@@ -1,4 +1,4 @@
-"""MeshMetric: how close the surface of an asset is to the true surface, if the prior knows that."""
+"""MeshMetric: how close the surface of an asset is to the true surface, if that is known."""
 
 import math
 from collections.abc import Callable
@@ -41,7 +41,8 @@ class MeshMetric(SurfaceSettings, Metric):
     * ``mesh_fscore = 2 precision recall / (precision + recall)``, and 0 if both are 0 (Knapitsch et al.
       2017).
 
-    If the modes of a prior have different shapes, the one with the smallest Chamfer distance counts.
+    If the modes of a truth have different shapes, the one with the smallest Chamfer distance counts. If the
+    asset may face any side, the true surface faces as the asset does (``turn_deg``).
     """
 
     node: ClassVar[str] = "metric.mesh"
@@ -63,11 +64,12 @@ class MeshMetric(SurfaceSettings, Metric):
 
         Raises ``UserError`` if the asset has no surface.
         """
-        if truth is None or truth.distance is None:
+        true = truth and truth.turned()
+        if true is None or true.distance is None:
             return {}
         surface, _ = self.surface(gaussians)
         results = []
-        for vertices, faces in true_surfaces(truth.distance):
+        for vertices, faces in true_surfaces(true.distance):
             to_true, to_mesh = distances_between(
                 (surface.vertices, surface.faces), (vertices, faces), self.samples, self.seed
             )

@@ -15,7 +15,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cadam3d.core.outcome import Outcome
-from cadam3d.io.records import read_config, read_histograms, read_metrics
+from cadam3d.io.records import (
+    psnr_of,
+    read_config,
+    read_histograms,
+    read_metrics,
+    read_quality,
+    ssim_of,
+)
 from cadam3d.io.run_folder import CONFIG
 from cadam3d.report.formatting import number
 from cadam3d.settings.compose import compose, config_dir, flatten
@@ -84,6 +91,11 @@ class JobResult:
     count: float | None  # Gaussians at the end
     psnr: float | None  # dB
     ssim: float | None
+    is_turned: bool  # the asset may face any side, and PSNR and SSIM are those at the best turn
+    psnr_start: float | None  # dB; of the Gaussians at the start
+    iou: float | None
+    iou_start: float | None
+    colour_error: float | None
     mib: float | None  # size of asset.ply
     seconds: float | None
 
@@ -150,7 +162,8 @@ def _known(job: Any) -> _KnownJob:
 
 def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> JobResult:
     shipped = _shipped(job.densifier)
-    numbers = {key: number(value) for key, value in job.summary.items()}
+    summary = {**job.summary, **read_quality(job.folder, job.summary)}
+    numbers = {key: number(value) for key, value in summary.items()}
     size = numbers.get("asset_bytes")
     given = {key: value for key, value in job.overrides.items() if key.startswith(PREFIX)}
     return JobResult(
@@ -163,8 +176,13 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
         outcome=job.outcome,
         message=str(job.summary.get("message") or ""),
         count=numbers.get("num_gaussians"),
-        psnr=numbers.get("psnr"),
-        ssim=numbers.get("ssim"),
+        psnr=psnr_of(numbers),
+        ssim=ssim_of(numbers),
+        is_turned=numbers.get("psnr_turned") is not None,
+        psnr_start=numbers.get("psnr_start"),
+        iou=numbers.get("iou"),
+        iou_start=numbers.get("iou_start"),
+        colour_error=numbers.get("colour_error"),
         mib=size / (1 << 20) if size is not None else None,
         seconds=numbers.get("seconds"),
     )

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from cadam3d.core.chart import Chart
+from cadam3d.io.records import psnr_of, ssim_of
 from cadam3d.io.run_folder import ASSET, CONFIG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE
 from cadam3d.report.charts import other_plots, sections
 from cadam3d.report.declarations import write_declarations
@@ -32,7 +33,14 @@ LABELS = {
     "psnr": "PSNR (dB)",
     "psnr_min": "PSNR of the worst view (dB)",
     "ssim": "SSIM",
-    "mode": "Best-matching mode of the prior",
+    "mode": "Best-matching mode of the truth",
+    "psnr_turned": "PSNR at the best turn (dB)",
+    "ssim_turned": "SSIM at the best turn",
+    "turn_deg": "Best turn about the vertical axis (degrees)",
+    "psnr_start": "PSNR of the Gaussians at the start (dB)",
+    "iou": "Overlap of the outlines (IoU)",
+    "iou_start": "Overlap of the outlines at the start (IoU)",
+    "colour_error": "Colour error (delta E)",
     "mesh_chamfer": "Chamfer distance of the mesh (world units)",
     "mesh_fscore": "F-score of the mesh",
     "mesh_precision": "Precision of the mesh",
@@ -48,6 +56,7 @@ LABELS = {
     "densifier": "Densifier",
     "guidance": "Guidance",
     "prior": "Prior",
+    "truth": "Truth",
     "rasterizer": "Rasterizer",
     "initializer": "Initializer",
     "camera": "Camera",
@@ -114,7 +123,7 @@ def _tiles(summary: Mapping[str, Any]) -> list[Tile]:
     numbers = {name: number(value) for name, value in summary.items()}
     count, initial = numbers.get("num_gaussians"), numbers.get("num_gaussians_initial")
     size, per_gaussian = numbers.get("asset_bytes"), numbers.get("bytes_per_gaussian")
-    psnr, ssim = numbers.get("psnr"), numbers.get("ssim")
+    psnr, ssim = psnr_of(numbers), ssim_of(numbers)
     done, asked, seconds = numbers.get("steps"), numbers.get("steps_asked"), numbers.get("seconds")
     tiles = []
     if count is not None:
@@ -123,6 +132,8 @@ def _tiles(summary: Mapping[str, Any]) -> list[Tile]:
         )
     if psnr is not None:
         remark = f"SSIM {ssim:.3f}" if ssim is not None else "held-out views"
+        start = numbers.get("psnr_start")
+        remark += f", {start:.2f} dB at the start" if start is not None else ""
         tiles.append(Tile("PSNR", f"{psnr:.2f} dB", remark))
     if size is not None:
         remark = f"{per_gaussian:.0f} B per Gaussian" if per_gaussian else ""

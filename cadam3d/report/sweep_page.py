@@ -211,12 +211,15 @@ def _title(plan: Plan, results: Sequence[JobResult]) -> str:
 
 
 def _extent(results: Sequence[JobResult]) -> list[str]:
-    """Return how many prompts, seeds, noise levels and settings the sweep has."""
+    """Return how many prompts, seeds, noise levels and settings there are, and how assets are compared."""
     texts = []
     for key, noun in ((PROMPT, "prompt"), (SEED, "seed"), (NOISE, "noise level")):
         if values := {result.cell[key] for result in results if result.cell[key]}:
             texts.append(plural(len(values), noun))
-    return [*texts, plural(len({result.setting for result in results}), "setting")]
+    texts.append(plural(len({result.setting for result in results}), "setting"))
+    if any(result.is_turned for result in results):
+        texts.append("PSNR and SSIM at the best turn about the vertical axis")
+    return texts
 
 
 def _tiles(results: Sequence[JobResult]) -> list[Tile]:

@@ -271,15 +271,24 @@ def _keys(node: Any) -> Iterator[object]:
 
 
 def read_components(
-    path: Path, keys: Sequence[str], folders: Sequence[Path], *, is_trusted: bool, retry: str
+    path: Path,
+    keys: Sequence[str],
+    folders: Sequence[Path],
+    *,
+    is_trusted: bool,
+    retry: str,
+    optional: Collection[str] = (),
 ) -> DictConfig:
-    """Return the prompt and the components ``keys`` of the run with the configuration ``path``.
+    """Return the prompt, the seed and the components ``keys`` of the run with the configuration ``path``.
 
-    Text that looks like an interpolation stays text. Raises ``UserError`` for a component that is not in the
-    YAML files in ``folders``, unless the run is trusted, and for settings that the component does not have.
+    Those of ``optional`` that the file does not have are left out. Text that looks like an interpolation
+    stays text. Raises ``UserError`` for a component that is not in the YAML files in ``folders``, unless the
+    run is trusted, and for settings that the component does not have.
     """
     content = read_yaml(path)
-    chosen = {key: content.get(key) for key in ("prompt", *keys)} if isinstance(content, dict) else {}
+    content = content if isinstance(content, dict) else {}
+    keys = [key for key in keys if key in content or key not in optional]
+    chosen = {key: content.get(key) for key in ("prompt", "seed", *keys)}
     if not isinstance(chosen.get("prompt"), str):
         raise UserError(f"{path}: expected the settings of a run, got no prompt. Try: another run")
     registry = Registry.of(folders)

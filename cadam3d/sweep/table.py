@@ -7,10 +7,13 @@ from typing import Any
 
 from cadam3d.io.atomic import replacing
 from cadam3d.io.jsonl import to_json
+from cadam3d.io.records import QUALITY, psnr_of
 from cadam3d.io.run_folder import TABLE
 from cadam3d.sweep.folder import Row, load
 
 FACTS = ("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "asset_bytes", "message")
+# Columns that only jobs with a named truth have.
+MORE_FACTS = tuple(name for name in QUALITY if name not in ("psnr", "psnr_min", "ssim"))
 # Columns of the table in the terminal, besides the outcome and the settings in which jobs differ.
 SHOWN = ("num_gaussians", "psnr", "seconds")
 
@@ -36,7 +39,8 @@ def as_text(rows: Sequence[Row]) -> str:
     lines = [["job", *(["arm"] if has_arms else []), *keys, "outcome", *SHOWN]]
     for row in rows:
         values = [row.number, *([row.arm] if has_arms else []), *(row.swept.get(key) for key in keys)]
-        facts = [row.outcome, *(row.summary.get(name) for name in SHOWN)]
+        shown = row.summary | {"psnr": psnr_of(row.summary)}
+        facts = [row.outcome, *(shown.get(name) for name in SHOWN)]
         lines.append([*values, *facts])
     return aligned(lines)
 
@@ -63,10 +67,11 @@ def _write(path: Path, rows: Sequence[Row]) -> None:
     keys = _swept_keys(rows)
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(["job", "arm", *keys, "outcome", *FACTS, "folder"])
+        names = [*FACTS, *(name for name in MORE_FACTS if any(name in row.summary for row in rows))]
+        writer.writerow(["job", "arm", *keys, "outcome", *names, "folder"])
         for row in rows:
             swept = [_plain(row.swept.get(key)) for key in keys]
-            facts = [row.summary.get(name) for name in FACTS]
+            facts = [row.summary.get(name) for name in names]
             writer.writerow([row.number, row.arm, *swept, row.outcome, *facts, row.folder.name])
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from cadam3d.core.outcome import Outcome
-from cadam3d.io.records import read_summary
+from cadam3d.io.records import psnr_of, read_summary
 from cadam3d.io.run_folder import ENDED
 from cadam3d.sweep.folder import Row
 from cadam3d.sweep.table import varying_keys
@@ -73,8 +73,8 @@ def result(summary: dict[str, Any]) -> str:
     facts = [] if outcome == Outcome.FINISHED else [str(outcome)]
     if "num_gaussians" in summary:
         facts.append(f"{summary['num_gaussians']:,} Gaussians")
-    if summary.get("psnr") is not None:
-        facts.append(f"{summary['psnr']:.2f} dB")
+    if (psnr := psnr_of(summary)) is not None:
+        facts.append(f"{psnr:.2f} dB")
     if "seconds" in summary:
         facts.append(f"{summary['seconds']:.0f} s")
     return ", ".join(facts)

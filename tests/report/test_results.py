@@ -1,9 +1,12 @@
 """Jobs become results: which keys make settings and cells, and which results may be compared."""
 
+import json
+
 import pytest
 
 from cadam3d.core.errors import UserError
 from cadam3d.report.results import ArmSetting, at_noise, counts, histograms, in_noise_order, measured, read
+from cadam3d.sweep.table import as_text, write_table
 
 
 def test_a_threshold_that_varies_within_an_arm_makes_settings(jobs):
@@ -50,6 +53,43 @@ def test_without_a_shipped_threshold_no_result_is_standard(jobs):
     for growth in (0.05, 0.1):
         jobs.add("mcmc", "densifier.cap=1500", f"densifier.growth={growth}", n=100, psnr=20.0)
     assert not any(result.is_standard for result in read(jobs.folder))
+
+
+def test_a_job_that_may_face_any_side_is_judged_at_its_best_turn(jobs):
+    turned = {"psnr_turned": 15.5, "ssim_turned": 0.7, "turn_deg": 40.0}
+    more = {"psnr_start": 12.0, "iou": 0.8, "iou_start": 0.6, "colour_error": 9.0}
+    jobs.add("cadam", n=100, psnr=12.5, ssim=0.5, **turned, **more)
+    jobs.add("baseline", n=100, psnr=12.5, ssim=0.5)
+    cadam, baseline = read(jobs.folder)
+    assert (cadam.psnr, cadam.ssim, cadam.is_turned) == (15.5, 0.7, True)
+    assert (cadam.psnr_start, cadam.iou, cadam.iou_start, cadam.colour_error) == (12.0, 0.8, 0.6, 9.0)
+    assert (baseline.psnr, baseline.ssim, baseline.is_turned) == (12.5, 0.5, False)
+    assert baseline.psnr_start is baseline.iou is baseline.colour_error is None
+
+
+def test_the_table_of_a_sweep_has_the_columns_of_a_truth_only_if_a_job_names_one(jobs):
+    jobs.add("cadam", n=100, psnr=12.5)
+    table = jobs.folder / "sweep.csv"
+    write_table(jobs.folder)
+    assert "psnr_turned" not in table.read_text(encoding="utf-8")
+    jobs.add("cadam", "seed=1", n=100, psnr=12.5, psnr_turned=15.5, iou=0.8)
+    rows = write_table(jobs.folder)
+    header, before, turned = table.read_text(encoding="utf-8").splitlines()
+    assert header.endswith("message,psnr_turned,iou,folder")
+    assert ",15.5,0.8," in turned
+    assert ",,," in before
+    assert [line.split()[-2] for line in as_text(rows).splitlines()] == ["psnr", "12.5", "15.5"]
+
+
+def test_a_job_without_a_psnr_has_that_of_its_evaluation(jobs):
+    """An evaluation of another asset, and one that cannot be read, do not count."""
+    for count, psnr in ((100, None), (100, 20.0), (99, None)):
+        folder = jobs.add("cadam", f"seed={count}", n=100, psnr=psnr)
+        (folder / "eval.json").write_text(json.dumps({"num_gaussians": count, "psnr": 15.0, "iou": "much"}))
+    (jobs.add("cadam", "seed=3", n=100, psnr=None) / "eval.json").write_text("[1")
+    results = read(jobs.folder)
+    assert [result.psnr for result in results] == [15.0, 20.0, None, None]
+    assert [result.iou for result in results] == [None] * 4
 
 
 def test_thresholds_may_be_words(jobs):

@@ -390,7 +390,7 @@ def components_of(plain: object, folder: Path, **options: Any) -> DictConfig:
 
 def test_only_what_is_measured_is_read_from_a_configuration(config, tmp_path):
     config["densifier"] = {"_target_": PAYLOAD}
-    assert set(components_of(config, tmp_path)) == {"prompt", "prior", "rasterizer"}
+    assert set(components_of(config, tmp_path)) == {"prompt", "seed", "prior", "rasterizer"}
 
 
 def test_a_payload_in_a_component_that_is_built_is_refused(config, tmp_path):

@@ -17,9 +17,10 @@ from cadam3d.prior.shapes.array_cache import cached_arrays
 from cadam3d.prior.shapes.grammar import EXAMPLE
 from cadam3d.prior.shapes.mixture import Mixture
 from cadam3d.prior.shapes.objects import known_objects, known_primitives
-from cadam3d.prior.shapes.scene import Scene, build, signed_distance
+from cadam3d.prior.shapes.scene import Scene, build
 from cadam3d.prior.shapes.trace_cache import shared_trace
 from cadam3d.prior.shapes.tracer import Layers
+from cadam3d.prior.shapes.truth import true_scene
 
 CENSUS_VIEWS = 4  # per object, equally spaced in azimuth
 CENSUS_ELEVATION_DEG = 15.0
@@ -175,17 +176,12 @@ class ShapesPrior(DiffusionPrior):
         return Prediction(clean=clean, noise=noise, velocity=self.noise_path.velocity(clean, noise, t))
 
     def truth(self, prompt: str) -> Truth:
-        """Return the images of all modes of ``prompt``, and their shape: they differ in colour only."""
-        scene = build(prompt)
+        """Return the images of all modes of ``prompt``, and their shape: they differ in colour only.
 
-        def images(cameras: Cameras, background: Tensor) -> Tensor:
-            layers, sized = self._layers(scene, cameras)
-            return layers.images(sized.albedo, background).permute(1, 0, 3, 4, 2)
-
-        def distance(points: Tensor) -> Tensor:
-            return signed_distance(scene.to(points.device, points.dtype), points)[None]
-
-        return Truth(images, distance)
+        The outlines are left out, because ``metric=outline`` is meant for priors that may be wrong about the
+        object. ``truth=shapes`` has them.
+        """
+        return replace(true_scene(build(prompt), self.samples_per_pixel), alpha=None)
 
     def _layers(self, scene: Scene, cameras: Cameras) -> tuple[Layers, Scene]:
         scene = scene.to(cameras.intrinsics.device, cameras.intrinsics.dtype)
