@@ -3,9 +3,10 @@
     python scripts/prove_recipes.py --out outputs/recipes
     python scripts/prove_recipes.py --out outputs/recipes --steps 1200 --prompt "a green chair"
 
-A recipe keeps all its settings except three: the size of images (64 pixels, which the priors were trained on), the
-number of steps, and the number of initial Gaussians. Shap-E and Point-E, which some recipes start from, are not part of
-cadam3d, so these recipes start from a ball. The same line again runs only what has no result yet.
+A recipe keeps all its settings except three: the size of images (64 pixels, which the priors were trained
+on), the number of steps, and the number of initial Gaussians. Shap-E and Point-E, from which some recipes
+start, are not part of cadam3d, so these recipes start from a ball. The same line again runs only what has no
+result yet.
 """
 
 import argparse
