@@ -1,4 +1,4 @@
-# make demo   install into .venv and train a first object
+# make demo   install into .venv and train two objects: with the exact prior, and with a small network
 # make test   ruff, pyright and the whole test suite: everything that must hold before a merge
 # make check  ruff, pyright and the tests of what has changed since the last commit on main; less than a minute
 # make clean  remove .venv and caches; outputs stay
@@ -17,7 +17,8 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --maxprocesses 8 
 
 demo: .venv/.installed
 	$(BIN)/cadam3d train prompt="a red and yellow checkered torus"
-	@echo "Output folder: outputs/latest (asset.ply, turntable.mp4, preview.png, report.html)"
+	$(BIN)/cadam3d train prior=shapes_mvdream prompt="a red mushroom" truth=shapes
+	@echo "Both objects are in outputs. The second is in outputs/latest (asset.ply, turntable.mp4, preview.png, report.html)"
 
 test: .venv/.installed-dev
 	$(BIN)/ruff check .
@@ -39,7 +40,7 @@ clean:
 
 # The installs are editable: a changed source needs no new install; changed dependencies do.
 .venv/.installed: pyproject.toml constraints.txt | $(BIN)/python
-	$(INSTALL) .
+	$(INSTALL) ".[diffusers]"
 	@touch $@
 
 .venv/.installed-dev: pyproject.toml constraints.txt | $(BIN)/python

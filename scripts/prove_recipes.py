@@ -18,6 +18,9 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw
 
+# LucidDreamer and its descendants replace each point by twenty Gaussians, so all start with 5,000.
+REPLICATED = {"luciddreamer", "gcs_beg", "flowdreamer", "flowdreamer_ucm"}
+GAUSSIANS, REPLICAS = 5000, 20
 PRIORS = {
     "gaussiandreamer": "shapes_sd",
     "luciddreamer": "shapes_sd",
@@ -30,7 +33,6 @@ PRIORS = {
 SETTINGS = (
     "truth=shapes",
     "camera.size=64",
-    "initializer.count=4000",
     "exporter=[ply,preview]",
     "exporter.preview.views=4",
     "exporter.preview.elevations_deg=[15]",
@@ -47,7 +49,8 @@ def run(recipe: str, folder: Path, prompt: str, steps: int, settings: list[str])
     if not summary.is_file():
         shutil.rmtree(folder, ignore_errors=True)
         line = [f"experiment={recipe}", f"prior={PRIORS[recipe]}", f"prompt={prompt}", f"steps={steps}"]
-        own = [*line, *SETTINGS, *settings, f"hydra.run.dir={folder}"]
+        count = GAUSSIANS // REPLICAS if recipe in REPLICATED else GAUSSIANS
+        own = [*line, *SETTINGS, f"initializer.count={count}", *settings, f"hydra.run.dir={folder}"]
         print("cadam3d train", *own, file=sys.stderr)
         subprocess.run([sys.executable, "-m", "cadam3d", "train", *own], check=True, stdout=sys.stderr)
     return json.loads(summary.read_text(encoding="utf-8"))
