@@ -18,8 +18,8 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw
 
-# LucidDreamer and its descendants replace each point by twenty Gaussians, so all start with 5,000.
-REPLICATED = {"luciddreamer", "gcs_beg", "flowdreamer", "flowdreamer_ucm"}
+# These recipes replace each point by twenty Gaussians. All start with 5,000.
+REPLICATED = {"luciddreamer", "gcs_beg", "flowdreamer", "flowdreamer_ucm", "mvdream"}
 GAUSSIANS, REPLICAS = 5000, 20
 PRIORS = {
     "gaussiandreamer": "shapes_sd",
