@@ -114,7 +114,7 @@ class Trainer:
     def _refine(self, state: TrainState, step: int) -> RefineReport | None:
         """Grow, prune and reset opacities if the schedule says so after step number ``step`` (from 1).
 
-        The last step of a run may only prune (``refine.last_max_scale``).
+        With ``refine.last_max_scale``, a last step that does not refine still prunes.
 
         A refinement is decided first and then applied to all three owners of rows: Gaussians, optimizer
         moments and densifier state. One that would exceed ``max_gaussians`` changes nothing except

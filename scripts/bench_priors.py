@@ -3,8 +3,9 @@
     python scripts/bench_priors.py --prior shapes_mvdream --out outputs/priors
     python scripts/bench_priors.py --prior shapes_sd --out outputs/priors guidance.scale=3
 
-The prompts are pairs of a colour and an object that the training of the priors left out. Words after the
-options are settings of ``cadam3d train``. The same line again trains only what has no result yet.
+It needs pip install '.[diffusers]'. The prompts are pairs of a colour and an object that the training of the
+priors left out. Words after the options are settings of ``cadam3d train``. The same line again trains only
+what has no result yet.
 
 An object has the right colour if its error is at most 20 (CIE Lab, delta E 76), and the right outline if the
 silhouettes overlap by at least 0.7 (IoU at the best turn). The gain is over the initial Gaussians of the same
@@ -31,6 +32,7 @@ PROMPTS = (
     "a cyan snowman",
     "a red boat",
 )
+# The largest error of a right colour (delta E), and the smallest overlap of a right outline (IoU).
 COLOUR, OUTLINE = 20.0, 0.7
 HEADER = (
     "| prompt | Gaussians | start | PSNR | gain | IoU at the start | IoU | colour error | turn | seconds |"
@@ -51,6 +53,7 @@ def train(prior: str, prompt: str, folder: Path, settings: list[str]) -> dict[st
 
 
 def row(prompt: str, found: dict[str, float]) -> str:
+    """Return a line of the table for the summary ``found`` of a run."""
     cells = [
         prompt,
         f"{found['num_gaussians']:,}",

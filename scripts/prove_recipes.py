@@ -3,10 +3,12 @@
     python scripts/prove_recipes.py --out outputs/recipes
     python scripts/prove_recipes.py --out outputs/recipes --steps 1200 --prompt "a green chair"
 
-A recipe keeps all its settings except three: the size of images (64 pixels, which the priors were trained
-on), the number of steps, and the number of initial Gaussians. Shap-E and Point-E, from which some recipes
-start, are not part of cadam3d, so these recipes start from a ball. The same line again runs only what has no
-result yet.
+A recipe keeps all its settings except four: the prior, the size of images (64 pixels, which the priors were
+trained on), the number of steps, and the number of points at the start, of which LucidDreamer's start makes
+twenty Gaussians each. Words after the options are further settings of ``cadam3d train``.
+
+Some recipes start from Shap-E, which is not part of cadam3d. Where it is not available, they start from a
+ball, and their summaries say so. The same line again runs only what has no result yet.
 """
 
 import argparse
@@ -57,6 +59,7 @@ def run(recipe: str, folder: Path, prompt: str, steps: int, settings: list[str])
 
 
 def row(recipe: str, found: dict[str, float]) -> str:
+    """Return a line of the table for the summary ``found`` of a run."""
     cells = [
         f"`{recipe}`",
         f"`{PRIORS[recipe]}`",

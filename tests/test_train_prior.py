@@ -162,14 +162,14 @@ def fit(folder: Path, steps: int, stop_after: int | None = None) -> torch.Tensor
     """Fit a line to noisy numbers for a number of steps, or stop early as if interrupted."""
     torch.manual_seed(0)
     model = torch.nn.Linear(1, 1)
-    seen = []
+    losses = []
 
-    def loss(step, generator):
-        if stop_after is not None and step >= stop_after:
+    def loss(generator):
+        if len(losses) == stop_after:
             raise KeyboardInterrupt
-        seen.append(step)
         x = torch.rand(16, 1, generator=generator)
-        return (model(x) - 3 * x - 1).square().mean()
+        losses.append((model(x) - 3 * x - 1).square().mean())
+        return losses[-1]
 
     stage = loop.Stage("line", model, loss, dict, 1e-2, loop.Budget(steps, None), seed=0)
     with suppress(KeyboardInterrupt):
@@ -199,6 +199,37 @@ def test_the_learning_rate_rises_and_then_falls():
 
 
 # --- the program
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        "--size 20",
+        "--groups 0",
+        "--groups 700",
+        "--processes 0",
+        "--minutes 0",
+        "--start nowhere",
+        "--format stable_diffusion_3 --prediction epsilon",
+        pytest.param("--device cuda", marks=pytest.mark.skipif(torch.cuda.is_available(), reason="has CUDA")),
+    ],
+)
+def test_a_mistake_is_reported_before_the_views_are_rendered(mistake, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        train_prior.main(f"--format mvdream --out {tmp_path / 'out'} {mistake}".split())
+    option = mistake.split()[-2]
+    assert f"error: {option}: expected " in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3, 7])
+@pytest.mark.parametrize("files", [1, 2, 5])
+def test_every_file_is_read_and_no_process_is_without_one(files, processes, tmp_path):
+    kind = stages.format_of("mvdream", SIZE, "epsilon")
+    plan = stages.Plan(tmp_path, tmp_path, files * views.GROUPS, kind, 0, processes, "cpu", None)
+    read = [list(plan.own_files(rank)) for rank in range(processes)]
+    assert all(read)
+    assert {number for numbers in read for number in numbers} == set(range(files))
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -153,7 +153,7 @@ def run(cfg: DictConfig) -> float | None:
 
 
 def note_beginning(notes: Iterable[str | None], backend: Backend) -> None:
-    """Print what the user must know of the prior, the prompt, the start and the rasterizer."""
+    """Print what the user must know about the prior, the prompt, the start and the rasterizer."""
     for text in filter(None, notes):
         note(text)
     note_backend(backend)

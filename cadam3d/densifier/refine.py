@@ -194,7 +194,7 @@ class Refine:
             keeps &= gaussians.opacities >= self.min_opacity
         if self.max_scale is not None and step > self.prune_from:
             keeps &= gaussians.scales.amax(dim=-1) <= self.max_scale
-        if self.last_max_scale is not None and step == self.steps:
+        if self.last_max_scale is not None and self.prunes_at(step):
             keeps &= gaussians.scales.amax(dim=-1) <= self.last_max_scale
         return keeps
 

@@ -89,6 +89,7 @@ def _mean_colour(
 
 
 def _lab(colours: Float[Tensor, "m v 3"]) -> Float[Tensor, "m v 3"]:
-    from kornia.color import rgb_to_lab  # slow to import, and not needed before training has ended
+    # Slow to import, and not needed before training has ended.
+    from kornia.color import rgb_to_lab
 
     return rgb_to_lab(colours.permute(2, 0, 1)).permute(1, 2, 0)

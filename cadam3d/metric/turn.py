@@ -33,7 +33,7 @@ def facing(truth: Truth, render: RenderFn) -> Truth:
     """Return ``truth`` with the turn at which the rendered asset fits it best in PSNR.
 
     First ``truth.turns`` turns are tried, evenly spaced. The best one is refined to a fifteenth of their
-    spacing, which is 1 degree for 24 turns. If the front is known, nothing changes.
+    spacing, which is 1 degree for 24 turns. If the front is known, ``truth`` is returned unchanged.
     """
     if truth.turns is None:
         return truth

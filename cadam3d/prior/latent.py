@@ -388,21 +388,22 @@ class LatentPrior(DiffusionPrior):
                 self.lexicon.require_known(key, text)
 
     def _size_hint(self) -> str | None:
-        """Return a warning if the images have another size than those that the model was trained with."""
+        """Return a warning if the images are larger than those in training, or less than half as large."""
         size, trained = self.size, self.trained_size
         if size is None or trained is None or trained / 2 <= size <= trained:
             return None
         return (
-            f"The model was trained with images of {trained} pixels per side, and prior.size={size} is far "
-            f"from that. prior.size={trained} usually looks better."
+            f"The model was trained with images of {trained} pixels per side, but prior.size is {size}. "
+            f"prior.size={trained} usually looks better."
         )
 
     def _require_size(self, key: str, size: int) -> None:
+        """Raise ``UserError`` if images of ``size`` pixels per side are too large for the network."""
         trained = self.trained_size
         require(
             trained is None or size <= LARGEST * trained,
             key,
-            expected=f"about {trained} pixels, the size with which the model was trained",
+            expected=f"at most {LARGEST * (trained or 0)} pixels, since the model was trained with {trained}",
             got=size,
             example=f"{key}={trained}",
         )

@@ -23,6 +23,14 @@ Line = dict[str, Any]
 # Infinite: the other arm never reaches the quality; 0: it always exceeds it.
 NO_RATIO: dict[float | None, str] = {math.inf: "never", 0.0: "always"}
 
+# Columns of results that are compared with a named truth: the field of the result, and its decimal places.
+OF_TRUTH = {
+    "PSNR at the start (dB)": ("psnr_start", 2),
+    "IoU": ("iou", 3),
+    "IoU at the start": ("iou_start", 3),
+    "colour error": ("colour_error", 1),
+}
+
 
 def objectives_table(results: Sequence[JobResult]) -> list[Line]:
     """Return the standard setting of each arm by objective and noise, medians over cells (paper table 1)."""
@@ -46,10 +54,10 @@ def objectives_table(results: Sequence[JobResult]) -> list[Line]:
                         "cells": len(members),
                         "PSNR (dB)": _median([result.psnr for result in members], 2),
                         "SSIM": _median([result.ssim for result in members], 4),
-                        "PSNR at the start (dB)": _median([result.psnr_start for result in members], 2),
-                        "IoU": _median([result.iou for result in members], 3),
-                        "IoU at the start": _median([result.iou_start for result in members], 3),
-                        "colour error": _median([result.colour_error for result in members], 1),
+                        **{
+                            title: _median([getattr(result, name) for result in members], digits)
+                            for title, (name, digits) in OF_TRUTH.items()
+                        },
                         "Gaussians": _median([result.count for result in members], 0),
                         "MiB": _median([result.mib for result in members], 3),
                         "seconds": _median([result.seconds for result in members], 1),
@@ -123,14 +131,10 @@ def standings_table(results: Sequence[JobResult]) -> list[Line]:
 
 def jobs_table(results: Sequence[JobResult]) -> list[Line]:
     """Return every job with its outcome. The columns of a named truth are left out if no job has one."""
-    of_truth = {
-        "PSNR at the start (dB)": lambda result: _rounded(result.psnr_start, 2),
-        "IoU": lambda result: _rounded(result.iou, 3),
-        "IoU at the start": lambda result: _rounded(result.iou_start, 3),
-        "colour error": lambda result: _rounded(result.colour_error, 1),
-    }
-    more = {
-        title: value for title, value in of_truth.items() if any(value(each) is not None for each in results)
+    known = {
+        title: column
+        for title, column in OF_TRUTH.items()
+        if any(getattr(result, column[0]) is not None for result in results)
     }
     return [
         {
@@ -141,7 +145,7 @@ def jobs_table(results: Sequence[JobResult]) -> list[Line]:
             "Gaussians": None if result.count is None else round(result.count),
             "PSNR (dB)": _rounded(result.psnr, 2),
             "SSIM": _rounded(result.ssim, 4),
-            **{title: value(result) for title, value in more.items()},
+            **{title: _rounded(getattr(result, name), digits) for title, (name, digits) in known.items()},
             "seconds": result.seconds,
         }
         for result in results

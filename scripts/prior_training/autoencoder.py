@@ -45,8 +45,8 @@ def build(latent_channels: int, size: int) -> AutoencoderKL:
     with torch.no_grad():
         for module in vae.modules():
             _start(module)
-        _enter(vae.encoder.conv_in, 3)
-        _enter(vae.decoder.conv_in, 3)
+        _enter(vae.encoder.conv_in)
+        _enter(vae.decoder.conv_in)
         for convolution in (vae.encoder.conv_out, vae.decoder.conv_out):
             _leave(convolution)
         for convolution in (vae.quant_conv, vae.post_quant_conv):
@@ -94,14 +94,14 @@ def _carry(convolution: nn.Conv2d, gain: float) -> None:
         convolution.weight[channel, channel, middle, middle] = gain
 
 
-def _enter(convolution: nn.Conv2d, colours: int) -> None:
-    """Write each colour with both signs, and the constants, to the carried channels."""
+def _enter(convolution: nn.Conv2d) -> None:
+    """Write each of the first three channels with both signs, and the constants, to the carried channels."""
     middle = convolution.weight.shape[-1] // 2
     convolution.weight[:CARRIED] = 0
     convolution.bias[:CARRIED] = 0
-    for colour in range(colours):
+    for colour in range(3):
         convolution.weight[colour, colour, middle, middle] = 1
-        convolution.weight[colours + colour, colour, middle, middle] = -1
+        convolution.weight[3 + colour, colour, middle, middle] = -1
     convolution.bias[CARRIED - 2], convolution.bias[CARRIED - 1] = LEVEL, -LEVEL
 
 
@@ -135,7 +135,7 @@ class Reconstruction:
     held_out: Groups
     device: torch.device
 
-    def loss(self, step: int, generator: torch.Generator) -> Tensor:
+    def loss(self, generator: torch.Generator) -> Tensor:
         """Return the error of colours and of differences between neighbours, and a small KL divergence."""
         rows = torch.randint(len(self.views), (GROUPS,), generator=generator)
         images, alpha = self.views.over(rows, backgrounds(GROUPS, generator))

@@ -1,4 +1,4 @@
-"""The model card, the pictures and the curves that are written beside a trained model."""
+"""The model card, the list of words and the sample pictures that are written beside a trained model."""
 
 import json
 from pathlib import Path

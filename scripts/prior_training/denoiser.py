@@ -40,8 +40,8 @@ class Denoising:
     held_out: Encoded
     device: torch.device
 
-    def loss(self, step: int, generator: torch.Generator) -> Tensor:
-        """Return the squared error of the network's prediction, at levels of noise that are spread evenly."""
+    def loss(self, generator: torch.Generator) -> Tensor:
+        """Return the mean squared error of the prediction, at levels of noise that are spread evenly."""
         together = self.kind.group
         count = IMAGES // together
         groups = torch.randint(len(self.views.latents), (count,), generator=generator)
@@ -58,6 +58,7 @@ class Denoising:
         """Return the mean squared error per level of noise, with the right, no and a wrong caption."""
         views = torch.arange(min(4 * len(self.held_out.latents), 256))
         right = self.held_out.captions.right(views)
+        # A wrong caption is that of the view seven groups (28 views) further on, which shows another object.
         ways = {"right": right, "empty": [""] * len(right), "wrong": right[28:] + right[:28]}
         return {
             name: [round(self._error(views, texts, level), 4) for level in LEVELS]

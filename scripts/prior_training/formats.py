@@ -12,7 +12,7 @@ from prior_training.text import LENGTH, MULTIVIEW, SINGLE, Wording
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (the usual name)
 
-from cadam3d.core.cameras import Cameras
+from cadam3d.core.cameras import orbit
 from cadam3d.io.pretrained import INDEX
 from cadam3d.prior.mvdream import CAMERA, VIEWS, across_views, camera_numbers
 from cadam3d.prior.stable_diffusion_3 import counting_zeros
@@ -71,7 +71,10 @@ class Format(ABC):
         model.load_state_dict(weights)
 
     def scaling(self, latents: Tensor) -> tuple[float, float]:
-        """Return the shift and the factor of latents, as the configuration of the autoencoder has them."""
+        """Return the shift and the factor of latents, ``shift_factor`` and ``scaling_factor`` in diffusers.
+
+        The network sees (latents - shift) * factor, of which the standard deviation is 1.
+        """
         return 0.0, 1 / float(latents.std())
 
 
@@ -258,7 +261,7 @@ class StableDiffusion3Format(Format):
         )
 
     def scaling(self, latents: Tensor) -> tuple[float, float]:
-        """Return the mean of the latents too, since this format has a shift."""
+        """Return the mean of the latents as the shift, and the factor, since this format has a shift."""
         return float(latents.mean()), 1 / float(latents.std())
 
     def noised(self, latents: Tensor, noise: Tensor, level: Tensor) -> Noised:
@@ -304,8 +307,5 @@ FORMATS: dict[str, type[Format]] = {
 
 def camera_rows(azimuth_deg: Tensor, elevation_deg: Tensor) -> Tensor:
     """Return the numbers by which prior=mvdream describes cameras, "v 16"; they do not depend on the lens."""
-    from cadam3d.core.cameras import orbit
-
     one = torch.ones_like(azimuth_deg)
-    cameras: Cameras = orbit(azimuth_deg, elevation_deg, 3 * one, 45 * one, 8, 8)
-    return camera_numbers(cameras)
+    return camera_numbers(orbit(azimuth_deg, elevation_deg, 3 * one, 45 * one, 8, 8))

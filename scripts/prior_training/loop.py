@@ -25,6 +25,7 @@ SAVE_EVERY = 90.0  # seconds
 LOG_EVERY = 50  # steps
 # The largest weight of the past in the moving average of the parameters, which is what is kept in the end.
 AVERAGE_DECAY = 0.98  # per AVERAGE_EVERY steps
+BAR = "{desc}: {percentage:3.0f} %|{bar}| {elapsed}<{remaining}{postfix}"
 
 
 @dataclass(frozen=True)
@@ -97,8 +98,8 @@ class Stage:
 
     name: str
     model: nn.Module
-    # From the number of the step and a generator of its own to the loss.
-    loss: Callable[[int, torch.Generator], Tensor]
+    # From the random generator of one step to the loss.
+    loss: Callable[[torch.Generator], Tensor]
     # Figures on held-out data, of the model as it is.
     evaluate: Callable[[], Mapping[str, Any]]
     rate: float  # the peak of the learning rate
@@ -127,7 +128,7 @@ def run(stage: Stage, workers: Workers, folder: Path) -> None:
         for group in optimizer.param_groups:
             group["lr"] = stage.rate * rate_at(step, progress)
         generator = torch.Generator().manual_seed(_seed(stage.seed, workers.rank, step))
-        loss = stage.loss(step, generator)
+        loss = stage.loss(generator)
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(parameters, 1.0)
@@ -159,11 +160,11 @@ def run(stage: Stage, workers: Workers, folder: Path) -> None:
     workers.wait()
 
 
-BAR = "{desc}: {percentage:3.0f} %|{bar}| {elapsed}<{remaining}{postfix}"
-
-
 def rate_at(step: int, progress: float) -> float:
-    """Return the factor of the learning rate: a short rise, then half a cosine."""
+    """Return the factor of the learning rate, in (0, 1]: a short rise, then half a cosine.
+
+    ``progress`` is the share of the budget that is spent, in [0, 1].
+    """
     cosine = 0.5 * (1 + math.cos(math.pi * progress))
     return min(1.0, (step + 1) / WARM_UP) * (LAST_RATE + (1 - LAST_RATE) * cosine)
 

@@ -48,8 +48,12 @@ class Plan:
         return self.out / "training"
 
     def own_files(self, rank: int) -> range:
-        """Return the numbers of the files of views that one process reads."""
-        return range(rank, file_count(self.groups), self.processes)
+        """Return the numbers of the files of views that one process reads.
+
+        Processes share files if there are fewer files than processes.
+        """
+        count = file_count(self.groups)
+        return range(rank % count, count, self.processes)
 
 
 def render(plan: Plan, processes: int) -> None:
@@ -66,6 +70,11 @@ def trained_autoencoder(plan: Plan) -> AutoencoderKL:
     """Return the trained autoencoder."""
     vae = autoencoder.build(plan.kind.latent_channels, plan.kind.size)
     return _smooth(vae, plan.work / "autoencoder.pt").to(memory_format=torch.channels_last)
+
+
+def weights_of(out: Path) -> Path:
+    """Return the file with the denoiser of a finished training, in full precision."""
+    return out / "training" / "denoiser.safetensors"
 
 
 def continue_from(plan: Plan, start: Path) -> None:
@@ -111,8 +120,8 @@ def write_pipeline(plan: Plan, scaling: tuple[float, float]) -> None:
     )
     read = tokenizer(plan.work / "tokenizer")
     model = trained_denoiser(plan, len(read))
-    # In full precision, for a model that continues from this one.
-    save_file(model.state_dict(), plan.work / "denoiser.safetensors")
+    # For a model that continues from this one.
+    save_file(model.state_dict(), weights_of(plan.out))
     plan.kind.save(plan.out, model, vae, read)
 
 
@@ -161,7 +170,7 @@ def _train_denoiser(rank: int, plan: Plan, budget: loop.Budget, scaling: tuple[f
     read = tokenizer(plan.work / f"tokenizer_{rank}") if rank else tokenizer(plan.work / "tokenizer")
     model = plan.kind.build(len(read))
     if plan.start is not None:
-        plan.kind.start(model, load_file(plan.start / "training" / "denoiser.safetensors"))
+        plan.kind.start(model, load_file(weights_of(plan.start)))
     model = model.to(workers.device)
 
     def encoded(views: Groups, latents: Tensor) -> Encoded:

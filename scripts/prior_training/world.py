@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from cadam3d.core.cameras import Cameras, orbit
+from cadam3d.prior.shapes.words import with_article
 
 PRIMITIVES = ("sphere", "cube", "torus", "cylinder", "cone", "capsule", "pyramid", "star", "arch", "ring")
 OBJECTS = (
@@ -61,11 +62,6 @@ def is_held_out(colour: str, noun: str) -> bool:
 def held_out_captions() -> list[str]:
     """Return the captions of one object in one colour that training never shows."""
     return [with_article(f"{c} {n}") for n in NOUNS for c in COLOURS if is_held_out(c, n)]
-
-
-def with_article(words: str) -> str:
-    """Return a noun phrase with "a" or "an"."""
-    return f"{'an' if words[0] in 'aeiou' else 'a'} {words}"
 
 
 @dataclass(frozen=True)

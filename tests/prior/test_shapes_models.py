@@ -117,7 +117,7 @@ def test_a_sentence_unlike_the_captions_gets_a_note(models, tmp_path):
 @pytest.mark.parametrize("size", [144, 512])
 def test_images_far_larger_than_those_of_the_training_are_refused(size, models):
     prior = built("prior=shapes_sd", f"prior.size={size}")
-    message = rf"^prior\.size: expected about 64 pixels.*, got {size}\. Try: prior\.size=64$"
+    message = rf"^prior\.size: expected at most 128 pixels.* with 64, got {size}\. Try: prior\.size=64$"
     for ask in (lambda: prior.embed("a red cube", ""), lambda: prior.memory("a red cube", "", 2, 64)):
         with pytest.raises(UserError, match=message):
             ask()
@@ -126,7 +126,7 @@ def test_images_far_larger_than_those_of_the_training_are_refused(size, models):
 def test_renders_that_are_not_resized_are_compared_with_the_training_too(models):
     prior = built("prior=shapes_sd", "prior.size=null")
     assert prior.encode(torch.rand(1, 64, 64, 3)).shape == (1, 4, 8, 8)
-    with pytest.raises(UserError, match=r"^camera\.size: expected about 64 pixels"):
+    with pytest.raises(UserError, match=r"^camera\.size: expected at most 128 pixels"):
         prior.encode(torch.rand(1, 256, 256, 3))
 
 

@@ -23,7 +23,7 @@ from cadam3d.prior.shapes.vocabulary import (
     RELATIONS,
     SIMILAR_NOUNS,
 )
-from cadam3d.prior.shapes.words import is_known, noun_of, typed_words
+from cadam3d.prior.shapes.words import is_known, noun_of, typed_words, with_article
 
 # Parts of speech in vocabulary.json. Views and qualities describe pictures, not objects.
 NEEDED = ("nouns", "colours")
@@ -170,8 +170,7 @@ class Lexicon:
         colours = dict.fromkeys(map(self._colour, phrase.colours))
         pattern = phrase.pattern if phrase.pattern in self.entries["patterns"] else None
         words = filter(None, (" and ".join(colours), pattern, self._noun(phrase.noun)))
-        text = " ".join(words)
-        return f"{'an' if text[0] in 'aeiou' else 'a'} {text}"
+        return with_article(" ".join(words))
 
 
 def _content(words: Sequence[str]) -> list[str]:

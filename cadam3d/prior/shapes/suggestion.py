@@ -32,6 +32,7 @@ from cadam3d.prior.shapes.words import (
     noun_of,
     plural_of,
     vocabulary,
+    with_article,
     words_of,
 )
 
@@ -199,7 +200,7 @@ def _written(draft: _Draft) -> str:
     words = [*number, *sizes, *stretch, *([" and ".join(colours)] if colours else []), *pattern, noun]
     if number or is_plural(noun):
         return " ".join(words)
-    return " ".join(["an" if words[0][0] in "aeiou" else "a", *words])
+    return with_article(" ".join(words))
 
 
 @cache

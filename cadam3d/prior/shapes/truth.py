@@ -20,7 +20,7 @@ MOST_TURNS = 72
 
 @dataclass(frozen=True, kw_only=True)
 class ShapesTruth(TruthSource):
-    """The scene that the embedded world has for a prompt.
+    """The scene that the embedded world has for a prompt, compared at the best of ``turns`` turns.
 
     With the same ``samples_per_pixel``, its images and its shape equal those that ``prior=shapes`` knows.
     """

@@ -114,3 +114,8 @@ def _belongs_to_word(text: str, i: int) -> bool:
         return text[i - 1 : i].isalnum() and behind[:1] == "s" and not behind[1:].isalnum()
     is_mark = unicodedata.category(letter) in ("Mn", "Mc") and ord(letter) not in VARIATION_SELECTORS
     return letter.isalnum() or is_mark
+
+
+def with_article(phrase: str) -> str:
+    """Return a noun phrase with "a" or "an" before it."""
+    return f"{'an' if phrase[0] in 'aeiou' else 'a'} {phrase}"
