@@ -214,9 +214,63 @@ def few_samples():
 def trained(tmp_path_factory):
     """A Stable Diffusion of a few steps, as the command writes it."""
     folder = tmp_path_factory.mktemp("model")
-    line = f"--format stable_diffusion --out {folder} --groups 4 --size {SIZE} --processes 1"
+    # The views are one file, so one process trains, however many are allowed.
+    line = f"--format stable_diffusion --out {folder} --groups 4 --size {SIZE} --processes 2"
     train_prior.main(f"{line} --autoencoder-steps 8 --steps 8".split())
     return folder
+
+
+def refusal(line, capsys):
+    with pytest.raises(SystemExit) as caught:
+        train_prior.main(line.split())
+    assert caught.value.code == 2
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ("--minutes 0", "--minutes: expected a number above 0, got 0"),
+        ("--minutes -1", "--minutes: expected a number above 0"),
+        ("--minutes nan", "--minutes: expected a number above 0"),
+        ("--steps 0", "--steps: expected a whole number >= 1"),
+        ("--autoencoder-steps 0", "--autoencoder-steps: expected a whole number >= 1"),
+        ("--groups 0", "--groups: expected a whole number >= 1"),
+        ("--groups 600", "--groups: expected a multiple of 512"),
+        ("--processes 0", "--processes: expected a whole number >= 1"),
+        ("--size 20", "--size: expected a multiple of 16"),
+        ("--device tpu", "--device: invalid choice"),
+        ("--start nowhere", "--start: nowhere/training/autoencoder.pt is missing"),
+    ],
+)
+def test_wrong_options_are_refused_before_anything_is_written(options, reason, tmp_path, capsys):
+    message = refusal(f"--format mvdream --out {tmp_path / 'new'} {options}", capsys)
+    assert f"argument {reason}" in message
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_device_or_a_folder_that_cannot_be_used_is_refused(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert "finds no CUDA GPU" in refusal(f"--format mvdream --out {tmp_path}/new --device cuda", capsys)
+    (tmp_path / "file").touch()
+    assert "file is a file" in refusal(f"--format mvdream --out {tmp_path / 'file'}", capsys)
+    monkeypatch.setattr(train_prior.os, "access", lambda *_: False)
+    assert f"{tmp_path} is not writable" in refusal(f"--format mvdream --out {tmp_path}/new/er", capsys)
+
+
+def test_files_of_another_training_are_not_mixed_with_a_new_one(tmp_path, capsys):
+    rgba = torch.zeros(1, 4, 4, SIZE, SIZE, dtype=torch.uint8)
+    kept = views.Groups(rgba, ["a red cube"], torch.zeros(1, 4), torch.zeros(1, 4))
+    torch.save(vars(kept), tmp_path / "views_0000.pt")
+    line = f"--format mvdream --out {tmp_path / 'new'} --views {tmp_path}"
+    assert f"have {SIZE} pixels per side, got 64" in refusal(line, capsys)
+    (tmp_path / "model_index.json").write_text('{"_class_name": "StableDiffusion3Pipeline"}')
+    assert "in the format stable_diffusion_3" in refusal(f"--format mvdream --out {tmp_path}", capsys)
+    (tmp_path / "training" / "latents").mkdir(parents=True)
+    for name in ("autoencoder.pt", "denoiser.safetensors"):
+        (tmp_path / "training" / name).touch()
+    line = f"--format mvdream --out {tmp_path / 'new'} --start {tmp_path}"
+    assert "stable_diffusion_3 cannot become a mvdream" in refusal(line, capsys)
 
 
 @pytest.mark.slow
