@@ -117,7 +117,7 @@ def _kept_format(folder: Path) -> str | None:
     """Return the format of the model that a folder has; None without one."""
     if not (folder / INDEX).is_file():
         return None
-    kind = json.loads((folder / INDEX).read_text(encoding="utf-8"))["_class_name"]
+    kind = str(json.loads((folder / INDEX).read_text(encoding="utf-8"))["_class_name"])
     return PRIORS.get(kind, kind).removeprefix("prior=")
 
 
