@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require_color, require_range
+from cadam3d.core.checks import require_choice, require_color, require_range
 
 
 class Background(ABC):
@@ -35,20 +35,26 @@ class ConstantBackground(Background):
 
 @dataclass(frozen=True, kw_only=True)
 class RandomBackground(Background):
-    """A uniformly random colour in some views and the constant one in the others, drawn for each view."""
+    """A uniformly random colour in some views and the constant one in the others, drawn for each view.
+
+    With ``shared``, all views of a step have the same colour, as a model of several views has seen them.
+    """
 
     probability: float  # in [0, 1]
     color: Sequence[float]  # RGB in [0, 1]
+    shared: bool
 
     def __post_init__(self) -> None:
         require_range("background.probability", self.probability, low=0, high=1, example=0.5)
         require_color("background.color", self.color)
+        require_choice("background.shared", self.shared, (True, False))
 
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
         """Return one colour per view; the number of random draws does not depend on their outcome."""
-        is_random = torch.rand(views, 1, generator=generator) < self.probability
-        colors = torch.rand(views, 3, generator=generator)
-        return torch.where(is_random, colors, _rgb(self.color))
+        count = 1 if self.shared else views
+        is_random = torch.rand(count, 1, generator=generator) < self.probability
+        colors = torch.rand(count, 3, generator=generator)
+        return torch.where(is_random, colors, _rgb(self.color)).expand(views, 3).contiguous()
 
 
 @dataclass(frozen=True, kw_only=True)

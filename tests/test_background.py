@@ -26,7 +26,9 @@ def test_a_constant_background_draws_nothing():
 @pytest.mark.parametrize("probability", [0.0, 0.3, 1.0])
 def test_a_random_background_is_random_with_its_probability(probability):
     constant = torch.tensor([2.0**-20, 0.5, 1.0])
-    colors = RandomBackground(probability=probability, color=constant.tolist()).sample(20_000, draw())
+    colors = RandomBackground(probability=probability, color=constant.tolist(), shared=False).sample(
+        20_000, draw()
+    )
     is_random = (colors != constant).any(dim=-1)
     assert float(is_random.float().mean()) == pytest.approx(probability, abs=0.01)
     assert colors.min() >= 0
@@ -63,7 +65,7 @@ def test_black_or_white_gives_only_these_two_and_white_with_its_probability(whit
 
 
 def test_views_are_drawn_independently():
-    colors = RandomBackground(probability=1.0, color=[0.0, 0.0, 0.0]).sample(5, draw())
+    colors = RandomBackground(probability=1.0, color=[0.0, 0.0, 0.0], shared=False).sample(5, draw())
     assert len(colors.unique(dim=0)) == 5
     lucid = LucidBackground(probability=1.0, black=0.0, color=[0.0, 0.0, 0.0])
     assert len(lucid.sample(5, draw()).unique(dim=0)) == 5
@@ -71,7 +73,7 @@ def test_views_are_drawn_independently():
 
 
 CHANGING = [
-    RandomBackground(probability=0.5, color=[0.0, 0.0, 0.0]),
+    RandomBackground(probability=0.5, color=[0.0, 0.0, 0.0], shared=False),
     LucidBackground(probability=0.66, black=0.5, color=[1.0, 1.0, 1.0]),
     BlackOrWhite(white=0.5),
 ]
@@ -93,7 +95,7 @@ def after(background) -> torch.Tensor:
 def test_later_draws_do_not_depend_on_the_probabilities():
     black = [0.0, 0.0, 0.0]
     for family in (
-        [RandomBackground(probability=p, color=black) for p in (0.0, 0.5, 1.0)],
+        [RandomBackground(probability=p, color=black, shared=False) for p in (0.0, 0.5, 1.0)],
         [LucidBackground(probability=p, black=b, color=black) for p in (0.0, 1.0) for b in (0.0, 1.0)],
         [BlackOrWhite(white=p) for p in (0.0, 1.0)],
     ):
@@ -106,7 +108,7 @@ def test_invalid_colors_are_refused(color):
     with pytest.raises(UserError, match=r"background\.color: expected three numbers"):
         ConstantBackground(color=color)
     with pytest.raises(UserError, match=r"background\.color: expected three numbers"):
-        RandomBackground(probability=0.5, color=color)
+        RandomBackground(probability=0.5, color=color, shared=False)
     with pytest.raises(UserError, match=r"background\.color: expected three numbers"):
         LucidBackground(probability=0.5, black=0.5, color=color)
 
@@ -114,10 +116,20 @@ def test_invalid_colors_are_refused(color):
 @pytest.mark.parametrize("probability", [-0.1, 1.1])
 def test_an_impossible_probability_is_refused(probability):
     with pytest.raises(UserError, match=r"background\.probability"):
-        RandomBackground(probability=probability, color=[0.0, 0.0, 0.0])
+        RandomBackground(probability=probability, color=[0.0, 0.0, 0.0], shared=False)
     with pytest.raises(UserError, match=r"background\.probability"):
         LucidBackground(probability=probability, black=0.5, color=[0.0, 0.0, 0.0])
     with pytest.raises(UserError, match=r"background\.black"):
         LucidBackground(probability=0.5, black=probability, color=[0.0, 0.0, 0.0])
     with pytest.raises(UserError, match=r"background\.white"):
         BlackOrWhite(white=probability)
+
+
+def test_a_shared_background_has_one_colour_per_step():
+    shared = RandomBackground(probability=0.5, color=[1.0, 1.0, 1.0], shared=True)
+    steps = [shared.sample(4, torch.Generator().manual_seed(seed)) for seed in range(200)]
+    assert all(torch.equal(step, step[:1].expand(4, 3)) for step in steps)
+    first = torch.stack([step[0] for step in steps])
+    is_white = (first == 1).all(dim=1)
+    assert 60 < is_white.sum() < 140
+    assert first[~is_white].std(dim=0).min() > 0.2

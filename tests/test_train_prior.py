@@ -13,7 +13,7 @@ pytest.importorskip("diffusers")
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 import train_prior
-from prior_training import autoencoder, card, formats, loop, samples, stages, text, views, world
+from prior_training import autoencoder, card, formats, loop, options, samples, stages, text, views, world
 
 from cadam3d.core.cameras import orbit
 from cadam3d.prior.mvdream import camera_numbers
@@ -201,27 +201,6 @@ def test_the_learning_rate_rises_and_then_falls():
 # --- the program
 
 
-@pytest.mark.parametrize(
-    "mistake",
-    [
-        "--size 20",
-        "--groups 0",
-        "--groups 700",
-        "--processes 0",
-        "--minutes 0",
-        "--start nowhere",
-        "--format stable_diffusion_3 --prediction epsilon",
-        pytest.param("--device cuda", marks=pytest.mark.skipif(torch.cuda.is_available(), reason="has CUDA")),
-    ],
-)
-def test_a_mistake_is_reported_before_the_views_are_rendered(mistake, tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        train_prior.main(f"--format mvdream --out {tmp_path / 'out'} {mistake}".split())
-    option = mistake.split()[-2]
-    assert f"error: {option}: expected " in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize("processes", [1, 2, 3, 7])
 @pytest.mark.parametrize("files", [1, 2, 5])
 def test_every_file_is_read_and_no_process_is_without_one(files, processes, tmp_path):
@@ -250,6 +229,60 @@ def trained(tmp_path_factory):
     return folder
 
 
+def refusal(line, capsys):
+    with pytest.raises(SystemExit) as caught:
+        train_prior.main(line.split())
+    assert caught.value.code == 2
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ("--minutes 0", "--minutes: expected a number above 0, got 0"),
+        ("--minutes -1", "--minutes: expected a number above 0"),
+        ("--minutes nan", "--minutes: expected a number above 0"),
+        ("--steps 0", "--steps: expected a whole number >= 1"),
+        ("--autoencoder-steps 0", "--autoencoder-steps: expected a whole number >= 1"),
+        ("--groups 0", "--groups: expected a whole number >= 1"),
+        ("--groups 600", "--groups: expected a multiple of 512"),
+        ("--processes 0", "--processes: expected a whole number >= 1"),
+        ("--size 20", "--size: expected a multiple of 16"),
+        ("--device tpu", "--device: invalid choice"),
+        ("--format stable_diffusion_3 --prediction epsilon", "--prediction: stable_diffusion_3 always"),
+        ("--start nowhere", "--start: nowhere/training/autoencoder.pt is missing"),
+    ],
+)
+def test_wrong_options_are_refused_before_anything_is_written(options, reason, tmp_path, capsys):
+    message = refusal(f"--format mvdream --out {tmp_path / 'new'} {options}", capsys)
+    assert f"argument {reason}" in message
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_device_or_a_folder_that_cannot_be_used_is_refused(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert "finds no CUDA GPU" in refusal(f"--format mvdream --out {tmp_path}/new --device cuda", capsys)
+    (tmp_path / "file").touch()
+    assert "file is a file" in refusal(f"--format mvdream --out {tmp_path / 'file'}", capsys)
+    monkeypatch.setattr(options.os, "access", lambda *_: False)
+    assert f"{tmp_path} is not writable" in refusal(f"--format mvdream --out {tmp_path}/new/er", capsys)
+
+
+def test_files_of_another_training_are_not_mixed_with_a_new_one(tmp_path, capsys):
+    rgba = torch.zeros(1, 4, 4, SIZE, SIZE, dtype=torch.uint8)
+    kept = views.Groups(rgba, ["a red cube"], torch.zeros(1, 4), torch.zeros(1, 4))
+    torch.save(vars(kept), tmp_path / "views_0000.pt")
+    line = f"--format mvdream --out {tmp_path / 'new'} --views {tmp_path}"
+    assert f"have {SIZE} pixels per side, got 64" in refusal(line, capsys)
+    (tmp_path / "model_index.json").write_text('{"_class_name": "StableDiffusion3Pipeline"}')
+    assert "in the format stable_diffusion_3" in refusal(f"--format mvdream --out {tmp_path}", capsys)
+    (tmp_path / "training" / "latents").mkdir(parents=True)
+    for name in ("autoencoder.pt", "denoiser.safetensors", "views.json"):
+        (tmp_path / "training" / name).touch()
+    line = f"--format mvdream --out {tmp_path / 'new'} --start {tmp_path}"
+    assert "stable_diffusion_3 cannot become a mvdream" in refusal(line, capsys)
+
+
 @pytest.mark.slow
 def test_the_command_writes_a_model_that_a_prior_reads(trained):
     index = json.loads((trained / "model_index.json").read_text())
@@ -268,9 +301,16 @@ def test_the_command_writes_a_model_that_a_prior_reads(trained):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("other", ["--views nowhere", "--groups 8", "--size 32"])
+def test_a_model_that_continues_keeps_the_views_of_its_latents(other, trained, tmp_path, capsys):
+    line = f"--format mvdream --out {tmp_path / 'mv'} --start {trained} {other}"
+    assert "continues with the views of that model" in refusal(line, capsys)
+
+
+@pytest.mark.slow
 def test_an_mvdream_continues_from_it(trained, tmp_path):
-    line = f"--format mvdream --out {tmp_path / 'mv'} --start {trained} --views {trained}/training/views"
-    train_prior.main(f"{line} --groups 4 --size {SIZE} --processes 1 --steps 8".split())
+    line = f"--format mvdream --out {tmp_path / 'mv'} --start {trained} --processes 1 --steps 8"
+    train_prior.main(line.split())
     index = json.loads((tmp_path / "mv" / "model_index.json").read_text())
     assert index["_class_name"] == "MVDreamPipeline"
     assert "from the weights" in (tmp_path / "mv" / "README.md").read_text()

@@ -99,9 +99,13 @@ class Source:
         if name in here:
             return MODELS / name
         known = " or ".join(f"{PACKAGE}{each}" for each in here)
+        # The option that is named after a model also chooses the format that reads it.
+        advice = (
+            f"{self.key}={here[0]} {self.key}.path={PACKAGE}{here[0]}" if here else f"{self.key}.path=DIR"
+        )
         raise UserError(
             f"{self.key}.path: expected {known or 'a folder, since no model comes with this installation'}, "
-            f"got {path!r}. Try: {self.key}.path={f'{PACKAGE}{here[0]}' if here else 'DIR'}"
+            f"got {path!r}. Try: {advice}"
         )
 
     def _remote(self, can_ask: bool) -> "Pretrained":

@@ -146,14 +146,15 @@ class LatentPrior(DiffusionPrior):
             example="'prior.prompting=${prompting}'",
         )
         if self.size is not None:
-            require_whole("prior.size", self.size, low=FACTOR, example=512)
-            is_multiple = self.size % (2 * FACTOR) == 0
+            # Every model accepts 64 pixels, and the next smaller size if it accepts this one.
+            unit = 2 * FACTOR
+            require_whole("prior.size", self.size, low=unit, example=64)
             require(
-                is_multiple,
+                self.size % unit == 0,
                 "prior.size",
-                expected="a multiple of 16",
+                expected=f"a multiple of {unit}",
                 got=self.size,
-                example="prior.size=512",
+                example=f"prior.size={self.size // unit * unit}",
             )
         require_choice("prior.noise_levels", self.noise_levels, LEVELS)
         require_choice("prior.dtype", self.dtype, ("auto", *DTYPES))
@@ -417,7 +418,8 @@ class LatentPrior(DiffusionPrior):
             "camera.size",
             expected=f"a multiple of {FACTOR} pixels, since prior.size is null",
             got=size[0],
-            example="prior.size=512",
+            # Never more than the network accepts, and never 0.
+            example=f"camera.size={max(FACTOR, size[0] // FACTOR * FACTOR)}",
         )
         if tuple(images.shape[2:]) == tuple(size):
             return images

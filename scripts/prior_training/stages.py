@@ -25,6 +25,7 @@ from cadam3d.prior.base import DiffusionPrior
 from cadam3d.settings.compose import component, compose
 
 AUTOENCODER_RATE = 1.5e-3
+VIEWS_FILE = "views.json"
 # Files whose latents give the shift and the factor.
 MEASURED_FILES = 4
 
@@ -56,9 +57,33 @@ class Plan:
         return range(rank % count, count, self.processes)
 
 
+@dataclass(frozen=True)
+class Views:
+    """The views that a model was trained on."""
+
+    folder: Path
+    groups: int
+    size: int  # of images, in pixels per side
+
+
 def render(plan: Plan, processes: int) -> None:
-    """Render the views that are missing."""
+    """Render the views that are missing, and note which they are for a model that continues from this one."""
     render_views(plan.views, plan.groups, plan.kind.size, plan.seed, processes)
+    plan.work.mkdir(parents=True, exist_ok=True)
+    noted = {"folder": str(plan.views.resolve()), "groups": plan.groups, "size": plan.kind.size}
+    (plan.work / VIEWS_FILE).write_text(json.dumps(noted) + "\n", encoding="utf-8")
+
+
+def views_of(out: Path) -> Views:
+    """Return the views on which the model in the folder ``out`` was trained."""
+    noted = json.loads((out / "training" / VIEWS_FILE).read_text(encoding="utf-8"))
+    return Views(Path(noted["folder"]), noted["groups"], noted["size"])
+
+
+def needed_to_continue(out: Path) -> list[Path]:
+    """Return the files that a model leaves for another one, which continues from it."""
+    names = ("autoencoder.pt", "latents", VIEWS_FILE)
+    return [*(out / "training" / name for name in names), weights_of(out)]
 
 
 def train_autoencoder(plan: Plan, budget: loop.Budget) -> None:

@@ -68,6 +68,21 @@ def test_the_advice_is_the_nearest_sentence_of_the_model(prompt, nearest):
     LEXICON.require_known("prompt", nearest)
 
 
+@pytest.mark.parametrize("prompt", ["\U0001f344", "...", "!?"])
+def test_a_prompt_without_any_word_is_refused(prompt):
+    assert advice(prompt) == "a red sphere"
+    assert f"Unknown: '{prompt}'" in refusal(prompt)
+    LEXICON.require_known("negative_prompt", prompt)
+
+
+def test_a_list_that_is_too_long_for_a_message_is_refused():
+    with pytest.raises(
+        UserError, match=r"^prior\.path: expected a model with a list of at most 1000 nouns"
+    ) as caught:
+        Lexicon.read({**VOCABULARY, "nouns": [f"w{i}" for i in range(10**5)]}, "prior=mine", "prior.path")
+    assert len(str(caught.value)) < 200
+
+
 def test_the_message_names_unknown_and_known_words():
     message = refusal("a Big gray ball and the xyzzy")
     assert message.startswith("prompt: expected words that prior=shapes_sd knows, got 'a Big gray ball")

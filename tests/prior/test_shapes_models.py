@@ -130,6 +130,21 @@ def test_renders_that_are_not_resized_are_compared_with_the_training_too(models)
         prior.encode(torch.rand(1, 256, 256, 3))
 
 
+@pytest.mark.parametrize(("size", "advised"), [(20, 16), (60, 56), (3, 8)])
+def test_the_size_that_is_advised_for_renders_works(size, advised, models):
+    prior = built("prior=shapes_sd", "prior.size=null")
+    with pytest.raises(UserError, match=rf"^camera\.size: .*, got {size}\. Try: camera\.size={advised}$"):
+        prior.encode(torch.rand(1, size, size, 3))
+    assert prior.encode(torch.rand(1, advised, advised, 3)).isfinite().all()
+
+
+@pytest.mark.parametrize(("size", "advised"), [(0, 64), (100, 96), (20, 16)])
+def test_the_size_that_is_advised_for_the_network_works(size, advised, models):
+    with pytest.raises(UserError, match=rf"^prior\.size: .*Try: prior\.size={advised}$"):
+        built("prior=shapes_sd", f"prior.size={size}")
+    built("prior=shapes_sd", f"prior.size={advised}").memory("a red cube", "", 1, None)
+
+
 @pytest.mark.parametrize(("size", "is_far"), [(16, True), (32, False), (64, False), (80, True), (128, True)])
 def test_a_size_far_from_that_of_the_training_gets_a_note(size, is_far, models, tmp_path):
     prior = built("prior=shapes_mvdream", f"prior.size={size}", f"prior.cache_dir={tmp_path}")
@@ -151,7 +166,9 @@ def test_a_model_that_does_not_say_its_size_is_used_at_any(models, tmp_path):
 def test_a_model_that_is_not_in_the_package_is_named(models):
     lacking = built("prior=stable_diffusion", "prior.path=package:shapes_xl").lacks()
     assert lacking.startswith("prior.path: expected package:shapes_mvdream or package:shapes_sd or package:")
-    assert lacking.endswith("got 'package:shapes_xl'. Try: prior.path=package:shapes_mvdream")
+    assert lacking.endswith(
+        "got 'package:shapes_xl'. Try: prior=shapes_mvdream prior.path=package:shapes_mvdream"
+    )
     # The name of a model is not a path.
     assert "expected package:" in built("prior=stable_diffusion", "prior.path=package:../models").lacks()
 

@@ -31,6 +31,8 @@ KINDS = (*NEEDED, "patterns", "relations", "views", "qualities")
 ABOUT_PICTURES = ("views", "qualities")
 # Words that every model knows.
 JOINTS = frozenset({"a", "an", "and"})
+# Messages list all words of a model, so a file that has more per part of speech is not a list of such words.
+MOST_ENTRIES = 1000
 # Signs that no caption has.
 PUNCTUATION = re.compile(r"[^\w\s,]|_")
 
@@ -51,11 +53,12 @@ class Lexicon:
         entries = {kind: content.get(kind, []) for kind in KINDS}
         for kind, words in entries.items():
             is_list = isinstance(words, list) and all(isinstance(word, str) and word for word in words)
+            count = len(words) if isinstance(words, list) else 0
             require(
-                is_list and (len(words) > 0 or kind not in NEEDED),
+                is_list and (kind not in NEEDED or count > 0) and count <= MOST_ENTRIES,
                 key,
-                expected=f"a model with a list of {kind} in its vocabulary.json",
-                got=words,
+                expected=f"a model with a list of at most {MOST_ENTRIES} {kind} in its vocabulary.json",
+                got=words if count <= MOST_ENTRIES else f"{count} of them",
                 example=f"{key}=DIR",
             )
         return cls(reader, entries)
@@ -67,6 +70,9 @@ class Lexicon:
         """
         typed = {word.lower(): word for word in typed_words(prompt)}
         unknown = [word for lower, word in typed.items() if lower not in self._words]
+        # A text of signs alone, such as an emoji, says as little as a word that the model has never seen.
+        if not typed and prompt.strip() and key == "prompt":
+            unknown = [prompt]
         if unknown:
             near = self._negative(prompt) if key == "negative_prompt" else self.nearest(prompt)
             known = {kind: words for kind, words in self.entries.items() if words}
