@@ -69,7 +69,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--prior", required=True, help="shapes_sd, shapes_mvdream or shapes_sd3")
+    parser.add_argument("--prior", required=True, choices=("shapes_sd", "shapes_mvdream"))
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--prompts", nargs="+", default=PROMPTS)
     arguments, settings = parser.parse_known_args()

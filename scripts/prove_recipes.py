@@ -1,4 +1,4 @@
-"""Run every published recipe on the priors that come with cadam3d, and write a table and a picture.
+"""Run published recipes on the priors that come with cadam3d, and write a table and a picture.
 
     python scripts/prove_recipes.py --out outputs/recipes
     python scripts/prove_recipes.py --out outputs/recipes --steps 1200 --prompt "a green chair"
@@ -21,15 +21,13 @@ from pathlib import Path
 from PIL import Image, ImageDraw
 
 # These recipes replace each point by twenty Gaussians. All start with 5,000.
-REPLICATED = {"luciddreamer", "gcs_beg", "flowdreamer", "flowdreamer_ucm", "mvdream"}
+REPLICATED = {"luciddreamer", "gcs_beg", "mvdream"}
 GAUSSIANS, REPLICAS = 5000, 20
 PRIORS = {
     "gaussiandreamer": "shapes_sd",
     "luciddreamer": "shapes_sd",
     "gcs_beg": "shapes_sd",
     "dreamgaussian": "shapes_sd",
-    "flowdreamer": "shapes_sd3",
-    "flowdreamer_ucm": "shapes_sd3",
     "mvdream": "shapes_mvdream",
 }
 SETTINGS = (

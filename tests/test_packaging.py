@@ -90,7 +90,6 @@ def models() -> dict[str, list[Path]]:
     }
 
 
-@pytest.mark.skipif(not models(), reason="the trained models are not in cadam3d/models yet")
 def test_the_wheel_carries_the_trained_models(wheel):
     sizes = {each.filename: each.file_size for each in zipfile.ZipFile(wheel).infolist()}
     named = {path.stem for path in find("configs/prior", "*.yaml") if "package:" in path.read_text("utf-8")}

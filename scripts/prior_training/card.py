@@ -18,6 +18,12 @@ TITLES = {
     "mvdream": "MVDream",
     "stable_diffusion_3": "Stable Diffusion 3",
 }
+# What chooses the prior for a format, with cameras and guidance that suit these models.
+USES = {
+    "stable_diffusion": "prior=shapes_sd",
+    "mvdream": "prior=shapes_mvdream",
+    "stable_diffusion_3": "prior=stable_diffusion_3 prior.size=64 prompting=compass camera=shapes_sd",
+}
 # Captions of the sample pictures that the training set contains, and how many that it does not contain.
 SHOWN = (
     "a blue sphere",
@@ -56,10 +62,6 @@ def _card(plan: Plan) -> str:
     logged = curves(plan)
     vae = _last(logged, "autoencoder", "psnr")
     denoiser = _last(logged, "denoiser", "right")
-    plain = {
-        "stable_diffusion": "",
-        "mvdream": " camera=multiview views=4 guidance.shared_t=true prompting=plain",
-    }
     rows = {way: " | ".join(f"{error:.3f}" for error in denoiser[way]) for way in ("right", "empty", "wrong")}
     return TEMPLATE.read_text(encoding="utf-8").format(
         format=name,
@@ -69,8 +71,7 @@ def _card(plan: Plan) -> str:
         colours=len(COLOURS),
         patterns=len(PATTERNS),
         relations=", ".join(RELATIONS),
-        line=f"cadam3d train prior={name} prior.path=FOLDER prior.size={plan.kind.size}"
-        f'{plain.get(name, "")} prompt="a red mushroom"',
+        line=f'cadam3d train {USES[name]} prior.path=FOLDER prompt="a red mushroom"',
         held_out_shown=SHOWN_HELD_OUT,
         images=VIEWS * plan.groups,
         groups=plan.groups,

@@ -175,5 +175,5 @@ def test_the_words_of_captions_are_always_known():
 
 @pytest.mark.parametrize("content", [{}, {"nouns": ["cube"]}, VOCABULARY | {"patterns": "striped"}])
 def test_a_file_without_lists_of_words_is_refused(content):
-    with pytest.raises(UserError, match=r"^prior\.path: expected a model with a list of at most 1000 \w+ in its vocab"):
+    with pytest.raises(UserError, match=r"^prior\.path: expected a model with a list of at most 1000 \w+ in"):
         Lexicon.read(content, "the model DIR", "prior.path")

@@ -19,7 +19,7 @@ from cadam3d.settings.compose import component, compose, config_dir
 from cadam3d.settings.hydra import read_flags
 from cadam3d.sweep.plan import compose_all, read_sweep
 
-KINDS = {"shapes_sd": "stable_diffusion", "shapes_mvdream": "mvdream", "shapes_sd3": "stable_diffusion_3"}
+KINDS = {"shapes_sd": "stable_diffusion", "shapes_mvdream": "mvdream"}
 FEW = ("steps=2", "initializer.count=50", "exporter=[ply]", "metric=[size]", "callback=[checkpoint]")
 
 
