@@ -212,8 +212,10 @@ def test_every_file_is_read_and_no_process_is_without_one(files, processes, tmp_
 
 
 @pytest.fixture(scope="module", autouse=True)
-def few_samples():
+def small_networks_and_few_samples():
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(formats.StableDiffusionFormat, "channels", (16, 32))
+        patch.setattr(autoencoder, "CHANNELS", (16, 16, 16, 16))
         patch.setattr(samples, "STEPS", 2)
         patch.setattr(card, "SHOWN", card.SHOWN[:2])
         patch.setattr(card, "SHOWN_HELD_OUT", 2)

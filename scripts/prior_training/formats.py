@@ -104,6 +104,7 @@ class StableDiffusionFormat(Format):
     prediction: str = "v_prediction"  # or epsilon
 
     name: ClassVar[str] = "stable_diffusion"
+    channels: ClassVar[tuple[int, ...]] = (64, 128)  # of the blocks of the UNet
     latent_channels: ClassVar[int] = 4
 
     @property
@@ -115,14 +116,13 @@ class StableDiffusionFormat(Format):
         """Return a UNet and a text encoder."""
         from diffusers import UNet2DConditionModel
 
-        channels = (64, 128)
         unet = UNet2DConditionModel(
             sample_size=self.size // 8,
-            block_out_channels=channels,
+            block_out_channels=self.channels,
             layers_per_block=1,
             norm_num_groups=16,
-            down_block_types=("CrossAttnDownBlock2D",) * len(channels),
-            up_block_types=("CrossAttnUpBlock2D",) * len(channels),
+            down_block_types=("CrossAttnDownBlock2D",) * len(self.channels),
+            up_block_types=("CrossAttnUpBlock2D",) * len(self.channels),
             cross_attention_dim=WIDTH,
             attention_head_dim=4,
             use_linear_projection=True,
