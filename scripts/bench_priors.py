@@ -3,13 +3,11 @@
     python scripts/bench_priors.py --prior shapes_mvdream --out outputs/priors
     python scripts/bench_priors.py --prior shapes_sd --out outputs/priors guidance.scale=3
 
-It needs pip install '.[diffusers]'. The prompts are pairs of a colour and an object that the training of the
-priors left out. Words after the options are settings of ``cadam3d train``. The same line again trains only
-what has no result yet.
+The prompts are pairs of a colour and an object that no caption in the training of the priors names. Words
+after options are settings of ``cadam3d train``. The same line again trains only what has no result yet.
 
 An object has the right colour if its error is at most 20 (CIE Lab, delta E 76), and the right outline if the
-silhouettes overlap by at least 0.7 (IoU at the best turn). The gain is over the initial Gaussians of the same
-run.
+silhouettes overlap by at least 0.7 (IoU at the best turn). The gain is over the initial Gaussians of the run.
 """
 
 import argparse

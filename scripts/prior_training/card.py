@@ -35,6 +35,7 @@ SHOWN = (
 )
 SHOWN_HELD_OUT = 6
 
+START = ", from the weights of a model in the format of Stable Diffusion, whose own steps are not counted"
 TEMPLATE = Path(__file__).with_name("card.md")
 
 
@@ -79,7 +80,7 @@ def _card(plan: Plan) -> str:
         seed=plan.seed,
         vae_steps=vae["step"],
         steps=denoiser["step"],
-        start="" if plan.start is None else ", from the weights of a model in the format of Stable Diffusion",
+        start="" if plan.start is None else START,
         processes="1 process" if plan.processes == 1 else f"{plan.processes} processes",
         vae_images=VIEWS * AUTOENCODER_GROUPS * plan.processes,
         images_per_step=IMAGES * plan.processes,

@@ -42,7 +42,8 @@ PATTERNS = ("striped", "checkered", "spotted")
 RELATIONS = ("on", "next to")
 
 VIEWS = 4  # of a group, a quarter turn apart, as prior=mvdream reads them
-# One pair of colour and noun in this many is never shown in training.
+# One pair of colour and noun in this many occurs in no caption of the training set. Its pictures may occur:
+# an object without a named colour has any colour or its own, and mushrooms are red.
 HELD_OUT_EVERY = 8
 ALWAYS_HELD_OUT = frozenset({("red", "mushroom")})
 
@@ -60,7 +61,7 @@ def is_held_out(colour: str, noun: str) -> bool:
 
 
 def held_out_captions() -> list[str]:
-    """Return the captions of one object in one colour that training never shows."""
+    """Return the captions of one object in one colour that training never reads."""
     return [with_article(f"{c} {n}") for n in NOUNS for c in COLOURS if is_held_out(c, n)]
 
 
