@@ -6,8 +6,9 @@
     cadam3d train prior=shapes_sd prior.path=models/mine prompt="a red mushroom"
 
 It renders views with captions, trains an autoencoder, then a denoiser with its text encoders, and writes a
-folder in the layout of diffusers with a model card (README.md), sample pictures and curves. After an
-interruption, the same line continues from the files in OUT/training. It needs pip install '.[diffusers]'.
+folder in the layout of diffusers with a model card (README.md), sample pictures and a picture of the curves.
+After an interruption, the same line continues from the files in OUT/training. It needs
+pip install '.[diffusers]'.
 """
 
 import sys

@@ -185,8 +185,10 @@ def test_a_training_that_was_interrupted_ends_as_if_it_had_not_been(tmp_path, mo
     whole = fit(folders[0], 80)
     fit(folders[1], 80, stop_after=37)
     assert torch.equal(fit(folders[1], 80), whole)
-    # A finished training is not continued.
+    # A finished training is not continued, and logs nothing more.
+    logged = (folders[1] / "curves.jsonl").read_text()
     assert torch.equal(fit(folders[1], 80, stop_after=0), whole)
+    assert (folders[1] / "curves.jsonl").read_text() == logged
 
 
 def test_the_learning_rate_rises_and_then_falls():
@@ -291,7 +293,7 @@ def test_the_command_writes_a_model_that_a_prior_reads(trained):
     assert index["_class_name"] == "StableDiffusionPipeline"
     card = (trained / "README.md").read_text()
     assert "{" not in card
-    assert (trained / "samples.png").is_file()
+    assert all((trained / name).is_file() for name in ("samples.png", "curves.png"))
     words = json.loads((trained / "vocabulary.json").read_text())
     assert ["red", "mushroom"] in words["held_out"]
     plan = stages.Plan(

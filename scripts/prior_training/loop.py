@@ -120,6 +120,7 @@ def run(stage: Stage, workers: Workers, folder: Path) -> None:
         optimizer.load_state_dict(kept["optimizer"])
         smooth, step, spent, done = kept["smooth"], kept["step"], kept["seconds"], kept["done"]
     workers.wait()
+    was_done = done
     begin = last_save = time.monotonic()
     progress, mean_loss = (1.0 if done else stage.budget.progress(step, spent)), None
     bar = tqdm(total=1000, desc=stage.name, disable=not workers.leads, bar_format=BAR)
@@ -155,7 +156,7 @@ def run(stage: Stage, workers: Workers, folder: Path) -> None:
     bar.close()
     for average, parameter in zip(smooth, parameters, strict=True):
         parameter.data.copy_(average)
-    if workers.leads:
+    if workers.leads and not was_done:
         _log(folder, stage.name, step=step, seconds=spent + time.monotonic() - begin, **stage.evaluate())
     workers.wait()
 
