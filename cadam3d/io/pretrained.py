@@ -87,7 +87,7 @@ class Source:
                 f"{self.key}.path: expected a folder with a {INDEX} (a model in the layout of diffusers), "
                 f"got {str(self.path)!r}: {what}. Try: {self.key}.path=DIR{hub}"
             )
-        return Pretrained(self, str(folder), None, folder / INDEX, _read_index(self.key, folder / INDEX))
+        return Pretrained(self, str(folder), None, folder / INDEX, _read_entries(self.key, folder / INDEX))
 
     def _folder(self) -> Path:
         """Return the folder that ``path`` names. Raises ``UserError`` for a model that the package lacks."""
@@ -120,7 +120,7 @@ class Source:
         for name in self.ids:
             index, reason, can_ask = _fetch_index(name, self.revision, can_ask)
             if index is not None:
-                return Pretrained(self, name, self.revision, index, _read_index(self.key, index))
+                return Pretrained(self, name, self.revision, index, _read_entries(self.key, index))
             reasons.append(f"{name}: {reason}")
         folder = f"models/{self.ids[0].split('/')[1]}"
         raise UserError(
@@ -177,7 +177,7 @@ class Pretrained:
             path = Path(self.where) / name / file
             if not path.is_file():
                 raise UserError(f"{self.source.key}: {path} is missing. Try: download {self.where} again")
-            return _read_index(self.source.key, path)
+            return _read_entries(self.source.key, path)
         if hasattr(kind, "load_config"):
             return dict(kind.load_config(self.where, subfolder=name, revision=self.revision))
         return kind.config_class.from_pretrained(self.where, subfolder=name, revision=self.revision).to_dict()
@@ -209,7 +209,7 @@ class Pretrained:
     def vocabulary(self) -> dict[str, Any] | None:
         """Return the words that the model knows, as it lists them; None for models that read free text."""
         file = self.file.parent / VOCABULARY
-        return _read_index(self.source.key, file) if file.is_file() else None
+        return _read_entries(self.source.key, file) if file.is_file() else None
 
     @property
     def identity(self) -> str:
@@ -262,15 +262,17 @@ def _module(library: str) -> Any:
     return import_module(own) if library.isidentifier() and find_spec(own) is not None else None
 
 
-def _read_index(key: str, file: Path) -> dict[str, Any]:
+def _read_entries(key: str, file: Path) -> dict[str, Any]:
     try:
-        index = read_json(file)
+        entries = read_json(file)
     except UserError as error:
         reason = str(error).partition(" Try: ")[0]
         raise UserError(f"{key}: {reason} Try: download the model again") from error
-    if not isinstance(index, dict):
-        raise UserError(f"{key}: {file} is not the index of a model. Try: download the model again")
-    return index
+    if not isinstance(entries, dict):
+        raise UserError(
+            f"{key}: {file}: expected names with values, got {entries!r:.40}. Try: download the model again"
+        )
+    return entries
 
 
 def _fetch_index(name: str, revision: str | None, can_ask: bool) -> tuple[Path | None, str, bool]:
