@@ -11,13 +11,14 @@ silhouettes overlap by at least 0.7 (IoU at the best turn). The gain is over the
 """
 
 import argparse
-import json
-import shutil
 import statistics
-import subprocess
-import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+import trained_runs
+
+PRIORS = ("shapes_sd", "shapes_mvdream", "shapes_sd3")
 PROMPTS = (
     "a red mushroom",
     "a purple cube",
@@ -30,60 +31,54 @@ PROMPTS = (
     "a cyan snowman",
     "a red boat",
 )
+SETTINGS = ("truth=shapes", "exporter=[ply,preview]")
 # The largest error of a right colour (delta E), and the smallest overlap of a right outline (IoU).
 COLOUR, OUTLINE = 20.0, 0.7
-HEADER = (
-    "| prompt | Gaussians | start | PSNR | gain | IoU at the start | IoU | colour error | turn | seconds |"
-)
+Summary = dict[str, Any]
+# What each column of the table shows of a run.
+COLUMNS: dict[str, Callable[[Summary], str]] = {
+    "prompt": lambda found: found["prompt"],
+    "Gaussians": lambda found: f"{found['num_gaussians']:,}",
+    "start": lambda found: f"{found['psnr_start']:.1f}",
+    "PSNR": lambda found: f"{found['psnr_turned']:.1f}",
+    "gain": lambda found: f"{gain(found):+.1f}",
+    "IoU at the start": lambda found: f"{found['iou_start']:.2f}",
+    "IoU": lambda found: f"{found['iou']:.2f}",
+    "colour error": lambda found: f"{found['colour_error']:.0f}",
+    "turn": lambda found: f"{found['turn_deg']:.0f}",
+    "seconds": lambda found: f"{found['seconds']:.0f}",
+}
 
 
-def train(prior: str, prompt: str, folder: Path, settings: list[str]) -> dict[str, float]:
-    """Train one object unless it has a result, and return its figures."""
-    summary = folder / "summary.json"
-    if not summary.is_file():
-        shutil.rmtree(folder, ignore_errors=True)
-        line = [sys.executable, "-m", "cadam3d", "train", f"prior={prior}", f"prompt={prompt}"]
-        subprocess.run(
-            [*line, "truth=shapes", "exporter=[ply,preview]", f"hydra.run.dir={folder}", *settings],
-            check=True,
-        )
-    return json.loads(summary.read_text(encoding="utf-8"))
+def gain(found: Summary) -> float:
+    """Return the PSNR that a run gains over its start, in dB."""
+    return found["psnr_turned"] - found["psnr_start"]
 
 
-def row(prompt: str, found: dict[str, float]) -> str:
-    """Return a line of the table for the summary ``found`` of a run."""
-    cells = [
-        prompt,
-        f"{found['num_gaussians']:,}",
-        *(f"{found[name]:.1f}" for name in ("psnr_start", "psnr_turned")),
-        f"{found['psnr_turned'] - found['psnr_start']:+.1f}",
-        *(f"{found[name]:.2f}" for name in ("iou_start", "iou")),
-        *(f"{found[name]:.0f}" for name in ("colour_error", "turn_deg", "seconds")),
-    ]
-    return f"| {' | '.join(cells)} |"
+def verdict(results: Sequence[Summary]) -> str:
+    """Return the median gain, and how many runs have the right colour, outline, and both."""
+    is_right = [(found["colour_error"] <= COLOUR, found["iou"] >= OUTLINE) for found in results]
+    colours, outlines = (sum(column) for column in zip(*is_right, strict=True))
+    counts = f"right colour {colours}, right outline {outlines}, both {sum(map(all, is_right))}"
+    return f"median gain {statistics.median(map(gain, results)):+.2f} dB; {counts} of {len(results)}"
 
 
-def main() -> None:
+def main(line: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--prior", required=True, choices=("shapes_sd", "shapes_mvdream"))
+    parser.add_argument("--prior", required=True, choices=PRIORS)
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--prompts", nargs="+", default=PROMPTS)
-    arguments, settings = parser.parse_known_args()
-    settings = [word for word in settings if word != "--"]
+    arguments, settings = parser.parse_known_args(line)
     results = []
-    print(HEADER, "|" + "---|" * HEADER.count(" |"), sep="\n")
+    print(trained_runs.header(COLUMNS))
     for prompt in arguments.prompts:
-        folder = arguments.out / arguments.prior / "_".join(["seed0", *settings, *prompt.split()[1:]])
-        results.append(train(arguments.prior, prompt, folder.absolute(), settings))
-        print(row(prompt, results[-1]), flush=True)
-    gains = [found["psnr_turned"] - found["psnr_start"] for found in results]
-    colours = sum(found["colour_error"] <= COLOUR for found in results)
-    outlines = sum(found["iou"] >= OUTLINE for found in results)
-    both = sum(found["colour_error"] <= COLOUR and found["iou"] >= OUTLINE for found in results)
-    counts = f"right colour {colours}, right outline {outlines}, both {both} of {len(results)}"
-    print(f"\nmedian gain {statistics.median(gains):+.2f} dB; {counts}")
+        folder = arguments.out / arguments.prior / trained_runs.folder_name(prompt, settings)
+        words = [f"prior={arguments.prior}", f"prompt={prompt}", *SETTINGS, *settings]
+        results.append(trained_runs.result(folder, words))
+        print(trained_runs.line_of([show(results[-1]) for show in COLUMNS.values()]), flush=True)
+    print(f"\n{verdict(results)}")
 
 
 if __name__ == "__main__":

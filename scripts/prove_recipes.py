@@ -1,7 +1,7 @@
-"""Run published recipes on the priors that come with cadam3d, and write a table and a picture.
+"""Run every published recipe on the priors that come with cadam3d, and write a table and a picture.
 
     python scripts/prove_recipes.py --out outputs/recipes
-    python scripts/prove_recipes.py --out outputs/recipes --steps 1200 --prompt "a green chair"
+    python scripts/prove_recipes.py --out outputs/recipes --steps 600 --prompt "a green chair"
 
 A recipe keeps all its settings except four: the prior, the size of images (64 pixels, which the priors were
 trained on), the number of steps, and the number of points at the start, of which LucidDreamer's start makes
@@ -12,23 +12,39 @@ ball, and their summaries say so. The same line again runs only what has no resu
 """
 
 import argparse
-import json
-import shutil
-import subprocess
-import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import trained_runs
 from PIL import Image, ImageDraw
 
-# These recipes replace each point by twenty Gaussians. All start with 5,000.
-REPLICATED = {"luciddreamer", "gcs_beg", "mvdream"}
-GAUSSIANS, REPLICAS = 5000, 20
-PRIORS = {
-    "gaussiandreamer": "shapes_sd",
-    "luciddreamer": "shapes_sd",
-    "gcs_beg": "shapes_sd",
-    "dreamgaussian": "shapes_sd",
-    "mvdream": "shapes_mvdream",
+GAUSSIANS = 5000  # at the start of every recipe
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What is not published about a run with a recipe."""
+
+    prior: str
+    replicas: int = 1  # Gaussians that the start makes of each point
+
+    def settings(self, name: str, prompt: str, steps: int) -> list[str]:
+        """Return the settings of a run with the recipe ``name``."""
+        count = GAUSSIANS // self.replicas
+        choice = [f"experiment={name}", f"prior={self.prior}", f"prompt={prompt}", f"steps={steps}"]
+        return [*choice, *SETTINGS, f"initializer.count={count}"]
+
+
+RECIPES = {
+    "gaussiandreamer": Recipe("shapes_sd"),
+    "luciddreamer": Recipe("shapes_sd", replicas=20),
+    "gcs_beg": Recipe("shapes_sd", replicas=20),
+    "dreamgaussian": Recipe("shapes_sd"),
+    "flowdreamer": Recipe("shapes_sd3", replicas=20),
+    "flowdreamer_ucm": Recipe("shapes_sd3", replicas=20),
+    "mvdream": Recipe("shapes_mvdream", replicas=20),
 }
 SETTINGS = (
     "truth=shapes",
@@ -39,51 +55,33 @@ SETTINGS = (
     "exporter.preview.labels=false",
     "exporter.preview.size=128",
 )
-HEADER = "| recipe | prior | Gaussians | PSNR (start) | IoU (start) | colour error | minutes |"
+# What each column of the table shows, of the name of a recipe and the summary of its run.
+COLUMNS: dict[str, Callable[[str, dict[str, Any]], str]] = {
+    "recipe": lambda name, found: f"`{name}`",
+    "prior": lambda name, found: f"`{RECIPES[name].prior}`",
+    "Gaussians": lambda name, found: f"{found['num_gaussians']:,}",
+    "PSNR (start)": lambda name, found: f"{found['psnr_turned']:.1f} ({found['psnr_start']:.1f}) dB",
+    "IoU (start)": lambda name, found: f"{found['iou']:.2f} ({found['iou_start']:.2f})",
+    "colour error": lambda name, found: f"{found['colour_error']:.0f}",
+    "minutes": lambda name, found: f"{found['seconds'] / 60:.1f}",
+}
 LABEL = 150  # pixels, of the names beside the pictures
 
 
-def run(recipe: str, folder: Path, prompt: str, steps: int, settings: list[str]) -> dict[str, float]:
-    """Train with one recipe unless there is a result, and return its figures."""
-    summary = folder / "summary.json"
-    if not summary.is_file():
-        shutil.rmtree(folder, ignore_errors=True)
-        line = [f"experiment={recipe}", f"prior={PRIORS[recipe]}", f"prompt={prompt}", f"steps={steps}"]
-        count = GAUSSIANS // REPLICAS if recipe in REPLICATED else GAUSSIANS
-        own = [*line, *SETTINGS, f"initializer.count={count}", *settings, f"hydra.run.dir={folder}"]
-        print("cadam3d train", *own, file=sys.stderr)
-        subprocess.run([sys.executable, "-m", "cadam3d", "train", *own], check=True, stdout=sys.stderr)
-    return json.loads(summary.read_text(encoding="utf-8"))
-
-
-def row(recipe: str, found: dict[str, float]) -> str:
-    """Return a line of the table for the summary ``found`` of a run."""
-    cells = [
-        f"`{recipe}`",
-        f"`{PRIORS[recipe]}`",
-        f"{found['num_gaussians']:,}",
-        f"{found['psnr_turned']:.1f} ({found['psnr_start']:.1f}) dB",
-        f"{found['iou']:.2f} ({found['iou_start']:.2f})",
-        f"{found['colour_error']:.0f}",
-        f"{found['seconds'] / 60:.1f}",
-    ]
-    return f"| {' | '.join(cells)} |"
-
-
-def picture(folders: dict[str, Path], path: Path) -> None:
-    """Write the previews below each other, each with the name of its recipe."""
-    previews = {name: Image.open(folder / "preview.png").convert("RGB") for name, folder in folders.items()}
-    width = LABEL + max(image.width for image in previews.values())
-    whole = Image.new("RGB", (width, sum(image.height for image in previews.values())), "white")
+def picture(previews: Mapping[str, Path], path: Path) -> None:
+    """Write pictures below each other, each with the name of its recipe."""
+    images = {name: Image.open(preview).convert("RGB") for name, preview in previews.items()}
+    width = LABEL + max(image.width for image in images.values())
+    whole = Image.new("RGB", (width, sum(image.height for image in images.values())), "white")
     draw, top = ImageDraw.Draw(whole), 0
-    for name, image in previews.items():
+    for name, image in images.items():
         whole.paste(image, (LABEL, top))
         draw.text((8, top + image.height // 2 - 6), name, fill="black")
         top += image.height
     whole.save(path)
 
 
-def main() -> None:
+def main(line: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -91,17 +89,20 @@ def main() -> None:
         "--out", type=Path, required=True, help="folder of the runs, the table and the picture"
     )
     parser.add_argument("--prompt", default="a red mushroom")
-    parser.add_argument("--steps", type=int, default=600)
-    parser.add_argument("--recipes", nargs="+", choices=list(PRIORS), default=list(PRIORS))
-    arguments, settings = parser.parse_known_args()
-    settings = [word for word in settings if word != "--"]
-    name = "_".join([*arguments.prompt.split(), str(arguments.steps), *settings])
-    folders = {recipe: (arguments.out / name / recipe).absolute() for recipe in arguments.recipes}
-    print(HEADER, "|" + "---|" * HEADER.count(" |"), sep="\n")
-    for recipe, folder in folders.items():
-        print(row(recipe, run(recipe, folder, arguments.prompt, arguments.steps, settings)), flush=True)
-    picture(folders, arguments.out / name / "recipes.png")
-    print(f"\npicture: {arguments.out / name / 'recipes.png'}")
+    parser.add_argument("--steps", type=int, default=1200)
+    parser.add_argument("--recipes", nargs="+", choices=list(RECIPES), default=list(RECIPES))
+    arguments, settings = parser.parse_known_args(line)
+    out = arguments.out / trained_runs.folder_name(f"{arguments.prompt} {arguments.steps}", settings)
+    lines = [trained_runs.header(COLUMNS)]
+    print(lines[0])
+    for name in arguments.recipes:
+        own = RECIPES[name].settings(name, arguments.prompt, arguments.steps)
+        found = trained_runs.result(out / name, [*own, *settings])
+        lines.append(trained_runs.line_of([show(name, found) for show in COLUMNS.values()]))
+        print(lines[-1], flush=True)
+    (out / "recipes.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    picture({name: out / name / "preview.png" for name in arguments.recipes}, out / "recipes.png")
+    print(f"\ntable and picture: {out / 'recipes.md'}, {out / 'recipes.png'}")
 
 
 if __name__ == "__main__":

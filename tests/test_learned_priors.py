@@ -79,7 +79,7 @@ def control(tmp_path_factory) -> Seen:
     return distilled(folder, "prior=shapes_sd", f"prior.cache_dir={folder}", is_random=True)
 
 
-@pytest.mark.parametrize("name", ["shapes_sd", "shapes_mvdream"])
+@pytest.mark.parametrize("name", ["shapes_sd", "shapes_mvdream", "shapes_sd3"])
 def test_a_trained_model_knows_colour_and_outline(name, truth, control, tmp_path):
     result = distilled(tmp_path, f"prior={name}", f"prior.cache_dir={tmp_path}")
     assert result.name() == COLOUR

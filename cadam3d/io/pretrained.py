@@ -98,14 +98,15 @@ class Source:
         here = sorted(index.parent.name for index in MODELS.glob(f"*/{INDEX}"))
         if name in here:
             return MODELS / name
-        known = " or ".join(f"{PACKAGE}{each}" for each in here)
+        if not here:
+            raise UserError(
+                f"{self.key}.path: expected a folder, since no model comes with this installation, got "
+                f"{path!r}. Try: {self.key}.path=DIR"
+            )
         # The option that is named after a model also chooses the format that reads it.
-        advice = (
-            f"{self.key}={here[0]} {self.key}.path={PACKAGE}{here[0]}" if here else f"{self.key}.path=DIR"
-        )
         raise UserError(
-            f"{self.key}.path: expected {known or 'a folder, since no model comes with this installation'}, "
-            f"got {path!r}. Try: {advice}"
+            f"{self.key}.path: expected one of {', '.join(PACKAGE + each for each in here)}, got {path!r}. "
+            f"Try: {self.key}={here[0]} {self.key}.path={PACKAGE}{here[0]}"
         )
 
     def _remote(self, can_ask: bool) -> "Pretrained":

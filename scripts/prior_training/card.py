@@ -23,7 +23,7 @@ TITLES = {
 USES = {
     "stable_diffusion": "prior=shapes_sd",
     "mvdream": "prior=shapes_mvdream",
-    "stable_diffusion_3": "prior=stable_diffusion_3 prior.size=64 prompting=compass camera=shapes_sd",
+    "stable_diffusion_3": "prior=shapes_sd3",
 }
 # Captions of the sample pictures that the training set contains, and how many that it does not contain.
 SHOWN = (

@@ -19,7 +19,7 @@ from cadam3d.settings.compose import component, compose, config_dir
 from cadam3d.settings.hydra import read_flags
 from cadam3d.sweep.plan import compose_all, read_sweep
 
-KINDS = {"shapes_sd": "stable_diffusion", "shapes_mvdream": "mvdream"}
+KINDS = {"shapes_sd": "stable_diffusion", "shapes_mvdream": "mvdream", "shapes_sd3": "stable_diffusion_3"}
 FEW = ("steps=2", "initializer.count=50", "exporter=[ply]", "metric=[size]", "callback=[checkpoint]")
 
 
@@ -166,11 +166,13 @@ def test_a_model_that_does_not_say_its_size_is_used_at_any(models, tmp_path):
 def test_a_model_that_is_not_in_the_package_is_named(models):
     lacking = built("prior=stable_diffusion", "prior.path=package:shapes_xl").lacks()
     assert lacking == (
-        "prior.path: expected package:shapes_mvdream or package:shapes_sd, got 'package:shapes_xl'. "
-        "Try: prior=shapes_mvdream prior.path=package:shapes_mvdream"
+        "prior.path: expected one of package:shapes_mvdream, package:shapes_sd, package:shapes_sd3, got "
+        "'package:shapes_xl'. Try: prior=shapes_mvdream prior.path=package:shapes_mvdream"
     )
     # The name of a model is not a path.
-    assert "expected package:" in built("prior=stable_diffusion", "prior.path=package:../models").lacks()
+    assert (
+        "expected one of package:" in built("prior=stable_diffusion", "prior.path=package:../models").lacks()
+    )
 
 
 def test_a_package_without_models_is_reported(tmp_path, monkeypatch):
