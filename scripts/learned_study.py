@@ -58,10 +58,14 @@ def values_of(results: Sequence[JobResult], key: str) -> list[str]:
 
 
 def parts(results: Sequence[JobResult]) -> Iterator[tuple[str, list[JobResult]]]:
-    """Yield the results of each prior and scale with a name, and then all results."""
+    """Yield the results of each prior and scale with a name, and then all results.
+
+    What the sweep does not vary is not in the name.
+    """
     for prior, scale in product(values_of(results, PRIOR), values_of(results, SCALE)):
         if own := part(results, prior, scale):
-            yield f"`{prior}`, scale {scale}", own
+            names = (prior and f"`{prior}`", scale and f"scale {scale}")
+            yield ", ".join(filter(None, names)), own
     yield "all", list(results)
 
 
