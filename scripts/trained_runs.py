@@ -10,13 +10,18 @@ from typing import Any
 
 
 def result(folder: Path, settings: Sequence[str]) -> dict[str, Any]:
-    """Train with the given settings unless ``folder`` has a result already, and return the run's summary."""
+    """Train with the given settings unless ``folder`` has a result already, and return the run's summary.
+
+    Ends the program if training fails, which has reported the reason.
+    """
     summary = folder / "summary.json"
     if not summary.is_file():
         shutil.rmtree(folder, ignore_errors=True)
         line = ["train", *settings, f"hydra.run.dir={folder.absolute()}"]
         print("cadam3d", *line, file=sys.stderr)
-        subprocess.run([sys.executable, "-m", "cadam3d", *line], check=True, stdout=sys.stderr)
+        code = subprocess.call([sys.executable, "-m", "cadam3d", *line], stdout=sys.stderr)
+        if code:
+            sys.exit(f"cadam3d ended with exit code {code}. The same line continues with this run.")
     return json.loads(summary.read_text(encoding="utf-8"))
 
 

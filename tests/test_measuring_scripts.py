@@ -24,7 +24,7 @@ def trained(monkeypatch):
     """Replace training: each run writes a summary and a picture, and its settings are kept."""
     lines = []
 
-    def train(line, check, stdout):
+    def train(line, stdout):
         settings = line[4:]
         folder = Path(settings[-1].removeprefix("hydra.run.dir="))
         folder.mkdir(parents=True)
@@ -32,8 +32,9 @@ def trained(monkeypatch):
         (folder / "summary.json").write_text(json.dumps(GOOD | REST | {"prompt": prompt}))
         Image.new("RGB", (40, 10)).save(folder / "preview.png")
         lines.append(settings[:-1])
+        return 0
 
-    monkeypatch.setattr(trained_runs.subprocess, "run", train)
+    monkeypatch.setattr(trained_runs.subprocess, "call", train)
     return lines
 
 
@@ -59,6 +60,12 @@ def test_a_run_without_a_summary_is_trained_again(trained, tmp_path):
     (tmp_path / "run" / "asset.ply").touch()
     assert trained_runs.result(tmp_path / "run", ["prompt=cube"])["prompt"] == "cube"
     assert not (tmp_path / "run" / "asset.ply").exists()
+
+
+def test_a_run_that_fails_ends_the_script_with_its_exit_code(tmp_path, monkeypatch):
+    monkeypatch.setattr(trained_runs.subprocess, "call", lambda *_, **__: 3)
+    with pytest.raises(SystemExit, match="exit code 3"):
+        trained_runs.result(tmp_path / "run", ["prompt=cube"])
 
 
 def test_the_verdict_counts_colour_outline_and_both():
