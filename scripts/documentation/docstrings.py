@@ -1,0 +1,100 @@
+"""An extension of griffe, which reads docstrings for the reference: fields have comments, and types shapes.
+
+``mkdocs.yml`` names this file. Our dataclasses explain their fields in comments, and our types hold shapes as
+strings; both are read from the source, so that nothing has to be imported.
+"""
+
+import re
+from typing import Any, cast
+
+import griffe
+
+ROLE = re.compile(r":(?:class|func|meth|mod|data):`([^`]+)`")
+SHAPED = {"Float", "Int", "Bool", "UInt8", "Int64", "Shaped", "Num", "Real", "Complex"}
+
+
+class Fields(griffe.Extension):
+    """Show the fields of a dataclass as a table, with the comments beside them as their meaning."""
+
+    def on_package(self, *, pkg: griffe.Module, **kwargs: Any) -> None:
+        """Edit all objects of a package after it has been read."""
+        edit(pkg)
+
+
+def edit(parent: griffe.Module | griffe.Class) -> None:
+    """Edit the docstrings and types of everything inside ``parent``."""
+    for each in list(parent.members.values()):
+        if each.is_alias:
+            continue
+        if each.docstring:
+            each.docstring.value = ROLE.sub(r"`\1`", each.docstring.value)
+        if each.is_function:
+            function = cast("griffe.Function", each)
+            for annotation in [function.returns, *(value.annotation for value in function.parameters)]:
+                quote_shapes(annotation)
+        elif each.is_attribute:
+            quote_shapes(cast("griffe.Attribute", each).annotation)
+        elif each.is_class:
+            edit(cast("griffe.Class", each))
+            if "dataclass" in each.labels:
+                tabulate_fields(cast("griffe.Class", each))
+        elif each.is_module:
+            edit(cast("griffe.Module", each))
+
+
+def quote_shapes(annotation: Any) -> None:
+    """Write the shapes of jaxtyping as strings again, because a one-letter shape was read as a name."""
+    if not isinstance(annotation, griffe.Expr):
+        return
+    for each in annotation.iterate(flat=False):
+        if each is not annotation:
+            quote_shapes(each)
+    if isinstance(annotation, griffe.ExprSubscript) and str(annotation.left) in SHAPED:
+        array, shape = cast("griffe.ExprTuple", annotation.slice).elements
+        text = str(shape).strip("\"'")
+        annotation.slice = griffe.ExprTuple([array, f'"{text}"'], implicit=True)
+
+
+def tabulate_fields(class_: griffe.Class) -> None:
+    """Move the fields of a dataclass from its members into a table below its docstring."""
+    fields = []
+    for name, member in list(class_.members.items()):
+        if name == "__init__" and member.lineno == 0:  # made from the fields
+            class_.del_member(name)
+        elif member.is_attribute and "property" not in member.labels and not name.startswith("_"):
+            field = cast("griffe.Attribute", member)
+            meaning = field.docstring.value if field.docstring else comment_of(field)
+            fields.append((field, meaning))
+            class_.del_member(name)
+    if not fields:
+        return
+    if any(field.value for field, _ in fields):
+        rows = [
+            griffe.DocstringParameter(
+                field.name, description=meaning, annotation=field.annotation, value=field.value
+            )
+            for field, meaning in fields
+        ]
+        section: griffe.DocstringSection = griffe.DocstringSectionParameters(rows, title="Fields")
+    else:
+        attributes = [
+            griffe.DocstringAttribute(field.name, description=meaning, annotation=field.annotation)
+            for field, meaning in fields
+        ]
+        section = griffe.DocstringSectionAttributes(attributes, title="Fields")
+    if class_.docstring:
+        class_.docstring.parsed.append(section)
+
+
+def comment_of(field: griffe.Attribute) -> str:
+    """Return the comment that explains a field: behind it, or else in the lines above it."""
+    lines = field.lines_collection[field.filepath]
+    last = lines[(field.endlineno or field.lineno or 1) - 1]
+    if "  # " in last:
+        return last.split("  # ", 1)[1]
+    above = []
+    for line in reversed(lines[: (field.lineno or 1) - 1]):
+        if not line.strip().startswith("# "):
+            break
+        above.append(line.strip().removeprefix("# "))
+    return " ".join(reversed(above))
