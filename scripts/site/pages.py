@@ -44,19 +44,20 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Return a page with links that lead to pages of the site, and with Markdown inside ``<details>``."""
+    if page.is_homepage:
+        page.meta["hide"] = ["navigation"]  # it has no neighbours
     origin = Path(page.file.abs_src_path or DOCS / page.file.src_uri)
     here = Path(page.file.src_uri).parent
 
     def link(found: re.Match[str]) -> str:
         text, path, anchor = found[1], found[2], found[3] or ""
         target = Path(os.path.normpath(origin.parent / path))
-        if target == Path(os.path.normpath(DOCS / here / path)) or not target.exists():
-            # Both worlds agree on this path, or MkDocs reports that it leads nowhere.
-            uri = path
+        if not target.is_relative_to(REPOSITORY) or not target.exists():
+            uri = path  # MkDocs reports it
         elif target.is_relative_to(DOCS):
             uri = os.path.relpath(target.relative_to(DOCS), here)
-        elif str(target.relative_to(REPOSITORY)) in PAGES:
-            uri = os.path.relpath(PAGES[str(target.relative_to(REPOSITORY))], here)
+        elif name := PAGES.get(str(target.relative_to(REPOSITORY))):
+            uri = os.path.relpath(name, here)
         else:
             return text[1:-1]  # the site has no page for other files of the repository
         return f"{text}({uri}{anchor})"
