@@ -36,9 +36,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             files.append(File.generated(config, page, abs_src_path=str(REPOSITORY / name)))
     for file in list(files):
         if file.src_uri.endswith(".ipynb"):
-            text = "\n\n".join(cells(json.loads(file.content_string)))
-            page = File.generated(config, file.src_uri.removesuffix(".ipynb") + ".md", content=text)
-            files.append(page)
+            name = Path(file.src_uri).name
+            download = f'<a href="{name}" download>Download this notebook</a>'
+            text = "\n\n".join([*cells(json.loads(file.content_string)), download])
+            page = file.src_uri.removesuffix(".ipynb") + ".md"
+            files.append(File.generated(config, page, content=text))
     return files
 
 
@@ -55,11 +57,12 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         if not target.is_relative_to(REPOSITORY) or not target.exists():
             uri = path  # MkDocs reports it
         elif target.is_relative_to(DOCS):
-            uri = os.path.relpath(target.relative_to(DOCS), here)
+            name = re.sub(r"\.ipynb$", ".md", str(target.relative_to(DOCS)))
+            uri = os.path.relpath(name, here)
         elif name := PAGES.get(str(target.relative_to(REPOSITORY))):
             uri = os.path.relpath(name, here)
         else:
-            return text[1:-1]  # the site has no page for other files of the repository
+            return text.lstrip("!")[1:-1]  # the site has no page for other files of the repository
         return f"{text}({uri}{anchor})"
 
     return LINK.sub(link, markdown).replace("<details>", '<details markdown="1">')
