@@ -87,6 +87,16 @@ def test_the_reference_has_shapes_comments_of_fields_and_docstrings(site):
     assert "Return the mask of Gaussians to grow: the one real difference between densifiers." in plain
 
 
+@pytest.mark.slow
+def test_no_docstring_is_misread_as_bold_text(site):
+    """No docstring means bold text; Markdown could read the signs of powers as such."""
+    bold = {
+        page.name: page.read_text(encoding="utf-8").count("<strong>") for page in site.glob("reference/*")
+    }
+    assert bold
+    assert not any(bold.values())
+
+
 @pytest.mark.parametrize("tag", ['<script src="https://a.example/x.js">', "@import '//a.example/x.css'"])
 def test_a_request_is_noticed(tag):
     assert REQUEST.search(tag)

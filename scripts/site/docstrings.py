@@ -10,6 +10,8 @@ from typing import Any, cast
 import griffe
 
 ROLE = re.compile(r":(?:class|func|meth|mod|data):`([^`]+)`")
+# A piece of code, or else the sign of a power, which Markdown would read as the begin of bold text.
+POWER = re.compile(r"(`+).+?\1|(?<=\w)\*\*(?=\w)")
 SHAPED = {"Float", "Int", "Bool", "UInt8", "Int64", "Shaped", "Num", "Real", "Complex"}
 
 
@@ -27,7 +29,7 @@ def edit(parent: griffe.Module | griffe.Class) -> None:
         if each.is_alias:
             continue
         if each.docstring:
-            each.docstring.value = ROLE.sub(r"`\1`", each.docstring.value)
+            each.docstring.value = as_markdown(each.docstring.value)
         if each.is_function:
             function = cast("griffe.Function", each)
             for annotation in [function.returns, *(value.annotation for value in function.parameters)]:
@@ -40,6 +42,11 @@ def edit(parent: griffe.Module | griffe.Class) -> None:
                 tabulate_fields(cast("griffe.Class", each))
         elif each.is_module:
             edit(cast("griffe.Module", each))
+
+
+def as_markdown(text: str) -> str:
+    """Return a docstring or a comment without what Markdown would read in another way."""
+    return POWER.sub(lambda found: found[0] if found[1] else r"\*\*", ROLE.sub(r"`\1`", text))
 
 
 def quote_shapes(annotation: Any) -> None:
@@ -63,7 +70,7 @@ def tabulate_fields(class_: griffe.Class) -> None:
             class_.del_member(name)
         elif member.is_attribute and "property" not in member.labels and not name.startswith("_"):
             field = cast("griffe.Attribute", member)
-            meaning = field.docstring.value if field.docstring else comment_of(field)
+            meaning = field.docstring.value if field.docstring else as_markdown(comment_of(field))
             fields.append((field, meaning))
             class_.del_member(name)
     if not fields:

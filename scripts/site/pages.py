@@ -27,6 +27,7 @@ PAGES = {
 }
 # A link or a picture with a path, possibly with an anchor.
 LINK = re.compile(r"(!?\[[^\[\]]*\])\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
+MODULE = re.compile(r"^::: cadam3d\.(\S+)$", re.MULTILINE)
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -65,7 +66,9 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             return text.lstrip("!")[1:-1]  # the site has no page for other files of the repository
         return f"{text}({uri}{anchor})"
 
-    return LINK.sub(link, markdown).replace("<details>", '<details markdown="1">')
+    markdown = LINK.sub(link, markdown).replace("<details>", '<details markdown="1">')
+    # The contents of a page of the reference name modules with their packages: prior.base, not base.
+    return MODULE.sub(r"\g<0>\n    options: {toc_label: \1}", markdown)
 
 
 def cells(notebook: dict[str, Any]) -> Iterator[str]:
