@@ -63,34 +63,39 @@ def quote_shapes(annotation: Any) -> None:
 
 
 def tabulate_fields(class_: griffe.Class) -> None:
-    """Move the fields of a dataclass from its members into a table below its docstring."""
-    fields = []
-    for name, member in list(class_.members.items()):
-        if name == "__init__" and member.lineno == 0:  # made from the fields
-            class_.del_member(name)
-        elif member.is_attribute and "property" not in member.labels and not name.startswith("_"):
-            field = cast("griffe.Attribute", member)
-            meaning = field.docstring.value if field.docstring else as_markdown(comment_of(field))
-            fields.append((field, meaning))
-            class_.del_member(name)
-    if not fields:
-        return
-    if any(field.value for field, _ in fields):
-        rows = [
-            griffe.DocstringParameter(
-                field.name, description=meaning, annotation=field.annotation, value=field.value
-            )
-            for field, meaning in fields
-        ]
-        section: griffe.DocstringSection = griffe.DocstringSectionParameters(rows, title="Fields")
-    else:
-        attributes = [
-            griffe.DocstringAttribute(field.name, description=meaning, annotation=field.annotation)
-            for field, meaning in fields
-        ]
-        section = griffe.DocstringSectionAttributes(attributes, title="Fields")
-    if class_.docstring:
-        class_.docstring.parsed.append(section)
+    """Move the fields of a dataclass from its members into a table below its docstring.
+
+    An ``__init__`` that griffe has made of the fields is left out.
+    """
+    init = class_.members.get("__init__")
+    if init is None:
+        return  # only a base is a dataclass
+    init = cast("griffe.Function", init)
+    if init.lineno == 0:
+        class_.del_member("__init__")
+    rows = []
+    for parameter in init.parameters:
+        field = class_.members.get(parameter.name)
+        if field is None or not field.is_attribute:
+            continue  # self, or a field of a base
+        field = cast("griffe.Attribute", field)
+        text = field.docstring.value if field.docstring else as_markdown(comment_of(field))
+        about = {"description": text, "annotation": field.annotation}
+        rows.append(griffe.DocstringParameter(parameter.name, value=parameter.default, **about))
+        class_.del_member(parameter.name)
+    if rows and class_.docstring:
+        class_.docstring.parsed.append(section_of(rows))
+
+
+def section_of(rows: list[griffe.DocstringParameter]) -> griffe.DocstringSection:
+    """Return the table of the fields, with a column of defaults if a field has one."""
+    if any(row.value is not None for row in rows):
+        return griffe.DocstringSectionParameters(rows, title="Fields")
+    attributes = [
+        griffe.DocstringAttribute(row.name, description=row.description, annotation=row.annotation)
+        for row in rows
+    ]
+    return griffe.DocstringSectionAttributes(attributes, title="Fields")
 
 
 def comment_of(field: griffe.Attribute) -> str:
