@@ -10,8 +10,8 @@ from typing import Any, cast
 import griffe
 
 ROLE = re.compile(r":(?:class|func|meth|mod|data):`([^`]+)`")
-# A piece of code, or else the sign of a power, which Markdown would read as the begin of bold text.
-POWER = re.compile(r"(`+).+?\1|(?<=\w)\*\*(?=\w)")
+# A piece of code, or else what Markdown would read as bold text (a power) or as a quotation (a first ``>``).
+MISREAD = re.compile(r"(`+).+?\1|(?<=\w)\*\*(?=\w)|^>")
 SHAPED = {"Float", "Int", "Bool", "UInt8", "Int64", "Shaped", "Num", "Real", "Complex"}
 
 
@@ -46,7 +46,8 @@ def edit(parent: griffe.Module | griffe.Class) -> None:
 
 def as_markdown(text: str) -> str:
     """Return a docstring or a comment without what Markdown would read in another way."""
-    return POWER.sub(lambda found: found[0] if found[1] else r"\*\*", ROLE.sub(r"`\1`", text))
+    text = ROLE.sub(r"`\1`", text)
+    return MISREAD.sub(lambda found: found[0] if found[1] else re.sub(".", r"\\\g<0>", found[0]), text)
 
 
 def quote_shapes(annotation: Any) -> None:
