@@ -48,7 +48,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Return a page with links that lead to pages of the site, and with Markdown inside ``<details>``."""
     if page.is_homepage:
-        page.meta["hide"] = ["navigation"]  # it has no neighbours
+        page.meta["hide"] = ["navigation", "toc"]  # it has no neighbours, and is short
     origin = Path(page.file.abs_src_path or DOCS / page.file.src_uri)
     here = Path(page.file.src_uri).parent
 
