@@ -1,4 +1,4 @@
-"""An extension of griffe, which reads docstrings for the reference: fields have comments, and types shapes.
+"""An extension of griffe, the program that reads docstrings for the reference pages of the site.
 
 ``mkdocs.yml`` names this file. Our dataclasses explain their fields in comments, and our types hold shapes as
 strings; both are read from the source, so that nothing has to be imported.
@@ -10,7 +10,7 @@ from typing import Any, cast
 import griffe
 
 ROLE = re.compile(r":(?:class|func|meth|mod|data):`([^`]+)`")
-# A piece of code, or else what Markdown would read as bold text (a power) or as a quotation (a first ``>``).
+# A piece of code, or else what Markdown would read as bold text (a power) or as a quotation (a ``>`` in front).
 MISREAD = re.compile(r"(`+).+?\1|(?<=\w)\*\*(?=\w)|^>")
 SHAPED = {"Float", "Int", "Bool", "UInt8", "Int64", "Shaped", "Num", "Real", "Complex"}
 
@@ -45,7 +45,7 @@ def edit(parent: griffe.Module | griffe.Class) -> None:
 
 
 def as_markdown(text: str) -> str:
-    """Return a docstring or a comment without what Markdown would read in another way."""
+    """Return a docstring or a comment with an escape wherever Markdown would misread it."""
     text = ROLE.sub(r"`\1`", text)
     return MISREAD.sub(lambda found: found[0] if found[1] else re.sub(".", r"\\\g<0>", found[0]), text)
 
@@ -100,7 +100,7 @@ def section_of(rows: list[griffe.DocstringParameter]) -> griffe.DocstringSection
 
 
 def comment_of(field: griffe.Attribute) -> str:
-    """Return the comment that explains a field: behind it, or else in the lines above it."""
+    """Return the comment that explains a field: at the end of its line, or else in the lines above."""
     lines = field.lines_collection[field.filepath]
     last = lines[(field.endlineno or field.lineno or 1) - 1]
     if "  # " in last:
