@@ -10,7 +10,7 @@ from typing import Any, cast
 import griffe
 
 ROLE = re.compile(r":(?:class|func|meth|mod|data):`([^`]+)`")
-# A piece of code, or else what Markdown would read as bold text (a power) or as a quotation (a ``>`` in front).
+# A piece of code, or else what Markdown would read as bold text (a power) or as a quotation (``>`` in front).
 MISREAD = re.compile(r"(`+).+?\1|(?<=\w)\*\*(?=\w)|^>")
 SHAPED = {"Float", "Int", "Bool", "UInt8", "Int64", "Shaped", "Num", "Real", "Complex"}
 
