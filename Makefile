@@ -1,6 +1,7 @@
 # make demo   install into .venv and train two objects: with the exact prior, and with a small network
 # make test   ruff, pyright and the whole test suite: everything that must hold before a merge
 # make check  ruff, pyright and the tests of what has changed since the last commit on main; less than a minute
+# make docs   build the documentation as a site into the folder site, strictly: no warning, no broken link
 # make clean  remove .venv and caches; outputs stay
 # PYTHON=python3.12 chooses the interpreter; JOBS=2 sets the number of test processes.
 
@@ -13,7 +14,7 @@ BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test check clean
+.PHONY: demo test check docs clean
 
 demo: .venv/.installed
 	$(BIN)/cadam3d train prompt="a red and yellow checkered torus"
@@ -34,8 +35,12 @@ check: .venv/.installed-dev
 	if [ -z "$$tests" ]; then echo "No tests belong to what has changed since $(BASE)."; \
 	else echo "Tests of what has changed since $(BASE): $$tests"; $(PYTEST) -m "not slow" $$tests; fi
 
+docs: .venv/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
+	@echo "Open site/index.html. To search it too, type: $(BIN)/python -m http.server --bind 127.0.0.1 --directory site"
+
 clean:
-	rm -rf .venv build dist .pytest_cache .ruff_cache
+	rm -rf .venv build dist site .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The installs are editable: a changed source needs no new install; changed dependencies do.
@@ -45,7 +50,11 @@ clean:
 
 .venv/.installed-dev: pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) ".[dev]"
-	@touch $@ .venv/.installed
+	@touch $@ .venv/.installed .venv/.installed-docs
+
+.venv/.installed-docs: pyproject.toml constraints.txt | $(BIN)/python
+	$(INSTALL) ".[docs]"
+	@touch $@
 
 $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "cadam3d needs Python 3.11, 3.12 or 3.13. Try: make $(MAKECMDGOALS) PYTHON=/path/to/python3.12"; exit 1; }

@@ -50,11 +50,15 @@ def tests_of_path(path: Path) -> set[Path]:
         case "tests" if path.name.startswith("test_"):
             selected = {REPOSITORY / path}
         case "tests" | "scripts":  # a helper of the tests beside it, or a script with a test of its own
-            selected = {*(REPOSITORY / path).parent.glob("test_*.py"), *TESTS.rglob(f"test_{path.stem}.py")}
+            names = (path.stem, path.parent.name)
+            selected = {test for name in names for test in TESTS.rglob(f"test_{name}.py")}
+            selected |= set((REPOSITORY / path).parent.glob("test_*.py"))
         case "pyproject.toml" | "Makefile" | "constraints.txt":
             selected = {TESTS / "test_packaging.py"}
+        case "mkdocs.yml" | "CITATION.cff":
+            selected = {TESTS / "test_site.py"}
         case _ if path.suffix == ".md":
-            selected = {TESTS / "test_docs.py", TESTS / "test_extending.py"}
+            selected = {TESTS / f"test_{name}.py" for name in ("docs", "extending", "site")}
     return selected
 
 

@@ -118,7 +118,8 @@ def test_the_source_archive_carries_what_its_own_tests_read(tmp_path):
     everything += [*find("tests", "*.py"), *REPOSITORY.glob("*.md")]
     everything += [path for files in models().values() for path in files]
     names = {str(path.relative_to(REPOSITORY)) for path in everything}
-    assert names | {"Makefile", "LICENSE", "pyproject.toml", "constraints.txt", ".ci/run"} <= set(modes)
+    names |= {"Makefile", "LICENSE", "pyproject.toml", "constraints.txt", "mkdocs.yml", "CITATION.cff"}
+    assert names | {".ci/run"} <= set(modes)
     assert modes[".ci/run"] & 0o100
 
 
@@ -228,6 +229,7 @@ def test_the_ci_runs_make_test_and_nothing_else():
         ("demo", 'train prompt="a red and yellow checkered torus"'),
         ("test", "-m pytest"),
         ("check", '-m "not slow"'),
+        ("docs", "-m mkdocs build"),
     ],
 )
 def test_a_make_target_runs_the_expected_command(goal, expected):

@@ -6,7 +6,7 @@ from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainSt
 
 
 class Callback(ABC):  # noqa: B024 (every hook has a sensible default: do nothing)
-    """Override the hooks that you need; the order of calls is start, (refine?, step, pause*)*, end."""
+    """Override the hooks that you need. The order of calls is ``start, (refine?, step, pause*)*, end``."""
 
     def on_start(self, context: RunContext, state: TrainState) -> None:  # noqa: B027
         """Called before the first step, also after a resume (then ``state.step`` > 0)."""
