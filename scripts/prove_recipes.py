@@ -1,7 +1,7 @@
 """Run every published recipe on the priors that come with cadam3d, and write a table and a picture.
 
     python scripts/prove_recipes.py --out outputs/recipes
-    python scripts/prove_recipes.py --out outputs/recipes --steps 600 --prompt "a green chair"
+    python scripts/prove_recipes.py --out outputs/recipes --steps 1200 --prompt "a green chair"
 
 A recipe keeps all its settings except four: the prior, the size of images (64 pixels, which the priors were
 trained on), the number of steps, and the number of points at the start, of which LucidDreamer's start makes
@@ -54,6 +54,9 @@ SETTINGS = (
     "exporter.preview.elevations_deg=[15]",
     "exporter.preview.labels=false",
     "exporter.preview.size=128",
+    # White stems show on grey. From this far, objects that have grown beyond the unit ball are visible as a whole.
+    "exporter.preview.background=[0.5,0.5,0.5]",
+    "exporter.preview.distance=4.5",
 )
 # What each column of the table shows, of the name of a recipe and the summary of its run.
 COLUMNS: dict[str, Callable[[str, dict[str, Any]], str]] = {
@@ -89,7 +92,7 @@ def main(line: Sequence[str] | None = None) -> None:
         "--out", type=Path, required=True, help="folder of the runs, the table and the picture"
     )
     parser.add_argument("--prompt", default="a red mushroom")
-    parser.add_argument("--steps", type=int, default=1200)
+    parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--recipes", nargs="+", choices=list(RECIPES), default=list(RECIPES))
     arguments, settings = parser.parse_known_args(line)
     out = arguments.out / trained_runs.folder_name(f"{arguments.prompt} {arguments.steps}", settings)
