@@ -1,10 +1,11 @@
 """CAdamStrategy: CAdam as a densification strategy of gsplat, in the place of its ``DefaultStrategy``.
 
-Written for gsplat 1.5.3; of its main branch it uses nothing that differs. The strategy observes what the
-optimizer of the means uses: the gradient is read by a hook that runs right before each step of that
-optimizer. At that time gradients of several cameras and of several backward passes have been added up, and
-the scale of a mixed-precision loss has been removed. A step that is skipped is not observed, and it does not
-matter how early the trainer clears its gradients.
+The strategy observes what the optimizer of the means uses: a hook reads the gradient right before each step
+of that optimizer. By then the gradients of several cameras and of several backward passes have been added
+up, and the scale of a mixed-precision loss has been removed. A step that is skipped is not observed, and it
+does not matter how early the trainer clears its gradients.
+
+This is written for gsplat 1.5.3, and uses nothing that differs on gsplat's main branch.
 """
 
 import warnings
@@ -50,8 +51,8 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
     """Grow the Gaussians whose gradient drifts consistently; clone, split and prune them as gsplat does.
 
     The settings of ``DefaultStrategy`` keep their names, defaults and meaning, except three: ``grow_grad2d``,
-    ``absgrad`` and ``key_for_gradient`` are accepted but have no effect, because the gates of CAdam replace
-    the threshold on screen-space gradients. Lengths (``grow_scale3d``, ``prune_scale3d``) are in units of
+    ``absgrad`` and ``key_for_gradient`` are accepted but ignored, because the gates of CAdam replace the
+    threshold on screen-space gradients. Lengths (``grow_scale3d``, ``prune_scale3d``) are in units of
     ``scene_scale``. Opacity resets lower the opacities of unreliable Gaussians only.
 
     The strategy is used like ``DefaultStrategy``, and also in loops for ``MCMCStrategy``, which pass ``lr``.
@@ -74,8 +75,8 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
         ]
         if changed:
             warnings.warn(
-                f"CAdamStrategy: {' and '.join(changed)} has no effect, because tau_Q and tau_SNR decide "
-                "which Gaussians grow.",
+                f"CAdamStrategy ignores {' and '.join(changed)}, because tau_Q and tau_SNR decide which "
+                "Gaussians grow.",
                 stacklevel=3,
             )
 
@@ -262,7 +263,7 @@ class _Observer:
 
     def __init__(self, optimizer: Optimizer, since: int) -> None:
         self.since = since  # first step
-        # Whether the optimizer is in its step. A subclass that calls the step of its parent runs hooks twice.
+        # Whether the optimizer is in its step. If a subclass calls the step of its parent, hooks run twice.
         self.is_stepping = False
         self._handles = (
             optimizer.register_step_pre_hook(_before_step),

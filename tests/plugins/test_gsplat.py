@@ -409,6 +409,20 @@ def test_an_optimizer_that_calls_the_step_of_its_parent_is_observed_once():
     assert_observed(toy.state, gradients)
 
 
+def test_a_step_of_the_optimizer_that_fails_does_not_end_the_observation(monkeypatch):
+    gradients = noise(3, 10)
+    toy = Toy(CAdamStrategy())
+    monkeypatch.setitem(toy.optimizers["means"].param_groups[0], "lr", None)
+    with pytest.raises(TypeError):
+        toy.step(0, gradients[0])
+    monkeypatch.undo()
+    for optimizer in toy.optimizers.values():
+        optimizer.zero_grad()
+    for step in (1, 2):
+        toy.step(step, gradients[step])
+    assert_observed(toy.state, gradients)
+
+
 def test_a_trainer_that_calls_the_strategy_before_the_optimizer_loses_the_gradients_that_gsplat_drops():
     """Operations of gsplat replace the parameters, so the optimizer does not get these gradients either."""
     torch.manual_seed(0)
@@ -594,7 +608,7 @@ def test_the_settings_of_default_strategy_keep_their_names_and_defaults():
 
 def test_settings_without_effect_are_accepted_with_a_warning():
     """Nerfstudio's splatfacto passes them to the strategy."""
-    with pytest.warns(UserWarning, match="grow_grad2d and absgrad has no effect"):
+    with pytest.warns(UserWarning, match="ignores grow_grad2d and absgrad, because"):
         CAdamStrategy(grow_grad2d=0.0008, absgrad=True)
 
 
