@@ -475,6 +475,18 @@ def test_a_run_that_is_saved_and_loaded_continues_to_the_bit():
         torch.testing.assert_close(loaded.params[name], rows, **EXACT)
 
 
+def test_the_state_of_the_last_call_is_updated():
+    gradients = noise(4, 10)
+    toy = Toy(CAdamStrategy())
+    toy.step(0, gradients[0])
+    first = toy.state
+    toy.state = toy.strategy.initialize_state()
+    for step in (1, 2, 3):
+        toy.step(step, gradients[step])
+    assert_observed(first, gradients[:1])
+    assert_observed(toy.state, gradients[1:])
+
+
 def test_nothing_is_observed_after_the_last_refinement():
     gradients = noise(5, 10)
     toy = Toy(CAdamStrategy(refine_stop_iter=3))
@@ -551,8 +563,8 @@ def test_faint_gaussians_are_pruned_at_refinements_and_large_ones_after_the_firs
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_size_on_screen_splits_and_prunes_as_in_gsplat(packed):
-    """A Gaussian is split from 0.3 of the image on and pruned from 0.6 on, until step 3."""
-    limits = {"grow_scale2d": 0.3, "prune_scale2d": 0.6, "refine_scale2d_stop_iter": 3}
+    """A Gaussian is split from 0.3 of the image on and pruned from 0.6 on, at steps 2 and 4."""
+    limits = {"grow_scale2d": 0.3, "prune_scale2d": 0.6, "refine_scale2d_stop_iter": 5}
     strategy = growing(tau_SNR=1e9, refine_every=2, reset_every=1, **limits)
     toy = Toy(strategy, n=3)
     # Radii in x and y, of two views, of images of 100 x 50 pixels.
@@ -561,14 +573,15 @@ def test_size_on_screen_splits_and_prunes_as_in_gsplat(packed):
     if packed:
         views, ids = radii[..., 0].nonzero(as_tuple=True)
         info = {**info, "radii": radii[views, ids], "gaussian_ids": ids.int()}
-    for step in range(4):
+    for step in range(5):
         shared = {**toy.shared, "info": info if step == 1 else {**info, "radii": info["radii"] * 0}}
         strategy.step_pre_backward(**shared, step=step)
         toy.loss(torch.ones(len(toy.params["means"]), 3)).backward()
         toy.optimize()
         strategy.step_post_backward(**shared, step=step, packed=packed)
-    # The first is split; the third is split too, and its children are as large as it was.
-    assert sorted(toy.state["age"].tolist()) == [1, 1, 4]
+    # The first is split. So is the third, but its children are pruned, because they inherit its size on screen.
+    # At step 4, sizes from before step 2 no longer count.
+    assert sorted(toy.state["age"].tolist()) == [2, 2, 5]
 
 
 def test_only_unreliable_opacities_are_reset_and_every_shape_of_opacities_works():
