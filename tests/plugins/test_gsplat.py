@@ -579,8 +579,8 @@ def test_size_on_screen_splits_and_prunes_as_in_gsplat(packed):
         toy.loss(torch.ones(len(toy.params["means"]), 3)).backward()
         toy.optimize()
         strategy.step_post_backward(**shared, step=step, packed=packed)
-    # The first is split. So is the third, but its children are pruned, because they inherit its size on screen.
-    # At step 4, sizes from before step 2 no longer count.
+    # The first is split. So is the third, but its children are pruned, because they inherit its size on
+    # screen. At step 4, sizes from before step 2 no longer count.
     assert sorted(toy.state["age"].tolist()) == [2, 2, 5]
 
 
