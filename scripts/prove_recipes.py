@@ -54,7 +54,7 @@ SETTINGS = (
     "exporter.preview.elevations_deg=[15]",
     "exporter.preview.labels=false",
     "exporter.preview.size=128",
-    # White stems show on grey. From this far, objects that have grown beyond the unit ball are visible as a whole.
+    # White stems show on grey, and from this far, objects larger than the unit ball are visible as a whole.
     "exporter.preview.background=[0.5,0.5,0.5]",
     "exporter.preview.distance=4.5",
 )

@@ -23,6 +23,7 @@ FLOORS = {
     **dict.fromkeys(("viewer",), 0.75),
     **dict.fromkeys(("camera", "background", "initializer", "rasterizer", "prior", "densifier"), 1.0),
     **dict.fromkeys(("augmentation", "optimizer", "exposure", "regularizer", "exporter", "metric"), 1.0),
+    **dict.fromkeys(("plugins",), 1.5),
     **dict.fromkeys(("state", "callback", "guidance"), 2.0),
     **dict.fromkeys(("trainer",), 3.0),
     **dict.fromkeys(("settings",), 4.0),

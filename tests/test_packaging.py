@@ -135,7 +135,8 @@ def test_every_imported_package_is_declared():
     """Core dependencies may be imported at the top of a module, those of an extra only inside functions."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     core = {re.match(r"[\w-]+", line).group() for line in project["dependencies"]}
-    extras = [project["optional-dependencies"][name] for name in ("diffusers", "formats", "texture")]
+    optional = project["optional-dependencies"]
+    extras = [optional[name] for name in ("diffusers", "formats", "gsplat", "texture")]
     extra = {re.match(r"[\w-]+", line).group() for lines in extras for line in lines}
     provides = metadata.packages_distributions()
     trees = [ast.parse(path.read_text(encoding="utf-8")) for path in find("cadam3d", "*.py")]

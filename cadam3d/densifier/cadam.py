@@ -89,13 +89,17 @@ class CAdam(Densifier[CAdamState]):
         )
 
     def observe(self, state: CAdamState, signal: GradientSignal) -> CAdamState:
-        """Return the moments after one more step (eq. 8 and 10), without waiting for the device.
+        """Return the moments after one more step; of the evidence, CAdam reads the gradient of the means."""
+        return self.update(state, signal.means)
+
+    def update(self, state: CAdamState, gradients: Float[Tensor, "n 3"]) -> CAdamState:
+        """Return the moments after one more gradient (eq. 8 and 10), without waiting for the device.
 
         These are Adam's operations in Adam's order, so with its betas the moments equal Adam's to the bit. If
         any gradient is NaN or infinite, the step changes nothing.
         """
-        is_finite = all_finite(signal.means)
-        gradients = torch.where(is_finite, signal.means, 0.0)
+        is_finite = all_finite(gradients)
+        gradients = torch.where(is_finite, gradients, 0.0)
         beta1, beta2 = float(self.beta1), float(self.beta2)
         decayed = state.v * torch.where(is_finite, beta2, 1.0)
         return CAdamState(

@@ -4,7 +4,7 @@ With the values of ``configs/densifier/cadam_open.yaml`` this is exactly ``cadam
 gives the reason for each value.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -74,7 +74,7 @@ class CAdamOpen(CAdam):
             gradients = torch.where(is_updated[:, None], gradients, 0.0)
         if self.grad_norm == "per_step_rms":
             gradients = _over_population_rms(gradients)
-        after = super().observe(state, replace(signal, means=gradients))
+        after = self.update(state, gradients)
         if is_updated is None:
             return after
         return CAdamState(

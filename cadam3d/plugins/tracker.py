@@ -1,0 +1,155 @@
+"""CAdamTracker: the moments of ``densifier=cadam`` for any trainer that has a tensor of means."""
+
+from collections.abc import Mapping
+from dataclasses import InitVar, dataclass, field, fields
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from cadam3d.core.checks import fail, require
+from cadam3d.densifier.cadam import CAdam, CAdamState
+from cadam3d.plugins.settings import CAdamSettings
+
+
+@dataclass(eq=False)
+class CAdamTracker(CAdamSettings):
+    """Running moments of the gradients of Gaussians, which say what to grow and which opacities to reset.
+
+    ``CAdamTracker(means)`` starts with as many Gaussians as ``means`` has rows, all newborn, on its device.
+    The trainer calls
+
+    - :meth:`observe` after each backward pass, before the optimizer moves anything,
+    - :meth:`select` to decide which Gaussians to clone or split, and :meth:`unreliable` to decide whose
+      opacity to reset,
+    - :meth:`append`, :meth:`keep` or :meth:`follow` whenever rows of its tensors are added or removed.
+
+    The arithmetic is that of ``densifier=cadam``. The moments take 28 bytes per Gaussian.
+    """
+
+    means: InitVar[Float[Tensor, "n 3"]]  # read for its number of rows and its device only
+    # Updates before a Gaussian may be called unreliable: one interval between refinements, the paper's K.
+    reset_min_age: int = field(default=100, kw_only=True)
+    state: CAdamState = field(init=False, repr=False)
+
+    def __post_init__(self, means: Float[Tensor, "n 3"]) -> None:
+        self.state = self.cadam().init_state(len(means), means.device)
+
+    def __len__(self) -> int:
+        return len(self.state.age)
+
+    def cadam(self) -> CAdam:
+        """Return the densifier with the current settings. Raises :class:`UserError` for a wrong value."""
+        return self._cadam(self.reset_min_age)
+
+    def observe(self, gradient: Tensor | None) -> None:
+        """Update the moments with the gradient of the loss to the means, in loss per world unit.
+
+        Call this once per step of the optimizer. The shape is (n, 3). The gradient may be sparse. If any of
+        its numbers is NaN or infinite, the step changes nothing. This does not wait for the device. Raises
+        :class:`UserError` if the tracker follows another number of Gaussians, or if there is no gradient.
+        """
+        if gradient is None or gradient.shape != (len(self), 3):
+            rows = len(self) if gradient is None else len(gradient)
+            remedies = {-1: "tracker.keep(mask)", 0: "tracker.observe(means.grad)"}
+            raise fail(
+                "observe",
+                expected=f"a gradient of shape ({len(self)}, 3), one row for each Gaussian of the tracker",
+                got=None if gradient is None else tuple(gradient.shape),
+                example=remedies.get(
+                    (rows > len(self)) - (rows < len(self)), f"tracker.append({rows - len(self)})"
+                ),
+            )
+        self.state = self.cadam().update(self.state, dense(gradient))
+
+    def select(self) -> Bool[Tensor, "n"]:
+        """Return the mask of Gaussians to grow (paper eq. 9 and 11). The trainer chooses how they grow."""
+        # CAdam draws nothing from the generator, and its thresholds do not depend on the step.
+        return self.cadam().select(self.state, 0, torch.Generator())
+
+    def unreliable(self) -> Bool[Tensor, "n"]:
+        """Return the mask of Gaussians whose opacity a reset lowers (paper eq. 13)."""
+        return self.cadam().unreliable(self.state)
+
+    def scores(self) -> dict[str, Float[Tensor, "n"]]:
+        """Return drift and noise, in loss per world unit, and ``snr``, their ratio, for logs and pictures."""
+        return self.cadam().scores(self.state)
+
+    def append(self, count: int) -> None:
+        """Add ``count`` newborn Gaussians after all others; newborns start at zero with age 0 (sec. 4.2)."""
+        rows = torch.arange(len(self), device=self.state.age.device)
+        self.follow(torch.cat([rows, rows.new_full((count,), -1)]))
+
+    def keep(self, mask: Bool[Tensor, "n"]) -> None:
+        """Remove all Gaussians that ``mask`` does not mark; the others keep their order and their history."""
+        require(
+            mask.shape == (len(self),),
+            "keep",
+            expected=f"a mask of {len(self)} Gaussians",
+            got=tuple(mask.shape),
+            example="tracker.keep(~pruned)",
+        )
+        self.follow(mask.nonzero()[:, 0])
+
+    def follow(self, rows: Int[Tensor, "after"]) -> None:
+        """Follow any other change: ``rows`` has the old row number of each Gaussian, or -1 for a newborn.
+
+        With it, Gaussians can change their order, and a child can take the place of its parent.
+        """
+        rows = rows.to(self.state.age.device)
+        in_range = bool(((rows >= -1) & (rows < len(self))).all())
+        require(
+            in_range,
+            "follow",
+            expected=f"row numbers from -1 to {len(self) - 1}",
+            got=rows.tolist() if len(rows) < 10 else f"numbers from {int(rows.min())} to {int(rows.max())}",
+            example="tracker.follow(torch.tensor([0, 1, -1]))",
+        )
+
+        def carry(history: Tensor) -> Tensor:
+            # Row -1 is the last one, which holds zeros.
+            return torch.cat([history, history.new_zeros((1, *history.shape[1:]))])[rows]
+
+        self.state = CAdamState(**{name: carry(history) for name, history in self.state.to_dict().items()})
+
+    def to(self, device: torch.device | str) -> "CAdamTracker":
+        """Move the moments to ``device`` and return this tracker."""
+        self.state = CAdamState(
+            **{name: history.to(device) for name, history in self.state.to_dict().items()}
+        )
+        return self
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the moments by name, for a checkpoint. The settings are not part of it."""
+        return self.state.to_dict()
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Continue from what :meth:`state_dict` returned, on the device of this tracker.
+
+        The number of Gaussians becomes that of ``state``. Raises :class:`UserError` if ``state`` is not a
+        state of a tracker.
+        """
+        names = [each.name for each in fields(CAdamState)]
+        is_tensors = sorted(state) == sorted(names) and all(
+            isinstance(each, Tensor) for each in state.values()
+        )
+        blank = self.cadam().init_state(state["age"].numel() if is_tensors else 0, self.state.age.device)
+        require(
+            is_tensors
+            and all(
+                state[name].shape == like.shape and state[name].dtype == like.dtype
+                for name, like in blank.to_dict().items()
+            ),
+            "load_state_dict",
+            expected=f"the tensors {', '.join(names)} that state_dict() returned",
+            got={
+                name: tuple(each.shape) if isinstance(each, Tensor) else each for name, each in state.items()
+            },
+            example='tracker.load_state_dict(checkpoint["cadam"])',
+        )
+        self.state = CAdamState(**{name: state[name].to(blank.age.device, copy=True) for name in names})
+
+
+def dense(gradient: Tensor) -> Float[Tensor, "n 3"]:
+    """Return a gradient as float32, outside autograd; rows that a sparse gradient leaves out are zero."""
+    return gradient.detach().to_dense().float()
