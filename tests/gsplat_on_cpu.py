@@ -1,9 +1,9 @@
 """A stand-in for ``gsplat.rasterization`` on a CPU, made of gsplat's own pure torch functions.
 
-gsplat's projection, spherical harmonics and ``accumulate`` run anywhere. Three parts are CUDA only and are
-written here after its documentation and the comments of its kernels: the radii with their opacity-aware box,
-the list of (Gaussian, pixel) pairs that are blended, and the absolute gradients. ``accumulate`` needs two small
-functions of ``nerfacc``, which are written here too.
+gsplat's projection, spherical harmonics and ``accumulate`` run anywhere. Three parts exist on CUDA only and
+are written here from its documentation: the radii with their opacity-aware box, the list of (Gaussian, pixel)
+pairs that are blended, and the absolute gradients. ``accumulate`` needs two small functions of ``nerfacc``,
+which are written here too.
 
 Like the kernels, the stand-in leaves garbage in the rows of Gaussians that a view does not see.
 """
@@ -24,7 +24,16 @@ SIGNATURE = inspect.signature(gsplat.rasterization)
 CAP, THRESHOLD, STOP = 0.999, 1 / 255, 1e-4
 # The arguments that the stand-in understands. It refuses other values of the remaining ones.
 KNOWN = {"means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height"}
-KNOWN |= {"near_plane", "far_plane", "eps2d", "sh_degree", "packed", "tile_size", "backgrounds", "render_mode"}
+KNOWN |= {
+    "near_plane",
+    "far_plane",
+    "eps2d",
+    "sh_degree",
+    "packed",
+    "tile_size",
+    "backgrounds",
+    "render_mode",
+}
 KNOWN |= {"absgrad", "rasterize_mode"}
 
 
@@ -40,7 +49,7 @@ def rasterization(*args, **kwargs) -> tuple[Tensor, Tensor, dict]:
 
 
 def _render(given: dict) -> tuple[Tensor, Tensor, dict]:
-    dtype, width, height = given["means"].dtype, given["width"], given["height"]
+    dtype = given["means"].dtype
     v, n = given["viewmats"].shape[0], given["means"].shape[0]
     exact = {name: value.double() for name, value in given.items() if isinstance(value, Tensor)}
     radii, means2d, conics, features, seen = [], [], [], [], []
@@ -57,7 +66,7 @@ def _render(given: dict) -> tuple[Tensor, Tensor, dict]:
     pictures = []
     for view, (rows, depth, opacities) in enumerate(seen):
         table = (conics[view][rows], opacities, features[view], depth)
-        pictures.append(_blend(centres, view, rows, table, width, height, given["absgrad"]))
+        pictures.append(_blend(centres, view, rows, table, given))
     sums, alphas = (torch.stack(each) for each in zip(*pictures, strict=True))
     if given["backgrounds"] is not None:
         behind = torch.nn.functional.pad(exact["backgrounds"], (0, 1))
@@ -105,7 +114,12 @@ def _project(
         calc_compensations=given["rasterize_mode"] == "antialiased",
     )
     opacities = exact["opacities"][rows]
-    return centres[0], depths[0], conics[0], opacities if compensations is None else opacities * compensations[0]
+    return (
+        centres[0],
+        depths[0],
+        conics[0],
+        opacities if compensations is None else opacities * compensations[0],
+    )
 
 
 def _colors(given: dict, exact: dict[str, Tensor], view: int, rows: Tensor) -> Tensor:
@@ -117,15 +131,16 @@ def _colors(given: dict, exact: dict[str, Tensor], view: int, rows: Tensor) -> T
 
 
 def _blend(
-    centres: Tensor, view: int, rows: Tensor, table: tuple[Tensor, ...], width: int, height: int, absgrad: bool
+    centres: Tensor, view: int, rows: Tensor, table: tuple[Tensor, ...], given: dict
 ) -> tuple[Tensor, Tensor]:
     """Return the sums of the features [h w 4] and of one [h w 1] over the Gaussians of each pixel."""
     conics, opacities, features, depths = table
+    width, height = given["width"], given["height"]
     own = centres[view].double()[rows]
     gaussians, pixels = _pairs(own, conics, opacities, depths, width, height)
     # Each pair has a centre of its own, so that its gradient can be seen alone.
     own = own[gaussians]
-    if absgrad and own.requires_grad:
+    if given["absgrad"] and own.requires_grad:
         own.register_hook(lambda grad: _add_absolutes(centres, view, rows[gaussians], grad))
     with patch.dict(sys.modules, {"nerfacc": _nerfacc()}):
         sums, alpha = parts.accumulate(
@@ -139,7 +154,8 @@ def _blend(
             width,
             height,
         )
-    return sums[0], alpha[0]
+    # The kernels give every input a gradient, if only of zeros.
+    return sums[0], alpha[0] + 0.0 * sums[0, ..., :1]
 
 
 @torch.no_grad()
