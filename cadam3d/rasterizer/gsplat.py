@@ -1,12 +1,12 @@
 """The gsplat rasterizer: nerfstudio's CUDA library behind the interface of this project.
 
-One call of ``gsplat.rasterization`` renders all views. Its image formation is ours with other numbers in one
-place: it caps alpha at 0.999, we at ``ALPHA_MAX``. The rest of this file translates conventions:
+One call of ``gsplat.rasterization`` renders all views. Its image formation is ours, except that alpha is
+capped at 0.999 instead of ``ALPHA_MAX``. This file translates the conventions:
 
-* raw tensors become activations, and Gaussians that we cull are hidden, because gsplat computes with NaN;
-* ``radii`` become ours, which are not rounded, so that both see the same Gaussians in each view;
-* ``means2d`` of gsplat is a node of the graph, but contains garbage where a Gaussian was not seen;
-* the absolute gradients, an attribute in gsplat, become the gradient of a tensor of zeros.
+* raw tensors become activations, and Gaussians that are not finite are hidden, because gsplat draws NaN;
+* radii become exact, so that the same Gaussians count as seen in each view as with every other backend;
+* ``means2d`` stays the node of gsplat's graph, and the garbage in rows that were not seen becomes zeros;
+* absolute gradients, an attribute in gsplat, become the gradient of a tensor of zeros.
 
 gsplat is optional and is imported at the first use. It may then compile its kernels for minutes.
 """
@@ -43,9 +43,9 @@ Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 TILE = 16  # pixels along the edge of a tile; gsplat tests no other number
 # The fourth power of a splat's size must fit into float32, or gsplat draws NaN.
 SIZE_MAX = 1e9  # pixels
-# After this time without a result, a line says that the kernels are being compiled.
+# If loading takes longer, a line gives the probable reason.
 PATIENCE = 5.0  # seconds
-COMPILING = "gsplat compiles its CUDA kernels, once on this machine. This can take several minutes ..."
+LOADING = "Loading gsplat. Its first use on a machine compiles CUDA kernels, which takes several minutes ..."
 SHOW_BUILD = 'python -c "import gsplat.cuda._backend"'
 
 
@@ -53,7 +53,7 @@ SHOW_BUILD = 'python -c "import gsplat.cuda._backend"'
 class GsplatRasterizer(Rasterizer):
     """Renders in float32 on a CUDA device with the package ``gsplat``.
 
-    Images and their dtype follow the Gaussians, and autocast is off inside; ``means2d`` stays float32.
+    Other dtypes are converted on the way in and out, except ``means2d``, and autocast is off inside.
     Gradients are summed with atomics, so their last bits change from run to run.
     """
 
@@ -99,15 +99,17 @@ def load_rasterization(device: torch.device) -> Rasterization:
 @cache
 def _load(device: torch.device) -> Rasterization | str:
     """Return ``gsplat.rasterization``, or the message of an error, so that a failed build is not repeated."""
-    news = Timer(PATIENCE, print, [COMPILING], {"file": sys.stderr, "flush": True})
+    news = Timer(PATIENCE, print, [LOADING], {"file": sys.stderr, "flush": True})
     news.start()
     try:
-        # gsplat reports on its build in colours, on the output that a program may read from ours.
+        # gsplat reports about its build on the standard output, which belongs to the results of a command.
         with redirect_stdout(StringIO()):
             gsplat = import_module("gsplat")
             # The first kernel that is needed compiles or loads all of them.
             turn, scale = torch.ones(1, 4, device=device), torch.ones(1, 3, device=device)
             gsplat.quat_scale_to_covar_preci(turn, scale, compute_preci=False)
+            # A kernel that was compiled for another GPU is reported only now.
+            torch.cuda.synchronize(device)
             return gsplat.rasterization
     except Exception as error:
         # A build may raise anything.
@@ -119,7 +121,7 @@ def _load(device: torch.device) -> Rasterization | str:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         return (
             f"rasterizer=gsplat: the kernels of gsplat cannot be built or loaded ({reason}). "
-            f"The complete output of the build follows. Try: {SHOW_BUILD}"
+            f"This repeats the build and prints all of its output. Try: {SHOW_BUILD}"
         )
     finally:
         news.cancel()
