@@ -7,6 +7,7 @@ import ast
 import inspect
 import math
 import sys
+import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -33,7 +34,7 @@ from splats import (
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import FIELDS
 from cadam3d.rasterizer import gsplat as adapter
-from cadam3d.rasterizer.base import Backend, Rasterizer
+from cadam3d.rasterizer.base import FAR, Backend, Rasterizer
 from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import GSPLAT, self_test
@@ -219,12 +220,18 @@ def test_a_number_that_is_not_finite_is_culled_and_leaves_no_trace(field):
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_a_bad_number_never_spreads_to_other_gaussians(field):
+def test_a_bad_number_reaches_neither_gsplat_nor_other_gaussians(field):
+    def spy(**given):
+        assert all(t.isfinite().all() for t in given.values() if isinstance(t, torch.Tensor))
+        # Products with a matrix stay finite.
+        assert (given["means"].abs() < FAR).all()
+        return rasterization(**given)
+
     # A colour of 1e38 is visible, and the gradients of its neighbours rightly exceed float32.
     for value in (value for value in POISON if (field, abs(value)) != ("sh", 1e38)):
         gaussians, cameras = make_gaussians(6, degree=1), make_cameras(1, 7, 9)
         getattr(gaussians, field).view(6, -1)[3] = value
-        output, grads = differentiate(gaussians, cameras)
+        output, grads = differentiate(gaussians, cameras, spy)
         for tensor in bits(output, grads):
             assert tensor.isfinite().all(), value
 
@@ -251,11 +258,16 @@ def test_what_the_interface_culls_leaves_no_trace(field, value):
 
 @pytest.mark.parametrize("length", [1.1e-6, 1e3, 1e18, 1e30])
 def test_the_length_of_any_other_quaternion_does_not_matter(length):
+    def spy(**given):
+        # gsplat squares them in float32.
+        assert (given["quats"].abs().amax(dim=1) == 1).all()
+        return rasterization(**given)
+
     gaussians, cameras = make_gaussians(4), make_cameras(1, 9, 9)
     gaussians.quats = torch.nn.functional.normalize(gaussians.quats)
     plain, long = (replace(gaussians, quats=gaussians.quats * factor) for factor in (1.0, length))
-    first, grads = differentiate(plain, cameras)
-    second, long_grads = differentiate(long, cameras)
+    first, grads = differentiate(plain, cameras, spy)
+    second, long_grads = differentiate(long, cameras, spy)
     assert_close("rgb", second.rgb, first.rgb, 1e-5)
     assert_close("gradient of quats", long_grads["quats"] * length, grads["quats"], 1e-4)
 
@@ -371,6 +383,7 @@ def test_inputs_are_not_modified():
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
 def test_gsplat_computes_in_float32_and_images_have_the_dtype_of_the_gaussians(dtype):
     def spy(**given):
+        assert not torch.is_autocast_enabled("cpu")
         assert all(t.dtype == torch.float32 for t in given.values() if isinstance(t, torch.Tensor))
         return rasterization(**given)
 
@@ -421,6 +434,8 @@ def test_gsplat_with_kernels_is_ready(a_gpu, monkeypatch):
     library(monkeypatch, lambda *args, **kwargs: None)
     assert GsplatRasterizer().prepare(GPU) == Backend("gsplat", reason=None)
     assert adapter.load_rasterization(GPU) is gsplat.rasterization
+    timers = [thread for thread in threading.enumerate() if isinstance(thread, threading.Timer)]
+    assert all(timer.finished.is_set() for timer in timers), "nothing is announced afterwards"
 
 
 def test_a_device_without_cuda_is_refused(a_gpu, monkeypatch):
