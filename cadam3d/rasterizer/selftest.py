@@ -5,8 +5,7 @@ capped, and a pixel stops at ``TRANSMITTANCE_MIN``. A number that is within roun
 either side of it, and no tolerance can cover the difference. So the scene is fixed, and none of its numbers
 is within 1e-4 of a step, which is hundreds of rounding errors. Still, the scene exercises every step.
 
-A library of others may have other steps and larger rounding errors. :class:`Demands` states what the test
-demands of it.
+Another library may have other steps and larger rounding errors, so :class:`Demands` belongs to a rasterizer.
 """
 
 import math
@@ -34,14 +33,14 @@ IMAGES = ("rgb", "alpha", "depth")
 
 @dataclass(frozen=True, kw_only=True)
 class Demands:
-    """What the self-test demands of a rasterizer.
+    """Limits that a rasterizer must keep in the self-test.
 
     The largest accepted deviations are relative to the largest number of each tensor. One splat that is
     missing in one tile causes more than 1e-3.
     """
 
-    images: float
-    gradients: float
+    images: float  # largest deviation of an image
+    gradients: float  # largest deviation of a gradient
     same_bits: bool  # whether a second run must give the same bits
     most_opacity: float = 1.0  # more opaque Gaussians of the scene are reduced to this
 
