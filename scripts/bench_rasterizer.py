@@ -19,7 +19,6 @@ from typing import NoReturn
 import torch
 from omegaconf import OmegaConf
 from rasterizer_bench.check import check, check_long_sort
-from rasterizer_bench.gsplat_yardstick import GsplatRasterizer, why_absent
 from rasterizer_bench.report import HEADER, SceneStages, make_rows, show_stages, start_report
 from rasterizer_bench.scenes import make_scene, make_shell
 from rasterizer_bench.stages import copy_speed, time_stages
@@ -47,7 +46,7 @@ DEFAULTS = {
         "degrees": [0, 3],
     },
 }
-# The only backend without a file in configs/rasterizer.
+# A yardstick that is optional: it is skipped where it cannot run.
 GSPLAT = "gsplat"
 # The size of the copy that determines the floor of each stage.
 COPY_BYTES = {"cuda": 2**31, "cpu": 2**25}
@@ -84,9 +83,7 @@ def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
     several = {"nargs": "+", "metavar": "N"}
     known = sorted(path.stem for path in (config_dir() / "rasterizer").glob("*.yaml"))
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument(
-        "--backends", nargs="+", choices=[*known, GSPLAT], help="ratios are relative to the first one"
-    )
+    parser.add_argument("--backends", nargs="+", choices=known, help="ratios are relative to the first one")
     parser.add_argument("--counts", type=whole(1), **several, help="numbers of Gaussians")
     parser.add_argument("--sizes", type=whole(1), **several, help="sizes of the square images, in pixels")
     parser.add_argument("--views", type=whole(1), **several, help="numbers of views rendered at once")
@@ -117,12 +114,14 @@ def make_backends(names: Sequence[str], device: torch.device) -> dict[str, Raste
     """
     backends: dict[str, Rasterizer] = {}
     for name in names:
-        if name != GSPLAT:
-            backends[name] = component(OmegaConf.load(config_dir() / "rasterizer" / f"{name}.yaml"))
-        elif reason := why_absent(device):
-            print(f"gsplat is skipped: {reason}", flush=True)
-        else:
-            backends[name] = GsplatRasterizer()
+        rasterizer: Rasterizer = component(OmegaConf.load(config_dir() / "rasterizer" / f"{name}.yaml"))
+        if name == GSPLAT:
+            try:
+                rasterizer.prepare(device)
+            except UserError as error:
+                print(f"gsplat is skipped: {error}", flush=True)
+                continue
+        backends[name] = rasterizer
     if not backends:
         raise UserError("no backend is left. Try: --backends cuda")
     return backends

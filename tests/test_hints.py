@@ -122,6 +122,7 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         (*A_CUBE, "densifier.reset=everything"),
         (*A_CUBE, "densifier=cadam_open", "densifier.reset=all", "densifier.tau_reset=1"),
         (*A_CUBE, "rasterizer=cuda"),
+        (*A_CUBE, "rasterizer=gsplat"),
     ],
     "prompts": [
         ("train", "prompt=a red cuube"),

@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping
 from functools import partial
+from importlib.metadata import PackageNotFoundError, version
 
 import torch
 
@@ -14,10 +15,13 @@ from cadam3d.rasterizer.auto import AutoRasterizer
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cpu import CpuRasterizer, instruction_set
 from cadam3d.rasterizer.cuda import CudaRasterizer
+from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.rasterizer.selftest import self_test
+from cadam3d.rasterizer.selftest import ATOMIC, GSPLAT, OWN, Demands, self_test
 
 CPU = torch.device("cpu")
+# Failures that do not end a training, because auto chooses another backend then.
+REPLACED = ("rasterizer=cuda", "rasterizer=gsplat")
 
 
 def check_rasterizers() -> Iterator[Finding]:
@@ -25,15 +29,22 @@ def check_rasterizers() -> Iterator[Finding]:
     gpus = [torch.device("cuda", i) for i in range(torch.cuda.device_count())]
     yield (kernels := attempt("kernels for cpu", _cpu_kernels))
     if kernels.verdict is Verdict.OK:
-        yield _tested("rasterizer=cpu", CpuRasterizer(cache_dir=None), CPU)
+        yield _tested("rasterizer=cpu", CpuRasterizer(cache_dir=None), CPU, OWN)
     if not gpus:
         yield attempt("kernels for cuda", _no_cuda)
     for gpu in gpus:
         yield (kernels := attempt("kernels for cuda", partial(_cuda_kernels, gpu)))
         if kernels.verdict is Verdict.OK:
-            yield _tested("rasterizer=cuda", CudaRasterizer(cache_dir=None), gpu)
+            yield _tested("rasterizer=cuda", CudaRasterizer(cache_dir=None), gpu, OWN)
+    if not gpus:
+        yield _gsplat_without_gpu()
+    for gpu in gpus:
+        yield (kernels := attempt("kernels for gsplat", partial(_gsplat_kernels, gpu)))
+        if kernels.verdict is Verdict.OK:
+            yield _tested("rasterizer=gsplat", GsplatRasterizer(), gpu, GSPLAT)
     for device in (CPU, *gpus):
-        yield _tested("rasterizer=reference", ReferenceRasterizer(), device)
+        demands = OWN if device == CPU else ATOMIC
+        yield _tested("rasterizer=reference", ReferenceRasterizer(), device, demands)
     for device in (CPU, *gpus):
         yield attempt("rasterizer=auto", partial(_choice, device))
 
@@ -74,13 +85,36 @@ def _no_cuda() -> Finding:
     return Finding("kernels for cuda", Verdict.NOTE, found, facts=facts)
 
 
-def _tested(topic: str, rasterizer: Rasterizer, device: torch.device) -> Finding:
-    return attempt(topic, partial(_test, topic, rasterizer, device))
+def _gsplat_without_gpu() -> Finding:
+    installed = _gsplat_version()
+    found = f"gsplat {installed} is installed" if installed else "gsplat is not installed, not needed"
+    return Finding("kernels for gsplat", Verdict.NOTE, f"torch sees no CUDA device; {found}")
 
 
-def _test(topic: str, rasterizer: Rasterizer, device: torch.device) -> Finding:
+def _gsplat_kernels(device: torch.device) -> Finding:
     start = time.perf_counter()
-    agreement = self_test(rasterizer, device)
+    GsplatRasterizer().prepare(device)
+    seconds = time.perf_counter() - start
+    installed, name = _gsplat_version(), torch.cuda.get_device_name(device)
+    facts = {"device": name, "version": installed, "load_seconds": seconds}
+    found = f"gsplat {installed} for {name}, loaded in {seconds:.1f} s"
+    return Finding("kernels for gsplat", Verdict.OK, found, facts=facts)
+
+
+def _gsplat_version() -> str | None:
+    try:
+        return version("gsplat")
+    except PackageNotFoundError:
+        return None
+
+
+def _tested(topic: str, rasterizer: Rasterizer, device: torch.device, demands: Demands) -> Finding:
+    return attempt(topic, partial(_test, topic, rasterizer, device, demands))
+
+
+def _test(topic: str, rasterizer: Rasterizer, device: torch.device, demands: Demands) -> Finding:
+    start = time.perf_counter()
+    agreement = self_test(rasterizer, device, demands)
     facts = {
         "device": str(device),
         "agrees": agreement.holds,
@@ -90,11 +124,9 @@ def _test(topic: str, rasterizer: Rasterizer, device: torch.device) -> Finding:
         "seconds": time.perf_counter() - start,
     }
     found = f"{agreement}, on {device}"
-    promises_bits = topic != "rasterizer=reference" or device.type == "cpu"
-    if agreement.holds and (agreement.repeats or not promises_bits):
+    if agreement.passes:
         return Finding(topic, Verdict.OK, found, facts=facts)
-    # auto does not choose a backend that fails, so training still works.
-    verdict = Verdict.NOTE if topic == "rasterizer=cuda" else Verdict.BROKEN
+    verdict = Verdict.NOTE if topic in REPLACED else Verdict.BROKEN
     return Finding(
         topic, verdict, found, "Please report this. Until it is fixed, use rasterizer=reference", facts
     )
@@ -107,7 +139,7 @@ def _choice(device: torch.device) -> Finding:
         found = f"chooses {backend.name} on {device}: the fastest there is, and it works"
         return Finding("rasterizer=auto", Verdict.OK, found, facts=facts)
     first, *others = backend.reason.splitlines()
-    found = f"chooses {backend.name} on {device}, which is slow: {first}"
+    found = f"chooses {backend.name} on {device}{backend.remark}: {first}"
     return Finding("rasterizer=auto", Verdict.NOTE, found, others[-1] if others else "", facts)
 
 

@@ -44,9 +44,9 @@ def note(text: str) -> None:
 
 
 def note_backend(backend: Backend) -> None:
-    """Print a note if a slow backend renders because a faster one is not available."""
+    """Print a note if another backend renders because a faster one is not available."""
     if backend.reason:
-        note(f"rendering with rasterizer={backend.name}, which is slow: {backend.reason}")
+        note(f"rendering with rasterizer={backend.name}{backend.remark}: {backend.reason}")
 
 
 def note_omission(name: str, omission: str | None) -> None:

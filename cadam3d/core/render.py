@@ -25,7 +25,7 @@ class RenderOutput:
     alpha: Float[Tensor, "v h w"]  # in [0, 1)
     # Expected camera z, sum(w z) / sum(w), in world units; 0 where alpha is 0.
     depth: Float[Tensor, "v h w"]
-    means2d: Float[Tensor, "v n 2"]  # pixels; keeps its gradient while training
+    means2d: Float[Tensor, "v n 2"]  # pixels; keeps its gradient while training; meaningless if not seen
     radii: Float[Tensor, "v n"]  # pixels; 0 = not seen
     # Zeros, only on request and if gradients are on. The gradient that a backward pass leaves on them is not
     # a derivative but the sum over pixels of |dLoss/dmeans2d|, separately for each axis (AbsGS).

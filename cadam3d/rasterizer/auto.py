@@ -1,6 +1,6 @@
 """The automatic choice of a rasterizer: the fastest that works on the device of the Gaussians."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -15,17 +15,18 @@ from cadam3d.core.render import RenderOutput
 from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.rasterizer.cpu import CpuRasterizer
 from cadam3d.rasterizer.cuda import CudaRasterizer
+from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.rasterizer.selftest import self_test
+from cadam3d.rasterizer.selftest import GSPLAT, OWN, Demands, self_test
 
-REPORT = "Please report this with the output of `cadam3d doctor`. Try: rasterizer=reference"
+REPORT = "Please report this with what the following prints. Try: cadam3d doctor"
 
 
 @dataclass(frozen=True, kw_only=True)
 class AutoRasterizer(Rasterizer):
     """Renders with the compiled kernels for the device of the Gaussians, or else with the reference.
 
-    The choice is made once per device and process.
+    On CUDA, gsplat comes between them. The choice is made once per device and process.
     """
 
     def render(
@@ -39,7 +40,7 @@ class AutoRasterizer(Rasterizer):
         return choose(gaussians.device).rasterizer.render(gaussians, cameras, background, absgrad)
 
     def prepare(self, device: torch.device) -> Backend:
-        """See :meth:`Rasterizer.prepare`. If the reference was chosen as a fallback, the reason is given."""
+        """See :meth:`Rasterizer.prepare`. If the choice is not the fastest, the reason is given."""
         return choose(device).backend
 
 
@@ -60,15 +61,23 @@ def choose(device: torch.device) -> Choice:
 
 @cache
 def _choose(device: torch.device) -> Choice:
+    failures: list[str] = []
+    for name, candidate in FASTEST.get(device.type, {}).items():
+        try:
+            rasterizer = candidate(device)
+            backend = rasterizer.prepare(device)
+            return Choice(rasterizer, replace(backend, reason=_reason(failures)))
+        except UserError as error:
+            _refuse_broken(name, device)
+            failures.append(str(error))
     reference = ReferenceRasterizer()
-    if device.type not in FASTEST:
-        return Choice(reference, reference.prepare(device))
-    try:
-        rasterizer = FASTEST[device.type](device)
-        return Choice(rasterizer, rasterizer.prepare(device))
-    except UserError as error:
-        _refuse_broken(device)
-        return Choice(reference, replace(reference.prepare(device), reason=str(error)))
+    return Choice(reference, replace(reference.prepare(device), reason=_reason(failures)))
+
+
+def _reason(failures: Sequence[str]) -> str | None:
+    """Return all messages as one, with what to type in the last one; ``None`` if there is none."""
+    whole = [*(message.partition(" Try: ")[0] for message in failures[:-1]), *failures[-1:]]
+    return " ".join(whole) or None
 
 
 def native_cpu(device: torch.device) -> Rasterizer:
@@ -80,30 +89,39 @@ def native_cpu(device: torch.device) -> Rasterizer:
 
 def checked_cuda(device: torch.device) -> Rasterizer:
     """Return the CUDA rasterizer. Raises :class:`UserError` unless it passes the self-test on ``device``."""
-    rasterizer = CudaRasterizer(cache_dir=None)
-    rasterizer.prepare(device)
-    name = torch.cuda.get_device_name(device)
+    return _checked(CudaRasterizer(cache_dir=None), device, OWN)
+
+
+def checked_gsplat(device: torch.device) -> Rasterizer:
+    """Return gsplat. Raises :class:`UserError` unless it is installed and passes the self-test."""
+    return _checked(GsplatRasterizer(), device, GSPLAT)
+
+
+def _checked(rasterizer: Rasterizer, device: torch.device, demands: Demands) -> Rasterizer:
+    key, name = f"rasterizer={rasterizer.prepare(device).name}", torch.cuda.get_device_name(device)
     try:
-        agreement = self_test(rasterizer, device)
+        agreement = self_test(rasterizer, device, demands)
     except (RuntimeError, MemoryError) as error:
         reason = str(error).splitlines()[0]
-        raise UserError(
-            f"rasterizer=cuda cannot finish its self-test on {name}: {reason}. {REPORT}"
-        ) from error
-    if not (agreement.holds and agreement.repeats):
-        raise UserError(f"rasterizer=cuda fails its self-test on {name}: it {agreement}. {REPORT}")
+        raise UserError(f"{key} cannot finish its self-test on {name}: {reason}. {REPORT}") from error
+    if not agreement.passes:
+        raise UserError(f"{key} fails its self-test on {name}: it {agreement}. {REPORT}")
     return rasterizer
 
 
-# For each type of device, a function that returns a rasterizer that works there or raises UserError.
-FASTEST: Mapping[str, Callable[[torch.device], Rasterizer]] = {"cpu": native_cpu, "cuda": checked_cuda}
+# For each type of device, rasterizers by name, the fastest first: functions that return one that works there
+# or raise UserError. Our kernels come before gsplat because they repeat their bits and need no nvcc.
+FASTEST: Mapping[str, Mapping[str, Callable[[torch.device], Rasterizer]]] = {
+    "cpu": {"cpu": native_cpu},
+    "cuda": {"cuda": checked_cuda, "gsplat": checked_gsplat},
+}
 
 
-def _refuse_broken(device: torch.device) -> None:
+def _refuse_broken(name: str, device: torch.device) -> None:
     """Raise :class:`UserError` if a failed kernel has made the device unusable.
 
-    A kernel that accesses invalid memory makes the device unusable for the whole process, so the reference
-    could not render there either.
+    A kernel that accesses invalid memory makes the device unusable for the whole process, so no other
+    rasterizer could render there either.
     """
     if device.type == "cuda" and torch.cuda.is_available():
         try:
@@ -111,6 +129,6 @@ def _refuse_broken(device: torch.device) -> None:
         except RuntimeError as error:
             reason = str(error).splitlines()[0]
             raise UserError(
-                f"rasterizer=auto: the self-test of rasterizer=cuda broke {device} ({reason}). "
+                f"rasterizer=auto: the self-test of rasterizer={name} broke {device} ({reason}). "
                 "Try: rasterizer=reference"
             ) from error

@@ -38,6 +38,11 @@ class Backend:
     # Why nothing faster renders, and what to type; None if nothing faster exists.
     reason: str | None = None
 
+    @property
+    def remark(self) -> str:
+        """Return what a message adds about the speed, with a comma in front; "" for compiled kernels."""
+        return ", which is slow" if self.name == "reference" else ""
+
 
 class Rasterizer(ABC):
     """Renders Gaussians. A component is its hyper-parameters, so it holds no tensors."""

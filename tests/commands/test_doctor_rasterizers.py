@@ -4,6 +4,7 @@ import ctypes
 import json
 import math
 from dataclasses import asdict, replace
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
@@ -14,12 +15,13 @@ from cadam3d.commands.doctor_rasterizers import check_rasterizers
 from cadam3d.commands.finding import Finding, Verdict
 from cadam3d.core.errors import UserError
 from cadam3d.io.cache import kernels_dir
-from cadam3d.rasterizer import auto, build, nvrtc
+from cadam3d.rasterizer import auto, build, gsplat, nvrtc
 from cadam3d.rasterizer.base import Backend
 from cadam3d.rasterizer.build import find_compiler
-from cadam3d.rasterizer.cpu import CpuRasterizer, load_kernels
+from cadam3d.rasterizer.cpu import load_kernels
+from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.rasterizer.selftest import Agreement, self_test
+from cadam3d.rasterizer.selftest import ATOMIC, GSPLAT, OWN, Agreement, self_test
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
 
@@ -130,7 +132,7 @@ def a_gpu(bare, monkeypatch, tmp_path):
 
 
 def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu, monkeypatch, agreement):
-    monkeypatch.setattr(doctor_rasterizers, "self_test", lambda rasterizer, device: agreement)
+    monkeypatch.setattr(doctor_rasterizers, "self_test", lambda rasterizer, device, demands: agreement)
     found = by_topic()
     assert found["kernels for cuda"].found.startswith(
         "sm_90 for a GPU (compute capability 9.0) by NVRTC 13.0 in /there/libnvrtc.so.13, compiled now in 7.0"
@@ -138,6 +140,43 @@ def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu
     assert found["rasterizer=cuda"].verdict is Verdict.OK
     assert found["rasterizer=cuda"].found == f"{agreement}, on cuda:0"
     assert found["rasterizer=auto"].found == "chooses cuda on cuda:0: the fastest there is, and it works"
+
+
+def test_gsplat_is_named_with_its_version_or_as_not_installed(bare, monkeypatch):
+    def missing(name):
+        raise PackageNotFoundError
+
+    monkeypatch.setattr(doctor_rasterizers, "version", lambda name: "1.5.3")
+    topic = "kernels for gsplat"
+    assert by_topic()[topic].found == "torch sees no CUDA device; gsplat 1.5.3 is installed"
+    monkeypatch.setattr(doctor_rasterizers, "version", missing)
+    assert by_topic()[topic].found == "torch sees no CUDA device; gsplat is not installed, not needed"
+
+
+def test_gsplat_is_tested_on_a_gpu_with_its_own_demands(a_gpu, monkeypatch, agreement):
+    monkeypatch.setattr(GsplatRasterizer, "prepare", lambda self, device: Backend("gsplat"))
+    monkeypatch.setattr(doctor_rasterizers, "version", lambda name: "1.5.3")
+    monkeypatch.setattr(
+        doctor_rasterizers,
+        "self_test",
+        lambda rasterizer, device, demands: replace(
+            agreement, demands=demands, repeats=demands is not GSPLAT
+        ),
+    )
+    found = by_topic()
+    assert found["kernels for gsplat"].found.startswith("gsplat 1.5.3 for a GPU, loaded in ")
+    assert found["rasterizer=gsplat"].verdict is Verdict.OK
+    assert found["rasterizer=gsplat"].found.endswith("different bits the second time, on cuda:0")
+
+
+def test_a_gpu_without_gsplat_gets_the_command_that_installs_it(a_gpu, monkeypatch, agreement):
+    monkeypatch.setattr(doctor_rasterizers, "self_test", lambda rasterizer, device, demands: agreement)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(gsplat, "find_spec", lambda name: None)
+    found = by_topic()
+    assert found["kernels for gsplat"].verdict is Verdict.NOTE
+    assert found["kernels for gsplat"].found.endswith("Try: pip install 'cadam3d[gsplat]'")
+    assert "rasterizer=gsplat" not in found
 
 
 @pytest.mark.parametrize(
@@ -148,6 +187,8 @@ def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu
         ("rasterizer=cpu", "cpu", {"repeats": False}, Verdict.BROKEN),
         # Without its self-test, auto chooses another backend.
         ("rasterizer=cuda", "cuda:0", {"repeats": False}, Verdict.NOTE),
+        ("rasterizer=gsplat", "cuda:0", {"repeats": False}, Verdict.OK),
+        ("rasterizer=gsplat", "cuda:0", {"gradients": {"means": 0.1}}, Verdict.NOTE),
         ("rasterizer=reference", "cpu", {"repeats": False}, Verdict.BROKEN),
         # On a GPU, the sums of the reference use atomics.
         ("rasterizer=reference", "cuda:0", {"repeats": False}, Verdict.OK),
@@ -155,20 +196,24 @@ def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu
 )
 def test_a_failed_self_test_is_reported(topic, device, change, verdict, monkeypatch, agreement):
     monkeypatch.setattr(
-        doctor_rasterizers, "self_test", lambda rasterizer, device: replace(agreement, **change)
+        doctor_rasterizers,
+        "self_test",
+        lambda rasterizer, device, demands: replace(agreement, demands=demands, **change),
     )
-    finding = doctor_rasterizers._tested(topic, CpuRasterizer(cache_dir=None), torch.device(device))
+    on_gpu = {"rasterizer=gsplat": GSPLAT, "rasterizer=reference": ATOMIC}
+    demands = OWN if device == "cpu" else on_gpu.get(topic, OWN)
+    finding = doctor_rasterizers._tested(topic, ReferenceRasterizer(), torch.device(device), demands)
     assert finding.verdict is verdict
     assert ("report" in finding.hint) is (verdict is not Verdict.OK)
     json.dumps(finding.facts, allow_nan=False)
 
 
 def test_a_self_test_that_crashes_is_a_finding(monkeypatch):
-    def crash(rasterizer, device):
+    def crash(rasterizer, device, demands):
         raise RuntimeError("an illegal memory access\nsomewhere")
 
     monkeypatch.setattr(doctor_rasterizers, "self_test", crash)
-    finding = doctor_rasterizers._tested("rasterizer=cuda", ReferenceRasterizer(), torch.device("cpu"))
+    finding = doctor_rasterizers._tested("rasterizer=cuda", ReferenceRasterizer(), torch.device("cpu"), OWN)
     assert finding.verdict is Verdict.BROKEN
     assert finding.found == "RuntimeError: an illegal memory access"
 

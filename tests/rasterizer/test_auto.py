@@ -1,20 +1,22 @@
-"""The automatic choice: compiled kernels that pass their tests, or else the reference and a reason."""
+"""The automatic choice: compiled kernels that pass their tests, or else what works, and a reason."""
 
 from dataclasses import dataclass, replace
 
 import pytest
 import torch
 
+from cadam3d.commands import messages
 from cadam3d.core.cameras import turntable
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.rasterizer import auto
+from cadam3d.rasterizer import auto, gsplat
 from cadam3d.rasterizer.auto import AutoRasterizer, checked_cuda, choose
 from cadam3d.rasterizer.base import Backend
 from cadam3d.rasterizer.build import find_compiler
 from cadam3d.rasterizer.cuda import CudaRasterizer
+from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.rasterizer.selftest import self_test
+from cadam3d.rasterizer.selftest import GSPLAT, OWN, self_test
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
 
@@ -54,13 +56,13 @@ def refuse(device):
 
 
 def test_the_fastest_rasterizer_for_the_device_is_used(monkeypatch):
-    monkeypatch.setattr(auto, "FASTEST", {"cpu": lambda device: Flat()})
+    monkeypatch.setattr(auto, "FASTEST", {"cpu": {"flat": lambda device: Flat()}})
     assert AutoRasterizer().prepare(CPU) == Backend("flat", reason=None)
     assert brightest(AutoRasterizer()) == 0
 
 
 def test_the_reference_is_the_fallback_and_gives_the_reason(monkeypatch):
-    monkeypatch.setattr(auto, "FASTEST", {"cpu": refuse})
+    monkeypatch.setattr(auto, "FASTEST", {"cpu": {"cpu": refuse}})
     assert AutoRasterizer().prepare(CPU) == Backend("reference", reason="no compiler. Try: install one")
     assert brightest(AutoRasterizer()) > 0
 
@@ -76,7 +78,7 @@ def test_the_choice_for_a_device_is_made_once(monkeypatch):
         choices.append(device)
         return ReferenceRasterizer()
 
-    monkeypatch.setattr(auto, "FASTEST", {"cpu": fastest})
+    monkeypatch.setattr(auto, "FASTEST", {"cpu": {"cpu": fastest}})
     brightest(AutoRasterizer())
     brightest(AutoRasterizer())
     AutoRasterizer().prepare(CPU)
@@ -87,13 +89,13 @@ def test_the_choice_is_not_made_before_it_is_needed(monkeypatch):
     def fastest(device):
         raise AssertionError("the choice is too early")
 
-    monkeypatch.setattr(auto, "FASTEST", {"cpu": fastest})
+    monkeypatch.setattr(auto, "FASTEST", {"cpu": {"cpu": fastest}})
     AutoRasterizer()
 
 
 @pytest.mark.parametrize("device", ["cpu", "mps", "meta", "cuda"])
 def test_there_is_a_backend_for_every_device(device):
-    assert AutoRasterizer().prepare(torch.device(device)).name in ("cpu", "cuda", "reference")
+    assert AutoRasterizer().prepare(torch.device(device)).name in ("cpu", "cuda", "gsplat", "reference")
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
@@ -113,16 +115,20 @@ def test_on_a_cpu_auto_renders_the_images_of_the_native_rasterizer():
 
 @pytest.fixture
 def a_gpu(monkeypatch):
-    """Fake a CUDA device on which the kernels compile and load; the test provides the self-test's result."""
+    """Fake a CUDA device on which our kernels load; the test provides the self-test's result.
+
+    gsplat is not installed.
+    """
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "a GPU")
     monkeypatch.setattr(torch.cuda, "synchronize", lambda device: None)
     monkeypatch.setattr(CudaRasterizer, "prepare", lambda self, device: Backend("cuda"))
+    monkeypatch.setattr(gsplat, "find_spec", lambda name: None)
 
     def behave(test):
-        def counted(rasterizer, device):
-            tested.append((rasterizer, device))
+        def counted(rasterizer, device, demands):
+            tested.append((rasterizer, device, demands))
             return test()
 
         tested = []
@@ -148,7 +154,7 @@ def test_cuda_kernels_that_pass_the_self_test_are_used_and_tested_once(a_gpu, ag
     tested = a_gpu(lambda: agreement)
     for device in (GPU, torch.device("cuda"), GPU):  # two names of one device
         assert choose(device).backend == Backend("cuda", reason=None)
-    assert tested == [(CudaRasterizer(cache_dir=None), GPU)]
+    assert tested == [(CudaRasterizer(cache_dir=None), GPU, OWN)]
 
 
 @pytest.mark.parametrize(
@@ -160,6 +166,7 @@ def test_cuda_kernels_that_fail_the_self_test_are_not_used(change, a_gpu, agreem
     assert backend.name == "reference"
     assert "rasterizer=cuda fails its self-test on a GPU: it " in backend.reason
     assert "report" in backend.reason
+    assert backend.reason.endswith(NO_GSPLAT)
     assert "\n" not in backend.reason
 
 
@@ -187,8 +194,78 @@ def test_a_device_that_a_crash_made_unusable_is_refused(a_gpu, monkeypatch):
 def test_kernels_that_do_not_compile_are_not_tested(a_gpu, monkeypatch):
     tested = a_gpu(raising(AssertionError("tested")))
     monkeypatch.setattr(CudaRasterizer, "prepare", lambda self, device: refuse(device))
-    assert choose(GPU).backend.reason == "no compiler. Try: install one"
+    assert choose(GPU).backend.reason == f"no compiler. {NO_GSPLAT}"
     assert not tested
+
+
+# -------------------------------------------------------------------------- gsplat, if ours do not work
+
+NO_GSPLAT = "rasterizer=gsplat: expected the package gsplat, got none. Try: pip install 'cadam3d[gsplat]'"
+
+
+@pytest.fixture
+def with_gsplat(a_gpu, monkeypatch):
+    """Install gsplat, and return a function that sets the result of each rasterizer's self-test."""
+    monkeypatch.setattr(GsplatRasterizer, "prepare", lambda self, device: Backend("gsplat"))
+
+    def behave(**tests):
+        def test(rasterizer, device, demands):
+            name = rasterizer.prepare(device).name
+            tested.append((name, demands))
+            return replace(tests[name](), demands=demands)
+
+        tested = []
+        monkeypatch.setattr(auto, "self_test", test)
+        return tested
+
+    return behave
+
+
+def test_gsplat_is_not_touched_while_our_kernels_work(with_gsplat, agreement):
+    tested = with_gsplat(cuda=lambda: agreement, gsplat=raising(AssertionError("tested")))
+    assert choose(GPU).backend == Backend("cuda", reason=None)
+    assert tested == [("cuda", OWN)]
+
+
+def test_gsplat_replaces_kernels_that_fail_and_one_note_tells_which_and_why(with_gsplat, agreement, capsys):
+    bad, unordered = replace(agreement, gradients={"means": 0.5}), replace(agreement, repeats=False)
+    tested = with_gsplat(cuda=lambda: bad, gsplat=lambda: unordered)
+    choice = choose(GPU)
+    assert choice.rasterizer == GsplatRasterizer()
+    assert choice.backend.name == "gsplat"
+    assert tested == [("cuda", OWN), ("gsplat", GSPLAT)]
+    messages.note.cache_clear()
+    messages.note_backend(choice.backend)
+    note = capsys.readouterr().err
+    assert note.startswith(
+        "Note: rendering with rasterizer=gsplat: rasterizer=cuda fails its self-test on a GPU: it disagrees"
+    )
+    assert note.endswith(" Try: cadam3d doctor\n")
+    assert note.count("\n") == note.count(" Try: ") == 1
+
+
+def test_gsplat_must_pass_its_self_test_too(with_gsplat, agreement):
+    bad = replace(agreement, images={"rgb": 0.5})
+    with_gsplat(cuda=raising(RuntimeError("no kernel image")), gsplat=lambda: bad)
+    backend = choose(GPU).backend
+    assert backend.name == "reference"
+    first, second = (
+        backend.reason.index(words)
+        for words in ("rasterizer=cuda cannot finish its self-test", "rasterizer=gsplat fails its self-test")
+    )
+    assert first < second
+    assert backend.reason.count(" Try: ") == 1
+
+
+def test_a_device_that_broke_is_not_given_to_gsplat(with_gsplat, monkeypatch):
+    def synchronize(device):
+        raise RuntimeError("an illegal memory access was encountered")
+
+    tested = with_gsplat(cuda=raising(RuntimeError("illegal")), gsplat=raising(AssertionError("tested")))
+    monkeypatch.setattr(torch.cuda, "synchronize", synchronize)
+    with pytest.raises(UserError, match="the self-test of rasterizer=cuda broke cuda:0"):
+        choose(GPU)
+    assert tested == [("cuda", OWN)]
 
 
 @pytest.mark.gpu

@@ -6,24 +6,23 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
 
-from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.rasterizer import cuda
-from cadam3d.rasterizer.base import FAR, NEAR, Rasterizer
+from cadam3d.rasterizer import cuda, gsplat
+from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cpu import CpuRasterizer
+from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.launcher import Launcher
 from cadam3d.rasterizer.reference import ReferenceRasterizer
+from cadam3d.rasterizer.selftest import GSPLAT, Agreement
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))  # as Python does for a script
 
 import bench_rasterizer
 from rasterizer_bench import check, report, stages, targets, timing
-from rasterizer_bench.gsplat_yardstick import GsplatRasterizer
 from rasterizer_bench.scenes import make_scene, make_shell
 
 CPU = torch.device("cpu")
@@ -184,50 +183,26 @@ def test_a_sort_that_is_wrong_is_found(emulator, monkeypatch):
     assert check.check_long_sort(emulator, CPU, 5000) == ["5000 keys are sorted wrongly"]
 
 
-def fake_gsplat() -> ModuleType:
-    """Return a module with ``gsplat.rasterization`` as documented, implemented with the reference."""
+def test_gsplat_is_checked_with_its_own_demands(monkeypatch):
+    pytest.importorskip("gsplat", reason="pip install -e .[dev]")
+    import gsplat_on_cpu
 
-    def rasterization(  # noqa: PLR0917
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        viewmats,
-        Ks,
-        width,
-        height,
-        *,
-        near_plane,
-        far_plane,
-        sh_degree,
-        packed,
-        backgrounds,
-        render_mode,
-    ):
-        assert (near_plane, far_plane, packed, render_mode) == (NEAR, FAR, False, "RGB+ED")
-        assert colors.shape[1] == (sh_degree + 1) ** 2
-        gaussians = Gaussians(means, scales.log(), quats, opacities.logit(), colors)
-        views = torch.zeros(len(viewmats))
-        cameras = Cameras(viewmats, Ks, height, width, views, views)
-        output = ReferenceRasterizer().render(gaussians, cameras, backgrounds)
-        images = torch.cat([output.rgb, output.depth[..., None]], dim=-1)
-        radii = output.radii.ceil().int()[..., None].expand(-1, -1, 2)  # one per axis
-        return images, output.alpha[..., None], {"means2d": output.means2d, "radii": radii}
+    def test(rasterizer, device, demands):
+        tested.append(demands)
+        return Agreement({"rgb": 1e-3}, {"means": 0.0}, repeats=False, demands=demands)
 
-    module = ModuleType("gsplat")
-    module.rasterization = rasterization
-    return module
+    tested = []
+    monkeypatch.setattr(check, "self_test", test)
+    monkeypatch.setattr(gsplat, "load_rasterization", lambda device: gsplat_on_cpu.rasterization)
+    [trouble] = check.check("gsplat", GsplatRasterizer(), CPU)
+    assert trouble.startswith("self-test: disagrees with the reference: images 1e-3")
+    assert tested == [GSPLAT]
 
 
-def test_gsplat_renders_the_same_scene(monkeypatch):
-    monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat())
-    assert not check.check("gsplat", GsplatRasterizer(), CPU)
-    scene = make_scene(make_shell(50, 2, CPU), 20, 3)
-    output = GsplatRasterizer().render(scene.gaussians, scene.cameras, scene.background)
-    scene.backward((output.rgb, output.alpha, output.depth))
-    assert output.radii.shape == (3, 50)
-    assert output.means2d.grad is not None
+def test_gsplat_is_skipped_where_it_cannot_run(capsys):
+    backends = bench_rasterizer.make_backends(["gsplat", "reference"], CPU)
+    assert list(backends) == ["reference"]
+    assert "gsplat is skipped: rasterizer=gsplat: expected a CUDA device" in capsys.readouterr().out
 
 
 # -------------------------------------------------------------------------- timing

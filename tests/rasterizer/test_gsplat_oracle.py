@@ -1,12 +1,7 @@
 """The reference rasterizer agrees with gsplat's CPU projection, spherical harmonics and ``accumulate``.
 
-``pip install -e .[dev]`` installs gsplat; without it these tests are skipped. gsplat needs two small
-functions of ``nerfacc``, which are defined here, and a list of (Gaussian, pixel) hits, which its CUDA code
-would make.
+``pip install -e .[dev]`` installs gsplat; without it these tests are skipped.
 """
-
-import sys
-from types import ModuleType
 
 import pytest
 import torch
@@ -20,7 +15,8 @@ from cadam3d.rasterizer.reference import ReferenceRasterizer
 pytestmark = pytest.mark.oracle
 pytest.importorskip("gsplat", reason="pip install -e .[dev]")
 
-from gsplat.cuda import _torch_impl as gsplat  # noqa: E402
+import gsplat_on_cpu  # noqa: E402
+from gsplat.cuda import _torch_impl  # noqa: E402
 
 
 def scene(degree: int) -> Gaussians:
@@ -45,76 +41,26 @@ def cameras(height: int, width: int) -> Cameras:
     return orbit(azimuth, 25 * full, 1.6 * full, 60 * full, height, width)
 
 
-@pytest.fixture
-def _nerfacc(monkeypatch):
-    """Define the two functions of nerfacc that ``accumulate`` imports, for hits sorted by ray."""
-
-    def render_weight_from_alpha(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
-        through = torch.cat([alphas.new_zeros(1), torch.log1p(-alphas).cumsum(0)])
-        first = torch.searchsorted(ray_indices, ray_indices)  # first hit of the same ray
-        transmittance = (through[:-1] - through[first]).exp()
-        return transmittance * alphas, transmittance
-
-    def accumulate_along_rays(
-        weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: int
-    ) -> Tensor:
-        each = weights[:, None] if values is None else weights[:, None] * values
-        return each.new_zeros(n_rays, each.shape[1]).index_add(0, ray_indices, each)
-
-    module = ModuleType("nerfacc")
-    module.render_weight_from_alpha = render_weight_from_alpha
-    module.accumulate_along_rays = accumulate_along_rays
-    monkeypatch.setitem(sys.modules, "nerfacc", module)
-
-
-@torch.no_grad()
-def hits(
-    means2d: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, height: int, width: int
-) -> tuple[Tensor, Tensor]:
-    """Return all (Gaussian, pixel) pairs that one view blends, by pixel and then depth, by brute force."""
-    pixels = torch.cartesian_prod(torch.arange(height), torch.arange(width)).flip(1) + 0.5
-    dx, dy = (pixels[:, None] - means2d).unbind(-1)
-    sigma = 0.5 * (conics[:, 0] * dx**2 + conics[:, 2] * dy**2) + conics[:, 1] * dx * dy
-    alpha = opacities * torch.exp(-sigma)
-    order = depths.argsort()
-    alpha = torch.where((alpha >= 1 / 255) & (depths > 0.01), alpha, 0)[:, order]
-    is_reached = (1 - alpha).cumprod(dim=1) > 1e-4
-    pixel, rank = ((alpha > 0) & is_reached).nonzero().unbind(dim=1)
-    return order[rank], pixel
-
-
 def oracle(gaussians: Gaussians, views: Cameras, background: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    covariances, _ = gsplat._quat_scale_to_covar_preci(gaussians.quats, gaussians.scales, compute_preci=False)
-    size = (views.width, views.height)
-    _, means2d, depths, conics, _ = gsplat._fully_fused_projection(
-        gaussians.means, covariances, views.world_to_camera, views.intrinsics, *size
+    images, alphas, info = gsplat_on_cpu.rasterization(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+        views.world_to_camera,
+        views.intrinsics,
+        views.width,
+        views.height,
+        sh_degree=gaussians.sh_degree,
+        packed=False,
+        backgrounds=background,
+        render_mode="RGB+ED",
     )
-    means2d.retain_grad()
-    pictures = []
-    for view in range(len(views)):
-        directions = gaussians.means - views.positions[view]
-        colors = gsplat._spherical_harmonics(gaussians.sh_degree, directions, gaussians.sh)
-        features = torch.cat([(colors + 0.5).clamp_min(0), depths[view][:, None]], dim=1)
-        rows, pixels = hits(
-            means2d[view], conics[view], gaussians.opacities, depths[view], views.height, views.width
-        )
-        sums, alpha = gsplat.accumulate(
-            means2d[view : view + 1],
-            conics[view : view + 1],
-            gaussians.opacities[None],
-            features[None],
-            rows,
-            pixels,
-            torch.zeros_like(rows),
-            *size,
-        )
-        rgb = sums[0, ..., :3] + (1 - alpha[0]) * background[view]
-        pictures.append((rgb, alpha[0, ..., 0], sums[0, ..., 3] / alpha[0, ..., 0].clamp_min(1e-10)))
-    rgb, alpha, depth = (torch.stack(each) for each in zip(*pictures, strict=True))
-    return rgb, alpha, depth, means2d
+    info["means2d"].retain_grad()
+    return images[..., :3], alphas[..., 0], images[..., 3], info["means2d"]
 
 
-@pytest.mark.usefixtures("_nerfacc")
 @pytest.mark.parametrize(("height", "width", "degree"), [(61, 45, 3), (96, 96, 0), (1, 1, 1), (17, 8, 2)])
 def test_images_and_gradients_agree_with_gsplat(height, width, degree):
     views, background = (
@@ -146,4 +92,4 @@ def assert_close_to_largest(got: Tensor | None, want: Tensor | None) -> None:
 
 def test_spherical_harmonics_agree_with_gsplat():
     directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
-    torch.testing.assert_close(sh_basis(directions, 3), gsplat._eval_sh_bases_fast(16, directions))
+    torch.testing.assert_close(sh_basis(directions, 3), _torch_impl._eval_sh_bases_fast(16, directions))
