@@ -96,17 +96,19 @@ class Base:
         """Return the job with other ``values``, set as Hydra sets them."""
         for key, value in values.items():
             OmegaConf.update(self.cfg, key, value, merge=True)
-        resolved = {}
+        resolved: dict[str, Any] = {}
+        unknown = set(self.referring)
         for key in self.referring:
             with suppress(InterpolationResolutionError):  # such as ${hydra:...}
                 node = OmegaConf.select(self.cfg, key)
-                resolved[key] = (
-                    OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
-                )
+                # A reference to a whole part, such as ${prompting}, stands for all its settings.
+                plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+                resolved.update(flatten(plain, key))
+                unknown.remove(key)
         return Composed(
             values={**self.plain, **values, **resolved},
             choices=self.cfg.hydra.runtime.choices,
-            unknown=set(self.referring) - resolved.keys(),
+            unknown=unknown,
         )
 
 

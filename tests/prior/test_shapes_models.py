@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from pipelines import VOCABULARY
 
 from cadam3d.commands import doctor
@@ -15,9 +16,9 @@ from cadam3d.core.errors import UserError
 from cadam3d.io import pretrained
 from cadam3d.io.jsonl import read_json
 from cadam3d.io.reading import read_yaml
-from cadam3d.settings.compose import component, compose, config_dir
+from cadam3d.settings.compose import component, compose, config_dir, flatten
 from cadam3d.settings.hydra import read_flags
-from cadam3d.sweep.plan import compose_all, read_sweep
+from cadam3d.sweep.plan import Composer, compose_all, read_sweep
 
 KINDS = {"shapes_sd": "stable_diffusion", "shapes_mvdream": "mvdream", "shapes_sd3": "stable_diffusion_3"}
 FEW = ("steps=2", "initializer.count=50", "exporter=[ply]", "metric=[size]", "callback=[checkpoint]")
@@ -202,3 +203,13 @@ def test_a_sweep_compares_an_exact_and_a_learned_prior():
     jobs = compose_all(sweep, composer)
     seen = [(job.get("prior"), job.get("camera"), job.get("views")) for job in jobs]
     assert seen[::2] == seen[1::2] == [("shapes", "orbit", 2), ("shapes_mvdream", "shapes_mvdream", 4)]
+
+
+def test_a_sweep_on_these_priors_knows_the_settings_that_its_jobs_write():
+    """Otherwise it would take its own finished jobs for those of another sweep."""
+    composer = Composer(read_flags([]), [])
+    for values in (["prompting.below_deg=-5.0"], ["prompting.below_deg=-7.5"]):
+        for name in ("shapes_sd", "shapes_sd3"):
+            line = ["prompt=a red cube", f"prior={name}", *values]
+            written = OmegaConf.to_container(compose(line), resolve=True)
+            assert composer.compose(line).values == dict(flatten(written))
