@@ -130,7 +130,7 @@ class Trainer:
             f"seed {self.seed}",
             f"on {self.device}",
         ]
-        return f"<Trainer {self.prompt!r}: {', '.join(facts)}>"
+        return f"<Trainer {self.prompt!r}: {', '.join(facts)}, on {self.device}>"
 
 
 def compose(  # noqa: PLR0913  (one argument per component)

@@ -82,7 +82,7 @@ COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "ca
 
 
 def run(cfg: DictConfig) -> float | None:
-    """Train in the folder of this job, and print the result. Return the PSNR in dB if there are true images."""
+    """Train in the folder of this job and print the result. Return the PSNR in dB if it was measured."""
     stop = StopOnSignal((signal.SIGINT, signal.SIGTERM))
     folder, summary, report = train(cfg, stop)
     print_result(folder, summary, report)
