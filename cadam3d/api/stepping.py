@@ -52,9 +52,13 @@ REPLACEABLE: Mapping[str, type] = {
 
 @dataclass(frozen=True)
 class Step(StepReport):
-    """Result of one step: ``step``, ``loss``, ``log`` and ``num_gaussians``, and the refinement, if any."""
+    """Result of one step: its number ``step`` (from 1), ``loss``, ``log``, ``num_gaussians`` and ``refinement``.
 
-    refinement: RefineReport | None  # what a refinement or an opacity reset after this step has changed
+    ``num_gaussians`` is the number that was rendered, before a refinement that follows the step.
+    """
+
+    # What the refinement or opacity reset after this step has changed; None if none was due.
+    refinement: RefineReport | None
 
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)

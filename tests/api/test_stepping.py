@@ -18,7 +18,7 @@ CADAM = ("densifier.min_age=0",)
 
 @dataclass
 class Nothing(RowState):
-    """One number per Gaussian, which nobody reads."""
+    """One number per Gaussian, which is never read."""
 
     zeros: torch.Tensor
 
@@ -63,9 +63,9 @@ def test_stepping_gives_the_bytes_of_a_run(run, trainer, tmp_path, monkeypatch):
     state = trainer.start()
     steps = []
     while trainer.outcome(state) is None:
+        before = len(state.gaussians)
         steps.append(trainer.step(state))
-        assert steps[-1].step == state.step
-        assert steps[-1].num_gaussians == len(state.gaussians)
+        assert (steps[-1].step, steps[-1].num_gaussians) == (state.step, before)
     assert trainer.outcome(state) == "finished"
     assert [step.refinement is not None for step in steps] == [False, True, False, True]
     assert len(state.gaussians) > 20

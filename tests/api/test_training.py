@@ -123,8 +123,9 @@ def test_the_program_of_the_caller_stays_as_it_was(run, place, tmp_path, monkeyp
     """The caller uses Hydra itself, has other modes of torch, and a log of its own."""
     monkeypatch.chdir(tmp_path)
     OmegaConf.register_new_resolver("slug", lambda text: f"my {text}", replace=True)
-    handler, root = Chatter(), logging.getLogger()
-    root.addHandler(handler)
+    handler = Chatter()
+    # Without the handlers that the command line has left in the process of the tests.
+    monkeypatch.setattr(logging.getLogger(), "handlers", [handler])
     dtype = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     try:
@@ -134,7 +135,6 @@ def test_the_program_of_the_caller_stays_as_it_was(run, place, tmp_path, monkeyp
             assert process_state() == before
     finally:
         torch.set_default_dtype(dtype)
-        root.removeHandler(handler)
         OmegaConf.clear_resolver("slug")
     assert asset_of(again) == asset_of(run)
     assert capfd.readouterr() == ("", "")
