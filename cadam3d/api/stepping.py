@@ -52,9 +52,9 @@ REPLACEABLE: Mapping[str, type] = {
 
 @dataclass(frozen=True)
 class Step(StepReport):
-    """Result of one step: its number ``step`` (from 1), ``loss``, ``log``, ``num_gaussians`` and ``refinement``.
+    """Result of one step, with the refinement that followed it, if any.
 
-    ``num_gaussians`` is the number that was rendered, before a refinement that follows the step.
+    ``num_gaussians`` is the number that was rendered, before that refinement.
     """
 
     # What the refinement or opacity reset after this step has changed; None if none was due.

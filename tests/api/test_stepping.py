@@ -126,7 +126,7 @@ def test_every_component_that_is_given_is_used():
         name: component(composed(*SMALL)[name])
         for name in ("guidance", "prior", "camera", "background", "optimizer", "initializer", "rasterizer")
     }
-    trainer = cadam3d.compose("prompt=a red cube", "steps=4", "views=1", **objects)
+    trainer = cadam3d.compose(*SMALL[:1], "steps=4", "views=1", **objects)
     for name in objects.keys() - {"initializer"}:
         assert getattr(trainer.parts, name) is objects[name]
     assert trainer.initializer is objects["initializer"]
