@@ -69,7 +69,9 @@ def load(
     # A name without a suffix is more likely a folder that does not exist than a file.
     if place.is_dir() or not place.suffix:
         folder = files.find_run(str(place))
-        place, title = files.find_asset(folder), facts_of(folder)["prompt"]
+        place, prompt = files.find_asset(folder), facts_of(folder)["prompt"]
+        # A stranger may have written the folder.
+        title = prompt if isinstance(prompt, str) else None
     else:
         title = place.stem
     gaussians = read_gaussians(place, up=up).to(resolve_device(device))
