@@ -1,4 +1,4 @@
-"""Stepping from Python: a trainer that makes one step per call, with own components where wanted."""
+"""Stepping from Python: a trainer that makes one step per call, with objects in place of components."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -65,7 +65,7 @@ class Step(StepReport):
 class Trainer:
     """A run that the caller steps by hand. It does not change; the state that :meth:`start` returns does.
 
-    Nothing is written, and no callbacks, exporters or metrics of the settings are used. The bytes of the
+    Nothing is written, and the callbacks, exporters and metrics of the settings are not used. The bytes of the
     Gaussians after the last step are those of :func:`cadam3d.train` with the same settings.
     """
 

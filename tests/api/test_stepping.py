@@ -85,15 +85,18 @@ def test_another_seed_is_another_run(trainer):
 def test_the_modes_of_torch_are_those_of_the_caller_between_steps(run, trainer):
     dtype = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
+    torch.set_default_device("meta")
     try:
         with torch.no_grad():
             state = trainer.start()
             for _ in trainer.run(state):
                 assert torch.get_default_dtype() == torch.float64
+                assert torch.get_default_device().type == "meta"
                 assert not torch.is_grad_enabled()
                 assert torch.get_deterministic_debug_mode() == 0
     finally:
         torch.set_default_dtype(dtype)
+        torch.set_default_device(None)
     assert same(run.asset.gaussians, trainer.asset(state).gaussians)
 
 
