@@ -65,8 +65,8 @@ class Step(StepReport):
 class Trainer:
     """A run that the caller steps by hand. It does not change; the state that :meth:`start` returns does.
 
-    Nothing is written, and the callbacks, exporters and metrics of the settings are not used. The bytes of the
-    Gaussians after the last step are those of :func:`cadam3d.train` with the same settings.
+    Nothing is written, and the callbacks, exporters and metrics of the settings are not used. The bytes of
+    the Gaussians after the last step are those of :func:`cadam3d.train` with the same settings.
     """
 
     prompt: str
