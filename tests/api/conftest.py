@@ -1,7 +1,19 @@
 """Fixtures for tests of the Python API."""
 
+import os
+from pathlib import Path
+
 import jaxtyping
 import pytest
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _elsewhere(tmp_path_factory):
+    """Run the tests of a file in a new folder, because every run makes a link in ``outputs``."""
+    before = Path.cwd()
+    os.chdir(tmp_path_factory.mktemp("elsewhere"))
+    yield
+    os.chdir(before)
 
 
 @pytest.fixture
