@@ -128,12 +128,7 @@ class Trainer:
     def __repr__(self) -> str:
         parts = self.parts
         names = [type(part).__name__ for part in (parts.densifier, parts.guidance, parts.prior)]
-        facts = [
-            f"{self.steps} steps of {parts.views} views",
-            *names,
-            f"seed {self.seed}",
-            f"on {self.device}",
-        ]
+        facts = [f"{self.steps} steps of {parts.views} views", *names, f"seed {self.seed}"]
         return f"<Trainer {self.prompt!r}: {', '.join(facts)}, on {self.device}>"
 
 

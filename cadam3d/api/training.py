@@ -71,10 +71,10 @@ class Run:
     def __repr__(self) -> str:
         summary = self.summary
         facts = [repr(summary.get("prompt", self.config.get("prompt")))]
-        if "outcome" in summary:
-            facts.append(f"{summary['outcome']} after {summary.get('steps')} steps")
-            facts.append(f"{summary.get('num_gaussians'):,} Gaussians")
-            facts.append(f"{summary.get('seconds'):.0f} s")
+        if {"outcome", "steps", "num_gaussians", "seconds"} <= summary.keys():
+            facts.append(f"{summary['outcome']} after {summary['steps']} steps")
+            facts.append(f"{summary['num_gaussians']:,} Gaussians")
+            facts.append(f"{summary['seconds']:.0f} s")
         else:
             facts.append("not finished")
         if (psnr := psnr_of(summary)) is not None:
