@@ -3,7 +3,8 @@
 import gc
 import shlex
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -70,15 +71,12 @@ class Line:
 def launch(command: str, words: Sequence[str]) -> int:
     """Run ``cadam3d <command> <words>`` and return its exit code.
 
-    Raises ``UserError`` for mistakes of the user. The exceptions of Hydra and OmegaConf are translated here
-    and nowhere else. An exception that the running command raises is a bug and keeps its traceback. Only a
-    reference that cannot be resolved and a path that the system refuses for its form are still translated
-    then, because some show up only in a running job.
+    Raises ``UserError`` for mistakes of the user.
     """
     if command == "doctor":
         words = ["json=true" if word == "--json" else word for word in words]
     task = Task(command)
-    try:
+    with explaining(task, words):
         overrides, flags = split(words)
         options = read_flags(flags)
         if options.experimental_rerun:
@@ -93,6 +91,18 @@ def launch(command: str, words: Sequence[str]) -> int:
         if line.is_sweep:
             return _sweep(line, task)
         return _command(line, task)
+
+
+@contextmanager
+def explaining(task: Task, words: Sequence[str]) -> Iterator[None]:
+    """Translate the exceptions of Hydra and OmegaConf into ``UserError``, here and nowhere else.
+
+    An exception that the running command raises is a bug and keeps its traceback. Only a reference that
+    cannot be resolved and a path that the system refuses for its form are still translated then, because some
+    show up only in a running job.
+    """
+    try:
+        yield
     except UserError:
         raise
     except Exception as error:
@@ -100,10 +110,28 @@ def launch(command: str, words: Sequence[str]) -> int:
         if task.has_started and not is_mistake:
             raise
         reraise_interrupt(error)
-        advice = explain(error, command, words)
+        advice = explain(error, task.command, words)
         if advice is None:
             raise
         raise advice from error
+
+
+def read_words(command: str, words: Sequence[str]) -> Line:
+    """Parse a line that runs a command once, for callers in Python.
+
+    Raises ``UserError`` for a line that sweeps or shows a page, which only the command line can do.
+    """
+    overrides, flags = split(words)
+    options = read_flags(flags)
+    line = read_line(command, overrides, flags, options)
+    is_page = wants_page(options) or options.help or options.cfg or options.experimental_rerun
+    if line.is_sweep or is_page:
+        shell = shlex.join(["cadam3d", command, *words])
+        raise UserError(
+            f"{' '.join(flags) or command}: expected the settings of one run, got a line of which only the "
+            f"command line knows what to do. Try, in a shell: {shell}"
+        )
+    return line
 
 
 def read_line(command: str, overrides: list[str], flags: list[str], options: Namespace) -> Line:
@@ -140,10 +168,19 @@ def read_line(command: str, overrides: list[str], flags: list[str], options: Nam
 def _command(line: Line, task: Task) -> int:
     """Run a command once, or show one of Hydra's pages about it."""
     options = line.options
-    if _wants_page(options) or options.cfg:
+    if wants_page(options) or options.cfg:
         run_hydra(line.command, [*line.overrides, *line.flags], task)
         return 0
-    cfg = compose_line(line.command, [*line.overrides, "hydra.mode=RUN"], options)
+    run_line(line, compose_checked(line), task)
+    return 0
+
+
+def compose_checked(line: Line) -> DictConfig:
+    """Return the configuration of a line, with Hydra's own node, after everything has been refused in it.
+
+    What only the components of the configuration can refuse, they refuse when they are built.
+    """
+    cfg = compose_line(line.command, [*line.overrides, "hydra.mode=RUN"], line.options)
     if not require_trust(cfg.get("trust", False)) and cfg.get("resume") is not None:
         overrides = Path(cfg.hydra.run.dir) / OVERRIDES
         judge_composition(cfg, overrides, targets_in(line.typed), line.trusting)
@@ -152,16 +189,23 @@ def _command(line: Line, task: Task) -> int:
     refuse_unread_settings(cfg, line.command, line.overrides)
     require_settings(cfg)
     _refuse_several_runs(cfg, line)
+    return cfg
+
+
+def run_line(line: Line, cfg: DictConfig, task: Task, *, has_log: bool = True) -> None:
+    """Run a command on the configuration of its line; training runs in a folder that it locks.
+
+    Without ``has_log``, the logging of this process stays as it is.
+    """
     if line.command in TRAINING:
-        _train(cfg, line, task)
+        _train(cfg, line, task, has_log=has_log)
     else:
-        run_composed(cfg, task)
-    return 0
+        run_composed(cfg, task, has_log=has_log)
 
 
 def _sweep(line: Line, task: Task) -> int:
     """Run a sweep, or show a page about it or the settings of its first job."""
-    if _wants_page(line.options):
+    if wants_page(line.options):
         run_hydra(line.command, [*line.overrides, *line.flags], task)
         return 0
     if line.options.cfg:
@@ -178,7 +222,7 @@ def _sweep(line: Line, task: Task) -> int:
     return command.run(line.command, line.overrides, line.flags, line.options)
 
 
-def _train(cfg: DictConfig, line: Line, task: Task) -> None:
+def _train(cfg: DictConfig, line: Line, task: Task, *, has_log: bool) -> None:
     """Choose the output folder and train there."""
     text = OmegaConf.select(cfg, RUN_FOLDER)
     if not text:
@@ -190,7 +234,7 @@ def _train(cfg: DictConfig, line: Line, task: Task) -> None:
     resume = Path(str(cfg.resume)) if cfg.resume else None
     with occupied(wanted, is_chosen=is_chosen, resume=resume) as folder:
         place_run(cfg, folder)
-        run_composed(cfg, task)
+        run_composed(cfg, task, has_log=has_log)
 
 
 def _refuse_several_runs(cfg: DictConfig, line: Line) -> None:
@@ -204,7 +248,7 @@ def _refuse_several_runs(cfg: DictConfig, line: Line) -> None:
         )
 
 
-def _wants_page(options: Namespace) -> bool:
+def wants_page(options: Namespace) -> bool:
     """Return whether the line asks for one of Hydra's own pages or for completions."""
     return bool(options.hydra_help or options.info or options.shell_completion)
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -165,8 +165,8 @@ class RefineReport:
     pruned: int
     reset: int  # opacities lowered
     statistics: dict[str, float]  # of the densifier
-    population: Population  # before the edit
-    edit: RowEdit | None  # what happened to the rows; None if none was added or removed
+    population: Population = field(repr=False)  # before the edit
+    edit: RowEdit | None = field(repr=False)  # what happened to the rows; None if none was added or removed
 
 
 @dataclass(frozen=True)

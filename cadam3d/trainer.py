@@ -60,8 +60,11 @@ class Trainer:
         require_range("views", self.views, low=1, example=2)
         self.camera.check_views(self.views)
 
-    def _step(self, state: TrainState, embedding: PromptEmbedding) -> tuple[StepReport, RefineReport | None]:
-        """Advance ``state`` in place by one step, and by a refinement or opacity reset if one is due."""
+    def step(self, state: TrainState, embedding: PromptEmbedding) -> tuple[StepReport, RefineReport | None]:
+        """Advance ``state`` in place by one step, and by a refinement or opacity reset if one is due.
+
+        Callbacks are not called, and ``state.seconds`` does not change.
+        """
         gaussians, draw = state.gaussians, state.generators
 
         # Render the Gaussians from a few cameras.
@@ -227,18 +230,18 @@ class Trainer:
         # A resumed run first repeats the refinement that ended it, because max_gaussians may be larger now.
         if state.refused:
             self._report(context, state, self._refine(state, state.step), None)
-        outcome = self._outcome(state)
+        outcome = self.outcome(state)
         while outcome is None:
             started = time.perf_counter()
-            report, refined = self._step(state, embedding)
+            report, refined = self.step(state, embedding)
             state.seconds += time.perf_counter() - started
             self._report(context, state, refined, report)
-            outcome = self._outcome(state)
+            outcome = self.outcome(state)
             if outcome is None and stop():
                 outcome = Outcome.INTERRUPTED
         return outcome
 
-    def _outcome(self, state: TrainState) -> Outcome | None:
+    def outcome(self, state: TrainState) -> Outcome | None:
         """Return how the run has ended, or ``None`` if it goes on."""
         if state.refused:
             return Outcome.MAX_GAUSSIANS

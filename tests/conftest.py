@@ -13,6 +13,7 @@ from _pytest import runner
 # Files with whole runs come first, because each is run by one process and should not be the last to end.
 LONG = (
     "test_end_to_end",
+    "test_notebook",
     "test_sweeps",
     "test_hints",
     "test_wrong_values",

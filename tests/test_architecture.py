@@ -31,6 +31,7 @@ FLOORS = {
     **dict.fromkeys(("report",), 6.0),
     **dict.fromkeys(("live",), 6.5),
     **dict.fromkeys(("commands", "launch"), 7.0),
+    **dict.fromkeys(("api",), 7.5),
     **dict.fromkeys(("cli", "__main__", "job"), 8.0),
 }
 # The lowest floor that may import Hydra and OmegaConf.

@@ -205,6 +205,7 @@ ELSEWHERE: dict[str, str] = {
     "commands/train.py::require_unused": "see test_wrong_values.py",
     "commands/train.py::start_or_resume": "needs a checkpoint",
     "launch.py::launch": "passes on the message of another function",
+    "launch.py::read_words": "belongs to the Python API; see tests/api",
     "report/": "needs the results of a sweep; see tests/report",
     "settings/advice.py::_job_refused": "passes on the message of a job",
     "settings/advice.py::_refused_path": "needs names that the system refuses; see test_cli.py",

@@ -1,7 +1,7 @@
 """Progress: step, number of Gaussians, loss, speed, time of the end and peak GPU memory.
 
-In a terminal this is a bar. Otherwise, as in a log file or the console of a sweep's job, it is a line every
-few seconds.
+In a terminal or a notebook this is a bar. Otherwise, as in a log file or the console of a sweep's job, it is
+a line every few seconds.
 """
 
 import os
@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from cadam3d.callback.base import Callback
 from cadam3d.core.checks import require_range
+from cadam3d.core.console import say
 from cadam3d.state import Outcome, RunContext, StepReport, TrainState
 
 DAY = 24 * 3600
@@ -23,7 +24,7 @@ TITLE = 32  # characters of the prompt
 
 @dataclass(kw_only=True)
 class Progress(Callback):
-    """A tqdm bar on standard error if that is a terminal, else plain lines.
+    """A tqdm bar on standard error if that is a terminal or the output of a notebook, else messages.
 
     ``done`` is the time of day at which the last step will end if steps keep the average duration that they
     have had since this process started training, without the time in which the run was paused. ``VRAM``, on a
@@ -49,10 +50,10 @@ class Progress(Callback):
         require_range("callback.progress.line_seconds", self.line_seconds, low=0, example=10)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
-        """Open the bar at the current step, if standard error is a terminal."""
+        """Open the bar at the current step, if standard error can show one."""
         self._begun, self._due, self._pending = (state.step, time.time()), 0.0, ""
         self._bar = None
-        if sys.stderr.isatty():
+        if shows_bars():
             self._bar = tqdm(
                 total=context.total_steps,
                 initial=state.step,
@@ -103,10 +104,15 @@ class Progress(Callback):
             self._print()
 
     def _print(self) -> None:
-        """Print the line of the last step. It is flushed, so that a log can be followed."""
+        """Print the line of the last step."""
         if not os.environ.get("TQDM_DISABLE"):
-            print(self._pending, file=sys.stderr, flush=True)
+            say(self._pending)
         self._pending, self._due = "", time.monotonic() + self.line_seconds
+
+
+def shows_bars() -> bool:
+    """Return whether standard error is a terminal, or the output of a cell in a notebook."""
+    return sys.stderr.isatty() or type(sys.stderr).__module__ == "ipykernel.iostream"
 
 
 def clock(now: float, seconds: float) -> str:

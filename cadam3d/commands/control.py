@@ -3,13 +3,14 @@
 The requests are files (``io/live.py``), which the page of ``cadam3d view`` or a shell creates.
 """
 
+import logging
 import shlex
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.checkpoint import save_checkpoint
 from cadam3d.io.live import clear, is_asked, take_request
@@ -52,7 +53,7 @@ class Control:
             if self._is_paused():
                 self._pause()
             if take_request(self.run, "stop"):
-                print("\nStopping, as requested. Everything will be saved.", file=sys.stderr)
+                say("\nStopping, as requested. Everything will be saved.")
                 return True
         return self.is_interrupted()
 
@@ -63,12 +64,12 @@ class Control:
         """Wait until the run may continue, or should stop."""
         file = shlex.quote(str(shown(self.run / LIVE_PAUSE)))
         step = self.state.step
-        print(f"\nPaused after step {step}, as requested. To resume: rm {file}", file=sys.stderr)
+        say(f"\nPaused after step {step}, as requested. To resume: rm {file}")
         while self._is_paused():
             self.wait()
             time.sleep(LOOK_SECONDS)
             self._save_if_asked()
-        print("The pause has ended.", file=sys.stderr)
+        say("The pause has ended.")
 
     def _save_if_asked(self) -> None:
         """Save the asset and a state from which the run can continue. A failure costs only these files."""
@@ -79,6 +80,6 @@ class Control:
             save_checkpoint(folder / checkpoint_name(step), self.state.to_payload())
             write_ply(folder / saved_name(step), self.state.gaussians, up="-y", pad_sh=0)
         except UserError as error:
-            print(f"\nWarning: not saved: {error}", file=sys.stderr)
+            say(f"\nWarning: not saved: {error}", logging.WARNING)
         else:
-            print(f"\nSaved {shown(folder / saved_name(step))}", file=sys.stderr)
+            say(f"\nSaved {shown(folder / saved_name(step))}")

@@ -58,14 +58,20 @@ def run(cfg: DictConfig) -> None:
 
 def fill_in_title(cfg: DictConfig, asset: Asset) -> None:
     """Make the prompt of the run the title of its page, in place, unless the line sets a title."""
-    key = "exporter.html.title"
     run_folder = run_of(asset)
-    if "html" in cfg.exporter and run_folder is not None and OmegaConf.select(cfg, key) is None:
+    if "html" in cfg.exporter and run_folder is not None:
         prompt = facts_of(run_folder)["prompt"]
         if isinstance(prompt, str):
-            # The folder may be a stranger's, and a title has no control characters.
-            title = "".join(" " if unicodedata.category(each) == "Cc" else each for each in prompt)
-            OmegaConf.update(cfg, key, escape(title))
+            set_title(cfg, prompt)
+
+
+def set_title(cfg: DictConfig, title: str) -> None:
+    """Make ``title`` that of the page, in place, if the line exports a page and sets no title."""
+    key = "exporter.html.title"
+    if "html" in cfg.exporter and OmegaConf.select(cfg, key) is None:
+        # The text may be a stranger's, and a title has no control characters.
+        plain = "".join(" " if unicodedata.category(each) == "Cc" else each for each in title)
+        OmegaConf.update(cfg, key, escape(plain))
 
 
 def run_of(asset: Asset) -> Path | None:

@@ -1,11 +1,11 @@
 """Notes: messages that are neither results nor errors."""
 
 import logging
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 
+from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.core.memory import is_out_of_memory
 from cadam3d.rasterizer.base import Backend
@@ -34,13 +34,13 @@ def keeping_others(name: str, warnings: list[str], *, is_only: bool = False) -> 
             raise UserError(text) from error
         warnings.append(text)
         log.info("%s", text)
-        print(f"Warning: {text}", file=sys.stderr)
+        say(f"Warning: {text}", logging.WARNING)
 
 
 @cache
 def note(text: str) -> None:
     """Print ``text`` as a note, once per process."""
-    print(f"Note: {text}", file=sys.stderr)
+    say(f"Note: {text}", logging.WARNING)
 
 
 def note_backend(backend: Backend) -> None:

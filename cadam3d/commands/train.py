@@ -6,10 +6,12 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import FrameType
+from types import FrameType, MappingProxyType
 from typing import Any
 
 import torch
@@ -28,6 +30,7 @@ from cadam3d.commands.messages import keeping_others, note, note_backend, note_o
 from cadam3d.commands.timetable import describe
 from cadam3d.core.chart import Chart
 from cadam3d.core.checks import require, require_whole
+from cadam3d.core.console import say
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -79,15 +82,38 @@ COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "ca
 
 
 def run(cfg: DictConfig) -> float | None:
-    """Train, export, measure and report. Return the PSNR in dB if there are true images."""
-    folder = Path(HydraConfig.get().runtime.output_dir)
+    """Train in the folder of this job and print the result. Return the PSNR in dB if it was measured."""
+    stop = StopOnSignal((signal.SIGINT, signal.SIGTERM))
+    folder, summary, report = train(cfg, stop)
+    print_result(folder, summary, report)
+    # This also applies if all steps were done already, so that a loop in a shell script ends.
+    if stop.received is not None:
+        sys.exit(128 + stop.received)
+    return psnr_of(summary)
+
+
+def train(
+    cfg: DictConfig, stop: "StopOnSignal", callbacks: Sequence[Callback] = ()
+) -> tuple[Path, dict[str, Any], Path]:
+    """Train, export, measure and report in the folder of this job. Return folder, summary and report.
+
+    ``callbacks`` are called after those of ``cfg``.
+    """
     device = resolve_device(cfg.device)
     require_whole("seed", cfg.seed, low=0, example=3)
-    require_determinism(device)
+    with deterministic(device):
+        return _train(cfg, device, stop, callbacks)
+
+
+def _train(
+    cfg: DictConfig, device: torch.device, stop: "StopOnSignal", callbacks: Sequence[Callback]
+) -> tuple[Path, dict[str, Any], Path]:
+    folder = Path(HydraConfig.get().runtime.output_dir)
     require_unused(cfg)
 
     # Everything that can be refused is refused here, before the folder changes.
     trainer = build_trainer(cfg, device)
+    trainer = replace(trainer, callbacks=[*trainer.callbacks, *callbacks])
     backend = trainer.rasterizer.prepare(device)
     exporters: dict[str, Exporter] = components(cfg.exporter, Exporter, "exporter")
     metrics: dict[str, Metric] = components(cfg.metric, Metric, "metric")
@@ -102,7 +128,7 @@ def run(cfg: DictConfig) -> float | None:
     trainer.prior.load()
     note_beginning((trainer.prior.notice(), embedding.notice(), state.initial_note), backend)
     timetable = describe(trainer)
-    print(f"Schedule: {timetable}", file=sys.stderr)
+    say(f"Schedule: {timetable}")
 
     remove_leftovers(folder)
     config_text = OmegaConf.to_yaml(cfg, resolve=True)
@@ -117,10 +143,7 @@ def run(cfg: DictConfig) -> float | None:
 
     charts = declare_charts(trainer, folder)
     context = run_context(cfg.prompt, trainer, state, folder)
-    with (
-        StopOnSignal() as stop,
-        Control(folder, state, stop, partial(trainer.wait, context, state)) as control,
-    ):
+    with stop, Control(folder, state, stop, partial(trainer.wait, context, state)) as control:
         outcome = trainer.train(state, embedding, context, control)
         log.info("%s after %d steps: %d Gaussians", outcome, state.step, len(state.gaussians))
 
@@ -145,11 +168,7 @@ def run(cfg: DictConfig) -> float | None:
             config_text=config_text,
             charts=charts,
         )
-    print_result(folder, summary, report)
-    # This also applies if all steps were done already, so that a loop in a shell script ends.
-    if stop.received is not None:
-        sys.exit(128 + stop.received)
-    return psnr_of(summary)
+    return folder, summary, report
 
 
 def note_beginning(notes: Iterable[str | None], backend: Backend) -> None:
@@ -159,13 +178,19 @@ def note_beginning(notes: Iterable[str | None], backend: Backend) -> None:
     note_backend(backend)
 
 
-def require_determinism(device: torch.device) -> None:
-    """Make torch refuse operations without reproducible results on the CPU, where training needs none.
+@contextmanager
+def deterministic(device: torch.device) -> Iterator[None]:
+    """Let torch refuse operations without reproducible results on the CPU, where training needs none.
 
     This has the effect of ``use_deterministic_algorithms``, which would load torch's compiler first and thus
-    take more than a second.
+    take more than a second. The mode of the process is restored afterwards.
     """
+    before = torch.get_deterministic_debug_mode()
     torch.set_deterministic_debug_mode("error" if device.type == "cpu" else "default")
+    try:
+        yield
+    finally:
+        torch.set_deterministic_debug_mode(before)
 
 
 def require_unused(cfg: DictConfig) -> None:
@@ -191,10 +216,20 @@ def require_views(cfg: DictConfig) -> None:
     require_memory("views", cfg.views, unit=max(CAMERA, PIXEL * float(size) ** 2), example=2)
 
 
-def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
-    """Build the components that ``cfg`` names, and move the prior to ``device``."""
+def build_trainer(
+    cfg: DictConfig, device: torch.device, given: Mapping[str, Any] = MappingProxyType({})
+) -> Trainer:
+    """Build the components that ``cfg`` names, and move the prior to ``device``.
+
+    The objects in ``given``, by the name of their group, replace components of ``cfg``, which are then not
+    built.
+    """
+
+    def part(name: str, kind: type) -> Any:
+        return given[name] if name in given else component(cfg[name], kind, name)
+
     require_whole("steps", cfg.steps, low=1, high=FAR_STEP, example=600)
-    refine: Refine = component(cfg.refine, Refine, "refine")
+    refine: Refine = part("refine", Refine)
     require(
         refine.steps == cfg.steps,
         "refine.steps",
@@ -205,16 +240,16 @@ def build_trainer(cfg: DictConfig, device: torch.device) -> Trainer:
     trainer = Trainer(
         steps=cfg.steps,
         views=cfg.views,
-        camera=component(cfg.camera, CameraSampler, "camera"),
-        background=component(cfg.background, Background, "background"),
-        augmentation=component(cfg.augmentation, Augmentation, "augmentation"),
-        rasterizer=component(cfg.rasterizer, Rasterizer, "rasterizer"),
-        prior=component(cfg.prior, DiffusionPrior, "prior").to(device),
-        guidance=component(cfg.guidance, Guidance, "guidance"),
-        densifier=component(cfg.densifier, Densifier, "densifier"),
+        camera=part("camera", CameraSampler),
+        background=part("background", Background),
+        augmentation=part("augmentation", Augmentation),
+        rasterizer=part("rasterizer", Rasterizer),
+        prior=part("prior", DiffusionPrior).to(device),
+        guidance=part("guidance", Guidance),
+        densifier=part("densifier", Densifier),
         refine=refine,
-        optimizer=component(cfg.optimizer, AdamSettings, "optimizer"),
-        exposure=component(cfg.exposure, Exposure, "exposure"),
+        optimizer=part("optimizer", AdamSettings),
+        exposure=part("exposure", Exposure),
         regularizers=components(cfg.regularizer, Regularizer, "regularizer"),
         callbacks=list(components(cfg.callback, Callback, "callback").values()),
     )
@@ -272,7 +307,7 @@ def start_or_resume(
     elif (found := latest_checkpoint(folder / CHECKPOINTS, read, note_damage)) is not None:
         path, state = found
     else:
-        print(f"No checkpoint in {folder / CHECKPOINTS} yet: starting at step 0.", file=sys.stderr)
+        say(f"No checkpoint in {folder / CHECKPOINTS} yet: starting at step 0.")
         return trainer.start(cfg.prompt, initializer, cfg.seed, device)
     require(
         cfg.seed == state.seed,
@@ -290,7 +325,7 @@ def start_or_resume(
     )
     note_changes(cfg, folder)
     if state.step == trainer.steps:
-        print(f"{path.name} has all {state.step} steps; writing the outputs again.", file=sys.stderr)
+        say(f"{path.name} has all {state.step} steps; writing the outputs again.")
     return state
 
 
@@ -321,7 +356,7 @@ def read_state(path: Path, trainer: Trainer, device: torch.device) -> TrainState
 
 def note_damage(error: UserError) -> None:
     """Print which checkpoint is left out, and why."""
-    print(f"Note: left out {str(error).partition(' Try: ')[0]}", file=sys.stderr)
+    say(f"Note: left out {str(error).partition(' Try: ')[0]}", logging.WARNING)
 
 
 def note_changes(cfg: DictConfig, folder: Path) -> None:
@@ -332,7 +367,7 @@ def note_changes(cfg: DictConfig, folder: Path) -> None:
     now = dict(flatten(OmegaConf.to_container(cfg, resolve=True)))
     for key in sorted(before.keys() | now.keys()):
         if key not in ("resume", "trust") and before.get(key) != now.get(key):
-            print(f"Note: {key} was {before.get(key)!r}, is now {now.get(key)!r}", file=sys.stderr)
+            say(f"Note: {key} was {before.get(key)!r}, is now {now.get(key)!r}", logging.WARNING)
 
 
 def link_latest(folder: Path) -> None:
@@ -351,7 +386,7 @@ def link_latest(folder: Path) -> None:
         finally:
             fresh.unlink(missing_ok=True)
     except OSError as error:
-        print(f"Note: {latest} not updated ({error.strerror}).", file=sys.stderr)
+        say(f"Note: {latest} not updated ({error.strerror}).", logging.WARNING)
 
 
 def summarize(cfg: DictConfig, state: TrainState, outcome: Outcome, backend: Backend) -> dict[str, Any]:
@@ -413,19 +448,20 @@ def print_result(folder: Path, summary: Mapping[str, Any], report: Path) -> None
 
 
 class StopOnSignal:
-    """Handles SIGINT and SIGTERM: after the first one the loop stops and saves, a later one stops it at once.
+    """Handles signals: after the first one the loop stops and saves, a later one stops it at once.
 
     Signals within ``TOGETHER_SECONDS`` count as one, because a scheduler sends its signal to a process and
     also to its parent, which passes it on.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, numbers: Sequence[int]) -> None:
         self.received: int | None = None
+        self._numbers = numbers
         self._received_at = 0.0
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> "StopOnSignal":
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in self._numbers:
             self._previous[number] = signal.signal(number, self._handle)
         return self
 
@@ -443,4 +479,4 @@ class StopOnSignal:
                 return
             raise KeyboardInterrupt
         self.received, self._received_at = number, time.monotonic()
-        print("\nStopping as soon as everything is saved; interrupt again to stop at once.", file=sys.stderr)
+        say("\nStopping as soon as everything is saved; interrupt again to stop at once.", logging.WARNING)

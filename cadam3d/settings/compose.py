@@ -5,8 +5,9 @@ import math
 import re
 import shlex
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from hydra import version
@@ -20,7 +21,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from cadam3d.core.checks import fail
+from cadam3d.core.checks import fail, require_choice
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_yaml
 from cadam3d.settings.declared import config_dir, require_declared
@@ -147,6 +148,21 @@ def _values(content: Any) -> Iterator[Any]:
         yield content
     for item in inner or ():
         yield from _values(item)
+
+
+def option(group: str, name: str, kind: type, changes: Mapping[str, Any] = MappingProxyType({})) -> Any:
+    """Build one option of a group from its YAML file in this package, without a command line.
+
+    ``changes`` replace values of the file. Raises ``UserError`` for an unknown option and for the mistakes
+    that :func:`component` reports.
+    """
+    files = {path.stem: path for path in sorted((config_dir() / group).glob("*.yaml"))}
+    require_choice(group, name, list(files))
+    content = read_yaml(files[name]) | {key: escaped(value) for key, value in changes.items()}
+    # A group of which several options can be chosen has each of them under its name.
+    is_one_of_several = f"# @package {group}.{name}" in files[name].read_text(encoding="utf-8")
+    cfg = OmegaConf.create({group: {name: content} if is_one_of_several else content})
+    return component(cfg[group][name] if is_one_of_several else cfg[group], kind, group)
 
 
 def components(group: Any, kind: type = object, key: str = "") -> dict[str, Any]:

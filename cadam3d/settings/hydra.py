@@ -4,7 +4,8 @@ import os
 import re
 import sys
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -13,9 +14,11 @@ from hydra import main as hydra_main
 from hydra._internal.callbacks import Callbacks
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.utils import create_config_search_path, get_args_parser
-from hydra.core.utils import JobStatus, configure_log, run_job
+from hydra.core.utils import JobRuntime, JobStatus, configure_log, run_job
 from hydra.types import HydraContext
+from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.basecontainer import BaseContainer
 from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
@@ -127,13 +130,15 @@ def place_run(cfg: DictConfig, folder: Path) -> None:
         cfg.hydra.overrides.hydra = [f"{RUN_FOLDER}={quote(str(folder))}", *kept]
 
 
-def run_composed(cfg: DictConfig, run: Run) -> None:
+def run_composed(cfg: DictConfig, run: Run, *, has_log: bool = True) -> None:
     """Run a command on its composed configuration as a job of Hydra.
 
-    The job has its log, its ``.hydra`` folder and ``HydraConfig``. Raises whatever the command raises, which
-    Hydra itself would print before it exits.
+    The job has its ``.hydra`` folder, ``HydraConfig`` and, if it ``has_log``, its log, for which Hydra
+    replaces the handlers of this process. Raises whatever the command raises, which Hydra itself would print
+    before it exits.
     """
-    configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)
+    if has_log:
+        configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)
     name, callbacks = cfg.hydra.job.config_name, Callbacks(cfg)
     callbacks.on_run_start(config=cfg, config_name=name)
     loader = ConfigLoaderImpl(config_search_path=create_config_search_path(str(config_dir())))
@@ -143,11 +148,30 @@ def run_composed(cfg: DictConfig, run: Run) -> None:
         job_dir_key=RUN_FOLDER,
         job_subdir_key=None,
         hydra_context=HydraContext(config_loader=loader, callbacks=callbacks),
+        configure_logging=has_log,
     )
     callbacks.on_run_end(config=cfg, config_name=name, job_return=job)
     if job.status is JobStatus.FAILED:
         # The property ``return_value`` would print a line first.
         raise job._return_value
+
+
+@contextmanager
+def keeping_globals() -> Iterator[None]:
+    """Restore the global state of Hydra and OmegaConf after the block, for programs that use them too.
+
+    This is the version whose behaviour Hydra has, the name of the job, and the functions that YAML files can
+    call. :func:`cadam3d.settings.compose.compose` and Hydra itself restore the rest.
+    """
+    version, runtime = VersionBase.instance(), JobRuntime.instance()
+    base, name, resolvers = version.version_base, runtime.get("name"), dict(BaseContainer._resolvers)
+    try:
+        yield
+    finally:
+        version.version_base = base
+        runtime.set("name", name)
+        BaseContainer._resolvers.clear()
+        BaseContainer._resolvers.update(resolvers)
 
 
 def run_hydra(command: str, arguments: Sequence[str], run: Run) -> None:

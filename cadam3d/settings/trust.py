@@ -14,11 +14,11 @@ With ``trust=true`` in the command line, nothing is judged.
 """
 
 import inspect
+import logging
 import os
 import re
 import shlex
 import stat
-import sys
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -34,6 +34,7 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.core import schedule
+from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import KINDS, read_yaml
 from cadam3d.settings.compose import LONGEST_KEY, config_dir, escaped
@@ -444,7 +445,7 @@ def _refusal(path: Path, found: str, expected: str, retry: str) -> UserError:
 
 
 def _note_cache(key: str, path: Path, how: str) -> None:
-    print(
+    say(
         f"Note: {key} in {path} is ignored, because code may be loaded from there. To set it, add {how}.",
-        file=sys.stderr,
+        logging.WARNING,
     )

@@ -7,6 +7,8 @@ import pytest
 
 from cadam3d.commands.train import TOGETHER_SECONDS, StopOnSignal
 
+BOTH = (signal.SIGINT, signal.SIGTERM)
+
 
 @pytest.fixture
 def clock(monkeypatch):
@@ -15,10 +17,10 @@ def clock(monkeypatch):
     return now
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", BOTH)
 def test_the_first_signal_is_recorded_and_the_handlers_are_restored(number, clock):
     before = signal.getsignal(number)
-    with StopOnSignal() as stop:
+    with StopOnSignal(BOTH) as stop:
         assert not stop()
         os.kill(os.getpid(), number)
         assert stop()
@@ -27,7 +29,7 @@ def test_the_first_signal_is_recorded_and_the_handlers_are_restored(number, cloc
 
 
 def test_a_signal_that_arrives_twice_within_a_second_counts_once(clock):
-    with StopOnSignal() as stop:
+    with StopOnSignal(BOTH) as stop:
         os.kill(os.getpid(), signal.SIGTERM)
         clock[0] += 0.9 * TOGETHER_SECONDS
         os.kill(os.getpid(), signal.SIGINT)
@@ -35,7 +37,7 @@ def test_a_signal_that_arrives_twice_within_a_second_counts_once(clock):
 
 
 def test_a_later_signal_stops_at_once(clock):
-    with StopOnSignal():
+    with StopOnSignal(BOTH):
         os.kill(os.getpid(), signal.SIGINT)
         clock[0] += 1.1 * TOGETHER_SECONDS
         with pytest.raises(KeyboardInterrupt):

@@ -1,0 +1,257 @@
+"""Assets in Python: ``load`` reads one, and an ``Asset`` can be rendered, exported, meshed and shown."""
+
+import html
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from omegaconf import DictConfig
+from torch import Tensor
+
+from cadam3d.api.guest import as_guest, literal, logging_messages, require_object, require_words
+from cadam3d.commands import asset as files
+from cadam3d.commands.export import require_apart, set_title
+from cadam3d.commands.messages import note_backend
+from cadam3d.core.cameras import Cameras
+from cadam3d.core.device import resolve_device
+from cadam3d.core.errors import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.render import RenderFn, RenderOutput, Subject
+from cadam3d.core.surface import SurfaceSettings
+from cadam3d.exporter.html import UNTITLED
+from cadam3d.exporter.images import ImagesExporter
+from cadam3d.exporter.mesh import MeshExporter
+from cadam3d.exporter.pictures import paint
+from cadam3d.exporter.programs import FORMATS
+from cadam3d.io.asset_file import read_gaussians
+from cadam3d.io.asset_record import facts_of
+from cadam3d.io.atomic import replacing
+from cadam3d.io.image import to_uint8
+from cadam3d.io.run_folder import VIEWER, expanded, shown
+from cadam3d.launch import Task, compose_checked, explaining, read_words, run_line
+from cadam3d.rasterizer.base import Rasterizer, render_fn
+from cadam3d.settings.compose import option
+from cadam3d.viewer.pack import pack
+from cadam3d.viewer.page import viewer_page
+
+if TYPE_CHECKING:
+    import trimesh
+
+VIEWS_AT_ONCE = 4  # bounds the memory of rendering many views
+FRAME = (
+    '<iframe srcdoc="{page}" title="{title}" sandbox="allow-scripts" allowfullscreen '
+    'style="width: 100%; height: {height}px; border: 0"></iframe>'
+)
+
+
+def load(
+    path: str | os.PathLike[str], *, up: str | None = None, device: str = "auto", rasterizer: str = "auto"
+) -> "Asset":
+    """Return the asset in a run folder, or in a file of any format that cadam3d reads.
+
+    The format is recognised by the content: PLY, compressed PLY, ``.splat`` or SPZ. ``up`` is the up axis of
+    a file that does not record it (``-y``, ``+y`` or ``+z``; None is the usual one of its format). ``device``
+    holds the Gaussians: ``auto`` is CUDA if there is one, else the CPU. ``rasterizer`` is an option of the
+    group ``rasterizer``.
+
+    Raises ``UserError`` if the folder or the file cannot be read.
+    """
+    place = expanded(os.fspath(path))
+    renders = option("rasterizer", rasterizer, Rasterizer)
+    # A name without a suffix is more likely a folder that does not exist than a file.
+    if place.is_dir() or not place.suffix:
+        folder = files.find_run(str(place))
+        place, prompt = files.find_asset(folder), facts_of(folder)["prompt"]
+        # A stranger may have written the folder.
+        title = prompt if isinstance(prompt, str) else None
+    else:
+        title = place.stem
+    gaussians = read_gaussians(place, up=up).to(resolve_device(device))
+    return Asset(gaussians, source=place, title=title, rasterizer=renders)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Asset:
+    """3D Gaussians, such as those of a run, with ways to look at them and to pass them on.
+
+    ``len(asset)`` is the number of Gaussians. ``asset.gaussians`` are the tensors themselves.
+    """
+
+    gaussians: Gaussians
+    source: Path | None = field(default=None, kw_only=True)  # the file they were read from
+    title: str | None = field(default=None, kw_only=True)  # such as the prompt; None = "3D Gaussians"
+    rasterizer: Rasterizer = field(
+        default_factory=lambda: option("rasterizer", "auto", Rasterizer), kw_only=True
+    )
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    def __repr__(self) -> str:
+        facts = [f"{len(self):,} Gaussians", f"SH degree {self.gaussians.sh_degree}"]
+        facts += [] if self.gaussians.device.type == "cpu" else [f"on {self.gaussians.device}"]
+        facts += [] if self.title is None else [repr(self.title)]
+        facts += [] if self.source is None else [f"from {shown(self.source)}"]
+        return f"<Asset: {', '.join(facts)}>"
+
+    def render(  # noqa: PLR0913  (one argument per setting)
+        self,
+        cameras: Cameras | None = None,
+        *,
+        kind: str = "rgb",
+        background: Sequence[float] | str | None = None,
+        views: int | None = None,
+        elevation_deg: float | None = None,
+        distance: float | None = None,
+        fov_y_deg: float | None = None,
+        size: int | None = None,
+    ) -> UInt8[np.ndarray, "v h w c"]:
+        """Return pictures as bytes from 0 to 255: one for each camera, or a turn around the object.
+
+        ``kind`` is ``rgb``, ``depth`` (yellow is near), ``alpha`` or ``normal``. ``background`` is RGB in [0,
+        1], or ``"transparent"``, which gives a fourth channel. The settings after it are those of the turn:
+        ``views`` pictures of ``size`` pixels, evenly spaced from the front on, ``elevation_deg`` above the
+        horizon at ``distance`` world units with a vertical field of view of ``fov_y_deg``. ``None`` is the
+        value in ``configs/exporter/images.yaml``. The pixels are those of ``cadam3d render`` with the same
+        settings.
+
+        Raises ``UserError`` for values out of range.
+        """
+        turn = {"views": views, "distance": distance, "fov_y_deg": fov_y_deg, "size": size}
+        turn["elevations_deg"] = None if elevation_deg is None else [elevation_deg]
+        turn = {name: value for name, value in turn.items() if value is not None}
+        if cameras is not None and turn:
+            raise UserError(
+                f"cameras: expected cameras or the settings of a turn, got both ({', '.join(turn)}). "
+                "Try: cameras=None"
+            )
+        look = {"kinds": [kind]} | ({} if background is None else {"background": background})
+        settings: ImagesExporter = option("exporter", "images", ImagesExporter, turn | look)
+        if cameras is None:
+            cameras, away = settings.ring(settings.views, settings.elevations_deg[0]), settings.distance
+        else:
+            require_object("cameras", cameras, Cameras, "cameras=None")
+            away = float(cameras.positions.norm(dim=-1).mean())
+        subject = Subject(self.gaussians, self._render)
+        pictures = []
+        for first in range(0, len(cameras), VIEWS_AT_ONCE):
+            some = cameras.index(slice(first, first + VIEWS_AT_ONCE))
+            [painted] = paint(
+                subject,
+                some,
+                settings.backgrounds(len(some)),
+                settings.kinds,
+                distance=away,
+                is_transparent=settings.is_transparent,
+            )
+            pictures.append(to_uint8(painted))
+        return np.concatenate(pictures)
+
+    def rasterize(self, cameras: Cameras, background: Float[Tensor, "v 3"] | None = None) -> RenderOutput:
+        """Return the exact numbers of a render, as tensors without gradient: rgb, alpha, depth and radii.
+
+        ``background`` is one RGB colour in [0, 1] per view; None is black.
+        """
+        return self._render(cameras, torch.zeros(len(cameras), 3) if background is None else background)
+
+    @cached_property
+    def _render(self) -> RenderFn:
+        with logging_messages():
+            note_backend(self.rasterizer.prepare(self.gaussians.device))
+        return render_fn(self.rasterizer, lambda: self.gaussians)
+
+    def export(self, path: str | os.PathLike[str], *overrides: str) -> list[Path]:
+        """Write the asset for another program, and return the paths of the files.
+
+        This is ``cadam3d export output=PATH OVERRIDES``. The suffix of ``path`` chooses the format: ``.ply``,
+        ``.compressed.ply``, ``.splat``, ``.spz``, ``.ksplat``, ``.sog``, ``.glb``, ``.html``, ``.obj``,
+        ``.png``, ``.mp4``, ``.webm`` or ``.gif``. An override chooses another one of the same suffix or
+        changes its settings, such as ``"exporter=[mesh]"`` or ``"exporter.ply.up=+z"``. A path without a
+        suffix is a folder for the files of ``exporter=[...]`` or ``for=...``.
+
+        Raises ``UserError`` if the settings are wrong or a file cannot be written.
+        """
+        require_words(overrides)
+        words = [literal("output", os.fspath(path)), *overrides]
+        job = _Export("export", asset=self)
+        with as_guest(), explaining(job, words):
+            line = read_words("export", words)
+            run_line(line, compose_checked(line), job, has_log=False)
+        return job.written
+
+    def mesh(self, **settings: Any) -> "trimesh.Trimesh":
+        """Return the outer surface as triangles with a colour per vertex, in world axes (+z up, front at +x).
+
+        ``settings`` are ``resolution``, ``level``, ``smallest_part`` and ``triangles``, by default those in
+        ``configs/exporter/mesh.yaml``. Raises ``UserError`` if the asset has no surface.
+        """
+        import trimesh
+
+        if unknown := sorted(settings.keys() - {each.name for each in fields(SurfaceSettings)}):
+            known = ", ".join(each.name for each in fields(SurfaceSettings))
+            raise UserError(
+                f"mesh: there is no setting {unknown[0]}, only {known}. Try: mesh(resolution=128)"
+            )
+        exporter: MeshExporter = option("exporter", "mesh", MeshExporter, settings)
+        surface, _ = exporter.surface(self.gaussians)
+        return trimesh.Trimesh(
+            vertices=surface.vertices,
+            faces=surface.faces,
+            vertex_normals=surface.normals,
+            vertex_colors=(surface.colors * 255).round().astype(np.uint8),
+            process=False,
+        )
+
+    def show(self, *, height: int = 480) -> Path | None:
+        """Show the asset in the output of a notebook, to turn and to zoom; ``height`` is in pixels.
+
+        Outside of a notebook, write a page into a new temporary folder, print its path, and return it.
+        """
+        title = self.title or UNTITLED
+        page = viewer_page(pack(self.gaussians), title=title)
+        if is_notebook():
+            from IPython.display import display
+
+            frame = FRAME.format(page=html.escape(page), title=html.escape(title), height=int(height))
+            display({"text/html": frame, "text/plain": repr(self)}, raw=True)
+            return None
+        path = Path(tempfile.mkdtemp(prefix="cadam3d-"), VIEWER)
+        with replacing(path) as temporary:
+            temporary.write_text(page, encoding="utf-8")
+        print(f"Open this in a browser: {path}")
+        return path
+
+
+def is_notebook() -> bool:
+    """Return whether this process runs the cells of a notebook, which can show HTML."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return hasattr(shell, "kernel")
+
+
+@dataclass
+class _Export(Task):
+    """An export of one asset. It keeps the paths that it has written."""
+
+    asset: Asset = field(kw_only=True)
+    written: list[Path] = field(default_factory=list, init=False)
+
+    def __call__(self, cfg: DictConfig) -> None:
+        """Write the files."""
+        self.has_started = True
+        source = self.asset.source or Path("asset")
+        asset = files.Asset(self.asset.gaussians, ply=source, folder=source.parent)
+        if self.asset.title is not None:
+            set_title(cfg, self.asset.title)
+        if self.asset.source is not None:
+            target = expanded(str(cfg.output))
+            inside = [target / FORMATS[name].file for name in cfg.exporter if name in FORMATS]
+            require_apart(asset, [target, *inside])
+        self.written = [output.path for output in files.write_files(cfg, asset, "")]

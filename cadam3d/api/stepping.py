@@ -1,0 +1,193 @@
+"""Stepping from Python: a trainer that makes one step per call, with objects in place of components."""
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, cast
+
+import torch
+from omegaconf import OmegaConf, open_dict
+from torch import Tensor
+
+from cadam3d import trainer as loop
+from cadam3d.api.asset import Asset
+from cadam3d.api.guest import as_guest, logging_messages, require_object, require_words, usual_modes
+from cadam3d.augmentation import Augmentation
+from cadam3d.background import Background
+from cadam3d.camera.base import CameraSampler
+from cadam3d.commands.train import build_trainer, deterministic, note_beginning, require_unused
+from cadam3d.core.checks import require_whole
+from cadam3d.core.device import resolve_device
+from cadam3d.core.errors import UserError
+from cadam3d.core.outcome import Outcome
+from cadam3d.densifier.base import Densifier
+from cadam3d.densifier.refine import Refine
+from cadam3d.exposure import Exposure
+from cadam3d.guidance.base import Guidance
+from cadam3d.initializer.base import Initializer
+from cadam3d.launch import Task, compose_checked, explaining, read_words
+from cadam3d.optimizer import AdamSettings
+from cadam3d.prior.base import DiffusionPrior, PromptEmbedding
+from cadam3d.rasterizer.base import Rasterizer
+from cadam3d.settings.compose import component
+from cadam3d.settings.line import key_of
+from cadam3d.state import RefineReport, StepReport, TrainState
+
+# What an object may replace, and the class of the object.
+REPLACEABLE: Mapping[str, type] = {
+    "augmentation": Augmentation,
+    "background": Background,
+    "camera": CameraSampler,
+    "densifier": Densifier,
+    "exposure": Exposure,
+    "guidance": Guidance,
+    "initializer": Initializer,
+    "optimizer": AdamSettings,
+    "prior": DiffusionPrior,
+    "rasterizer": Rasterizer,
+    "refine": Refine,
+}
+
+
+@dataclass(frozen=True)
+class Step(StepReport):
+    """Result of one step, with the refinement that followed it, if any.
+
+    ``num_gaussians`` is the number that was rendered, before that refinement.
+    """
+
+    # What the refinement or opacity reset after this step has changed; None if none was due.
+    refinement: RefineReport | None
+
+
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
+class Trainer:
+    """A run that the caller steps by hand. It does not change; the state that :meth:`start` returns does.
+
+    Nothing is written, and the callbacks, exporters and metrics of the settings are not used. The bytes of
+    the Gaussians after the last step are those of :func:`cadam3d.train` with the same settings.
+    """
+
+    prompt: str
+    negative_prompt: str
+    seed: int
+    device: torch.device
+    config: dict[str, Any]  # all settings, resolved
+    initializer: Initializer  # makes the Gaussians of the start
+    parts: loop.Trainer  # the other components: parts.densifier, parts.guidance, parts.prior and so on
+
+    @property
+    def steps(self) -> int:
+        """Return the number of steps of the whole run."""
+        return self.parts.steps
+
+    def start(self, seed: int | None = None) -> TrainState:
+        """Return the state before the first step; ``seed`` replaces that of the settings.
+
+        The prior is loaded and the rasterizer compiled, if they need that.
+        """
+        seed = self.seed if seed is None else seed
+        require_whole("seed", seed, low=0, example=3)
+        with logging_messages(), usual_modes(), deterministic(self.device):
+            backend = self.parts.rasterizer.prepare(self.device)
+            notice = self._embedding.notice()
+            state = self.parts.start(self.prompt, self.initializer, seed, self.device)
+            # The prior is loaded last, because an initializer may have needed the memory and has freed it.
+            self.parts.prior.load()
+            note_beginning((self.parts.prior.notice(), notice, state.initial_note), backend)
+        return state
+
+    def step(self, state: TrainState) -> Step:
+        """Advance ``state`` in place by one step, with its refinement or opacity reset if one is due."""
+        started = time.perf_counter()
+        with usual_modes(), deterministic(self.device):
+            report, refinement = self.parts.step(state, self._embedding)
+        state.seconds += time.perf_counter() - started
+        return Step(**vars(report), refinement=refinement)
+
+    def run(self, state: TrainState) -> Iterator[Step]:
+        """Advance ``state`` in place until the run ends, and yield every step after it is done."""
+        while self.outcome(state) is None:
+            yield self.step(state)
+
+    def outcome(self, state: TrainState) -> Outcome | None:
+        """Return how the run has ended, such as ``"finished"``, or ``None`` if more steps are to be done."""
+        return self.parts.outcome(state)
+
+    def asset(self, state: TrainState) -> Asset:
+        """Return a copy of the present Gaussians as an asset, to render, show and export."""
+        return Asset(
+            state.gaussians.detach().map(Tensor.clone), title=self.prompt, rasterizer=self.parts.rasterizer
+        )
+
+    @cached_property
+    def _embedding(self) -> PromptEmbedding:
+        return self.parts.prior.embed(self.prompt, self.negative_prompt)
+
+    def __repr__(self) -> str:
+        parts = self.parts
+        names = [type(part).__name__ for part in (parts.densifier, parts.guidance, parts.prior)]
+        facts = [f"{self.steps} steps of {parts.views} views", *names, f"seed {self.seed}"]
+        return f"<Trainer {self.prompt!r}: {', '.join(facts)}, on {self.device}>"
+
+
+def compose(  # noqa: PLR0913  (one argument per component)
+    *overrides: str,
+    augmentation: Augmentation | None = None,
+    background: Background | None = None,
+    camera: CameraSampler | None = None,
+    densifier: Densifier | None = None,
+    exposure: Exposure | None = None,
+    guidance: Guidance | None = None,
+    initializer: Initializer | None = None,
+    optimizer: AdamSettings | None = None,
+    prior: DiffusionPrior | None = None,
+    rasterizer: Rasterizer | None = None,
+    refine: Refine | None = None,
+) -> Trainer:
+    """Return a trainer with the settings of ``cadam3d train OVERRIDES``, to be stepped by hand.
+
+    ``overrides`` are the words of the command line, without quotes for a shell; one of them must be the
+    prompt, such as ``"prompt=a red cube"``. Every other argument is an object that replaces the component of
+    this name. Its settings must then not be among the overrides.
+
+    Raises ``UserError`` for mistakes, with the texts of the command line.
+    """
+    arguments = dict(locals())
+    given = {name: arguments[name] for name in REPLACEABLE if arguments[name] is not None}
+    require_words(overrides)
+    for name, value in given.items():
+        example = f'"{name}={value}"' if isinstance(value, str) else f"{name}=None"
+        require_object(name, value, REPLACEABLE[name], example)
+    for override in overrides:
+        name = key_of(override).partition(".")[0]
+        if name in given:
+            raise UserError(
+                f"{key_of(override)}: expected the object or its settings, got both. "
+                f"Try: compose without {override!r}"
+            )
+        if name == "resume":
+            raise UserError(
+                'resume: only a whole run continues another. Try: cadam3d.train(None, "resume=RUN")'
+            )
+    task = Task("train")
+    with as_guest(), explaining(task, overrides):
+        cfg = compose_checked(read_words("train", overrides))
+        with open_dict(cfg):
+            cfg.pop("hydra")
+        device = resolve_device(cfg.device)
+        require_whole("seed", cfg.seed, low=0, example=3)
+        require_unused(cfg)
+        trainer = build_trainer(cfg, device, given)
+        if initializer is None:
+            initializer = component(cfg.initializer, Initializer, "initializer")
+        return Trainer(
+            prompt=cfg.prompt,
+            negative_prompt=cfg.negative_prompt,
+            seed=cfg.seed,
+            device=device,
+            config=cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True)),
+            initializer=cast(Initializer, initializer),
+            parts=trainer,
+        )

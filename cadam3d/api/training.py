@@ -1,0 +1,157 @@
+"""Training from Python: ``train`` does what ``cadam3d train`` does, and returns the run that it has made."""
+
+import os
+import shlex
+import signal
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from cadam3d.api.asset import Asset, load
+from cadam3d.api.guest import as_guest, literal, logged_to, require_object, require_words
+from cadam3d.callback.base import Callback
+from cadam3d.commands import train as command
+from cadam3d.commands.asset import find_run
+from cadam3d.core.errors import UserError
+from cadam3d.io.records import psnr_of, read_config, read_metrics, read_summary
+from cadam3d.io.run_folder import CONFIG, LOG, REPORT, shown
+from cadam3d.launch import Task, compose_checked, explaining, read_words, run_line
+from cadam3d.settings.line import RUN_FOLDER, key_of
+
+
+class Run:
+    """A run: the results in a folder that ``cadam3d train`` or :func:`train` has written.
+
+    Everything is read from the files when it is asked for, so that a run that still trains shows its present
+    state, and a run of last week can be opened with ``Run("outputs/latest")``.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        """Open the run in ``folder``. Raises ``UserError`` if the folder does not hold a run."""
+        self.folder: Path = find_run(os.fspath(folder))
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Return the facts of ``summary.json``, such as ``num_gaussians`` and ``psnr``; {} before the end."""
+        return read_summary(self.folder)
+
+    @property
+    def metrics(self) -> list[dict[str, Any]]:
+        """Return the rows of ``metrics.jsonl``, oldest first.
+
+        Each has a ``kind`` (``"step"`` or ``"refine"``) and a ``step``. Rows of steps have ``loss``,
+        ``num_gaussians`` and ``seconds``; rows of refinements have the counts of what was changed.
+        """
+        return read_metrics(self.folder)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Return all settings of the run as plain nested dicts, resolved."""
+        return read_config(self.folder / CONFIG)
+
+    @property
+    def asset(self) -> Asset:
+        """Return the asset. Raises ``UserError`` if the run has written none."""
+        return load(self.folder)
+
+    @property
+    def report(self) -> Path:
+        """Return the path of the page with the object, charts and numbers, which training writes last."""
+        return self.folder / REPORT
+
+    def resume(self, *overrides: str, callbacks: Sequence[Callback] = ()) -> "Run":
+        """Continue the run in its folder, with changed settings such as ``"steps=900"``; see ``train``."""
+        return train(None, literal("resume", str(self.folder)), *overrides, callbacks=callbacks)
+
+    def __repr__(self) -> str:
+        summary = self.summary
+        facts = [repr(summary.get("prompt", self.config.get("prompt")))]
+        if {"outcome", "steps", "num_gaussians", "seconds"} <= summary.keys():
+            facts.append(f"{summary['outcome']} after {summary['steps']} steps")
+            facts.append(f"{summary['num_gaussians']:,} Gaussians")
+            facts.append(f"{summary['seconds']:.0f} s")
+        else:
+            facts.append("not finished")
+        if (psnr := psnr_of(summary)) is not None:
+            facts.append(f"PSNR {psnr:.2f} dB")
+        return f"<Run {shown(self.folder)}: {', '.join(facts)}>"
+
+
+def train(
+    prompt: str | None,
+    *overrides: str,
+    callbacks: Sequence[Callback] = (),
+    folder: str | os.PathLike[str] | None = None,
+) -> Run:
+    """Train an asset for ``prompt``, and return the run.
+
+    This is ``cadam3d train prompt=... OVERRIDES``, with the same settings, checks, files and bytes. The
+    prompt may contain any characters. ``overrides`` are the words of the command line, such as
+    ``"steps=300"`` or ``"densifier=baseline"``, without quotes for a shell. ``folder`` is the folder of the
+    run, by default a new one in ``outputs``. ``callbacks`` are called after those of the settings. To
+    continue a run, pass ``"resume=FOLDER"`` and ``None`` as the prompt, or call :meth:`Run.resume`.
+
+    Raises ``UserError`` for mistakes, with the texts of the command line. After Ctrl-C, or the interrupt of a
+    notebook, the run saves everything as on the command line, and then ``KeyboardInterrupt`` is raised. A
+    second one stops at once. Messages go to the logger ``cadam3d.messages``.
+    """
+    words = _words(prompt, overrides, folder)
+    require_object("callbacks", callbacks, Sequence, "callbacks=[]")
+    for callback in callbacks:
+        require_object("callbacks", callback, Callback, "callbacks=[]")
+    job = _Training("train", callbacks=callbacks)
+    with as_guest(), explaining(job, words):
+        line = read_words("train", words)
+        run_line(line, compose_checked(line), job, has_log=False)
+    run = Run(job.folder)
+    if job.stop.received is not None:
+        again = f"cadam3d train {shlex.quote(f'resume={shown(run.folder)}')}"
+        raise KeyboardInterrupt(f"Everything is saved. Continue with: {again}")
+    return run
+
+
+@dataclass
+class _Training(Task):
+    """A run in this process. It keeps its folder and whether it was interrupted."""
+
+    callbacks: Sequence[Callback] = ()
+    folder: Path = field(default=Path(), init=False)
+    stop: command.StopOnSignal = field(default_factory=lambda: command.StopOnSignal(_signals()), init=False)
+
+    def __call__(self, cfg: DictConfig) -> None:
+        """Train. The signal that ends a program stays that of the caller."""
+        self.has_started = True
+        self.folder = Path(HydraConfig.get().runtime.output_dir)
+        with logged_to(self.folder / LOG):
+            command.train(cfg, self.stop, self.callbacks)
+
+
+def _signals() -> tuple[int, ...]:
+    """Return the signals that training may handle; Python handles signals in the main thread only."""
+    is_main = threading.current_thread() is threading.main_thread()
+    return (signal.SIGINT,) if is_main else ()
+
+
+def _words(
+    prompt: str | None, overrides: tuple[str, ...], folder: str | os.PathLike[str] | None
+) -> list[str]:
+    """Return the words of the command line that does the same."""
+    require_words(overrides)
+    named = {}
+    if prompt is not None:
+        require_object("prompt", prompt, str, '"a red cube"')
+        named["prompt"] = prompt
+    if folder is not None:
+        named[RUN_FOLDER] = os.fspath(folder)
+    for override in overrides:
+        if key_of(override) in named:
+            raise UserError(
+                f"{key_of(override)}: expected one value, got the argument {named[key_of(override)]!r} and "
+                f"{override!r}. Try: the argument alone"
+            )
+    return [*(literal(key, text) for key, text in named.items()), *overrides]

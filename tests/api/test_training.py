@@ -1,0 +1,229 @@
+"""``cadam3d.train`` gives the bytes of the command line, and leaves the program that calls it as it was."""
+
+import logging
+import os
+import signal
+import threading
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import JobRuntime
+from hydra.version import VersionBase
+from omegaconf import OmegaConf
+
+import cadam3d
+from cadam3d.api.guest import literal
+from cadam3d.settings.line import quoted, text_of
+from cadam3d.state import RunContext, StepReport, TrainState
+
+SMALL = ("prior=tiny", "rasterizer=reference", "steps=4", "views=1", "camera.size=8", "initializer.count=20")
+SMALL += ("refine.start=0", "refine.end=9", "refine.interval=2", "densifier.min_age=0", "seed=3")
+SMALL += ("exporter=[ply]", "metric=[size]", "callback=[checkpoint,metrics]", "callback.checkpoint.every=1")
+NASTY = "it's 50% of \"a, cube\" = [red], {x: $HOME} ${seed} \\' 🎈"
+
+
+@dataclass
+class Witness(cadam3d.Callback):
+    """Records the steps, and interrupts the program after one of them."""
+
+    interrupts_at: int | None = None
+    seen: list[tuple[int, int]] = field(default_factory=list)
+
+    def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
+        self.seen.append((report.step, len(state.gaussians)))
+        if report.step == self.interrupts_at:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("runs")
+
+
+@pytest.fixture(scope="module")
+def run(place) -> cadam3d.Run:
+    return cadam3d.train(NASTY, *SMALL, folder=place / "usual")
+
+
+def asset_of(run: cadam3d.Run) -> bytes:
+    return (run.folder / "asset.ply").read_bytes()
+
+
+def test_the_bytes_are_those_of_the_command_line(run, type_line):
+    done = type_line("train", f"prompt={NASTY}", *SMALL, "hydra.run.dir=line")
+    assert done.code == 0, done.err
+    line = cadam3d.Run("line")
+    assert asset_of(line) == asset_of(run)
+    assert line.config == run.config
+    words = [(each.folder / ".hydra/overrides.yaml").read_text(encoding="utf-8") for each in (line, run)]
+    assert words[0] == words[1]
+    assert {path.name for path in line.folder.iterdir()} == {path.name for path in run.folder.iterdir()}
+
+
+@pytest.mark.parametrize(
+    "prompt",
+    [NASTY, "'a cube'", '"a cube"', "null", "a=b", "[a,b]", "a\\", "${steps}", "choice(a,b)", " é\n"],
+)
+def test_a_prompt_may_contain_any_characters(prompt):
+    assert text_of(quoted(literal("prompt", prompt), is_sweep=False)) == prompt
+
+
+def test_a_run_shows_its_numbers(run):
+    assert run.config["prompt"] == run.summary["prompt"] == NASTY
+    assert run.summary["num_gaussians"] == len(run.asset)
+    assert run.metrics[-1]["step"] == 4
+    assert {row["kind"] for row in run.metrics} == {"step", "refine"}
+    assert run.report.is_file()
+    assert f"finished after 4 steps, {len(run.asset)} Gaussians" in repr(run)
+    assert repr(cadam3d.Run(run.folder)) == repr(run)
+
+
+@dataclass(eq=False)
+class Chatter(logging.Handler):
+    """A handler of the caller, which wants warnings."""
+
+    seen: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        super().__init__()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.seen.append(f"{record.levelname} {record.getMessage()}")
+
+
+def process_state() -> dict[str, object]:
+    """Return what a library must not change."""
+    logger, root = logging.getLogger("cadam3d"), logging.getLogger()
+    return {
+        "version": VersionBase.instance().getbase(),
+        "job": JobRuntime.instance().get("name"),
+        "hydra": GlobalHydra.instance().hydra,
+        "config": HydraConfig.instance().cfg,
+        "resolvers": OmegaConf.create({"a": "${slug:x}"}).a,
+        "determinism": torch.get_deterministic_debug_mode(),
+        "dtype": torch.get_default_dtype(),
+        "grad": torch.is_grad_enabled(),
+        "signals": [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)],
+        "logging": (root.level, list(root.handlers), logger.level, list(logger.handlers), logger.propagate),
+        "folder": Path.cwd(),
+        "environment": dict(os.environ),
+        "warnings": list(warnings.filters),
+        "random": torch.get_rng_state().sum().item(),
+    }
+
+
+def test_the_program_of_the_caller_stays_as_it_was(run, place, tmp_path, monkeypatch, capfd):
+    """The caller uses Hydra itself, has other modes of torch, and a log of its own."""
+    monkeypatch.chdir(tmp_path)
+    OmegaConf.register_new_resolver("slug", lambda text: f"my {text}", replace=True)
+    handler, root = Chatter(), logging.getLogger()
+    # Without the handlers and the level that the command line has left in the process of the tests.
+    monkeypatch.setattr(root, "handlers", [handler])
+    level, dtype = root.level, torch.get_default_dtype()
+    root.setLevel(logging.WARNING)
+    torch.set_default_dtype(torch.float64)
+    try:
+        with hydra.initialize(config_path=None, job_name="mine", version_base="1.2"), torch.no_grad():
+            before = process_state()
+            again = cadam3d.train(NASTY, *SMALL, "callback=[checkpoint,metrics,progress]", folder="again")
+            assert process_state() == before
+    finally:
+        torch.set_default_dtype(dtype)
+        root.setLevel(level)
+        OmegaConf.clear_resolver("slug")
+    assert asset_of(again) == asset_of(run)
+    assert capfd.readouterr() == ("", "")
+    # The log of the run has more, but the caller asked for warnings only.
+    assert not [line for line in handler.seen if line.startswith("INFO")]
+    assert "prompt" in (again.folder / "train.log").read_text(encoding="utf-8")
+
+
+def test_a_callback_sees_every_step_and_a_thread_trains_in_any_folder(run, place):
+    witness, runs, folder = Witness(), [], place / "it's, {my} [folder]"
+
+    def work() -> None:
+        runs.append(cadam3d.train(NASTY, *SMALL, callbacks=[witness], folder=folder))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert [step for step, _ in witness.seen] == [1, 2, 3, 4]
+    assert witness.seen[-1][1] == len(run.asset)
+    assert asset_of(runs[0]) == asset_of(run)
+    assert runs[0].folder == folder
+
+
+def test_an_interrupt_saves_and_the_run_continues_to_the_same_bytes(run, place):
+    with pytest.raises(KeyboardInterrupt, match="Everything is saved"):
+        cadam3d.train(NASTY, *SMALL, callbacks=[Witness(interrupts_at=2)], folder=place / "interrupted")
+    half = cadam3d.Run(place / "interrupted")
+    assert half.summary["outcome"] == "interrupted"
+    whole = half.resume()
+    assert whole.folder == half.folder
+    assert whole.summary["outcome"] == "finished"
+    assert asset_of(whole) == asset_of(run)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("stesp=3",),
+        ("prior=tiny", "densifier.tau_Q=2"),
+        ("resume=nowhere",),
+        ("hydra.run.dir=taken",),
+        ("a word",),
+    ],
+    ids=lambda words: words[-1],
+)
+def test_an_error_has_the_text_of_the_command_line(words, type_line):
+    Path("taken").mkdir()
+    Path("taken/summary.json").write_text("{}")
+    shown = type_line("train", "prompt=a red cube", *words)
+    with pytest.raises(cadam3d.UserError) as caught:
+        cadam3d.train("a red cube", *words)
+    assert str(caught.value) == shown.message
+    assert [path.name for path in Path().iterdir()] == ["taken"]
+
+
+def test_a_prompt_is_needed():
+    with pytest.raises(cadam3d.UserError, match="prompt: no value given"):
+        cadam3d.train(None)
+
+
+@pytest.mark.parametrize(
+    ("words", "settings", "message"),
+    [
+        ((5,), {}, "prompt: expected an object of class builtins.str, got 5"),
+        (("a cube", 5), {}, "overrides: expected an object of class builtins.str, got 5"),
+        (("a cube", "prompt=a cone"), {}, "prompt: expected one value"),
+        (("a cube", "hydra.run.dir=b"), {"folder": "a"}, "hydra.run.dir: expected one value"),
+        (("a cube", "--cfg", "job"), {}, "only the command line"),
+        (("a cube", "--help"), {}, "only the command line"),
+        (("a cube", "-m"), {}, "only the command line"),
+        (("a cube",), {"callbacks": [print]}, "callbacks: expected an object of class"),
+        (("a cube",), {"callbacks": Witness()}, "callbacks: expected an object of class"),
+    ],
+)
+def test_what_only_python_can_get_wrong_is_refused(words, settings, message, without_type_checks):
+    with pytest.raises(cadam3d.UserError, match=message):
+        cadam3d.train(*words, **settings)
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    with pytest.raises(cadam3d.UserError, match=r"expected the folder of a run"):
+        cadam3d.Run(tmp_path)
+
+
+def test_a_run_that_has_not_ended_shows_what_it_has(run, tmp_path):
+    (tmp_path / "config.yaml").write_bytes((run.folder / "config.yaml").read_bytes())
+    begun = cadam3d.Run(tmp_path)
+    assert (begun.summary, begun.metrics) == ({}, [])
+    assert "not finished" in repr(begun)
+    with pytest.raises(cadam3d.UserError, match=r"has no asset\.ply yet"):
+        begun.asset  # noqa: B018
