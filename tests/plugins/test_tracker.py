@@ -250,6 +250,7 @@ def test_an_import_of_the_plugins_loads_no_package_of_the_command_line():
         "collections",
         "dataclasses",
         "difflib",
+        "importlib",
         "math",
         "numpy",
         "sys",
