@@ -13,15 +13,22 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from cadam3d.api.asset import Asset, load
-from cadam3d.api.guest import as_guest, literal, logged_to, require_object, require_words
+from cadam3d.api.guest import (
+    as_guest,
+    literal,
+    logged_to,
+    path_text,
+    require_free,
+    require_object,
+    require_words,
+)
 from cadam3d.callback.base import Callback
 from cadam3d.commands import train as command
 from cadam3d.commands.asset import find_run
-from cadam3d.core.errors import UserError
 from cadam3d.io.records import psnr_of, read_config, read_metrics, read_summary
 from cadam3d.io.run_folder import CONFIG, LOG, REPORT, shown
 from cadam3d.launch import Task, compose_checked, explaining, read_words, run_line
-from cadam3d.settings.line import RUN_FOLDER, key_of
+from cadam3d.settings.line import RUN_FOLDER
 
 
 class Run:
@@ -33,7 +40,7 @@ class Run:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         """Open the run in ``folder``. Raises ``UserError`` if the folder does not hold a run."""
-        self.folder: Path = find_run(os.fspath(folder))
+        self.folder: Path = find_run(path_text("folder", folder, 'Run("outputs/latest")'))
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -66,6 +73,8 @@ class Run:
 
     def resume(self, *overrides: str, callbacks: Sequence[Callback] = ()) -> "Run":
         """Continue the run in its folder, with changed settings such as ``"steps=900"``; see ``train``."""
+        require_words(overrides)
+        require_free(overrides, {"resume": self.folder})
         return train(None, literal("resume", str(self.folder)), *overrides, callbacks=callbacks)
 
     def __repr__(self) -> str:
@@ -147,11 +156,6 @@ def _words(
         require_object("prompt", prompt, str, '"a red cube"')
         named["prompt"] = prompt
     if folder is not None:
-        named[RUN_FOLDER] = os.fspath(folder)
-    for override in overrides:
-        if key_of(override) in named:
-            raise UserError(
-                f"{key_of(override)}: expected one value, got the argument {named[key_of(override)]!r} and "
-                f"{override!r}. Try: the argument alone"
-            )
+        named[RUN_FOLDER] = path_text("folder", folder, 'folder="outputs/mine"')
+    require_free(overrides, named)
     return [*(literal(key, text) for key, text in named.items()), *overrides]
