@@ -128,7 +128,7 @@ class Asset:
         cameras: Cameras | None = None,
         *,
         kind: str = "rgb",
-        background: Sequence[float] | str | None = None,
+        background: Sequence[float] | np.ndarray | Tensor | str | None = None,
         views: int | None = None,
         elevation_deg: float | None = None,
         distance: float | None = None,

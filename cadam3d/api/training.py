@@ -102,8 +102,9 @@ def train(
     This is ``cadam3d train prompt=... OVERRIDES``, with the same settings, checks, files and bytes. The
     prompt may contain any characters. ``overrides`` are the words of the command line, such as
     ``"steps=300"`` or ``"densifier=baseline"``, without quotes for a shell. ``folder`` is the folder of the
-    run, by default a new one in ``outputs``. ``callbacks`` are called after those of the settings. To
-    continue a run, pass ``"resume=FOLDER"`` and ``None`` as the prompt, or call :meth:`Run.resume`.
+    run, by default a new one in ``outputs``; ``${seed}`` in it is the value of that setting. ``callbacks``
+    are called after those of the settings. To continue a run, pass ``"resume=FOLDER"`` and ``None`` as the
+    prompt, or call :meth:`Run.resume`.
 
     Raises ``UserError`` for mistakes, with the texts of the command line. After Ctrl-C, or the interrupt of a
     notebook, the run saves everything as on the command line, and then ``KeyboardInterrupt`` is raised. A
@@ -158,4 +159,9 @@ def _words(
     if folder is not None:
         named[RUN_FOLDER] = path_text("folder", folder, 'folder="outputs/mine"')
     require_free(overrides, named)
-    return [*(literal(key, text) for key, text in named.items()), *overrides]
+    # Hydra resolves references in the name of the folder, even quoted ones, so they are not quoted.
+    words = [
+        f"{key}={text}" if key == RUN_FOLDER and "${" in text else literal(key, text)
+        for key, text in named.items()
+    ]
+    return [*words, *overrides]

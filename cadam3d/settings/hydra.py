@@ -23,7 +23,7 @@ from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
 from cadam3d.settings.advice import default_option, did_you_mean, line_of
-from cadam3d.settings.compose import VERSION_BASE, compose, config_dir, escape, quote, register_resolvers
+from cadam3d.settings.compose import VERSION_BASE, compose, config_dir, quote, register_resolvers
 from cadam3d.settings.declared import TARGET, replacement
 from cadam3d.settings.line import RUN_FOLDER, key_of
 
@@ -125,7 +125,7 @@ def refuse_unread_settings(cfg: DictConfig, command: str, overrides: Sequence[st
 def place_run(cfg: DictConfig, folder: Path) -> None:
     """Change ``cfg``, in place, as if the line had set ``hydra.run.dir`` to ``folder``."""
     with open_dict(cfg):
-        cfg.hydra.run.dir = escape(str(folder))
+        cfg.hydra.run.dir = str(folder)
         kept = [override for override in cfg.hydra.overrides.hydra if key_of(override) != RUN_FOLDER]
         cfg.hydra.overrides.hydra = [f"{RUN_FOLDER}={quote(str(folder))}", *kept]
 
