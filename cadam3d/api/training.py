@@ -100,11 +100,11 @@ def train(
     """Train an asset for ``prompt``, and return the run.
 
     This is ``cadam3d train prompt=... OVERRIDES``, with the same settings, checks, files and bytes. The
-    prompt may contain any characters. ``overrides`` are the words of the command line, such as
-    ``"steps=300"`` or ``"densifier=baseline"``, without quotes for a shell. ``folder`` is the folder of the
-    run, by default a new one in ``outputs``; ``${seed}`` in it is the value of that setting. ``callbacks``
-    are called after those of the settings. To continue a run, pass ``"resume=FOLDER"`` and ``None`` as the
-    prompt, or call :meth:`Run.resume`.
+    prompt may contain quotes, commas, braces and line breaks. ``overrides`` are the words of the command
+    line, such as ``"steps=300"`` or ``"densifier=baseline"``, without quotes for a shell. ``folder`` is the
+    folder of the run, by default a new one in ``outputs``; ``${seed}`` in it is the value of that setting.
+    ``callbacks`` are called after those of the settings. To continue a run, pass ``"resume=FOLDER"`` and
+    ``None`` as the prompt, or call :meth:`Run.resume`.
 
     Raises ``UserError`` for mistakes, with the texts of the command line. After Ctrl-C, or the interrupt of a
     notebook, the run saves everything as on the command line, and then ``KeyboardInterrupt`` is raised. A
