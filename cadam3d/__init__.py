@@ -21,6 +21,9 @@ _HOMES = {
     "train": "cadam3d.api.training",
 }
 
+# What ``from cadam3d import *`` imports.
+__all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
+
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:

@@ -16,11 +16,22 @@ from jaxtyping import Float, UInt8
 from omegaconf import DictConfig
 from torch import Tensor
 
-from cadam3d.api.guest import as_guest, literal, logging_messages, require_object, require_words
+from cadam3d.api.guest import (
+    as_guest,
+    literal,
+    logging_messages,
+    path_text,
+    plain,
+    require_free,
+    require_object,
+    require_words,
+    usual_modes,
+)
 from cadam3d.commands import asset as files
 from cadam3d.commands.export import require_apart, set_title
 from cadam3d.commands.messages import note_backend
 from cadam3d.core.cameras import Cameras
+from cadam3d.core.checks import require, require_whole
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -52,6 +63,7 @@ FRAME = (
 )
 
 
+@usual_modes()
 def load(
     path: str | os.PathLike[str], *, up: str | None = None, device: str = "auto", rasterizer: str = "auto"
 ) -> "Asset":
@@ -64,10 +76,10 @@ def load(
 
     Raises ``UserError`` if the folder or the file cannot be read.
     """
-    place = expanded(os.fspath(path))
+    place = expanded(path_text("path", path, 'load("outputs/latest")'))
     renders = option("rasterizer", rasterizer, Rasterizer)
-    # A name without a suffix is more likely a folder that does not exist than a file.
-    if place.is_dir() or not place.suffix:
+    # The name of something that does not exist means a folder if it has no suffix.
+    if place.is_dir() or not (place.suffix or place.exists()):
         folder = files.find_run(str(place))
         place, prompt = files.find_asset(folder), facts_of(folder)["prompt"]
         # A stranger may have written the folder.
@@ -92,6 +104,14 @@ class Asset:
         default_factory=lambda: option("rasterizer", "auto", Rasterizer), kw_only=True
     )
 
+    def __post_init__(self) -> None:
+        require_object("gaussians", self.gaussians, Gaussians, "load(PATH).gaussians")
+        require_object("rasterizer", self.rasterizer, Rasterizer, 'load(PATH, rasterizer="cpu")')
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields alone: a copy makes a renderer of its own, which shows its own Gaussians."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
+
     def __len__(self) -> int:
         return len(self.gaussians)
 
@@ -102,12 +122,13 @@ class Asset:
         facts += [] if self.source is None else [f"from {shown(self.source)}"]
         return f"<Asset: {', '.join(facts)}>"
 
+    @usual_modes()
     def render(  # noqa: PLR0913  (one argument per setting)
         self,
         cameras: Cameras | None = None,
         *,
         kind: str = "rgb",
-        background: Sequence[float] | str | None = None,
+        background: Sequence[float] | np.ndarray | Tensor | str | None = None,
         views: int | None = None,
         elevation_deg: float | None = None,
         distance: float | None = None,
@@ -127,18 +148,18 @@ class Asset:
         """
         turn = {"views": views, "distance": distance, "fov_y_deg": fov_y_deg, "size": size}
         turn["elevations_deg"] = None if elevation_deg is None else [elevation_deg]
-        turn = {name: value for name, value in turn.items() if value is not None}
+        turn = {name: plain(value) for name, value in turn.items() if value is not None}
         if cameras is not None and turn:
             raise UserError(
                 f"cameras: expected cameras or the settings of a turn, got both ({', '.join(turn)}). "
                 "Try: cameras=None"
             )
-        look = {"kinds": [kind]} | ({} if background is None else {"background": background})
+        look = {"kinds": [kind]} | ({} if background is None else {"background": plain(background)})
         settings: ImagesExporter = option("exporter", "images", ImagesExporter, turn | look)
         if cameras is None:
             cameras, away = settings.ring(settings.views, settings.elevations_deg[0]), settings.distance
         else:
-            require_object("cameras", cameras, Cameras, "cameras=None")
+            _require_cameras(cameras)
             away = float(cameras.positions.norm(dim=-1).mean())
         subject = Subject(self.gaussians, self._render)
         pictures = []
@@ -155,12 +176,23 @@ class Asset:
             pictures.append(to_uint8(painted))
         return np.concatenate(pictures)
 
+    @usual_modes()
     def rasterize(self, cameras: Cameras, background: Float[Tensor, "v 3"] | None = None) -> RenderOutput:
         """Return the exact numbers of a render, as tensors without gradient: rgb, alpha, depth and radii.
 
-        ``background`` is one RGB colour in [0, 1] per view; None is black.
+        ``background`` is one RGB colour in [0, 1] per view; None is black. Raises ``UserError`` for arguments
+        of another type or shape.
         """
-        return self._render(cameras, torch.zeros(len(cameras), 3) if background is None else background)
+        _require_cameras(cameras)
+        if background is None:
+            background = torch.zeros(len(cameras), 3)
+        require_object("background", background, Tensor, "background=None")
+        shape = tuple(background.shape)
+        expected = f"one colour per view, of shape ({len(cameras)}, 3)"
+        require(
+            shape == (len(cameras), 3), "background", expected=expected, got=shape, example="background=None"
+        )
+        return self._render(cameras, background)
 
     @cached_property
     def _render(self) -> RenderFn:
@@ -180,13 +212,16 @@ class Asset:
         Raises ``UserError`` if the settings are wrong or a file cannot be written.
         """
         require_words(overrides)
-        words = [literal("output", os.fspath(path)), *overrides]
+        place = path_text("output", path, 'export("asset.ply")')
+        require_free(overrides, {"output": place, "run": self, "ply": self})
+        words = [literal("output", place), *overrides]
         job = _Export("export", asset=self)
         with as_guest(), explaining(job, words):
             line = read_words("export", words)
             run_line(line, compose_checked(line), job, has_log=False)
         return job.written
 
+    @usual_modes()
     def mesh(self, **settings: Any) -> "trimesh.Trimesh":
         """Return the outer surface as triangles with a colour per vertex, in world axes (+z up, front at +x).
 
@@ -200,7 +235,9 @@ class Asset:
             raise UserError(
                 f"mesh: there is no setting {unknown[0]}, only {known}. Try: mesh(resolution=128)"
             )
-        exporter: MeshExporter = option("exporter", "mesh", MeshExporter, settings)
+        exporter: MeshExporter = option(
+            "exporter", "mesh", MeshExporter, {name: plain(value) for name, value in settings.items()}
+        )
         surface, _ = exporter.surface(self.gaussians)
         return trimesh.Trimesh(
             vertices=surface.vertices,
@@ -210,17 +247,19 @@ class Asset:
             process=False,
         )
 
+    @usual_modes()
     def show(self, *, height: int = 480) -> Path | None:
         """Show the asset in the output of a notebook, to turn and to zoom; ``height`` is in pixels.
 
         Outside of a notebook, write a page into a new temporary folder, print its path, and return it.
         """
+        require_whole("height", height, low=1, example=480)
         title = self.title or UNTITLED
         page = viewer_page(pack(self.gaussians), title=title)
         if is_notebook():
             from IPython.display import display
 
-            frame = FRAME.format(page=html.escape(page), title=html.escape(title), height=int(height))
+            frame = FRAME.format(page=html.escape(page), title=html.escape(title), height=height)
             display({"text/html": frame, "text/plain": repr(self)}, raw=True)
             return None
         path = Path(tempfile.mkdtemp(prefix="cadam3d-"), VIEWER)
@@ -228,6 +267,11 @@ class Asset:
             temporary.write_text(page, encoding="utf-8")
         print(f"Open this in a browser: {path}")
         return path
+
+
+def _require_cameras(cameras: Cameras) -> None:
+    require_object("cameras", cameras, Cameras, "cameras=None")
+    require(len(cameras) > 0, "cameras", expected="at least one camera", got=0, example="cameras=None")
 
 
 def is_notebook() -> bool:

@@ -5,20 +5,24 @@ restored here: Hydra's global state, torch's modes, logging, and where messages 
 """
 
 import logging
+import os
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from cadam3d.commands.messages import note
 from cadam3d.core.checks import fail
 from cadam3d.core.console import heard_by
+from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import quote
 from cadam3d.settings.hydra import keeping_globals
-from cadam3d.settings.line import QUOTED
+from cadam3d.settings.line import QUOTED, key_of
 
 log = logging.getLogger("cadam3d")
 # The messages that the command line prints. They are not part of train.log.
@@ -50,16 +54,27 @@ def logging_messages() -> Iterator[None]:
 
 @contextmanager
 def usual_modes() -> Iterator[None]:
-    """Run the block with gradients, float32 and the CPU as defaults, whatever the caller has chosen."""
-    dtype = torch.get_default_dtype()
+    """Run the block with the modes of torch that a new process has, whatever the caller has chosen.
+
+    These are float32 and the CPU as defaults, exact products of matrices, gradients, and no autocast.
+    """
+    dtype, precision = torch.get_default_dtype(), torch.get_float32_matmul_precision()
     # The context of a device slows every call of torch a little, so it is entered only where it is needed.
     device = nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu")
-    torch.set_default_dtype(torch.float32)
-    try:
-        with device, torch.inference_mode(False), torch.enable_grad():
-            yield
-    finally:
-        torch.set_default_dtype(dtype)
+    with ExitStack() as stack:
+        stack.callback(torch.set_default_dtype, dtype)
+        torch.set_default_dtype(torch.float32)
+        # Writing this setting touches several backends, so it is written only where it differs.
+        if precision != "highest":
+            stack.callback(torch.set_float32_matmul_precision, precision)
+            torch.set_float32_matmul_precision("highest")
+        for kind in ("cpu", "cuda"):
+            if torch.is_autocast_enabled(kind):
+                stack.enter_context(torch.autocast(kind, enabled=False))
+        stack.enter_context(device)
+        stack.enter_context(torch.inference_mode(False))
+        stack.enter_context(torch.enable_grad())
+        yield
 
 
 @contextmanager
@@ -102,14 +117,15 @@ def _pass_on(text: str, level: int) -> None:
 
 def literal(key: str, text: str) -> str:
     """Return the word of a command line that sets ``key`` to exactly ``text``, whatever it contains."""
-    is_plain = not QUOTED.fullmatch(text) and "${" not in text
+    is_plain = not QUOTED.fullmatch(text) and "${" not in text and text.lower() != "null"
     return f"{key}={text if is_plain else quote(text)}"
 
 
 def require_object(key: str, value: object, kind: type, example: str) -> None:
     """Raise ``UserError`` unless ``value`` is an object of class ``kind``."""
     if not isinstance(value, kind):
-        expected = f"an object of class {kind.__module__}.{kind.__name__}"
+        name = kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__name__}"
+        expected = f"an object of class {name}"
         raise fail(key, expected=expected, got=value, example=example)
 
 
@@ -117,3 +133,28 @@ def require_words(overrides: tuple[Any, ...]) -> None:
     """Raise ``UserError`` unless every override is a text."""
     for override in overrides:
         require_object("overrides", override, str, '"steps=600"')
+
+
+def path_text(key: str, path: object, example: str) -> str:
+    """Return a path as text. Raises ``UserError`` for anything that cannot be a path."""
+    text = os.fspath(path) if isinstance(path, str | os.PathLike) else None
+    if not isinstance(text, str) or not text or "\0" in text:
+        raise fail(key, expected="a path", got=path, example=example)
+    return text
+
+
+def require_free(overrides: tuple[str, ...], taken: Mapping[str, object]) -> None:
+    """Raise ``UserError`` for an override of a key in ``taken``, which an argument sets already."""
+    for override in overrides:
+        if (key := key_of(override)) in taken:
+            raise UserError(
+                f"{key}: expected one value, got the argument {taken[key]!r} and {override!r}. "
+                "Try: the argument alone"
+            )
+
+
+def plain(value: Any) -> Any:
+    """Return ``value`` with the numbers and arrays of NumPy and torch as those of Python."""
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return value.tolist() if isinstance(value, np.ndarray | np.generic | Tensor) else value

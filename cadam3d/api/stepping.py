@@ -99,7 +99,10 @@ class Trainer:
         return state
 
     def step(self, state: TrainState) -> Step:
-        """Advance ``state`` in place by one step, with its refinement or opacity reset if one is due."""
+        """Advance ``state`` in place by one step, with its refinement or opacity reset if one is due.
+
+        This also works after the end of the run, which only :meth:`outcome` and :meth:`run` know.
+        """
         started = time.perf_counter()
         with usual_modes(), deterministic(self.device):
             report, refinement = self.parts.step(state, self._embedding)
@@ -115,6 +118,7 @@ class Trainer:
         """Return how the run has ended, such as ``"finished"``, or ``None`` if more steps are to be done."""
         return self.parts.outcome(state)
 
+    @usual_modes()
     def asset(self, state: TrainState) -> Asset:
         """Return a copy of the present Gaussians as an asset, to render, show and export."""
         return Asset(

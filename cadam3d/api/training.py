@@ -13,15 +13,22 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from cadam3d.api.asset import Asset, load
-from cadam3d.api.guest import as_guest, literal, logged_to, require_object, require_words
+from cadam3d.api.guest import (
+    as_guest,
+    literal,
+    logged_to,
+    path_text,
+    require_free,
+    require_object,
+    require_words,
+)
 from cadam3d.callback.base import Callback
 from cadam3d.commands import train as command
 from cadam3d.commands.asset import find_run
-from cadam3d.core.errors import UserError
 from cadam3d.io.records import psnr_of, read_config, read_metrics, read_summary
 from cadam3d.io.run_folder import CONFIG, LOG, REPORT, shown
 from cadam3d.launch import Task, compose_checked, explaining, read_words, run_line
-from cadam3d.settings.line import RUN_FOLDER, key_of
+from cadam3d.settings.line import RUN_FOLDER
 
 
 class Run:
@@ -33,7 +40,7 @@ class Run:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         """Open the run in ``folder``. Raises ``UserError`` if the folder does not hold a run."""
-        self.folder: Path = find_run(os.fspath(folder))
+        self.folder: Path = find_run(path_text("folder", folder, 'Run("outputs/latest")'))
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -66,6 +73,8 @@ class Run:
 
     def resume(self, *overrides: str, callbacks: Sequence[Callback] = ()) -> "Run":
         """Continue the run in its folder, with changed settings such as ``"steps=900"``; see ``train``."""
+        require_words(overrides)
+        require_free(overrides, {"resume": self.folder})
         return train(None, literal("resume", str(self.folder)), *overrides, callbacks=callbacks)
 
     def __repr__(self) -> str:
@@ -91,10 +100,11 @@ def train(
     """Train an asset for ``prompt``, and return the run.
 
     This is ``cadam3d train prompt=... OVERRIDES``, with the same settings, checks, files and bytes. The
-    prompt may contain any characters. ``overrides`` are the words of the command line, such as
-    ``"steps=300"`` or ``"densifier=baseline"``, without quotes for a shell. ``folder`` is the folder of the
-    run, by default a new one in ``outputs``. ``callbacks`` are called after those of the settings. To
-    continue a run, pass ``"resume=FOLDER"`` and ``None`` as the prompt, or call :meth:`Run.resume`.
+    prompt may contain quotes, commas, braces and line breaks. ``overrides`` are the words of the command
+    line, such as ``"steps=300"`` or ``"densifier=baseline"``, without quotes for a shell. ``folder`` is the
+    folder of the run, by default a new one in ``outputs``; ``${seed}`` in it is the value of that setting.
+    ``callbacks`` are called after those of the settings. To continue a run, pass ``"resume=FOLDER"`` and
+    ``None`` as the prompt, or call :meth:`Run.resume`.
 
     Raises ``UserError`` for mistakes, with the texts of the command line. After Ctrl-C, or the interrupt of a
     notebook, the run saves everything as on the command line, and then ``KeyboardInterrupt`` is raised. A
@@ -147,11 +157,11 @@ def _words(
         require_object("prompt", prompt, str, '"a red cube"')
         named["prompt"] = prompt
     if folder is not None:
-        named[RUN_FOLDER] = os.fspath(folder)
-    for override in overrides:
-        if key_of(override) in named:
-            raise UserError(
-                f"{key_of(override)}: expected one value, got the argument {named[key_of(override)]!r} and "
-                f"{override!r}. Try: the argument alone"
-            )
-    return [*(literal(key, text) for key, text in named.items()), *overrides]
+        named[RUN_FOLDER] = path_text("folder", folder, 'folder="outputs/mine"')
+    require_free(overrides, named)
+    # Hydra resolves references in the name of the folder, even quoted ones, so they are not quoted.
+    words = [
+        f"{key}={text}" if key == RUN_FOLDER and "${" in text else literal(key, text)
+        for key, text in named.items()
+    ]
+    return [*words, *overrides]

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.core.chart import Chart
+from cadam3d.core.checks import require
 from cadam3d.core.edit import RowEdit, RowState
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
@@ -130,7 +131,16 @@ class Densifier(ABC, Generic[State]):
 
         A densifier with its own "how" overrides this. Only ``generator`` (on the CPU) is changed.
         """
-        selected = self.select(state, step, generator)
+        selected, n = self.select(state, step, generator), len(gaussians)
+        # A mask of another shape could be broadcast, and a wrong choice would not show.
+        form = getattr(selected, "dtype", type(selected)), tuple(getattr(selected, "shape", ()))
+        require(
+            form == (torch.bool, (n,)),
+            f"densifier {type(self).__name__}",
+            expected=f"a mask from select: a tensor of bool of shape ({n},)",
+            got=form,
+            example="densifier=cadam",
+        )
         return refine.plan(gaussians, selected, step, generator, self.unwanted(state))
 
     def after_reset(self, state: State, rows: Bool[Tensor, "n"]) -> State:

@@ -19,7 +19,7 @@ from hydra.errors import HydraException, InstantiationException
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf, open_dict
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException, UnsupportedValueType
 
 from cadam3d.core.checks import fail, require_choice
 from cadam3d.core.errors import UserError
@@ -161,7 +161,13 @@ def option(group: str, name: str, kind: type, changes: Mapping[str, Any] = Mappi
     content = read_yaml(files[name]) | {key: escaped(value) for key, value in changes.items()}
     # A group of which several options can be chosen has each of them under its name.
     is_one_of_several = f"# @package {group}.{name}" in files[name].read_text(encoding="utf-8")
-    cfg = OmegaConf.create({group: {name: content} if is_one_of_several else content})
+    try:
+        cfg = OmegaConf.create({group: {name: content} if is_one_of_several else content})
+    except UnsupportedValueType as error:
+        expected = "a number, a text or a list of them"
+        raise fail(
+            error.full_key or group, expected=expected, got=dict(changes), example=f"{group}={name}"
+        ) from None
     return component(cfg[group][name] if is_one_of_several else cfg[group], kind, group)
 
 

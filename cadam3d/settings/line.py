@@ -25,6 +25,10 @@ PATH_KEYS = (
 LIST_KEYS = ("run", "labels")
 # A path that Hydra's grammar reads without quotes. It cannot read "~".
 PLAIN_PATH = re.compile(r"[\w./+-]*", re.ASCII)
+# What the grammar reads as a number or a truth value, although it may be the name of a folder.
+NOT_A_TEXT = re.compile(
+    r"[+-]?([\d_.]*\d[\d_.]*(e[+-]?\d[\d_]*)?|nan|inf)|true|false", re.IGNORECASE | re.ASCII
+)
 QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
 SWEEP_CALL = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)", re.DOTALL)
 # The text up to a comma that is not followed by a space.
@@ -92,7 +96,8 @@ def quoted(override: str, *, is_sweep: bool) -> str:
         return override
     if name in LIST_KEYS and is_list(override) and "${" not in value:
         return f"{key}=[{','.join(map(_item, _items(value[1:-1])))}]"
-    if name in PATH_KEYS and not PLAIN_PATH.fullmatch(value) and "${" not in value:
+    is_plain = PLAIN_PATH.fullmatch(value) and not NOT_A_TEXT.fullmatch(value)
+    if name in PATH_KEYS and not is_plain and "${" not in value:
         return f"{key}={quote(value)}"
     if name in TEXT_KEYS and not (is_sweep and SWEEP_CALL.fullmatch(value)):
         pieces = _prompts(value) if is_sweep else [value]

@@ -1,6 +1,8 @@
 """Assets in Python are read, rendered, exported and meshed as the command line does it."""
 
+import copy
 import json
+import pickle
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -77,6 +79,9 @@ def test_a_setting_of_an_export_and_a_folder(ball, file):
         ("a.xyz", (), "output: expected a file with suffix"),
         ("a.ply", ("exporter.ply.up=z",), "exporter.ply.up: expected one of"),
         ("a.ply", ("exporter=[plx]",), "exporter: expected one of"),
+        ("a.ply", ("output=b.ply",), "output: expected one value"),
+        ("a.ply", ("run=b",), "run: expected one value"),
+        ("", (), "output: expected a path"),
     ],
 )
 def test_an_export_that_cannot_work_is_refused(file, name, words, message):
@@ -126,6 +131,63 @@ def test_pictures_may_be_transparent_and_of_any_cameras(ball):
 def test_wrong_settings_of_pictures_are_refused(ball, settings, message):
     with pytest.raises(cadam3d.UserError, match=message):
         ball.render(**settings)
+
+
+def test_settings_may_be_numbers_of_numpy_and_torch(ball, without_type_checks):
+    settings = {"views": np.int64(2), "size": np.int32(16)}
+    colours = [
+        (1, 0.5, 0),
+        np.array([1, 0.5, 0]),
+        torch.tensor([1, 0.5, 0]),
+        [np.float32(1), np.float32(0.5), 0],
+    ]
+    expected, *others = (ball.render(**settings, background=each) for each in colours)
+    assert all(np.array_equal(each, expected) for each in others)
+    with pytest.raises(cadam3d.UserError, match=r"exporter\.images\.views: expected a number"):
+        ball.render(views=object())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((5,), "cameras: expected an object of class"),
+        ((make_cameras(1, 4, 4).index(slice(0, 0)),), "cameras: expected at least one camera"),
+        ((make_cameras(2, 4, 4), [1, 1, 1]), "background: expected an object of class torch"),
+        ((make_cameras(2, 4, 4), torch.ones(3)), "background: expected one colour per view"),
+    ],
+)
+def test_what_cannot_be_rasterized_is_refused(ball, arguments, message, without_type_checks):
+    with pytest.raises(cadam3d.UserError, match=message):
+        ball.rasterize(*arguments)
+
+
+def test_the_modes_of_torch_of_the_caller_change_nothing(ball, file):
+    cameras = make_cameras(2, 8, 8)
+    expected, mesh = ball.rasterize(cameras).rgb, ball.mesh(resolution=16)
+    dtype = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    torch.set_default_device("meta")
+    try:
+        assert load(file).gaussians.means.equal(ball.gaussians.means)
+        assert ball.rasterize(cameras).rgb.equal(expected)
+        assert np.array_equal(ball.mesh(resolution=16).vertices, mesh.vertices)
+    finally:
+        torch.set_default_dtype(dtype)
+        torch.set_default_device(None)
+
+
+def test_a_copy_shows_its_own_gaussians(ball):
+    pictures = ball.render(**SMALL)
+    for another in (copy.deepcopy(ball), pickle.loads(pickle.dumps(ball))):
+        assert np.array_equal(another.render(**SMALL), pictures)
+        another.gaussians.means.add_(0.3)
+        assert not np.array_equal(another.render(**SMALL), pictures)
+    assert np.array_equal(ball.render(**SMALL), pictures)
+
+
+def test_a_file_needs_no_suffix_to_be_loaded(ball, file):
+    file.rename("ball")
+    assert len(load("ball")) == 200
 
 
 def test_the_mesh_is_closed_and_in_world_axes(ball):

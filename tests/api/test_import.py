@@ -38,6 +38,12 @@ def test_a_public_name_is_listed_and_loads(name):
     assert getattr(cadam3d, name).__name__ == name
 
 
+def test_a_star_import_gives_the_public_names():
+    names = {}
+    exec("from cadam3d import *", names)
+    assert names.keys() - {"__builtins__"} == NAMES
+
+
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="has no attribute 'trian'"):
         cadam3d.trian  # noqa: B018

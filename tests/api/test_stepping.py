@@ -100,6 +100,20 @@ def test_the_modes_of_torch_are_those_of_the_caller_between_steps(run, trainer):
     assert same(run.asset.gaussians, trainer.asset(state).gaussians)
 
 
+def test_modes_that_change_numbers_are_off_during_a_step(run, trainer):
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    try:
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            state = trainer.start()
+            list(trainer.run(state))
+            assert torch.is_autocast_enabled("cpu")
+        assert torch.get_float32_matmul_precision() == "medium"
+    finally:
+        torch.set_float32_matmul_precision(before)
+    assert same(run.asset.gaussians, trainer.asset(state).gaussians)
+
+
 def test_an_asset_of_a_state_is_a_copy(trainer):
     state = trainer.start()
     before = trainer.asset(state)
@@ -122,6 +136,16 @@ def test_a_densifier_of_the_caller_decides_what_grows():
     refinements = [step.refinement for step in trainer.run(state) if step.refinement is not None]
     assert [refinement.selected for refinement in refinements] == [5, 5]
     assert len(state.gaussians) == refinements[-1].after > 20
+
+
+def test_a_densifier_that_returns_no_mask_is_refused(without_type_checks):
+    class Numbers(First):
+        def select(self, state, step, generator):
+            return state.zeros[:1]
+
+    trainer = cadam3d.compose(*SMALL, densifier=Numbers())
+    with pytest.raises(cadam3d.UserError, match=r"Numbers: expected a mask from select: .* of shape \(20,\)"):
+        list(trainer.run(trainer.start()))
 
 
 def test_every_component_that_is_given_is_used():

@@ -170,6 +170,26 @@ def test_an_interrupt_saves_and_the_run_continues_to_the_same_bytes(run, place):
     assert asset_of(whole) == asset_of(run)
 
 
+@pytest.mark.parametrize("name", ["1e3", "1_000", "true", "null"])
+def test_a_folder_has_exactly_the_name_that_was_given(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = cadam3d.train("a cube", *SMALL, "steps=1", "exporter=[]", "metric=[]", folder=name)
+    assert run.folder == tmp_path / name
+
+
+def test_a_folder_may_refer_to_settings_and_a_run_in_it_stays(run, place):
+    taken = run.folder.with_name("3")
+    taken.mkdir()
+    (taken / "summary.json").write_text("{}")
+    with pytest.raises(cadam3d.UserError, match=r"3 holds summary\.json"):
+        cadam3d.train(NASTY, *SMALL, folder=place / "${seed}")
+
+
+def test_a_run_resumes_itself_only(run):
+    with pytest.raises(cadam3d.UserError, match="resume: expected one value"):
+        run.resume("resume=elsewhere")
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -199,8 +219,10 @@ def test_a_prompt_is_needed():
 @pytest.mark.parametrize(
     ("words", "settings", "message"),
     [
-        ((5,), {}, "prompt: expected an object of class builtins.str, got 5"),
-        (("a cube", 5), {}, "overrides: expected an object of class builtins.str, got 5"),
+        ((5,), {}, "prompt: expected an object of class str, got 5"),
+        (("a cube", 5), {}, "overrides: expected an object of class str, got 5"),
+        (("a cube",), {"folder": 5}, "folder: expected a path, got 5"),
+        (("a cube",), {"folder": "a\0b"}, "folder: expected a path"),
         (("a cube", "prompt=a cone"), {}, "prompt: expected one value"),
         (("a cube", "hydra.run.dir=b"), {"folder": "a"}, "hydra.run.dir: expected one value"),
         (("a cube", "--cfg", "job"), {}, "only the command line"),
