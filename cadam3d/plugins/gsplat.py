@@ -156,7 +156,7 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
                 "optimizers",
                 expected='an optimizer of "means"',
                 got=sorted(optimizers),
-                example="strategy.check_sanity(params, optimizers)",
+                example='optimizers["means"] = torch.optim.Adam([params["means"]])',
             )
         observer = _OBSERVERS.get(optimizer)
         if step >= self.refine_stop_iter:
@@ -164,7 +164,16 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
                 observer.detach(optimizer)
             return None
         if observer is None:
-            observer = _Observer(optimizer, step)
+            try:
+                observer = _Observer(optimizer, step)
+            except AttributeError:
+                # A wrapper, such as that of accelerate, has no hooks of its own.
+                raise fail(
+                    "optimizers",
+                    expected='the optimizer of "means" itself, which has hooks',
+                    got=f"a wrapper of class {type(optimizer).__name__}",
+                    example='optimizers["means"] = optimizers["means"].optimizer',
+                ) from None
         observer.strategy, observer.state = self, _checked(state)
         observer.is_stepping = False
         # A state that was loaded from a file may be on another device.
@@ -259,6 +268,14 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
     @torch.no_grad()
     def _measure(self, state: dict[str, Any], info: dict[str, Any], count: int, packed: bool) -> None:
         """Remember the largest radius on screen since the last refinement, as a share of the image."""
+        needed = {"radii", "width", "height", *(["gaussian_ids"] if packed else [])}
+        require(
+            needed <= set(info),
+            "info",
+            expected=f"{', '.join(sorted(needed))} of a rasterization, for the sizes on screen",
+            got=sorted(info),
+            example="strategy.refine_scale2d_stop_iter = 0",
+        )
         radii = info["radii"].amax(dim=-1) / float(max(info["width"], info["height"]))
         if state["radii"] is None:
             state["radii"] = radii.new_zeros(count)

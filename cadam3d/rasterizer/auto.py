@@ -102,7 +102,7 @@ def _checked(rasterizer: Rasterizer, device: torch.device, demands: Demands) -> 
     try:
         agreement = self_test(rasterizer, device, demands)
     except Exception as error:
-        # Another version of a library may raise anything. The name comes first, because a message may be empty.
+        # Another version of a library may raise anything, also without a message.
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise UserError(f"{key} cannot finish its self-test on {name}: {reason}. {REPORT}") from error
     if not agreement.passes:

@@ -720,6 +720,30 @@ def test_without_an_optimizer_of_the_means_the_message_says_so():
         toy.strategy.step_pre_backward(**toy.shared, step=0)
 
 
+class Wrapper(torch.optim.Optimizer):
+    """Has the class but not the hooks of an optimizer, like the wrapper of accelerate."""
+
+    def __init__(self, optimizer):
+        self.optimizer = optimizer
+
+
+def test_a_wrapper_of_an_optimizer_is_refused_with_the_way_to_unwrap_it():
+    toy = Toy(CAdamStrategy())
+    whole, optimizer = dict(toy.optimizers), toy.optimizers["means"]
+    toy.optimizers["means"] = Wrapper(optimizer)
+    with pytest.raises(UserError, match=r"itself.*got 'a wrapper of class Wrapper'") as caught:
+        toy.strategy.step_pre_backward(**toy.shared, step=0)
+    exec(str(caught.value).partition("Try: ")[2], {"optimizers": toy.optimizers})
+    assert toy.optimizers == whole
+    toy.step(0, torch.ones(10, 3))
+
+
+def test_without_radii_the_message_names_the_setting_that_needs_them():
+    toy = Toy(CAdamStrategy(refine_scale2d_stop_iter=9))
+    with pytest.raises(UserError, match=r"info: expected height, radii, .*Try: .*refine_scale2d_stop"):
+        toy.step(0, torch.ones(10, 3))
+
+
 @pytest.mark.parametrize("missing", [("gsplat",), ("gsplat", "gsplat.strategy")])
 def test_without_gsplat_the_import_says_what_to_type(missing, monkeypatch):
     for name in missing:
