@@ -1,4 +1,4 @@
-"""CAdamStrategy: CAdam as a densification strategy of gsplat, in the place of its ``DefaultStrategy``.
+"""CAdamStrategy: CAdam as a densification strategy of gsplat, in place of its ``DefaultStrategy``.
 
 The strategy observes what the optimizer of the means uses: a hook reads the gradient right before each step
 of that optimizer. By then the gradients of several cameras and of several backward passes have been added
