@@ -123,6 +123,7 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         (*A_CUBE, "densifier=cadam_open", "densifier.reset=all", "densifier.tau_reset=1"),
         (*A_CUBE, "rasterizer=cuda"),
         (*A_CUBE, "rasterizer=gsplat"),
+        (*A_CUBE, "seed=-1"),
     ],
     "prompts": [
         ("train", "prompt=a red cuube"),
