@@ -1,4 +1,4 @@
-"""CAdamStrategy: CAdam as a densification strategy of gsplat, in the place of its ``DefaultStrategy``.
+"""CAdamStrategy: CAdam as a densification strategy of gsplat, in place of its ``DefaultStrategy``.
 
 The strategy observes what the optimizer of the means uses: a hook reads the gradient right before each step
 of that optimizer. By then the gradients of several cameras and of several backward passes have been added
@@ -53,7 +53,8 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
     The settings of ``DefaultStrategy`` keep their names, defaults and meaning, except three: ``grow_grad2d``,
     ``absgrad`` and ``key_for_gradient`` are accepted but ignored, because the gates of CAdam replace the
     threshold on screen-space gradients. Lengths (``grow_scale3d``, ``prune_scale3d``) are in units of
-    ``scene_scale``. Opacity resets lower the opacities of unreliable Gaussians only.
+    ``scene_scale``. Opacity resets lower the opacities of unreliable Gaussians only, and none that has no
+    optimizer.
 
     The strategy is used like ``DefaultStrategy``, and also in loops for ``MCMCStrategy``, which pass ``lr``.
     It needs ``optimizers["means"]`` to be stepped once per training step. All tensors are in the state, which
@@ -66,7 +67,14 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
     def __post_init__(self) -> None:
         require_whole("refine_every", self.refine_every, low=1, example=100)
         require_whole("reset_every", self.reset_every, low=1, example=3000)
-        require_range("prune_opa", self.prune_opa, above=0, below=1 / RESET_OVER_PRUNE, example=0.005)
+        require_range("prune_opa", self.prune_opa, low=0, below=1 / RESET_OVER_PRUNE, example=0.005)
+        require(
+            self.prune_opa > 0 or self.reset == "none",
+            "prune_opa",
+            expected=f'more than 0, because reset="{self.reset}" lowers opacities to a multiple of it',
+            got=self.prune_opa,
+            example='prune_opa=0, reset="none"',
+        )
         self.cadam()
         changed = [
             name
@@ -122,7 +130,9 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
             and step % self.refine_every == 0
             and step % self.reset_every >= self.pause_refine_after_reset
         )
-        resets = step > 0 and step % self.reset_every == 0 and self.reset != "none"
+        # Nothing would raise the opacities again if they are not trained.
+        can_reset = self.reset != "none" and "opacities" in optimizers
+        resets = can_reset and step > 0 and step % self.reset_every == 0
         if not (refines or resets) or not self._has_evidence(state, step - observer.since):
             return
         if refines:
@@ -146,7 +156,7 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
                 "optimizers",
                 expected='an optimizer of "means"',
                 got=sorted(optimizers),
-                example="strategy.check_sanity(params, optimizers)",
+                example='optimizers["means"] = torch.optim.Adam([params["means"]])',
             )
         observer = _OBSERVERS.get(optimizer)
         if step >= self.refine_stop_iter:
@@ -154,9 +164,21 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
                 observer.detach(optimizer)
             return None
         if observer is None:
-            observer = _Observer(optimizer, step)
+            try:
+                observer = _Observer(optimizer, step)
+            except AttributeError:
+                # A wrapper, such as that of accelerate, has no hooks of its own.
+                raise fail(
+                    "optimizers",
+                    expected='the optimizer of "means" itself, which has hooks',
+                    got=f"a wrapper of class {type(optimizer).__name__}",
+                    example='optimizers["means"] = optimizers["means"].optimizer',
+                ) from None
         observer.strategy, observer.state = self, _checked(state)
         observer.is_stepping = False
+        # A state that was loaded from a file may be on another device.
+        device = optimizer.param_groups[0]["params"][0].device
+        state.update({name: each.to(device) for name, each in state.items() if isinstance(each, Tensor)})
         return observer
 
     def _observe(self, state: dict[str, Any], gradient: Float[Tensor, "n 3"]) -> None:
@@ -165,7 +187,7 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
         if state["age"] is None:
             moments = cadam.init_state(len(gradient), gradient.device)
         else:
-            moments = CAdamState(**{name: state[name].to(gradient.device) for name in MOMENTS})
+            moments = _moments(state)
         require(
             len(moments.age) == len(gradient),
             "state",
@@ -246,6 +268,14 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
     @torch.no_grad()
     def _measure(self, state: dict[str, Any], info: dict[str, Any], count: int, packed: bool) -> None:
         """Remember the largest radius on screen since the last refinement, as a share of the image."""
+        needed = {"radii", "width", "height", *(["gaussian_ids"] if packed else [])}
+        require(
+            needed <= set(info),
+            "info",
+            expected=f"{', '.join(sorted(needed))} of a rasterization, for the sizes on screen",
+            got=sorted(info),
+            example="strategy.refine_scale2d_stop_iter = 0",
+        )
         radii = info["radii"].amax(dim=-1) / float(max(info["width"], info["height"]))
         if state["radii"] is None:
             state["radii"] = radii.new_zeros(count)

@@ -47,19 +47,26 @@ class CAdamTracker(CAdamSettings):
 
         Call this once per step of the optimizer. The shape is (n, 3). The gradient may be sparse. If any of
         its numbers is NaN or infinite, the step changes nothing. This does not wait for the device. Raises
-        :class:`UserError` if the tracker follows another number of Gaussians, or if there is no gradient.
+        :class:`UserError` if the tracker follows another number of Gaussians or is on another device, or if
+        there is no gradient.
         """
         if gradient is None or gradient.shape != (len(self), 3):
-            rows = len(self) if gradient is None else len(gradient)
+            added = 0 if gradient is None or gradient.dim() == 0 else len(gradient) - len(self)
             remedies = {-1: "tracker.keep(mask)", 0: "tracker.observe(means.grad)"}
             raise fail(
                 "observe",
                 expected=f"a gradient of shape ({len(self)}, 3), one row for each Gaussian of the tracker",
                 got=None if gradient is None else tuple(gradient.shape),
-                example=remedies.get(
-                    (rows > len(self)) - (rows < len(self)), f"tracker.append({rows - len(self)})"
-                ),
+                example=remedies.get((added > 0) - (added < 0), f"tracker.append({added})"),
             )
+        device = self.state.age.device
+        require(
+            gradient.device == device,
+            "observe",
+            expected=f"a gradient on {device}, where the moments are",
+            got=str(gradient.device),
+            example=f'tracker.to("{gradient.device}")',
+        )
         self.state = self.cadam().update(self.state, dense(gradient))
 
     def select(self) -> Bool[Tensor, "n"]:

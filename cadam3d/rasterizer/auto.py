@@ -101,8 +101,9 @@ def _checked(rasterizer: Rasterizer, device: torch.device, demands: Demands) -> 
     key, name = f"rasterizer={rasterizer.prepare(device).name}", torch.cuda.get_device_name(device)
     try:
         agreement = self_test(rasterizer, device, demands)
-    except (RuntimeError, MemoryError) as error:
-        reason = str(error).splitlines()[0]
+    except Exception as error:
+        # Another version of a library may raise anything, also without a message.
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise UserError(f"{key} cannot finish its self-test on {name}: {reason}. {REPORT}") from error
     if not agreement.passes:
         raise UserError(f"{key} fails its self-test on {name}: it {agreement}. {REPORT}")

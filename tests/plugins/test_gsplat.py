@@ -497,6 +497,31 @@ def test_nothing_is_observed_after_the_last_refinement():
     assert not toy.optimizers["means"]._optimizer_step_post_hooks
 
 
+def test_a_state_that_was_loaded_on_another_device_follows_the_gaussians():
+    toy = Toy(CAdamStrategy())
+    toy.step(0, torch.ones(10, 3))
+    toy.state["radii"] = torch.zeros(10)
+    toy.optimizers["means"].param_groups[0]["params"] = [toy.params["means"].to("meta")]
+    toy.strategy.step_pre_backward(**toy.shared, step=1)
+    assert {toy.state[name].device.type for name in ("m", "v", "age", "radii")} == {"meta"}
+
+
+class Selective(torch.optim.SGD):
+    """Takes a mask in its step, as SelectiveAdam of gsplat does, whose kernel needs a GPU."""
+
+    def step(self, visibility):
+        super().step()
+
+
+def test_an_optimizer_whose_step_takes_a_mask_is_observed():
+    gradients = noise(3, 10)
+    toy = Toy(CAdamStrategy(), kind=Selective)
+    toy.optimize = lambda: [each.step(torch.ones(10)) or each.zero_grad() for each in toy.optimizers.values()]
+    for step, gradient in enumerate(gradients):
+        toy.step(step, gradient)
+    assert_observed(toy.state, gradients)
+
+
 def test_a_new_optimizer_is_found():
     gradients = noise(4, 10)
     toy = Toy(CAdamStrategy())
@@ -599,6 +624,25 @@ def test_only_unreliable_opacities_are_reset_and_every_shape_of_opacities_works(
         assert (after[5:].sigmoid() <= 0.02 + 1e-6).all()
 
 
+def test_opacities_that_are_not_trained_are_not_reset():
+    toy = Toy(CAdamStrategy(reset="all", reset_every=2))
+    toy.params["opacities"].requires_grad_(False)
+    del toy.optimizers["opacities"]
+    toy.strategy.check_sanity(toy.params, toy.optimizers)
+    before = toy.params["opacities"].clone()
+    for step in range(3):
+        toy.step(step, torch.ones(10, 3))
+    assert torch.equal(toy.params["opacities"], before)
+
+
+def test_nothing_is_pruned_below_an_opacity_of_zero():
+    toy = Toy(growing(prune_opa=0))
+    with torch.no_grad():
+        toy.params["opacities"].fill_(-99.0)
+    toy.step(1, noise(1, 10)[0])
+    assert len(toy.params["means"]) == 15
+
+
 def test_verbose_says_what_happened(capsys):
     toy = Toy(growing(verbose=True, reset="all", refine_every=2, reset_every=2, reset_min_age=0))
     for step in range(3):
@@ -632,6 +676,7 @@ def test_settings_without_effect_are_accepted_with_a_warning():
         ({"refine_every": 0}, r"^refine_every: .*Try: refine_every=100$"),
         ({"reset_every": 0}, "^reset_every: "),
         ({"prune_opa": 0.5}, "^prune_opa: "),
+        ({"prune_opa": 0}, r'^prune_opa: .*Try: prune_opa=0, reset="none"$'),
     ],
 )
 def test_a_wrong_setting_is_named(settings, message):
@@ -673,6 +718,30 @@ def test_without_an_optimizer_of_the_means_the_message_says_so():
     del toy.optimizers["means"]
     with pytest.raises(UserError, match='optimizers: expected an optimizer of "means"'):
         toy.strategy.step_pre_backward(**toy.shared, step=0)
+
+
+class Wrapper(torch.optim.Optimizer):
+    """Has the class but not the hooks of an optimizer, like the wrapper of accelerate."""
+
+    def __init__(self, optimizer):
+        self.optimizer = optimizer
+
+
+def test_a_wrapper_of_an_optimizer_is_refused_with_the_way_to_unwrap_it():
+    toy = Toy(CAdamStrategy())
+    whole, optimizer = dict(toy.optimizers), toy.optimizers["means"]
+    toy.optimizers["means"] = Wrapper(optimizer)
+    with pytest.raises(UserError, match=r"itself.*got 'a wrapper of class Wrapper'") as caught:
+        toy.strategy.step_pre_backward(**toy.shared, step=0)
+    exec(str(caught.value).partition("Try: ")[2], {"optimizers": toy.optimizers})
+    assert toy.optimizers == whole
+    toy.step(0, torch.ones(10, 3))
+
+
+def test_without_radii_the_message_names_the_setting_that_needs_them():
+    toy = Toy(CAdamStrategy(refine_scale2d_stop_iter=9))
+    with pytest.raises(UserError, match=r"info: expected height, radii, .*Try: .*refine_scale2d_stop"):
+        toy.step(0, torch.ones(10, 3))
 
 
 @pytest.mark.parametrize("missing", [("gsplat",), ("gsplat", "gsplat.strategy")])

@@ -142,6 +142,11 @@ MISTAKES = {
     "rows added": (lambda tracker: tracker.observe(torch.zeros(N + 2, 3)), r"Try: tracker\.append\(2\)$"),
     "rows removed": (lambda tracker: tracker.observe(torch.zeros(4, 3)), r"Try: tracker\.keep\(mask\)$"),
     "screen": (lambda tracker: tracker.observe(torch.zeros(N, 2)), r"shape \(12, 3\).*got \(12, 2\)"),
+    "a number": (lambda tracker: tracker.observe(torch.tensor(1.0)), r"shape \(12, 3\).*got \(\)"),
+    "device": (
+        lambda tracker: tracker.observe(torch.zeros(N, 3, device="meta")),
+        r'a gradient on cpu.*got .meta.\. Try: tracker\.to\("meta"\)$',
+    ),
     "short mask": (
         lambda tracker: tracker.keep(torch.ones(3, dtype=torch.bool)),
         "keep: expected a mask of 12",

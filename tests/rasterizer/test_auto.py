@@ -170,7 +170,9 @@ def test_cuda_kernels_that_fail_the_self_test_are_not_used(change, a_gpu, agreem
     assert "\n" not in backend.reason
 
 
-@pytest.mark.parametrize("error", [RuntimeError("CUDA error\nat line 1"), MemoryError("full")])
+@pytest.mark.parametrize(
+    "error", [RuntimeError("CUDA error\nat line 1"), MemoryError(), TypeError("an unknown argument")]
+)
 def test_cuda_kernels_that_crash_in_the_self_test_are_not_used(error, a_gpu):
     a_gpu(raising(error))
     backend = choose(GPU).backend
