@@ -400,7 +400,7 @@ def refused_line(capsys, monkeypatch, *words: str) -> str:
 WRONG_LINES = {
     "device=null": "device: expected a text",
     "device=meta": "device: expected a device of this machine",
-    "resume=0": "resume: expected a text or null",
+    "resume=0": "resume: expected the folder of a run",
     "callback={}": "callback: {} changes nothing",
     "callback.progress=null": "callback.progress: expected an object of class Callback",
     "+foo=1": "foo: no such setting",
