@@ -81,6 +81,12 @@ def written(estimate: Estimate, digits: int, factor: float = 1.0) -> str:
     return f"{numbers[0]}{interval}{p_value}"
 
 
+def median(numbers: Sequence[float]) -> float:
+    """Return the median of the numbers that are known; NaN if none is."""
+    known = [number for number in numbers if not np.isnan(number)]
+    return float(np.median(known)) if known else np.nan
+
+
 def levels(results: Sequence[JobResult]) -> str:
     """Return a table of all settings: medians of the count, the PSNR, the gain over no growth and the IoU."""
     gain = gain_over(results)
@@ -94,7 +100,7 @@ def levels(results: Sequence[JobResult]) -> str:
                 gain,
                 lambda each: each.iou if each.iou is not None else np.nan,
             ]
-            medians = [float(np.nanmedian([number(each) for each in own])) for number in numbers]
+            medians = [median([number(each) for each in own]) for number in numbers]
             early = sum(each.ended_early for each in own)
             cells = [f"{len(own)}" + (f" ({early} ended early)" if early else ""), f"{medians[0]:,.0f}"]
             rows.append(

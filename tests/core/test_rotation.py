@@ -1,5 +1,6 @@
 """Rotation matrices: kornia's to the last bit, values and gradients."""
 
+import jaxtyping
 import pytest
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
@@ -26,3 +27,8 @@ def test_matrices_and_gradients_equal_those_of_kornia_to_the_last_bit(dtype):
         found.append((matrices.detach(), leaf.grad))
     for ours, theirs in zip(*found, strict=True):
         assert torch.equal(ours, theirs)
+
+
+def test_the_suite_checks_the_shapes_that_functions_state():
+    with pytest.raises(jaxtyping.TypeCheckError):
+        rotation_matrices(torch.zeros(4))
