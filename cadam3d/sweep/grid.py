@@ -80,6 +80,7 @@ class Job:
     name: str  # of its folder; depends only on its arm and its settings
     overrides: tuple[str, ...]  # of ``cadam3d train``
     prompt: Prompt | None  # None if its prompt is not one of a file or a set
+    brought: tuple[str, ...]  # keys of the settings that come with the prompt
 
 
 HasSetting = Callable[[Sequence[str], str], bool]
@@ -170,12 +171,14 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
             taken = [setting for setting in shared if setting.key not in {*axes, *foreign[name]}]
             for own in product(*axes.values()):
                 typed = (*taken, *own)
-                settings = (*typed, *_brought(typed, has_setting))
+                brought = _brought(typed, has_setting)
+                settings = (*typed, *brought)
                 job = Job(
                     arm=name,
                     name=_folder_name(name, settings, named, counted),
                     overrides=tuple(setting.line for setting in settings),
                     prompt=next((setting.prompt for setting in typed if setting.prompt), None),
+                    brought=tuple(setting.key for setting in brought),
                 )
                 other = found.setdefault(frozenset(setting.identity for setting in settings), job)
                 if other.arm != name and (causes := [key for key in axes if key in line]):

@@ -118,7 +118,8 @@ def read_choice(node: Mapping[Any, Any] | None, default: str | None = None) -> C
 def read_prompts(source: str) -> tuple[Prompt, ...]:
     """Return the prompts of a set, or of the file at the path ``source``. Repeated entries count once.
 
-    Raises ``UserError``, with the line, for anything that is not a prompt.
+    Raises ``UserError``, with the line, for anything that is not a prompt and for a prompt with two different
+    entries.
     """
     path = _find(source)
     text = _decoded(path)
@@ -132,13 +133,14 @@ def read_prompts(source: str) -> tuple[Prompt, ...]:
     require(bool(entries), KEY, expected="prompts", got=f"none in {path}", example=f"{KEY}={_sets()[0]}")
     if len(entries) > MOST:
         raise _refusal(str(path), f"at most {MOST} prompts", len(entries))
-    found: dict[tuple[str, tuple[tuple[str, str], ...]], tuple[Prompt, str]] = {}
+    found: dict[str, tuple[Prompt, str]] = {}
     for node, category in entries:
         prompt = _prompt(node, category)
-        first, place = found.setdefault((prompt.text, prompt.settings), (prompt, node.place))
+        first, place = found.setdefault(prompt.text, (prompt, node.place))
         if first != prompt:
-            expected = f"the name and the category that this prompt has in {place.rpartition(', ')[2]}"
-            raise _refusal(node.place, expected, f"{prompt.name}, {prompt.category}")
+            where = place.removeprefix(f"{path}, ")
+            expected = f"what {where} says about this prompt too, or another prompt"
+            raise _refusal(node.place, expected, prompt.text)
     return tuple(prompt for prompt, _ in found.values())
 
 

@@ -12,6 +12,8 @@ from cadam3d.io.run_folder import TABLE
 from cadam3d.sweep.folder import Row, load
 
 FACTS = ("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "asset_bytes", "message")
+# Columns that only jobs with a prompt of a file or a set have.
+LABELS = ("prompt_name", "category")
 # Columns that only jobs with a named truth have.
 MORE_FACTS = tuple(name for name in QUALITY if name not in ("psnr", "psnr_min", "ssim"))
 # Columns of the table in the terminal, besides the outcome and the settings in which jobs differ.
@@ -68,11 +70,13 @@ def _write(path: Path, rows: Sequence[Row]) -> None:
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         names = [*FACTS, *(name for name in MORE_FACTS if any(name in row.summary for row in rows))]
-        writer.writerow(["job", "arm", *keys, "outcome", *names, "folder"])
+        labels = [name for name in LABELS if any(getattr(row, name) for row in rows)]
+        writer.writerow(["job", "arm", *labels, *keys, "outcome", *names, "folder"])
         for row in rows:
             swept = [_plain(row.swept.get(key)) for key in keys]
             facts = [row.summary.get(name) for name in names]
-            writer.writerow([row.number, row.arm, *swept, row.outcome, *facts, row.folder.name])
+            said = [getattr(row, name) for name in labels]
+            writer.writerow([row.number, row.arm, *said, *swept, row.outcome, *facts, row.folder.name])
 
 
 def _swept_keys(rows: Sequence[Row]) -> list[str]:
