@@ -435,7 +435,7 @@ def test_a_dry_run_lists_the_prompts_of_a_set(sweep, tmp_path):
             "sweep",
             "prompts: expected either prompts= or prompt=, got both. Try: cadam3d sweep prompts=shapes6",
         ),
-        (("prompts=shapes6", "prompts.shards=1/2"), "sweep", "Did you mean prompts.shard?"),
+        (("prompts=shapes6", "prompts.shards=1/2"), "sweep", "Did you mean prompts.shard or "),
         (("prompts=shapes6", "negative_prompts=x"), "sweep", "Did you mean negative_prompt?"),
     ],
 )
