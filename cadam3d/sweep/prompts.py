@@ -169,7 +169,7 @@ class _Node:
     written: str = field(default="", compare=False)  # the value in messages, if it is not text
 
 
-def _written(node: _Node) -> str:
+def _shown(node: _Node) -> str:
     """Return a value of a file for a message."""
     if node.content is None:
         return "nothing"
@@ -256,9 +256,7 @@ def _tree(path: Path, text: str) -> _Node:
         place = str(path) if line is None else f"{path}, line {line}"
         reason = getattr(error, "problem", None) or getattr(error, "msg", None) or str(error)
         reason = " ".join(str(reason).split())[:120]
-        raise UserError(
-            f"{KEY}: {place}: expected plain {kind}, got something else ({reason}). Try: {KEY}={_sets()[0]}"
-        ) from error
+        raise _refusal(place, f"plain {kind}", f"something else ({reason})") from error
 
 
 def _from_yaml(node: yaml.Node | None, file: str) -> _Node:
@@ -310,7 +308,7 @@ def _entries(root: _Node) -> Iterator[tuple[_Node, str]]:
     for name, node in lists.items():
         if not isinstance(node.content, list):
             expected = "a list of prompts, or names with lists of prompts"
-            raise _refusal(node.place, expected, _written(node))
+            raise _refusal(node.place, expected, _shown(node))
         for item in node.content:
             yield item, name.strip() if len(lists) > 1 else ""
 
@@ -343,7 +341,7 @@ def _prompt(node: _Node, category: str) -> Prompt:
 def _text(node: _Node, what: str, *, may_be_empty: bool = False) -> str:
     """Return the text of a node without blanks around it. Raises ``UserError`` if it cannot be ``what``."""
     if not isinstance(node.content, str):
-        raise _refusal(node.place, f"{what} as text", _written(node))
+        raise _refusal(node.place, f"{what} as text", _shown(node))
     text = node.content.strip()
     if not (text or may_be_empty):
         raise _refusal(node.place, what, _quoted(text))
