@@ -139,6 +139,8 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
     if problem is not None:
         raise _not_saved(folder, problem) from problem
     print(f"\n{len(results)} jobs: {shown(folder / EVALUATION)}\nreport: {shown(report.write_sweep(folder))}")
+    if table := report.paper_table(folder):
+        print(f"\n{table}")
 
 
 def _not_saved(folder: Path, error: UserError) -> UserError:

@@ -60,11 +60,8 @@ def ssim_of(summary: Mapping[str, Any]) -> float | None:
     return summary.get("ssim") if turned is None else turned
 
 
-def read_quality(run: Path, summary: Mapping[str, Any]) -> dict[str, float]:
-    """Return the quality in ``eval.json`` of a run that has measured none itself.
-
-    Returns {} if the summary has a PSNR, or if the evaluation is of another asset or cannot be believed.
-    """
+def read_evaluation(run: Path, summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of ``eval.json``; {} if it is of another asset than ``summary`` or unreadable."""
     try:
         evaluation = read_json(run / EVALUATION)
     except UserError:
@@ -72,8 +69,17 @@ def read_quality(run: Path, summary: Mapping[str, Any]) -> dict[str, float]:
     is_of_run = isinstance(evaluation, dict) and evaluation.get("num_gaussians") == summary.get(
         "num_gaussians"
     )
-    if not is_of_run or psnr_of(summary) is not None:
+    return evaluation if is_of_run else {}
+
+
+def read_quality(run: Path, summary: Mapping[str, Any]) -> dict[str, float]:
+    """Return the quality in ``eval.json`` of a run that has measured none itself.
+
+    Returns {} if the summary has a PSNR, or if the evaluation is of another asset or cannot be believed.
+    """
+    if psnr_of(summary) is not None:
         return {}
+    evaluation = read_evaluation(run, summary)
     return {name: evaluation[name] for name in QUALITY if is_number(evaluation.get(name))}
 
 

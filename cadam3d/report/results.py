@@ -6,7 +6,7 @@ Gaussians and see the same views and noise, so settings are compared within cell
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cadam3d.core.outcome import Outcome
+from cadam3d.core.quality import QUALITIES
 from cadam3d.io.records import (
+    MEASUREMENTS,
     psnr_of,
     read_config,
+    read_evaluation,
     read_histograms,
     read_metrics,
     read_quality,
@@ -31,7 +34,7 @@ from cadam3d.sweep.folder import UNFINISHED, load
 # The other outcomes leave nothing to measure.
 WITH_ASSET = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.OUT_OF_MEMORY)
 ARM, PREFIX = "densifier", "densifier."
-SEED, PROMPT, NOISE, GUIDANCE = "seed", "prompt", "noise", "guidance"
+SEED, PROMPT, NOISE, GUIDANCE, RECIPE = "seed", "prompt", "noise", "guidance", "experiment"
 NO_NOISE = "none"  # the level whose gradients have no noise
 NOISE_ORDER = (NO_NOISE, "weak", "medium", "strong")  # other levels follow in alphabetical order
 
@@ -98,6 +101,11 @@ class JobResult:
     colour_error: float | None
     mib: float | None  # size of asset.ply
     seconds: float | None
+    objective: str  # the option of ``guidance`` it ran with; empty if that is not known
+    # Every number that was measured, and what is recorded about how; those of eval.json replace those of
+    # training.
+    numbers: Mapping[str, float] = field(repr=False)
+    measurements: Mapping[str, Mapping[str, Any]] = field(repr=False)
 
     @property
     def arm(self) -> str:
@@ -165,6 +173,7 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
     summary = {**job.summary, **read_quality(job.folder, job.summary)}
     numbers = {key: number(value) for key, value in summary.items()}
     size = numbers.get("asset_bytes")
+    sources = (job.summary, read_evaluation(job.folder, job.summary))
     given = {key: value for key, value in job.overrides.items() if key.startswith(PREFIX)}
     return JobResult(
         folder=job.folder,
@@ -185,7 +194,27 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
         colour_error=numbers.get("colour_error"),
         mib=size / (1 << 20) if size is not None else None,
         seconds=numbers.get("seconds"),
+        objective=str(job.overrides.get(GUIDANCE) or job.summary.get(GUIDANCE) or ""),
+        numbers=_numbers(sources),
+        measurements=_measurements(sources),
     )
+
+
+def _numbers(sources: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    found = {name: number(each.get(name)) for each in sources for name in QUALITIES if name in each}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _measurements(sources: Iterable[Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    """Return the record of each number, from the last file that has the number."""
+    found: dict[str, Mapping[str, Any]] = {}
+    for each in sources:
+        records = each.get(MEASUREMENTS)
+        for name in QUALITIES:
+            if name in each:
+                record = records.get(name) if isinstance(records, dict) else None
+                found[name] = record if isinstance(record, dict) else {}
+    return found
 
 
 def _cell(job: _KnownJob, axes: Sequence[str]) -> Cell:
@@ -293,6 +322,16 @@ def at_noise(results: Iterable[JobResult], level: str) -> list[JobResult]:
 def with_noise(results: Sequence[JobResult]) -> Sequence[JobResult]:
     """Return the results with noisy gradients, which the paper is about; all results if there are none."""
     return [result for result in results if result.cell[NOISE] != NO_NOISE] or results
+
+
+def objective_axis(results: Iterable[JobResult]) -> str:
+    """Return the key of the cells that chooses the objective.
+
+    That is ``experiment`` if recipes vary and ``guidance`` does not.
+    """
+    results = list(results)
+    varies = {key: any(result.cell[key] for result in results) for key in (GUIDANCE, RECIPE)}
+    return RECIPE if varies[RECIPE] and not varies[GUIDANCE] else GUIDANCE
 
 
 def measured(results: Iterable[JobResult]) -> list[JobResult]:

@@ -18,7 +18,7 @@ from cadam3d.report.claims import (
     standard_setting,
     standings,
 )
-from cadam3d.report.results import GUIDANCE, JobResult, arms_of, at_noise, levels_of, measured
+from cadam3d.report.results import JobResult, arms_of, at_noise, levels_of, measured, objective_axis
 from cadam3d.report.verdicts import OURS, THEIRS
 
 Line = dict[str, Any]
@@ -34,9 +34,9 @@ OF_TRUTH = {
 
 def objectives_table(results: Sequence[JobResult]) -> list[Line]:
     """Return the standard setting of each arm by objective and noise, medians over cells (paper table 1)."""
-    lines = []
-    for objective in sorted({result.cell[GUIDANCE] for result in measured(results)}):
-        of_objective = [result for result in results if result.cell[GUIDANCE] == objective]
+    lines, axis = [], objective_axis(results)
+    for objective in sorted({result.cell[axis] for result in measured(results)}):
+        of_objective = [result for result in results if result.cell[axis] == objective]
         for level in levels_of(of_objective):
             here = at_noise(of_objective, level)
             theirs = standard_setting(here, THEIRS)

@@ -30,6 +30,7 @@ ALWAYS_SHOWN = ("prompt", "seed")
 # Each job starts a process, which takes seconds, and is a row of a table. With this many jobs, the starts
 # alone take a day, and the table is too long to read.
 MOST_JOBS = 10_000
+KEYS = {"each", "arms", "figures", "paper_table"}  # of a grid
 # Lists the grids of the package, for messages about one that cannot be read.
 EXAMPLE = "cadam3d sweep --help grid"
 
@@ -65,6 +66,7 @@ class Grid:
     each: Axes
     arms: dict[str, Axes]  # at least one; named "" without a grid
     figures: list[str] | None = None  # of its report; None: all for which there are data
+    paper_table: bool = False  # whether the sweep ends with the paper's table 1 of its jobs
 
 
 @dataclass(frozen=True)
@@ -82,13 +84,13 @@ HasSetting = Callable[[Sequence[str], str], bool]
 def read_grid(node: Any) -> Grid:
     """Return the grid that plain dicts and lists describe; None describes a grid of one nameless arm.
 
-    Raises ``UserError`` for keys other than ``each``, ``arms`` and ``figures`` and for wrong values of these.
+    Raises ``UserError`` for keys other than those of :class:`Grid` and for wrong values of these.
     """
     if node is None:
         return Grid(each={}, arms={"": {}})
-    if not isinstance(node, dict) or not node or not node.keys() <= {"each", "arms", "figures"}:
+    if not isinstance(node, dict) or not node or not node.keys() <= KEYS:
         got = "|".join(map(str, node)) if isinstance(node, dict) else node
-        raise UserError(f"grid: expected each, arms and figures, got {got}. Try: {EXAMPLE}")
+        raise UserError(f"grid: expected each, arms, figures and paper_table, got {got}. Try: {EXAMPLE}")
     arms = node.get("arms")
     arms = {"": {}} if arms is None else arms
     if not isinstance(arms, dict) or not arms:
@@ -98,10 +100,16 @@ def read_grid(node: Any) -> Grid:
         raise UserError(
             f"grid.figures: expected a list of names, got {figures}. Try: 'grid.figures=[frontier]'"
         )
+    has_table = node.get("paper_table", False)
+    if not isinstance(has_table, bool):
+        raise UserError(
+            f"grid.paper_table: expected true or false, got {has_table}. Try: grid.paper_table=true"
+        )
     return Grid(
         each=_axes(node.get("each"), "grid.each"),
         arms={str(name): _axes(axes, f"grid.arms.{name}") for name, axes in arms.items()},
         figures=figures,
+        paper_table=has_table,
     )
 
 

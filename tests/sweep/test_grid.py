@@ -193,8 +193,15 @@ def test_all_keys_in_which_jobs_may_differ_are_listed(pareto):
 @pytest.mark.parametrize(
     ("node", "expected"),
     [
-        ({"densifier": "baseline,cadam"}, "grid: expected each, arms and figures, got densifier"),
-        ([1], "grid: expected each, arms and figures"),
+        (
+            {"densifier": "baseline,cadam"},
+            "grid: expected each, arms, figures and paper_table, got densifier",
+        ),
+        (
+            {"paper_table": "yes"},
+            "grid.paper_table: expected true or false, got yes. Try: grid.paper_table=true",
+        ),
+        ([1], "grid: expected each, arms, figures and paper_table"),
         ({"arms": {}}, "grid.arms: expected named arms"),
         ({"arms": ["a"]}, "grid.arms: expected named arms"),
         ({"arms": {"a": 1}}, "grid.arms.a: expected keys with values, got 1"),
