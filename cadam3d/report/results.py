@@ -102,6 +102,7 @@ class JobResult:
     mib: float | None  # size of asset.ply
     seconds: float | None
     objective: str  # the option of ``guidance`` it ran with; empty if that is not known
+    category: str  # of its prompt; empty if it has none
     # Every number that was measured, and what is recorded about how; those of eval.json replace those of
     # training.
     numbers: Mapping[str, float] = field(repr=False)
@@ -137,6 +138,7 @@ class _KnownJob:
     overrides: Mapping[str, Any]  # key to value
     summary: Mapping[str, Any]
     outcome: str
+    category: str
 
     @property
     def densifier(self) -> str:
@@ -164,7 +166,7 @@ def _known(job: Any) -> _KnownJob:
     Without a grid the arm of a job has no name; it is then the densifier.
     """
     overrides = dict(_pair(str(line)) for line in job.overrides)
-    known = _KnownJob(job.arm, job.folder, overrides, job.summary, str(job.outcome))
+    known = _KnownJob(job.arm, job.folder, overrides, job.summary, str(job.outcome), job.category)
     return known if job.arm else _KnownJob(**{**vars(known), "arm": known.densifier or "default"})
 
 
@@ -195,6 +197,7 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
         mib=size / (1 << 20) if size is not None else None,
         seconds=numbers.get("seconds"),
         objective=str(job.overrides.get(GUIDANCE) or job.summary.get(GUIDANCE) or ""),
+        category=job.category,
         numbers=_numbers(sources),
         measurements=_measurements(sources),
     )

@@ -195,13 +195,10 @@ def test_all_keys_in_which_jobs_may_differ_are_listed(pareto):
     [
         (
             {"densifier": "baseline,cadam"},
-            "grid: expected each, arms, figures and paper_table, got densifier",
+            "grid: expected each, arms, prompts, figures, paper_table, got dens",
         ),
-        (
-            {"paper_table": "yes"},
-            "grid.paper_table: expected true or false, got yes. Try: grid.paper_table=true",
-        ),
-        ([1], "grid: expected each, arms, figures and paper_table"),
+        ([1], "grid: expected each, arms, prompts, figures, paper_table, got"),
+        ({"paper_table": "yes"}, "grid.paper_table: expected true or false, got yes. Try: grid.paper"),
         ({"arms": {}}, "grid.arms: expected named arms"),
         ({"arms": ["a"]}, "grid.arms: expected named arms"),
         ({"arms": {"a": 1}}, "grid.arms.a: expected keys with values, got 1"),
