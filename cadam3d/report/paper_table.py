@@ -336,7 +336,7 @@ def _notes(results: Sequence[JobResult], usable: Sequence[JobResult], names: Seq
     )
     if lacking := len(results) - len(usable):
         notes.append(
-            f"{plural(lacking, 'job')} of {len(results)} left nothing to measure or did not end yet."
+            f"{lacking} of {plural(len(results), 'job')} left nothing to measure or did not end yet."
         )
     if early := Counter((result.arm, result.outcome) for result in usable if result.ended_early):
         listed = ", ".join(f"{count} of {arm} ({outcome})" for (arm, outcome), count in sorted(early.items()))

@@ -205,7 +205,10 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
 
 def _numbers(sources: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     found = {name: number(each.get(name)) for each in sources for name in QUALITIES if name in each}
-    return {name: value for name, value in found.items() if value is not None}
+    known = {name: value for name, value in found.items() if value is not None}
+    if "asset_bytes" in known:
+        known.setdefault("asset_mib", known["asset_bytes"] / (1 << 20))
+    return known
 
 
 def _measurements(sources: Iterable[Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
