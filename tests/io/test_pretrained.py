@@ -138,7 +138,7 @@ def test_a_list_of_folders_serves_priors_of_different_kinds(model, tmp_path):
         both.find(("SDXL",), {})
     with pytest.raises(UserError, match="nothing there"):
         source(path=[str(model), str(tmp_path / "typo")]).find(KINDS, OTHERS)
-    for wrong in ([], [""], [1]):
+    for wrong in ([], [""]):
         with pytest.raises(UserError, match="expected a folder, a list of folders or null"):
             source(path=wrong)
 

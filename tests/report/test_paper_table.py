@@ -193,6 +193,7 @@ def test_columns_are_the_numbers_that_every_row_has(jobs):
         "psnr_turned",
         "ssim_turned",
         "num_gaussians",
+        "asset_mib",
     ]
     assert all(heading in headings(table_of(jobs.folder)) for heading in ("CLIP score ↑", "Gaussians ↓"))
     assert set(NUMBERS) <= set(QUALITIES)
