@@ -8,7 +8,6 @@ import re
 
 import pytest
 
-from cadam3d.core.errors import UserError
 from cadam3d.core.quality import QUALITIES
 from cadam3d.io import run_folder
 from cadam3d.report import table_files
@@ -202,23 +201,43 @@ def test_columns_are_the_numbers_that_every_row_has(jobs):
 @pytest.mark.parametrize(
     ("other", "expected"),
     [
-        (scored(30, {"name": "t3bench"}), "clip_score: expected one protocol"),
-        (scored(30, {**PROTOCOL, "views": 8}), "clip_score: expected one protocol"),
-        (scored(30, sha="bb"), "clip_score: expected one model"),
-        ({"clip_score": 30.0}, "clip_score: expected one protocol"),
+        (scored(30, {"name": "t3bench", "views": 12}), "protocol.name is paper (1) and t3bench (1)"),
+        (scored(30, {**PROTOCOL, "views": 8}), "protocol.views is 12 (1) and 8 (1)"),
+        (scored(30, sha="bb"), "weights_sha256 is aa (1) and bb (1)"),
+        ({"clip_score": 30.0, "measurements": {}}, "clip_score has a record"),
     ],
 )
-def test_mixed_protocols_are_refused_and_leave_no_table(jobs, other, expected):
-    jobs.paper_table = True
+def test_numbers_of_different_methods_are_not_put_into_one_table(jobs, other, expected):
     jobs.add("baseline", n=100, psnr=20, arm="baseline", **scored(31.0))
     folder = jobs.add("cadam", n=10, psnr=20, arm="cadam", **scored(30.0))
-    assert "31.00" in table_files.write(jobs.folder)
+    assert table_of(jobs.folder).names[0] == "clip_score"
     summary = json.loads((folder / run_folder.SUMMARY).read_text())
-    (folder / run_folder.SUMMARY).write_text(json.dumps({**summary, "measurements": {}, **other}))
-    with pytest.raises(UserError, match=expected) as caught:
-        table_files.write(jobs.folder)
-    assert "Try: cadam3d eval run=" in str(caught.value)
-    assert not (jobs.folder / run_folder.PAPER_TABLE_MARKDOWN).exists()
+    (folder / run_folder.SUMMARY).write_text(json.dumps({**summary, **other}))
+    table = table_of(jobs.folder)
+    assert "clip_score" not in table.names
+    assert "num_gaussians" in table.names
+    [note] = [note for note in table.notes if expected in note]
+    assert note.endswith("'metric=[clip_score]'")
+    assert "31.00" not in markdown(table) + latex(table) + comma_separated(table)
+
+
+def test_scores_of_one_table_belong_to_one_protocol(jobs):
+    for arm in ("baseline", "cadam"):
+        both = scored(30.0)
+        both["niqe"] = 5.0
+        both["measurements"]["niqe"] = {"protocol": {"name": "t3bench", "views": 12}, "weights_sha256": "cc"}
+        jobs.add(arm, n=100, psnr=20, arm=arm, **both)
+    table = table_of(jobs.folder)
+    assert "clip_score" in table.names
+    assert "niqe" not in table.names
+    assert any("niqe belongs to another protocol" in note for note in table.notes)
+
+
+def test_settings_that_come_with_prompts_do_not_split_the_rows(jobs):
+    for prompt, negative in (("a cube", "blurry"), ("a torus", "ugly")):
+        jobs.add("cadam", f"prompt={prompt}", f"negative_prompt={negative}", n=10, psnr=20, arm="cadam")
+    rows = [row for row in table_of(jobs.folder).sections[0].rows if row.source == "this sweep"]
+    assert [(row.objective, row.prompts) for row in rows] == [("SDS", "2")]
 
 
 def test_eval_replaces_the_numbers_of_training(jobs):
