@@ -48,6 +48,7 @@ class Plan:
     jobs: list[PlannedJob]
     figures: list[str] | None = None  # of the report; None: all for which there are data
     line: list[str] = field(default_factory=list)  # what was typed after ``cadam3d sweep``
+    paper_table: bool = False  # whether the paper's table 1 is made of its jobs
 
 
 @dataclass(frozen=True)
@@ -134,6 +135,7 @@ def _require_plan(content: Any) -> None:
     is_count = is_whole(threads) and 1 <= threads <= MOST_THREADS
     _require(threads is None or is_count, "threads: expected a whole number")
     _require(figures is None or _are_texts(figures), "figures: expected names")
+    _require(type(content.get("paper_table", False)) is bool, "paper_table: expected true or false")
     for name in ("flags", "line"):
         _require(_are_texts(content.get(name, [])), f"{name}: expected words")
     for job in content["jobs"]:

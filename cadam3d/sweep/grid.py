@@ -31,6 +31,7 @@ ALWAYS_SHOWN = ("prompt", "seed")
 # Each job starts a process, which takes seconds, and is a row of a table. With this many jobs, the starts
 # alone take a day, and the table is too long to read.
 MOST_JOBS = 10_000
+KEYS = ("each", "arms", "prompts", "figures", "paper_table")  # of a grid
 # Lists the grids of the package, for messages about one that cannot be read.
 EXAMPLE = "cadam3d sweep --help grid"
 
@@ -70,6 +71,7 @@ class Grid:
     arms: dict[str, Axes]  # at least one; named "" without a grid
     prompts: str | None = None  # a file or a set; a line may choose others
     figures: list[str] | None = None  # of its report; None: all for which there are data
+    paper_table: bool = False  # whether the sweep ends with the paper's table 1 of its jobs
 
 
 @dataclass(frozen=True)
@@ -93,9 +95,9 @@ def read_grid(node: Any) -> Grid:
     """
     if node is None:
         return Grid(each={}, arms={"": {}})
-    if not isinstance(node, dict) or not node or not node.keys() <= {"each", "arms", "prompts", "figures"}:
+    if not isinstance(node, dict) or not node or not node.keys() <= set(KEYS):
         got = "|".join(map(str, node)) if isinstance(node, dict) else node
-        raise UserError(f"grid: expected each, arms, prompts and figures, got {got}. Try: {EXAMPLE}")
+        raise UserError(f"grid: expected {', '.join(KEYS)}, got {got}. Try: {EXAMPLE}")
     arms = node.get("arms")
     arms = {"": {}} if arms is None else arms
     if not isinstance(arms, dict) or not arms:
@@ -105,6 +107,11 @@ def read_grid(node: Any) -> Grid:
         raise UserError(
             f"grid.figures: expected a list of names, got {figures}. Try: 'grid.figures=[frontier]'"
         )
+    has_table = node.get("paper_table", False)
+    if not isinstance(has_table, bool):
+        raise UserError(
+            f"grid.paper_table: expected true or false, got {has_table}. Try: grid.paper_table=true"
+        )
     prompts = node.get("prompts")
     if not (prompts is None or isinstance(prompts, str)):
         raise UserError(f"grid.prompts: expected a file or a set, got {prompts}. Try: grid.prompts=paper50")
@@ -113,6 +120,7 @@ def read_grid(node: Any) -> Grid:
         arms={str(name): _axes(axes, f"grid.arms.{name}") for name, axes in arms.items()},
         prompts=prompts,
         figures=figures,
+        paper_table=has_table,
     )
 
 

@@ -96,6 +96,7 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
             jobs=jobs,
             figures=sweep.grid.figures,
             line=[*_flags_named(flags, JOB_FLAGS), *overrides],
+            paper_table=sweep.grid.paper_table,
         )
         write_plan(folder, plan)
         done = len(rows) - len(pending)
