@@ -309,8 +309,9 @@ def _entries(root: _Node) -> Iterator[tuple[_Node, str]]:
         if not isinstance(node.content, list):
             expected = "a list of prompts, or names with lists of prompts"
             raise _refusal(node.place, expected, _shown(node))
+        category = _text(_Node(node.place, name), "a category as the name") if len(lists) > 1 else ""
         for item in node.content:
-            yield item, name.strip() if len(lists) > 1 else ""
+            yield item, category
 
 
 def _prompt(node: _Node, category: str) -> Prompt:

@@ -14,6 +14,7 @@ from cadam3d.settings.line import setting_word
 from cadam3d.sweep.folder import Row, load
 
 FACTS = ("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "asset_bytes", "message")
+BRIEF = 80  # characters
 # Columns that only jobs with a prompt of a file or a set have.
 LABELS = ("prompt_name", "category")
 # Columns that only jobs with a named truth have.
@@ -52,9 +53,11 @@ def as_text(rows: Sequence[Row]) -> str:
     keys = varying_keys(rows)
     has_arms = any(row.arm for row in rows)
     scores = _scores(rows)
-    lines = [["job", *(["arm"] if has_arms else []), *keys, "outcome", *SHOWN, *scores.columns]]
+    lines: list[list[Any]] = [
+        ["job", *(["arm"] if has_arms else []), *keys, "outcome", *SHOWN, *scores.columns]
+    ]
     for index, row in enumerate(rows):
-        values = [row.number, *([row.arm] if has_arms else []), *(row.swept.get(key) for key in keys)]
+        values = [row.number, *([row.arm] if has_arms else []), *(brief(row.swept.get(key)) for key in keys)]
         shown = row.summary | {"psnr": psnr_of(row.summary)}
         facts = [row.outcome, *(shown.get(name) for name in SHOWN)]
         lines.append([*values, *facts, *(column[index] for column in scores.columns.values())])
@@ -91,6 +94,12 @@ def aligned(lines: Sequence[Sequence[Any]]) -> str:
 def _scores(rows: Sequence[Row]) -> Scores:
     folder = rows[0].folder.parent if rows else Path()
     return scores_of([read_scores(row.folder, row.summary) for row in rows], folder)
+
+
+def brief(value: Any) -> str:
+    """Return a value on one line of at most ``BRIEF`` characters, for a column or a sentence."""
+    text = " ".join(_cell(value).split())
+    return text if len(text) <= BRIEF else f"{text[: BRIEF - 3]}..."
 
 
 def varying_keys(rows: Sequence[Row]) -> list[str]:

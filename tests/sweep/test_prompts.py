@@ -8,12 +8,15 @@ import pytest
 
 from cadam3d.core.errors import UserError
 from cadam3d.prior.shapes.grammar import parse
+from cadam3d.report import results
 from cadam3d.settings.hydra import read_flags
 from cadam3d.settings.line import quoted
 from cadam3d.sweep import prompts as module
+from cadam3d.sweep.folder import Plan, PlannedJob, load, write_plan
 from cadam3d.sweep.grid import Grid, Job, expand, prompt_axis, read_grid, read_line, sweep_name
 from cadam3d.sweep.plan import compose_all, read_sweep
 from cadam3d.sweep.prompts import Choice, Prompt, read_choice, read_prompts
+from cadam3d.sweep.table import brief
 
 # What commas, quotes, brackets, references and other scripts would change if they were not quoted.
 HARSH = [
@@ -35,6 +38,8 @@ HARSH = [
     "a\tb",
     "long " * 1900,
 ]
+# A line of a text file cannot hold these.
+LINES = ["one\ntwo", "one\r\n\u2028 two"]
 
 
 def texts(prompts) -> list[str]:
@@ -149,6 +154,7 @@ LONG = "x" * (module.LONGEST + 1)
         ),
         ("x.json", '{"a": ["b", 3]}', "x.json, 'a', entry 2: expected a prompt as text, got 3"),
         ("x.json", "[" * 5000, "expected plain JSON"),
+        ("x.json", '{"a\\u0000": ["b"], "c": ["d"]}', "expected a category as the name without control"),
         ("x.json", '["lib:corgi_hat"]', "entry 1: expected a prompt, and not a reference to threestudio's"),
         ("x.txt", "???", "x.txt, line 1: expected a prompt, got '???'"),
         ("x.csv", "a", "expected a file with one of the suffixes .txt, .text, .yaml, .yml, .json, or none"),
@@ -350,14 +356,39 @@ def test_a_sweep_is_named_by_its_file_and_a_shard_has_a_folder_of_its_own(tmp_pa
     assert sweep_name("paper", other, choice("paper50", shard="1/4")) == "paper_shard-1-of-4"
 
 
+def test_jobs_of_a_prompt_are_compared_whether_or_not_they_have_its_settings(tmp_path):
+    jobs = [
+        PlannedJob(
+            arm=arm,
+            folder=f"{arm}_{prompt}",
+            overrides=[f"prompt='{prompt}'", *([f"initializer.prompt='{prompt}s'"] if brought else [])],
+            swept={},
+            brought=brought,
+        )
+        for prompt in ("cat", "dog")
+        for arm, brought in (("ball", []), ("shap_e", ["initializer.prompt"]))
+    ]
+    write_plan(tmp_path, Plan(cwd=str(tmp_path), flags=[], threads=None, jobs=jobs))
+    assert [row.brought for row in load(tmp_path)] == [job.brought for job in jobs]
+    ball_cat, shap_e_cat, ball_dog, _ = (result.cell for result in results.read(tmp_path))
+    assert ball_cat == shap_e_cat != ball_dog
+
+
+def test_a_long_prompt_of_several_lines_is_one_short_cell():
+    assert brief("one\n  two") == "one two"
+    assert len(brief("x" * 500)) == 80
+
+
 def test_every_prompt_reaches_its_job_literally_with_its_settings(tmp_path):
     path = tmp_path / "prompts.json"
-    entries = [{"prompt": each, "initializer_prompt": each, "negative_prompt": each} for each in HARSH]
+    entries = [
+        {"prompt": each, "initializer_prompt": each, "negative_prompt": each} for each in [*HARSH, *LINES]
+    ]
     path.write_text(json.dumps(entries))
     line = [quoted(f"prompts={path}", is_sweep=True), "initializer=ball,shap_e"]
     sweep, composer = read_sweep("sweep", line, read_flags([]))
     composed = compose_all(sweep, composer)
-    wanted = [(text.strip(), name) for text in HARSH for name in ("ball", "shap_e")]
+    wanted = [(text.strip(), name) for text in [*HARSH, *LINES] for name in ("ball", "shap_e")]
     assert [(job.get("prompt"), job.get("initializer")) for job in composed] == wanted
     assert [job.get("negative_prompt") for job in composed] == [text for text, _ in wanted]
     assert [job.get("initializer.prompt") for job in composed] == [
