@@ -101,7 +101,7 @@ def read_choice(node: Mapping[Any, Any] | None, default: str | None = None) -> C
     if source is None:
         for name in ("shard", "category", "first"):
             if node.get(name) is not None:
-                typed = f"{KEY}=paper50 {KEY}.{name}={node[name]}"
+                typed = f"{KEY}={_sets()[0]} {shlex.quote(f'{KEY}.{name}={node[name]}')}"
                 raise fail(f"{KEY}.{name}", expected=f"{KEY}=FILE too", got=node[name], example=typed)
         return None
     is_source = isinstance(source, str) and bool(source.strip())

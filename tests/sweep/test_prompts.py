@@ -319,6 +319,13 @@ def test_the_settings_of_a_prompt_count_for_its_folder_and_not_for_those_of_othe
     assert second.prompt == negative
 
 
+def test_the_settings_of_one_prompt_change_no_folder_of_another_in_any_arm():
+    grid = read_grid({"arms": {"some": {"negative_prompt": ["x", "y"]}, "none": {"densifier": "none"}}})
+    plain, other = Prompt(text="a cat"), Prompt(text="a dog", settings=(("negative_prompt", "z"),))
+    alone = [job.name for job in jobs_of([plain], grid)]
+    assert [job.name for job in jobs_of([plain, other], grid)][: len(alone)] == alone
+
+
 def test_the_line_and_the_grid_take_precedence_over_the_settings_of_a_prompt():
     prompts = [Prompt(text="a cat", settings=(("negative_prompt", "own"),)), Prompt(text="a dog")]
     lines = [job.overrides for job in jobs_of(prompts, line=["negative_prompt='typed'"])]
