@@ -319,7 +319,8 @@ def _notes(results: Sequence[JobResult], usable: Sequence[JobResult], names: Seq
     if any(group.family == row.objective for group in _groups(results) for row in ROWS):
         notes.append(
             "Rows marked published are printed in the paper's table 1. They belong to another protocol: "
-            "other prompts, views, models and hardware. Compare their differences with ours, not their numbers."
+            "other prompts, views, models and hardware. Compare their differences with ours, and not the "
+            "numbers themselves."
         )
     if lacking := len(results) - len(usable):
         notes.append(
