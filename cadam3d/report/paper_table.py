@@ -84,13 +84,6 @@ class PaperTable:
         """Return the labels of the columns of numbers."""
         return [QUALITIES[name].heading for name in self.names]
 
-    @property
-    def has_intervals(self) -> bool:
-        """Return whether any number has an interval."""
-        return any(
-            cell.half for section in self.sections for row in section.rows for cell in row.cells.values()
-        )
-
 
 @dataclass(frozen=True)
 class Group:
@@ -323,10 +316,12 @@ def _notes(results: Sequence[JobResult], usable: Sequence[JobResult], names: Seq
     )
     if known := [name for name in protocols if name]:
         notes.append(f"Learned scores: protocol={', '.join(known)}, as eval.json of each job records it.")
-    notes.append(
-        "Rows marked published are printed in the paper's table 1. They belong to another protocol: other "
-        "prompts, views, models and hardware. Compare differences between their rows, not rows of both."
-    )
+    if any(group.family == row.objective for group in _groups(results) for row in ROWS):
+        notes.append(
+            "Rows marked published are printed in the paper's table 1. They belong to another protocol: "
+            "other prompts, views, models and hardware. Compare their differences with ours, and not the "
+            "numbers themselves."
+        )
     if lacking := len(results) - len(usable):
         notes.append(
             f"{lacking} of {plural(len(results), 'job')} left nothing to measure or did not end yet."

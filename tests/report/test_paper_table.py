@@ -131,6 +131,13 @@ def test_published_rows_keep_their_text_and_never_share_a_cell(three):
     assert any("another protocol" in note for note in table.notes)
 
 
+def test_objectives_that_the_paper_lacks_have_no_published_rows(jobs):
+    jobs.add("cadam", "guidance=gcs", n=10, psnr=20, arm="cadam")
+    table = table_of(jobs.folder)
+    assert [row.source for row in table.sections[0].rows] == ["this sweep"]
+    assert not any("published" in note for note in table.notes)
+
+
 def test_categories_have_parts_of_their_own(three):
     table = table_of(three)
     assert [section.category for section in table.sections] == ["", "Material", "Structure & 100 %"]
