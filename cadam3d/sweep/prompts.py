@@ -83,7 +83,7 @@ class Choice:
             return prompts
         number, count = self.shard
         if count > len(prompts):
-            expected = f"at most one shard for each of the {len(prompts)} prompts"
+            expected = f"no more shards than prompts ({len(prompts)})"
             raise fail(SHARD, expected=expected, got=f"{number}/{count}", example=f"{SHARD}=1/{len(prompts)}")
         begin, end = ((number + step) * len(prompts) // count for step in (-1, 0))
         return prompts[begin:end]

@@ -253,7 +253,7 @@ def test_a_category_and_a_number_choose_a_part(tmp_path):
         ({"shard": 2}, "prompts.shard: expected i/n"),
         (
             {"shard": "1/51"},
-            "prompts.shard: expected at most one shard for each of the 50 prompts, got '1/51'",
+            "prompts.shard: expected no more shards than prompts (50), got '1/51'",
         ),
         ({"first": 0}, "prompts.first: expected a whole number >= 1, got 0"),
         ({"first": True}, "prompts.first: expected a whole number"),
