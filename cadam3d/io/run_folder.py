@@ -68,6 +68,9 @@ MULTIRUN = "multirun.yaml"  # written by Hydra
 # While this file exists, running jobs save and end, and no other job starts.
 STOP = ".stop"
 TABLE = "sweep.csv"
+PAPER_TABLE_CSV = "table.csv"  # the paper's table 1 of the jobs
+PAPER_TABLE_MARKDOWN = "table.md"
+PAPER_TABLE_LATEX = "table.tex"
 SHARED = "traces"  # a folder, removed after the sweep
 
 # Written by a sweep, into the folder of each job.
@@ -138,7 +141,8 @@ def occupant(folder: Path) -> str | None:
 
 def occupant_of_sweep(folder: Path) -> str | None:
     """Return the name of something in ``folder`` that a sweep would overwrite or remove; None if nothing."""
-    names = (TABLE, REPORT, EVALUATION, FIGURES, MULTIRUN, SHARED, STOP)
+    tables = (TABLE, PAPER_TABLE_CSV, PAPER_TABLE_MARKDOWN, PAPER_TABLE_LATEX)
+    names = (*tables, REPORT, EVALUATION, FIGURES, MULTIRUN, SHARED, STOP)
     return next((name for name in names if os.path.lexists(folder / name)), None)
 
 

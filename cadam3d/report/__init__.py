@@ -36,6 +36,17 @@ def write_sweep(folder: Path) -> Path:
     return write(folder)
 
 
+def write_paper_table(folder: Path) -> str:
+    """Write the paper's table 1 of the sweep in ``folder`` as files, and return it as Markdown.
+
+    Returns "" if its grid does not ask for the table or no job has left an asset. Raises ``UserError`` if a
+    file cannot be written.
+    """
+    from cadam3d.report.table_files import write
+
+    return write(folder)
+
+
 def verdict(folder: Path) -> list[str]:
     """Return the sentences that open the page of the sweep in ``folder``; empty if nothing is comparable."""
     from cadam3d.report.results import read

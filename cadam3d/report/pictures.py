@@ -14,8 +14,8 @@ from cadam3d.report.claims import by_cell, standard_setting
 from cadam3d.report.figures import arm_of_two_thresholds
 from cadam3d.report.palette import SOFT
 from cadam3d.report.results import (
-    GUIDANCE,
     NOISE,
+    RECIPE,
     Cell,
     JobResult,
     arms_of,
@@ -23,6 +23,7 @@ from cadam3d.report.results import (
     histograms,
     level_title,
     measured,
+    objective_axis,
 )
 from cadam3d.report.style import hide_axes, looks, new_figure
 from cadam3d.settings.compose import flatten
@@ -89,26 +90,26 @@ def ablation_figure(results: Sequence[JobResult]) -> Figure | None:
 
 def objectives_figure(results: Sequence[JobResult]) -> Figure | None:
     """Show one cell with a line per objective and a column per arm (paper fig. 4)."""
-    style = looks(arms_of(results))
-    results = [result for result in measured(results) if result.cell[GUIDANCE]]
-    objectives = sorted({result.cell[GUIDANCE] for result in results})
+    style, axis = looks(arms_of(results)), objective_axis(results)
+    results = [result for result in measured(results) if result.cell[axis]]
+    objectives = sorted({result.cell[axis] for result in results})
     shown = showcase([result for result in results if has_views(result)])
     if len(objectives) < 2 or shown is None:
         return None
-    cells = {result.cell for result in results if result.cell.without(GUIDANCE) == shown.without(GUIDANCE)}
+    cells = {result.cell for result in results if result.cell.without(axis) == shown.without(axis)}
     arms = [arm for arm in arms_of(results) if standard_setting(results, arm) is not None][:MAX_COLUMNS]
     figure, panels = _grid(len(objectives), len(arms), inch=1.9)
     for line, objective in zip(panels, objectives, strict=True):
-        cell = next((each for each in cells if each[GUIDANCE] == objective), None)
+        cell = next((each for each in cells if each[axis] == objective), None)
         members = {result.arm: result for result in standard_results(results, cell)} if cell else {}
         for axes, arm in zip(line, arms, strict=True):
             if (result := members.get(arm)) and has_views(result):
                 axes.imshow(views(result)[0], interpolation="antialiased")
                 _caption(axes, f"{result.count:,.0f}, {result.psnr:.2f} dB")
-        _line_title(line[0], objective.upper())
+        _line_title(line[0], objective if axis == RECIPE else objective.upper())
     for axes, arm in zip(panels[0], arms, strict=True):
         axes.set_title(arm, color=style[arm].color, fontsize=9, loc="center")
-    _name_cell(figure, shown.without(GUIDANCE))
+    _name_cell(figure, shown.without(axis))
     return figure
 
 

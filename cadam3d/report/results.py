@@ -6,7 +6,7 @@ Gaussians and see the same views and noise, so settings are compared within cell
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,16 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cadam3d.core.outcome import Outcome
+from cadam3d.core.quality import QUALITIES
 from cadam3d.io.records import (
+    Score,
     psnr_of,
     read_config,
+    read_evaluation,
     read_histograms,
     read_metrics,
     read_quality,
+    scores_in,
     ssim_of,
 )
 from cadam3d.io.run_folder import CONFIG
@@ -31,7 +35,7 @@ from cadam3d.sweep.folder import UNFINISHED, load
 # The other outcomes leave nothing to measure.
 WITH_ASSET = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.OUT_OF_MEMORY)
 ARM, PREFIX = "densifier", "densifier."
-SEED, PROMPT, NOISE, GUIDANCE = "seed", "prompt", "noise", "guidance"
+SEED, PROMPT, NOISE, GUIDANCE, RECIPE = "seed", "prompt", "noise", "guidance", "experiment"
 NO_NOISE = "none"  # the level whose gradients have no noise
 NOISE_ORDER = (NO_NOISE, "weak", "medium", "strong")  # other levels follow in alphabetical order
 
@@ -98,6 +102,12 @@ class JobResult:
     colour_error: float | None
     mib: float | None  # size of asset.ply
     seconds: float | None
+    objective: str  # the option of ``guidance`` it ran with; empty if that is not known
+    category: str  # of its prompt; empty if it has none
+    # Every number that was measured, and those with a record of how. Those of eval.json replace those from
+    # the end of training.
+    numbers: Mapping[str, float] = field(repr=False)
+    scores: Mapping[str, Score] = field(repr=False)
 
     @property
     def arm(self) -> str:
@@ -129,6 +139,7 @@ class _KnownJob:
     overrides: Mapping[str, Any]  # key to value
     summary: Mapping[str, Any]
     outcome: str
+    category: str
 
     @property
     def densifier(self) -> str:
@@ -153,10 +164,12 @@ def read(sweep_folder: Path) -> list[JobResult]:
 def _known(job: Any) -> _KnownJob:
     """Return a job of :func:`cadam3d.sweep.folder.load` with its overrides parsed.
 
-    Without a grid the arm of a job has no name; it is then the densifier.
+    Without a grid the arm of a job has no name; it is then the densifier. Settings that come with a prompt
+    are left out: they belong to the prompt, and arms without such a setting are compared all the same.
     """
-    overrides = dict(_pair(str(line)) for line in job.overrides)
-    known = _KnownJob(job.arm, job.folder, overrides, job.summary, str(job.outcome))
+    pairs = (_pair(str(line)) for line in job.overrides)
+    overrides = {key: value for key, value in pairs if key not in job.brought}
+    known = _KnownJob(job.arm, job.folder, overrides, job.summary, str(job.outcome), job.category)
     return known if job.arm else _KnownJob(**{**vars(known), "arm": known.densifier or "default"})
 
 
@@ -165,6 +178,7 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
     summary = {**job.summary, **read_quality(job.folder, job.summary)}
     numbers = {key: number(value) for key, value in summary.items()}
     size = numbers.get("asset_bytes")
+    sources = (job.summary, read_evaluation(job.folder, job.summary))
     given = {key: value for key, value in job.overrides.items() if key.startswith(PREFIX)}
     return JobResult(
         folder=job.folder,
@@ -185,7 +199,27 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
         colour_error=numbers.get("colour_error"),
         mib=size / (1 << 20) if size is not None else None,
         seconds=numbers.get("seconds"),
+        objective=str(job.overrides.get(GUIDANCE) or job.summary.get(GUIDANCE) or ""),
+        category=job.category,
+        numbers=_numbers(sources),
+        scores=_scores(sources),
     )
+
+
+def _numbers(sources: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    found = {name: number(each.get(name)) for each in sources for name in QUALITIES if name in each}
+    known = {name: value for name, value in found.items() if value is not None}
+    if "asset_bytes" in known:
+        known.setdefault("asset_mib", known["asset_bytes"] / (1 << 20))
+    return known
+
+
+def _scores(sources: Iterable[Mapping[str, Any]]) -> dict[str, Score]:
+    """Return the scores by name, from the last file that has a number of this name."""
+    found: dict[str, Score] = {}
+    for each in sources:
+        found = {name: score for name, score in found.items() if name not in each} | scores_in(each)
+    return found
 
 
 def _cell(job: _KnownJob, axes: Sequence[str]) -> Cell:
@@ -293,6 +327,16 @@ def at_noise(results: Iterable[JobResult], level: str) -> list[JobResult]:
 def with_noise(results: Sequence[JobResult]) -> Sequence[JobResult]:
     """Return the results with noisy gradients, which the paper is about; all results if there are none."""
     return [result for result in results if result.cell[NOISE] != NO_NOISE] or results
+
+
+def objective_axis(results: Iterable[JobResult]) -> str:
+    """Return the key of the cells that chooses the objective.
+
+    That is ``experiment`` if recipes vary and ``guidance`` does not.
+    """
+    results = list(results)
+    varies = {key: any(result.cell[key] for result in results) for key in (GUIDANCE, RECIPE)}
+    return RECIPE if varies[RECIPE] and not varies[GUIDANCE] else GUIDANCE
 
 
 def measured(results: Iterable[JobResult]) -> list[JobResult]:

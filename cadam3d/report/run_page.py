@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from cadam3d.core.chart import Chart
-from cadam3d.io.records import psnr_of, ssim_of
+from cadam3d.core.quality import QUALITIES
+from cadam3d.io.records import MEASUREMENTS, psnr_of, ssim_of
 from cadam3d.io.run_folder import ASSET, CONFIG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE
 from cadam3d.report.charts import other_plots, sections
 from cadam3d.report.declarations import write_declarations
@@ -17,6 +18,7 @@ from cadam3d.viewer.page import script, style
 
 EMBED_BYTES = 8 << 20  # a larger video is linked, not embedded
 FILES = (ASSET, TURNTABLE, PREVIEW, SUMMARY, METRICS, CONFIG)
+HIDDEN = ("warnings", MEASUREMENTS)  # entries of the summary that are no facts
 COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "device")
 LABELS = {
     "prompt": "Prompt",
@@ -24,27 +26,7 @@ LABELS = {
     "outcome": "Outcome",
     "num_gaussians_initial": "Gaussians at the start",
     "initializer_note": "Fallback of the initializer",
-    "num_gaussians": "Gaussians",
-    "asset_bytes": "Size of asset.ply (bytes)",
-    "asset_mib": "Size of asset.ply (MiB)",
-    "bytes_per_gaussian": "Bytes per Gaussian",
-    "median_scale": "Median scale (world units)",
-    "median_opacity": "Median opacity",
-    "psnr": "PSNR (dB)",
-    "psnr_min": "PSNR of the worst view (dB)",
-    "ssim": "SSIM",
-    "mode": "Best-matching mode of the truth",
-    "psnr_turned": "PSNR at the best turn (dB)",
-    "ssim_turned": "SSIM at the best turn",
-    "turn_deg": "Best turn about the vertical axis (degrees)",
-    "psnr_start": "PSNR of the Gaussians at the start (dB)",
-    "iou": "Overlap of the outlines (IoU)",
-    "iou_start": "Overlap of the outlines at the start (IoU)",
-    "colour_error": "Colour error (delta E)",
-    "mesh_chamfer": "Chamfer distance of the mesh (world units)",
-    "mesh_fscore": "F-score of the mesh",
-    "mesh_precision": "Precision of the mesh",
-    "mesh_recall": "Recall of the mesh",
+    **{name: quality.fact for name, quality in QUALITIES.items()},
     "backend": "Rasterizer backend",
     "backend_reason": "Why not a faster backend",
     "seconds": "Seconds",
@@ -153,7 +135,7 @@ def _video_source(path: Path) -> str:
 def _facts(summary: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """Return the label and the value of every fact, the known ones first."""
     ordered = [*(key for key in LABELS if key in summary), *(key for key in summary if key not in LABELS)]
-    return [(LABELS.get(key) or key.replace("_", " "), summary[key]) for key in ordered if key != "warnings"]
+    return [(LABELS.get(key) or key.replace("_", " "), summary[key]) for key in ordered if key not in HIDDEN]
 
 
 def _flat(line: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,13 +12,15 @@ from matplotlib.figure import Figure
 from cadam3d.core.errors import UserError
 from cadam3d.core.outcome import Outcome
 from cadam3d.io.run_folder import FIGURES, REPORT, TABLE
-from cadam3d.report import figures, pictures, tables, verdicts
+from cadam3d.report import figures, pictures, table_formats, tables, verdicts
 from cadam3d.report.claims import LEAST_FOR_QUARTILES, compare, standard_setting
 from cadam3d.report.formatting import plural
-from cadam3d.report.pages import Tile, table, write_page
+from cadam3d.report.pages import Column, Table, Tile, table, write_page
+from cadam3d.report.paper_table import PaperTable
 from cadam3d.report.results import ARM, NOISE, PROMPT, SEED, JobResult, arms_of, read, with_noise
 from cadam3d.report.score_maps import declared_scores, score_figure
 from cadam3d.report.style import inline, styled, write_figure
+from cadam3d.report.table_files import read_table
 from cadam3d.settings.line import key_of
 from cadam3d.sweep.folder import Plan, is_sweep, read_plan
 
@@ -39,6 +41,30 @@ class ShownFigure:
     title: str
     caption: str
     svg: str
+
+
+@dataclass(frozen=True)
+class ShownPaperTable:
+    """The paper's table as a part of the page."""
+
+    sections: list[tuple[str, Table]]  # with the category, if there is more than one
+    notes: list[str]
+
+    @classmethod
+    def of(cls, found: PaperTable) -> "ShownPaperTable":
+        """Return the table, ready to be shown."""
+        titles = [
+            Column(title, is_text=position < len(table_formats.FIRST), is_link=False)
+            for position, title in enumerate(table_formats.headings(found))
+        ]
+        sections = [
+            (
+                (section.category or table_formats.ALL) if len(found.sections) > 1 else "",
+                Table(titles, [table_formats.texts(row, found.names) for row in section.rows]),
+            )
+            for section in found.sections
+        ]
+        return cls(sections, found.notes)
 
 
 SPREAD = (
@@ -124,6 +150,7 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None) -> Path:
     }
     for name, lines in contents.items():
         tables.write_csv(folder / f"{name}.csv", lines)
+    paper = read_table(sweep_folder)
     drawn = [_drawn(results, name, kinds[name], folder) for name in names or kinds if name in kinds]
     files = [name for name in (TABLE, FIGURES) if (sweep_folder / name).exists()]
     return write_page(
@@ -133,6 +160,7 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None) -> Path:
         outcomes=Counter(result.outcome for result in results).most_common(),
         extent=_extent(results),
         warnings=_unknown(names or (), kinds),
+        paper_table=None if paper is None else ShownPaperTable.of(paper),
         verdict=verdicts.headline(results),
         tiles=_tiles(results),
         key_table=table(contents["objectives"], align_decimals=True),

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from cadam3d.core.quality import QUALITIES
 from cadam3d.io.atomic import replacing
 from cadam3d.report.claims import (
+    PSNR,
     SSIM,
     by_cell,
     compare,
@@ -16,7 +18,7 @@ from cadam3d.report.claims import (
     standard_setting,
     standings,
 )
-from cadam3d.report.results import GUIDANCE, JobResult, arms_of, at_noise, levels_of, measured
+from cadam3d.report.results import JobResult, arms_of, at_noise, levels_of, measured, objective_axis
 from cadam3d.report.verdicts import OURS, THEIRS
 
 Line = dict[str, Any]
@@ -25,18 +27,16 @@ NO_RATIO: dict[float | None, str] = {math.inf: "never", 0.0: "always"}
 
 # Columns of results that are compared with a named truth: the field of the result, and its decimal places.
 OF_TRUTH = {
-    "PSNR at the start (dB)": ("psnr_start", 2),
-    "IoU": ("iou", 3),
-    "IoU at the start": ("iou_start", 3),
-    "colour error": ("colour_error", 1),
+    quality.heading: (quality.name, quality.decimals)
+    for quality in map(QUALITIES.__getitem__, ("psnr_start", "iou", "iou_start", "colour_error"))
 }
 
 
 def objectives_table(results: Sequence[JobResult]) -> list[Line]:
     """Return the standard setting of each arm by objective and noise, medians over cells (paper table 1)."""
-    lines = []
-    for objective in sorted({result.cell[GUIDANCE] for result in measured(results)}):
-        of_objective = [result for result in results if result.cell[GUIDANCE] == objective]
+    lines, axis = [], objective_axis(results)
+    for objective in sorted({result.cell[axis] for result in measured(results)}):
+        of_objective = [result for result in results if result.cell[axis] == objective]
         for level in levels_of(of_objective):
             here = at_noise(of_objective, level)
             theirs = standard_setting(here, THEIRS)
@@ -52,8 +52,8 @@ def objectives_table(results: Sequence[JobResult]) -> list[Line]:
                         "noise": level,
                         "arm": arm,
                         "cells": len(members),
-                        "PSNR (dB)": _median([result.psnr for result in members], 2),
-                        "SSIM": _median([result.ssim for result in members], 4),
+                        PSNR.axis: _median([result.psnr for result in members], PSNR.digits),
+                        SSIM.axis: _median([result.ssim for result in members], SSIM.digits),
                         **{
                             title: _median([getattr(result, name) for result in members], digits)
                             for title, (name, digits) in OF_TRUTH.items()
@@ -143,8 +143,8 @@ def jobs_table(results: Sequence[JobResult]) -> list[Line]:
             **{key: value for key, value in result.cell.axes if value},
             "outcome": result.outcome,
             "Gaussians": None if result.count is None else round(result.count),
-            "PSNR (dB)": _rounded(result.psnr, 2),
-            "SSIM": _rounded(result.ssim, 4),
+            PSNR.axis: _rounded(result.psnr, PSNR.digits),
+            SSIM.axis: _rounded(result.ssim, SSIM.digits),
             **{title: _rounded(getattr(result, name), digits) for title, (name, digits) in known.items()},
             "seconds": result.seconds,
         }

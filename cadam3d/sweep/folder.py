@@ -32,6 +32,10 @@ class PlannedJob:
     overrides: list[str]  # of ``cadam3d train``
     # The prompt, the seed, and the values of all other keys in which jobs of this sweep differ.
     swept: dict[str, Any]
+    # What the file or the set of prompts says about the prompt; "" if it says nothing.
+    prompt_name: str = ""
+    category: str = ""
+    brought: list[str] = field(default_factory=list)  # keys of the settings that come with the prompt
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,7 @@ class Plan:
     jobs: list[PlannedJob]
     figures: list[str] | None = None  # of the report; None: all for which there are data
     line: list[str] = field(default_factory=list)  # what was typed after ``cadam3d sweep``
+    paper_table: bool = False  # whether the paper's table 1 is made of its jobs
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,9 @@ class Row:
     overrides: list[str]
     swept: dict[str, Any]
     summary: dict[str, Any] = field(repr=False)  # {} if there is none yet
+    prompt_name: str = ""  # from the file or the set of prompts; "" if it gives none
+    category: str = ""
+    brought: list[str] = field(default_factory=list)  # keys of the settings that come with the prompt
 
     @property
     def outcome(self) -> str:
@@ -92,6 +100,9 @@ def rows_of(sweep: Path, jobs: Sequence[PlannedJob]) -> list[Row]:
             overrides=job.overrides,
             swept=job.swept,
             summary=read_summary(sweep / job.folder),
+            prompt_name=job.prompt_name,
+            category=job.category,
+            brought=job.brought,
         )
         for number, job in enumerate(jobs)
     ]
@@ -124,12 +135,16 @@ def _require_plan(content: Any) -> None:
     is_count = is_whole(threads) and 1 <= threads <= MOST_THREADS
     _require(threads is None or is_count, "threads: expected a whole number")
     _require(figures is None or _are_texts(figures), "figures: expected names")
+    _require(type(content.get("paper_table", False)) is bool, "paper_table: expected true or false")
     for name in ("flags", "line"):
         _require(_are_texts(content.get(name, [])), f"{name}: expected words")
     for job in content["jobs"]:
         _require(isinstance(job, dict) and _is_text(job["arm"]), "arm: expected a name")
         _require(_are_texts(job["overrides"]), "overrides: expected a list of key=value")
         _require(isinstance(job["swept"], dict), "swept: expected keys and values")
+        for name in ("prompt_name", "category"):
+            _require(_is_text(job.get(name, "")), f"{name}: expected a text")
+        _require(_are_texts(job.get("brought", [])), "brought: expected keys")
         # A name that leads elsewhere would let the sweep write there.
         folder = job["folder"]
         is_inside = _is_text(folder) and folder not in ("", ".", "..") and not set("/\\") & set(folder)

@@ -19,12 +19,23 @@ from cadam3d.settings.compose import flatten
 from cadam3d.settings.declared import require_settings
 from cadam3d.settings.hydra import compose_line, refuse_missing_settings, refuse_unread_settings
 from cadam3d.settings.line import SWEEP_FOLDER, key_of
-from cadam3d.sweep.grid import ALWAYS_SHOWN, Axes, Grid, Job, expand, read_grid, read_line, swept_keys
+from cadam3d.sweep.grid import (
+    ALWAYS_SHOWN,
+    Axes,
+    Grid,
+    Job,
+    expand,
+    prompt_axis,
+    read_grid,
+    read_line,
+    swept_keys,
+)
+from cadam3d.sweep.prompts import FILE, KEY, Choice, read_choice
 
 # An override that is neither an addition nor a deletion and names no package.
 PLAIN_KEY = re.compile(r"[A-Za-z_][\w.]*=")
 LAUNCHER_KEY = re.compile(r"launcher($|\.)|hydra[./]launcher($|\.)")
-GRID_KEY = re.compile(r"grid($|\.)")
+GRID_KEY = re.compile(r"(grid|prompts)($|\.)")
 DRY_RUN = "dry_run"
 REFUSED_KEY = re.compile(r"hydra\.run\.dir$|hydra\.sweep\.subdir$|hydra[./]sweeper($|\.)")
 NOTHING_TO_SWEEP = "sweep: nothing to sweep over. Try: densifier=baseline,cadam"
@@ -34,7 +45,7 @@ NOTHING_TO_SWEEP = "sweep: nothing to sweep over. Try: densifier=baseline,cadam"
 class Parts:
     """The overrides of a line, sorted by what they change. A search path for YAML files applies to all."""
 
-    grid: list[str]  # and whether to list the jobs only
+    grid: list[str]  # and the choice of prompts, and whether to list the jobs only
     launcher: list[str]
     folder: list[str]
     jobs: list[str]
@@ -48,6 +59,7 @@ class Sweep:
     parts: Parts  # of the line
     grid: Grid
     axes: Axes  # of the line
+    prompts: Choice | None  # None if the line and the grid name no file or set of prompts
     jobs: list[Job]
 
     @property
@@ -127,31 +139,44 @@ class Composer:
 
     def compose(self, overrides: Sequence[str]) -> Composed:
         """Return the settings under ``overrides``. Raises if they cannot be composed or lack a value."""
-        values = {}
-        key_lines = []
-        for line in overrides:
-            is_value = PLAIN_KEY.match(line) and key_of(line) in self._leaves and "${" not in line
-            if is_value:
-                values[key_of(line)] = _value(line)
-            key_lines.append(key_of(line) if is_value else line)
-        known = tuple(key_lines)
+        # Values of keys that not every option has are set on a composed job too, unless they replace a part.
+        dotted = [line for line in overrides if self._is_value(line) or self._may_be_value(line)]
+        plain = [line for line in dotted if self._is_value(line)]
+        base = self._base_of(overrides, dotted)
+        if not {key_of(line) for line in dotted} <= base.plain.keys():
+            base, dotted = self._base_of(overrides, plain), plain
+        composed = base.composed({key_of(line): _value(line) for line in dotted})
+        require_settings(composed.values)
+        return composed
+
+    def has(self, overrides: Sequence[str], key: str) -> bool:
+        """Return whether a job under ``overrides`` has a setting or a group called ``key``."""
+        # Which settings there are does not depend on plain values.
+        arm = tuple(line for line in overrides if not self._is_value(line))
+        if arm not in self._keys:
+            base = self._base(arm)
+            self._keys[arm] = [*base.plain, *base.referring, *base.cfg.hydra.runtime.choices]
+        return any(f"{known}.".startswith(f"{key}.") for known in self._keys[arm])
+
+    def _is_value(self, line: str) -> bool:
+        """Return whether an override sets a plain value that the jobs have by default."""
+        return bool(PLAIN_KEY.match(line)) and key_of(line) in self._leaves and "${" not in line
+
+    @staticmethod
+    def _may_be_value(line: str) -> bool:
+        """Return whether an override may set a plain value of an option, and surely chooses no option."""
+        return bool(PLAIN_KEY.match(line)) and "." in key_of(line) and "${" not in line
+
+    def _base_of(self, overrides: Sequence[str], values: Sequence[str]) -> Base:
+        """Return a job under ``overrides`` that differs from others in ``values``, composed only once."""
+        known = tuple(key_of(line) if line in values else line for line in overrides)
         if known not in self._bases:
             base = self._base(overrides)
             require_values(base.cfg)
             refuse_missing_settings(base.cfg, "sweep", overrides)
             refuse_unread_settings(base.cfg, "sweep", overrides)
             self._bases[known] = base
-        composed = self._bases[known].composed(values)
-        require_settings(composed.values)
-        return composed
-
-    def has(self, overrides: Sequence[str], key: str) -> bool:
-        """Return whether a job under ``overrides`` has a setting or a group called ``key``."""
-        arm = tuple(overrides)
-        if arm not in self._keys:
-            base = self._base(overrides)
-            self._keys[arm] = [*base.plain, *base.referring, *base.cfg.hydra.runtime.choices]
-        return any(f"{known}.".startswith(f"{key}.") for known in self._keys[arm])
+        return self._bases[known]
 
     def _base(self, overrides: Sequence[str]) -> Base:
         return Base.of(compose_line("train", [*self._common, *overrides], self._options))
@@ -173,11 +198,30 @@ def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> tu
     node = cfg.get("grid")
     grid = read_grid(None if node is None else OmegaConf.to_container(node, resolve=True))
     axes = read_line(parts.jobs)
+    prompts = _read_prompts(cfg, grid, axes, overrides)
+    if prompts is not None:
+        axes = {"prompt": prompt_axis(prompts.read())} | axes
     composer = Composer(options, _search_path(overrides))
     jobs = expand(grid, axes, composer.has)
-    if command == "sweep" and node is None and len(jobs) == 1:
+    if command == "sweep" and node is None and prompts is None and len(jobs) == 1:
         raise UserError(NOTHING_TO_SWEEP)
-    return Sweep(cfg=cfg, parts=parts, grid=grid, axes=axes, jobs=jobs), composer
+    return Sweep(cfg=cfg, parts=parts, grid=grid, axes=axes, prompts=prompts, jobs=jobs), composer
+
+
+def _read_prompts(cfg: DictConfig, grid: Grid, axes: Axes, overrides: Sequence[str]) -> Choice | None:
+    """Return the choice of prompts of a line or its grid. A prompt in the line replaces those of the grid.
+
+    Raises ``UserError`` if the line has both a prompt and a choice of prompts.
+    """
+    node = cfg.get(KEY)
+    choice = None if node is None else OmegaConf.to_container(node, resolve=True)
+    assert choice is None or isinstance(choice, dict), "the line gives a file, not this node"
+    if "prompt" not in axes:
+        return read_choice(choice, grid.prompts)
+    if read_choice(choice, None) is not None:
+        kept = line_of("sweep", [override for override in overrides if key_of(override) != "prompt"])
+        raise UserError(f"{KEY}: expected either {KEY}= or prompt=, got both. Try: {kept}")
+    return None
 
 
 def sort_overrides(overrides: Sequence[str]) -> Parts:
@@ -191,7 +235,9 @@ def sort_overrides(overrides: Sequence[str]) -> Parts:
             raise UserError(f"{key}: not for sweeps; their jobs share one folder. Try: {line}")
         if key == "hydra.mode":
             continue
-        if GRID_KEY.match(key) or key == DRY_RUN:
+        if key == KEY and "=" in override:
+            parts.grid.append(f"{FILE}={override.partition('=')[2]}")
+        elif GRID_KEY.match(key) or key == DRY_RUN:
             parts.grid.append(override)
         elif LAUNCHER_KEY.match(key):
             parts.launcher.append(override.lstrip("+") if key == "launcher" else override)

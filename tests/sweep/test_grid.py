@@ -193,8 +193,12 @@ def test_all_keys_in_which_jobs_may_differ_are_listed(pareto):
 @pytest.mark.parametrize(
     ("node", "expected"),
     [
-        ({"densifier": "baseline,cadam"}, "grid: expected each, arms and figures, got densifier"),
-        ([1], "grid: expected each, arms and figures"),
+        (
+            {"densifier": "baseline,cadam"},
+            "grid: expected each, arms, prompts, figures, paper_table, got dens",
+        ),
+        ([1], "grid: expected each, arms, prompts, figures, paper_table, got"),
+        ({"paper_table": "yes"}, "grid.paper_table: expected true or false, got yes. Try: grid.paper"),
         ({"arms": {}}, "grid.arms: expected named arms"),
         ({"arms": ["a"]}, "grid.arms: expected named arms"),
         ({"arms": {"a": 1}}, "grid.arms.a: expected keys with values, got 1"),
