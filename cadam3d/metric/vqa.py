@@ -86,7 +86,7 @@ class Vqa(ModelMetric):
         answerer = _loaded(found, found.facts()["weights_sha256"], self.dtype, device)
         if self.template is None and not getattr(answerer.processor, "chat_template", None):
             raise UserError(
-                f"{self.node}.template: expected a text with the model's mark of a picture and with {PLACE} for "
+                f"{self.node}.template: expected a text with the model's mark of a picture and {PLACE} for "
                 f"the question, because {found.source.model} has no chat template, got None. "
                 f"Try: {self.node}.template='\"<image>{PLACE}\"'"
             )
