@@ -57,30 +57,45 @@ class ImageReward(ScoreMetric):
             example=f"{self.node}.model=null",
         )
 
+    def prepare(self) -> None:
+        """Import the package, and find the files of the model, after a download if that is necessary."""
+        package = _package(self.node)
+        if NAME in self._named():
+            self._load(package, torch.device("cpu"))
+
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a reward."""
-        package = _package(self.node)
-        folder = (CACHE if self.model is None else Path(self.model)).expanduser()
-        weights, settings = folder / WEIGHTS, folder / SETTINGS
-        lacking = [file for file in (weights, settings) if not file.is_file()]
-        if lacking and self.model is not None:
-            raise self._missing(f"{lacking[0]} is missing")
-        # With a name instead of files, the package downloads them.
-        named = (NAME, str(folder), None) if lacking else (str(weights), None, str(settings))
-        try:
-            model = _loaded(package, *named, device)
-            sha256 = sha256_of([weights])
-        # The package, and the libraries below it, raise almost anything.
-        except Exception as error:
-            if isinstance(error, torch.OutOfMemoryError):
-                raise
-            raise self._missing(" ".join(str(error).split())[:200]) from error
+        model, sha256 = self._load(_package(self.node), device)
         facts = {"model": NAME, "revision": None, "weights_sha256": sha256, "package": _version()}
         return Scorer(
             score=lambda images, text: _rewards(model, images, text),
             facts=facts,
             complaint=lambda text: _complaint(model, text),
         )
+
+    def _load(self, package: Any, device: torch.device) -> tuple[Any, str]:
+        """Return the model and the hash of its weights."""
+        try:
+            model = _loaded(package, *self._named(), device)
+            return model, sha256_of([self._folder() / WEIGHTS])
+        # The package, and the libraries below it, raise almost anything.
+        except Exception as error:
+            if isinstance(error, torch.OutOfMemoryError):
+                raise
+            raise self._missing(" ".join(str(error).split())[:200]) from error
+
+    def _named(self) -> tuple[str, str | None, str | None]:
+        """Return what the package calls name, download_root and med_config; with NAME, it downloads."""
+        folder = self._folder()
+        files = (folder / WEIGHTS, folder / SETTINGS)
+        if lacking := [file for file in files if not file.is_file()]:
+            if self.model is not None:
+                raise self._missing(f"{lacking[0]} is missing")
+            return NAME, str(folder), None
+        return str(files[0]), None, str(files[1])
+
+    def _folder(self) -> Path:
+        return (CACHE if self.model is None else Path(self.model)).expanduser()
 
     def _missing(self, reason: str) -> UserError:
         return UserError(
@@ -97,7 +112,8 @@ def _package(key: str) -> Any:
     except Exception as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(
-            f"{key}: the package {PACKAGE} cannot be imported ({reason}). Try, in a new environment: {INSTALL}"
+            f"{key}: the package {PACKAGE} cannot be imported ({reason}). "
+            f"Try, in a new environment: {INSTALL}"
         ) from error
 
 

@@ -112,10 +112,11 @@ def test_without_files_the_package_downloads_them_into_its_cache(package, folder
     monkeypatch.setattr(image_reward, "CACHE", cache)
 
     def downloaded(*arguments):
-        cache.mkdir()
+        cache.mkdir(exist_ok=True)
         (cache / "ImageReward.pt").write_bytes(b"others")
 
     monkeypatch.setattr(image_reward, "_loaded", lambda *arguments: downloaded(package.append(arguments)))
+    metric(None).prepare()
     facts = metric(None).scorer(torch.device("cpu")).facts
     assert package[0][1:4] == ("ImageReward-v1.0", str(cache), None)
     assert facts["weights_sha256"] == hashlib.sha256(b"others").hexdigest()
@@ -129,8 +130,9 @@ def test_a_long_prompt_is_reported(package, folder):
 
 
 def refusal(model):
+    """Return what is said before a run begins."""
     with pytest.raises(UserError) as caught:
-        metric(model).scorer(torch.device("cpu"))
+        metric(model).prepare()
     return str(caught.value)
 
 
@@ -154,7 +156,8 @@ def test_an_error_of_the_package_becomes_one_line(package, folder, monkeypatch):
         raise OSError("We couldn't connect\nto the hub")
 
     monkeypatch.setattr(image_reward, "_loaded", fails)
-    assert "no model is available (We couldn't connect to the hub)" in refusal(folder)
+    monkeypatch.setattr(image_reward, "CACHE", folder / "empty")
+    assert "no model is available (We couldn't connect to the hub)" in refusal(None)
 
 
 def test_an_empty_folder_name_is_refused():
