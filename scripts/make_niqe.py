@@ -37,15 +37,7 @@ from cadam3d.metric import natural
 from cadam3d.metric.niqe import OWN_PARAMETERS
 
 DATA = Path(skimage.__file__).parent / "data"
-HALVED = (
-    "astronaut.png",
-    "camera.png",
-    "chelsea.png",
-    "coffee.png",
-    "motorcycle_left.png",
-    "coins.png",
-    "gravel.png",
-)
+HALVED = ("astronaut", "camera", "chelsea", "coffee", "motorcycle_left", "coins", "gravel")
 WHOLE = Path(matplotlib.__file__).parent / "mpl-data/sample_data/grace_hopper.jpg"
 OFFSETS = (0, natural.BLOCK // 2)  # of the blocks, in both directions
 SHARPNESS = 0.4  # relative to the sharpest block of a photograph
@@ -104,14 +96,11 @@ def _sharp_blocks(
 
 def expected(package: Path) -> dict[str, Any]:
     """Return basicsr's numbers for the images of the tests, with its parameters and with ours."""
-    sys.path.insert(0, str(TESTS))
-    from niqe_images import images
-
     calculate, niqe = _basicsr(package)
     with OWN_PARAMETERS.open("rb") as file, np.load(file) as stored:
         ours = [stored[key] for key in natural.KEYS]
     numbers: dict[str, Any] = {"own": {}, "basicsr": {}}
-    for name, image in images().items():
+    for name, image in _imported("niqe_images", TESTS / "niqe_images.py").images().items():
         bgr = image[..., ::-1]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # plain blocks have no fit
@@ -135,14 +124,7 @@ def _basicsr(package: Path) -> tuple[Callable[..., float], Callable[..., float]]
         return made
 
     def read(name: str) -> Any:
-        path = package.parent / Path(*name.split(".")).with_suffix(".py")
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec is not None
-        assert spec.loader is not None
-        made = importlib.util.module_from_spec(spec)
-        sys.modules[name] = made
-        spec.loader.exec_module(made)
-        return made
+        return _imported(name, package.parent / Path(*name.split(".")).with_suffix(".py"))
 
     module("cv2")
     module("scipy.ndimage.filters", convolve=scipy.ndimage.convolve)  # its old name
@@ -155,6 +137,17 @@ def _basicsr(package: Path) -> tuple[Callable[..., float], Callable[..., float]]
     read("basicsr.metrics.metric_util")
     found = read("basicsr.metrics.niqe")
     return found.calculate_niqe, found.niqe
+
+
+def _imported(name: str, path: Path) -> Any:
+    """Return the module in a file."""
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    made = importlib.util.module_from_spec(spec)
+    sys.modules[name] = made
+    spec.loader.exec_module(made)
+    return made
 
 
 if __name__ == "__main__":

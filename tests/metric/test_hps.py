@@ -158,10 +158,16 @@ def test_the_version_chooses_the_file_on_the_hub(tmp_path, weights, base, expect
 
 
 def refusal(**changes):
+    """Return what is said when the model is loaded."""
     with pytest.raises(UserError) as caught:
-        metric(**changes).prepare()
         metric(**changes).scorer(torch.device("cpu"))
     return str(caught.value)
+
+
+def test_missing_files_are_reported_before_a_run(base, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    with pytest.raises(UserError, match="hf download xswu/HPSv2"):
+        metric(base=str(base)).prepare()
 
 
 def test_without_weights_one_line_says_what_to_download_and_what_to_type(base, monkeypatch):
