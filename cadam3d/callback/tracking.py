@@ -21,9 +21,10 @@ from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainSt
 class Tracking(Callback):
     """Pass the numbers and the previews of a run on to a program that shows many runs.
 
-    The numbers have the names of ``metrics.jsonl`` and ``summary.json`` behind the words ``train/``, ``refine/``
-    and ``result/``. A tracker that fails is switched off with a warning, whatever it raised, because it is
-    code of others that the run does not need. Nothing here draws a random number or changes the run.
+    The numbers have the names of ``metrics.jsonl`` and ``summary.json`` behind the words ``train/``,
+    ``refine/`` and ``result/``. A tracker that fails is switched off with a warning, whatever it raised,
+    because it is code of others that the run does not need. Nothing here draws a random number or changes
+    the run.
     """
 
     package: ClassVar[str]  # that pip installs; also the name of the callback and of the extra
@@ -45,7 +46,7 @@ class Tracking(Callback):
 
     @abstractmethod
     def open(self, context: RunContext, step: int) -> None:
-        """Begin to record, or continue after ``step`` of the same run; the settings are in ``config.yaml``."""
+        """Begin to record, or continue after ``step`` of the same run."""
 
     @abstractmethod
     def record(self, step: int, numbers: Mapping[str, float], preview: Path | None) -> None:

@@ -1,9 +1,9 @@
 """Wandb: records a run for Weights & Biases, and sends it there if an API key is configured.
 
-What leaves this machine is what the functions below name: the settings in ``config.yaml``, the numbers and the
-previews, the names of the run and of its sweep, and the versions of Python and of wandb. Everything that wandb
-collects by itself is switched off: the console, code, git, the list of packages, the machine and its load, the
-command line, and reports of errors. Without a key, nothing is sent.
+What leaves this machine is what the functions below name: the settings in ``config.yaml``, the numbers and
+the previews, the names of the run and of its sweep, and the versions of Python and of wandb. Everything that
+wandb collects by itself is switched off: the console, code, git, the list of packages, the machine and its
+load, the command line, and reports of errors. Without a key, nothing is sent.
 """
 
 import os
@@ -158,7 +158,7 @@ def known_run(path: Path) -> tuple[str, int]:
 
 
 def has_key() -> bool:
-    """Return whether wandb finds an API key in the environment, its settings or ``.netrc``; never ask for it."""
+    """Return whether wandb finds an API key in the environment or in ``.netrc``, without asking for it."""
     import wandb
     from wandb.sdk.lib import wbauth
 

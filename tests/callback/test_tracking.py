@@ -1,8 +1,7 @@
-"""TensorBoard and Weights & Biases: what they record, how they continue, and that they cost no run anything."""
+"""TensorBoard and Weights & Biases: what they record, how they continue, and that no run needs them."""
 
 import os
 import shutil
-import signal
 import socket
 import struct
 from collections.abc import Iterator
@@ -88,16 +87,14 @@ def alone(tmp_path_factory):
 # --- what both have in common -----------------------------------------------------------------------------
 
 
-def test_a_step_has_its_numbers_its_refinement_and_its_preview_wherever_the_previews_are_in_the_list(
-    tmp_path,
-):
+def test_a_step_has_its_preview_wherever_the_previews_are_in_the_list(tmp_path):
     recorder = Recorder()
     train(tmp_path, recorder)
     steps = {call[0]: call[1:] for call in recorder.calls if isinstance(call[0], int)}
     assert list(steps) == [1, 4, 8, 10]
     assert [steps[step][1] for step in steps] == [None, "step_000004.png", "step_000008.png", None]
     assert {"train/loss", "train/num_gaussians", "train/seconds"} <= set(steps[1][0])
-    assert {"refine/before", "refine/cloned", "refine/snr_median"} <= set(steps[8][0])
+    assert {"refine/before", "refine/cloned", "refine/snr_p50"} <= set(steps[8][0])
     results = {"result/steps": 10, "result/psnr": 21.5, "result/num_gaussians": 31}
     assert recorder.calls[-2:] == [("conclude", 10, results), ("close", True)]
 
@@ -273,7 +270,6 @@ def test_nothing_that_wandb_could_collect_by_itself_is_in_its_files(offline):
         b"pytest",
         b"site-packages",
         b"requirements.txt",
-        b"wandb-metadata",
         b"output.log",
         b"git",
     ):
@@ -299,7 +295,7 @@ def test_a_server_that_cannot_be_reached_leaves_the_run_offline(without_key, tmp
     monkeypatch.setattr(wandb_callback, "has_key", lambda: True)
     monkeypatch.setenv("WANDB_API_KEY", "a" * 40)
     assert train(tmp_path, tracker(timeout=2), steps=2).step == 2
-    assert "Weights & Biases: nothing is sent (" in capsys.readouterr().err
+    assert "nothing is sent (" in capsys.readouterr().err
     assert len(list(tmp_path.glob("wandb/offline-run-*/*.wandb"))) == 1
 
 
@@ -308,9 +304,10 @@ def test_a_key_is_found_without_asking_for_one(without_key, monkeypatch):
     assert not has_key()
 
 
-@pytest.mark.parametrize(
-    "content", [None, "", "[]", '{"id": "../evil", "recorded": 3}', '{"id": "0123456789abcdef"}']
-)
+FOREIGN = [None, "", "[]", '{"id": "../evil", "recorded": 3}', '{"id": "0123456789abcdef"}']
+
+
+@pytest.mark.parametrize("content", FOREIGN)
 def test_a_record_that_this_program_has_not_written_begins_a_new_run(content, tmp_path):
     path = tmp_path / "cadam3d.json"
     if content is not None:
