@@ -20,7 +20,7 @@ from cadam3d.initializer.base import Initializer
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.records import psnr_of
 from cadam3d.io.run_folder import ASSET, CONFIG, EVALUATION, copying, shown, suggestion, typed_path
-from cadam3d.metric.base import Metric
+from cadam3d.metric.base import Measurand, Metric
 from cadam3d.prior.base import DiffusionPrior
 from cadam3d.prior.truth import PriorTruth, TruthSource
 from cadam3d.settings.compose import component, components
@@ -75,10 +75,13 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     result: dict[str, Any] = {"run": str(shown(folder)), "prompt": own.prompt}
     result |= measure(
         metrics,
-        asset.gaussians,
-        renderer(own.rasterizer, asset.gaussians),
-        truth,
-        asset.ply,
+        Measurand(
+            gaussians=asset.gaussians,
+            render=renderer(own.rasterizer, asset.gaussians),
+            prompt=own.prompt,
+            truth=truth,
+            asset=asset.ply,
+        ),
         partial(start_of, folder, device, is_trusted=is_trusted) if source.measures_start else None,
         warnings,
     )

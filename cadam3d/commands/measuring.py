@@ -1,47 +1,52 @@
 """Measure: what the metrics say about an asset and about the Gaussians that its run started from."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
 
 from cadam3d.commands.messages import keeping_others, note
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderFn, Truth
 from cadam3d.initializer.base import Initializer
-from cadam3d.metric.base import Metric
+from cadam3d.io.records import MEASUREMENTS
+from cadam3d.metric.base import Measurand, Metric
 from cadam3d.metric.turn import facing
 from cadam3d.state import start_generators
 
 
 def measure(
     metrics: Mapping[str, Metric],
-    gaussians: Gaussians,
-    render: RenderFn,
-    truth: Truth | None,
-    asset: Path | None,
+    measurand: Measurand,
     start: Callable[[], Gaussians] | None,
     warnings: list[str],
 ) -> dict[str, Any]:
     """Return the numbers of all metrics. A metric that fails costs only its own numbers, and adds a warning.
 
+    The details of numbers that have some are under ``MEASUREMENTS``, which is missing if there are none.
+
     ``start`` returns the Gaussians at the start of the run. If it is None, they are not measured.
     """
     numbers: dict[str, Any] = {}
-    if truth is not None and metrics:
+    details: dict[str, dict[str, Any]] = {}
+    if measurand.truth is not None and metrics:
         with keeping_others("truth", warnings):
-            truth = facing(truth, render)
+            measurand = replace(measurand, truth=facing(measurand.truth, measurand.render))
     for name, metric in metrics.items():
         with keeping_others(f"metric.{name}", warnings):
-            numbers |= metric.measure(gaussians, render, truth, asset)
-    if truth is not None and start is not None and metrics:
+            measurement = metric.measure(measurand)
+            numbers |= measurement.numbers
+            details |= measurement.details
+    if measurand.truth is not None and start is not None and metrics:
         with keeping_others("initializer", warnings):
             first = start()
+            beginning = replace(
+                measurand, gaussians=first, render=partial(measurand.render, shown=first), asset=None
+            )
             for metric in metrics.values():
-                numbers |= metric.measure_start(first, partial(render, shown=first), truth)
-    return numbers
+                numbers |= metric.measure_start(beginning)
+    return numbers | ({MEASUREMENTS: details} if details else {})
 
 
 def rebuild_start(prompt: str, initializer: Initializer, seed: int, device: torch.device) -> Gaussians:

@@ -60,7 +60,7 @@ from cadam3d.io.run_folder import (
     checkpoint_step,
     shown,
 )
-from cadam3d.metric.base import Metric
+from cadam3d.metric.base import Measurand, Metric
 from cadam3d.optimizer import AdamSettings
 from cadam3d.prior.base import DiffusionPrior
 from cadam3d.prior.prompting import Prompting
@@ -154,7 +154,10 @@ def _train(
         gaussians = state.gaussians.detach()
         written, warnings = export(exporters, gaussians, context.render, folder)
         asset = folder / ASSET if folder / ASSET in written else None
-        summary |= measure(metrics, gaussians, context.render, truth, asset, start, warnings)
+        measurand = Measurand(
+            gaussians=gaussians, render=context.render, prompt=cfg.prompt, truth=truth, asset=asset
+        )
+        summary |= measure(metrics, measurand, start, warnings)
         if asset is not None:
             summary["asset_bytes"] = asset.stat().st_size
         # This is the last entry of a complete summary.

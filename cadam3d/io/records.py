@@ -32,6 +32,9 @@ QUALITY = (
     "colour_error",
 )
 
+# The entry of summary.json and of eval.json that says, for numbers by name, how they came about.
+MEASUREMENTS = "measurements"
+
 
 def read_summary(run: Path) -> dict[str, Any]:
     """Return the facts of the run in ``run``; {} if it has no summary, or one that cannot be believed."""

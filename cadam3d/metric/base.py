@@ -1,30 +1,51 @@
-"""Metric: numbers about a finished asset."""
+"""Metric: numbers about a finished asset. Measurand: what is measured. Measurement: what a metric returns."""
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, Truth
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurand:
+    """An asset with everything that a metric may look at."""
+
+    gaussians: Gaussians
+    render: RenderFn  # shows these Gaussians
+    prompt: str  # the text that the asset was made for
+    # The true object; None if it is not known. If the asset may face any side, ``truth.turned()`` faces as
+    # the asset does.
+    truth: Truth | None = None
+    asset: Path | None = None  # the file with these Gaussians; None if none was written
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What one metric has measured of one asset.
+
+    ``numbers`` become entries of ``summary.json`` and ``eval.json``. ``details`` says, for some of them by
+    name, how the number came about: protocol, model, values of the single views and so on. It must consist
+    of what JSON can hold, and both files keep it under ``measurements``.
+    """
+
+    numbers: dict[str, float]
+    details: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 class Metric(ABC):
     """Interface of all metrics. A subclass is a frozen dataclass of its settings."""
 
     @abstractmethod
-    def measure(
-        self, gaussians: Gaussians, render: RenderFn, truth: Truth | None, asset: Path | None
-    ) -> dict[str, float]:
-        """Return named numbers.
+    def measure(self, measurand: Measurand) -> Measurement:
+        """Return named numbers. Those that need something that is not known are left out."""
 
-        ``truth`` is the true object if it is known, and ``asset`` is the file with these Gaussians if one was
-        written. Numbers that need one of them are left out if it is ``None``. If the asset may face any side,
-        ``truth.turned()`` faces as the asset does.
-        """
-
-    def measure_start(self, gaussians: Gaussians, render: RenderFn, truth: Truth) -> dict[str, float]:
+    def measure_start(self, measurand: Measurand) -> dict[str, float]:
         """Return named numbers about the Gaussians at the start of the run, as a baseline; {} by default.
 
-        This is called only if the run names a truth. ``render`` shows these Gaussians, and ``truth`` is that
-        of :meth:`measure`, with the turn of the asset.
+        This is called only if the run names a truth. ``measurand`` has these Gaussians, and the truth of
+        :meth:`measure` with the turn of the asset. It has no file.
         """
         return {}

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
 import torch
@@ -10,9 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.checks import require_whole
-from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, Truth
-from cadam3d.metric.base import Metric
+from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.held_out import HeldOutSettings
 
 SSIM_WINDOW = 11  # pixels (Wang et al. 2004)
@@ -35,28 +33,29 @@ class Fidelity(HeldOutSettings, Metric):
         super().__post_init__()
         require_whole("metric.fidelity.size", self.size, low=SSIM_WINDOW, example=128)
 
-    def measure(
-        self, gaussians: Gaussians, render: RenderFn, truth: Truth | None, asset: Path | None
-    ) -> dict[str, float]:
-        """Return PSNR, SSIM and the mode that they belong to; {} if there are no true images.
+    def measure(self, measurand: Measurand) -> Measurement:
+        """Return PSNR, SSIM and the mode that they belong to; nothing if there are no true images.
 
         ``psnr`` (dB) and ``ssim`` are means over the views, ``psnr_min`` (dB) is that of the worst view, and
         ``mode`` is the index of the mode. If the asset may face any side, ``psnr_turned`` and ``ssim_turned``
         compare with the object turned by ``turn_deg``, in (-180, 180] degrees, counterclockwise seen from
         above.
         """
+        truth = measurand.truth
         if truth is None:
-            return {}
-        unturned, *others = self._compare(render, [truth, truth.turned()] if truth.turn_deg else [truth])
+            return Measurement({})
+        truths = [truth, truth.turned()] if truth.turn_deg else [truth]
+        unturned, *others = self._compare(measurand.render, truths)
         if truth.turn_deg is None:
-            return unturned
+            return Measurement(unturned)
         turned = others[0] if others else unturned
         at_turn = {"psnr_turned": turned["psnr"], "ssim_turned": turned["ssim"], "turn_deg": truth.turn_deg}
-        return unturned | at_turn
+        return Measurement(unturned | at_turn)
 
-    def measure_start(self, gaussians: Gaussians, render: RenderFn, truth: Truth) -> dict[str, float]:
+    def measure_start(self, measurand: Measurand) -> dict[str, float]:
         """Return ``psnr_start`` (dB), against the images with which ``psnr_turned`` compares the asset."""
-        return {"psnr_start": self._compare(render, [truth.turned()])[0]["psnr"]}
+        assert measurand.truth is not None
+        return {"psnr_start": self._compare(measurand.render, [measurand.truth.turned()])[0]["psnr"]}
 
     def _compare(self, render: RenderFn, truths: Sequence[Truth]) -> list[dict[str, float]]:
         """Return the four numbers of every truth. Each view is rendered once."""

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -12,10 +11,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cadam3d.core.checks import require_range, require_whole
-from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderFn, Truth
 from cadam3d.core.surface import SurfaceSettings, areas, outer_shell
-from cadam3d.metric.base import Metric
+from cadam3d.metric.base import Measurand, Measurement, Metric
 
 # The true surface is marched in the cube [-1, 1]^3, which holds every object, with this many nodes per side.
 # It is off by up to a third of a cell (0.003 world units) at sharp edges, and by less than 0.0002 elsewhere.
@@ -57,17 +54,15 @@ class MeshMetric(SurfaceSettings, Metric):
         require_whole("metric.mesh.samples", self.samples, low=100, high=10_000_000, example=50000)
         require_whole("metric.mesh.seed", self.seed, low=0, high=2**62, example=0)
 
-    def measure(
-        self, gaussians: Gaussians, render: RenderFn, truth: Truth | None, asset: Path | None
-    ) -> dict[str, float]:
-        """Return the four numbers of the class; {} if the true shape is not known.
+    def measure(self, measurand: Measurand) -> Measurement:
+        """Return the four numbers of the class; nothing if the true shape is not known.
 
         Raises ``UserError`` if the asset has no surface.
         """
-        true = truth and truth.turned()
+        true = measurand.truth and measurand.truth.turned()
         if true is None or true.distance is None:
-            return {}
-        surface, _ = self.surface(gaussians)
+            return Measurement({})
+        surface, _ = self.surface(measurand.gaussians)
         results = []
         for vertices, faces in true_surfaces(true.distance):
             to_true, to_mesh = distances_between(
@@ -82,7 +77,7 @@ class MeshMetric(SurfaceSettings, Metric):
                     "mesh_recall": recall,
                 }
             )
-        return min(results, key=lambda result: result["mesh_chamfer"])
+        return Measurement(min(results, key=lambda result: result["mesh_chamfer"]))
 
 
 # Vertices "v 3" and triangles "f 3".

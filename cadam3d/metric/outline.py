@@ -1,16 +1,14 @@
 """Outline: whether an asset has the true silhouette and the true colour, which PSNR alone does not say."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn, Truth
-from cadam3d.metric.base import Metric
+from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.held_out import HeldOutSettings
 
 # The alpha above which a pixel belongs to the object.
@@ -34,19 +32,18 @@ class Outline(HeldOutSettings, Metric):
 
     node: ClassVar[str] = "metric.outline"
 
-    def measure(
-        self, gaussians: Gaussians, render: RenderFn, truth: Truth | None, asset: Path | None
-    ) -> dict[str, float]:
-        """Return ``iou`` in [0, 1] and ``colour_error``; {} if the true outlines are not known.
+    def measure(self, measurand: Measurand) -> Measurement:
+        """Return ``iou`` in [0, 1] and ``colour_error``; nothing if the true outlines are not known.
 
         ``colour_error`` is left out if the silhouettes meet in no view.
         """
-        true = truth and truth.turned()
-        return {} if true is None else self._compare(render, true)
+        true = measurand.truth and measurand.truth.turned()
+        return Measurement({} if true is None else self._compare(measurand.render, true))
 
-    def measure_start(self, gaussians: Gaussians, render: RenderFn, truth: Truth) -> dict[str, float]:
+    def measure_start(self, measurand: Measurand) -> dict[str, float]:
         """Return ``iou_start``, against the outlines with which ``iou`` compares the asset."""
-        numbers = self._compare(render, truth.turned())
+        assert measurand.truth is not None
+        numbers = self._compare(measurand.render, measurand.truth.turned())
         return {"iou_start": numbers["iou"]} if numbers else {}
 
     def _compare(self, render: RenderFn, true: Truth) -> dict[str, float]:

@@ -1,11 +1,8 @@
 """Size: how many Gaussians an asset has, and how many bytes its file takes."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
-from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderFn, Truth
-from cadam3d.metric.base import Metric
+from cadam3d.metric.base import Measurand, Measurement, Metric
 
 MIB = 1 << 20  # bytes
 
@@ -14,17 +11,16 @@ MIB = 1 << 20  # bytes
 class Size(Metric):
     """Number of Gaussians, and size of the written file including any padding."""
 
-    def measure(
-        self, gaussians: Gaussians, render: RenderFn, truth: Truth | None, asset: Path | None
-    ) -> dict[str, int | float]:
+    def measure(self, measurand: Measurand) -> Measurement:
         """Return counts, sizes and medians.
 
         ``num_gaussians`` is always present. ``asset_bytes``, ``asset_mib`` and ``bytes_per_gaussian`` need a
         file. ``bytes_per_gaussian``, ``median_scale`` (world units, longest axis) and ``median_opacity`` need
         at least one Gaussian.
         """
+        gaussians, asset = measurand.gaussians, measurand.asset
         count = len(gaussians)
-        sizes: dict[str, int | float] = {"num_gaussians": count}
+        sizes: dict[str, float] = {"num_gaussians": count}
         if asset is not None:
             asset_bytes = asset.stat().st_size
             sizes |= {"asset_bytes": asset_bytes, "asset_mib": asset_bytes / MIB}
@@ -33,4 +29,4 @@ class Size(Metric):
         if count > 0:
             sizes["median_scale"] = float(gaussians.scales.amax(dim=-1).median())
             sizes["median_opacity"] = float(gaussians.opacities.median())
-        return sizes
+        return Measurement(sizes)

@@ -7,6 +7,7 @@ from cadam3d.core.cameras import turntable
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput, Truth
+from cadam3d.metric.base import Measurand
 from cadam3d.metric.fidelity import Fidelity
 
 SETTINGS = {
@@ -53,9 +54,15 @@ def truths(*shifts):
 
 
 def measure(render, truth, **changes):
-    return Fidelity(**{**SETTINGS, **changes}).measure(
-        no_gaussians(), render, None if truth is None else Truth(truth), None
+    measurement = Fidelity(**{**SETTINGS, **changes}).measure(
+        Measurand(
+            gaussians=no_gaussians(),
+            render=render,
+            prompt="a cube",
+            truth=None if truth is None else Truth(truth),
+        )
     )
+    return measurement.numbers
 
 
 @pytest.mark.parametrize(("error", "psnr"), [(0.1, 20.0), (-0.1, 20.0), (0.01, 40.0)])

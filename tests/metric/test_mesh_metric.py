@@ -10,6 +10,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import Truth
 from cadam3d.metric import mesh
+from cadam3d.metric.base import Measurand
 from cadam3d.metric.mesh import MeshMetric, distances_between, true_surfaces
 from cadam3d.prior.shapes.scene import build, signed_distance
 
@@ -58,7 +59,8 @@ def gaussian_ball() -> Gaussians:
 
 
 def measure(truth, **changes):
-    return MeshMetric(**{**SETTINGS, **changes}).measure(gaussian_ball(), never_renders, truth, None)
+    ball = Measurand(gaussians=gaussian_ball(), render=never_renders, prompt="a ball", truth=truth)
+    return MeshMetric(**{**SETTINGS, **changes}).measure(ball).numbers
 
 
 def never_images(cameras, background):

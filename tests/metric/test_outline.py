@@ -6,6 +6,7 @@ import torch
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput, Truth
+from cadam3d.metric.base import Measurand
 from cadam3d.metric.outline import Outline
 
 SETTINGS = {
@@ -54,7 +55,11 @@ def truth_of(*discs):
 
 
 def measure(render, truth, **changes):
-    return Outline(**{**SETTINGS, **changes}).measure(no_gaussians(), render, truth, None)
+    return Outline(**{**SETTINGS, **changes}).measure(seen_as(render, truth)).numbers
+
+
+def seen_as(render, truth):
+    return Measurand(gaussians=no_gaussians(), render=render, prompt="a disc", truth=truth)
 
 
 def test_an_asset_that_is_the_truth_has_an_overlap_of_one_and_no_colour_error():
@@ -103,7 +108,7 @@ def test_an_asset_that_shows_nothing_has_no_overlap_and_no_colour():
 
 def test_the_start_has_an_overlap_of_its_own():
     outline = Outline(**SETTINGS)
-    start = outline.measure_start(no_gaussians(), renders(14.0), truth_of((20.0, RED)))
+    start = outline.measure_start(seen_as(renders(14.0), truth_of((20.0, RED))))
     assert start == {"iou_start": measure(renders(14.0), truth_of((20.0, RED)))["iou"]}
 
 

@@ -5,6 +5,7 @@ import torch
 
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.ply import write_ply
+from cadam3d.metric.base import Measurand
 from cadam3d.metric.size import Size
 
 
@@ -22,12 +23,18 @@ def never_renders(cameras, background):
     raise AssertionError("counting needs no picture")
 
 
+def measure(shown, asset):
+    return (
+        Size().measure(Measurand(gaussians=shown, render=never_renders, prompt="a cube", asset=asset)).numbers
+    )
+
+
 @pytest.mark.parametrize(("degree", "pad_sh"), [(0, 0), (0, 3), (1, 0), (1, 2), (3, 0)])
 @pytest.mark.parametrize("n", [0, 1, 500])
 def test_sizes_are_those_of_the_file(tmp_path, degree, pad_sh, n):
     path = tmp_path / "asset.ply"
     write_ply(path, gaussians(n, degree), up="-y", pad_sh=pad_sh)
-    measured = Size().measure(gaussians(n, degree), never_renders, None, path)
+    measured = measure(gaussians(n, degree), path)
     size = path.stat().st_size
     assert measured["num_gaussians"] == n
     assert measured["asset_bytes"] == size
@@ -36,17 +43,17 @@ def test_sizes_are_those_of_the_file(tmp_path, degree, pad_sh, n):
 
 
 def test_without_a_file_there_are_no_sizes():
-    measured = Size().measure(gaussians(3), never_renders, None, None)
+    measured = measure(gaussians(3), None)
     assert set(measured) == {"num_gaussians", "median_scale", "median_opacity"}
 
 
 def test_medians_are_of_the_longest_axis_and_of_the_opacity():
-    measured = Size().measure(gaussians(3), never_renders, None, None)
+    measured = measure(gaussians(3), None)
     assert measured["median_scale"] == pytest.approx(0.4)
     assert measured["median_opacity"] == pytest.approx(0.5)
 
 
 def test_counts_are_whole_numbers(tmp_path):
     write_ply(tmp_path / "asset.ply", gaussians(3), up="-y", pad_sh=0)
-    measured = Size().measure(gaussians(3), never_renders, None, tmp_path / "asset.ply")
+    measured = measure(gaussians(3), tmp_path / "asset.ply")
     assert type(measured["num_gaussians"]) is type(measured["asset_bytes"]) is int

@@ -11,6 +11,7 @@ from cadam3d.core.cameras import vertical_turn
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import Truth
 from cadam3d.metric import turn
+from cadam3d.metric.base import Measurand
 from cadam3d.metric.fidelity import Fidelity
 from cadam3d.metric.mesh import MeshMetric
 from cadam3d.metric.outline import Outline
@@ -38,6 +39,10 @@ def small_pictures(monkeypatch):
 
 def shown(gaussians: Gaussians):
     return render_fn(ReferenceRasterizer(), lambda: gaussians)
+
+
+def seen(gaussians: Gaussians, truth: Truth) -> Measurand:
+    return Measurand(gaussians=gaussians, render=shown(gaussians), prompt="five blobs", truth=truth)
 
 
 def true_object(**changes) -> Truth:
@@ -80,18 +85,18 @@ def test_the_numbers_at_the_turn_are_those_of_the_asset_that_was_not_turned():
     straight = facing(true_object(), shown(worn()))
     askew = facing(true_object(), shown(turned(worn(), 40.0)))
     assert (straight.turn_deg, askew.turn_deg) == (0.0, 40.0)
-    before = FIDELITY.measure(worn(), shown(worn()), straight, None)
-    after = FIDELITY.measure(worn(), shown(turned(worn(), 40.0)), askew, None)
+    before = FIDELITY.measure(seen(worn(), straight)).numbers
+    after = FIDELITY.measure(seen(turned(worn(), 40.0), askew)).numbers
     assert after["psnr_turned"] == pytest.approx(before["psnr"], abs=0.01)
     assert after["ssim_turned"] == pytest.approx(before["ssim"], abs=1e-3)
     assert after["psnr"] < before["psnr"] - 3
-    before = OUTLINE.measure(worn(), shown(worn()), straight, None)
-    after = OUTLINE.measure(worn(), shown(turned(worn(), 40.0)), askew, None)
+    before = OUTLINE.measure(seen(worn(), straight)).numbers
+    after = OUTLINE.measure(seen(turned(worn(), 40.0), askew)).numbers
     assert after == pytest.approx(before, abs=1e-2)
 
 
 def test_an_asset_that_faces_the_front_has_the_same_numbers_at_its_turn():
-    measured = FIDELITY.measure(worn(), shown(worn()), facing(true_object(), shown(worn())), None)
+    measured = FIDELITY.measure(seen(worn(), facing(true_object(), shown(worn())))).numbers
     assert measured["turn_deg"] == 0.0
     assert (measured["psnr_turned"], measured["ssim_turned"]) == (measured["psnr"], measured["ssim"])
 
@@ -111,7 +116,7 @@ def test_a_truth_that_knows_the_front_is_not_turned():
 
     assert facing(truth, never) is truth
     assert truth.turned() is truth
-    assert set(FIDELITY.measure(worn(), shown(worn()), truth, None)) == {"psnr", "psnr_min", "ssim", "mode"}
+    assert set(FIDELITY.measure(seen(worn(), truth)).numbers) == {"psnr", "psnr_min", "ssim", "mode"}
 
 
 def test_the_best_mode_decides_the_turn():
@@ -127,8 +132,8 @@ def test_the_best_mode_decides_the_turn():
 def test_the_start_is_compared_with_the_images_of_the_turned_asset():
     truth = replace(true_object(), turn_deg=40.0)
     start = turned(worn(), 40.0)
-    straight = FIDELITY.measure(worn(), shown(worn()), true_object(), None)
-    assert FIDELITY.measure_start(start, shown(start), truth)["psnr_start"] == pytest.approx(
+    straight = FIDELITY.measure(seen(worn(), true_object())).numbers
+    assert FIDELITY.measure_start(seen(start, truth))["psnr_start"] == pytest.approx(
         straight["psnr"], abs=0.01
     )
 
@@ -150,5 +155,5 @@ def test_the_true_surface_turns_too():
         worn().index(slice(0, 1)), means=torch.tensor([[0.0, 0.4, 0.0]]), opacity_logits=torch.tensor([4.0])
     )
     blob = replace(blob, log_scales=torch.full((1, 3), -1.9))
-    measured = mesh.measure(blob, shown(blob), true_object(distance=ball, turn_deg=90.0), None)
+    measured = mesh.measure(seen(blob, true_object(distance=ball, turn_deg=90.0))).numbers
     assert measured["mesh_chamfer"] < 0.1

@@ -1,0 +1,174 @@
+"""Protocol: how an asset is shown to a model that scores pictures, and how the scores become one number.
+
+A score of a picture says little without its protocol: another background, elevation or model changes it by
+more than methods differ. A protocol therefore has a name, and everything that it says is in the record of
+every number that was measured with it.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from cadam3d.core.cameras import Cameras
+from cadam3d.core.checks import require, require_choice
+from cadam3d.core.pictures import PictureSettings
+from cadam3d.core.render import RenderFn, RenderOutput
+
+# Views that are rendered and scored at once, which bounds the memory.
+VIEWS_AT_ONCE = 4
+CROPS = ("none", "object")
+AGGREGATIONS = ("mean", "best")
+INSIDE = 0.5  # the alpha above which a pixel belongs to the object
+MARGIN = 0.1  # around a cropped object, as a share of its longer side
+PROMPT = "{}"  # the place of the prompt in a text
+
+
+@dataclass(frozen=True)
+class ModelName:
+    """A model that a protocol names."""
+
+    id: str  # OWNER/NAME on the Hugging Face hub
+    revision: str | None  # a commit on the hub; None = the newest
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protocol(PictureSettings, ABC):
+    """Views, pictures, text and models of an evaluation. The subclasses place the cameras."""
+
+    node: ClassVar[str] = "protocol"
+
+    name: str
+    crop: str  # before the preprocessing of the model: "none", or "object" for a square around it
+    text: str  # what the picture is compared with; {} is the prompt
+    # Name of a scorer, such as "clip", to a mapping with the keys "id" and "revision".
+    models: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.name != "", "protocol.name", expected="a name", got=self.name, example="protocol=paper")
+        require_choice("protocol.crop", self.crop, CROPS)
+        require(
+            self.text.count(PROMPT) == 1,
+            "protocol.text",
+            expected="a text with {} once, where the prompt goes",
+            got=self.text,
+            example="protocol.text='\"a DSLR photo of {}\"'",
+        )
+        for scorer, model in self.models.items():
+            is_model = isinstance(model, Mapping) and set(model) == {"id", "revision"}
+            require(
+                is_model and isinstance(model["id"], str) and isinstance(model["revision"], str | None),
+                f"protocol.models.{scorer}",
+                expected="a model with the keys id and revision",
+                got=model,
+                example=f"protocol.models.{scorer}.revision=null",
+            )
+
+    @cached_property
+    @abstractmethod
+    def cameras(self) -> Cameras:
+        """Return the cameras of all views."""
+
+    @abstractmethod
+    def aggregate(self, values: Float[Tensor, "v"], *, less_is_better: bool) -> float:
+        """Return the one number that the values of all views become."""
+
+    @property
+    @abstractmethod
+    def is_mean(self) -> bool:
+        """Return whether the number is the mean of the values, so that it has an interval."""
+
+    def text_of(self, prompt: str) -> str:
+        """Return the text with which the pictures are compared."""
+        return self.text.replace(PROMPT, prompt)
+
+    def model(self, scorer: str) -> ModelName | None:
+        """Return the model that the protocol names for a scorer; None if it names none."""
+        named = self.models.get(scorer)
+        return None if named is None else ModelName(**named)
+
+    def images(self, render: RenderFn) -> Iterator[Float[Tensor, "v h w 3"]]:
+        """Yield the pictures of the asset that ``render`` shows, in [0, 1], a few views at a time."""
+        for first in range(0, len(self.cameras), VIEWS_AT_ONCE):
+            some = self.cameras.index(slice(first, first + VIEWS_AT_ONCE))
+            output = render(some, self.backgrounds(len(some)))
+            yield self._cropped(output)
+
+    def record(self) -> dict[str, Any]:
+        """Return all settings as plain data, for the record of a number; models are recorded with it."""
+        settings = {key: value for key, value in asdict(self).items() if key != "models"}
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in settings.items()}
+
+    def _cropped(self, output: RenderOutput) -> Float[Tensor, "v h w 3"]:
+        images = output.rgb.detach().float().clamp(0, 1)
+        if self.crop == "none":
+            return images
+        pairs = zip(images, output.alpha.detach(), strict=True)
+        return torch.stack([_around_object(image, alpha, self._fill(image)) for image, alpha in pairs])
+
+    def _fill(self, image: Tensor) -> Float[Tensor, "3"]:
+        return self.backgrounds(1)[0].to(image)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RingProtocol(Protocol):
+    """Views that are evenly spaced on rings, one ring per elevation; the first of each sees the front."""
+
+    views: int  # >= 1, per elevation
+    elevations_deg: Sequence[float]  # in [-90, 90]
+    aggregation: str  # "mean", or "best" for the best view
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_views(self.views, example=12)
+        self.require_angles("elevations_deg", self.elevations_deg, limit=90, example=15)
+        require_choice("protocol.aggregation", self.aggregation, AGGREGATIONS)
+
+    @cached_property
+    def cameras(self) -> Cameras:
+        """Return the cameras, ring by ring."""
+        azimuth = torch.arange(self.views, dtype=torch.float32) * (360.0 / self.views)
+        elevation = torch.tensor([float(angle) for angle in self.elevations_deg])
+        return self.cameras_at(azimuth.repeat(len(elevation)), elevation.repeat_interleave(self.views))
+
+    def aggregate(self, values: Float[Tensor, "v"], *, less_is_better: bool) -> float:
+        """Return the mean, or the value of the best view."""
+        return float(values.mean() if self.is_mean else _best(values, less_is_better))
+
+    @property
+    def is_mean(self) -> bool:
+        """Return whether the number is the mean."""
+        return self.aggregation == "mean"
+
+
+def _best(values: Tensor, less_is_better: bool) -> Tensor:
+    return values.min() if less_is_better else values.max()
+
+
+def _around_object(
+    image: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], fill: Float[Tensor, "3"]
+) -> Float[Tensor, "h w 3"]:
+    """Return the square around the object, resized to the size of the image; the image if it is empty."""
+    rows, columns = (alpha > INSIDE).any(dim=1).nonzero(), (alpha > INSIDE).any(dim=0).nonzero()
+    if len(rows) == 0:
+        return image
+    (top, bottom), (left, right) = ((int(each[0]), int(each[-1]) + 1) for each in (rows, columns))
+    side = round(max(bottom - top, right - left) * (1 + 2 * MARGIN))
+    square = fill.expand(side, side, 3).clone()
+    # The square may reach beyond the image, where there is only background.
+    first_row, first_column = (top + bottom - side) // 2, (left + right - side) // 2
+    height, width = alpha.shape
+    inside_rows = slice(max(first_row, 0), min(first_row + side, height))
+    inside_columns = slice(max(first_column, 0), min(first_column + side, width))
+    part = image[inside_rows, inside_columns]
+    row, column = inside_rows.start - first_row, inside_columns.start - first_column
+    square[row : row + part.shape[0], column : column + part.shape[1]] = part
+    resized = interpolate(square.permute(2, 0, 1)[None], size=(height, width), mode="bicubic", antialias=True)
+    return resized[0].permute(1, 2, 0).clamp(0, 1)

@@ -1,0 +1,93 @@
+"""ScoreMetric: the base of all metrics that score the pictures of a protocol one by one with a model."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.metric.base import Measurand, Measurement, Metric
+from cadam3d.metric.protocol import Protocol
+
+LEVEL = 0.95  # of the interval
+
+
+@dataclass(frozen=True)
+class Scorer:
+    """A model that is ready to score pictures."""
+
+    # From images "v h w 3" in [0, 1] and a text to one score per image, "v", on any device.
+    score: Callable[[Tensor, str], Tensor]
+    # What the record of a number says about the model: "model", "revision", "weights_sha256" and so on.
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoreMetric(Metric):
+    """One number from the scores of single pictures, taken as a protocol says.
+
+    A subclass sets ``number`` and returns its model from :meth:`scorer`.
+    """
+
+    number: ClassVar[str]  # the name of the number, such as "clip_score"
+    less_is_better: ClassVar[bool] = False
+
+    protocol: Protocol
+
+    @abstractmethod
+    def scorer(self, device: torch.device) -> Scorer:
+        """Return the model, on ``device``. Raises ``UserError`` if its files are missing or damaged."""
+
+    def measure(self, measurand: Measurand) -> Measurement:
+        """Return the number, with a record of how it came about; nothing for an asset without Gaussians."""
+        if len(measurand.gaussians) == 0:
+            return Measurement({})
+        scorer = self.scorer(measurand.gaussians.device)
+        text = self.protocol.text_of(measurand.prompt)
+        values = self.values(measurand, scorer, text)
+        return self.measurement(values, text, scorer.facts)
+
+    def values(self, measurand: Measurand, scorer: Scorer, text: str) -> Float[Tensor, "v"]:
+        """Return the score of every view of the protocol."""
+        scores = [scorer.score(images, text) for images in self.protocol.images(measurand.render)]
+        return torch.cat([score.detach().double().cpu() for score in scores])
+
+    def measurement(
+        self, values: Float[Tensor, "v"], text: str | None, facts: Mapping[str, Any]
+    ) -> Measurement:
+        """Return the number that the values of all views become, with its record."""
+        value = self.protocol.aggregate(values, less_is_better=self.less_is_better)
+        record = {
+            "value": value,
+            "protocol": self.protocol.record(),
+            **facts,
+            "text": text,
+            "views": [float(each) for each in values],
+            "mean": float(values.mean()),
+            "interval": self.interval(values) if self.protocol.is_mean else None,
+        }
+        return Measurement({self.number: value}, {self.number: record})
+
+    def interval(self, values: Float[Tensor, "v"]) -> dict[str, Any] | None:
+        """Return the 95 % interval of the mean over viewpoints; None for fewer than two views.
+
+        It is Student's t interval, which treats the views as a random sample of viewpoints. It says how much
+        the choice of the viewpoints matters for this asset, and nothing about other seeds or prompts.
+        """
+        count = len(values)
+        if count < 2:
+            return None
+        from scipy.stats import t  # slow to import
+
+        half = float(t.ppf((1 + LEVEL) / 2, count - 1)) * float(values.std()) / math.sqrt(count)
+        mean = float(values.mean())
+        return interval_record(mean - half, mean + half, "the mean over viewpoints, by Student's t")
+
+
+def interval_record(low: float, high: float, of: str) -> dict[str, Any]:
+    """Return an interval for the record of a number; ``of`` says what it is an interval of, and how."""
+    return {"low": low, "high": high, "level": LEVEL, "of": of}
