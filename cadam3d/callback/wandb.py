@@ -53,22 +53,16 @@ class Wandb(Tracking):
         require_range("callback.wandb.timeout", self.timeout, low=1, example=30)
 
     def open(self, context: RunContext, step: int) -> None:
-        """Start a run of wandb, or continue that of the folder. If there is no connection, it is offline."""
+        """Start a run of wandb, or continue that of the folder. It is offline unless a server accepts it."""
         # wandb reads this when it is imported. To send reports of its errors, set the variable to true.
         os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         self._file = context.folder / WANDB_RUN
         self._id, self._recorded = known_run(self._file)
         mode, reason = self._choose_mode()
+        self._run = self._start(context, mode)
         if mode == "online":
-            try:
-                self._run = self._start(context, mode)
-                # The server may know more steps than this disk, or fewer.
-                self._recorded = max(self._run.step - 1, 0)
-            # Whatever the reason is, the run can be recorded on this disk.
-            except Exception as error:
-                mode, reason = "offline", " ".join(str(error).split())[:200]
-        if mode != "online":
-            self._run = self._start(context, mode)
+            # The server may have more steps than this disk knows of, or fewer.
+            self._recorded = max(self._run.step - 1, 0)
         self._keep()
         folder = shown(context.folder / WANDB)
         if mode == "online":
@@ -103,9 +97,8 @@ class Wandb(Tracking):
             return "offline", "callback.wandb.mode=offline"
         if named := os.environ.get("WANDB_MODE"):
             return named, f"WANDB_MODE={named}"
-        if not has_key():
-            return "offline", "there is no API key; wandb login stores one"
-        return "online", ""
+        refusal = refused()
+        return ("online", "") if refusal is None else ("offline", refusal)
 
     def _start(self, context: RunContext, mode: str) -> Any:
         import wandb
@@ -157,10 +150,17 @@ def known_run(path: Path) -> tuple[str, int]:
     return secrets.token_hex(8), 0
 
 
-def has_key() -> bool:
-    """Return whether wandb finds an API key in the environment or in ``.netrc``, without asking for it."""
+def refused() -> str | None:
+    """Return why no server takes the run; None if there is an API key that a server has just accepted.
+
+    The key may be in the environment, in ``.netrc`` or in the settings of wandb. The user is never asked.
+    """
     import wandb
     from wandb.sdk.lib import wbauth
 
     host = wandb.setup().settings.base_url
-    return wbauth.authenticate_session(host=host, source="cadam3d", prompt=False) is not None
+    try:
+        found = wbauth.authenticate_session(host=host, source="cadam3d", prompt=False, verify=True)
+    except wandb.Error as error:
+        return " ".join(str(error).split())[:200]
+    return "there is no API key; wandb login stores one" if found is None else None

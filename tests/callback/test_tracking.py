@@ -1,8 +1,6 @@
 """TensorBoard and Weights & Biases: what they record, how they continue, and that no run needs them."""
 
 import os
-import shutil
-import socket
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,16 +10,17 @@ import torch
 from composed import as_yaml, composed
 
 from cadam3d.callback import tracking
-from cadam3d.callback import wandb as wandb_callback
 from cadam3d.callback.previews import Previews
 from cadam3d.callback.tensorboard import TensorBoard
 from cadam3d.callback.tracking import Tracking
-from cadam3d.callback.wandb import Wandb, has_key, known_run
+from cadam3d.callback.wandb import Wandb, known_run, refused
 from cadam3d.commands.train import build_trainer, run_context
+from cadam3d.core.console import heard_by
 from cadam3d.core.errors import UserError
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.run_folder import JOBS
-from cadam3d.settings.compose import component
+from cadam3d.settings.compose import component, components
+from cadam3d.state import RunContext
 
 CPU = torch.device("cpu")
 SMALL = ("prompt=a red cube", "prior=tiny", "rasterizer=reference", "camera.size=12", "initializer.count=30")
@@ -38,22 +37,30 @@ def prepare(folder: Path) -> None:
     (folder / ".hydra/overrides.yaml").write_text("- prompt=a red cube\n- +densifier=cadam\n")
 
 
-def train(folder: Path, *trackers: Tracking, steps: int = 10, state=None):
-    """Train to ``steps``, on from ``state`` if there is one, and return the state."""
+def train(folder: Path, *trackers: Tracking, steps: int = 10):
+    """Train with ``trackers`` and return the state."""
     prepare(folder)
     cfg = composed(*LINE, f"steps={steps}")
     trainer = build_trainer(cfg, CPU)
     # The trackers are first, so that the preview of a step is drawn after they were called.
     trainer.callbacks[:0] = trackers
     embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
-    if state is None:
-        initializer = component(cfg.initializer, Initializer, "initializer")
-        state = trainer.start(cfg.prompt, initializer, cfg.seed, CPU)
+    initializer = component(cfg.initializer, Initializer, "initializer")
+    state = trainer.start(cfg.prompt, initializer, cfg.seed, CPU)
     context = run_context(cfg.prompt, trainer, state, folder)
     trainer.train(state, embedding, context)
     for tracker in trackers:
         tracker.on_result(context, {**SUMMARY, "steps": steps})
     return state
+
+
+def context_of(folder: Path) -> RunContext:
+    """Return the context of a run in ``folder`` that no test trains."""
+    prepare(folder)
+    cfg = composed(*LINE)
+    trainer = build_trainer(cfg, CPU)
+    initializer = component(cfg.initializer, Initializer, "initializer")
+    return run_context(cfg.prompt, trainer, trainer.start(cfg.prompt, initializer, cfg.seed, CPU), folder)
 
 
 class Recorder(Tracking):
@@ -125,7 +132,7 @@ def test_a_run_that_ends_with_an_error_closes_its_tracker(tmp_path, monkeypatch)
 def test_a_missing_package_names_its_extra(name, monkeypatch):
     monkeypatch.setattr(tracking, "find_spec", lambda _: None)
     with pytest.raises(UserError) as raised:
-        component(composed(f"callback=[{name}]", "prompt=a").callback[name])
+        components(composed(f"callback=[{name}]", "prompt=a").callback, key="callback")
     assert str(raised.value) == (
         f"callback.{name}: needs {name}, which is not installed. Try: pip install 'cadam3d[{name}]'"
     )
@@ -178,17 +185,19 @@ def test_tracking_does_not_change_the_run(boarded, alone):
 
 def test_a_resumed_run_replaces_the_steps_after_its_checkpoint_in_tensorboard(tmp_path):
     pytest.importorskip("tensorboard")
-    state = train(tmp_path, TensorBoard(every=1), steps=3)
-    # This run was killed after step 6, and continues from its checkpoint of step 3.
-    shutil.copytree(tmp_path / "tensorboard", tmp_path / "kept")
-    ahead = TensorBoard(every=1)
-    again = train(tmp_path / "ahead", TensorBoard(every=1), steps=3)
-    train(tmp_path / "ahead", ahead, steps=6, state=again)
-    for path in (tmp_path / "ahead/tensorboard").iterdir():
-        shutil.copy(path, tmp_path / "tensorboard")
-    train(tmp_path, TensorBoard(every=1), steps=8, state=state)
-    steps = [each.step for each in events(tmp_path / "tensorboard").Scalars("train/loss")]
-    assert steps[-5:] == [4, 5, 6, 7, 8]
+    context = context_of(tmp_path)
+    # The run was killed after step 6, and continues from its checkpoint of step 3.
+    for begin, end in ((0, 6), (3, 8)):
+        board = TensorBoard(every=1)
+        board.open(context, begin)
+        for step in range(begin + 1, end + 1):
+            board.record(step, {"train/loss": 100.0 * begin + step}, None)
+        board.close(is_complete=False)
+    losses = events(tmp_path / "tensorboard").Scalars("train/loss")
+    assert [(each.step, each.value) for each in losses] == [
+        *((1, 1), (2, 2), (3, 3)),
+        *((4, 304), (5, 305), (6, 306), (7, 307), (8, 308)),
+    ]
 
 
 # --- Weights & Biases -------------------------------------------------------------------------------------
@@ -237,71 +246,84 @@ def history(path: Path) -> dict[int, set[str]]:
 
 @pytest.fixture(scope="module")
 def offline(without_key, tmp_path_factory):
-    """Return the folder of a sweep's job that was tracked, stopped after step 6 and resumed from step 4."""
+    """Track a job of a sweep without a key up to step 8; resume it from step 4. Return it and what it said."""
     sweep = tmp_path_factory.mktemp("sweep")
     (sweep / JOBS).write_text("{}")
-    folder = sweep / "job"
-    state = train(folder, steps=4)
-    train(folder, tracker(every=1), steps=6)
-    train(folder, tracker(every=1), steps=8, state=state)
-    return folder, state
+    folder, said = sweep / "a job", []
+    with heard_by(lambda text, level: said.append(text)):
+        state = train(folder, tracker(every=1), steps=8)
+        again = tracker(every=1)
+        again.open(context_of(folder), 4)
+        for step in range(5, 11):
+            again.record(step, {"train/loss": float(step)}, None)
+        again.close(is_complete=True)
+    return folder, said, state
 
 
 @pytest.mark.slow
-def test_without_a_key_the_run_is_recorded_on_the_disk_and_each_step_once(offline, alone):
+def test_without_a_key_the_run_is_recorded_on_the_disk_and_each_step_once(offline):
     first, second = sorted((offline[0] / "wandb").glob("offline-run-*/*.wandb"))
     before, after = history(first), history(second)
-    assert [step for step in before if "train/loss" in before[step]] == [1, 2, 3, 4, 5, 6]
-    assert [step for step in after if "train/loss" in after[step]] == [7, 8]
-    assert {"preview", "refine/after"} <= before[4]
-    assert {"preview", "refine/after"} <= after[8]
-    started = [record.run for path in (first, second) for record in records(path) if record.HasField("run")]
+    assert [step for step in before if "train/loss" in before[step]] == [1, 2, 3, 4, 5, 6, 7, 8]
+    assert [step for step in after if "train/loss" in after[step]] == [9, 10]
+    assert {"preview/path", "refine/after"} <= before[4]
+    assert len(list(offline[0].glob("wandb/*/files/media/images/preview_*.png"))) == 2
+
+
+@pytest.mark.slow
+def test_a_run_of_wandb_keeps_its_id_and_has_the_settings_and_the_sweep_as_its_group(offline):
+    paths = (offline[0] / "wandb").glob("offline-run-*/*.wandb")
+    started = [record.run for path in paths for record in records(path) if record.HasField("run")]
     assert len({run.run_id for run in started}) == 1
     assert {run.run_group for run in started} == {offline[0].parent.name}
+    assert {run.display_name for run in started} == {"a job"}
     config = {item.key: item.value_json for item in started[0].config.update}
     assert config["prompt"] == '"a red cube"'
 
 
 @pytest.mark.slow
+def test_the_final_numbers_are_in_the_summary_of_wandb(offline):
+    first = min((offline[0] / "wandb").glob("offline-run-*/*.wandb"))
+    updates = [record.summary.update for record in records(first) if record.HasField("summary")]
+    found = {item.key or "/".join(item.nested_key): item.value_json for update in updates for item in update}
+    assert found["result/psnr"] == "21.5"
+
+
+@pytest.mark.slow
 def test_nothing_that_wandb_could_collect_by_itself_is_in_its_files(offline):
     content = b"".join(path.read_bytes() for path in (offline[0] / "wandb").glob("*/*.wandb"))
-    assert socket.gethostname().encode() not in content or len(socket.gethostname()) < 4
-    for unwanted in (
+    unwanted = [
         b"pytest",
         b"site-packages",
         b"requirements.txt",
         b"output.log",
         b"git",
-    ):
-        assert unwanted not in content, unwanted
+        str(Path.cwd()).encode(),
+    ]
+    assert not [each for each in unwanted if each in content]
     names = {path.name for path in (offline[0] / "wandb").rglob("*") if path.is_file()}
     assert not names & {"requirements.txt", "wandb-metadata.json", "output.log", "conda-environment.yaml"}
 
 
 @pytest.mark.slow
-def test_the_run_says_how_to_send_it_later(without_key, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    train(tmp_path / "a run", tracker(mode="offline"), steps=1)
-    lines = capsys.readouterr().err.splitlines()
-    assert (
-        "Weights & Biases: nothing is sent (callback.wandb.mode=offline). To send the run later, type:"
-        in lines
-    )
-    assert "  wandb sync 'a run/wandb'" in lines
+def test_the_run_says_that_nothing_is_sent_and_how_to_send_it_later(offline):
+    assert offline[1][0].startswith("Weights & Biases: nothing is sent (there is no API key")
+    assert offline[1][1].split("wandb sync ")[1] == f"'{offline[0] / 'wandb'}'"
 
 
 @pytest.mark.slow
-def test_a_server_that_cannot_be_reached_leaves_the_run_offline(without_key, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(wandb_callback, "has_key", lambda: True)
-    monkeypatch.setenv("WANDB_API_KEY", "a" * 40)
-    assert train(tmp_path, tracker(timeout=2), steps=2).step == 2
-    assert "nothing is sent (" in capsys.readouterr().err
-    assert len(list(tmp_path.glob("wandb/offline-run-*/*.wandb"))) == 1
+def test_wandb_does_not_change_the_run(offline, tmp_path):
+    assert torch.equal(train(tmp_path, steps=8).gaussians.means, offline[2].gaussians.means)
 
 
-def test_a_key_is_found_without_asking_for_one(without_key, monkeypatch):
+@pytest.mark.slow
+def test_a_server_that_cannot_be_reached_is_a_reason_to_stay_offline(without_key, monkeypatch):
     monkeypatch.setattr("builtins.input", lambda *_: pytest.fail("asked"))
-    assert not has_key()
+    assert "no API key" in str(refused())
+    monkeypatch.setenv("WANDB_API_KEY", "a" * 40)
+    reason = refused()
+    assert reason is not None
+    assert "\n" not in reason
 
 
 FOREIGN = [None, "", "[]", '{"id": "../evil", "recorded": 3}', '{"id": "0123456789abcdef"}']
