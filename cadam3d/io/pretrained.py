@@ -119,7 +119,9 @@ class Source:
         )
         reasons: list[str] = []
         for name in self.ids:
-            index, reason, can_ask = _fetch_index(name, self.revision, can_ask)
+            index, reason, can_ask = fetch_file(
+                name, INDEX, self.revision, can_ask, lacking="not in the layout of diffusers"
+            )
             if index is not None:
                 return Pretrained(self, name, self.revision, index, _read_entries(self.key, index))
             reasons.append(f"{name}: {reason}")
@@ -276,8 +278,13 @@ def _read_entries(key: str, file: Path) -> dict[str, Any]:
     return entries
 
 
-def _fetch_index(name: str, revision: str | None, can_ask: bool) -> tuple[Path | None, str, bool]:
-    """Return the index of a model on the hub, or None and the reason, and whether to ask the hub again."""
+def fetch_file(
+    name: str, file: str, revision: str | None, can_ask: bool, *, lacking: str
+) -> tuple[Path | None, str, bool]:
+    """Return a file of a model on the hub, or None and the reason, and whether to ask the hub again.
+
+    ``lacking`` says what a model without this file is not.
+    """
     from huggingface_hub import constants, hf_hub_download, utils
     from huggingface_hub.errors import (
         EntryNotFoundError,
@@ -293,8 +300,8 @@ def _fetch_index(name: str, revision: str | None, can_ask: bool) -> tuple[Path |
     # Otherwise the messages about retries would hide ours.
     utils.logging.set_verbosity_error()
     try:
-        file = hf_hub_download(name, INDEX, revision=revision, local_files_only=offline or not can_ask)
-        return Path(file), "", can_ask
+        found = hf_hub_download(name, file, revision=revision, local_files_only=offline or not can_ask)
+        return Path(found), "", can_ask
     except GatedRepoError:
         reason = "gated (accept its licence on its page, then: hf auth login)"
     except RevisionNotFoundError:
@@ -308,7 +315,7 @@ def _fetch_index(name: str, revision: str | None, can_ask: bool) -> tuple[Path |
         # Every further request would take as long.
         can_ask = False
     except EntryNotFoundError:
-        reason = f"has no {INDEX}: not in the layout of diffusers"
+        reason = f"has no {file}: {lacking}"
     except (HfHubHTTPError, OSError) as error:
         reason = " ".join(str(error).split())[:120]
     finally:
