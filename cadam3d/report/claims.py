@@ -8,12 +8,13 @@ sign test counts prompts.
 import math
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from scipy.stats import binomtest
 
+from cadam3d.core.quality import QUALITIES, Quality
 from cadam3d.report.results import NOISE, PROMPT, SEED, ArmSetting, Cell, JobResult, measured
 
 NO_GROWTH = "none"  # the arm that gains are measured from
@@ -30,31 +31,35 @@ MOST_LISTED = 4  # values that are listed one by one
 
 
 @dataclass(frozen=True)
-class Quality:
-    """A measure of quality; more is better."""
+class Compared:
+    """A quality by which settings are compared; more is better."""
 
-    name: str
-    unit: str  # empty if there is none
-    digits: int  # after the point, in tables
+    quality: Quality
     of: Callable[[JobResult], float | None]
+
+    @property
+    def digits(self) -> int:
+        """Return the number of digits after the point, in tables."""
+        return self.quality.decimals
+
+    @property
+    def unit(self) -> str:
+        """Return the unit; empty if there is none."""
+        return self.quality.unit
 
     @property
     def axis(self) -> str:
         """Return the label of an axis: the name with its unit."""
-        return self.with_unit(self.name)
+        return self.quality.heading
 
     @property
     def gain(self) -> str:
         """Return the label of the difference to the job without growth, with its unit."""
-        return self.with_unit(f"{self.name} gained by growth")
-
-    def with_unit(self, words: str) -> str:
-        """Return ``words`` followed by the unit, if there is one."""
-        return f"{words} ({self.unit})" if self.unit else words
+        return replace(self.quality, label=f"{self.quality.label} gained by growth").heading
 
 
-PSNR = Quality("PSNR", "dB", 2, lambda result: result.psnr)
-SSIM = Quality("SSIM", "", 4, lambda result: result.ssim)
+PSNR = Compared(QUALITIES["psnr"], lambda result: result.psnr)
+SSIM = Compared(QUALITIES["ssim"], lambda result: result.ssim)
 
 
 @dataclass(frozen=True)
@@ -248,7 +253,7 @@ def frontier(
     results: Sequence[JobResult],
     arm: str,
     reference: Sequence[JobResult] | None = None,
-    quality: Quality = PSNR,
+    quality: Compared = PSNR,
 ) -> list[FrontierPoint]:
     """Return the settings of ``arm``, those with fewest Gaussians first.
 
@@ -286,7 +291,7 @@ def has_no_growth(results: Sequence[JobResult]) -> bool:
     return any(result.arm == NO_GROWTH for result in measured(results))
 
 
-def gain_over(reference: Sequence[JobResult], quality: Quality = PSNR) -> Callable[[JobResult], float]:
+def gain_over(reference: Sequence[JobResult], quality: Compared = PSNR) -> Callable[[JobResult], float]:
     """Return a function: the quality of a result minus that of its job without growth in ``reference``.
 
     The job without growth has the same prompt and seed. The function returns NaN where that job or the

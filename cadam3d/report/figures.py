@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from cadam3d.report.claims import (
     PSNR,
     SSIM,
+    Compared,
     FrontierPoint,
     Hull,
-    Quality,
     Spread,
     by_cell,
     frontier,
@@ -56,7 +56,7 @@ def frontier_ssim_figure(results: Sequence[JobResult]) -> Figure | None:
     return frontier_figure(results, SSIM)
 
 
-def frontier_figure(results: Sequence[JobResult], quality: Quality = PSNR) -> Figure | None:
+def frontier_figure(results: Sequence[JobResult], quality: Compared = PSNR) -> Figure | None:
     """Draw quality over count, a panel per noise level: all settings, a curve per arm, spreads as bars."""
     style = looks(arms_of(results))
     results = [result for result in results if quality.of(result) is not None]
@@ -148,7 +148,7 @@ def _bars(axes: Axes, point: FrontierPoint, look: Look) -> None:
 
 
 def _upper_curve(
-    axes: Axes, results: Sequence[JobResult], level: str, reference: Sequence[JobResult], quality: Quality
+    axes: Axes, results: Sequence[JobResult], level: str, reference: Sequence[JobResult], quality: Compared
 ) -> list[Label]:
     """Draw what any arm reaches with the same seeds without noise: how much growth could help at all.
 

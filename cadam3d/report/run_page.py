@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from cadam3d.core.chart import Chart
+from cadam3d.core.quality import QUALITIES
 from cadam3d.io.records import psnr_of, ssim_of
 from cadam3d.io.run_folder import ASSET, CONFIG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE
 from cadam3d.report.charts import other_plots, sections
@@ -24,27 +25,7 @@ LABELS = {
     "outcome": "Outcome",
     "num_gaussians_initial": "Gaussians at the start",
     "initializer_note": "Fallback of the initializer",
-    "num_gaussians": "Gaussians",
-    "asset_bytes": "Size of asset.ply (bytes)",
-    "asset_mib": "Size of asset.ply (MiB)",
-    "bytes_per_gaussian": "Bytes per Gaussian",
-    "median_scale": "Median scale (world units)",
-    "median_opacity": "Median opacity",
-    "psnr": "PSNR (dB)",
-    "psnr_min": "PSNR of the worst view (dB)",
-    "ssim": "SSIM",
-    "mode": "Best-matching mode of the truth",
-    "psnr_turned": "PSNR at the best turn (dB)",
-    "ssim_turned": "SSIM at the best turn",
-    "turn_deg": "Best turn about the vertical axis (degrees)",
-    "psnr_start": "PSNR of the Gaussians at the start (dB)",
-    "iou": "Overlap of the outlines (IoU)",
-    "iou_start": "Overlap of the outlines at the start (IoU)",
-    "colour_error": "Colour error (delta E)",
-    "mesh_chamfer": "Chamfer distance of the mesh (world units)",
-    "mesh_fscore": "F-score of the mesh",
-    "mesh_precision": "Precision of the mesh",
-    "mesh_recall": "Recall of the mesh",
+    **{name: quality.fact for name, quality in QUALITIES.items()},
     "backend": "Rasterizer backend",
     "backend_reason": "Why not a faster backend",
     "seconds": "Seconds",

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from cadam3d.core.quality import QUALITIES
 from cadam3d.io.atomic import replacing
 from cadam3d.report.claims import (
+    PSNR,
     SSIM,
     by_cell,
     compare,
@@ -25,10 +27,8 @@ NO_RATIO: dict[float | None, str] = {math.inf: "never", 0.0: "always"}
 
 # Columns of results that are compared with a named truth: the field of the result, and its decimal places.
 OF_TRUTH = {
-    "PSNR at the start (dB)": ("psnr_start", 2),
-    "IoU": ("iou", 3),
-    "IoU at the start": ("iou_start", 3),
-    "colour error": ("colour_error", 1),
+    quality.heading: (quality.name, quality.decimals)
+    for quality in map(QUALITIES.__getitem__, ("psnr_start", "iou", "iou_start", "colour_error"))
 }
 
 
@@ -52,8 +52,8 @@ def objectives_table(results: Sequence[JobResult]) -> list[Line]:
                         "noise": level,
                         "arm": arm,
                         "cells": len(members),
-                        "PSNR (dB)": _median([result.psnr for result in members], 2),
-                        "SSIM": _median([result.ssim for result in members], 4),
+                        PSNR.axis: _median([result.psnr for result in members], PSNR.digits),
+                        SSIM.axis: _median([result.ssim for result in members], SSIM.digits),
                         **{
                             title: _median([getattr(result, name) for result in members], digits)
                             for title, (name, digits) in OF_TRUTH.items()
@@ -143,8 +143,8 @@ def jobs_table(results: Sequence[JobResult]) -> list[Line]:
             **{key: value for key, value in result.cell.axes if value},
             "outcome": result.outcome,
             "Gaussians": None if result.count is None else round(result.count),
-            "PSNR (dB)": _rounded(result.psnr, 2),
-            "SSIM": _rounded(result.ssim, 4),
+            PSNR.axis: _rounded(result.psnr, PSNR.digits),
+            SSIM.axis: _rounded(result.ssim, SSIM.digits),
             **{title: _rounded(getattr(result, name), digits) for title, (name, digits) in known.items()},
             "seconds": result.seconds,
         }
