@@ -246,7 +246,7 @@ def history(path: Path) -> dict[int, set[str]]:
 
 @pytest.fixture(scope="module")
 def offline(without_key, tmp_path_factory):
-    """Track a job of a sweep without a key up to step 8; resume it from step 4. Return it and what it said."""
+    """Track the job of a sweep without a key up to step 8, and resume it from step 4."""
     sweep = tmp_path_factory.mktemp("sweep")
     (sweep / JOBS).write_text("{}")
     folder, said = sweep / "a job", []
