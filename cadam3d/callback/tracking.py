@@ -39,7 +39,7 @@ class Tracking(Callback):
     def __post_init__(self) -> None:
         if find_spec(self.package) is None:
             raise UserError(
-                f"callback.{self.package}: needs {self.package}, which is not installed. "
+                f"callback={self.package}: expected the package {self.package}, got none. "
                 f"Try: pip install 'cadam3d[{self.package}]'"
             )
         require_whole(f"callback.{self.package}.every", self.every, low=1, example=10)
