@@ -41,8 +41,11 @@ DARK = 0.1
 # Mean squared difference between two views below which an object looks the same from all sides. On
 # prior=shapes, bodies of revolution have at most 10 ** -4, and the least of all others, a lighthouse, 0.002.
 LEAST_SPREAD = 10**-3.5
-# Differences smaller than this share of the spread are no evidence.
-LEAST_NOISE = 0.05
+# Differences count as evidence if they are larger than this share of the error of the asset, and than this
+# share of the spread. With smaller values, small errors decide ties such as those between the sides of a cube.
+# Larger ones hide the second front of a blurred asset.
+NOISE = 0.25
+LEAST_NOISE = 0.03
 # Directions with a smaller share of the largest singular value are left out of the projection.
 LEAST_DIRECTION = 1e-3
 
@@ -196,7 +199,7 @@ def _compare(asset: Float[Tensor, "v p"], true: Float[Tensor, "v p"]) -> _Compar
     among_true = torch.cdist(theirs, theirs).square() / pixels
     spread = float(among_true.sum()) / (VIEWS * (VIEWS - 1))
     error = float(differences.min(dim=1).values.mean())
-    noise = max(error, LEAST_NOISE * spread, torch.finfo(torch.float64).tiny)
+    noise = max(NOISE * error, LEAST_NOISE * spread, torch.finfo(torch.float64).tiny)
     return _Comparison(
         likeness=(-differences / noise).softmax(dim=1),
         expected=(-among_true / noise).softmax(dim=1).sum(dim=0),
