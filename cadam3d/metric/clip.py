@@ -45,7 +45,11 @@ class Clip:
 
     def lost_tokens(self, text: str) -> int:
         """Return how many tokens of a text the model cannot read."""
-        return max(0, len(self.tokenizer(text)["input_ids"]) - self.longest)
+        return max(0, len(self._all_tokens(text)) - self.longest)
+
+    def tokens(self, text: str) -> list[int]:
+        """Return the tokens of a text that the model reads, of a long text without the mark of its end."""
+        return self._all_tokens(text)[: self.longest - 1]
 
     def complaint(self, text: str) -> str | None:
         """Return a warning about a text that is too long for the model; None if it reads all of it."""
@@ -56,6 +60,9 @@ class Clip:
             f"the model reads {self.longest} tokens, so the last {lost} of the prompt "
             f"{'are' if lost > 1 else 'is'} not scored. Try: a shorter prompt"
         )
+
+    def _all_tokens(self, text: str) -> list[int]:
+        return self.tokenizer(text, verbose=False)["input_ids"]
 
     @property
     def longest(self) -> int:

@@ -42,8 +42,8 @@ DARK = 0.1
 # prior=shapes, bodies of revolution have at most 10 ** -4, and the least of all others, a lighthouse, 0.002.
 LEAST_SPREAD = 10**-3.5
 # Differences count as evidence if they are larger than this share of the error of the asset, and than this
-# share of the spread. With smaller values, small errors decide ties such as those between the sides of a cube.
-# Larger ones hide the second front of a blurred asset.
+# share of the spread. With smaller values, small errors decide ties such as those between the sides of a
+# cube. Larger ones hide the second front of a blurred asset.
 NOISE = 0.25
 LEAST_NOISE = 0.03
 # Directions with a smaller share of the largest singular value are left out of the projection.

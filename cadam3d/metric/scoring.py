@@ -109,7 +109,7 @@ class ModelMetric(ScoreMetric):
     revision: str | None  # of an id; None = the protocol's, or the newest of a model that is named here
 
     def source(self) -> TransformerSource:
-        """Return the place of the model. Raises ``UserError`` if neither the metric nor the protocol has one."""
+        """Return the place of the model. Raises ``UserError`` if neither metric nor protocol names one."""
         named = self.protocol.model(self.kind) if self.model is None else ModelName(self.model, None)
         if named is None:
             raise UserError(
