@@ -164,8 +164,7 @@ class _Comparison:
         """Return the two numbers with their record."""
         settings = {"views": VIEWS, "elevation_deg": ELEVATION_DEG, "fov_y_deg": FOV_DEG, "size": SIZE}
         shown = self.likeness.sum(dim=0)
-        record = {
-            "protocol": {"name": "truth", **settings},
+        views = {
             # For each view of the asset, from azimuth 0 on, the azimuth of the true view that it looks like.
             "looks_like_deg": [360.0 / VIEWS * int(best) for best in self.likeness.argmax(dim=1)],
             # For each true view, from azimuth 0 on, how often it is shown, and how often it should be.
@@ -174,6 +173,7 @@ class _Comparison:
             "error": self.error,
             "spread": self.spread,
         }
+        record = {"protocol": {"name": "truth", **settings}, "views": views}
         if self.spread < LEAST_SPREAD:
             reason = "the true object looks the same from all sides, so it has no front"
             return Measurement({}, _none(reason, record))

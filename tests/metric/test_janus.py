@@ -139,9 +139,10 @@ def test_an_object_that_looks_the_same_from_all_sides_has_no_number(prompt):
 
 def test_the_record_says_which_view_looks_like_which(car):
     record = measured(car, faces(2)).details["janus"]
-    assert record["looks_like_deg"][:7] == [15.0 * view for view in range(6)] + [record["looks_like_deg"][6]]
-    assert record["looks_like_deg"][12:18] == [15.0 * view for view in range(6)]
-    assert sum(record["shown"]) == pytest.approx(VIEWS, abs=0.01)
+    front = [15.0 * view for view in range(6)]
+    assert record["views"]["looks_like_deg"][:6] == front
+    assert record["views"]["looks_like_deg"][12:18] == front
+    assert sum(record["views"]["shown"]) == pytest.approx(VIEWS, abs=0.01)
     assert record["protocol"]["name"] == "truth"
 
 
@@ -256,6 +257,30 @@ def test_without_a_clear_front_there_is_no_number():
     found = seen(0, contrast=0.01)
     assert found.numbers == {}
     assert found.details["janus"]["reason"] == "the model sees no side as the front"
+
+
+def test_the_sides_are_the_softmax_over_three_texts_of_a_clip_model(clip_folder):
+    from PIL import Image
+    from transformers import CLIPModel, CLIPProcessor
+
+    pictures = torch.rand(6, 32, 32, 3, generator=torch.Generator().manual_seed(0))
+
+    def render(cameras, background):
+        return shown(pictures[[round(float(azimuth) % 360) // 60 for azimuth in cameras.azimuth_deg]])
+
+    measurand = Measurand(gaussians=ONE, render=render, prompt="a corgi")
+    found = metric(by="model", model=str(clip_folder), views=6).measure(measurand).details["janus"]
+    model, processor = CLIPModel.from_pretrained(clip_folder), CLIPProcessor.from_pretrained(clip_folder)
+    inputs = processor(
+        text=[f"{side} view of a corgi" for side in ("front", "side", "back")],
+        images=[Image.fromarray(each) for each in (pictures * 255).round().byte().numpy()],
+        return_tensors="pt",
+        padding=True,
+    )
+    with torch.no_grad():
+        expected = model(**inputs).logits_per_image.softmax(dim=1)[:, 0]
+    assert found["views"] == pytest.approx(expected.tolist(), abs=1e-5)
+    assert len(found["weights_sha256"]) == 64
 
 
 # --- which way --------------------------------------------------------------------------------------------
