@@ -90,6 +90,7 @@ class Wandb(Tracking):
         """Write and send what is left, for ``timeout`` seconds at most."""
         if self._run is not None:
             self._run.finish(exit_code=0 if is_complete else 1)
+            self._remove_links()
 
     def _choose_mode(self) -> tuple[str, str]:
         """Return the mode of wandb, and why nothing is sent."""
@@ -131,7 +132,15 @@ class Wandb(Tracking):
             x_disable_machine_info=True,
             x_transaction_log_flush_interval=FLUSH_SECONDS,
         )
-        return wandb.init(settings=settings, config=read_yaml(context.folder / CONFIG))
+        run = wandb.init(settings=settings, config=read_yaml(context.folder / CONFIG))
+        self._remove_links()
+        return run
+
+    def _remove_links(self) -> None:
+        """Remove wandb's link to a log in the user's cache, since no command accepts links out of a run."""
+        for path in self._file.parent.glob("*/logs/*"):
+            if path.is_symlink():
+                path.unlink()
 
     def _keep(self) -> None:
         write_json(self._file, {"id": self._id, "recorded": self._recorded})

@@ -20,6 +20,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.run_folder import JOBS
 from cadam3d.settings.compose import component, components
+from cadam3d.settings.trust import require_contained
 from cadam3d.state import RunContext
 
 CPU = torch.device("cpu")
@@ -303,6 +304,12 @@ def test_nothing_that_wandb_could_collect_by_itself_is_in_its_files(offline):
     assert not [each for each in unwanted if each in content]
     names = {path.name for path in (offline[0] / "wandb").rglob("*") if path.is_file()}
     assert not names & {"requirements.txt", "wandb-metadata.json", "output.log", "conda-environment.yaml"}
+
+
+@pytest.mark.slow
+def test_wandb_leaves_no_link_to_files_outside_of_the_run(offline):
+    require_contained(offline[0], retry="trust=true")
+    assert not [path for path in (offline[0] / "wandb").rglob("*") if path.is_symlink()]
 
 
 @pytest.mark.slow
