@@ -74,22 +74,14 @@ class TransformerSource:
         )
         if config is None:
             raise self._missing(f"no model is available. {self.model}: {reason}")
-        from huggingface_hub import constants, snapshot_download
-
-        offline = constants.HF_HUB_OFFLINE or not can_ask
         try:
-            folder = snapshot_download(
-                self.model,
-                revision=self.revision,
-                allow_patterns=list(NEEDED),
-                local_files_only=offline,
-            )
+            folder = _snapshot(self.model, self.revision, can_ask)
         # Also the errors of the hub, which are errors of the operating system.
         except (OSError, ValueError) as error:
             reason = " ".join(str(error).split())[:120]
             raise self._missing(f"no model is available. {self.model}: {reason}") from error
         # In the cache of the hub, the name of a snapshot is its commit.
-        return TransformerFolder(self, Path(folder), Path(folder).name)
+        return TransformerFolder(self, folder, folder.name)
 
     def _missing(self, problem: str) -> UserError:
         """Return the error that says what to download, where to put it and what to type."""
@@ -190,6 +182,16 @@ class TransformerFolder:
         if isinstance(error, torch.OutOfMemoryError):
             return error
         return self.damaged(f"its {what} cannot be loaded ({' '.join(str(error).split())[:200]})")
+
+
+@cache  # every job of a sweep needs the model, and asking the hub takes time
+def _snapshot(name: str, revision: str | None, can_ask: bool) -> Path:
+    """Return the folder of a model of the hub, after a download of what is not on this disk."""
+    from huggingface_hub import constants, snapshot_download
+
+    offline = constants.HF_HUB_OFFLINE or not can_ask
+    folder = snapshot_download(name, revision=revision, allow_patterns=list(NEEDED), local_files_only=offline)
+    return Path(folder)
 
 
 def sha256_of(files: Sequence[Path]) -> str:
