@@ -78,6 +78,11 @@ class Janus(ModelMetric):
         require_whole("metric.janus.views", self.views, low=6, high=MOST_VIEWS, example=24)
         require_range("metric.janus.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
 
+    def prepare(self) -> None:
+        """Find the files of the model if the line asks for one. With ``by=auto``, the truth may replace it."""
+        if self.by == "model":
+            super().prepare()
+
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, whose scores are the logits of the texts for a picture."""
         clip = load_clip(self.source(), device)

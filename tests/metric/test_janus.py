@@ -307,6 +307,9 @@ def test_a_model_that_is_missing_says_what_to_type(monkeypatch, tmp_path):
     measurand = Measurand(gaussians=ONE, render=lambda *_: pytest.fail("rendered"), prompt="a corgi")
     with pytest.raises(UserError, match=r"^metric\.janus\.model: .* Try: "):
         metric(model=str(tmp_path / "nowhere")).measure(measurand)
+    with pytest.raises(UserError, match=r"^metric\.janus\.model: "):
+        metric(model=str(tmp_path / "nowhere"), by="model").prepare()
+    metric(model=str(tmp_path / "nowhere")).prepare()
 
 
 def test_an_asset_without_gaussians_has_no_front():
