@@ -14,7 +14,7 @@ and the asset has as many fronts as there are separate maxima of "front" over th
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, ClassVar
 
 import torch
@@ -79,7 +79,7 @@ class Janus(ModelMetric):
         require_range("metric.janus.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
 
     def prepare(self) -> None:
-        """Find the files of the model if the line asks for one. With ``by=auto``, the truth may replace it."""
+        """Find the files of the model if the line asks for one. With ``by=auto`` the truth may replace it."""
         if self.by == "model":
             super().prepare()
 
@@ -87,8 +87,10 @@ class Janus(ModelMetric):
         """Return the model, whose scores are the logits of the texts for a picture."""
         clip = load_clip(self.source(), device)
         direction = cache(lambda text: clip.texts([text])[0])
+        # The same pictures are compared with several texts in a row.
+        pictures = lru_cache(maxsize=1)(clip.pictures)
         return Scorer(
-            score=lambda images, text: clip.logit_scale * clip.pictures(images) @ direction(text),
+            score=lambda images, text: clip.logit_scale * pictures(images) @ direction(text),
             facts=clip.facts,
             complaint=clip.complaint,
         )
@@ -109,7 +111,7 @@ class Janus(ModelMetric):
             return self._by_model(measurand)
         asset = _features(lambda cameras, background: measurand.render(cameras, background).rgb[None])[0]
         modes = [_compare(asset, mode) for mode in _features(measurand.truth.images)]
-        return min(modes, key=lambda each: each.error).measurement()
+        return min(modes, key=lambda each: each.mismatch).measurement()
 
     def _by_model(self, measurand: Measurand) -> Measurement:
         scorer = self.scorer(measurand.gaussians.device)
@@ -121,11 +123,15 @@ class Janus(ModelMetric):
             images = measurand.render(one, self.protocol.backgrounds(1)).rgb.detach().float().clamp(0, 1)
             logits.append(torch.cat([scorer.score(images, text) for text in texts]))
         fronts = torch.stack(logits).detach().double().cpu().softmax(dim=1)[:, 0]
-        shown = {"views": self.views, "elevations_deg": [float(self.elevation_deg)], "crop": "none"}
+        shown = {
+            "views": self.views,
+            "elevations_deg": [float(self.elevation_deg)],
+            "crop": "none",
+            "text": "SIDE view of {}",
+            "aggregation": "fronts",
+        }
         record = {
-            "protocol": self.protocol.record()
-            | shown
-            | {"aggregation": "fronts", "text": "{side} view of {}"},
+            "protocol": self.protocol.record() | shown,
             **scorer.facts,
             "text": texts[0],
             # The probability of each view, from azimuth 0 on, to be a front.
@@ -162,7 +168,8 @@ class _Comparison:
 
     likeness: Float[Tensor, "v v"]  # of each view of the asset to each true one; rows have the sum 1
     expected: Float[Tensor, "v"]  # how often the true object shows each side
-    error: float  # mean squared difference to the most similar true view
+    mismatch: float  # mean squared difference to the most similar true view
+    error: float  # the same after the projection
     spread: float  # mean squared difference between two true views
 
     def measurement(self) -> Measurement:
@@ -208,6 +215,7 @@ def _compare(asset: Float[Tensor, "v p"], true: Float[Tensor, "v p"]) -> _Compar
     return _Comparison(
         likeness=(-differences / noise).softmax(dim=1),
         expected=(-among_true / noise).softmax(dim=1).sum(dim=0),
+        mismatch=float(torch.cdist(asset, true).square().min(dim=1).values.mean()) / pixels,
         error=error,
         spread=spread,
     )
