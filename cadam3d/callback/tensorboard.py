@@ -36,7 +36,7 @@ class TensorBoard(Tracking):
         settings = (context.folder / CONFIG).read_text(encoding="utf-8")
         # Four spaces make a block of code in Markdown.
         block = "".join(f"    {line}\n" for line in settings.splitlines())
-        self._writer.add_text("config.yaml", block, step)
+        self._writer.add_text(CONFIG, block, step)
 
     def record(self, step: int, numbers: Mapping[str, float], preview: Path | None) -> None:
         """Write scalars and a picture."""

@@ -238,6 +238,12 @@ def records(path: Path) -> Iterator:
             parts = b""
 
 
+def written(folder: Path) -> list[Path]:
+    """Return the files of wandb in the folder of a run, the oldest first."""
+    found = (folder / "wandb").glob("offline-run-*/*.wandb")
+    return sorted(found, key=lambda path: path.stat().st_mtime_ns)
+
+
 def history(path: Path) -> dict[int, set[str]]:
     """Return the names of the numbers of each step in a file of wandb."""
     rows = [record.history for record in records(path) if record.HasField("history")]
@@ -263,7 +269,7 @@ def offline(without_key, tmp_path_factory):
 
 @pytest.mark.slow
 def test_without_a_key_the_run_is_recorded_on_the_disk_and_each_step_once(offline):
-    first, second = sorted((offline[0] / "wandb").glob("offline-run-*/*.wandb"))
+    first, second = written(offline[0])
     before, after = history(first), history(second)
     assert [step for step in before if "train/loss" in before[step]] == [1, 2, 3, 4, 5, 6, 7, 8]
     assert [step for step in after if "train/loss" in after[step]] == [9, 10]
@@ -273,8 +279,9 @@ def test_without_a_key_the_run_is_recorded_on_the_disk_and_each_step_once(offlin
 
 @pytest.mark.slow
 def test_a_run_of_wandb_keeps_its_id_and_has_the_settings_and_the_sweep_as_its_group(offline):
-    paths = (offline[0] / "wandb").glob("offline-run-*/*.wandb")
-    started = [record.run for path in paths for record in records(path) if record.HasField("run")]
+    started = [
+        record.run for path in written(offline[0]) for record in records(path) if record.HasField("run")
+    ]
     assert len({run.run_id for run in started}) == 1
     assert {run.run_group for run in started} == {offline[0].parent.name}
     assert {run.display_name for run in started} == {"a job"}
@@ -284,7 +291,7 @@ def test_a_run_of_wandb_keeps_its_id_and_has_the_settings_and_the_sweep_as_its_g
 
 @pytest.mark.slow
 def test_the_final_numbers_are_in_the_summary_of_wandb(offline):
-    first = min((offline[0] / "wandb").glob("offline-run-*/*.wandb"))
+    first = written(offline[0])[0]
     updates = [record.summary.update for record in records(first) if record.HasField("summary")]
     found = {item.key or "/".join(item.nested_key): item.value_json for update in updates for item in update}
     assert found["result/psnr"] == "21.5"
@@ -292,7 +299,7 @@ def test_the_final_numbers_are_in_the_summary_of_wandb(offline):
 
 @pytest.mark.slow
 def test_nothing_that_wandb_could_collect_by_itself_is_in_its_files(offline):
-    content = b"".join(path.read_bytes() for path in (offline[0] / "wandb").glob("*/*.wandb"))
+    content = b"".join(path.read_bytes() for path in written(offline[0]))
     unwanted = [
         b"pytest",
         b"site-packages",
