@@ -219,7 +219,7 @@ def without_key(tmp_path_factory):
 
 
 def tracker(**changes) -> Wandb:
-    return Wandb(**{"every": 4, "project": "p", "entity": None, "mode": "auto", "timeout": 5, **changes})
+    return Wandb(**{"every": 4, "project": "p", "entity": None, "mode": "auto", "timeout": 60, **changes})
 
 
 def records(path: Path) -> Iterator:
