@@ -50,7 +50,9 @@ def as_text(rows: Sequence[Row]) -> str:
     keys = varying_keys(rows)
     has_arms = any(row.arm for row in rows)
     scores = _scores(rows)
-    lines = [["job", *(["arm"] if has_arms else []), *keys, "outcome", *SHOWN, *scores.columns]]
+    lines: list[list[Any]] = [
+        ["job", *(["arm"] if has_arms else []), *keys, "outcome", *SHOWN, *scores.columns]
+    ]
     for index, row in enumerate(rows):
         values = [row.number, *([row.arm] if has_arms else []), *(row.swept.get(key) for key in keys)]
         shown = row.summary | {"psnr": psnr_of(row.summary)}
