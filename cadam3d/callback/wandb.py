@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from cadam3d.callback.tracking import Tracking
-from cadam3d.core.checks import require_choice, require_range
+from cadam3d.core.checks import require, require_choice, require_range
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import is_whole, read_json, write_json
@@ -25,6 +25,10 @@ from cadam3d.io.run_folder import CONFIG, WANDB, WANDB_RUN, shown, sweep_of
 from cadam3d.state import RunContext
 
 MODES = ("auto", "offline")
+# The modes of wandb that send nothing; "disabled" records nothing either.
+SILENT_MODES = ("offline", "dryrun", "disabled")
+# Characters that the name of a project must not have.
+RESERVED = frozenset("/\\#?%:")
 FLUSH_SECONDS = 5.0
 
 
@@ -49,6 +53,13 @@ class Wandb(Tracking):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        require(
+            self.project != "" and not RESERVED & set(self.project),
+            "callback.wandb.project",
+            expected="a name without / \\ # ? % :",
+            got=self.project,
+            example="callback.wandb.project=cadam3d",
+        )
         require_choice("callback.wandb.mode", self.mode, MODES)
         require_range("callback.wandb.timeout", self.timeout, low=1, example=30)
 
@@ -67,7 +78,7 @@ class Wandb(Tracking):
         folder = shown(context.folder / WANDB)
         if mode == "online":
             say(f"Weights & Biases: sending settings, numbers and previews to {self._run.url}")
-        elif mode == "offline":
+        elif mode != "disabled":
             say(f"Weights & Biases: nothing is sent ({reason}). To send the run later, type:")
             say(f"  wandb sync {shlex.quote(str(folder))}")
 
@@ -96,7 +107,8 @@ class Wandb(Tracking):
         """Return the mode of wandb, and why nothing is sent."""
         if self.mode == "offline":
             return "offline", "callback.wandb.mode=offline"
-        if named := os.environ.get("WANDB_MODE"):
+        named = os.environ.get("WANDB_MODE")
+        if named in SILENT_MODES:
             return named, f"WANDB_MODE={named}"
         refusal = refused()
         return ("online", "") if refusal is None else ("offline", refusal)

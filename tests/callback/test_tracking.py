@@ -18,7 +18,7 @@ from cadam3d.commands.train import build_trainer, run_context
 from cadam3d.core.console import heard_by
 from cadam3d.core.errors import UserError
 from cadam3d.initializer.base import Initializer
-from cadam3d.io.run_folder import JOBS
+from cadam3d.io.run_folder import JOBS, occupant
 from cadam3d.settings.compose import component, components
 from cadam3d.settings.trust import require_contained
 from cadam3d.state import RunContext
@@ -127,6 +127,12 @@ def test_a_run_that_ends_with_an_error_closes_its_tracker(tmp_path, monkeypatch)
     with pytest.raises(ZeroDivisionError):
         train(tmp_path, recorder)
     assert recorder.calls[1:] == [(1, recorder.calls[1][1], None), ("close", False)]
+
+
+@pytest.mark.parametrize("name", ["tensorboard", "wandb"])
+def test_no_run_begins_in_a_folder_with_records_of_another_one(name, tmp_path):
+    (tmp_path / name).mkdir()
+    assert occupant(tmp_path) == name
 
 
 @pytest.mark.parametrize("name", ["tensorboard", "wandb"])
@@ -358,6 +364,8 @@ def test_wrong_values_name_their_key():
         UserError, match=r"^callback\.wandb\.mode: expected one of auto\|offline, got 'online'"
     ):
         tracker(mode="online")
+    with pytest.raises(UserError, match=r"^callback\.wandb\.project: expected a name without"):
+        tracker(project="me/mine")
     with pytest.raises(UserError, match=r"^callback\.wandb\.timeout: "):
         tracker(timeout=0)
     with pytest.raises(
