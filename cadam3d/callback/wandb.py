@@ -29,6 +29,7 @@ MODES = ("auto", "offline")
 SILENT_MODES = ("offline", "dryrun", "disabled")
 # Characters that the name of a project must not have.
 RESERVED = frozenset("/\\#?%:")
+LONGEST_NAME = 128  # characters, of runs and groups
 FLUSH_SECONDS = 5.0
 
 
@@ -122,8 +123,8 @@ class Wandb(Tracking):
             project=self.project,
             entity=self.entity,
             run_id=self._id,
-            run_name=context.folder.resolve().name,
-            run_group=None if sweep is None else sweep.name,
+            run_name=context.folder.resolve().name[:LONGEST_NAME],
+            run_group=None if sweep is None else sweep.name[:LONGEST_NAME],
             resume="allow",
             root_dir=str(context.folder.resolve()),
             # A run that another part of this process has started stays as it is.
