@@ -22,9 +22,8 @@ class Tracking(Callback):
     """Pass the numbers and the previews of a run on to a program that shows many runs.
 
     The numbers have the names of ``metrics.jsonl`` and ``summary.json`` behind the words ``train/``,
-    ``refine/`` and ``result/``. A tracker that fails is switched off with a warning, whatever it raised,
-    because it is code of others that the run does not need. Nothing here draws a random number or changes
-    the run.
+    ``refine/`` and ``result/``. No run depends on a tracker: one that fails is switched off with a warning,
+    whatever it raised. Nothing here draws a random number or changes the run.
     """
 
     package: ClassVar[str]  # that pip installs; also the name of the callback and of the extra

@@ -70,7 +70,7 @@ class Wandb(Tracking):
         os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         self._file = context.folder / WANDB_RUN
         self._id, self._recorded = known_run(self._file)
-        mode, reason = self._choose_mode()
+        mode, reason = self._choose_mode(context.folder.resolve())
         self._run = self._start(context, mode)
         if mode == "online":
             # The server may have more steps than this disk knows of, or fewer.
@@ -104,13 +104,15 @@ class Wandb(Tracking):
             self._run.finish(exit_code=0 if is_complete else 1)
             self._remove_links()
 
-    def _choose_mode(self) -> tuple[str, str]:
+    def _choose_mode(self, run: Path) -> tuple[str, str]:
         """Return the mode of wandb, and why nothing is sent."""
         if self.mode == "offline":
             return "offline", "callback.wandb.mode=offline"
         named = os.environ.get("WANDB_MODE")
         if named in SILENT_MODES:
             return named, f"WANDB_MODE={named}"
+        if brings_settings(run):
+            return "offline", "the folder of the run has settings of wandb, which could name another server"
         refusal = refused()
         return ("online", "") if refusal is None else ("offline", refusal)
 
@@ -170,6 +172,16 @@ def known_run(path: Path) -> tuple[str, int]:
     if isinstance(name, str) and re.fullmatch("[0-9a-f]{16}", name) and is_whole(recorded):
         return name, recorded
     return secrets.token_hex(8), 0
+
+
+def brings_settings(run: Path) -> bool:
+    """Return whether wandb would read settings from the folder of a run, or from that of its sweep.
+
+    wandb reads ``wandb/settings`` in the current folder, and sends the API key to the server that is named
+    there. This program never writes that file, so it is of unknown origin.
+    """
+    here = Path.cwd()
+    return here.is_relative_to(sweep_of(run) or run) and (here / WANDB / "settings").exists()
 
 
 def refused() -> str | None:

@@ -13,7 +13,7 @@ from cadam3d.callback import tracking
 from cadam3d.callback.previews import Previews
 from cadam3d.callback.tensorboard import TensorBoard
 from cadam3d.callback.tracking import Tracking
-from cadam3d.callback.wandb import Wandb, known_run, refused
+from cadam3d.callback.wandb import Wandb, brings_settings, known_run, refused
 from cadam3d.commands.train import build_trainer, run_context
 from cadam3d.core.console import heard_by
 from cadam3d.core.errors import UserError
@@ -344,6 +344,21 @@ def test_a_server_that_cannot_be_reached_is_a_reason_to_stay_offline(without_key
     reason = refused()
     assert reason is not None
     assert "\n" not in reason
+
+
+def test_settings_of_wandb_in_the_folder_of_a_run_are_of_unknown_origin(tmp_path, monkeypatch):
+    job = tmp_path / "sweep/job"
+    for folder in (tmp_path, job.parent, job):
+        (folder / "wandb").mkdir(parents=True)
+        (folder / "wandb/settings").write_text("[default]\nbase_url = http://elsewhere\n")
+    (job.parent / JOBS).write_text("{}")
+    found = []
+    for folder in (tmp_path, job.parent, job):
+        monkeypatch.chdir(folder)
+        found.append(brings_settings(job))
+    assert found == [False, True, True]
+    (job / "wandb/settings").unlink()
+    assert not brings_settings(job)
 
 
 FOREIGN = [None, "", "[]", '{"id": "../evil", "recorded": 3}', '{"id": "0123456789abcdef"}']
