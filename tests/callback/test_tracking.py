@@ -2,6 +2,7 @@
 
 import os
 import struct
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -245,9 +246,13 @@ def records(path: Path) -> Iterator:
 
 
 def written(folder: Path) -> list[Path]:
-    """Return the files of wandb in the folder of a run, the oldest first."""
-    found = (folder / "wandb").glob("offline-run-*/*.wandb")
-    return sorted(found, key=lambda path: path.stat().st_mtime_ns)
+    """Return the files of wandb in the folder of a run in the order of steps, once they are complete."""
+    found = list((folder / "wandb").glob("offline-run-*/*.wandb"))
+    end = time.monotonic() + 30
+    while not all(any(record.HasField("exit") for record in records(path)) for path in found):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    return sorted(found, key=lambda path: min(history(path)))
 
 
 def history(path: Path) -> dict[int, set[str]]:
