@@ -24,7 +24,7 @@ class Measurand:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What one metric has measured of one asset.
+    """Numbers that one metric has measured of one asset.
 
     ``numbers`` become entries of ``summary.json`` and ``eval.json``. ``details`` says, for some of them by
     name, how the number came about: protocol, model, values of the single views and so on. It must consist

@@ -48,7 +48,7 @@ class Protocol(PictureSettings, ABC):
     name: str
     crop: str  # before the preprocessing of the model: "none", or "object" for a square around it
     text: str  # what the picture is compared with; {} is the prompt
-    # Name of a scorer, such as "clip", to a mapping with the keys "id" and "revision".
+    # Name of a scorer, such as "clip", to None or a mapping with the keys "id" and "revision".
     models: Mapping[str, Any]
 
     def __post_init__(self) -> None:
@@ -63,13 +63,14 @@ class Protocol(PictureSettings, ABC):
             example="protocol.text='\"a DSLR photo of {}\"'",
         )
         for scorer, model in self.models.items():
-            is_model = isinstance(model, Mapping) and set(model) == {"id", "revision"}
+            is_named = isinstance(model, Mapping) and set(model) == {"id", "revision"}
+            is_named = is_named and isinstance(model["id"], str) and isinstance(model["revision"], str | None)
             require(
-                is_model and isinstance(model["id"], str) and isinstance(model["revision"], str | None),
+                model is None or is_named,
                 f"protocol.models.{scorer}",
-                expected="a model with the keys id and revision",
+                expected="the id and the revision of a model, or null",
                 got=model,
-                example=f"protocol.models.{scorer}.revision=null",
+                example=f"'protocol.models.{scorer}={{id:OWNER/NAME,revision:null}}'",
             )
 
     @cached_property

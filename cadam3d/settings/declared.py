@@ -234,6 +234,8 @@ def _word(declared: Any) -> str:
     if origin in LISTS:
         items = {int: "whole numbers", float: "numbers", str: "texts"}
         return f"a list of {items.get(arguments[0] if arguments else Any, 'values')}"
+    if origin in DICTS:
+        return "keys with values"
     if declared is object:
         return "a component"
     return f"an object of class {declared.__name__}" if inspect.isclass(declared) else str(declared)
@@ -305,5 +307,5 @@ def _grammar(value: Any) -> str:
         return "[" + ",".join(map(_grammar, value)) + "]"
     if value is None or isinstance(value, bool):
         return yaml.safe_dump(value).splitlines()[0]
-    # Hydra's grammar reads an interpolation inside another one only between quotation marks.
-    return f'"{value}"' if "${" in str(value) else str(value)
+    # Between quotation marks, Hydra's grammar reads an interpolation inside another one, and braces as text.
+    return f'"{value}"' if "{" in str(value) else str(value)

@@ -7,7 +7,7 @@ import torch
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.render import RenderOutput
-from cadam3d.metric.protocol import Protocol, RingProtocol, SphereProtocol
+from cadam3d.metric.protocol import ModelName, Protocol, RingProtocol, SphereProtocol
 from cadam3d.settings.compose import option
 
 PICTURES = {
@@ -117,6 +117,12 @@ def test_without_a_crop_the_pictures_are_those_of_the_renderer():
 def test_a_picture_without_an_object_is_not_cropped():
     empty = disc_at(8, 30, 0)
     assert all((images[..., 2] == 1).all() for images in replace(RING, crop="object").images(empty))
+
+
+def test_a_protocol_may_leave_a_model_out():
+    protocol = replace(RING, models={"clip": None, "pick": {"id": "one/pick", "revision": None}})
+    assert protocol.model("clip") is protocol.model("hps") is None
+    assert protocol.model("pick") == ModelName("one/pick", None)
 
 
 def test_the_prompt_goes_where_the_braces_are():
