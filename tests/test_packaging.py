@@ -139,7 +139,8 @@ def test_every_imported_package_is_declared():
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     core = {re.match(r"[\w-]+", line).group() for line in project["dependencies"]}
     optional = project["optional-dependencies"]
-    extras = [optional[name] for name in ("diffusers", "formats", "gsplat", "notebook", "texture")]
+    names = ("diffusers", "formats", "gsplat", "notebook", "tensorboard", "texture", "wandb")
+    extras = [optional[name] for name in names]
     extra = {re.match(r"[\w-]+", line).group() for lines in extras for line in lines}
     provides = metadata.packages_distributions()
     trees = [ast.parse(path.read_text(encoding="utf-8")) for path in find("cadam3d", "*.py")]

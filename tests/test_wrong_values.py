@@ -83,6 +83,7 @@ WHOLE = {
         "exporter.mesh.textured_triangles",
     ],
     "metric=[fidelity]": ["metric.fidelity.views", "metric.fidelity.size"],
+    "metric=[janus]": ["metric.janus.views"],
     "metric=[mesh]": [
         "metric.mesh.resolution",
         "metric.mesh.triangles",
@@ -90,6 +91,8 @@ WHOLE = {
         "metric.mesh.seed",
     ],
     "callback=[metrics]": ["callback.metrics.every"],
+    "callback=[tensorboard]": ["callback.tensorboard.every"],
+    "callback=[wandb]": ["callback.wandb.every"],
     "callback=[previews]": ["callback.previews.every", "callback.previews.views", "callback.previews.size"],
     "callback=[checkpoint]": ["callback.checkpoint.every", "callback.checkpoint.keep"],
 }

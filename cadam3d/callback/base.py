@@ -1,12 +1,17 @@
 """Callback: watches the training loop. It may write files but never change training."""
 
 from abc import ABC
+from collections.abc import Mapping
+from typing import Any
 
 from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState
 
 
 class Callback(ABC):  # noqa: B024 (every hook has a sensible default: do nothing)
-    """Override the hooks that you need. The order of calls is ``start, (refine?, step, pause*)*, end``."""
+    """Override the hooks that you need.
+
+    The order of calls is ``start, (refine?, step, pause*)*, end, result``.
+    """
 
     def on_start(self, context: RunContext, state: TrainState) -> None:  # noqa: B027
         """Called before the first step, also after a resume (then ``state.step`` > 0)."""
@@ -22,6 +27,9 @@ class Callback(ABC):  # noqa: B024 (every hook has a sensible default: do nothin
 
     def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:  # noqa: B027
         """Called after the last step, whatever the outcome."""
+
+    def on_result(self, context: RunContext, summary: Mapping[str, Any]) -> None:  # noqa: B027
+        """Called when the outputs of the run are written and measured. ``summary`` is ``summary.json``."""
 
     def on_abort(self, context: RunContext) -> None:  # noqa: B027
         """Called when the loop raised an exception, to release the terminal.

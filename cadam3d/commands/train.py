@@ -163,6 +163,8 @@ def _train(
         # This is the last entry of a complete summary.
         summary["warnings"] = warnings
         write_json(folder / SUMMARY, summary)
+        for callback in trainer.callbacks:
+            callback.on_result(context, summary)
 
         report = write_report(
             folder,

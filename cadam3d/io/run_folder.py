@@ -49,6 +49,9 @@ LIVE_STOP = "live/stop"  # training removes this file, saves and ends
 LIVE_WATCHED = "live/watched"  # touched by every page that shows the run
 SNAPSHOTS = "snapshots"  # a folder: the Gaussians at some steps, packed for the report
 SAVED = "saved"  # a folder: assets and states that a user has saved during training
+TENSORBOARD = "tensorboard"  # a folder: event files
+WANDB = "wandb"  # a folder: what Weights & Biases keeps of the run on this disk
+WANDB_RUN = "wandb/cadam3d.json"  # under which id it is known there, and the last step that was recorded
 PROGRESS = "progress.mp4"  # or .webm or .gif
 TURNTABLE = "turntable.mp4"  # or .webm or .gif
 VIEWER = "viewer.html"
@@ -126,6 +129,11 @@ def snapshots(run: Path) -> dict[int, Path]:
     return dict(sorted((int(name.group(1)), path) for name, path in named if name is not None))
 
 
+def sweep_of(run: Path) -> Path | None:
+    """Return the folder of the sweep that the run in the folder ``run`` is a job of; None for another run."""
+    return run.parent if (run.parent / JOBS).is_file() else None
+
+
 def holds_run(folder: Path) -> bool:
     """Return whether a run has left results or checkpoints in ``folder``."""
     return any((folder / name).exists() for name in (SUMMARY, CHECKPOINTS))
@@ -152,8 +160,8 @@ def _written_by_runs() -> tuple[str, ...]:
     videos = [video_name(name, codec) for name in (TURNTABLE, PROGRESS) for codec in ("mp4", "webm", "gif")]
     formats = (ASSET_COMPRESSED_PLY, ASSET_GLB, ASSET_KSPLAT, ASSET_SOG, ASSET_SPLAT, ASSET_SPZ)
     meshes = (ASSET_MESH_GLB, ASSET_MESH_MTL, ASSET_MESH_OBJ, ASSET_MESH_PLY, ASSET_MESH_PNG)
-    folders = (CANDIDATES, CHECKPOINTS, HYDRA, IMAGES, LIVE, PREVIEWS, SAVED, SNAPSHOTS)
-    return (*files, *videos, *formats, *meshes, *folders)
+    folders = (CANDIDATES, CHECKPOINTS, HYDRA, IMAGES, LIVE, PREVIEWS, SAVED, SNAPSHOTS, TENSORBOARD)
+    return (*files, *videos, *formats, *meshes, *folders, WANDB)
 
 
 def video_name(name: str, codec: str) -> str:

@@ -1,0 +1,127 @@
+"""Tracking: what TensorBoard and Weights & Biases have in common."""
+
+import logging
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, ClassVar
+
+from cadam3d.callback.base import Callback
+from cadam3d.core.checks import require_whole
+from cadam3d.core.console import say
+from cadam3d.core.errors import UserError
+from cadam3d.io.image import step_picture
+from cadam3d.io.run_folder import PREVIEWS
+from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState
+
+
+@dataclass(kw_only=True)
+class Tracking(Callback):
+    """Pass the numbers and the previews of a run on to a program that shows many runs.
+
+    The numbers have the names of ``metrics.jsonl`` and ``summary.json`` behind the words ``train/``,
+    ``refine/`` and ``result/``. No run depends on a tracker: one that fails is switched off with a warning,
+    whatever it raised. Nothing here draws a random number or changes the run.
+    """
+
+    package: ClassVar[str]  # that pip installs; also the name of the callback and of the extra
+
+    every: int  # steps
+    _works: bool = field(default=True, init=False, repr=False)
+    # The last step that was reported, if any, and its numbers. They are passed on one step later, when the
+    # preview of the step has been drawn, wherever the callbacks are in the list.
+    _step: int | None = field(default=None, init=False, repr=False)
+    _numbers: dict[str, float] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if find_spec(self.package) is None:
+            raise UserError(
+                f"callback={self.package}: expected the package {self.package}, got none. "
+                f"Try: pip install 'cadam3d[{self.package}]'"
+            )
+        require_whole(f"callback.{self.package}.every", self.every, low=1, example=10)
+
+    @abstractmethod
+    def open(self, context: RunContext, step: int) -> None:
+        """Begin to record, or continue after ``step`` of the same run."""
+
+    @abstractmethod
+    def record(self, step: int, numbers: Mapping[str, float], preview: Path | None) -> None:
+        """Record the numbers and the picture of one step. Steps come in order."""
+
+    @abstractmethod
+    def conclude(self, context: RunContext, step: int, results: Mapping[str, float]) -> None:
+        """Record the numbers of the finished run."""
+
+    @abstractmethod
+    def close(self, *, is_complete: bool) -> None:
+        """Write what is left. ``is_complete`` is False if the run ended with an error."""
+
+    def on_start(self, context: RunContext, state: TrainState) -> None:
+        """Open the tracker at the current step."""
+        self._works, self._step, self._numbers = True, None, {}
+        self._attempt(lambda: self.open(context, state.step))
+
+    def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
+        """Keep the counts and the statistics of a refinement for :meth:`on_step` of the same step."""
+        self._pass_on(context, report.step)
+        counts = {
+            name: each for name, each in vars(report).items() if isinstance(each, int) and name != "step"
+        }
+        numbers = counts | report.statistics
+        self._numbers |= {f"refine/{name}": number for name, number in numbers.items()}
+
+    def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
+        """Keep the numbers of a multiple of ``every``, and of the first and the last step."""
+        self._pass_on(context, report.step)
+        if report.step % self.every == 0 or report.step in (1, context.total_steps):
+            numbers = {
+                "loss": report.loss,
+                "num_gaussians": report.num_gaussians,
+                "seconds": state.seconds,
+                **report.log,
+            }
+            self._numbers |= {f"train/{name}": number for name, number in numbers.items()}
+
+    def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
+        """Record the last step."""
+        self._pass_on(context, None)
+
+    def on_result(self, context: RunContext, summary: Mapping[str, Any]) -> None:
+        """Record the numbers of the summary and close the tracker."""
+        numbers = {f"result/{name}": each for name, each in summary.items() if type(each) in (int, float)}
+        self._attempt(lambda: self.conclude(context, summary["steps"], numbers))
+        self._attempt(lambda: self.close(is_complete=True))
+
+    def on_abort(self, context: RunContext) -> None:
+        """Record what there is and close the tracker."""
+        self._pass_on(context, None)
+        self._attempt(lambda: self.close(is_complete=False))
+
+    def _pass_on(self, context: RunContext, next_step: int | None) -> None:
+        """Record the step that was reported before ``next_step``, which is None after the last one."""
+        step, numbers = self._step, self._numbers
+        if step == next_step:
+            return
+        self._step, self._numbers = next_step, {}
+        if step is None:
+            return
+        picture = step_picture(context.folder / PREVIEWS, step)
+        preview = picture if picture.is_file() else None
+        if numbers or preview is not None:
+            self._attempt(lambda: self.record(step, numbers, preview))
+
+    def _attempt(self, action: Callable[[], None]) -> None:
+        if not self._works:
+            return
+        try:
+            action()
+        except Exception as error:
+            self._works = False
+            reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+            say(
+                f"Warning: callback.{self.package} has stopped ({reason}). The run continues.",
+                logging.WARNING,
+            )

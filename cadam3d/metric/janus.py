@@ -1,0 +1,238 @@
+"""Janus: how many fronts an asset has. Text-to-3D often shows the same face from several sides.
+
+There are two ways to find out. Their numbers have different meanings and must not be compared.
+
+**By the truth.** Each view of the asset looks like some view of the true object. If the asset has one front,
+its views show every side of the object as often as the object itself does. If it has two, one side is seen
+twice and another one never. Only what differs between the views of the true object says from where it is
+seen. Pictures are therefore projected onto the space of these differences, which removes blur and noise.
+Brightness is left out, because light makes a difference between the sides of a ball.
+
+**By a model.** A CLIP model says for each view whether it is a front, a side or a back view of the prompt,
+and the asset has as many fronts as there are separate maxima of "front" over the azimuth.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.core.cameras import Cameras, fitting_distance, turntable
+from cadam3d.core.checks import require_choice, require_range, require_whole
+from cadam3d.metric.base import Measurand, Measurement
+from cadam3d.metric.clip import load_clip
+from cadam3d.metric.scoring import ModelMetric, Scorer
+
+WAYS = ("auto", "truth", "model")
+
+# By the truth.
+VIEWS = 24
+SIZE = 48  # pixels
+ELEVATION_DEG = 15.0
+FOV_DEG = 40.0
+# Views that are rendered or traced at once, which bounds the memory.
+VIEWS_AT_ONCE = 12
+# Added to the sum of the channels before colours are divided by it, so that black is a colour of its own.
+DARK = 0.1
+# Mean squared difference between two views below which an object looks the same from all sides. On
+# prior=shapes, bodies of revolution have at most 10 ** -4, and the least of all others, a lighthouse, 0.002.
+LEAST_SPREAD = 10**-3.5
+# Differences count as evidence if they are larger than this share of the error of the asset, and than this
+# share of the spread. With smaller values, small errors decide ties such as those between the sides of a
+# cube. Larger ones hide the second front of a blurred asset.
+NOISE = 0.25
+LEAST_NOISE = 0.03
+# Directions with a smaller share of the largest singular value are left out of the projection.
+LEAST_DIRECTION = 1e-3
+
+# By a model.
+SIDES = ("front", "side", "back")
+# Difference between the highest and the lowest probability of a front below which no view is one.
+LEAST_CONTRAST = 0.1
+# Relative to the lowest and the highest probability; views above it belong to a front.
+HALF = 0.5
+# A second front is at least this far from the first one, in degrees.
+APART_DEG = 120.0
+MOST_VIEWS = 360
+
+
+@dataclass(frozen=True, kw_only=True)
+class Janus(ModelMetric):
+    """Count the fronts of an asset, by the true object or by a model of pictures and texts."""
+
+    node: ClassVar[str] = "metric.janus"
+    number: ClassVar[str] = "janus"
+    kind: ClassVar[str] = "clip"
+    less_is_better: ClassVar[bool] = True
+
+    by: str  # auto | truth | model
+    views: int  # azimuths that the model sees
+    elevation_deg: float  # of these views, in [-90, 90]
+
+    def __post_init__(self) -> None:
+        require_choice("metric.janus.by", self.by, WAYS)
+        require_whole("metric.janus.views", self.views, low=6, high=MOST_VIEWS, example=24)
+        require_range("metric.janus.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
+
+    def prepare(self) -> None:
+        """Find the files of the model if the line asks for one. With ``by=auto`` the truth may replace it."""
+        if self.by == "model":
+            super().prepare()
+
+    def scorer(self, device: torch.device) -> Scorer:
+        """Return the model, whose scores are the logits of the texts for a picture."""
+        clip = load_clip(self.source(), device)
+        direction = cache(lambda text: clip.texts([text])[0])
+        # The same pictures are compared with several texts in a row.
+        pictures = lru_cache(maxsize=1)(clip.pictures)
+        return Scorer(
+            score=lambda images, text: clip.logit_scale * pictures(images) @ direction(text),
+            facts=clip.facts,
+            complaint=clip.complaint,
+        )
+
+    def measure(self, measurand: Measurand) -> Measurement:
+        """Return ``janus`` and ``janus_fronts``; nothing if there is no truth or no Gaussian.
+
+        By the truth, ``janus`` is the share of the views that show a side which other views show already: 0
+        for the true object, and nearly 1 - 1/k for k equal fronts. ``janus_fronts`` is how often the asset
+        shows the quarter turn that it shows most, compared with the true object. By a model, ``janus`` is the
+        height of the second front, from 0 (there is none) to 1 (it is as clear as the first), and
+        ``janus_fronts`` is the number of fronts. The turn of the asset does not matter. Without a front, as
+        of an object that looks the same from all sides, there is no number, and the record says so.
+        """
+        if len(measurand.gaussians) == 0 or (self.by == "truth" and measurand.truth is None):
+            return Measurement({})
+        if self.by == "model" or measurand.truth is None:
+            return self._by_model(measurand)
+        asset = _features(lambda cameras, background: measurand.render(cameras, background).rgb[None])[0]
+        modes = [_compare(asset, mode) for mode in _features(measurand.truth.images)]
+        return min(modes, key=lambda each: each.mismatch).measurement()
+
+    def _by_model(self, measurand: Measurand) -> Measurement:
+        scorer = self.scorer(measurand.gaussians.device)
+        texts = [f"{side} view of {measurand.prompt}" for side in SIDES]
+        cameras = self.protocol.ring(self.views, self.elevation_deg)
+        logits = []
+        for view in range(self.views):
+            one = cameras.index(slice(view, view + 1))
+            images = measurand.render(one, self.protocol.backgrounds(1)).rgb.detach().float().clamp(0, 1)
+            logits.append(torch.cat([scorer.score(images, text) for text in texts]))
+        fronts = torch.stack(logits).detach().double().cpu().softmax(dim=1)[:, 0]
+        shown = {
+            "views": self.views,
+            "elevations_deg": [float(self.elevation_deg)],
+            "crop": "none",
+            "text": "SIDE view of {}",
+            "aggregation": "fronts",
+        }
+        record = {
+            "protocol": self.protocol.record() | shown,
+            **scorer.facts,
+            "text": texts[0],
+            # The probability of each view, from azimuth 0 on, to be a front.
+            "views": [round(float(each), 6) for each in fronts],
+        }
+        complaint = scorer.complaint(texts[0])
+        warnings = () if complaint is None else (complaint,)
+        lowest, highest = fronts.min(), fronts.max()
+        if highest - lowest < LEAST_CONTRAST:
+            return Measurement({}, _none("the model sees no side as the front", record), warnings)
+        heights = (fronts - lowest) / (highest - lowest)
+        away = torch.arange(self.views) * (360.0 / self.views)
+        others = heights.roll(-int(heights.argmax()))[(away >= APART_DEG) & (away <= 360 - APART_DEG)]
+        is_front = heights >= HALF
+        numbers = {
+            "janus": float(others.max()),
+            "janus_fronts": float((is_front & ~is_front.roll(1)).sum()),
+        }
+        return Measurement(numbers, _records(numbers, record), warnings)
+
+
+def _none(reason: str, record: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the records for an asset without a number."""
+    return {"janus": {"value": None, "reason": reason, **record}}
+
+
+def _records(numbers: dict[str, float], record: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return {name: {"value": value, **record} for name, value in numbers.items()}
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """The views of an asset, compared with those of one mode of the truth."""
+
+    likeness: Float[Tensor, "v v"]  # of each view of the asset to each true one; rows have the sum 1
+    expected: Float[Tensor, "v"]  # how often the true object shows each side
+    mismatch: float  # mean squared difference to the most similar true view
+    error: float  # the same after the projection
+    spread: float  # mean squared difference between two true views
+
+    def measurement(self) -> Measurement:
+        """Return the two numbers with their record."""
+        settings = {"views": VIEWS, "elevation_deg": ELEVATION_DEG, "fov_y_deg": FOV_DEG, "size": SIZE}
+        shown = self.likeness.sum(dim=0)
+        views = {
+            # For each view of the asset, from azimuth 0 on, the azimuth of the true view that it looks like.
+            "looks_like_deg": [360.0 / VIEWS * int(best) for best in self.likeness.argmax(dim=1)],
+            # For each true view, from azimuth 0 on, how often it is shown, and how often it should be.
+            "shown": [round(float(count), 4) for count in shown],
+            "expected": [round(float(count), 4) for count in self.expected],
+            "error": self.error,
+            "spread": self.spread,
+        }
+        record = {"protocol": {"name": "truth", **settings}, "views": views}
+        if self.spread < LEAST_SPREAD:
+            reason = "the true object looks the same from all sides, so it has no front"
+            return Measurement({}, _none(reason, record))
+        numbers = {
+            "janus": float(0.5 * (shown - self.expected).abs().sum() / VIEWS),
+            "janus_fronts": float((_by_quarters(shown) / _by_quarters(self.expected)).max().round()),
+        }
+        return Measurement(numbers, _records(numbers, record))
+
+
+def _by_quarters(counts: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+    """Return the sums over the quarter turns that begin at each view."""
+    return torch.stack([counts.roll(-first)[: VIEWS // 4].sum() for first in range(VIEWS)])
+
+
+def _compare(asset: Float[Tensor, "v p"], true: Float[Tensor, "v p"]) -> _Comparison:
+    pixels = true.shape[1]
+    centre = true.mean(dim=0)
+    _, sizes, directions = torch.linalg.svd(true - centre, full_matrices=False)
+    directions = directions[sizes > LEAST_DIRECTION * sizes.max()]
+    ours, theirs = (asset - centre) @ directions.T, (true - centre) @ directions.T
+    differences = torch.cdist(ours, theirs).square() / pixels
+    among_true = torch.cdist(theirs, theirs).square() / pixels
+    spread = float(among_true.sum()) / (VIEWS * (VIEWS - 1))
+    error = float(differences.min(dim=1).values.mean())
+    noise = max(NOISE * error, LEAST_NOISE * spread, torch.finfo(torch.float64).tiny)
+    return _Comparison(
+        likeness=(-differences / noise).softmax(dim=1),
+        expected=(-among_true / noise).softmax(dim=1).sum(dim=0),
+        mismatch=float(torch.cdist(asset, true).square().min(dim=1).values.mean()) / pixels,
+        error=error,
+        spread=spread,
+    )
+
+
+def _features(images: Callable[[Cameras, Tensor], Tensor]) -> Float[Tensor, "m v p"]:
+    """Return opacity and hue of each pixel of all views, for each mode, whatever the light is."""
+    cameras = turntable(
+        VIEWS, elevation_deg=ELEVATION_DEG, distance=fitting_distance(FOV_DEG), fov_y_deg=FOV_DEG, size=SIZE
+    )
+    parts = []
+    for first in range(0, VIEWS, VIEWS_AT_ONCE):
+        some = cameras.index(slice(first, first + VIEWS_AT_ONCE))
+        black, white = (
+            images(some, torch.full((len(some), 3), level)).detach().cpu().double().clamp(0, 1)
+            for level in (0.0, 1.0)
+        )
+        alpha = 1 - (white - black).mean(dim=-1, keepdim=True)
+        parts.append(torch.cat([alpha, black / (black.sum(dim=-1, keepdim=True) + DARK)], dim=-1))
+    return torch.cat(parts, dim=1).flatten(2)
