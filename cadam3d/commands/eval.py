@@ -73,6 +73,8 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     warnings: list[str] = []
     metrics: dict[str, Metric] = components(cfg.metric, Metric, "metric")
     result: dict[str, Any] = {"run": str(shown(folder)), "prompt": own.prompt}
+    # Whatever the metrics are, this says to which asset the numbers belong.
+    result["num_gaussians"] = len(asset.gaussians)
     result |= measure(
         metrics,
         Measurand(
