@@ -221,6 +221,28 @@ def test_a_sweep_continues_after_a_killed_job_and_the_same_line_completes_it(fin
     assert not (tmp_path / "outputs").exists()  # outputs/latest is for single runs
 
 
+def test_four_attempts_survive_a_kill_in_the_middle_and_the_best_is_linked(tmp_path, type_in):
+    words = [*BARE, "metric=[fidelity]", "metric.fidelity.views=1", "attempts=4", "select=psnr"]
+    words.append("hydra.run.dir=cube")
+    folder = tmp_path / "cube"
+    process = start(tmp_path, "train", *words)
+    wait_for(folder / "seed=1" / "config.yaml", process)
+    process.kill()  # SIGKILL: the first attempt has a result, and the second one trains
+    process.communicate()
+    untouched = (folder / "seed=0" / "summary.json").stat().st_mtime_ns
+    assert not (folder / "best").exists()
+
+    out, _ = type_in(tmp_path, "train", *words)
+    assert (folder / "seed=0" / "summary.json").stat().st_mtime_ns == untouched
+    psnr = [json.loads((folder / f"seed={seed}" / "summary.json").read_text())["psnr"] for seed in range(4)]
+    assert len(set(psnr)) == 4  # four different assets
+    best = psnr.index(max(psnr))
+    assert (folder / "best").readlink() == Path(f"seed={best}")
+    assert f"is seed={best} with {psnr[best]:.2f} dB" in out
+    assert (tmp_path / "outputs" / "latest" / "best" / "asset.ply").is_file()
+    assert f"is seed={best} with" in (folder / "report.html").read_text()
+
+
 def rows_of(sweep: Path) -> list[dict[str, str]]:
     with (sweep / "sweep.csv").open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))

@@ -125,6 +125,18 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         (*A_CUBE, "rasterizer=gsplat"),
         (*A_CUBE, "seed=-1"),
     ],
+    "attempts": [
+        (*A_CUBE, "attempts=0"),
+        (*A_CUBE, "attempts=2", "seed=-1"),
+        (*A_CUBE, "attempts=2", "select=psnrr"),
+        (*A_CUBE, "attempts=2", "select=mesh_fscore"),
+        (*A_CUBE, "attempts=2", "metric=[]"),
+        (*A_CUBE, "attempts=2", "hydra.run.dir=a run"),
+        (*A_CUBE, "attempts=1", "dry_run=true"),
+        ("train", "resume=a run", "attempts=2"),
+        ("train", "resume=a sweep"),
+        ("sweep", "prompt=a red cube", "densifier=cadam,none", "attempts=2"),
+    ],
     "prompts": [
         ("train", "prompt=a red cuube"),
         ("train", "prompt="),
@@ -198,6 +210,8 @@ GAPS = (
 LONGEST_WAY = 4  # messages
 # Code whose messages need what these tests lack. A key is a folder, a file, or FILE::FUNCTION.
 ELSEWHERE: dict[str, str] = {
+    "commands/attempts.py::_keep": "needs a folder that cannot be written",
+    "commands/attempts.py::_nothing_to_choose_by": "needs attempts that have ended; see tests/sweep",
     "commands/eval.py::_evaluate_sweep": "needs a sweep whose jobs all fail",
     "commands/eval.py::start_of": "needs the folder of a stranger",
     "commands/eval.py::_not_saved": "needs a folder that cannot be written; see tests/commands",
