@@ -177,7 +177,9 @@ def _command(line: Line, task: Task) -> int:
     """Run a command once, or show one of Hydra's pages about it."""
     options = line.options
     if wants_page(options) or options.cfg:
-        run_hydra(line.command, [*line.overrides, *line.flags], task)
+        has_attempts = any(key_of(override) == "attempts" for override in line.overrides)
+        shown = [each for each in line.overrides if not (has_attempts and _is_of_sweeps(each))]
+        run_hydra(line.command, [*shown, *line.flags], task)
         return 0
     if line.command == "train":
         return _train_once_or_more(line, task)

@@ -60,6 +60,7 @@ def read_attempts(
         prompts=None,
         jobs=[Job("", f"{SEED}{seed}", (*common, f"seed={seed}"), None) for seed in seeds],
         command="train",
+        shown=() if cfg.get("select") is None else (cfg.select,),
         place=expanded(str(cfg.hydra.run.dir)) if is_chosen else _place(cfg, axes),
     )
     return sweep, Composer(options, search_path(overrides))
