@@ -26,6 +26,33 @@ def clip_tokenizer(folder: Path, **options):
     return CLIPTokenizer.from_pretrained(folder, **{"model_max_length": 77, **options})
 
 
+def clip(folder: Path, seed: int = 0) -> Path:
+    """Save a small CLIP model with its tokenizer and the preprocessing of its pictures."""
+    from transformers import CLIPConfig, CLIPImageProcessorPil, CLIPModel
+
+    tokenizer = clip_tokenizer(folder)
+    last = len(tokenizer) - 1
+    small = {"hidden_size": 16, "intermediate_size": 24, "num_hidden_layers": 2, "num_attention_heads": 2}
+    words = {"vocab_size": last + 1, "bos_token_id": last - 1, "eos_token_id": last, "pad_token_id": last}
+    config = CLIPConfig(
+        text_config=small | words,
+        vision_config=small | {"image_size": 32, "patch_size": 8},
+        projection_dim=12,
+    )
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        model = CLIPModel(config)
+        # Drawn larger than usual, so that pictures and texts differ clearly.
+        for parameter in model.parameters():
+            parameter.data *= 4 if parameter.dim() > 1 else 1
+        model.save_pretrained(folder)
+    tokenizer.save_pretrained(folder)
+    CLIPImageProcessorPil(size={"shortest_edge": 32}, crop_size={"height": 32, "width": 32}).save_pretrained(
+        folder
+    )
+    return folder
+
+
 def t5_tokenizer():
     """Return a unigram tokenizer, trained on a dozen words."""
     from tokenizers import Tokenizer, models, pre_tokenizers, trainers

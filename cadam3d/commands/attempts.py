@@ -15,7 +15,13 @@ from cadam3d.core.quality import QUALITIES
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.run_folder import ASSET, BEST, CHOICE, REPORT, shown
 from cadam3d.settings.line import setting_word
-from cadam3d.sweep.attempts import attempt_of, existing_attempts, read_attempts, require_measured
+from cadam3d.sweep.attempts import (
+    attempt_of,
+    existing_attempts,
+    read_attempts,
+    require_measured,
+    require_one_method,
+)
 from cadam3d.sweep.choice import PREFERRED, Choice, choose
 from cadam3d.sweep.folder import load
 from cadam3d.sweep.start import folder_of, run_sweep
@@ -40,9 +46,11 @@ def run(
     ended = run_sweep(sweep, composer, overrides, flags, on_start=link_latest)
     if ended.was_dry:
         return ended.code
-    attempts = [attempt_of(row) for row in load(ended.folder)]
+    rows = load(ended.folder)
+    attempts = [attempt_of(row) for row in rows]
     choice = choose(attempts, select)
     if choice is not None:
+        require_one_method(choice, rows, ended.folder)
         _keep(choice, ended.folder)
     if not ended.was_stopped:
         _write_report(ended.folder)

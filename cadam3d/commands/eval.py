@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.jsonl import write_json
-from cadam3d.io.records import psnr_of
+from cadam3d.io.records import MEASUREMENTS, Score, psnr_of, scores_in
 from cadam3d.io.run_folder import ASSET, CONFIG, EVALUATION, copying, shown, suggestion, typed_path
 from cadam3d.metric.base import Measurand, Metric
 from cadam3d.prior.base import DiffusionPrior
@@ -27,6 +28,9 @@ from cadam3d.settings.compose import component, components
 from cadam3d.settings.line import setting_word
 from cadam3d.settings.trust import require_contained, require_trust
 from cadam3d.sweep.folder import is_sweep, load
+from cadam3d.sweep.table import aligned, scores_of, write_table
+
+SHORT = 7  # characters of a commit, as git abbreviates it
 
 
 def run(cfg: DictConfig) -> None:
@@ -41,8 +45,7 @@ def run(cfg: DictConfig) -> None:
         _evaluate_sweep(cfg, folder)
         return
     result = evaluate(cfg, find_run(str(cfg.run)))
-    for name, value in result.items():
-        print(f"{name:<20}{value:.4f}" if isinstance(value, float) else f"{name:<20}{value}")
+    print(_as_text(result))
     try:
         write_json(folder / EVALUATION, result)
     except UserError as error:
@@ -72,8 +75,8 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
 
     warnings: list[str] = []
     metrics: dict[str, Metric] = components(cfg.metric, Metric, "metric")
+    # The number of Gaussians shows readers of the file whether it is about the present asset.
     result: dict[str, Any] = {"run": str(shown(folder)), "prompt": own.prompt}
-    # Whatever the metrics are, this says to which asset the numbers belong.
     result["num_gaussians"] = len(asset.gaussians)
     result |= measure(
         metrics,
@@ -95,6 +98,35 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
             "add truth=shapes"
         )
     return result
+
+
+def _as_text(result: Mapping[str, Any]) -> str:
+    """Return the entries of an ``eval.json`` as a table, one line each, with how each score was measured."""
+    scores = scores_in(result)
+    lines = []
+    for name, value in result.items():
+        if name != MEASUREMENTS:
+            text = f"{value:.4f}" if isinstance(value, float) else str(value)
+            note = f"   {_explained(scores[name])}" if name in scores else ""
+            lines.append(f"{name:<20}{text}{note}")
+    return "\n".join(lines)
+
+
+def _explained(score: Score) -> str:
+    """Return the interval of a score, the number of views, the protocol and the model, as far as known."""
+    record = score.record
+    protocol, interval, views = (record.get(key) for key in ("protocol", "interval", "views"))
+    parts = []
+    if isinstance(interval, dict):
+        parts.append(f"{interval['low']:.4f} to {interval['high']:.4f}")
+    if isinstance(views, list):
+        parts.append(f"{len(views)} view{'' if len(views) == 1 else 's'}")
+    if isinstance(protocol, dict):
+        parts.append(f"protocol={protocol.get('name')}")
+    if record.get("model"):
+        revision = str(record.get("revision") or "")[:SHORT]
+        parts.append(f"{record['model']}{'@' if revision else ''}{revision}")
+    return ", ".join(parts)
 
 
 def start_of(folder: Path, device: torch.device, *, is_trusted: bool) -> Gaussians:
@@ -138,11 +170,27 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
         write_json(folder / EVALUATION, results)
     except UserError as error:
         problem = problem or error
+    print(_table(results, folder))
     if problem is not None:
         raise _not_saved(folder, problem) from problem
+    write_table(folder)
     print(f"\n{len(results)} jobs: {shown(folder / EVALUATION)}\nreport: {shown(report.write_sweep(folder))}")
     if table := report.paper_table(folder):
         print(f"\n{table}")
+
+
+def _table(results: Sequence[Mapping[str, Any]], sweep: Path) -> str:
+    """Return the scores of all jobs and their means; empty if nothing was scored."""
+    scores = scores_of([scores_in(result) for result in results], sweep)
+    if not scores.columns and not scores.left_out:
+        return ""
+    lines: list[list[Any]] = [["job", *scores.columns]]
+    for index, result in enumerate(results):
+        name = Path(str(result["run"])).name
+        lines.append([name, *(column[index] for column in scores.columns.values())])
+    known = [[value for value in column if value is not None] for column in scores.columns.values()]
+    lines.append(["mean", *(sum(values) / len(values) for values in known)])
+    return "\n".join(["", aligned(lines), *scores.left_out])
 
 
 def _not_saved(folder: Path, error: UserError) -> UserError:

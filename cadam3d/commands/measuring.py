@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from cadam3d.commands.messages import keeping_others, note
+from cadam3d.commands.messages import keeping_others, note, warn
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.records import MEASUREMENTS
@@ -38,6 +38,8 @@ def measure(
             measurement = metric.measure(measurand)
             numbers |= measurement.numbers
             details |= measurement.details
+            for text in measurement.warnings:
+                warn(f"metric.{name}: {text}", warnings)
     if measurand.truth is not None and start is not None and metrics:
         with keeping_others("initializer", warnings):
             first = start()

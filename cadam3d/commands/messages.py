@@ -32,9 +32,14 @@ def keeping_others(name: str, warnings: list[str], *, is_only: bool = False) -> 
             raise
         if is_only:
             raise UserError(text) from error
-        warnings.append(text)
-        log.info("%s", text)
-        say(f"Warning: {text}", logging.WARNING)
+        warn(text, warnings)
+
+
+def warn(text: str, warnings: list[str]) -> None:
+    """Print a warning, and add it to those of the run."""
+    warnings.append(text)
+    log.info("%s", text)
+    say(f"Warning: {text}", logging.WARNING)
 
 
 @cache

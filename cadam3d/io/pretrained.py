@@ -5,8 +5,9 @@ a text encoder, a tokenizer) is loaded separately and when it is needed. Unused 
 """
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -35,15 +36,18 @@ class Source:
     """The places to search for a model. ``key`` is their node in the configuration, for messages."""
 
     key: str  # such as "prior"
-    path: str | None  # a folder, or PACKAGE and a name
+    # A folder, or PACKAGE and a name; or a list of these, of which the first suitable model is used.
+    path: str | Sequence[str] | None
     ids: Sequence[str]  # on the Hugging Face hub
     revision: str | None  # on the hub
     variant: str | None  # of the weight files
 
     def __post_init__(self) -> None:
         key = self.key
-        is_path = self.path is None or (isinstance(self.path, str) and self.path != "")
-        require(is_path, f"{key}.path", expected="a folder or null", got=self.path, example=f"{key}.path=DIR")
+        paths = [self.path] if isinstance(self.path, str) else self.path
+        is_path = paths is None or (len(paths) > 0 and all(isinstance(each, str) and each for each in paths))
+        wanted = "a folder, a list of folders or null"
+        require(is_path, f"{key}.path", expected=wanted, got=self.path, example=f"{key}.path=DIR")
         listed = isinstance(self.ids, Sequence) and not isinstance(self.ids, str)
         require(
             listed and all(isinstance(name, str) and name.count("/") == 1 for name in self.ids),
@@ -67,7 +71,10 @@ class Source:
         not installed, or with a reason for everything that was tried.
         """
         require_extra(self.key)
-        found = self._local() if self.path is not None else self._remote(ask_hub)
+        if self.path is None:
+            found = self._remote(ask_hub)
+        else:
+            found = self._local() if isinstance(self.path, str) else self._suitable(self.path, kinds)
         kind = str(found.index.get("_class_name"))
         if kind not in kinds:
             advice = others.get(kind, f"another {self.key}.path")
@@ -75,6 +82,21 @@ class Source:
                 f"{self.key}: {found.where} is a {kind}, not a {' or '.join(kinds)}. Try: {advice}"
             )
         return found
+
+    def _suitable(self, paths: Sequence[str], kinds: Sequence[str]) -> "Pretrained":
+        """Return the first model of a list whose class is one of ``kinds``.
+
+        Raises ``UserError`` if there is none, and if a folder has no model.
+        """
+        models = [replace(self, path=path)._local() for path in paths]
+        suitable = [model for model in models if model.index.get("_class_name") in kinds]
+        if not suitable:
+            got = ", ".join(f"{model.where} (a {model.index.get('_class_name')})" for model in models)
+            words = shlex.quote(f"{self.key}.path=[{','.join([*paths, 'DIR'])}]")
+            raise UserError(
+                f"{self.key}.path: expected a {' or '.join(kinds)} in the list, got {got}. Try: {words}"
+            )
+        return suitable[0]
 
     def _local(self) -> "Pretrained":
         folder = self._folder()
@@ -119,7 +141,9 @@ class Source:
         )
         reasons: list[str] = []
         for name in self.ids:
-            index, reason, can_ask = _fetch_index(name, self.revision, can_ask)
+            index, reason, can_ask = fetch_file(
+                name, INDEX, self.revision, can_ask, lacking="not in the layout of diffusers"
+            )
             if index is not None:
                 return Pretrained(self, name, self.revision, index, _read_entries(self.key, index))
             reasons.append(f"{name}: {reason}")
@@ -276,8 +300,13 @@ def _read_entries(key: str, file: Path) -> dict[str, Any]:
     return entries
 
 
-def _fetch_index(name: str, revision: str | None, can_ask: bool) -> tuple[Path | None, str, bool]:
-    """Return the index of a model on the hub, or None and the reason, and whether to ask the hub again."""
+def fetch_file(
+    name: str, file: str, revision: str | None, can_ask: bool, *, lacking: str
+) -> tuple[Path | None, str, bool]:
+    """Return a file of a model on the hub, or None and the reason, and whether to ask the hub again.
+
+    ``lacking`` says what a model without this file is not.
+    """
     from huggingface_hub import constants, hf_hub_download, utils
     from huggingface_hub.errors import (
         EntryNotFoundError,
@@ -293,8 +322,8 @@ def _fetch_index(name: str, revision: str | None, can_ask: bool) -> tuple[Path |
     # Otherwise the messages about retries would hide ours.
     utils.logging.set_verbosity_error()
     try:
-        file = hf_hub_download(name, INDEX, revision=revision, local_files_only=offline or not can_ask)
-        return Path(file), "", can_ask
+        found = hf_hub_download(name, file, revision=revision, local_files_only=offline or not can_ask)
+        return Path(found), "", can_ask
     except GatedRepoError:
         reason = "gated (accept its licence on its page, then: hf auth login)"
     except RevisionNotFoundError:
@@ -308,7 +337,7 @@ def _fetch_index(name: str, revision: str | None, can_ask: bool) -> tuple[Path |
         # Every further request would take as long.
         can_ask = False
     except EntryNotFoundError:
-        reason = f"has no {INDEX}: not in the layout of diffusers"
+        reason = f"has no {file}: {lacking}"
     except (HfHubHTTPError, OSError) as error:
         reason = " ".join(str(error).split())[:120]
     finally:

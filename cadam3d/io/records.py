@@ -4,7 +4,9 @@ Numbers and text in these files may come from a stranger, and reports calculate 
 only entries of the kinds that training writes.
 """
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,11 @@ QUALITY = (
 
 # The entry of summary.json and of eval.json that says, for numbers by name, how they came about.
 MEASUREMENTS = "measurements"
+# Entries of such a record that may differ between assets of one table. All others say how the number was
+# measured. Equal weights are one model, whatever its folder is called.
+OF_ASSET = ("value", "text", "views", "mean", "interval")
+OF_PLACE = ("model", "revision")
+WEIGHTS = "weights_sha256"
 
 
 def read_summary(run: Path) -> dict[str, Any]:
@@ -81,6 +88,61 @@ def read_quality(run: Path, summary: Mapping[str, Any]) -> dict[str, float]:
         return {}
     evaluation = read_evaluation(run, summary)
     return {name: evaluation[name] for name in QUALITY if is_number(evaluation.get(name))}
+
+
+@dataclass(frozen=True)
+class Score:
+    """A number with the record of how it came about."""
+
+    value: float
+    record: Mapping[str, Any]
+
+    @property
+    def method(self) -> dict[str, str]:
+        """Return how the number was measured, as texts by dotted key: the protocol, the weights and so on.
+
+        Numbers with equal methods may be compared, and no others.
+        """
+        left_out = (*OF_ASSET, *(OF_PLACE if self.record.get(WEIGHTS) is not None else ()))
+        return dict(_flat({key: value for key, value in self.record.items() if key not in left_out}))
+
+
+def scores_in(numbers: Mapping[str, Any]) -> dict[str, Score]:
+    """Return the numbers of a ``summary.json`` or an ``eval.json`` that have a record, by name."""
+    records = numbers.get(MEASUREMENTS)
+    return {
+        name: Score(float(numbers[name]), record)
+        for name, record in (records.items() if isinstance(records, dict) else ())
+        if is_number(numbers.get(name)) and isinstance(record, dict)
+    }
+
+
+def read_scores(run: Path, summary: Mapping[str, Any]) -> dict[str, Score]:
+    """Return the scores of a run by name. Those of ``eval.json`` replace those from the end of training."""
+    return scores_in(summary) | scores_in(read_evaluation(run, summary))
+
+
+def difference(name: str, scores: Iterable[Score]) -> str | None:
+    """Return a sentence about scores that must not be in one table; None if all have one method.
+
+    ``name`` is that of the number.
+    """
+    methods = [score.method for score in scores]
+    for key in dict.fromkeys(key for method in methods for key in method):
+        values = Counter(method.get(key, "unknown") for method in methods)
+        if len(values) > 1:
+            listed = " and ".join(f"{value} ({count})" for value, count in values.most_common())
+            return f"{name} was measured in different ways: {key} is {listed}"
+    return None
+
+
+def _flat(node: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the dotted keys of nested dicts with their values as text; the name of a protocol comes first."""
+    if not isinstance(node, dict):
+        yield key, str(node)
+        return
+    for name in sorted(node, key=lambda name: (name != "protocol", name != "name", str(name))):
+        yield from _flat(node[name], f"{key}.{name}" if key else str(name))
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:

@@ -33,6 +33,7 @@ class Measurement:
 
     numbers: dict[str, float]
     details: dict[str, dict[str, Any]] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()  # for the user, each with what to do about it
 
 
 class Metric(ABC):

@@ -5,6 +5,7 @@ more than methods differ. A protocol therefore has a name, and everything that i
 every number that was measured with it.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -12,12 +13,12 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, normalize
 
-from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import require, require_choice
+from cadam3d.core.cameras import Cameras, orbit
+from cadam3d.core.checks import require, require_choice, require_whole
 from cadam3d.core.pictures import PictureSettings
 from cadam3d.core.render import RenderFn, RenderOutput
 
@@ -146,6 +147,119 @@ class RingProtocol(Protocol):
     def is_mean(self) -> bool:
         """Return whether the number is the mean."""
         return self.aggregation == "mean"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SphereProtocol(Protocol):
+    """Views from the vertices of an icosahedron whose faces are divided, with several fields of view each.
+
+    This is how T3Bench (He et al. 2023) finds the quality of an asset. The best field of view counts for each
+    vertex. Then the values of all vertices are smoothed ``rounds`` times, by the mean over a vertex and its
+    neighbours, so that one lucky view does not decide. The best vertex counts.
+    """
+
+    subdivisions: int  # 0 to 4; each divides every triangle into four
+    # More fields of view beside ``fov_y_deg``, each in (0, 180) degrees.
+    other_fovs_y_deg: Sequence[float]
+    rounds: int  # of smoothing, >= 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_whole("protocol.subdivisions", self.subdivisions, low=0, high=4, example=2)
+        require_whole("protocol.rounds", self.rounds, low=0, high=100, example=3)
+        for each in self.other_fovs_y_deg:
+            is_angle = isinstance(each, int | float) and 0 < each < 180
+            example = "'protocol.other_fovs_y_deg=[45,30]'"
+            require(
+                is_angle,
+                "protocol.other_fovs_y_deg",
+                expected="angles in (0, 180)",
+                got=each,
+                example=example,
+            )
+
+    @cached_property
+    def cameras(self) -> Cameras:
+        """Return the cameras: all fields of view of the first vertex, then those of the second, and so on."""
+        x, y, z = self._vertices.unbind(dim=1)
+        azimuth, elevation = torch.rad2deg(torch.atan2(y, x)), torch.rad2deg(torch.asin(z.clamp(-1, 1)))
+        fovs = torch.tensor([float(each) for each in (self.fov_y_deg, *self.other_fovs_y_deg)])
+        azimuth, elevation = (each.repeat_interleave(len(fovs)).float() for each in (azimuth, elevation))
+        full = torch.full_like(azimuth, float(self.distance))
+        return orbit(azimuth, elevation, full, fovs.repeat(len(x)), self.size, self.size)
+
+    def aggregate(self, values: Float[Tensor, "v"], *, less_is_better: bool) -> float:
+        """Return the smoothed value of the best vertex."""
+        by_vertex = values.double().reshape(len(self._vertices), -1)
+        field = by_vertex.amin(dim=1) if less_is_better else by_vertex.amax(dim=1)
+        near = self._nearness
+        for _ in range(self.rounds):
+            field = near @ field / near.sum(dim=1)
+        return float(_best(field, less_is_better))
+
+    @property
+    def is_mean(self) -> bool:
+        """Return False: the number is that of the best vertex."""
+        return False
+
+    @cached_property
+    def _mesh(self) -> tuple[Float[Tensor, "p 3"], Int[Tensor, "f 3"]]:
+        """Return the vertices on the unit sphere, and the triangles."""
+        return _icosphere(self.subdivisions)
+
+    @property
+    def _vertices(self) -> Float[Tensor, "p 3"]:
+        return self._mesh[0]
+
+    @cached_property
+    def _nearness(self) -> Float[Tensor, "p p"]:
+        """Return 1 for a vertex with itself and with each of its neighbours, else 0."""
+        vertices, faces = self._mesh
+        near = torch.eye(len(vertices), dtype=torch.float64)
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            near[faces[:, a], faces[:, b]] = 1
+            near[faces[:, b], faces[:, a]] = 1
+        return near
+
+
+def _icosphere(subdivisions: int) -> tuple[Float[Tensor, "p 3"], Int[Tensor, "f 3"]]:
+    """Return an icosahedron on the unit sphere, of which every triangle is divided into four repeatedly.
+
+    It stands on an edge, so that the poles are in the middle of two edges of the undivided one.
+    """
+    golden = (1 + math.sqrt(5)) / 2
+    signs = [(a, b) for a in (-1.0, 1.0) for b in (-golden, golden)]
+    corners = [c for a, b in signs for c in ((a, b, 0.0), (0.0, a, b), (b, 0.0, a))]
+    points = normalize(torch.tensor(corners, dtype=torch.float64), dim=1)
+    apart = torch.cdist(points, points)
+    # The corners of a triangle are neighbours, which are the five nearest corners of each.
+    joined = (apart > 0) & (apart < 1.1 * apart[apart > 0].min())
+    count = range(len(points))
+    faces = torch.tensor(
+        [
+            (a, b, c)
+            for a in count
+            for b in count[a + 1 :]
+            for c in count[b + 1 :]
+            if joined[a, b] and joined[b, c] and joined[a, c]
+        ]
+    )
+    for _ in range(subdivisions):
+        points, faces = _divided(points, faces)
+    return points, faces
+
+
+def _divided(
+    points: Float[Tensor, "p 3"], faces: Int[Tensor, "f 3"]
+) -> tuple[Float[Tensor, "q 3"], Int[Tensor, "g 3"]]:
+    """Return the mesh with a new vertex in the middle of every edge, moved onto the unit sphere."""
+    a, b, c = faces.unbind(dim=1)
+    edges = torch.cat([torch.stack(pair, dim=1).sort(dim=1).values for pair in ((a, b), (b, c), (c, a))])
+    unique, middle = torch.unique(edges, dim=0, return_inverse=True)
+    ab, bc, ca = (middle + len(points)).split(len(faces))
+    new = normalize(points[unique].sum(dim=1), dim=1)
+    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    return torch.cat([points, new]), torch.cat([torch.stack(part, dim=1) for part in parts])
 
 
 def _best(values: Tensor, less_is_better: bool) -> Tensor:

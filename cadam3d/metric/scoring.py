@@ -1,17 +1,22 @@
-"""ScoreMetric: the base of all metrics that score the pictures of a protocol one by one with a model."""
+"""ScoreMetric: the base of all metrics that score the pictures of a protocol one by one.
+
+ModelMetric: such a metric with a model of transformers that the protocol or the metric names.
+"""
 
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cadam3d.core.errors import UserError
+from cadam3d.io.transformer import TransformerSource
 from cadam3d.metric.base import Measurand, Measurement, Metric
-from cadam3d.metric.protocol import Protocol
+from cadam3d.metric.protocol import ModelName, Protocol
 
 LEVEL = 0.95  # of the interval
 
@@ -24,6 +29,8 @@ class Scorer:
     score: Callable[[Tensor, str], Tensor]
     # What the record of a number says about the model: "model", "revision", "weights_sha256" and so on.
     facts: Mapping[str, Any] = field(default_factory=dict)
+    # From a text to a warning about it, such as that it is too long for the model; None if all is well.
+    complaint: Callable[[str], str | None] = lambda text: None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +56,10 @@ class ScoreMetric(Metric):
         scorer = self.scorer(measurand.gaussians.device)
         text = self.protocol.text_of(measurand.prompt)
         values = self.values(measurand, scorer, text)
-        return self.measurement(values, text, scorer.facts)
+        complaint = scorer.complaint(text)
+        return replace(
+            self.measurement(values, text, scorer.facts), warnings=() if complaint is None else (complaint,)
+        )
 
     def values(self, measurand: Measurand, scorer: Scorer, text: str) -> Float[Tensor, "v"]:
         """Return the score of every view of the protocol."""
@@ -86,6 +96,28 @@ class ScoreMetric(Metric):
         half = float(t.ppf((1 + LEVEL) / 2, count - 1)) * float(values.std()) / math.sqrt(count)
         mean = float(values.mean())
         return interval_record(mean - half, mean + half, "the mean over viewpoints, by Student's t")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelMetric(ScoreMetric):
+    """A score by a model of transformers, which is the protocol's unless the metric names another one."""
+
+    node: ClassVar[str]  # of the configuration, such as "metric.clip_score"
+    kind: ClassVar[str]  # the name of the model in protocols, such as "clip"
+
+    model: str | None  # a folder, or an id on the hub; None = the protocol's
+    revision: str | None  # of an id; None = the protocol's, or the newest of a model that is named here
+
+    def source(self) -> TransformerSource:
+        """Return the place of the model. Raises ``UserError`` if neither metric nor protocol names one."""
+        named = self.protocol.model(self.kind) if self.model is None else ModelName(self.model, None)
+        if named is None:
+            raise UserError(
+                f"{self.node}.model: protocol={self.protocol.name} names no model for this metric. "
+                f"Try: {self.node}.model=DIR"
+            )
+        revision = named.revision if self.revision is None else self.revision
+        return TransformerSource(self.node, named.id, revision)
 
 
 def interval_record(low: float, high: float, of: str) -> dict[str, Any]:

@@ -116,7 +116,7 @@ class LatentPrior(DiffusionPrior):
     float32 elsewhere.
     """
 
-    path: str | None  # folder, or package: and a name
+    path: str | Sequence[str] | None  # folder, or package: and a name; or a list of these
     ids: Sequence[str]  # on the hub
     revision: str | None  # on the hub
     variant: str | None  # of weight files

@@ -85,7 +85,7 @@ class MVDream(StableDiffusion):
 
         Raises ``UserError`` if its network does not read cameras.
         """
-        if self.path is not None and Path(self.path).expanduser().is_file():
+        if isinstance(self.path, str) and Path(self.path).expanduser().is_file():
             found = SingleFile.open(self.source, SCHEDULER, self.tokenizer, "prior.tokenizer")
         else:
             found = with_ldm_unet(self.source.find(self.kinds, PRIORS))

@@ -39,8 +39,8 @@ def write_sweep(folder: Path) -> Path:
 def paper_table(folder: Path) -> str:
     """Write the paper's table 1 of the sweep in ``folder`` as files, and return it as Markdown.
 
-    Returns "" if its grid does not ask for the table or no job has left an asset. Raises ``UserError`` if the
-    jobs were measured in different ways, and if a file cannot be written.
+    Returns "" if its grid does not ask for the table or no job has left an asset. Raises ``UserError`` if a
+    file cannot be written.
     """
     from cadam3d.report.table_files import write
 

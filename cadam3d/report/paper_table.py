@@ -4,16 +4,14 @@ Published numbers have rows of their own. Numbers of different protocols or mode
 table.
 """
 
-import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
-from cadam3d.core.errors import UserError
 from cadam3d.core.quality import QUALITIES
+from cadam3d.io import records
 from cadam3d.io.run_folder import shown
 from cadam3d.report.formatting import plural
 from cadam3d.report.means import Mean, change, difference, mean
@@ -86,13 +84,6 @@ class PaperTable:
         """Return the labels of the columns of numbers."""
         return [QUALITIES[name].heading for name in self.names]
 
-    @property
-    def has_intervals(self) -> bool:
-        """Return whether any number has an interval."""
-        return any(
-            cell.half for section in self.sections for row in section.rows for cell in row.cells.values()
-        )
-
 
 @dataclass(frozen=True)
 class Group:
@@ -120,21 +111,18 @@ class Group:
 
 
 def paper_table(results: Sequence[JobResult], folder: Path) -> PaperTable | None:
-    """Return the table of the jobs of the sweep in ``folder``; None if none has left an asset.
-
-    Raises ``UserError`` if a number was measured in different ways.
-    """
+    """Return the table of the jobs of the sweep in ``folder``; None if none has left an asset."""
     usable = with_asset(results)
     if not usable:
         return None
-    refuse_mixed(usable, folder)
-    names = columns(_rows_of_jobs(usable))
+    left_out = mixed(usable)
+    names = [name for name in columns(_rows_of_jobs(usable)) if name not in left_out]
     categories = [each for each in dict.fromkeys(result.category for result in results) if each]
     sections = [Section("", _rows(results, names, with_published=True))]
     for category in categories:
         members = [result for result in results if result.category == category]
         sections.append(Section(category, _rows(members, names, with_published=False)))
-    return PaperTable(names, sections, _notes(results, usable, names))
+    return PaperTable(names, sections, [*_notes(results, usable, names), *_again(left_out, usable, folder)])
 
 
 def with_asset(results: Iterable[JobResult]) -> list[JobResult]:
@@ -150,59 +138,57 @@ def columns(rows: Iterable[Sequence[JobResult]]) -> list[str]:
     return [name for name in names if REPLACED.get(name) not in shared]
 
 
-def refuse_mixed(results: Sequence[JobResult], folder: Path) -> None:
-    """Raise ``UserError`` if numbers belong to different protocols, or one number to different models.
+def mixed(results: Sequence[JobResult]) -> dict[str, str]:
+    """Return a sentence about each number that must not be in a table of these jobs.
 
-    Numbers without a protocol, such as a PSNR, have no record and need none.
+    Such a number was measured in different ways, or by another protocol than the columns before it. Numbers
+    without a protocol, such as a PSNR, have no record and need none.
     """
-    recorded = {
-        name: [job.measurements.get(name, {}) for job in results if name in job.numbers] for name in SCORES
-    }
-    recorded = {name: records for name, records in recorded.items() if any(records)}
-    protocols = [_protocol(each.get("protocol")) for records in recorded.values() for each in records]
-    _require_one(next(iter(recorded), ""), "protocol", protocols, recorded, folder)
-    for name, records in recorded.items():
-        models = [f"{each.get('model')} (sha256 {each.get('weights_sha256')})" for each in records]
-        _require_one(name, "model", models, recorded, folder)
+    problems: dict[str, str] = {}
+    protocol: dict[str, str] = {}
+    for name in SCORES:
+        found = [job.scores.get(name) for job in results if name in job.numbers]
+        scores = [score for score in found if score is not None]
+        if not scores:
+            continue
+        if problem := records.difference(name, scores):
+            problems[name] = problem
+        elif len(scores) < len(found):
+            problems[name] = f"{name} has a record of how it was measured in some jobs only"
+        elif own := {key: value for key, value in scores[0].method.items() if key.startswith("protocol")}:
+            protocol = protocol or own
+            if own != protocol:
+                problems[name] = f"{name} belongs to another protocol than the other scores"
+    return problems
 
 
-def _require_one(name: str, what: str, values: Sequence[str], recorded: Iterable[str], folder: Path) -> None:
-    counts = Counter(values)
-    if len(counts) < 2:
-        return
-    got = " and ".join(f"{value} ({plural(count, 'number')})" for value, count in counts.most_common())
-    metrics = ",".join(dict.fromkeys(QUALITIES[each].metric for each in recorded))
-    words = [setting_word("run", shown(folder)), f"'metric=[{metrics}]'"]
-    raise UserError(
-        f"{name}: expected one {what} for all numbers of a table, got {got}. "
-        f"All jobs can be measured again in one way. Try: cadam3d eval {' '.join(words)}"
-    )
-
-
-def _protocol(protocol: Any) -> str:
-    """Return a protocol as text: its name, and its settings in short, because they may have been changed."""
-    if not isinstance(protocol, Mapping):
-        return str(protocol or "unknown")
-    name = str(protocol.get("name", "unknown"))
-    rest = json.dumps({key: value for key, value in protocol.items() if key != "name"}, sort_keys=True)
-    return f"{name} {rest}"
+def _again(left_out: Mapping[str, str], results: Sequence[JobResult], folder: Path) -> list[str]:
+    """Return the sentences about numbers that are left out, with the line that measures all scores anew."""
+    scores = {name for result in results for name in result.scores}
+    metrics = dict.fromkeys(QUALITIES[name].metric for name in SCORES if name in scores)
+    line = f"cadam3d eval {setting_word('run', shown(folder))} 'metric=[{','.join(metrics)}]'"
+    return [f"{problem}, so it is not in the table. Try: {line}" for problem in left_out.values()]
 
 
 def _groups(results: Sequence[JobResult]) -> list[Group]:
+    axes: dict[str, set[str]] = {}
+    of_prompts: dict[tuple[str, str], set[str]] = {}
+    for result in results:
+        for key, value in result.cell.axes:
+            axes.setdefault(key, set()).add(value)
+            of_prompts.setdefault((key, result.cell[PROMPT]), set()).add(value)
+    # Settings that come with prompts, such as their negative prompts, do not make groups.
+    free = {key for (key, _), values in of_prompts.items() if len(values) > 1} - {PROMPT, SEED}
     members: dict[Cell, list[JobResult]] = {}
     for result in results:
-        members.setdefault(result.cell.without(PROMPT, SEED), []).append(result)
+        members.setdefault(result.cell.without(*axes.keys() - free), []).append(result)
     return [_group(cell, jobs) for cell, jobs in members.items()]
 
 
 def _group(cell: Cell, jobs: list[JobResult]) -> Group:
     families = dict.fromkeys(job.objective.partition("_")[0].upper() for job in jobs if job.objective)
     family = "/".join(families)
-    others = [
-        value if key == RECIPE else f"{key}={value}"
-        for key, value in cell.axes
-        if value not in ("", "default") and key != GUIDANCE
-    ]
+    others = [value if key == RECIPE else f"{key}={value}" for key, value in cell.axes if key != GUIDANCE]
     return Group(", ".join(filter(None, [family, *others])) or MISSING, family, jobs)
 
 
@@ -323,20 +309,22 @@ def _notes(results: Sequence[JobResult], usable: Sequence[JobResult], names: Seq
         "means, as in the paper: 90 % fewer means that the mean is a tenth.",
     ]
     protocols = dict.fromkeys(
-        str(record["protocol"].get("name"))
+        score.method.get("protocol.name")
         for job in usable
-        for name in names
-        if isinstance((record := job.measurements.get(name, {})).get("protocol"), Mapping)
+        for name, score in job.scores.items()
+        if name in names
     )
-    if protocols:
-        notes.append(f"Learned scores: protocol={', '.join(protocols)}, in eval.json of each job.")
-    notes.append(
-        "Rows marked published are printed in the paper's table 1. They belong to another protocol: other "
-        "prompts, views, models and hardware. Compare differences between their rows, not rows of both."
-    )
+    if known := [name for name in protocols if name]:
+        notes.append(f"Learned scores: protocol={', '.join(known)}, as eval.json of each job records it.")
+    if any(group.family == row.objective for group in _groups(results) for row in ROWS):
+        notes.append(
+            "Rows marked published are printed in the paper's table 1. They belong to another protocol: "
+            "other prompts, views, models and hardware. Compare their differences with ours, and not the "
+            "numbers themselves."
+        )
     if lacking := len(results) - len(usable):
         notes.append(
-            f"{plural(lacking, 'job')} of {len(results)} left nothing to measure or did not end yet."
+            f"{lacking} of {plural(len(results), 'job')} left nothing to measure or did not end yet."
         )
     if early := Counter((result.arm, result.outcome) for result in usable if result.ended_early):
         listed = ", ".join(f"{count} of {arm} ({outcome})" for (arm, outcome), count in sorted(early.items()))

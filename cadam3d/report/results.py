@@ -17,13 +17,14 @@ from omegaconf import OmegaConf
 from cadam3d.core.outcome import Outcome
 from cadam3d.core.quality import QUALITIES
 from cadam3d.io.records import (
-    MEASUREMENTS,
+    Score,
     psnr_of,
     read_config,
     read_evaluation,
     read_histograms,
     read_metrics,
     read_quality,
+    scores_in,
     ssim_of,
 )
 from cadam3d.io.run_folder import CONFIG
@@ -103,10 +104,10 @@ class JobResult:
     seconds: float | None
     objective: str  # the option of ``guidance`` it ran with; empty if that is not known
     category: str  # of its prompt; empty if it has none
-    # Every number that was measured, and what is recorded about how; those of eval.json replace those of
-    # training.
+    # Every number that was measured, and those with a record of how. Those of eval.json replace those from
+    # the end of training.
     numbers: Mapping[str, float] = field(repr=False)
-    measurements: Mapping[str, Mapping[str, Any]] = field(repr=False)
+    scores: Mapping[str, Score] = field(repr=False)
 
     @property
     def arm(self) -> str:
@@ -199,24 +200,23 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
         objective=str(job.overrides.get(GUIDANCE) or job.summary.get(GUIDANCE) or ""),
         category=job.category,
         numbers=_numbers(sources),
-        measurements=_measurements(sources),
+        scores=_scores(sources),
     )
 
 
 def _numbers(sources: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     found = {name: number(each.get(name)) for each in sources for name in QUALITIES if name in each}
-    return {name: value for name, value in found.items() if value is not None}
+    known = {name: value for name, value in found.items() if value is not None}
+    if "asset_bytes" in known:
+        known.setdefault("asset_mib", known["asset_bytes"] / (1 << 20))
+    return known
 
 
-def _measurements(sources: Iterable[Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
-    """Return the record of each number, from the last file that has the number."""
-    found: dict[str, Mapping[str, Any]] = {}
+def _scores(sources: Iterable[Mapping[str, Any]]) -> dict[str, Score]:
+    """Return the scores by name, from the last file that has a number of this name."""
+    found: dict[str, Score] = {}
     for each in sources:
-        records = each.get(MEASUREMENTS)
-        for name in QUALITIES:
-            if name in each:
-                record = records.get(name) if isinstance(records, dict) else None
-                found[name] = record if isinstance(record, dict) else {}
+        found = {name: score for name, score in found.items() if name not in each} | scores_in(each)
     return found
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from cadam3d.core.chart import Chart
 from cadam3d.core.quality import QUALITIES
-from cadam3d.io.records import psnr_of, ssim_of
+from cadam3d.io.records import MEASUREMENTS, psnr_of, ssim_of
 from cadam3d.io.run_folder import ASSET, CONFIG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE
 from cadam3d.report.charts import other_plots, sections
 from cadam3d.report.declarations import write_declarations
@@ -18,6 +18,7 @@ from cadam3d.viewer.page import script, style
 
 EMBED_BYTES = 8 << 20  # a larger video is linked, not embedded
 FILES = (ASSET, TURNTABLE, PREVIEW, SUMMARY, METRICS, CONFIG)
+HIDDEN = ("warnings", MEASUREMENTS)  # entries of the summary that are no facts
 COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "device")
 LABELS = {
     "prompt": "Prompt",
@@ -134,7 +135,7 @@ def _video_source(path: Path) -> str:
 def _facts(summary: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """Return the label and the value of every fact, the known ones first."""
     ordered = [*(key for key in LABELS if key in summary), *(key for key in summary if key not in LABELS)]
-    return [(LABELS.get(key) or key.replace("_", " "), summary[key]) for key in ordered if key != "warnings"]
+    return [(LABELS.get(key) or key.replace("_", " "), summary[key]) for key in ordered if key not in HIDDEN]
 
 
 def _flat(line: Mapping[str, Any]) -> dict[str, Any]:

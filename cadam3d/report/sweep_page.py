@@ -151,7 +151,7 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None) -> Path:
     }
     for name, lines in contents.items():
         tables.write_csv(folder / f"{name}.csv", lines)
-    paper, refusal = _paper_table(sweep_folder)
+    paper = read_table(sweep_folder)
     drawn = [_drawn(results, name, kinds[name], folder) for name in names or kinds if name in kinds]
     files = [name for name in (TABLE, FIGURES) if (sweep_folder / name).exists()]
     return write_page(
@@ -160,8 +160,8 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None) -> Path:
         title=_title(plan, results),
         outcomes=Counter(result.outcome for result in results).most_common(),
         extent=_extent(results),
-        warnings=[*_unknown(names or (), kinds), *refusal],
-        paper_table=paper,
+        warnings=_unknown(names or (), kinds),
+        paper_table=None if paper is None else ShownPaperTable.of(paper),
         verdict=[*_choice(sweep_folder, plan), *verdicts.headline(results)],
         tiles=_tiles(results),
         key_table=table(contents["objectives"], align_decimals=True),
@@ -188,15 +188,6 @@ def _choice(folder: Path, plan: Plan) -> list[str]:
         return []
     reason = content.get("why") if isinstance(content, dict) else None
     return [reason] if isinstance(reason, str) else []
-
-
-def _paper_table(folder: Path) -> tuple[ShownPaperTable | None, list[str]]:
-    """Return the paper's table of the sweep, if there is one, and why it could not be made."""
-    try:
-        found = read_table(folder)
-    except UserError as error:
-        return None, [str(error)]
-    return None if found is None else ShownPaperTable.of(found), []
 
 
 def for_shell(word: str) -> str:

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
 from cadam3d.io.run_folder import PAPER_TABLE_CSV, PAPER_TABLE_LATEX, PAPER_TABLE_MARKDOWN
 from cadam3d.report.paper_table import PaperTable, paper_table
@@ -14,25 +13,16 @@ FORMATS = {PAPER_TABLE_MARKDOWN: markdown, PAPER_TABLE_CSV: comma_separated, PAP
 
 
 def read_table(sweep: Path) -> PaperTable | None:
-    """Return the table of a sweep; None if its grid does not ask for it or no job has left an asset.
-
-    Raises ``UserError`` if its jobs were measured in different ways.
-    """
+    """Return the table of a sweep; None if its grid does not ask for it or no job has left an asset."""
     return paper_table(read(sweep), sweep) if read_plan(sweep).paper_table else None
 
 
 def write(sweep: Path) -> str:
     """Write the table in all formats, and return it as Markdown; "" if there is none.
 
-    Raises ``UserError`` as :func:`read_table` does, after it has removed the files of an earlier table, which
-    would be taken for the present one; and if a file cannot be written.
+    Raises ``UserError`` if a file cannot be written.
     """
-    try:
-        table = read_table(sweep)
-    except UserError:
-        for name in FORMATS:
-            (sweep / name).unlink(missing_ok=True)
-        raise
+    table = read_table(sweep)
     if table is None:
         return ""
     for name, write_as in FORMATS.items():

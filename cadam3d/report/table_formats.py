@@ -62,7 +62,7 @@ def markdown(table: PaperTable) -> str:
         lines += [_markdown_line(headings(table))]
         lines += [_markdown_line([*["---"] * len(FIRST), *["---:"] * len(table.names)])]
         lines += [_markdown_line(texts(row, table.names)) for row in section.rows] + [""]
-    return "\n".join([*lines, *(f"- {_in_markdown(note)}" for note in table.notes)]) + "\n"
+    return "\n".join([*lines, *(f"- {' '.join(note.split())}" for note in table.notes)]) + "\n"
 
 
 def comma_separated(table: PaperTable) -> str:

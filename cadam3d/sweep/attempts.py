@@ -12,11 +12,11 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.outcome import Outcome
 from cadam3d.core.quality import QUALITIES
 from cadam3d.io.jsonl import is_number
-from cadam3d.io.records import read_evaluation
-from cadam3d.io.run_folder import LATEST, expanded
+from cadam3d.io.records import difference, read_evaluation, read_scores
+from cadam3d.io.run_folder import LATEST, expanded, shown
 from cadam3d.settings.compose import slug
 from cadam3d.settings.line import RUN_FOLDER, key_of
-from cadam3d.sweep.choice import PREFERRED, SELECTABLE, Attempt, choose
+from cadam3d.sweep.choice import PREFERRED, SELECTABLE, Attempt, Choice, choose
 from cadam3d.sweep.folder import PlannedJob, Row, rows_of
 from cadam3d.sweep.grid import Axes, Grid, Job, read_line, sweep_name
 from cadam3d.sweep.plan import Composer, Sweep, compose_sweep, search_path, sort_overrides
@@ -60,7 +60,6 @@ def read_attempts(
         prompts=None,
         jobs=[Job("", f"{SEED}{seed}", (*common, f"seed={seed}"), None) for seed in seeds],
         command="train",
-        shown=() if cfg.get("select") is None else (cfg.select,),
         place=expanded(str(cfg.hydra.run.dir)) if is_chosen else _place(cfg, axes),
     )
     return sweep, Composer(options, search_path(overrides))
@@ -84,12 +83,24 @@ def attempt_of(row: Row) -> Attempt:
     seed, summary = row.swept["seed"], row.summary
     if not row.has_result or row.outcome == Outcome.VANISHED or not summary.get("num_gaussians"):
         return Attempt(seed)
-    evaluation = read_evaluation(row.folder, summary)
     measured, evaluated = (
         {name: float(known[name]) for name in SELECTABLE if is_number(known.get(name))}
-        for known in (summary, evaluation)
+        for known in (summary, read_evaluation(row.folder, summary))
     )
-    return Attempt(seed, measured, evaluated)
+    # A table shows these too: the newer ones, which are only compared if they were measured in one way.
+    scores = {name: score.value for name, score in read_scores(row.folder, summary).items()}
+    return Attempt(seed, measured | {name: scores[name] for name in SELECTABLE if name in scores}, evaluated)
+
+
+def require_one_method(choice: Choice, rows: Sequence[Row], folder: Path) -> None:
+    """Raise ``UserError`` if the numbers that a choice compares were measured in different ways."""
+    name, metric = choice.quality.name, choice.quality.metric
+    compared = [row for row in rows if row.swept["seed"] in choice.values]
+    scores = [read_scores(row.folder, row.summary).get(name) for row in compared]
+    problem = difference(name, [score for score in scores if score is not None])
+    if problem is not None:
+        line = shlex.join(["cadam3d", "eval", f"run={shown(folder)}", f"metric=[{metric}]"])
+        raise UserError(f"select: {problem}. Measure all attempts in one way. Try: {line}")
 
 
 def require_measured(

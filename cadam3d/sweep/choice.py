@@ -25,8 +25,8 @@ class Attempt:
     """One attempt, with the numbers of its asset. Without an asset that can be compared it has none."""
 
     seed: int
-    measured: Mapping[str, float] = field(default_factory=dict)  # in summary.json
-    evaluated: Mapping[str, float] = field(default_factory=dict)  # in eval.json
+    measured: Mapping[str, float] = field(default_factory=dict)
+    evaluated: Mapping[str, float] = field(default_factory=dict)  # by cadam3d eval, after training
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,9 @@ def require_attempts(attempts: object, select: object) -> None:
 def choose(attempts: Sequence[Attempt], select: str | None) -> Choice | None:
     """Return the best attempt by the number ``select``; None if no attempt has that number.
 
-    ``None`` stands for the first of ``PREFERRED`` that an attempt has. Numbers in ``summary.json`` and in
-    ``eval.json`` are not mixed, because they may have been measured in different ways: those in
-    ``eval.json`` count only if no summary has any. Of attempts with equal numbers, the one with the lowest
+    ``None`` stands for the first of ``PREFERRED`` that an attempt has. The numbers of an evaluation after
+    training count only if training has measured none of them in any attempt, because both may have been
+    measured with different settings. Of attempts with equal numbers, the one with the lowest
     seed is the best.
     """
     for name in PREFERRED if select is None else (select,):

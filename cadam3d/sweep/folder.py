@@ -133,7 +133,7 @@ def _require_plan(content: Any) -> None:
     is_count = is_whole(threads) and 1 <= threads <= MOST_THREADS
     _require(threads is None or is_count, "threads: expected a whole number")
     _require(figures is None or _are_texts(figures), "figures: expected names")
-    _require(isinstance(content.get("paper_table", False), bool), "paper_table: expected true or false")
+    _require(type(content.get("paper_table", False)) is bool, "paper_table: expected true or false")
     _require(content.get("command", "sweep") in ("sweep", "train"), "command: expected sweep or train")
     for name in ("flags", "line"):
         _require(_are_texts(content.get(name, [])), f"{name}: expected words")

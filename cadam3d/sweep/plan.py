@@ -62,9 +62,8 @@ class Sweep:
     prompts: Choice | None  # None if the line and the grid name no file or set of prompts
     jobs: list[Job]
     command: str = "sweep"  # of the line; "train" if the jobs are several attempts at one run
-    place: Path | None = (
-        None  # the folder; None: that of the line, or one with a name that says what is swept
-    )
+    # The folder, unless the line has one; None stands for a name that says what is swept.
+    place: Path | None = None
 
     @property
     def grid_name(self) -> str | None:

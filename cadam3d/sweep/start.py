@@ -125,7 +125,7 @@ def run_sweep(
                     problem = _launch(folder, sweep, pending, flags)
         finally:
             shutil.rmtree(folder / SHARED, ignore_errors=True)
-            code = _report_results(folder, write_table(folder), problem, sweep)
+            code = _report_results(folder, write_table(folder), problem, sweep.noun)
     if stop.received is not None:
         return Ended(folder, 128 + stop.received, was_stopped=True)
     return Ended(folder, code, was_stopped=False)
@@ -288,11 +288,11 @@ def _launch(folder: Path, sweep: Sweep, pending: Sequence[Row], flags: Sequence[
     return ""
 
 
-def _report_results(folder: Path, rows: Sequence[Row], problem: str, sweep: Sweep) -> int:
+def _report_results(folder: Path, rows: Sequence[Row], problem: str, noun: str) -> int:
     """Print the table and what is left to do. A long table is cut down to the jobs without a result."""
     listed = rows if len(rows) <= LONGEST else [row for row in rows if not row.has_result][:LONGEST]
-    table = f"\n{as_text(listed, sweep.shown)}\n" if listed else ""
-    print(f"{table}\n{_jobs(len(rows), sweep.noun)}: {shown(folder / TABLE)}", flush=True)
+    table = f"\n{as_text(listed)}\n" if listed else ""
+    print(f"{table}\n{_jobs(len(rows), noun)}: {shown(folder / TABLE)}", flush=True)
     if problem:
         print(f"cadam3d: {problem}", file=sys.stderr)
     left = outcomes(rows)
@@ -306,7 +306,7 @@ def _report_results(folder: Path, rows: Sequence[Row], problem: str, sweep: Swee
     see = f"; see {shown(consoles[0])}" if consoles else ""
     them = "it" if count == 1 else "them"
     print(
-        f"cadam3d: {count} of {_jobs(len(rows), sweep.noun)} {_has(count)} no result ({which}){see}. "
+        f"cadam3d: {count} of {_jobs(len(rows), noun)} {_has(count)} no result ({which}){see}. "
         f"Rerun the same command to retry {them}.",
         file=sys.stderr,
     )

@@ -1,14 +1,16 @@
 """Table: write ``sweep.csv``, with one row per job, from the files on disk."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from cadam3d.io.atomic import replacing
 from cadam3d.io.jsonl import to_json
-from cadam3d.io.records import QUALITY, psnr_of
-from cadam3d.io.run_folder import TABLE
+from cadam3d.io.records import QUALITY, Score, difference, psnr_of, read_scores
+from cadam3d.io.run_folder import TABLE, shown
+from cadam3d.settings.line import setting_word
 from cadam3d.sweep.folder import Row, load
 
 FACTS = ("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "asset_bytes", "message")
@@ -16,6 +18,14 @@ FACTS = ("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "a
 MORE_FACTS = tuple(name for name in QUALITY if name not in ("psnr", "psnr_min", "ssim"))
 # Columns of the table in the terminal, besides the outcome and the settings in which jobs differ.
 SHOWN = ("num_gaussians", "psnr", "seconds")
+
+
+@dataclass(frozen=True)
+class Scores:
+    """The scores of jobs that may be in one table, because each was measured in one way."""
+
+    columns: Mapping[str, Sequence[float | None]]  # one value per job, by the name of the number
+    left_out: Sequence[str]  # a sentence about each number that was measured in different ways
 
 
 def write_table(sweep: Path) -> list[Row]:
@@ -33,16 +43,39 @@ def write_table(sweep: Path) -> list[Row]:
 
 
 def as_text(rows: Sequence[Row]) -> str:
-    """Return a table for the terminal, without settings that are the same in all jobs of an arm."""
+    """Return a table for the terminal, without settings that are the same in all jobs of an arm.
+
+    Sentences below it say which scores it leaves out.
+    """
     keys = varying_keys(rows)
     has_arms = any(row.arm for row in rows)
-    lines = [["job", *(["arm"] if has_arms else []), *keys, "outcome", *SHOWN]]
-    for row in rows:
+    scores = _scores(rows)
+    lines = [["job", *(["arm"] if has_arms else []), *keys, "outcome", *SHOWN, *scores.columns]]
+    for index, row in enumerate(rows):
         values = [row.number, *([row.arm] if has_arms else []), *(row.swept.get(key) for key in keys)]
         shown = row.summary | {"psnr": psnr_of(row.summary)}
         facts = [row.outcome, *(shown.get(name) for name in SHOWN)]
-        lines.append([*values, *facts])
-    return aligned(lines)
+        lines.append([*values, *facts, *(column[index] for column in scores.columns.values())])
+    return "\n".join([aligned(lines), *scores.left_out])
+
+
+def scores_of(jobs: Sequence[Mapping[str, Score]], sweep: Path) -> Scores:
+    """Return the scores of the jobs of a sweep, by name for each job, as columns. Missing ones are None.
+
+    Numbers of one name that were measured in different ways (with different protocols, models or lists of
+    prompts) are left out.
+    """
+    columns: dict[str, list[float | None]] = {}
+    left_out = []
+    for name in dict.fromkeys(name for job in jobs for name in job):
+        found = [job.get(name) for job in jobs]
+        problem = difference(name, [score for score in found if score is not None])
+        if problem is None:
+            columns[name] = [None if score is None else score.value for score in found]
+        else:
+            again = f"cadam3d eval {setting_word('run', shown(sweep))} 'metric=[{name}]'"
+            left_out.append(f"{problem}, so it is not in the table. Try: {again}")
+    return Scores(columns, left_out)
 
 
 def aligned(lines: Sequence[Sequence[Any]]) -> str:
@@ -51,6 +84,11 @@ def aligned(lines: Sequence[Sequence[Any]]) -> str:
     widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
     padded = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in texts]
     return "\n".join("  ".join(line).rstrip() for line in padded)
+
+
+def _scores(rows: Sequence[Row]) -> Scores:
+    folder = rows[0].folder.parent if rows else Path()
+    return scores_of([read_scores(row.folder, row.summary) for row in rows], folder)
 
 
 def varying_keys(rows: Sequence[Row]) -> list[str]:
@@ -68,10 +106,12 @@ def _write(path: Path, rows: Sequence[Row]) -> None:
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         names = [*FACTS, *(name for name in MORE_FACTS if any(name in row.summary for row in rows))]
-        writer.writerow(["job", "arm", *keys, "outcome", *names, "folder"])
-        for row in rows:
+        scores = _scores(rows).columns
+        writer.writerow(["job", "arm", *keys, "outcome", *names, *scores, "folder"])
+        for index, row in enumerate(rows):
             swept = [_plain(row.swept.get(key)) for key in keys]
             facts = [row.summary.get(name) for name in names]
+            facts += [column[index] for column in scores.values()]
             writer.writerow([row.number, row.arm, *swept, row.outcome, *facts, row.folder.name])
 
 

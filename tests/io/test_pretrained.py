@@ -126,6 +126,23 @@ def test_a_model_of_another_kind_names_the_prior_to_use(model, tmp_path):
         source(path=str(tmp_path)).find(KINDS, OTHERS)
 
 
+def test_a_list_of_folders_serves_priors_of_different_kinds(model, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "model_index.json").write_text(json.dumps({"_class_name": "StableDiffusion3Pipeline"}))
+    both = source(path=[str(other), str(model)])
+    assert both.find(KINDS, OTHERS).where == str(model)
+    assert both.find(KINDS, OTHERS).identity == source(path=str(model)).find(KINDS, OTHERS).identity
+    assert both.find(("StableDiffusion3Pipeline",), {}).where == str(other)
+    with pytest.raises(UserError, match=r"expected a SDXL in the list, got .* Try: 'prior\.path=\[/"):
+        both.find(("SDXL",), {})
+    with pytest.raises(UserError, match="nothing there"):
+        source(path=[str(model), str(tmp_path / "typo")]).find(KINDS, OTHERS)
+    for wrong in ([], [""]):
+        with pytest.raises(UserError, match="expected a folder, a list of folders or null"):
+            source(path=wrong)
+
+
 @pytest.mark.parametrize("text", ["", "no json", "[1]"])
 def test_a_damaged_index_is_reported_in_one_line(tmp_path, text):
     (tmp_path / "model_index.json").write_text(text)

@@ -38,12 +38,15 @@ class Jobs:
         self.folder = folder
         self.figures: list[str] | None = None
         self.line: list[str] = []
+        self.paper_table = False
+        self.category = ""  # of the prompts of the jobs that are added next
         self.planned: list[PlannedJob] = []
 
     def plan(self, arm: str, overrides: Sequence[str], name: str = "") -> Path:
         """Add a job to the plan and return its folder, which does not exist yet."""
         name = name or f"{len(self.planned)}_{overrides[0].partition('=')[2]}"
-        self.planned.append(PlannedJob(arm=arm, folder=name, overrides=list(overrides), swept={}))
+        job = PlannedJob(arm=arm, folder=name, overrides=list(overrides), swept={}, category=self.category)
+        self.planned.append(job)
         self.write_plan()
         return self.folder / name
 
@@ -56,6 +59,7 @@ class Jobs:
             jobs=self.planned,
             figures=self.figures,
             line=self.line,
+            paper_table=self.paper_table,
         )
         write_plan(self.folder, plan)
 

@@ -22,7 +22,12 @@ def test_a_plan_is_read_as_it_was_written(tmp_path: Path):
 
 @pytest.mark.parametrize("key", [*asdict(PLAN), *(f"jobs.{key}" for key in asdict(JOB))])
 def test_no_entry_of_a_plan_has_another_type(tmp_path: Path, key: str):
-    plausible = {"threads": [None, 7], "figures": [None], "jobs.swept": [{"a": 1}]}.get(key, [])
+    plausible = {
+        "threads": [None, 7],
+        "figures": [None],
+        "paper_table": [True],
+        "jobs.swept": [{"a": 1}],
+    }.get(key, [])
     for wrong in WRONG:
         content = asdict(PLAN)
         name = key.removeprefix("jobs.")

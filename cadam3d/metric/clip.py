@@ -1,0 +1,118 @@
+"""Clip: pictures and texts in the common space of a CLIP model (Radford et al. 2021)."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from cadam3d.io.transformer import TransformerFolder, TransformerSource
+
+# Models that are kept in memory, so that several metrics, and all jobs of a sweep, load each of them once.
+KEPT = 2
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A loaded model with its tokenizer and the preprocessing of its pictures."""
+
+    model: Any  # a CLIPModel of transformers, frozen
+    tokenizer: Any
+    preprocess: Any  # an image processor of transformers
+    facts: dict[str, Any]  # for the record of a number
+
+    def pictures(self, images: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v d"]:
+        """Return a unit vector for each picture. Pictures are rounded to 8 bits first, as in a file."""
+        rounded = (images.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+        pixels = self.preprocess(images=list(rounded), return_tensors="pt", input_data_format="channels_last")
+        pixel_values = pixels["pixel_values"].to(self._device)
+        return normalize(_vectors(self.model.get_image_features(pixel_values=pixel_values)), dim=-1)
+
+    def texts(self, texts: Sequence[str]) -> Float[Tensor, "t d"]:
+        """Return a unit vector for each text. What is too long is cut off (see :meth:`lost_tokens`)."""
+        tokens = self.tokenizer(
+            list(texts), padding=True, truncation=True, max_length=self.longest, return_tensors="pt"
+        ).to(self._device)
+        features = self.model.get_text_features(
+            input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"]
+        )
+        return normalize(_vectors(features), dim=-1)
+
+    def lost_tokens(self, text: str) -> int:
+        """Return how many tokens of a text the model cannot read."""
+        return max(0, len(self._all_tokens(text)) - self.longest)
+
+    def tokens(self, text: str) -> list[int]:
+        """Return the tokens of a text that the model reads, of a long text without the mark of its end."""
+        return self._all_tokens(text)[: self.longest - 1]
+
+    def complaint(self, text: str) -> str | None:
+        """Return a warning about a text that is too long for the model; None if it reads all of it."""
+        lost = self.lost_tokens(text)
+        if lost == 0:
+            return None
+        return (
+            f"the model reads {self.longest} tokens, so the last {lost} of the prompt "
+            f"{'are' if lost > 1 else 'is'} not scored. Try: a shorter prompt"
+        )
+
+    def _all_tokens(self, text: str) -> list[int]:
+        return self.tokenizer(text, verbose=False)["input_ids"]
+
+    @property
+    def longest(self) -> int:
+        """Return the number of tokens that the model reads, 77 for the published ones."""
+        return int(self.model.config.text_config.max_position_embeddings)
+
+    @property
+    def logit_scale(self) -> float:
+        """Return the factor by which the model was trained to multiply cosines."""
+        return math.exp(float(self.model.logit_scale))
+
+    @property
+    def _device(self) -> torch.device:
+        return self.model.logit_scale.device
+
+
+def load_clip(source: TransformerSource, device: torch.device) -> Clip:
+    """Return the CLIP model of ``source``, on ``device``. Raises ``UserError`` if it is not available."""
+    found = source.find()
+    return _loaded(found, found.facts()["weights_sha256"], device)
+
+
+@lru_cache(maxsize=KEPT)
+def _loaded(found: TransformerFolder, _sha256: str, device: torch.device) -> Clip:
+    import transformers
+
+    if found.config().get("model_type") != "clip":
+        raise found.damaged("it is not a CLIP model (model_type: clip) of transformers")
+    tokenizer = found.read(transformers.CLIPTokenizer)
+    preprocess = found.read(_preprocessing())
+    model = found.load(transformers.CLIPModel)
+    # If the files of a tokenizer are missing, transformers silently makes one that knows no word.
+    if len(tokenizer) < model.config.text_config.vocab_size / 2:
+        raise found.damaged("files of its tokenizer are missing")
+    return Clip(model.to(device), tokenizer, preprocess, found.facts())
+
+
+def _preprocessing() -> Any:
+    """Return the class that resizes with Pillow, as the published models were trained and are evaluated.
+
+    With torchvision, transformers would prefer another class that rounds differently, and the scores of a
+    machine would depend on what is installed there. Versions of transformers without the first name have
+    only the class that uses Pillow, under the second name.
+    """
+    import transformers
+
+    name = "CLIPImageProcessorPil"
+    return getattr(transformers, name if hasattr(transformers, name) else "CLIPImageProcessor")
+
+
+def _vectors(output: Any) -> Float[Tensor, "n d"]:
+    """Return the vectors of a call that returns them alone, or with the states before their projection."""
+    return output if isinstance(output, Tensor) else output.pooler_output

@@ -1,0 +1,121 @@
+"""ClipRPrecision: whether a CLIP model finds the prompt of an asset among many, from its pictures."""
+
+import hashlib
+import math
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.core.checks import fail, require
+from cadam3d.core.errors import UserError
+from cadam3d.io.reading import read_text, read_yaml
+from cadam3d.metric.clip import load_clip
+from cadam3d.metric.scoring import ModelMetric, Scorer, interval_record
+
+# The sets of prompts that come with this package, by the names of their files.
+SETS = Path(__file__).parent.parent / "sweep" / "prompt_sets"
+KEY = "metric.clip_r_precision.prompts"
+EXAMPLE = f"{KEY}=paper50"
+YAML = (".yaml", ".yml")
+LARGEST = 1 << 22  # bytes of a file
+NORMAL = 1.959963984540054  # the 97.5 % quantile of the normal distribution
+BATCH = 64  # texts that are read at once
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipRPrecision(ModelMetric):
+    """The share of the pictures to which no other prompt of a list is as similar as the own one.
+
+    This is the CLIP R-Precision of Park et al. (2021) with one relevant text, as Dream Fields (Jain et al.
+    2022) and DreamFusion (Poole et al. 2023) measure it. The protocol's text template goes around every
+    prompt of the list. An asset whose prompt is not in the list has it as one more candidate.
+    """
+
+    node: ClassVar[str] = "metric.clip_r_precision"
+    number: ClassVar[str] = "clip_r_precision"
+    kind: ClassVar[str] = "clip"
+
+    prompts: str  # a set of this package, or a file with one prompt per line or with a list in YAML
+
+    def scorer(self, device: torch.device) -> Scorer:
+        """Return the model, which gives each picture 1 if the own text is the most similar one, else 0.
+
+        Raises ``UserError`` if the prompts cannot be read.
+        """
+        candidates = read_candidates(self.prompts)
+        clip = load_clip(self.source(), device)
+        texts = [self.protocol.text_of(prompt) for prompt in candidates]
+        known = torch.cat([clip.texts(texts[at : at + BATCH]) for at in range(0, len(texts), BATCH)])
+        own = cache(lambda text: clip.texts([text])[0])
+
+        @cache
+        def has_double(text: str) -> bool:
+            """Return whether another prompt reads the same, because both are too long for the model."""
+            return any(other != text and clip.tokens(other) == clip.tokens(text) for other in texts)
+
+        def score(images: Tensor, text: str) -> Tensor:
+            if has_double(text):
+                return torch.zeros(len(images))
+            pictures = clip.pictures(images)
+            others = known[[other != text for other in texts]]
+            return (pictures @ own(text) > (pictures @ others.T).amax(dim=1)).double()
+
+        facts = {"candidates": len(candidates), "candidates_sha256": _hash(candidates)}
+        return Scorer(score=score, facts=clip.facts | facts, complaint=clip.complaint)
+
+    def interval(self, values: Float[Tensor, "v"]) -> dict[str, Any] | None:
+        """Return the 95 % interval of the share over viewpoints, by Wilson's formula for a proportion."""
+        count, share = len(values), float(values.mean())
+        middle = share + NORMAL**2 / (2 * count)
+        half = NORMAL * math.sqrt(share * (1 - share) / count + (NORMAL / (2 * count)) ** 2)
+        total = 1 + NORMAL**2 / count
+        # Rounding must not put the share itself outside.
+        low, high = min(share, (middle - half) / total), max(share, (middle + half) / total)
+        return interval_record(low, high, "the share over viewpoints, by Wilson's formula")
+
+
+def read_candidates(source: str) -> list[str]:
+    """Return the prompts of a set of this package or of a file, each once, in order.
+
+    A text file has one prompt per line; empty lines and lines that begin with # do not count. A file in YAML
+    has a list of texts, or of entries with a ``prompt``. Raises ``UserError`` for other files, and for fewer
+    than two prompts.
+    """
+    path = SETS / f"{source}.yaml"
+    path = path if path.is_file() else Path(source).expanduser()
+    if not path.is_file():
+        sets = "|".join(sorted(each.stem for each in SETS.glob("*.yaml")))
+        expected = f"a file, or one of the sets {sets}"
+        raise fail(KEY, expected=expected, got=source, example=EXAMPLE)
+    if path.suffix.lower() in YAML:
+        found = [_text(entry, path) for entry in _entries(path)]
+    else:
+        lines = read_text(path, largest=LARGEST).removeprefix("\ufeff").splitlines()
+        found = [line.strip() for line in lines]
+        found = [line for line in found if line and line[0] != "#"]
+    candidates = list(dict.fromkeys(found))
+    require(len(candidates) > 1, KEY, expected="at least two prompts", got=str(path), example=EXAMPLE)
+    return candidates
+
+
+def _entries(path: Path) -> list[Any]:
+    entries = read_yaml(path)
+    if not isinstance(entries, list):
+        raise fail(KEY, expected="a list in YAML", got=str(path), example=EXAMPLE)
+    return entries
+
+
+def _text(entry: Any, path: Path) -> str:
+    text = entry.get("prompt") if isinstance(entry, dict) else entry
+    if not isinstance(text, str) or not text.strip():
+        raise UserError(f"{KEY}: {path}: expected prompts, got {entry!r:.60}. Try: {EXAMPLE}")
+    return text.strip()
+
+
+def _hash(texts: list[str]) -> str:
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()

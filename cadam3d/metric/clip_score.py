@@ -1,0 +1,35 @@
+"""ClipScore: how similar the pictures of an asset are to its prompt."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import ClassVar
+
+import torch
+
+from cadam3d.metric.clip import load_clip
+from cadam3d.metric.scoring import ModelMetric, Scorer
+
+PERCENT = 100.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipScore(ModelMetric):
+    """100 times the cosine between a picture and the text, in the space of a CLIP model.
+
+    This is CLIPScore (Hessel et al. 2021) on the scale that papers about text-to-3D use: without its factor
+    of 2.5, and without raising negative values to 0.
+    """
+
+    node: ClassVar[str] = "metric.clip_score"
+    number: ClassVar[str] = "clip_score"
+    kind: ClassVar[str] = "clip"
+
+    def scorer(self, device: torch.device) -> Scorer:
+        """Return the model, which gives each picture a score in [-100, 100]."""
+        clip = load_clip(self.source(), device)
+        direction = cache(lambda text: clip.texts([text])[0])
+        return Scorer(
+            score=lambda images, text: PERCENT * clip.pictures(images) @ direction(text),
+            facts=clip.facts,
+            complaint=clip.complaint,
+        )

@@ -1,0 +1,347 @@
+"""CLIP score, R-precision and PickScore: the values of plain calls of transformers, and records of how."""
+
+import hashlib
+import json
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+from PIL import Image
+from splats import make_gaussians
+
+from cadam3d.core.errors import UserError
+from cadam3d.core.render import RenderOutput
+from cadam3d.io.transformer import TransformerFolder, sha256_of
+from cadam3d.metric.base import Measurand
+from cadam3d.metric.clip_r_precision import ClipRPrecision, read_candidates
+from cadam3d.metric.clip_score import ClipScore
+from cadam3d.metric.pick_score import PickScore
+from cadam3d.metric.protocol import RingProtocol
+
+PROMPT = "a red cube"
+PROTOCOL = RingProtocol(
+    name="small",
+    views=3,
+    elevations_deg=[0.0, 40.0],
+    distance=3.0,
+    fov_y_deg=40.0,
+    size=48,
+    background=[1.0, 1.0, 1.0],
+    crop="none",
+    text="a view of {}",
+    aggregation="mean",
+    models={"clip": {"id": "openai/clip", "revision": "abc"}, "pick": {"id": "one/pick", "revision": None}},
+)
+
+
+def scene(cameras, background, shown=None):
+    """Return pictures that differ between views: coloured noise, drawn from the angles of the camera."""
+    pictures = []
+    for azimuth, elevation in zip(cameras.azimuth_deg, cameras.elevation_deg, strict=True):
+        seed = round(float(azimuth) * 10 + float(elevation) * 10_000) + 10_000_000
+        blocks = torch.rand(3, 3, 3, generator=torch.Generator().manual_seed(seed))
+        pictures.append(blocks.repeat_interleave(16, 0).repeat_interleave(16, 1))
+    rgb, empty = torch.stack(pictures), torch.zeros(len(cameras), 0)
+    return RenderOutput(rgb, rgb[..., 0], rgb[..., 0], empty[..., None].expand(-1, 0, 2), empty)
+
+
+@pytest.fixture
+def measurand():
+    return Measurand(gaussians=make_gaussians(2), render=scene, prompt=PROMPT)
+
+
+@pytest.fixture
+def make(clip_folder):
+    def metric(kind, **changes):
+        settings = {"protocol": PROTOCOL, "model": str(clip_folder), "revision": None}
+        return kind(**settings | changes)
+
+    return metric
+
+
+@pytest.fixture(scope="session")
+def expected(clip_folder):
+    """Return cosines of all views with texts, and the trained factor, by plain calls of transformers."""
+    from transformers import CLIPModel, CLIPProcessor
+
+    model, processor = CLIPModel.from_pretrained(clip_folder), CLIPProcessor.from_pretrained(clip_folder)
+
+    def cosines(texts):
+        rgb = (scene(PROTOCOL.cameras, None).rgb * 255).round().byte().numpy()
+        images = [Image.fromarray(each) for each in rgb]
+        inputs = processor(text=texts, images=images, return_tensors="pt", padding=True)
+        with torch.no_grad():
+            output = model(**inputs)
+            return output.logits_per_image / model.logit_scale.exp(), model.logit_scale.exp().item()
+
+    return cosines
+
+
+def test_clip_score_is_100_times_the_cosine_of_each_view(make, measurand, expected):
+    measured = make(ClipScore).measure(measurand)
+    cosines = 100 * expected(["a view of a red cube"])[0][:, 0]
+    record = measured.details["clip_score"]
+    assert record["views"] == pytest.approx(cosines.tolist(), abs=1e-5)
+    assert measured.numbers["clip_score"] == pytest.approx(cosines.mean().item(), abs=1e-5)
+    assert cosines.std() > 0.5
+
+
+def test_pick_score_is_the_logit_of_each_view(make, measurand, expected):
+    measured = make(PickScore).measure(measurand)
+    cosines, scale = expected(["a view of a red cube"])
+    assert measured.details["pick_score"]["views"] == pytest.approx(
+        (scale * cosines[:, 0]).tolist(), abs=1e-5
+    )
+    assert measured.numbers["pick_score"] == pytest.approx((scale * cosines).mean().item(), abs=1e-5)
+
+
+@pytest.fixture
+def candidates(tmp_path):
+    path = tmp_path / "prompts.txt"
+    path.write_text("# a list\na blue cat\n\na corgi on the table\na red cube\na big sphere\na blue cat\n")
+    return path
+
+
+@pytest.mark.parametrize("prompt", ["a red cube", "a blue cat", "a corgi on the table", "a small view"])
+def test_r_precision_is_the_share_of_views_that_find_their_prompt(
+    make, measurand, expected, candidates, prompt
+):
+    """The last prompt is not in the list, and competes with all of it."""
+    measured = make(ClipRPrecision, prompts=str(candidates)).measure(replace(measurand, prompt=prompt))
+    prompts = ["a blue cat", "a corgi on the table", "a red cube", "a big sphere"]
+    prompts += [] if prompt in prompts else [prompt]
+    cosines, _ = expected([f"a view of {each}" for each in prompts])
+    hits = (cosines.argmax(dim=1) == prompts.index(prompt)).double()
+    record = measured.details["clip_r_precision"]
+    assert record["views"] == hits.tolist()
+    assert measured.numbers["clip_r_precision"] == pytest.approx(hits.mean().item())
+    assert record["candidates"] == 4
+    assert 0 <= record["interval"]["low"] <= hits.mean() <= record["interval"]["high"] <= 1
+
+
+def test_the_list_of_r_precision_decides_something(make, measurand, candidates):
+    metric = make(ClipRPrecision, prompts=str(candidates))
+    found = [
+        metric.measure(replace(measurand, prompt=prompt)).numbers["clip_r_precision"]
+        for prompt in read_candidates(str(candidates))
+    ]
+    assert sum(found) == pytest.approx(1.0)  # every view finds exactly one of the prompts
+
+
+def test_texts_that_the_model_cannot_tell_apart_are_not_found(make, measurand, tmp_path):
+    long = "a cat " * 80
+    (tmp_path / "prompts.txt").write_text(f"{long} one\n{long} two\n")
+    metric = make(ClipRPrecision, prompts=str(tmp_path / "prompts.txt"))
+    measured = metric.measure(replace(measurand, prompt=f"{long} one"))
+    assert measured.numbers["clip_r_precision"] == 0
+
+
+def test_the_record_says_how_a_number_came_about(make, measurand, clip_folder):
+    record = make(ClipScore).measure(measurand).details["clip_score"]
+    assert json.loads(json.dumps(record)) == record
+    assert record["protocol"] == {
+        "name": "small",
+        "views": 3,
+        "elevations_deg": [0.0, 40.0],
+        "distance": 3.0,
+        "fov_y_deg": 40.0,
+        "size": 48,
+        "background": [1.0, 1.0, 1.0],
+        "crop": "none",
+        "text": "a view of {}",
+        "aggregation": "mean",
+    }
+    assert record["model"] == str(clip_folder)
+    assert record["revision"] is None
+    weights = (clip_folder / "model.safetensors").read_bytes()
+    assert record["weights_sha256"] == hashlib.sha256(weights).hexdigest()
+    assert record["text"] == "a view of a red cube"
+    assert record["interval"]["low"] < record["mean"] < record["interval"]["high"]
+
+
+def test_the_interval_of_a_mean_is_that_of_student(make, measurand):
+    from scipy.stats import ttest_1samp
+
+    record = make(ClipScore).measure(measurand).details["clip_score"]
+    known = ttest_1samp(record["views"], 0).confidence_interval(0.95)
+    assert (record["interval"]["low"], record["interval"]["high"]) == pytest.approx(tuple(known))
+
+
+def test_the_best_view_counts_if_the_protocol_says_so(make, measurand):
+    best = make(ClipScore, protocol=replace(PROTOCOL, aggregation="best")).measure(measurand)
+    record = best.details["clip_score"]
+    assert best.numbers["clip_score"] == max(record["views"])
+    assert record["mean"] < max(record["views"])
+    assert record["interval"] is None
+
+
+def test_the_order_of_the_views_does_not_matter(make, measurand):
+    one = make(ClipScore).measure(measurand).numbers["clip_score"]
+    turned = replace(PROTOCOL, elevations_deg=[40.0, 0.0])
+    other = make(ClipScore, protocol=turned).measure(measurand).numbers["clip_score"]
+    assert other == pytest.approx(one, abs=1e-5)
+
+
+def test_an_asset_without_gaussians_has_no_score(make, measurand):
+    empty = replace(measurand, gaussians=make_gaussians(2).index(slice(0, 0)))
+    assert make(ClipScore).measure(empty).numbers == {}
+
+
+def test_several_metrics_load_a_model_once(make, measurand, candidates, tmp_path, clip_folder, monkeypatch):
+    folder = shutil.copytree(clip_folder, tmp_path / "another")
+    loads = []
+    load = TransformerFolder.load
+    monkeypatch.setattr(TransformerFolder, "load", lambda self, kind: loads.append(kind) or load(self, kind))
+    for kind, more in ((ClipScore, {}), (PickScore, {}), (ClipRPrecision, {"prompts": str(candidates)})):
+        make(kind, model=str(folder), **more).measure(measurand)
+    assert len(loads) == 1
+    # Other weights in the same folder are another model.
+    other = make(ClipScore, model=str(folder))
+    before = other.measure(measurand).details["clip_score"]
+    with (folder / "model.safetensors").open("r+b") as file:
+        file.seek(-4, 2)
+        file.write(b"\0\0\x80\x3f")
+    after = other.measure(measurand).details["clip_score"]
+    assert len(loads) == 2
+    assert before["weights_sha256"] != after["weights_sha256"]
+
+
+def test_the_hash_of_several_files_is_that_of_the_list_of_sha256sum(tmp_path):
+    lines = ""
+    for name in ("model-00001-of-00002.safetensors", "model-00002-of-00002.safetensors"):
+        (tmp_path / name).write_text(name)
+        lines += f"{hashlib.sha256(name.encode()).hexdigest()}  {name}\n"
+    files = sorted(tmp_path.iterdir(), reverse=True)
+    assert sha256_of(files) == hashlib.sha256(lines.encode()).hexdigest()
+
+
+def test_a_long_prompt_is_cut_off_with_a_warning(make, measurand):
+    long = replace(measurand, prompt="red " * 200)
+    measured = make(ClipScore).measure(long)
+    [warning] = measured.warnings
+    assert "reads 77 tokens" in warning
+    cut = replace(measurand, prompt="red " * 150)
+    assert make(ClipScore).measure(cut).numbers == pytest.approx(measured.numbers)
+    assert make(ClipScore).measure(measurand).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("kind", "line"),
+    [
+        (ClipScore, "hf download openai/clip --revision abc --local-dir models/clip "),
+        (PickScore, "hf download one/pick --local-dir models/pick "),
+    ],
+)
+def test_missing_weights_say_what_to_download_and_what_to_type(make, measurand, kind, line, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    metric = make(kind, model=None)
+    with pytest.raises(UserError) as caught:
+        metric.measure(measurand)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert text.startswith(f"{kind.node}.model: ")
+    assert line in text
+    assert text.endswith(f"Then: {kind.node}.model={line.split()[-1]}")
+
+
+def test_a_model_of_the_hub_has_its_commit_in_the_record(make, measurand, clip_folder, tmp_path, monkeypatch):
+    snapshot = shutil.copytree(clip_folder, tmp_path / "snapshots" / "0123456789abcdef")
+    asked = []
+
+    def download(name, **options):
+        asked.append((name, options["revision"]))
+        return str(snapshot)
+
+    monkeypatch.setattr(
+        "huggingface_hub.hf_hub_download", lambda *names, **options: str(snapshot / "config.json")
+    )
+    monkeypatch.setattr("huggingface_hub.snapshot_download", download)
+    record = make(ClipScore, model=None).measure(measurand).details["clip_score"]
+    assert asked == [("openai/clip", "abc")]
+    assert (record["model"], record["revision"]) == ("openai/clip", "0123456789abcdef")
+    make(ClipScore, model="my/clip").measure(measurand)
+    assert asked[-1] == ("my/clip", None)
+
+
+def without(name):
+    def damage(folder):
+        (folder / name).unlink()
+
+    return damage
+
+
+def only_pickled(folder):
+    torch.save({}, folder / "pytorch_model.bin")
+    (folder / "model.safetensors").unlink()
+
+
+def of_another_kind(folder):
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | {"model_type": "siglip"}))
+
+
+def with_weights_of_another_model(folder):
+    from safetensors.torch import save_file
+
+    save_file({"embeddings": torch.zeros(2)}, folder / "model.safetensors", {"format": "pt"})
+
+
+def cut_short(folder):
+    whole = (folder / "model.safetensors").read_bytes()
+    (folder / "model.safetensors").write_bytes(whole[:-100])
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (without("config.json"), "has no config.json"),
+        (without("preprocessor_config.json"), "cannot be loaded"),
+        (only_pickled, "it could run code"),
+        (of_another_kind, "not a CLIP model"),
+        (with_weights_of_another_model, "it is no CLIPModel"),
+        (cut_short, "cannot be loaded"),
+    ],
+)
+def test_a_damaged_model_is_one_message(make, measurand, clip_folder, tmp_path, damage, message):
+    folder = shutil.copytree(clip_folder, tmp_path / "damaged")
+    damage(folder)
+    with pytest.raises(UserError, match=message) as caught:
+        make(ClipScore, model=str(folder)).measure(measurand)
+    assert str(caught.value).startswith("metric.clip_score.model: ")
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [("", "expected a folder"), ("~/nothing/here", "there is no folder"), ("models", "there is no folder")],
+)
+def test_a_model_that_is_no_folder_and_no_id_is_refused(make, measurand, model, message, monkeypatch):
+    with pytest.raises(UserError, match=message):
+        make(ClipScore, model=model).measure(measurand)
+
+
+def test_a_protocol_may_name_no_model(make, measurand):
+    metric = make(PickScore, model=None, protocol=replace(PROTOCOL, models={}))
+    with pytest.raises(UserError, match=r"metric\.pick_score\.model: protocol=small names no model"):
+        metric.measure(measurand)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.txt", "only one\n", "at least two prompts"),
+        ("a.yaml", "prompt: one\n", "a list in YAML"),
+        ("a.yaml", "- 1\n- two\n", "expected prompts, got 1"),
+        ("missing.txt", None, "a file, or one of the sets"),
+    ],
+)
+def test_a_list_of_prompts_is_checked(tmp_path, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(UserError, match=message):
+        read_candidates(str(tmp_path / name))
+
+
+def test_a_list_in_yaml_has_texts_or_entries(tmp_path):
+    (tmp_path / "a.yaml").write_text("- a cat\n- prompt: a dog\n  category: Animal\n- a cat\n")
+    assert read_candidates(str(tmp_path / "a.yaml")) == ["a cat", "a dog"]

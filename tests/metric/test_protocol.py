@@ -1,0 +1,171 @@
+"""Protocols: where the cameras are, what is cropped, and how the values of views become one number."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from cadam3d.core.errors import UserError
+from cadam3d.core.render import RenderOutput
+from cadam3d.metric.protocol import Protocol, RingProtocol, SphereProtocol
+from cadam3d.settings.compose import option
+
+PICTURES = {
+    "distance": 2.2,
+    "fov_y_deg": 60.0,
+    "size": 40,
+    "background": [0.0, 0.0, 1.0],
+    "crop": "none",
+    "text": "{}",
+    "models": {},
+}
+RING = RingProtocol(**PICTURES, name="ring", views=4, elevations_deg=[0.0, 30.0], aggregation="mean")
+SPHERE = SphereProtocol(**PICTURES, name="sphere", subdivisions=1, other_fovs_y_deg=[45.0, 30.0], rounds=3)
+
+
+def test_a_ring_begins_at_the_front():
+    azimuths, elevations = RING.cameras.azimuth_deg, RING.cameras.elevation_deg
+    assert azimuths.abs().tolist() == [0, 90, 180, 90] * 2
+    assert elevations.tolist() == [0.0] * 4 + [30.0] * 4
+
+
+@pytest.mark.parametrize(("subdivisions", "places"), [(0, 12), (1, 42), (2, 162)])
+def test_places_on_the_sphere_are_spread_evenly(subdivisions, places):
+    protocol = replace(SPHERE, subdivisions=subdivisions, other_fovs_y_deg=[])
+    positions = protocol.cameras.positions.double()
+    assert len(positions) == places
+    assert positions.norm(dim=1) == pytest.approx(torch.full((places,), 2.2).numpy(), abs=1e-5)
+    assert positions.mean(dim=0).abs().max() < 1e-6
+    apart = torch.cdist(positions, positions) + 10 * torch.eye(places)
+    nearest = apart.amin(dim=1)
+    assert nearest.max() < 1.2 * nearest.min()
+
+
+def test_every_place_has_all_fields_of_view():
+    cameras = SPHERE.cameras
+    assert len(cameras) == 42 * 3
+    focal = cameras.intrinsics[:, 0, 0].reshape(42, 3)
+    wanted = 20 / torch.tan(torch.deg2rad(torch.tensor([60.0, 45.0, 30.0])) / 2)
+    assert torch.allclose(focal, wanted.expand(42, 3), rtol=1e-5)
+    places = cameras.positions.reshape(42, 3, 3)
+    assert torch.allclose(places, places[:, :1].expand(-1, 3, -1), atol=1e-6)
+
+
+def test_equal_values_stay_equal_and_the_best_field_of_view_counts():
+    values = torch.full((42, 3), 1.0)
+    values[:, 2] = 2.0
+    assert SPHERE.aggregate(values.flatten(), less_is_better=False) == pytest.approx(2.0)
+    assert SPHERE.aggregate(values.flatten(), less_is_better=True) == pytest.approx(1.0)
+
+
+def test_one_lucky_place_is_averaged_with_its_neighbours():
+    values = torch.zeros(42, 3)
+    values[0] = 6.0
+    once = replace(SPHERE, rounds=1)
+    # A corner of the icosahedron has five neighbours.
+    assert once.aggregate(values.flatten(), less_is_better=False) == pytest.approx(1.0)
+    assert replace(SPHERE, rounds=0).aggregate(values.flatten(), less_is_better=False) == 6.0
+    assert 0 < SPHERE.aggregate(values.flatten(), less_is_better=False) < 1.0
+
+
+def test_smoothing_is_repeated_averages_over_neighbours():
+    """The same as loops over places and their neighbours, which are the places within 0.65 of the radius."""
+    values = torch.rand(42 * 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    places = SPHERE.cameras.positions.reshape(42, 3, 3)[:, 0].double() / 2.2
+    near = [[j for j in range(42) if (places[i] - places[j]).norm() < 0.65] for i in range(42)]
+    assert {len(each) for each in near} == {6, 7}
+    scores = [float(values.reshape(42, 3)[i].max()) for i in range(42)]
+    for _ in range(3):
+        scores = [sum(scores[j] for j in each) / len(each) for each in near]
+    assert SPHERE.aggregate(values, less_is_better=False) == pytest.approx(max(scores))
+
+
+def disc_at(row, column, radius):
+    """Return a function that renders a red disc on the background of the protocol."""
+
+    def render(cameras, background, shown=None):
+        y, x = torch.meshgrid(torch.arange(40), torch.arange(40), indexing="ij")
+        alpha = ((x - column) ** 2 + (y - row) ** 2 < radius**2).float().expand(len(cameras), 40, 40)
+        red = torch.tensor([1.0, 0.0, 0.0])
+        rgb = alpha[..., None] * red + (1 - alpha[..., None]) * background[:, None, None]
+        empty = torch.zeros(len(cameras), 0)
+        return RenderOutput(rgb, alpha, alpha, empty[..., None].expand(-1, 0, 2), empty)
+
+    return render
+
+
+@pytest.mark.parametrize("place", [(20, 20), (8, 30), (2, 2)])
+def test_a_cropped_object_is_in_the_middle_and_fills_the_picture(place):
+    cropped = replace(RING, crop="object")
+    for images in cropped.images(disc_at(*place, 6)):
+        assert images.shape == (4, 40, 40, 3)
+        red = images[..., 0] > 0.5
+        rows = red.any(dim=2).nonzero()[:, 1]
+        assert 28 <= rows.max() - rows.min() + 1 <= 36
+        assert (images[:, 0, 0] - torch.tensor([0.0, 0.0, 1.0])).abs().max() < 0.05
+        if place != (2, 2):  # most of this disc is outside the picture
+            middle = (rows.max() + rows.min()) / 2
+            assert 18.5 <= middle <= 20.5
+
+
+def test_without_a_crop_the_pictures_are_those_of_the_renderer():
+    render = disc_at(8, 30, 6)
+    [first, _] = RING.images(render)
+    assert torch.equal(first, render(RING.cameras.index(slice(0, 4)), RING.backgrounds(4)).rgb)
+
+
+def test_a_picture_without_an_object_is_not_cropped():
+    empty = disc_at(8, 30, 0)
+    assert all((images[..., 2] == 1).all() for images in replace(RING, crop="object").images(empty))
+
+
+def test_the_prompt_goes_where_the_braces_are():
+    assert replace(RING, text="a photo of {}, 8k").text_of("a {cat}") == "a photo of a {cat}, 8k"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"text": "no place"}, "protocol.text"),
+        ({"text": "{} and {}"}, "protocol.text"),
+        ({"crop": "some"}, "protocol.crop"),
+        ({"aggregation": "median"}, "protocol.aggregation"),
+        ({"views": 0}, "protocol.views"),
+        ({"elevations_deg": []}, "protocol.elevations_deg"),
+        ({"models": {"clip": "openai/clip"}}, "protocol.models.clip"),
+        ({"models": {"clip": {"id": "openai/clip"}}}, "protocol.models.clip"),
+        ({"name": ""}, "protocol.name"),
+    ],
+)
+def test_wrong_values_are_named(change, message):
+    with pytest.raises(UserError, match=message):
+        replace(RING, **change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"subdivisions": 9}, "protocol.subdivisions"),
+        ({"other_fovs_y_deg": [180.0]}, "protocol.other_fovs_y_deg"),
+        ({"rounds": -1}, "protocol.rounds"),
+    ],
+)
+def test_wrong_values_of_a_sphere_are_named(change, message):
+    with pytest.raises(UserError, match=message):
+        replace(SPHERE, **change)
+
+
+@pytest.mark.parametrize(
+    ("name", "views"),
+    [("paper", 12), ("gaussiandreamer", 120), ("dreamfusion", 8), ("shapes", 36), ("t3bench", 810)],
+)
+def test_a_protocol_has_its_own_name_and_its_published_number_of_views(name, views):
+    protocol = option("protocol", name, Protocol) if name in ("paper", "t3bench") else composed(name)
+    assert protocol.name == name
+    assert len(protocol.cameras) == views
+
+
+def composed(name):
+    from cadam3d.settings.compose import component, compose
+
+    return component(compose([f"protocol={name}", "prompt=a cube"]).protocol, Protocol)

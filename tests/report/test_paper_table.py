@@ -1,0 +1,283 @@
+"""The paper's table of a sweep: its numbers equal numbers computed by hand, and its formats agree."""
+
+import csv
+import io
+import json
+import math
+import re
+
+import pytest
+
+from cadam3d.core.quality import QUALITIES
+from cadam3d.io import run_folder
+from cadam3d.report import table_files
+from cadam3d.report.means import change, difference, mean
+from cadam3d.report.paper_table import columns, paper_table
+from cadam3d.report.published import NUMBERS, ROWS
+from cadam3d.report.results import read
+from cadam3d.report.table_formats import comma_separated, headings, in_latex, latex, markdown, texts
+
+# The body of the paper's table 1, as its source has it.
+TEX = r"""
+    \multirow{2}{*}{\textbf{SDS}} & Baseline & 30.14 & -0.125 & 0.194 & 9.908 & 1067K & 46.4MB \\
+     & \textbf{CAdam} & 29.95 & -0.028 & 0.185 & 9.643 & \textbf{143K} & \textbf{6.1MB} \\
+    \multirow{2}{*}{\textbf{ISM}} & Baseline & 31.10 & 0.413 & 0.225 & 6.438 & 1706K & 110.6MB \\
+     & \textbf{CAdam} & 28.48 & 0.518 & 0.225 & 8.167 & \textbf{81K} & \textbf{5.3MB} \\
+    \multirow{2}{*}{\textbf{VFDS}} & Baseline & 29.88 & 0.436 & 0.235 & 7.183 & 3373K & 218.8MB \\
+     & \textbf{CAdam} & 29.21 & 0.486 & 0.237  & 8.891 & \textbf{82K} & \textbf{5.3MB} \\
+"""
+PROTOCOL = {"name": "paper", "views": 12}
+# Student's t at 97.5 % with two degrees of freedom, from a printed table.
+T2 = 4.3027
+
+
+def scored(clip: float, protocol=PROTOCOL, sha: str = "aa") -> dict:
+    """Return the entries of a summary with a CLIP score."""
+    record = {"protocol": protocol, "model": "clip", "weights_sha256": sha}
+    return {"clip_score": clip, "measurements": {"clip_score": record}}
+
+
+@pytest.fixture
+def three(jobs):
+    """Two objectives, three prompts, both densifiers; the baseline of the second lacks one prompt."""
+    jobs.paper_table = True
+    counts = {"a cube": (1000, 100), "a | torus": (2000, 300), "a tower": (3000, 200)}
+    for guidance in ("sds", "vfds"):
+        for prompt, (theirs, ours) in counts.items():
+            where = (f"prompt='{prompt}'", f"guidance={guidance}")
+            jobs.category = "Material" if prompt == "a cube" else "Structure & 100 %"
+            if not (guidance == "vfds" and prompt == "a tower"):
+                jobs.add("baseline", *where, n=theirs, psnr=20 + theirs / 1000, arm="baseline")
+            else:
+                jobs.plan("baseline", ["densifier=baseline", *where], "waits")
+            jobs.add("cadam", *where, n=ours, psnr=20 + theirs / 1000 - 0.1 * ours / 100, arm="cadam")
+    return jobs.folder
+
+
+def table_of(folder):
+    table = paper_table(read(folder), folder)
+    assert table is not None
+    return table
+
+
+def row_of(table, objective, method, source="this sweep", section=0):
+    found = [
+        row
+        for row in table.sections[section].rows
+        if (row.objective.partition(",")[0], row.method, row.source) == (objective, method, source)
+    ]
+    assert len(found) == 1
+    return found[0]
+
+
+def test_the_published_numbers_are_those_of_the_source():
+    clean = re.sub(r"\\multirow\{2\}\{\*\}|\\textbf|[{}]|\\\\", "", TEX)
+    lines = [[cell.strip() for cell in line.split("&")] for line in clean.strip().splitlines()]
+    objective = ""
+    for line, row in zip(lines, ROWS, strict=True):
+        objective = line[0] or objective
+        assert (row.objective, row.arm) == (objective, line[1].lower())
+        assert [row.texts[name] for name in NUMBERS] == line[2:]
+
+
+def test_means_and_intervals_equal_those_computed_by_hand(three):
+    table = table_of(three)
+    baseline, cadam = row_of(table, "SDS", "baseline"), row_of(table, "SDS", "cadam")
+    assert baseline.cells["num_gaussians"].text == "2000"
+    # The standard deviation of 1000, 2000 and 3000 is 1000.
+    assert float(baseline.cells["num_gaussians"].half) == pytest.approx(T2 * 1000 / math.sqrt(3), abs=1)
+    assert cadam.cells["num_gaussians"].text == "200"
+    assert baseline.cells["psnr"].text == "22.00"
+    assert cadam.cells["psnr"].text == "21.80"
+
+
+def test_differences_are_paired_by_prompt(three):
+    row = row_of(table_of(three), "SDS", "cadam - baseline")
+    # PSNR differs by -0.1, -0.3 and -0.2 dB, with a standard deviation of 0.1 dB.
+    assert row.cells["psnr"].text == "-0.20"
+    assert float(row.cells["psnr"].half) == pytest.approx(T2 * 0.1 / math.sqrt(3), abs=0.006)
+    # 600 of 6,000 Gaussians remain. The residuals 100 - 100, 300 - 200 and 200 - 300 have a deviation of 100.
+    assert row.cells["num_gaussians"].text == "90.0 % fewer"
+    half = 100 * T2 * 100 / math.sqrt(3) / 2000
+    assert float(row.cells["num_gaussians"].half) == pytest.approx(half, abs=0.06)
+
+
+def test_missing_jobs_are_counted_and_left_out_of_pairs(three):
+    table = table_of(three)
+    assert row_of(table, "VFDS", "baseline").prompts == "2 of 3"
+    assert row_of(table, "VFDS", "cadam").prompts == "3"
+    difference_row = row_of(table, "VFDS", "cadam - baseline")
+    assert difference_row.prompts == "2 of 3"
+    assert difference_row.cells["num_gaussians"].text == "86.7 % fewer"
+    assert any("1 of 12 jobs" in note for note in table.notes)
+
+
+def test_seeds_are_averaged_within_a_prompt_first(jobs):
+    jobs.paper_table = True
+    for prompt, seeds in (("a cube", (10, 20, 60)), ("a torus", (90,))):
+        for seed, psnr in enumerate(seeds):
+            jobs.add("cadam", f"prompt={prompt}", f"seed={seed}", n=100, psnr=psnr, arm="cadam")
+    assert row_of(table_of(jobs.folder), "SDS", "cadam").cells["psnr"].text == "60.00"
+
+
+def test_published_rows_keep_their_text_and_never_share_a_cell(three):
+    table = table_of(three)
+    published = row_of(table, "VFDS", "cadam", "published")
+    assert published.cells["num_gaussians"].value == "82K"
+    assert published.cells["asset_mib"].value == "5.3MB"
+    assert published.cells["psnr"].text == "-"
+    assert row_of(table, "SDS", "cadam - baseline", "published").cells["num_gaussians"].text == "86.6 % fewer"
+    assert not any(row.source == "published" for section in table.sections[1:] for row in section.rows)
+    assert any("another protocol" in note for note in table.notes)
+
+
+def test_objectives_that_the_paper_lacks_have_no_published_rows(jobs):
+    jobs.add("cadam", "guidance=gcs", n=10, psnr=20, arm="cadam")
+    table = table_of(jobs.folder)
+    assert [row.source for row in table.sections[0].rows] == ["this sweep"]
+    assert not any("published" in note for note in table.notes)
+
+
+def test_categories_have_parts_of_their_own(three):
+    table = table_of(three)
+    assert [section.category for section in table.sections] == ["", "Material", "Structure & 100 %"]
+    assert row_of(table, "SDS", "baseline", section=1).cells["num_gaussians"].text == "1000"
+    assert row_of(table, "SDS", "baseline", section=1).cells["num_gaussians"].half == ""
+    assert row_of(table, "SDS", "baseline", section=2).prompts == "2"
+
+
+def test_all_formats_show_the_same_cells(three):
+    table = table_of(three)
+    wanted = [texts(row, table.names) for section in table.sections for row in section.rows]
+
+    lines = [line for line in markdown(table).splitlines() if line.startswith("| ")]
+    shown = [[cell.replace("\\", "") for cell in re.split(r" (?<!\\)\| ", line[2:-2])] for line in lines]
+    body = [line for line in shown if line != headings(table) and not line[0].startswith("---")]
+    assert body == wanted
+
+    rows = list(csv.reader(io.StringIO(comma_separated(table))))
+    assert [row[1:5] for row in rows[1:]] == [line[:4] for line in wanted]
+    for row, line in zip(rows[1:], wanted, strict=True):
+        for i, cell in enumerate(line[4:]):
+            number, half, prompts = row[5 + 3 * i : 8 + 3 * i]
+            interval = f" ± {half}" if half else ""
+            own = f" ({prompts})" if prompts and prompts != line[3].partition(" ")[0] else ""
+            assert cell.replace(",", "") == f"{number}{interval}{own}"
+
+    body = [line for line in latex(table).splitlines() if line.endswith(r"\\")]
+    assert len(body) == len(wanted) + len(table.sections)
+    for line in wanted:
+        assert " & ".join(map(in_latex, line)) + r" \\" in body
+
+
+def test_the_latex_is_balanced_and_escapes_what_users_type(three):
+    text = latex(table_of(three))
+    assert r"\caption{Structure \& 100 \%}" in text
+    code = "\n".join(line for line in text.splitlines() if not line.startswith("%"))
+    bare = re.sub(r"\\[&%$#_{}\\]", "", code)
+    depth = 0
+    for character in bare:
+        depth += {"{": 1, "}": -1}.get(character, 0)
+        assert depth >= 0
+    assert depth == 0
+    assert bare.count("$") % 2 == 0
+    assert not set("%#^~|_±↑↓") & set(bare)
+    begun, ended = re.findall(r"\\begin\{(\w+)\}", code), re.findall(r"\\end\{(\w+)\}", code)
+    assert sorted(begun) == sorted(ended)
+    for tabular in re.findall(r"\\begin\{tabular\}\{(\w+)\}\n(.*?)\\end\{tabular\}", code, re.DOTALL):
+        rows = [line for line in tabular[1].splitlines() if line.endswith(r"\\")]
+        assert {len(re.findall(r"(?<!\\)&", line)) + 1 for line in rows} == {len(tabular[0])}
+
+
+def test_columns_are_the_numbers_that_every_row_has(jobs):
+    for arm in ("baseline", "cadam"):
+        more = {"iou": 0.5} if arm == "cadam" else {}
+        jobs.add(arm, n=100, psnr=20, arm=arm, ssim_turned=0.8, psnr_turned=21.0, **scored(30.0), **more)
+    results = read(jobs.folder)
+    assert columns([[result] for result in results]) == [
+        "clip_score",
+        "psnr_turned",
+        "ssim_turned",
+        "num_gaussians",
+        "asset_mib",
+    ]
+    assert all(heading in headings(table_of(jobs.folder)) for heading in ("CLIP score ↑", "Gaussians ↓"))
+    assert set(NUMBERS) <= set(QUALITIES)
+
+
+@pytest.mark.parametrize(
+    ("other", "expected"),
+    [
+        (scored(30, {"name": "t3bench", "views": 12}), "protocol.name is paper (1) and t3bench (1)"),
+        (scored(30, {**PROTOCOL, "views": 8}), "protocol.views is 12 (1) and 8 (1)"),
+        (scored(30, sha="bb"), "weights_sha256 is aa (1) and bb (1)"),
+        ({"clip_score": 30.0, "measurements": {}}, "clip_score has a record"),
+    ],
+)
+def test_numbers_of_different_methods_are_not_put_into_one_table(jobs, other, expected):
+    jobs.add("baseline", n=100, psnr=20, arm="baseline", **scored(31.0))
+    folder = jobs.add("cadam", n=10, psnr=20, arm="cadam", **scored(30.0))
+    assert table_of(jobs.folder).names[0] == "clip_score"
+    summary = json.loads((folder / run_folder.SUMMARY).read_text())
+    (folder / run_folder.SUMMARY).write_text(json.dumps({**summary, **other}))
+    table = table_of(jobs.folder)
+    assert "clip_score" not in table.names
+    assert "num_gaussians" in table.names
+    [note] = [note for note in table.notes if expected in note]
+    assert note.endswith("'metric=[clip_score]'")
+    assert "31.00" not in markdown(table) + latex(table) + comma_separated(table)
+
+
+def test_scores_of_one_table_belong_to_one_protocol(jobs):
+    for arm in ("baseline", "cadam"):
+        both = scored(30.0)
+        both["niqe"] = 5.0
+        both["measurements"]["niqe"] = {"protocol": {"name": "t3bench", "views": 12}, "weights_sha256": "cc"}
+        jobs.add(arm, n=100, psnr=20, arm=arm, **both)
+    table = table_of(jobs.folder)
+    assert "clip_score" in table.names
+    assert "niqe" not in table.names
+    assert any("niqe belongs to another protocol" in note for note in table.notes)
+
+
+def test_settings_that_come_with_prompts_do_not_split_the_rows(jobs):
+    for prompt, negative in (("a cube", "blurry"), ("a torus", "ugly")):
+        jobs.add("cadam", f"prompt={prompt}", f"negative_prompt={negative}", n=10, psnr=20, arm="cadam")
+    rows = [row for row in table_of(jobs.folder).sections[0].rows if row.source == "this sweep"]
+    assert [(row.objective, row.prompts) for row in rows] == [("SDS", "2")]
+
+
+def test_eval_replaces_the_numbers_of_training(jobs):
+    jobs.paper_table = True
+    folder = jobs.add("cadam", n=10, psnr=20, arm="cadam", **scored(30.0))
+    evaluation = {"num_gaussians": 10, **scored(25.0, {"name": "t3bench"})}
+    (folder / run_folder.EVALUATION).write_text(json.dumps(evaluation))
+    table = table_of(jobs.folder)
+    assert row_of(table, "SDS", "cadam").cells["clip_score"].text == "25.00"
+    assert any("protocol=t3bench" in note for note in table.notes)
+    # An evaluation of another asset does not count.
+    (folder / run_folder.EVALUATION).write_text(json.dumps({**evaluation, "num_gaussians": 11}))
+    assert row_of(table_of(jobs.folder), "SDS", "cadam").cells["clip_score"].text == "30.00"
+
+
+def test_a_sweep_has_a_table_only_if_its_grid_asks_for_it(jobs):
+    jobs.add("cadam", n=10, psnr=20, arm="cadam")
+    assert table_files.write(jobs.folder) == ""
+    assert not (jobs.folder / run_folder.PAPER_TABLE_CSV).exists()
+
+
+def test_recipes_are_objectives(jobs):
+    jobs.paper_table = True
+    recipes = {"gaussiandreamer": "sds_gaussiandreamer", "flowdreamer": "vfds_flowdreamer"}
+    for recipe, objective in recipes.items():
+        jobs.add("cadam", f"experiment={recipe}", n=10, psnr=20, arm="cadam", guidance=objective)
+    labels = [row.objective for row in table_of(jobs.folder).sections[0].rows if row.source == "this sweep"]
+    assert labels == ["SDS, gaussiandreamer", "VFDS, flowdreamer"]
+
+
+def test_a_single_prompt_has_no_interval_and_no_pair_no_difference():
+    assert mean({"a": 3.0}) is not None
+    assert mean({"a": 3.0}).half is None  # pyright: ignore[reportOptionalMemberAccess]
+    assert mean({}) is None
+    assert difference({"a": 1.0}, {"b": 1.0}) is None
+    assert change({"a": 1.0}, {"a": 0.0}) is None
