@@ -1,6 +1,5 @@
 """``cadam3d train attempts=N``: train several seeds, keep all of them, and link the best one."""
 
-import shlex
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ from cadam3d.settings.line import setting_word
 from cadam3d.sweep.attempts import (
     attempt_of,
     existing_attempts,
+    measuring_line,
     read_attempts,
     require_measured,
     require_one_method,
@@ -41,9 +41,10 @@ def run(
     """
     select = cfg.get("select")
     sweep, composer = read_attempts(cfg, overrides, options, words)
-    existing = existing_attempts(sweep, folder_of(sweep))
-    require_measured(select, list(cfg.get("metric") or ()), existing, words)
-    ended = run_sweep(sweep, composer, overrides, flags, on_start=link_latest)
+    folder = folder_of(sweep)
+    existing = existing_attempts(sweep, folder)
+    require_measured(select, list(cfg.get("metric") or ()), existing, folder, words)
+    ended = run_sweep(sweep, composer, words, flags, on_start=link_latest)
     if ended.was_dry:
         return ended.code
     rows = load(ended.folder)
@@ -106,9 +107,8 @@ def _print(choice: Choice, folder: Path) -> None:
 
 def _nothing_to_choose_by(select: str | None, folder: Path) -> UserError:
     """Return the error for attempts of which none has the number to compare by."""
-    metric = "clip_score" if select is None else QUALITIES[select].metric
     wanted = f"one of {', '.join(PREFERRED)}" if select is None else select
-    line = shlex.join(["cadam3d", "eval", f"run={shown(folder)}", f"metric=[{metric}]"])
+    line = measuring_line(folder, "clip_score" if select is None else QUALITIES[select].metric)
     return UserError(
         f"select: no attempt has {wanted}. All of them are kept: measure them, and then type the same line "
         f"again. Try: {line}"

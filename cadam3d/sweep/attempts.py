@@ -25,6 +25,7 @@ SEED = "seed="  # the name of the folder of an attempt begins with it
 PARENT = Path(LATEST).parent
 # The settings of a line that are not those of a single attempt.
 OF_THE_LINE = ("attempts", "select", RUN_FOLDER)
+OF_TRUTH = ("fidelity", "outline", "mesh")  # metrics that compare with the true object
 IN_EVERY_SUMMARY = ("num_gaussians",)  # with whatever metrics
 
 
@@ -99,16 +100,28 @@ def require_one_method(choice: Choice, rows: Sequence[Row], folder: Path) -> Non
     scores = [read_scores(row.folder, row.summary).get(name) for row in compared]
     problem = difference(name, [score for score in scores if score is not None])
     if problem is not None:
-        line = shlex.join(["cadam3d", "eval", f"run={shown(folder)}", f"metric=[{metric}]"])
+        line = measuring_line(folder, metric)
         raise UserError(f"select: {problem}. Measure all attempts in one way. Try: {line}")
 
 
+def measuring_line(folder: Path, metric: str) -> str:
+    """Return the line that measures all attempts in a folder with one metric."""
+    # If training has not found the truth, it must be named.
+    truth = ["truth=shapes"] if metric in OF_TRUTH else []
+    return shlex.join(["cadam3d", "eval", f"run={shown(folder)}", f"metric=[{metric}]", *truth])
+
+
 def require_measured(
-    select: str | None, chosen: Sequence[str], attempts: Sequence[Attempt], words: Sequence[str]
+    select: str | None,
+    chosen: Sequence[str],
+    attempts: Sequence[Attempt],
+    folder: Path,
+    words: Sequence[str],
 ) -> None:
     """Raise ``UserError`` if the attempts will lack the number that they are compared by.
 
-    ``chosen`` are the metrics of the line, and ``attempts`` are those that exist, which may have the number.
+    ``chosen`` are the metrics of the line, and ``words`` is the line as it was typed. ``attempts`` is what is
+    in ``folder`` already, where ``cadam3d eval`` may have measured the number.
     """
     names = PREFERRED if select is None else (select,)
     metrics = [QUALITIES[name].metric for name in names]
@@ -117,10 +130,15 @@ def require_measured(
     known = choose(attempts, select)
     if known is not None and not known.without:
         return
-    kept = [word for word in words if key_of(word) != "metric"]
-    metric = f"metric=[{','.join([*chosen, metrics[0]])}]"
     numbers = f"one of {', '.join(PREFERRED)}" if select is None else select
-    line = shlex.join(["cadam3d", "train", *kept, metric])
-    raise UserError(
-        f"select: expected metrics that measure {numbers}, got {', '.join(chosen) or 'none'}. Try: {line}"
-    )
+    got = ", ".join(chosen) or "none"
+    if all(attempt.measured for attempt in attempts):
+        line, then = (
+            measuring_line(folder, metrics[0]),
+            " The attempts exist: measure them, and type this again.",
+        )
+    else:
+        kept = [word for word in words if key_of(word) != "metric"]
+        metric = f"metric=[{','.join([*chosen, metrics[0]])}]"
+        line, then = shlex.join(["cadam3d", "train", *kept, metric]), ""
+    raise UserError(f"select: expected metrics that measure {numbers}, got {got}.{then} Try: {line}")

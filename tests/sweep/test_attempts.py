@@ -238,6 +238,8 @@ def test_a_number_that_no_chosen_metric_measures_is_refused_before_anything_runs
 def test_a_number_of_a_later_evaluation_counts(train):
     train(*LINE)
     folder = only_folder()
+    _, _, err = train(*LINE, "select=clip_score")
+    assert err.endswith(f"Try: cadam3d eval run={folder} 'metric=[clip_score]'\n")
     for seed in range(4):
         number = {"num_gaussians": 5, "clip_score": 30.0 + seed}
         (folder / f"seed={seed}" / "eval.json").write_text(json.dumps(number))
@@ -249,7 +251,24 @@ def test_attempts_without_the_number_are_kept_and_the_message_says_how_to_measur
     code, _, err = train("prompt=an attempt", "attempts=2", "select=psnr_min")
     assert code == 1
     assert "select: no attempt has psnr_min." in err
-    assert err.endswith(f"Try: cadam3d eval run={only_folder()} 'metric=[fidelity]'\n")
+    assert err.endswith(f"Try: cadam3d eval run={only_folder()} 'metric=[fidelity]' truth=shapes\n")
+
+
+def test_numbers_that_were_measured_in_different_ways_are_not_compared(train):
+    train("prompt=an attempt", "attempts=2")
+    for seed, protocol in enumerate(("paper", "t3bench")):
+        number = {"num_gaussians": 5, "clip_score": 30.0 + seed}
+        number["measurements"] = {"clip_score": {"protocol": {"name": protocol}}}
+        (only_folder() / f"seed={seed}" / "eval.json").write_text(json.dumps(number))
+    code, _, err = train("prompt=an attempt", "attempts=2", "select=clip_score")
+    assert (code, "clip_score was measured in different ways: protocol.name is" in err) == (1, True)
+    assert (only_folder() / "best").readlink() == Path("seed=1")  # as before, by psnr
+
+
+def test_the_line_of_attempts_is_the_answer_to_resuming_their_folder(train):
+    train(*LINE)
+    code, _, err = train("resume=outputs/latest")
+    assert (code, err.endswith("Try: cadam3d train 'prompt=an attempt' attempts=4\n")) == (1, True), err
 
 
 @pytest.mark.parametrize(
