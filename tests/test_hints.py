@@ -136,6 +136,7 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         ("train", "resume=a run", "attempts=2"),
         ("train", "resume=a sweep"),
         ("sweep", "prompt=a red cube", "densifier=cadam,none", "attempts=2"),
+        ("sweep", "prompt=a red cube", "densifier=cadam,none", "dry_run=7"),
     ],
     "prompts": [
         ("train", "prompt=a red cuube"),
@@ -233,6 +234,7 @@ ELSEWHERE: dict[str, str] = {
     "sweep/folder.py": "needs a damaged sweep",
     "sweep/grid.py": "needs a wrong grid; see tests/sweep",
     "sweep/start.py::_locked": "needs a second process",
+    "sweep/attempts.py::require_one_method": "needs attempts that were measured; see tests/sweep",
     "sweep/start.py::_refuse_occupied": "needs files in the way; see tests/sweep",
     "sweep/start.py::_refuse_other_settings": "needs the results of a sweep; see tests/sweep",
 }

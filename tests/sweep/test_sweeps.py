@@ -345,7 +345,7 @@ def test_rows_of_another_line_do_not_appear(sweep):
 def test_a_second_sweep_in_the_folder_of_a_running_one_is_refused(sweep):
     folder = Path("multirun/densifiers")
     folder.mkdir(parents=True)
-    with start._locked(folder):
+    with start._locked(folder, "hydra.sweep.dir"):
         result = sweep("prompt=a cube", "grid=densifiers")
     assert result.code == 1
     assert f"hydra.sweep.dir: multirun/densifiers is in use by process {os.getpid()} on " in result.err
