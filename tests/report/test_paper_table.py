@@ -1,6 +1,7 @@
 """The paper's table of a sweep: its numbers equal numbers computed by hand, and its formats agree."""
 
 import csv
+import html
 import io
 import json
 import math
@@ -8,6 +9,7 @@ import re
 
 import pytest
 
+from cadam3d import report
 from cadam3d.core.quality import QUALITIES
 from cadam3d.io import run_folder
 from cadam3d.report import table_files
@@ -187,6 +189,16 @@ def test_the_latex_is_balanced_and_escapes_what_users_type(three):
     for tabular in re.findall(r"\\begin\{tabular\}\{(\w+)\}\n(.*?)\\end\{tabular\}", code, re.DOTALL):
         rows = [line for line in tabular[1].splitlines() if line.endswith(r"\\")]
         assert {len(re.findall(r"(?<!\\)&", line)) + 1 for line in rows} == {len(tabular[0])}
+
+
+def test_the_page_of_the_sweep_shows_the_table_with_escaped_text(three):
+    plan = json.loads((three / run_folder.JOBS).read_text())
+    plan["jobs"][0]["category"] = "<b>"
+    (three / run_folder.JOBS).write_text(json.dumps({**plan, "figures": ["no such"]}))
+    page = report.write_sweep(three).read_text(encoding="utf-8")
+    assert "<h3>&lt;b&gt;</h3>" in page
+    for row in table_of(three).sections[0].rows:
+        assert all(html.escape(cell) in page for cell in texts(row, table_of(three).names))
 
 
 def test_columns_are_the_numbers_that_every_row_has(jobs):

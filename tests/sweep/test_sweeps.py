@@ -172,6 +172,17 @@ def test_a_grid_gives_its_name_and_its_arms(sweep):
     assert "densifier" not in result.out.split("job  ")[1].splitlines()[0]
 
 
+def test_a_grid_may_end_with_the_table_of_the_paper(sweep):
+    result = sweep("prompt=a cube", "grid=densifiers", "~grid.arms.none", "+grid.paper_table=true")
+    folder = Path("multirun/densifiers")
+    table = (folder / "table.md").read_text(encoding="utf-8")
+    assert "| cadam - baseline |" in table
+    assert result.out.rstrip().endswith(table.rstrip())
+    assert {"table.csv", "table.tex"} <= {path.name for path in folder.iterdir()}
+    assert sweep("prompt=a cube", "grid=densifiers", "~grid.arms.none").code == 0
+    assert not list(folder.glob("table.*"))
+
+
 def test_an_arm_can_be_left_out(sweep):
     assert sweep("prompt=a cube", "grid=densifiers", "~grid.arms.none").code == 0
     assert [row["arm"] for row in read_table(Path("multirun/densifiers"))] == ["baseline", "cadam"]
