@@ -1,5 +1,6 @@
 """The images on which our NIQE is compared with that of basicsr: five photographs, each in four states."""
 
+from functools import cache
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -11,6 +12,7 @@ HEIGHT, WIDTH = 390, 490  # pixels: up to 20 blocks, and a rest that does not co
 PLAIN = np.array([255, 255, 255])
 
 
+@cache
 def images() -> dict[str, np.ndarray]:
     """Return RGB images of 8 bits by name: as they are, blurred, noisy, and as an object on white."""
     found = {}

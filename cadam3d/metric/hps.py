@@ -49,9 +49,17 @@ class Hps(ModelMetric):
             example=f"{self.node}.base=laion/CLIP-ViT-H-14-laion2B-s32B-b79K",
         )
 
+    def prepare(self) -> None:
+        """Find the files of the model, after a download if that is necessary."""
+        if self._is_folder():
+            super().prepare()
+        else:
+            self._base()
+            self._file(self.source())
+
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a score in [-1, 1]."""
-        clip = self._load(device)
+        clip = load_clip(self.source(), device) if self._is_folder() else self._from_file(device)
         direction = cache(lambda text: clip.texts([text])[0])
         return Scorer(
             score=lambda images, text: clip.pictures(images) @ direction(text),
@@ -59,16 +67,17 @@ class Hps(ModelMetric):
             complaint=clip.complaint,
         )
 
-    def _load(self, device: torch.device) -> Clip:
-        source = self.source()
-        if Path(source.model).expanduser().is_dir():
-            return load_clip(source, device)
-        # Also reports a missing extra, before anything is opened.
-        base = TransformerSource(self.node, self.base, None, "base", SMALL).find()
+    def _is_folder(self) -> bool:
+        return Path(self.source().model).expanduser().is_dir()
+
+    def _base(self) -> TransformerFolder:
+        return TransformerSource(self.node, self.base, None, "base", SMALL).find()
+
+    def _from_file(self, device: torch.device) -> Clip:
+        source, base = self.source(), self._base()
         file, revision = self._file(source)
-        facts = {"model": source.model, "revision": revision, "weights_sha256": sha256_of([file])}
-        if file.name in FILES.values():
-            facts["file"] = file.name
+        model = source.model if revision is None else f"{source.model}/{file.name}"
+        facts = {"model": model, "revision": revision, "weights_sha256": sha256_of([file])}
         return _loaded(file, base, tuple(facts.items()), device)
 
     def _file(self, source: TransformerSource) -> tuple[Path, str | None]:

@@ -46,6 +46,10 @@ class Niqe(ScoreMetric):
             example="metric.niqe.parameters=null",
         )
 
+    def prepare(self) -> None:
+        """Read the parameters."""
+        self.scorer(torch.device("cpu"))
+
     def scorer(self, device: torch.device) -> Scorer:
         """Return what measures one picture. It computes on the CPU, and ignores the text."""
         if self.protocol.size < SMALLEST:
@@ -66,7 +70,8 @@ class Niqe(ScoreMetric):
     def measure(self, measurand: Measurand) -> Measurement:
         """Return ``niqe`` with its record; nothing if no view has two blocks with texture.
 
-        Views with fewer have no number. They are left out, and the record counts them.
+        Views with fewer have no number. They are left out of the mean, and the record counts them. If the
+        protocol takes something other than the mean, there is no number then.
         """
         if len(measurand.gaussians) == 0:
             return Measurement({})
@@ -76,7 +81,8 @@ class Niqe(ScoreMetric):
         lost = len(values) - len(known)
         missing = f"{lost} of {len(values)} views are left out, because they show no texture"
         warnings = (missing,) if lost else ()
-        if len(known) == 0:
+        # A number other than the mean may need every view.
+        if len(known) == 0 or (lost and not self.protocol.is_mean):
             return Measurement({}, warnings=warnings)
         facts: dict[str, Any] = {**scorer.facts, "views_left_out": lost}
         return replace(self.measurement(known, None, facts), warnings=warnings)

@@ -14,7 +14,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.io import transformer
 from cadam3d.io.image import to_uint8
 from cadam3d.io.pretrained import DTYPES
-from cadam3d.io.transformer import TransformerFolder
+from cadam3d.io.transformer import TransformerFolder, TransformerSource
 from cadam3d.metric.scoring import ModelMetric, Scorer
 
 # Chat templates, and vocabularies of older models, are files of their own.
@@ -80,18 +80,24 @@ class Vqa(ModelMetric):
             )
         require_choice(f"{self.node}.dtype", self.dtype, tuple(DTYPES))
 
+    def source(self) -> TransformerSource:
+        """Return the place of the model. Raises ``UserError`` if neither metric nor protocol names one."""
+        return replace(super().source(), needed=NEEDED)
+
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a score in [0, 1]."""
-        found = replace(self.source(), needed=NEEDED).find()
+        found = self.source().find()
         answerer = _loaded(found, found.facts()["weights_sha256"], self.dtype, device)
         if self.template is None and not getattr(answerer.processor, "chat_template", None):
             raise UserError(
-                f"{self.node}.template: expected a text with the model's mark of a picture and with {PLACE} for "
+                f"{self.node}.template: expected a text with the model's mark of a picture and {PLACE} for "
                 f"the question, because {found.source.model} has no chat template, got None. "
                 f"Try: {self.node}.template='\"<image>{PLACE}\"'"
             )
-        facts = {**answerer.facts, "question": self.question, "normalized": self.normalize}
-        return Scorer(score=lambda images, text: self._scores(answerer, images, text), facts=facts)
+        asked = {"question": self.question, "template": self.template, "normalized": self.normalize}
+        return Scorer(
+            score=lambda images, text: self._scores(answerer, images, text), facts={**answerer.facts, **asked}
+        )
 
     def _scores(self, answerer: Answerer, images: Float[Tensor, "v h w 3"], text: str) -> Float[Tensor, "v"]:
         question = self.question.replace(PLACE, text)

@@ -124,7 +124,7 @@ def test_a_checkpoint_scores_as_its_model_does_in_transformers(tmp_path, weights
     assert record["views"] == pytest.approx(expected, abs=1e-5)
     assert measured.numbers["hps"] == pytest.approx(sum(expected) / 3, abs=1e-5)
     assert record["weights_sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
-    assert (record["model"], record["file"]) == (str(file), "HPS_v2_compressed.pt")
+    assert record["model"] == str(file)
     assert json.loads(json.dumps(record)) == record
 
 
@@ -152,12 +152,14 @@ def test_the_version_chooses_the_file_on_the_hub(tmp_path, weights, base, expect
     monkeypatch.setattr(hps, "fetch_file", fetch)
     measured = metric(base=str(base), version=version).measure(MEASURAND)
     assert asked == [("xswu/HPSv2", hps.FILES[version])]
+    assert measured.details["hps"]["model"] == "xswu/HPSv2/HPS_v2_compressed.pt"
     assert measured.details["hps"]["revision"] == tmp_path.name
     assert measured.details["hps"]["views"] == pytest.approx(expected, abs=1e-5)
 
 
 def refusal(**changes):
     with pytest.raises(UserError) as caught:
+        metric(**changes).prepare()
         metric(**changes).scorer(torch.device("cpu"))
     return str(caught.value)
 

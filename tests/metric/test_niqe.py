@@ -7,6 +7,7 @@ compute the numbers with our parameters, because those of basicsr do not come wi
 
 import hashlib
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -159,6 +160,14 @@ def test_views_without_texture_are_left_out_and_counted():
     assert measured.details["niqe"]["views_left_out"] == 1
     assert len(measured.details["niqe"]["views"]) == 1
     assert "1 of 2 views" in measured.warnings[0]
+
+
+def test_the_best_view_needs_all_views():
+    chosen = replace(metric(), protocol=replace(protocol(), aggregation="best"))
+    picked = chosen.measure(showing(picture("chelsea as it is"), picture("chelsea noisy")))
+    values = picked.details["niqe"]["views"]
+    assert picked.numbers["niqe"] == min(values)
+    assert chosen.measure(showing(picture("chelsea as it is"), torch.ones(192, 192, 3))).numbers == {}
 
 
 def test_without_any_texture_there_is_no_number():
