@@ -252,6 +252,12 @@ def test_scores_of_one_table_belong_to_one_protocol(jobs):
     assert any("niqe belongs to another protocol" in note for note in table.notes)
 
 
+def test_a_table_without_scores_says_how_to_measure_them(jobs):
+    jobs.add("cadam", n=10, psnr=20, arm="cadam")
+    notes = table_of(jobs.folder).notes
+    assert any(note.endswith("'metric=[clip_score,image_reward,hps,niqe]'") for note in notes)
+
+
 def test_settings_that_come_with_prompts_do_not_split_the_rows(jobs):
     for prompt, negative in (("a cube", "blurry"), ("a torus", "ugly")):
         jobs.add("cadam", f"prompt={prompt}", f"negative_prompt={negative}", n=10, psnr=20, arm="cadam")
