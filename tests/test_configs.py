@@ -25,6 +25,7 @@ from cadam3d.settings.compose import component, components, compose, config_dir,
 from cadam3d.settings.hydra import read_flags
 from cadam3d.sweep import plan
 from cadam3d.sweep.plan import compose_all, read_sweep
+from cadam3d.sweep.prompts import read_prompts
 
 CONFIGS = config_dir()
 SEVERAL = ("exporter", "callback", "metric")  # groups with several choices
@@ -255,9 +256,9 @@ ORIGINAL_COMPOSE_LINE = plan.compose_line
 def test_every_arm_of_a_grid_composes(grid, monkeypatch):
     """Compose enough jobs that each arm and each choice occurs at least once.
 
-    Of the prompts, seeds and noises that all arms share, only the first is composed. The number of jobs that
-    the file claims is compared with the product of all. Values of single settings are not choices, because
-    composing does not depend on them.
+    Of the prompts, seeds and noises that all arms share, and of a set of prompts, only the first is
+    composed. The number of jobs that the file claims is compared with the product of all. Values of single
+    settings are not choices, because composing does not depend on them.
     """
     monkeypatch.setattr(plan, "compose_line", lambda command, line, _: line_of_jobs(command, tuple(line)))
     text = (CONFIGS / "grid" / f"{grid}.yaml").read_text(encoding="utf-8")
@@ -270,11 +271,13 @@ def test_every_arm_of_a_grid_composes(grid, monkeypatch):
         f"grid={grid}",
         *(f"{key}={quote(first) if isinstance(first, str) else first}" for key, first in firsts.items()),
     ]
-    line += [] if "prompt" in axes else [PROMPT]
+    named = yaml.safe_load(text).get("prompts")
+    line += [] if "prompt" in axes else ["prompts.first=1" if named else PROMPT]
+    of_set = len(read_prompts(named)) if named else 1
     sweep, composer = read_sweep("sweep", line, NO_FLAGS)
     assert len(sweep.jobs) > 1
     claimed = re.search(r": ([\d,]+) jobs", text)
-    counted = len(sweep.jobs) * math.prod(len(values) for values in axes.values())
+    counted = len(sweep.jobs) * math.prod(len(values) for values in axes.values()) * of_set
     assert claimed is None or int(claimed.group(1).replace(",", "")) == counted
     seen: set[str] = set()
     covering = []

@@ -45,7 +45,7 @@ CALL = rf"(?:\w+=\S* )*(?:\.venv/bin/)?(?:{'|'.join(PROGRAMS)}) "
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"^ {4}\S.*$", re.MULTILINE)
 NAMED_BLOCK = re.compile(
-    r"`([\w./]+\.(?:py|yaml|toml))`[^`\n]*:\n\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL
+    r"`([\w./]+\.(?:py|yaml|toml|txt))`[^`\n]*:\n\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL
 )
 
 # This program only writes the words of its command line to the file RECORD.

@@ -145,6 +145,18 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         ("train", "prompt=a red and blue and green cube"),
         ("train", "prompt=a corgi", "prior=tiny", "truth=shapes"),
     ],
+    "files of prompts": [
+        ("sweep", "prompts=nowhere"),
+        ("sweep", "prompts=text/broken.json"),
+        ("sweep", "prompts=shapes6", "prompt=a red cube"),
+        ("sweep", "prompts=shapes6", "prompts.shard=0/2"),
+        ("sweep", "prompts=shapes6", "prompts.shard=1/9"),
+        ("sweep", "prompts=shapes6", "prompts.first=0"),
+        ("sweep", "prompts=shapes6", "prompts.category=Matter"),
+        ("sweep", "prompts=text/prompts.txt", "prompts.category=Matter"),
+        ("train", "prompts=shapes6"),
+        ("train", "prompts.shard=1/2"),
+    ],
     "files": [
         (*A_CUBE, "initializer=ply", "initializer.path=aset.ply"),
         (*A_CUBE, "initializer=ply", "initializer.path=text/broken.ply"),
@@ -474,6 +486,8 @@ def make_places(folder: Path) -> None:
     (folder / "taken/asset.json").write_text("{}")
     (folder / "text").mkdir()
     (folder / "text/broken.ply").write_text("no PLY file")
+    (folder / "text/broken.json").write_text("no JSON")
+    (folder / "text/prompts.txt").write_text("a red cube\na blue ball\n")
 
 
 def accept(*_: object, **__: object) -> None:

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from cadam3d import report
 from cadam3d.commands.asset import find_run, open_run, renderer, run_components
-from cadam3d.commands.measuring import measure, rebuild_start
+from cadam3d.commands.measuring import CHANGED, build_metrics, measure, rebuild_start
 from cadam3d.core.checks import require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -21,10 +21,10 @@ from cadam3d.initializer.base import Initializer
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.records import MEASUREMENTS, Score, psnr_of, scores_in
 from cadam3d.io.run_folder import ASSET, CONFIG, EVALUATION, copying, shown, suggestion, typed_path
-from cadam3d.metric.base import Measurand, Metric
+from cadam3d.metric.base import Measurand
 from cadam3d.prior.base import DiffusionPrior
 from cadam3d.prior.truth import PriorTruth, TruthSource
-from cadam3d.settings.compose import component, components
+from cadam3d.settings.compose import component
 from cadam3d.settings.line import setting_word
 from cadam3d.settings.trust import require_contained, require_trust
 from cadam3d.sweep.folder import is_sweep, load
@@ -41,6 +41,8 @@ def run(cfg: DictConfig) -> None:
     folder = typed_path(str(cfg.run))
     if folder.is_dir():
         require_contained(folder, None if require_trust(cfg.trust) else trusting())
+    # A missing model is one message, not one for every job.
+    build_metrics(cfg.metric)
     if is_sweep(folder):
         _evaluate_sweep(cfg, folder)
         return
@@ -74,12 +76,11 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     truth = source.of(own.prompt, prior)
 
     warnings: list[str] = []
-    metrics: dict[str, Metric] = components(cfg.metric, Metric, "metric")
     # The number of Gaussians shows readers of the file whether it is about the present asset.
     result: dict[str, Any] = {"run": str(shown(folder)), "prompt": own.prompt}
     result["num_gaussians"] = len(asset.gaussians)
     result |= measure(
-        metrics,
+        build_metrics(cfg.metric),
         Measurand(
             gaussians=asset.gaussians,
             render=renderer(own.rasterizer, asset.gaussians),
@@ -122,7 +123,9 @@ def _explained(score: Score) -> str:
     if isinstance(views, list):
         parts.append(f"{len(views)} view{'' if len(views) == 1 else 's'}")
     if isinstance(protocol, dict):
-        parts.append(f"protocol={protocol.get('name')}")
+        changed = protocol.get(CHANGED)
+        another = f" with another {' and '.join(changed)}" if changed else ""
+        parts.append(f"protocol={protocol.get('name')}{another}")
     if record.get("model"):
         revision = str(record.get("revision") or "")[:SHORT]
         parts.append(f"{record['model']}{'@' if revision else ''}{revision}")
@@ -175,7 +178,7 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
         raise _not_saved(folder, problem) from problem
     write_table(folder)
     print(f"\n{len(results)} jobs: {shown(folder / EVALUATION)}\nreport: {shown(report.write_sweep(folder))}")
-    if table := report.paper_table(folder):
+    if table := report.write_paper_table(folder):
         print(f"\n{table}")
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import torch
@@ -12,8 +12,21 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.records import MEASUREMENTS
 from cadam3d.metric.base import Measurand, Metric
+from cadam3d.metric.protocol import Protocol
 from cadam3d.metric.turn import facing
+from cadam3d.settings.compose import component, components, compose
+from cadam3d.settings.declared import config_dir
 from cadam3d.state import start_generators
+
+CHANGED = "changed"  # the entry of a protocol's record that lists what differs from the shipped one
+
+
+def build_metrics(group: Any) -> dict[str, Metric]:
+    """Return the chosen metrics by name. Raises ``UserError`` if something that one needs is missing."""
+    metrics: dict[str, Metric] = components(group, Metric, "metric")
+    for metric in metrics.values():
+        metric.prepare()
+    return metrics
 
 
 def measure(
@@ -48,7 +61,28 @@ def measure(
             )
             for metric in metrics.values():
                 numbers |= metric.measure_start(beginning)
-    return numbers | ({MEASUREMENTS: details} if details else {})
+    return numbers | (
+        {MEASUREMENTS: {name: _honest(each) for name, each in details.items()}} if details else {}
+    )
+
+
+def _honest(record: dict[str, Any]) -> dict[str, Any]:
+    """Return the record of a number with the settings in which its protocol differs from that of its name."""
+    protocol = record.get("protocol")
+    shipped = _shipped_protocol(str(protocol.get("name"))) if isinstance(protocol, dict) else None
+    if not isinstance(protocol, dict) or shipped is None:
+        return record
+    changed = sorted(key for key in protocol if protocol[key] != shipped.get(key))
+    return record | {"protocol": protocol | ({CHANGED: changed} if changed else {})}
+
+
+@cache
+def _shipped_protocol(name: str) -> dict[str, Any] | None:
+    """Return the settings of a protocol of this package; None for others."""
+    if name not in {path.stem for path in (config_dir() / "protocol").glob("*.yaml")}:
+        return None
+    protocol: Protocol = component(compose([f"protocol={name}", "prompt=any"]).protocol, Protocol)
+    return protocol.record()
 
 
 def rebuild_start(prompt: str, initializer: Initializer, seed: int, device: torch.device) -> Gaussians:

@@ -25,7 +25,7 @@ def write_report(folder: Path) -> None:
         page = report.write_sweep(folder)
         print("".join(f"\n{sentence}\n" for sentence in report.verdict(folder)))
         print(f"report: {shown(page)}", flush=True)
-        if table := report.paper_table(folder):
+        if table := report.write_paper_table(folder):
             print(f"\n{table}", flush=True)
     except UserError as error:
         print(f"cadam3d: {error}", file=sys.stderr)

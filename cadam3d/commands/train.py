@@ -25,7 +25,7 @@ from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
 from cadam3d.commands.control import Control
 from cadam3d.commands.linking import link_latest
-from cadam3d.commands.measuring import measure, rebuild_start
+from cadam3d.commands.measuring import build_metrics, measure, rebuild_start
 from cadam3d.commands.messages import keeping_others, note, note_backend, note_omission
 from cadam3d.commands.timetable import describe
 from cadam3d.core.chart import Chart
@@ -59,7 +59,7 @@ from cadam3d.io.run_folder import (
     checkpoint_step,
     shown,
 )
-from cadam3d.metric.base import Measurand, Metric
+from cadam3d.metric.base import Measurand
 from cadam3d.optimizer import AdamSettings
 from cadam3d.prior.base import DiffusionPrior
 from cadam3d.prior.prompting import Prompting
@@ -116,7 +116,7 @@ def _train(
     trainer = replace(trainer, callbacks=[*trainer.callbacks, *callbacks])
     backend = trainer.rasterizer.prepare(device)
     exporters: dict[str, Exporter] = components(cfg.exporter, Exporter, "exporter")
-    metrics: dict[str, Metric] = components(cfg.metric, Metric, "metric")
+    metrics = build_metrics(cfg.metric)
     initializer = component(cfg.initializer, Initializer, "initializer")
     memory = estimate_memory(cfg, trainer)
     source: TruthSource = component(cfg.truth, TruthSource, "truth")

@@ -153,11 +153,11 @@ def with_ldm_unet(found: Pretrained) -> Pretrained:
     return LatentDiffusion(found.source, found.where, found.revision, found.file, index, {"unet": (file, "")})
 
 
-def read_tensors(key: str, file: Path) -> Mapping[str, Tensor]:
+def read_tensors(key: str, file: Path, setting: str = "path") -> Mapping[str, Tensor]:
     """Return the tensors of a file by name. If possible the file is mapped, so that only used data is read.
 
-    Nothing in the file is executed. Raises ``UserError`` if it cannot be read; ``key`` is the configuration
-    node of the model, for the message.
+    Nothing in the file is executed. Raises ``UserError`` if it cannot be read. For the message, ``key`` is
+    the configuration node of the model, and ``setting`` names the file in it.
     """
     from safetensors.torch import load_file
 
@@ -172,7 +172,7 @@ def read_tensors(key: str, file: Path) -> Mapping[str, Tensor]:
         reason = " ".join(str(error).split())[:120]
         raise UserError(
             f"{key}: {file} is not a file of tensors ({reason}). Try: download it again, or use another "
-            f"{key}.path"
+            f"{key}.{setting}"
         ) from error
 
 

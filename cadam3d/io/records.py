@@ -38,7 +38,7 @@ QUALITY = (
 MEASUREMENTS = "measurements"
 # Entries of such a record that may differ between assets of one table. All others say how the number was
 # measured. Equal weights are one model, whatever its folder is called.
-OF_ASSET = ("value", "text", "views", "mean", "interval")
+OF_ASSET = ("value", "reason", "text", "views", "views_left_out", "mean", "interval")
 OF_PLACE = ("model", "revision")
 WEIGHTS = "weights_sha256"
 

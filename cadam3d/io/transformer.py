@@ -37,14 +37,21 @@ class TransformerSource:
     key: str = field(compare=False)
     model: str  # a folder, or OWNER/NAME on the Hugging Face hub
     revision: str | None  # on the hub; None = the newest
+    setting: str = field(default="model", compare=False)  # below the node, the setting that names the model
+    needed: Sequence[str] = NEEDED  # what is downloaded
+
+    @property
+    def name(self) -> str:
+        """Return the whole name of the setting that names the model."""
+        return f"{self.key}.{self.setting}"
 
     def __post_init__(self) -> None:
         require(
             self.model.strip() != "",
-            f"{self.key}.model",
+            self.name,
             expected="a folder, an id on the hub or null",
             got=self.model,
-            example=f"{self.key}.model=null",
+            example=f"{self.name}=null",
         )
 
     def find(self) -> "TransformerFolder":
@@ -74,38 +81,27 @@ class TransformerSource:
         )
         if config is None:
             raise self._missing(f"no model is available. {self.model}: {reason}")
-        from huggingface_hub import constants, snapshot_download
-
-        offline = constants.HF_HUB_OFFLINE or not can_ask
         try:
-            folder = snapshot_download(
-                self.model,
-                revision=self.revision,
-                allow_patterns=list(NEEDED),
-                local_files_only=offline,
-            )
+            folder = _snapshot(self.model, self.revision, self.needed, can_ask)
         # Also the errors of the hub, which are errors of the operating system.
         except (OSError, ValueError) as error:
             reason = " ".join(str(error).split())[:120]
             raise self._missing(f"no model is available. {self.model}: {reason}") from error
         # In the cache of the hub, the name of a snapshot is its commit.
-        return TransformerFolder(self, Path(folder), Path(folder).name)
+        return TransformerFolder(self, folder, folder.name)
 
     def _missing(self, problem: str) -> UserError:
         """Return the error that says what to download, where to put it and what to type."""
-        key = f"{self.key}.model"
         if not self._is_id:
-            return UserError(f"{key}: {problem}. Try: {key}=null")
-        return UserError(f"{key}: {problem}. Try, with a network connection: {self.download()}")
+            return UserError(f"{self.name}: {problem}. Try: {self.name}=null")
+        return UserError(f"{self.name}: {problem}. Try, with a network connection: {self.download()}")
 
     def download(self) -> str:
         """Return the line that downloads the model, and the setting that names its folder afterwards."""
         folder = f"models/{self.model.split('/')[1]}"
         revision = "" if self.revision is None else f"--revision {self.revision} "
-        only = " ".join(f"--include '{pattern}'" for pattern in NEEDED)
-        return (
-            f"hf download {self.model} {revision}--local-dir {folder} {only}. Then: {self.key}.model={folder}"
-        )
+        only = " ".join(f"--include '{pattern}'" for pattern in self.needed)
+        return f"hf download {self.model} {revision}--local-dir {folder} {only}. Then: {self.name}={folder}"
 
 
 @dataclass(frozen=True)
@@ -122,7 +118,7 @@ class TransformerFolder:
             entries = read_json(self.folder / CONFIG)
         except UserError as error:
             reason = str(error).partition(" Try: ")[0]
-            raise UserError(f"{self.source.key}.model: {reason} Try: download the model again") from error
+            raise UserError(f"{self.source.name}: {reason} Try: download the model again") from error
         if not isinstance(entries, dict):
             raise self.damaged(f"{CONFIG} has no names with values")
         return entries
@@ -146,8 +142,8 @@ class TransformerFolder:
             raise self.damaged(f"{lacking[0]} is missing")
         return [self.folder / name for name in names]
 
-    def load(self, kind: Any) -> Any:
-        """Return the model as a ``kind`` of transformers: on the CPU, frozen, in 32 bits.
+    def load(self, kind: Any, dtype: torch.dtype = torch.float32) -> Any:
+        """Return the model as a ``kind`` of transformers: on the CPU, and frozen.
 
         Raises ``UserError`` if a file is missing or damaged, or if it lacks weights that ``kind`` has.
         """
@@ -157,7 +153,11 @@ class TransformerFolder:
         transformers.utils.logging.disable_progress_bar()
         try:
             model, report = kind.from_pretrained(
-                self.folder, use_safetensors=True, dtype=torch.float32, output_loading_info=True
+                self.folder,
+                use_safetensors=True,
+                dtype=dtype,
+                output_loading_info=True,
+                trust_remote_code=False,
             )
         except Exception as error:
             raise self._unreadable(kind.__name__, error) from error
@@ -169,7 +169,7 @@ class TransformerFolder:
     def read(self, kind: Any) -> Any:
         """Return a tokenizer or image processor from the files of the model, of a class of transformers."""
         try:
-            return kind.from_pretrained(self.folder)
+            return kind.from_pretrained(self.folder, trust_remote_code=False)
         except Exception as error:
             raise self._unreadable(kind.__name__, error) from error
 
@@ -183,13 +183,23 @@ class TransformerFolder:
 
     def damaged(self, problem: str) -> UserError:
         """Return the error for a model that was found but cannot be used."""
-        key, where = f"{self.source.key}.model", self.source.model
+        key, where = self.source.name, self.source.model
         return UserError(f"{key}: {where} cannot be used: {problem}. Try: another {key}")
 
     def _unreadable(self, what: str, error: Exception) -> BaseException:
         if isinstance(error, torch.OutOfMemoryError):
             return error
         return self.damaged(f"its {what} cannot be loaded ({' '.join(str(error).split())[:200]})")
+
+
+@cache  # every job of a sweep needs the model, and asking the hub takes time
+def _snapshot(name: str, revision: str | None, needed: Sequence[str], can_ask: bool) -> Path:
+    """Return the folder of a model of the hub, after a download of what is not on this disk."""
+    from huggingface_hub import constants, snapshot_download
+
+    offline = constants.HF_HUB_OFFLINE or not can_ask
+    folder = snapshot_download(name, revision=revision, allow_patterns=list(needed), local_files_only=offline)
+    return Path(folder)
 
 
 def sha256_of(files: Sequence[Path]) -> str:

@@ -39,6 +39,13 @@ class Measurement:
 class Metric(ABC):
     """Interface of all metrics. A subclass is a frozen dataclass of its settings."""
 
+    def prepare(self) -> None:  # noqa: B027 (most metrics need nothing)
+        """Raise ``UserError`` if something is missing that the metric needs, such as the files of a model.
+
+        This is called before a run begins and before assets are measured, so that nothing is done in vain.
+        Files on a hub are downloaded now.
+        """
+
     @abstractmethod
     def measure(self, measurand: Measurand) -> Measurement:
         """Return named numbers. Those that need something that is not known are left out."""

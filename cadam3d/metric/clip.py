@@ -91,13 +91,18 @@ def _loaded(found: TransformerFolder, _sha256: str, device: torch.device) -> Cli
 
     if found.config().get("model_type") != "clip":
         raise found.damaged("it is not a CLIP model (model_type: clip) of transformers")
+    return assembled(found, found.load(transformers.CLIPModel), found.facts(), device)
+
+
+def assembled(found: TransformerFolder, model: Any, facts: dict[str, Any], device: torch.device) -> Clip:
+    """Return a CLIP model, on ``device``, with the tokenizer and the preprocessing in a folder."""
+    import transformers
+
     tokenizer = found.read(transformers.CLIPTokenizer)
-    preprocess = found.read(_preprocessing())
-    model = found.load(transformers.CLIPModel)
     # If the files of a tokenizer are missing, transformers silently makes one that knows no word.
     if len(tokenizer) < model.config.text_config.vocab_size / 2:
         raise found.damaged("files of its tokenizer are missing")
-    return Clip(model.to(device), tokenizer, preprocess, found.facts())
+    return Clip(model.to(device), tokenizer, found.read(_preprocessing()), facts)
 
 
 def _preprocessing() -> Any:

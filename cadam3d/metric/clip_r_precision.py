@@ -42,6 +42,11 @@ class ClipRPrecision(ModelMetric):
 
     prompts: str  # a set of this package, or a file with one prompt per line or with a list in YAML
 
+    def prepare(self) -> None:
+        """Read the prompts, and find the files of the model."""
+        read_candidates(self.prompts)
+        super().prepare()
+
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture 1 if the own text is the most similar one, else 0.
 

@@ -108,6 +108,10 @@ class ModelMetric(ScoreMetric):
     model: str | None  # a folder, or an id on the hub; None = the protocol's
     revision: str | None  # of an id; None = the protocol's, or the newest of a model that is named here
 
+    def prepare(self) -> None:
+        """Find the files of the model, after a download if that is necessary."""
+        self.source().find().weights()
+
     def source(self) -> TransformerSource:
         """Return the place of the model. Raises ``UserError`` if neither metric nor protocol names one."""
         named = self.protocol.model(self.kind) if self.model is None else ModelName(self.model, None)

@@ -36,7 +36,7 @@ def write_sweep(folder: Path) -> Path:
     return write(folder)
 
 
-def paper_table(folder: Path) -> str:
+def write_paper_table(folder: Path) -> str:
     """Write the paper's table 1 of the sweep in ``folder`` as files, and return it as Markdown.
 
     Returns "" if its grid does not ask for the table or no job has left an asset. Raises ``UserError`` if a

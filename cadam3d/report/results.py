@@ -164,9 +164,11 @@ def read(sweep_folder: Path) -> list[JobResult]:
 def _known(job: Any) -> _KnownJob:
     """Return a job of :func:`cadam3d.sweep.folder.load` with its overrides parsed.
 
-    Without a grid the arm of a job has no name; it is then the densifier.
+    Without a grid the arm of a job has no name; it is then the densifier. Settings that come with a prompt
+    are left out: they belong to the prompt, and arms without such a setting are compared all the same.
     """
-    overrides = dict(_pair(str(line)) for line in job.overrides)
+    pairs = (_pair(str(line)) for line in job.overrides)
+    overrides = {key: value for key, value in pairs if key not in job.brought}
     known = _KnownJob(job.arm, job.folder, overrides, job.summary, str(job.outcome), job.category)
     return known if job.arm else _KnownJob(**{**vars(known), "arm": known.densifier or "default"})
 

@@ -348,7 +348,9 @@ def _known(wrong: str, command: str, words: Sequence[str]) -> dict[str, object]:
 
     The options that the user has chosen are taken into account if they compose.
     """
-    choices = [word for word in words if CHOICE.fullmatch(word) and key_of(word) not in (wrong, "grid")]
+    choices = [
+        word for word in words if CHOICE.fullmatch(word) and key_of(word) not in (wrong, "grid", "prompts")
+    ]
     for attempt in (choices, []):
         try:
             cfg = compose(attempt, command)

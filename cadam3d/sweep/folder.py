@@ -35,6 +35,7 @@ class PlannedJob:
     # What the file or the set of prompts says about the prompt; "" if it says nothing.
     prompt_name: str = ""
     category: str = ""
+    brought: list[str] = field(default_factory=list)  # keys of the settings that come with the prompt
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ class Row:
     summary: dict[str, Any] = field(repr=False)  # {} if there is none yet
     prompt_name: str = ""  # from the file or the set of prompts; "" if it gives none
     category: str = ""
+    brought: list[str] = field(default_factory=list)  # keys of the settings that come with the prompt
 
     @property
     def outcome(self) -> str:
@@ -101,6 +103,7 @@ def rows_of(sweep: Path, jobs: Sequence[PlannedJob]) -> list[Row]:
             summary=read_summary(sweep / job.folder),
             prompt_name=job.prompt_name,
             category=job.category,
+            brought=job.brought,
         )
         for number, job in enumerate(jobs)
     ]
@@ -143,6 +146,7 @@ def _require_plan(content: Any) -> None:
         _require(isinstance(job["swept"], dict), "swept: expected keys and values")
         for name in ("prompt_name", "category"):
             _require(_is_text(job.get(name, "")), f"{name}: expected a text")
+        _require(_are_texts(job.get("brought", [])), "brought: expected keys")
         # A name that leads elsewhere would let the sweep write there.
         folder = job["folder"]
         is_inside = _is_text(folder) and folder not in ("", ".", "..") and not set("/\\") & set(folder)

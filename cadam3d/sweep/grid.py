@@ -82,6 +82,7 @@ class Job:
     name: str  # of its folder; depends only on its arm and its settings
     overrides: tuple[str, ...]  # of ``cadam3d train``
     prompt: Prompt | None  # None if its prompt is not one of a file or a set
+    brought: tuple[str, ...]  # keys of the settings that come with the prompt
 
 
 HasSetting = Callable[[Sequence[str], str], bool]
@@ -178,12 +179,18 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
             taken = [setting for setting in shared if setting.key not in {*axes, *foreign[name]}]
             for own in product(*axes.values()):
                 typed = (*taken, *own)
-                settings = (*typed, *_brought(typed, has_setting))
+                brought = _brought(typed, has_setting)
+                settings = (*typed, *brought)
                 job = Job(
                     arm=name,
-                    name=_folder_name(name, settings, named, counted),
+                    name=_folder_name(
+                        name,
+                        [setting for setting in typed if setting.key in named],
+                        [setting for setting in settings if setting.key in counted],
+                    ),
                     overrides=tuple(setting.line for setting in settings),
                     prompt=next((setting.prompt for setting in typed if setting.prompt), None),
+                    brought=tuple(setting.key for setting in brought),
                 )
                 other = found.setdefault(frozenset(setting.identity for setting in settings), job)
                 if other.arm != name and (causes := [key for key in axes if key in line]):
@@ -326,25 +333,21 @@ def _brought_keys(line: Axes) -> list[str]:
 
 
 def _named(grid: Grid, line: Axes) -> set[str]:
-    """Return the keys that the name of a folder shows: all that may vary, even if the line narrows them.
-
-    Settings that come with prompts are not shown, because the prompt is.
-    """
+    """Return the keys that the name of a folder shows: all that may vary, even if the line narrows them."""
     varied = {key for axes in grid.arms.values() for key, axis in axes.items() if len(axis) > 1}
     varied |= {key for key, axis in grid.each.items() if len(axis) > 1}
     fixed = {key for axes in (*grid.arms.values(), grid.each) for key in axes} - varied
     # A shard of prompts may be a single one; its jobs have the names that they have in the whole sweep.
     several = {key for key, axis in line.items() if len(axis) > 1 or any(each.prompt for each in axis)}
-    brought = {key for key in _brought_keys(line) if key not in line and key not in grid.each}
-    return {key for key in swept_keys(grid, line) if key not in fixed - several} - brought
+    return {key for key in swept_keys(grid, line) if key not in fixed - several}
 
 
-def _folder_name(arm: str, settings: Sequence[AxisValue], named: set[str], counted: Sequence[str]) -> str:
+def _folder_name(arm: str, named: Sequence[AxisValue], counted: Sequence[AxisValue]) -> str:
     """Return a readable name with a digest of everything in which this job may differ from the others."""
-    shown = sorted((each for each in settings if each.key in named), key=lambda each: each.key)
+    shown = sorted(named, key=lambda each: each.key)
     words = [each.text for each in shown if each.key in TEXT_KEYS]
     words += [f"{each.key.rpartition('.')[2]}={each.text}" for each in shown if each.key not in TEXT_KEYS]
-    digest = _digest([arm, *sorted(each.identity for each in settings if each.key in counted)])
+    digest = _digest([arm, *sorted(each.identity for each in counted)])
     return "_".join([*([slug(arm)] if arm else []), slug(*words), digest])
 
 

@@ -152,22 +152,13 @@ class Composer:
 
     def compose(self, overrides: Sequence[str]) -> Composed:
         """Return the settings under ``overrides``. Raises if they cannot be composed or lack a value."""
-        values = {}
-        key_lines = []
-        for line in overrides:
-            if self._is_value(line):
-                values[key_of(line)] = _value(line)
-                key_lines.append(key_of(line))
-            else:
-                key_lines.append(line)
-        known = tuple(key_lines)
-        if known not in self._bases:
-            base = self._base(overrides)
-            require_values(base.cfg)
-            refuse_missing_settings(base.cfg, "sweep", overrides)
-            refuse_unread_settings(base.cfg, "sweep", overrides)
-            self._bases[known] = base
-        composed = self._bases[known].composed(values)
+        # Values of keys that not every option has are set on a composed job too, unless they replace a part.
+        dotted = [line for line in overrides if self._is_value(line) or self._may_be_value(line)]
+        plain = [line for line in dotted if self._is_value(line)]
+        base = self._base_of(overrides, dotted)
+        if not {key_of(line) for line in dotted} <= base.plain.keys():
+            base, dotted = self._base_of(overrides, plain), plain
+        composed = base.composed({key_of(line): _value(line) for line in dotted})
         require_settings(composed.values)
         return composed
 
@@ -183,6 +174,22 @@ class Composer:
     def _is_value(self, line: str) -> bool:
         """Return whether an override sets a plain value that the jobs have by default."""
         return bool(PLAIN_KEY.match(line)) and key_of(line) in self._leaves and "${" not in line
+
+    @staticmethod
+    def _may_be_value(line: str) -> bool:
+        """Return whether an override may set a plain value of an option, and surely chooses no option."""
+        return bool(PLAIN_KEY.match(line)) and "." in key_of(line) and "${" not in line
+
+    def _base_of(self, overrides: Sequence[str], values: Sequence[str]) -> Base:
+        """Return a job under ``overrides`` that differs from others in ``values``, composed only once."""
+        known = tuple(key_of(line) if line in values else line for line in overrides)
+        if known not in self._bases:
+            base = self._base(overrides)
+            require_values(base.cfg)
+            refuse_missing_settings(base.cfg, "sweep", overrides)
+            refuse_unread_settings(base.cfg, "sweep", overrides)
+            self._bases[known] = base
+        return self._bases[known]
 
     def _base(self, overrides: Sequence[str]) -> Base:
         return Base.of(compose_line("train", [*self._common, *overrides], self._options))

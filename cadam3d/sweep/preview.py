@@ -17,7 +17,7 @@ from cadam3d.io.jsonl import read_json
 from cadam3d.io.run_folder import CONFIG, ENDED, STOP
 from cadam3d.sweep.folder import Plan, Row, load, write_plan
 from cadam3d.sweep.process import run_job
-from cadam3d.sweep.table import aligned, varying_keys
+from cadam3d.sweep.table import aligned, brief, varying_keys
 from cadam3d.sweep.watch import duration, result
 
 MEASURED_SECONDS = 10.0  # of training
@@ -43,7 +43,7 @@ def listing(rows: Sequence[Row]) -> str:
     has_arms = any(row.arm for row in rows)
     lines = [["job", *(["arm"] if has_arms else []), *keys, "state", "folder"]]
     for row in rows:
-        values = [row.number, *([row.arm] if has_arms else []), *(row.swept.get(key) for key in keys)]
+        values = [row.number, *([row.arm] if has_arms else []), *(brief(row.swept.get(key)) for key in keys)]
         lines.append([*values, _state(row), row.folder.name])
     return aligned(lines)
 

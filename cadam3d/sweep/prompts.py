@@ -101,7 +101,7 @@ def read_choice(node: Mapping[Any, Any] | None, default: str | None = None) -> C
     if source is None:
         for name in ("shard", "category", "first"):
             if node.get(name) is not None:
-                typed = f"{KEY}=paper50 {KEY}.{name}={node[name]}"
+                typed = f"{KEY}={_sets()[0]} {shlex.quote(f'{KEY}.{name}={node[name]}')}"
                 raise fail(f"{KEY}.{name}", expected=f"{KEY}=FILE too", got=node[name], example=typed)
         return None
     is_source = isinstance(source, str) and bool(source.strip())
@@ -118,7 +118,8 @@ def read_choice(node: Mapping[Any, Any] | None, default: str | None = None) -> C
 def read_prompts(source: str) -> tuple[Prompt, ...]:
     """Return the prompts of a set, or of the file at the path ``source``. Repeated entries count once.
 
-    Raises ``UserError``, with the line, for anything that is not a prompt.
+    Raises ``UserError``, with the line, for anything that is not a prompt and for a prompt with two different
+    entries.
     """
     path = _find(source)
     text = _decoded(path)
@@ -129,16 +130,18 @@ def read_prompts(source: str) -> tuple[Prompt, ...]:
         entries = [
             (_Node(f"{path}, line {number}", line), "") for number, line in lines if line and line[0] != "#"
         ]
-    require(bool(entries), KEY, expected="prompts", got=f"none in {path}", example=f"{KEY}={_sets()[0]}")
+    if not entries:
+        raise _refusal(str(path), "prompts", "none")
     if len(entries) > MOST:
         raise _refusal(str(path), f"at most {MOST} prompts", len(entries))
-    found: dict[tuple[str, tuple[tuple[str, str], ...]], tuple[Prompt, str]] = {}
+    found: dict[str, tuple[Prompt, str]] = {}
     for node, category in entries:
         prompt = _prompt(node, category)
-        first, place = found.setdefault((prompt.text, prompt.settings), (prompt, node.place))
+        first, place = found.setdefault(prompt.text, (prompt, node.place))
         if first != prompt:
-            expected = f"the name and the category that this prompt has in {place.rpartition(', ')[2]}"
-            raise _refusal(node.place, expected, f"{prompt.name}, {prompt.category}")
+            where = place.removeprefix(f"{path}, ")
+            expected = f"what {where} says about this prompt too, or another prompt"
+            raise _refusal(node.place, expected, _quoted(prompt.text))
     return tuple(prompt for prompt, _ in found.values())
 
 
@@ -166,6 +169,13 @@ class _Node:
     written: str = field(default="", compare=False)  # the value in messages, if it is not text
 
 
+def _shown(node: _Node) -> str:
+    """Return a value of a file for a message."""
+    if node.content is None:
+        return "nothing"
+    return _quoted(node.content) if isinstance(node.content, str) else node.written
+
+
 def _find(source: str) -> Path:
     """Return the path of a set or of a file. A name without a suffix is first looked for among the sets."""
     if source in _sets():
@@ -180,7 +190,7 @@ def _find(source: str) -> Path:
         raise fail(KEY, expected=_file_or_set(), got=source, example=f"{KEY}={near}")
     if path.suffix.lower() not in (*TREES, *PLAIN):
         suffixes = ", ".join([*(suffix for suffix in (*PLAIN, *TREES) if suffix), "or none"])
-        raise _refusal(str(path), f"a file with one of the suffixes {suffixes}", path.suffix)
+        raise _refusal(str(path), f"a file with one of the suffixes {suffixes}", _quoted(path.suffix))
     return path
 
 
@@ -205,9 +215,12 @@ def _shard(value: Any) -> tuple[int, int] | None:
 
 def _refusal(place: str, expected: str, got: object) -> UserError:
     """Return the error about a file. A set of this package is what surely can be read instead."""
-    shown = repr(got) if isinstance(got, str) else str(got)
-    shown = f"{shown[:80]}..." if len(shown) > 80 else shown
-    return UserError(f"{KEY}: {place}: expected {expected}, got {shown}. Try: {KEY}={_sets()[0]}")
+    return UserError(f"{KEY}: {place}: expected {expected}, got {got}. Try: {KEY}={_sets()[0]}")
+
+
+def _quoted(text: str) -> str:
+    """Return a piece of a file for a message."""
+    return repr(f"{text[:60]}..." if len(text) > 60 else text)
 
 
 def _decoded(path: Path) -> str:
@@ -223,7 +236,7 @@ def _decoded(path: Path) -> str:
     if not is_readable(text):
         lines = enumerate(text.split("\n"), start=1)
         number, line = next((number, line) for number, line in lines if not is_readable(line))
-        raise _refusal(f"{path}, line {number}", "text without control characters", line)
+        raise _refusal(f"{path}, line {number}", "text without control characters", _quoted(line))
     return text
 
 
@@ -243,9 +256,7 @@ def _tree(path: Path, text: str) -> _Node:
         place = str(path) if line is None else f"{path}, line {line}"
         reason = getattr(error, "problem", None) or getattr(error, "msg", None) or str(error)
         reason = " ".join(str(reason).split())[:120]
-        raise UserError(
-            f"{KEY}: {place}: expected plain {kind}, got something else ({reason}). Try: {KEY}={_sets()[0]}"
-        ) from error
+        raise _refusal(place, f"plain {kind}", f"something else ({reason})") from error
 
 
 def _from_yaml(node: yaml.Node | None, file: str) -> _Node:
@@ -262,7 +273,7 @@ def _from_yaml(node: yaml.Node | None, file: str) -> _Node:
             if not isinstance(key, yaml.ScalarNode):
                 raise _refusal(where, "a key", "a list or a mapping")
             if key.value in content:
-                raise _refusal(where, "each key once", key.value)
+                raise _refusal(where, "each key once", _quoted(key.value))
             content[key.value] = _from_yaml(value, file)
         return _Node(place, content, "keys and values")
     return _Node(place, None if node.tag == "tag:yaml.org,2002:null" else node.value)
@@ -297,9 +308,10 @@ def _entries(root: _Node) -> Iterator[tuple[_Node, str]]:
     for name, node in lists.items():
         if not isinstance(node.content, list):
             expected = "a list of prompts, or names with lists of prompts"
-            raise _refusal(node.place, expected, node.written or node.content)
+            raise _refusal(node.place, expected, _shown(node))
+        category = _text(_Node(node.place, name), "a category as the name") if len(lists) > 1 else ""
         for item in node.content:
-            yield item, name.strip() if len(lists) > 1 else ""
+            yield item, category
 
 
 def _prompt(node: _Node, category: str) -> Prompt:
@@ -310,10 +322,10 @@ def _prompt(node: _Node, category: str) -> Prompt:
         if key not in ENTRY:
             near = did_you_mean(key, ENTRY)
             meant = f" (did you mean {near[0]}?)" if near else ""
-            raise _refusal(value.place, f"one of the keys {', '.join(ENTRY)}{meant}", key)
+            raise _refusal(value.place, f"one of the keys {', '.join(ENTRY)}{meant}", _quoted(key))
     given = {key: value for key, value in node.content.items() if value.content is not None}
     if "prompt" not in given:
-        raise _refusal(node.place, "the key prompt", "|".join(node.content) or "nothing")
+        raise _refusal(node.place, "the key prompt", "|".join(node.content) or "none")
     settings = [
         (SETTINGS[key], _text(given[key], key, may_be_empty=key == "negative_prompt"))
         for key in SETTINGS
@@ -330,17 +342,17 @@ def _prompt(node: _Node, category: str) -> Prompt:
 def _text(node: _Node, what: str, *, may_be_empty: bool = False) -> str:
     """Return the text of a node without blanks around it. Raises ``UserError`` if it cannot be ``what``."""
     if not isinstance(node.content, str):
-        raise _refusal(node.place, f"{what} as text", node.written or "nothing")
+        raise _refusal(node.place, f"{what} as text", _shown(node))
     text = node.content.strip()
     if not (text or may_be_empty):
-        raise _refusal(node.place, what, text)
+        raise _refusal(node.place, what, _quoted(text))
     if len(text) > LONGEST:
         raise _refusal(node.place, f"{what} of at most {LONGEST} characters", len(text))
     if not is_readable(text):
-        raise _refusal(node.place, f"{what} without control characters", text)
+        raise _refusal(node.place, f"{what} without control characters", _quoted(text))
     if text.startswith(REFERENCE):
         expected = f"{what}, and not a reference to threestudio's library"
-        raise _refusal(node.place, expected, text)
+        raise _refusal(node.place, expected, _quoted(text))
     if text == "???":
-        raise _refusal(node.place, what, text)
+        raise _refusal(node.place, what, _quoted(text))
     return text

@@ -219,6 +219,7 @@ def _planned(sweep: Sweep, composed: Sequence[Composed]) -> list[PlannedJob]:
             swept={key: settings.get(key) for key in keys},
             prompt_name=job.prompt.name if job.prompt else "",
             category=job.prompt.category if job.prompt else "",
+            brought=list(job.brought),
         )
         for job, settings in zip(sweep.jobs, composed, strict=True)
     ]

@@ -14,6 +14,9 @@ from cadam3d.settings.line import setting_word
 from cadam3d.sweep.folder import Row, load
 
 FACTS = ("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "asset_bytes", "message")
+BRIEF = 80  # characters
+# Columns that only jobs with a prompt of a file or a set have.
+LABELS = ("prompt_name", "category")
 # Columns that only jobs with a named truth have.
 MORE_FACTS = tuple(name for name in QUALITY if name not in ("psnr", "psnr_min", "ssim"))
 # Columns of the table in the terminal, besides the outcome and the settings in which jobs differ.
@@ -50,9 +53,11 @@ def as_text(rows: Sequence[Row]) -> str:
     keys = varying_keys(rows)
     has_arms = any(row.arm for row in rows)
     scores = _scores(rows)
-    lines = [["job", *(["arm"] if has_arms else []), *keys, "outcome", *SHOWN, *scores.columns]]
+    lines: list[list[Any]] = [
+        ["job", *(["arm"] if has_arms else []), *keys, "outcome", *SHOWN, *scores.columns]
+    ]
     for index, row in enumerate(rows):
-        values = [row.number, *([row.arm] if has_arms else []), *(row.swept.get(key) for key in keys)]
+        values = [row.number, *([row.arm] if has_arms else []), *(brief(row.swept.get(key)) for key in keys)]
         shown = row.summary | {"psnr": psnr_of(row.summary)}
         facts = [row.outcome, *(shown.get(name) for name in SHOWN)]
         lines.append([*values, *facts, *(column[index] for column in scores.columns.values())])
@@ -91,6 +96,12 @@ def _scores(rows: Sequence[Row]) -> Scores:
     return scores_of([read_scores(row.folder, row.summary) for row in rows], folder)
 
 
+def brief(value: Any) -> str:
+    """Return a value on one line of at most ``BRIEF`` characters, for a column or a sentence."""
+    text = " ".join(_cell(value).split())
+    return text if len(text) <= BRIEF else f"{text[: BRIEF - 3]}..."
+
+
 def varying_keys(rows: Sequence[Row]) -> list[str]:
     """Return the keys in which jobs of the same arm differ."""
     arms = len({row.arm for row in rows})
@@ -106,13 +117,15 @@ def _write(path: Path, rows: Sequence[Row]) -> None:
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         names = [*FACTS, *(name for name in MORE_FACTS if any(name in row.summary for row in rows))]
+        labels = [name for name in LABELS if any(getattr(row, name) for row in rows)]
         scores = _scores(rows).columns
-        writer.writerow(["job", "arm", *keys, "outcome", *names, *scores, "folder"])
+        writer.writerow(["job", "arm", *labels, *keys, "outcome", *names, *scores, "folder"])
         for index, row in enumerate(rows):
+            said = [getattr(row, name) for name in labels]
             swept = [_plain(row.swept.get(key)) for key in keys]
             facts = [row.summary.get(name) for name in names]
             facts += [column[index] for column in scores.values()]
-            writer.writerow([row.number, row.arm, *swept, row.outcome, *facts, row.folder.name])
+            writer.writerow([row.number, row.arm, *said, *swept, row.outcome, *facts, row.folder.name])
 
 
 def _swept_keys(rows: Sequence[Row]) -> list[str]:

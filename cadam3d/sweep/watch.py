@@ -10,7 +10,7 @@ from cadam3d.core.outcome import Outcome
 from cadam3d.io.records import psnr_of, read_summary
 from cadam3d.io.run_folder import ENDED
 from cadam3d.sweep.folder import Row
-from cadam3d.sweep.table import varying_keys
+from cadam3d.sweep.table import brief, varying_keys
 
 POLL_SECONDS = 0.5
 
@@ -61,8 +61,8 @@ class Watch:
 def describe(row: Row, keys: Sequence[str]) -> str:
     """Describe a job in a few words: its arm, and the settings in which it differs within that arm."""
     values = {key: row.swept[key] for key in keys if row.swept.get(key) is not None}
-    parts = [str(value) if key == "prompt" else f"{key}={value}" for key, value in values.items()]
-    return ", ".join([*([row.arm] if row.arm else []), *parts]) or str(row.swept.get("prompt"))
+    parts = [brief(value) if key == "prompt" else f"{key}={brief(value)}" for key, value in values.items()]
+    return ", ".join([*([row.arm] if row.arm else []), *parts]) or brief(row.swept.get("prompt"))
 
 
 def result(summary: dict[str, Any]) -> str:

@@ -12,6 +12,7 @@ from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.render import RenderOutput
+from cadam3d.io import transformer
 from cadam3d.io.transformer import TransformerFolder, sha256_of
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.clip_r_precision import ClipRPrecision, read_candidates
@@ -257,6 +258,7 @@ def test_a_model_of_the_hub_has_its_commit_in_the_record(make, measurand, clip_f
         "huggingface_hub.hf_hub_download", lambda *names, **options: str(snapshot / "config.json")
     )
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
+    transformer._snapshot.cache_clear()
     record = make(ClipScore, model=None).measure(measurand).details["clip_score"]
     assert asked == [("openai/clip", "abc")]
     assert (record["model"], record["revision"]) == ("openai/clip", "0123456789abcdef")

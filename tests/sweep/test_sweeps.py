@@ -172,6 +172,17 @@ def test_a_grid_gives_its_name_and_its_arms(sweep):
     assert "densifier" not in result.out.split("job  ")[1].splitlines()[0]
 
 
+def test_a_grid_may_end_with_the_table_of_the_paper(sweep):
+    result = sweep("prompt=a cube", "grid=densifiers", "~grid.arms.none", "+grid.paper_table=true")
+    folder = Path("multirun/densifiers")
+    table = (folder / "table.md").read_text(encoding="utf-8")
+    assert "| cadam - baseline |" in table
+    assert result.out.rstrip().endswith(table.rstrip())
+    assert {"table.csv", "table.tex"} <= {path.name for path in folder.iterdir()}
+    assert sweep("prompt=a cube", "grid=densifiers", "~grid.arms.none").code == 0
+    assert not list(folder.glob("table.*"))
+
+
 def test_an_arm_can_be_left_out(sweep):
     assert sweep("prompt=a cube", "grid=densifiers", "~grid.arms.none").code == 0
     assert [row["arm"] for row in read_table(Path("multirun/densifiers"))] == ["baseline", "cadam"]
@@ -352,6 +363,99 @@ def test_a_second_sweep_in_the_folder_of_a_running_one_is_refused(sweep):
     assert result.err.endswith("Try: hydra.sweep.dir=multirun/densifiers-2\n")
     assert not (folder / JOBS).exists()
     assert sweep("prompt=a cube", "grid=densifiers").code == 0
+
+
+# --- prompts of a file ------------------------------------------------------------------------------------
+
+
+ENTRIES = """
+- {name: cube, category: Material, prompt: "a cube, of glass"}
+- {name: ball, category: Concept, prompt: a ball, negative_prompt: blurry}
+- {name: torus, category: Concept, prompt: "a ${x} torus"}
+"""
+
+
+def test_the_prompts_of_a_file_are_swept_and_their_labels_are_in_the_table(sweep, calls):
+    Path("mine.yaml").write_text(ENTRIES, encoding="utf-8")
+    result = sweep("prompts=mine.yaml", "seed=0,1")
+    assert result.code == 0, result.err
+    rows = read_table(only_sweep())
+    columns = ("prompt_name", "category", "prompt", "negative_prompt", "seed")
+    assert [tuple(row[name] for name in columns) for row in rows] == [
+        (name, category, prompt, negative, seed)
+        for name, category, prompt, negative in (
+            ("cube", "Material", "a cube, of glass", ""),
+            ("ball", "Concept", "a ball", "blurry"),
+            ("torus", "Concept", "a ${x} torus", ""),
+        )
+        for seed in "01"
+    ]
+    assert [row.category for row in load(only_sweep())][::2] == ["Material", "Concept", "Concept"]
+    assert only_sweep().name.startswith("mine-seed=0-1_")
+    words = calls(only_sweep())[2]["words"]
+    assert words[:4] == ["train", "prompt='a ball'", "seed=0", "negative_prompt='blurry'"]
+
+
+def test_a_longer_file_continues_the_sweep_and_a_changed_entry_is_another_job(sweep, calls):
+    Path("mine.txt").write_text("a cube\n")
+    assert sweep("prompts=mine.txt").code == 0
+    Path("mine.txt").write_text("a cube\na ball\n")
+    assert "2 jobs in " in (out := sweep("prompts=mine.txt").out)
+    assert "; 1 already has a result" in out
+    Path("mine.yaml").write_text("- {prompt: a cube, negative_prompt: blurry}")
+    assert "; " not in sweep("prompts=mine.yaml", f"hydra.sweep.dir={only_sweep()}").out.splitlines()[0]
+    assert len(calls(only_sweep())) == 3
+
+
+def test_shards_merge_into_the_whole_sweep_by_copying_their_folders(sweep):
+    Path("mine.yaml").write_text(ENTRIES, encoding="utf-8")
+    line = ("prompts=mine.yaml", "densifier=cadam")
+    for number in (1, 2):
+        assert sweep(*line, f"prompts.shard={number}/2").code == 0
+    shards = sorted(Path("multirun").iterdir())
+    whole, _, suffix = shards[0].name.partition("_shard-")
+    assert (suffix, [len(read_table(folder)) for folder in shards]) == ("1-of-2", [1, 2])
+    for folder in shards:
+        shutil.copytree(folder, f"multirun/{whole}", dirs_exist_ok=True)
+    assert f"3 jobs in multirun/{whole}; 3 already have a result" in sweep(*line).out
+    assert [row["prompt_name"] for row in read_table(Path("multirun", whole))] == ["cube", "ball", "torus"]
+
+
+def test_a_dry_run_lists_the_prompts_of_a_set(sweep, tmp_path):
+    out = sweep("prompts=paper50", "prompts.category=structure", "prompts.first=2", "dry_run=true").out
+    assert out.startswith("2 jobs in multirun/paper50-structure_")
+    assert "a five-tiered wooden pagoda with upturned eaves" in out
+    assert contents(tmp_path) == {}
+
+
+@pytest.mark.parametrize(
+    ("words", "command", "expected"),
+    [
+        (
+            ("prompts=mine.txt",),
+            "train",
+            "prompts: files and sets of prompts belong to sweeps. Try: cadam3d sweep prompts=mine.txt",
+        ),
+        (
+            ("prompts=nope", "seed=0,1"),
+            "sweep",
+            "expected a file, or one of the sets paper50|shapes6, got 'nope'",
+        ),
+        (
+            ("prompts=shapes6", "prompt=a cube"),
+            "sweep",
+            "prompts: expected either prompts= or prompt=, got both. Try: cadam3d sweep prompts=shapes6",
+        ),
+        (("prompts=shapes6", "prompts.shards=1/2"), "sweep", "Did you mean prompts.shard or "),
+        (("prompts=shapes6", "negative_prompts=x"), "sweep", "Did you mean negative_prompt?"),
+    ],
+)
+def test_a_mistake_about_prompts_is_one_message(words, command, expected, sweep):
+    result = sweep(*words, command=command)
+    assert result.code == 1
+    assert expected in result.err
+    assert len(result.err.splitlines()) == 1
+    assert not list(Path.cwd().iterdir())
 
 
 # --- stopping ---------------------------------------------------------------------------------------------

@@ -1,0 +1,107 @@
+"""Niqe: how far the statistics of a picture are from those of photographs, without any reference."""
+
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cadam3d.core.checks import require, require_choice
+from cadam3d.core.errors import UserError
+from cadam3d.metric import natural
+from cadam3d.metric.base import Measurand, Measurement
+from cadam3d.metric.scoring import ScoreMetric, Scorer
+
+OWN_PARAMETERS = Path(__file__).with_name("niqe_parameters.npz")
+# The name of these parameters in the record of a number.
+OWN_NAME = "cadam3d, from eight photographs"
+PLAIN = ("keep", "drop")
+SMALLEST = 2 * natural.BLOCK  # pixels; four blocks
+
+
+@dataclass(frozen=True, kw_only=True)
+class Niqe(ScoreMetric):
+    """The Natural Image Quality Evaluator of Mittal et al. (2013); lower is better.
+
+    The parameters describe pristine photographs. Numbers with different parameters cannot be compared, so the
+    record of every number names them. See ``natural`` for what is computed.
+    """
+
+    number: ClassVar[str] = "niqe"
+    less_is_better: ClassVar[bool] = True
+
+    parameters: str | None  # a file such as basicsr's niqe_pris_params.npz; None = those of this package
+    plain_blocks: str  # "keep" or "drop"
+
+    def __post_init__(self) -> None:
+        require_choice("metric.niqe.plain_blocks", self.plain_blocks, PLAIN)
+        require(
+            self.parameters is None or (isinstance(self.parameters, str) and self.parameters.strip() != ""),
+            "metric.niqe.parameters",
+            expected="a file or null",
+            got=self.parameters,
+            example="metric.niqe.parameters=null",
+        )
+
+    def prepare(self) -> None:
+        """Read the parameters."""
+        self.scorer(torch.device("cpu"))
+
+    def scorer(self, device: torch.device) -> Scorer:
+        """Return what measures one picture. It computes on the CPU, and ignores the text."""
+        if self.protocol.size < SMALLEST:
+            raise UserError(
+                f"protocol.size: expected at least {SMALLEST} pixels, because niqe compares blocks of "
+                f"{natural.BLOCK} pixels, got {self.protocol.size}. Try: protocol.size=512"
+            )
+        content, name = self._content()
+        pristine = natural.read(content, name, "metric.niqe.parameters")
+        facts = {
+            "model": name,
+            "revision": None,
+            "weights_sha256": hashlib.sha256(content).hexdigest(),
+            "plain_blocks": self.plain_blocks,
+        }
+        return Scorer(score=lambda images, _text: self._distances(images, pristine), facts=facts)
+
+    def measure(self, measurand: Measurand) -> Measurement:
+        """Return ``niqe`` with its record; nothing if no view has two blocks with texture.
+
+        Views with fewer have no number. They are left out of the mean, and the record counts them. If the
+        protocol takes something other than the mean, there is no number then.
+        """
+        if len(measurand.gaussians) == 0:
+            return Measurement({})
+        scorer = self.scorer(measurand.gaussians.device)
+        values = self.values(measurand, scorer, "")
+        known = values[values.isfinite()]
+        lost = len(values) - len(known)
+        missing = f"{lost} of {len(values)} views are left out, because they show no texture"
+        warnings = (missing,) if lost else ()
+        # A number other than the mean may need every view.
+        if len(known) == 0 or (lost and not self.protocol.is_mean):
+            return Measurement({}, warnings=warnings)
+        facts: dict[str, Any] = {**scorer.facts, "views_left_out": lost}
+        return replace(self.measurement(known, None, facts), warnings=warnings)
+
+    def _content(self) -> tuple[bytes, str]:
+        """Return the bytes of the parameters and their name."""
+        if self.parameters is None:
+            return OWN_PARAMETERS.read_bytes(), OWN_NAME
+        try:
+            return Path(self.parameters).expanduser().read_bytes(), self.parameters
+        except OSError as error:
+            raise UserError(
+                f"metric.niqe.parameters: expected a file such as basicsr's niqe_pris_params.npz, got "
+                f"{self.parameters!r} ({error.strerror}). Try: metric.niqe.parameters=null"
+            ) from error
+
+    def _distances(self, images: Float[Tensor, "v h w 3"], pristine: natural.Pristine) -> Float[Tensor, "v"]:
+        keeps = self.plain_blocks == "keep"
+        lumas = [natural.luma(image) for image in images.cpu().numpy()]
+        features = [natural.block_features(luma, pristine.window) for luma in lumas]
+        distances = [natural.distance(each, pristine, keeps) for each in features]
+        return torch.tensor(distances, dtype=torch.float64)

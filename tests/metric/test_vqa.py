@@ -1,0 +1,187 @@
+"""Vqa: the probability of yes by plain calls of transformers, on a small random LLaVA."""
+
+import json
+import shutil
+
+import pytest
+import torch
+from PIL import Image
+from splats import make_gaussians
+
+from cadam3d.core.errors import UserError
+from cadam3d.core.render import RenderOutput
+from cadam3d.metric.base import Measurand
+from cadam3d.metric.protocol import RingProtocol
+from cadam3d.metric.vqa import Vqa
+
+# All spellings of yes and no that count, and words that only begin like them.
+YES, NO = ["Yes", "yes", "▁Yes", "ĠYES"], ["No", "▁no"]
+OTHERS = ["yesterday", "not", "▁", "USER", "ASSISTANT", "Does", "this", "figure", "show", "Please", "answer"]
+SPECIAL = ["<unk>", "<s>", "</s>", "<pad>", "<image>"]
+VOCABULARY = SPECIAL + YES + NO + OTHERS + ["or", "a", "red", "cube", "?", ".", ":", '"']
+CHAT = (
+    "{% for message in messages %}USER: {% for item in message['content'] %}"
+    "{% if item['type'] == 'image' %}<image>{% else %} {{ item['text'] }}{% endif %}"
+    "{% endfor %}{% endfor %}{% if add_generation_prompt %} ASSISTANT:{% endif %}"
+)
+QUESTION = 'Does this figure show "{}"? Please answer yes or no.'
+PROTOCOL = RingProtocol(
+    name="small",
+    views=3,
+    elevations_deg=[0.0],
+    distance=3.0,
+    fov_y_deg=40.0,
+    size=32,
+    background=[1.0, 1.0, 1.0],
+    crop="none",
+    text="a {}",
+    aggregation="mean",
+    models={"vqa": {"id": "llava-hf/llava-1.5-7b-hf", "revision": None}},
+)
+PICTURES = torch.rand(3, 32, 32, 3, generator=torch.Generator().manual_seed(0)).round()
+
+
+def render(cameras, background):
+    alpha, empty = PICTURES[..., 0], torch.zeros(len(cameras), 0)
+    return RenderOutput(PICTURES, alpha, alpha, empty[..., None].expand(-1, 0, 2), empty)
+
+
+MEASURAND = Measurand(gaussians=make_gaussians(2), render=render, prompt="red cube")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    from tokenizers import Tokenizer, models, pre_tokenizers
+    from transformers import (
+        CLIPImageProcessorPil,
+        CLIPVisionConfig,
+        LlamaConfig,
+        LlavaConfig,
+        LlavaForConditionalGeneration,
+        LlavaProcessor,
+        PreTrainedTokenizerFast,
+    )
+
+    path = tmp_path_factory.mktemp("models") / "llava"
+    words = Tokenizer(models.WordLevel({word: i for i, word in enumerate(VOCABULARY)}, unk_token="<unk>"))
+    words.pre_tokenizer = pre_tokenizers.Whitespace()
+    special = {"unk_token": "<unk>", "bos_token": "<s>", "eos_token": "</s>", "pad_token": "<pad>"}
+    tokenizer = PreTrainedTokenizerFast(
+        tokenizer_object=words, additional_special_tokens=["<image>"], **special
+    )
+    small = {"hidden_size": 16, "intermediate_size": 24, "num_hidden_layers": 2, "num_attention_heads": 2}
+    config = LlavaConfig(
+        vision_config=CLIPVisionConfig(**small, image_size=32, patch_size=8),
+        text_config=LlamaConfig(**small, vocab_size=len(VOCABULARY), max_position_embeddings=128),
+        image_token_index=VOCABULARY.index("<image>"),
+    )
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = LlavaForConditionalGeneration(config)
+        # Drawn larger than usual, so that the answers to pictures differ clearly.
+        for parameter in model.parameters():
+            parameter.data *= 8 if parameter.dim() > 1 else 1
+    model.save_pretrained(path)
+    pictures = CLIPImageProcessorPil(size={"shortest_edge": 32}, crop_size={"height": 32, "width": 32})
+    LlavaProcessor(
+        pictures,
+        tokenizer,
+        patch_size=8,
+        vision_feature_select_strategy="default",
+        num_additional_image_tokens=1,
+        image_token="<image>",
+        chat_template=CHAT,
+    ).save_pretrained(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def shares(folder):
+    """Return the probabilities of all tokens after a prompt, one row per picture, by plain calls."""
+    from transformers import LlavaForConditionalGeneration, LlavaProcessor
+
+    model = LlavaForConditionalGeneration.from_pretrained(folder, dtype=torch.float32).eval()
+    processor = LlavaProcessor.from_pretrained(folder)
+
+    def after(prompt):
+        rows = []
+        for picture in (PICTURES * 255).byte().numpy():
+            inputs = processor(images=Image.fromarray(picture), text=prompt, return_tensors="pt")
+            with torch.no_grad():
+                rows.append(model(**inputs).logits[0, -1].softmax(dim=-1))
+        return torch.stack(rows)
+
+    return after
+
+
+def metric(folder, **changes):
+    settings = {"protocol": PROTOCOL, "model": str(folder), "revision": None, "question": QUESTION}
+    settings |= {"template": None, "normalize": False, "dtype": "float32"}
+    return Vqa(**settings | changes)
+
+
+def columns(words):
+    return [VOCABULARY.index(word) for word in words]
+
+
+CHATTED = 'USER: <image> Does this figure show "a red cube"? Please answer yes or no. ASSISTANT:'
+
+
+def test_the_number_is_the_probability_of_all_spellings_of_yes(folder, shares):
+    measured = metric(folder).measure(MEASURAND)
+    expected = shares(CHATTED)[:, columns(YES)].sum(dim=1)
+    record = measured.details["vqa"]
+    assert record["views"] == pytest.approx(expected.tolist(), abs=1e-5)
+    assert measured.numbers["vqa"] == pytest.approx(expected.mean().item(), abs=1e-5)
+    assert expected.std() > 1e-3
+    assert record["yes_tokens"] == YES
+    assert record["question"] == QUESTION
+    assert record["text"] == "a red cube"
+    assert json.loads(json.dumps(record)) == record
+
+
+def test_it_can_be_normalized_against_no(folder, shares):
+    found = metric(folder, normalize=True).measure(MEASURAND).details["vqa"]["views"]
+    yes, no = (shares(CHATTED)[:, columns(words)].sum(dim=1) for words in (YES, NO))
+    assert found == pytest.approx((yes / (yes + no)).tolist(), abs=1e-5)
+
+
+def test_question_and_template_can_be_replaced(folder, shares):
+    changed = metric(folder, question="Does this show {}?", template="<image> {} ASSISTANT:")
+    found = changed.measure(MEASURAND).details["vqa"]["views"]
+    expected = shares("<image> Does this show a red cube? ASSISTANT:")[:, columns(YES)].sum(dim=1)
+    assert found == pytest.approx(expected.tolist(), abs=1e-5)
+
+
+def refusal(folder, **changes):
+    with pytest.raises(UserError) as caught:
+        metric(folder, **changes).measure(MEASURAND)
+    return str(caught.value)
+
+
+def test_a_model_without_a_chat_template_needs_a_template(folder, tmp_path, shares):
+    bare = shutil.copytree(folder, tmp_path / "bare")
+    (bare / "chat_template.jinja").unlink()
+    text = refusal(bare)
+    assert text.startswith("metric.vqa.template: expected a text with the model's mark of a picture")
+    assert text.endswith("""Try: metric.vqa.template='"<image>{}"'""")
+    metric(bare, template="<image>{}").measure(MEASURAND)
+
+
+def test_a_model_without_pictures_is_refused(clip_folder):
+    assert "cannot be used" in refusal(clip_folder)
+
+
+def test_without_the_model_one_line_says_what_to_download(monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    text = refusal(None, model=None)
+    assert "hf download llava-hf/llava-1.5-7b-hf --local-dir models/llava-1.5-7b-hf" in text
+    assert text.endswith("Then: metric.vqa.model=models/llava-1.5-7b-hf")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("question", "What is it?"), ("template", "<image>"), ("dtype", "int8")]
+)
+def test_wrong_settings_are_refused(folder, key, value):
+    with pytest.raises(UserError, match=f"metric.vqa.{key}: expected"):
+        metric(folder, **{key: value})
