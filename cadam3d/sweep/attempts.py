@@ -59,7 +59,7 @@ def read_attempts(
         grid=Grid(each={}, arms={"": {}}, figures=["growth"]),
         axes=axes,
         prompts=None,
-        jobs=[Job("", f"{SEED}{seed}", (*common, f"seed={seed}"), None) for seed in seeds],
+        jobs=[Job("", f"{SEED}{seed}", (*common, f"seed={seed}"), None, ()) for seed in seeds],
         command="train",
         place=expanded(str(cfg.hydra.run.dir)) if is_chosen else _place(cfg, axes),
     )
