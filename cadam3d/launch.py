@@ -5,7 +5,7 @@ import shlex
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.run_folder import OVERRIDES, expanded
+from cadam3d.io.run_folder import JOBS, OVERRIDES, expanded, has_file, typed_path
 from cadam3d.settings.advice import explain, is_refused_path, line_of, require_values, reraise_interrupt
 from cadam3d.settings.compose import LONGEST_KEY, TEXT_KEYS, config_dir
 from cadam3d.settings.declared import require_settings
@@ -28,10 +28,21 @@ from cadam3d.settings.hydra import (
     run_composed,
     run_hydra,
 )
-from cadam3d.settings.line import RUN_FOLDER, exporting, key_of, quoted, resumed, split
+from cadam3d.settings.line import (
+    DRY_RUN,
+    LAUNCHER_KEY,
+    RUN_FOLDER,
+    exporting,
+    key_of,
+    quoted,
+    resumed,
+    split,
+    text_of,
+)
 from cadam3d.settings.place import occupied
 from cadam3d.settings.target import require_target
 from cadam3d.settings.trust import judge_composition, require_trust, targets_in
+from cadam3d.sweep.choice import require_attempts
 
 TRAINING = ("train", "sweep")  # the commands that have a run folder
 EXPORTING = ("render", "export")  # the commands with output=
@@ -65,6 +76,7 @@ class Line:
     options: Namespace  # the flags, parsed
     is_sweep: bool
     typed: list[str]  # the overrides without those of a resumed run
+    words: list[str]  # the same as they were typed, for messages
     trusting: str  # what to type to trust the folder of a resumed run
 
 
@@ -147,39 +159,77 @@ def read_line(command: str, overrides: list[str], flags: list[str], options: Nam
     if is_sweep and command not in TRAINING:
         kept = [override for override in overrides if override != "hydra.mode=MULTIRUN"]
         raise UserError(f"{command}: only training can be swept. Try: {line_of(command, kept)}")
-    if command == "train" and not is_sweep and "dry_run" in map(key_of, overrides):
-        words = [override for override in overrides if key_of(override) != "dry_run"]
-        raise UserError(
-            "dry_run: expected a sweep, whose jobs it lists, got a single run. The settings of a run can be "
-            f"printed instead. Try: {shlex.join(['cadam3d', command, *words, *flags, '--cfg', 'job'])}"
-        )
     if command == "export":
         require_target(overrides)
+    words = overrides
     overrides = typed = [quoted(override, is_sweep=is_sweep) for override in overrides]
     if command in TRAINING:
+        _refuse_resumed_jobs(typed)
         folders = [Path(options.config_path) if options.config_path else config_dir()]
         folders += [Path(options.config_dir)] if options.config_dir else []
         overrides = resumed(typed, is_sweep=is_sweep, folders=folders, retry=trusting)
     elif command in EXPORTING:
         overrides = exporting(typed)
-    return Line(command, overrides, flags, options, is_sweep, typed, trusting)
+    return Line(command, overrides, flags, options, is_sweep, typed, words, trusting)
 
 
 def _command(line: Line, task: Task) -> int:
     """Run a command once, or show one of Hydra's pages about it."""
     options = line.options
     if wants_page(options) or options.cfg:
-        run_hydra(line.command, [*line.overrides, *line.flags], task)
+        has_attempts = any(key_of(override) == "attempts" for override in line.overrides)
+        shown = [each for each in line.overrides if not (has_attempts and _is_of_sweeps(each))]
+        run_hydra(line.command, [*shown, *line.flags], task)
         return 0
+    if line.command == "train":
+        return _train_once_or_more(line, task)
     run_line(line, compose_checked(line), task)
     return 0
 
 
-def compose_checked(line: Line) -> DictConfig:
-    """Return the configuration of a line, with Hydra's own node, after everything has been refused in it.
+def _train_once_or_more(line: Line, task: Task) -> int:
+    """Train a run, or several attempts at it. Attempts are the jobs of a sweep and can have its settings."""
+    own = [override for override in line.overrides if _is_of_sweeps(override)]
+    rest = [override for override in line.overrides if not _is_of_sweeps(override)]
+    cfg = _composed(replace(line, overrides=rest))
+    if cfg.get("attempts", 1) > 1:
+        from cadam3d.commands import attempts
 
-    What only the components of the configuration can refuse, they refuse when they are built.
+        return attempts.run(cfg, line.overrides, line.flags, line.options, line.words)
+    run_line(line, compose_checked(line) if own else cfg, task)
+    return 0
+
+
+def _is_of_sweeps(override: str) -> bool:
+    """Return whether an override is a setting of sweeps and not of the runs in them."""
+    return key_of(override) == DRY_RUN or LAUNCHER_KEY.match(key_of(override)) is not None
+
+
+def compose_checked(line: Line) -> DictConfig:
+    """Return the configuration of a line that does one thing, with Hydra's own node.
+
+    Everything has been refused in it that is not refused when the components are built. Raises ``UserError``
+    also for several attempts at a run.
     """
+    words = [word for word in line.words if key_of(word) != DRY_RUN]
+    if line.command == "train" and len(words) < len(line.words):
+        page = shlex.join(["cadam3d", "train", *words, *line.flags, "--cfg", "job"])
+        raise UserError(
+            f"{DRY_RUN}: expected a sweep or several attempts, which it lists, got a single run. The "
+            f"settings of a run can be printed instead. Try: {page}"
+        )
+    cfg = _composed(line)
+    if line.command == "train" and cfg.get("attempts", 1) > 1:
+        shell = shlex.join(["cadam3d", "train", *line.words, *line.flags])
+        raise UserError(
+            f"attempts: expected 1, got {cfg.attempts}. Attempts are processes, which only the command line "
+            f"starts. Try, in a shell: {shell}"
+        )
+    return cfg
+
+
+def _composed(line: Line) -> DictConfig:
+    """Return the configuration of a line. Raises ``UserError`` and Hydra's exceptions."""
     cfg = compose_line(line.command, [*line.overrides, "hydra.mode=RUN"], line.options)
     if not require_trust(cfg.get("trust", False)) and cfg.get("resume") is not None:
         overrides = Path(cfg.hydra.run.dir) / OVERRIDES
@@ -189,6 +239,8 @@ def compose_checked(line: Line) -> DictConfig:
     refuse_unread_settings(cfg, line.command, line.overrides)
     require_settings(cfg)
     _refuse_several_runs(cfg, line)
+    if line.command == "train":
+        require_attempts(cfg.get("attempts", 1), cfg.get("select"))
     return cfg
 
 
@@ -246,6 +298,22 @@ def _refuse_several_runs(cfg: DictConfig, line: Line) -> None:
             f"run: expected one run, got a list of {len(runs)}, which only cadam3d {COMPARING} compares. "
             f"Try: {shlex.join(['cadam3d', COMPARING, typed])}"
         )
+
+
+def _refuse_resumed_jobs(overrides: Sequence[str]) -> None:
+    """Refuse ``resume=`` with the folder of a sweep or of attempts, with the line that continues its jobs."""
+    texts = [text_of(override) for override in overrides if key_of(override) == "resume"]
+    if not texts or not has_file(folder := typed_path(texts[-1]), JOBS):
+        return
+    from cadam3d.sweep.folder import read_plan
+
+    plan = read_plan(folder)
+    line = shlex.join(["cadam3d", plan.command, *plan.line]) if plan.line else "cadam3d sweep --help"
+    noun = "attempts at a run" if plan.command == "train" else "jobs of a sweep"
+    raise UserError(
+        f"resume: expected the folder of a run, got {texts[-1]!r}, which has {len(plan.jobs)} {noun}. "
+        f"The line that started them continues them. Try: {line}"
+    )
 
 
 def wants_page(options: Namespace) -> bool:

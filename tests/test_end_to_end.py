@@ -15,7 +15,10 @@ import pytest
 
 from cadam3d import cli
 from cadam3d.io.jsonl import read_jsonl
+from cadam3d.io.lock import INHERITED
 from cadam3d.io.ply import read_ply
+from cadam3d.sweep.folder import Row
+from cadam3d.sweep.process import run_job
 
 pytestmark = pytest.mark.slow
 
@@ -219,6 +222,47 @@ def test_a_sweep_continues_after_a_killed_job_and_the_same_line_completes_it(fin
     assert err.startswith("cadam3d: views: was 1 in table/")
     assert err.endswith("Try: hydra.sweep.dir=table-2\n")
     assert not (tmp_path / "outputs").exists()  # outputs/latest is for single runs
+
+
+@pytest.fixture
+def jobs_here(monkeypatch) -> None:
+    """Let a sweep run its jobs in this process, which has loaded torch already."""
+
+    def run_jobs(_name: str, arguments: list[str], _run: object) -> None:
+        given = dict(word.split("=", 1) for word in arguments if "=" in word)
+        for number in given["job"].split(","):
+            run_job(Path(given["hydra.sweep.dir"].strip("'")), int(number))
+
+    def run_here(_plan: object, row: Row, _stop: Path, lock: int) -> int:
+        monkeypatch.setenv(INHERITED, str(lock))
+        words = [f"resume={row.folder}"] if row.has_checkpoint else []
+        return cli.dispatch(["train", *words, *row.overrides, f"hydra.run.dir={row.folder}"])
+
+    monkeypatch.setattr("cadam3d.sweep.start.run_hydra", run_jobs)
+    monkeypatch.setattr("cadam3d.sweep.process._wait", run_here)
+
+
+@pytest.mark.usefixtures("jobs_here")
+def test_four_attempts_survive_a_kill_in_the_middle_and_the_best_is_linked(tmp_path, type_in):
+    words = [*BARE, "metric=[fidelity]", "metric.fidelity.views=1", "attempts=4", "select=psnr"]
+    words.append("hydra.run.dir=cube")
+    folder = tmp_path / "cube"
+    process = start(tmp_path, "train", *words)
+    wait_for(folder / "seed=1" / "config.yaml", process)
+    process.kill()  # SIGKILL: the first attempt has a result, and the second one trains
+    process.communicate()
+    untouched = (folder / "seed=0" / "summary.json").stat().st_mtime_ns
+    assert not (folder / "best").exists()
+
+    out, _ = type_in(tmp_path, "train", *words)
+    assert (folder / "seed=0" / "summary.json").stat().st_mtime_ns == untouched
+    psnr = [json.loads((folder / f"seed={seed}" / "summary.json").read_text())["psnr"] for seed in range(4)]
+    assert len(set(psnr)) == 4  # four different assets
+    best = psnr.index(max(psnr))
+    assert (folder / "best").readlink() == Path(f"seed={best}")
+    assert f"is seed={best} with {psnr[best]:.2f} dB" in out
+    assert (tmp_path / "outputs" / "latest" / "best" / "asset.ply").is_file()
+    assert f"is seed={best} with" in (folder / "report.html").read_text()
 
 
 def rows_of(sweep: Path) -> list[dict[str, str]]:

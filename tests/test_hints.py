@@ -125,6 +125,19 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         (*A_CUBE, "rasterizer=gsplat"),
         (*A_CUBE, "seed=-1"),
     ],
+    "attempts": [
+        (*A_CUBE, "attempts=0"),
+        (*A_CUBE, "attempts=2", "seed=-1"),
+        (*A_CUBE, "attempts=2", "select=psnrr"),
+        (*A_CUBE, "attempts=2", "select=mesh_fscore"),
+        (*A_CUBE, "attempts=2", "metric=[]"),
+        (*A_CUBE, "attempts=2", "hydra.run.dir=a run"),
+        (*A_CUBE, "attempts=1", "dry_run=true"),
+        ("train", "resume=a run", "attempts=2"),
+        ("train", "resume=a sweep"),
+        ("sweep", "prompt=a red cube", "densifier=cadam,none", "attempts=2"),
+        ("sweep", "prompt=a red cube", "densifier=cadam,none", "dry_run=7"),
+    ],
     "prompts": [
         ("train", "prompt=a red cuube"),
         ("train", "prompt="),
@@ -210,6 +223,8 @@ GAPS = (
 LONGEST_WAY = 4  # messages
 # Code whose messages need what these tests lack. A key is a folder, a file, or FILE::FUNCTION.
 ELSEWHERE: dict[str, str] = {
+    "commands/attempts.py::_keep": "needs a folder that cannot be written",
+    "commands/attempts.py::_nothing_to_choose_by": "needs attempts that have ended; see tests/sweep",
     "commands/eval.py::_evaluate_sweep": "needs a sweep whose jobs all fail",
     "commands/eval.py::start_of": "needs the folder of a stranger",
     "commands/eval.py::_not_saved": "needs a folder that cannot be written; see tests/commands",
@@ -231,6 +246,7 @@ ELSEWHERE: dict[str, str] = {
     "sweep/folder.py": "needs a damaged sweep",
     "sweep/grid.py": "needs a wrong grid; see tests/sweep",
     "sweep/start.py::_locked": "needs a second process",
+    "sweep/attempts.py::require_one_method": "needs attempts that were measured; see tests/sweep",
     "sweep/start.py::_refuse_occupied": "needs files in the way; see tests/sweep",
     "sweep/start.py::_refuse_other_settings": "needs the results of a sweep; see tests/sweep",
 }

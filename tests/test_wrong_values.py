@@ -377,7 +377,10 @@ def test_settings_that_this_run_does_not_read_are_checked_too(value):
             require_unused(changed("camera=orbit", key, value))
 
 
-@pytest.mark.parametrize("name", ["prompt", "negative_prompt", "steps", "views", "seed", "device", "resume"])
+@pytest.mark.parametrize(
+    "name",
+    ["prompt", "negative_prompt", "steps", "views", "seed", "device", "resume", "attempts", "select"],
+)
 @pytest.mark.parametrize("value", [[], {}, 1e23, 10**30, True, math.nan, "\udcff"])
 def test_a_setting_outside_of_components_has_a_value_of_its_type(name, value):
     with pytest.raises(UserError, match=rf"^{name}: expected .* Try: \S*{name}="):

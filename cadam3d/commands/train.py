@@ -1,6 +1,5 @@
 """``cadam3d train``: optimise an asset for a prompt and write it into a run folder."""
 
-import errno
 import logging
 import os
 import signal
@@ -25,6 +24,7 @@ from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
 from cadam3d.commands.control import Control
+from cadam3d.commands.linking import link_latest
 from cadam3d.commands.measuring import build_metrics, measure, rebuild_start
 from cadam3d.commands.messages import keeping_others, note, note_backend, note_omission
 from cadam3d.commands.timetable import describe
@@ -53,7 +53,6 @@ from cadam3d.io.run_folder import (
     ASSET,
     CHECKPOINTS,
     CONFIG,
-    LATEST,
     PREVIEW,
     SUMMARY,
     TURNTABLE,
@@ -71,6 +70,7 @@ from cadam3d.report import write_report
 from cadam3d.report.declarations import write_declarations
 from cadam3d.settings.compose import component, components, flatten, load_config
 from cadam3d.settings.declared import TARGET
+from cadam3d.settings.line import NOT_OF_A_RUN
 from cadam3d.state import Outcome, PayloadError, RunContext, TrainState
 from cadam3d.trainer import Trainer
 
@@ -371,27 +371,8 @@ def note_changes(cfg: DictConfig, folder: Path) -> None:
     before = dict(flatten(OmegaConf.to_container(load_config(folder / CONFIG), resolve=True)))
     now = dict(flatten(OmegaConf.to_container(cfg, resolve=True)))
     for key in sorted(before.keys() | now.keys()):
-        if key not in ("resume", "trust") and before.get(key) != now.get(key):
+        if key not in NOT_OF_A_RUN and before.get(key) != now.get(key):
             say(f"Note: {key} was {before.get(key)!r}, is now {now.get(key)!r}", logging.WARNING)
-
-
-def link_latest(folder: Path) -> None:
-    """Make ``outputs/latest`` a link to ``folder``. If that is not possible, print a note."""
-    latest = Path(LATEST)
-    fresh = latest.with_name(f".latest-{os.getpid()}")
-    try:
-        latest.parent.mkdir(parents=True, exist_ok=True)
-        target, base = folder.resolve(), latest.parent.resolve()
-        if os.path.lexists(latest) and not latest.is_symlink():
-            raise FileExistsError(errno.EEXIST, "it exists and is not a link")
-        fresh.unlink(missing_ok=True)
-        fresh.symlink_to(target.relative_to(base) if target.is_relative_to(base) else target)
-        try:
-            fresh.replace(latest)
-        finally:
-            fresh.unlink(missing_ok=True)
-    except OSError as error:
-        say(f"Note: {latest} not updated ({error.strerror}).", logging.WARNING)
 
 
 def summarize(cfg: DictConfig, state: TrainState, outcome: Outcome, backend: Backend) -> dict[str, Any]:

@@ -76,6 +76,10 @@ PAPER_TABLE_MARKDOWN = "table.md"
 PAPER_TABLE_LATEX = "table.tex"
 SHARED = "traces"  # a folder, removed after the sweep
 
+# Written by several attempts at one run, beside the files of a sweep.
+BEST = "best"  # a link to the folder of the best attempt
+CHOICE = "best.json"  # which attempt that is, and why
+
 # Written by a sweep, into the folder of each job.
 CONSOLE = "console.txt"
 ENDED = "job.json"  # exit code and seconds
@@ -150,7 +154,7 @@ def occupant(folder: Path) -> str | None:
 def occupant_of_sweep(folder: Path) -> str | None:
     """Return the name of something in ``folder`` that a sweep would overwrite or remove; None if nothing."""
     tables = (TABLE, PAPER_TABLE_CSV, PAPER_TABLE_MARKDOWN, PAPER_TABLE_LATEX)
-    names = (*tables, REPORT, EVALUATION, FIGURES, MULTIRUN, SHARED, STOP)
+    names = (*tables, REPORT, EVALUATION, FIGURES, MULTIRUN, SHARED, STOP, BEST, CHOICE)
     return next((name for name in names if os.path.lexists(folder / name)), None)
 
 

@@ -21,7 +21,8 @@ from cadam3d.report.verdicts import OURS, THEIRS
 from cadam3d.settings.line import setting_word
 
 # The columns, as far as there are numbers: those of the paper, other scores, then comparisons with a truth.
-SCORES = ("clip_score", "image_reward", "hps", "niqe", "clip_r_precision", "pick_score", "vqa", "janus")
+PAPER_SCORES = ("clip_score", "image_reward", "hps", "niqe")
+SCORES = (*PAPER_SCORES, "clip_r_precision", "pick_score", "vqa", "janus")
 OF_TRUTH = ("psnr", "ssim", "psnr_turned", "ssim_turned", "iou", "colour_error")
 # Two settings are compared by the ratio of these.
 SIZES = ("num_gaussians", "asset_mib")
@@ -122,7 +123,10 @@ def paper_table(results: Sequence[JobResult], folder: Path) -> PaperTable | None
     for category in categories:
         members = [result for result in results if result.category == category]
         sections.append(Section(category, _rows(members, names, with_published=False)))
-    return PaperTable(names, sections, [*_notes(results, usable, names), *_again(left_out, usable, folder)])
+    notes = [*_notes(results, usable, names), *_again(left_out, usable, folder)]
+    if not any(name in usable[0].numbers for name in PAPER_SCORES):
+        notes.append(f"The paper's scores are not measured yet. Try: {_line(PAPER_SCORES, folder)}")
+    return PaperTable(names, sections, notes)
 
 
 def with_asset(results: Iterable[JobResult]) -> list[JobResult]:
@@ -165,9 +169,14 @@ def mixed(results: Sequence[JobResult]) -> dict[str, str]:
 def _again(left_out: Mapping[str, str], results: Sequence[JobResult], folder: Path) -> list[str]:
     """Return the sentences about numbers that are left out, with the line that measures all scores anew."""
     scores = {name for result in results for name in result.scores}
-    metrics = dict.fromkeys(QUALITIES[name].metric for name in SCORES if name in scores)
-    line = f"cadam3d eval {setting_word('run', shown(folder))} 'metric=[{','.join(metrics)}]'"
+    line = _line([name for name in SCORES if name in scores], folder)
     return [f"{problem}, so it is not in the table. Try: {line}" for problem in left_out.values()]
+
+
+def _line(names: Iterable[str], folder: Path) -> str:
+    """Return the command that measures numbers of all jobs of the sweep in ``folder``."""
+    metrics = dict.fromkeys(QUALITIES[name].metric for name in names)
+    return f"cadam3d eval {setting_word('run', shown(folder))} 'metric=[{','.join(metrics)}]'"
 
 
 def _groups(results: Sequence[JobResult]) -> list[Group]:

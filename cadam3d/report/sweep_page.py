@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.outcome import Outcome
-from cadam3d.io.run_folder import FIGURES, REPORT, TABLE
+from cadam3d.io.jsonl import read_json
+from cadam3d.io.run_folder import CHOICE, FIGURES, REPORT, TABLE
 from cadam3d.report import figures, pictures, table_formats, tables, verdicts
 from cadam3d.report.claims import LEAST_FOR_QUARTILES, compare, standard_setting
 from cadam3d.report.formatting import plural
@@ -161,7 +162,7 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None) -> Path:
         extent=_extent(results),
         warnings=_unknown(names or (), kinds),
         paper_table=None if paper is None else ShownPaperTable.of(paper),
-        verdict=verdicts.headline(results),
+        verdict=[*_choice(sweep_folder, plan), *verdicts.headline(results)],
         tiles=_tiles(results),
         key_table=table(contents["objectives"], align_decimals=True),
         without_standard=[arm for arm in arms_of(results) if standard_setting(results, arm) is None],
@@ -175,6 +176,18 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None) -> Path:
         commands=_commands(plan),
         files=files,
     )
+
+
+def _choice(folder: Path, plan: Plan) -> list[str]:
+    """Return why one of several attempts is the best, if the jobs are attempts and one was chosen."""
+    if plan.command != "train" or not (folder / CHOICE).is_file():
+        return []
+    try:
+        content = read_json(folder / CHOICE)
+    except UserError:
+        return []
+    reason = content.get("why") if isinstance(content, dict) else None
+    return [reason] if isinstance(reason, str) else []
 
 
 def for_shell(word: str) -> str:
@@ -231,6 +244,8 @@ def _title(plan: Plan, results: Sequence[JobResult]) -> str:
         varied += [key for key in keys if len({dict(each).get(key) for each in pairs}) > 1]
     listed = " and ".join(filter(None, [", ".join(varied[:-1]), *varied[-1:]]))
     name = grid or f"Sweep of {listed}".removesuffix(" of ")
+    if plan.command == "train":
+        name = plural(len(results), "attempt")
     texts = dict.fromkeys(result.cell[PROMPT] for result in results)
     prompts = [shorten(text, LONGEST_PROMPT, placeholder=" ...") for text in texts]
     shown = list(filter(None, prompts))[:MOST_PROMPTS]
@@ -275,6 +290,6 @@ def _tiles(results: Sequence[JobResult]) -> list[Tile]:
 
 def _commands(plan: Plan) -> str:
     """Return the command line of the sweep and that of each of its jobs."""
-    lines = [["sweep", *plan.line]] if plan.line else []
+    lines = [[plan.command, *plan.line]] if plan.line else []
     lines += [["train", *job.overrides] for job in plan.jobs]
     return "\n".join(" ".join(["cadam3d", *(for_shell(str(word)) for word in line)]) for line in lines)

@@ -24,6 +24,9 @@ def write(sweep: Path) -> str:
     """
     table = read_table(sweep)
     if table is None:
+        # Those of an earlier line would be taken for those of the present jobs.
+        for name in FORMATS:
+            (sweep / name).unlink(missing_ok=True)
         return ""
     for name, write_as in FORMATS.items():
         with replacing(sweep / name) as temporary:

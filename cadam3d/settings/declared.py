@@ -36,14 +36,15 @@ BLANKS = "\n\t\r"
 # The settings outside of all components, over all commands.
 SETTINGS: dict[str, Any] = {
     **dict.fromkeys(("prompt", "negative_prompt", "device"), str),
-    **dict.fromkeys(("resume", "ply", "ply_up", "output"), str | None),
+    **dict.fromkeys(("resume", "ply", "ply_up", "output", "select"), str | None),
     "run": str | Sequence[str] | None,
     "labels": Sequence[str] | None,
-    **dict.fromkeys(("steps", "views", "seed", "port"), int),
+    **dict.fromkeys(("steps", "views", "seed", "port", "attempts"), int),
     **dict.fromkeys(("open", "json"), bool),
 }
 EXAMPLES = {"prompt": "a cube", "steps": 600, "run": LATEST, "resume": LATEST, "labels": None}
 EXAMPLES |= {"negative_prompt": "", "device": "auto", "ply_up": "-y", "views": 2, "seed": 0, "port": 0}
+EXAMPLES |= {"attempts": 4, "select": "psnr"}
 WORDS = {
     int: "a whole number",
     float: "a finite number",

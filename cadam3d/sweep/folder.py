@@ -47,8 +47,9 @@ class Plan:
     threads: int | None  # OpenMP threads of a job; None: the default of its machine
     jobs: list[PlannedJob]
     figures: list[str] | None = None  # of the report; None: all for which there are data
-    line: list[str] = field(default_factory=list)  # what was typed after ``cadam3d sweep``
+    line: list[str] = field(default_factory=list)  # what was typed after ``cadam3d COMMAND``
     paper_table: bool = False  # whether the paper's table 1 is made of its jobs
+    command: str = "sweep"  # of the line; "train" if the jobs are several attempts at one run
 
 
 @dataclass(frozen=True)
@@ -136,6 +137,7 @@ def _require_plan(content: Any) -> None:
     _require(threads is None or is_count, "threads: expected a whole number")
     _require(figures is None or _are_texts(figures), "figures: expected names")
     _require(type(content.get("paper_table", False)) is bool, "paper_table: expected true or false")
+    _require(content.get("command", "sweep") in ("sweep", "train"), "command: expected sweep or train")
     for name in ("flags", "line"):
         _require(_are_texts(content.get(name, [])), f"{name}: expected words")
     for job in content["jobs"]:

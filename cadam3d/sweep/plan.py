@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -18,7 +19,8 @@ from cadam3d.settings.advice import RefusedJobError, line_of, require_values
 from cadam3d.settings.compose import flatten
 from cadam3d.settings.declared import require_settings
 from cadam3d.settings.hydra import compose_line, refuse_missing_settings, refuse_unread_settings
-from cadam3d.settings.line import SWEEP_FOLDER, key_of
+from cadam3d.settings.line import DRY_RUN, LAUNCHER_KEY, RUN_FOLDER, SWEEP_FOLDER, key_of
+from cadam3d.sweep.choice import require_attempts
 from cadam3d.sweep.grid import (
     ALWAYS_SHOWN,
     Axes,
@@ -34,9 +36,7 @@ from cadam3d.sweep.prompts import FILE, KEY, Choice, read_choice
 
 # An override that is neither an addition nor a deletion and names no package.
 PLAIN_KEY = re.compile(r"[A-Za-z_][\w.]*=")
-LAUNCHER_KEY = re.compile(r"launcher($|\.)|hydra[./]launcher($|\.)")
 GRID_KEY = re.compile(r"(grid|prompts)($|\.)")
-DRY_RUN = "dry_run"
 REFUSED_KEY = re.compile(r"hydra\.run\.dir$|hydra\.sweep\.subdir$|hydra[./]sweeper($|\.)")
 NOTHING_TO_SWEEP = "sweep: nothing to sweep over. Try: densifier=baseline,cadam"
 
@@ -61,6 +61,9 @@ class Sweep:
     axes: Axes  # of the line
     prompts: Choice | None  # None if the line and the grid name no file or set of prompts
     jobs: list[Job]
+    command: str = "sweep"  # of the line; "train" if the jobs are several attempts at one run
+    # The folder, unless the line has one; None stands for a name that says what is swept.
+    place: Path | None = None
 
     @property
     def grid_name(self) -> str | None:
@@ -71,6 +74,16 @@ class Sweep:
     def is_dry(self) -> bool:
         """Return whether the jobs are only listed."""
         return self.cfg[DRY_RUN]
+
+    @property
+    def folder_key(self) -> str:
+        """Return the setting that chooses the folder."""
+        return RUN_FOLDER if self.command == "train" else SWEEP_FOLDER
+
+    @property
+    def noun(self) -> str:
+        """Return what a job is called in messages."""
+        return "attempt" if self.command == "train" else "job"
 
 
 @dataclass(frozen=True)
@@ -188,6 +201,25 @@ def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> tu
     Raises ``UserError`` for a line with a single job or with settings that a sweep cannot have.
     """
     parts = sort_overrides(overrides)
+    cfg = compose_sweep(parts, options)
+    node = cfg.get("grid")
+    grid = read_grid(None if node is None else OmegaConf.to_container(node, resolve=True))
+    axes = read_line(parts.jobs)
+    prompts = _read_prompts(cfg, grid, axes, overrides)
+    if prompts is not None:
+        axes = {"prompt": prompt_axis(prompts.read())} | axes
+    composer = Composer(options, search_path(overrides))
+    jobs = expand(grid, axes, composer.has)
+    if command == "sweep" and node is None and prompts is None and len(jobs) == 1:
+        raise UserError(NOTHING_TO_SWEEP)
+    return Sweep(cfg=cfg, parts=parts, grid=grid, axes=axes, prompts=prompts, jobs=jobs), composer
+
+
+def compose_sweep(parts: Parts, options: Namespace) -> DictConfig:
+    """Return the settings of a sweep itself, which are its grid, its launcher and Hydra's node.
+
+    Raises ``UserError`` for wrong values, and Hydra's exceptions.
+    """
     # The flag --config-name is for the jobs and not for the sweep itself.
     own = Namespace(**{**vars(options), "config_name": None})
     cfg = compose_line("sweep", [*parts.grid, *parts.launcher, *parts.folder], own)
@@ -195,17 +227,7 @@ def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> tu
     OmegaConf.to_container(cfg.hydra.launcher, resolve=True)
     is_answer = isinstance(cfg[DRY_RUN], bool)
     require(is_answer, DRY_RUN, expected="true or false", got=cfg[DRY_RUN], example=f"{DRY_RUN}=true")
-    node = cfg.get("grid")
-    grid = read_grid(None if node is None else OmegaConf.to_container(node, resolve=True))
-    axes = read_line(parts.jobs)
-    prompts = _read_prompts(cfg, grid, axes, overrides)
-    if prompts is not None:
-        axes = {"prompt": prompt_axis(prompts.read())} | axes
-    composer = Composer(options, _search_path(overrides))
-    jobs = expand(grid, axes, composer.has)
-    if command == "sweep" and node is None and prompts is None and len(jobs) == 1:
-        raise UserError(NOTHING_TO_SWEEP)
-    return Sweep(cfg=cfg, parts=parts, grid=grid, axes=axes, prompts=prompts, jobs=jobs), composer
+    return cfg
 
 
 def _read_prompts(cfg: DictConfig, grid: Grid, axes: Axes, overrides: Sequence[str]) -> Choice | None:
@@ -245,7 +267,7 @@ def sort_overrides(overrides: Sequence[str]) -> Parts:
             parts.folder.append(override)
         else:
             parts.jobs.append(override)
-    parts.grid.extend(_search_path(overrides))
+    parts.grid.extend(search_path(overrides))
     return parts
 
 
@@ -255,9 +277,21 @@ def compose_all(sweep: Sweep, composer: Composer) -> list[Composed]:
     for job in sweep.jobs:
         try:
             composed.append(composer.compose(job.overrides))
+            _refuse_attempts(composed[-1])
         except Exception as error:
             raise RefusedJobError(job.arm, job.overrides) from error
     return composed
+
+
+def _refuse_attempts(job: Composed) -> None:
+    """Refuse a job that would be several attempts. A train.yaml from elsewhere may lack this setting."""
+    attempts = job.values.get("attempts", 1)
+    require_attempts(attempts, job.values.get("select"))
+    if attempts > 1:
+        raise UserError(
+            f"attempts: expected 1 in a sweep, whose jobs may have different seeds, got {attempts}. "
+            f"Try: attempts=1 'seed=range(0,{attempts})'"
+        )
 
 
 def shown_keys(sweep: Sweep) -> list[str]:
@@ -265,7 +299,8 @@ def shown_keys(sweep: Sweep) -> list[str]:
     return list(dict.fromkeys([*ALWAYS_SHOWN, *swept_keys(sweep.grid, sweep.axes)]))
 
 
-def _search_path(overrides: Sequence[str]) -> list[str]:
+def search_path(overrides: Sequence[str]) -> list[str]:
+    """Return the overrides that name more folders of YAML files."""
     return [line for line in overrides if key_of(line) == "hydra.searchpath"]
 
 

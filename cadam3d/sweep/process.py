@@ -117,7 +117,9 @@ def _wait(plan: Plan, row: Row, stop: Path, lock: int) -> int:
     # Hydra's main function sets this in the process of the sweep. A job prints a mistake of the user without
     # a traceback.
     environment.pop("HYDRA_FULL_ERROR", None)
-    environment.setdefault(TRACES, str(stop.with_name(SHARED)))
+    # Attempts have different seeds, so none of them could read the traces of another one.
+    if plan.command == "sweep":
+        environment.setdefault(TRACES, str(stop.with_name(SHARED)))
     environment[INHERITED] = str(lock)
     if Path(plan.cwd) == PACKAGE_ROOT:
         # A checkout that is not installed is found in the current folder only.

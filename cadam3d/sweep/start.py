@@ -9,7 +9,7 @@ import shutil
 import signal
 import sys
 from argparse import Namespace
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,13 +42,13 @@ from cadam3d.io.run_folder import (
 )
 from cadam3d.settings.compose import flatten, quote
 from cadam3d.settings.hydra import run_hydra
-from cadam3d.settings.line import SWEEP_FOLDER, key_of, setting_word
+from cadam3d.settings.line import NOT_OF_A_RUN, SWEEP_FOLDER, key_of, setting_word
 from cadam3d.settings.place import in_use
 from cadam3d.settings.trust import is_trusted, require_contained
 from cadam3d.sweep import preview, worker
 from cadam3d.sweep.folder import Plan, PlannedJob, Row, is_sweep, outcomes, rows_of, write_plan
 from cadam3d.sweep.grid import sweep_name
-from cadam3d.sweep.plan import Composed, Sweep, compose_all, read_sweep, shown_keys
+from cadam3d.sweep.plan import Composed, Composer, Sweep, compose_all, read_sweep, shown_keys
 from cadam3d.sweep.table import as_text, write_table
 from cadam3d.sweep.watch import Watch
 
@@ -75,18 +75,31 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
     With ``dry_run=true`` only list the jobs. Raises an exception before anything runs if a job cannot be
     composed, and ``UserError`` if the folder has results that were made with other settings.
     """
-    sweep, composer = read_sweep(command, overrides, options)
+    return run_sweep(*read_sweep(command, overrides, options), overrides, flags)
+
+
+def run_sweep(
+    sweep: Sweep,
+    composer: Composer,
+    overrides: Sequence[str],
+    flags: Sequence[str],
+    on_start: Callable[[Path], None] | None = None,
+) -> Ended:
+    """Run a sweep that a line with these ``overrides`` and ``flags`` describes, as :func:`start` says.
+
+    ``on_start`` is called with the folder before the first job starts, and not in a dry run.
+    """
     composed = compose_all(sweep, composer)
-    folder = _folder(sweep)
+    folder = folder_of(sweep)
     if folder.is_dir() and not is_trusted(overrides):
-        require_contained(folder, shlex.join(["cadam3d", "sweep", *overrides, *flags, "trust=true"]))
+        require_contained(folder, shlex.join(["cadam3d", sweep.command, *overrides, *flags, "trust=true"]))
     jobs = _planned(sweep, composed)
-    _refuse_other_settings(folder, rows_of(folder, jobs), composed)
+    _refuse_other_settings(folder, rows_of(folder, jobs), composed, sweep.folder_key)
     if sweep.is_dry:
         return _preview(folder, sweep, jobs, composed, flags)
-    claim(folder, SWEEP_FOLDER, is_chosen=True)
-    with _locked(folder), _stoppable(folder) as stop:
-        _refuse_occupied(folder)
+    claim(folder, sweep.folder_key, is_chosen=True)
+    with _locked(folder, sweep.folder_key), _stoppable(folder) as stop:
+        _refuse_occupied(folder, sweep.folder_key)
         rows = rows_of(folder, jobs)
         pending = [row for row in rows if not row.has_result]
         plan = Plan(
@@ -97,11 +110,14 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
             figures=sweep.grid.figures,
             line=[*_flags_named(flags, JOB_FLAGS), *overrides],
             paper_table=sweep.grid.paper_table,
+            command=sweep.command,
         )
         write_plan(folder, plan)
+        if on_start is not None:
+            on_start(folder)
         done = len(rows) - len(pending)
         already = f"; {done} already {_has(done)} a result" if done else ""
-        print(f"{_jobs(len(rows))} in {shown(folder)}{already}")
+        print(f"{_jobs(len(rows), sweep.noun)} in {shown(folder)}{already}")
         problem = ""
         try:
             if pending:
@@ -109,7 +125,7 @@ def start(command: str, overrides: Sequence[str], flags: Sequence[str], options:
                     problem = _launch(folder, sweep, pending, flags)
         finally:
             shutil.rmtree(folder / SHARED, ignore_errors=True)
-            code = _report_results(folder, write_table(folder), problem)
+            code = _report_results(folder, write_table(folder), problem, sweep.noun)
     if stop.received is not None:
         return Ended(folder, 128 + stop.received, was_stopped=True)
     return Ended(folder, code, was_stopped=False)
@@ -126,7 +142,7 @@ def _preview(
     rows = rows_of(folder, jobs)
     pending = sum(not row.has_result for row in rows)
     done = len(rows) - pending
-    print(f"{_jobs(len(rows))} in {shown(folder)}; {done} already {_has(done)} a result")
+    print(f"{_jobs(len(rows), sweep.noun)} in {shown(folder)}; {done} already {_has(done)} a result")
     print(f"\n{preview.listing(rows)}\n", flush=True)
     plan = Plan(
         cwd=str(Path.cwd()),
@@ -166,31 +182,31 @@ class Stop:
         )
 
 
-def _folder(sweep: Sweep) -> Path:
+def folder_of(sweep: Sweep) -> Path:
     """Return the folder of the sweep, which may not exist yet."""
-    place = PARENT / sweep_name(sweep.grid_name, sweep.axes, sweep.prompts)
+    place = sweep.place or PARENT / sweep_name(sweep.grid_name, sweep.axes, sweep.prompts)
     if sweep.parts.folder:
         text = OmegaConf.select(sweep.cfg, SWEEP_FOLDER)
         if not text:
             example = shlex.quote(f"{SWEEP_FOLDER}={place}")
             raise UserError(f"{SWEEP_FOLDER}: expected a folder, got nothing. Try: {example}")
         place = expanded(str(text))
-    _refuse_occupied(place)
+    _refuse_occupied(place, sweep.folder_key)
     return typed_path(str(place))
 
 
-def _refuse_occupied(folder: Path) -> None:
+def _refuse_occupied(folder: Path, key: str) -> None:
     """Refuse the folder of a run, and one with something that a sweep would overwrite or remove."""
     name = occupant_of_sweep(folder)
     if has_file(folder, OVERRIDES) or holds_run(folder):
         name = "a run"
     if name is not None and not is_sweep(folder):
-        raise UserError(f"{SWEEP_FOLDER}: {shown(folder)} holds {name}. Try: {_beside(folder)}")
+        raise UserError(f"{key}: {shown(folder)} holds {name}. Try: {_beside(folder, key)}")
 
 
-def _beside(folder: Path) -> str:
-    """Return the words that choose a new folder beside ``folder`` for a sweep."""
-    return setting_word(SWEEP_FOLDER, shown(numbered(folder)))
+def _beside(folder: Path, key: str) -> str:
+    """Return the words that choose a new folder beside ``folder`` with the setting ``key``."""
+    return setting_word(key, shown(numbered(folder)))
 
 
 def _planned(sweep: Sweep, composed: Sequence[Composed]) -> list[PlannedJob]:
@@ -209,19 +225,21 @@ def _planned(sweep: Sweep, composed: Sequence[Composed]) -> list[PlannedJob]:
     ]
 
 
-def _refuse_other_settings(folder: Path, rows: Sequence[Row], composed: Sequence[Composed]) -> None:
+def _refuse_other_settings(
+    folder: Path, rows: Sequence[Row], composed: Sequence[Composed], folder_key: str
+) -> None:
     """Refuse results on disk that were made with other settings, because the table would mislabel them."""
     for row, now in zip(rows, composed, strict=True):
         config = row.folder / CONFIG
         if not config.is_file() or not (row.has_result or row.has_checkpoint):
             continue
         before = dict(flatten(read_config(config)))
-        for key in sorted((before.keys() | now.values.keys()) - now.unknown - {"resume", "trust"}):
+        for key in sorted((before.keys() | now.values.keys()) - now.unknown - {*NOT_OF_A_RUN}):
             if before.get(key) != now.values.get(key):
                 raise UserError(
                     f"{key}: was {before.get(key)} in {shown(row.folder)}, is {now.values.get(key)} now. "
                     "The earlier settings or another folder are possible. "
-                    f"Try: {_beside(folder)}"
+                    f"Try: {_beside(folder, folder_key)}"
                 )
 
 
@@ -271,11 +289,11 @@ def _launch(folder: Path, sweep: Sweep, pending: Sequence[Row], flags: Sequence[
     return ""
 
 
-def _report_results(folder: Path, rows: Sequence[Row], problem: str) -> int:
+def _report_results(folder: Path, rows: Sequence[Row], problem: str, noun: str) -> int:
     """Print the table and what is left to do. A long table is cut down to the jobs without a result."""
     listed = rows if len(rows) <= LONGEST else [row for row in rows if not row.has_result][:LONGEST]
     table = f"\n{as_text(listed)}\n" if listed else ""
-    print(f"{table}\n{_jobs(len(rows))}: {shown(folder / TABLE)}", flush=True)
+    print(f"{table}\n{_jobs(len(rows), noun)}: {shown(folder / TABLE)}", flush=True)
     if problem:
         print(f"cadam3d: {problem}", file=sys.stderr)
     left = outcomes(rows)
@@ -289,7 +307,7 @@ def _report_results(folder: Path, rows: Sequence[Row], problem: str) -> int:
     see = f"; see {shown(consoles[0])}" if consoles else ""
     them = "it" if count == 1 else "them"
     print(
-        f"cadam3d: {count} of {_jobs(len(rows))} {_has(count)} no result ({which}){see}. "
+        f"cadam3d: {count} of {_jobs(len(rows), noun)} {_has(count)} no result ({which}){see}. "
         f"Rerun the same command to retry {them}.",
         file=sys.stderr,
     )
@@ -297,15 +315,15 @@ def _report_results(folder: Path, rows: Sequence[Row], problem: str) -> int:
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _locked(folder: Path, key: str) -> Iterator[None]:
     """Keep other sweeps and runs out of the folder until this process ends, in whatever way."""
     with ExitStack() as stack:
         try:
-            stack.enter_context(locked(folder / LOCK, lambda holder: in_use(folder, holder, SWEEP_FOLDER)))
+            stack.enter_context(locked(folder / LOCK, lambda holder: in_use(folder, holder, key)))
         except OSError as error:
             raise UserError(
-                f"{SWEEP_FOLDER}: cannot write to {shown(folder)} ({error.strerror or error}). "
-                f"Try: {setting_word(SWEEP_FOLDER, spare('cadam3d'))}"
+                f"{key}: cannot write to {shown(folder)} ({error.strerror or error}). "
+                f"Try: {setting_word(key, spare('cadam3d'))}"
             ) from error
         yield
 
@@ -323,8 +341,8 @@ def _stoppable(folder: Path) -> Iterator[Stop]:
             signal.signal(number, handler)
 
 
-def _jobs(count: int) -> str:
-    return "1 job" if count == 1 else f"{count} jobs"
+def _jobs(count: int, noun: str) -> str:
+    return f"1 {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def _has(count: int) -> str:

@@ -228,6 +228,7 @@ def test_a_prompt_is_needed():
         (("a cube", "--cfg", "job"), {}, "only the command line"),
         (("a cube", "--help"), {}, "only the command line"),
         (("a cube", "-m"), {}, "only the command line"),
+        (("a cube", "attempts=2"), {}, "only the command line"),
         (("a cube",), {"callbacks": [print]}, "callbacks: expected an object of class"),
         (("a cube",), {"callbacks": Witness()}, "callbacks: expected an object of class"),
     ],

@@ -1,6 +1,7 @@
 """The paper's table of a sweep: its numbers equal numbers computed by hand, and its formats agree."""
 
 import csv
+import html
 import io
 import json
 import math
@@ -8,6 +9,7 @@ import re
 
 import pytest
 
+from cadam3d import report
 from cadam3d.core.quality import QUALITIES
 from cadam3d.io import run_folder
 from cadam3d.report import table_files
@@ -189,6 +191,16 @@ def test_the_latex_is_balanced_and_escapes_what_users_type(three):
         assert {len(re.findall(r"(?<!\\)&", line)) + 1 for line in rows} == {len(tabular[0])}
 
 
+def test_the_page_of_the_sweep_shows_the_table_with_escaped_text(three):
+    plan = json.loads((three / run_folder.JOBS).read_text())
+    plan["jobs"][0]["category"] = "<b>"
+    (three / run_folder.JOBS).write_text(json.dumps({**plan, "figures": ["no such"]}))
+    page = report.write_sweep(three).read_text(encoding="utf-8")
+    assert "<h3>&lt;b&gt;</h3>" in page
+    for row in table_of(three).sections[0].rows:
+        assert all(html.escape(cell) in page for cell in texts(row, table_of(three).names))
+
+
 def test_columns_are_the_numbers_that_every_row_has(jobs):
     for arm in ("baseline", "cadam"):
         more = {"iou": 0.5} if arm == "cadam" else {}
@@ -238,6 +250,12 @@ def test_scores_of_one_table_belong_to_one_protocol(jobs):
     assert "clip_score" in table.names
     assert "niqe" not in table.names
     assert any("niqe belongs to another protocol" in note for note in table.notes)
+
+
+def test_a_table_without_scores_says_how_to_measure_them(jobs):
+    jobs.add("cadam", n=10, psnr=20, arm="cadam")
+    notes = table_of(jobs.folder).notes
+    assert any(note.endswith("'metric=[clip_score,image_reward,hps,niqe]'") for note in notes)
 
 
 def test_settings_that_come_with_prompts_do_not_split_the_rows(jobs):

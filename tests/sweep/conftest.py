@@ -39,7 +39,7 @@ summary = dict(prompt=prompt, seed=seed, num_gaussians_initial=4, num_gaussians=
 summary |= dict(steps=steps, steps_asked=steps)
 
 def write(outcome, **more):
-    (folder / "summary.json").write_text(json.dumps(dict(summary, outcome=outcome, **more)))
+    (folder / "summary.json").write_text(json.dumps(dict(summary, outcome=outcome) | more))
 
 def stop(number, frame):
     write("interrupted", warnings=[])
@@ -74,6 +74,12 @@ if prompt == "a long one":  # until the test ends it
         if os.getppid() != parent and (beside / "end").exists():
             sys.exit(1)
         time.sleep(0.02)
+if prompt == "an attempt":  # which of them is the best depends on the seed
+    write("finished", psnr=[21.0, 23.5, 22.25, 23.5, 20.0][seed], asset_bytes=340, warnings=[])
+    sys.exit(0)
+if prompt == "a vanishing":
+    write("vanished", **{{"num_gaussians": 0, "psnr": 50.0, "warnings": []}})
+    sys.exit(0)
 if prompt == "a crowd":
     write("out_of_memory", warnings=[])
     sys.exit(0)

@@ -172,6 +172,17 @@ def test_a_grid_gives_its_name_and_its_arms(sweep):
     assert "densifier" not in result.out.split("job  ")[1].splitlines()[0]
 
 
+def test_a_grid_may_end_with_the_table_of_the_paper(sweep):
+    result = sweep("prompt=a cube", "grid=densifiers", "~grid.arms.none", "+grid.paper_table=true")
+    folder = Path("multirun/densifiers")
+    table = (folder / "table.md").read_text(encoding="utf-8")
+    assert "| cadam - baseline |" in table
+    assert result.out.rstrip().endswith(table.rstrip())
+    assert {"table.csv", "table.tex"} <= {path.name for path in folder.iterdir()}
+    assert sweep("prompt=a cube", "grid=densifiers", "~grid.arms.none").code == 0
+    assert not list(folder.glob("table.*"))
+
+
 def test_an_arm_can_be_left_out(sweep):
     assert sweep("prompt=a cube", "grid=densifiers", "~grid.arms.none").code == 0
     assert [row["arm"] for row in read_table(Path("multirun/densifiers"))] == ["baseline", "cadam"]
@@ -345,7 +356,7 @@ def test_rows_of_another_line_do_not_appear(sweep):
 def test_a_second_sweep_in_the_folder_of_a_running_one_is_refused(sweep):
     folder = Path("multirun/densifiers")
     folder.mkdir(parents=True)
-    with start._locked(folder):
+    with start._locked(folder, "hydra.sweep.dir"):
         result = sweep("prompt=a cube", "grid=densifiers")
     assert result.code == 1
     assert f"hydra.sweep.dir: multirun/densifiers is in use by process {os.getpid()} on " in result.err

@@ -1,0 +1,115 @@
+"""``cadam3d train attempts=N``: train several seeds, keep all of them, and link the best one."""
+
+import sys
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from cadam3d import report
+from cadam3d.commands.linking import link_best, link_latest
+from cadam3d.core.errors import UserError
+from cadam3d.core.quality import QUALITIES
+from cadam3d.io.jsonl import write_json
+from cadam3d.io.run_folder import ASSET, BEST, CHOICE, REPORT, shown
+from cadam3d.settings.line import setting_word
+from cadam3d.sweep.attempts import (
+    attempt_of,
+    existing_attempts,
+    measuring_line,
+    read_attempts,
+    require_measured,
+    require_one_method,
+)
+from cadam3d.sweep.choice import PREFERRED, Choice, choose
+from cadam3d.sweep.folder import load
+from cadam3d.sweep.start import folder_of, run_sweep
+
+
+def run(
+    cfg: DictConfig,
+    overrides: Sequence[str],
+    flags: Sequence[str],
+    options: Namespace,
+    words: Sequence[str],
+) -> int:
+    """Train the attempts that a line asks for, choose the best and report on them; return the exit code.
+
+    ``overrides`` are quoted for Hydra, and ``words`` are the same as they were typed. The code is 0 if every
+    attempt has a result and one was chosen, or after a dry run.
+    """
+    select = cfg.get("select")
+    sweep, composer = read_attempts(cfg, overrides, options, words)
+    folder = folder_of(sweep)
+    existing = existing_attempts(sweep, folder)
+    require_measured(select, list(cfg.get("metric") or ()), existing, folder, words)
+    ended = run_sweep(sweep, composer, words, flags, on_start=link_latest)
+    if ended.was_dry:
+        return ended.code
+    rows = load(ended.folder)
+    attempts = [attempt_of(row) for row in rows]
+    choice = choose(attempts, select)
+    if choice is not None:
+        require_one_method(choice, rows, ended.folder)
+        _keep(choice, ended.folder)
+    if not ended.was_stopped:
+        _write_report(ended.folder)
+    if choice is not None:
+        _print(choice, ended.folder)
+    elif any(attempt.measured for attempt in attempts):
+        raise _nothing_to_choose_by(select, ended.folder)
+    return ended.code
+
+
+def _keep(choice: Choice, folder: Path) -> None:
+    """Write which attempt is the best, and link it."""
+    name = f"seed={choice.best}"
+    facts = {
+        "best": name,
+        "seed": choice.best,
+        "select": choice.quality.name,
+        "values": {f"seed={seed}": value for seed, value in choice.values.items()},
+        "without": [f"seed={seed}" for seed in choice.without],
+        "why": choice.sentence,
+    }
+    write_json(folder / CHOICE, facts)
+    try:
+        link_best(folder, name)
+    except OSError as error:
+        raise UserError(
+            f"{shown(folder)}/{BEST}: cannot be written ({error.strerror or error}). {choice.sentence} "
+            f"Try: cadam3d view {setting_word('run', shown(folder / name))}"
+        ) from error
+
+
+def _write_report(folder: Path) -> None:
+    """Write the page that compares the attempts. A failure is printed, because it costs nothing else."""
+    try:
+        report.write_sweep(folder)
+    except UserError as error:
+        print(f"cadam3d: {error}", file=sys.stderr)
+
+
+def _print(choice: Choice, folder: Path) -> None:
+    """Print why the best attempt was chosen, where its files are, and what to type next."""
+    # The link is printed, not the folder to which it leads.
+    best = shown(folder) / BEST
+    print(f"\n{choice.sentence}\n")
+    print(f"  {'best':<9}{best} -> seed={choice.best}")
+    if (folder / BEST / ASSET).is_file():
+        print(f"  {'asset':<9}{best / ASSET}")
+    if (folder / REPORT).is_file():
+        print(f"  {'report':<9}{shown(folder / REPORT)}")
+    word = setting_word("run", best)
+    print(f"  {'next':<9}cadam3d view {word}\n  {'':<9}cadam3d export {word}", flush=True)
+
+
+def _nothing_to_choose_by(select: str | None, folder: Path) -> UserError:
+    """Return the error for attempts of which none has the number to compare by."""
+    wanted = f"one of {', '.join(PREFERRED)}" if select is None else select
+    line = measuring_line(folder, "clip_score" if select is None else QUALITIES[select].metric)
+    return UserError(
+        f"select: no attempt has {wanted}. All of them are kept: measure them, and then type the same line "
+        f"again. Try: {line}"
+    )
