@@ -1,1 +1,1 @@
-"""Study: a blinded comparison of arms by people, from the page that they see to the analysis of their answers."""
+"""Study: people compare arms without knowing which is which, on a page that works without a network."""
