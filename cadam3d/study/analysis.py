@@ -40,17 +40,16 @@ class Screened:
     """How one rater did in the catch trials."""
 
     name: str
-    right: int
+    right: int  # answers in catch trials
     total: int
-    # The probability that a rater who guesses does well enough to be kept.
-    by_chance: float
+    by_chance: float  # probability that independent guesses pass
 
 
 @dataclass(frozen=True)
 class Screening:
-    """Which raters the analysis uses: those with at least ``least`` of their catch trials right."""
+    """Which raters the analysis uses: those with at least the share ``least`` of right answers."""
 
-    least: float  # share of the catch trials, in [0, 1]
+    least: float  # of the answers in catch trials, in [0, 1]
     kept: tuple[Screened, ...]
     excluded: tuple[Screened, ...]
 
@@ -138,8 +137,8 @@ class Analysis:
 def analyse(raters: Sequence[Rater], *, least_caught: float) -> Analysis:
     """Return the analysis of the answers of all raters who pass the catch trials.
 
-    A rater is excluded if the share of catch trials that were answered rightly is below ``least_caught``, in
-    [0, 1]. A rater who has seen none is kept. Raise :class:`UserError` if no answer is left.
+    A rater is excluded if the share of right answers in catch trials is below ``least_caught``, in [0, 1]. A
+    rater who has seen no catch trial is kept. Raise :class:`UserError` if no answer is left.
     """
     require_range("least_caught", least_caught, low=0, high=1, example=0.8)
     screening = screen(raters, least_caught)
@@ -167,7 +166,10 @@ def analyse(raters: Sequence[Rater], *, least_caught: float) -> Analysis:
 
 
 def screen(raters: Sequence[Rater], least: float) -> Screening:
-    """Divide the raters into those with at least the share ``least`` of catch trials right, and the others."""
+    """Divide the raters into those who pass the catch trials and those who do not.
+
+    ``least`` is the share of the answers in catch trials that must be right, in [0, 1].
+    """
     screened = []
     for rater in sorted(raters, key=lambda rater: rater.name):
         right, total = sum(rater.catches), len(rater.catches)
@@ -258,11 +260,8 @@ def _ranking(arms: Sequence[str], answers: Sequence[Answer]) -> Ranking:
         group, won_all = apart
         inside = ", ".join(arms[i] for i in group)
         outside = ", ".join(arm for i, arm in enumerate(arms) if i not in group)
-        problem = (
-            f"{inside} won every comparison with {outside}, so the difference of their strengths has no upper bound"
-            if won_all
-            else f"no answer compares {inside} with {outside}"
-        )
+        won = f"{inside} won every comparison with {outside}, so their difference has no upper bound"
+        problem = won if won_all else f"no answer compares {inside} with {outside}"
         return Ranking((), problem)
     values = fit_strengths(wins)
     margins = strength_margins(chosen, other, _clusters(answers), values)

@@ -6,7 +6,7 @@ estimate in log-odds, plus and minus a quantile of Student's t times a standard 
 answers by rater and by prompt. ``docs/study_statistics.md`` has the measured coverage.
 """
 
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -96,23 +96,36 @@ def _variance(influences: Float[np.ndarray, "n"], groups: Int[np.ndarray, "n"]) 
 def rate_interval(chosen: Bool[np.ndarray, "n"], clusters: Clusters) -> Interval:
     """Return the interval of the rate at which an arm is chosen, in [0, 1]; n is at least 1.
 
-    If all answers agree, one end of the interval is that rate itself. The other end is that of a study in
-    which one answer differs, and of such studies the one with the widest interval. Answers in a single cell
-    say nothing about others, and give the interval from 0 to 1.
+    If all answers agree, one end is that rate itself, and :func:`_unanimous` gives the other one. Answers in
+    a single cell say nothing about others, and give the interval from 0 to 1.
     """
-    share = float(chosen.mean())
     if clusters.cells.max() == 0:
         return Interval(0.0, 1.0)
-    if share in (0.0, 1.0):
-        # Answers with the same numbers of companions are interchangeable, so one of them suffices.
-        _, first = np.unique(clusters.sizes(), axis=1, return_index=True)
-        others = [rate_interval(chosen ^ (np.arange(len(chosen)) == i), clusters) for i in first]
-        if share == 1:
-            return Interval(min(each.low for each in others), 1.0)
-        return Interval(0.0, max(each.high for each in others))
+    share = float(chosen.mean())
+    if share == 1:
+        return Interval(_unanimous(clusters), 1.0)
+    if share == 0:
+        return Interval(0.0, 1 - _unanimous(clusters))
     half = margin((chosen - share) / (len(chosen) * share * (1 - share)), clusters)
     center = float(logit(share))
     return Interval(float(expit(center - half)), float(expit(center + half)))
+
+
+def _unanimous(clusters: Clusters) -> float:
+    """Return the lower end of the interval of a rate if all answers choose the arm.
+
+    Such answers do not show how much raters and prompts differ. The result is the larger of two bounds that
+    are both cautious: the exact bound of a study with one answer for each rater or for each prompt, of which
+    there are fewer, and the bound of this study with one answer turned round.
+    """
+    units = min(int(groups.max()) + 1 for groups in (clusters.raters, clusters.prompts) if groups.max() > 0)
+    exact = ((1 - CONFIDENCE) / 2) ** (1 / units)
+    # Answers that share rater, prompt and cell with equally many others are interchangeable. One of each kind
+    # is turned round, and the lowest bound counts.
+    _, kinds = np.unique(clusters.sizes(), axis=1, return_index=True)
+    positions = np.arange(len(clusters.cells))
+    turned = min(rate_interval(positions != i, clusters).low for i in kinds)
+    return max(exact, turned)
 
 
 @dataclass(frozen=True)

@@ -121,21 +121,21 @@ def _loser(pair: Comparison) -> str:
 
 def _evidence(pair: Comparison, analysis: Analysis) -> str:
     """Return the rate of the arm that was chosen more often, with its interval and p-value."""
-    rate, interval = pair.rate.share, pair.rate.interval
+    rate, low, high = pair.rate.share, pair.rate.interval.low, pair.rate.interval.high
     if rate < 1 / 2:
-        rate, interval = 1 - rate, Interval(1 - interval.high, 1 - interval.low)
+        rate, low, high = 1 - rate, 1 - high, 1 - low
     corrected = " after correction" if analysis.comparisons > 1 else ""
     return (
-        f"{100 * rate:.1f} % of answers (95 % interval {100 * interval.low:.1f} to {100 * interval.high:.1f} %, "
+        f"{100 * rate:.1f} % of answers (95 % interval {100 * low:.1f} to {100 * high:.1f} %, "
         f"sign test p = {pair.corrected_p_value:.2g}{corrected})"
     )
 
 
 def caution(analysis: Analysis) -> str:
-    """Return how the verdicts are to be read, and whether the study is too small to be certain of anything."""
+    """Return how to read the verdicts, and whether the study is too small for any certain difference."""
     text = (
-        "A difference is certain if the interval excludes 50 % and the sign tests over raters and over prompts "
-        "agree. Without one, the arms may still differ: the interval shows which rates remain possible."
+        "A difference is certain if the interval excludes 50 % and the sign tests over raters and over "
+        "prompts agree. Without one, the arms may still differ: the interval shows which rates are possible."
     )
     needed = _least_units(analysis.comparisons)
     if min(analysis.raters, analysis.prompts) < needed:
@@ -152,7 +152,7 @@ def _least_units(comparisons: int) -> int:
 def screening_lines(analysis: Analysis) -> list[str]:
     """Return which raters were excluded, by which rule, and what the catch trials cannot show."""
     screening = analysis.screening
-    rule = f"fewer than {100 * screening.least:g} % of their catch trials right"
+    rule = f"fewer than {100 * screening.least:g} % right answers in catch trials"
     if screening.excluded:
         names = ", ".join(f"{each.name} ({each.right} of {each.total})" for each in screening.excluded)
         count = _plural(len(screening.excluded), "rater")
@@ -166,7 +166,7 @@ def screening_lines(analysis: Analysis) -> list[str]:
     if weak:
         worst = max(each.by_chance for each in weak)
         lines.append(
-            f"{_plural(len(weak), 'rater')} had so few catch trials that a guess passes them with a "
+            f"{_plural(len(weak), 'rater')} had so few catch trials that guesses pass them with a "
             f"probability of up to {100 * worst:.0f} %."
         )
     return lines
