@@ -20,9 +20,10 @@ SWEEP_FOLDER = "hydra.sweep.dir"
 PATH_KEYS = (
     *("run", "ply", "output", "resume", RUN_FOLDER, SWEEP_FOLDER),
     *("initializer.path", "initializer.prompt", "rasterizer.cache_dir"),
+    *("runs", "answers", "key", "consent", "prompts"),
 )
 # Keys whose value may be a list of paths or of texts, such as run=[A,B].
-LIST_KEYS = ("run", "labels")
+LIST_KEYS = ("run", "runs", "labels", "arms", "answers")
 # A path that Hydra's grammar reads without quotes. It cannot read "~".
 PLAIN_PATH = re.compile(r"[\w./+-]*", re.ASCII)
 # What the grammar reads as a number or a truth value, although it may be the name of a folder.

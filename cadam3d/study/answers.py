@@ -104,7 +104,7 @@ def find_files(patterns: Sequence[str]) -> list[Path]:
         elif os.path.lexists(place):
             paths = [place]
         else:
-            paths = sorted(map(Path, glob.glob(str(place))))
+            paths = sorted(map(Path, glob.glob(str(place))))  # noqa: PTH207  (Path.glob refuses absolute patterns)
         if not paths:
             reason = "has no .json file" if place.is_dir() else "there is no such file"
             raise UserError(
@@ -180,18 +180,8 @@ def collect(files: Sequence[AnswerFile], key: Key) -> Collected:
     return Collected(sorted(raters, key=lambda rater: rater.name.casefold()), left)
 
 
-def split_by_catches(raters: Sequence[Rater], least_right: float) -> tuple[list[Rater], list[Rater]]:
-    """Return the raters who pass the catch trials, and those who fail.
-
-    A rater passes with at least the share ``least_right`` of right answers to the questions of catch trials.
-    A rater who has met no catch trial passes.
-    """
-    kept = [rater for rater in raters if sum(rater.catches) >= least_right * len(rater.catches)]
-    return kept, [rater for rater in raters if rater not in kept]
-
-
 def _file(path: Path, value: Any) -> AnswerFile:
-    """Return the answers that plain JSON describes. Raises ``ValueError`` and the like for any other value."""
+    """Return the answers in plain JSON. Raises ``ValueError`` and the like for any other value."""
     if not isinstance(value, dict) or value.get("kind") != KIND:
         raise ValueError(f"it has no kind {KIND!r}")
     if value["version"] != VERSION:

@@ -52,7 +52,7 @@ def write_key(path: Path, study: str, plan: Plan, *, seed: int) -> None:
                     "arm": source.run.arm,
                     "prompt": source.run.prompt,
                     "seed": source.run.seed,
-                    **dict(source.run.conditions),
+                    "conditions": dict(source.run.conditions),
                     "run": str(shown(source.run.folder)),
                     "is_ruined": source.is_ruined,
                 }

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from random import Random
+from typing import Any
 
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
@@ -77,8 +78,14 @@ def find_runs(places: Sequence[str], labels: Sequence[str] | None) -> Found:
         return _arms_of_sweep(folders[0])
     if not 2 <= len(folders) <= MOST_ARMS:
         raise UserError(
-            f"runs: expected the folder of a sweep, or a list of 2 to {MOST_ARMS} folders, each of which is an "
-            f"arm, got {len(folders)}. Try: {_example(folders)}"
+            f"runs: expected the folder of a sweep, or a list of 2 to {MOST_ARMS} folders, each of which is "
+            f"an arm, got {len(folders)}. Try: {_example(folders)}"
+        )
+    if len(set(folders)) < len(folders):
+        names = ",".join(str(shown(folder)) for folder in dict.fromkeys(folders))
+        raise UserError(
+            "runs: expected different folders, got one of them twice. "
+            f"Try: {setting_word('runs', f'[{names}]')}"
         )
     results = [_results(place, folder) for place, folder in zip(places, folders, strict=True)]
     names = _default_labels(folders, results) if labels is None else [label.strip() for label in labels]
@@ -86,7 +93,7 @@ def find_runs(places: Sequence[str], labels: Sequence[str] | None) -> Found:
     if len(set(names)) != len(folders) or len(names) != len(folders) or not are_names:
         raise fail(
             "labels",
-            expected=f"a different text of 1 to {LONGEST_LABEL} characters for each of the {len(folders)} arms",
+            expected=f"{len(folders)} different texts of 1 to {LONGEST_LABEL} characters, one for each arm",
             got=names,
             example="labels=null",
         )
@@ -188,7 +195,7 @@ def _conditions(job: JobResult) -> tuple[tuple[str, str], ...]:
     return job.cell.without(PROMPT, SEED).axes
 
 
-def _results(place: str, folder: Path) -> dict[Path, Mapping]:
+def _results(place: str, folder: Path) -> Mapping[Path, Mapping[str, Any]]:
     """Return the summaries of the runs in a place by their folders. Raises ``UserError`` if it has none."""
     if is_sweep(folder):
         folders = [job.folder for job in read(folder)]
@@ -207,8 +214,10 @@ def _results(place: str, folder: Path) -> dict[Path, Mapping]:
     return found
 
 
-def _default_labels(folders: Sequence[Path], results: Sequence[Mapping[Path, Mapping]]) -> list[str]:
-    """Return the densifier of each arm if these differ, else the names of the folders, or else their paths."""
+def _default_labels(
+    folders: Sequence[Path], results: Sequence[Mapping[Path, Mapping[str, Any]]]
+) -> list[str]:
+    """Return the densifier of each arm if these differ, else the name or the path of its folder."""
     densifiers = [
         {str(facts.get("densifier") or "") for facts in summaries.values()} for summaries in results
     ]
@@ -223,8 +232,8 @@ def _ambiguous(members: Sequence[Run]) -> UserError:
     one, other = next((one, other) for one, other in combinations(members, 2) if one.seed == other.seed)
     word = setting_word("runs", f"[{shown(one.folder)},{shown(other.folder)}]")
     return UserError(
-        f"runs: expected one run of each prompt and seed in the arm {one.arm!r}, got two of {one.prompt!r} with "
-        f"seed {one.seed}: {one.folder.name} and {other.folder.name}. To compare these two, try: {word}"
+        f"runs: expected one run of each prompt and seed in the arm {one.arm!r}, got two of {one.prompt!r} "
+        f"with seed {one.seed}: {one.folder.name} and {other.folder.name}. To compare these two, try: {word}"
     )
 
 
@@ -236,8 +245,8 @@ def _no_pair(runs: Sequence[Run], *, same_seed: bool) -> UserError:
     shares_prompt = any(len(arms) > 1 for arms in prompts.values())
     if same_seed and shares_prompt:
         return UserError(
-            "runs: expected runs of different arms with the same prompt and seed, got other seeds in each arm. "
-            "Try: same_seed=false"
+            "runs: expected runs of different arms with the same prompt and seed, got other seeds in each "
+            "arm. Try: same_seed=false"
         )
     some = "; ".join(
         f"{arm}: {prompt!r}" for prompt, arms in list(prompts.items())[:2] for arm in sorted(arms)
