@@ -189,7 +189,7 @@ def strength_rows(simulations: int) -> Iterator[Sequence[str]]:
         yield [f"{raters} x {prompts}", f"{rater_sd:g}, {prompt_sd:g}", *cells]
 
 
-def test_rows(simulations: int) -> Iterator[Sequence[str]]:
+def alarm_rows(simulations: int) -> Iterator[Sequence[str]]:
     """Yield the lines of the table of sign tests of two equal arms."""
     yield ["raters x prompts", "effects", "over prompts", "over raters", "both"]
     for (raters, prompts), effects in product(SIZES, EFFECTS):
@@ -208,7 +208,7 @@ def main() -> None:
     titles = {
         "Rates: coverage in % (mean width in %)": rate_rows,
         "Strengths of three arms: coverage in %": strength_rows,
-        "Two equal arms: sign tests with p < 0.05, in %": test_rows,
+        "Two equal arms: sign tests with p < 0.05, in %": alarm_rows,
     }
     for title, rows in titles.items():
         print(f"\n{title}\n")

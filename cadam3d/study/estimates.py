@@ -48,7 +48,7 @@ class Clusters:
     @cached_property
     def cells(self) -> Int[np.ndarray, "n"]:
         """Return the position of the pair of rater and prompt to which each answer belongs."""
-        return _positions(list(zip(self.raters.tolist(), self.prompts.tolist(), strict=True)))
+        return np.unique(self.raters * (self.prompts.max() + 1) + self.prompts, return_inverse=True)[1]
 
     def sizes(self) -> Int[np.ndarray, "3 n"]:
         """Return for each answer how many answers share its rater, its prompt and its cell."""

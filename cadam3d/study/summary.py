@@ -207,18 +207,22 @@ def _pairs(analysis: Analysis) -> list[Paragraph | Table]:
 def verdict(result: QuestionResult, analysis: Analysis) -> str:
     """Return what can be claimed about one question, in a sentence."""
     label = LABELS[result.question]
-    if len(result.comparisons) > 1:
-        certain = [pair for pair in result.comparisons if pair.is_certain]
-        if not certain:
-            return f"{label}: no certain difference between any two arms."
-        claims = [f"{_winner(each)} was preferred to {_loser(each)}" for each in certain]
-        rest = "; no other difference is certain" if len(certain) < len(result.comparisons) else ""
-        return f"{label}: {', '.join(claims)}{rest}."
-    pair = result.comparisons[0]
+    match result.comparisons:
+        case (pair,):
+            return f"{label}: {_claim(pair, analysis)}."
+        case pairs:
+            certain = [pair for pair in pairs if pair.is_certain]
+            claims = [f"{_winner(pair)} was preferred to {_loser(pair)}" for pair in certain]
+            rest = "; no other difference is certain" if len(certain) < len(pairs) else ""
+            found = f"{', '.join(claims)}{rest}" if claims else "no certain difference between any two arms"
+            return f"{label}: {found}."
+
+
+def _claim(pair: Comparison, analysis: Analysis) -> str:
     if pair.is_certain:
-        return f"{label}: {_winner(pair)} was preferred, in {_evidence(pair, analysis)}."
+        return f"{_winner(pair)} was preferred, in {_evidence(pair, analysis)}"
     subject = "both arms were" if pair.rate.share == EVEN else f"{_winner(pair)} was"
-    return f"{label}: no certain difference; {subject} chosen in {_evidence(pair, analysis)}."
+    return f"no certain difference; {subject} chosen in {_evidence(pair, analysis)}"
 
 
 def _winner(pair: Comparison) -> str:
