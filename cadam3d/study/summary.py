@@ -131,9 +131,7 @@ def screening_lines(analysis: Analysis) -> list[str]:
         lines = [f"No rater was excluded: none had {rule}."]
     untested = [each.name for each in screening.kept if not each.total]
     if untested:
-        lines.append(
-            f"No question of a catch trial was answered by {', '.join(untested)}, and they are kept."
-        )
+        lines.append(f"Kept without an answer in a catch trial: {', '.join(untested)}.")
     weak = [each.by_chance for each in screening.kept if each.total and each.by_chance > CHANCE_LIMIT]
     if weak:
         count = _plural(len(weak), "rater")

@@ -121,8 +121,13 @@ def test_the_sign_test_counts_majorities_and_leaves_out_ties():
     chosen = np.array([1, 1, 0, 0, 0, 1, 1, 0, 1]) > 0
     test = sign_test(chosen, np.array([0, 0, 0, 1, 1, 1, 2, 2, 3]))
     assert (test.wins, test.losses, test.ties) == (2, 1, 1)
-    assert test.p_value == pytest.approx(binomtest(2, 3).pvalue)
     assert sign_test(np.array([True, False]), np.array([0, 0])).p_value == 1
+
+
+@pytest.mark.parametrize(("wins", "losses"), [(0, 6), (9, 2), (5, 5), (5, 4), (40, 20)])
+def test_the_p_value_is_that_of_the_exact_binomial_test(wins, losses):
+    test = sign_test(np.arange(wins + losses) < wins, np.arange(wins + losses))
+    assert test.p_value == pytest.approx(binomtest(wins, wins + losses).pvalue)
 
 
 def test_the_correction_of_holm_has_the_values_of_its_definition():
