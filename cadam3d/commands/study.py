@@ -70,7 +70,6 @@ def _write(cfg: DictConfig) -> None:
         for number, source in enumerate(plan.sources)
     ]
     study = study_id(plan.trials, frames)
-    _require_same(folder, study)
     page = study_page(study, plan.trials, frames, seconds=float(settings.seconds), consent=consent)
     with replacing(folder / PAGE) as temporary:
         temporary.write_text(page, encoding="utf-8")
@@ -139,22 +138,18 @@ def _output(cfg: DictConfig) -> Path:
         raise UserError(f"output: expected a folder, got {text!r}. Try: output=study")
     if folder.is_dir() and (name := occupant(folder)):
         raise UserError(f"output: expected a folder of its own, got one with {name}. Try: {free}")
+    if os.path.lexists(folder / KEY):
+        # Without its key, the answers to a study are lost.
+        raise UserError(
+            f"output: expected a folder without a study, got {shown(folder)}, which has the key of one. "
+            f"Try: {free}"
+        )
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         reason = error.strerror or error
         raise UserError(f"output: cannot write to {folder} ({reason}). Try: output=study") from error
     return folder
-
-
-def _require_same(folder: Path, study: str) -> None:
-    """Raise ``UserError`` if ``folder`` has the key of another study, without which its answers are lost."""
-    if os.path.lexists(folder / KEY) and read_key(folder / KEY).study != study:
-        free = setting_word("output", shown(numbered(folder)))
-        raise UserError(
-            f"output: expected a folder without a study, got {shown(folder)}, which has the key of another "
-            f"one. Try: {free}"
-        )
 
 
 def _film_all(pairs: Sequence[Pair], cfg: DictConfig, settings: ClipSettings) -> dict[Run, Clip]:
@@ -205,7 +200,7 @@ def _print_page(folder: Path, pairs: Sequence[Pair], plan: Plan, settings: ClipS
 def _evaluate(cfg: DictConfig) -> None:
     """Print what the answers say, and write ``study.json`` and ``study.md`` beside the key."""
     from cadam3d.study.analysis import analyse
-    from cadam3d.study.summary import markdown, text
+    from cadam3d.study.summary import summary
 
     require_range("least_caught", cfg.least_caught, low=0, high=1, example=0.8)
     paths = find_files(_texts(cfg.answers))
@@ -228,15 +223,24 @@ def _evaluate(cfg: DictConfig) -> None:
             "Try: cadam3d study --help"
         )
     analysis = analyse(collected.raters, least_caught=float(cfg.least_caught))
-    print(text(analysis))
+    table = summary(analysis)
+    print(table)
     folder = place.parent
     facts = {"study": key.study, "catch_trials": key.catch_trials, "trials": len(key.trials)}
     reasons = [{"file": each.path.name, "reason": each.reason} for each in left]
     result = {"kind": RESULTS_KIND, **facts, "left_out": reasons, **analysis.to_json()}
     write_json(folder / RESULTS, result)
     with replacing(folder / TABLE) as temporary:
-        temporary.write_text(markdown(analysis), encoding="utf-8")
-    print(f"\n{shown(folder / RESULTS)}, {shown(folder / TABLE)}")
+        temporary.write_text(_report(table, left), encoding="utf-8")
+    print(f"{shown(folder / RESULTS)}, {shown(folder / TABLE)}")
+
+
+def _report(table: str, left: Sequence[LeftOut]) -> str:
+    """Return the summary of a study, with the files that are left out."""
+    if not left:
+        return table
+    lines = "\n".join(f"- {each.path.name}: {each.reason}" for each in left)
+    return f"{table}\nFiles that are left out:\n\n{lines}\n"
 
 
 def _find_key(cfg: DictConfig, files: Sequence[AnswerFile]) -> tuple[Path, Key]:

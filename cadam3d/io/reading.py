@@ -126,18 +126,28 @@ def read_yaml(path: Path) -> Any:
         raise unusable(path, f"expected plain YAML, got {reason}") from error
 
 
+def parse_yaml(text: str) -> yaml.Node | None:
+    """Return the tree of nodes of plain YAML, in which every value has its line and its spelling.
+
+    Raises ``yaml.YAMLError`` for what is not YAML, and ``ValueError`` for what is not plain data.
+    """
+    _require_plain(text)
+    return yaml.compose(text, _Loader)
+
+
 def _require_plain(text: str) -> None:
     """Raise ``ValueError`` for tags, aliases and too many levels, before anything is built."""
     depth = 0
     for event in yaml.parse(text, _Loader):
+        line = f"in line {event.start_mark.line + 1}"
         if isinstance(event, yaml.AliasEvent):
-            raise ValueError(f"an alias, *{event.anchor}")
+            raise ValueError(f"an alias, *{event.anchor}, {line}")
         # Even the tags of YAML itself make sets, tuples and dates, which are not plain data.
         if (tag := getattr(event, "tag", None)) is not None:
-            raise ValueError(f"a tag, {tag}")
+            raise ValueError(f"a tag, {tag}, {line}")
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > DEEPEST:
-                raise ValueError(f"more than {DEEPEST} levels")
+                raise ValueError(f"more than {DEEPEST} levels {line}")
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1

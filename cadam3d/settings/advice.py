@@ -35,6 +35,7 @@ CHOICE = re.compile(r"\+?[a-z]\w*=(\w+|\[[\w,]*\])")
 # The command that has a key, and the reason, by the key and the command that lacks it.
 MISPLACED = {
     ("grid", "train"): ("sweep", "grids belong to sweeps"),
+    ("prompts", "train"): ("sweep", "files and sets of prompts belong to sweeps"),
     **{("for", command): ("export", "belongs to cadam3d export") for command in ("render", "view")},
 }
 PROMPT_WORD = 'prompt="a red and yellow checkered torus"'
@@ -270,8 +271,8 @@ def _unknown_key(key: str, command: str, words: Sequence[str], settings: Sequenc
 
     ``settings`` are the overrides of the job that lacks the key; None means ``words``.
     """
-    if (key, command) in MISPLACED:
-        owner, reason = MISPLACED[key, command]
+    if (root := (key.partition(".")[0], command)) in MISPLACED:
+        owner, reason = MISPLACED[root]
         return UserError(f"{key}: {reason}. Try: {line_of(owner, words)}")
     value = next((word.partition("=")[2] for word in words if key_of(word) == key), None)
     known = _known(key, command, words if settings is None else settings)

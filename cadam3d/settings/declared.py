@@ -67,7 +67,7 @@ PLAIN: dict[Any, Callable[[Any], bool]] = {
         (type(value) is float and abs(value) <= sys.float_info.max)
         or (type(value) is int and abs(value) <= LARGEST_WHOLE)
     ),
-    str: lambda value: isinstance(value, str) and _is_readable(value),
+    str: lambda value: isinstance(value, str) and is_readable(value),
     bool: lambda value: isinstance(value, bool),
     NoneType: lambda value: value is None,
 }
@@ -180,7 +180,7 @@ def _is_described(node: Any) -> bool:
     return isinstance(node, DictConfig) and not node._is_none() and TARGET in node
 
 
-def _is_readable(text: str) -> bool:
+def is_readable(text: str) -> bool:
     """Return whether a text can be written into a file and shown: Unicode without control characters."""
     return all(
         character in BLANKS or (character >= " " and not "\x7f" <= character <= "\x9f") for character in text

@@ -20,7 +20,8 @@ SWEEP_FOLDER = "hydra.sweep.dir"
 PATH_KEYS = (
     *("run", "ply", "output", "resume", RUN_FOLDER, SWEEP_FOLDER),
     *("initializer.path", "initializer.prompt", "rasterizer.cache_dir"),
-    *("runs", "answers", "key", "consent", "prompts"),
+    *("runs", "answers", "key", "consent"),
+    *("prompts", "prompts.file", "prompts.category"),
 )
 # Keys whose value may be a list of paths or of texts, such as run=[A,B].
 LIST_KEYS = ("run", "runs", "labels", "arms", "answers")

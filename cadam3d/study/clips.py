@@ -75,7 +75,7 @@ class Clip:
 def film(render: RenderFn, settings: ClipSettings) -> Clip:
     """Return one turn of an object."""
     cameras, color = settings.cameras(), torch.tensor([float(channel) for channel in settings.backdrop])
-    backdrop = to_uint8(color)
+    backdrop = to_uint8(color[None, None])
     frames, small, visible = [], [], []
     for first in range(0, settings.frames, VIEWS_AT_ONCE):
         some = cameras.index(slice(first, first + VIEWS_AT_ONCE))

@@ -32,6 +32,9 @@ class PlannedJob:
     overrides: list[str]  # of ``cadam3d train``
     # The prompt, the seed, and the values of all other keys in which jobs of this sweep differ.
     swept: dict[str, Any]
+    # What the file or the set of prompts says about the prompt; "" if it says nothing.
+    prompt_name: str = ""
+    category: str = ""
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,8 @@ class Row:
     overrides: list[str]
     swept: dict[str, Any]
     summary: dict[str, Any] = field(repr=False)  # {} if there is none yet
+    prompt_name: str = ""  # from the file or the set of prompts; "" if it gives none
+    category: str = ""
 
     @property
     def outcome(self) -> str:
@@ -92,6 +97,8 @@ def rows_of(sweep: Path, jobs: Sequence[PlannedJob]) -> list[Row]:
             overrides=job.overrides,
             swept=job.swept,
             summary=read_summary(sweep / job.folder),
+            prompt_name=job.prompt_name,
+            category=job.category,
         )
         for number, job in enumerate(jobs)
     ]
@@ -130,6 +137,8 @@ def _require_plan(content: Any) -> None:
         _require(isinstance(job, dict) and _is_text(job["arm"]), "arm: expected a name")
         _require(_are_texts(job["overrides"]), "overrides: expected a list of key=value")
         _require(isinstance(job["swept"], dict), "swept: expected keys and values")
+        for name in ("prompt_name", "category"):
+            _require(_is_text(job.get(name, "")), f"{name}: expected a text")
         # A name that leads elsewhere would let the sweep write there.
         folder = job["folder"]
         is_inside = _is_text(folder) and folder not in ("", ".", "..") and not set("/\\") & set(folder)

@@ -11,7 +11,7 @@ import math
 import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice, product
 from typing import Any
 
@@ -21,6 +21,7 @@ from hydra.core.override_parser.types import Glob, Override, RangeSweep
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import to_json
 from cadam3d.settings.compose import TEXT_KEYS, quote, slug
+from cadam3d.sweep.prompts import FIRST, Choice, Prompt
 
 # Text that Hydra reads the same way with and without quotes, apart from the reserved words.
 IDENTIFIER = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)
@@ -41,6 +42,9 @@ class AxisValue:
     key: str  # without a leading + or ~
     line: str  # as it was written for Hydra
     value: str  # as JSON
+    # The prompt of a file or a set that this setting is, and the other settings that it brings.
+    prompt: Prompt | None = None
+    more: tuple["AxisValue", ...] = ()
 
     @property
     def text(self) -> str:
@@ -64,6 +68,7 @@ class Grid:
 
     each: Axes
     arms: dict[str, Axes]  # at least one; named "" without a grid
+    prompts: str | None = None  # a file or a set; a line may choose others
     figures: list[str] | None = None  # of its report; None: all for which there are data
 
 
@@ -74,6 +79,7 @@ class Job:
     arm: str
     name: str  # of its folder; depends only on its arm and its settings
     overrides: tuple[str, ...]  # of ``cadam3d train``
+    prompt: Prompt | None  # None if its prompt is not one of a file or a set
 
 
 HasSetting = Callable[[Sequence[str], str], bool]
@@ -82,13 +88,13 @@ HasSetting = Callable[[Sequence[str], str], bool]
 def read_grid(node: Any) -> Grid:
     """Return the grid that plain dicts and lists describe; None describes a grid of one nameless arm.
 
-    Raises ``UserError`` for keys other than ``each``, ``arms`` and ``figures`` and for wrong values of these.
+    Raises ``UserError`` for keys other than those of :class:`Grid` and for wrong values of these.
     """
     if node is None:
         return Grid(each={}, arms={"": {}})
-    if not isinstance(node, dict) or not node or not node.keys() <= {"each", "arms", "figures"}:
+    if not isinstance(node, dict) or not node or not node.keys() <= {"each", "arms", "prompts", "figures"}:
         got = "|".join(map(str, node)) if isinstance(node, dict) else node
-        raise UserError(f"grid: expected each, arms and figures, got {got}. Try: {EXAMPLE}")
+        raise UserError(f"grid: expected each, arms, prompts and figures, got {got}. Try: {EXAMPLE}")
     arms = node.get("arms")
     arms = {"": {}} if arms is None else arms
     if not isinstance(arms, dict) or not arms:
@@ -98,9 +104,13 @@ def read_grid(node: Any) -> Grid:
         raise UserError(
             f"grid.figures: expected a list of names, got {figures}. Try: 'grid.figures=[frontier]'"
         )
+    prompts = node.get("prompts")
+    if not (prompts is None or isinstance(prompts, str)):
+        raise UserError(f"grid.prompts: expected a file or a set, got {prompts}. Try: grid.prompts=paper50")
     return Grid(
         each=_axes(node.get("each"), "grid.each"),
         arms={str(name): _axes(axes, f"grid.arms.{name}") for name, axes in arms.items()},
+        prompts=prompts,
         figures=figures,
     )
 
@@ -118,13 +128,26 @@ def read_line(overrides: Iterable[str]) -> Axes:
     return axes
 
 
+def prompt_axis(prompts: Iterable[Prompt]) -> list[AxisValue]:
+    """Return the values of the key ``prompt``, each with the settings that come with the prompt."""
+    return [
+        replace(
+            _setting(f"prompt={quote(each.text)}"),
+            prompt=each,
+            more=tuple(_setting(f"{key}={quote(value)}") for key, value in each.settings),
+        )
+        for each in prompts
+    ]
+
+
 def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) -> list[Job]:
     """Return the jobs of all arms, each once, so that all arms of one prompt and seed come before the next.
 
     The line takes precedence over the grid. A setting in the line applies to every arm that has such a
     setting, because densifiers have different ones; ``has_setting(overrides of an arm, key)`` decides that. A
-    setting that no arm has stays in all jobs, so that Hydra refuses it. Raises ``UserError`` if the line
-    makes two arms equal.
+    setting that no arm has stays in all jobs, so that Hydra refuses it. A setting that comes with a prompt
+    applies where neither the line nor the grid sets the same key and the job has such a setting. Raises
+    ``UserError`` if the line makes two arms equal.
     """
     common = {key: axis for key, axis in line.items() if key not in grid.each}
     common |= {key: line.get(key, axis) for key, axis in grid.each.items()}
@@ -137,21 +160,22 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
     if number > MOST_JOBS:
         axes_of = {key: axis for axes in (*arms.values(), common) for key, axis in axes.items()}
         longest = max(axes_of, key=lambda key: len(axes_of[key]))
-        raise UserError(
-            f"{longest}: expected at most {MOST_JOBS} jobs in a sweep, got {number}. "
-            f"Try: {shlex.quote(axes_of[longest][0].line)}"
-        )
+        example = axes_of[longest][0]
+        word = f"{FIRST}=1" if example.prompt else shlex.quote(example.line)
+        raise UserError(f"{longest}: expected at most {MOST_JOBS} jobs in a sweep, got {number}. Try: {word}")
     named, counted = _named(grid, line), swept_keys(grid, line)
     found: dict[frozenset[str], Job] = {}
     for shared in product(*common.values()):
         for name, axes in arms.items():
             taken = [setting for setting in shared if setting.key not in {*axes, *foreign[name]}]
             for own in product(*axes.values()):
-                settings = (*taken, *own)
+                typed = (*taken, *own)
+                settings = (*typed, *_brought(typed, has_setting))
                 job = Job(
                     arm=name,
                     name=_folder_name(name, settings, named, counted),
                     overrides=tuple(setting.line for setting in settings),
+                    prompt=next((setting.prompt for setting in typed if setting.prompt), None),
                 )
                 other = found.setdefault(frozenset(setting.identity for setting in settings), job)
                 if other.arm != name and (causes := [key for key in axes if key in line]):
@@ -166,21 +190,30 @@ def swept_keys(grid: Grid, line: Axes) -> list[str]:
     """Return the keys in which jobs may differ: those of the grid, and those with several values in the line.
 
     Prompt and seed count too if the line gives them: another prompt is another job, not another setting of
-    all jobs.
+    all jobs. So do the settings that come with prompts, unless the line has one value for all jobs.
     """
     keys = [*grid.each, *(key for axes in grid.arms.values() for key in axes)]
     keys += [key for key, axis in line.items() if len(axis) > 1 or key in ALWAYS_SHOWN]
+    keys += [key for key in _brought_keys(line) if key not in line]
     return list(dict.fromkeys(keys))
 
 
-def sweep_name(grid_name: str | None, line: Axes) -> str:
-    """Return the name of the folder of a sweep: the name of its grid, or else a summary of the line."""
+def sweep_name(grid_name: str | None, line: Axes, prompts: Choice | None = None) -> str:
+    """Return the name of the folder of a sweep: the name of its grid, or else a summary of the line.
+
+    ``prompts`` are those of a file or a set, which is named instead of them. A shard has a folder of its own.
+    """
+    suffix = "_shard-{}-of-{}".format(*prompts.shard) if prompts and prompts.shard else ""
     if grid_name:
-        return slug(grid_name)
-    keys = sorted(line, key=lambda key: (key not in TEXT_KEYS, len(line[key]) == 1, key))
+        return f"{slug(grid_name)}{suffix}"
+    keys = [key for key, axis in line.items() if not any(setting.prompt for setting in axis)]
+    keys.sort(key=lambda key: (key not in TEXT_KEYS, len(line[key]) == 1, key))
     values = {key: ",".join(setting.text for setting in line[key]) for key in keys}
     words = [values[key] if key in TEXT_KEYS else f"{key}={values[key]}" for key in keys]
-    return f"{slug(*words)}_{_digest(setting.identity for key in keys for setting in line[key])}"
+    parts = [setting.identity for key in keys for setting in line[key]]
+    if prompts:
+        words, parts = [prompts.title, *words], [prompts.identity, *parts]
+    return f"{slug(*words)}_{_digest(parts)}{suffix}"
 
 
 def _axes(node: Any, where: str) -> Axes:
@@ -273,12 +306,29 @@ def _foreign(
     return {name: keys - in_no_arm for name, keys in missing.items()}
 
 
+def _brought(settings: Sequence[AxisValue], has_setting: HasSetting) -> list[AxisValue]:
+    """Return the settings that come with the prompt of a job and apply to it."""
+    keys, lines = {setting.key for setting in settings}, [setting.line for setting in settings]
+    brought = [each for setting in settings for each in setting.more]
+    return [each for each in brought if each.key not in keys and has_setting(lines, each.key)]
+
+
+def _brought_keys(line: Axes) -> list[str]:
+    return [each.key for axis in line.values() for setting in axis for each in setting.more]
+
+
 def _named(grid: Grid, line: Axes) -> set[str]:
-    """Return the keys that the name of a folder shows: all that may vary, even if the line narrows them."""
+    """Return the keys that the name of a folder shows: all that may vary, even if the line narrows them.
+
+    Settings that come with prompts are not shown, because the prompt is.
+    """
     varied = {key for axes in grid.arms.values() for key, axis in axes.items() if len(axis) > 1}
     varied |= {key for key, axis in grid.each.items() if len(axis) > 1}
     fixed = {key for axes in (*grid.arms.values(), grid.each) for key in axes} - varied
-    return {key for key in swept_keys(grid, line) if key not in fixed or len(line.get(key, ())) > 1}
+    # A shard of prompts may be a single one; its jobs have the names that they have in the whole sweep.
+    several = {key for key, axis in line.items() if len(axis) > 1 or any(each.prompt for each in axis)}
+    brought = {key for key in _brought_keys(line) if key not in line and key not in grid.each}
+    return {key for key in swept_keys(grid, line) if key not in fixed - several} - brought
 
 
 def _folder_name(arm: str, settings: Sequence[AxisValue], named: set[str], counted: Sequence[str]) -> str:

@@ -19,12 +19,23 @@ from cadam3d.settings.compose import flatten
 from cadam3d.settings.declared import require_settings
 from cadam3d.settings.hydra import compose_line, refuse_missing_settings, refuse_unread_settings
 from cadam3d.settings.line import SWEEP_FOLDER, key_of
-from cadam3d.sweep.grid import ALWAYS_SHOWN, Axes, Grid, Job, expand, read_grid, read_line, swept_keys
+from cadam3d.sweep.grid import (
+    ALWAYS_SHOWN,
+    Axes,
+    Grid,
+    Job,
+    expand,
+    prompt_axis,
+    read_grid,
+    read_line,
+    swept_keys,
+)
+from cadam3d.sweep.prompts import FILE, KEY, Choice, read_choice
 
 # An override that is neither an addition nor a deletion and names no package.
 PLAIN_KEY = re.compile(r"[A-Za-z_][\w.]*=")
 LAUNCHER_KEY = re.compile(r"launcher($|\.)|hydra[./]launcher($|\.)")
-GRID_KEY = re.compile(r"grid($|\.)")
+GRID_KEY = re.compile(r"(grid|prompts)($|\.)")
 DRY_RUN = "dry_run"
 REFUSED_KEY = re.compile(r"hydra\.run\.dir$|hydra\.sweep\.subdir$|hydra[./]sweeper($|\.)")
 NOTHING_TO_SWEEP = "sweep: nothing to sweep over. Try: densifier=baseline,cadam"
@@ -34,7 +45,7 @@ NOTHING_TO_SWEEP = "sweep: nothing to sweep over. Try: densifier=baseline,cadam"
 class Parts:
     """The overrides of a line, sorted by what they change. A search path for YAML files applies to all."""
 
-    grid: list[str]  # and whether to list the jobs only
+    grid: list[str]  # and the choice of prompts, and whether to list the jobs only
     launcher: list[str]
     folder: list[str]
     jobs: list[str]
@@ -48,6 +59,7 @@ class Sweep:
     parts: Parts  # of the line
     grid: Grid
     axes: Axes  # of the line
+    prompts: Choice | None  # None if the line and the grid name no file or set of prompts
     jobs: list[Job]
 
     @property
@@ -130,10 +142,11 @@ class Composer:
         values = {}
         key_lines = []
         for line in overrides:
-            is_value = PLAIN_KEY.match(line) and key_of(line) in self._leaves and "${" not in line
-            if is_value:
+            if self._is_value(line):
                 values[key_of(line)] = _value(line)
-            key_lines.append(key_of(line) if is_value else line)
+                key_lines.append(key_of(line))
+            else:
+                key_lines.append(line)
         known = tuple(key_lines)
         if known not in self._bases:
             base = self._base(overrides)
@@ -147,11 +160,16 @@ class Composer:
 
     def has(self, overrides: Sequence[str], key: str) -> bool:
         """Return whether a job under ``overrides`` has a setting or a group called ``key``."""
-        arm = tuple(overrides)
+        # Which settings there are does not depend on plain values.
+        arm = tuple(line for line in overrides if not self._is_value(line))
         if arm not in self._keys:
-            base = self._base(overrides)
+            base = self._base(arm)
             self._keys[arm] = [*base.plain, *base.referring, *base.cfg.hydra.runtime.choices]
         return any(f"{known}.".startswith(f"{key}.") for known in self._keys[arm])
+
+    def _is_value(self, line: str) -> bool:
+        """Return whether an override sets a plain value that the jobs have by default."""
+        return bool(PLAIN_KEY.match(line)) and key_of(line) in self._leaves and "${" not in line
 
     def _base(self, overrides: Sequence[str]) -> Base:
         return Base.of(compose_line("train", [*self._common, *overrides], self._options))
@@ -173,11 +191,30 @@ def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> tu
     node = cfg.get("grid")
     grid = read_grid(None if node is None else OmegaConf.to_container(node, resolve=True))
     axes = read_line(parts.jobs)
+    prompts = _read_prompts(cfg, grid, axes, overrides)
+    if prompts is not None:
+        axes = {"prompt": prompt_axis(prompts.read())} | axes
     composer = Composer(options, _search_path(overrides))
     jobs = expand(grid, axes, composer.has)
-    if command == "sweep" and node is None and len(jobs) == 1:
+    if command == "sweep" and node is None and prompts is None and len(jobs) == 1:
         raise UserError(NOTHING_TO_SWEEP)
-    return Sweep(cfg=cfg, parts=parts, grid=grid, axes=axes, jobs=jobs), composer
+    return Sweep(cfg=cfg, parts=parts, grid=grid, axes=axes, prompts=prompts, jobs=jobs), composer
+
+
+def _read_prompts(cfg: DictConfig, grid: Grid, axes: Axes, overrides: Sequence[str]) -> Choice | None:
+    """Return the choice of prompts of a line or its grid. A prompt in the line replaces those of the grid.
+
+    Raises ``UserError`` if the line has both a prompt and a choice of prompts.
+    """
+    node = cfg.get(KEY)
+    choice = None if node is None else OmegaConf.to_container(node, resolve=True)
+    assert choice is None or isinstance(choice, dict), "the line gives a file, not this node"
+    if "prompt" not in axes:
+        return read_choice(choice, grid.prompts)
+    if read_choice(choice, None) is not None:
+        kept = line_of("sweep", [override for override in overrides if key_of(override) != "prompt"])
+        raise UserError(f"{KEY}: expected either {KEY}= or prompt=, got both. Try: {kept}")
+    return None
 
 
 def sort_overrides(overrides: Sequence[str]) -> Parts:
@@ -191,7 +228,9 @@ def sort_overrides(overrides: Sequence[str]) -> Parts:
             raise UserError(f"{key}: not for sweeps; their jobs share one folder. Try: {line}")
         if key == "hydra.mode":
             continue
-        if GRID_KEY.match(key) or key == DRY_RUN:
+        if key == KEY and "=" in override:
+            parts.grid.append(f"{FILE}={override.partition('=')[2]}")
+        elif GRID_KEY.match(key) or key == DRY_RUN:
             parts.grid.append(override)
         elif LAUNCHER_KEY.match(key):
             parts.launcher.append(override.lstrip("+") if key == "launcher" else override)

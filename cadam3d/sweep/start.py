@@ -167,7 +167,7 @@ class Stop:
 
 def _folder(sweep: Sweep) -> Path:
     """Return the folder of the sweep, which may not exist yet."""
-    place = PARENT / sweep_name(sweep.grid_name, sweep.axes)
+    place = PARENT / sweep_name(sweep.grid_name, sweep.axes, sweep.prompts)
     if sweep.parts.folder:
         text = OmegaConf.select(sweep.cfg, SWEEP_FOLDER)
         if not text:
@@ -200,6 +200,8 @@ def _planned(sweep: Sweep, composed: Sequence[Composed]) -> list[PlannedJob]:
             folder=job.name,
             overrides=list(job.overrides),
             swept={key: settings.get(key) for key in keys},
+            prompt_name=job.prompt.name if job.prompt else "",
+            category=job.prompt.category if job.prompt else "",
         )
         for job, settings in zip(sweep.jobs, composed, strict=True)
     ]

@@ -193,8 +193,8 @@ def test_all_keys_in_which_jobs_may_differ_are_listed(pareto):
 @pytest.mark.parametrize(
     ("node", "expected"),
     [
-        ({"densifier": "baseline,cadam"}, "grid: expected each, arms and figures, got densifier"),
-        ([1], "grid: expected each, arms and figures"),
+        ({"densifier": "baseline,cadam"}, "grid: expected each, arms, prompts and figures, got densifier"),
+        ([1], "grid: expected each, arms, prompts and figures"),
         ({"arms": {}}, "grid.arms: expected named arms"),
         ({"arms": ["a"]}, "grid.arms: expected named arms"),
         ({"arms": {"a": 1}}, "grid.arms.a: expected keys with values, got 1"),
