@@ -34,11 +34,12 @@ def ends(interval) -> tuple[float, float]:
     return interval.low, interval.high
 
 
-def test_the_interval_of_a_crossed_study_has_the_variances_of_raters_and_of_prompts():
+@pytest.mark.parametrize(("effect", "seed"), [(2, 0), (1, 7)])
+def test_the_interval_of_a_crossed_study_has_the_variances_of_raters_and_of_prompts(effect, seed):
     """Computed from the means of rows and columns, as in a two-way analysis of variance."""
-    generator = np.random.default_rng(0)
+    generator = np.random.default_rng(seed)
     tastes = generator.normal(size=(10, 1)) + generator.normal(size=(1, 8))
-    table = (generator.random((10, 8)) < expit(2 * tastes)).astype(float)
+    table = (generator.random((10, 8)) < expit(effect * tastes)).astype(float)
     share = table.mean()
     of_raters = table.mean(1).var(ddof=1) / 10
     of_prompts = table.mean(0).var(ddof=1) / 8
@@ -46,6 +47,7 @@ def test_the_interval_of_a_crossed_study_has_the_variances_of_raters_and_of_prom
     assert min(of_raters, of_prompts) > of_answers, "both effects must show"
     variance = of_raters + of_prompts - of_answers
     freedom = variance**2 / (of_raters**2 / 9 + of_prompts**2 / 7)
+    assert (freedom < 7) is (seed == 7), "once there are fewer than 8 prompts allow"
     half = t.ppf(0.975, max(freedom, 7)) * np.sqrt(variance) / (share * (1 - share))
     expected = expit(logit(share) + np.array([-half, half]))
     assert ends(rate_interval(table.reshape(-1) > 0, crossed(10, 8))) == pytest.approx(tuple(expected))
