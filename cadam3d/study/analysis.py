@@ -37,7 +37,7 @@ EVEN = 0.5  # the rate of two arms that are liked equally
 
 @dataclass(frozen=True)
 class Screened:
-    """How one rater did in the catch trials."""
+    """The result of one rater in the catch trials."""
 
     name: str
     right: int  # answers in catch trials
@@ -47,16 +47,16 @@ class Screened:
 
 @dataclass(frozen=True)
 class Screening:
-    """Which raters the analysis uses: those with at least the share ``least`` of right answers."""
+    """The raters whose answers count, and those who failed the catch trials."""
 
-    least: float  # of the answers in catch trials, in [0, 1]
+    least: float  # share of the answers in catch trials that must be right, in [0, 1]
     kept: tuple[Screened, ...]
     excluded: tuple[Screened, ...]
 
 
 @dataclass(frozen=True)
 class Rate:
-    """How often an arm was chosen, of all comparisons in which it took part."""
+    """The share of its comparisons in which an arm was chosen."""
 
     arm: str
     chosen: int
@@ -105,7 +105,7 @@ class Ranking:
 
 @dataclass(frozen=True)
 class QuestionResult:
-    """What the answers to one question say."""
+    """The result of one question."""
 
     question: str  # one of QUESTION_NAMES
     raters: int
@@ -119,7 +119,7 @@ class QuestionResult:
 
 @dataclass(frozen=True)
 class Analysis:
-    """What a study says: its size, the raters that were excluded, and the result of each question."""
+    """The result of a study: its size, the raters who were excluded, and the result of each question."""
 
     arms: tuple[str, ...]
     raters: int  # that were kept and have answered

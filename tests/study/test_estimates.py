@@ -47,7 +47,7 @@ def test_the_interval_of_a_crossed_study_has_the_variances_of_raters_and_of_prom
     assert min(of_raters, of_prompts) > of_answers, "both effects must show"
     variance = of_raters + of_prompts - of_answers
     freedom = variance**2 / (of_raters**2 / 9 + of_prompts**2 / 7)
-    assert (freedom < 7) is (seed == 7), "once there are fewer than 8 prompts allow"
+    assert (freedom < 7) == (seed == 7), "the second case needs the lower limit of the degrees of freedom"
     half = t.ppf(0.975, max(freedom, 7)) * np.sqrt(variance) / (share * (1 - share))
     expected = expit(logit(share) + np.array([-half, half]))
     assert ends(rate_interval(table.reshape(-1) > 0, crossed(10, 8))) == pytest.approx(tuple(expected))
