@@ -8,7 +8,7 @@ normal. The true rate is the one over all raters and all prompts. ``docs/study_s
 """
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 
@@ -94,8 +94,9 @@ def two_arms(rate: float, rater_sd: float, prompt_sd: float, **size: float) -> S
     return study(brentq(lambda strength: study(strength).true_rate(0, 1) - rate, -20, 20))
 
 
-def bootstrap_interval(chosen: np.ndarray, clusters: Clusters, generator: np.random.Generator) -> Interval:
+def bootstrap_interval(chosen: np.ndarray, clusters: Clusters) -> Interval:
     """Return the percentile interval of Owen's pigeonhole bootstrap (2007): raters and prompts are drawn."""
+    generator = np.random.default_rng(0)
     raters, prompts = clusters.raters.max() + 1, clusters.prompts.max() + 1
     drawn_raters = generator.multinomial(raters, np.full(raters, 1 / raters), RESAMPLES)
     drawn_prompts = generator.multinomial(prompts, np.full(prompts, 1 / prompts), RESAMPLES)
@@ -107,29 +108,26 @@ def bootstrap_interval(chosen: np.ndarray, clusters: Clusters, generator: np.ran
     return Interval(*np.quantile(rates, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2]).tolist())
 
 
-def independent_interval(chosen: np.ndarray) -> Interval:
-    """Return Wilson's interval, which takes all answers for independent."""
+def independent_interval(chosen: np.ndarray, clusters: Clusters) -> Interval:
+    """Return Wilson's interval, which takes all answers for independent and ignores their clusters."""
     n, share, z = len(chosen), chosen.mean(), 1.96
     center, half = share + z * z / (2 * n), z * np.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
     return Interval((center - half) / (1 + z * z / n), (center + half) / (1 + z * z / n))
 
 
-def rate_coverage(study: Study, simulations: int, seed: int = 0) -> dict[str, list[float]]:
-    """Return for each kind of interval how often it contains the true rate, and its mean width, in %."""
+def rate_coverage(
+    study: Study, simulations: int, interval: Callable[[np.ndarray, Clusters], Interval], seed: int = 0
+) -> tuple[float, float]:
+    """Return how often the interval contains the true rate of the first of two arms, and its width, in %."""
     generator = np.random.default_rng(seed)
     truth = study.true_rate(0, 1)
-    found: dict[str, list[tuple[bool, float]]] = {}
+    found = []
     for _ in range(simulations):
         arms, _, clusters = study.answers(generator)
-        chosen = arms == 0
-        intervals = {
-            "clustered": rate_interval(chosen, clusters),
-            "bootstrap": bootstrap_interval(chosen, clusters, generator),
-            "independent": independent_interval(chosen),
-        }
-        for name, each in intervals.items():
-            found.setdefault(name, []).append((not each.excludes(truth), each.high - each.low))
-    return {name: (100 * np.mean(values, axis=0)).tolist() for name, values in found.items()}
+        each = interval(arms == 0, clusters)
+        found.append((not each.excludes(truth), each.high - each.low))
+    coverage, width = (100 * np.mean(found, axis=0)).tolist()
+    return coverage, width
 
 
 def strength_coverage(study: Study, simulations: int, seed: int = 0) -> list[float]:
@@ -163,10 +161,16 @@ def false_alarms(study: Study, simulations: int, seed: int = 0) -> list[float]:
 
 def rate_rows(simulations: int) -> Iterator[Sequence[str]]:
     """Yield the lines of the table of rates."""
-    yield ["raters x prompts", "effects", "rate", "clustered", "bootstrap", "independent"]
+    kinds = {
+        "clustered": rate_interval,
+        "bootstrap": bootstrap_interval,
+        "independent": independent_interval,
+    }
+    yield ["raters x prompts", "effects", "rate", *kinds]
     for (raters, prompts), effects, rate in product(SIZES, EFFECTS, RATES):
-        found = rate_coverage(two_arms(rate, *effects, raters=raters, prompts=prompts), simulations)
-        cells = [f"{coverage:.1f} ({width:.0f})" for coverage, width in found.values()]
+        study = two_arms(rate, *effects, raters=raters, prompts=prompts)
+        found = [rate_coverage(study, simulations, interval) for interval in kinds.values()]
+        cells = [f"{coverage:.1f} ({width:.0f})" for coverage, width in found]
         yield [f"{raters} x {prompts}", f"{effects[0]:g}, {effects[1]:g}", f"{rate:g}", *cells]
 
 
@@ -185,7 +189,7 @@ def strength_rows(simulations: int) -> Iterator[Sequence[str]]:
         yield [f"{raters} x {prompts}", f"{rater_sd:g}, {prompt_sd:g}", *cells]
 
 
-def test_rows(simulations: int) -> Iterator[Sequence[str]]:
+def alarm_rows(simulations: int) -> Iterator[Sequence[str]]:
     """Yield the lines of the table of sign tests of two equal arms."""
     yield ["raters x prompts", "effects", "over prompts", "over raters", "both"]
     for (raters, prompts), effects in product(SIZES, EFFECTS):
@@ -204,7 +208,7 @@ def main() -> None:
     titles = {
         "Rates: coverage in % (mean width in %)": rate_rows,
         "Strengths of three arms: coverage in %": strength_rows,
-        "Two equal arms: sign tests with p < 0.05, in %": test_rows,
+        "Two equal arms: sign tests with p < 0.05, in %": alarm_rows,
     }
     for title, rows in titles.items():
         print(f"\n{title}\n")
