@@ -34,7 +34,7 @@ ENCODER_EFFORT = 4  # 0 to 6
 
 @dataclass(frozen=True, kw_only=True)
 class ClipSettings:
-    """How every clip of a study is rendered."""
+    """Settings with which every clip of a study is rendered."""
 
     size: int  # pixels, height and width
     frames: int  # of one turn
