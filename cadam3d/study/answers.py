@@ -64,7 +64,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class AnswerFile:
-    """What a rater has saved."""
+    """The choices that a rater has saved."""
 
     path: Path
     study: str

@@ -25,6 +25,7 @@ LARGEST = 2048  # pixels
 # A ruined clip keeps this many pixels per side of each frame, and each of them gets noise.
 RUINED_SIZE = 12  # pixels
 RUINED_NOISE = 70.0  # standard deviation, of 255
+RUINED_QUALITY = 30  # of WebP; there is no detail to keep
 # A clip in which less than this share of the pixels differs from the background shows nothing.
 LEAST_VISIBLE = 0.01
 VISIBLE_CHANGE = 16  # of 255
@@ -33,7 +34,7 @@ ENCODER_EFFORT = 4  # 0 to 6
 
 @dataclass(frozen=True, kw_only=True)
 class ClipSettings:
-    """How every clip of a study is rendered."""
+    """Settings with which every clip of a study is rendered."""
 
     size: int  # pixels, height and width
     frames: int  # of one turn
@@ -84,7 +85,7 @@ def film(render: RenderFn, settings: ClipSettings) -> Clip:
             visible.append(float((change >= VISIBLE_CHANGE).mean()))
             image = Image.fromarray(picture)
             small.append(np.asarray(image.resize((RUINED_SIZE, RUINED_SIZE), Image.Resampling.BOX)))
-            frames.append(_encoded(image, settings.quality))
+            frames.append(encoded(image, settings.quality))
     return Clip(tuple(frames), np.stack(small), float(np.mean(visible)))
 
 
@@ -95,14 +96,15 @@ def ruined(clip: Clip, settings: ClipSettings, seed: int) -> tuple[bytes, ...]:
     """
     noise = np.random.default_rng(seed).normal(0.0, RUINED_NOISE, size=clip.small.shape[1:])
     coarse = (clip.small + noise).clip(0, 255).astype(np.uint8)
-    size = (settings.size, settings.size)
+    size, quality = (settings.size, settings.size), min(settings.quality, RUINED_QUALITY)
     return tuple(
-        _encoded(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC), settings.quality)
+        encoded(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC), quality)
         for picture in coarse
     )
 
 
-def _encoded(image: Image.Image, quality: int) -> bytes:
+def encoded(image: Image.Image, quality: int) -> bytes:
+    """Return a picture as the bytes of a WebP file."""
     buffer = io.BytesIO()
     image.save(buffer, "WEBP", quality=quality, method=ENCODER_EFFORT)
     return buffer.getvalue()

@@ -23,7 +23,7 @@ LARGEST_KEY = 1 << 24  # bytes
 
 @dataclass(frozen=True)
 class Key:
-    """What is needed to read the answers to a study."""
+    """The facts that are needed to read the answers to a study."""
 
     study: str  # its name, which the page and the files of answers have too
     arms: tuple[str, ...]

@@ -14,7 +14,7 @@ from cadam3d.study.runs import Pair, Run
 
 @dataclass(frozen=True)
 class Source:
-    """What a clip shows."""
+    """The run that a clip shows, and whether it is ruined."""
 
     run: Run
     is_ruined: bool  # it is blurred and noisy until nothing can be recognised

@@ -14,7 +14,7 @@ from chromium import headless
 from PIL import Image
 
 from cadam3d.study.answers import collect, find_files, read_files
-from cadam3d.study.clips import _encoded
+from cadam3d.study.clips import encoded
 from cadam3d.study.key import read_key, write_key
 from cadam3d.study.page import study_id, study_page
 from cadam3d.study.plan import make_plan
@@ -41,7 +41,7 @@ def folder(tmp_path_factory) -> Path:
     draw = np.random.default_rng(0)
     clips = [
         [
-            _encoded(Image.fromarray(draw.integers(0, 255, (8, 8, 3), dtype=np.uint8)), 80)
+            encoded(Image.fromarray(draw.integers(0, 255, (8, 8, 3), dtype=np.uint8)), 80)
             for _ in range(FRAMES)
         ]
         for _ in plan.sources
