@@ -200,7 +200,7 @@ def _print_page(folder: Path, pairs: Sequence[Pair], plan: Plan, settings: ClipS
 def _evaluate(cfg: DictConfig) -> None:
     """Print what the answers say, and write ``study.json`` and ``study.md`` beside the key."""
     from cadam3d.study.analysis import analyse
-    from cadam3d.study.summary import summary
+    from cadam3d.study.summary import Bullets, markdown, text
 
     require_range("least_caught", cfg.least_caught, low=0, high=1, example=0.8)
     paths = find_files(_texts(cfg.answers))
@@ -223,24 +223,19 @@ def _evaluate(cfg: DictConfig) -> None:
             "Try: cadam3d study --help"
         )
     analysis = analyse(collected.raters, least_caught=float(cfg.least_caught))
-    table = summary(analysis)
-    print(table)
+    print(text(analysis))
     folder = place.parent
     facts = {"study": key.study, "catch_trials": key.catch_trials, "trials": len(key.trials)}
     reasons = [{"file": each.path.name, "reason": each.reason} for each in left]
     result = {"kind": RESULTS_KIND, **facts, "left_out": reasons, **analysis.to_json()}
     write_json(folder / RESULTS, result)
     with replacing(folder / TABLE) as temporary:
-        temporary.write_text(_report(table, left), encoding="utf-8")
-    print(f"{shown(folder / RESULTS)}, {shown(folder / TABLE)}")
-
-
-def _report(table: str, left: Sequence[LeftOut]) -> str:
-    """Return the summary of a study, with the files that are left out."""
-    if not left:
-        return table
-    lines = "\n".join(f"- {each.path.name}: {each.reason}" for each in left)
-    return f"{table}\nFiles that are left out:\n\n{lines}\n"
+        page = markdown(analysis)
+        if left:
+            lines = Bullets([f"{each.path.name}: {each.reason}" for each in left])
+            page += f"\nFiles that are left out:\n\n{lines.markdown()}\n"
+        temporary.write_text(page, encoding="utf-8")
+    print(f"\n{shown(folder / RESULTS)}, {shown(folder / TABLE)}")
 
 
 def _find_key(cfg: DictConfig, files: Sequence[AnswerFile]) -> tuple[Path, Key]:
