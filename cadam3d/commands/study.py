@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.commands.asset import open_run, renderer
 from cadam3d.commands.messages import note
-from cadam3d.core.checks import require, require_range, require_whole
+from cadam3d.core.checks import require_range, require_whole
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
@@ -114,19 +114,12 @@ def _pairs(cfg: DictConfig, generator: Random) -> list[Pair]:
     return draw_pairs(pairs, cfg.pairs, generator)
 
 
-def _prompts(source: object) -> set[str] | None:
+def _prompts(source: str | None) -> set[str] | None:
     """Return the texts of the prompts that ``prompts=`` names; None for all."""
     if source is None:
         return None
     from cadam3d.sweep.prompts import read_prompts
 
-    require(
-        isinstance(source, str),
-        "prompts",
-        expected="a file or the name of a set",
-        got=source,
-        example="prompts=null",
-    )
     return {prompt.text for prompt in read_prompts(str(source))}
 
 

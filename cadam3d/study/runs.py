@@ -15,6 +15,7 @@ from typing import Any
 
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
+from cadam3d.io.caption import plain
 from cadam3d.io.records import read_summary
 from cadam3d.io.run_folder import ASSET, CONFIG, has_file, shown, typed_path
 from cadam3d.report.results import PROMPT, SEED, JobResult, read
@@ -88,7 +89,7 @@ def find_runs(places: Sequence[str], labels: Sequence[str] | None) -> Found:
             f"Try: {setting_word('runs', f'[{names}]')}"
         )
     results = [_results(place, folder) for place, folder in zip(places, folders, strict=True)]
-    names = _default_labels(folders, results) if labels is None else [label.strip() for label in labels]
+    names = _default_labels(folders, results) if labels is None else [plain(label) for label in labels]
     are_names = all(0 < len(name) <= LONGEST_LABEL for name in names)
     if len(set(names)) != len(folders) or len(names) != len(folders) or not are_names:
         raise fail(
@@ -187,7 +188,8 @@ def _arms_of_sweep(folder: Path) -> Found:
         if not {"prompt", "seed"} <= summary.keys() or not has_file(job.folder, ASSET):
             left += 1
             continue
-        runs.append(Run(job.folder, job.setting.name, summary["prompt"], summary["seed"], _conditions(job)))
+        arm = plain(job.setting.name)
+        runs.append(Run(job.folder, arm, summary["prompt"], summary["seed"], _conditions(job)))
     return Found(runs, left)
 
 
@@ -219,13 +221,13 @@ def _default_labels(
 ) -> list[str]:
     """Return the densifier of each arm if these differ, else the name or the path of its folder."""
     densifiers = [
-        {str(facts.get("densifier") or "") for facts in summaries.values()} for summaries in results
+        {plain(str(facts.get("densifier") or "")) for facts in summaries.values()} for summaries in results
     ]
     by_densifier = ["" if len(names) != 1 else next(iter(names)) for names in densifiers]
-    for names in (by_densifier, [folder.name for folder in folders]):
+    for names in (by_densifier, [plain(folder.name) for folder in folders]):
         if all(names) and len(set(names)) == len(names):
             return [name[:LONGEST_LABEL] for name in names]
-    return [str(shown(folder))[-LONGEST_LABEL:] for folder in folders]
+    return [plain(str(shown(folder)))[-LONGEST_LABEL:] for folder in folders]
 
 
 def _ambiguous(members: Sequence[Run]) -> UserError:
