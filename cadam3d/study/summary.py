@@ -123,6 +123,8 @@ def _size(analysis: Analysis) -> str:
 def screening_lines(analysis: Analysis) -> list[str]:
     """Return which raters were excluded, by which rule, and what the catch trials cannot show."""
     screening = analysis.screening
+    if not any(each.total for each in (*screening.kept, *screening.excluded)):
+        return ["No rater was excluded, because none has met a catch trial."]
     rule = f"fewer than {100 * screening.least:g} % right answers in catch trials"
     if screening.excluded:
         names = ", ".join(f"{each.name} ({each.right} of {each.total})" for each in screening.excluded)
