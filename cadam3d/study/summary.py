@@ -115,9 +115,9 @@ def blocks(analysis: Analysis) -> list[Paragraph | Bullets | Table]:
 
 
 def _size(analysis: Analysis) -> str:
-    counts = [_plural(analysis.raters, "rater"), _plural(analysis.prompts, "prompt")]
-    counts += [_plural(len(analysis.arms), "arm"), _plural(analysis.answers, "answer")]
-    return f"{', '.join(counts)}."
+    counts = {"rater": analysis.raters, "prompt": analysis.prompts, "arm": len(analysis.arms)}
+    listed = ", ".join(_plural(count, noun) for noun, count in counts.items())
+    return f"{listed} and {_plural(analysis.answers, 'answer')}."
 
 
 def screening_lines(analysis: Analysis) -> list[str]:
