@@ -59,7 +59,7 @@ def run(cfg: DictConfig) -> None:
 def _write(cfg: DictConfig) -> None:
     """Write ``study.html`` and ``key.json`` into ``output``, and print what they contain."""
     settings = _settings(cfg)
-    consent = CONSENT if cfg.consent is None else read_text(expanded(cfg.consent), largest=LARGEST_CONSENT)
+    consent = _consent(cfg.consent)
     generator = Random(cfg.seed)
     pairs = _pairs(cfg, generator)
     folder = _output(cfg)
@@ -92,6 +92,17 @@ def _settings(cfg: DictConfig) -> ClipSettings:
         backdrop=list(cfg.backdrop),
         quality=cfg.quality,
     )
+
+
+def _consent(path: str | None) -> str:
+    """Return the text that raters read before they begin."""
+    if path is None:
+        return CONSENT
+    try:
+        return read_text(expanded(path), largest=LARGEST_CONSENT)
+    except UserError as error:
+        reason = str(error).partition(". Try: ")[0]
+        raise UserError(f"consent: expected a text file, got {reason}. Try: consent=null") from error
 
 
 def _pairs(cfg: DictConfig, generator: Random) -> list[Pair]:
@@ -245,11 +256,19 @@ def _find_key(cfg: DictConfig, files: Sequence[AnswerFile]) -> tuple[Path, Key]:
         return path, read_key(path / KEY if path.is_dir() else path)
     folders = [expanded(str(cfg.output)), *(place for file in files for place in _around(file.path))]
     paths = [path for folder in dict.fromkeys(folders) if (path := folder / KEY).is_file()]
-    keys = {path: read_key(path) for path in paths}
+    keys: dict[Path, Key] = {}
+    problem: UserError | None = None
+    for path in paths:
+        try:
+            keys[path] = read_key(path)
+        except UserError as error:
+            problem = problem or error
     for study, _ in Counter(file.study for file in files).most_common():
         for path, key in keys.items():
             if key.study == study:
                 return path, key
+    if problem is not None:
+        raise problem
     got = f"only keys of other studies in {', '.join(map(str, paths[:3]))}" if paths else "none"
     raise UserError(
         f"key: expected the key of the study {files[0].study!r} in {cfg.output}/, beside the answers or in "

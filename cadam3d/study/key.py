@@ -76,7 +76,7 @@ def read_key(path: Path) -> Key:
         reason = " ".join(str(error).split())[:200]
         raise UserError(
             f"key: expected the key of a study, got {str(shown(path))!r}, which is not one ({reason}). "
-            "Try: key=null"
+            "Try: cadam3d study --help"
         ) from error
 
 

@@ -11,6 +11,8 @@ from random import Random
 
 from cadam3d.study.runs import Pair, Run
 
+LEAST_CATCHES = 2
+
 
 @dataclass(frozen=True)
 class Source:
@@ -47,8 +49,11 @@ class _Sides:
 
 
 def catch_count(pairs: int, share: float) -> int:
-    """Return the number of catch trials: ``share`` of the pairs, rounded, and at least one unless it is 0."""
-    return max(1, round(share * pairs)) if share > 0 else 0
+    """Return the number of catch trials: ``share`` of the pairs, rounded, and at least two unless it is 0.
+
+    With two of them, a rater who always chooses the same side fails.
+    """
+    return max(LEAST_CATCHES, round(share * pairs)) if share > 0 else 0
 
 
 def make_plan(pairs: Sequence[Pair], visible: Sequence[Run], catches: int, generator: Random) -> Plan:

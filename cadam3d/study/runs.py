@@ -16,7 +16,7 @@ from typing import Any
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.io.records import read_summary
-from cadam3d.io.run_folder import ASSET, CONFIG, has_file, shown, suggestion, typed_path
+from cadam3d.io.run_folder import ASSET, CONFIG, has_file, shown, typed_path
 from cadam3d.report.results import PROMPT, SEED, JobResult, read
 from cadam3d.settings.line import setting_word
 from cadam3d.sweep.folder import is_sweep
@@ -207,9 +207,9 @@ def _results(place: str, folder: Path) -> Mapping[Path, Mapping[str, Any]]:
     found = {each: facts for each, facts in summaries.items() if {"prompt", "seed"} <= facts.keys()}
     if not found:
         reason = "no such folder" if not folder.exists() else "it has no finished run"
-        example = suggestion("cadam3d render", "run", CONFIG)
         raise UserError(
-            f"runs: expected the folder of a run or of several runs, got {place!r} ({reason}). Try: {example}"
+            f"runs: expected the folder of a run or of several runs, got {place!r} ({reason}). "
+            "Try: cadam3d study --help"
         )
     return found
 

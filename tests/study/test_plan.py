@@ -101,8 +101,8 @@ def test_catch_trials_are_spread_over_the_study():
         assert number * length <= place - number < (number + 1) * length
 
 
-@pytest.mark.parametrize(("pairs", "share", "count"), [(50, 0.1, 5), (3, 0.1, 1), (50, 0.0, 0), (7, 1.0, 7)])
-def test_the_share_of_catch_trials_is_at_least_one_unless_it_is_zero(pairs, share, count):
+@pytest.mark.parametrize(("pairs", "share", "count"), [(50, 0.1, 5), (3, 0.1, 2), (50, 0.0, 0), (7, 1.0, 7)])
+def test_there_are_at_least_two_catch_trials_unless_their_share_is_zero(pairs, share, count):
     assert catch_count(pairs, share) == count
 
 
