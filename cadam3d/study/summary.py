@@ -115,14 +115,16 @@ def blocks(analysis: Analysis) -> list[Paragraph | Bullets | Table]:
 
 
 def _size(analysis: Analysis) -> str:
-    counts = [_plural(analysis.raters, "rater"), _plural(analysis.prompts, "prompt")]
-    counts += [_plural(len(analysis.arms), "arm"), _plural(analysis.answers, "answer")]
-    return f"{', '.join(counts)}."
+    counts = {"rater": analysis.raters, "prompt": analysis.prompts, "arm": len(analysis.arms)}
+    listed = ", ".join(_plural(count, noun) for noun, count in counts.items())
+    return f"{listed} and {_plural(analysis.answers, 'answer')}."
 
 
 def screening_lines(analysis: Analysis) -> list[str]:
     """Return which raters were excluded, by which rule, and what the catch trials cannot show."""
     screening = analysis.screening
+    if not any(each.total for each in (*screening.kept, *screening.excluded)):
+        return ["No rater was excluded, because none has met a catch trial."]
     rule = f"fewer than {100 * screening.least:g} % right answers in catch trials"
     if screening.excluded:
         names = ", ".join(f"{each.name} ({each.right} of {each.total})" for each in screening.excluded)

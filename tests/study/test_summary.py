@@ -77,6 +77,12 @@ def test_raters_who_were_excluded_or_not_tested_are_named():
     assert "No rater was excluded" in few
 
 
+def test_a_study_without_catch_trials_says_so():
+    page = shown(simulated_raters({"a": 0, "b": 0}, 3, 2, catches=[]))
+    assert "- No rater was excluded, because none has met a catch trial.\n" in page
+    assert "Kept" not in page
+
+
 def test_intervals_say_what_they_are_about():
     for size, scope in {
         (3, 4): "with 95 % intervals over raters and prompts:",
