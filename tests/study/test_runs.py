@@ -53,6 +53,11 @@ def test_runs_of_one_densifier_are_named_by_their_folders_and_labels_replace_bot
     assert {run.arm for run in find(*places, labels=["old", "new"]).runs} == {"old", "new"}
 
 
+def test_the_name_of_an_arm_is_printable_whatever_a_folder_says(tmp_path):
+    places = [make_run(tmp_path / name, densifier=f"\x1b[2J{name}\n") for name in ("x", "y")]
+    assert {run.arm for run in find(*places).runs} == {"[2Jx", "[2Jy"}
+
+
 def test_folders_with_a_run_per_prompt_are_paired_by_prompt_and_seed(tmp_path):
     for arm in ("A", "B"):
         for name, prompt, seed in (("cube", "a cube", 0), ("cube1", "a cube", 1), ("cone", "a cone", 0)):
