@@ -210,6 +210,7 @@ function show() {
     play(clips, ahead < TOTAL ? shown(ahead).clips : []);
   }
   $("place").textContent = `Pair ${place + 1} of ${trials.length} · question ${(step % questions.length) + 1} of ${questions.length}`;
+  $("who").textContent = rater.name; // a person who continues by mistake for another one should notice
   $("progress").max = TOTAL;
   $("progress").value = rater.answers.filter(Boolean).length;
   $("prompt").textContent = prompt;
