@@ -2,7 +2,8 @@
 
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -17,7 +18,16 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.reading import read_text
-from cadam3d.io.run_folder import expanded, numbered, occupant, shown, typed_path
+from cadam3d.io.run_folder import (
+    expanded,
+    nearest_existing,
+    numbered,
+    occupant,
+    remove_empty,
+    require_writable,
+    shown,
+    typed_path,
+)
 from cadam3d.settings.line import setting_word
 from cadam3d.study.answers import (
     RESULTS_KIND,
@@ -62,19 +72,19 @@ def _write(cfg: DictConfig) -> None:
     consent = _consent(cfg.consent)
     generator = Random(cfg.seed)
     pairs = _pairs(cfg, generator)
-    folder = _output(cfg)
-    clips = _film_all(pairs, cfg, settings)
-    plan = _plan(cfg, pairs, clips, generator)
-    frames = [
-        ruined(clips[source.run], settings, number) if source.is_ruined else clips[source.run].frames
-        for number, source in enumerate(plan.sources)
-    ]
-    study = study_id(plan.trials, frames)
-    page = study_page(study, plan.trials, frames, seconds=float(settings.seconds), consent=consent)
-    with replacing(folder / PAGE) as temporary:
-        temporary.write_text(page, encoding="utf-8")
-    write_key(folder / KEY, study, plan, seed=cfg.seed)
-    _print_page(folder, pairs, plan, settings)
+    with _output(cfg) as folder:
+        clips = _film_all(pairs, cfg, settings)
+        plan = _plan(cfg, pairs, clips, generator)
+        frames = [
+            ruined(clips[source.run], settings, number) if source.is_ruined else clips[source.run].frames
+            for number, source in enumerate(plan.sources)
+        ]
+        study = study_id(plan.trials, frames)
+        page = study_page(study, plan.trials, frames, seconds=float(settings.seconds), consent=consent)
+        with replacing(folder / PAGE) as temporary:
+            temporary.write_text(page, encoding="utf-8")
+        write_key(folder / KEY, study, plan, seed=cfg.seed)
+        _print_page(folder, pairs, plan, settings)
 
 
 def _settings(cfg: DictConfig) -> ClipSettings:
@@ -133,8 +143,12 @@ def _note_left(found: Found, runs: Sequence[Run], pairs: Sequence[Pair]) -> None
         note(f"{_count(len(single), 'run')} without a partner in another arm: {some}{more}")
 
 
-def _output(cfg: DictConfig) -> Path:
-    """Create the folder of the page. Raises ``UserError`` if it cannot be used."""
+@contextmanager
+def _output(cfg: DictConfig) -> Iterator[Path]:
+    """Yield the folder of the page, which is removed again if it stays empty.
+
+    Raises ``UserError`` if it cannot be used.
+    """
     text = str(cfg.output or "")
     folder = typed_path(text)
     free = setting_word("output", shown(numbered(folder.with_name(folder.name or "study"))))
@@ -148,12 +162,17 @@ def _output(cfg: DictConfig) -> Path:
             f"output: expected a folder without a study, got {shown(folder)}, which has the key of one. "
             f"Try: {free}"
         )
+    existing = nearest_existing(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        require_writable(folder)
     except OSError as error:
         reason = error.strerror or error
         raise UserError(f"output: cannot write to {folder} ({reason}). Try: output=study") from error
-    return folder
+    try:
+        yield folder
+    finally:
+        remove_empty(folder, existing)
 
 
 def _film_all(pairs: Sequence[Pair], cfg: DictConfig, settings: ClipSettings) -> dict[Run, Clip]:

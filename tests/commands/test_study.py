@@ -196,6 +196,7 @@ def test_objects_that_cannot_be_seen_make_no_catch_trial(tmp_path, type_line):
     code, _, err = type_line("study", f"runs=[{','.join(ARMS)}]", *SMALL)
     assert code == 1
     assert "cadam3d: backdrop: expected a colour in front of which the objects can be seen" in err
+    assert not (tmp_path / "study").exists()
     assert type_line("study", f"runs=[{','.join(ARMS)}]", *SMALL, "catch_share=0").code == 0
 
 
