@@ -120,7 +120,7 @@ def find_files(patterns: Sequence[str]) -> list[Path]:
 
 
 def read_files(paths: Sequence[Path]) -> tuple[list[AnswerFile], list[LeftOut]]:
-    """Return the content of the files with answers, and the files that have none that can be used.
+    """Return the content of the files with answers, and the files that cannot be used.
 
     The key and the results of a study may be in the same folder. They are skipped without a word.
     """
@@ -145,7 +145,7 @@ def read_files(paths: Sequence[Path]) -> tuple[list[AnswerFile], list[LeftOut]]:
 def collect(files: Sequence[AnswerFile], key: Key) -> Collected:
     """Return the raters of the study of ``key`` with their answers about arms.
 
-    - A file of another study is left out, and so is one whose answers do not fit the study.
+    - A file of another study is left out, and so is a file with answers that do not fit the study.
     - A rater may save several times. The last file of a session counts.
     - Two sessions under one name may be of two people, so all their files are left out. Upper and lower case
       are the same name.

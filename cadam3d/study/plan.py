@@ -89,7 +89,7 @@ def make_plan(pairs: Sequence[Pair], visible: Sequence[Run], catches: int, gener
 
 
 def _balanced(pairs: Sequence[Pair], generator: Random) -> list[_Sides]:
-    """Return every pair as a trial whose sides are drawn evenly for each two arms."""
+    """Return every pair as a trial, with sides that are drawn evenly for each two arms."""
     of_arms: dict[tuple[str, str], list[Pair]] = defaultdict(list)
     for pair in pairs:
         of_arms[pair.arms].append(pair)

@@ -67,15 +67,17 @@ class Found:
 def find_runs(places: Sequence[str], labels: Sequence[str] | None) -> Found:
     """Return the runs of all arms that ``runs=`` names.
 
-    A single place is the folder of a sweep, whose arms are compared as in its report. Of several places, each
-    is an arm: a run, a sweep, or a folder with runs in it. ``labels`` are the names of these arms, by default
+    A single place is the folder of a sweep, and its arms are those of its report. Of several places, each is
+    an arm: a run, a sweep, or a folder with runs in it. ``labels`` are the names of these arms, by default
     their densifiers if these differ, else the names of the folders. Raises ``UserError`` if a place is not
     one of these, or if there are fewer than two arms.
     """
     folders = [typed_path(place) for place in places]
     if len(folders) == 1 and is_sweep(folders[0]):
         if labels is not None:
-            raise UserError("labels: expected null for a sweep, whose arms have names. Try: labels=null")
+            raise UserError(
+                "labels: expected null for a sweep, because its arms have names already. Try: labels=null"
+            )
         return _arms_of_sweep(folders[0])
     if not 2 <= len(folders) <= MOST_ARMS:
         raise UserError(
