@@ -20,10 +20,11 @@ COMMANDS = {  # the purpose of each, and a line to paste
     "export": ("write an asset for other programs", "cadam3d export run=outputs/latest"),
     "eval": ("measure a finished run or sweep", "cadam3d eval run=outputs/latest"),
     "view": ("show a run in a browser, also while it trains", "cadam3d view run=outputs/latest"),
+    "study": ("let people compare runs, and evaluate it", "cadam3d study runs=multirun/thresholds"),
     "doctor": ("check this machine, with a hint per failure", "cadam3d doctor"),
 }
 # The command for a line that begins with one of these settings; all other settings are of training.
-COMMAND_OF = {"run": "view", "ply": "view", "grid": "sweep"}
+COMMAND_OF = {"run": "view", "ply": "view", "grid": "sweep", "runs": "study", "answers": "study"}
 HELP_FLAGS = ("--help", "-h", "help")
 COMPLETION_FLAGS = ("--shell-completion", "-sc")
 

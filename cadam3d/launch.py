@@ -334,6 +334,10 @@ def _refuse_bare_words(command: str, overrides: Sequence[str], flags: Sequence[s
         line = f"cadam3d {command} {key}={shlex.quote(whole)} {shlex.join(others)}".rstrip()
     elif command == "doctor":
         line = "cadam3d doctor"
+    elif command == "study":
+        # A shell has expanded a pattern of files, or the words are the folders of runs.
+        key = "answers" if bare[0].endswith(".json") else "runs"
+        line = line_of(command, [*others, f"{key}=[{','.join(bare)}]"])
     else:
         key = "ply" if bare[0].endswith((".ply", ".splat", ".spz")) and command != "eval" else "run"
         line = line_of(command, [*others, f"{key}={bare[0]}"])

@@ -29,7 +29,7 @@ FLOORS = {
     **dict.fromkeys(("settings",), 4.0),
     **dict.fromkeys(("sweep",), 5.0),
     **dict.fromkeys(("report",), 6.0),
-    **dict.fromkeys(("live",), 6.5),
+    **dict.fromkeys(("live", "study"), 6.5),
     **dict.fromkeys(("commands", "launch"), 7.0),
     **dict.fromkeys(("api",), 7.5),
     **dict.fromkeys(("cli", "__main__", "job"), 8.0),

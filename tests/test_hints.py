@@ -36,6 +36,7 @@ from splats import make_gaussians
 import cadam3d
 from cadam3d import cli
 from cadam3d.core.errors import UserError
+from cadam3d.io.jsonl import write_json
 from cadam3d.io.ply import write_ply
 from cadam3d.rasterizer import auto
 from cadam3d.rasterizer.build import find_compiler
@@ -51,6 +52,7 @@ ACCEPTED = "accepted"
 OVERRIDE = re.compile(r"(?:[+~]{0,2}[A-Za-z_][\w./@]*=.*|~[A-Za-z_][\w./]*|--?[a-z-]+(?:=.*)?)", re.DOTALL)
 SHELL = ("pip install ", "hf download ", "nvidia-smi", 'eval "$(cadam3d -sc install=bash)"')
 A_CUBE = ("train", "prompt=a red cube", "prior=tiny")
+A_STUDY = ("study", "runs=[an arm,another arm]")
 
 # Wrong lines, by what is wrong with them. A run is in "a run" and in outputs/latest, a sweep in "a sweep".
 LINES: dict[str, list[tuple[str, ...]]] = {
@@ -202,6 +204,39 @@ LINES: dict[str, list[tuple[str, ...]]] = {
         ("view", "run=a run", "port=99999"),
         ("view", "run=a run", "browser=false"),
     ],
+    "studies": [
+        ("study",),
+        ("study", "an arm", "another arm"),
+        (*A_STUDY, "answers=answers"),
+        (*A_STUDY, "labels=[one]"),
+        (*A_STUDY, "arms=[one,two]"),
+        (*A_STUDY, "prompts=nowhere"),
+        (*A_STUDY, "prompts=[a cube]"),
+        (*A_STUDY, "pairs=0"),
+        (*A_STUDY, "catch_share=2"),
+        (*A_STUDY, "seed=-1"),
+        (*A_STUDY, "frames=0"),
+        (*A_STUDY, "seconds=0"),
+        (*A_STUDY, "backdrop=[1,2,3]"),
+        (*A_STUDY, "size=abc"),
+        (*A_STUDY, "consent=nowhere"),
+        (*A_STUDY, "output="),
+        (*A_STUDY, "output=/dev/null/x"),
+        (*A_STUDY, "output=a run"),
+        (*A_STUDY, "output=a study"),
+        ("study", "runs=an arm"),
+        ("study", "runs=a sweep"),
+        ("study", "runs=[an arm,an arm]"),
+        ("study", "runs=[an arm,nowhere]"),
+        ("study", "runs=[an arm,an arm of cones]"),
+        ("study", "runs=[an arm,a later arm]"),
+        ("study", "answers=nowhere"),
+        ("study", "answers=taken"),
+        ("study", "answers=answers"),
+        ("study", "answers=answers", "least_caught=2"),
+        ("study", "answers=answers", "key=asset.ply"),
+        ("study", "answers=answers", "key=a study"),
+    ],
     "sweeps": [
         ("sweep", "prompt=a red cube"),
         ("sweep", "prompt=a red cube", "densifier=cadam,cadm"),
@@ -228,6 +263,7 @@ ELSEWHERE: dict[str, str] = {
     "commands/eval.py::_evaluate_sweep": "needs a sweep whose jobs all fail",
     "commands/eval.py::start_of": "needs the folder of a stranger",
     "commands/eval.py::_not_saved": "needs a folder that cannot be written; see tests/commands",
+    "commands/study.py::_plan": "needs renders; see tests/commands/test_study.py",
     "commands/view.py::_listening": "needs a port that is in use; see tests/commands/test_view.py",
     "commands/train.py::build_trainer": "needs other steps in refine than in the run",
     "commands/train.py::require_unused": "see test_wrong_values.py",
@@ -472,6 +508,7 @@ def make_places(folder: Path) -> None:
         (folder / run / ".hydra/overrides.yaml").write_text("['prompt=a red cube', 'prior=tiny']")
         write_ply(folder / run / "asset.ply", gaussians, up="-y", pad_sh=0)
     (folder / "new/asset.ply").unlink()
+    make_study(folder)
     (folder / "a run/summary.json").write_text("{}")
     (folder / "outputs").mkdir()
     (folder / "outputs/latest").symlink_to(folder / "a run")
@@ -488,6 +525,21 @@ def make_places(folder: Path) -> None:
     (folder / "text/broken.ply").write_text("no PLY file")
     (folder / "text/broken.json").write_text("no JSON")
     (folder / "text/prompts.txt").write_text("a red cube\na blue ball\n")
+
+
+def make_study(folder: Path) -> None:
+    """Put the runs of a study, its key and a file of answers into ``folder``."""
+    arms = {"an arm": ("a cube", 0), "another arm": ("a cube", 0)}
+    arms |= {"an arm of cones": ("a cone", 0), "a later arm": ("a cube", 1)}
+    for arm, (prompt, seed) in arms.items():
+        (folder / arm / "0").mkdir(parents=True)
+        write_ply(folder / arm / "0/asset.ply", make_gaussians(6), up="-y", pad_sh=0)
+        (folder / arm / "0/config.yaml").touch()
+        write_json(folder / arm / "0/summary.json", {"prompt": prompt, "seed": seed})
+    plain = {"version": 1, "study": "mine", "arms": [], "clips": [], "trials": []}
+    write_json(folder / "a study/key.json", {"kind": "study key", **plain})
+    plain = {"version": 1, "study": "other", "rater": "1", "session": "1", "saves": 1, "answers": []}
+    write_json(folder / "answers/1.json", {"kind": "study answers", **plain})
 
 
 def accept(*_: object, **__: object) -> None:
@@ -518,6 +570,7 @@ def answers(tmp_path_factory) -> Iterator[Answers]:
         patch.setattr("cadam3d.commands.train.remove_leftovers", accept)
         patch.setattr("cadam3d.sweep.start.write_plan", accept)
         patch.setattr("cadam3d.commands.doctor.run", accept)
+        patch.setattr("cadam3d.commands.study.film", accept)
         patch.setattr("webbrowser.open", lambda _: True)
         patch.setattr("cadam3d.live.server.Server.serve_forever", accept)
         for exporter in ("images.ImagesExporter", "turntable.TurntableExporter", "preview.PreviewExporter"):

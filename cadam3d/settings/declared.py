@@ -38,11 +38,20 @@ SETTINGS: dict[str, Any] = {
     **dict.fromkeys(("prompt", "negative_prompt", "device"), str),
     **dict.fromkeys(("resume", "ply", "ply_up", "output", "select"), str | None),
     "run": str | Sequence[str] | None,
-    "labels": Sequence[str] | None,
+    **dict.fromkeys(("runs", "answers"), str | Sequence[str] | None),
+    **dict.fromkeys(("labels", "arms"), Sequence[str] | None),
+    **dict.fromkeys(("key", "consent"), str | None),
+    **dict.fromkeys(("size", "frames", "quality"), int),
+    **dict.fromkeys(("seconds", "elevation_deg", "distance", "catch_share", "least_caught"), float),
+    "pairs": int | None,
+    "backdrop": Sequence[float],
     **dict.fromkeys(("steps", "views", "seed", "port", "attempts"), int),
-    **dict.fromkeys(("open", "json"), bool),
+    **dict.fromkeys(("open", "json", "same_seed"), bool),
 }
 EXAMPLES = {"prompt": "a cube", "steps": 600, "run": LATEST, "resume": LATEST, "labels": None}
+EXAMPLES |= {"runs": None, "answers": None, "arms": None, "size": 384, "frames": 72, "quality": 80}
+EXAMPLES |= {"seconds": 6.0, "elevation_deg": 20.0, "distance": 3.0, "catch_share": 0.1, "least_caught": 0.8}
+EXAMPLES |= {"pairs": 30, "backdrop": [1.0, 1.0, 1.0], "same_seed": True, "key": None, "consent": None}
 EXAMPLES |= {"negative_prompt": "", "device": "auto", "ply_up": "-y", "views": 2, "seed": 0, "port": 0}
 EXAMPLES |= {"attempts": 4, "select": "psnr"}
 WORDS = {

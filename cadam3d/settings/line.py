@@ -20,6 +20,7 @@ SWEEP_FOLDER = "hydra.sweep.dir"
 PATH_KEYS = (
     *("run", "ply", "output", "resume", RUN_FOLDER, SWEEP_FOLDER),
     *("initializer.path", "initializer.prompt", "rasterizer.cache_dir"),
+    *("runs", "answers", "key", "consent"),
     *("prompts", "prompts.file", "prompts.category"),
     "prompts.shard",
 )
@@ -29,7 +30,7 @@ LAUNCHER_KEY = re.compile(r"launcher($|\.)|hydra[./]launcher($|\.)")
 # Settings of a line that say nothing about what a run computes, so they may differ when it is continued.
 NOT_OF_A_RUN = ("resume", "trust", "attempts", "select")
 # Keys whose value may be a list of paths or of texts, such as run=[A,B].
-LIST_KEYS = ("run", "labels")
+LIST_KEYS = ("run", "runs", "labels", "arms", "answers")
 # A path that Hydra's grammar reads without quotes. It cannot read "~".
 PLAIN_PATH = re.compile(r"[\w./+-]*", re.ASCII)
 # What the grammar reads as a number or a truth value, although it may be the name of a folder.

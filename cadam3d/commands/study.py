@@ -1,0 +1,307 @@
+"""``cadam3d study``: write the page of a blinded comparison, or evaluate the answers of its raters."""
+
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from cadam3d.commands.asset import open_run, renderer
+from cadam3d.commands.messages import note
+from cadam3d.core.checks import require_range, require_whole
+from cadam3d.core.console import say
+from cadam3d.core.errors import UserError
+from cadam3d.io.atomic import replacing
+from cadam3d.io.jsonl import write_json
+from cadam3d.io.reading import read_text
+from cadam3d.io.run_folder import (
+    expanded,
+    nearest_existing,
+    numbered,
+    occupant,
+    remove_empty,
+    require_writable,
+    shown,
+    typed_path,
+)
+from cadam3d.settings.line import setting_word
+from cadam3d.study.answers import (
+    RESULTS_KIND,
+    AnswerFile,
+    LeftOut,
+    collect,
+    find_files,
+    read_files,
+)
+from cadam3d.study.clips import LEAST_VISIBLE, Clip, ClipSettings, film, ruined
+from cadam3d.study.key import KEY, PAGE, RESULTS, TABLE, Key, read_key, write_key
+from cadam3d.study.page import study_id, study_page
+from cadam3d.study.plan import Plan, catch_count, make_plan
+from cadam3d.study.runs import Found, Pair, Run, draw_pairs, find_runs, pair_runs, select
+
+LARGEST_PAGE = 100_000_000  # bytes; above this, some mail servers and phones refuse a page
+LARGEST_CONSENT = 1 << 16  # bytes
+CONSENT = """Taking part is voluntary, and you can stop at any time without giving a reason.
+
+This page sends nothing. Your answers, the time that each of them took, and the name or number that you type \
+below stay in this browser until you save them as a file. You decide whether you send that file."""
+
+
+def run(cfg: DictConfig) -> None:
+    """Write the page and the key of a study of ``runs=``, or evaluate the files in ``answers=``."""
+    if (cfg.runs is None) == (cfg.answers is None):
+        got = "neither" if cfg.runs is None else "both"
+        line = "cadam3d study --help" if cfg.runs is None else "answers=null"
+        raise UserError(f"runs, answers: expected one of them, got {got}. Try: {line}")
+    if cfg.answers is None:
+        _write(cfg)
+    else:
+        _evaluate(cfg)
+
+
+# The page.
+
+
+def _write(cfg: DictConfig) -> None:
+    """Write ``study.html`` and ``key.json`` into ``output``, and print what they contain."""
+    settings = _settings(cfg)
+    consent = _consent(cfg.consent)
+    generator = Random(cfg.seed)
+    pairs = _pairs(cfg, generator)
+    with _output(cfg) as folder:
+        clips = _film_all(pairs, cfg, settings)
+        plan = _plan(cfg, pairs, clips, generator)
+        frames = [
+            ruined(clips[source.run], settings, number) if source.is_ruined else clips[source.run].frames
+            for number, source in enumerate(plan.sources)
+        ]
+        study = study_id(plan.trials, frames)
+        page = study_page(study, plan.trials, frames, seconds=float(settings.seconds), consent=consent)
+        with replacing(folder / PAGE) as temporary:
+            temporary.write_text(page, encoding="utf-8")
+        write_key(folder / KEY, study, plan, seed=cfg.seed)
+        _print_page(folder, pairs, plan, settings)
+
+
+def _settings(cfg: DictConfig) -> ClipSettings:
+    """Return how clips are rendered, after all other settings of a page have been checked."""
+    require_whole("seed", cfg.seed, low=0, example=0)
+    require_range("catch_share", cfg.catch_share, low=0, high=1, example=0.1)
+    if cfg.pairs is not None:
+        require_whole("pairs", cfg.pairs, low=1, example=30)
+    return ClipSettings(
+        size=cfg.size,
+        frames=cfg.frames,
+        seconds=cfg.seconds,
+        elevation_deg=cfg.elevation_deg,
+        distance=cfg.distance,
+        backdrop=list(cfg.backdrop),
+        quality=cfg.quality,
+    )
+
+
+def _consent(path: str | None) -> str:
+    """Return the text that raters read before they begin."""
+    if path is None:
+        return CONSENT
+    try:
+        return read_text(expanded(path), largest=LARGEST_CONSENT)
+    except UserError as error:
+        reason = str(error).partition(". Try: ")[0]
+        raise UserError(f"consent: expected a text file, got {reason}. Try: consent=null") from error
+
+
+def _pairs(cfg: DictConfig, generator: Random) -> list[Pair]:
+    """Return the pairs of runs that the page shows, and print a note if runs are left out."""
+    found = find_runs(_texts(cfg.runs), None if cfg.labels is None else _texts(cfg.labels))
+    runs = select(found.runs, None if cfg.arms is None else _texts(cfg.arms), _prompts(cfg.prompts))
+    pairs = pair_runs(runs, same_seed=cfg.same_seed)
+    _note_left(found, runs, pairs)
+    return draw_pairs(pairs, cfg.pairs, generator)
+
+
+def _prompts(source: str | None) -> set[str] | None:
+    """Return the texts of the prompts that ``prompts=`` names; None for all."""
+    if source is None:
+        return None
+    from cadam3d.sweep.prompts import read_prompts
+
+    return {prompt.text for prompt in read_prompts(str(source))}
+
+
+def _note_left(found: Found, runs: Sequence[Run], pairs: Sequence[Pair]) -> None:
+    if found.without_asset:
+        note(f"{_count(found.without_asset, 'run')} left no asset and cannot be shown")
+    single = [run for run in runs if not any(run in pair.runs for pair in pairs)]
+    if single:
+        some = ", ".join(str(shown(run.folder)) for run in single[:3])
+        more = ", ..." if len(single) > 3 else ""
+        note(f"{_count(len(single), 'run')} without a partner in another arm: {some}{more}")
+
+
+@contextmanager
+def _output(cfg: DictConfig) -> Iterator[Path]:
+    """Yield the folder of the page, which is removed again if it stays empty.
+
+    Raises ``UserError`` if it cannot be used.
+    """
+    text = str(cfg.output or "")
+    folder = typed_path(text)
+    free = setting_word("output", shown(numbered(folder.with_name(folder.name or "study"))))
+    if not text.strip() or folder.parent == folder:
+        raise UserError(f"output: expected a folder, got {text!r}. Try: output=study")
+    if folder.is_dir() and (name := occupant(folder)):
+        raise UserError(f"output: expected a folder of its own, got one with {name}. Try: {free}")
+    if os.path.lexists(folder / KEY):
+        # Without its key, the answers to a study are lost.
+        raise UserError(
+            f"output: expected a folder without a study, got {shown(folder)}, which has the key of one. "
+            f"Try: {free}"
+        )
+    existing = nearest_existing(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        require_writable(folder)
+    except OSError as error:
+        reason = error.strerror or error
+        raise UserError(f"output: cannot write to {folder} ({reason}). Try: output=study") from error
+    try:
+        yield folder
+    finally:
+        remove_empty(folder, existing)
+
+
+def _film_all(pairs: Sequence[Pair], cfg: DictConfig, settings: ClipSettings) -> dict[Run, Clip]:
+    """Return a clip of every run, rendered in the same way."""
+    runs = list(dict.fromkeys(run for pair in pairs for run in pair.runs))
+    clips = {}
+    for number, each in enumerate(runs, 1):
+        say(f"turntable {number} of {len(runs)}")
+        gaussians = open_run(each.folder, cfg.device).gaussians
+        clips[each] = film(renderer(cfg.rasterizer, gaussians), settings)
+    return clips
+
+
+def _plan(cfg: DictConfig, pairs: Sequence[Pair], clips: dict[Run, Clip], generator: Random) -> Plan:
+    """Return the trials. Raises ``UserError`` if no clip shows enough for a catch trial."""
+    catches = catch_count(len(pairs), cfg.catch_share)
+    visible = [run for run, clip in clips.items() if clip.visible >= LEAST_VISIBLE]
+    if catches and not visible:
+        raise UserError(
+            "backdrop: expected a colour in front of which the objects can be seen, got "
+            f"{list(cfg.backdrop)}: no turntable shows anything. Try: 'backdrop=[0.5,0.5,0.5]'"
+        )
+    return make_plan(pairs, visible, catches, generator)
+
+
+def _print_page(folder: Path, pairs: Sequence[Pair], plan: Plan, settings: ClipSettings) -> None:
+    met = Counter(pair.arms for pair in pairs)
+    for (one, other), count in sorted(met.items()):
+        print(f"{one} and {other}: {_count(count, 'pair')}")
+    size = (folder / PAGE).stat().st_size
+    catches = len(plan.trials) - len(pairs)
+    print(
+        f"{_count(len(plan.trials), 'trial')}, of which {_count(catches, 'catch trial')}; {size / 1e6:.1f} MB"
+    )
+    print(f"for the raters:  {shown(folder / PAGE)}")
+    print(f"keep it secret:  {shown(folder / KEY)}")
+    if size > LARGEST_PAGE:
+        note(
+            f"the page has {size / 1e6:.0f} MB. To make it smaller, add "
+            f"size={max(1, settings.size * 2 // 3)}, frames={max(1, settings.frames * 2 // 3)} or "
+            f"pairs={max(1, len(pairs) // 2)}"
+        )
+
+
+# The answers.
+
+
+def _evaluate(cfg: DictConfig) -> None:
+    """Print what the answers say, and write ``study.json`` and ``study.md`` beside the key."""
+    from cadam3d.study.analysis import analyse
+    from cadam3d.study.summary import Bullets, markdown, text
+
+    require_range("least_caught", cfg.least_caught, low=0, high=1, example=0.8)
+    paths = find_files(_texts(cfg.answers))
+    files, left = read_files(paths)
+    for each in left:
+        _warn(each)
+    if not files:
+        raise UserError(
+            f"answers: expected files that raters have saved, got {_count(len(paths), 'file')} without any. "
+            "Try: cadam3d study --help"
+        )
+    place, key = _find_key(cfg, files)
+    collected = collect(files, key)
+    for each in collected.left_out:
+        _warn(each)
+    left += collected.left_out
+    if not collected.raters:
+        raise UserError(
+            f"answers: expected answers to the study of {shown(place)}, got none. The reasons are above. "
+            "Try: cadam3d study --help"
+        )
+    analysis = analyse(collected.raters, least_caught=float(cfg.least_caught))
+    print(text(analysis))
+    folder = place.parent
+    facts = {"study": key.study, "catch_trials": key.catch_trials, "trials": len(key.trials)}
+    reasons = [{"file": each.path.name, "reason": each.reason} for each in left]
+    result = {"kind": RESULTS_KIND, **facts, "left_out": reasons, **analysis.to_json()}
+    write_json(folder / RESULTS, result)
+    with replacing(folder / TABLE) as temporary:
+        page = markdown(analysis)
+        if left:
+            lines = Bullets([f"{each.path.name}: {each.reason}" for each in left])
+            page += f"\nFiles that are left out:\n\n{lines.markdown()}\n"
+        temporary.write_text(page, encoding="utf-8")
+    print(f"\n{shown(folder / RESULTS)}, {shown(folder / TABLE)}")
+
+
+def _find_key(cfg: DictConfig, files: Sequence[AnswerFile]) -> tuple[Path, Key]:
+    """Return the key of the study that most of the files are about, and its path."""
+    if cfg.key is not None:
+        path = expanded(cfg.key)
+        return path, read_key(path / KEY if path.is_dir() else path)
+    folders = [expanded(str(cfg.output)), *(place for file in files for place in _around(file.path))]
+    paths = [path for folder in dict.fromkeys(folders) if (path := folder / KEY).is_file()]
+    keys: dict[Path, Key] = {}
+    problem: UserError | None = None
+    for path in paths:
+        try:
+            keys[path] = read_key(path)
+        except UserError as error:
+            problem = problem or error
+    for study, _ in Counter(file.study for file in files).most_common():
+        for path, key in keys.items():
+            if key.study == study:
+                return path, key
+    if problem is not None:
+        raise problem
+    got = f"only keys of other studies in {', '.join(map(str, paths[:3]))}" if paths else "none"
+    raise UserError(
+        f"key: expected the key of the study {files[0].study!r} in {cfg.output}/, beside the answers or in "
+        f"the folder above, got {got}. Its name is {KEY}. Try: cadam3d study --help"
+    )
+
+
+def _around(path: Path) -> tuple[Path, Path]:
+    """Return the folder of a file, and the folder above."""
+    folder = path.absolute().parent
+    return folder, folder.parent
+
+
+def _warn(left: LeftOut) -> None:
+    say(f"Warning: {shown(left.path)} is left out: {left.reason}")
+
+
+def _texts(value: Any) -> list[str]:
+    """Return the texts of a setting that is one text or a list of them."""
+    return [str(item) for item in value] if OmegaConf.is_list(value) else [str(value)]
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"

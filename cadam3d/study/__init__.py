@@ -1,0 +1,1 @@
+"""Study: people compare arms without knowing which is which, on a page that works without a network."""

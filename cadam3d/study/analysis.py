@@ -1,0 +1,289 @@
+"""Analysis: what the answers of a study say about its arms, as numbers with their uncertainty.
+
+All functions are pure, and no result depends on the order of raters or of answers. ``study/estimates.py`` has
+the intervals and tests, and ``study/summary.py`` writes the analysis as text.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from scipy.special import expit
+from scipy.stats import binom
+
+from cadam3d.core.checks import fail, require_range
+from cadam3d.study.answers import Answer, Rater
+from cadam3d.study.estimates import (
+    CONFIDENCE,
+    Clusters,
+    Interval,
+    SignTest,
+    agreement,
+    count_wins,
+    fit_strengths,
+    holm,
+    rate_interval,
+    sign_test,
+    strength_margins,
+    unranked,
+)
+from cadam3d.study.questions import QUESTION_NAMES
+
+EVEN = 0.5  # the rate of two arms that are liked equally
+
+
+@dataclass(frozen=True)
+class Screened:
+    """The result of one rater in the catch trials."""
+
+    name: str
+    right: int  # answers in catch trials
+    total: int
+    by_chance: float  # probability that independent guesses pass
+
+
+@dataclass(frozen=True)
+class Screening:
+    """The raters whose answers count, and those who failed the catch trials."""
+
+    least: float  # share of the answers in catch trials that must be right, in [0, 1]
+    kept: tuple[Screened, ...]
+    excluded: tuple[Screened, ...]
+
+
+@dataclass(frozen=True)
+class Rate:
+    """The share of its comparisons in which an arm was chosen."""
+
+    arm: str
+    chosen: int
+    answers: int
+    share: float  # chosen / answers
+    interval: Interval  # of the share, over raters and prompts
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two arms and the answers to one question about them."""
+
+    first: str
+    second: str
+    rate: Rate  # of the first arm, against the second
+    # A test over prompts says whether other prompts would give the same result with these raters, and a test
+    # over raters whether other raters would with these prompts. A claim about both needs both tests.
+    over_prompts: SignTest
+    over_raters: SignTest
+    p_value: float  # the larger one of the two tests
+    corrected_p_value: float  # by Holm's method, for the number of comparisons in the study
+
+    @property
+    def is_certain(self) -> bool:
+        """Return whether the interval excludes one half and the corrected sign test agrees."""
+        return self.rate.interval.excludes(EVEN) and self.corrected_p_value < 1 - CONFIDENCE
+
+
+@dataclass(frozen=True)
+class Strength:
+    """The strength of an arm in the Bradley-Terry model, relative to the average of all arms."""
+
+    arm: str
+    log_odds: float
+    preferred: float  # probability that it is chosen over an arm of average strength
+    interval: Interval  # of this probability, over raters and prompts
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The strengths of more than two arms, or why they cannot be estimated."""
+
+    strengths: tuple[Strength, ...]  # strongest first; empty if there is a problem
+    problem: str | None
+
+
+@dataclass(frozen=True)
+class QuestionResult:
+    """The result of one question."""
+
+    question: str  # one of QUESTION_NAMES
+    raters: int
+    prompts: int
+    answers: int
+    rates: tuple[Rate, ...]  # one for each arm that was compared, by name
+    comparisons: tuple[Comparison, ...]  # one for each pair of arms that was compared
+    ranking: Ranking | None  # None for two arms, because the rates say the same
+    agreement: float | None  # Krippendorff's alpha of the raters, for two arms
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """The result of a study: its size, the raters who were excluded, and the result of each question."""
+
+    arms: tuple[str, ...]
+    raters: int  # that were kept and have answered
+    prompts: int
+    answers: int
+    comparisons: int  # sign tests, for whose number the p-values are corrected
+    screening: Screening
+    questions: tuple[QuestionResult, ...]  # in the order of the paper; without unanswered ones
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the analysis as nested dictionaries of plain values, for a JSON file."""
+        return asdict(self)
+
+
+def analyse(raters: Sequence[Rater], *, least_caught: float) -> Analysis:
+    """Return the analysis of the answers of all raters who pass the catch trials.
+
+    A rater is excluded if the share of right answers in catch trials is below ``least_caught``, in [0, 1]. A
+    rater who has seen no catch trial is kept. Raise :class:`UserError` if no answer is left.
+    """
+    require_range("least_caught", least_caught, low=0, high=1, example=0.8)
+    screening = screen(raters, least_caught)
+    kept = {rater.name for rater in screening.kept}
+    answers = [answer for rater in raters if rater.name in kept for answer in rater.answers]
+    if not answers:
+        excluded = len(screening.excluded)
+        raise fail(
+            "answers",
+            expected="answers of at least one rater who passes the catch trials",
+            got=f"{len(raters)} raters, of which {excluded} failed them",
+            example="least_caught=0",
+        )
+    by_question = [[each for each in answers if each.question == name] for name in QUESTION_NAMES]
+    results = _corrected([question_result(each) for each in by_question if each])
+    return Analysis(
+        arms=_arms(answers),
+        raters=len({answer.rater for answer in answers}),
+        prompts=len({answer.prompt for answer in answers}),
+        answers=len(answers),
+        comparisons=sum(len(result.comparisons) for result in results),
+        screening=screening,
+        questions=tuple(results),
+    )
+
+
+def screen(raters: Sequence[Rater], least: float) -> Screening:
+    """Divide the raters into those who pass the catch trials and those who do not.
+
+    ``least`` is the share of the answers in catch trials that must be right, in [0, 1].
+    """
+    screened = []
+    for rater in sorted(raters, key=lambda rater: rater.name):
+        right, total = sum(rater.catches), len(rater.catches)
+        # Half of the guesses are right on average.
+        by_chance = float(binom.sf(_needed(total, least) - 1, total, EVEN))
+        screened.append(Screened(rater.name, right, total, by_chance))
+    passed = [each.right >= _needed(each.total, least) for each in screened]
+    return Screening(
+        least,
+        kept=tuple(each for each, passes in zip(screened, passed, strict=True) if passes),
+        excluded=tuple(each for each, passes in zip(screened, passed, strict=True) if not passes),
+    )
+
+
+def _needed(total: int, least: float) -> int:
+    """Return how many of ``total`` catch trials must be right."""
+    return math.ceil(total * least - 1e-9)
+
+
+def question_result(answers: Sequence[Answer]) -> QuestionResult:
+    """Return what the answers to one question say, of which there must be at least one.
+
+    The p-values of its comparisons are not corrected.
+    """
+    answers = sorted(answers, key=lambda each: (each.rater, each.prompt, each.chosen, each.other))
+    arms = _arms(answers)
+    pairs = [pair for pair in combinations(arms, 2) if _between(answers, *pair)]
+    has_two_arms = len(arms) == 2
+    return QuestionResult(
+        question=answers[0].question,
+        raters=len({answer.rater for answer in answers}),
+        prompts=len({answer.prompt for answer in answers}),
+        answers=len(answers),
+        rates=tuple(
+            _rate(arm, [each for each in answers if arm in (each.chosen, each.other)]) for arm in arms
+        ),
+        comparisons=tuple(_comparison(*pair, _between(answers, *pair)) for pair in pairs),
+        ranking=None if has_two_arms else _ranking(arms, answers),
+        agreement=agreement(_is_chosen(arms[0], answers), _clusters(answers)) if has_two_arms else None,
+    )
+
+
+def _arms(answers: Sequence[Answer]) -> tuple[str, ...]:
+    return tuple(sorted({arm for answer in answers for arm in (answer.chosen, answer.other)}))
+
+
+def _between(answers: Sequence[Answer], first: str, second: str) -> list[Answer]:
+    return [answer for answer in answers if {answer.chosen, answer.other} == {first, second}]
+
+
+def _is_chosen(arm: str, answers: Sequence[Answer]) -> np.ndarray:
+    return np.array([answer.chosen == arm for answer in answers])
+
+
+def _clusters(answers: Sequence[Answer]) -> Clusters:
+    return Clusters.of([answer.rater for answer in answers], [answer.prompt for answer in answers])
+
+
+def _rate(arm: str, answers: Sequence[Answer]) -> Rate:
+    """Return the rate of an arm from the answers in which it took part."""
+    chosen = _is_chosen(arm, answers)
+    interval = rate_interval(chosen, _clusters(answers))
+    return Rate(arm, int(chosen.sum()), len(chosen), float(chosen.mean()), interval)
+
+
+def _comparison(first: str, second: str, answers: Sequence[Answer]) -> Comparison:
+    chosen, clusters = _is_chosen(first, answers), _clusters(answers)
+    over_prompts, over_raters = sign_test(chosen, clusters.prompts), sign_test(chosen, clusters.raters)
+    p_value = max(over_prompts.p_value, over_raters.p_value)
+    return Comparison(
+        first,
+        second,
+        rate=_rate(first, answers),
+        over_prompts=over_prompts,
+        over_raters=over_raters,
+        p_value=p_value,
+        corrected_p_value=p_value,
+    )
+
+
+def _ranking(arms: Sequence[str], answers: Sequence[Answer]) -> Ranking:
+    position = {arm: i for i, arm in enumerate(arms)}
+    chosen = np.array([position[answer.chosen] for answer in answers])
+    other = np.array([position[answer.other] for answer in answers])
+    wins = count_wins(chosen, other, len(arms))
+    apart = unranked(wins)
+    if apart is not None:
+        group, won_all = apart
+        inside = ", ".join(arms[i] for i in group)
+        outside = ", ".join(arm for i, arm in enumerate(arms) if i not in group)
+        won = f"{inside} won every comparison with {outside}, so their difference has no upper bound"
+        problem = won if won_all else f"no answer compares {inside} with {outside}"
+        return Ranking((), problem)
+    values = fit_strengths(wins)
+    margins = strength_margins(chosen, other, _clusters(answers), values)
+    strengths = [
+        Strength(arm, float(value), float(expit(value)), _around(float(value), float(half)))
+        for arm, value, half in zip(arms, values, margins, strict=True)
+    ]
+    return Ranking(tuple(sorted(strengths, key=lambda each: (-each.log_odds, each.arm))), None)
+
+
+def _around(log_odds: float, half: float) -> Interval:
+    """Return the probabilities ``half`` below and above ``log_odds``."""
+    return Interval(float(expit(log_odds - half)), float(expit(log_odds + half)))
+
+
+def _corrected(results: Sequence[QuestionResult]) -> list[QuestionResult]:
+    """Return the results with p-values corrected for the number of comparisons of all questions."""
+    p_values = iter(holm([each.p_value for result in results for each in result.comparisons]))
+    return [
+        replace(
+            result,
+            comparisons=tuple(replace(each, corrected_p_value=next(p_values)) for each in result.comparisons),
+        )
+        for result in results
+    ]

@@ -1,0 +1,250 @@
+"""Answers: the files that raters send back, and what they have answered about which arms.
+
+The files come from strangers. A file that cannot be used costs no other file: it is left out, with a reason.
+"""
+
+import glob
+import os
+import unicodedata
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cadam3d.core.errors import UserError
+from cadam3d.io.jsonl import is_number, is_whole, parse_json
+from cadam3d.io.reading import read_bytes
+from cadam3d.io.run_folder import expanded, shown
+from cadam3d.study.key import KIND as KEY_KIND
+from cadam3d.study.key import Key
+from cadam3d.study.questions import QUESTION_NAMES
+
+KIND = "study answers"
+RESULTS_KIND = "study results"
+VERSION = 1
+LARGEST_FILE = 1 << 22  # bytes; an answer has about a hundred
+LONGEST_NAME = 60  # characters, as on the page
+LONGEST_ID = 64  # characters
+MOST_FILES = 10_000
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One decision of one rater between two arms, about one question."""
+
+    rater: str
+    prompt: str
+    question: str  # one of QUESTION_NAMES
+    chosen: str  # the arm that won
+    other: str  # the arm that lost; never the same as chosen
+
+
+@dataclass(frozen=True)
+class Rater:
+    """All that one rater has answered.
+
+    If an arm has several runs of one prompt, there are several answers to each question about that prompt. A
+    rater who stopped early has fewer answers and fewer catches than the others.
+    """
+
+    name: str  # unique in a study
+    answers: tuple[Answer, ...]  # without those of catch trials
+    catches: tuple[bool, ...]  # for each answered question of a catch trial, whether the answer was right
+
+
+@dataclass(frozen=True)
+class Choice:
+    """An answer in a file: the clip that was chosen."""
+
+    trial: int
+    question: str
+    chosen: int
+
+
+@dataclass(frozen=True)
+class AnswerFile:
+    """The choices that a rater has saved."""
+
+    path: Path
+    study: str
+    rater: str
+    session: str  # drawn by the page when the rater began
+    saves: int  # how often the rater had saved in this session, this time included
+    choices: tuple[Choice, ...]
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A file that is not used, and why."""
+
+    path: Path
+    reason: str
+
+
+@dataclass(frozen=True)
+class Collected:
+    """The raters of a study, and the files that are left out."""
+
+    raters: list[Rater]
+    left_out: list[LeftOut]
+
+
+def find_files(patterns: Sequence[str]) -> list[Path]:
+    """Return the files that ``answers=`` names, each once, in order.
+
+    An item is a file, a folder (for all ``.json`` files in it) or a pattern such as ``answers/*.json``.
+    Raises ``UserError`` if an item names no file.
+    """
+    found: dict[Path, None] = {}
+    for pattern in patterns:
+        place = expanded(pattern)
+        if place.is_dir():
+            paths = sorted(place.glob("*.json"))
+        elif os.path.lexists(place):
+            paths = [place]
+        else:
+            paths = sorted(map(Path, glob.glob(str(place))))  # noqa: PTH207  (Path.glob refuses absolute patterns)
+        if not paths:
+            reason = "has no .json file" if place.is_dir() else "there is no such file"
+            raise UserError(
+                f"answers: expected files that raters have saved, got {pattern!r} ({reason}). "
+                "Try: cadam3d study --help"
+            )
+        found |= dict.fromkeys(paths)
+    if len(found) > MOST_FILES:
+        raise UserError(
+            f"answers: expected at most {MOST_FILES} files, got {len(found)}. Try: cadam3d study --help"
+        )
+    return list(found)
+
+
+def read_files(paths: Sequence[Path]) -> tuple[list[AnswerFile], list[LeftOut]]:
+    """Return the content of the files with answers, and the files that cannot be used.
+
+    The key and the results of a study may be in the same folder. They are skipped without a word.
+    """
+    files: list[AnswerFile] = []
+    left: list[LeftOut] = []
+    for path in paths:
+        try:
+            value = parse_json(read_bytes(path, largest=LARGEST_FILE))
+            if isinstance(value, dict) and value.get("kind") in (KEY_KIND, RESULTS_KIND):
+                continue
+            files.append(_file(path, value))
+        except UserError as error:
+            # Its beginning is the path, and its end is a hint to use another file.
+            reason = str(error).removeprefix(f"{path}: ").partition(". Try: ")[0]
+            left.append(LeftOut(path, reason))
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
+            reason = " ".join(str(error).split())[:100]
+            left.append(LeftOut(path, f"it is not a whole file of answers ({reason})"))
+    return files, left
+
+
+def collect(files: Sequence[AnswerFile], key: Key) -> Collected:
+    """Return the raters of the study of ``key`` with their answers about arms.
+
+    - A file of another study is left out, and so is a file with answers that do not fit the study.
+    - A rater may save several times. The last file of a session counts.
+    - Two sessions under one name may be of two people, so all their files are left out. Upper and lower case
+      are the same name.
+    - A rater may have answered only some of the questions. These answers count.
+    """
+    raters: list[Rater] = []
+    left: list[LeftOut] = []
+    of_name: dict[str, list[AnswerFile]] = defaultdict(list)
+    for file in files:
+        problem = _problem(file, key)
+        if problem:
+            left.append(LeftOut(file.path, problem))
+        else:
+            of_name[file.rater.casefold()].append(file)
+    for same in of_name.values():
+        if len({file.session for file in same}) > 1:
+            names = [str(shown(file.path)) for file in same]
+            for file in same:
+                others = ", ".join(name for name in names if name != str(shown(file.path)))
+                left.append(
+                    LeftOut(
+                        file.path, f"another person or session has the same name {file.rater!r}: {others}"
+                    )
+                )
+            continue
+        last = max(same, key=lambda file: (file.saves, len(file.choices)))
+        for file in same:
+            if file is not last:
+                newer = shown(last.path)
+                left.append(LeftOut(file.path, f"the same rater has saved again later: {newer}"))
+        raters.append(_rater(last, key))
+    return Collected(sorted(raters, key=lambda rater: rater.name.casefold()), left)
+
+
+def _file(path: Path, value: Any) -> AnswerFile:
+    """Return the answers in plain JSON. Raises ``ValueError`` and the like for any other value."""
+    if not isinstance(value, dict) or value.get("kind") != KIND:
+        raise ValueError(f"it has no kind {KIND!r}")
+    if value["version"] != VERSION:
+        raise ValueError(f"version {value['version']!r}; this program reads version {VERSION}")
+    answers = value["answers"]
+    if not isinstance(answers, list):
+        raise ValueError("answers: expected a list")
+    if not is_whole(value["saves"]):
+        raise ValueError("saves: expected a whole number")
+    choices = tuple(map(_choice, answers))
+    if len({(choice.trial, choice.question) for choice in choices}) < len(choices):
+        raise ValueError("a question is answered twice")
+    study, session = (_short(value, name, LONGEST_ID) for name in ("study", "session"))
+    rater = " ".join(_short(value, "rater", LONGEST_NAME).split())
+    return AnswerFile(path, study, rater, session, value["saves"], choices)
+
+
+def _choice(value: Any) -> Choice:
+    if not isinstance(value, dict) or value["question"] not in QUESTION_NAMES:
+        raise ValueError("an answer has no known question")
+    if not is_whole(value["trial"]) or not is_whole(value["chosen"]):
+        raise ValueError("an answer has no trial or no choice")
+    if not is_number(value.get("seconds", 0)):
+        raise ValueError("seconds: expected a number")
+    return Choice(value["trial"], value["question"], value["chosen"])
+
+
+def _short(value: dict[str, Any], name: str, longest: int) -> str:
+    text = value[name]
+    is_text = isinstance(text, str) and 0 < len(text.strip()) <= longest
+    # Names are printed into terminals and tables.
+    if not is_text or any(unicodedata.category(each) in ("Cc", "Cf", "Zl", "Zp") for each in text):
+        raise ValueError(f"{name}: expected a text of 1 to {longest} printable characters")
+    return text
+
+
+def _problem(file: AnswerFile, key: Key) -> str:
+    """Return why the answers in a file are not about the study of ``key``; "" if they are."""
+    if file.study != key.study:
+        return f"it is of another study ({file.study!r})"
+    if not file.choices:
+        return "it has no answers"
+    for choice in file.choices:
+        if choice.trial >= len(key.trials) or choice.chosen not in key.trials[choice.trial].clips:
+            return "an answer does not fit the study"
+    return ""
+
+
+def _rater(file: AnswerFile, key: Key) -> Rater:
+    return Rater(file.rater, tuple(_answers(file, key)), tuple(_catches(file, key)))
+
+
+def _answers(file: AnswerFile, key: Key) -> Iterator[Answer]:
+    for choice in file.choices:
+        trial = key.trials[choice.trial]
+        if trial.right is None:
+            [other] = set(trial.clips) - {choice.chosen}
+            chosen, lost = key.clips[choice.chosen], key.clips[other]
+            yield Answer(file.rater, trial.prompt, choice.question, chosen, lost)
+
+
+def _catches(file: AnswerFile, key: Key) -> Iterator[bool]:
+    for choice in file.choices:
+        right = key.trials[choice.trial].right
+        if right is not None:
+            yield choice.chosen == right

@@ -1,0 +1,259 @@
+"""Intervals and tests for answers that share raters and prompts, and the Bradley-Terry model.
+
+The answers of one rater resemble each other, and so do the answers about one prompt. A formula for
+independent answers would give intervals that are far too narrow. All intervals here have one form: an
+estimate in log-odds, plus and minus a quantile of Student's t times a standard error that clusters the
+answers by rater and by prompt. ``docs/study_statistics.md`` has the measured coverage.
+"""
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse.csgraph import connected_components
+from scipy.special import bdtr, expit, log_expit, logit, stdtrit
+
+CONFIDENCE = 0.95
+MOST_STEPS = 200  # of Newton's method, which usually converges in fewer than ten
+TOLERANCE = 1e-10  # of the gradient of the log-likelihood, per answer
+
+
+@dataclass(frozen=True)
+class Interval:
+    """The ends of a 95 % confidence interval."""
+
+    low: float
+    high: float
+
+    def excludes(self, value: float) -> bool:
+        """Return whether ``value`` is outside."""
+        return not self.low <= value <= self.high
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """The rater and the prompt of each of n answers, as positions counted from 0."""
+
+    raters: Int[np.ndarray, "n"]
+    prompts: Int[np.ndarray, "n"]
+
+    @classmethod
+    def of(cls, raters: Sequence[Hashable], prompts: Sequence[Hashable]) -> "Clusters":
+        """Return the clusters of answers from the names of their raters and prompts."""
+        return cls(_positions(raters), _positions(prompts))
+
+    @cached_property
+    def cells(self) -> Int[np.ndarray, "n"]:
+        """Return the position of the pair of rater and prompt to which each answer belongs."""
+        return np.unique(self.raters * (self.prompts.max() + 1) + self.prompts, return_inverse=True)[1]
+
+    def sizes(self) -> Int[np.ndarray, "3 n"]:
+        """Return for each answer how many answers share its rater, its prompt and its cell."""
+        return np.stack([np.bincount(each)[each] for each in (self.raters, self.prompts, self.cells)])
+
+
+def _positions(names: Sequence[Hashable]) -> Int[np.ndarray, "n"]:
+    """Return the position of each name among the different names."""
+    found = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    return np.array([found[name] for name in names], dtype=np.int64)
+
+
+def margin(influences: Float[np.ndarray, "n"], clusters: Clusters) -> float:
+    """Return half the width of the 95 % interval of an estimate; infinity if there is only one cell.
+
+    ``influences`` says by how much each answer moves the estimate; they sum to 0. The variance has three
+    parts: what single answers contribute, and what raters, and what prompts, contribute beyond that. It is
+    the two-way clustered variance of Cameron, Gelbach and Miller (2011), ``V_rater + V_prompt - V_answer``,
+    except that no part is negative. The degrees of freedom of t are those of Welch and Satterthwaite, but at
+    least the smaller number of clusters minus 1. With a single rater the interval is about prompts alone, and
+    with a single prompt about raters alone.
+    """
+    cells = int(clusters.cells.max()) + 1
+    if cells == 1:
+        return np.inf
+    # An arm with several seeds has several answers in a cell, which may resemble each other as well.
+    answer = max(_variance(influences, np.arange(len(influences))), _variance(influences, clusters.cells))
+    ways = [groups for groups in (clusters.raters, clusters.prompts) if groups.max() > 0]
+    parts = [(_variance(influences, groups), int(groups.max())) for groups in ways]
+    beyond = [(variance, freedom) for variance, freedom in parts if variance > answer]
+    variance = answer + sum(each - answer for each, _ in beyond)
+    freedom: float = cells - 1
+    if beyond:
+        satterthwaite = variance**2 / sum(each**2 / own for each, own in beyond)
+        freedom = max(satterthwaite, min(own for _, own in parts))
+    return float(stdtrit(freedom, (1 + CONFIDENCE) / 2) * np.sqrt(variance))
+
+
+def _variance(influences: Float[np.ndarray, "n"], groups: Int[np.ndarray, "n"]) -> float:
+    """Return the variance of an estimate if only the groups of answers are independent of each other."""
+    sums = np.bincount(groups, weights=influences)
+    return float((sums**2).sum() * len(sums) / (len(sums) - 1))
+
+
+def rate_interval(chosen: Bool[np.ndarray, "n"], clusters: Clusters) -> Interval:
+    """Return the interval of the rate at which an arm is chosen, in [0, 1]; n is at least 1.
+
+    If all answers agree, one end is that rate itself, and :func:`_unanimous` gives the other one. Answers in
+    a single cell say nothing about others, and give the interval from 0 to 1.
+    """
+    if clusters.cells.max() == 0:
+        return Interval(0.0, 1.0)
+    share = float(chosen.mean())
+    if share == 1:
+        return Interval(_unanimous(clusters), 1.0)
+    if share == 0:
+        return Interval(0.0, 1 - _unanimous(clusters))
+    half = margin((chosen - share) / (len(chosen) * share * (1 - share)), clusters)
+    center = float(logit(share))
+    return Interval(float(expit(center - half)), float(expit(center + half)))
+
+
+def _unanimous(clusters: Clusters) -> float:
+    """Return the lower end of the interval of a rate if all answers choose the arm.
+
+    Such answers do not show how much raters and prompts differ. The result is the larger of two bounds that
+    are both cautious: the exact bound of a study with one answer for each rater or for each prompt, of which
+    there are fewer, and the bound of this study with one answer turned round.
+    """
+    units = min(int(groups.max()) + 1 for groups in (clusters.raters, clusters.prompts) if groups.max() > 0)
+    exact = ((1 - CONFIDENCE) / 2) ** (1 / units)
+    # Answers that share rater, prompt and cell with equally many others are interchangeable. One of each kind
+    # is turned round, and the lowest bound counts.
+    _, kinds = np.unique(clusters.sizes(), axis=1, return_index=True)
+    positions = np.arange(len(clusters.cells))
+    turned = min(rate_interval(positions != i, clusters).low for i in kinds)
+    return max(exact, turned)
+
+
+@dataclass(frozen=True)
+class SignTest:
+    """An exact sign test over raters or over prompts."""
+
+    wins: int  # units in which the first arm was chosen more often
+    losses: int
+    ties: int  # units with equally many answers for both, which the test leaves out
+    p_value: float  # two-sided; 1 if all units are ties
+
+
+def sign_test(chosen: Bool[np.ndarray, "n"], units: Int[np.ndarray, "n"]) -> SignTest:
+    """Return the sign test of "neither arm has more majorities", in which each unit has one vote."""
+    margins = np.bincount(units, weights=np.where(chosen, 1, -1))
+    wins, losses = int((margins > 0).sum()), int((margins < 0).sum())
+    p_value = min(1.0, 2 * float(bdtr(min(wins, losses), wins + losses, 1 / 2)))
+    return SignTest(wins, losses, len(margins) - wins - losses, p_value)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return p-values that are corrected for their number, by Holm's method (1979)."""
+    corrected = [0.0] * len(p_values)
+    highest = 0.0
+    for rank, i in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
+        highest = max(highest, min(1.0, p_values[i] * (len(p_values) - rank)))
+        corrected[i] = highest
+    return corrected
+
+
+def agreement(chosen: Bool[np.ndarray, "n"], clusters: Clusters) -> float | None:
+    """Return Krippendorff's alpha of the raters: 1 if they agree about every prompt, about 0 if by chance.
+
+    It is for nominal data with missing answers. It is ``None`` if no two raters have answered about the same
+    prompt, if a rater has answered about a prompt more than once, or if all answers are the same.
+    """
+    if clusters.cells.max() + 1 < len(chosen):
+        return None
+    total = np.bincount(clusters.prompts)
+    for_first = np.bincount(clusters.prompts, weights=chosen)
+    pairable = total > 1
+    total, for_first = total[pairable], for_first[pairable]
+    answers, first = total.sum(), for_first.sum()
+    if first in (0, answers):
+        return None
+    observed = (for_first * (total - for_first) / (total - 1)).sum() / answers
+    expected = first * (answers - first) / (answers * (answers - 1))
+    return float(1 - observed / expected)
+
+
+def fit_strengths(wins: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k"]:
+    """Return the strengths of k arms in the model of Bradley and Terry (1952), by maximum likelihood.
+
+    ``wins[i, j]`` is how often arm i was chosen over arm j. The strengths are in log-odds and have the mean
+    0: arm i is chosen over arm j with probability ``expit(s[i] - s[j])``. They exist only if
+    :func:`unranked` finds nothing.
+    """
+    assert not unranked(wins)
+    strengths = np.zeros(len(wins))
+    for _ in range(MOST_STEPS):
+        gradient = _gradient(wins, strengths)
+        if np.abs(gradient).max() <= TOLERANCE * wins.sum():
+            break
+        step = np.linalg.pinv(_information(wins, strengths)) @ gradient
+        # The likelihood is concave, so a short enough step always improves it.
+        while _likelihood(wins, strengths + step) < _likelihood(wins, strengths) - 1e-12 * wins.sum():
+            step /= 2
+        strengths = strengths + step
+    return strengths - strengths.mean()
+
+
+def _difference(strengths: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k k"]:
+    return strengths[:, None] - strengths[None, :]
+
+
+def _likelihood(wins: Float[np.ndarray, "k k"], strengths: Float[np.ndarray, "k"]) -> float:
+    return float((wins * log_expit(_difference(strengths))).sum())
+
+
+def _gradient(wins: Float[np.ndarray, "k k"], strengths: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
+    return (wins - (wins + wins.T) * expit(_difference(strengths))).sum(1)
+
+
+def _information(
+    wins: Float[np.ndarray, "k k"], strengths: Float[np.ndarray, "k"]
+) -> Float[np.ndarray, "k k"]:
+    """Return the negative Hessian of the log-likelihood, whose null space is a shift of all strengths."""
+    chance = expit(_difference(strengths))
+    weights = (wins + wins.T) * chance * (1 - chance)
+    return np.diag(weights.sum(1)) - weights
+
+
+def strength_margins(
+    chosen: Int[np.ndarray, "n"],
+    other: Int[np.ndarray, "n"],
+    clusters: Clusters,
+    strengths: Float[np.ndarray, "k"],
+) -> Float[np.ndarray, "k"]:
+    """Return half the width of the 95 % interval of each strength, measured from the mean of all arms.
+
+    ``chosen`` and ``other`` are the positions of the arms that won and lost each answer. For two arms, the
+    interval of the difference of their strengths is that of :func:`rate_interval`, in log-odds.
+    """
+    inverse = np.linalg.pinv(_information(count_wins(chosen, other, len(strengths)), strengths))
+    surprise = expit(strengths[other] - strengths[chosen])
+    return np.array([margin(surprise * (row[chosen] - row[other]), clusters) for row in inverse])
+
+
+def count_wins(
+    chosen: Int[np.ndarray, "n"], other: Int[np.ndarray, "n"], arms: int
+) -> Float[np.ndarray, "k k"]:
+    """Return how often each of ``arms`` arms (row) was chosen over each other one (column)."""
+    return np.bincount(chosen * arms + other, minlength=arms * arms).reshape(arms, arms).astype(float)
+
+
+def unranked(wins: Float[np.ndarray, "k k"]) -> tuple[list[int], bool] | None:
+    """Return arms whose strengths relative to the others are not finite; ``None`` if there are none.
+
+    The second value says whether these arms won all their comparisons with the others; if it is false, they
+    were never compared with the others. Finite strengths exist exactly if the arms can not be divided into
+    two groups of which one never wins against the other (Ford, 1957).
+    """
+    links = wins > 0
+    for connection in ("weak", "strong"):
+        count, groups = connected_components(links, directed=True, connection=connection)
+        if count == 1:
+            continue
+        for group in range(count):
+            inside = groups == group
+            if not links[np.ix_(~inside, inside)].any():
+                return np.flatnonzero(inside).tolist(), connection == "strong"
+    return None

@@ -1,0 +1,83 @@
+"""Page: one HTML file that shows a study to raters, without a library and without a request to the network.
+
+The page contains descriptions, clips and questions. It contains no names of arms or files and no numbers of
+Gaussians, and a clip has a number that was drawn. What the clips show is in the key of the study only.
+"""
+
+import base64
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from cadam3d.study.plan import Trial
+from cadam3d.study.questions import QUESTIONS
+
+SOURCES = Path(__file__).parent
+ID_LENGTH = 16  # characters
+SECONDS_PER_ANSWER = 5  # for the estimate on the first screen
+
+
+def study_id(trials: Sequence[Trial], clips: Sequence[Sequence[bytes]]) -> str:
+    """Return the name of a study, which depends on everything that its raters see."""
+    digest = hashlib.sha256(_trials_json(trials).encode())
+    for clip in clips:
+        digest.update(str(len(clip)).encode())
+        for frame in clip:
+            digest.update(hashlib.sha256(frame).digest())
+    return digest.hexdigest()[:ID_LENGTH]
+
+
+def study_page(
+    study: str, trials: Sequence[Trial], clips: Sequence[Sequence[bytes]], *, seconds: float, consent: str
+) -> str:
+    """Return the whole page: ``trials`` about ``clips``, each of which is a list of WebP pictures.
+
+    ``seconds`` is the time of one turn. ``consent`` is text that is shown before the start; an empty line
+    begins a paragraph. A policy in the page forbids every request and every other script.
+    """
+    environment = Environment(
+        loader=FileSystemLoader(SOURCES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    code, look = _source("page.js"), _source("page.css")
+    data = {
+        "study": study,
+        "seconds": seconds,
+        "questions": [{"name": question.name, "text": question.text} for question in QUESTIONS],
+        "trials": json.loads(_trials_json(trials)),
+    }
+    return environment.get_template("page.html.jinja").render(
+        style=look,
+        style_hash=_hash(look),
+        script=code,
+        script_hash=_hash(code),
+        # Inside a script, a browser reads everything up to the next "</script" as it is.
+        data=json.dumps(data, ensure_ascii=False).replace("<", "\\u003c"),
+        clips=["\n".join(base64.b64encode(frame).decode() for frame in clip) for clip in clips],
+        consent=[text.strip() for text in consent.split("\n\n") if text.strip()],
+        pairs=len(trials),
+        questions=len(QUESTIONS),
+        minutes=max(1, math.ceil(len(trials) * len(QUESTIONS) * SECONDS_PER_ANSWER / 60)),
+    )
+
+
+def _trials_json(trials: Sequence[Trial]) -> str:
+    """Return what a page knows of its trials. Whether one is a catch trial is not part of it."""
+    return json.dumps([{"prompt": trial.prompt, "clips": trial.clips} for trial in trials])
+
+
+@cache
+def _source(name: str) -> str:
+    return (SOURCES / name).read_text(encoding="utf-8")
+
+
+def _hash(text: str) -> str:
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

@@ -1,0 +1,225 @@
+"""Files of answers: what counts, and what happens to damaged, repeated, foreign and incomplete ones."""
+
+import json
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from cadam3d.core.errors import UserError
+from cadam3d.study.answers import LARGEST_FILE, collect, find_files, read_files
+from cadam3d.study.key import Key, read_key, write_key
+from cadam3d.study.plan import Trial, make_plan
+from cadam3d.study.questions import QUESTION_NAMES
+from cadam3d.study.runs import Pair, Run
+
+STUDY = "0123456789abcdef"
+# Clips 0 and 2 are of heron, 1 and 3 of stork, and 4 is a ruined one. Trial 1 is a catch trial.
+KEY = Key(
+    study=STUDY,
+    arms=("heron", "stork"),
+    clips=("heron", "stork", "heron", "stork", "heron"),
+    trials=(Trial("a cube", (0, 1)), Trial("a cube", (4, 1), right=1), Trial("a cone", (3, 2))),
+)
+
+
+def written(chosen: dict[int, int], questions=QUESTION_NAMES, **changes) -> dict:
+    """Return a file of answers in which every question about a trial has the same clip as its answer."""
+    answers = [
+        {
+            "trial": trial,
+            "shown": list(KEY.trials[trial].clips),
+            "question": name,
+            "chosen": clip,
+            "seconds": 2.5,
+        }
+        for trial, clip in chosen.items()
+        for name in questions
+    ]
+    whole = {"kind": "study answers", "version": 1, "study": STUDY, "rater": "7", "session": "a1", "saves": 1}
+    return {**whole, "answers": answers, **changes}
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Return a function that writes files, each given as JSON or as bytes, and collects their answers."""
+
+    def collected(**files):
+        for name, content in files.items():
+            data = content if isinstance(content, bytes) else json.dumps(content).encode()
+            (tmp_path / f"{name}.json").write_bytes(data)
+        found, left = read_files(find_files([str(tmp_path)]))
+        result = collect(found, KEY)
+        reasons = {each.path.stem: each.reason for each in [*left, *result.left_out]}
+        return {rater.name: rater for rater in result.raters}, reasons
+
+    return collected
+
+
+def test_answers_name_arms_instead_of_clips(read):
+    raters, left = read(one=written({0: 1, 2: 2}, questions=("overall",)))
+    assert not left
+    assert [(each.prompt, each.question, each.chosen, each.other) for each in raters["7"].answers] == [
+        ("a cube", "overall", "stork", "heron"),
+        ("a cone", "overall", "heron", "stork"),
+    ]
+    assert {each.rater for each in raters["7"].answers} == {"7"}
+
+
+def test_every_question_of_a_catch_trial_is_a_catch_and_no_answer(read):
+    content = written({0: 1, 1: 1})
+    content["answers"][-1]["chosen"] = 4
+    raters, _ = read(one=content)
+    assert raters["7"].catches == (True, True, True, True, False)
+    assert len(raters["7"].answers) == len(QUESTION_NAMES)
+
+
+def test_an_incomplete_file_counts_with_the_answers_it_has(read):
+    raters, left = read(one=written({2: 3}, questions=("overall", "cleanliness")))
+    assert not left
+    assert (len(raters["7"].answers), raters["7"].catches) == (2, ())
+
+
+def test_the_last_file_of_a_session_counts(read):
+    raters, left = read(
+        early=written({0: 0}, saves=1), late=written({0: 1, 2: 2}, saves=2), copy=written({0: 0}, saves=1)
+    )
+    assert len(raters["7"].answers) == 2 * len(QUESTION_NAMES)
+    assert raters["7"].answers[0].chosen == "stork"
+    assert set(left) == {"early", "copy"}
+    assert all("saved again later" in reason for reason in left.values())
+
+
+def test_two_sessions_under_one_name_are_both_left_out_and_name_each_other(read):
+    raters, left = read(
+        one=written({0: 0}, rater="Ann"),
+        two=written({0: 1}, rater="ann ", session="b2"),
+        three=written({0: 1}, rater="Bob", session="c3"),
+    )
+    assert set(raters) == {"Bob"}
+    assert set(left) == {"one", "two"}
+    assert "two.json" in left["one"]
+    assert "one.json" in left["two"]
+
+
+def test_a_file_of_another_study_is_left_out(read):
+    raters, left = read(one=written({0: 0}), two=written({0: 0}, study="f" * 16, rater="8"))
+    assert set(raters) == {"7"}
+    assert left == {"two": f"it is of another study ({'f' * 16!r})"}
+
+
+def test_the_key_and_the_results_beside_the_answers_are_skipped_without_a_word(read):
+    raters, left = read(one=written({0: 0}), key={"kind": "study key"}, study={"kind": "study results"})
+    assert set(raters) == {"7"}
+    assert not left
+
+
+def broken(**changes) -> dict:
+    content = written({0: 0})
+    content["answers"][0] |= changes
+    return content
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{",
+        b"\xff\xfe",
+        b"[" * 100_000,
+        b'{"kind": "study answers", "kind": "study answers"}',
+        b" " * (LARGEST_FILE + 1),
+        [],
+        {},
+        written({0: 0}, kind="study"),
+        written({0: 0}, version=2),
+        written({0: 0}, answers={}),
+        written({0: 0}, answers=[1]),
+        written({0: 0}, saves="1"),
+        written({0: 0}, saves=True),
+        written({0: 0}, rater=""),
+        written({0: 0}, rater="x" * 61),
+        written({0: 0}, rater="evil\x1b[2J"),
+        written({0: 0}, rater=None),
+        written({0: 0}, session=5),
+        written({0: 0}, study=["0"]),
+        {key: value for key, value in written({0: 0}).items() if key != "saves"},
+        written({}),
+        broken(trial=-1),
+        broken(trial=3),
+        broken(trial=0.0),
+        broken(chosen=2),
+        broken(chosen=True),
+        broken(question="beauty"),
+        broken(question=["overall"]),
+        broken(question="overall"),
+        broken(seconds="2"),
+    ],
+    ids=lambda content: str(content)[:30],
+)
+def test_a_damaged_file_is_left_out_with_a_reason_and_costs_no_other(read, content):
+    raters, left = read(bad=content, good=written({0: 0}, rater="8", session="b2"))
+    assert set(raters) == {"8"}
+    assert set(left) == {"bad"}
+    assert left["bad"].isprintable()
+    assert len(left["bad"]) < 200
+
+
+def test_a_pipe_is_left_out_and_not_waited_for(tmp_path, read):
+    import os
+
+    os.mkfifo(tmp_path / "pipe.json")
+    raters, left = read(good=written({0: 0}))
+    assert set(raters) == {"7"}
+    assert "named pipe" in left["pipe"]
+
+
+def test_files_are_found_by_name_folder_and_pattern_each_once(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.json", "b.json", "c.txt", "x[1].json"):
+        Path(name).touch()
+    assert [path.name for path in find_files(["b.json", "*.json", "."])] == ["b.json", "a.json", "x[1].json"]
+    assert [path.name for path in find_files(["x[1].json"])] == ["x[1].json"]
+    assert [path.name for path in find_files([str(tmp_path / "?.json")])] == ["a.json", "b.json"]
+
+
+@pytest.mark.parametrize("pattern", ["nowhere/*.json", "nowhere.json", "empty"])
+def test_a_pattern_without_a_file_is_one_message(tmp_path, monkeypatch, pattern):
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="answers: expected files that raters have saved"):
+        find_files([pattern])
+
+
+def test_a_key_is_read_as_it_was_written(tmp_path):
+    runs = [Run(Path(arm), arm, "a cube", 0) for arm in ("heron", "stork")]
+    plan = make_plan([Pair((runs[0], runs[1]))], runs, 1, Random(0))
+    write_key(tmp_path / "key.json", STUDY, plan, seed=0)
+    key = read_key(tmp_path / "key.json")
+    assert key.trials == plan.trials
+    assert key.clips == tuple(source.run.arm for source in plan.sources)
+    assert (key.study, key.arms, key.catch_trials) == (STUDY, ("heron", "stork"), 1)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"kind": "study answers"},
+        {"version": 0},
+        {"arms": ["heron"]},
+        {"clips": "heron"},
+        {"trials": [{"prompt": "a cube", "clips": [0], "right": None}]},
+        {"trials": [{"prompt": "a cube", "clips": [0, 0], "right": None}]},
+        {"trials": [{"prompt": "a cube", "clips": [0, 9], "right": None}]},
+        {"trials": [{"prompt": "a cube", "clips": [0, 1], "right": 2}]},
+        {"trials": [{"clips": [0, 1], "right": None}]},
+    ],
+    ids=str,
+)
+def test_a_damaged_key_is_one_message(tmp_path, changes):
+    runs = [Run(Path(arm), arm, "a cube", 0) for arm in ("heron", "stork")]
+    path = tmp_path / "key.json"
+    write_key(path, STUDY, make_plan([Pair((runs[0], runs[1]))], runs, 1, Random(0)), seed=0)
+    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | changes), encoding="utf-8")
+    with pytest.raises(UserError, match="key: expected the key of a study"):
+        read_key(path)

@@ -1,0 +1,200 @@
+"""Intervals, tests and the Bradley-Terry model: laws, exact values, and choix as an oracle."""
+
+import choix
+import numpy as np
+import pytest
+from scipy.special import expit, logit
+from scipy.stats import binomtest, t
+
+from cadam3d.study.estimates import (
+    Clusters,
+    agreement,
+    count_wins,
+    fit_strengths,
+    holm,
+    margin,
+    rate_interval,
+    sign_test,
+    strength_margins,
+    unranked,
+)
+
+
+def crossed(raters: int, prompts: int) -> Clusters:
+    """Every rater answers once about every prompt."""
+    return Clusters(np.repeat(np.arange(raters), prompts), np.tile(np.arange(prompts), raters))
+
+
+def drawn(raters: int, prompts: int, seed: int = 0, rate: float = 0.6) -> tuple[np.ndarray, Clusters]:
+    generator = np.random.default_rng(seed)
+    return generator.random(raters * prompts) < rate, crossed(raters, prompts)
+
+
+def ends(interval) -> tuple[float, float]:
+    return interval.low, interval.high
+
+
+@pytest.mark.parametrize(("effect", "seed"), [(2, 0), (1, 7)])
+def test_the_interval_of_a_crossed_study_has_the_variances_of_raters_and_of_prompts(effect, seed):
+    """Computed from the means of rows and columns, as in a two-way analysis of variance."""
+    generator = np.random.default_rng(seed)
+    tastes = generator.normal(size=(10, 1)) + generator.normal(size=(1, 8))
+    table = (generator.random((10, 8)) < expit(effect * tastes)).astype(float)
+    share = table.mean()
+    of_raters = table.mean(1).var(ddof=1) / 10
+    of_prompts = table.mean(0).var(ddof=1) / 8
+    of_answers = table.var(ddof=1) / 80
+    assert min(of_raters, of_prompts) > of_answers, "both effects must show"
+    variance = of_raters + of_prompts - of_answers
+    freedom = variance**2 / (of_raters**2 / 9 + of_prompts**2 / 7)
+    assert (freedom < 7) == (seed == 7), "the second case needs the lower limit of the degrees of freedom"
+    half = t.ppf(0.975, max(freedom, 7)) * np.sqrt(variance) / (share * (1 - share))
+    expected = expit(logit(share) + np.array([-half, half]))
+    assert ends(rate_interval(table.reshape(-1) > 0, crossed(10, 8))) == pytest.approx(tuple(expected))
+
+
+def test_answers_of_copied_raters_add_no_certainty():
+    """Raters who always answer alike, but differ from prompt to prompt, say no more than one of them."""
+    of_prompt = np.array([True, True, True, False, True, False, True, True])
+    one = rate_interval(of_prompt, crossed(1, 8))
+    many = rate_interval(np.tile(of_prompt, 50), crossed(50, 8))
+    assert many.high - many.low == pytest.approx(one.high - one.low, rel=0.02)
+
+
+def test_the_interval_does_not_depend_on_which_factor_is_called_rater():
+    chosen, clusters = drawn(9, 5)
+    swapped = Clusters(clusters.prompts, clusters.raters)
+    assert ends(rate_interval(chosen, clusters)) == pytest.approx(ends(rate_interval(chosen, swapped)))
+
+
+def test_the_interval_of_the_other_arm_is_the_mirror_image():
+    for rate in (0.6, 1.0):
+        chosen, clusters = drawn(7, 6, rate=rate)
+        one, other = rate_interval(chosen, clusters), rate_interval(~chosen, clusters)
+        assert ends(other) == pytest.approx((1 - one.high, 1 - one.low))
+
+
+def test_the_order_of_answers_changes_nothing():
+    chosen, clusters = drawn(7, 6)
+    order = np.random.default_rng(1).permutation(len(chosen))
+    shuffled = Clusters.of(clusters.raters[order].tolist(), clusters.prompts[order].tolist())
+    expected = ends(rate_interval(chosen, clusters))
+    assert ends(rate_interval(chosen[order], shuffled)) == pytest.approx(expected)
+
+
+def test_answers_that_all_agree_leave_a_bound_that_falls_with_the_first_other_answer():
+    clusters = crossed(8, 6)
+    all_agree = rate_interval(np.ones(48, dtype=bool), clusters)
+    one_differs = rate_interval(np.arange(48) > 0, clusters)
+    assert all_agree.high == 1
+    assert 0.5 < one_differs.low <= all_agree.low < 1
+
+
+def test_a_few_prompts_that_all_agree_have_the_exact_bound_of_as_many_answers():
+    exact = binomtest(4, 4).proportion_ci(method="exact").low
+    assert rate_interval(np.ones(4, dtype=bool), crossed(1, 4)).low == pytest.approx(exact)
+
+
+def test_one_rater_and_one_prompt_say_nothing_about_others():
+    for count in (1, 3):
+        clusters = Clusters(np.zeros(count, dtype=int), np.zeros(count, dtype=int))
+        assert ends(rate_interval(np.arange(count) > 0, clusters)) == (0, 1)
+        assert margin(np.zeros(count), clusters) == np.inf
+
+
+def test_an_interval_is_never_empty_even_if_clusters_agree_by_chance():
+    chosen = np.array([True, False] * 4)
+    clusters = Clusters(np.repeat(np.arange(4), 2), np.tile([0, 1], 4))
+    for factor in (clusters, Clusters(clusters.raters, np.zeros(8, dtype=int))):
+        interval = rate_interval(chosen, factor)
+        assert interval.low < 0.3
+        assert interval.high > 0.7
+
+
+def test_several_seeds_of_an_arm_are_not_independent_answers():
+    """Ten answers of each rater about each prompt that always agree are worth one."""
+    chosen, clusters = drawn(6, 6)
+    copies = Clusters(np.repeat(clusters.raters, 10), np.repeat(clusters.prompts, 10))
+    one, ten = rate_interval(chosen, clusters), rate_interval(np.repeat(chosen, 10), copies)
+    assert ends(ten) == pytest.approx(ends(one), abs=0.005)
+
+
+def test_the_sign_test_counts_majorities_and_leaves_out_ties():
+    chosen = np.array([1, 1, 0, 0, 0, 1, 1, 0, 1]) > 0
+    test = sign_test(chosen, np.array([0, 0, 0, 1, 1, 1, 2, 2, 3]))
+    assert (test.wins, test.losses, test.ties) == (2, 1, 1)
+    assert sign_test(np.array([True, False]), np.array([0, 0])).p_value == 1
+
+
+@pytest.mark.parametrize(("wins", "losses"), [(0, 6), (9, 2), (5, 5), (5, 4), (40, 20)])
+def test_the_p_value_is_that_of_the_exact_binomial_test(wins, losses):
+    test = sign_test(np.arange(wins + losses) < wins, np.arange(wins + losses))
+    assert test.p_value == pytest.approx(binomtest(wins, wins + losses).pvalue)
+
+
+def test_the_correction_of_holm_has_the_values_of_its_definition():
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.9, 0.6]) == [1, 1]
+    assert holm([]) == []
+
+
+def test_agreement_is_krippendorffs_alpha():
+    """By hand: 4 pairable prompts with the answers 11, 00, 10 and 111; the answer about the last is alone."""
+    raters = [0, 1, 0, 1, 0, 1, 0, 1, 2, 0]
+    prompts = [0, 0, 1, 1, 2, 2, 3, 3, 3, 4]
+    chosen = np.array([1, 1, 0, 0, 1, 0, 1, 1, 1, 0]) > 0
+    # Coincidences: two of 9 values disagree; the values are 6 times 1 and 3 times 0.
+    expected = 1 - (2 / 9) / (2 * 6 * 3 / (9 * 8))
+    assert agreement(chosen, Clusters.of(raters, prompts)) == pytest.approx(expected)
+
+
+def test_agreement_is_1_for_raters_who_agree_and_undefined_without_a_shared_prompt():
+    clusters = crossed(4, 6)
+    assert agreement(clusters.prompts < 2, clusters) == 1
+    assert agreement(np.ones(24, dtype=bool), clusters) is None
+    assert agreement(np.array([True, False]), Clusters.of([0, 1], [0, 1])) is None
+    assert agreement(np.array([True, False]), Clusters.of([0, 0], [0, 0])) is None
+
+
+@pytest.mark.parametrize("arms", [2, 3, 6])
+def test_strengths_are_those_of_choix(arms):
+    generator = np.random.default_rng(arms)
+    true = generator.normal(size=arms)
+    pairs = []
+    while unranked(count_wins(*(np.array(pairs, dtype=int).reshape(-1, 2).T), arms)) is not None:
+        i, j = generator.choice(arms, 2, replace=False)
+        pairs.append((i, j) if generator.random() < expit(true[i] - true[j]) else (j, i))
+    expected = choix.ilsr_pairwise(arms, [(int(i), int(j)) for i, j in pairs], alpha=0)
+    found = fit_strengths(count_wins(*np.array(pairs).T, arms))
+    assert found == pytest.approx(expected - expected.mean(), abs=1e-6)
+    assert found.mean() == pytest.approx(0, abs=1e-12)
+
+
+def test_strengths_exist_for_very_uneven_wins():
+    wins = np.array([[0, 10_000, 3], [1, 0, 10_000], [0, 1, 0]], dtype=float)
+    strengths = fit_strengths(wins)
+    expected = (wins + wins.T) * expit(strengths[:, None] - strengths[None, :])
+    assert expected.sum(1) == pytest.approx(wins.sum(1), rel=1e-6)
+
+
+def test_of_two_arms_the_interval_of_the_strength_is_that_of_the_rate():
+    chosen, clusters = drawn(9, 7)
+    winner, loser = np.where(chosen, 0, 1), np.where(chosen, 1, 0)
+    strengths = fit_strengths(count_wins(winner, loser, 2))
+    half = strength_margins(winner, loser, clusters, strengths)
+    # A strength is half of the difference.
+    assert expit(2 * (strengths - half)[0]) == pytest.approx(rate_interval(chosen, clusters).low)
+    assert expit(2 * (strengths + half)[0]) == pytest.approx(rate_interval(chosen, clusters).high)
+
+
+@pytest.mark.parametrize(
+    ("wins", "found"),
+    [
+        ([[0, 1, 0], [0, 0, 1], [1, 0, 0]], None),
+        ([[0, 1, 1], [1, 0, 1], [0, 0, 0]], ([0, 1], True)),
+        ([[0, 0, 0], [1, 0, 1], [1, 1, 0]], ([1, 2], True)),
+        ([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]], ([0, 1], False)),
+    ],
+)
+def test_arms_without_finite_strengths_are_found(wins, found):
+    assert unranked(np.array(wins, dtype=float)) == found
