@@ -114,6 +114,8 @@ def read(content: bytes, where: str, key: str) -> Pristine:
     # A damaged file makes its reader raise almost anything.
     except Exception as error:
         reason = " ".join(str(error).split())[:120]
+        if "pickle" in reason:  # NumPy advises to run what is in it
+            reason = "it contains something other than numbers"
         raise _unlike(key, where, reason) from error
     shapes = (mean.size, covariance.shape, window.ndim)
     if shapes != (NUM_FEATURES, (NUM_FEATURES, NUM_FEATURES), 2):
