@@ -39,8 +39,8 @@ DOWNLOAD = (
 class ImageReward(ScoreMetric):
     """The reward of Xu et al. (2023), about -2 to 2, which their package ``image-reward`` computes.
 
-    The package does not work beside current versions of transformers, so it belongs into an environment for
-    this metric alone (``INSTALL``).
+    The package does not work beside current versions of transformers, so it needs an environment for this
+    metric alone (``INSTALL``).
     """
 
     number: ClassVar[str] = "image_reward"

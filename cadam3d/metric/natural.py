@@ -1,7 +1,7 @@
 """Statistics of natural images for NIQE (Mittal et al. 2013): features, their model, and the distance to it.
 
-Where the paper leaves something open, this follows basicsr 1.4, whose numbers most papers publish. Three of
-its conventions change the result and are therefore part of the definition:
+Where the paper leaves something open, this follows basicsr 1.4, with which most papers measure. Three of its
+conventions change the result and are therefore part of the definition:
 
 * The image is the luma of ITU-R BT.601 in [16, 235], rounded to whole numbers.
 * The second scale is half the size, by a bicubic kernel that is stretched to twice its width.
@@ -39,7 +39,7 @@ HALVING = np.array([-3, -9, 29, 111, 111, 29, -9, -3]) / 256
 # The shapes that a fit may have, and for each the ratio of moments by which it is recognised.
 SHAPES = np.arange(0.2, 10.001, 0.001)
 RATIOS = gamma(2 / SHAPES) ** 2 / (gamma(1 / SHAPES) * gamma(3 / SHAPES))
-# Neighbours whose products are fitted: to the right, below, and on both diagonals. (rows, columns)
+# The neighbours with which products are fitted: to the right, below, and on both diagonals. (rows, columns)
 NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
 # The entries of a file of parameters, which are those of basicsr.
 KEYS = ("mu_pris_param", "cov_pris_param", "gaussian_window")
@@ -114,6 +114,8 @@ def read(content: bytes, where: str, key: str) -> Pristine:
     # A damaged file makes its reader raise almost anything.
     except Exception as error:
         reason = " ".join(str(error).split())[:120]
+        if "pickle" in reason:  # NumPy advises to run what is in it
+            reason = "it contains something other than numbers"
         raise _unlike(key, where, reason) from error
     shapes = (mean.size, covariance.shape, window.ndim)
     if shapes != (NUM_FEATURES, (NUM_FEATURES, NUM_FEATURES), 2):
