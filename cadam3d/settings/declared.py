@@ -318,7 +318,5 @@ def _grammar(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return yaml.safe_dump(value).splitlines()[0]
     # Between quotation marks, Hydra's grammar reads an interpolation inside another one, and braces as text.
-    if "{" not in str(value):
-        return str(value)
-    mark = "'" if '"' in str(value) else '"'
-    return f"{mark}{value}{mark}"
+    text = str(value)
+    return '"' + text.replace('"', '\\"') + '"' if "{" in text else text
