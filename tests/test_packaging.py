@@ -55,7 +55,7 @@ def test_the_wheel_carries_every_source_and_nothing_else_of_the_repository(wheel
     assert {name for name in names if name.endswith(".py")} == here
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"cadam3d"}
     assert {"cadam3d/py.typed", "cadam3d/__init__.pyi"} <= set(names)
-    sets = {str(path.relative_to(REPOSITORY)) for path in find("cadam3d/sweep/prompt_sets", "*.yaml")}
+    sets = {str(path.relative_to(REPOSITORY)) for path in find("cadam3d/io/prompt_sets", "*.yaml")}
     assert sets
     assert sets <= set(names)
     assert any(name.endswith("licenses/LICENSE") for name in names)

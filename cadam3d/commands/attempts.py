@@ -63,7 +63,7 @@ def run(
 
 
 def _keep(choice: Choice, folder: Path) -> None:
-    """Write which attempt is the best, and link it."""
+    """Write ``best.json``, which names the best attempt, and link this attempt."""
     name = f"seed={choice.best}"
     facts = {
         "best": name,
@@ -84,7 +84,7 @@ def _keep(choice: Choice, folder: Path) -> None:
 
 
 def _write_report(folder: Path) -> None:
-    """Write the page that compares the attempts. A failure is printed, because it costs nothing else."""
+    """Write the page that compares the attempts. A failure is printed and does not stop the command."""
     try:
         report.write_sweep(folder)
     except UserError as error:
@@ -93,7 +93,7 @@ def _write_report(folder: Path) -> None:
 
 def _print(choice: Choice, folder: Path) -> None:
     """Print why the best attempt was chosen, where its files are, and what to type next."""
-    # The link is printed, not the folder to which it leads.
+    # Print the link itself instead of the folder to which it leads.
     best = shown(folder) / BEST
     print(f"\n{choice.sentence}\n")
     print(f"  {'best':<9}{best} -> seed={choice.best}")

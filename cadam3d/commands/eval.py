@@ -41,7 +41,7 @@ def run(cfg: DictConfig) -> None:
     folder = typed_path(str(cfg.run))
     if folder.is_dir():
         require_contained(folder, None if require_trust(cfg.trust) else trusting())
-    # A missing model is one message, not one for every job.
+    # If a model is missing, this stops with one message, instead of one for every job.
     build_metrics(cfg.metric)
     if is_sweep(folder):
         _evaluate_sweep(cfg, folder)
@@ -76,7 +76,7 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     truth = source.of(own.prompt, prior)
 
     warnings: list[str] = []
-    # The number of Gaussians shows readers of the file whether it is about the present asset.
+    # By the number of Gaussians, readers of the file recognise whether it describes the present asset.
     result: dict[str, Any] = {"run": str(shown(folder)), "prompt": own.prompt}
     result["num_gaussians"] = len(asset.gaussians)
     result |= measure(
@@ -102,7 +102,7 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
 
 
 def _as_text(result: Mapping[str, Any]) -> str:
-    """Return the entries of an ``eval.json`` as a table, one line each, with how each score was measured."""
+    """Return the entries of an ``eval.json``, one line each; those of scores say how they were measured."""
     scores = scores_in(result)
     lines = []
     for name, value in result.items():

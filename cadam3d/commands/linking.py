@@ -19,9 +19,9 @@ def link_latest(folder: Path) -> None:
 
 
 def link_best(folder: Path, name: str) -> None:
-    """Make ``best`` in ``folder`` a link to the run ``name`` beside it, or a copy where links do not exist.
+    """Make ``best`` in ``folder`` a link to the run ``name`` beside it, or a copy if links are not possible.
 
-    A copy of another run is kept under a new name, because files may have been added to it. Raises
+    An earlier copy of another run is renamed and kept, because files may have been added to it. Raises
     ``OSError`` if neither is possible.
     """
     best, run = folder / BEST, folder / name
@@ -33,5 +33,5 @@ def link_best(folder: Path, name: str) -> None:
         if os.path.lexists(best):
             kept = numbered(best)
             best.rename(kept)
-            say(f"Note: what was {shown(folder)}/{BEST} is now {kept.name}.", logging.WARNING)
+            say(f"Note: {shown(folder)}/{BEST} was renamed to {kept.name}.", logging.WARNING)
         shutil.copytree(run, best, ignore=shutil.ignore_patterns(LOCK))

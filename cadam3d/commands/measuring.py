@@ -1,4 +1,4 @@
-"""Measure: what the metrics say about an asset and about the Gaussians that its run started from."""
+"""Measuring: call the metrics for an asset, and for the Gaussians from which its run started."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -35,10 +35,9 @@ def measure(
     start: Callable[[], Gaussians] | None,
     warnings: list[str],
 ) -> dict[str, Any]:
-    """Return the numbers of all metrics. A metric that fails costs only its own numbers, and adds a warning.
+    """Return the numbers of all metrics. If a metric fails, only its numbers are missing, and a warning is added.
 
-    The details of numbers that have some are under ``MEASUREMENTS``, which is missing if there are none.
-
+    The records of how numbers were measured are under ``MEASUREMENTS``, which is missing if there are none.
     ``start`` returns the Gaussians at the start of the run. If it is None, they are not measured.
     """
     numbers: dict[str, Any] = {}
@@ -62,12 +61,15 @@ def measure(
             for metric in metrics.values():
                 numbers |= metric.measure_start(beginning)
     return numbers | (
-        {MEASUREMENTS: {name: _honest(each) for name, each in details.items()}} if details else {}
+        {MEASUREMENTS: {name: _with_changes(each) for name, each in details.items()}} if details else {}
     )
 
 
-def _honest(record: dict[str, Any]) -> dict[str, Any]:
-    """Return the record of a number with the settings in which its protocol differs from that of its name."""
+def _with_changes(record: dict[str, Any]) -> dict[str, Any]:
+    """Return the record of a number with the names of the settings in which its protocol was changed.
+
+    Settings are changed if they differ from the shipped protocol of the same name.
+    """
     protocol = record.get("protocol")
     shipped = _shipped_protocol(str(protocol.get("name"))) if isinstance(protocol, dict) else None
     if not isinstance(protocol, dict) or shipped is None:
@@ -78,7 +80,7 @@ def _honest(record: dict[str, Any]) -> dict[str, Any]:
 
 @cache
 def _shipped_protocol(name: str) -> dict[str, Any] | None:
-    """Return the settings of a protocol of this package; None for others."""
+    """Return the settings of a protocol of this package; None if it has none of this name."""
     if name not in {path.stem for path in (config_dir() / "protocol").glob("*.yaml")}:
         return None
     protocol: Protocol = component(compose([f"protocol={name}", "prompt=any"]).protocol, Protocol)

@@ -28,6 +28,7 @@ from cadam3d.io.run_folder import (
     shown,
     typed_path,
 )
+from cadam3d.report.formatting import plural
 from cadam3d.settings.line import setting_word
 from cadam3d.study.answers import (
     RESULTS_KIND,
@@ -135,12 +136,12 @@ def _prompts(source: str | None) -> set[str] | None:
 
 def _note_left(found: Found, runs: Sequence[Run], pairs: Sequence[Pair]) -> None:
     if found.without_asset:
-        note(f"{_count(found.without_asset, 'run')} left no asset and cannot be shown")
+        note(f"{plural(found.without_asset, 'run')} left no asset and cannot be shown")
     single = [run for run in runs if not any(run in pair.runs for pair in pairs)]
     if single:
         some = ", ".join(str(shown(run.folder)) for run in single[:3])
         more = ", ..." if len(single) > 3 else ""
-        note(f"{_count(len(single), 'run')} without a partner in another arm: {some}{more}")
+        note(f"{plural(len(single), 'run')} without a partner in another arm: {some}{more}")
 
 
 @contextmanager
@@ -201,11 +202,11 @@ def _plan(cfg: DictConfig, pairs: Sequence[Pair], clips: dict[Run, Clip], genera
 def _print_page(folder: Path, pairs: Sequence[Pair], plan: Plan, settings: ClipSettings) -> None:
     met = Counter(pair.arms for pair in pairs)
     for (one, other), count in sorted(met.items()):
-        print(f"{one} and {other}: {_count(count, 'pair')}")
+        print(f"{one} and {other}: {plural(count, 'pair')}")
     size = (folder / PAGE).stat().st_size
     catches = len(plan.trials) - len(pairs)
     print(
-        f"{_count(len(plan.trials), 'trial')}, of which {_count(catches, 'catch trial')}; {size / 1e6:.1f} MB"
+        f"{plural(len(plan.trials), 'trial')}, of which {plural(catches, 'catch trial')}; {size / 1e6:.1f} MB"
     )
     print(f"for the raters:  {shown(folder / PAGE)}")
     print(f"keep it secret:  {shown(folder / KEY)}")
@@ -221,7 +222,7 @@ def _print_page(folder: Path, pairs: Sequence[Pair], plan: Plan, settings: ClipS
 
 
 def _evaluate(cfg: DictConfig) -> None:
-    """Print what the answers say, and write ``study.json`` and ``study.md`` beside the key."""
+    """Analyse the answers, print the result, and write ``study.json`` and ``study.md`` beside the key."""
     from cadam3d.study.analysis import analyse
     from cadam3d.study.summary import Bullets, markdown, text
 
@@ -232,7 +233,7 @@ def _evaluate(cfg: DictConfig) -> None:
         _warn(each)
     if not files:
         raise UserError(
-            f"answers: expected files that raters have saved, got {_count(len(paths), 'file')} without any. "
+            f"answers: expected files that raters have saved, got {plural(len(paths), 'file')} without any. "
             "Try: cadam3d study --help"
         )
     place, key = _find_key(cfg, files)
@@ -301,7 +302,3 @@ def _warn(left: LeftOut) -> None:
 def _texts(value: Any) -> list[str]:
     """Return the texts of a setting that is one text or a list of them."""
     return [str(item) for item in value] if OmegaConf.is_list(value) else [str(value)]
-
-
-def _count(number: int, thing: str) -> str:
-    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"

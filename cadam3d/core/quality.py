@@ -15,8 +15,8 @@ class Quality:
     label: str  # for columns and within sentences
     unit: str = ""  # empty if there is none
     decimals: int  # after the point
-    is_more_better: bool | None  # None: neither more nor less is better
-    explained: str = ""  # a longer label with its unit, for lists of facts; empty: the label says enough
+    is_more_better: bool | None  # None = neither more nor less is better
+    explained: str = ""  # a longer label with its unit, for lists of facts; empty = the heading
 
     @property
     def heading(self) -> str:
@@ -38,6 +38,10 @@ class Quality:
         assert self.is_more_better is not None
         return value if self.is_more_better else -value
 
+
+# The numbers that replace others if the asset may face any side. They compare at the turn at which the asset
+# fits best, and the others may compare with a wrong side.
+AT_BEST_TURN = {"psnr": "psnr_turned", "ssim": "ssim_turned"}
 
 # In the order in which a list of facts shows them.
 QUALITIES = {

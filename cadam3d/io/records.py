@@ -34,11 +34,12 @@ QUALITY = (
     "colour_error",
 )
 
-# The entry of summary.json and of eval.json that says, for numbers by name, how they came about.
+# The entry of summary.json and of eval.json with a record of how each number was measured, by its name.
 MEASUREMENTS = "measurements"
-# Entries of such a record that may differ between assets of one table. All others say how the number was
-# measured. Equal weights are one model, whatever its folder is called.
+# Entries of such a record that may differ between the assets of one table. All others describe how the number
+# was measured.
 OF_ASSET = ("value", "reason", "text", "views", "views_left_out", "mean", "interval")
+# Entries that do not count if the hash of the weights is known: equal weights are the same model.
 OF_PLACE = ("model", "revision")
 WEIGHTS = "weights_sha256"
 
@@ -68,7 +69,7 @@ def ssim_of(summary: Mapping[str, Any]) -> float | None:
 
 
 def read_evaluation(run: Path, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of ``eval.json``; {} if it is of another asset than ``summary`` or unreadable."""
+    """Return ``eval.json``; {} if it cannot be read, or if it describes another asset than ``summary``."""
     try:
         evaluation = read_json(run / EVALUATION)
     except UserError:
@@ -92,7 +93,7 @@ def read_quality(run: Path, summary: Mapping[str, Any]) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Score:
-    """A number with the record of how it came about."""
+    """A number with the record of how it was measured."""
 
     value: float
     record: Mapping[str, Any]
@@ -101,7 +102,7 @@ class Score:
     def method(self) -> dict[str, str]:
         """Return how the number was measured, as texts by dotted key: the protocol, the weights and so on.
 
-        Numbers with equal methods may be compared, and no others.
+        Only numbers with equal methods may be compared.
         """
         left_out = (*OF_ASSET, *(OF_PLACE if self.record.get(WEIGHTS) is not None else ()))
         return dict(_flat({key: value for key, value in self.record.items() if key not in left_out}))
@@ -119,7 +120,18 @@ def scores_in(numbers: Mapping[str, Any]) -> dict[str, Score]:
 
 def read_scores(run: Path, summary: Mapping[str, Any]) -> dict[str, Score]:
     """Return the scores of a run by name. Those of ``eval.json`` replace those from the end of training."""
-    return scores_in(summary) | scores_in(read_evaluation(run, summary))
+    return latest_scores([summary, read_evaluation(run, summary)])
+
+
+def latest_scores(sources: Iterable[Mapping[str, Any]]) -> dict[str, Score]:
+    """Return the scores by name, each from the last source that has a number of this name.
+
+    A later number without a record replaces an earlier score, and then there is no score of this name.
+    """
+    found: dict[str, Score] = {}
+    for numbers in sources:
+        found = {name: each for name, each in found.items() if name not in numbers} | scores_in(numbers)
+    return found
 
 
 def difference(name: str, scores: Iterable[Score]) -> str | None:

@@ -1,9 +1,9 @@
-"""Clip: pictures and texts in the common space of a CLIP model (Radford et al. 2021)."""
+"""Clip: pictures and texts in the shared space of a CLIP model (Radford et al. 2021)."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import torch
@@ -12,8 +12,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from cadam3d.io.transformer import TransformerFolder, TransformerSource
+from cadam3d.metric.scoring import Scorer, cut_off
 
-# Models that are kept in memory, so that several metrics, and all jobs of a sweep, load each of them once.
+# The number of models in memory. With them, several metrics and all jobs of a sweep load each model once.
 KEPT = 2
 
 
@@ -34,7 +35,7 @@ class Clip:
         return normalize(_vectors(self.model.get_image_features(pixel_values=pixel_values)), dim=-1)
 
     def texts(self, texts: Sequence[str]) -> Float[Tensor, "t d"]:
-        """Return a unit vector for each text. What is too long is cut off (see :meth:`lost_tokens`)."""
+        """Return a unit vector for each text. Long texts are cut off (see :meth:`lost_tokens`)."""
         tokens = self.tokenizer(
             list(texts), padding=True, truncation=True, max_length=self.longest, return_tensors="pt"
         ).to(self._device)
@@ -48,17 +49,20 @@ class Clip:
         return max(0, len(self._all_tokens(text)) - self.longest)
 
     def tokens(self, text: str) -> list[int]:
-        """Return the tokens of a text that the model reads, of a long text without the mark of its end."""
+        """Return the tokens of a text that the model reads; those of a long text lack the mark of its end."""
         return self._all_tokens(text)[: self.longest - 1]
 
     def complaint(self, text: str) -> str | None:
         """Return a warning about a text that is too long for the model; None if it reads all of it."""
-        lost = self.lost_tokens(text)
-        if lost == 0:
-            return None
-        return (
-            f"the model reads {self.longest} tokens, so the last {lost} of the prompt "
-            f"{'are' if lost > 1 else 'is'} not scored. Try: a shorter prompt"
+        return cut_off(self.lost_tokens(text), self.longest)
+
+    def scorer(self, factor: float = 1.0) -> Scorer:
+        """Return what gives each picture ``factor`` times its cosine with the text."""
+        direction = cache(lambda text: self.texts([text])[0])
+        return Scorer(
+            score=lambda images, text: factor * self.pictures(images) @ direction(text),
+            facts=self.facts,
+            complaint=self.complaint,
         )
 
     def _all_tokens(self, text: str) -> list[int]:

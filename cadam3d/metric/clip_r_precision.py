@@ -13,12 +13,11 @@ from torch import Tensor
 
 from cadam3d.core.checks import fail, require
 from cadam3d.core.errors import UserError
+from cadam3d.io.prompts import set_file, set_names
 from cadam3d.io.reading import read_text, read_yaml
 from cadam3d.metric.clip import load_clip
 from cadam3d.metric.scoring import ModelMetric, Scorer, interval_record
 
-# The sets of prompts that come with this package, by the names of their files.
-SETS = Path(__file__).parent.parent / "sweep" / "prompt_sets"
 KEY = "metric.clip_r_precision.prompts"
 EXAMPLE = f"{KEY}=paper50"
 YAML = (".yaml", ".yml")
@@ -29,7 +28,7 @@ BATCH = 64  # texts that are read at once
 
 @dataclass(frozen=True, kw_only=True)
 class ClipRPrecision(ModelMetric):
-    """The share of the pictures to which no other prompt of a list is as similar as the own one.
+    """The share of the pictures that are more similar to the prompt of the asset than to any other of a list.
 
     This is the CLIP R-Precision of Park et al. (2021) with one relevant text, as Dream Fields (Jain et al.
     2022) and DreamFusion (Poole et al. 2023) measure it. The protocol's text template goes around every
@@ -48,7 +47,7 @@ class ClipRPrecision(ModelMetric):
         super().prepare()
 
     def scorer(self, device: torch.device) -> Scorer:
-        """Return the model, which gives each picture 1 if the own text is the most similar one, else 0.
+        """Return the model, which gives each picture 1 if the text of its asset is the most similar, else 0.
 
         Raises ``UserError`` if the prompts cannot be read.
         """
@@ -60,7 +59,7 @@ class ClipRPrecision(ModelMetric):
 
         @cache
         def has_double(text: str) -> bool:
-            """Return whether another prompt reads the same, because both are too long for the model."""
+            """Return whether the model reads another prompt as this one, because it cuts off both."""
             return any(other != text and clip.tokens(other) == clip.tokens(text) for other in texts)
 
         def score(images: Tensor, text: str) -> Tensor:
@@ -91,11 +90,9 @@ def read_candidates(source: str) -> list[str]:
     has a list of texts, or of entries with a ``prompt``. Raises ``UserError`` for other files, and for fewer
     than two prompts.
     """
-    path = SETS / f"{source}.yaml"
-    path = path if path.is_file() else Path(source).expanduser()
+    path = set_file(source) if source in set_names() else Path(source).expanduser()
     if not path.is_file():
-        sets = "|".join(sorted(each.stem for each in SETS.glob("*.yaml")))
-        expected = f"a file, or one of the sets {sets}"
+        expected = f"a file, or one of the sets {'|'.join(set_names())}"
         raise fail(KEY, expected=expected, got=source, example=EXAMPLE)
     if path.suffix.lower() in YAML:
         found = [_text(entry, path) for entry in _entries(path)]

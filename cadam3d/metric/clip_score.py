@@ -1,7 +1,6 @@
 """ClipScore: how similar the pictures of an asset are to its prompt."""
 
 from dataclasses import dataclass
-from functools import cache
 from typing import ClassVar
 
 import torch
@@ -17,7 +16,7 @@ class ClipScore(ModelMetric):
     """100 times the cosine between a picture and the text, in the space of a CLIP model.
 
     This is CLIPScore (Hessel et al. 2021) on the scale that papers about text-to-3D use: without its factor
-    of 2.5, and without raising negative values to 0.
+    of 2.5, and without replacing negative values by 0.
     """
 
     node: ClassVar[str] = "metric.clip_score"
@@ -26,10 +25,4 @@ class ClipScore(ModelMetric):
 
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a score in [-100, 100]."""
-        clip = load_clip(self.source(), device)
-        direction = cache(lambda text: clip.texts([text])[0])
-        return Scorer(
-            score=lambda images, text: PERCENT * clip.pictures(images) @ direction(text),
-            facts=clip.facts,
-            complaint=clip.complaint,
-        )
+        return load_clip(self.source(), device).scorer(PERCENT)

@@ -1,7 +1,7 @@
 """Hps: Human Preference Score v2, how much people would like a picture for its prompt."""
 
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,13 +19,13 @@ from cadam3d.metric.scoring import ModelMetric, Scorer
 # The file of each version in the repository of the authors, xswu/HPSv2.
 FILES = {"v2.0": "HPS_v2_compressed.pt", "v2.1": "HPS_v2.1_compressed.pt"}
 SUFFIXES = (".pt", ".pth", ".bin", ".safetensors")
-# The small files of a CLIP model: everything except its weights.
+# The files of a CLIP model except its weights, all of which are small.
 SMALL = ("*.json", "*.txt")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hps(ModelMetric):
-    """The cosine between a picture and the text, in the space of a CLIP model that was trained on choices.
+    """The cosine between a picture and the text, in the space of a CLIP model trained on choices of people.
 
     Wu et al. (2023) trained OpenCLIP's ViT-H/14 on choices of people, and publish a file with its weights
     under the names of OpenCLIP. The numbers are about 0.2 to 0.3, and those of v2.0 and v2.1 differ. Papers
@@ -60,12 +60,7 @@ class Hps(ModelMetric):
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a score in [-1, 1]."""
         clip = load_clip(self.source(), device) if self._is_folder() else self._from_file(device)
-        direction = cache(lambda text: clip.texts([text])[0])
-        return Scorer(
-            score=lambda images, text: clip.pictures(images) @ direction(text),
-            facts=clip.facts,
-            complaint=clip.complaint,
-        )
+        return clip.scorer()
 
     def _is_folder(self) -> bool:
         return Path(self.source().model).expanduser().is_dir()
@@ -106,7 +101,7 @@ class Hps(ModelMetric):
 def _loaded(
     file: Path, base: TransformerFolder, facts: tuple[tuple[str, Any], ...], device: torch.device
 ) -> Clip:
-    """Return the model in a file. The facts contain its hash, so another file has another model."""
+    """Return the model in a file. ``facts`` has the hash of the file, so a changed file is read again."""
     try:
         model = clip_model(read_tensors(Hps.node, file, "model"), base.config())
     except (ValueError, RuntimeError, TypeError, KeyError) as error:

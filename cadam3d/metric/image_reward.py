@@ -17,7 +17,7 @@ from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
 from cadam3d.io.image import to_uint8
 from cadam3d.io.transformer import sha256_of
-from cadam3d.metric.scoring import ScoreMetric, Scorer
+from cadam3d.metric.scoring import ScoreMetric, Scorer, cut_off
 
 MODULE, PACKAGE = "ImageReward", "image-reward"
 NAME = "ImageReward-v1.0"
@@ -26,9 +26,9 @@ WEIGHTS, SETTINGS = "ImageReward.pt", "med_config.json"
 CACHE = Path("~/.cache/ImageReward")
 LONGEST = 35  # tokens that the package reads
 FOLDER = "models/ImageReward"
-# The package does not name all that it imports, and is older than some of it.
+# The package does not declare everything that it imports, and some of it must be old.
 INSTALL = "pip install 'cadam3d[image_reward]' openai-clip torchvision 'setuptools<70' 'transformers<4.56'"
-# It reads a vocabulary from the cache of the hub, and only from there.
+# The package reads the vocabulary only from the cache of the hub, so it is downloaded there.
 DOWNLOAD = (
     f"hf download THUDM/ImageReward {WEIGHTS} {SETTINGS} --local-dir {FOLDER} && "
     f"hf download bert-base-uncased config.json tokenizer.json tokenizer_config.json vocab.txt"
@@ -141,11 +141,4 @@ def _rewards(model: Any, images: Float[Tensor, "v h w 3"], text: str) -> Float[T
 
 def _complaint(model: Any, text: str) -> str | None:
     """Return a warning about a text that is too long for the package; None if it reads all of it."""
-    lost = len(model.blip.tokenizer(text)["input_ids"]) - LONGEST
-    if lost <= 0:
-        return None
-    verb = "are" if lost > 1 else "is"
-    return (
-        f"the model reads {LONGEST} tokens, so the last {lost} of the prompt {verb} not scored. "
-        f"Try: a shorter prompt"
-    )
+    return cut_off(len(model.blip.tokenizer(text)["input_ids"]) - LONGEST, LONGEST)

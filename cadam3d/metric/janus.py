@@ -53,7 +53,7 @@ LEAST_DIRECTION = 1e-3
 SIDES = ("front", "side", "back")
 # Difference between the highest and the lowest probability of a front below which no view is one.
 LEAST_CONTRAST = 0.1
-# Relative to the lowest and the highest probability; views above it belong to a front.
+# Views with at least this probability belong to a front, on a scale from the lowest (0) to the highest (1).
 HALF = 0.5
 # A second front is at least this far from the first one, in degrees.
 APART_DEG = 120.0
@@ -62,7 +62,7 @@ MOST_VIEWS = 360
 
 @dataclass(frozen=True, kw_only=True)
 class Janus(ModelMetric):
-    """Count the fronts of an asset, by the true object or by a model of pictures and texts."""
+    """The number of fronts of an asset, by the true object or by a model of pictures and texts."""
 
     node: ClassVar[str] = "metric.janus"
     number: ClassVar[str] = "janus"
@@ -79,7 +79,7 @@ class Janus(ModelMetric):
         require_range("metric.janus.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
 
     def prepare(self) -> None:
-        """Find the files of the model if the line asks for one. With ``by=auto`` the truth may replace it."""
+        """Find the files of the model if ``by=model``. With ``by=auto``, the truth may replace it."""
         if self.by == "model":
             super().prepare()
 
@@ -102,8 +102,8 @@ class Janus(ModelMetric):
         for the true object, and nearly 1 - 1/k for k equal fronts. ``janus_fronts`` is how often the asset
         shows the quarter turn that it shows most, compared with the true object. By a model, ``janus`` is the
         height of the second front, from 0 (there is none) to 1 (it is as clear as the first), and
-        ``janus_fronts`` is the number of fronts. The turn of the asset does not matter. Without a front, as
-        of an object that looks the same from all sides, there is no number, and the record says so.
+        ``janus_fronts`` is the number of fronts. The turn of the asset does not matter. An object without a
+        front, such as one that looks the same from all sides, has no number, and the record says so.
         """
         if len(measurand.gaussians) == 0 or (self.by == "truth" and measurand.truth is None):
             return Measurement({})
@@ -134,7 +134,7 @@ class Janus(ModelMetric):
             "protocol": self.protocol.record() | shown,
             **scorer.facts,
             "text": texts[0],
-            # The probability of each view, from azimuth 0 on, to be a front.
+            # The probability that each view is a front, from azimuth 0 on.
             "views": [round(float(each), 6) for each in fronts],
         }
         complaint = scorer.complaint(texts[0])

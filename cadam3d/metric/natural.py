@@ -1,6 +1,6 @@
 """Statistics of natural images for NIQE (Mittal et al. 2013): features, their model, and the distance to it.
 
-Where the paper leaves something open, this follows basicsr 1.4, with which most papers measure. Three of its
+Where the paper leaves something open, this follows basicsr 1.4, which most papers use. Three of its
 conventions change the result and are therefore part of the definition:
 
 * The image is the luma of ITU-R BT.601 in [16, 235], rounded to whole numbers.
@@ -8,7 +8,7 @@ conventions change the result and are therefore part of the definition:
 * A block without any contrast in a direction has no fit there. Its shape counts as the smallest of the grid,
   and its missing widths are left out of the means.
 
-Pictures are processed in single precision, also as there. In plain areas, rounding decides between a small
+As in basicsr, pictures are processed in single precision. In plain areas, rounding decides between a small
 number and zero, and the shapes come from a grid, so the precision is visible in the fourth digit of a result.
 """
 
@@ -114,7 +114,8 @@ def read(content: bytes, where: str, key: str) -> Pristine:
     # A damaged file makes its reader raise almost anything.
     except Exception as error:
         reason = " ".join(str(error).split())[:120]
-        if "pickle" in reason:  # NumPy advises to run what is in it
+        # NumPy's message recommends running what is in the file.
+        if "pickle" in reason:
             reason = "it contains something other than numbers"
         raise _unlike(key, where, reason) from error
     shapes = (mean.size, covariance.shape, window.ndim)

@@ -18,7 +18,7 @@ from cadam3d.metric.scoring import ScoreMetric, Scorer
 OWN_PARAMETERS = Path(__file__).with_name("niqe_parameters.npz")
 # The name of these parameters in the record of a number.
 OWN_NAME = "cadam3d, from eight photographs"
-PLAIN = ("keep", "drop")
+PLAIN = ("keep", "drop")  # what to do with plain blocks
 SMALLEST = 2 * natural.BLOCK  # pixels; four blocks
 
 
@@ -70,8 +70,8 @@ class Niqe(ScoreMetric):
     def measure(self, measurand: Measurand) -> Measurement:
         """Return ``niqe`` with its record; nothing if no view has two blocks with texture.
 
-        Views with fewer have no number. They are left out of the mean, and the record counts them. If the
-        protocol takes something other than the mean, there is no number then.
+        Views with fewer such blocks are left out of the mean, and the record counts them. If the protocol
+        aggregates in another way, one such view leaves no number.
         """
         if len(measurand.gaussians) == 0:
             return Measurement({})

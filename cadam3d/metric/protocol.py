@@ -1,8 +1,8 @@
 """Protocol: how an asset is shown to a model that scores pictures, and how the scores become one number.
 
-A score of a picture says little without its protocol: another background, elevation or model changes it by
-more than methods differ. A protocol therefore has a name, and everything that it says is in the record of
-every number that was measured with it.
+The score of a picture means little without its protocol: another background, elevation or model changes it
+by more than the difference between methods. A protocol therefore has a name, and all its settings are in the
+record of every number that was measured with it.
 """
 
 import math
@@ -154,9 +154,9 @@ class RingProtocol(Protocol):
 class SphereProtocol(Protocol):
     """Views from the vertices of an icosahedron whose faces are divided, with several fields of view each.
 
-    This is how T3Bench (He et al. 2023) finds the quality of an asset. The best field of view counts for each
-    vertex. Then the values of all vertices are smoothed ``rounds`` times, by the mean over a vertex and its
-    neighbours, so that one lucky view does not decide. The best vertex counts.
+    This is how T3Bench (He et al. 2023) measures the quality of an asset. The best field of view counts for
+    each vertex. Then the values of all vertices are smoothed ``rounds`` times, by the mean over a vertex and
+    its neighbours, so that one lucky view does not decide. The best vertex counts.
     """
 
     subdivisions: int  # 0 to 4; each divides every triangle into four
@@ -224,9 +224,9 @@ class SphereProtocol(Protocol):
 
 
 def _icosphere(subdivisions: int) -> tuple[Float[Tensor, "p 3"], Int[Tensor, "f 3"]]:
-    """Return an icosahedron on the unit sphere, of which every triangle is divided into four repeatedly.
+    """Return an icosahedron on the unit sphere whose triangles are repeatedly divided into four.
 
-    It stands on an edge, so that the poles are in the middle of two edges of the undivided one.
+    It stands on an edge: the poles are in the middle of two edges of the undivided icosahedron.
     """
     golden = (1 + math.sqrt(5)) / 2
     signs = [(a, b) for a in (-1.0, 1.0) for b in (-golden, golden)]

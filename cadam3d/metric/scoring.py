@@ -1,6 +1,7 @@
-"""ScoreMetric: the base of all metrics that score the pictures of a protocol one by one.
+"""Scoring: the base classes of metrics that score the pictures of a protocol one by one.
 
-ModelMetric: such a metric with a model of transformers that the protocol or the metric names.
+A ``ScoreMetric`` may score in any way. A ``ModelMetric`` uses a model of transformers, which the protocol or
+the metric names.
 """
 
 import math
@@ -29,13 +30,13 @@ class Scorer:
     score: Callable[[Tensor, str], Tensor]
     # What the record of a number says about the model: "model", "revision", "weights_sha256" and so on.
     facts: Mapping[str, Any] = field(default_factory=dict)
-    # From a text to a warning about it, such as that it is too long for the model; None if all is well.
+    # From a text to a warning about it, such as that it is too long for the model; None if there is none.
     complaint: Callable[[str], str | None] = lambda text: None
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreMetric(Metric):
-    """One number from the scores of single pictures, taken as a protocol says.
+    """One number from the scores of single pictures, which are taken as a protocol says.
 
     A subclass sets ``number`` and returns its model from :meth:`scorer`.
     """
@@ -100,7 +101,7 @@ class ScoreMetric(Metric):
 
 @dataclass(frozen=True, kw_only=True)
 class ModelMetric(ScoreMetric):
-    """A score by a model of transformers, which is the protocol's unless the metric names another one."""
+    """A score by a model of transformers: the one of the protocol, unless the metric names another one."""
 
     node: ClassVar[str]  # of the configuration, such as "metric.clip_score"
     kind: ClassVar[str]  # the name of the model in protocols, such as "clip"
@@ -122,6 +123,17 @@ class ModelMetric(ScoreMetric):
             )
         revision = named.revision if self.revision is None else self.revision
         return TransformerSource(self.node, named.id, revision)
+
+
+def cut_off(lost: int, longest: int) -> str | None:
+    """Return a warning about a text of which ``lost`` tokens are not read; None if all of them are read."""
+    if lost <= 0:
+        return None
+    verb = "are" if lost > 1 else "is"
+    return (
+        f"the model reads {longest} tokens, so the last {lost} of the prompt {verb} not scored. "
+        "Try: a shorter prompt"
+    )
 
 
 def interval_record(low: float, high: float, of: str) -> dict[str, Any]:

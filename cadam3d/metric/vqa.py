@@ -17,17 +17,17 @@ from cadam3d.io.pretrained import DTYPES
 from cadam3d.io.transformer import TransformerFolder, TransformerSource
 from cadam3d.metric.scoring import ModelMetric, Scorer
 
-# Chat templates, and vocabularies of older models, are files of their own.
+# Chat templates and the vocabularies of older models are in separate files.
 NEEDED = (*transformer.NEEDED, "*.jinja", "tokenizer.model")
-PLACE = "{}"
-# With these, tokenizers mark that a token begins a word.
+PLACE = "{}"  # of the text in the question, and of the question in the template
+# The characters with which tokenizers mark that a token begins a word.
 WORD_STARTS = "▁Ġ "
 YES, NO = "yes", "no"
 
 
 @dataclass(frozen=True)
 class Answerer:
-    """A vision-language model with the tokens that count as an answer."""
+    """A vision-language model with the tokens that count as yes and as no."""
 
     model: Any  # of transformers, frozen
     processor: Any
@@ -50,9 +50,9 @@ class Answerer:
 class Vqa(ModelMetric):
     """The probability that a vision-language model answers a question about a picture with yes.
 
-    This is VQAScore (Lin et al. 2024) with any model of transformers. The answer is the first token. Every
-    token of the vocabulary counts that spells "yes", in upper or lower case, with or without the mark of a
-    beginning word, and their probabilities are added.
+    This is VQAScore (Lin et al. 2024) with any model of transformers. The answer is the first token. The
+    probabilities of all tokens that spell "yes" are added: in upper or lower case, with or without the mark
+    that begins a word.
     """
 
     node: ClassVar[str] = "metric.vqa"
@@ -60,7 +60,7 @@ class Vqa(ModelMetric):
     kind: ClassVar[str] = "vqa"
 
     question: str  # {} is the text of the protocol
-    template: str | None  # around the question, {} in it; None = the chat template of the model
+    template: str | None  # the text around the question, which is {} in it; None = the model's chat template
     normalize: bool  # whether to divide by the probability of yes or no
     dtype: str  # of the weights
 
@@ -102,7 +102,7 @@ class Vqa(ModelMetric):
     def _scores(self, answerer: Answerer, images: Float[Tensor, "v h w 3"], text: str) -> Float[Tensor, "v"]:
         question = self.question.replace(PLACE, text)
         scores = []
-        # One by one, because models cut pictures into different numbers of tiles.
+        # One picture at a time, because a model may cut each into another number of tiles.
         for image in images:
             yes, no = answerer.probabilities(self._inputs(answerer.processor, image, question))
             scores.append(yes / (yes + no) if self.normalize else yes)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from cadam3d.core.quality import QUALITIES
+from cadam3d.core.quality import AT_BEST_TURN, QUALITIES
 from cadam3d.io import records
 from cadam3d.io.run_folder import shown
 from cadam3d.report.formatting import plural
@@ -20,14 +20,13 @@ from cadam3d.report.results import GUIDANCE, PROMPT, RECIPE, SEED, WITH_ASSET, A
 from cadam3d.report.verdicts import OURS, THEIRS
 from cadam3d.settings.line import setting_word
 
-# The columns, as far as there are numbers: those of the paper, other scores, then comparisons with a truth.
+# The columns, in order, of which a table has those that were measured: the paper's scores, other scores, then
+# comparisons with a truth.
 PAPER_SCORES = ("clip_score", "image_reward", "hps", "niqe")
 SCORES = (*PAPER_SCORES, "clip_r_precision", "pick_score", "vqa", "janus")
 OF_TRUTH = ("psnr", "ssim", "psnr_turned", "ssim_turned", "iou", "colour_error")
-# Two settings are compared by the ratio of these.
+# The numbers by whose ratio two settings are compared.
 SIZES = ("num_gaussians", "asset_mib")
-# Of a turned comparison, the other one would be a comparison with the wrong side.
-REPLACED = {"psnr": "psnr_turned", "ssim": "ssim_turned"}
 MINE, PUBLISHED = "this sweep", "published"
 DIFFERENCE = f"{OURS} - {THEIRS}"
 MISSING = "-"
@@ -39,7 +38,7 @@ class TableCell:
 
     text: str = MISSING
     half: str = ""  # half the width of its 95 % interval; empty if there is none
-    prompts: int | None = None  # that it was measured on; None for a published number
+    prompts: int | None = None  # how many prompts it was measured on; None for a published number
 
     @property
     def value(self) -> str:
@@ -74,7 +73,7 @@ class Section:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """The whole table."""
+    """The paper's table 1 of a sweep."""
 
     names: list[str]  # of the numbers, one for each column
     sections: list[Section]
@@ -139,7 +138,7 @@ def columns(rows: Iterable[Sequence[JobResult]]) -> list[str]:
     known = [{name for job in jobs for name in job.numbers} for jobs in rows]
     shared = set.intersection(*known) if known else set()
     names = [name for name in (*SCORES, *OF_TRUTH, *SIZES) if name in shared]
-    return [name for name in names if REPLACED.get(name) not in shared]
+    return [name for name in names if AT_BEST_TURN.get(name) not in shared]
 
 
 def mixed(results: Sequence[JobResult]) -> dict[str, str]:

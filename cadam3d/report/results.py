@@ -18,13 +18,13 @@ from cadam3d.core.outcome import Outcome
 from cadam3d.core.quality import QUALITIES
 from cadam3d.io.records import (
     Score,
+    latest_scores,
     psnr_of,
     read_config,
     read_evaluation,
     read_histograms,
     read_metrics,
     read_quality,
-    scores_in,
     ssim_of,
 )
 from cadam3d.io.run_folder import CONFIG
@@ -104,8 +104,8 @@ class JobResult:
     seconds: float | None
     objective: str  # the option of ``guidance`` it ran with; empty if that is not known
     category: str  # of its prompt; empty if it has none
-    # Every number that was measured, and those with a record of how. Those of eval.json replace those from
-    # the end of training.
+    # All numbers that were measured, and those that have a record of how. Those of eval.json replace those
+    # from the end of training.
     numbers: Mapping[str, float] = field(repr=False)
     scores: Mapping[str, Score] = field(repr=False)
 
@@ -165,7 +165,7 @@ def _known(job: Any) -> _KnownJob:
     """Return a job of :func:`cadam3d.sweep.folder.load` with its overrides parsed.
 
     Without a grid the arm of a job has no name; it is then the densifier. Settings that come with a prompt
-    are left out: they belong to the prompt, and arms without such a setting are compared all the same.
+    are left out: they belong to the prompt, and arms without such a setting are compared too.
     """
     pairs = (_pair(str(line)) for line in job.overrides)
     overrides = {key: value for key, value in pairs if key not in job.brought}
@@ -202,7 +202,7 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
         objective=str(job.overrides.get(GUIDANCE) or job.summary.get(GUIDANCE) or ""),
         category=job.category,
         numbers=_numbers(sources),
-        scores=_scores(sources),
+        scores=latest_scores(sources),
     )
 
 
@@ -212,14 +212,6 @@ def _numbers(sources: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     if "asset_bytes" in known:
         known.setdefault("asset_mib", known["asset_bytes"] / (1 << 20))
     return known
-
-
-def _scores(sources: Iterable[Mapping[str, Any]]) -> dict[str, Score]:
-    """Return the scores by name, from the last file that has a number of this name."""
-    found: dict[str, Score] = {}
-    for each in sources:
-        found = {name: score for name, score in found.items() if name not in each} | scores_in(each)
-    return found
 
 
 def _cell(job: _KnownJob, axes: Sequence[str]) -> Cell:

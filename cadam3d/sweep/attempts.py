@@ -1,4 +1,4 @@
-"""Attempts: several seeds of one run as the jobs of a sweep, and what is known about each of them."""
+"""Attempts: several seeds of one run as the jobs of a sweep, and the numbers of each of them."""
 
 import shlex
 from argparse import Namespace
@@ -25,8 +25,10 @@ SEED = "seed="  # the name of the folder of an attempt begins with it
 PARENT = Path(LATEST).parent
 # The settings of a line that are not those of a single attempt.
 OF_THE_LINE = ("attempts", "select", RUN_FOLDER)
-OF_TRUTH = ("fidelity", "outline", "mesh")  # metrics that compare with the true object
-IN_EVERY_SUMMARY = ("num_gaussians",)  # with whatever metrics
+# Metrics that compare with the true object.
+OF_TRUTH = ("fidelity", "outline", "mesh")
+# Numbers that every summary has, whichever metrics were chosen.
+IN_EVERY_SUMMARY = ("num_gaussians",)
 
 
 def read_attempts(
@@ -73,14 +75,14 @@ def _place(cfg: DictConfig, axes: Axes) -> Path:
 
 
 def existing_attempts(sweep: Sweep, folder: Path) -> list[Attempt]:
-    """Return what the attempts of a sweep have left in its folder, which may not exist yet."""
+    """Return the attempts of a sweep with the numbers in its folder, which may not exist yet."""
     seeds = [int(job.name.removeprefix(SEED)) for job in sweep.jobs]
     jobs = [PlannedJob("", f"{SEED}{seed}", [], {"seed": seed}) for seed in seeds]
     return [attempt_of(row) for row in rows_of(folder, jobs)]
 
 
 def attempt_of(row: Row) -> Attempt:
-    """Return what is known about an attempt: no number at all if it has left no asset."""
+    """Return an attempt with its numbers; it has none if it has left no asset."""
     seed, summary = row.swept["seed"], row.summary
     if not row.has_result or row.outcome == Outcome.VANISHED or not summary.get("num_gaussians"):
         return Attempt(seed)
@@ -88,7 +90,8 @@ def attempt_of(row: Row) -> Attempt:
         {name: float(known[name]) for name in SELECTABLE if is_number(known.get(name))}
         for known in (summary, read_evaluation(row.folder, summary))
     )
-    # A table shows these too: the newer ones, which are only compared if they were measured in one way.
+    # As in the tables, scores of an evaluation replace those of training. ``require_one_method`` then refuses
+    # to compare scores that were measured in different ways.
     scores = {name: score.value for name, score in read_scores(row.folder, summary).items()}
     return Attempt(seed, measured | {name: scores[name] for name in SELECTABLE if name in scores}, evaluated)
 
@@ -106,7 +109,7 @@ def require_one_method(choice: Choice, rows: Sequence[Row], folder: Path) -> Non
 
 def measuring_line(folder: Path, metric: str) -> str:
     """Return the line that measures all attempts in a folder with one metric."""
-    # If training has not found the truth, it must be named.
+    # A run that did not measure these numbers may know no truth, so the line names one.
     truth = ["truth=shapes"] if metric in OF_TRUTH else []
     return shlex.join(["cadam3d", "eval", f"run={shown(folder)}", f"metric=[{metric}]", *truth])
 
@@ -120,8 +123,8 @@ def require_measured(
 ) -> None:
     """Raise ``UserError`` if the attempts will lack the number that they are compared by.
 
-    ``chosen`` are the metrics of the line, and ``words`` is the line as it was typed. ``attempts`` is what is
-    in ``folder`` already, where ``cadam3d eval`` may have measured the number.
+    ``chosen`` are the metrics of the line, and ``words`` is the line as it was typed. ``attempts`` are those
+    that are in ``folder`` already, where ``cadam3d eval`` may have measured the number.
     """
     names = PREFERRED if select is None else (select,)
     metrics = [QUALITIES[name].metric for name in names]
@@ -133,12 +136,11 @@ def require_measured(
     numbers = f"one of {', '.join(PREFERRED)}" if select is None else select
     got = ", ".join(chosen) or "none"
     if all(attempt.measured for attempt in attempts):
-        line, then = (
-            measuring_line(folder, metrics[0]),
-            " The attempts exist: measure them, and type this again.",
-        )
+        line = measuring_line(folder, metrics[0])
+        then = " The attempts exist: measure them, and type this again."
     else:
         kept = [word for word in words if key_of(word) != "metric"]
         metric = f"metric=[{','.join([*chosen, metrics[0]])}]"
-        line, then = shlex.join(["cadam3d", "train", *kept, metric]), ""
+        line = shlex.join(["cadam3d", "train", *kept, metric])
+        then = ""
     raise UserError(f"select: expected metrics that measure {numbers}, got {got}.{then} Try: {line}")

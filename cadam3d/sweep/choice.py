@@ -8,13 +8,11 @@ from dataclasses import dataclass, field
 from statistics import mean
 
 from cadam3d.core.checks import require_choice, require_whole
-from cadam3d.core.quality import QUALITIES, Quality
+from cadam3d.core.quality import AT_BEST_TURN, QUALITIES, Quality
 
-# Without select=, the first of these numbers that an attempt has: a comparison with the truth, then what
-# people prefer, then agreement with the prompt.
+# Without select=, the first of these numbers that an attempt has decides: a comparison with the truth, then
+# the preferences of people, then agreement with the prompt.
 PREFERRED = ("psnr", "image_reward", "hps", "pick_score", "vqa", "clip_score")
-# If the asset may face any side, these numbers count at the turn at which it fits best, as everywhere else.
-AT_BEST_TURN = {"psnr": "psnr_turned", "ssim": "ssim_turned"}
 MOST_ATTEMPTS = 1000
 # The numbers by which attempts can be compared.
 SELECTABLE = tuple(name for name, quality in QUALITIES.items() if quality.is_more_better is not None)
@@ -81,8 +79,8 @@ def choose(attempts: Sequence[Attempt], select: str | None) -> Choice | None:
 
     ``None`` stands for the first of ``PREFERRED`` that an attempt has. The numbers of an evaluation after
     training count only if training has measured none of them in any attempt, because both may have been
-    measured with different settings. Of attempts with equal numbers, the one with the lowest
-    seed is the best.
+    measured with different settings. Of attempts with equal numbers, the one with the lowest seed is the
+    best.
     """
     for name in PREFERRED if select is None else (select,):
         for key in filter(None, (AT_BEST_TURN.get(name), name)):
@@ -100,7 +98,7 @@ def choose(attempts: Sequence[Attempt], select: str | None) -> Choice | None:
 
 
 def known_numbers(attempts: Sequence[Attempt]) -> list[str]:
-    """Return the numbers by which these attempts can be compared, as far as at least one has them."""
+    """Return the numbers by which these attempts can be compared, which at least one of them has."""
     known = {name for attempt in attempts for name in (*attempt.measured, *attempt.evaluated)}
     return [name for name in SELECTABLE if name in known]
 

@@ -21,7 +21,7 @@ from hydra.core.override_parser.types import Glob, Override, RangeSweep
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import to_json
 from cadam3d.settings.compose import TEXT_KEYS, quote, slug
-from cadam3d.sweep.prompts import FIRST, Choice, Prompt
+from cadam3d.sweep.prompts import FIRST, Prompt, PromptChoice
 
 # Text that Hydra reads the same way with and without quotes, apart from the reserved words.
 IDENTIFIER = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)
@@ -213,7 +213,7 @@ def swept_keys(grid: Grid, line: Axes) -> list[str]:
     return list(dict.fromkeys(keys))
 
 
-def sweep_name(grid_name: str | None, line: Axes, prompts: Choice | None = None) -> str:
+def sweep_name(grid_name: str | None, line: Axes, prompts: PromptChoice | None = None) -> str:
     """Return the name of the folder of a sweep: the name of its grid, or else a summary of the line.
 
     ``prompts`` are those of a file or a set, which is named instead of them. A shard has a folder of its own.

@@ -32,7 +32,7 @@ from cadam3d.sweep.grid import (
     read_line,
     swept_keys,
 )
-from cadam3d.sweep.prompts import FILE, KEY, Choice, read_choice
+from cadam3d.sweep.prompts import FILE, KEY, PromptChoice, read_choice
 
 # An override that is neither an addition nor a deletion and names no package.
 PLAIN_KEY = re.compile(r"[A-Za-z_][\w.]*=")
@@ -59,7 +59,7 @@ class Sweep:
     parts: Parts  # of the line
     grid: Grid
     axes: Axes  # of the line
-    prompts: Choice | None  # None if the line and the grid name no file or set of prompts
+    prompts: PromptChoice | None  # None if the line and the grid name no file or set of prompts
     jobs: list[Job]
     command: str = "sweep"  # of the line; "train" if the jobs are several attempts at one run
     # The folder, unless the line has one; None stands for a name that says what is swept.
@@ -230,7 +230,7 @@ def compose_sweep(parts: Parts, options: Namespace) -> DictConfig:
     return cfg
 
 
-def _read_prompts(cfg: DictConfig, grid: Grid, axes: Axes, overrides: Sequence[str]) -> Choice | None:
+def _read_prompts(cfg: DictConfig, grid: Grid, axes: Axes, overrides: Sequence[str]) -> PromptChoice | None:
     """Return the choice of prompts of a line or its grid. A prompt in the line replaces those of the grid.
 
     Raises ``UserError`` if the line has both a prompt and a choice of prompts.

@@ -18,6 +18,7 @@ import yaml  # comes with OmegaConf
 
 from cadam3d.core.checks import fail, require, require_whole
 from cadam3d.core.errors import UserError
+from cadam3d.io.prompts import set_file, set_names
 from cadam3d.io.reading import parse_yaml, read_bytes
 from cadam3d.io.run_folder import expanded
 from cadam3d.settings.advice import did_you_mean
@@ -25,8 +26,6 @@ from cadam3d.settings.declared import is_readable
 
 KEY, FILE = "prompts", "prompts.file"
 SHARD, CATEGORY, FIRST = "prompts.shard", "prompts.category", "prompts.first"
-# The sets that come with this package.
-SETS = Path(__file__).parent / "prompt_sets"
 # The settings of a run that the keys of an entry give, besides its prompt.
 SETTINGS = {"negative_prompt": "negative_prompt", "initializer_prompt": "initializer.prompt"}
 ENTRY = ("prompt", *SETTINGS, "name", "category")
@@ -53,7 +52,7 @@ class Prompt:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Choice:
+class PromptChoice:
     """The prompts that a line chooses: a file or a set, and which part of it."""
 
     source: str  # as it was typed
@@ -89,7 +88,7 @@ class Choice:
         return prompts[begin:end]
 
 
-def read_choice(node: Mapping[Any, Any] | None, default: str | None = None) -> Choice | None:
+def read_choice(node: Mapping[Any, Any] | None, default: str | None = None) -> PromptChoice | None:
     """Return the choice that the settings ``prompts.*`` of a sweep describe; None if it has no such prompts.
 
     ``default`` is the file or set of the grid. Raises ``UserError`` for wrong values.
@@ -101,18 +100,18 @@ def read_choice(node: Mapping[Any, Any] | None, default: str | None = None) -> C
     if source is None:
         for name in ("shard", "category", "first"):
             if node.get(name) is not None:
-                typed = f"{KEY}={_sets()[0]} {shlex.quote(f'{KEY}.{name}={node[name]}')}"
+                typed = f"{KEY}={set_names()[0]} {shlex.quote(f'{KEY}.{name}={node[name]}')}"
                 raise fail(f"{KEY}.{name}", expected=f"{KEY}=FILE too", got=node[name], example=typed)
         return None
     is_source = isinstance(source, str) and bool(source.strip())
-    require(is_source, KEY, expected=_file_or_set(), got=source, example=f"{KEY}={_sets()[0]}")
+    require(is_source, KEY, expected=_file_or_set(), got=source, example=f"{KEY}={set_names()[0]}")
     if first is not None:
         require_whole(FIRST, first, low=1, example=6)
     if category is not None:
         is_text = isinstance(category, str) and bool(category.strip())
         require(is_text, CATEGORY, expected="a category", got=category, example=f"{CATEGORY}=Material")
         category = category.strip()
-    return Choice(source=source, category=category, first=first, shard=_shard(shard))
+    return PromptChoice(source=source, category=category, first=first, shard=_shard(shard))
 
 
 def read_prompts(source: str) -> tuple[Prompt, ...]:
@@ -154,7 +153,7 @@ def _of_category(prompts: tuple[Prompt, ...], category: str | None) -> tuple[Pro
         known = list(dict.fromkeys(each.category for each in prompts if each.category))
         if not known:
             expected = "a file in which prompts have categories"
-            raise fail(CATEGORY, expected=expected, got=category, example=f"{KEY}={_sets()[0]}")
+            raise fail(CATEGORY, expected=expected, got=category, example=f"{KEY}={set_names()[0]}")
         example = shlex.quote(f"{CATEGORY}={(did_you_mean(category, known) or known)[0]}")
         raise fail(CATEGORY, expected=f"one of {'|'.join(known)}", got=category, example=example)
     return chosen
@@ -178,15 +177,15 @@ def _shown(node: _Node) -> str:
 
 def _find(source: str) -> Path:
     """Return the path of a set or of a file. A name without a suffix is first looked for among the sets."""
-    if source in _sets():
-        return SETS / f"{source}.yaml"
+    if source in set_names():
+        return set_file(source)
     path = expanded(source)
     try:
         exists = path.exists()
     except (OSError, ValueError):
         exists = False
     if not exists:
-        near = (did_you_mean(Path(source).stem, _sets()) or _sets())[0]
+        near = (did_you_mean(Path(source).stem, set_names()) or set_names())[0]
         raise fail(KEY, expected=_file_or_set(), got=source, example=f"{KEY}={near}")
     if path.suffix.lower() not in (*TREES, *PLAIN):
         suffixes = ", ".join([*(suffix for suffix in (*PLAIN, *TREES) if suffix), "or none"])
@@ -194,13 +193,8 @@ def _find(source: str) -> Path:
     return path
 
 
-def _sets() -> list[str]:
-    """Return the names of the sets of this package."""
-    return sorted(path.stem for path in SETS.glob("*.yaml"))
-
-
 def _file_or_set() -> str:
-    return f"a file, or one of the sets {'|'.join(_sets())}"
+    return f"a file, or one of the sets {'|'.join(set_names())}"
 
 
 def _shard(value: Any) -> tuple[int, int] | None:
@@ -215,7 +209,7 @@ def _shard(value: Any) -> tuple[int, int] | None:
 
 def _refusal(place: str, expected: str, got: object) -> UserError:
     """Return the error about a file. A set of this package is what surely can be read instead."""
-    return UserError(f"{KEY}: {place}: expected {expected}, got {got}. Try: {KEY}={_sets()[0]}")
+    return UserError(f"{KEY}: {place}: expected {expected}, got {got}. Try: {KEY}={set_names()[0]}")
 
 
 def _quoted(text: str) -> str:

@@ -15,7 +15,7 @@ from cadam3d.sweep import prompts as module
 from cadam3d.sweep.folder import Plan, PlannedJob, load, write_plan
 from cadam3d.sweep.grid import Grid, Job, expand, prompt_axis, read_grid, read_line, sweep_name
 from cadam3d.sweep.plan import compose_all, read_sweep
-from cadam3d.sweep.prompts import Choice, Prompt, read_choice, read_prompts
+from cadam3d.sweep.prompts import Prompt, PromptChoice, read_choice, read_prompts
 from cadam3d.sweep.table import brief
 
 # What commas, quotes, brackets, references and other scripts would change if they were not quoted.
@@ -218,7 +218,7 @@ def test_the_prompts_for_the_shapes_prior_can_be_read_by_it():
 # --- a part of the prompts --------------------------------------------------------------------------------
 
 
-def choice(file: str | None = "paper50", **node) -> Choice:
+def choice(file: str | None = "paper50", **node) -> PromptChoice:
     found = read_choice({"file": file, **node})
     assert found is not None
     return found
