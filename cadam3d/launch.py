@@ -206,10 +206,10 @@ def _is_of_sweeps(override: str) -> bool:
 
 
 def compose_checked(line: Line) -> DictConfig:
-    """Return the configuration of a line that does one thing, with Hydra's own node.
+    """Return the configuration of a line that starts a single run or another command, with Hydra's own node.
 
-    Everything has been refused in it that is not refused when the components are built. Raises ``UserError``
-    also for several attempts at a run.
+    All checks have passed except those that run when components are built. Raises ``UserError`` for several
+    attempts at a run too.
     """
     words = [word for word in line.words if key_of(word) != DRY_RUN]
     if line.command == "train" and len(words) < len(line.words):

@@ -1,4 +1,4 @@
-"""TensorBoard: writes event files, which ``tensorboard --logdir`` shows."""
+"""TensorBoard: write event files, which ``tensorboard --logdir`` shows."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,8 +18,8 @@ FLUSH_SECONDS = 10
 class TensorBoard(Tracking):
     """Write ``tensorboard/`` into the folder of the run: curves, previews, settings and final numbers.
 
-    The settings are a text. Those that were typed and the final numbers are also a row of the tab HParams,
-    which compares the jobs of a sweep.
+    All settings are one text. The settings that were typed and the final numbers are also a row of the tab
+    HParams, which compares the jobs of a sweep.
     """
 
     package: ClassVar[str] = "tensorboard"
@@ -28,7 +28,7 @@ class TensorBoard(Tracking):
     _writer: Any = field(default=None, init=False, repr=False)
 
     def open(self, context: RunContext, step: int) -> None:
-        """Begin another event file. TensorBoard then leaves out what older files have of later steps."""
+        """Begin another event file. TensorBoard then ignores the steps after ``step`` in older files."""
         from torch.utils.tensorboard import SummaryWriter
 
         folder = context.folder / TENSORBOARD

@@ -21,17 +21,17 @@ from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainSt
 class Tracking(Callback):
     """Pass the numbers and the previews of a run on to a program that shows many runs.
 
-    The numbers have the names of ``metrics.jsonl`` and ``summary.json`` behind the words ``train/``,
-    ``refine/`` and ``result/``. No run depends on a tracker: one that fails is switched off with a warning,
-    whatever it raised. Nothing here draws a random number or changes the run.
+    The numbers have the names of ``metrics.jsonl`` and ``summary.json``, with one of the prefixes ``train/``,
+    ``refine/`` and ``result/``. No run depends on a tracker: if one raises any exception, it is switched off
+    with a warning. Nothing here draws a random number or changes the run.
     """
 
     package: ClassVar[str]  # that pip installs; also the name of the callback and of the extra
 
     every: int  # steps
     _works: bool = field(default=True, init=False, repr=False)
-    # The last step that was reported, if any, and its numbers. They are passed on one step later, when the
-    # preview of the step has been drawn, wherever the callbacks are in the list.
+    # The last step that was reported, if any, and its numbers. They are passed on one step later. By then the
+    # preview of the step has been drawn, even if the callback that draws it comes later in the list.
     _step: int | None = field(default=None, init=False, repr=False)
     _numbers: dict[str, float] = field(default_factory=dict, init=False, repr=False)
 
@@ -96,7 +96,7 @@ class Tracking(Callback):
         self._attempt(lambda: self.close(is_complete=True))
 
     def on_abort(self, context: RunContext) -> None:
-        """Record what there is and close the tracker."""
+        """Record the last step and close the tracker."""
         self._pass_on(context, None)
         self._attempt(lambda: self.close(is_complete=False))
 

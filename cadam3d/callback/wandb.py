@@ -1,7 +1,7 @@
-"""Wandb: records a run for Weights & Biases, and sends it there if an API key is configured.
+"""Wandb: record a run for Weights & Biases, and send it there if an API key is configured.
 
-What leaves this machine is what the functions below name: the settings in ``config.yaml``, the numbers and
-the previews, the names of the run and of its sweep, and the versions of Python and of wandb. Everything that
+Only what the functions below name leaves this machine: the settings in ``config.yaml``, the numbers and the
+previews, the names of the run and of its sweep, and the versions of Python and of wandb. Everything that
 wandb collects by itself is switched off: the console, code, git, the list of packages, the machine and its
 load, the command line, and reports of errors. Without a key, nothing is sent.
 """
@@ -65,8 +65,8 @@ class Wandb(Tracking):
         require_range("callback.wandb.timeout", self.timeout, low=1, example=30)
 
     def open(self, context: RunContext, step: int) -> None:
-        """Start a run of wandb, or continue that of the folder. It is offline unless a server accepts it."""
-        # wandb reads this when it is imported. To send reports of its errors, set the variable to true.
+        """Start a run of wandb, or continue that of the folder: offline, unless a server accepts it."""
+        # wandb reads this when it is imported. To send reports of its errors, set it to true beforehand.
         os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         self._file = context.folder / WANDB_RUN
         self._id, self._recorded = known_run(self._file)
@@ -129,11 +129,11 @@ class Wandb(Tracking):
             run_group=None if sweep is None else sweep.name[:LONGEST_NAME],
             resume="allow",
             root_dir=str(context.folder.resolve()),
-            # A run that another part of this process has started stays as it is.
+            # Do not end a run that another part of this process has started.
             reinit="create_new",
             init_timeout=self.timeout,
             finish_timeout=self.timeout,
-            # A button on a page of the server does not end the training.
+            # Without this, a button on a page of the server would end the training.
             stop_fn=lambda: None,
             silent=True,
             symlink=False,

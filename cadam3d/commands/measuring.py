@@ -35,7 +35,7 @@ def measure(
     start: Callable[[], Gaussians] | None,
     warnings: list[str],
 ) -> dict[str, Any]:
-    """Return the numbers of all metrics. If a metric fails, only its numbers are missing, and a warning is added.
+    """Return the numbers of all metrics. If a metric fails, only its own are missing, and a warning is added.
 
     The records of how numbers were measured are under ``MEASUREMENTS``, which is missing if there are none.
     ``start`` returns the Gaussians at the start of the run. If it is None, they are not measured.

@@ -1,6 +1,6 @@
 """Means: averages over prompts and paired differences, with 95 % intervals over prompts.
 
-The paper's table has means, where the other tables of a sweep have medians.
+The paper's table has means. The other tables of a sweep have medians.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Published: the paper's table 1, with every number as it is printed there.
 
-The paper measures with views, models and prompts that it does not list, so these numbers are shown beside
-ours and never combined with them. Its "MB" are MiB: 1706K Gaussians of 68 bytes each are 110.6 of them.
+The paper does not list the views, models and prompts with which it measures, so these numbers are shown
+beside ours and never combined with them. Its "MB" are MiB: 1706K Gaussians of 68 bytes each take 110.6 MiB.
 """
 
 from collections.abc import Mapping

@@ -24,7 +24,7 @@ def write(sweep: Path) -> str:
     """
     table = read_table(sweep)
     if table is None:
-        # Those of an earlier line would be taken for those of the present jobs.
+        # Files that an earlier line wrote would be mistaken for the table of the present jobs.
         for name in FORMATS:
             (sweep / name).unlink(missing_ok=True)
         return ""

@@ -27,7 +27,7 @@ PATH_KEYS = (
 # Whether the jobs of a sweep are only listed, and where they run. No run has these settings.
 DRY_RUN = "dry_run"
 LAUNCHER_KEY = re.compile(r"launcher($|\.)|hydra[./]launcher($|\.)")
-# Settings of a line that say nothing about what a run computes, so they may differ when it is continued.
+# Settings of a line that do not change what a run computes, so they may differ when it is continued.
 NOT_OF_A_RUN = ("resume", "trust", "attempts", "select")
 # Keys whose value may be a list of paths or of texts, such as run=[A,B].
 LIST_KEYS = ("run", "runs", "labels", "arms", "answers")

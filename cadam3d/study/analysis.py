@@ -1,4 +1,4 @@
-"""Analysis: what the answers of a study say about its arms, as numbers with their uncertainty.
+"""Analysis: turn the answers of a study into numbers about its arms, with their uncertainty.
 
 All functions are pure, and no result depends on the order of raters or of answers. ``study/estimates.py`` has
 the intervals and tests, and ``study/summary.py`` writes the analysis as text.
@@ -138,7 +138,7 @@ def analyse(raters: Sequence[Rater], *, least_caught: float) -> Analysis:
     """Return the analysis of the answers of all raters who pass the catch trials.
 
     A rater is excluded if the share of right answers in catch trials is below ``least_caught``, in [0, 1]. A
-    rater who has seen no catch trial is kept. Raise :class:`UserError` if no answer is left.
+    rater who has seen no catch trial is kept. Raises ``UserError`` if no answer is left.
     """
     require_range("least_caught", least_caught, low=0, high=1, example=0.8)
     screening = screen(raters, least_caught)
@@ -190,9 +190,9 @@ def _needed(total: int, least: float) -> int:
 
 
 def question_result(answers: Sequence[Answer]) -> QuestionResult:
-    """Return what the answers to one question say, of which there must be at least one.
+    """Return the result of one question from its answers, of which there must be at least one.
 
-    The p-values of its comparisons are not corrected.
+    The p-values of the comparisons are not corrected.
     """
     answers = sorted(answers, key=lambda each: (each.rater, each.prompt, each.chosen, each.other))
     arms = _arms(answers)

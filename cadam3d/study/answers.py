@@ -1,6 +1,6 @@
-"""Answers: the files that raters send back, and what they have answered about which arms.
+"""Answers: read the files that raters send back, and find the arms that each answer is about.
 
-The files come from strangers. A file that cannot be used costs no other file: it is left out, with a reason.
+The files come from strangers. A file that cannot be used is left out with a reason, and the others count.
 """
 
 import glob
@@ -42,7 +42,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Rater:
-    """All that one rater has answered.
+    """All answers of one rater.
 
     If an arm has several runs of one prompt, there are several answers to each question about that prompt. A
     rater who stopped early has fewer answers and fewer catches than the others.
@@ -122,7 +122,7 @@ def find_files(patterns: Sequence[str]) -> list[Path]:
 def read_files(paths: Sequence[Path]) -> tuple[list[AnswerFile], list[LeftOut]]:
     """Return the content of the files with answers, and the files that cannot be used.
 
-    The key and the results of a study may be in the same folder. They are skipped without a word.
+    The key and the results of a study may be in the same folder. They are skipped without a message.
     """
     files: list[AnswerFile] = []
     left: list[LeftOut] = []
@@ -138,7 +138,7 @@ def read_files(paths: Sequence[Path]) -> tuple[list[AnswerFile], list[LeftOut]]:
             left.append(LeftOut(path, reason))
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             reason = " ".join(str(error).split())[:100]
-            left.append(LeftOut(path, f"it is not a whole file of answers ({reason})"))
+            left.append(LeftOut(path, f"it is not a complete file of answers ({reason})"))
     return files, left
 
 

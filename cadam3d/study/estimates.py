@@ -114,13 +114,13 @@ def _unanimous(clusters: Clusters) -> float:
     """Return the lower end of the interval of a rate if all answers choose the arm.
 
     Such answers do not show how much raters and prompts differ. The result is the larger of two bounds that
-    are both cautious: the exact bound of a study with one answer for each rater or for each prompt, of which
-    there are fewer, and the bound of this study with one answer turned round.
+    are both cautious: the exact bound of a study with as many answers as there are raters or prompts,
+    whichever are fewer, and the bound of this study with one answer reversed.
     """
     units = min(int(groups.max()) + 1 for groups in (clusters.raters, clusters.prompts) if groups.max() > 0)
     exact = ((1 - CONFIDENCE) / 2) ** (1 / units)
     # Answers that share rater, prompt and cell with equally many others are interchangeable. One of each kind
-    # is turned round, and the lowest bound counts.
+    # is reversed, and the lowest bound counts.
     _, kinds = np.unique(clusters.sizes(), axis=1, return_index=True)
     positions = np.arange(len(clusters.cells))
     turned = min(rate_interval(positions != i, clusters).low for i in kinds)
@@ -156,10 +156,11 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def agreement(chosen: Bool[np.ndarray, "n"], clusters: Clusters) -> float | None:
-    """Return Krippendorff's alpha of the raters: 1 if they agree about every prompt, about 0 if by chance.
+    """Return Krippendorff's alpha of the raters: 1 for full agreement, about 0 for agreement by chance.
 
-    It is for nominal data with missing answers. It is ``None`` if no two raters have answered about the same
-    prompt, if a rater has answered about a prompt more than once, or if all answers are the same.
+    It is the variant for nominal data with missing answers. The result is ``None`` if no two raters have
+    answered about the same prompt, if a rater has answered about a prompt more than once, or if all answers
+    are the same.
     """
     if clusters.cells.max() + 1 < len(chosen):
         return None
@@ -244,7 +245,7 @@ def unranked(wins: Float[np.ndarray, "k k"]) -> tuple[list[int], bool] | None:
     """Return arms whose strengths relative to the others are not finite; ``None`` if there are none.
 
     The second value says whether these arms won all their comparisons with the others; if it is false, they
-    were never compared with the others. Finite strengths exist exactly if the arms can not be divided into
+    were never compared with the others. Finite strengths exist exactly if the arms cannot be divided into
     two groups of which one never wins against the other (Ford, 1957).
     """
     links = wins > 0

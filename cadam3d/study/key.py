@@ -67,7 +67,7 @@ def write_key(path: Path, study: str, plan: Plan, *, seed: int) -> None:
 
 
 def read_key(path: Path) -> Key:
-    """Return the key in a file. Raises ``UserError`` if the file is no key of a study."""
+    """Return the key in a file. Raises ``UserError`` if the file is not the key of a study."""
     content = read_bytes(path, largest=LARGEST_KEY)
     try:
         value = parse_json(content)
@@ -103,7 +103,7 @@ def _trial(value: Any, clips: int) -> Trial:
     one, other = (_number(each, clips) for each in _list(value["clips"]))
     right = value["right"]
     if one == other or (right is not None and _number(right, clips) not in (one, other)):
-        raise ValueError("a trial has other clips than two")
+        raise ValueError("a trial does not have two different clips")
     return Trial(_text(value["prompt"]), (one, other), right)
 
 

@@ -1,7 +1,7 @@
 """Page: one HTML file that shows a study to raters, without a library and without a request to the network.
 
 The page contains descriptions, clips and questions. It contains no names of arms or files and no numbers of
-Gaussians, and a clip has a number that was drawn. What the clips show is in the key of the study only.
+Gaussians. Each clip has a random number, and only the key of the study says what it shows.
 """
 
 import base64
@@ -70,7 +70,7 @@ def study_page(
 
 
 def _trials_json(trials: Sequence[Trial]) -> str:
-    """Return what a page knows of its trials. Whether one is a catch trial is not part of it."""
+    """Return the trials as the page has them, which does not include which of them are catch trials."""
     return json.dumps([{"prompt": trial.prompt, "clips": trial.clips} for trial in trials])
 
 

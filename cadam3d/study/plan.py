@@ -19,7 +19,7 @@ class Source:
     """The run that a clip shows, and whether it is ruined."""
 
     run: Run
-    is_ruined: bool  # it is blurred and noisy until nothing can be recognised
+    is_ruined: bool  # so blurred and noisy that nothing can be recognised
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,12 @@ def catch_count(pairs: int, share: float) -> int:
 def make_plan(pairs: Sequence[Pair], visible: Sequence[Run], catches: int, generator: Random) -> Plan:
     """Return the trials of a study: every pair once, and ``catches`` catch trials spread among them.
 
-    Of each two arms, one has the first side as often as the other, up to one trial. Catch trials show runs in
+    Of any two arms, each is on the first side equally often, up to one trial. Catch trials show runs in
     ``visible``, which must not be empty, and the right clip is on each side equally often.
     """
     trials = generator.sample(_balanced(pairs, generator), len(pairs))
     checks = _catch_trials(visible, catches, generator)
-    # Each catch trial is somewhere in a section of its own, so that a rater who stops early has seen some.
+    # The study has one section for each catch trial, so that a rater who stops early has seen some of them.
     for number, check in reversed(list(enumerate(checks))):
         low, high = (len(trials) * k // len(checks) for k in (number, number + 1))
         trials.insert(generator.randint(low, max(low, high - 1)) if high > low else low, check)
@@ -103,7 +103,7 @@ def _balanced(pairs: Sequence[Pair], generator: Random) -> list[_Sides]:
 
 
 def _catch_trials(visible: Sequence[Run], count: int, generator: Random) -> list[_Sides]:
-    """Return catch trials of different runs, as far as there are any."""
+    """Return catch trials. Runs repeat only after each of them has been shown."""
     drawn = generator.sample(list(visible), len(visible))
     trials = []
     for number, is_turned in enumerate(_evenly(count, generator)):

@@ -1,4 +1,4 @@
-"""Runs: the arms of a study, and the pairs of runs that raters compare.
+"""Runs: find the arms of a study and the pairs of runs that raters compare.
 
 An *arm* is what is compared, such as a densifier. Two runs of different arms are a pair if they have the same
 prompt and agree in everything else that varies, such as the seed or the objective.
@@ -58,7 +58,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Found:
-    """The runs that a line names, and how many others it names that left no asset."""
+    """The runs that a line names and that left an asset, and the number of those that left none."""
 
     runs: list[Run]
     without_asset: int
@@ -249,14 +249,14 @@ def _no_pair(runs: Sequence[Run], *, same_seed: bool) -> UserError:
     shares_prompt = any(len(arms) > 1 for arms in prompts.values())
     if same_seed and shares_prompt:
         return UserError(
-            "runs: expected runs of different arms with the same prompt and seed, got other seeds in each "
-            "arm. Try: same_seed=false"
+            "runs: expected runs of different arms with the same prompt and seed, got different seeds in "
+            "each arm. Try: same_seed=false"
         )
     some = "; ".join(
         f"{arm}: {prompt!r}" for prompt, arms in list(prompts.items())[:2] for arm in sorted(arms)
     )
     return UserError(
-        "runs: expected runs of different arms with the same prompt, got other prompts in each arm "
+        "runs: expected runs of different arms with the same prompt, got different prompts in each arm "
         f"({some[:200]}). Try: cadam3d sweep --help"
     )
 

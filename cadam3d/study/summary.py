@@ -124,7 +124,7 @@ def screening_lines(analysis: Analysis) -> list[str]:
     """Return which raters were excluded, by which rule, and what the catch trials cannot show."""
     screening = analysis.screening
     if not any(each.total for each in (*screening.kept, *screening.excluded)):
-        return ["No rater was excluded, because none has met a catch trial."]
+        return ["No rater was excluded, because none met a catch trial."]
     rule = f"fewer than {100 * screening.least:g} % right answers in catch trials"
     if screening.excluded:
         names = ", ".join(f"{each.name} ({each.right} of {each.total})" for each in screening.excluded)
@@ -139,7 +139,7 @@ def screening_lines(analysis: Analysis) -> list[str]:
         count = _plural(len(weak), "rater")
         chance = f"{100 * max(weak):.0f} %"
         lines.append(
-            f"The catch trials of {count} are few: guesses pass with a probability of up to {chance}."
+            f"{count} met so few catch trials that guesses pass with a probability of up to {chance}."
         )
     return lines
 
@@ -160,7 +160,7 @@ def _rates(analysis: Analysis) -> list[Paragraph | Table]:
 
 
 def _scope(analysis: Analysis) -> str:
-    """Return what the intervals are about: the clusters of which the study has at least two."""
+    """Return the words that say which raters and prompts the intervals are about."""
     counts = {"raters": analysis.raters, "prompts": analysis.prompts}
     several = [name for name, count in counts.items() if count > 1]
     if not several:

@@ -43,7 +43,7 @@ class AxisValue:
     key: str  # without a leading + or ~
     line: str  # as it was written for Hydra
     value: str  # as JSON
-    # The prompt of a file or a set that this setting is, and the other settings that it brings.
+    # If this setting is a prompt of a file or a set: that prompt, and the other settings that come with it.
     prompt: Prompt | None = None
     more: tuple["AxisValue", ...] = ()
 
@@ -205,7 +205,7 @@ def swept_keys(grid: Grid, line: Axes) -> list[str]:
     """Return the keys in which jobs may differ: those of the grid, and those with several values in the line.
 
     Prompt and seed count too if the line gives them: another prompt is another job, not another setting of
-    all jobs. So do the settings that come with prompts, unless the line has one value for all jobs.
+    all jobs. Settings that come with prompts count as well, unless the line has one value for all jobs.
     """
     keys = [*grid.each, *(key for axes in grid.arms.values() for key in axes)]
     keys += [key for key, axis in line.items() if len(axis) > 1 or key in ALWAYS_SHOWN]
@@ -216,7 +216,7 @@ def swept_keys(grid: Grid, line: Axes) -> list[str]:
 def sweep_name(grid_name: str | None, line: Axes, prompts: PromptChoice | None = None) -> str:
     """Return the name of the folder of a sweep: the name of its grid, or else a summary of the line.
 
-    ``prompts`` are those of a file or a set, which is named instead of them. A shard has a folder of its own.
+    If the prompts are those of a file or a set, its name stands for them. Each shard has its own folder.
     """
     suffix = "_shard-{}-of-{}".format(*prompts.shard) if prompts and prompts.shard else ""
     if grid_name:
@@ -337,7 +337,7 @@ def _named(grid: Grid, line: Axes) -> set[str]:
     varied = {key for axes in grid.arms.values() for key, axis in axes.items() if len(axis) > 1}
     varied |= {key for key, axis in grid.each.items() if len(axis) > 1}
     fixed = {key for axes in (*grid.arms.values(), grid.each) for key in axes} - varied
-    # A shard of prompts may be a single one; its jobs have the names that they have in the whole sweep.
+    # Even if a shard has a single prompt, the names of its jobs are those that they have in the whole sweep.
     several = {key for key, axis in line.items() if len(axis) > 1 or any(each.prompt for each in axis)}
     return {key for key in swept_keys(grid, line) if key not in fixed - several}
 

@@ -1,8 +1,8 @@
 """Prompts: read the prompts of a sweep from a file, or from a set that comes with this package.
 
-A prompt may bring settings for its own jobs, such as a negative prompt, and a category by which tables can be
-split. The file may come from a stranger: it is read as plain data, and every mistake in it is one message
-that names the line.
+A prompt may come with settings for its own jobs, such as a negative prompt, and with a category by which
+tables can be split. The file may come from a stranger. It is read as plain data, and a mistake in it is
+reported in one message that names the line.
 """
 
 import json
@@ -26,7 +26,7 @@ from cadam3d.settings.declared import is_readable
 
 KEY, FILE = "prompts", "prompts.file"
 SHARD, CATEGORY, FIRST = "prompts.shard", "prompts.category", "prompts.first"
-# The settings of a run that the keys of an entry give, besides its prompt.
+# The setting of a run for each key of an entry, besides the prompt.
 SETTINGS = {"negative_prompt": "negative_prompt", "initializer_prompt": "initializer.prompt"}
 ENTRY = ("prompt", *SETTINGS, "name", "category")
 TREES = (".yaml", ".yml", ".json")
@@ -43,7 +43,7 @@ REFERENCE = "lib:"
 
 @dataclass(frozen=True, kw_only=True)
 class Prompt:
-    """One prompt of a sweep, with the settings that its jobs have besides the prompt."""
+    """One prompt of a sweep, with further settings of its jobs."""
 
     text: str
     settings: tuple[tuple[str, str], ...] = ()  # keys and values
@@ -117,8 +117,8 @@ def read_choice(node: Mapping[Any, Any] | None, default: str | None = None) -> P
 def read_prompts(source: str) -> tuple[Prompt, ...]:
     """Return the prompts of a set, or of the file at the path ``source``. Repeated entries count once.
 
-    Raises ``UserError``, with the line, for anything that is not a prompt and for a prompt with two different
-    entries.
+    Raises ``UserError``, which names the line, for anything that is not a prompt, and if a prompt has two
+    different entries.
     """
     path = _find(source)
     text = _decoded(path)
@@ -145,7 +145,7 @@ def read_prompts(source: str) -> tuple[Prompt, ...]:
 
 
 def _of_category(prompts: tuple[Prompt, ...], category: str | None) -> tuple[Prompt, ...]:
-    """Return the prompts of a category, in any case of its letters; None means all prompts."""
+    """Return the prompts of a category, in upper or lower case; None means all prompts."""
     if category is None:
         return prompts
     chosen = tuple(each for each in prompts if each.category.casefold() == category.casefold())
@@ -208,7 +208,7 @@ def _shard(value: Any) -> tuple[int, int] | None:
 
 
 def _refusal(place: str, expected: str, got: object) -> UserError:
-    """Return the error about a file. A set of this package is what surely can be read instead."""
+    """Return the error about a file. It proposes a set of this package, which can always be read."""
     return UserError(f"{KEY}: {place}: expected {expected}, got {got}. Try: {KEY}={set_names()[0]}")
 
 

@@ -67,8 +67,8 @@ def as_text(rows: Sequence[Row]) -> str:
 def scores_of(jobs: Sequence[Mapping[str, Score]], sweep: Path) -> Scores:
     """Return the scores of the jobs of a sweep, by name for each job, as columns. Missing ones are None.
 
-    Numbers of one name that were measured in different ways (with different protocols, models or lists of
-    prompts) are left out.
+    A number that was measured in different ways (with different protocols, models or lists of prompts) is
+    left out.
     """
     columns: dict[str, list[float | None]] = {}
     left_out = []
