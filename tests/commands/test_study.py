@@ -150,7 +150,7 @@ def test_answers_become_a_table_and_files_beside_the_key(arms, type_line, tmp_pa
     assert "2 raters, 3 prompts, 2 arms and 30 answers" in out
     assert re.search(r"^ibis +100\.0", out, re.MULTILINE)
     assert "Excluded 1 rater" in out
-    assert "broken.json is left out: it is not a whole file of answers" in err
+    assert "broken.json is left out: it is not a complete file of answers" in err
     result = read_json(tmp_path / "study/study.json")
     assert (result["study"], result["catch_trials"], result["answers"]) == (key["study"], 2, 30)
     assert [each["file"] for each in result["left_out"]] == ["broken.json"]

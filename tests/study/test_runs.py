@@ -166,5 +166,5 @@ def test_an_unknown_arm_is_refused_with_those_there_are(tmp_path):
 def test_arms_without_a_common_prompt_are_refused(tmp_path):
     make_run(tmp_path / "A", "a cube")
     make_run(tmp_path / "B", "a cone")
-    with pytest.raises(UserError, match=r"got other prompts in each arm \(A: 'a cube'; B: 'a cone'\)"):
+    with pytest.raises(UserError, match=r"got different prompts in each arm \(A: 'a cube'; B: 'a cone'\)"):
         paired(find(tmp_path / "A", tmp_path / "B"))

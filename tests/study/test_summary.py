@@ -73,13 +73,13 @@ def test_raters_who_were_excluded_or_not_tested_are_named():
     assert "Kept without an answer in a catch trial: early." in page
     assert "are few" not in page
     few = shown(simulated_raters({"a": 0, "b": 0}, 3, 2, catches=[True] * 5))
-    assert "The catch trials of 3 raters are few: guesses pass with a probability of up to 19 %." in few
+    assert "3 raters met so few catch trials that guesses pass with a probability of up to 19 %." in few
     assert "No rater was excluded" in few
 
 
 def test_a_study_without_catch_trials_says_so():
     page = shown(simulated_raters({"a": 0, "b": 0}, 3, 2, catches=[]))
-    assert "- No rater was excluded, because none has met a catch trial.\n" in page
+    assert "- No rater was excluded, because none met a catch trial.\n" in page
     assert "Kept" not in page
 
 
