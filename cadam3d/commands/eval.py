@@ -177,8 +177,9 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
     if problem is not None:
         raise _not_saved(folder, problem) from problem
     write_table(folder)
+    table = report.write_paper_table(folder)
     print(f"\n{len(results)} jobs: {shown(folder / EVALUATION)}\nreport: {shown(report.write_sweep(folder))}")
-    if table := report.write_paper_table(folder):
+    if table:
         print(f"\n{table}")
 
 

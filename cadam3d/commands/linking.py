@@ -34,4 +34,10 @@ def link_best(folder: Path, name: str) -> None:
             kept = numbered(best)
             best.rename(kept)
             say(f"Note: {shown(folder)}/{BEST} was renamed to {kept.name}.", logging.WARNING)
-        shutil.copytree(run, best, ignore=shutil.ignore_patterns(LOCK))
+        # A copy that is interrupted must not be taken for a complete one.
+        fresh = best.with_name(f".{BEST}-{os.getpid()}")
+        try:
+            shutil.copytree(run, fresh, ignore=shutil.ignore_patterns(LOCK))
+            fresh.rename(best)
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)

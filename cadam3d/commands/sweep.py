@@ -22,10 +22,12 @@ def run(command: str, overrides: Sequence[str], flags: Sequence[str], options: N
 def write_report(folder: Path) -> None:
     """Write the report of the sweep in ``folder`` and print its verdict. A failure is printed, not raised."""
     try:
+        # The page lists the files of the table.
+        table = report.write_paper_table(folder)
         page = report.write_sweep(folder)
         print("".join(f"\n{sentence}\n" for sentence in report.verdict(folder)))
         print(f"report: {shown(page)}", flush=True)
-        if table := report.write_paper_table(folder):
+        if table:
             print(f"\n{table}", flush=True)
     except UserError as error:
         print(f"cadam3d: {error}", file=sys.stderr)

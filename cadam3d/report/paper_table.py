@@ -237,7 +237,11 @@ def _difference_row(
     usable, others = ([job for job in jobs if job.cell in both] for jobs in (usable, others))
     cells = {}
     for name in names:
-        first, second = _by_prompt(usable, name), _by_prompt(others, name)
+        measured = [{job.cell for job in jobs if name in job.numbers} for jobs in (usable, others)]
+        shared = set.intersection(*measured)
+        first, second = (
+            _by_prompt([job for job in jobs if job.cell in shared], name) for jobs in (usable, others)
+        )
         if name in SIZES:
             found = change(first, second)
             cells[name] = TableCell() if found is None else _change_cell(found)

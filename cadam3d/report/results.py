@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from cadam3d.core.outcome import Outcome
 from cadam3d.core.quality import QUALITIES
 from cadam3d.io.records import (
+    QUALITY,
     Score,
     latest_scores,
     psnr_of,
@@ -105,7 +106,8 @@ class JobResult:
     objective: str  # the option of ``guidance`` it ran with; empty if that is not known
     category: str  # of its prompt; empty if it has none
     # All numbers that were measured, and those that have a record of how. Those of eval.json replace those
-    # from the end of training.
+    # from the end of training, except that comparisons with a truth all come from one of the two, as in
+    # sweep.csv.
     numbers: Mapping[str, float] = field(repr=False)
     scores: Mapping[str, Score] = field(repr=False)
 
@@ -178,7 +180,10 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
     summary = {**job.summary, **read_quality(job.folder, job.summary)}
     numbers = {key: number(value) for key, value in summary.items()}
     size = numbers.get("asset_bytes")
-    sources = (job.summary, read_evaluation(job.folder, job.summary))
+    # Whether a comparison with a truth comes from training or from eval.json is the same for all tables.
+    evaluation = read_evaluation(job.folder, job.summary)
+    evaluation = {name: value for name, value in evaluation.items() if name not in QUALITY}
+    sources = (summary, evaluation)
     given = {key: value for key, value in job.overrides.items() if key.startswith(PREFIX)}
     return JobResult(
         folder=job.folder,

@@ -21,7 +21,7 @@ from cadam3d.report.paper_table import PaperTable
 from cadam3d.report.results import ARM, NOISE, PROMPT, SEED, JobResult, arms_of, read, with_noise
 from cadam3d.report.score_maps import declared_scores, score_figure
 from cadam3d.report.style import inline, styled, write_figure
-from cadam3d.report.table_files import read_table
+from cadam3d.report.table_files import FORMATS, read_table
 from cadam3d.settings.line import key_of
 from cadam3d.sweep.folder import Plan, is_sweep, read_plan
 
@@ -153,7 +153,7 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None) -> Path:
         tables.write_csv(folder / f"{name}.csv", lines)
     paper = read_table(sweep_folder)
     drawn = [_drawn(results, name, kinds[name], folder) for name in names or kinds if name in kinds]
-    files = [name for name in (TABLE, FIGURES) if (sweep_folder / name).exists()]
+    files = [name for name in (TABLE, *FORMATS, FIGURES) if (sweep_folder / name).exists()]
     return write_page(
         sweep_folder / REPORT,
         "sweep.html.jinja",

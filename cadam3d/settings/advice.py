@@ -16,7 +16,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_yaml
 from cadam3d.io.run_folder import CONFIG, HYDRA_SETTINGS, OVERRIDES, suggestion
 from cadam3d.settings.compose import NO_NAME_COMPLAINT, compose, config_dir, flatten, quote
-from cadam3d.settings.line import key_of, quoted, text_of
+from cadam3d.settings.line import OF_ATTEMPTS, key_of, quoted, text_of
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
 # The package of each option of hydra/launcher that Hydra itself lacks.
@@ -123,6 +123,11 @@ def require_values(cfg: DictConfig) -> None:
 def line_of(command: str, words: Sequence[str]) -> str:
     """Return ``cadam3d <command> <words>`` as it is typed into a shell."""
     return shlex.join(["cadam3d", command, *words])
+
+
+def _sweep_line(words: Sequence[str]) -> str:
+    """Return a line of ``cadam3d train`` as a sweep, whose jobs are single attempts."""
+    return line_of("sweep", [word for word in words if key_of(word) not in OF_ATTEMPTS])
 
 
 def _job_refused(error: RefusedJobError, command: str, words: Sequence[str]) -> UserError | None:
@@ -273,7 +278,8 @@ def _unknown_key(key: str, command: str, words: Sequence[str], settings: Sequenc
     """
     if (root := (key.partition(".")[0], command)) in MISPLACED:
         owner, reason = MISPLACED[root]
-        return UserError(f"{key}: {reason}. Try: {line_of(owner, words)}")
+        line = _sweep_line(words) if owner == "sweep" else line_of(owner, words)
+        return UserError(f"{key}: {reason}. Try: {line}")
     value = next((word.partition("=")[2] for word in words if key_of(word) == key), None)
     known = _known(key, command, words if settings is None else settings)
     if value is not None and key in known:
@@ -378,5 +384,5 @@ def _several_values(override: str, command: str, words: Sequence[str]) -> UserEr
     if command not in ("train", "sweep"):
         first = shlex.quote(f"{key}={value.partition(',')[0]}")
         return UserError(f"{key}: expected one value, got {value!r}. Try: {first}")
-    line = line_of("sweep", words)
+    line = _sweep_line(words)
     return UserError(f"{key}: several values make a sweep (a list is {example}). Try: {line}")

@@ -27,8 +27,10 @@ PATH_KEYS = (
 # Whether the jobs of a sweep are only listed, and where they run. No run has these settings.
 DRY_RUN = "dry_run"
 LAUNCHER_KEY = re.compile(r"launcher($|\.)|hydra[./]launcher($|\.)")
+# Settings of a line that trains several seeds, which its runs do not have.
+OF_ATTEMPTS = ("attempts", "select")
 # Settings of a line that do not change what a run computes, so they may differ when it is continued.
-NOT_OF_A_RUN = ("resume", "trust", "attempts", "select")
+NOT_OF_A_RUN = ("resume", "trust", *OF_ATTEMPTS)
 # Keys whose value may be a list of paths or of texts, such as run=[A,B].
 LIST_KEYS = ("run", "runs", "labels", "arms", "answers")
 # A path that Hydra's grammar reads without quotes. It cannot read "~".

@@ -21,6 +21,7 @@ from hydra.core.override_parser.types import Glob, Override, RangeSweep
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import to_json
 from cadam3d.settings.compose import TEXT_KEYS, quote, slug
+from cadam3d.settings.line import NOT_OF_A_RUN
 from cadam3d.sweep.prompts import FIRST, Prompt, PromptChoice
 
 # Text that Hydra reads the same way with and without quotes, apart from the reserved words.
@@ -221,7 +222,12 @@ def sweep_name(grid_name: str | None, line: Axes, prompts: PromptChoice | None =
     suffix = "_shard-{}-of-{}".format(*prompts.shard) if prompts and prompts.shard else ""
     if grid_name:
         return f"{slug(grid_name)}{suffix}"
-    keys = [key for key, axis in line.items() if not any(setting.prompt for setting in axis)]
+    # A folder that is trusted has the name that it had before.
+    keys = [
+        key
+        for key, axis in line.items()
+        if key not in NOT_OF_A_RUN and not any(setting.prompt for setting in axis)
+    ]
     keys.sort(key=lambda key: (key not in TEXT_KEYS, len(line[key]) == 1, key))
     values = {key: ",".join(setting.text for setting in line[key]) for key in keys}
     words = [values[key] if key in TEXT_KEYS else f"{key}={values[key]}" for key in keys]

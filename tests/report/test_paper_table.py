@@ -114,6 +114,25 @@ def test_missing_jobs_are_counted_and_left_out_of_pairs(three):
     assert any("1 of 12 jobs" in note for note in table.notes)
 
 
+def test_differences_of_a_number_use_the_seeds_in_which_both_have_it(jobs):
+    jobs.paper_table = True
+    for seed, (theirs, ours) in enumerate([(30.0, 31.0), (10.0, None)]):
+        where = ("prompt=cube", "guidance=sds", f"seed={seed}")
+        jobs.add("baseline", *where, n=100, psnr=20, arm="baseline", **scored(theirs))
+        jobs.add("cadam", *where, n=50, psnr=20, arm="cadam", **({} if ours is None else scored(ours)))
+    row = row_of(table_of(jobs.folder), "SDS", "cadam - baseline")
+    assert row.cells["clip_score"].text == "+1.00"
+
+
+def test_a_truth_that_eval_compares_with_does_not_replace_that_of_training(three):
+    before = row_of(table_of(three), "SDS", "baseline").cells["psnr"]
+    folder = read(three)[0].folder
+    numbers = json.loads((folder / run_folder.SUMMARY).read_text())
+    (folder / run_folder.EVALUATION).write_text(json.dumps(numbers | {"psnr": 90.0, "clip_score": 30.0}))
+    assert row_of(table_of(three), "SDS", "baseline").cells["psnr"] == before
+    assert read(three)[0].numbers["clip_score"] == 30.0
+
+
 def test_seeds_are_averaged_within_a_prompt_first(jobs):
     jobs.paper_table = True
     for prompt, seeds in (("a cube", (10, 20, 60)), ("a torus", (90,))):

@@ -1,6 +1,7 @@
 """``cadam3d train attempts=N``: which attempt is chosen, and why; a small program replaces training."""
 
 import json
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -323,3 +324,36 @@ def test_without_links_the_best_is_a_copy_and_an_earlier_copy_is_kept(tmp_path, 
     link_best(tmp_path, "seed=1")
     assert json.loads((tmp_path / "best" / "summary.json").read_text()) == {"seed": 1}
     assert (tmp_path / "best-2" / "mine.txt").exists()
+
+
+def test_a_copy_that_was_interrupted_is_not_taken_for_the_best(tmp_path, monkeypatch):
+    def refuse(*_: object) -> None:
+        raise OSError(1, "Operation not permitted")
+
+    def end(*_: object, **__: object) -> None:
+        (tmp_path / "copied").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(links.Path, "symlink_to", refuse)
+    (tmp_path / "seed=0").mkdir()
+    for name in ("summary.json", "asset.ply"):
+        (tmp_path / "seed=0" / name).touch()
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "copystat", end)  # the last thing that a copy does
+        with pytest.raises(KeyboardInterrupt):
+            link_best(tmp_path, "seed=0")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["copied", "seed=0"]
+    link_best(tmp_path, "seed=0")
+    assert (tmp_path / "best" / "asset.ply").exists()
+
+
+@pytest.mark.parametrize("word", ["seed=0,1", "prompts=paper50", "grid=paper"])
+def test_the_line_of_a_sweep_that_is_suggested_has_no_attempts(word, train):
+    code, _, err = train(*LINE, "select=psnr", word)
+    line = shlex.join(["cadam3d", "sweep", "prompt=an attempt", word])
+    assert (code, err.endswith(f"Try: {line}\n")) == (1, True), err
+
+
+def test_attempts_that_are_trusted_have_the_folder_that_they_had(train):
+    outputs = [train(*LINE, "dry_run=true", *more)[1].split()[3] for more in ([], ["trust=true"])]
+    assert outputs[0] == outputs[1]
