@@ -16,6 +16,7 @@ from cadam3d.core.checks import require_range, require_whole
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
+from cadam3d.io.caption import plain
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.reading import read_text
 from cadam3d.io.run_folder import (
@@ -250,13 +251,14 @@ def _evaluate(cfg: DictConfig) -> None:
     print(text(analysis))
     folder = place.parent
     facts = {"study": key.study, "catch_trials": key.catch_trials, "trials": len(key.trials)}
-    reasons = [{"file": each.path.name, "reason": each.reason} for each in left]
-    result = {"kind": RESULTS_KIND, **facts, "left_out": reasons, **analysis.to_json()}
+    reasons = [each.printed for each in left]
+    listed = [{"file": name, "reason": reason} for name, reason in reasons]
+    result = {"kind": RESULTS_KIND, **facts, "left_out": listed, **analysis.to_json()}
     write_json(folder / RESULTS, result)
     with replacing(folder / TABLE) as temporary:
         page = markdown(analysis)
-        if left:
-            lines = Bullets([f"{each.path.name}: {each.reason}" for each in left])
+        if reasons:
+            lines = Bullets([f"{name}: {reason}" for name, reason in reasons])
             page += f"\nFiles that are left out:\n\n{lines.markdown()}\n"
         temporary.write_text(page, encoding="utf-8")
     print(f"\n{shown(folder / RESULTS)}, {shown(folder / TABLE)}")
@@ -296,7 +298,7 @@ def _around(path: Path) -> tuple[Path, Path]:
 
 
 def _warn(left: LeftOut) -> None:
-    say(f"Warning: {shown(left.path)} is left out: {left.reason}")
+    say(plain(f"Warning: {shown(left.path)} is left out: {left.reason}"))
 
 
 def _texts(value: Any) -> list[str]:

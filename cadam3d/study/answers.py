@@ -5,7 +5,6 @@ The files come from strangers. A file that cannot be used is left out with a rea
 
 import glob
 import os
-import unicodedata
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cadam3d.core.errors import UserError
+from cadam3d.io.caption import plain
 from cadam3d.io.jsonl import is_number, is_whole, parse_json
 from cadam3d.io.reading import read_bytes
 from cadam3d.io.run_folder import expanded, shown
@@ -81,6 +81,11 @@ class LeftOut:
     path: Path
     reason: str
 
+    @property
+    def printed(self) -> tuple[str, str]:
+        """Return the name of the file, which a stranger has chosen, and the reason, safe to print."""
+        return plain(self.path.name), plain(self.reason)
+
 
 @dataclass(frozen=True)
 class Collected:
@@ -146,37 +151,38 @@ def collect(files: Sequence[AnswerFile], key: Key) -> Collected:
     """Return the raters of the study of ``key`` with their answers about arms.
 
     - A file of another study is left out, and so is a file with answers that do not fit the study.
-    - A rater may save several times. The last file of a session counts.
+    - A session is of one rater, even if its files have different names. The last file of it counts.
     - Two sessions under one name may be of two people, so all their files are left out. Upper and lower case
       are the same name.
     - A rater may have answered only some of the questions. These answers count.
     """
     raters: list[Rater] = []
     left: list[LeftOut] = []
-    of_name: dict[str, list[AnswerFile]] = defaultdict(list)
+    sessions: dict[str, list[AnswerFile]] = defaultdict(list)
     for file in files:
         problem = _problem(file, key)
         if problem:
             left.append(LeftOut(file.path, problem))
         else:
-            of_name[file.rater.casefold()].append(file)
-    for same in of_name.values():
-        if len({file.session for file in same}) > 1:
-            names = [str(shown(file.path)) for file in same]
-            for file in same:
-                others = ", ".join(name for name in names if name != str(shown(file.path)))
-                left.append(
-                    LeftOut(
-                        file.path, f"another person or session has the same name {file.rater!r}: {others}"
-                    )
-                )
-            continue
+            sessions[file.session].append(file)
+    of_name: dict[str, list[AnswerFile]] = defaultdict(list)
+    for same in sessions.values():
         last = max(same, key=lambda file: (file.saves, len(file.choices)))
+        of_name[last.rater.casefold()].append(last)
+        newer = shown(last.path)
+        left += [
+            LeftOut(file.path, f"the same rater has saved again later: {newer}")
+            for file in same
+            if file is not last
+        ]
+    for same in of_name.values():
+        if len(same) == 1:
+            raters.append(_rater(same[0], key))
+            continue
         for file in same:
-            if file is not last:
-                newer = shown(last.path)
-                left.append(LeftOut(file.path, f"the same rater has saved again later: {newer}"))
-        raters.append(_rater(last, key))
+            others = ", ".join(str(shown(other.path)) for other in same if other is not file)
+            reason = f"another person or session has the same name {file.rater!r}: {others}"
+            left.append(LeftOut(file.path, reason))
     return Collected(sorted(raters, key=lambda rater: rater.name.casefold()), left)
 
 
@@ -195,7 +201,10 @@ def _file(path: Path, value: Any) -> AnswerFile:
     if len({(choice.trial, choice.question) for choice in choices}) < len(choices):
         raise ValueError("a question is answered twice")
     study, session = (_short(value, name, LONGEST_ID) for name in ("study", "session"))
-    rater = " ".join(_short(value, "rater", LONGEST_NAME).split())
+    # A name may have characters that cannot be seen, such as those inside some emoji and Persian words.
+    rater = plain(_short(value, "rater", LONGEST_NAME))
+    if not all((rater, study.isprintable(), session.isprintable())):
+        raise ValueError("rater, study, session: expected texts that can be printed")
     return AnswerFile(path, study, rater, session, value["saves"], choices)
 
 
@@ -211,10 +220,8 @@ def _choice(value: Any) -> Choice:
 
 def _short(value: dict[str, Any], name: str, longest: int) -> str:
     text = value[name]
-    is_text = isinstance(text, str) and 0 < len(text.strip()) <= longest
-    # Names are printed into terminals and tables.
-    if not is_text or any(unicodedata.category(each) in ("Cc", "Cf", "Zl", "Zp") for each in text):
-        raise ValueError(f"{name}: expected a text of 1 to {longest} printable characters")
+    if not isinstance(text, str) or not 0 < len(text.strip()) <= longest:
+        raise ValueError(f"{name}: expected a text of 1 to {longest} characters")
     return text
 
 

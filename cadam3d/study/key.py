@@ -7,6 +7,7 @@ from typing import Any
 
 from cadam3d import __version__
 from cadam3d.core.errors import UserError
+from cadam3d.io.caption import plain
 from cadam3d.io.jsonl import is_whole, parse_json, write_json
 from cadam3d.io.reading import read_bytes
 from cadam3d.io.run_folder import shown
@@ -95,7 +96,11 @@ def _key(value: Any) -> Key:
     clips = tuple(_text(clip["arm"]) for clip in _list(value["clips"]))
     if not set(clips) <= set(arms):
         raise ValueError("a clip is of an unknown arm")
+    if any(plain(arm) != arm for arm in arms):
+        raise ValueError("the name of an arm cannot be printed")
     trials = tuple(_trial(trial, len(clips)) for trial in _list(value["trials"]))
+    if any(trial.right is None and len({clips[clip] for clip in trial.clips}) < 2 for trial in trials):
+        raise ValueError("a trial compares an arm with itself")
     return Key(_text(value["study"]), arms, clips, trials)
 
 

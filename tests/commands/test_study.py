@@ -157,6 +157,20 @@ def test_answers_become_a_table_and_files_beside_the_key(arms, type_line, tmp_pa
     assert "broken.json" in (tmp_path / "study/study.md").read_text(encoding="utf-8")
 
 
+def test_names_of_files_do_not_control_the_terminal(arms, type_line, tmp_path):
+    type_line("study", arms, *SMALL)
+    key = read_json(tmp_path / "study/key.json")
+    for name in ("a\x1b[2J\udcff.json", "b\x1b[2J\udcff.json"):
+        write_json(tmp_path / "study/answers" / name, answered(key, "1", prefers_ibis))
+    (tmp_path / "study/answers/c\x1b[2J\udcff.json").write_text("{", encoding="utf-8")
+    code, out, err = type_line("study", "answers=study/answers")
+    assert code == 0
+    page = (tmp_path / "study/study.md").read_text(encoding="utf-8")
+    assert "c [2J .json is left out" in err
+    assert "b \\[2J .json: the same rater" in page
+    assert "\x1b" not in out + err + page
+
+
 def test_the_key_is_found_beside_the_answers_above_them_in_output_or_where_the_line_says(
     arms, type_line, tmp_path
 ):

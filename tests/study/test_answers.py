@@ -102,6 +102,24 @@ def test_two_sessions_under_one_name_are_both_left_out_and_name_each_other(read)
     assert "one.json" in left["two"]
 
 
+def test_a_session_under_two_names_is_one_rater_with_the_later_name(read):
+    raters, left = read(
+        early=written({0: 0}, rater="ann", saves=1), late=written({0: 1, 2: 2}, rater="anne", saves=2)
+    )
+    assert set(raters) == {"anne"}
+    assert raters["anne"].answers[0].chosen == "stork"
+    assert set(left) == {"early"}
+
+
+def test_invisible_characters_of_names_cost_no_answers(read):
+    names = {"x\u200cy": "x y", "a\x1b[2Jb": "a [2Jb"}
+    raters, left = read(
+        **{f"f{i}": written({0: 0}, rater=name, session=f"s{i}") for i, name in enumerate(names)}
+    )
+    assert set(raters) == set(names.values())
+    assert not left
+
+
 def test_a_file_of_another_study_is_left_out(read):
     raters, left = read(one=written({0: 0}), two=written({0: 0}, study="f" * 16, rater="8"))
     assert set(raters) == {"7"}
@@ -139,7 +157,8 @@ def broken(**changes) -> dict:
         written({0: 0}, saves=True),
         written({0: 0}, rater=""),
         written({0: 0}, rater="x" * 61),
-        written({0: 0}, rater="evil\x1b[2J"),
+        written({0: 0}, rater="\u200b\x1b"),
+        written({0: 0}, session="evil\x1b[2J"),
         written({0: 0}, rater=None),
         written({0: 0}, session=5),
         written({0: 0}, study=["0"]),
@@ -213,6 +232,9 @@ def test_a_key_is_read_as_it_was_written(tmp_path):
         {"trials": [{"prompt": "a cube", "clips": [0, 9], "right": None}]},
         {"trials": [{"prompt": "a cube", "clips": [0, 1], "right": 2}]},
         {"trials": [{"clips": [0, 1], "right": None}]},
+        # Without a right answer, a trial must compare two arms.
+        {"clips": [{"arm": "heron"}] * 4},
+        {"arms": ["heron", "stork", "evil\x1b[2J"]},
     ],
     ids=str,
 )
