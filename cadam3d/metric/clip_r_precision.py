@@ -14,8 +14,8 @@ from torch import Tensor
 from cadam3d.core.checks import fail, require
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_text, read_yaml
-from cadam3d.metric.clip import load_clip
-from cadam3d.metric.scoring import ModelMetric, Scorer, interval_record
+from cadam3d.metric.clip import ClipMetric, load_clip
+from cadam3d.metric.scoring import Scorer, interval_record
 
 # The sets of prompts that come with this package, by the names of their files.
 SETS = Path(__file__).parent.parent / "sweep" / "prompt_sets"
@@ -28,7 +28,7 @@ BATCH = 64  # texts that are read at once
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClipRPrecision(ModelMetric):
+class ClipRPrecision(ClipMetric):
     """The share of the pictures to which no other prompt of a list is as similar as the own one.
 
     This is the CLIP R-Precision of Park et al. (2021) with one relevant text, as Dream Fields (Jain et al.
