@@ -19,7 +19,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.jsonl import write_json
-from cadam3d.io.records import MEASUREMENTS, Score, psnr_of, scores_in
+from cadam3d.io.records import MEASUREMENTS, Score, psnr_of, read_summary, scores_in, with_earlier
 from cadam3d.io.run_folder import ASSET, CONFIG, EVALUATION, copying, shown, suggestion, typed_path
 from cadam3d.metric.base import Measurand
 from cadam3d.prior.base import DiffusionPrior
@@ -49,7 +49,7 @@ def run(cfg: DictConfig) -> None:
     result = evaluate(cfg, find_run(str(cfg.run)))
     print(_as_text(result))
     try:
-        write_json(folder / EVALUATION, result)
+        write_json(folder / EVALUATION, with_earlier(result, folder, cfg.metric))
     except UserError as error:
         raise _not_saved(folder, error) from error
     print(f"\n{shown(folder / EVALUATION)}")
@@ -76,9 +76,11 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     truth = source.of(own.prompt, prior)
 
     warnings: list[str] = []
-    # By the number of Gaussians, readers of the file recognise whether it describes the present asset.
+    # By these two numbers, readers of the file recognise whether it describes the present asset.
     result: dict[str, Any] = {"run": str(shown(folder)), "prompt": own.prompt}
     result["num_gaussians"] = len(asset.gaussians)
+    if (steps := read_summary(folder).get("steps")) is not None:
+        result["steps"] = steps
     result |= measure(
         build_metrics(cfg.metric),
         Measurand(
@@ -161,6 +163,7 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
         quality = "no psnr" if psnr is None else f"{psnr:6.2f} dB"
         print(f"{quality}  {results[-1].get('num_gaussians', '-'):>8} Gaussians  {job.name}", flush=True)
         try:
+            results[-1] = with_earlier(results[-1], job, cfg.metric)
             write_json(job / EVALUATION, results[-1])
         except UserError as error:
             problem = problem or error

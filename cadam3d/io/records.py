@@ -5,13 +5,14 @@ only entries of the kinds that training writes.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.outcome import Outcome
+from cadam3d.core.quality import QUALITIES
 from cadam3d.io.jsonl import is_number, is_whole, read_json, read_jsonl
 from cadam3d.io.reading import read_yaml
 from cadam3d.io.run_folder import EVALUATION, HISTOGRAMS, METRICS, SUMMARY
@@ -74,10 +75,31 @@ def read_evaluation(run: Path, summary: Mapping[str, Any]) -> dict[str, Any]:
         evaluation = read_json(run / EVALUATION)
     except UserError:
         return {}
-    is_of_run = isinstance(evaluation, dict) and evaluation.get("num_gaussians") == summary.get(
-        "num_gaussians"
-    )
+    if not isinstance(evaluation, dict) or evaluation.get("num_gaussians") != summary.get("num_gaussians"):
+        return {}
+    # A run that was resumed may have as many Gaussians as before, but it has more steps.
+    is_of_run = evaluation.get("steps", summary.get("steps")) == summary.get("steps")
     return evaluation if is_of_run else {}
+
+
+def with_earlier(fresh: Mapping[str, Any], run: Path, metrics: Collection[str]) -> dict[str, Any]:
+    """Return the entries of a new ``eval.json``: what was measured now, and earlier numbers of the same asset.
+
+    ``metrics`` are the options of ``metric=`` that were measured now. All numbers of these are new. Of other
+    metrics, the numbers that ``eval.json`` has already are kept with their records.
+    """
+    earlier = read_evaluation(run, fresh)
+    known = {
+        name: value
+        for name, value in earlier.items()
+        if name in QUALITIES and QUALITIES[name].metric not in metrics and is_number(value)
+    }
+    # Metrics from elsewhere have other names.
+    known |= {name: earlier[name] for name in scores_in(earlier) if name not in QUALITIES}
+    known = {name: value for name, value in known.items() if name not in fresh}
+    records = {name: score.record for name, score in scores_in(earlier).items() if name in known}
+    records |= fresh.get(MEASUREMENTS, {})
+    return {**known, **fresh} | ({MEASUREMENTS: records} if records else {})
 
 
 def read_quality(run: Path, summary: Mapping[str, Any]) -> dict[str, float]:

@@ -73,6 +73,8 @@ class TransformerSource:
 
     @property
     def _is_id(self) -> bool:
+        if Path(self.model).expanduser().exists():
+            return False
         return self.model.count("/") == 1 and self.model[0] not in "./~" and self.model[-1] != "/"
 
     def _downloaded(self) -> "TransformerFolder":
@@ -114,14 +116,22 @@ class TransformerFolder:
 
     def config(self) -> dict[str, Any]:
         """Return the configuration of the model. Raises ``UserError`` if it cannot be read."""
-        try:
-            entries = read_json(self.folder / CONFIG)
-        except UserError as error:
-            reason = str(error).partition(" Try: ")[0]
-            raise UserError(f"{self.source.name}: {reason} Try: download the model again") from error
+        entries = self._content(CONFIG)
         if not isinstance(entries, dict):
             raise self.damaged(f"{CONFIG} has no names with values")
         return entries
+
+    def check(self) -> None:
+        """Raise ``UserError`` if a file is missing or incomplete. Of the weights, only the headers are read."""
+        from safetensors import SafetensorError, safe_open
+
+        self.config()
+        for file in self.weights():
+            try:
+                with safe_open(file, framework="pt"):
+                    pass
+            except (SafetensorError, OSError) as error:
+                raise self.damaged(f"{file.name} is incomplete or damaged ({error})") from error
 
     def weights(self) -> list[Path]:
         """Return the files of the weights, in the order of their names.
@@ -133,7 +143,7 @@ class TransformerFolder:
             return [single]
         if not index.is_file():
             raise self.damaged(f"it has no {WEIGHTS}, and no other format is read, since it could run code")
-        content = read_json(index)
+        content = self._content(SHARDS)
         shards = content.get("weight_map") if isinstance(content, dict) else None
         names = sorted(set(shards.values())) if isinstance(shards, dict) else []
         if not names or not all(isinstance(name, str) and Path(name).name == name for name in names):
@@ -185,6 +195,14 @@ class TransformerFolder:
         """Return the error for a model that was found but cannot be used."""
         key, where = self.source.name, self.source.model
         return UserError(f"{key}: {where} cannot be used: {problem}. Try: another {key}")
+
+    def _content(self, name: str) -> Any:
+        """Return what a file of the model in the format JSON contains."""
+        try:
+            return read_json(self.folder / name)
+        except UserError as error:
+            reason = str(error).partition(" Try: ")[0]
+            raise UserError(f"{self.source.name}: {reason} Try: download the model again") from error
 
     def _unreadable(self, what: str, error: Exception) -> BaseException:
         if isinstance(error, torch.OutOfMemoryError):

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from cadam3d.io.transformer import TransformerFolder, TransformerSource
-from cadam3d.metric.scoring import Scorer, cut_off
+from cadam3d.metric.scoring import ModelMetric, Scorer, cut_off
 
 # The number of models in memory. With them, several metrics and all jobs of a sweep load each model once.
 KEPT = 2
@@ -83,6 +83,15 @@ class Clip:
         return self.model.logit_scale.device
 
 
+@dataclass(frozen=True, kw_only=True)
+class ClipMetric(ModelMetric):
+    """A score by a CLIP model."""
+
+    def check_model(self, found: TransformerFolder) -> None:
+        """Read the tokenizer and the preprocessing."""
+        check_clip(found)
+
+
 def load_clip(source: TransformerSource, device: torch.device) -> Clip:
     """Return the CLIP model of ``source``, on ``device``. Raises ``UserError`` if it is not available."""
     found = source.find()
@@ -93,20 +102,30 @@ def load_clip(source: TransformerSource, device: torch.device) -> Clip:
 def _loaded(found: TransformerFolder, _sha256: str, device: torch.device) -> Clip:
     import transformers
 
-    if found.config().get("model_type") != "clip":
-        raise found.damaged("it is not a CLIP model (model_type: clip) of transformers")
+    check_clip(found)  # before the weights, which take time
     return assembled(found, found.load(transformers.CLIPModel), found.facts(), device)
 
 
 def assembled(found: TransformerFolder, model: Any, facts: dict[str, Any], device: torch.device) -> Clip:
     """Return a CLIP model, on ``device``, with the tokenizer and the preprocessing in a folder."""
+    tokenizer, preprocess = check_clip(found)
+    return Clip(model.to(device), tokenizer, preprocess, facts)
+
+
+def check_clip(found: TransformerFolder) -> tuple[Any, Any]:
+    """Return the tokenizer and the preprocessing in the folder of a CLIP model.
+
+    Raises ``UserError`` if the folder has another kind of model, or if one of them is missing or damaged.
+    """
     import transformers
 
+    if found.config().get("model_type") != "clip":
+        raise found.damaged("it is not a CLIP model (model_type: clip) of transformers")
     tokenizer = found.read(transformers.CLIPTokenizer)
     # If the files of a tokenizer are missing, transformers silently makes one that knows no word.
-    if len(tokenizer) < model.config.text_config.vocab_size / 2:
+    if len(tokenizer) < found.read(transformers.CLIPConfig).text_config.vocab_size / 2:
         raise found.damaged("files of its tokenizer are missing")
-    return Clip(model.to(device), tokenizer, found.read(_preprocessing()), facts)
+    return tokenizer, found.read(_preprocessing())
 
 
 def _preprocessing() -> Any:

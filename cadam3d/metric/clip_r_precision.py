@@ -15,8 +15,8 @@ from cadam3d.core.checks import fail, require
 from cadam3d.core.errors import UserError
 from cadam3d.io.prompts import set_file, set_names
 from cadam3d.io.reading import read_text, read_yaml
-from cadam3d.metric.clip import load_clip
-from cadam3d.metric.scoring import ModelMetric, Scorer, interval_record
+from cadam3d.metric.clip import ClipMetric, load_clip
+from cadam3d.metric.scoring import Scorer, interval_record
 
 KEY = "metric.clip_r_precision.prompts"
 EXAMPLE = f"{KEY}=paper50"
@@ -27,7 +27,7 @@ BATCH = 64  # texts that are read at once
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClipRPrecision(ModelMetric):
+class ClipRPrecision(ClipMetric):
     """The share of the pictures that are more similar to the prompt of the asset than to any other of a list.
 
     This is the CLIP R-Precision of Park et al. (2021) with one relevant text, as Dream Fields (Jain et al.

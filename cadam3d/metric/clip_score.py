@@ -5,14 +5,14 @@ from typing import ClassVar
 
 import torch
 
-from cadam3d.metric.clip import load_clip
-from cadam3d.metric.scoring import ModelMetric, Scorer
+from cadam3d.metric.clip import ClipMetric, load_clip
+from cadam3d.metric.scoring import Scorer
 
 PERCENT = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClipScore(ModelMetric):
+class ClipScore(ClipMetric):
     """100 times the cosine between a picture and the text, in the space of a CLIP model.
 
     This is CLIPScore (Hessel et al. 2021) on the scale that papers about text-to-3D use: without its factor

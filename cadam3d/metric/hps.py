@@ -13,8 +13,8 @@ from cadam3d.io.ldm import read_tensors
 from cadam3d.io.open_clip import clip_model
 from cadam3d.io.pretrained import fetch_file
 from cadam3d.io.transformer import TransformerFolder, TransformerSource, sha256_of
-from cadam3d.metric.clip import Clip, assembled, load_clip
-from cadam3d.metric.scoring import ModelMetric, Scorer
+from cadam3d.metric.clip import Clip, ClipMetric, assembled, check_clip, load_clip
+from cadam3d.metric.scoring import Scorer
 
 # The file of each version in the repository of the authors, xswu/HPSv2.
 FILES = {"v2.0": "HPS_v2_compressed.pt", "v2.1": "HPS_v2.1_compressed.pt"}
@@ -24,7 +24,7 @@ SMALL = ("*.json", "*.txt")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Hps(ModelMetric):
+class Hps(ClipMetric):
     """The cosine between a picture and the text, in the space of a CLIP model trained on choices of people.
 
     Wu et al. (2023) trained OpenCLIP's ViT-H/14 on choices of people, and publish a file with its weights
@@ -50,12 +50,13 @@ class Hps(ModelMetric):
         )
 
     def prepare(self) -> None:
-        """Find the files of the model, after a download if that is necessary."""
+        """Find the files of the model, after a download if that is necessary, and check that they are whole."""
         if self._is_folder():
             super().prepare()
         else:
-            self._base()
-            self._file(self.source())
+            check_clip(self._base())
+            # The tensors are mapped, so this reads little.
+            read_tensors(self.node, self._file(self.source())[0], "model")
 
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a score in [-1, 1]."""

@@ -24,8 +24,8 @@ from torch import Tensor
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
 from cadam3d.core.checks import require_choice, require_range, require_whole
 from cadam3d.metric.base import Measurand, Measurement
-from cadam3d.metric.clip import load_clip
-from cadam3d.metric.scoring import ModelMetric, Scorer
+from cadam3d.metric.clip import ClipMetric, load_clip
+from cadam3d.metric.scoring import Scorer
 
 WAYS = ("auto", "truth", "model")
 
@@ -61,7 +61,7 @@ MOST_VIEWS = 360
 
 
 @dataclass(frozen=True, kw_only=True)
-class Janus(ModelMetric):
+class Janus(ClipMetric):
     """The number of fronts of an asset, by the true object or by a model of pictures and texts."""
 
     node: ClassVar[str] = "metric.janus"
@@ -121,8 +121,9 @@ class Janus(ModelMetric):
         for view in range(self.views):
             one = cameras.index(slice(view, view + 1))
             images = measurand.render(one, self.protocol.backgrounds(1)).rgb.detach().float().clamp(0, 1)
-            logits.append(torch.cat([scorer.score(images, text) for text in texts]))
+            logits.append(torch.cat([self._score(scorer, images, text) for text in texts]))
         fronts = torch.stack(logits).detach().double().cpu().softmax(dim=1)[:, 0]
+        self.require_finite(fronts)
         shown = {
             "views": self.views,
             "elevations_deg": [float(self.elevation_deg)],

@@ -5,12 +5,12 @@ from typing import ClassVar
 
 import torch
 
-from cadam3d.metric.clip import load_clip
-from cadam3d.metric.scoring import ModelMetric, Scorer
+from cadam3d.metric.clip import ClipMetric, load_clip
+from cadam3d.metric.scoring import Scorer
 
 
 @dataclass(frozen=True, kw_only=True)
-class PickScore(ModelMetric):
+class PickScore(ClipMetric):
     """The cosine between a picture and the text, times the trained factor of the model (about 100).
 
     The model is a CLIP model that Kirstain et al. (2023) trained on choices of people. If the scores of two

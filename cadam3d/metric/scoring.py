@@ -15,7 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.transformer import TransformerSource
+from cadam3d.core.memory import is_out_of_memory
+from cadam3d.io.transformer import TransformerFolder, TransformerSource
 from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.protocol import ModelName, Protocol
 
@@ -57,6 +58,7 @@ class ScoreMetric(Metric):
         scorer = self.scorer(measurand.gaussians.device)
         text = self.protocol.text_of(measurand.prompt)
         values = self.values(measurand, scorer, text)
+        self.require_finite(values)
         complaint = scorer.complaint(text)
         return replace(
             self.measurement(values, text, scorer.facts), warnings=() if complaint is None else (complaint,)
@@ -64,8 +66,25 @@ class ScoreMetric(Metric):
 
     def values(self, measurand: Measurand, scorer: Scorer, text: str) -> Float[Tensor, "v"]:
         """Return the score of every view of the protocol."""
-        scores = [scorer.score(images, text) for images in self.protocol.images(measurand.render)]
+        scores = [self._score(scorer, images, text) for images in self.protocol.images(measurand.render)]
         return torch.cat([score.detach().double().cpu() for score in scores])
+
+    def _score(self, scorer: Scorer, images: Float[Tensor, "v h w 3"], text: str) -> Float[Tensor, "v"]:
+        try:
+            return scorer.score(images, text)
+        # Models and what prepares their inputs raise almost anything, and a run must not end because of them.
+        except Exception as error:
+            if is_out_of_memory(error) or isinstance(error, UserError):
+                raise
+            reason = " ".join(str(error).split())[:200]
+            raise UserError(
+                f"{self.number}: the model cannot score this prompt ({reason}). Try: another model"
+            ) from error
+
+    def require_finite(self, values: Tensor) -> None:
+        """Raise ``UserError`` if a model has returned something other than numbers."""
+        if not values.isfinite().all():
+            raise UserError(f"{self.number}: its model returns NaN or infinity. Try: another model")
 
     def measurement(
         self, values: Float[Tensor, "v"], text: str | None, facts: Mapping[str, Any]
@@ -110,8 +129,17 @@ class ModelMetric(ScoreMetric):
     revision: str | None  # of an id; None = the protocol's, or the newest of a model that is named here
 
     def prepare(self) -> None:
-        """Find the files of the model, after a download if that is necessary."""
-        self.source().find().weights()
+        """Find the files of the model, after a download if that is necessary, and check that they are whole.
+
+        The weights are not loaded, because they would take memory during the training.
+        """
+        found = self.source().find()
+        found.check()
+        self.check_model(found)
+
+    @abstractmethod
+    def check_model(self, found: TransformerFolder) -> None:
+        """Raise ``UserError`` if the small files of a model show that it is of another kind or incomplete."""
 
     def source(self) -> TransformerSource:
         """Return the place of the model. Raises ``UserError`` if neither metric nor protocol names one."""

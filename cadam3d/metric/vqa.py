@@ -84,20 +84,27 @@ class Vqa(ModelMetric):
         """Return the place of the model. Raises ``UserError`` if neither metric nor protocol names one."""
         return replace(super().source(), needed=NEEDED)
 
+    def check_model(self, found: TransformerFolder) -> None:
+        """Read the processor, and check that there is a template and a token for each answer."""
+        self._require_template(_reader(found)[0], found)
+
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a score in [0, 1]."""
         found = self.source().find()
         answerer = _loaded(found, found.facts()["weights_sha256"], self.dtype, device)
-        if self.template is None and not getattr(answerer.processor, "chat_template", None):
+        self._require_template(answerer.processor, found)
+        asked = {"question": self.question, "template": self.template, "normalized": self.normalize}
+        return Scorer(
+            score=lambda images, text: self._scores(answerer, images, text), facts={**answerer.facts, **asked}
+        )
+
+    def _require_template(self, processor: Any, found: TransformerFolder) -> None:
+        if self.template is None and not getattr(processor, "chat_template", None):
             raise UserError(
                 f"{self.node}.template: expected a text with the model's mark of a picture and {PLACE} for "
                 f"the question, because {found.source.model} has no chat template, got None. "
                 f"Try: {self.node}.template='\"<image>{PLACE}\"'"
             )
-        asked = {"question": self.question, "template": self.template, "normalized": self.normalize}
-        return Scorer(
-            score=lambda images, text: self._scores(answerer, images, text), facts={**answerer.facts, **asked}
-        )
 
     def _scores(self, answerer: Answerer, images: Float[Tensor, "v h w 3"], text: str) -> Float[Tensor, "v"]:
         question = self.question.replace(PLACE, text)
@@ -127,17 +134,28 @@ class Vqa(ModelMetric):
 
 @lru_cache(maxsize=1)  # it has gigabytes, and all jobs of a sweep need it
 def _loaded(found: TransformerFolder, _sha256: str, dtype: str, device: torch.device) -> Answerer:
-    from transformers import AutoModelForImageTextToText, AutoProcessor
+    from transformers import AutoModelForImageTextToText
+
+    processor, vocabulary, yes, no = _reader(found)
+    model = found.load(AutoModelForImageTextToText, DTYPES[dtype]).to(device)
+    names = {number: piece for piece, number in vocabulary.items()}
+    facts = {**found.facts(), "dtype": dtype, "yes_tokens": [names[number] for number in yes]}
+    return Answerer(model, processor, yes, no, facts)
+
+
+def _reader(found: TransformerFolder) -> tuple[Any, dict[str, int], tuple[int, ...], tuple[int, ...]]:
+    """Return the processor of a model, its vocabulary, and the tokens that spell yes and no.
+
+    Raises ``UserError`` if one of them is missing.
+    """
+    from transformers import AutoProcessor
 
     processor = found.read(AutoProcessor)
     vocabulary = getattr(getattr(processor, "tokenizer", None), "get_vocab", dict)()
     yes, no = (_spelling(word, vocabulary) for word in (YES, NO))
     if not yes or not no:
         raise found.damaged(f"its tokenizer has no token for {YES if not yes else NO}")
-    model = found.load(AutoModelForImageTextToText, DTYPES[dtype]).to(device)
-    names = {number: piece for piece, number in vocabulary.items()}
-    facts = {**found.facts(), "dtype": dtype, "yes_tokens": [names[number] for number in yes]}
-    return Answerer(model, processor, yes, no, facts)
+    return processor, vocabulary, yes, no
 
 
 def _spelling(word: str, vocabulary: Mapping[str, int]) -> tuple[int, ...]:
