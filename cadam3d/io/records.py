@@ -83,10 +83,10 @@ def read_evaluation(run: Path, summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_earlier(fresh: Mapping[str, Any], run: Path, metrics: Collection[str]) -> dict[str, Any]:
-    """Return the entries of a new ``eval.json``: what was measured now, and earlier numbers of the same asset.
+    """Return the entries of a new ``eval.json``: the new numbers, and earlier numbers of the same asset.
 
-    ``metrics`` are the options of ``metric=`` that were measured now. All numbers of these are new. Of other
-    metrics, the numbers that ``eval.json`` has already are kept with their records.
+    ``metrics`` are the options of ``metric=`` that were measured now. All their numbers are new. Numbers of
+    other metrics that ``eval.json`` has already are kept with their records.
     """
     earlier = read_evaluation(run, fresh)
     known = {
@@ -94,7 +94,7 @@ def with_earlier(fresh: Mapping[str, Any], run: Path, metrics: Collection[str]) 
         for name, value in earlier.items()
         if name in QUALITIES and QUALITIES[name].metric not in metrics and is_number(value)
     }
-    # Metrics from elsewhere have other names.
+    # Metrics that do not belong to this package have other names.
     known |= {name: earlier[name] for name in scores_in(earlier) if name not in QUALITIES}
     known = {name: value for name, value in known.items() if name not in fresh}
     records = {name: score.record for name, score in scores_in(earlier).items() if name in known}

@@ -22,7 +22,7 @@ from cadam3d.io.pretrained import fetch_file
 CONFIG = "config.json"
 WEIGHTS = "model.safetensors"
 SHARDS = "model.safetensors.index.json"
-# What a model needs; weights in other formats are not downloaded.
+# The files that a model needs; weights in other formats are not downloaded.
 NEEDED = ("*.json", "*.txt", WEIGHTS, "model-*.safetensors")
 EXTRA = ("transformers", "safetensors", "huggingface_hub")
 BLOCK = 1 << 20  # bytes that are hashed at once
@@ -38,7 +38,7 @@ class TransformerSource:
     model: str  # a folder, or OWNER/NAME on the Hugging Face hub
     revision: str | None  # on the hub; None = the newest
     setting: str = field(default="model", compare=False)  # below the node, the setting that names the model
-    needed: Sequence[str] = NEEDED  # what is downloaded
+    needed: Sequence[str] = NEEDED  # patterns of the files that are downloaded
 
     @property
     def name(self) -> str:
@@ -122,7 +122,7 @@ class TransformerFolder:
         return entries
 
     def check(self) -> None:
-        """Raise ``UserError`` if a file is missing or incomplete. Of the weights, only the headers are read."""
+        """Raise ``UserError`` if a file is missing or incomplete. It reads only the headers of the weights."""
         from safetensors import SafetensorError, safe_open
 
         self.config()
@@ -173,7 +173,7 @@ class TransformerFolder:
             raise self._unreadable(kind.__name__, error) from error
         # With weights of another model, transformers draws the missing ones at random and goes on.
         if missing := sorted(report["missing_keys"]):
-            raise self.damaged(f"it is no {kind.__name__}: {missing[0]} is missing")
+            raise self.damaged(f"it is not a {kind.__name__}: {missing[0]} is missing")
         return model.requires_grad_(False).eval()
 
     def read(self, kind: Any) -> Any:
@@ -197,7 +197,7 @@ class TransformerFolder:
         return UserError(f"{key}: {where} cannot be used: {problem}. Try: another {key}")
 
     def _content(self, name: str) -> Any:
-        """Return what a file of the model in the format JSON contains."""
+        """Return the content of a JSON file of the model."""
         try:
             return read_json(self.folder / name)
         except UserError as error:

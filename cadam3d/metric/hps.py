@@ -50,12 +50,12 @@ class Hps(ClipMetric):
         )
 
     def prepare(self) -> None:
-        """Find the files of the model, after a download if that is necessary, and check that they are whole."""
+        """Find the files of the model, after a download if necessary, and check that they are complete."""
         if self._is_folder():
             super().prepare()
         else:
             check_clip(self._base())
-            # The tensors are mapped, so this reads little.
+            # The file is mapped, so this reads little of it.
             read_tensors(self.node, self._file(self.source())[0], "model")
 
     def scorer(self, device: torch.device) -> Scorer:

@@ -72,7 +72,7 @@ class ScoreMetric(Metric):
     def _score(self, scorer: Scorer, images: Float[Tensor, "v h w 3"], text: str) -> Float[Tensor, "v"]:
         try:
             return scorer.score(images, text)
-        # Models and what prepares their inputs raise almost anything, and a run must not end because of them.
+        # Models and the preparation of their inputs raise almost any exception, which must not end a run.
         except Exception as error:
             if is_out_of_memory(error) or isinstance(error, UserError):
                 raise
@@ -129,9 +129,9 @@ class ModelMetric(ScoreMetric):
     revision: str | None  # of an id; None = the protocol's, or the newest of a model that is named here
 
     def prepare(self) -> None:
-        """Find the files of the model, after a download if that is necessary, and check that they are whole.
+        """Find the files of the model, after a download if necessary, and check that they are complete.
 
-        The weights are not loaded, because they would take memory during the training.
+        The weights are not loaded, because they would take memory during training.
         """
         found = self.source().find()
         found.check()

@@ -85,7 +85,7 @@ class Vqa(ModelMetric):
         return replace(super().source(), needed=NEEDED)
 
     def check_model(self, found: TransformerFolder) -> None:
-        """Read the processor, and check that there is a template and a token for each answer."""
+        """Read the processor, and check that there are a template and tokens for both answers."""
         self._require_template(_reader(found)[0], found)
 
     def scorer(self, device: torch.device) -> Scorer:

@@ -1,4 +1,4 @@
-"""TensorBoard and Weights & Biases: what they record, how they continue, and that no run needs them."""
+"""TensorBoard and Weights & Biases: what they record, how they continue, and that no run depends on them."""
 
 import os
 import struct
@@ -108,7 +108,7 @@ def test_a_step_has_its_preview_wherever_the_previews_are_in_the_list(tmp_path):
     assert recorder.calls[-2:] == [("conclude", 10, results), ("close", True)]
 
 
-def test_a_tracker_that_fails_costs_only_itself(tmp_path, alone, capsys):
+def test_a_failing_tracker_does_not_affect_the_run_or_other_trackers(tmp_path, alone, capsys):
     broken, sound = Recorder(fails_at=4), Recorder()
     state = train(tmp_path, broken, sound)
     message = capsys.readouterr().err

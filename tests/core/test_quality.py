@@ -1,4 +1,4 @@
-"""Qualities: their labels, and that every metric has an entry."""
+"""Qualities have labels and directions, every metric has an entry, and metrics agree with the directions."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""CLIP score, R-precision and PickScore: the values of plain calls of transformers, and records of how."""
+"""CLIP score, R-precision and PickScore: their values equal plain calls of transformers, and have records."""
 
 import hashlib
 import json
@@ -301,7 +301,7 @@ def cut_short(folder):
         (without("preprocessor_config.json"), "cannot be loaded"),
         (only_pickled, "it could run code"),
         (of_another_kind, "not a CLIP model"),
-        (with_weights_of_another_model, "it is no CLIPModel"),
+        (with_weights_of_another_model, "it is not a CLIPModel"),
         (cut_short, "cannot be loaded"),
     ],
 )

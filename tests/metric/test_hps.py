@@ -1,4 +1,4 @@
-"""Hps: the score of a checkpoint with OpenCLIP's names, read into transformers, and plain refusals."""
+"""Hps: scores of a checkpoint with OpenCLIP's names equal those of transformers, and mistakes are one message."""
 
 import hashlib
 import json

@@ -113,7 +113,7 @@ def test_equal_fronts_are_counted_and_cost_their_share(car, count):
     assert found["janus"] == pytest.approx(1 - 1 / count, abs=0.09)
 
 
-def test_the_clearer_the_second_front_is_the_worse(car):
+def test_a_clearer_second_front_is_worse(car):
     found = [measured(car, faces(2, share)).numbers["janus"] for share in (0, 0.2, 0.4, 0.5, 0.6, 0.8, 1)]
     assert found == sorted(found)
     assert found[0] < 0.001
@@ -242,7 +242,7 @@ def test_two_fronts_are_worse_than_one_and_three_are_counted():
     assert seen(0, 120, 240).numbers == {"janus": pytest.approx(1), "janus_fronts": 3}
 
 
-def test_the_clearer_a_model_sees_the_second_front_the_worse():
+def test_a_second_front_that_a_model_sees_more_clearly_is_worse():
     found = [seen(0, 180, heights=(1.0, height)).numbers["janus"] for height in (0, 0.3, 0.6, 0.9)]
     assert found == sorted(set(found))
 

@@ -159,7 +159,7 @@ def test_objectives_that_the_paper_lacks_have_no_published_rows(jobs):
     assert not any("published" in note for note in table.notes)
 
 
-def test_categories_have_parts_of_their_own(three):
+def test_each_category_has_its_own_part(three):
     table = table_of(three)
     assert [section.category for section in table.sections] == ["", "Material", "Structure & 100 %"]
     assert row_of(table, "SDS", "baseline", section=1).cells["num_gaussians"].text == "1000"

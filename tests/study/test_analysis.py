@@ -1,4 +1,4 @@
-"""The analysis of a study: known preferences are found, and what must not matter does not."""
+"""The analysis of a study finds known preferences, and does not depend on orders and names."""
 
 import json
 from dataclasses import replace
@@ -39,7 +39,7 @@ def numbers(analysis: Analysis) -> dict[tuple[str, str], tuple[float, ...]]:
     }
 
 
-def test_a_clear_preference_is_certain_and_none_is_not():
+def test_a_clear_preference_is_certain_and_a_tie_is_not():
     clear = simulated_raters({"baseline": 0.0, "cadam": 2.0}, 30, 12)
     equal = simulated_raters({"baseline": 0.0, "cadam": 0.0}, 30, 12)
     for raters, is_certain in ((clear, True), (equal, False)):

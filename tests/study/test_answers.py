@@ -1,4 +1,4 @@
-"""Files of answers: what counts, and what happens to damaged, repeated, foreign and incomplete ones."""
+"""Files of answers: which ones count, and what happens to damaged, repeated, foreign and incomplete ones."""
 
 import json
 from pathlib import Path
@@ -74,7 +74,7 @@ def test_every_question_of_a_catch_trial_is_a_catch_and_no_answer(read):
     assert len(raters["7"].answers) == len(QUESTION_NAMES)
 
 
-def test_an_incomplete_file_counts_with_the_answers_it_has(read):
+def test_the_answers_of_an_incomplete_file_count(read):
     raters, left = read(one=written({2: 3}, questions=("overall", "cleanliness")))
     assert not left
     assert (len(raters["7"].answers), raters["7"].catches) == (2, ())
@@ -126,7 +126,7 @@ def test_a_file_of_another_study_is_left_out(read):
     assert left == {"two": f"it is of another study ({'f' * 16!r})"}
 
 
-def test_the_key_and_the_results_beside_the_answers_are_skipped_without_a_word(read):
+def test_the_key_and_the_results_beside_the_answers_are_skipped_without_a_message(read):
     raters, left = read(one=written({0: 0}), key={"kind": "study key"}, study={"kind": "study results"})
     assert set(raters) == {"7"}
     assert not left
@@ -176,7 +176,7 @@ def broken(**changes) -> dict:
     ],
     ids=lambda content: str(content)[:30],
 )
-def test_a_damaged_file_is_left_out_with_a_reason_and_costs_no_other(read, content):
+def test_a_damaged_file_is_left_out_with_a_reason_and_the_others_count(read, content):
     raters, left = read(bad=content, good=written({0: 0}, rater="8", session="b2"))
     assert set(raters) == {"8"}
     assert set(left) == {"bad"}
@@ -184,7 +184,7 @@ def test_a_damaged_file_is_left_out_with_a_reason_and_costs_no_other(read, conte
     assert len(left["bad"]) < 200
 
 
-def test_a_pipe_is_left_out_and_not_waited_for(tmp_path, read):
+def test_a_named_pipe_is_left_out_without_waiting_for_it(tmp_path, read):
     import os
 
     os.mkfifo(tmp_path / "pipe.json")

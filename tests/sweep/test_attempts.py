@@ -48,7 +48,7 @@ def test_the_best_has_most_or_least_depending_on_the_number(name):
     assert choice.best == (1 if QUALITIES[name].is_more_better else 2)
 
 
-def test_of_equal_attempts_the_one_with_the_lowest_seed_is_chosen_in_whatever_order_they_come():
+def test_of_equal_attempts_the_one_with_the_lowest_seed_is_chosen_in_any_order():
     equal = attempts(20.0, 24.0, 24.0)
     assert choose(equal, "psnr").best == choose(equal[::-1], "psnr").best == 1
     assert "the same as seed=2" in choose(equal, "psnr").sentence
@@ -266,7 +266,7 @@ def test_numbers_that_were_measured_in_different_ways_are_not_compared(train):
     assert (only_folder() / "best").readlink() == Path("seed=1")  # as before, by psnr
 
 
-def test_the_line_of_attempts_is_the_answer_to_resuming_their_folder(train):
+def test_resuming_the_folder_of_attempts_is_refused_with_the_line_that_continues_them(train):
     train(*LINE)
     code, _, err = train("resume=outputs/latest")
     assert (code, err.endswith("Try: cadam3d train 'prompt=an attempt' attempts=4\n")) == (1, True), err
