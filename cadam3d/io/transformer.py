@@ -122,7 +122,7 @@ class TransformerFolder:
         return entries
 
     def check(self) -> None:
-        """Raise ``UserError`` if a file is missing or incomplete. It reads only the headers of the weights."""
+        """Raise ``UserError`` if a file is missing or incomplete. Only headers of weights are read."""
         from safetensors import SafetensorError, safe_open
 
         self.config()

@@ -1,4 +1,4 @@
-"""Hps: scores of a checkpoint with OpenCLIP's names equal those of transformers, and mistakes are one message."""
+"""Hps: scores of a checkpoint with the names of OpenCLIP equal those of transformers, and plain refusals."""
 
 import hashlib
 import json
