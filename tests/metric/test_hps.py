@@ -158,7 +158,7 @@ def test_the_version_chooses_the_file_on_the_hub(tmp_path, weights, base, expect
 
 
 def refusal(**changes):
-    """Return what is said when the model is loaded."""
+    """Return the message that is printed when the model is loaded."""
     with pytest.raises(UserError) as caught:
         metric(**changes).scorer(torch.device("cpu"))
     return str(caught.value)

@@ -130,7 +130,7 @@ def test_a_long_prompt_is_reported(package, folder):
 
 
 def refusal(model):
-    """Return what is said before a run begins."""
+    """Return the message that is printed before a run begins."""
     with pytest.raises(UserError) as caught:
         metric(model).prepare()
     return str(caught.value)
