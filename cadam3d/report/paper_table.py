@@ -123,7 +123,7 @@ def paper_table(results: Sequence[JobResult], folder: Path) -> PaperTable | None
         members = [result for result in results if result.category == category]
         sections.append(Section(category, _rows(members, names, with_published=False)))
     notes = [*_notes(results, usable, names), *_again(left_out, usable, folder)]
-    if not any(name in usable[0].numbers for name in PAPER_SCORES):
+    if not any(name in result.numbers for result in usable for name in PAPER_SCORES):
         notes.append(f"The paper's scores are not measured yet. Try: {_line(PAPER_SCORES, folder)}")
     return PaperTable(names, sections, notes)
 

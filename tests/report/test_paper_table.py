@@ -275,6 +275,8 @@ def test_a_table_without_scores_says_how_to_measure_them(jobs):
     jobs.add("cadam", n=10, psnr=20, arm="cadam")
     notes = table_of(jobs.folder).notes
     assert any(note.endswith("'metric=[clip_score,image_reward,hps,niqe]'") for note in notes)
+    jobs.add("baseline", n=10, psnr=20, arm="baseline", **scored(30.0))
+    assert not any("not measured yet" in note for note in table_of(jobs.folder).notes)
 
 
 def test_settings_that_come_with_prompts_do_not_split_the_rows(jobs):
