@@ -15,7 +15,7 @@ const NOTICE_MS = 6000;
 // The seed of the study fixes the order and the sides. A rater begins at a place that depends on the name, and
 // every second name sees the sides exchanged, so that neither order nor side depends on the pair over all raters.
 
-let rater = null; // name, session, saves, answers: one per step, in the order in which this rater sees them
+let rater = null; // name, session, saves, isSaved, answers: one per step, in the order in which this rater sees them
 let step = 0;
 
 function hash(text) {
@@ -76,6 +76,7 @@ function written() {
 
 function save() {
   rater.saves += 1;
+  rater.isSaved = true;
   keep();
   const text = written();
   const link = document.createElement("a");
@@ -85,7 +86,7 @@ function save() {
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 60000);
   $("text").value = text;
-  $("next-person").hidden = false;
+  offerNext();
   notice(`Saved as ${link.download}`);
 }
 
@@ -179,6 +180,11 @@ for (const side of SIDES) {
 
 // --- screens ---------------------------------------------------------------------------------------------------
 
+// Another person may begin in this browser as soon as a file has all answers, also if questions are left.
+function offerNext() {
+  for (const name of ["next-person", "next-now"]) $(name).hidden = !rater?.isSaved;
+}
+
 let since = 0; // when the question was shown, in milliseconds
 let pair = -1;
 
@@ -187,6 +193,7 @@ function screen(name) {
 }
 
 function show() {
+  offerNext();
   if (rater === null) {
     screen("start");
     $("name").focus();
@@ -227,6 +234,7 @@ function choose(side) {
   if (!playing.length) return; // the objects are not shown yet
   const seconds = Math.min(Math.round((performance.now() - since) / 100) / 10, LONGEST_PAUSE);
   rater.answers[step] = { chosen: shown(step).clips[side], seconds };
+  rater.isSaved = false;
   step += 1;
   keep();
   show();
@@ -258,7 +266,7 @@ $("begin").addEventListener("submit", (event) => {
     $("begin").reportValidity();
     return;
   }
-  rater = { name, session: newSession(), saves: 0, answers: [] };
+  rater = { name, session: newSession(), saves: 0, isSaved: false, answers: [] };
   step = 0;
   keep();
   show();
@@ -271,15 +279,16 @@ $("replay").addEventListener("click", replay);
 $("pause").addEventListener("click", () => pause(!paused));
 $("save").addEventListener("click", save);
 $("save-now").addEventListener("click", save);
-$("next-person").addEventListener("click", () => {
+function nextPerson() {
   if (!confirm("Remove these answers from this browser, and let another person begin?")) return;
   forget();
   rater = null;
   step = 0;
   $("begin").reset();
-  $("next-person").hidden = true;
   show();
-});
+}
+
+for (const name of ["next-person", "next-now"]) $(name).addEventListener("click", nextPerson);
 
 const KEYS = {
   ArrowLeft: () => choose(0), 1: () => choose(0), ArrowRight: () => choose(1), 2: () => choose(1),

@@ -187,6 +187,24 @@ def test_every_second_number_sees_the_sides_exchanged_and_all_see_every_trial(vi
             assert each["clips"] == (clips if int(name) % 2 else clips[::-1])
 
 
+def test_another_person_can_begin_once_the_answers_of_the_first_are_saved(visit):
+    page = visit(accept_downloads=True)
+    page.on("dialog", lambda dialog: dialog.accept())
+    begin(page, "1")
+    answer(page, "1")
+    assert not page.is_visible("#next-now")
+    page.click("#save-now")
+    page.reload()
+    assert page.is_visible("#next-now")
+    answer(page, "2")  # which is in no file yet
+    assert not page.is_visible("#next-now")
+    page.click("#save-now")
+    page.click("#next-now")
+    begin(page, "2")
+    assert page.inner_text("#who") == "2"
+    assert place_of(page) == "Pair 1 of 3 · question 1 of 5"
+
+
 def test_the_start_needs_a_name_and_consent(visit):
     page = visit()
     page.keyboard.press("Enter")
