@@ -122,7 +122,7 @@ class TransformerFolder:
         return entries
 
     def check(self) -> None:
-        """Raise ``UserError`` if a file is missing or incomplete. Of the weights, only the headers are read."""
+        """Raise ``UserError`` if a file is missing or incomplete. Of weights, only headers are read."""
         from safetensors import SafetensorError, safe_open
 
         self.config()

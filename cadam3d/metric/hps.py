@@ -50,7 +50,7 @@ class Hps(ClipMetric):
         )
 
     def prepare(self) -> None:
-        """Find the files of the model, after a download if that is necessary, and check that they are whole."""
+        """Find the files of the model, after a download if necessary, and check that they are whole."""
         if self._is_folder():
             super().prepare()
         else:

@@ -185,6 +185,10 @@ def record(**changes):
 def test_values_texts_and_places_of_a_model_may_differ():
     one = Score(1.0, record(model="clip", views=[1.0]))
     assert difference("n", [one, Score(2.0, record(model="/a/b", text="y", views=[2.0]))]) is None
+    # A whole number is the same setting as a float and as an integer.
+    whole, real = ({"name": "paper", "distance": 3, "elevations_deg": [kind(15)]} for kind in (int, float))
+    scores = [Score(1.0, record(protocol=each)) for each in (whole, real | {"distance": 3.0})]
+    assert difference("n", scores) is None
     # Without a hash, the name of a model is all that is known of it.
     nameless = [Score(1.0, record(weights_sha256=None, model=model)) for model in ("clip", "other")]
     assert "model is clip (1) and other (1)" in str(difference("n", nameless))
