@@ -44,6 +44,8 @@ class TensorBoard(Tracking):
             self._writer.add_scalar(name, number, step)
         if preview is not None:
             self._writer.add_image("preview", read_png(preview), step, dataformats="HWC")
+        # A run that is killed continues at its checkpoint, and does not record earlier steps again.
+        self._writer.flush()
 
     def conclude(self, context: RunContext, step: int, results: Mapping[str, float]) -> None:
         """Write the final numbers as scalars, and as the row of the run in the tab HParams."""

@@ -173,10 +173,17 @@ def difference(name: str, scores: Iterable[Score]) -> str | None:
 def _flat(node: Any, key: str = "") -> Iterator[tuple[str, str]]:
     """Yield the dotted keys of nested dicts with their values as text; the name of a protocol comes first."""
     if not isinstance(node, dict):
-        yield key, str(node)
+        yield key, str(_plain(node))
         return
     for name in sorted(node, key=lambda name: (name != "protocol", name != "name", str(name))):
         yield from _flat(node[name], f"{key}.{name}" if key else str(name))
+
+
+def _plain(value: Any) -> Any:
+    """Return a value with whole floats as integers, because 3.0 and 3 are one setting."""
+    if isinstance(value, list):
+        return [_plain(each) for each in value]
+    return int(value) if type(value) is float and value.is_integer() else value
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:

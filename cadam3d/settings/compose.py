@@ -116,7 +116,7 @@ def component(node: Any, kind: type = object, key: str = "") -> Any:
         require_declared(node, kind, place or key or "configuration")
         return instantiate(_resolved(node), _convert_="all")
     except InstantiationException as error:
-        raise _construction_error(error) from error
+        raise _construction_error(error, node) from error
     except OmegaConfBaseException as error:
         reason = str(error.msg).splitlines()[0]
         raise UserError(
@@ -280,16 +280,29 @@ def quote(text: str) -> str:
     return "'" + escaped + "\\" * trailing + "'"
 
 
-def _construction_error(error: InstantiationException) -> BaseException:
+def _construction_error(error: InstantiationException, node: Any) -> BaseException:
     """Return ``UserError`` for a mistake in the configuration, or else the exception of the constructor."""
     cause = error.__cause__
     key = re.search(r"full_key: (\S+)", str(error))
-    where = key.group(1) if key else "configuration"
+    where = _typed_place(node, key.group(1)) if key else "configuration"
     if isinstance(cause, UserError):
         return _placed(cause, where)
     if cause is None:
         return UserError(f"{where}: {str(error).splitlines()[0]}. Try: cadam3d train --cfg job")
     return cause
+
+
+def _typed_place(node: Any, where: str) -> str:
+    """Return the place at which the user types a setting of the node ``where``, which is in ``node``.
+
+    It is another place if the inner node is an interpolation: ``protocol`` for ``metric.niqe.protocol``.
+    """
+    if not isinstance(node, DictConfig):
+        return where
+    name = where.removeprefix(f"{node._get_full_key('')}.")
+    raw: Any = OmegaConf.to_container(node, resolve=False)
+    taken = re.fullmatch(r"\$\{([\w.]+)\}", str(raw.get(name)))
+    return taken.group(1) if taken else where
 
 
 def _placed(error: UserError, where: str) -> UserError:

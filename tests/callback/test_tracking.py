@@ -200,6 +200,8 @@ def test_a_resumed_run_replaces_the_steps_after_its_checkpoint_in_tensorboard(tm
         board.open(context, begin)
         for step in range(begin + 1, end + 1):
             board.record(step, {"train/loss": 100.0 * begin + step}, None)
+        # Nothing is lost in a kill, which closes no file.
+        assert events(tmp_path / "tensorboard").Scalars("train/loss")[-1].step == end
         board.close(is_complete=False)
     losses = events(tmp_path / "tensorboard").Scalars("train/loss")
     assert [(each.step, each.value) for each in losses] == [

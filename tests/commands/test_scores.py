@@ -1,6 +1,7 @@
 """Scores of models in the commands: train and eval record their methods, and tables never mix them."""
 
 import csv
+import shlex
 import shutil
 from pathlib import Path
 
@@ -73,6 +74,38 @@ def test_a_protocol_as_it_was_shipped_has_no_changes(tmp_path, type_line, models
         "eval", "run=run", "metric=[clip_score]", "metric.clip_score.model=clip", "protocol=dreamfusion"
     )
     assert "changed" not in read_json(run / "eval.json")["measurements"]["clip_score"]["protocol"]
+
+
+def test_an_evaluation_keeps_what_others_have_measured(tmp_path, type_line, clip):
+    run = make_run(tmp_path / "run")
+    type_line("eval", "run=run", "metric=[clip_score,size]", clip, *SMALL)
+    before = read_json(run / "eval.json")
+    _, out, _ = type_line("eval", "run=run", "metric=[niqe]", "protocol.views=2", "protocol.size=192")
+    after = read_json(run / "eval.json")
+    assert "clip_score" not in out
+    assert set(after["measurements"]) == {"clip_score", "niqe"}
+    assert [after[name] for name in before if name not in ("measurements", "warnings")] == [
+        before[name] for name in before if name not in ("measurements", "warnings")
+    ]
+    # What is measured again is new, and numbers of another asset are not kept.
+    type_line("eval", "run=run", "metric=[clip_score]", clip, *SMALL, "protocol.name=mine")
+    again = read_json(run / "eval.json")["measurements"]
+    assert again["clip_score"]["protocol"]["name"] == "mine"
+    assert again["niqe"] == after["measurements"]["niqe"]
+    write_json(run / "summary.json", read_json(run / "summary.json") | {"steps": 5})
+    type_line("eval", "run=run", "metric=[size]")
+    assert "measurements" in read_json(run / "eval.json")  # an evaluation without steps is of any
+    write_json(run / "summary.json", read_json(run / "summary.json") | {"steps": 10})
+    type_line("eval", "run=run", "metric=[size]")
+    assert "measurements" not in read_json(run / "eval.json")
+
+
+def test_a_wrong_protocol_is_named_as_it_is_typed(tmp_path, type_line, clip):
+    make_run(tmp_path / "run")
+    message = type_line("eval", "run=run", "metric=[clip_score]", clip, "protocol.text=cat").message
+    assert message.startswith("protocol.text: ")
+    line = message.rpartition("Try: ")[2]
+    assert type_line("eval", "run=run", "metric=[clip_score]", clip, *SMALL, *shlex.split(line)).code == 0
 
 
 def test_training_measures_scores_too(tmp_path, type_line, clip):
@@ -152,6 +185,10 @@ def record(**changes):
 def test_values_texts_and_places_of_a_model_may_differ():
     one = Score(1.0, record(model="clip", views=[1.0]))
     assert difference("n", [one, Score(2.0, record(model="/a/b", text="y", views=[2.0]))]) is None
+    # A whole number is the same setting as a float and as an integer.
+    whole, real = ({"name": "paper", "distance": 3, "elevations_deg": [kind(15)]} for kind in (int, float))
+    scores = [Score(1.0, record(protocol=each)) for each in (whole, real | {"distance": 3.0})]
+    assert difference("n", scores) is None
     # Without a hash, the name of a model is all that is known of it.
     nameless = [Score(1.0, record(weights_sha256=None, model=model)) for model in ("clip", "other")]
     assert "model is clip (1) and other (1)" in str(difference("n", nameless))

@@ -347,3 +347,37 @@ def test_a_list_of_prompts_is_checked(tmp_path, name, content, message):
 def test_a_list_in_yaml_has_texts_or_entries(tmp_path):
     (tmp_path / "a.yaml").write_text("- a cat\n- prompt: a dog\n  category: Animal\n- a cat\n")
     assert read_candidates(str(tmp_path / "a.yaml")) == ["a cat", "a dog"]
+
+
+@pytest.mark.parametrize(
+    "damage", [of_another_kind, cut_short, without("preprocessor_config.json"), without("vocab.json")]
+)
+def test_a_damaged_model_is_found_before_a_run_begins(make, clip_folder, tmp_path, damage):
+    """The tokenizer of the last one is in two files, so both are removed."""
+    folder = shutil.copytree(clip_folder, tmp_path / "damaged")
+    make(ClipScore, model=str(folder)).prepare()
+    (folder / "tokenizer.json").unlink()
+    damage(folder)
+    with pytest.raises(UserError, match=r"^metric\.clip_score\.model: .*damaged cannot be used"):
+        make(ClipScore, model=str(folder)).prepare()
+
+
+def test_a_score_that_is_not_a_number_is_refused(make, measurand, clip_folder, tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    folder = shutil.copytree(clip_folder, tmp_path / "nan")
+    weights = load_file(folder / "model.safetensors")
+    weights["visual_projection.weight"] *= float("nan")
+    save_file(weights, folder / "model.safetensors", {"format": "pt"})
+    for kind in (ClipScore, PickScore):
+        with pytest.raises(UserError, match="returns NaN or infinity"):
+            make(kind, model=str(folder)).measure(measurand)
+
+
+def test_whatever_a_model_raises_costs_only_its_score(make, measurand, monkeypatch):
+    def fail(*_):
+        raise ValueError("too many <image>\ntokens")
+
+    monkeypatch.setattr("cadam3d.metric.clip.Clip.pictures", fail)
+    with pytest.raises(UserError, match=r"cannot score this prompt \(too many <image> tokens\)"):
+        make(ClipScore).measure(measurand)
