@@ -125,6 +125,21 @@ def test_the_same_seed_gives_the_same_bytes_and_another_one_another_study(arms, 
     assert (tmp_path / "one/key.json").read_bytes() == (tmp_path / "two/key.json").read_bytes()
 
 
+def test_the_numbers_of_the_clips_cannot_be_computed_from_the_page_and_the_seed(arms, type_line, tmp_path):
+    keys = []
+    for name in ("one", "two"):
+        assert type_line("study", arms, *SMALL, f"output={name}").code == 0
+        keys.append([clip["run"] for clip in read_json(tmp_path / name / "key.json")["clips"]])
+        for number, arm in enumerate(ARMS):  # other assets of the same prompts
+            asset = tmp_path / arm / "0/asset.ply"
+            asset.write_bytes(
+                (
+                    make_run(tmp_path / "other" / name / arm, arm, "a cube", count=9 + number) / "asset.ply"
+                ).read_bytes()
+            )
+    assert keys[0] != keys[1]
+
+
 def test_all_clips_have_the_same_size_and_length(arms, type_line, tmp_path):
     import base64
     import io
