@@ -15,11 +15,13 @@ from cadam3d.commands.messages import note
 from cadam3d.core.checks import require_range, require_whole
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
+from cadam3d.io.asset_record import sha256_of
 from cadam3d.io.atomic import replacing
 from cadam3d.io.caption import plain
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.reading import read_text
 from cadam3d.io.run_folder import (
+    ASSET,
     expanded,
     nearest_existing,
     numbered,
@@ -72,8 +74,9 @@ def _write(cfg: DictConfig) -> None:
     """Write ``study.html`` and ``key.json`` into ``output``, and print what they contain."""
     settings = _settings(cfg)
     consent = _consent(cfg.consent)
-    generator = Random(cfg.seed)
-    pairs = _pairs(cfg, generator)
+    pairs = _pairs(cfg)
+    generator = _generator(cfg.seed, pairs)
+    pairs = draw_pairs(pairs, cfg.pairs, generator)
     with _output(cfg) as folder:
         clips = _film_all(pairs, cfg, settings)
         plan = _plan(cfg, pairs, clips, generator)
@@ -117,13 +120,24 @@ def _consent(path: str | None) -> str:
         raise UserError(f"consent: expected a text file, got {reason}. Try: consent=null") from error
 
 
-def _pairs(cfg: DictConfig, generator: Random) -> list[Pair]:
-    """Return the pairs of runs that the page shows, and print a note if runs are left out."""
+def _generator(seed: int, pairs: Sequence[Pair]) -> Random:
+    """Return what draws the order, the sides and the numbers of the clips.
+
+    A rater may know this program and guess the seed. The draws also depend on the assets, which a page does
+    not contain, so that they cannot be repeated from it.
+    """
+    runs = dict.fromkeys(run for pair in pairs for run in pair.runs)
+    hashes = [sha256_of(run.folder / ASSET) for run in runs]
+    return Random(f"{seed} {' '.join(hashes)}")
+
+
+def _pairs(cfg: DictConfig) -> list[Pair]:
+    """Return all pairs of runs, and print a note if runs are left out."""
     found = find_runs(_texts(cfg.runs), None if cfg.labels is None else _texts(cfg.labels))
     runs = select(found.runs, None if cfg.arms is None else _texts(cfg.arms), _prompts(cfg.prompts))
     pairs = pair_runs(runs, same_seed=cfg.same_seed)
     _note_left(found, runs, pairs)
-    return draw_pairs(pairs, cfg.pairs, generator)
+    return pairs
 
 
 def _prompts(source: str | None) -> set[str] | None:

@@ -92,7 +92,7 @@ def require_settings(values: Mapping[Any, Any]) -> None:
     """
     for name in sorted(SETTINGS.keys() & values.keys()):
         if not _fits(values[name], SETTINGS[name], name):
-            value = EXAMPLES.get(name, SPARE[_alternatives(SETTINGS[name])[0]])
+            value = EXAMPLES[name] if name in EXAMPLES else SPARE[_alternatives(SETTINGS[name])[0]]
             raise _refusal(name, SETTINGS[name], values[name], argument(name, value))
     if not values.get("prompt", "unused").strip():
         example = argument("prompt", EXAMPLES["prompt"])

@@ -5,6 +5,7 @@ The files come from strangers. A file that cannot be used is left out with a rea
 
 import glob
 import os
+from codecs import BOM_UTF8
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -133,7 +134,9 @@ def read_files(paths: Sequence[Path]) -> tuple[list[AnswerFile], list[LeftOut]]:
     left: list[LeftOut] = []
     for path in paths:
         try:
-            value = parse_json(read_bytes(path, largest=LARGEST_FILE))
+            # Some editors on Windows put a mark before the text.
+            content = read_bytes(path, largest=LARGEST_FILE).removeprefix(BOM_UTF8)
+            value = parse_json(content)
             if isinstance(value, dict) and value.get("kind") in (KEY_KIND, RESULTS_KIND):
                 continue
             files.append(_file(path, value))
@@ -171,7 +174,7 @@ def collect(files: Sequence[AnswerFile], key: Key) -> Collected:
         of_name[last.rater.casefold()].append(last)
         newer = shown(last.path)
         left += [
-            LeftOut(file.path, f"the same rater has saved again later: {newer}")
+            LeftOut(file.path, f"the answers of this session are saved again in {newer}")
             for file in same
             if file is not last
         ]

@@ -85,11 +85,10 @@ def find_runs(places: Sequence[str], labels: Sequence[str] | None) -> Found:
             f"an arm, got {len(folders)}. Try: {_example(folders)}"
         )
     if len(set(folders)) < len(folders):
-        names = ",".join(str(shown(folder)) for folder in dict.fromkeys(folders))
-        raise UserError(
-            "runs: expected different folders, got one of them twice. "
-            f"Try: {setting_word('runs', f'[{names}]')}"
-        )
+        different = [str(shown(folder)) for folder in dict.fromkeys(folders)]
+        word = setting_word("runs", f"[{','.join(different)}]")
+        example = word if len(different) > 1 else "cadam3d study --help"
+        raise UserError(f"runs: expected different folders, got one of them twice. Try: {example}")
     results = [_results(place, folder) for place, folder in zip(places, folders, strict=True)]
     names = _default_labels(folders, results) if labels is None else [plain(label) for label in labels]
     are_names = all(0 < len(name) <= LONGEST_LABEL for name in names)

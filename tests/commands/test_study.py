@@ -125,6 +125,21 @@ def test_the_same_seed_gives_the_same_bytes_and_another_one_another_study(arms, 
     assert (tmp_path / "one/key.json").read_bytes() == (tmp_path / "two/key.json").read_bytes()
 
 
+def test_the_numbers_of_the_clips_cannot_be_computed_from_the_page_and_the_seed(arms, type_line, tmp_path):
+    keys = []
+    for name in ("one", "two"):
+        assert type_line("study", arms, *SMALL, f"output={name}").code == 0
+        keys.append([clip["run"] for clip in read_json(tmp_path / name / "key.json")["clips"]])
+        for number, arm in enumerate(ARMS):  # other assets of the same prompts
+            asset = tmp_path / arm / "0/asset.ply"
+            asset.write_bytes(
+                (
+                    make_run(tmp_path / "other" / name / arm, arm, "a cube", count=9 + number) / "asset.ply"
+                ).read_bytes()
+            )
+    assert keys[0] != keys[1]
+
+
 def test_all_clips_have_the_same_size_and_length(arms, type_line, tmp_path):
     import base64
     import io
@@ -167,7 +182,7 @@ def test_names_of_files_do_not_control_the_terminal(arms, type_line, tmp_path):
     assert code == 0
     page = (tmp_path / "study/study.md").read_text(encoding="utf-8")
     assert "c [2J .json is left out" in err
-    assert "b \\[2J .json: the same rater" in page
+    assert "b \\[2J .json: the answers of this session" in page
     assert "\x1b" not in out + err + page
 
 
@@ -233,6 +248,10 @@ def test_a_text_of_consent_is_shown_as_text(arms, type_line, tmp_path):
         ),
         (("runs=[a,b]", "catch_share=2"), "catch_share: expected a number >= 0 and <= 1, got 2"),
         (("answers=a", "least_caught=2"), "least_caught: expected a number >= 0 and <= 1, got 2"),
+        (("runs=[a,b]", "labels=x"), "labels: expected a list of texts or null, got 'x'. Try: labels=null"),
+        (("runs=[a,b]", "arms=x"), "arms: expected a list of texts or null, got 'x'. Try: arms=null"),
+        (("runs=[a,b]", "backdrop=red"), "backdrop: expected a list of numbers, got 'red'. Try: 'backdrop="),
+        (("runs=[a,a]",), "runs: expected different folders, got one of them twice. Try: cadam3d study --"),
         (("a.json", "b.json"), "'a.json': expected key=value. Try: cadam3d study 'answers=[a.json,b.json]'"),
         (("a", "b"), "'a': expected key=value. Try: cadam3d study 'runs=[a,b]'"),
     ],

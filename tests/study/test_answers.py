@@ -87,7 +87,7 @@ def test_the_last_file_of_a_session_counts(read):
     assert len(raters["7"].answers) == 2 * len(QUESTION_NAMES)
     assert raters["7"].answers[0].chosen == "stork"
     assert set(left) == {"early", "copy"}
-    assert all("saved again later" in reason for reason in left.values())
+    assert all("saved again" in reason for reason in left.values())
 
 
 def test_two_sessions_under_one_name_are_both_left_out_and_name_each_other(read):
@@ -117,6 +117,12 @@ def test_invisible_characters_of_names_cost_no_answers(read):
         **{f"f{i}": written({0: 0}, rater=name, session=f"s{i}") for i, name in enumerate(names)}
     )
     assert set(raters) == set(names.values())
+    assert not left
+
+
+def test_a_mark_that_some_editors_put_before_the_text_costs_no_answers(read):
+    raters, left = read(edited=b"\xef\xbb\xbf" + json.dumps(written({0: 0})).encode())
+    assert set(raters) == {"7"}
     assert not left
 
 
