@@ -112,6 +112,9 @@ def _as_text(result: Mapping[str, Any]) -> str:
             text = f"{value:.4f}" if isinstance(value, float) else str(value)
             note = f"   {_explained(scores[name])}" if name in scores else ""
             lines.append(f"{name:<20}{text}{note}")
+    for name, record in result.get(MEASUREMENTS, {}).items():
+        if name not in scores and "reason" in record:
+            lines.append(f"{name:<20}-   {record['reason']}")
     return "\n".join(lines)
 
 
@@ -149,7 +152,7 @@ def trusting() -> str:
 
 def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
     """Measure every job of a sweep, and write the ``eval.json`` and the report of the sweep."""
-    results, failures = [], 0
+    results, written, failures = [], [], 0
     problem: UserError | None = None
     for job in (row.folder for row in load(folder)):
         try:
@@ -157,14 +160,15 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
         except UserError as error:
             failures += 1
             results.append({"run": str(shown(job)), "message": str(error)})
+            written.append(results[-1])
             print(f"cadam3d: {job.name}: {error}", file=sys.stderr)
             continue
         psnr = psnr_of(results[-1])
         quality = "no psnr" if psnr is None else f"{psnr:6.2f} dB"
         print(f"{quality}  {results[-1].get('num_gaussians', '-'):>8} Gaussians  {job.name}", flush=True)
         try:
-            results[-1] = with_earlier(results[-1], job, cfg.metric)
-            write_json(job / EVALUATION, results[-1])
+            written.append(with_earlier(results[-1], job, cfg.metric))
+            write_json(job / EVALUATION, written[-1])
         except UserError as error:
             problem = problem or error
     if failures == len(results):
@@ -173,7 +177,7 @@ def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
             "Run the sweep again, after a look at this machine. Try: cadam3d doctor"
         )
     try:
-        write_json(folder / EVALUATION, results)
+        write_json(folder / EVALUATION, written)
     except UserError as error:
         problem = problem or error
     print(_table(results, folder))

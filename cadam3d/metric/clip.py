@@ -16,6 +16,8 @@ from cadam3d.metric.scoring import ModelMetric, Scorer, cut_off
 
 # The number of models in memory. With them, several metrics and all jobs of a sweep load each model once.
 KEPT = 2
+# The settings of an image processor that change the pixels.
+PREPROCESSING = ("size", "resample", "crop_size", "do_center_crop", "image_mean", "image_std")
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,16 @@ def _loaded(found: TransformerFolder, _sha256: str, device: torch.device) -> Cli
 def assembled(found: TransformerFolder, model: Any, facts: dict[str, Any], device: torch.device) -> Clip:
     """Return a CLIP model, on ``device``, with the tokenizer and the preprocessing in a folder."""
     tokenizer, preprocess = check_clip(found)
-    return Clip(model.to(device), tokenizer, preprocess, facts)
+    return Clip(model.to(device), tokenizer, preprocess, facts | _settings(model, preprocess))
+
+
+def _settings(model: Any, preprocess: Any) -> dict[str, Any]:
+    """Return what is not in the weights and changes a score, for its record: pictures and activations."""
+    known = preprocess.to_dict()
+    steps = {name: known.get(name) for name in PREPROCESSING}
+    activations = {model.config.text_config.hidden_act, model.config.vision_config.hidden_act}
+    plain = {name: list(value) if isinstance(value, tuple) else value for name, value in steps.items()}
+    return {"preprocessing": plain, "activation": " and ".join(sorted(activations))}
 
 
 def check_clip(found: TransformerFolder) -> tuple[Any, Any]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from cadam3d.core.quality import QUALITIES
 from cadam3d.io.atomic import replacing
 from cadam3d.io.jsonl import to_json
 from cadam3d.io.records import QUALITY, Score, difference, psnr_of, read_scores
@@ -78,7 +79,9 @@ def scores_of(jobs: Sequence[Mapping[str, Score]], sweep: Path) -> Scores:
         if problem is None:
             columns[name] = [None if score is None else score.value for score in found]
         else:
-            again = f"cadam3d eval {setting_word('run', shown(sweep))} 'metric=[{name}]'"
+            # Some metrics measure several numbers. Those from elsewhere are not in the list.
+            metric = QUALITIES[name].metric if name in QUALITIES else name
+            again = f"cadam3d eval {setting_word('run', shown(sweep))} 'metric=[{metric}]'"
             left_out.append(f"{problem}, so it is not in the table. Try: {again}")
     return Scores(columns, left_out)
 

@@ -14,7 +14,7 @@ from cadam3d.io.jsonl import read_json, write_json
 from cadam3d.io.ply import write_ply
 from cadam3d.io.records import Score, difference, read_scores
 from cadam3d.sweep.folder import Plan, PlannedJob, load, write_plan
-from cadam3d.sweep.table import as_text, write_table
+from cadam3d.sweep.table import as_text, scores_of, write_table
 
 SMALL = ("protocol.views=2", "protocol.size=24")
 
@@ -215,3 +215,9 @@ def test_records_of_an_unknown_kind_are_not_used(tmp_path, records):
     run = make_run(tmp_path / "run")
     write_json(run / "eval.json", {"clip_score": 3.0, "num_gaussians": 6, "measurements": records})
     assert read_scores(run, read_json(run / "summary.json")) == {}
+
+
+def test_the_advice_about_a_number_names_the_metric_that_measures_it():
+    jobs = [{"janus_fronts": Score(1.0, {"protocol": {"name": name}})} for name in ("truth", "paper")]
+    [sentence] = scores_of(jobs, Path("sweep")).left_out
+    assert sentence.endswith("Try: cadam3d eval run=sweep 'metric=[janus]'")

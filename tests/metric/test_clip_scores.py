@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from splats import make_gaussians
 from cadam3d.core.errors import UserError
 from cadam3d.core.render import RenderOutput
 from cadam3d.io import transformer
+from cadam3d.io.records import Score, difference
 from cadam3d.io.transformer import TransformerFolder, sha256_of
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.clip_r_precision import ClipRPrecision, read_candidates
@@ -381,3 +383,26 @@ def test_whatever_a_model_raises_costs_only_its_score(make, measurand, monkeypat
     monkeypatch.setattr("cadam3d.metric.clip.Clip.pictures", fail)
     with pytest.raises(UserError, match=r"cannot score this prompt \(too many <image> tokens\)"):
         make(ClipScore).measure(measurand)
+
+
+@pytest.mark.parametrize(
+    ("file", "change"),
+    [
+        ("preprocessor_config.json", {"image_mean": [0.5, 0.5, 0.5]}),
+        ("config.json", {"text_config": {"hidden_act": "gelu"}}),
+    ],
+)
+def test_equal_weights_with_other_settings_are_another_method(
+    make, measurand, clip_folder, tmp_path, file, change
+):
+    folder = shutil.copytree(clip_folder, tmp_path / "another")
+    settings = json.loads((folder / file).read_text())
+    for name, value in change.items():
+        settings[name] = settings[name] | value if isinstance(value, dict) else value
+    (folder / file).write_text(json.dumps(settings))
+    found = [
+        Score(each.numbers["clip_score"], json.loads(json.dumps(each.details["clip_score"])))
+        for each in (make(ClipScore, model=str(path)).measure(measurand) for path in (clip_folder, folder))
+    ]
+    assert found[0].value != pytest.approx(found[1].value)
+    assert re.search("preprocessing.image_mean|activation", str(difference("clip_score", found)))
