@@ -78,13 +78,13 @@ class ScoreMetric(Metric):
                 raise
             reason = " ".join(str(error).split())[:200]
             raise UserError(
-                f"{self.number}: the model cannot score this prompt ({reason}). Try: another model"
+                f"metric.{self.number}: the model cannot score this prompt ({reason}). Try: another model"
             ) from error
 
     def require_finite(self, values: Tensor) -> None:
         """Raise ``UserError`` if a model has returned something other than numbers."""
         if not values.isfinite().all():
-            raise UserError(f"{self.number}: its model returns NaN or infinity. Try: another model")
+            raise UserError(f"metric.{self.number}: its model returns NaN or infinity. Try: another model")
 
     def measurement(
         self, values: Float[Tensor, "v"], text: str | None, facts: Mapping[str, Any]
