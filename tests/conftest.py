@@ -72,6 +72,7 @@ def pytest_collection_finish():
     gc.set_threshold(50_000, 20, 20)
     _skip_unused_maps()
     _read_settings_once()
+    _compose_once()
 
 
 def _read_settings_once() -> None:
@@ -95,6 +96,31 @@ def _read_settings_once() -> None:
         return pickle.loads(parsed[config_path])
 
     reader.load_config = load_once
+
+
+def _compose_once() -> None:
+    """Let Hydra compose each line once, as long as all settings come from the package, which does not change.
+
+    Every third composition of the suite repeats an earlier one.
+    """
+    from hydra._internal.config_loader_impl import ConfigLoaderImpl
+
+    from cadam3d.settings.compose import config_dir
+
+    compose = ConfigLoaderImpl.load_configuration
+    of_package = {str(config_dir()), f"file://{config_dir()}", "pkg://hydra.conf", "structured://"}
+    composed = {}
+
+    def compose_once(self, config_name, overrides, **options):
+        sources = [source.path for source in self.get_search_path().get_path()]
+        if not of_package.issuperset(sources):
+            return compose(self, config_name, overrides, **options)
+        key = (config_name, *overrides, *sorted(options.items()))
+        if key not in composed:
+            composed[key] = pickle.dumps(compose(self, config_name, overrides, **options))
+        return pickle.loads(composed[key])
+
+    ConfigLoaderImpl.load_configuration = compose_once
 
 
 def _skip_unused_maps() -> None:
