@@ -17,10 +17,12 @@ from cadam3d.core.checks import fail, require_choice
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.outcome import Outcome
 from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.frames import UPS
+from cadam3d.io.records import read_summary
 from cadam3d.io.run_folder import (
     ASSET,
     CONFIG,
@@ -95,6 +97,9 @@ def find_asset(folder: Path) -> Path:
     ply = folder / ASSET
     if not has_file(ply):
         line = f"cadam3d train {resume_word(shown(folder))}"
+        # A run that has finished without the file was asked for other formats, or for none.
+        if read_summary(folder).get("outcome") == Outcome.FINISHED:
+            line += " 'exporter=[ply]'"
         raise UserError(f"{shown(folder)}: has no {ASSET} yet. Try: {line}")
     return ply
 

@@ -267,6 +267,15 @@ def test_eval_of_a_sweep_measures_every_job_and_reports_those_that_fail(tmp_path
     assert (sweep / "c/eval.json").is_file()
 
 
+def test_a_finished_run_without_an_asset_is_exported_by_the_line_of_the_message(tmp_path, type_line):
+    line = ("train", "prompt=a red cube", "steps=2", "camera.size=8", "initializer.count=20")
+    more = ("rasterizer=reference", "exporter=[]", "metric=[]", "hydra.run.dir=run", "callback=[checkpoint]")
+    assert type_line(*line, *more).code == 0
+    advice = type_line("eval", "run=run", *SMALL).message.rpartition("Try: cadam3d ")[2]
+    assert type_line(*shlex.split(advice)).code == 0
+    assert (tmp_path / "run/asset.ply").is_file()
+
+
 def test_eval_of_a_sweep_without_any_asset_fails(tmp_path, type_line):
     make_sweep(tmp_path / "sweep", "a")
     assert type_line("eval", "run=sweep")[0] == 1
