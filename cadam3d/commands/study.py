@@ -298,7 +298,8 @@ def _find_key(cfg: DictConfig, files: Sequence[AnswerFile]) -> tuple[Path, Key]:
                 return path, key
     if problem is not None:
         raise problem
-    got = f"only keys of other studies in {', '.join(map(str, paths[:3]))}" if paths else "none"
+    others = ", ".join(dict.fromkeys(str(shown(path)) for path in paths))
+    got = f"only keys of other studies in {others}" if paths else "none"
     raise UserError(
         f"key: expected the key of the study {files[0].study!r} in {cfg.output}/, beside the answers or in "
         f"the folder above, got {got}. Its name is {KEY}. Try: cadam3d study --help"

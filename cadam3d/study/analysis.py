@@ -14,7 +14,8 @@ import numpy as np
 from scipy.special import expit
 from scipy.stats import binom
 
-from cadam3d.core.checks import fail, require_range
+from cadam3d.core.checks import require_range
+from cadam3d.core.errors import UserError
 from cadam3d.study.answers import Answer, Rater
 from cadam3d.study.estimates import (
     CONFIDENCE,
@@ -145,12 +146,11 @@ def analyse(raters: Sequence[Rater], *, least_caught: float) -> Analysis:
     kept = {rater.name for rater in screening.kept}
     answers = [answer for rater in raters if rater.name in kept for answer in rater.answers]
     if not answers:
-        excluded = len(screening.excluded)
-        raise fail(
-            "answers",
-            expected="answers of at least one rater who passes the catch trials",
-            got=f"{len(raters)} raters, of which {excluded} failed them",
-            example="least_caught=0",
+        # Some raters may have answered catch trials only.
+        example = "least_caught=0" if any(rater.answers for rater in raters) else "cadam3d study --help"
+        raise UserError(
+            "answers: expected answers of at least one rater who passes the catch trials, got none "
+            f"(raters who failed: {len(screening.excluded)} of {len(raters)}). Try: {example}"
         )
     by_question = [[each for each in answers if each.question == name] for name in QUESTION_NAMES]
     results = _corrected([question_result(each) for each in by_question if each])

@@ -69,7 +69,11 @@ def write_key(path: Path, study: str, plan: Plan, *, seed: int) -> None:
 
 def read_key(path: Path) -> Key:
     """Return the key in a file. Raises ``UserError`` if the file is not the key of a study."""
-    content = read_bytes(path, largest=LARGEST_KEY)
+    try:
+        content = read_bytes(path, largest=LARGEST_KEY)
+    except UserError as error:
+        reason = str(error).partition(". Try: ")[0]
+        raise UserError(f"key: expected the key of a study, got {reason}. Try: key=null") from error
     try:
         value = parse_json(content)
         return _key(value)

@@ -38,10 +38,14 @@ function newSession() {
 
 // --- keeping the answers ---------------------------------------------------------------------------------------
 
+let isKept = true; // whether the browser keeps the answers
+
 function keep() {
   try {
     localStorage.setItem(PLACE, JSON.stringify({ rater, step }));
   } catch {
+    if (!isKept) return;
+    isKept = false;
     notice("This browser cannot keep your answers. Please do not close or reload this page before you have saved them.");
   }
 }
@@ -54,6 +58,20 @@ function restore() {
     step = Math.min(Math.max(Math.trunc(kept.step) || 0, 0), TOTAL);
   } catch { /* nothing usable was kept */ }
 }
+
+// Answers that neither the browser nor a file has are not closed without a question.
+addEventListener("beforeunload", (event) => {
+  if (!isKept && rater?.answers.length && !rater.isSaved) event.preventDefault();
+});
+
+// The page may be open twice in one browser. Otherwise, the second window would write over the answers of the first.
+addEventListener("storage", (event) => {
+  if (event.key !== PLACE) return;
+  rater = null;
+  step = 0;
+  restore();
+  show();
+});
 
 function forget() {
   try {

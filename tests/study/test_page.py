@@ -205,6 +205,29 @@ def test_another_person_can_begin_once_the_answers_of_the_first_are_saved(visit)
     assert place_of(page) == "Pair 1 of 3 · question 1 of 5"
 
 
+def test_two_windows_of_one_browser_continue_the_same_answers(visit):
+    page = visit()
+    begin(page, "1")
+    other = page.context.new_page()
+    other.goto(page.url)
+    answer(other, "12")
+    until(page, "step === 2")
+    answer(page, "1")
+    until(other, "rater.answers.length === 3 && rater.answers.every(Boolean)")
+
+
+def test_answers_that_the_browser_cannot_keep_are_not_closed_without_a_question(visit):
+    asked = []
+    page = visit()
+    page.on("dialog", lambda dialog: (asked.append(dialog.type), dialog.accept()))
+    page.evaluate("() => { Storage.prototype.setItem = () => { throw new Error('full'); }; }")
+    begin(page, "1")
+    assert "cannot keep your answers" in page.inner_text("#notice")
+    answer(page, "1")
+    page.reload()
+    assert asked == ["beforeunload"]
+
+
 def test_the_start_needs_a_name_and_consent(visit):
     page = visit()
     page.keyboard.press("Enter")
