@@ -195,9 +195,14 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
                 )
                 other = found.setdefault(frozenset(setting.identity for setting in settings), job)
                 if other.arm != name and (causes := [key for key in axes if key in line]):
+                    # An arm that has the value without the line is the one that the line is about.
+                    values = [each.value for each in grid.arms[name].get(causes[0], ())]
+                    wanted = [each.value for each in line[causes[0]]]
+                    left_out = other.arm if values == wanted else name
                     raise UserError(
                         f"{causes[0]}: the arms {other.arm} and {name} differ in this setting, so the line "
-                        f"cannot set it for both. Leave out {causes[0]} or an arm. Try: '~grid.arms.{name}'"
+                        f"cannot set it for both. Leave out {causes[0]} or an arm. "
+                        f"Try: '~grid.arms.{left_out}'"
                     )
     return list(found.values())
 

@@ -109,6 +109,13 @@ def test_a_setting_of_the_line_reaches_an_arm_that_does_not_name_it():
     assert [values(job)["tau"] for job in jobs] == [0.9, 0.9]
 
 
+@pytest.mark.parametrize(("value", "left_out"), [("a", "two"), ("b", "one")])
+def test_the_arm_that_the_line_is_about_is_not_the_one_to_leave_out(value, left_out):
+    grid = read_grid({"arms": {"one": {"densifier": "a"}, "two": {"densifier": "b"}}})
+    with pytest.raises(UserError, match=rf"'~grid.arms.{left_out}'$"):
+        expand(grid, read_line([f"densifier={value}"]))
+
+
 def test_a_line_that_makes_two_arms_the_same_is_refused(pareto):
     with pytest.raises(
         UserError, match=r"^densifier: the arms one and two differ in this setting.*'~grid.arms.two'"
