@@ -185,10 +185,17 @@ def test_arms_that_were_never_compared_have_no_comparison():
     assert [(each.first, each.second) for each in result.comparisons] == [("a", "b"), ("b", "c")]
 
 
-@pytest.mark.parametrize("raters", [[], [rater("r")], [rater("r", ("a", "b"), catches=[False])]])
-def test_a_study_without_usable_answers_is_refused(raters):
+@pytest.mark.parametrize(
+    ("raters", "example"),
+    [
+        ([], "cadam3d study --help"),
+        ([rater("r")], "cadam3d study --help"),
+        ([rater("r", ("a", "b"), catches=[False])], "least_caught=0"),
+    ],
+)
+def test_a_study_without_usable_answers_is_refused(raters, example):
     with pytest.raises(
-        UserError, match=r"answers: expected answers of at least one rater .* Try: least_caught=0"
+        UserError, match=rf"answers: expected answers of at least one rater .* Try: {example}$"
     ):
         analyse(raters, least_caught=0.8)
 
