@@ -224,6 +224,7 @@ def without_key(tmp_path_factory):
         patch.setenv("WANDB_CONFIG_DIR", str(tmp_path_factory.mktemp("config")))
         patch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")
         patch.setenv("WANDB_ERROR_REPORTING", "false")
+        patch.setenv("WANDB_HTTP_TIMEOUT", "1")  # seconds, during which wandb tries again
         yield
 
 
