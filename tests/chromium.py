@@ -22,6 +22,17 @@ FLAGS = (
 )
 
 
+def watch(page: Any, problems: list[str]) -> None:
+    """Add everything that a page prints, every error and every request to another place to ``problems``."""
+    page.on("console", lambda message: problems.append(message.text))
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("request", lambda request: problems.append(request.url) if is_foreign(request.url) else None)
+
+
+def is_foreign(url: str) -> bool:
+    return not url.startswith(("file:", "blob:", "data:"))
+
+
 @contextmanager
 def headless() -> Iterator[Any]:
     """Run Chromium, and return playwright's browser; skip the test where it does not run."""

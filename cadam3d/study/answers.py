@@ -71,7 +71,7 @@ class AnswerFile:
     study: str
     rater: str
     session: str  # drawn by the page when the rater began
-    saves: int  # how often the rater had saved in this session, this time included
+    saves: int  # how often the rater had saved, this time included
     choices: tuple[Choice, ...]
 
 
@@ -174,7 +174,7 @@ def collect(files: Sequence[AnswerFile], key: Key) -> Collected:
         of_name[last.rater.casefold()].append(last)
         newer = shown(last.path)
         left += [
-            LeftOut(file.path, f"the answers of this session are saved again in {newer}")
+            LeftOut(file.path, f"{newer} has the answers of the same sitting")
             for file in same
             if file is not last
         ]

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 from PIL import Image
+from protocols import ring
 from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
@@ -20,20 +21,12 @@ from cadam3d.metric.base import Measurand
 from cadam3d.metric.clip_r_precision import ClipRPrecision, read_candidates
 from cadam3d.metric.clip_score import ClipScore
 from cadam3d.metric.pick_score import PickScore
-from cadam3d.metric.protocol import RingProtocol
 
 PROMPT = "a red cube"
-PROTOCOL = RingProtocol(
-    name="small",
-    views=3,
+PROTOCOL = ring(
     elevations_deg=[0.0, 40.0],
-    distance=3.0,
-    fov_y_deg=40.0,
     size=48,
-    background=[1.0, 1.0, 1.0],
-    crop="none",
     text="a view of {}",
-    aggregation="mean",
     models={"clip": {"id": "openai/clip", "revision": "abc"}, "pick": {"id": "one/pick", "revision": None}},
 )
 

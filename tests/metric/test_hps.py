@@ -7,6 +7,7 @@ import shutil
 import pytest
 import torch
 from PIL import Image
+from protocols import ring
 from safetensors.torch import save_file
 from splats import make_gaussians
 
@@ -15,21 +16,8 @@ from cadam3d.core.render import RenderOutput
 from cadam3d.metric import hps
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.hps import Hps
-from cadam3d.metric.protocol import RingProtocol
 
-PROTOCOL = RingProtocol(
-    name="small",
-    views=3,
-    elevations_deg=[0.0],
-    distance=3.0,
-    fov_y_deg=40.0,
-    size=32,
-    background=[1.0, 1.0, 1.0],
-    crop="none",
-    text="{}",
-    aggregation="mean",
-    models={"hps": {"id": "xswu/HPSv2", "revision": None}},
-)
+PROTOCOL = ring(models={"hps": {"id": "xswu/HPSv2", "revision": None}})
 PICTURES = torch.rand(3, 32, 32, 3, generator=torch.Generator().manual_seed(0))
 
 

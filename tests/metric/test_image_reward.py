@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from protocols import ring
 from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
@@ -21,21 +22,8 @@ from cadam3d.core.render import RenderOutput
 from cadam3d.metric import image_reward
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.image_reward import ImageReward
-from cadam3d.metric.protocol import RingProtocol
 
-PROTOCOL = RingProtocol(
-    name="small",
-    views=3,
-    elevations_deg=[0.0],
-    distance=3.0,
-    fov_y_deg=40.0,
-    size=8,
-    background=[1.0, 1.0, 1.0],
-    crop="none",
-    text="a {}",
-    aggregation="mean",
-    models={},
-)
+PROTOCOL = ring(size=8, text="a {}")
 PICTURES = torch.rand(3, 8, 8, 3, generator=torch.Generator().manual_seed(0))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from niqe_images import images
+from protocols import ring
 from scipy.special import gamma
 from splats import make_gaussians
 
@@ -23,25 +24,12 @@ from cadam3d.core.render import RenderOutput
 from cadam3d.metric import natural
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.niqe import OWN_NAME, OWN_PARAMETERS, Niqe
-from cadam3d.metric.protocol import RingProtocol
 
 EXPECTED = json.loads((Path(__file__).parent / "niqe_basicsr.json").read_text(encoding="utf-8"))["own"]
 
 
 def protocol(size=192, views=2):
-    return RingProtocol(
-        name="test",
-        views=views,
-        elevations_deg=[0.0],
-        distance=3.0,
-        fov_y_deg=40.0,
-        size=size,
-        background=[1.0, 1.0, 1.0],
-        crop="none",
-        text="{}",
-        models={},
-        aggregation="mean",
-    )
+    return ring(views=views, size=size)
 
 
 def metric(parameters=None, plain_blocks="keep", **changes):

@@ -6,12 +6,12 @@ import shutil
 import pytest
 import torch
 from PIL import Image
+from protocols import ring
 from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.render import RenderOutput
 from cadam3d.metric.base import Measurand
-from cadam3d.metric.protocol import RingProtocol
 from cadam3d.metric.vqa import Vqa
 
 # All spellings of yes and no that count, and words that only begin like them.
@@ -25,19 +25,7 @@ CHAT = (
     "{% endfor %}{% endfor %}{% if add_generation_prompt %} ASSISTANT:{% endif %}"
 )
 QUESTION = 'Does this figure show "{}"? Please answer yes or no.'
-PROTOCOL = RingProtocol(
-    name="small",
-    views=3,
-    elevations_deg=[0.0],
-    distance=3.0,
-    fov_y_deg=40.0,
-    size=32,
-    background=[1.0, 1.0, 1.0],
-    crop="none",
-    text="a {}",
-    aggregation="mean",
-    models={"vqa": {"id": "llava-hf/llava-1.5-7b-hf", "revision": None}},
-)
+PROTOCOL = ring(text="a {}", models={"vqa": {"id": "llava-hf/llava-1.5-7b-hf", "revision": None}})
 PICTURES = torch.rand(3, 32, 32, 3, generator=torch.Generator().manual_seed(0)).round()
 
 

@@ -10,7 +10,7 @@ from random import Random
 
 import numpy as np
 import pytest
-from chromium import headless
+from chromium import headless, watch
 from PIL import Image
 
 from cadam3d.study.answers import collect, find_files, read_files
@@ -62,9 +62,7 @@ def visit(browser, folder):
         context = browser.new_context(viewport={"width": 1000, "height": 700}, **options)
         contexts.append(context)
         page = context.new_page()
-        page.on("console", lambda message: problems.append(message.text))
-        page.on("pageerror", lambda error: problems.append(str(error)))
-        page.on("request", lambda request: problems.append(request.url) if is_foreign(request.url) else None)
+        watch(page, problems)
         page.goto((folder / "study.html").as_uri())
         return page
 
@@ -72,10 +70,6 @@ def visit(browser, folder):
     for context in contexts:
         context.close()
     assert not problems
-
-
-def is_foreign(url: str) -> bool:
-    return not url.startswith(("file:", "blob:", "data:"))
 
 
 def begin(page, name: str) -> None:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from chromium import headless
+from chromium import headless, watch
 from PIL import Image
 from snapshots import some_gaussians
 
@@ -53,9 +53,7 @@ def visit(browser, tmp_path):
         context = browser.new_context(viewport={"width": width, "height": height}, **options)
         contexts.append(context)
         page = context.new_page()
-        page.on("console", lambda message: problems.append(message.text))
-        page.on("pageerror", lambda error: problems.append(str(error)))
-        page.on("request", lambda request: problems.append(request.url) if is_foreign(request.url) else None)
+        watch(page, problems)
         page.add_init_script(before)
         page.goto(path.as_uri())
         return page
@@ -64,10 +62,6 @@ def visit(browser, tmp_path):
     for context in contexts:
         context.close()
     assert not problems
-
-
-def is_foreign(url: str) -> bool:
-    return not url.startswith(("file:", "blob:", "data:"))
 
 
 def shown(visit, packed: bytes, *, title="a cube", **options):
