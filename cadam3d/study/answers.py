@@ -174,7 +174,7 @@ def collect(files: Sequence[AnswerFile], key: Key) -> Collected:
         of_name[last.rater.casefold()].append(last)
         newer = shown(last.path)
         left += [
-            LeftOut(file.path, f"{newer} has the answers of the same sitting")
+            LeftOut(file.path, f"{newer} has the answers of the same session")
             for file in same
             if file is not last
         ]

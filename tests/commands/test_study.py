@@ -182,7 +182,7 @@ def test_names_of_files_do_not_control_the_terminal(arms, type_line, tmp_path):
     assert code == 0
     page = (tmp_path / "study/study.md").read_text(encoding="utf-8")
     assert "c [2J .json is left out" in err
-    assert "b \\[2J .json: study/answers/a \\[2J .json has the answers of the same sitting" in page
+    assert "b \\[2J .json: study/answers/a \\[2J .json has the answers of the same session" in page
     assert "\x1b" not in out + err + page
 
 

@@ -87,7 +87,7 @@ def test_the_last_file_of_a_session_counts(read):
     assert len(raters["7"].answers) == 2 * len(QUESTION_NAMES)
     assert raters["7"].answers[0].chosen == "stork"
     assert set(left) == {"early", "copy"}
-    assert all("of the same sitting" in reason for reason in left.values())
+    assert all("of the same session" in reason for reason in left.values())
 
 
 def test_two_sessions_under_one_name_are_both_left_out_and_name_each_other(read):
