@@ -61,13 +61,18 @@ class Transfers(TorchDispatchMode):
 
 def step_without_values(monkeypatch, lines: Sequence[str]) -> tuple[int, list[bool]]:
     """Do one step on a device without values. Return how often numbers were read, and the copies."""
-    cfg = composed(*SMALL, *lines)
+    has_prior = any(line.startswith("prior=") for line in lines)
+    cfg = composed(*(line for line in SMALL if not (has_prior and line.startswith("prior="))), *lines)
+    if has_prior:
+        # Embedded texts have values. This keeps them for the prior below.
+        build_trainer(cfg, CPU).prior.embed(cfg.prompt, cfg.negative_prompt)
     trainer = replace(build_trainer(cfg, META), rasterizer=Blobs())
     state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
     gaussians = state.gaussians.to(META)
     state.optimizer = trainer.optimizer.start(gaussians)
     state.densifier = trainer.densifier.init_state(len(gaussians), META)
     embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
+    trainer.prior.load()
     readings = []
 
     def read(numbers, device):
@@ -114,6 +119,14 @@ def test_a_step_waits_for_the_device_once(lines, monkeypatch):
 def test_the_stand_in_refuses_to_be_waited_for(work):
     with pytest.raises((NotImplementedError, RuntimeError)):
         work(torch.ones(1, device=META))
+
+
+def test_a_step_with_networks_waits_for_the_device_once(monkeypatch, tmp_path):
+    pytest.importorskip("diffusers")
+    lines = ["prior=shapes_mvdream", f"prior.cache_dir={tmp_path}", "camera.size=32"]
+    readings, copies = step_without_values(monkeypatch, lines)
+    assert readings == 1
+    assert all(copies), "a copy to the device waits for it"
 
 
 # -------------------------------------------------------------------------- overflow

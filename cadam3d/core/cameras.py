@@ -1,7 +1,7 @@
 """Cameras: OpenCV axes (+x right, +y down, +z forward) in a world with +z up and the object's front at +x."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float, Int
@@ -18,6 +18,8 @@ class Cameras:
     width: int
     azimuth_deg: Float[Tensor, "v"]  # in [-180, 180]; 0 = front (+x), 90 = the +y side
     elevation_deg: Float[Tensor, "v"]  # in [-90, 90]; positive = from above
+    # The same views on the CPU, if they were drawn there: to read them, the host need not wait for a device.
+    drawn: "Cameras | None" = field(default=None, repr=False, compare=False)
 
     def __len__(self) -> int:
         return self.world_to_camera.shape[0]
@@ -49,6 +51,10 @@ class Cameras:
             azimuth_deg=self.azimuth_deg.to(target),
             elevation_deg=self.elevation_deg.to(target),
         )
+
+    def on_cpu(self) -> "Cameras":
+        """Return the same cameras on the CPU; waits for their device unless they were drawn on the CPU."""
+        return self.to("cpu") if self.drawn is None else self.drawn
 
     def resize(self, height: int, width: int) -> "Cameras":
         """Return the same views at another image size, with intrinsics scaled per axis."""

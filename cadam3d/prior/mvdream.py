@@ -41,7 +41,7 @@ class MultiviewEmbedding(LatentEmbedding):
 
     def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> TextCondition:
         """Return the condition of these views. Raises ``UserError`` unless they form groups of four."""
-        require_groups(cameras)
+        require_groups(cameras.on_cpu())
         return super().at(cameras, background)
 
 
