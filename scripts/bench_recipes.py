@@ -170,7 +170,7 @@ def measure(recipe: str, model: Path, args: argparse.Namespace) -> dict[str, Any
     watch = Stopwatch(device)
     for name in ("encode", "decode", "predict"):
         object.__setattr__(trainer.prior, name, watch(name, getattr(trainer.prior, name)))
-    object.__setattr__(trainer.rasterizer, "render", watch("render", trainer.rasterizer.render))
+    object.__setattr__(trainer.rasterizer, "render_ahead", watch("render", trainer.rasterizer.render_ahead))
     state = trainer.start(cfg.prompt, component(cfg.initializer), 0, device)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)

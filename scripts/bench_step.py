@@ -135,6 +135,8 @@ def middle(turns: list[Any]) -> Any:
     first = turns[0]
     if isinstance(first, dict):
         return {key: middle([turn.get(key) for turn in turns]) for key in first}
+    if all(turn == first for turn in turns):
+        return first
     numbers = [turn for turn in turns if isinstance(turn, int | float)]
     return statistics.median(numbers) if len(numbers) == len(turns) else first
 
@@ -259,7 +261,7 @@ def three_passes(run: Run, args: argparse.Namespace) -> dict[str, Any]:
         return {
             "backend": run.trainer.rasterizer.prepare(device).name,
             "views": run.trainer.views,
-            "size": getattr(run.trainer.camera, "size", None),
+            "size": str(getattr(run.trainer.camera, "size", "?")),
             **whole,
             **time_parts(parts, args, watch),
             **count_operations(parts, watch),
@@ -299,7 +301,12 @@ def clocks_around_functions(watch: Watch) -> list[tuple[Any, str, Any]]:
 
     owners = {
         torch.Tensor: {"backward": "backward"},
-        GaussianOptimizer: {"step": "optimizer", "finite_gradients": "optimizer", "displace": "optimizer"},
+        GaussianOptimizer: {
+            "step": "optimizer",
+            "finite_gradients": "optimizer",
+            "extreme_gradients": "optimizer",
+            "displace": "optimizer",
+        },
         trainer.Trainer: {"_refine": "refinement", "_report": "callbacks", "_tell": "callbacks"},
         trainer: {"read_numbers": "readback"},
     }

@@ -51,7 +51,7 @@ def test_every_part_of_a_step_is_measured_and_counted(tmp_path, capsys):
     assert found["readbacks"]["readback"] == 1
     sizes = {"parameters": 56, "gradients": 56, "moments": 112, "densifier": 28}
     assert found["bytes_per_gaussian"] == sizes
-    assert (found["gaussians"], found["views"], found["size"]) == (20, 2, 8)
+    assert (found["gaussians"], found["views"], found["size"]) == (20, 2, "8")
     # The classes are as they were.
     assert [vars(owner)[name] for owner, name in CHANGED if name in vars(owner)] == before
 

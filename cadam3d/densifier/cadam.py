@@ -264,4 +264,5 @@ def all_finite(values: Float[Tensor, "n 3"]) -> Bool[Tensor, ""]:
         return torch.ones((), dtype=torch.bool, device=values.device)
     # Both are NaN if any value is.
     low, high = values.aminmax()
-    return low.isfinite() & high.isfinite()
+    # A product with 0 is NaN if the factor is NaN or infinite.
+    return (low * 0 + high * 0) == 0
