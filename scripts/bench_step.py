@@ -81,7 +81,7 @@ def main(words: list[str] | None = None) -> None:
             for _ in range(args.repeats if args.base else 1):
                 for name, tree in trees.items():
                     turns[name].append(measure_there(tree, prior, args))
-        except subprocess.CalledProcessError as error:
+        except LeftOutError as error:
             print(f"{prior} is left out: {error}")
             continue
         for name, found in turns.items():
@@ -125,8 +125,9 @@ def measure_there(tree: Path, prior: str, args: argparse.Namespace) -> dict[str,
             value = getattr(args, name)
             line += [] if value is None else [f"--{name}", str(value)]
         line += [*(["--tiny"] if args.tiny else []), *(["--", *args.settings] if args.settings else [])]
-        # What the run prints belongs to no result, but its errors are shown.
-        subprocess.run(line, stdout=subprocess.DEVNULL, check=True)
+        done = subprocess.run(line, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            raise LeftOutError(done.stderr.strip().splitlines()[-1])
         return json.loads(out.read_text())
 
 
@@ -142,6 +143,10 @@ def middle(turns: list[Any]) -> Any:
 
 
 # -------------------------------------------------------------------------- one prior of one tree
+
+
+class LeftOutError(Exception):
+    """A prior cannot be measured here, because a package or something else is missing; the text says what."""
 
 
 class Watch:
