@@ -36,7 +36,7 @@ from cadam3d.rasterizer.cuda_sort import BLOCK, scan, scan_bytes, sort, sort_byt
 from cadam3d.rasterizer.driver import Driver
 from cadam3d.rasterizer.forecast import Forecast, find_forecast
 from cadam3d.rasterizer.launcher import Launch, Launcher
-from cadam3d.rasterizer.native import RenderPass, require_shapes, run_pass, upload
+from cadam3d.rasterizer.native import RenderPass, outside_of_graphs, require_shapes, run_pass, upload
 from cadam3d.rasterizer.workspace import Workspace, plan
 
 # The kernels define the same constants (kernels/*.cuh).
@@ -106,6 +106,7 @@ def load_kernels(cache_dir: str | None) -> Launcher:
     return Driver(kernels_dir(cache_dir))
 
 
+@outside_of_graphs
 def rasterize(
     launcher: Launcher,
     gaussians: Gaussians,
@@ -133,6 +134,7 @@ def rasterize(
     return run_pass(kernels, gaussians, moved[2])
 
 
+@outside_of_graphs
 def rasterize_ahead(
     launcher: Launcher,
     gaussians: Gaussians,
