@@ -248,7 +248,7 @@ class _CudaPass(RenderPass):
         at, depths = self.frame.addresses(self.kept), self.scratch.addresses(self.scratch_blocks)
         pairs, first = (views.stop - views.start) * n, 4 * views.start * n
         order, total = depths["order"], at["totals"] + 4 * views.start
-        sort(self.launch, depths["depth_keys"] + first, order, pairs, DEPTH_BITS, _temporary(depths))
+        sort(self.launch, depths["depth_keys"] + first, order, pairs, DEPTH_BITS, _temporary(depths), 0, True)
         sums = (at["counts"] + first, depths["offsets"], pairs, depths["sums_of_chunks"], order, total)
         scan(self.launch, *sums)
 
