@@ -30,6 +30,9 @@ class RenderOutput:
     # Zeros, only on request and if gradients are on. The gradient that a backward pass leaves on them is not
     # a derivative but the sum over pixels of |dLoss/dmeans2d|, separately for each axis (AbsGS).
     absgrad: Float[Tensor, "v n 2"] | None = None
+    # Whether the memory that was reserved ahead was too small, on the device. Then the images show only the
+    # background and all gradients are zero. None if the memory always suffices.
+    overflowed: Bool[Tensor, ""] | None = None
 
     @property
     def visible(self) -> Bool[Tensor, "v n"]:

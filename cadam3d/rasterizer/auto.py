@@ -39,6 +39,16 @@ class AutoRasterizer(Rasterizer):
         """See :meth:`Rasterizer.render`."""
         return choose(gaussians.device).rasterizer.render(gaussians, cameras, background, absgrad)
 
+    def render_ahead(
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        background: Float[Tensor, "v 3"],
+        absgrad: bool = False,
+    ) -> RenderOutput:
+        """See :meth:`Rasterizer.render_ahead`."""
+        return choose(gaussians.device).rasterizer.render_ahead(gaussians, cameras, background, absgrad)
+
     def prepare(self, device: torch.device) -> Backend:
         """See :meth:`Rasterizer.prepare`. If the choice is not the fastest, the reason is given."""
         return choose(device).backend

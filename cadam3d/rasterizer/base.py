@@ -70,6 +70,21 @@ class Rasterizer(ABC):
         cancel. It changes no other result.
         """
 
+    def render_ahead(
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        background: Float[Tensor, "v 3"],
+        absgrad: bool = False,
+    ) -> RenderOutput:
+        """Render as :meth:`render` does, with the same bits, but if possible without waiting for the device.
+
+        Memory is then reserved before its size is known. If it is too small, ``output.overflowed`` is true:
+        the images show only the background, all gradients are zero, and the caller must repeat the work with
+        :meth:`render`. By default this is :meth:`render`, which never overflows.
+        """
+        return self.render(gaussians, cameras, background, absgrad)
+
     def prepare(self, device: torch.device) -> Backend:
         """Compile and load everything that rendering on ``device`` needs, and return the backend for it.
 

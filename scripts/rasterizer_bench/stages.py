@@ -21,7 +21,7 @@ from torch import Tensor
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
-from cadam3d.rasterizer import cuda
+from cadam3d.rasterizer import cuda, cuda_sort
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cuda import rasterize
 from cadam3d.rasterizer.launcher import Launch, Launcher
@@ -89,7 +89,7 @@ class StageClock(Launcher):
         self, launch: Launch, mark: Callable[[], object], kernel: str, blocks: int, threads: int, *arguments
     ) -> None:
         if kernel == "tile_ranges":
-            self.slots += arguments[1]
+            self.slots += arguments[2]
         begin = mark()
         launch(kernel, blocks, threads, *arguments)
         stage = stage_of(kernel, self.spans[-1] if self.spans else None)
@@ -153,7 +153,7 @@ def sorted_bytes(items: int, bits: int) -> int:
     A pass reads keys for counting, reads keys and values for scattering, and writes both. The first pass has
     no values to read.
     """
-    passes = -(-bits // cuda.RADIX_BITS)
+    passes = -(-bits // cuda_sort.RADIX_BITS)
     return items * WORD * (5 * passes - 1)
 
 

@@ -110,6 +110,27 @@ def test_on_a_cpu_auto_renders_the_images_of_the_native_rasterizer():
     assert torch.equal(got.depth, want.depth)
 
 
+def test_auto_also_renders_ahead_with_the_chosen_rasterizer(monkeypatch):
+    class Ahead(ReferenceRasterizer):
+        def render_ahead(self, gaussians, cameras, background, absgrad=False):
+            output = self.render(gaussians, cameras, background, absgrad)
+            return replace(output, overflowed=torch.ones((), dtype=torch.bool))
+
+    monkeypatch.setattr(auto, "FASTEST", {"cpu": {"ahead": lambda device: Ahead()}})
+    cameras = turntable(1, elevation_deg=0.0, distance=2.0, fov_y_deg=40.0, size=8)
+    arguments = a_ball(), cameras, torch.zeros(1, 3)
+    assert AutoRasterizer().render_ahead(*arguments).overflowed
+    assert AutoRasterizer().render(*arguments).overflowed is None
+
+
+def test_a_rasterizer_that_cannot_render_ahead_just_renders():
+    cameras = turntable(2, elevation_deg=10.0, distance=2.0, fov_y_deg=40.0, size=8)
+    arguments = a_ball(), cameras, torch.rand(2, 3)
+    ahead, exact = ReferenceRasterizer().render_ahead(*arguments), ReferenceRasterizer().render(*arguments)
+    assert ahead.overflowed is None
+    assert torch.equal(ahead.rgb, exact.rgb)
+
+
 # -------------------------------------------------------------------------- the gate before CUDA
 
 
