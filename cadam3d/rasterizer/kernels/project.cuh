@@ -70,13 +70,13 @@ SPLAT_FN void project_gaussian(const float* means, const float* log_scales, cons
   }
 }
 
-constexpr i64 LONG_RUN = 64;  // records; a longer run is summed by the whole warp
+constexpr u32 LONG_RUN = 64;  // records; a longer run is summed by the whole warp
 
 template <int WIDTH>
-SPLAT_FN void add_record(const float2* records, i64 slot, float* sum) {
+SPLAT_FN void add_record(const float2* records, u32 slot, float* sum) {
 #pragma unroll
   for (int j = 0; j < WIDTH / 2; ++j) {
-    const float2 two = records[WIDTH / 2 * slot + j];
+    const float2 two = records[WIDTH / 2 * i64(slot) + j];
     sum[2 * j] += two.x, sum[2 * j + 1] += two.y;
   }
 }
@@ -84,19 +84,18 @@ SPLAT_FN void add_record(const float2* records, i64 slot, float* sum) {
 // Sums ``count`` records of WIDTH floats from ``first`` on; each lane has its own run. All lanes of a warp
 // must call this function.
 template <int WIDTH>
-SPLAT_FN void sum_records(const float2* records, i64 first, i64 count, float* sum) {
+SPLAT_FN void sum_records(const float2* records, u32 first, u32 count, float* sum) {
   for (int j = 0; j < WIDTH; ++j) sum[j] = 0;
   if (count <= LONG_RUN)
-    for (i64 slot = first; slot < first + count; ++slot) add_record<WIDTH>(records, slot, sum);
+    for (u32 slot = first; slot < first + count; ++slot) add_record<WIDTH>(records, slot, sum);
   const int lane = lane_index();
   u32 waiting = __ballot_sync(ALL, count > LONG_RUN);
   while (waiting) {
     const int owner = __ffs(int(waiting)) - 1;
     waiting &= waiting - 1;
-    const i64 from = i64(__shfl_sync(ALL, u64(first), owner)),
-              many = i64(__shfl_sync(ALL, u64(count), owner));
+    const u32 from = __shfl_sync(ALL, first, owner), many = __shfl_sync(ALL, count, owner);
     float part[WIDTH] = {};
-    for (i64 slot = from + lane; slot < from + many; slot += WARP) add_record<WIDTH>(records, slot, part);
+    for (u32 slot = from + u32(lane); slot < from + many; slot += WARP) add_record<WIDTH>(records, slot, part);
 #pragma unroll
     for (int j = 0; j < WIDTH; ++j) {
 #pragma unroll
@@ -144,10 +143,9 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
                                 float* grad_quats) {
   const i64 i = thread_index();
   const bool is_mine = i < n;  // threads without a Gaussian help with long runs
-  const bool has_records = i64(*total_slots) <= capacity;
-  bool is_seen = false;
-  for (i64 v = 0; v < views && is_mine && has_records; ++v)
-    is_seen = is_seen || slot_count[v * n + i] > 0;
+  bool is_seen = false;  // in any view, with records
+  if (is_mine && i64(*total_slots) <= capacity)
+    for (i64 v = 0; v < views; ++v) is_seen = is_seen || slot_count[v * n + i] > 0;
   // A thread without a Gaussian loads the first one and does not use it. This needs no branch, so the loops
   // unroll.
   const Gaussian<COEFFICIENTS> gaussian =
@@ -159,7 +157,7 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
   if (is_mine && first_view > 0) totals.load(i, total);
   for (i64 v = first_view; v < end_view; ++v) {
     const i64 pair = v * n + i;
-    const bool is_visible = is_mine && has_records && slot_count[pair] > 0;
+    const bool is_visible = is_seen && slot_count[pair] > 0;
     float sum[RECORD];
     sum_records<RECORD>(records, is_visible ? first_slot[pair] : 0, is_visible ? slot_count[pair] : 0, sum);
     float centre[2] = {0, 0};
