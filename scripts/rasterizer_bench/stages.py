@@ -222,6 +222,7 @@ def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:
     with torch.no_grad():
         output = rasterizer.render(scene.gaussians, scene.cameras, scene.background)
     views, height, width = output.alpha.shape
+    tile_height = cuda.tile_height(views, height, width)
     return Load(
         gaussians=len(scene.gaussians),
         coefficients=scene.gaussians.sh.shape[1],
@@ -229,7 +230,7 @@ def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:
         visible=int(output.visible.sum()),
         slots=slots,
         pixels=views * height * width,
-        tiles=views * (-(-height // cuda.TILE)) * (-(-width // cuda.TILE)),
+        tiles=views * (-(-height // tile_height)) * (-(-width // cuda.TILE_WIDTH)),
     )
 
 
