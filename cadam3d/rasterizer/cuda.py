@@ -48,9 +48,10 @@ DEPTH_BITS = 32
 MOST = 2**31 - 1
 # Bytes of the records of one group of views. A group has at least one view, whatever that view needs.
 RECORD_MEMORY = 256 * 2**20
-# Below this number of tiles of 8x8 pixels in all views, tiles are 8x4: there are more of them, with shorter
-# lists. The number depends on no device, so that results depend on the input alone.
-FEW_TILES = 2048
+# With at most this number of tiles of 8x8 in a view, tiles are 8x4, which are more and have shorter lists.
+# Otherwise most of a large GPU would have nothing to do (docs/kernels.md has the arithmetic). The choice
+# depends on the size of a view alone, so a batch has the bits of its single views on every device.
+FEW_TILES = 1024
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +139,7 @@ class _CudaPass(RenderPass):
     ) -> None:
         super().__init__(cameras, device, absgrad)
         self.launcher = launcher
-        self.tile_height = tile_height(self.views, self.height, self.width)
+        self.tile_height = tile_height(self.height, self.width)
         # The number of slots that memory is reserved for, before it is known. None: the host waits for it.
         self.capacity = capacity
         # Whether all views are expected to be one group, so that their depths can be sorted before the wait.
@@ -420,10 +421,9 @@ def _merged(one: dict[str, int], other: dict[str, int]) -> dict[str, int]:
     return {name: max(one.get(name, 0), other.get(name, 0)) for name in one | other}
 
 
-def tile_height(views: int, height: int, width: int) -> int:
-    """Return the height of the tiles: 8 pixels, or 4 if tiles of 8 would be too few to fill a GPU."""
-    tiles = views * _pieces(height, 8) * _pieces(width, TILE_WIDTH)
-    return 4 if tiles < FEW_TILES else 8
+def tile_height(height: int, width: int) -> int:
+    """Return the height of the tiles in pixels: 8, or 4 if those would be few."""
+    return 4 if _pieces(height, 8) * _pieces(width, TILE_WIDTH) <= FEW_TILES else 8
 
 
 def most_slots(absgrad: bool) -> int:

@@ -222,7 +222,7 @@ def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:
     with torch.no_grad():
         output = rasterizer.render(scene.gaussians, scene.cameras, scene.background)
     views, height, width = output.alpha.shape
-    tile_height = cuda.tile_height(views, height, width)
+    tile_height = cuda.tile_height(height, width)
     return Load(
         gaussians=len(scene.gaussians),
         coefficients=scene.gaussians.sh.shape[1],

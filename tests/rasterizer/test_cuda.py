@@ -68,9 +68,7 @@ def test_the_bits_of_tiles_of_8x4_do_not_depend_on_the_schedule_of_threads(emula
 
 def test_only_small_images_have_small_tiles(monkeypatch):
     monkeypatch.undo()
-    assert cuda.tile_height(2, 112, 112) == 4
-    assert [cuda.tile_height(views, 256, 256) for views in (1, 2, 4)] == [4, 8, 8]
-    assert cuda.tile_height(1, 512, 512) == 8
+    assert [cuda.tile_height(size, size) for size in (1, 112, 256, 257, 512)] == [4, 4, 4, 8, 8]
 
 
 @pytest.fixture(scope="module")
