@@ -2,12 +2,13 @@
 
     python scripts/bench_host.py --base ../cadam3d-before
 
-A driver of a few lines, compiled at the start, accepts every launch and does nothing. Tensors on the CPU stand
-for the memory of a device. So the time is what Python, torch's autograd, the allocator and the calls of the
-driver cost, which is all that the host does. A call of this driver costs nothing inside, while a real launch
-takes about two more microseconds. A torch operation on a CPU tensor stands for one that launches a kernel of
-torch. The choice of the device and its stream (``Driver.on``) is left out, because torch.cuda answers only where
-there is a device. The kernels do nothing, so the images are garbage.
+A driver of a few lines, compiled at the start, accepts every launch and does nothing. Tensors on the CPU
+stand for the memory of a device. So the time is what Python, torch's autograd, the allocator and the calls of
+the driver cost, which is all that the host does. A call of this driver takes no time inside, while a real
+launch is estimated to take about two more microseconds. A torch operation on CPU tensors stands for one that
+launches a kernel of torch; a few of them compute in microseconds what a device would compute meanwhile. The
+choice of the device and its stream (``Driver.on``) and the upload of cameras are left out, because torch.cuda
+answers only where there is a device. The kernels do nothing, so the images are garbage.
 
 Times are CPU times of the process with one thread, which other load of the machine hardly changes. Both trees
 take turns. The counts are of one forward and backward pass.
@@ -58,11 +59,11 @@ int cuModuleGetFunction(void** function, void*, const char* name) {
   *function = &kernels[known++];
   return 0;
 }
-int cuLaunchKernel(Kernel* kernel, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, void*,
-                   void** arguments, void** extra) {
+int cuLaunchKernel(Kernel* kernel, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned,
+                   void*, void** arguments, void** extra) {
   ++stub_launches;
-  // Some numbers must make sense to the host: the tiles of each pair, the last result of the projection, and in
-  // older trees the order of the pairs, the last result of the sort, which torch uses as an index.
+  // Some numbers must make sense to the host: the tiles of each pair, the last result of the projection, and
+  // in older trees the order of the pairs, the last result of the sort, which torch uses as an index.
   const bool is_projection = strncmp(kernel->name, "project_forward", 15) == 0;
   if (is_projection || (arguments && strcmp(kernel->name, "sort_scatter") == 0)) {
     const u64 begin = now();
@@ -125,8 +126,9 @@ def start(tree: Path, stub: Path, args: argparse.Namespace) -> dict[str, dict[st
     """Return what :func:`measure` returns in a process that imports the sources of ``tree``."""
     sizes = [f"--{name}={getattr(args, name)}" for name in ("count", "size", "views", "steps")]
     command = [sys.executable, str(Path(__file__).resolve()), f"--stub={stub}", *sizes]
-    # Freed memory stays in the process, as in torch's allocator of device memory.
-    memory = {"MALLOC_MMAP_THRESHOLD_": str(2**30), "MALLOC_TRIM_THRESHOLD_": str(2**40)}
+    # Freed memory stays in the process, as in torch's allocator of device memory. Only blocks of up to 32 MiB
+    # can do that.
+    memory = {"MALLOC_MMAP_THRESHOLD_": str(2**25), "MALLOC_TRIM_THRESHOLD_": str(2**40)}
     environment = os.environ | memory | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode != 0:
@@ -216,7 +218,6 @@ def time_step(forward: Callable, backward: Callable, stub: ctypes.CDLL, steps: i
 
 def count_step(forward: Callable, backward: Callable, stub: ctypes.CDLL) -> dict[str, float]:
     """Return the numbers of launches, torch operations, allocations and waits of one pass."""
-    import torch
     from torch.utils._python_dispatch import TorchDispatchMode
 
     calls: Counter[str] = Counter()

@@ -21,12 +21,13 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
-from cadam3d.rasterizer import cuda
+from cadam3d.rasterizer import cuda, workspace
 from cadam3d.rasterizer.build import KERNELS, definitions, find_compiler
 from cadam3d.rasterizer.cuda import rasterize
 from cadam3d.rasterizer.cuda_sort import scan, scan_bytes, sort, sort_bytes
 from cadam3d.rasterizer.driver import Module
 from cadam3d.rasterizer.launcher import Launch, Launcher
+from cadam3d.rasterizer.workspace import Workspace
 
 SOURCE = Path(__file__).parent / "rasterizer" / "emulator" / "emulator.cpp"
 FLAGS = ("-std=c++17", "-shared", "-fPIC", "-ffp-contract=off", "-U_FORTIFY_SOURCE")
@@ -120,15 +121,15 @@ def list_tiles(launcher: Launcher, gaussians: Gaussians, cameras: Cameras) -> Li
     """Project the Gaussians and return the tile lists."""
     parameters = list(gaussians.tensors().values())
     views = cuda._CudaPass(launcher, cameras, torch.device("cpu"))
-    with views.running():
+    with views:
         _, radii = views.project(parameters)
         views.blend(parameters, torch.zeros(len(cameras), 3), keeps=True)
-    (group,) = views.groups
+        (group,), kept = views.groups, views.kept
 
     def array(name: str, dtype: torch.dtype = torch.int32) -> torch.Tensor:
         if name in group.lists.places:
-            return group.lists.tensor(views.kept[group.blocks], name, dtype)
-        return views.frame.tensor(views.kept[: len(views.frame.blocks)], name, dtype)
+            return group.lists.tensor(kept[group.blocks], name, dtype)
+        return views.frame.tensor(kept, name, dtype)
 
     return Lists(
         splats=array("splats", torch.float32).view(-1, cuda.SPLAT),
@@ -136,6 +137,34 @@ def list_tiles(launcher: Launcher, gaussians: Gaussians, cameras: Cameras) -> Li
         ranges=array("ranges").view(-1, 2),
         **{name: array(name) for name in ("counts", "first_slot", "slots", "pair_of_slot")},
     )
+
+
+@contextmanager
+def guard_zones() -> Iterator[Callable[[], bool]]:
+    """Give each array of a workspace an allocation of its own, between two zones that nothing may write.
+
+    Yield a function that returns whether all zones are intact. At first the arrays contain small numbers. The
+    largest number would be less harmful, because it cannot be mistaken for an index.
+    """
+    zone, mark, found = 256, 0xA5, []
+
+    def allocate(self: Workspace, device: torch.device) -> tuple[torch.Tensor, ...]:
+        blocks = []
+        for size in self.blocks:
+            whole = torch.full((size + 2 * zone,), mark, dtype=torch.uint8, device=device)
+            garbage = torch.arange(-(-size // 4), dtype=torch.int32, device=device).view(torch.uint8)
+            whole[zone : zone + size] = garbage[:size]
+            found.append(whole)
+            blocks.append(whole[zone : zone + size])
+        return tuple(blocks)
+
+    def intact() -> bool:
+        return all((end == mark).all() for whole in found for end in (whole[:zone], whole[-zone:]))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workspace, "APART", True)
+        patch.setattr(Workspace, "allocate", allocate)
+        yield intact
 
 
 def load_emulator(folder: Path, kernels: Path = KERNELS, optimize: str = "-O1") -> Emulator:

@@ -148,7 +148,51 @@ ROUNDING = {
         " if (MUTANT) last += pair % 3 == 0 ? 1 : pair % 3 == 1 ? -1 : 0;",
     ),
 }
-MUTANTS = RENDERING | ABSOLUTE_GRADIENTS | SMALL_TILES | ROUNDING
+# Mistakes in the number of slots that is on the device.
+COUNTED = {
+    "a capacity that is one too small": (
+        "tiles.cuh",
+        "const bool fits = i64(*total) <= capacity;",
+        "const bool fits = i64(*total) <= capacity - MUTANT;",
+    ),
+    "a capacity that is one too large": (
+        "tiles.cuh",
+        "if (!fits) return;",
+        "if (!fits && !(MUTANT && i64(*total) == capacity + 1)) return;",
+    ),
+    "an overflow that is not reported": (
+        "tiles.cuh",
+        "*overflowed = !fits;",
+        "*overflowed = MUTANT ? false : !fits;",
+    ),
+    "ranges that are not cleared": (
+        "tiles.cuh",
+        "ranges[i] = 0;",
+        "ranges[i] = MUTANT ? ranges[i] : 0;",
+    ),
+    "a sort that believes a total that does not fit": (
+        "device.cuh",
+        "return i64(*total) <= capacity ? i64(*total) : 0;",
+        "return i64(*total) <= capacity || MUTANT ? i64(*total) : 0;",
+    ),
+    "gradients from records that do not exist": (
+        "project.cuh",
+        "const bool has_records = i64(*total_slots) <= capacity;",
+        "const bool has_records = MUTANT || i64(*total_slots) <= capacity;",
+    ),
+    "absolute gradients from records that do not exist": (
+        "project.cuh",
+        "const bool has_records = i64(*total) <= capacity;",
+        "const bool has_records = MUTANT || i64(*total) <= capacity;",
+    ),
+    "a report of the Gaussians alone": ("tiles.cuh", "<< 32 | *total;", "<< 32 | (MUTANT ? 0 : *total);"),
+    "a total that wraps around": (
+        "sort.cuh",
+        "return a + b < a ? ALL : a + b;",
+        "return a + b < a && !MUTANT ? ALL : a + b;",
+    ),
+}
+MUTANTS = RENDERING | ABSOLUTE_GRADIENTS | SMALL_TILES | ROUNDING | COUNTED
 NUMBERS = {name: number for number, name in enumerate(MUTANTS, start=1)}
 
 

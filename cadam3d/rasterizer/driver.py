@@ -3,8 +3,8 @@
 import ctypes
 import struct
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import torch
@@ -29,18 +29,23 @@ class Driver(Launcher):
         self._cache_dir = cache_dir
         self._modules: dict[int, Module] = {}
 
-    @contextmanager
-    def on(self, device: torch.device) -> Iterator[Launch]:
+    def on(self, device: torch.device) -> AbstractContextManager[Launch]:
         """See :meth:`Launcher.on`. Raises :class:`UserError` if the kernels do not compile or load."""
         current = torch.cuda.current_device()
         index = current if device.index is None else device.index
-        # Switching takes longer than a launch, and usually the device is current already.
-        with nullcontext() if index == current else torch.cuda.device(index):
-            if index not in self._modules:
-                cubin = build(self._cache_dir, torch.cuda.get_device_capability(index))
-                self._modules[index] = Module(load_driver(), index, cubin.path.read_bytes())
-            with self._modules[index].launching(torch.cuda.current_stream(index).cuda_stream) as launch:
-                yield launch
+        # Switching to another device takes longer than a launch, and usually none is needed.
+        return self._launching(index) if index == current else self._on_another(index)
+
+    @contextmanager
+    def _on_another(self, index: int) -> Iterator[Launch]:
+        with torch.cuda.device(index), self._launching(index) as launch:
+            yield launch
+
+    def _launching(self, index: int) -> AbstractContextManager[Launch]:
+        if index not in self._modules:
+            cubin = build(self._cache_dir, torch.cuda.get_device_capability(index))
+            self._modules[index] = Module(load_driver(), index, cubin.path.read_bytes())
+        return self._modules[index].launching(torch.cuda.current_stream(index).cuda_stream)
 
 
 def load_driver() -> ctypes.CDLL:
@@ -55,56 +60,54 @@ class Module:
     """Compiled kernels in the memory of one device."""
 
     def __init__(self, driver: ctypes.CDLL, index: int, cubin: bytes) -> None:
-        self._driver, self._functions = driver, _Functions(self._find)
+        self.driver, self.functions = driver, _Functions(self._find)
         self._context, self._handle, ordinal = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_int()
-        # Launch functions that no context uses at the moment.
-        self._idle: list[_Launch] = []
+        self._popped = ctypes.pointer(ctypes.c_void_p())
+        # Launch functions that are not in use at the moment.
+        self.idle: list[_Launch] = []
         self._call("cuInit", 0)
         self._call("cuDeviceGet", ctypes.byref(ordinal), index)
         # Torch uses this context too. It is never released, because it lives as long as the process.
         self._call("cuDevicePrimaryCtxRetain", ctypes.byref(self._context), ordinal)
-        with self._current():
+        self.push()
+        try:
             self._call("cuModuleLoadData", ctypes.byref(self._handle), cubin)
+        finally:
+            self.pop()
 
-    @contextmanager
-    def launching(self, stream: int) -> Iterator[Launch]:
-        """Yield the launch function (see :meth:`Launcher.on`) for a stream of the device."""
+    def launching(self, stream: int) -> AbstractContextManager[Launch]:
+        """Return a context with the launch function (see :meth:`Launcher.on`) for a stream of the device."""
         # Autograd runs the backward pass in another thread, and two threads must not share a buffer.
-        launch = self._idle.pop() if self._idle else _Launch(self._driver, self._functions, self._check)
+        launch = self.idle.pop() if self.idle else _Launch(self)
         launch.stream.value = stream
-        with self._current():
-            yield launch
-        self._idle.append(launch)
+        return launch
 
     def _find(self, kernel: str) -> ctypes.c_void_p:
         function = ctypes.c_void_p()
         self._call("cuModuleGetFunction", ctypes.byref(function), self._handle, kernel.encode())
         return function
 
-    @contextmanager
-    def _current(self) -> Iterator[None]:
-        # The threads of autograd may not have a context yet.
-        self._call("cuCtxPushCurrent_v2", self._context)
-        try:
-            yield
-        finally:
-            self._call("cuCtxPopCurrent_v2", ctypes.byref(ctypes.c_void_p()))
+    def push(self) -> None:
+        """Make the context of the device current in this thread, which may not have one yet."""
+        self.check("cuCtxPushCurrent_v2", self.driver.cuCtxPushCurrent_v2(self._context))
 
-    def _call(self, name: str, *arguments: object) -> None:
-        status = getattr(self._driver, name)(*arguments)
-        if status != 0:
-            self._check(name, status)
+    def pop(self) -> None:
+        """Undo :meth:`push`."""
+        self.check("cuCtxPopCurrent_v2", self.driver.cuCtxPopCurrent_v2(self._popped))
 
-    def _check(self, name: str, status: int) -> None:
+    def check(self, name: str, status: int) -> None:
         """Raise an error that quotes the driver, unless ``status`` is 0."""
         if status == 0:
             return
         message = ctypes.c_char_p()
-        self._driver.cuGetErrorString(status, ctypes.byref(message))
+        self.driver.cuGetErrorString(status, ctypes.byref(message))
         reason = (message.value or b"error").decode()
         if status == OUT_OF_MEMORY:
             raise MemoryError(f"rasterizer=cuda: {name}: {reason}")
         raise UserError(f"rasterizer=cuda: {name}: {reason} ({status}). Try: rasterizer=reference")
+
+    def _call(self, name: str, *arguments: object) -> None:
+        self.check(name, getattr(self.driver, name)(*arguments))
 
 
 class _Functions(dict[str, ctypes.c_void_p]):
@@ -120,30 +123,34 @@ class _Functions(dict[str, ctypes.c_void_p]):
 
 
 class _Launch:
-    """Launches kernels on ``stream``. The arguments are packed into one buffer, which the driver copies.
+    """Launches kernels on ``stream``, as a context in which the device is current for the driver.
 
-    A launch takes about a microsecond of Python, half of the time that a list of pointers would take. The
-    driver's function has no ``argtypes``: with them, ctypes would check eleven arguments each time. Handles and
-    addresses are ``c_void_p`` therefore, because a bare number would be passed with 32 bits.
+    The arguments are packed into one buffer, which the driver copies. So a launch takes about a microsecond
+    of Python. The driver's function has no ``argtypes``, because with them ctypes would check eleven
+    arguments each time. Therefore handles and addresses are ``c_void_p``: a bare number is passed with 32
+    bits.
     """
 
-    def __init__(
-        self,
-        driver: ctypes.CDLL,
-        functions: Mapping[str, ctypes.c_void_p],
-        check: Callable[[str, int], None],
-    ) -> None:
+    def __init__(self, module: Module) -> None:
         self.stream = ctypes.c_void_p()
-        self._call, self._functions, self._check = driver.cuLaunchKernel, functions, check
+        self._module, self._functions, self._call = module, module.functions, module.driver.cuLaunchKernel
         self._buffer, self._size = ctypes.create_string_buffer(8 * MOST_ARGUMENTS), ctypes.c_size_t()
         buffer, size = ctypes.addressof(self._buffer), ctypes.addressof(self._size)
         self._extra = (ctypes.c_void_p * 5)(BUFFER_POINTER, buffer, BUFFER_SIZE, size, END)
+
+    def __enter__(self) -> Launch:
+        self._module.push()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._module.pop()
+        self._module.idle.append(self)
 
     def __call__(self, kernel: str, blocks: int, threads: int, *arguments: int) -> None:
         count = len(arguments)
         PACKERS[count](self._buffer, 0, *arguments)
         self._size.value = 8 * count
-        function, grid = self._functions[kernel], (blocks, 1, 1, threads, 1, 1)
-        status = self._call(function, *grid, 0, self.stream, None, self._extra)
+        function, stream, extra = self._functions[kernel], self.stream, self._extra
+        status = self._call(function, blocks, 1, 1, threads, 1, 1, 0, stream, None, extra)
         if status != 0:
-            self._check("cuLaunchKernel", status)
+            self._module.check("cuLaunchKernel", status)

@@ -222,7 +222,6 @@ def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:
     with torch.no_grad():
         output = rasterizer.render(scene.gaussians, scene.cameras, scene.background)
     views, height, width = output.alpha.shape
-    tile_height = cuda.tile_height(height, width)
     return Load(
         gaussians=len(scene.gaussians),
         coefficients=scene.gaussians.sh.shape[1],
@@ -230,7 +229,7 @@ def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:
         visible=int(output.visible.sum()),
         slots=slots,
         pixels=views * height * width,
-        tiles=views * (-(-height // tile_height)) * (-(-width // cuda.TILE_WIDTH)),
+        tiles=views * cuda.count_tiles(height, width),
     )
 
 
