@@ -355,7 +355,6 @@ OVERLAPS = [
     ("tile_keys", "offsets"),
     ("temporary 0", "depth_keys"),
     ("temporary 1", "order"),
-    ("temporary 2", "temporary 0"),
     ("slots", "pair_of_slot"),
     ("counts", "first_slot"),
     ("splats", "transmittance"),

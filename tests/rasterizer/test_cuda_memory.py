@@ -76,7 +76,7 @@ def test_the_bits_do_not_depend_on_the_memory_for_records(emulator, degree, monk
         monkeypatch.setattr(cuda, "RECORD_MEMORY", 4 * cuda.RECORD * most_slots)
         spy = Spy(emulator)
         assert_same_bits(bits(*whole), bits(*differentiate(spy, scene)))
-        launches = spy.arguments_of("blend_backward")
+        launches = spy.arguments_of("blend_backward_8x8")
         assert len(launches) == len(spy.arguments_of(f"project_backward_{(degree + 1) ** 2}")) == groups
         # A single view always gets the memory that it needs.
         most = max(4 * cuda.RECORD * most_slots, 4 * cuda.RECORD * max(slots))
@@ -101,7 +101,7 @@ def test_the_bits_do_not_depend_on_how_much_32_bits_can_count(emulator, n, log_s
     assert 2 * max(n, min(slots)) > cuda.MOST
     spy = Spy(emulator)
     assert_same_bits(bits(*whole), bits(*differentiate(spy, scene)))
-    assert len(spy.arguments_of("blend_forward")) == VIEWS
+    assert len(spy.arguments_of("blend_forward_8x8")) == VIEWS
 
 
 def test_a_group_has_as_many_views_as_fit_and_at_least_one():

@@ -29,6 +29,8 @@ def run_everything(emulator: Emulator) -> None:
     for degree in range(4):
         # One group per view, or one for all views.
         cuda.RECORD_MEMORY = 0 if degree == 1 else 256 * 2**20
+        # Tiles of 8x4 or of 8x8.
+        cuda.FEW_TILES = 10**9 if degree % 2 else 0
         render(emulator, 33, degree, -1.0, (2, 9 + degree, 17), absgrad=degree > 0)
     # Memory that is reserved ahead: just enough, one slot too little, none.
     slots = sum(count_slots(emulator, make_gaussians(33, log_scale=-1.0), make_cameras(2, 9, 17)))
@@ -36,6 +38,7 @@ def run_everything(emulator: Emulator) -> None:
         render(emulator, 33, 0, -1.0, (2, 9, 17), absgrad=True, capacity=capacity)
     # These splats touch more tiles, and have more records, than one thread handles alone.
     for absgrad in (False, True):
+        cuda.FEW_TILES = 10**9 if absgrad else 0
         render(emulator, 3, 0, 1.5, (1, 75, 70), absgrad=absgrad)
 
 
