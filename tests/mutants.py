@@ -154,8 +154,8 @@ SORTING = {
     ),
     "no barrier behind cleared bins": (
         "sort.cuh",
-        "stage.bins[i] = 0;\n    __syncthreads();",
-        "stage.bins[i] = 0;\n    if (!MUTANT) __syncthreads();",
+        "stage.counters[i] = 0;\n    __syncthreads();",
+        "stage.counters[i] = 0;\n    if (!MUTANT) __syncthreads();",
     ),
     "no wait before a bin moves on": (
         "sort.cuh",

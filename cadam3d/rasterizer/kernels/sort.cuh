@@ -1,15 +1,20 @@
 // Prefix sums that saturate, and a stable radix sort of 32-bit keys with 32-bit values.
 //
-// The sort handles one digit of the keys per pass, least significant first. A pass counts the digits in the
-// share of each block (sort_count), adds the counts of the shares before each one (sort_columns), and then
-// moves the items to their places (sort_scatter). Within a chunk a warp owns consecutive items and ranks them
-// by votes, so equal keys keep their order. No block waits for another one within a kernel, so no result
-// depends on when a store becomes visible to other blocks: the end of a kernel is the only fence between them.
+// The sort handles one digit of the keys per pass, the least significant one first. A pass counts the values
+// of the digit in the share of each block (sort_count), adds the counts of the blocks before each one
+// (sort_columns), and moves the items to their positions (sort_scatter). A warp owns consecutive items of a
+// chunk and ranks them by votes, so equal keys keep their order.
 //
 // Digits have up to 11 bits, because three passes over a depth move 13 words per key where four passes of
-// 8 bits move 18, and the number of a tile never takes more than two. The counters of the warps have 16 bits
-// and share their memory with a chunk of 8192 keys, so a block needs 44 KiB, two blocks fit into an SM (one on
-// Turing), and items leave a chunk sorted, in runs of four per digit even if all digits are random.
+// 8 bits would move 18, and the number of a tile takes no more than two. The counters of the warps have 16 bits
+// and share their memory with the items of a chunk, which leave it in order and so in fewer, larger pieces; a
+// block needs 44 KiB and at most 128 registers per thread, so two of them fit on a multiprocessor (on Turing,
+// one).
+//
+// No kernel reads what another block of the same launch has written, so blocks need neither fences nor tickets:
+// the end of a launch makes its stores visible to the next one on the stream. Within a block, __syncthreads
+// separates the stores to shared memory from the loads of other warps. Within a warp, votes and shuffles do not
+// order memory, but __syncwarp does.
 #pragma once
 
 #include "device.cuh"
@@ -18,13 +23,13 @@ typedef unsigned short u16;
 
 constexpr int WARPS = BLOCK / WARP;             // of a block
 constexpr int SCAN_ITEMS = 8;                   // of one thread
-constexpr int SCAN_CHUNK = BLOCK * SCAN_ITEMS;  // items that a block adds at a time; mirrored in ../cuda_sort.py
+constexpr int SCAN_CHUNK = BLOCK * SCAN_ITEMS;  // of a block at a time; mirrored in ../cuda_sort.py
 constexpr int DIGIT_BITS = 11;                  // at most; mirrored in ../cuda_sort.py
 constexpr int DIGITS = 1 << DIGIT_BITS;         // at most
 constexpr int SORT_ITEMS = 16;                  // of one thread, at most; mirrored in ../cuda_sort.py
-constexpr int SORT_CHUNK = BLOCK * SORT_ITEMS;  // items that a block sorts at a time, at most
+constexpr int SORT_CHUNK = BLOCK * SORT_ITEMS;  // of a block at a time, at most
 constexpr int COLUMN_BLOCK = 1024;              // threads of sort_columns; mirrored in ../cuda_sort.py
-constexpr int COLUMN_ROWS = 32;                 // rows of one warp there, so 1024 rows at most
+constexpr int COLUMN_ROWS = 16;                 // of one warp there; its 32 warps handle 512 blocks
 static_assert(DIGITS == BLOCK * SCAN_ITEMS, "a block scans all digits at once");
 
 // Returns a + b, or the largest number if that needs more than 32 bits. So a total that is too large is never
@@ -130,8 +135,8 @@ scan_reduce(const u32* __restrict__ in, const u32* __restrict__ index, i64 n, u3
   if (threadIdx.x == 0) sums[blockIdx.x] = total;
 }
 
-// Exclusive prefix sums, and the sum of all numbers in ``total``, which may be null. ``sums`` are the results of
-// scan_reduce with the same grid. If ``sums`` is null, each block adds all numbers before its share itself,
+// Exclusive prefix sums, and the sum of all numbers in ``total``, which may be null. ``sums`` are the results
+// of scan_reduce with the same grid. If ``sums`` is null, each block adds all numbers before its share itself,
 // which saves a launch for short arrays. ``out`` may be ``in`` if there are ``sums`` and no index, because then
 // each thread reads only the numbers that it replaces.
 KERNEL(BLOCK)
@@ -185,8 +190,8 @@ struct Counters {
     for (int i = int(threadIdx.x); i < int(digit.values()) * copies; i += BLOCK) memory[i] = 0;
     __syncthreads();
   }
-  // Counts the keys in [begin, end): those before ``middle`` in the lower half of a counter, if it is not
-  // ``end``, and all others in the upper half.
+  // Adds 1 for each key in [begin, middle), and 2^16 for each key in [middle, end). All keys of a batch are
+  // loaded before the first one is counted.
   SPLAT_FN void count(const u32* keys, u32 begin, u32 middle, u32 end, Digit digit) {
     constexpr int BATCH = 16;
     const int copy = lane_index() & (copies - 1);
@@ -211,8 +216,8 @@ struct Counters {
 };
 
 // counts [blocks values]: how often each value of the digit occurs in the share of each block. A block without
-// a share writes nothing. For ``count`` and ``capacity`` see ``usable``; ``items`` is the number of items of a
-// thread in a chunk.
+// a share writes nothing. For ``count`` and ``capacity`` see ``usable``; ``items`` is the number of items of
+// a thread in a chunk.
 KERNEL(BLOCK)
 sort_count(const u32* __restrict__ keys, const u32* __restrict__ count, i64 capacity, i64 items, i64 shift,
            i64 bits, u32* __restrict__ counts) {
@@ -227,8 +232,7 @@ sort_count(const u32* __restrict__ keys, const u32* __restrict__ count, i64 capa
 }
 
 // Replaces the counts of each block by the sums over the blocks before it; totals [values]: the sums over all
-// blocks. A lane handles one value, and a warp 32 of the blocks, of which there are at most
-// 1024.
+// blocks. A lane handles one value, and a warp 16 of the blocks.
 KERNEL(COLUMN_BLOCK)
 sort_columns(const u32* __restrict__ count, i64 capacity, i64 items, i64 bits, i64 blocks,
              u32* __restrict__ counts, u32* __restrict__ totals) {
@@ -270,8 +274,8 @@ union Stage {
 // Writes to bases [values] the position of the first item of this block with each value of the digit.
 //
 // If there are ``totals``, sort_columns has added the ``counts``. If not, each block adds the counts of all
-// blocks itself, and without ``counts`` it counts the keys of all blocks itself. Both save a launch, which would
-// take longer if the keys are few. A block counts at most 2^15 keys, so a half of a counter is enough.
+// blocks itself, and without ``counts`` it counts the keys of all blocks itself. For few keys, a launch more
+// would take longer. A block counts at most 2^15 keys, so a half of a counter is enough.
 SPLAT_FN void find_bases(const u32* keys, u32 n, u32 chunk, Share share, Digit digit, const u32* counts,
                          const u32* totals, u32* memory, u32* bases, u32* sums) {
   const u32 values = digit.values(), block = blockIdx.x;
@@ -332,7 +336,7 @@ SPLAT_FN u32 find_peers(u32 value, bool is_item, Digit digit) {
   u32 peers = __ballot_sync(ALL, is_item);
 #pragma unroll
   for (int step = 1; step <= DIGIT_BITS; ++step) {
-    // Bits behind the last one change nothing. They are skipped, though not one by one, which would take longer.
+    // Bits behind the last one change nothing. A branch for each of them would take longer than voting.
     if ((step == 8 || step == 10) && step > digit.bits) break;
     const u32 is_set = value & digit.values() >> step, votes = __ballot_sync(ALL, is_set);
     peers &= is_set ? votes : ~votes;
@@ -340,8 +344,8 @@ SPLAT_FN u32 find_peers(u32 value, bool is_item, Digit digit) {
   return peers;
 }
 
-// Moves each item to its position in the order of one digit. If ``values`` is null, the value of an item is its
-// index; if ``sorted_keys`` is null, only the values are needed. See ``find_bases`` for counts and totals.
+// Moves each item to its position in the order of one digit. If ``values`` is null, the value of an item is
+// its index; if ``sorted_keys`` is null, only the values are needed. See ``find_bases`` for counts and totals.
 KERNEL(BLOCK)
 sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const u32* __restrict__ count,
              i64 capacity, i64 items, i64 shift, i64 bits, const u32* __restrict__ counts,
@@ -368,7 +372,8 @@ sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const
 #pragma unroll
     for (int r = 0; r < SORT_ITEMS; ++r)
       value[r] = values && r < rounds && r * WARP < mine ? (values + first)[r * WARP] : first + r * WARP;
-    for (int i = t; i < int(digit.values()) * WARPS; i += BLOCK) stage.bins[i] = 0;
+    // Two bins at a time.
+    for (int i = t; i < int(digit.values()) * WARPS / 2; i += BLOCK) stage.counters[i] = 0;
     __syncthreads();
     // The rank of each item among those of its warp with the same digit.
     u16* const bins = stage.bins + warp * int(digit.values());
@@ -381,7 +386,7 @@ sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const
       place[r] = bins[d] + u32(__popc(peers & ((1u << lane) - 1)));
       __syncwarp();  // all lanes have read before the last of the peers advances the bin
       if (is_item && peers >> lane == 1) bins[d] = u16(place[r] + 1);
-      __syncwarp();
+      __syncwarp();  // that store comes before the loads of the next round
     }
     __syncthreads();
     // Counts become places: value after value, and warp after warp.
