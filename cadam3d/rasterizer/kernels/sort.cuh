@@ -52,18 +52,19 @@ SPLAT_FN Share share_of_block(u32 n, u32 chunk) {
   return {begin, begin + size < n ? begin + size : n};
 }
 
-// Number r of a thread, of ``rounds`` each: consecutive numbers of a warp belong to consecutive lanes.
+// The index of number r of a thread if each has ``rounds`` of them: neighbours belong to neighbouring lanes.
 SPLAT_FN u32 striped(int r, int rounds) {
   return u32((int(threadIdx.x) / WARP * rounds + r) * WARP + lane_index());
 }
 
 // Replaces the numbers of a block by the sums of those before them, in the order of ``striped``, and returns
 // the sum of all. ``sums`` is shared memory for WARPS numbers.
-SPLAT_FN u32 block_scan(u32 (&numbers)[SCAN_ITEMS], int rounds, u32* sums) {
+template <int MOST>
+SPLAT_FN u32 block_scan(u32 (&numbers)[MOST], int rounds, u32* sums) {
   const int lane = lane_index(), warp = int(threadIdx.x) / WARP;
   u32 carry = 0;
 #pragma unroll
-  for (int r = 0; r < SCAN_ITEMS; ++r) {
+  for (int r = 0; r < MOST; ++r) {
     if (r >= rounds) break;
     u32 inclusive = numbers[r];
 #pragma unroll
@@ -84,14 +85,14 @@ SPLAT_FN u32 block_scan(u32 (&numbers)[SCAN_ITEMS], int rounds, u32* sums) {
     total = add_saturating(total, sums[w]);
   }
 #pragma unroll
-  for (int r = 0; r < SCAN_ITEMS; ++r) numbers[r] = add_saturating(before, numbers[r]);
+  for (int r = 0; r < MOST; ++r) numbers[r] = add_saturating(before, numbers[r]);
   __syncthreads();  // after this, the shared memory may be used again
   return total;
 }
 
 // Returns the sum of one number of each thread.
 SPLAT_FN u32 block_sum(u32 number, u32* sums) {
-  u32 numbers[SCAN_ITEMS] = {number};
+  u32 numbers[1] = {number};
   return block_scan(numbers, 1, sums);
 }
 
@@ -172,10 +173,11 @@ struct Digit {
   SPLAT_FN Digit(i64 shift, i64 bits) : shift(int(shift)), bits(int(bits)) {}
   SPLAT_FN u32 values() const { return 1u << bits; }
   SPLAT_FN u32 of(u32 key) const { return key >> shift & (values() - 1); }
-  // The values are divided among the threads of a block in the order of ``striped``. This is the number of
-  // values of a thread. If there are more threads than values, some have none, and their value is too large.
-  SPLAT_FN int rounds() const { return values() > BLOCK ? int(values() / BLOCK) : 1; }
 };
+
+// The number of items of a thread if a block divides ``count`` of them in the order of ``striped``. If there are
+// fewer items than threads, the index of some threads is too large. The count is a power of two.
+SPLAT_FN int rounds_for(u32 count) { return count > BLOCK ? int(count / BLOCK) : 1; }
 
 // Counters of digits in shared memory. Many keys may have the same digit, and atomics on one address wait for
 // one another. So the lanes of a warp spread over copies of each counter, as many as there is memory for.
@@ -262,10 +264,13 @@ sort_columns(const u32* __restrict__ count, i64 capacity, i64 items, i64 bits, i
   if (warp == 0 && d < values) totals[d] = total;
 }
 
-// Shared memory of sort_scatter, for three purposes in turn.
+// Shared memory of sort_scatter, for three purposes in turn. A bin counts the items of a warp with one value of
+// the digit, and then it is the place of the first of them in the chunk. Bins are also handled in pairs, the
+// first of them in the lower half of a number; no half overflows, because a chunk has fewer than 2^16 items.
 union Stage {
   u32 counters[Counters::SIZE];
-  u16 bins[WARPS * DIGITS];  // of each warp and value: the number of items, and then the place of the first
+  u16 bins[WARPS * DIGITS];
+  u32 pairs[WARPS * DIGITS / 2];
   struct {
     u32 keys[SORT_CHUNK], values[SORT_CHUNK];
   } sorted;
@@ -279,7 +284,7 @@ union Stage {
 SPLAT_FN void find_bases(const u32* keys, u32 n, u32 chunk, Share share, Digit digit, const u32* counts,
                          const u32* totals, u32* memory, u32* bases, u32* sums) {
   const u32 values = digit.values(), block = blockIdx.x;
-  const int rounds = digit.rounds();
+  const int rounds = rounds_for(values);
   int stride = 1;  // of the sums over the blocks before this one, in ``memory``
   if (!counts) {
     Counters counters(memory, digit);
@@ -352,11 +357,12 @@ sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const
              const u32* __restrict__ totals, u32* __restrict__ sorted_keys,
              u32* __restrict__ sorted_values) {
   __shared__ Stage stage;
-  __shared__ u32 bases[DIGITS];  // the position of the next item with a value, minus its place in the chunk
-  __shared__ u16 ends[DIGITS];   // the place behind the last item with a value
+  __shared__ u32 bases[DIGITS];     // the position of the next item with a value, minus its place in the chunk
+  __shared__ u32 ends[DIGITS / 2];  // the places behind the last items with two values, in halves
   __shared__ u32 sums[WARPS];
   const Digit digit(shift, bits);
   const int t = int(threadIdx.x), lane = lane_index(), warp = t / WARP, rounds = int(items);
+  const int pairs = int(digit.values() / 2), pair_rounds = rounds_for(u32(pairs));
   const u32 n = u32(usable(count, capacity)), size = u32(rounds) * BLOCK;
   const Share share = share_of_block(n, size);
   if (share.begin >= share.end) return;
@@ -372,11 +378,10 @@ sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const
 #pragma unroll
     for (int r = 0; r < SORT_ITEMS; ++r)
       value[r] = values && r < rounds && r * WARP < mine ? (values + first)[r * WARP] : first + r * WARP;
-    // Two bins at a time.
-    for (int i = t; i < int(digit.values()) * WARPS / 2; i += BLOCK) stage.counters[i] = 0;
+    for (int i = t; i < pairs * WARPS; i += BLOCK) stage.pairs[i] = 0;
     __syncthreads();
     // The rank of each item among those of its warp with the same digit.
-    u16* const bins = stage.bins + warp * int(digit.values());
+    u16* const bins = stage.bins + warp * pairs * 2;
 #pragma unroll
     for (int r = 0; r < SORT_ITEMS; ++r) {
       place[r] = 0;
@@ -390,27 +395,33 @@ sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const
     }
     __syncthreads();
     // Counts become places: value after value, and warp after warp.
-    u32 numbers[SCAN_ITEMS] = {};
+    constexpr int OWN = DIGITS / 2 / BLOCK;  // pairs of a thread, at most
+    u32 counted[OWN] = {}, places[OWN];
     const auto each_own = [&](const auto& visit) {
 #pragma unroll
-      for (int r = 0; r < SCAN_ITEMS; ++r) {
-        const u32 d = striped(r, digit.rounds());
-        if (r < digit.rounds() && d < digit.values()) visit(d, numbers[r]);
+      for (int r = 0; r < OWN; ++r) {
+        const int pair = int(striped(r, pair_rounds));
+        if (r < pair_rounds && pair < pairs) visit(r, pair);
       }
     };
-#pragma unroll 1
+#pragma unroll 2
     for (int w = 0; w < WARPS; ++w)
-      each_own([&](u32 d, u32& number) { number += stage.bins[w * int(digit.values()) + int(d)]; });
-    block_scan(numbers, digit.rounds(), sums);
-    each_own([&](u32 d, u32 number) { bases[d] -= number; });
-#pragma unroll 1
+      each_own([&](int r, int pair) { counted[r] += stage.pairs[w * pairs + pair]; });
+#pragma unroll
+    for (int r = 0; r < OWN; ++r) places[r] = (counted[r] & 0xffff) + (counted[r] >> 16);
+    block_scan(places, pair_rounds, sums);
+    each_own([&](int r, int pair) {
+      const u32 begin = places[r], middle = begin + (counted[r] & 0xffff);
+      bases[2 * pair] -= begin, bases[2 * pair + 1] -= middle;
+      places[r] = begin | middle << 16;
+      ends[pair] = places[r] + counted[r];
+    });
+#pragma unroll 2
     for (int w = 0; w < WARPS; ++w)
-      each_own([&](u32 d, u32& number) {
-        u16& bin = stage.bins[w * int(digit.values()) + int(d)];
-        const u32 next = number + bin;
-        bin = u16(number), number = next;
+      each_own([&](int r, int pair) {
+        const u32 next = places[r] + stage.pairs[w * pairs + pair];
+        stage.pairs[w * pairs + pair] = places[r], places[r] = next;
       });
-    each_own([&](u32 d, u32 number) { ends[d] = u16(number); });
     __syncthreads();
 #pragma unroll
     for (int r = 0; r < SORT_ITEMS; ++r) place[r] += bins[digit.of(key[r])];
@@ -429,7 +440,8 @@ sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const
       sorted_values[to] = stage.sorted.values[i];
     }
     __syncthreads();  // the bases and the items have been read
-    for (u32 d = threadIdx.x; d < digit.values(); d += BLOCK) bases[d] += ends[d];
+    for (int pair = t; pair < pairs; pair += BLOCK)
+      bases[2 * pair] += ends[pair] & 0xffff, bases[2 * pair + 1] += ends[pair] >> 16;
     // The barrier behind the next clearing of the bins follows before anything reads the bases.
   }
 }
