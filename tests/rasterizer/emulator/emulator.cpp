@@ -28,8 +28,8 @@ static const struct {
     ENTRY(project_forward_4),   ENTRY(project_forward_9),  ENTRY(project_forward_16),
     ENTRY(project_backward_4),  ENTRY(project_backward_9), ENTRY(project_backward_16),
 #endif
-    ENTRY(centre_backward),     ENTRY(scan_short),         ENTRY(scan_reduce),
-    ENTRY(scan_apply),          ENTRY(sort_count),         ENTRY(sort_scatter),
+    ENTRY(centre_backward),     ENTRY(scan_reduce),        ENTRY(scan_apply),
+    ENTRY(sort_count),          ENTRY(sort_columns),       ENTRY(sort_scatter),
     ENTRY(tile_list),           ENTRY(tile_ranges),        ENTRY(sum_absolutes),
     ENTRY(blend_forward_8x4),   ENTRY(blend_backward_8x4), ENTRY(blend_backward_absolute_8x4),
     ENTRY(blend_forward_8x8),   ENTRY(blend_backward_8x8), ENTRY(blend_backward_absolute_8x8),
