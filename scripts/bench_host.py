@@ -270,7 +270,7 @@ def counted_waits(calls: Counter[str]) -> Iterator[None]:
             setattr(torch.Tensor, name, original)
 
 
-def summarize(rounds: list[dict]) -> dict[str, object]:
+def summarize(rounds: list[dict]) -> dict[str, dict[str, float]]:
     """Return the medians over all processes, and the ratios to the exact way of the other tree."""
     found: dict[str, dict] = {}
     for tree, ways in rounds[0].items():
