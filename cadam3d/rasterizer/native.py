@@ -5,6 +5,9 @@ is an ordinary node of the graph: it can retain its gradient, and a loss may use
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import ParamSpec, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -19,6 +22,9 @@ from cadam3d.rasterizer.base import absgrad_probe
 # The numbers of coefficients of degree 0 to 3.
 SH_SIZES = (1, 4, 9, 16)
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
 
 class RenderPass(ABC):
     """One call of a rasterizer: its cameras, and everything that the kernels keep for the backward pass.
@@ -27,12 +33,26 @@ class RenderPass(ABC):
     :meth:`Gaussians.tensors`, in that order.
     """
 
+    # Memory that the kernels fill in the forward pass and read in the backward pass. Autograd saves it, so
+    # that it is freed after the backward pass even if the images live on.
+    kept: tuple[Tensor, ...] = ()
+    # Whether reserved memory was too small; see RenderOutput.
+    overflowed: Tensor | None = None
+
     def __init__(self, cameras: Cameras, device: torch.device, absgrad: bool = False) -> None:
         self.height, self.width, self.device = cameras.height, cameras.width, device
         # Whether the backward pass computes absgrad as well.
         self.absgrad = absgrad
         self.matrices = plain(cameras.world_to_camera.detach(), device)
         self.intrinsics = plain(cameras.intrinsics.detach(), device)
+
+    def __enter__(self) -> "RenderPass":
+        """Enter the context in which the other methods must be called."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Leave that context. From here on, only autograd keeps the memory."""
+        self.kept = ()
 
     @property
     def views(self) -> int:
@@ -67,42 +87,77 @@ class RenderPass(ABC):
         """Return the gradient of the means that arrives through means2d."""
 
 
+def outside_of_graphs(function: Callable[P, R]) -> Callable[P, R]:
+    """Return the function for callers that ``torch.compile`` compiles: it is called, but not compiled itself.
+
+    Kernels work on addresses, which a compiled graph must not contain. ``torch.compiler.disable`` alone, as a
+    decorator, would do the same, but using it takes a second, which every start of the program would pay.
+    """
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.compiler.is_compiling():
+            return torch.compiler.disable(function)(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return call
+
+
+@outside_of_graphs
 def run_pass(kernels: RenderPass, gaussians: Gaussians, background: Float[Tensor, "v 3"]) -> RenderOutput:
     """Render with the kernels of one pass, with autocast off; see ``Rasterizer.render``."""
+    # Entering this context takes longer than all of the ordinary checks together.
+    if torch.is_autocast_enabled(gaussians.device.type):
+        with torch.autocast(gaussians.device.type, enabled=False):
+            return run_pass(kernels, gaussians, background)
     dtype, device = gaussians.means.dtype, gaussians.device
     means, *others = (plain(tensor, device) for tensor in gaussians.tensors().values())
-    with torch.autocast(device.type, enabled=False):
-        means2d, radii = _Project.apply(kernels, means, *(tensor.detach() for tensor in others))
+    keeps = torch.is_grad_enabled()
+    with kernels:
+        means2d, radii = _Project.apply(kernels, means, others)
         means2d = means2d.to(dtype)
-        keeps = torch.is_grad_enabled()
         if keeps:
             means2d.requires_grad_().retain_grad()
         probe = absgrad_probe(means2d, kernels.absgrad)
         tensors = (means, *others, plain(background, device))
         probed = None if probe is None else plain(probe, device)
         images = _Blend.apply(kernels, keeps, plain(means2d, device), probed, *tensors)
-        rgb, alpha, depth = (image.to(dtype) for image in images)
-    radii = radii.to(dtype)
-    return RenderOutput(rgb=rgb, alpha=alpha, depth=depth, means2d=means2d, radii=radii, absgrad=probe)
+    rgb, alpha, depth = (image.to(dtype) for image in images)
+    return RenderOutput(
+        rgb=rgb,
+        alpha=alpha,
+        depth=depth,
+        means2d=means2d,
+        radii=radii.to(dtype),
+        absgrad=probe,
+        overflowed=kernels.overflowed,
+    )
 
 
 class _Project(torch.autograd.Function):
     """Maps Gaussians to ``means2d`` and ``radii``; projected centres depend on the means alone."""
 
     @staticmethod
-    def forward(ctx, kernels: RenderPass, *parameters: Tensor) -> tuple[Tensor, Tensor]:
-        means2d, radii = kernels.project(list(parameters))
+    def forward(ctx, kernels: RenderPass, means: Tensor, others: list[Tensor]) -> tuple[Tensor, Tensor]:
+        parameters = [means, *others]
+        means2d, radii = kernels.project(parameters)
         ctx.kernels = kernels
-        ctx.save_for_backward(*parameters, radii)
+        ctx.save_for_backward(*parameters, radii, *kernels.kept)
         ctx.mark_non_differentiable(radii)
+        ctx.set_materialize_grads(False)
         return means2d, radii
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        *parameters, radii = ctx.saved_tensors
-        grad_means = ctx.kernels.centre_backward(parameters, radii, grads[0].contiguous())
-        return None, grad_means, None, None, None, None
+    def backward(ctx, grad_means2d: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
+        if grad_means2d is None:
+            return None, None, None
+        kernels, saved = ctx.kernels, ctx.saved_tensors
+        *parameters, radii = saved[:6]
+        with kernels:
+            kernels.kept = saved[6:]
+            grad_means = kernels.centre_backward(parameters, radii, grad_means2d.contiguous())
+        return None, grad_means, None
 
 
 class _Blend(torch.autograd.Function):
@@ -115,16 +170,19 @@ class _Blend(torch.autograd.Function):
         *parameters, background = tensors
         rgb, alpha, depth = kernels.blend(parameters, background, keeps)
         ctx.kernels = kernels
-        ctx.save_for_backward(*tensors, alpha, depth)
+        ctx.save_for_backward(*tensors, alpha, depth, *kernels.kept)
         ctx.set_materialize_grads(False)
         return rgb, alpha, depth
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        *parameters, background, alpha, depth = ctx.saved_tensors
+        kernels, saved = ctx.kernels, ctx.saved_tensors
+        *parameters, background, alpha, depth = saved[:8]
         images = [alpha, depth, *(None if grad is None else grad.contiguous() for grad in grads)]
-        totals = ctx.kernels.blend_backward(parameters, background, images)
+        with kernels:
+            kernels.kept = saved[8:]
+            totals = kernels.blend_backward(parameters, background, images)
         grad_background = None
         if ctx.needs_input_grad[-1] and grads[0] is not None:
             grad_background = (grads[0] * (1 - alpha)[..., None]).sum(dim=(1, 2))
@@ -133,7 +191,26 @@ class _Blend(torch.autograd.Function):
 
 def plain(tensor: Tensor, device: torch.device) -> Tensor:
     """Return the tensor as kernels read it: contiguous float32 on ``device``."""
+    if tensor.dtype is torch.float32 and tensor.device == device and tensor.is_contiguous():
+        return tensor
     return tensor.to(device, torch.float32).contiguous()
+
+
+def upload(tensors: Sequence[Tensor], device: torch.device) -> Sequence[Tensor]:
+    """Return the tensors as float32 on ``device``: what is on the CPU moves in one copy, without a wait.
+
+    A tensor with a gradient or on another device stays where it is.
+    """
+    moving = [t for t in tensors if t.device.type == "cpu" and not t.requires_grad]
+    if device.type == "cpu" or not moving:
+        return tensors
+    # A copy of ordinary memory would wait for the device. Torch does not give pinned memory to others before
+    # the copy is done.
+    is_pinned = device.type == "cuda"
+    packed = torch.empty(sum(t.numel() for t in moving), pin_memory=is_pinned)
+    torch.cat([t.flatten().float() for t in moving], out=packed)
+    pieces = iter(packed.to(device, non_blocking=True).split([t.numel() for t in moving]))
+    return [next(pieces).view(t.shape) if any(t is each for each in moving) else t for t in tensors]
 
 
 def require_shapes(gaussians: Gaussians, cameras: Cameras, background: Tensor) -> None:

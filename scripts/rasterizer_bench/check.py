@@ -9,6 +9,7 @@ from torch import Tensor
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.base import Rasterizer
+from cadam3d.rasterizer.cuda_sort import sort, sort_bytes
 from cadam3d.rasterizer.launcher import Launcher
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import GSPLAT, OWN, self_test
@@ -127,8 +128,12 @@ def check_long_sort(launcher: Launcher, device: torch.device, keys: int) -> list
     """Return a problem if the kernels sort ``keys`` random keys differently than torch does."""
     generator = torch.Generator(device).manual_seed(0)
     unsorted = torch.randint(0, 2**31 - 1, (keys,), dtype=torch.int32, device=device, generator=generator)
-    with launcher.on(device) as launch:
-        got, order = cuda._sort(launch, unsorted, cuda.DEPTH_BITS)
     want, want_order = unsorted.sort(stable=True)
+    sizes, order = sort_bytes(keys, cuda.DEPTH_BITS), torch.empty_like(unsorted)
+    blocks = [unsorted, *(unsorted.new_empty(size, dtype=torch.uint8) for size in sizes)]
+    first, *temporary = (block.data_ptr() for block in blocks)
+    with launcher.on(device) as launch:
+        found = sort(launch, first, order.data_ptr(), keys, cuda.DEPTH_BITS, temporary)
+    got = next(block for block in blocks if block.data_ptr() == found).view(torch.int32)[:keys]
     is_right = torch.equal(got, want) and torch.equal(order, want_order.int())
     return [] if is_right else [f"{keys} keys are sorted wrongly"]

@@ -21,7 +21,7 @@ from torch import Tensor
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
-from cadam3d.rasterizer import cuda
+from cadam3d.rasterizer import cuda, cuda_sort
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cuda import rasterize
 from cadam3d.rasterizer.launcher import Launch, Launcher
@@ -89,7 +89,7 @@ class StageClock(Launcher):
         self, launch: Launch, mark: Callable[[], object], kernel: str, blocks: int, threads: int, *arguments
     ) -> None:
         if kernel == "tile_ranges":
-            self.slots += arguments[1]
+            self.slots += arguments[2]
         begin = mark()
         launch(kernel, blocks, threads, *arguments)
         stage = stage_of(kernel, self.spans[-1] if self.spans else None)
@@ -148,13 +148,8 @@ class Load:
 
 
 def sorted_bytes(items: int, bits: int) -> int:
-    """Return the bytes of a sort.
-
-    A pass reads keys for counting, reads keys and values for scattering, and writes both. The first pass has
-    no values to read.
-    """
-    passes = -(-bits // cuda.RADIX_BITS)
-    return items * WORD * (5 * passes - 1)
+    """Return the bytes of a sort. The sort of depths does not write the sorted keys."""
+    return cuda_sort.sorted_bytes(items, bits, only_order=bits == cuda.DEPTH_BITS)
 
 
 def stage_bytes(load: Load) -> dict[str, int]:
@@ -229,7 +224,7 @@ def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:
         visible=int(output.visible.sum()),
         slots=slots,
         pixels=views * height * width,
-        tiles=views * (-(-height // cuda.TILE)) * (-(-width // cuda.TILE)),
+        tiles=views * cuda.count_tiles(height, width),
     )
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.rasterizer import cuda, gsplat
+from cadam3d.rasterizer import cuda, cuda_sort, gsplat
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cpu import CpuRasterizer
 from cadam3d.rasterizer.gsplat import GsplatRasterizer
@@ -243,12 +243,12 @@ def test_every_launch_belongs_to_a_known_stage(emulator):
     kernels = {stage: [] for stage in stages.STAGES}
     for span in clock.spans:
         kernels[span.stage].append(span.kernel)  # KeyError: unknown
-    passes = cuda.DEPTH_BITS // cuda.RADIX_BITS
-    assert kernels["depth sort"] == ["sort_count", "scan_short", "sort_scatter"] * passes
-    assert kernels["tile lists"] == ["scan_short", "tile_list"]
-    assert kernels["tile sort"] == ["sort_count", "scan_short", "sort_scatter", "tile_ranges"]
-    assert kernels["blend forward"] == ["blend_forward"]
-    assert kernels["blend backward"] == ["blend_backward"]
+    passes = len(cuda_sort.digit_bits(cuda.DEPTH_BITS))
+    assert kernels["depth sort"] == ["sort_scatter"] * passes
+    assert kernels["tile lists"] == ["scan_apply", "tile_list"]
+    assert kernels["tile sort"] == ["sort_scatter", "tile_ranges"]
+    assert kernels["blend forward"] == ["blend_forward_8x8"]
+    assert kernels["blend backward"] == ["blend_backward_8x8"]
     assert kernels["project backward"] == ["project_backward_4", "centre_backward"]
 
 
