@@ -274,7 +274,11 @@ SORTING = {
         "    __syncthreads();  // the bases and",
         "    if (!MUTANT) __syncthreads();  // the bases and",
     ),
-    "bases that do not move on": ("sort.cuh", "+= ends[pair] & 0xffff,", "+= MUTANT ? 0 : ends[pair] & 0xffff,"),
+    "bases that do not move on": (
+        "sort.cuh",
+        "+= ends[pair] & 0xffff,",
+        "+= MUTANT ? 0 : ends[pair] & 0xffff,",
+    ),
 }
 MUTANTS = RENDERING | ABSOLUTE_GRADIENTS | SMALL_TILES | ROUNDING | COUNTED | SORTING
 NUMBERS = {name: number for number, name in enumerate(MUTANTS, start=1)}
