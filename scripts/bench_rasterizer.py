@@ -95,6 +95,7 @@ def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--threads", type=whole(1), default=1, metavar="N")
     parser.add_argument("--check", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--check-only", action="store_true", help="check the backends without timing them")
+    parser.add_argument("--stages", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write all results to this file")
     args = parser.parse_args(words)
     for name, value in DEFAULTS[args.device].items():
@@ -163,9 +164,7 @@ def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher
             report.rows += rows
             print(*rows, sep="\n", flush=True)
             if launcher and timings["cuda"]:
-                stages = time_stages(launcher, scene, args.repeats, report.copy_bytes_per_ms)
-                report.stages.append(SceneStages(*at, stages))
-                print(show_stages(stages), flush=True)
+                add_stages(report, at, time_stages(launcher, scene, args.repeats, report.copy_bytes_per_ms))
             # The file is written after every scene, because a later one may exceed the memory.
             if args.json:
                 report.write(args.json)

@@ -14,8 +14,12 @@ import argparse
 import sys
 from pathlib import Path
 
-if sys.version_info < (3, 11):
-    sys.exit("gpu: expected Python 3.11 or newer, got {}.{}. Try: python3.12 scripts/gpu.py".format(*sys.version_info))
+if sys.version_info < (3, 11):  # noqa: UP036
+    sys.exit(
+        "gpu: expected Python 3.11 or newer, got {}.{}. Try: python3.12 scripts/gpu.py".format(
+            *sys.version_info
+        )
+    )
 
 from gpu_run.machine import REPOSITORY, NoGpuError, find_device
 from gpu_run.markdown import show
@@ -38,11 +42,15 @@ class Parser(argparse.ArgumentParser):
 def parse(words: list[str] | None) -> argparse.Namespace:
     """Parse the command line."""
     parser = Parser("gpu", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--part", nargs="+", choices=PARTS, default=list(PARTS), help="all by default, in this order")
+    parser.add_argument(
+        "--part", nargs="+", choices=PARTS, default=list(PARTS), help="all by default, in this order"
+    )
     parser.add_argument("--folder", type=Path, default=FOLDER, help="for results; %(default)s by default")
     parser.add_argument("--look", action="store_true", help="only look for a GPU")
     parser.add_argument("--wheels", action="store_true", help="only list packages to bring along")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="only show the JSON of a run as Markdown")
+    parser.add_argument(
+        "--markdown", type=Path, metavar="FILE", help="only show the JSON of a run as Markdown"
+    )
     return parser.parse_args(words)
 
 
@@ -50,26 +58,30 @@ def main(words: list[str] | None = None) -> int:
     """Do what the command line says, and return the exit code: 1 without a GPU, or if something fails."""
     args = parse(words)
     try:
-        if args.wheels:
-            print(describe())
-            return 0
-        if args.markdown:
-            print(show(read_record(args.markdown)), end="")
-            return 0
-        device = find_device()
-        if args.look:
-            print(f"{device.name}, driver for CUDA up to {device.driver_cuda}")
-            return 0
-        return Session(args.folder.absolute(), device).run([part for part in PARTS if part in args.part])
+        return run(args)
     except NoGpuError as error:
         print(f"gpu: expected an NVIDIA GPU, got none: {error}. Try: nvidia-smi", file=sys.stderr)
-        return 1
     except (TroubleError, OSError, ValueError) as error:
         print(f"gpu: {error}", file=sys.stderr)
-        return 1
     except KeyboardInterrupt:
         print("gpu: stopped. The same line continues.", file=sys.stderr)
         return 130
+    return 1
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do what the options say, and return the exit code."""
+    if args.wheels:
+        print(describe())
+        return 0
+    if args.markdown:
+        print(show(read_record(args.markdown)), end="")
+        return 0
+    device = find_device()
+    if args.look:
+        print(f"{device.name}, driver for CUDA up to {device.driver_cuda}")
+        return 0
+    return Session(args.folder.absolute(), device).run([part for part in PARTS if part in args.part])
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Find the GPU, the tools and the packages of a machine, with Python alone and without installing anything."""
+"""Find the GPU, the tools and the packages of a machine, with Python alone."""
 
 import ctypes
 import hashlib
@@ -89,7 +89,9 @@ def _name_of(driver: Any, status: int) -> str:
 def find_tools(environment: Mapping[str, str] = os.environ) -> dict[str, str]:
     """Return the paths of those of ``TOOLS`` that are installed."""
     folders = [*environment.get("PATH", "").split(os.pathsep)]
-    folders += [str(Path(environment[key]) / "bin") for key in ("CUDA_HOME", "CUDA_PATH") if key in environment]
+    folders += [
+        str(Path(environment[key]) / "bin") for key in ("CUDA_HOME", "CUDA_PATH") if key in environment
+    ]
     for pattern in TOOL_FOLDERS:
         folders += sorted(map(str, Path("/").glob(pattern.lstrip("/"))), reverse=True)
     found = {name: shutil.which(name, path=os.pathsep.join(folders)) for name in TOOLS}

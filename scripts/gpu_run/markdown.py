@@ -12,7 +12,9 @@ NOTHING = "**No GPU has run anything here yet.**"
 def show(record: Record) -> str:
     """Return the whole record: the machine, one table of all results, and how to make it again."""
     lines = [*machine(record), "", *table(("what", "scene", "result"), rows(record)), ""]
-    return "\n".join([*lines, "Measured with `python scripts/gpu.py`; times are medians in milliseconds.", ""])
+    return "\n".join(
+        [*lines, "Measured with `python scripts/gpu.py`; times are medians in milliseconds.", ""]
+    )
 
 
 def machine(record: Record) -> list[str]:
@@ -23,7 +25,7 @@ def machine(record: Record) -> list[str]:
     packages = ", ".join(f"{name} {number}" for name, number in found["packages"].items())
     tools = ", ".join(found["tools"]) or "none"
     return [
-        f"{found['device']} ({found['memory_bytes'] / GIB:.0f} GiB, compute capability {found['capability']}), "
+        f"{found['device']} ({found['memory_bytes'] / GIB:.0f} GiB), capability {found['capability']}, "
         f"driver {found['driver'] or 'unknown'} (up to CUDA {found['driver_cuda']}),",
         f"torch {found['torch']} (CUDA {found['torch_cuda']}, NVRTC {found['nvrtc'] or 'missing'}), "
         f"Python {found['python']}, {found['processor']},",
@@ -81,10 +83,8 @@ def time_of(row: dict[str, Any]) -> str:
     """Return the times, the memory and the verdict of a row of ``bench_rasterizer``."""
     if row["forward_backward_ms"] is None:
         return "out of memory"
-    words = [
-        f"{row['forward_backward_ms']:.2f} (forward {row['forward_ms']:.2f}, backward {row['backward_ms']:.2f}, "
-        f"host {row['host_ms']:.2f})"
-    ]
+    phases = [f"{phase} {row[f'{phase}_ms']:.2f}" for phase in ("forward", "backward", "host")]
+    words = [f"{row['forward_backward_ms']:.2f} ({', '.join(phases)})"]
     if row["peak_bytes"] is not None:
         words.append(f"{row['peak_bytes'] / MB:.0f} MB")
     targets = [f"{row['demanded_ms']:g} ms"] if row["demanded_ms"] is not None else []
@@ -106,7 +106,9 @@ def stage_time(stage: dict[str, Any]) -> str:
     if stage["launches"]:
         text += f" in {stage['launches']} launches"
     if stage["floor_ms"]:
-        text += f"; {stage['median_ms'] / stage['floor_ms']:.1f}x the time of its {stage['bytes'] / MB:.1f} MB"
+        text += (
+            f"; {stage['median_ms'] / stage['floor_ms']:.1f}x the time of its {stage['bytes'] / MB:.1f} MB"
+        )
     return text
 
 

@@ -109,7 +109,11 @@ def checks(setup: Setup) -> list[Piece]:
             judge=by_check,
         ),
         Piece(
-            "demo", CHECKS, (setup.python, "-m", "cadam3d", *line), 120.0, judge=by_last_line(r"finished after .*")
+            "demo",
+            CHECKS,
+            (setup.python, "-m", "cadam3d", *line),
+            120.0,
+            judge=by_last_line(r"finished after .*"),
         ),
         Piece(
             "other tests",
@@ -134,9 +138,7 @@ def times(setup: Setup) -> list[Piece]:
         words = ["--device", "cuda", "--backends", *backends, *scenes, "--degrees", degrees]
         words += ["--no-check", "--no-stages", "--json", RESULT]
         limit = 300.0 if name == "times" else 120.0
-        pieces.append(
-            Piece(name, TIMES, setup.script("bench_rasterizer", *words), limit, judge=by_rows)
-        )
+        pieces.append(Piece(name, TIMES, setup.script("bench_rasterizer", *words), limit, judge=by_rows))
     return pieces
 
 

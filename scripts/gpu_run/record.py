@@ -50,4 +50,6 @@ def read_record(path: Path) -> Record:
         pieces = {name: Entry(**entry) for name, entry in data["pieces"].items()}
         return Record(data["machine"], data["state"], pieces)
     except (json.JSONDecodeError, UnicodeDecodeError, TypeError, KeyError, AttributeError) as error:
-        raise ValueError(f"{path} is not a record of this script ({type(error).__name__}: {error})") from error
+        raise ValueError(
+            f"{path} is not a record of this script ({type(error).__name__}: {error})"
+        ) from error

@@ -140,7 +140,9 @@ class Runner:
         deadline = time.monotonic() + seconds
         waiting = [piece for piece in pieces if piece.part == part]
         jobs = [
-            self._processes.start(piece) for piece in waiting if piece.in_background and not self._is_done(piece)
+            self._processes.start(piece)
+            for piece in waiting
+            if piece.in_background and not self._is_done(piece)
         ]
         try:
             for piece in waiting:

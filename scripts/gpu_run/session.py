@@ -21,7 +21,7 @@ from gpu_run.machine import (
 )
 from gpu_run.markdown import show, verdicts
 from gpu_run.pieces import CHECKS, PARTS, Setup, plan
-from gpu_run.record import FAILED, PASSED, Record, read_record
+from gpu_run.record import ENDED, FAILED, Record, read_record
 from gpu_run.runner import Piece, Processes, Runner
 
 AGAIN = "python scripts/gpu.py"
@@ -61,7 +61,7 @@ class Session:
                     return 1
         finally:
             self._finish(record)
-        is_whole = all(entry.status not in FAILURES for entry in record.pieces.values())
+        is_whole = all(entry.status not in (FAILED, ENDED) for entry in record.pieces.values())
         return 0 if is_whole else 1
 
     def run_part(self, record: Record, part: str) -> bool:
@@ -90,7 +90,7 @@ class Session:
         packages = find_packages()
         if "torch" not in packages:
             raise TroubleError(
-                f"expected torch beside {sys.executable}, got none. Try: {sys.executable} -m pip install torch"
+                f"expected torch in {sys.executable}, got none. Try: {sys.executable} -m pip install torch"
             )
         command = (sys.executable, "-m", "gpu_run.on_device", "facts", "--json", "{result}")
         piece = Piece("machine", CHECKS, command, FACTS_SECONDS)
@@ -125,7 +125,9 @@ class Session:
             return Record(machine, state, record.pieces)
         old = self._path.with_name(f"gpu-{record.machine['date'].replace(':', '')[:17]}.json")
         self._path.replace(old)
-        self._show(f"The GPU, torch or the files of the project have changed, so {old.name} has the old results.")
+        self._show(
+            f"The GPU, torch or the files of the project have changed, so {old.name} has the old results."
+        )
         return Record(machine, state)
 
     def _require_checks(self, record: Record) -> None:
@@ -146,7 +148,3 @@ class Session:
         counts = {status: statuses.count(status) for status in dict.fromkeys(statuses)}
         said = ", ".join(f"{count} {status}" for status, count in counts.items()) or "nothing has run"
         self._show(f"{said}. Results: {self._path} and {self._path.with_suffix('.md').name}")
-
-
-FAILURES = (FAILED,)
-assert PASSED not in FAILURES

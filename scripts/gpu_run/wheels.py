@@ -7,7 +7,9 @@ from pathlib import Path
 
 from gpu_run.machine import REPOSITORY
 
-PYTHON, PLATFORM = "3.12", "manylinux_2_28_x86_64"
+PYTHON = "3.12"
+# pip does not know that a newer one of these systems can use wheels for an older one.
+PLATFORMS = ("manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64")
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,7 @@ class Package:
     has_wheel: bool = True
 
 
-CHECKS, GSPLAT, DEMO, RECIPES = "checks and times", "gsplat", "demo", "recipes"
+CHECKS, GSPLAT, DEMO, RECIPES = "checks and times", "gsplat", "the demo", "the recipes"
 # Torch brings filelock, and nearly always numpy. The order is that of the parts of a run.
 PACKAGES = (
     Package("numpy", CHECKS, is_pure=False),
@@ -73,7 +75,10 @@ PACKAGES = (
 def requirement(package: Package, repository: Path = REPOSITORY) -> str:
     """Return the name with the bounds of pyproject.toml (from below) and constraints.txt (from above)."""
     project = tomllib.loads((repository / "pyproject.toml").read_text())["project"]
-    lines = [*project["dependencies"], *(line for lines in project["optional-dependencies"].values() for line in lines)]
+    lines = [
+        *project["dependencies"],
+        *(line for lines in project["optional-dependencies"].values() for line in lines),
+    ]
     lines += (repository / "constraints.txt").read_text().splitlines()
     found = [re.match(r"([A-Za-z0-9_.-]+?)((?:[<>=!~]=?[\w.]+,?)+)", line) for line in lines]
     bounds = {match[2] for match in found if match and _plain(match[1]) == _plain(package.name)}
@@ -88,13 +93,19 @@ def describe() -> str:
     """Return the packages with their bounds, and the lines that fetch and install them."""
     lines = [
         "A machine without a package registry needs torch built for CUDA, and these packages beside it.",
-        "Pure wheels fit every Python; fetch the others for the Python and the kind of machine that runs them.",
+        "A pure wheel fits every Python. Fetch the others for the Python and the system of that machine.",
     ]
     for purpose in dict.fromkeys(package.purpose for package in PACKAGES):
-        lines += ["", f"for the {purpose}" + ("" if purpose == CHECKS else " (optional)") + ":"]
+        lines += ["", f"for {purpose}" + ("" if purpose == CHECKS else " (optional)") + ":"]
         for package in PACKAGES:
             if package.purpose == purpose:
-                kind = "no wheel: build one" if not package.has_wheel else "pure" if package.is_pure else "not pure"
+                kind = (
+                    "no wheel: build one"
+                    if not package.has_wheel
+                    else "pure"
+                    if package.is_pure
+                    else "not pure"
+                )
                 lines.append(f"  {requirement(package):<36} {kind}")
     return "\n".join([*lines, "", *fetching()])
 
@@ -105,9 +116,10 @@ def fetching() -> list[str]:
     with_wheel = " ".join(f"'{requirement(package)}'" for package in needed if package.has_wheel)
     without = " ".join(f"'{requirement(package)}'" for package in needed if not package.has_wheel)
     names = " ".join(package.name for package in needed)
+    platforms = " ".join(f"--platform {platform}" for platform in PLATFORMS)
     return [
         "On a machine with a registry, for the checks and the times:",
-        f"  pip download --no-deps --only-binary=:all: --python-version {PYTHON} --platform {PLATFORM} "
+        f"  pip download --no-deps --only-binary=:all: --python-version {PYTHON} {platforms} "
         f"--dest wheels {with_wheel}",
         f"  pip wheel --no-deps --wheel-dir wheels {without}",
         "On the machine with the GPU, in the folder of the project:",

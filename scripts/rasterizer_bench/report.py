@@ -16,7 +16,7 @@ import cadam3d
 REPOSITORY = Path(__file__).parents[2]
 HEADER = (
     f"{'N':>9} {'pixels':>6} {'views':>5} {'SH':>2} {'backend':>10} {'forward':>9} {'backward':>9} "
-    f"{'both':>9} {'best':>9} {'ratio':>7} {'memory':>8}  target"
+    f"{'both':>9} {'host':>9} {'best':>9} {'ratio':>7} {'memory':>8}  target"
 )
 
 
@@ -32,6 +32,7 @@ class Row:
     forward_ms: float | None = None
     backward_ms: float | None = None
     forward_backward_ms: float | None = None
+    host_ms: float | None = None  # until the calls of forward and backward have returned
     forward_backward_min_ms: float | None = None
     ratio: float | None = None  # time of the first backend divided by this one's, forward + backward
     peak_bytes: int | None = None
@@ -43,7 +44,8 @@ class Row:
         scene = f"{self.count:>9} {self.size:>6} {self.views:>5} {self.degree:>2} {self.backend:>10}"
         if self.forward_backward_ms is None:
             return f"{scene}   out of memory"
-        times = (self.forward_ms, self.backward_ms, self.forward_backward_ms, self.forward_backward_min_ms)
+        times = (self.forward_ms, self.backward_ms, self.forward_backward_ms, self.host_ms)
+        times += (self.forward_backward_min_ms,)
         ratio = "" if self.ratio is None else f"{self.ratio:.2f}x"
         memory = "" if self.peak_bytes is None else f"{self.peak_bytes / 2**20:.0f} MB"
         cells = "".join(f" {time:>9.2f}" for time in times) + f" {ratio:>7} {memory:>8}"
@@ -111,6 +113,8 @@ class SceneStages:
     size: int
     views: int
     degree: int
+    wall_ms: float
+    kernel_ms: float
     stages: list[StageTiming]
 
 

@@ -9,7 +9,8 @@ from rasterizer_bench.scenes import Scene
 
 from cadam3d.rasterizer.base import Rasterizer
 
-PHASES = ("forward", "backward", "forward_backward")
+# The last one is the time that the host needs for forward and backward until both calls have returned.
+PHASES = ("forward", "backward", "forward_backward", "host")
 OUT_OF_MEMORY = (torch.OutOfMemoryError, MemoryError)
 
 
@@ -72,11 +73,13 @@ def time_phases(rasterizer: Rasterizer, scene: Scene) -> dict[str, float]:
     scene.zero_grad()
     again = now(device)
     scene.backward(scene.render(rasterizer))
+    host = time.perf_counter() - again
     whole = now(device) - again
     return {
         "forward": (middle - start) * 1e3,
         "backward": (end - middle) * 1e3,
         "forward_backward": whole * 1e3,
+        "host": host * 1e3,
     }
 
 
