@@ -9,6 +9,7 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -16,10 +17,14 @@ import pytest
 import torch
 from filelock import FileLock
 
+from cadam3d.core.cameras import Cameras
 from cadam3d.core.errors import UserError
+from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
+from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.build import KERNELS, definitions, find_compiler
 from cadam3d.rasterizer.cuda import rasterize
+from cadam3d.rasterizer.cuda_sort import scan, scan_bytes, sort, sort_bytes
 from cadam3d.rasterizer.driver import Module
 from cadam3d.rasterizer.launcher import Launch, Launcher
 
@@ -52,6 +57,85 @@ class Emulator(Launcher):
     def activate(self, mutant: int) -> None:
         """Switch on a planted mistake by its number (see mutants.py); 0 switches all of them off."""
         ctypes.c_int.in_dll(self.library, "active_mutant").value = mutant
+
+
+def scan_tensor(launch: Launch, values: torch.Tensor, index: torch.Tensor | None = None) -> torch.Tensor:
+    """Return the exclusive prefix sums of ``values``, or of ``values[index]``, and behind them the total."""
+    n = (values if index is None else index).shape[0]
+    sums = torch.empty(n + 1, dtype=torch.int32, device=values.device)
+    temporary = torch.empty(scan_bytes(n), dtype=torch.uint8, device=values.device)
+    where = 0 if index is None else index.data_ptr()
+    scan(launch, values.data_ptr(), sums.data_ptr(), n, temporary.data_ptr(), where, sums[n:].data_ptr())
+    return sums
+
+
+def sort_tensor(
+    launch: Launch, keys: torch.Tensor, bit_count: int, total: int | None = None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the sorted keys and their old positions. ``total`` is the number of keys on the device."""
+    n, keys, order = keys.shape[0], keys.clone(), torch.empty_like(keys)
+    temporary = [keys.new_empty(size, dtype=torch.uint8) for size in sort_bytes(n, bit_count)]
+    count = keys.new_tensor([n if total is None else total])
+    at, counted = [tensor.data_ptr() for tensor in temporary], 0 if total is None else count.data_ptr()
+    found = sort(launch, keys.data_ptr(), order.data_ptr(), n, bit_count, at, counted)
+    block = next(block for block in (keys, *temporary) if block.data_ptr() == found)
+    return block.view(torch.int32)[:n], order
+
+
+def as_unsigned(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor.long() & 0xFFFFFFFF
+
+
+def as_signed(values: torch.Tensor) -> torch.Tensor:
+    """Return numbers below 2**32 as the int32 with the same bits."""
+    return torch.where(values < 2**31, values, values - 2**32).int()
+
+
+def check_sort(emulator: Emulator, n: int, distinct: int, bit_count: int) -> None:
+    """Compare a sort of random keys with the one of torch."""
+    values = torch.randint(0, 2**bit_count, (distinct,), generator=torch.Generator().manual_seed(n))
+    picks = torch.randint(0, distinct, (n,), generator=torch.Generator().manual_seed(n + 1))
+    keys = values[picks]
+    with emulator.on(torch.device("cpu")) as launch:
+        got, order = sort_tensor(launch, as_signed(keys), bit_count)
+    want, want_order = keys.sort(stable=True)
+    assert torch.equal(as_unsigned(got), want)
+    assert torch.equal(order.long(), want_order)
+
+
+@dataclass(frozen=True)
+class Lists:
+    """Splats and tile lists of views that are one group; see cuda.py."""
+
+    splats: torch.Tensor  # [pairs SPLAT]
+    counts: torch.Tensor  # [pairs]
+    first_slot: torch.Tensor  # [pairs]
+    is_seen: torch.Tensor  # [pairs]
+    slots: torch.Tensor  # [slots]
+    pair_of_slot: torch.Tensor  # [slots]
+    ranges: torch.Tensor  # [tiles + 1, 2]
+
+
+def list_tiles(launcher: Launcher, gaussians: Gaussians, cameras: Cameras) -> Lists:
+    """Project the Gaussians and return the tile lists."""
+    parameters = list(gaussians.tensors().values())
+    views = cuda._CudaPass(launcher, cameras, torch.device("cpu"))
+    with views.running():
+        _, radii = views.project(parameters)
+        views.blend(parameters, torch.zeros(len(cameras), 3), keeps=True)
+    (group,) = views.groups
+
+    def array(name: str, dtype: torch.dtype = torch.int32) -> torch.Tensor:
+        if name in group.lists.places:
+            return group.lists.tensor(views.kept[group.blocks], name, dtype)
+        return views.frame.tensor(views.kept[: len(views.frame.blocks)], name, dtype)
+
+    return Lists(
+        splats=array("splats", torch.float32).view(-1, cuda.SPLAT),
+        is_seen=radii.flatten() > 0,
+        ranges=array("ranges").view(-1, 2),
+        **{name: array(name) for name in ("counts", "first_slot", "slots", "pair_of_slot")},
+    )
 
 
 def load_emulator(folder: Path, kernels: Path = KERNELS, optimize: str = "-O1") -> Emulator:

@@ -1,6 +1,7 @@
 """Run compiled kernels through the CUDA driver, on torch's current stream and in torch's own context."""
 
 import ctypes
+import struct
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,7 +9,6 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer.launcher import Launch, Launcher
@@ -16,6 +16,8 @@ from cadam3d.rasterizer.nvrtc import build
 
 LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 OUT_OF_MEMORY = 2  # CUDA_ERROR_OUT_OF_MEMORY
+# Labels in the list of extra options of a launch: CU_LAUNCH_PARAM_END and so on.
+END, BUFFER_POINTER, BUFFER_SIZE = 0, 1, 2
 
 
 class Driver(Launcher):
@@ -65,12 +67,16 @@ class Module:
         with self._current():
             yield partial(self._launch, ctypes.c_void_p(stream))
 
-    def _launch(self, stream: ctypes.c_void_p, kernel: str, blocks: int, threads: int, *arguments) -> None:
-        values = (ctypes.c_uint64 * len(arguments))(*map(_as_number, arguments))
-        start = ctypes.addressof(values)
-        pointers = (ctypes.c_void_p * len(arguments))(*range(start, start + 8 * len(arguments), 8))
-        size = (blocks, 1, 1, threads, 1, 1)
-        self._call("cuLaunchKernel", self._function(kernel), *size, 0, stream, pointers, None)
+    def _launch(
+        self, stream: ctypes.c_void_p, kernel: str, blocks: int, threads: int, *arguments: int
+    ) -> None:
+        packed = struct.pack(f"{len(arguments)}q", *arguments)
+        size = ctypes.c_size_t(len(packed))
+        extra = (ctypes.c_void_p * 5)(
+            BUFFER_POINTER, ctypes.cast(packed, ctypes.c_void_p), BUFFER_SIZE, ctypes.addressof(size), END
+        )
+        grid = (blocks, 1, 1, threads, 1, 1)
+        self._call("cuLaunchKernel", self._function(kernel), *grid, 0, stream, None, extra)
 
     def _function(self, kernel: str) -> ctypes.c_void_p:
         if kernel not in self._functions:
@@ -97,13 +103,3 @@ class Module:
             if status == OUT_OF_MEMORY:
                 raise MemoryError(f"rasterizer=cuda: {name}: {reason}")
             raise UserError(f"rasterizer=cuda: {name}: {reason} ({status}). Try: rasterizer=reference")
-
-
-def _as_number(argument: object) -> int:
-    """Return the eight bytes of a kernel argument: the address of a tensor, 0 for ``None``, or the number."""
-    if isinstance(argument, Tensor):
-        return argument.data_ptr()
-    if argument is None:
-        return 0
-    assert isinstance(argument, int), argument
-    return argument

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 import torch
 
 # launch(kernel, blocks, threads, *arguments) starts ``blocks`` blocks of ``threads`` threads. An argument is
-# a tensor, which is passed as its address, a whole number, or None, which is passed as a null pointer.
+# a whole number. An array is passed as its address, and an array that is left out as 0.
 Launch = Callable[..., None]
 
 

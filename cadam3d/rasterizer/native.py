@@ -5,6 +5,8 @@ is an ordinary node of the graph: it can retain its gradient, and a loss may use
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import torch
 from jaxtyping import Float
@@ -27,12 +29,22 @@ class RenderPass(ABC):
     :meth:`Gaussians.tensors`, in that order.
     """
 
+    # Memory that the kernels fill in the forward pass and read in the backward pass. Autograd saves it, so
+    # that it is freed after the backward pass even if the images live on.
+    kept: tuple[Tensor, ...] = ()
+    # Whether reserved memory was too small; see RenderOutput.
+    overflowed: Tensor | None = None
+
     def __init__(self, cameras: Cameras, device: torch.device, absgrad: bool = False) -> None:
         self.height, self.width, self.device = cameras.height, cameras.width, device
         # Whether the backward pass computes absgrad as well.
         self.absgrad = absgrad
         self.matrices = plain(cameras.world_to_camera.detach(), device)
         self.intrinsics = plain(cameras.intrinsics.detach(), device)
+
+    def running(self) -> AbstractContextManager[object]:
+        """Return the context in which the other methods must be called."""
+        return nullcontext()
 
     @property
     def views(self) -> int:
@@ -69,21 +81,33 @@ class RenderPass(ABC):
 
 def run_pass(kernels: RenderPass, gaussians: Gaussians, background: Float[Tensor, "v 3"]) -> RenderOutput:
     """Render with the kernels of one pass, with autocast off; see ``Rasterizer.render``."""
+    # Entering this context takes longer than all of the ordinary checks together.
+    if torch.is_autocast_enabled(gaussians.device.type):
+        with torch.autocast(gaussians.device.type, enabled=False):
+            return run_pass(kernels, gaussians, background)
     dtype, device = gaussians.means.dtype, gaussians.device
     means, *others = (plain(tensor, device) for tensor in gaussians.tensors().values())
-    with torch.autocast(device.type, enabled=False):
+    keeps = torch.is_grad_enabled()
+    with kernels.running():
         means2d, radii = _Project.apply(kernels, means, *(tensor.detach() for tensor in others))
         means2d = means2d.to(dtype)
-        keeps = torch.is_grad_enabled()
         if keeps:
             means2d.requires_grad_().retain_grad()
         probe = absgrad_probe(means2d, kernels.absgrad)
         tensors = (means, *others, plain(background, device))
         probed = None if probe is None else plain(probe, device)
         images = _Blend.apply(kernels, keeps, plain(means2d, device), probed, *tensors)
-        rgb, alpha, depth = (image.to(dtype) for image in images)
-    radii = radii.to(dtype)
-    return RenderOutput(rgb=rgb, alpha=alpha, depth=depth, means2d=means2d, radii=radii, absgrad=probe)
+    kernels.kept = ()
+    rgb, alpha, depth = (image.to(dtype) for image in images)
+    return RenderOutput(
+        rgb=rgb,
+        alpha=alpha,
+        depth=depth,
+        means2d=means2d,
+        radii=radii.to(dtype),
+        absgrad=probe,
+        overflowed=kernels.overflowed,
+    )
 
 
 class _Project(torch.autograd.Function):
@@ -93,15 +117,19 @@ class _Project(torch.autograd.Function):
     def forward(ctx, kernels: RenderPass, *parameters: Tensor) -> tuple[Tensor, Tensor]:
         means2d, radii = kernels.project(list(parameters))
         ctx.kernels = kernels
-        ctx.save_for_backward(*parameters, radii)
+        ctx.save_for_backward(*parameters, radii, *kernels.kept)
         ctx.mark_non_differentiable(radii)
+        ctx.set_materialize_grads(False)
         return means2d, radii
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        *parameters, radii = ctx.saved_tensors
-        grad_means = ctx.kernels.centre_backward(parameters, radii, grads[0].contiguous())
+    def backward(ctx, grad_means2d: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
+        if grad_means2d is None:
+            return (None,) * 6
+        *parameters, radii = ctx.saved_tensors[:6]
+        with _resumed(ctx.kernels, ctx.saved_tensors[6:]):
+            grad_means = ctx.kernels.centre_backward(parameters, radii, grad_means2d.contiguous())
         return None, grad_means, None, None, None, None
 
 
@@ -115,24 +143,38 @@ class _Blend(torch.autograd.Function):
         *parameters, background = tensors
         rgb, alpha, depth = kernels.blend(parameters, background, keeps)
         ctx.kernels = kernels
-        ctx.save_for_backward(*tensors, alpha, depth)
+        ctx.save_for_backward(*tensors, alpha, depth, *kernels.kept)
         ctx.set_materialize_grads(False)
         return rgb, alpha, depth
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        *parameters, background, alpha, depth = ctx.saved_tensors
+        *parameters, background, alpha, depth = ctx.saved_tensors[:8]
         images = [alpha, depth, *(None if grad is None else grad.contiguous() for grad in grads)]
-        totals = ctx.kernels.blend_backward(parameters, background, images)
+        with _resumed(ctx.kernels, ctx.saved_tensors[8:]):
+            totals = ctx.kernels.blend_backward(parameters, background, images)
         grad_background = None
         if ctx.needs_input_grad[-1] and grads[0] is not None:
             grad_background = (grads[0] * (1 - alpha)[..., None]).sum(dim=(1, 2))
         return None, None, *totals, grad_background
 
 
+@contextmanager
+def _resumed(kernels: RenderPass, kept: tuple[Tensor, ...]) -> Iterator[None]:
+    """Run kernels of the backward pass, with the memory that was kept for it."""
+    kernels.kept = kept
+    try:
+        with kernels.running():
+            yield
+    finally:
+        kernels.kept = ()
+
+
 def plain(tensor: Tensor, device: torch.device) -> Tensor:
     """Return the tensor as kernels read it: contiguous float32 on ``device``."""
+    if tensor.dtype is torch.float32 and tensor.device == device and tensor.is_contiguous():
+        return tensor
     return tensor.to(device, torch.float32).contiguous()
 
 

@@ -9,7 +9,8 @@ from torch import Tensor
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.base import Rasterizer
-from cadam3d.rasterizer.launcher import Launcher
+from cadam3d.rasterizer.cuda_sort import sort, sort_bytes
+from cadam3d.rasterizer.launcher import Launch, Launcher
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import GSPLAT, OWN, self_test
 
@@ -125,10 +126,25 @@ def changes(rasterizer: Rasterizer, scene: Scene) -> list[str]:
 
 def check_long_sort(launcher: Launcher, device: torch.device, keys: int) -> list[str]:
     """Return a problem if the kernels sort ``keys`` random keys differently than torch does."""
-    generator = torch.Generator(device).manual_seed(0)
-    unsorted = torch.randint(0, 2**31 - 1, (keys,), dtype=torch.int32, device=device, generator=generator)
-    with launcher.on(device) as launch:
-        got, order = cuda._sort(launch, unsorted, cuda.DEPTH_BITS)
+    unsorted = make_keys(keys, cuda.DEPTH_BITS - 1, device)
     want, want_order = unsorted.sort(stable=True)
+    with launcher.on(device) as launch:
+        got, order = sort_keys(launch, unsorted, cuda.DEPTH_BITS)
     is_right = torch.equal(got, want) and torch.equal(order, want_order.int())
     return [] if is_right else [f"{keys} keys are sorted wrongly"]
+
+
+def make_keys(count: int, bits: int, device: torch.device) -> Tensor:
+    """Return random numbers below ``2**bits``, of at most 31 bits."""
+    generator = torch.Generator(device).manual_seed(0)
+    return torch.randint(0, 2**bits - 1, (count,), dtype=torch.int32, device=device, generator=generator)
+
+
+def sort_keys(launch: Launch, keys: Tensor, bits: int) -> tuple[Tensor, Tensor]:
+    """Return the keys in the order of their lowest ``bits`` bits, and their old positions."""
+    count, order = len(keys), torch.empty_like(keys)
+    blocks = [keys.clone(), *(keys.new_empty(n, dtype=torch.uint8) for n in sort_bytes(count, bits))]
+    first, *temporary = (block.data_ptr() for block in blocks)
+    found = sort(launch, first, order.data_ptr(), count, bits, temporary)
+    block = next(block for block in blocks if block.data_ptr() == found)
+    return block.view(torch.int32)[:count], order

@@ -24,7 +24,7 @@ from torch import Tensor
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
-from cadam3d.rasterizer import cuda
+from cadam3d.rasterizer import cuda, cuda_sort
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cuda import rasterize
 from cadam3d.rasterizer.launcher import Launch, Launcher
@@ -111,7 +111,7 @@ class LaunchClock(Launcher):
 
     def _launch(self, launch: Launch, kernel: str, blocks: int, threads: int, *arguments) -> None:
         if kernel == "tile_ranges":
-            self.slots += arguments[1]
+            self.slots += arguments[2]
         begin = time.perf_counter()
         launch(kernel, blocks, threads, *arguments)
         self.launches.append(Kernel(kernel, (time.perf_counter() - begin) * 1e3))
@@ -172,7 +172,7 @@ def sorted_bytes(items: int, bits: int) -> int:
     A pass reads keys for counting, reads keys and values for scattering, and writes both. The first pass has
     no values to read.
     """
-    passes = -(-bits // cuda.RADIX_BITS)
+    passes = -(-bits // cuda_sort.RADIX_BITS)
     return items * WORD * (5 * passes - 1)
 
 

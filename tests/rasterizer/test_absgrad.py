@@ -174,10 +174,11 @@ def test_groups_of_views_give_the_same_bits_and_account_for_absgrad_memory(emula
 
     def groups(absgrad: bool) -> int:
         views = cuda._CudaPass(emulator, scene[1], torch.device("cpu"), absgrad)
-        views.project(list(gaussians.tensors().values()))
-        slots = int(views.slot_count.sum())
-        monkeypatch.setattr(cuda, "RECORD_MEMORY", 4 * cuda.RECORD * slots)
-        return len(views._split())
+        with views.running():
+            views.project(list(gaussians.tensors().values()))
+        slots = views.read_slots()
+        monkeypatch.setattr(cuda, "RECORD_MEMORY", 4 * cuda.RECORD * sum(slots))
+        return len(views._split(slots, len(gaussians)))
 
     assert groups(absgrad=False) == 1
     assert groups(absgrad=True) > 1

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from emulation import Emulator, passes
+from emulation import Emulator, check_sort, list_tiles, passes
 from mutants import NUMBERS, RENDERING, ROUNDING
 from splats import (
     assert_agrees,
@@ -83,53 +83,6 @@ def test_a_missing_cuda_device_is_reported_before_anything_is_compiled(monkeypat
 # -------------------------------------------------------------------------- the parts
 
 
-def as_unsigned(tensor: torch.Tensor) -> torch.Tensor:
-    return tensor.long() & 0xFFFFFFFF
-
-
-@pytest.mark.parametrize("n", [1, 255, 2047, 2048, 2049, 16384, 16385, 20000])
-def test_prefix_sums_are_exact_up_to_32_bits(emulator, n):
-    values = torch.randint(0, 2**32 // n, (n,), generator=torch.Generator().manual_seed(n))
-    with emulator.on(CPU) as launch:
-        sums = cuda._scan(launch, torch.where(values < 2**31, values, values - 2**32).int())
-    assert torch.equal(as_unsigned(sums), values.cumsum(0) - values)
-
-
-def check_sort(emulator: Emulator, n: int, distinct: int, bit_count: int) -> None:
-    values = torch.randint(0, 2**bit_count, (distinct,), generator=torch.Generator().manual_seed(n))
-    picks = torch.randint(0, distinct, (n,), generator=torch.Generator().manual_seed(n + 1))
-    keys = values[picks]
-    with emulator.on(CPU) as launch:
-        got, order = cuda._sort(launch, torch.where(keys < 2**31, keys, keys - 2**32).int(), bit_count)
-    want, want_order = keys.sort(stable=True)
-    assert torch.equal(as_unsigned(got), want)
-    assert torch.equal(order.long(), want_order)
-
-
-@pytest.mark.parametrize("n", [0, 1, 2, 31, 32, 33, 255, 256, 257, 4095, 4096, 4097, 5000, 12289])
-def test_the_sort_is_exact_and_stable(emulator, n):
-    for distinct, bit_count in ((1, 32), (7, 32), (10**6, 32), (10**6, 17), (2, 1)):
-        check_sort(emulator, n, distinct, bit_count)
-
-
-def test_the_sort_is_exact_when_its_counts_need_three_kernels(emulator):
-    assert 270_000 // cuda.SORT_CHUNK * 2**cuda.RADIX_BITS > cuda.SCAN_SHORT
-    check_sort(emulator, 270_000, 10**6, 16)
-
-
-@pytest.mark.gpu
-def test_the_sort_handles_more_than_2_to_27_keys(tmp_path):
-    if not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
-    n = 2**27 + 1
-    keys = torch.randint(0, 2**31 - 1, (n,), dtype=torch.int32, device="cuda")
-    with cuda.load_kernels(str(tmp_path)).on(keys.device) as launch:
-        got, order = cuda._sort(launch, keys, 32)
-    want, want_order = keys.sort(stable=True)
-    assert torch.equal(got, want)
-    assert torch.equal(order.long(), want_order)
-
-
 @pytest.mark.parametrize(
     ("gaussians", "cameras"),
     [
@@ -141,29 +94,25 @@ def test_the_sort_handles_more_than_2_to_27_keys(tmp_path):
 )
 def test_every_tile_with_a_pixel_in_reach_is_listed_and_few_others(emulator, gaussians, cameras):
     v, n, height, width = len(cameras), len(gaussians), cameras.height, cameras.width
-    views = cuda._CudaPass(emulator, cameras, CPU)
-    views.project(list(gaussians.tensors().values()))
-    with emulator.on(CPU) as launch:
-        lists = views._list(launch, *views._split()[0])
-    listed = torch.zeros(v * views.tiles, v * n, dtype=torch.bool)
+    lists = list_tiles(emulator, gaussians, cameras)
+    listed = torch.zeros(len(lists.ranges) - 1, v * n, dtype=torch.bool)
     for tile, (begin, end) in enumerate(lists.ranges[:-1].tolist()):
         pairs = lists.pair_of_slot[lists.slots[begin:end].long()].long()
-        depths = views.splats.view(-1, cuda.SPLAT)[pairs, 7]
-        assert (depths.diff() >= 0).all()
+        assert (lists.splats[pairs, 7].diff() >= 0).all(), "nearest first"
         listed[tile, pairs] = True
     assert listed.sum() == lists.slots.shape[0], "as many as were counted, and none of them twice"
     assert not lists.ranges[-1].any(), "no slot is left over"
 
-    x, y, l11, l12, l22, cut, *_ = views.splats.double().view(-1, cuda.SPLAT, 1, 1).unbind(dim=1)
+    x, y, l11, l12, l22, cut, *_ = lists.splats.double()[..., None, None].unbind(dim=1)
     tiles_y, tiles_x = -(-height // cuda.TILE), -(-width // cuda.TILE)
     rows, columns = (torch.arange(tiles * cuda.TILE)[None] + 0.5 for tiles in (tiles_y, tiles_x))
     dx, dy = columns.double() - x, rows.double().mT - y
     is_reached = (l11 * dx + l12 * dy).square() + (l22 * dy).square() <= cut * (1 - 1e-5)
     is_reached &= (rows.mT < height) & (columns < width)
-    is_seen = views.depth_keys.flatten() != -1
+    is_seen = lists.is_seen
     in_tile = is_reached.view(-1, tiles_y, cuda.TILE, tiles_x, cuda.TILE).any(dim=4).any(dim=2).flatten(1)
     wanted = (in_tile & is_seen[:, None]).view(v, n, -1)
-    want = torch.zeros_like(listed).view(v, views.tiles, v, n)
+    want = torch.zeros_like(listed).view(v, -1, v, n)
     for view in range(v):
         want[view, :, view] = wanted[view].T
     want = want.view_as(listed)
@@ -172,22 +121,17 @@ def test_every_tile_with_a_pixel_in_reach_is_listed_and_few_others(emulator, gau
 
 
 def test_constants_mirror_those_of_the_kernels():
-    source = "".join((KERNELS / f"{name}.cuh").read_text() for name in ("device", "sort", "project", "blend"))
+    source = "".join((KERNELS / f"{name}.cuh").read_text() for name in ("device", "project", "blend"))
     for line in (
-        f"BLOCK = {cuda.BLOCK};",
         f"PROJECT_BLOCK = {cuda.PROJECT_BLOCK};",
         f"BLEND_BLOCK = {cuda.BLEND_BLOCK};",
         f"WARP = {cuda.WARP};",
         f"TILE = {cuda.TILE};",
         f"RECORD = {cuda.RECORD};",
         f"ABSOLUTES = {cuda.ABSOLUTES};",
-        f"RADIX_BITS = {cuda.RADIX_BITS};",
         f"sizeof(Camera) == {cuda.CAMERA} * sizeof(float)",
     ):
         assert line in source
-    assert (cuda.SCAN_CHUNK, cuda.SORT_CHUNK) == (cuda.BLOCK * 8, cuda.BLOCK * 16)
-    assert "SCAN_ITEMS = 8;" in source
-    assert "SORT_ROUNDS = 16;" in source
 
 
 # -------------------------------------------------------------------------- mutants
@@ -217,15 +161,12 @@ def test_a_mutant_is_caught(mutants, mutant):
 def judge_slots(emulator: Emulator) -> None:
     """Check that each pair fills exactly its own slots and that every rendered number is finite."""
     gaussians, cameras = make_gaussians(60, log_scale=-1.0), make_cameras(2, 21, 27)
-    views = cuda._CudaPass(emulator, cameras, CPU)
-    views.project(list(gaussians.tensors().values()))
-    with emulator.on(CPU) as launch:
-        group = views._list(launch, *views._split()[0])
-    counts = views.slot_count.flatten().long()
+    lists = list_tiles(emulator, gaussians, cameras)
+    counts = lists.counts.long()
     pairs = torch.arange(counts.numel()).repeat_interleave(counts)
     nth = torch.arange(pairs.numel()) - (counts.cumsum(0) - counts)[pairs]
-    assert torch.equal(group.pair_of_slot[views.first_slot.flatten().long()[pairs] + nth].long(), pairs)
-    assert group.ranges[-1].any(), "some slots are left over"
+    assert torch.equal(lists.pair_of_slot[lists.first_slot.long()[pairs] + nth].long(), pairs)
+    assert lists.ranges[-1].any(), "some slots are left over"
     scene = gaussians, cameras, backgrounds(2), make_weights(2, 21, 27)
     assert all(number.isfinite().all() for number in bits(*render_and_differentiate(emulator.render, *scene)))
 

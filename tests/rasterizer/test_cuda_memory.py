@@ -1,5 +1,6 @@
 """Views that need too much memory together are split into groups, which does not change the bits."""
 
+import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -26,6 +27,8 @@ pytestmark = pytest.mark.usefixtures("garbage_in_new_memory")
 
 CPU = torch.device("cpu")
 VIEWS = 4
+# The place of the capacity among the arguments of project_backward: after parameters and sizes.
+CAPACITY = 13
 
 
 class Spy(Launcher):
@@ -63,8 +66,9 @@ def differentiate(launcher: Launcher, scene):
 
 def slots_per_view(emulator, gaussians, cameras) -> list[int]:
     views = cuda._CudaPass(emulator, cameras, CPU)
-    views.project(list(gaussians.tensors().values()))
-    return views.slot_count.sum(dim=1).tolist()
+    with views.running():
+        views.project(list(gaussians.tensors().values()))
+    return views.read_slots()
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -83,7 +87,9 @@ def test_the_bits_do_not_depend_on_the_memory_for_records(emulator, degree, monk
         assert len(launches) == len(spy.arguments_of(f"project_backward_{(degree + 1) ** 2}")) == groups
         # A single view always gets the memory that it needs.
         most = max(4 * cuda.RECORD * most_slots, 4 * cuda.RECORD * max(slots))
-        assert all(4 * arguments[-1].numel() <= most for arguments in launches)
+        backwards = spy.arguments_of(f"project_backward_{(degree + 1) ** 2}")
+        capacities = [arguments[CAPACITY] for arguments in backwards]
+        assert all(4 * cuda.RECORD * capacity <= most for capacity in capacities)
 
 
 @pytest.mark.parametrize(
@@ -118,9 +124,8 @@ def test_a_group_has_as_many_views_as_fit_and_at_least_one():
 def test_views_beyond_32_bits_together_are_split(emulator, views, pairs, monkeypatch):
     monkeypatch.setattr(cuda, "RECORD_MEMORY", 2**60)
     kernels = cuda._CudaPass(emulator, make_cameras(views, 8, 8), CPU)
-    kernels.slot_count = torch.tensor([[pairs - 1, 1, 0]] * views, dtype=torch.int32)
     assert views * pairs > cuda.MOST
-    groups = kernels._split()
+    groups = kernels._split([pairs] * views, 3)
     assert sum(slots for _, slots in groups) == views * pairs
     assert all(slots <= cuda.MOST for _, slots in groups)
     assert len(groups) == -(-views // (cuda.MOST // pairs))
@@ -130,12 +135,14 @@ def test_more_than_32_bits_of_pairs_in_one_view_are_refused_and_counted(emulator
     def claim_too_much(kernel, arguments):
         if kernel.startswith("project_forward"):
             # Tiles of each splat. Their total is above 2**32.
-            arguments[-1].fill_(2**31 - 1)
+            counts = (ctypes.c_uint32 * 120).from_address(arguments[-1])
+            counts[:] = [2**31 - 1] * 120
 
-    gaussians, *scene = make_scene()
+    gaussians, cameras, background, _ = make_scene()
+    cameras = cameras.index(slice(0, 1))
     spy = Spy(emulator, claim_too_much)
     with pytest.raises(UserError, match=rf"pairs in a view, got {120 * (2**31 - 1)}\."):
-        rasterize(spy, gaussians, *scene[:2])
+        rasterize(spy, gaussians, cameras, background[:1])
     assert not spy.arguments_of("tile_list")
 
 
@@ -143,12 +150,11 @@ def test_lists_are_kept_only_for_a_backward_pass(emulator):
     gaussians, cameras, background, _ = make_scene()
     views = cuda._CudaPass(emulator, cameras, CPU)
     parameters = list(gaussians.tensors().values())
-    views.project(parameters)
-    views.blend(parameters, background, keeps=False)
-    assert views.groups == []
-    views.project(parameters)
-    views.blend(parameters, background, keeps=True)
-    assert len(views.groups) == 1
+    for keeps in (False, True):
+        with views.running():
+            views.project(parameters)
+            views.blend(parameters, background, keeps)
+        assert len(views.groups) == keeps
 
 
 def test_a_grid_may_have_more_blocks_than_its_other_dimensions_allow(emulator):
@@ -156,7 +162,8 @@ def test_a_grid_may_have_more_blocks_than_its_other_dimensions_allow(emulator):
     keys = torch.arange(slots, dtype=torch.int32) // 3
     ranges = torch.zeros(int(keys[-1]) + 1, 2, dtype=torch.int32)
     with emulator.on(CPU) as launch:
-        launch("tile_ranges", slots, 1, keys, slots, ranges)
+        total = torch.tensor([slots], dtype=torch.int32)
+        launch("tile_ranges", slots, 1, *(t.data_ptr() for t in (keys, total)), slots, ranges.data_ptr())
     begins = torch.arange(0, slots, 3, dtype=torch.int32)
     assert torch.equal(ranges[:, 0], begins)
     assert torch.equal(ranges[:, 1], (begins + 3).clamp_max(slots))

@@ -59,6 +59,8 @@ def outcome(runtime, build_cache, tmp_path_factory) -> subprocess.CompletedProce
         # Python leaks by design, and the sanitizer does not track the stacks of fibers.
         "ASAN_OPTIONS": "detect_leaks=0:detect_stack_use_after_return=0:halt_on_error=0",
         "OMP_NUM_THREADS": "1",
+        # Each array of the rasterizer gets an allocation of its own, as under compute-sanitizer.
+        "PYTORCH_NO_CUDA_MEMORY_CACHING": "1",
     }
     command = [sys.executable, str(PROGRAM), str(library), str(len(PLANTED))]
     return subprocess.run(

@@ -69,7 +69,7 @@ def test_errors_of_the_driver_are_quoted(stub):
         pytest.raises(UserError, match=r"cuModuleGetFunction: named symbol not found \(500\)"),
         Module(stub, 0, b"").launching(0) as launch,
     ):
-        launch("unknown", 1, 32, torch.zeros(1), 3, None)
+        launch("unknown", 1, 32, 2**40, 3, 0)
     with pytest.raises(UserError, match="no kernel image"):
         Module(stub, 0, b"foreign")
 
@@ -143,7 +143,7 @@ def launched(stub) -> dict[str, object]:
 def test_kernels_run_on_the_given_device_and_its_current_stream(stub, built, tmp_path, device, index):
     with driver.Driver(tmp_path).on(torch.device(device)) as launch:
         assert torch.cuda.current_device() == index
-        launch("works", 70_000, 256, None)
+        launch("works", 70_000, 256, 0)
     assert torch.cuda.current_device() == 0
     assert built == [(8, index)]
     stream, context = 2**40 + index, 100 + index

@@ -22,6 +22,14 @@ constexpr int RECORD = 10;        // floats that the blend writes per (splat, ti
 constexpr int ABSOLUTES = 2;      // additional floats for absgrad; mirrored in ../cuda.py
 constexpr u32 CULLED = ALL;       // depth key of a culled pair, which sorts last
 
+// The number of slots of a group is on the device, because the host does not wait for it. Memory and grids have
+// room for ``capacity`` slots. If that is too little, every kernel behaves as if there were no slots at all.
+// ``total`` may be null if the host knows the number, which is the capacity then.
+SPLAT_FN i64 usable(const u32* total, i64 capacity) {
+  if (!total) return capacity;
+  return i64(*total) <= capacity ? i64(*total) : 0;
+}
+
 SPLAT_FN i64 thread_index() { return i64(blockIdx.x) * blockDim.x + threadIdx.x; }
 SPLAT_FN int lane_index() { return int(threadIdx.x) % WARP; }
 

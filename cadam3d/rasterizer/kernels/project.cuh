@@ -123,20 +123,24 @@ struct Totals {
   }
 };
 
-// All gradients of one Gaussian except the path through means2d, which ends in grad_means2d [v n 2].
+// All gradients of one Gaussian except the path through means2d, which ends in grad_means2d [v n 2]. They are
+// zero if the slots did not fit into the memory that was reserved for them, because then there are no records.
 // Processes the views first_view .. end_view - 1, for which there are records. The launch with the last view
 // also computes the gradients of log-scales and quaternions.
 template <int COEFFICIENTS>
 SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, const float* quats,
                                 const float* opacity_logits, const float* sh, const Camera* cameras, i64 n,
                                 i64 views, i64 first_view, i64 end_view, const u32* first_slot,
-                                const u32* slot_count, const float* records, float* grad_means2d,
+                                const u32* slot_count, const u32* total_slots, i64 capacity,
+                                const float* records, float* grad_means2d,
                                 const Totals<COEFFICIENTS>& totals, float* grad_log_scales,
                                 float* grad_quats) {
   const i64 i = thread_index();
   const bool is_mine = i < n;  // threads without a Gaussian help with long runs
+  const bool has_records = i64(*total_slots) <= capacity;
   bool is_seen = false;
-  for (i64 v = 0; v < views && is_mine; ++v) is_seen = is_seen || slot_count[v * n + i] > 0;
+  for (i64 v = 0; v < views && is_mine && has_records; ++v)
+    is_seen = is_seen || slot_count[v * n + i] > 0;
   // A thread without a Gaussian loads the first one and does not use it. This needs no branch, so the loops
   // unroll.
   const Gaussian<COEFFICIENTS> gaussian =
@@ -148,7 +152,7 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
   if (is_mine && first_view > 0) totals.load(i, total);
   for (i64 v = first_view; v < end_view; ++v) {
     const i64 pair = v * n + i;
-    const bool is_visible = is_mine && slot_count[pair] > 0;
+    const bool is_visible = is_mine && has_records && slot_count[pair] > 0;
     float sum[RECORD];
     sum_records<RECORD>(records, is_visible ? first_slot[pair] : 0, is_visible ? slot_count[pair] : 0, sum);
     float centre[2] = {0, 0};
@@ -174,10 +178,12 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
 // absgrad [pairs 2]: the sum over the pixels of the absolute value of what each adds to the gradient of a
 // centre.
 KERNEL(BLOCK)
-sum_absolutes(i64 pairs, const float* absolutes, const float4* splats, const u32* first_slot,
-              const u32* slot_count, float* absgrad) {
+sum_absolutes(i64 pairs, const u32* total, i64 capacity, const float* absolutes, const float4* splats,
+              const u32* first_slot, const u32* slot_count, float* absgrad) {
   const i64 pair = thread_index();
-  const bool is_visible = pair < pairs && slot_count[pair] > 0;  // other threads help with long runs
+  const bool has_records = i64(*total) <= capacity;
+  // Other threads help with long runs.
+  const bool is_visible = pair < pairs && has_records && slot_count[pair] > 0;
   float sum[ABSOLUTES], absolute[2] = {0, 0};
   sum_records<ABSOLUTES>(absolutes, is_visible ? first_slot[pair] : 0, is_visible ? slot_count[pair] : 0, sum);
   if (is_visible) splat::mean2d_absolute(splats[3 * pair].z, sum, absolute);  // z: l11
@@ -218,13 +224,13 @@ constexpr int PROJECT_BLOCK = 128;
   project_backward_##COEFFICIENTS(                                                                           \
       const float* means, const float* log_scales, const float* quats, const float* opacity_logits,          \
       const float* sh, const Camera* cameras, i64 n, i64 views, i64 first_view, i64 end_view,                \
-      const u32* first_slot, const u32* slot_count, const float* records, float* grad_axes,                  \
-      float* grad_means2d, float* grad_means, float* grad_log_scales, float* grad_quats,                     \
+      const u32* first_slot, const u32* slot_count, const u32* total, i64 capacity, const float* records,    \
+      float* grad_axes, float* grad_means2d, float* grad_means, float* grad_log_scales, float* grad_quats,   \
       float* grad_opacity_logits, float* grad_sh) {                                                          \
     gaussian_backward<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, cameras, n, views,         \
-                                    first_view, end_view, first_slot, slot_count, records, grad_means2d,     \
-                                    {grad_means, grad_axes, grad_opacity_logits, grad_sh}, grad_log_scales,  \
-                                    grad_quats);                                                             \
+                                    first_view, end_view, first_slot, slot_count, total, capacity, records,  \
+                                    grad_means2d, {grad_means, grad_axes, grad_opacity_logits, grad_sh},     \
+                                    grad_log_scales, grad_quats);                                            \
   }
 
 KERNELS_FOR(1)

@@ -73,14 +73,26 @@ SPLAT_FN void fill_slots(const Splat& s, const Grid& grid, u32 pair, u32 first_k
 
 constexpr u32 MANY_TILES = 32;  // a splat with more is listed by the whole warp
 
-// order, offsets [pairs]: the pairs, nearest first, and the prefix sums of their counts. tile_keys,
-// pair_of_slot [slots]. counts, first_slot [v n]: the number of slots of each pair, and the first of them.
+// order, offsets [pairs]: the pairs, nearest first, and the prefix sums of their counts. total, capacity: the
+// number of slots, and of those that there is room for (see ``usable``). tile_keys, pair_of_slot [capacity].
+// counts, first_slot [v n]: the number of slots of each pair, and the first of them. ranges: see tile_ranges,
+// all of it zero after this kernel. overflowed: whether there is not enough room; report: the total and n, for
+// the host. Both may be null.
 KERNEL(BLOCK)
-tile_list(const u32* order, const u32* counts, const u32* offsets, i64 pairs, i64 n, const float4* splats,
-          i64 views, i64 height, i64 width, u32* tile_keys, u32* pair_of_slot, u32* first_slot) {
+tile_list(const u32* order, const u32* counts, const u32* offsets, const u32* total, i64 capacity, i64 pairs,
+          i64 n, const float4* splats, i64 views, i64 height, i64 width, u32* tile_keys, u32* pair_of_slot,
+          u32* first_slot, u32* ranges, bool* overflowed, u64* report) {
   const i64 k = thread_index();
   const Grid grid = make_grid(height, width);
   const u32 tiles = u32(grid.tiles_x) * u32(grid.tiles_y), sentinel = u32(views) * tiles;
+  const bool fits = i64(*total) <= capacity;
+  for (i64 i = k; i < 2 * (i64(sentinel) + 1); i += i64(gridDim.x) * blockDim.x) ranges[i] = 0;
+  if (k == 0) {
+    if (overflowed) *overflowed = !fits;
+    // The host may read at any time. A single store of eight bytes is never seen by halves.
+    if (report) *report = u64(n) << 32 | *total;
+  }
+  if (!fits) return;
   u32 pair = 0, slot = 0, count = 0;
   if (k < pairs) {
     pair = order[k], slot = offsets[k], count = counts[pair];
@@ -102,10 +114,10 @@ tile_list(const u32* order, const u32* counts, const u32* offsets, i64 pairs, i6
   }
 }
 
-// ranges [v tiles + 1, 2]: begin and end of each list among the sorted keys; the caller fills it with zeros.
-// The last list holds the slots that belong to no tile. It is empty as long as listing agrees with counting.
-KERNEL(BLOCK) tile_ranges(const u32* tile_keys, i64 slots, u32* ranges) {
-  const i64 e = thread_index();
+// ranges [v tiles + 1, 2]: begin and end of each list among the sorted keys; zeros before this kernel. The last
+// list holds the slots that belong to no tile. It is empty as long as listing agrees with counting.
+KERNEL(BLOCK) tile_ranges(const u32* tile_keys, const u32* total, i64 capacity, u32* ranges) {
+  const i64 e = thread_index(), slots = usable(total, capacity);
   if (e >= slots) return;
   const u32 key = tile_keys[e];
   if (e == 0 || tile_keys[e - 1] != key) ranges[2 * i64(key)] = u32(e);

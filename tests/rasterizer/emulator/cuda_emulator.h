@@ -165,12 +165,13 @@ inline void run_block(int threads) {
 extern "C" char __start_emulated_shared[], __stop_emulated_shared[];
 
 template <class... Parameters, size_t... I>
-void run_grid(void (*kernel)(Parameters...), unsigned blocks, int threads, uint64_t seed, void** raw,
-              std::index_sequence<I...>) {
+void run_grid(void (*kernel)(Parameters...), unsigned blocks, int threads, uint64_t seed, const char* raw,
+              size_t size, std::index_sequence<I...>) {
   static_assert(((sizeof(Parameters) == 8) && ...), "a launch is a list of eight-byte numbers");
+  if (size != 8 * sizeof...(Parameters)) throw Failure("a launch with too many or too few arguments");
   auto call = [&] {
     std::tuple<Parameters...> parameters;
-    (std::memcpy(&std::get<I>(parameters), raw[I], 8), ...);
+    (std::memcpy(&std::get<I>(parameters), raw + 8 * I, 8), ...);
     kernel(std::get<I>(parameters)...);
   };
   machine.body = [](void* f) { (*static_cast<decltype(call)*>(f))(); };
@@ -191,8 +192,9 @@ void run_grid(void (*kernel)(Parameters...), unsigned blocks, int threads, uint6
 }
 
 template <class... Parameters>
-void launch(void (*kernel)(Parameters...), unsigned blocks, int threads, uint64_t seed, void** raw) {
-  run_grid(kernel, blocks, threads, seed, raw, std::index_sequence_for<Parameters...>());
+void launch(void (*kernel)(Parameters...), unsigned blocks, int threads, uint64_t seed, const char* raw,
+            size_t size) {
+  run_grid(kernel, blocks, threads, seed, raw, size, std::index_sequence_for<Parameters...>());
 }
 
 inline int lane() { return machine.running % WARP; }

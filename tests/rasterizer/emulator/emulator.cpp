@@ -11,11 +11,11 @@ int active_mutant = 0;
 // The emulator must come first, because it defines __global__ and the like for the kernels.
 #include "cuda.cu"
 
-typedef void (*Launcher)(unsigned blocks, int threads, uint64_t seed, void** arguments);
+typedef void (*Launcher)(unsigned blocks, int threads, uint64_t seed, const char* arguments, size_t size);
 
 template <auto kernel>
-static void launch(unsigned blocks, int threads, uint64_t seed, void** arguments) {
-  emulator::launch(kernel, blocks, threads, seed, arguments);
+static void launch(unsigned blocks, int threads, uint64_t seed, const char* arguments, size_t size) {
+  emulator::launch(kernel, blocks, threads, seed, arguments, size);
 }
 
 #define ENTRY(kernel) {#kernel, launch<kernel>}
@@ -71,10 +71,13 @@ int cuModuleGetFunction(Launcher* function, void*, const char* name) {
   return NOT_FOUND;
 }
 int cuLaunchKernel(Launcher function, unsigned blocks, unsigned, unsigned, unsigned threads, unsigned,
-                   unsigned, unsigned, uint64_t stream, void** arguments, void**) {
+                   unsigned, unsigned, uint64_t stream, void** arguments, void** extra) {
   try {
     if (contexts < 1 || blocks == 0) throw emulator::Failure("no context, or no block");
-    function(blocks, int(threads), stream, arguments);
+    // The arguments are in one buffer: its address and the address of its size, each after its label.
+    if (arguments || extra[0] != (void*)1 || extra[2] != (void*)2 || extra[4])
+      throw emulator::Failure("the arguments are not packed");
+    function(blocks, int(threads), stream, (const char*)extra[1], *(size_t*)extra[3]);
     return OK;
   } catch (const std::exception& error) {
     trouble = error.what();

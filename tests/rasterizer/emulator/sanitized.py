@@ -8,23 +8,23 @@ import ctypes
 import sys
 
 import torch
-from emulation import Emulator
+from emulation import Emulator, scan_tensor, sort_tensor
 from splats import backgrounds, make_cameras, make_gaussians, make_weights, render_and_differentiate
 
-from cadam3d.rasterizer import cuda
+from cadam3d.rasterizer import cuda, cuda_sort
 
 CPU = torch.device("cpu")
-SCANNED = (1, 31, 33, 255, 257, cuda.SCAN_CHUNK, cuda.SCAN_CHUNK + 1, cuda.SCAN_SHORT + 1)
-SORTED = (1, 33, 257, cuda.SORT_CHUNK - 1, cuda.SORT_CHUNK + 1)
+SCANNED = (1, 31, 33, 255, 257, cuda_sort.SCAN_CHUNK, cuda_sort.SCAN_CHUNK + 1, cuda_sort.SCAN_SHORT + 1)
+SORTED = (1, 33, 257, cuda_sort.SORT_CHUNK - 1, cuda_sort.SORT_CHUNK + 1)
 
 
 def run_everything(emulator: Emulator) -> None:
     with emulator.on(CPU) as launch:
         for n in SCANNED:
-            assert cuda._scan(launch, torch.ones(n, dtype=torch.int32))[-1] == n - 1
+            assert scan_tensor(launch, torch.ones(n, dtype=torch.int32))[-1] == n
         for n in SORTED:
             keys = torch.arange(n, 0, -1, dtype=torch.int32)
-            assert torch.equal(cuda._sort(launch, keys, 16)[0].long(), keys.long().sort().values)
+            assert torch.equal(sort_tensor(launch, keys, 16)[0].long(), keys.long().sort().values)
     for degree in range(4):
         # One group per view, or one for all views.
         cuda.RECORD_MEMORY = 0 if degree == 1 else 256 * 2**20

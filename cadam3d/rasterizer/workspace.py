@@ -1,0 +1,57 @@
+"""Memory of kernels: many named arrays in a single allocation, which saves most of the time of allocating."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+# Arrays begin at multiples of this, as those of torch's allocator do at least.
+ALIGNMENT = 256  # bytes
+# Whether every array gets an allocation of its own. A tool that checks each access to memory cannot see that
+# a kernel leaves one array for the next one in the same block. With such a tool this variable is set anyway,
+# because otherwise torch's own allocator returns pieces of large blocks too.
+APART = os.environ.get("PYTORCH_NO_CUDA_MEMORY_CACHING") == "1"
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Named arrays without their memory: where each of them begins."""
+
+    places: Mapping[str, tuple[int, int]]  # by name: which block, and bytes from its beginning
+    sizes: Mapping[str, int]  # bytes of each array
+    blocks: tuple[int, ...]  # bytes of each block
+
+    def allocate(self, device: torch.device) -> tuple[Tensor, ...]:
+        """Return new blocks of memory, with arbitrary contents."""
+        return tuple(torch.empty(size, dtype=torch.uint8, device=device) for size in self.blocks)
+
+    def addresses(self, blocks: tuple[Tensor, ...]) -> dict[str, int]:
+        """Return the addresses of all arrays in blocks that :meth:`allocate` has returned, or in copies."""
+        starts = [block.data_ptr() for block in blocks]
+        return {name: starts[block] + offset for name, (block, offset) in self.places.items()}
+
+    def tensor(self, blocks: tuple[Tensor, ...], name: str, dtype: torch.dtype) -> Tensor:
+        """Return an array as a tensor of one dimension."""
+        (block, offset), size = self.places[name], self.sizes[name]
+        return blocks[block][offset : offset + size].view(dtype)
+
+
+def plan(**sizes: int) -> Workspace:
+    """Return a workspace with an array of so many bytes for each name."""
+    return _plan(tuple(sizes.items()), APART)
+
+
+# A training renders one size over and over again.
+@lru_cache(maxsize=256)
+def _plan(sizes: tuple[tuple[str, int], ...], apart: bool) -> Workspace:
+    if apart:
+        places = {name: (block, 0) for block, (name, _) in enumerate(sizes)}
+        return Workspace(places, dict(sizes), tuple(size for _, size in sizes))
+    places, end = {}, 0
+    for name, size in sizes:
+        places[name] = (0, end)
+        end += -(-size // ALIGNMENT) * ALIGNMENT
+    return Workspace(places, dict(sizes), (end,))
