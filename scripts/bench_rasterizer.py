@@ -18,10 +18,14 @@ from typing import NoReturn
 
 import torch
 from omegaconf import OmegaConf
+
+# The script measures the package that it stands beside, from any folder.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 from rasterizer_bench.check import check, check_long_sort
 from rasterizer_bench.report import HEADER, Report, SceneStages, make_rows, show_stages, start_report
-from rasterizer_bench.scenes import make_scene, make_shell
-from rasterizer_bench.stages import SceneTiming, copy_speed, time_stages
+from rasterizer_bench.scenes import Scene, make_scene, make_shell
+from rasterizer_bench.stages import NoKernelsError, copy_speed, time_stages
 from rasterizer_bench.timing import OUT_OF_MEMORY, take_turns
 
 from cadam3d.core.errors import UserError
@@ -164,7 +168,7 @@ def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher
             report.rows += rows
             print(*rows, sep="\n", flush=True)
             if launcher and args.stages and timings["cuda"]:
-                add_stages(report, at, time_stages(launcher, scene, args.repeats, report.copy_bytes_per_ms))
+                add_stages(report, at, launcher, scene)
             # The file is written after every scene, because a later one may exceed the memory.
             if args.json:
                 report.write(args.json)
@@ -173,8 +177,14 @@ def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher
         print(f"{sum(verdicts)} of {len(verdicts)} targets met")
 
 
-def add_stages(report: Report, at: tuple[int, int, int, int], timing: SceneTiming) -> None:
-    """Add the stages of a scene to the report, and print them."""
+def add_stages(report: Report, at: tuple[int, int, int, int], launcher: Launcher, scene: Scene) -> None:
+    """Time the stages of a scene, add them to the report, and print them."""
+    assert report.copy_bytes_per_ms is not None
+    try:
+        timing = time_stages(launcher, scene, report.settings["repeats"], report.copy_bytes_per_ms)
+    except NoKernelsError as error:
+        print(f"no stages: {error}", flush=True)
+        return
     report.stages.append(SceneStages(*at, timing.wall_ms, timing.kernel_ms, timing.stages))
     print(show_stages(timing.stages), flush=True)
 

@@ -134,7 +134,7 @@ def explain(launcher: Any, device: Any, scenes: Any, repeats: int, copied: int) 
     from dataclasses import asdict
 
     from rasterizer_bench.scenes import make_scene, make_shell
-    from rasterizer_bench.stages import copy_speed, time_stages
+    from rasterizer_bench.stages import NoKernelsError, copy_speed, time_stages
     from rasterizer_bench.timing import OUT_OF_MEMORY
 
     found, lacking, speed = [], [], copy_speed(device, copied)
@@ -146,6 +146,8 @@ def explain(launcher: Any, device: Any, scenes: Any, repeats: int, copied: int) 
         except OUT_OF_MEMORY:
             lacking.append(f"{count} Gaussians at {size} px do not fit into the memory")
             continue
+        except NoKernelsError as error:
+            return {"says": str(error), "skipped": True}
         at = {"count": count, "size": size, "views": views, "degree": degree}
         found.append(at | {"wall_ms": times.wall_ms, "kernel_ms": times.kernel_ms})
         found[-1]["stages"] = [asdict(stage) for stage in times.stages]
@@ -265,9 +267,9 @@ def _duration(launch: dict[str, Any]) -> float:
 def stages() -> dict[str, Any]:
     """Return which stage of the kernels is the first that is wrong."""
     import torch
-    from gpu_run.bisect import find_stage
 
     from cadam3d.rasterizer.cuda import load_kernels
+    from gpu_run.bisect import find_stage
 
     return find_stage(load_kernels(None), torch.device("cuda"))
 
