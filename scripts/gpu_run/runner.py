@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -34,6 +35,15 @@ class Finished:
         """Return the last line of the log that is not empty."""
         lines = [line.strip() for line in self.log.splitlines() if line.strip()]
         return lines[-1] if lines else "it printed nothing"
+
+
+def excuse(log: str) -> str | None:
+    """Return what a machine lacks for a piece that has failed; ``None`` if the log does not say so."""
+    if missing := re.findall(r"^E?\s*ModuleNotFoundError: No module named '([^']+)'", log, re.MULTILINE):
+        return f"not installed: {', '.join(dict.fromkeys(missing))}"
+    if found := re.findall(r"^.*(?:OutOfMemoryError|CUDA out of memory).*$", log, re.MULTILINE):
+        return f"not enough memory: {found[-1].strip()}"
+    return None
 
 
 # Returns a status and one line about it.
@@ -182,6 +192,8 @@ class Runner:
             status, says = ENDED, f"still running after {took:.0f} s; its last line: {finished.last_line}"
         else:
             status, says = job.piece.judge(finished)
+            if status == FAILED and not job.piece.is_gate and (reason := excuse(finished.log)):
+                status, says = SKIPPED, reason
         self._keep(job.piece, status, says, took, finished.result)
 
     def _keep(

@@ -22,12 +22,15 @@ from gpu_run.machine import (
 from gpu_run.markdown import show, verdicts
 from gpu_run.pieces import CHECKS, PARTS, Setup, plan
 from gpu_run.record import ENDED, FAILED, Record, read_record
-from gpu_run.runner import Piece, Processes, Runner
+from gpu_run.runner import RESULT, Piece, Processes, Runner
 
 AGAIN = "python scripts/gpu.py"
+FACTS = (sys.executable, "-m", "gpu_run.on_device", "facts", "--json", RESULT)
 # What a first import of torch on a slow disk may take.
 FACTS_SECONDS = 180.0
 STAGES_SECONDS = 150.0
+# Facts that results depend on, beside the files of the project.
+STATE = ("device", "driver", "torch", "python", "packages")
 
 
 class TroubleError(Exception):
@@ -92,8 +95,7 @@ class Session:
             raise TroubleError(
                 f"expected torch in {sys.executable}, got none. Try: {sys.executable} -m pip install torch"
             )
-        command = (sys.executable, "-m", "gpu_run.on_device", "facts", "--json", "{result}")
-        piece = Piece("machine", CHECKS, command, FACTS_SECONDS)
+        piece = Piece("machine", CHECKS, FACTS, FACTS_SECONDS)
         finished = self._processes.wait(self._processes.start(piece), FACTS_SECONDS)
         facts = finished.result or {"trouble": f"torch does not start: {finished.last_line}"}
         if trouble := facts.pop("trouble", None):
@@ -116,7 +118,7 @@ class Session:
 
     def _continue(self, machine: dict[str, Any]) -> Record:
         """Return the record of the folder if it still applies, and otherwise a new one."""
-        parts = [hash_sources(), *(str(machine[key]) for key in ("device", "driver", "torch", "python"))]
+        parts = [hash_sources(), *(str(machine[key]) for key in STATE)]
         state = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
         if not self._path.exists():
             return Record(machine, state)

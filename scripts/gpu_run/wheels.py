@@ -26,7 +26,7 @@ class Package:
 
 
 CHECKS, GSPLAT, DEMO, RECIPES = "checks and times", "gsplat", "the demo", "the recipes"
-# Torch brings filelock, and nearly always numpy. The order is that of the parts of a run.
+# Packages that the project does not ask for itself come with those above them. Torch brings filelock.
 PACKAGES = (
     Package("numpy", CHECKS, is_pure=False),
     Package("jaxtyping", CHECKS),
@@ -36,7 +36,6 @@ PACKAGES = (
     Package("antlr4-python3-runtime", CHECKS, bounds="==4.9.3", has_wheel=False),
     Package("packaging", CHECKS),
     Package("pyyaml", CHECKS, is_pure=False),
-    Package("tqdm", CHECKS),
     Package("pytest", CHECKS),
     Package("pluggy", CHECKS),
     Package("iniconfig", CHECKS),
@@ -50,6 +49,7 @@ PACKAGES = (
     Package("kornia-rs", DEMO, is_pure=False),
     Package("jinja2", DEMO),
     Package("markupsafe", DEMO, is_pure=False),
+    Package("tqdm", DEMO),
     Package("scipy", DEMO, is_pure=False),
     Package("imageio", DEMO),
     Package("pillow", DEMO, is_pure=False),
@@ -111,20 +111,24 @@ def describe() -> str:
 
 
 def fetching() -> list[str]:
-    """Return the lines to type for the packages that the checks and the times need."""
-    needed = [package for package in PACKAGES if package.purpose == CHECKS]
-    with_wheel = " ".join(f"'{requirement(package)}'" for package in needed if package.has_wheel)
-    without = " ".join(f"'{requirement(package)}'" for package in needed if not package.has_wheel)
-    names = " ".join(package.name for package in needed)
+    """Return the lines to type for the checks and the times, and those for one optional part."""
+
+    def named(purpose: str, has_wheel: bool) -> str:
+        chosen = [each for each in PACKAGES if (each.purpose, each.has_wheel) == (purpose, has_wheel)]
+        return " ".join(f"'{requirement(package)}'" for package in chosen)
+
     platforms = " ".join(f"--platform {platform}" for platform in PLATFORMS)
+    download = f"  pip download --only-binary=:all: --python-version {PYTHON} {platforms} --dest wheels "
+    names = " ".join(package.name for package in PACKAGES if package.purpose == CHECKS)
     return [
-        "On a machine with a registry, for the checks and the times:",
-        f"  pip download --no-deps --only-binary=:all: --python-version {PYTHON} {platforms} "
-        f"--dest wheels {with_wheel}",
-        f"  pip wheel --no-deps --wheel-dir wheels {without}",
+        "On a machine with a registry, in the folder of the project, for the checks and the times:",
+        f"  pip wheel --no-deps --wheel-dir wheels {named(CHECKS, has_wheel=False)}",
+        f"{download}--find-links wheels --constraint constraints.txt {named(CHECKS, has_wheel=True)}",
+        "For an optional part, without the packages that it shares with torch:",
+        f"{download}--no-deps {named(GSPLAT, has_wheel=True)}",
         "On the machine with the GPU, in the folder of the project:",
-        f"  python3 -m pip install --no-index --no-deps --find-links wheels --target site {names}",
+        f"  python3 -m pip install --no-index --find-links wheels --target site {names}",
         "  PYTHONPATH=site python3 scripts/gpu.py",
-        "Leave out what is installed there already. gsplat also needs nvcc, and the video of the demo "
-        "imageio-ffmpeg (30 MB or more); without them their lines of the report say so.",
+        "gsplat also needs nvcc, and the video of the demo needs imageio-ffmpeg (30 MB or more).",
+        "What is missing is named in the report and skipped.",
     ]
