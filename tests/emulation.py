@@ -120,15 +120,15 @@ def list_tiles(launcher: Launcher, gaussians: Gaussians, cameras: Cameras) -> Li
     """Project the Gaussians and return the tile lists."""
     parameters = list(gaussians.tensors().values())
     views = cuda._CudaPass(launcher, cameras, torch.device("cpu"))
-    with views.running():
+    with views:
         _, radii = views.project(parameters)
         views.blend(parameters, torch.zeros(len(cameras), 3), keeps=True)
-    (group,) = views.groups
+        (group,), kept = views.groups, views.kept
 
     def array(name: str, dtype: torch.dtype = torch.int32) -> torch.Tensor:
         if name in group.lists.places:
-            return group.lists.tensor(views.kept[group.blocks], name, dtype)
-        return views.frame.tensor(views.kept[: len(views.frame.blocks)], name, dtype)
+            return group.lists.tensor(kept[group.blocks], name, dtype)
+        return views.frame.tensor(kept, name, dtype)
 
     return Lists(
         splats=array("splats", torch.float32).view(-1, cuda.SPLAT),

@@ -18,9 +18,8 @@ everything except the projection runs on one group of views after another, with 
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
 
 import torch
 from jaxtyping import Float
@@ -31,11 +30,13 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.io.cache import kernels_dir
+from cadam3d.rasterizer import workspace
 from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.rasterizer.cuda_sort import BLOCK, scan, scan_bytes, sort, sort_bytes
 from cadam3d.rasterizer.driver import Driver
+from cadam3d.rasterizer.forecast import Forecast, find_forecast
 from cadam3d.rasterizer.launcher import Launch, Launcher
-from cadam3d.rasterizer.native import RenderPass, require_shapes, run_pass
+from cadam3d.rasterizer.native import RenderPass, require_shapes, run_pass, upload
 from cadam3d.rasterizer.workspace import Workspace, plan
 
 # The kernels define the same constants (kernels/*.cuh).
@@ -74,6 +75,17 @@ class CudaRasterizer(Rasterizer):
         _refuse_others(gaussians.device)
         return rasterize(load_kernels(self.cache_dir), gaussians, cameras, background, absgrad)
 
+    def render_ahead(
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        background: Float[Tensor, "v 3"],
+        absgrad: bool = False,
+    ) -> RenderOutput:
+        """See :meth:`Rasterizer.render_ahead`. Raises :class:`UserError` as :meth:`render` does."""
+        _refuse_others(gaussians.device)
+        return rasterize_ahead(load_kernels(self.cache_dir), gaussians, cameras, background, absgrad)
+
     def prepare(self, device: torch.device) -> Backend:
         """See :meth:`Rasterizer.prepare`."""
         _refuse_others(device)
@@ -100,26 +112,58 @@ def rasterize(
     cameras: Cameras,
     background: Float[Tensor, "v 3"],
     absgrad: bool = False,
+    capacity: int | None = None,
+    forecast: Forecast | None = None,
 ) -> RenderOutput:
-    """Render with the kernels of ``launcher``; see :meth:`Rasterizer.render`."""
+    """Render with the kernels of ``launcher``; see :meth:`Rasterizer.render`.
+
+    With a ``capacity``, memory is reserved for so many slots, and the host does not wait for their number.
+    The ``forecast`` learns the number either way.
+    """
     require_shapes(gaussians, cameras, background)
-    pixels = cameras.height * cameras.width
-    if max(len(gaussians), pixels) > MOST:
+    n, pixels, device = len(gaussians), cameras.height * cameras.width, gaussians.device
+    if max(n, pixels) > MOST:
         raise UserError(
             f"rasterizer=cuda: expected at most {MOST} Gaussians, and as many pixels in a view, got "
-            f"{len(gaussians)} and {pixels}. Try: camera.size=512"
+            f"{n} and {pixels}. Try: camera.size=512"
         )
-    return run_pass(_CudaPass(launcher, cameras, gaussians.device, absgrad), gaussians, background)
+    moved = upload((cameras.world_to_camera, cameras.intrinsics, background), device)
+    cameras = replace(cameras, world_to_camera=moved[0], intrinsics=moved[1])
+    kernels = _CudaPass(launcher, cameras, device, absgrad, capacity, forecast)
+    return run_pass(kernels, gaussians, moved[2])
+
+
+def rasterize_ahead(
+    launcher: Launcher,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    background: Float[Tensor, "v 3"],
+    absgrad: bool = False,
+) -> RenderOutput:
+    """Render with the kernels of ``launcher``; see :meth:`Rasterizer.render_ahead`."""
+    v, n = len(cameras), len(gaussians)
+    if v == 0 or n == 0:
+        return rasterize(launcher, gaussians, cameras, background, absgrad)
+    forecast = find_forecast(gaussians.device, v, cameras.height, cameras.width)
+    capacity = forecast.capacity(n)
+    tiles = _pieces(cameras.height, TILE) * _pieces(cameras.width, TILE)
+    # If the views may need several groups, their numbers of slots must be known.
+    most = MOST if v == 1 else most_slots(absgrad)
+    if capacity is None or capacity > most or v * max(n, tiles) > MOST:
+        capacity = None
+    return rasterize(launcher, gaussians, cameras, background, absgrad, capacity, forecast)
 
 
 class _CudaPass(RenderPass):
     """One call of the CUDA rasterizer; see :class:`RenderPass`."""
 
     launch: Launch
-    # Where the arrays are that live until the backward pass (``_frame_sizes``); their memory is in ``kept``.
+    # The arrays that live until the backward pass (``_frame_sizes``); their memory is in ``kept``.
     frame: Workspace
-    # The arrays that are needed until the tile lists are there (``_depth_sizes``), and their memory.
-    scratch: Workspace
+    # The addresses of the arrays of ``frame``.
+    at: dict[str, int]
+    # The addresses of the arrays that are needed until the tile lists are there (``_depth_sizes``).
+    scratch: dict[str, int]
     scratch_blocks: tuple[Tensor, ...] = ()
     # Returns the number of slots of each view, after waiting for the device.
     read_slots: Callable[[], list[int]]
@@ -132,38 +176,36 @@ class _CudaPass(RenderPass):
         device: torch.device,
         absgrad: bool = False,
         capacity: int | None = None,
+        forecast: Forecast | None = None,
     ) -> None:
         super().__init__(cameras, device, absgrad)
-        self.launcher = launcher
-        # The number of slots that memory is reserved for, before it is known. None: the host waits for it.
+        # The number of tiles of one view.
+        self.tiles = _pieces(self.height, TILE) * _pieces(self.width, TILE)
+        # The number of slots that memory is reserved for before it is known. None: the host waits for it.
         self.capacity = capacity
-        # Whether all views are expected to be one group, so that their depths can be sorted before the wait.
-        self.expects_one_group = self.views == 1
+        # This learns the number of slots, if given.
+        self.forecast = forecast
+        self._launcher = launcher
 
-    @contextmanager
-    def running(self) -> Iterator[None]:
-        """See :meth:`RenderPass.running`."""
-        with self.launcher.on(self.device) as self.launch:
-            yield
+    def __enter__(self) -> "_CudaPass":
+        self._context = self._launcher.on(self.device)
+        self.launch = self._context.__enter__()
+        return self
 
-    @property
-    def tiles(self) -> int:
-        """Return the number of tiles of one view."""
-        return _pieces(self.height, TILE) * _pieces(self.width, TILE)
+    def __exit__(self, *error: object) -> None:
+        """See :meth:`RenderPass.__exit__`."""
+        super().__exit__(*error)
+        self.scratch_blocks = ()
+        self._context.__exit__(*error)
 
     def project(self, parameters: list[Tensor]) -> tuple[Tensor, Tensor]:
         """See :meth:`RenderPass.project`; also reserves memory, and fills the arrays with a row per pair."""
-        means = parameters[0]
-        v, n = self.views, means.shape[0]
-        frame, scratch = _frame_sizes(v, n, self.height * self.width), _depth_sizes(v * n)
-        if self.capacity is not None:
-            frame |= _list_sizes(v * self.tiles, self.capacity)
-            scratch = _merged(scratch, _tile_sizes(v * self.tiles, self.capacity))
-        self.frame, self.scratch = plan(**frame), plan(**scratch)
-        self.kept, self.scratch_blocks = self.frame.allocate(self.device), self.scratch.allocate(self.device)
-        at = self.frame.addresses(self.kept)
+        v, n, pixels = self.views, parameters[0].shape[0], self.height * self.width
+        self.frame, scratch = _plan_pass(v, n, pixels, self.tiles, self.capacity, workspace.APART)
+        self.kept, self.scratch_blocks = self.frame.allocate(self.device), scratch.allocate(self.device)
+        self.at, self.scratch = self.frame.addresses(self.kept), scratch.addresses(self.scratch_blocks)
         views = (self.matrices.data_ptr(), self.intrinsics.data_ptr(), v, self.height, self.width)
-        _launch_each(self.launch, "prepare_cameras", v, BLOCK, *views, at["cameras"])
+        _launch_each(self.launch, "prepare_cameras", v, BLOCK, *views, self.at["cameras"])
         means2d, radii = self._project(parameters)
         if self.capacity is None:
             counts = self.frame.tensor(self.kept, "counts", torch.int32).view(v, n)
@@ -173,11 +215,11 @@ class _CudaPass(RenderPass):
     def _project(self, parameters: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Return ``means2d`` and ``radii``, and fill the splats, the depth keys and the counts of tiles."""
         means, *_, sh = parameters
-        v, n = self.views, means.shape[0]
+        v, n, at = self.views, means.shape[0], self.at
         means2d, radii = means.new_empty(v, n, 2), means.new_empty(v, n)
-        at, depths = self.frame.addresses(self.kept), self.scratch.addresses(self.scratch_blocks)
         inputs = (*_addresses(parameters), at["cameras"], n, v, self.height, self.width)
-        results = (at["splats"], means2d.data_ptr(), radii.data_ptr(), depths["depth_keys"], at["counts"])
+        on_screen = (means2d.data_ptr(), radii.data_ptr())
+        results = (at["splats"], *on_screen, self.scratch["depth_keys"], at["counts"])
         kernel = f"project_forward_{sh.shape[1]}"
         _launch_each(self.launch, kernel, n, PROJECT_BLOCK, *inputs, *results)
         return means2d, radii
@@ -186,47 +228,43 @@ class _CudaPass(RenderPass):
         self, parameters: list[Tensor], background: Tensor, keeps: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
         """See :meth:`RenderPass.blend`."""
-        size = (self.views, self.height, self.width)
+        size, n = (self.views, self.height, self.width), parameters[0].shape[0]
         rgb, alpha, depth = (background.new_empty(*size, *channels) for channels in ((3,), (), ()))
-        n, pixels = parameters[0].shape[0], self.height * self.width
+        images = (rgb.data_ptr(), alpha.data_ptr(), depth.data_ptr())
         self.groups = []
-        for group in self._make_groups(parameters):
-            first = group.views.start
-            at = self.frame.addresses(self.kept)
-            images = (
-                rgb.data_ptr() + 12 * pixels * first,
-                *(address + 4 * pixels * first for address in (alpha.data_ptr(), depth.data_ptr())),
-                *(at[name] + 4 * pixels * first for name in ("transmittance", "last")),
-            )
-            inputs = self._blend_inputs(group, n, background)
-            _launch_each(self.launch, "blend_forward", group.tiles * WARP, BLEND_BLOCK, *inputs, *images)
+        for group, lists in self._make_groups(parameters):
+            inputs = self._blend_inputs(group, lists, n, background)
+            pixel = group.views.start * self.height * self.width
+            results = (images[0] + 12 * pixel, images[1] + 4 * pixel, images[2] + 4 * pixel)
+            results += (self.at["transmittance"] + 4 * pixel, self.at["last"] + 4 * pixel)
+            _launch_each(self.launch, "blend_forward", group.tiles * WARP, BLEND_BLOCK, *inputs, *results)
             if keeps:
                 self.groups.append(group)
-        self.scratch_blocks = ()
         return rgb, alpha, depth
 
-    def _make_groups(self, parameters: list[Tensor]) -> Iterator["_Group"]:
-        """Yield groups of views with their tile lists."""
+    def _make_groups(self, parameters: list[Tensor]) -> Iterator[tuple["_Group", dict[str, int]]]:
+        """Yield groups of views, each with the addresses of its tile lists."""
         everything, n = slice(0, self.views), parameters[0].shape[0]
         if self.capacity is not None:
             self.overflowed = torch.empty((), dtype=torch.bool, device=self.device)
             self._order(everything, n)
-            group = _Group(everything, self.views * self.tiles, self.capacity, self.frame, slice(None))
-            yield self._list(group, n, self.scratch.addresses(self.scratch_blocks))
+            tiles = self.views * self.tiles
+            yield self._list(
+                _Group(everything, tiles, self.capacity, self.frame, slice(None)), n, self.scratch
+            )
             return
-        is_ordered = self.expects_one_group
+        # One view is always one group, so its depths can be sorted before the host waits.
+        is_ordered = self.views == 1
         if is_ordered:
             self._order(everything, n)
-        groups = self._split(self.read_slots(), n)
-        if is_ordered and len(groups) > 1:
-            # The guess was wrong, and sorting has overwritten the depth keys.
-            self._project(parameters)
-            is_ordered = False
-        for views, slots in groups:
+        counted = self.read_slots()
+        if self.forecast is not None:
+            self.forecast.learn(sum(counted), n)
+        for views, slots in self._split(counted, n):
             if not is_ordered:
                 self._order(views, n)
             tiles = (views.stop - views.start) * self.tiles
-            lists, scratch = plan(**_list_sizes(tiles, slots)), plan(**_tile_sizes(tiles, slots))
+            lists, scratch = _plan_lists(tiles, slots, workspace.APART)
             blocks, scratch_blocks = lists.allocate(self.device), scratch.allocate(self.device)
             where = slice(len(self.kept), len(self.kept) + len(blocks))
             self.kept += blocks
@@ -245,76 +283,87 @@ class _CudaPass(RenderPass):
 
     def _order(self, views: slice, n: int) -> None:
         """Sort the pairs of some views by depth, and number their slots in that order."""
-        at, depths = self.frame.addresses(self.kept), self.scratch.addresses(self.scratch_blocks)
+        at, scratch = self.at, self.scratch
         pairs, first = (views.stop - views.start) * n, 4 * views.start * n
-        order, total = depths["order"], at["totals"] + 4 * views.start
-        sort(self.launch, depths["depth_keys"] + first, order, pairs, DEPTH_BITS, _temporary(depths))
-        sums = (at["counts"] + first, depths["offsets"], pairs, depths["sums_of_chunks"], order, total)
-        scan(self.launch, *sums)
+        order, total = scratch["order"], at["totals"] + 4 * views.start
+        sort(self.launch, scratch["depth_keys"] + first, order, pairs, DEPTH_BITS, _temporary(scratch))
+        sums, counts = scratch["offsets"], at["counts"] + first
+        scan(self.launch, counts, sums, pairs, scratch["sums_of_chunks"], order, total)
 
-    def _list(self, group: "_Group", n: int, scratch: dict[str, int]) -> "_Group":
-        """Fill the tile lists of a group of views whose pairs are in order; return the group."""
-        at, depths = self.frame.addresses(self.kept), self.scratch.addresses(self.scratch_blocks)
-        lists = group.addresses(self.kept)
+    def _list(self, group: "_Group", n: int, scratch: dict[str, int]) -> tuple["_Group", dict[str, int]]:
+        """Fill the tile lists of a group of views whose pairs are in order; return it and their addresses."""
+        at, lists, ordered = self.at, group.addresses(self.kept), self.scratch
         v, first = group.views.stop - group.views.start, 4 * group.views.start * n
-        counted = (at["totals"] + 4 * group.views.start, group.capacity)
+        total, capacity = at["totals"] + 4 * group.views.start, group.capacity
         tile_keys, ranges = scratch["tile_keys"], lists["ranges"]
-        order = (depths["order"], at["counts"] + first, depths["offsets"], *counted, v * n, n)
+        order = (ordered["order"], at["counts"] + first, ordered["offsets"], total, capacity, v * n, n)
         inputs = (*order, at["splats"] + SPLAT * first, v, self.height, self.width)
         results = (tile_keys, lists["pair_of_slot"], at["first_slot"] + first, ranges)
         overflowed = 0 if self.overflowed is None else self.overflowed.data_ptr()
+        is_ahead = self.capacity is not None
+        report = self.forecast.report.data_ptr() if is_ahead and self.forecast is not None else 0
         # At least one thread is needed to clear the ranges.
-        _launch_each(self.launch, "tile_list", max(v * n, 1), BLOCK, *inputs, *results, overflowed, 0)
+        threads = max(v * n, 1)
+        _launch_each(self.launch, "tile_list", threads, BLOCK, *inputs, *results, overflowed, report)
         bits, temporary = group.tiles.bit_length(), _temporary(scratch)
-        keys = sort(self.launch, tile_keys, lists["slots"], group.capacity, bits, temporary, counted[0])
-        _launch_each(self.launch, "tile_ranges", group.capacity, BLOCK, keys, *counted, ranges)
-        return group
+        keys = sort(self.launch, tile_keys, lists["slots"], capacity, bits, temporary, total)
+        _launch_each(self.launch, "tile_ranges", capacity, BLOCK, keys, total, capacity, ranges)
+        return group, lists
 
-    def _blend_inputs(self, group: "_Group", n: int, background: Tensor) -> tuple[int, ...]:
-        at, lists, first = self.frame.addresses(self.kept), group.addresses(self.kept), group.views.start
-        where = (lists["slots"], lists["pair_of_slot"], lists["ranges"], group.tiles)
-        behind = background.data_ptr() + 12 * first
-        return (at["splats"] + 4 * SPLAT * first * n, *where, behind, self.height, self.width)
+    def _blend_inputs(
+        self, group: "_Group", lists: dict[str, int], n: int, background: Tensor
+    ) -> tuple[int, ...]:
+        first, where = (
+            group.views.start,
+            (lists["slots"], lists["pair_of_slot"], lists["ranges"], group.tiles),
+        )
+        splats, behind = self.at["splats"] + 4 * SPLAT * first * n, background.data_ptr() + 12 * first
+        return (splats, *where, behind, self.height, self.width)
 
     def blend_backward(
         self, parameters: list[Tensor], background: Tensor, images: list[Tensor | None]
     ) -> list[Tensor | None]:
         """See :meth:`RenderPass.blend_backward`."""
         means, *_, sh = parameters
-        v, n, pixels = self.views, means.shape[0], self.height * self.width
+        v, n, launch = self.views, means.shape[0], self.launch
         slots = max((group.capacity for group in self.groups), default=0)
-        scratch = plan(**_record_sizes(slots, n, self.absgrad, len(self.groups) > 1))
-        blocks = scratch.allocate(self.device)
-        at, temporary = self.frame.addresses(self.kept), scratch.addresses(blocks)
-        records, axes = temporary["records"], temporary["axes"] if len(self.groups) > 1 else 0
+        plan = _plan_records(slots, n, self.absgrad, len(self.groups) > 1, workspace.APART)
+        blocks = plan.allocate(self.device)
+        at, scratch = self.frame.addresses(self.kept), plan.addresses(blocks)
+        self.at = at
         absgrad = means.new_empty(v, n, 2) if self.absgrad else None
         grads = [means.new_empty(v, n, 2), *(torch.empty_like(tensor) for tensor in parameters)]
-        inputs = (*_addresses(parameters), at["cameras"], n, v)
-        results = _addresses(grads)
+        inputs, results = (*_addresses(parameters), at["cameras"], n, v), _addresses(grads)
         alpha, depth, grad_rgb, grad_alpha, grad_depth = images
+        records, axes = scratch["records"], scratch["axes"] if len(self.groups) > 1 else 0
+        kernel = f"project_backward_{sh.shape[1]}"
         for group in self.groups:
-            first, counted = group.views.start, (at["totals"] + 4 * group.views.start, group.capacity)
-            images_here = (
-                *(_at(image, 4 * pixels * first) for image in (alpha, depth)),
-                *(at[name] + 4 * pixels * first for name in ("transmittance", "last")),
-                _at(grad_rgb, 12 * pixels * first),
-                *(_at(image, 4 * pixels * first) for image in (grad_alpha, grad_depth)),
+            first, total, capacity = group.views.start, at["totals"] + 4 * group.views.start, group.capacity
+            pixel, pair = first * self.height * self.width, first * n
+            seen = (
+                *(_at(alpha, 4 * pixel), _at(depth, 4 * pixel)),
+                *(at["transmittance"] + 4 * pixel, at["last"] + 4 * pixel),
+                *(_at(grad_rgb, 12 * pixel), _at(grad_alpha, 4 * pixel), _at(grad_depth, 4 * pixel)),
             )
-            blend = (*self._blend_inputs(group, n, background), *images_here, records)
+            blend = (*self._blend_inputs(group, group.addresses(self.kept), n, background), *seen, records)
             # One more warp clears the slots that belong to no tile.
-            threads = (group.tiles + 1) * WARP
+            warps = (group.tiles + 1) * WARP
             if absgrad is None:
-                _launch_each(self.launch, "blend_backward", threads, BLEND_BLOCK, *blend)
+                _launch_each(launch, "blend_backward", warps, BLEND_BLOCK, *blend)
             else:
-                kernel, apart = "blend_backward_absolute", temporary["absolutes"]
-                _launch_each(self.launch, kernel, threads, BLEND_BLOCK, *blend, apart)
+                apart = scratch["absolutes"]
+                _launch_each(launch, "blend_backward_absolute", warps, BLEND_BLOCK, *blend, apart)
                 pairs = (group.views.stop - first) * n
-                which = (at["splats"] + 4 * SPLAT * first * n, at["first_slot"] + 4 * first * n)
-                which += (at["counts"] + 4 * first * n, _at(absgrad, 8 * first * n))
-                _launch_each(self.launch, "sum_absolutes", pairs, BLOCK, pairs, *counted, apart, *which)
-            sums = (at["first_slot"], at["counts"], *counted, records, axes)
+                which = (
+                    at["splats"] + 4 * SPLAT * pair,
+                    at["first_slot"] + 4 * pair,
+                    at["counts"] + 4 * pair,
+                )
+                sums = (total, capacity, apart, *which, _at(absgrad, 8 * pair))
+                _launch_each(launch, "sum_absolutes", pairs, BLOCK, pairs, *sums)
+            sums = (at["first_slot"], at["counts"], total, capacity, records, axes)
             arguments = (*inputs, first, group.views.stop, *sums, *results)
-            _launch_each(self.launch, f"project_backward_{sh.shape[1]}", n, PROJECT_BLOCK, *arguments)
+            _launch_each(launch, kernel, n, PROJECT_BLOCK, *arguments)
         grad_means2d, *others = grads
         return [grad_means2d, absgrad, *others]
 
@@ -340,6 +389,41 @@ class _Group:
     def addresses(self, kept: tuple[Tensor, ...]) -> dict[str, int]:
         """Return the addresses of the lists."""
         return self.lists.addresses(kept[self.blocks])
+
+
+@lru_cache
+def _plan_pass(
+    v: int, n: int, pixels: int, tiles: int, capacity: int | None, apart: bool
+) -> tuple[Workspace, Workspace]:
+    """Return the arrays that live until the backward pass, and those that live until there are tile lists.
+
+    Without a capacity, the arrays with a row per slot are left out.
+    """
+    frame, scratch = _frame_sizes(v, n, pixels), _depth_sizes(v * n)
+    if capacity is not None:
+        frame |= _list_sizes(v * tiles, capacity)
+        slots = _tile_sizes(v * tiles, capacity)
+        # Both sorts use the same temporary arrays, one after the other.
+        scratch = {name: max(scratch.get(name, 0), slots.get(name, 0)) for name in scratch | slots}
+    return plan(frame, apart), plan(scratch, apart)
+
+
+@lru_cache
+def _plan_lists(tiles: int, slots: int, apart: bool) -> tuple[Workspace, Workspace]:
+    """Return the tile lists of a group, and the arrays that are needed to make them."""
+    return plan(_list_sizes(tiles, slots), apart), plan(_tile_sizes(tiles, slots), apart)
+
+
+@lru_cache
+def _plan_records(slots: int, n: int, absgrad: bool, has_groups: bool, apart: bool) -> Workspace:
+    """Return the arrays that only the backward pass needs."""
+    sizes = {
+        "records": 4 * RECORD * slots,
+        "absolutes": 4 * ABSOLUTES * slots * absgrad,
+        # Gradients of the axes of each Gaussian, summed over the groups so far.
+        "axes": 36 * n * has_groups,
+    }
+    return plan(sizes, apart)
 
 
 def _frame_sizes(v: int, n: int, pixels: int) -> dict[str, int]:
@@ -387,16 +471,6 @@ def _tile_sizes(tiles: int, capacity: int) -> dict[str, int]:
     return {"tile_keys": 4 * capacity, **temporary}
 
 
-def _record_sizes(slots: int, n: int, absgrad: bool, has_groups: bool) -> dict[str, int]:
-    """Return the bytes of the arrays that only the backward pass needs."""
-    return {
-        "records": 4 * RECORD * slots,
-        "absolutes": 4 * ABSOLUTES * slots * absgrad,
-        # Gradients of the axes of each Gaussian, summed over the groups so far.
-        "axes": 36 * n * has_groups,
-    }
-
-
 def _temporary_sizes(sizes: Sequence[int]) -> dict[str, int]:
     return {f"temporary {number}": size for number, size in enumerate(sizes)}
 
@@ -404,11 +478,6 @@ def _temporary_sizes(sizes: Sequence[int]) -> dict[str, int]:
 def _temporary(scratch: dict[str, int]) -> list[int]:
     """Return the addresses of the temporary arrays of the sort."""
     return [address for name, address in scratch.items() if name.startswith("temporary")]
-
-
-def _merged(one: dict[str, int], other: dict[str, int]) -> dict[str, int]:
-    """Return all arrays of both. One that both have is used twice, one use after the other."""
-    return {name: max(one.get(name, 0), other.get(name, 0)) for name in one | other}
 
 
 def most_slots(absgrad: bool) -> int:

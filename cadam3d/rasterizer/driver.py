@@ -3,9 +3,8 @@
 import ctypes
 import struct
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import partial
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import torch
@@ -18,6 +17,9 @@ LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 OUT_OF_MEMORY = 2  # CUDA_ERROR_OUT_OF_MEMORY
 # Labels in the list of extra options of a launch: CU_LAUNCH_PARAM_END and so on.
 END, BUFFER_POINTER, BUFFER_SIZE = 0, 1, 2
+# Functions that write so many whole numbers of eight bytes into a buffer.
+MOST_ARGUMENTS = 32
+PACKERS = [struct.Struct(f"{count}q").pack_into for count in range(MOST_ARGUMENTS + 1)]
 
 
 class Driver(Launcher):
@@ -27,16 +29,23 @@ class Driver(Launcher):
         self._cache_dir = cache_dir
         self._modules: dict[int, Module] = {}
 
-    @contextmanager
-    def on(self, device: torch.device) -> Iterator[Launch]:
+    def on(self, device: torch.device) -> AbstractContextManager[Launch]:
         """See :meth:`Launcher.on`. Raises :class:`UserError` if the kernels do not compile or load."""
-        index = torch.cuda.current_device() if device.index is None else device.index
-        with torch.cuda.device(index):
-            if index not in self._modules:
-                cubin = build(self._cache_dir, torch.cuda.get_device_capability(index))
-                self._modules[index] = Module(load_driver(), index, cubin.path.read_bytes())
-            with self._modules[index].launching(torch.cuda.current_stream(index).cuda_stream) as launch:
-                yield launch
+        current = torch.cuda.current_device()
+        index = current if device.index is None else device.index
+        # Switching to another device takes longer than a launch, and usually none is needed.
+        return self._launching(index) if index == current else self._on_another(index)
+
+    @contextmanager
+    def _on_another(self, index: int) -> Iterator[Launch]:
+        with torch.cuda.device(index), self._launching(index) as launch:
+            yield launch
+
+    def _launching(self, index: int) -> AbstractContextManager[Launch]:
+        if index not in self._modules:
+            cubin = build(self._cache_dir, torch.cuda.get_device_capability(index))
+            self._modules[index] = Module(load_driver(), index, cubin.path.read_bytes())
+        return self._modules[index].launching(torch.cuda.current_stream(index).cuda_stream)
 
 
 def load_driver() -> ctypes.CDLL:
@@ -51,55 +60,97 @@ class Module:
     """Compiled kernels in the memory of one device."""
 
     def __init__(self, driver: ctypes.CDLL, index: int, cubin: bytes) -> None:
-        self._driver = driver
-        self._functions: dict[str, ctypes.c_void_p] = {}
+        self.driver, self.functions = driver, _Functions(self._find)
         self._context, self._handle, ordinal = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_int()
+        self._popped = ctypes.pointer(ctypes.c_void_p())
+        # Launch functions that are not in use at the moment.
+        self.idle: list[_Launch] = []
         self._call("cuInit", 0)
         self._call("cuDeviceGet", ctypes.byref(ordinal), index)
         # Torch uses this context too. It is never released, because it lives as long as the process.
         self._call("cuDevicePrimaryCtxRetain", ctypes.byref(self._context), ordinal)
-        with self._current():
-            self._call("cuModuleLoadData", ctypes.byref(self._handle), cubin)
-
-    @contextmanager
-    def launching(self, stream: int) -> Iterator[Launch]:
-        """Yield the launch function (see :meth:`Launcher.on`) for a stream of the device."""
-        with self._current():
-            yield partial(self._launch, ctypes.c_void_p(stream))
-
-    def _launch(
-        self, stream: ctypes.c_void_p, kernel: str, blocks: int, threads: int, *arguments: int
-    ) -> None:
-        packed = struct.pack(f"{len(arguments)}q", *arguments)
-        size = ctypes.c_size_t(len(packed))
-        extra = (ctypes.c_void_p * 5)(
-            BUFFER_POINTER, ctypes.cast(packed, ctypes.c_void_p), BUFFER_SIZE, ctypes.addressof(size), END
-        )
-        grid = (blocks, 1, 1, threads, 1, 1)
-        self._call("cuLaunchKernel", self._function(kernel), *grid, 0, stream, None, extra)
-
-    def _function(self, kernel: str) -> ctypes.c_void_p:
-        if kernel not in self._functions:
-            function = ctypes.c_void_p()
-            self._call("cuModuleGetFunction", ctypes.byref(function), self._handle, kernel.encode())
-            self._functions[kernel] = function
-        return self._functions[kernel]
-
-    @contextmanager
-    def _current(self) -> Iterator[None]:
-        # The threads of autograd may not have a context yet.
-        self._call("cuCtxPushCurrent_v2", self._context)
+        self.push()
         try:
-            yield
+            self._call("cuModuleLoadData", ctypes.byref(self._handle), cubin)
         finally:
-            self._call("cuCtxPopCurrent_v2", ctypes.byref(ctypes.c_void_p()))
+            self.pop()
+
+    def launching(self, stream: int) -> AbstractContextManager[Launch]:
+        """Return a context with the launch function (see :meth:`Launcher.on`) for a stream of the device."""
+        # Autograd runs the backward pass in another thread, and two threads must not share a buffer.
+        launch = self.idle.pop() if self.idle else _Launch(self)
+        launch.stream.value = stream
+        return launch
+
+    def _find(self, kernel: str) -> ctypes.c_void_p:
+        function = ctypes.c_void_p()
+        self._call("cuModuleGetFunction", ctypes.byref(function), self._handle, kernel.encode())
+        return function
+
+    def push(self) -> None:
+        """Make the context of the device current in this thread, which may not have one yet."""
+        self.check("cuCtxPushCurrent_v2", self.driver.cuCtxPushCurrent_v2(self._context))
+
+    def pop(self) -> None:
+        """Undo :meth:`push`."""
+        self.check("cuCtxPopCurrent_v2", self.driver.cuCtxPopCurrent_v2(self._popped))
+
+    def check(self, name: str, status: int) -> None:
+        """Raise an error that quotes the driver, unless ``status`` is 0."""
+        if status == 0:
+            return
+        message = ctypes.c_char_p()
+        self.driver.cuGetErrorString(status, ctypes.byref(message))
+        reason = (message.value or b"error").decode()
+        if status == OUT_OF_MEMORY:
+            raise MemoryError(f"rasterizer=cuda: {name}: {reason}")
+        raise UserError(f"rasterizer=cuda: {name}: {reason} ({status}). Try: rasterizer=reference")
 
     def _call(self, name: str, *arguments: object) -> None:
-        status = getattr(self._driver, name)(*arguments)
+        self.check(name, getattr(self.driver, name)(*arguments))
+
+
+class _Functions(dict[str, ctypes.c_void_p]):
+    """The handles of kernels by name, each of which the driver is asked for once."""
+
+    def __init__(self, find: Callable[[str], ctypes.c_void_p]) -> None:
+        super().__init__()
+        self._find = find
+
+    def __missing__(self, kernel: str) -> ctypes.c_void_p:
+        self[kernel] = self._find(kernel)
+        return self[kernel]
+
+
+class _Launch:
+    """Launches kernels on ``stream``, as a context in which the device is current for the driver.
+
+    The arguments are packed into one buffer, which the driver copies. So a launch takes about a microsecond
+    of Python. The driver's function has no ``argtypes``, because with them ctypes would check eleven
+    arguments each time. Therefore handles and addresses are ``c_void_p``: a bare number is passed with 32
+    bits.
+    """
+
+    def __init__(self, module: Module) -> None:
+        self.stream = ctypes.c_void_p()
+        self._module, self._functions, self._call = module, module.functions, module.driver.cuLaunchKernel
+        self._buffer, self._size = ctypes.create_string_buffer(8 * MOST_ARGUMENTS), ctypes.c_size_t()
+        buffer, size = ctypes.addressof(self._buffer), ctypes.addressof(self._size)
+        self._extra = (ctypes.c_void_p * 5)(BUFFER_POINTER, buffer, BUFFER_SIZE, size, END)
+
+    def __enter__(self) -> Launch:
+        self._module.push()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._module.pop()
+        self._module.idle.append(self)
+
+    def __call__(self, kernel: str, blocks: int, threads: int, *arguments: int) -> None:
+        count = len(arguments)
+        PACKERS[count](self._buffer, 0, *arguments)
+        self._size.value = 8 * count
+        function, stream, extra = self._functions[kernel], self.stream, self._extra
+        status = self._call(function, blocks, 1, 1, threads, 1, 1, 0, stream, None, extra)
         if status != 0:
-            message = ctypes.c_char_p()
-            self._driver.cuGetErrorString(status, ctypes.byref(message))
-            reason = (message.value or b"error").decode()
-            if status == OUT_OF_MEMORY:
-                raise MemoryError(f"rasterizer=cuda: {name}: {reason}")
-            raise UserError(f"rasterizer=cuda: {name}: {reason} ({status}). Try: rasterizer=reference")
+            self._module.check("cuLaunchKernel", status)

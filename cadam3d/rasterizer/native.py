@@ -5,8 +5,7 @@ is an ordinary node of the graph: it can retain its gradient, and a loss may use
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -42,9 +41,13 @@ class RenderPass(ABC):
         self.matrices = plain(cameras.world_to_camera.detach(), device)
         self.intrinsics = plain(cameras.intrinsics.detach(), device)
 
-    def running(self) -> AbstractContextManager[object]:
-        """Return the context in which the other methods must be called."""
-        return nullcontext()
+    def __enter__(self) -> "RenderPass":
+        """Enter the context in which the other methods must be called."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Leave that context. From here on, only autograd keeps the memory."""
+        self.kept = ()
 
     @property
     def views(self) -> int:
@@ -88,7 +91,7 @@ def run_pass(kernels: RenderPass, gaussians: Gaussians, background: Float[Tensor
     dtype, device = gaussians.means.dtype, gaussians.device
     means, *others = (plain(tensor, device) for tensor in gaussians.tensors().values())
     keeps = torch.is_grad_enabled()
-    with kernels.running():
+    with kernels:
         means2d, radii = _Project.apply(kernels, means, *(tensor.detach() for tensor in others))
         means2d = means2d.to(dtype)
         if keeps:
@@ -97,7 +100,6 @@ def run_pass(kernels: RenderPass, gaussians: Gaussians, background: Float[Tensor
         tensors = (means, *others, plain(background, device))
         probed = None if probe is None else plain(probe, device)
         images = _Blend.apply(kernels, keeps, plain(means2d, device), probed, *tensors)
-    kernels.kept = ()
     rgb, alpha, depth = (image.to(dtype) for image in images)
     return RenderOutput(
         rgb=rgb,
@@ -127,9 +129,11 @@ class _Project(torch.autograd.Function):
     def backward(ctx, grad_means2d: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
         if grad_means2d is None:
             return (None,) * 6
-        *parameters, radii = ctx.saved_tensors[:6]
-        with _resumed(ctx.kernels, ctx.saved_tensors[6:]):
-            grad_means = ctx.kernels.centre_backward(parameters, radii, grad_means2d.contiguous())
+        kernels, saved = ctx.kernels, ctx.saved_tensors
+        *parameters, radii = saved[:6]
+        with kernels:
+            kernels.kept = saved[6:]
+            grad_means = kernels.centre_backward(parameters, radii, grad_means2d.contiguous())
         return None, grad_means, None, None, None, None
 
 
@@ -150,25 +154,16 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        *parameters, background, alpha, depth = ctx.saved_tensors[:8]
+        kernels, saved = ctx.kernels, ctx.saved_tensors
+        *parameters, background, alpha, depth = saved[:8]
         images = [alpha, depth, *(None if grad is None else grad.contiguous() for grad in grads)]
-        with _resumed(ctx.kernels, ctx.saved_tensors[8:]):
-            totals = ctx.kernels.blend_backward(parameters, background, images)
+        with kernels:
+            kernels.kept = saved[8:]
+            totals = kernels.blend_backward(parameters, background, images)
         grad_background = None
         if ctx.needs_input_grad[-1] and grads[0] is not None:
             grad_background = (grads[0] * (1 - alpha)[..., None]).sum(dim=(1, 2))
         return None, None, *totals, grad_background
-
-
-@contextmanager
-def _resumed(kernels: RenderPass, kept: tuple[Tensor, ...]) -> Iterator[None]:
-    """Run kernels of the backward pass, with the memory that was kept for it."""
-    kernels.kept = kept
-    try:
-        with kernels.running():
-            yield
-    finally:
-        kernels.kept = ()
 
 
 def plain(tensor: Tensor, device: torch.device) -> Tensor:
@@ -176,6 +171,23 @@ def plain(tensor: Tensor, device: torch.device) -> Tensor:
     if tensor.dtype is torch.float32 and tensor.device == device and tensor.is_contiguous():
         return tensor
     return tensor.to(device, torch.float32).contiguous()
+
+
+def upload(tensors: Sequence[Tensor], device: torch.device) -> Sequence[Tensor]:
+    """Return the tensors as float32 on ``device``: what is on the CPU moves in one copy, without a wait.
+
+    A tensor with a gradient or on another device stays where it is.
+    """
+    moving = [t for t in tensors if t.device.type == "cpu" and not t.requires_grad]
+    if device.type == "cpu" or not moving:
+        return tensors
+    # A copy of ordinary memory would wait for the device. Torch does not give pinned memory to others before
+    # the copy is done.
+    is_pinned = device.type == "cuda"
+    packed = torch.empty(sum(t.numel() for t in moving), pin_memory=is_pinned)
+    torch.cat([t.flatten().float() for t in moving], out=packed)
+    pieces = iter(packed.to(device, non_blocking=True).split([t.numel() for t in moving]))
+    return [next(pieces).view(t.shape) if any(t is each for each in moving) else t for t in tensors]
 
 
 def require_shapes(gaussians: Gaussians, cameras: Cameras, background: Tensor) -> None:

@@ -3,7 +3,6 @@
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -39,19 +38,13 @@ class Workspace:
         return blocks[block][offset : offset + size].view(dtype)
 
 
-def plan(**sizes: int) -> Workspace:
-    """Return a workspace with an array of so many bytes for each name."""
-    return _plan(tuple(sizes.items()), APART)
-
-
-# A training renders one size over and over again.
-@lru_cache(maxsize=256)
-def _plan(sizes: tuple[tuple[str, int], ...], apart: bool) -> Workspace:
+def plan(sizes: Mapping[str, int], apart: bool) -> Workspace:
+    """Return a workspace with an array of so many bytes for each name, in one block or in one block each."""
     if apart:
-        places = {name: (block, 0) for block, (name, _) in enumerate(sizes)}
-        return Workspace(places, dict(sizes), tuple(size for _, size in sizes))
+        places = {name: (block, 0) for block, name in enumerate(sizes)}
+        return Workspace(places, sizes, tuple(sizes.values()))
     places, end = {}, 0
-    for name, size in sizes:
+    for name, size in sizes.items():
         places[name] = (0, end)
         end += -(-size // ALIGNMENT) * ALIGNMENT
-    return Workspace(places, dict(sizes), (end,))
+    return Workspace(places, sizes, (end,))

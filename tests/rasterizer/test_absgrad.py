@@ -174,7 +174,7 @@ def test_groups_of_views_give_the_same_bits_and_account_for_absgrad_memory(emula
 
     def groups(absgrad: bool) -> int:
         views = cuda._CudaPass(emulator, scene[1], torch.device("cpu"), absgrad)
-        with views.running():
+        with views:
             views.project(list(gaussians.tensors().values()))
         slots = views.read_slots()
         monkeypatch.setattr(cuda, "RECORD_MEMORY", 4 * cuda.RECORD * sum(slots))

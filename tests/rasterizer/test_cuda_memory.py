@@ -66,7 +66,7 @@ def differentiate(launcher: Launcher, scene):
 
 def slots_per_view(emulator, gaussians, cameras) -> list[int]:
     views = cuda._CudaPass(emulator, cameras, CPU)
-    with views.running():
+    with views:
         views.project(list(gaussians.tensors().values()))
     return views.read_slots()
 
@@ -151,7 +151,7 @@ def test_lists_are_kept_only_for_a_backward_pass(emulator):
     views = cuda._CudaPass(emulator, cameras, CPU)
     parameters = list(gaussians.tensors().values())
     for keeps in (False, True):
-        with views.running():
+        with views:
             views.project(parameters)
             views.blend(parameters, background, keeps)
         assert len(views.groups) == keeps

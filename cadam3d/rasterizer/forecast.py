@@ -1,0 +1,52 @@
+"""Forecast: how many slots the next render needs, so that memory is reserved without waiting for a count."""
+
+import ctypes
+from functools import cache
+
+import torch
+
+# More slots are reserved than any recent render needed, by this factor.
+MARGIN = 1.25
+# What a render needed counts less with every later one: half after 700 of them.
+DECAY = 0.999
+# At least so many slots are reserved, which take less memory than a small image.
+LEAST = 4096
+
+
+class Forecast:
+    """Predicts the slots of renders of one size from those of earlier renders of this size.
+
+    Kernels write what they have counted to ``report``, in pinned memory, which a device can write and the
+    host can read at any time. So the host never waits, and learns from a render as soon as it has been
+    counted.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        # The number of Gaussians in the upper half, that of slots in the lower half; 0 before any report.
+        self.report = torch.zeros(1, dtype=torch.int64, pin_memory=device.type == "cuda")
+        self._reported = ctypes.c_uint64.from_address(self.report.data_ptr())
+        # The largest recent number of slots per Gaussian, and the latest number of Gaussians.
+        self._density, self._gaussians = 0.0, 0
+
+    def learn(self, slots: int, gaussians: int) -> None:
+        """Take into account what a render needed."""
+        self._density = max(slots / gaussians, DECAY * self._density)
+        self._gaussians = gaussians
+
+    def capacity(self, gaussians: int) -> int | None:
+        """Return the number of slots to reserve; ``None`` if nothing is known yet."""
+        if reported := self._reported.value:
+            self.learn(reported & 0xFFFFFFFF, reported >> 32)
+        if self._gaussians == 0:
+            return None
+        # The Gaussians that are left after pruning may be the large ones.
+        wanted = int(MARGIN * self._density * max(gaussians, self._gaussians)) + LEAST
+        # Few different sizes, so that the allocator finds a freed block of the same size.
+        step = 1 << max(wanted.bit_length() - 4, 0)
+        return -(-wanted // step) * step
+
+
+@cache
+def find_forecast(device: torch.device, views: int, height: int, width: int) -> Forecast:
+    """Return the forecast for renders of one size on one device, which lives as long as the process."""
+    return Forecast(device)

@@ -1,0 +1,306 @@
+"""Measure the host time of rasterizer=cuda on a machine without a GPU, here and in another checkout.
+
+    python scripts/bench_host.py --base ../cadam3d-before
+
+A driver of a few lines, compiled at the start, accepts every launch and does nothing. Tensors on the CPU
+stand for the memory of a device. So the time is what Python, torch's autograd, the allocator and the calls of
+the driver cost, which is all that the host does. A call of this driver takes no time inside, while a real
+launch is estimated to take about two more microseconds. A torch operation on CPU tensors stands for one that
+launches a kernel of torch; a few of them compute in microseconds what a device would compute meanwhile. The
+choice of the device and its stream (``Driver.on``) and the upload of cameras are left out, because torch.cuda
+answers only where there is a device. The kernels do nothing, so the images are garbage.
+
+Times are CPU times of the process with one thread, which other load of the machine hardly changes. Both trees
+take turns. The counts are of one forward and backward pass.
+"""
+
+import argparse
+import ctypes
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parents[1]
+# Each Gaussian touches this many tiles in each view.
+TILES = 16
+WAYS = {"exact": "rasterize", "ahead": "rasterize_ahead"}
+STUB = """
+#include <string.h>
+#include <time.h>
+typedef unsigned long long u64;
+struct Kernel { char name[64]; };
+static Kernel kernels[64];
+static int known = 0, tiles = 0;
+static u64 pairs = 0;
+static u64 now() {
+  timespec time;
+  clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &time);
+  return u64(time.tv_sec) * 1000000000 + u64(time.tv_nsec);
+}
+extern "C" {
+u64 stub_launches = 0, stub_nanoseconds = 0;
+void stub_start(int of_each_pair, u64 all_pairs) { tiles = of_each_pair, pairs = all_pairs; }
+int cuInit(unsigned) { return 0; }
+int cuDeviceGet(int* device, int ordinal) { *device = ordinal; return 0; }
+int cuDevicePrimaryCtxRetain(void** context, int) { *context = &known; return 0; }
+int cuCtxPushCurrent_v2(void*) { return 0; }
+int cuCtxPopCurrent_v2(void**) { return 0; }
+int cuModuleLoadData(void** module, const void*) { *module = &known; return 0; }
+int cuModuleGetFunction(void** function, void*, const char* name) {
+  strncpy(kernels[known].name, name, 63);
+  *function = &kernels[known++];
+  return 0;
+}
+int cuLaunchKernel(Kernel* kernel, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned,
+                   void*, void** arguments, void** extra) {
+  ++stub_launches;
+  // Some numbers must make sense to the host: the tiles of each pair, the last result of the projection, and
+  // in older trees the order of the pairs, the last result of the sort, which torch uses as an index.
+  const bool is_projection = strncmp(kernel->name, "project_forward", 15) == 0;
+  if (is_projection || (arguments && strcmp(kernel->name, "sort_scatter") == 0)) {
+    const u64 begin = now();
+    const int last = is_projection ? 14 : 7;
+    unsigned* numbers = (unsigned*)(arguments ? *(u64*)arguments[last] : ((u64*)extra[1])[last]);
+    const unsigned number = is_projection ? tiles : 0;
+    for (u64 i = 0; i < pairs; ++i) numbers[i] = number;
+    stub_nanoseconds += now() - begin;
+  }
+  return 0;
+}
+int cuGetErrorString(int, const char** text) { *text = "error"; return 0; }
+}
+"""
+
+
+def main() -> None:
+    args = read_arguments()
+    if args.stub:
+        print(json.dumps(measure(args)))
+        return
+    trees = {"base": args.base, "here": HERE} if args.base else {"here": HERE}
+    with tempfile.TemporaryDirectory() as folder:
+        stub = compile_stub(Path(folder))
+        rounds = [
+            {name: start(tree, stub, args) for name, tree in trees.items()} for _ in range(args.repeats)
+        ]
+    found = summarize(rounds)
+    print(json.dumps(found, indent=2) if args.json else as_text(found, args))
+
+
+def read_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--base", type=lambda text: Path(text).resolve(), help="a checkout to compare with")
+    parser.add_argument("--count", type=int, default=20_000, help="Gaussians (default: 20000)")
+    parser.add_argument("--size", type=int, default=512, help="pixels along an edge (default: 512)")
+    parser.add_argument("--views", type=int, default=1, help="views (default: 1)")
+    parser.add_argument("--steps", type=int, default=200, help="passes in each process (default: 200)")
+    parser.add_argument("--repeats", type=int, default=5, help="processes of each tree (default: 5)")
+    parser.add_argument("--json", action="store_true", help="print numbers for programs")
+    parser.add_argument("--stub", help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+def compile_stub(folder: Path) -> Path:
+    from cadam3d.rasterizer.build import find_compiler
+
+    compiler = find_compiler()
+    if compiler is None:
+        raise SystemExit("bench_host: no C++ compiler. Try: cadam3d doctor")
+    source, library = folder / "stub.cpp", folder / "stub.so"
+    source.write_text(STUB)
+    subprocess.run(
+        [*compiler.command, "-O1", "-shared", "-fPIC", str(source), "-o", str(library)], check=True
+    )
+    return library
+
+
+def start(tree: Path, stub: Path, args: argparse.Namespace) -> dict[str, dict[str, float]]:
+    """Return what :func:`measure` returns in a process that imports the sources of ``tree``."""
+    sizes = [f"--{name}={getattr(args, name)}" for name in ("count", "size", "views", "steps")]
+    command = [sys.executable, str(Path(__file__).resolve()), f"--stub={stub}", *sizes]
+    # Freed memory stays in the process, as in torch's allocator of device memory. Only blocks of up to 32 MiB
+    # can do that.
+    memory = {"MALLOC_MMAP_THRESHOLD_": str(2**25), "MALLOC_TRIM_THRESHOLD_": str(2**40)}
+    environment = os.environ | memory | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise SystemExit(f"{tree}: {done.stderr}")
+    return json.loads(done.stdout)
+
+
+def measure(args: argparse.Namespace) -> dict[str, dict[str, float]]:
+    """Return microseconds and counts of the forward and the backward pass, for each way to render."""
+    import torch
+
+    from cadam3d.rasterizer import cuda
+
+    torch.set_num_threads(1)
+    stub = ctypes.CDLL(args.stub)
+    stub.stub_start(TILES, ctypes.c_uint64(args.views * args.count))
+    launcher = StubLauncher(stub)
+    found = {}
+    for way, function in WAYS.items():
+        if not hasattr(cuda, function):
+            continue
+        forward, backward = make_step(getattr(cuda, function), launcher, args)
+        for _ in range(20):
+            backward(forward())
+        found[way] = time_step(forward, backward, stub, args.steps) | count_step(forward, backward, stub)
+    return found
+
+
+class StubLauncher:
+    """Launches kernels with the driver of this script; any tree accepts it as a launcher."""
+
+    def __init__(self, stub: ctypes.CDLL) -> None:
+        from cadam3d.rasterizer.driver import Module
+
+        self.module = Module(stub, 0, b"")
+
+    def on(self, _) -> AbstractContextManager:
+        """Return a context with the function that launches kernels."""
+        return self.module.launching(0)
+
+
+def make_step(render: Callable, launcher, args: argparse.Namespace) -> tuple[Callable, Callable]:
+    import torch
+
+    from cadam3d.core.cameras import orbit
+    from cadam3d.core.gaussians import Gaussians
+
+    def leaf(*size: int) -> torch.Tensor:
+        return torch.zeros(args.count, *size, requires_grad=True)
+
+    gaussians = Gaussians(leaf(3), leaf(3), leaf(4), leaf(), leaf(1, 3))
+    angles = torch.zeros(args.views)
+    cameras = orbit(angles, angles, angles + 2, angles + 50, args.size, args.size)
+    background, size = torch.zeros(args.views, 3), (args.views, args.size, args.size)
+    grads = (torch.zeros(*size, 3), torch.zeros(size), torch.zeros(size))
+    leaves, engine = list(gaussians.tensors().values()), torch.autograd.Variable._execution_engine
+
+    def forward():
+        return render(launcher, gaussians, cameras, background)
+
+    def backward(output) -> None:
+        for tensor in leaves:
+            tensor.grad = None
+        # Without the checks of torch.autograd.backward, which take longer than some of our kernels.
+        engine.run_backward((output.rgb, output.alpha, output.depth), grads, False, False, (), True, True)
+
+    return forward, backward
+
+
+def time_step(forward: Callable, backward: Callable, stub: ctypes.CDLL, steps: int) -> dict[str, float]:
+    """Return medians in microseconds, without the time in which the driver makes up numbers."""
+    times, made_up = {"forward": [], "backward": []}, ctypes.c_uint64.in_dll(stub, "stub_nanoseconds")
+
+    def now() -> int:
+        return time.process_time_ns() - made_up.value
+
+    for _ in range(steps):
+        begin = now()
+        output = forward()
+        middle = now()
+        backward(output)
+        end = now()
+        times["forward"].append(middle - begin)
+        times["backward"].append(end - middle)
+    return {f"{name}_us": statistics.median(values) / 1e3 for name, values in times.items()}
+
+
+def count_step(forward: Callable, backward: Callable, stub: ctypes.CDLL) -> dict[str, float]:
+    """Return the numbers of launches, torch operations, allocations and waits of one pass."""
+    from torch.utils._python_dispatch import TorchDispatchMode
+
+    calls: Counter[str] = Counter()
+
+    class Count(TorchDispatchMode):
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            name = func.__name__.partition(".")[0]
+            # Views and aliases cost time on the host, but nothing on a device.
+            calls["operations"] += 1
+            calls["allocations"] += name in ("empty", "new_empty", "empty_like", "empty_strided", "zeros")
+            return func(*args, **(kwargs or {}))
+
+    launches = ctypes.c_uint64.in_dll(stub, "stub_launches")
+    before = launches.value
+    with Count(), counted_waits(calls):
+        backward(forward())
+    return {
+        "launches": launches.value - before,
+        **{name: calls[name] for name in ("operations", "allocations", "waits")},
+    }
+
+
+@contextmanager
+def counted_waits(calls: Counter[str]) -> Iterator[None]:
+    """Count the calls that read numbers of a tensor, each of which would wait for a device."""
+    import torch
+
+    originals = {name: getattr(torch.Tensor, name) for name in ("tolist", "item", "cpu")}
+
+    def counting(original: Callable) -> Callable:
+        def call(*args, **kwargs):
+            calls["waits"] += 1
+            return original(*args, **kwargs)
+
+        return call
+
+    for name, original in originals.items():
+        setattr(torch.Tensor, name, counting(original))
+    try:
+        yield
+    finally:
+        for name, original in originals.items():
+            setattr(torch.Tensor, name, original)
+
+
+def summarize(rounds: list[dict]) -> dict[str, object]:
+    """Return the medians over all processes, and the ratios to the exact way of the other tree."""
+    found: dict[str, dict] = {}
+    for tree, ways in rounds[0].items():
+        for way, numbers in ways.items():
+            medians = {name: statistics.median(each[tree][way][name] for each in rounds) for name in numbers}
+            found[f"{tree}, {way}"] = medians | {"sum_us": medians["forward_us"] + medians["backward_us"]}
+    if base := found.get("base, exact"):
+        for numbers in found.values():
+            numbers["to_base"] = numbers["sum_us"] / base["sum_us"]
+    return found
+
+
+def as_text(found: dict, args: argparse.Namespace) -> str:
+    """Return a table with a row for each tree and way to render."""
+    columns = (
+        "forward_us",
+        "backward_us",
+        "sum_us",
+        "to_base",
+        "launches",
+        "operations",
+        "allocations",
+        "waits",
+    )
+    scene = f"{args.count} Gaussians, {args.views} views, {args.size} px, stub driver, CPU time"
+    lines = [scene, f"{'':<14}" + "".join(f"{name:>13}" for name in columns)]
+    for name, numbers in found.items():
+        cells = (number_text(column, numbers.get(column)) for column in columns)
+        lines.append(f"{name:<14}" + "".join(f"{cell:>13}" for cell in cells))
+    return "\n".join(lines)
+
+
+def number_text(column: str, number: float | None) -> str:
+    if number is None:
+        return ""
+    return f"{number:.2f}" if column == "to_base" else f"{number:.0f}"
+
+
+if __name__ == "__main__":
+    main()
