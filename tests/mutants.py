@@ -15,27 +15,6 @@ UNUSED = "KERNELS_FOR(4)\nKERNELS_FOR(9)\nKERNELS_FOR(16)\n"
 ONLY_DEGREE_0 = "#define EMULATOR_ONLY_DEGREE_0\n"
 
 RENDERING = {
-    "no barrier in the prefix sum": (
-        "sort.cuh",
-        "    sums[t] = inclusive;\n    __syncthreads();\n  }",
-        "    sums[t] = inclusive;\n    if (!MUTANT) __syncthreads();\n  }",
-    ),
-    "a barrier that not all threads reach": (
-        "sort.cuh",
-        "  __syncthreads();  // after this",
-        "  if (t || !MUTANT) __syncthreads();  // after this",
-    ),
-    "no wait before a bin moves on": (
-        "sort.cuh",
-        "    __syncwarp();  // all",
-        "    if (!MUTANT) __syncwarp();  // all",
-    ),
-    "a bin that does not move on": ("sort.cuh", "= at + 1;", "= MUTANT ? at : at + 1;"),
-    "no barrier before bins become positions": (
-        "sort.cuh",
-        "  __syncthreads();\n  u32 position",
-        "  if (!MUTANT) __syncthreads();\n  u32 position",
-    ),
     "the last row of tiles is forgotten": (
         "tiles.cuh",
         "row <= rows.last / TILE",
@@ -101,7 +80,117 @@ ROUNDING = {
         " if (MUTANT) last += pair % 3 == 0 ? 1 : pair % 3 == 1 ? -1 : 0;",
     ),
 }
-MUTANTS = RENDERING | ABSOLUTE_GRADIENTS | ROUNDING
+SORTING = {
+    "sums that wrap around": ("sort.cuh", "a + b < a ? ALL", "a + b < a && !MUTANT ? ALL"),
+    "no barrier in the prefix sum": (
+        "sort.cuh",
+        "sums[warp] = carry;\n  __syncthreads();",
+        "sums[warp] = carry;\n  if (!MUTANT) __syncthreads();",
+    ),
+    "a barrier that not all threads reach": (
+        "sort.cuh",
+        "  __syncthreads();  // after this",
+        "  if (threadIdx.x || !MUTANT) __syncthreads();  // after this",
+    ),
+    "no barrier before the memory of sums is used again": (
+        "sort.cuh",
+        "numbers[r] = add_saturating(before, numbers[r]);",
+        "numbers[r] = add_saturating(before, numbers[r]);\n  if (MUTANT) return total;",
+    ),
+    "a sum without the blocks before": (
+        "sort.cuh",
+        "i < blockIdx.x; i += BLOCK",
+        "i < blockIdx.x && !MUTANT; i += BLOCK",
+    ),
+    "every block writes the total": (
+        "sort.cuh",
+        "threadIdx.x == 0 && share.end == u32(n)",
+        "threadIdx.x == 0 && (MUTANT || share.end == u32(n))",
+    ),
+    "a digit without its highest bit": (
+        "sort.cuh",
+        "key >> shift & (values() - 1)",
+        "key >> shift & ((values() >> MUTANT) - 1)",
+    ),
+    "votes on one bit too few": (
+        "sort.cuh",
+        "step <= DIGIT_BITS; ++step",
+        "step <= DIGIT_BITS - MUTANT; ++step",
+    ),
+    "counters that are not ready": (
+        "sort.cuh",
+        "memory[i] = 0;\n    __syncthreads();",
+        "memory[i] = 0;\n    if (!MUTANT) __syncthreads();",
+    ),
+    "counters that are not complete": (
+        "sort.cuh",
+        "      }\n    }\n    __syncthreads();\n  }\n  SPLAT_FN u32 sum",
+        "      }\n    }\n    if (!MUTANT) __syncthreads();\n  }\n  SPLAT_FN u32 sum",
+    ),
+    "a key on the wrong side of the middle": (
+        "sort.cuh",
+        "j * BLOCK < middle ?",
+        "j * BLOCK < middle + MUTANT ?",
+    ),
+    "no barrier between the columns": (
+        "sort.cuh",
+        "sums[warp][lane] = sum;\n  __syncthreads();",
+        "sums[warp][lane] = sum;\n  if (!MUTANT) __syncthreads();",
+    ),
+    "rows that were never written": (
+        "sort.cuh",
+        "n > 0 ? (n + size - 1) / size : 0;",
+        "MUTANT ? u32(blocks) : n > 0 ? (n + size - 1) / size : 0;",
+    ),
+    "counts of this block belong to those before": (
+        "sort.cuh",
+        "first + j < block ?",
+        "first + j < block + MUTANT ?",
+    ),
+    "no barrier before the totals are read": (
+        "sort.cuh",
+        "bases[i] = totals[i];\n    __syncthreads();",
+        "bases[i] = totals[i];\n    if (!MUTANT) __syncthreads();",
+    ),
+    "no barrier behind cleared bins": (
+        "sort.cuh",
+        "stage.bins[i] = 0;\n    __syncthreads();",
+        "stage.bins[i] = 0;\n    if (!MUTANT) __syncthreads();",
+    ),
+    "no wait before a bin moves on": (
+        "sort.cuh",
+        "      __syncwarp();  // all",
+        "      if (!MUTANT) __syncwarp();  // all",
+    ),
+    "a bin that does not move on": ("sort.cuh", "u16(place[r] + 1);", "u16(place[r] + !MUTANT);"),
+    "no barrier before counts become places": (
+        "sort.cuh",
+        "    __syncthreads();\n    // Counts become places",
+        "    if (!MUTANT) __syncthreads();\n    // Counts become places",
+    ),
+    "no barrier before places are read": (
+        "sort.cuh",
+        "ends[d] = u16(number); });\n    __syncthreads();",
+        "ends[d] = u16(number); });\n    if (!MUTANT) __syncthreads();",
+    ),
+    "no barrier before items replace bins": (
+        "sort.cuh",
+        "    __syncthreads();  // the bins have been read",
+        "    if (!MUTANT) __syncthreads();  // the bins have been read",
+    ),
+    "no barrier before the items are read": (
+        "sort.cuh",
+        "      }\n    __syncthreads();\n#pragma unroll 4",
+        "      }\n    if (!MUTANT) __syncthreads();\n#pragma unroll 4",
+    ),
+    "no barrier before the next chunk": (
+        "sort.cuh",
+        "    __syncthreads();  // the bases and",
+        "    if (!MUTANT) __syncthreads();  // the bases and",
+    ),
+    "bases that do not move on": ("sort.cuh", "bases[d] += ends[d];", "bases[d] += MUTANT ? 0 : ends[d];"),
+}
+MUTANTS = RENDERING | ABSOLUTE_GRADIENTS | ROUNDING | SORTING
 NUMBERS = {name: number for number, name in enumerate(MUTANTS, start=1)}
 
 

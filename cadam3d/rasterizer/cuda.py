@@ -32,7 +32,7 @@ from cadam3d.core.render import RenderOutput
 from cadam3d.io.cache import kernels_dir
 from cadam3d.rasterizer import workspace
 from cadam3d.rasterizer.base import Backend, Rasterizer
-from cadam3d.rasterizer.cuda_sort import BLOCK, scan, scan_bytes, sort, sort_bytes
+from cadam3d.rasterizer.cuda_sort import BLOCK, scan, scan_bytes, sort, sort_bytes, sort_order
 from cadam3d.rasterizer.driver import Driver
 from cadam3d.rasterizer.forecast import Forecast, find_forecast
 from cadam3d.rasterizer.launcher import Launch, Launcher
@@ -286,7 +286,7 @@ class _CudaPass(RenderPass):
         at, scratch = self.at, self.scratch
         pairs, first = (views.stop - views.start) * n, 4 * views.start * n
         order, total = scratch["order"], at["totals"] + 4 * views.start
-        sort(self.launch, scratch["depth_keys"] + first, order, pairs, DEPTH_BITS, _temporary(scratch))
+        sort_order(self.launch, scratch["depth_keys"] + first, order, pairs, DEPTH_BITS, _temporary(scratch))
         sums, counts = scratch["offsets"], at["counts"] + first
         scan(self.launch, counts, sums, pairs, scratch["sums_of_chunks"], order, total)
 

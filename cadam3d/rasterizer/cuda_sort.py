@@ -1,7 +1,7 @@
 """Prefix sums and a stable radix sort of unsigned 32-bit numbers, with the kernels of ``kernels/sort.cuh``.
 
 Arrays are passed as addresses. Temporary memory belongs to the caller: ``scan_bytes`` and ``sort_bytes``
-return how much of it is needed, one number for each array.
+return how much of it is needed, one number for each array. More numbers never need less memory.
 """
 
 from collections.abc import Sequence
@@ -9,15 +9,25 @@ from collections.abc import Sequence
 from cadam3d.rasterizer.launcher import Launch
 
 # The kernels define the same constants (kernels/device.cuh, kernels/sort.cuh).
-BLOCK = 256  # threads
-SCAN_CHUNK, SORT_CHUNK, RADIX_BITS = 2048, 4096, 8
-# One block scans up to this many numbers alone, which is faster than three launches.
-SCAN_SHORT = 8 * SCAN_CHUNK
+BLOCK, COLUMN_BLOCK, WARP = 256, 1024, 32  # threads
+SCAN_CHUNK = 2048  # numbers that a block adds at a time
+DIGIT_BITS = 11  # at most
+SORT_ITEMS = 16  # keys of one thread at a time, at most
+
+# No more blocks divide the numbers of an array among them; a block may process several chunks.
+MOST_BLOCKS = 1024
+# Fewer keys per thread use more of the device if there are not enough keys for this many blocks.
+WANTED_BLOCKS, FEWEST_ITEMS = 128, 4
+# If there are no more numbers, each block adds all of those before its own, or counts all keys, because that
+# should take less time than the launch that it saves. The counters of such a block have 16 bits.
+FEW_NUMBERS = 2**15
+# The same for the counts of all blocks.
+FEW_COUNTS = 2**15
 
 
 def scan_bytes(count: int) -> int:
     """Return the bytes of the temporary array that :func:`scan` needs for ``count`` numbers."""
-    return 0 if count <= SCAN_SHORT else 4 * _pieces(count, SCAN_CHUNK)
+    return 0 if count <= FEW_NUMBERS else 4 * _scan_blocks(count)
 
 
 def scan(
@@ -25,23 +35,35 @@ def scan(
 ) -> None:
     """Write exclusive prefix sums of ``values``, or of ``values[index]``, to ``sums``.
 
-    They saturate at the largest number. So does ``total``, if its address is given. Without an index,
-    ``sums`` may be ``values``.
+    They saturate at the largest number. So does ``total``, if its address is given. ``sums`` is another array
+    than ``values``.
     """
-    if count <= SCAN_SHORT:
-        launch("scan_short", 1, BLOCK, values, index, count, sums, total)
+    blocks = _scan_blocks(count)
+    if count <= FEW_NUMBERS:
+        launch("scan_apply", blocks, BLOCK, values, index, count, 0, sums, total)
         return
-    chunks = _pieces(count, SCAN_CHUNK)
-    launch("scan_reduce", chunks, BLOCK, values, index, count, temporary)
-    launch("scan_short", 1, BLOCK, temporary, 0, chunks, temporary, total)
-    launch("scan_apply", chunks, BLOCK, values, index, count, temporary, sums)
+    launch("scan_reduce", blocks, BLOCK, values, index, count, sums, temporary)
+    # The first kernel has brought the numbers into the order of the index.
+    inputs = (sums if index else values, 0, count, temporary)
+    launch("scan_apply", blocks, BLOCK, *inputs, sums, total)
+
+
+def digit_bits(bits: int) -> list[int]:
+    """Return the number of bits of each digit: as few digits as possible, and about equally many bits."""
+    digits = _pieces(bits, DIGIT_BITS)
+    return [(bits + number) // digits for number in reversed(range(digits))]
 
 
 def sort_bytes(capacity: int, bits: int) -> tuple[int, ...]:
     """Return the bytes of the temporary arrays that :func:`sort` needs for ``capacity`` keys."""
-    counts = _counts(capacity)
-    pairs = 4 * capacity if bits > RADIX_BITS else 0
-    return (4 * capacity, pairs, 4 * counts, scan_bytes(counts))
+    if capacity == 0:
+        return 0, 0, 0
+    digits = digit_bits(bits)
+    wanted = max(WANTED_BLOCKS, _pieces(capacity, SORT_ITEMS * BLOCK))
+    rows = min(_pieces(capacity, FEWEST_ITEMS * BLOCK), wanted, MOST_BLOCKS)
+    # One more row receives the totals.
+    counts = 0 if capacity <= FEW_NUMBERS else 4 * (rows + 1) << max(digits)
+    return 4 * capacity, 4 * capacity if len(digits) > 1 else 0, counts
 
 
 def sort(
@@ -55,29 +77,64 @@ def sort(
 ) -> int:
     """Sort unsigned keys by their lowest ``bits`` bits, and return the address of the sorted keys.
 
-    Their old positions go to ``order``; equal keys keep their order. ``keys`` is overwritten. ``total`` is
-    the address of the number of keys, which is 0 for all kernels if it exceeds ``capacity``. Without it,
-    there are ``capacity`` keys.
+    Their old positions go to ``order``; equal keys keep their order. ``keys`` is overwritten. ``total`` is the
+    address of the number of keys, which is 0 for all kernels if it exceeds ``capacity``. Without it, there
+    are ``capacity`` keys. The capacity is less than 2^31.
     """
-    other_keys, other_order, counts, sums_of_chunks = temporary
+    return _sort(launch, (keys, order, *temporary), (total, capacity), digit_bits(bits), writes_keys=True)
+
+
+def sort_order(
+    launch: Launch, keys: int, order: int, capacity: int, bits: int, temporary: Sequence[int]
+) -> None:
+    """Write only the order of :func:`sort`, which saves writing the sorted keys."""
+    _sort(launch, (keys, order, *temporary), (0, capacity), digit_bits(bits), writes_keys=False)
+
+
+def _sort(
+    launch: Launch,
+    arrays: tuple[int, ...],
+    counted: tuple[int, int],
+    digits: Sequence[int],
+    writes_keys: bool,
+) -> int:
+    keys, order, other_keys, other_order, counts = arrays
+    _, capacity = counted
     if capacity == 0:
         return keys
-    chunks, passes, old = _pieces(capacity, SORT_CHUNK), _pieces(bits, RADIX_BITS), 0
-    for number in range(passes):
-        shift = number * RADIX_BITS
-        launch("sort_count", chunks, BLOCK, keys, total, capacity, shift, chunks, counts)
-        scan(launch, counts, counts, _counts(capacity), sums_of_chunks)
+    items = min(max(_pieces(capacity, BLOCK * WANTED_BLOCKS), FEWEST_ITEMS), SORT_ITEMS)
+    blocks = min(_pieces(capacity, BLOCK * items), MOST_BLOCKS)
+    rows = counts if capacity > FEW_NUMBERS else 0
+    shift, old = 0, 0
+    for number, width in enumerate(digits):
+        rest = len(digits) - number
+        totals = counts + 4 * (blocks << width) if rows and blocks << width > FEW_COUNTS else 0
+        if rows:
+            launch("sort_count", blocks, BLOCK, keys, *counted, items, shift, width, rows)
+        if totals:
+            columns = _pieces(1 << width, WARP)
+            launch("sort_columns", columns, COLUMN_BLOCK, *counted, items, width, blocks, rows, totals)
         # The last pass writes to ``order``.
-        new = order if (passes - number) % 2 else other_order
-        inputs = (keys, old, total, capacity, shift, chunks, counts)
-        launch("sort_scatter", chunks, BLOCK, *inputs, other_keys, new)
-        keys, other_keys, old = other_keys, keys, new
+        new = order if rest % 2 else other_order
+        results = (other_keys if writes_keys or rest > 1 else 0, new)
+        inputs = (keys, old, *counted, items, shift, width, rows, totals)
+        launch("sort_scatter", blocks, BLOCK, *inputs, *results)
+        keys, other_keys, old, shift = other_keys, keys, new, shift + width
     return keys
 
 
-def _counts(capacity: int) -> int:
-    """Return how many numbers a pass of the sort counts: one per digit and chunk."""
-    return 2**RADIX_BITS * _pieces(capacity, SORT_CHUNK)
+def sorted_bytes(keys: int, bits: int, only_order: bool = False) -> int:
+    """Return the bytes that a sort reads and writes, apart from counts: a model, not a measurement.
+
+    A pass reads the keys for counting, reads keys and values for moving them, and writes both. The first pass
+    has no values to read. Few keys are counted by each block, which reads them from a cache.
+    """
+    passes, counts = len(digit_bits(bits)), keys > FEW_NUMBERS
+    return 4 * keys * (passes * (4 + counts) - 1 - only_order)
+
+
+def _scan_blocks(count: int) -> int:
+    return min(max(_pieces(count, SCAN_CHUNK), 1), MOST_BLOCKS)
 
 
 def _pieces(count: int, size: int) -> int:

@@ -167,13 +167,8 @@ class Load:
 
 
 def sorted_bytes(items: int, bits: int) -> int:
-    """Return the bytes of a sort.
-
-    A pass reads keys for counting, reads keys and values for scattering, and writes both. The first pass has
-    no values to read.
-    """
-    passes = -(-bits // cuda_sort.RADIX_BITS)
-    return items * WORD * (5 * passes - 1)
+    """Return the bytes of a sort. The sort of depths does not write the sorted keys."""
+    return cuda_sort.sorted_bytes(items, bits, only_order=bits == cuda.DEPTH_BITS)
 
 
 def stage_bytes(load: Load) -> dict[str, int]:

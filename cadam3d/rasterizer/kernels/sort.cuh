@@ -1,149 +1,430 @@
-// Prefix sums that saturate, and a stable radix sort.
+// Prefix sums that saturate, and a stable radix sort of 32-bit keys with 32-bit values.
 //
-// The sort handles eight bits per pass, least significant first. A pass counts the digits of each chunk,
-// converts the counts (digit after digit, chunk after chunk) to positions with one prefix sum, and scatters
-// the items. Within a chunk a warp owns consecutive items and ranks them by votes, so equal keys keep their
-// order.
+// The sort handles one digit of the keys per pass, least significant first. A pass counts the digits in the
+// share of each block (sort_count), adds the counts of the shares before each one (sort_columns), and then
+// moves the items to their places (sort_scatter). Within a chunk a warp owns consecutive items and ranks them
+// by votes, so equal keys keep their order. No block waits for another one within a kernel, so no result
+// depends on when a store becomes visible to other blocks: the end of a kernel is the only fence between them.
+//
+// Digits have up to 11 bits, because three passes over a depth move 13 words per key where four passes of
+// 8 bits move 18, and the number of a tile never takes more than two. The counters of the warps have 16 bits
+// and share their memory with a chunk of 8192 keys, so a block needs 44 KiB, two blocks fit into an SM (one on
+// Turing), and items leave a chunk sorted, in runs of four per digit even if all digits are random.
 #pragma once
 
 #include "device.cuh"
 
-constexpr int SCAN_ITEMS = 8;                    // consecutive items of one thread
-constexpr int SCAN_CHUNK = BLOCK * SCAN_ITEMS;   // of one block; mirrored in ../cuda_sort.py
-constexpr int RADIX_BITS = 8;                    // mirrored in ../cuda_sort.py
-constexpr int BINS = 1 << RADIX_BITS;            // one thread of a block per bin
-constexpr int WARPS = BLOCK / WARP;              // of a block
-constexpr int SORT_ROUNDS = 16;                  // items of one thread
-constexpr int SORT_CHUNK = BLOCK * SORT_ROUNDS;  // of one block; mirrored in ../cuda_sort.py
-static_assert(BINS == BLOCK, "a thread per bin");
+typedef unsigned short u16;
+
+constexpr int WARPS = BLOCK / WARP;             // of a block
+constexpr int SCAN_ITEMS = 8;                   // of one thread
+constexpr int SCAN_CHUNK = BLOCK * SCAN_ITEMS;  // items that a block adds at a time; mirrored in ../cuda_sort.py
+constexpr int DIGIT_BITS = 11;                  // at most; mirrored in ../cuda_sort.py
+constexpr int DIGITS = 1 << DIGIT_BITS;         // at most
+constexpr int SORT_ITEMS = 16;                  // of one thread, at most; mirrored in ../cuda_sort.py
+constexpr int SORT_CHUNK = BLOCK * SORT_ITEMS;  // items that a block sorts at a time, at most
+constexpr int COLUMN_BLOCK = 1024;              // threads of sort_columns; mirrored in ../cuda_sort.py
+constexpr int COLUMN_ROWS = 32;                 // rows of one warp there, so 1024 rows at most
+static_assert(DIGITS == BLOCK * SCAN_ITEMS, "a block scans all digits at once");
 
 // Returns a + b, or the largest number if that needs more than 32 bits. So a total that is too large is never
 // mistaken for a small one.
 SPLAT_FN u32 add_saturating(u32 a, u32 b) { return a + b < a ? ALL : a + b; }
 
-// Returns the sum over the threads before this one; ``total`` is the sum over all threads of the block.
-// ``sums`` is shared memory for BLOCK numbers.
-SPLAT_FN u32 block_scan(u32 value, u32* sums, u32* total) {
-  const int t = int(threadIdx.x);
-  u32 inclusive = value;
-  sums[t] = inclusive;
-  __syncthreads();
-  for (int reach = 1; reach < BLOCK; reach *= 2) {
-    const u32 before = t >= reach ? sums[t - reach] : 0;
-    __syncthreads();
-    inclusive = add_saturating(inclusive, before);
-    sums[t] = inclusive;
-    __syncthreads();
-  }
-  *total = sums[BLOCK - 1];
-  const u32 exclusive = t > 0 ? sums[t - 1] : 0;
-  __syncthreads();  // after this, the shared memory may be used again
-  return exclusive;
+// The items are divided among the blocks into shares of as many whole chunks each; the last blocks may have
+// less or nothing. There are fewer than 2^31 items, so the end of a share fits into 32 bits.
+SPLAT_FN u32 share_size(u32 n, u32 blocks, u32 chunk) {
+  const u32 chunks = (n + chunk - 1) / chunk;
+  return (chunks + blocks - 1) / blocks * chunk;
 }
 
-// Item i of the numbers to add: in[i], or in[index[i]] if there is an index.
-SPLAT_FN u32 item_at(const u32* in, const u32* index, i64 i) { return in[index ? i64(index[i]) : i]; }
+struct Share {
+  u32 begin, end;  // empty if begin >= end
+};
 
-// Exclusive prefix sums of one chunk, all increased by ``carry``; returns the sum of the chunk. Without an
-// index, ``out`` may be ``in``, because each thread reads and writes only its own items.
-SPLAT_FN u32 scan_chunk(const u32* in, const u32* index, i64 begin, i64 n, u32 carry, u32* out, u32* sums) {
-  const i64 first = begin + i64(threadIdx.x) * SCAN_ITEMS;
-  const i64 end = first + SCAN_ITEMS < n ? first + SCAN_ITEMS : n;
-  u32 sum = 0, total;
-  for (i64 i = first; i < end; ++i) sum = add_saturating(sum, item_at(in, index, i));
-  u32 before = add_saturating(carry, block_scan(sum, sums, &total));
-  for (i64 i = first; i < end; ++i) {
-    const u32 item = item_at(in, index, i);
-    out[i] = before;
-    before = add_saturating(before, item);
+SPLAT_FN Share share_of_block(u32 n, u32 chunk) {
+  const u32 size = share_size(n, gridDim.x, chunk), begin = blockIdx.x * size;
+  return {begin, begin + size < n ? begin + size : n};
+}
+
+// Number r of a thread, of ``rounds`` each: consecutive numbers of a warp belong to consecutive lanes.
+SPLAT_FN u32 striped(int r, int rounds) {
+  return u32((int(threadIdx.x) / WARP * rounds + r) * WARP + lane_index());
+}
+
+// Replaces the numbers of a block by the sums of those before them, in the order of ``striped``, and returns
+// the sum of all. ``sums`` is shared memory for WARPS numbers.
+SPLAT_FN u32 block_scan(u32 (&numbers)[SCAN_ITEMS], int rounds, u32* sums) {
+  const int lane = lane_index(), warp = int(threadIdx.x) / WARP;
+  u32 carry = 0;
+#pragma unroll
+  for (int r = 0; r < SCAN_ITEMS; ++r) {
+    if (r >= rounds) break;
+    u32 inclusive = numbers[r];
+#pragma unroll
+    for (int reach = 1; reach < WARP; reach *= 2) {
+      const u32 below = __shfl_sync(ALL, inclusive, (lane - reach) & (WARP - 1));
+      if (lane >= reach) inclusive = add_saturating(inclusive, below);
+    }
+    const u32 before = __shfl_sync(ALL, inclusive, (lane - 1) & (WARP - 1));
+    numbers[r] = lane > 0 ? add_saturating(carry, before) : carry;
+    carry = add_saturating(carry, __shfl_sync(ALL, inclusive, WARP - 1));
   }
+  if (lane == 0) sums[warp] = carry;
+  __syncthreads();
+  u32 before = 0, total = 0;
+#pragma unroll
+  for (int w = 0; w < WARPS; ++w) {
+    if (w == warp) before = total;
+    total = add_saturating(total, sums[w]);
+  }
+#pragma unroll
+  for (int r = 0; r < SCAN_ITEMS; ++r) numbers[r] = add_saturating(before, numbers[r]);
+  __syncthreads();  // after this, the shared memory may be used again
   return total;
 }
 
-// One block loops over all chunks. This is for short arrays, and in place for the sums of chunks. ``index`` and
-// ``grand_total`` may be null.
-KERNEL(BLOCK) scan_short(const u32* in, const u32* index, i64 n, u32* out, u32* grand_total) {
-  __shared__ u32 shared[BLOCK];
-  u32 carry = 0;
-  for (i64 begin = 0; begin < n; begin += SCAN_CHUNK)
-    carry = add_saturating(carry, scan_chunk(in, index, begin, n, carry, out, shared));
-  if (grand_total && threadIdx.x == 0) *grand_total = carry;
+// Returns the sum of one number of each thread.
+SPLAT_FN u32 block_sum(u32 number, u32* sums) {
+  u32 numbers[SCAN_ITEMS] = {number};
+  return block_scan(numbers, 1, sums);
 }
 
-// A long array needs three kernels: the sums of the chunks, their prefix sums (scan_short), then each chunk.
-KERNEL(BLOCK) scan_reduce(const u32* in, const u32* index, i64 n, u32* sums) {
-  __shared__ u32 shared[BLOCK];
-  const i64 first = i64(blockIdx.x) * SCAN_CHUNK + i64(threadIdx.x) * SCAN_ITEMS;
-  u32 sum = 0, total;
-  for (int i = 0; i < SCAN_ITEMS; ++i)
-    sum = add_saturating(sum, first + i < n ? item_at(in, index, first + i) : 0);
-  block_scan(sum, shared, &total);
+// Loads the numbers of a chunk in the order of ``striped``, and zeros behind ``end``: in[i], or in[index[i]].
+SPLAT_FN void load_chunk(const u32* in, const u32* index, u32 begin, u32 end, u32 (&numbers)[SCAN_ITEMS]) {
+  u32 at[SCAN_ITEMS];
+#pragma unroll
+  for (int r = 0; r < SCAN_ITEMS; ++r) {
+    at[r] = begin + striped(r, SCAN_ITEMS);
+    if (index && at[r] < end) at[r] = index[at[r]];
+  }
+#pragma unroll
+  for (int r = 0; r < SCAN_ITEMS; ++r)
+    numbers[r] = begin + striped(r, SCAN_ITEMS) < end ? in[at[r]] : 0;
+}
+
+SPLAT_FN void store_chunk(const u32 (&numbers)[SCAN_ITEMS], u32 begin, u32 end, u32* out) {
+#pragma unroll
+  for (int r = 0; r < SCAN_ITEMS; ++r) {
+    const u32 i = begin + striped(r, SCAN_ITEMS);
+    if (i < end) out[i] = numbers[r];
+  }
+}
+
+// sums [blocks]: the sum of the share of each block. If there is an index, ``gathered`` receives the numbers
+// in its order, so that the next kernel reads them in a row.
+KERNEL(BLOCK)
+scan_reduce(const u32* __restrict__ in, const u32* __restrict__ index, i64 n, u32* __restrict__ gathered,
+            u32* __restrict__ sums) {
+  __shared__ u32 shared[WARPS];
+  const Share share = share_of_block(u32(n), SCAN_CHUNK);
+  u32 sum = 0;
+  for (u32 begin = share.begin; begin < share.end; begin += SCAN_CHUNK) {
+    u32 numbers[SCAN_ITEMS];
+    load_chunk(in, index, begin, share.end, numbers);
+#pragma unroll
+    for (int r = 0; r < SCAN_ITEMS; ++r) sum = add_saturating(sum, numbers[r]);
+    if (index) store_chunk(numbers, begin, share.end, gathered);
+  }
+  const u32 total = block_sum(sum, shared);
   if (threadIdx.x == 0) sums[blockIdx.x] = total;
 }
 
-KERNEL(BLOCK) scan_apply(const u32* in, const u32* index, i64 n, const u32* sums, u32* out) {
-  __shared__ u32 shared[BLOCK];
-  scan_chunk(in, index, i64(blockIdx.x) * SCAN_CHUNK, n, sums[blockIdx.x], out, shared);
+// Exclusive prefix sums, and the sum of all numbers in ``total``, which may be null. ``sums`` are the results of
+// scan_reduce with the same grid. If ``sums`` is null, each block adds all numbers before its share itself,
+// which saves a launch for short arrays. ``out`` may be ``in`` if there are ``sums`` and no index, because then
+// each thread reads only the numbers that it replaces.
+KERNEL(BLOCK)
+scan_apply(const u32* in, const u32* index, i64 n, const u32* sums, u32* out, u32* total) {
+  __shared__ u32 shared[WARPS];
+  const Share share = share_of_block(u32(n), SCAN_CHUNK);
+  if (share.begin >= share.end && n > 0) return;
+  u32 before = 0, numbers[SCAN_ITEMS];
+  if (sums) {
+    for (u32 i = threadIdx.x; i < blockIdx.x; i += BLOCK) before = add_saturating(before, sums[i]);
+  } else {
+    for (u32 begin = 0; begin < share.begin; begin += SCAN_CHUNK) {
+      load_chunk(in, index, begin, share.begin, numbers);
+#pragma unroll
+      for (int r = 0; r < SCAN_ITEMS; ++r) before = add_saturating(before, numbers[r]);
+    }
+  }
+  u32 carry = block_sum(before, shared);
+  for (u32 begin = share.begin; begin < share.end; begin += SCAN_CHUNK) {
+    load_chunk(in, index, begin, share.end, numbers);
+    const u32 sum = block_scan(numbers, SCAN_ITEMS, shared);
+#pragma unroll
+    for (int r = 0; r < SCAN_ITEMS; ++r) numbers[r] = add_saturating(carry, numbers[r]);
+    store_chunk(numbers, begin, share.end, out);
+    carry = add_saturating(carry, sum);
+  }
+  if (total && threadIdx.x == 0 && share.end == u32(n)) *total = carry;
 }
 
-SPLAT_FN u32 digit_of(u32 key, i64 shift) { return (key >> shift) & (BINS - 1); }
+// Some bits of a key.
+struct Digit {
+  int shift, bits;
+  SPLAT_FN Digit(i64 shift, i64 bits) : shift(int(shift)), bits(int(bits)) {}
+  SPLAT_FN u32 values() const { return 1u << bits; }
+  SPLAT_FN u32 of(u32 key) const { return key >> shift & (values() - 1); }
+  // The values are divided among the threads of a block in the order of ``striped``. This is the number of
+  // values of a thread. If there are more threads than values, some have none, and their value is too large.
+  SPLAT_FN int rounds() const { return values() > BLOCK ? int(values() / BLOCK) : 1; }
+};
 
-// counts [BINS chunks]. For ``total`` and ``capacity`` see ``usable``.
-KERNEL(BLOCK)
-sort_count(const u32* keys, const u32* total, i64 capacity, i64 shift, i64 chunks, u32* counts) {
-  __shared__ u32 bins[BINS];
-  const i64 n = usable(total, capacity);
-  const int t = int(threadIdx.x);
-  bins[t] = 0;
-  __syncthreads();
-  const i64 begin = i64(blockIdx.x) * SORT_CHUNK;
-  for (int round = 0; round < SORT_ROUNDS; ++round) {
-    const i64 i = begin + round * BLOCK + t;
-    if (i < n) atomicAdd(&bins[digit_of(keys[i], shift)], 1u);
+// Counters of digits in shared memory. Many keys may have the same digit, and atomics on one address wait for
+// one another. So the lanes of a warp spread over copies of each counter, as many as there is memory for.
+struct Counters {
+  static constexpr int SIZE = 4 * DIGITS;
+  u32* memory;  // SIZE numbers
+  int copies;
+
+  SPLAT_FN Counters(u32* memory, Digit digit) : memory(memory) {
+    const int most = SIZE >> digit.bits;
+    copies = most < WARP ? most : WARP;
+    for (int i = int(threadIdx.x); i < int(digit.values()) * copies; i += BLOCK) memory[i] = 0;
+    __syncthreads();
   }
-  __syncthreads();
-  counts[t * chunks + blockIdx.x] = bins[t];
+  // Counts the keys in [begin, end): those before ``middle`` in the lower half of a counter, if it is not
+  // ``end``, and all others in the upper half.
+  SPLAT_FN void count(const u32* keys, u32 begin, u32 middle, u32 end, Digit digit) {
+    constexpr int BATCH = 16;
+    const int copy = lane_index() & (copies - 1);
+    for (u32 first = begin + threadIdx.x; first < end; first += BATCH * BLOCK) {
+      const int rest = int(end - first);
+      u32 loaded[BATCH];
+#pragma unroll
+      for (int j = 0; j < BATCH; ++j) loaded[j] = j * BLOCK < rest ? (keys + first)[j * BLOCK] : 0;
+#pragma unroll
+      for (int j = 0; j < BATCH; ++j) {
+        u32* const counter = memory + int(digit.of(loaded[j])) * copies + copy;
+        if (j * BLOCK < rest) atomicAdd(counter, first + j * BLOCK < middle ? 1u : 1u << 16);
+      }
+    }
+    __syncthreads();
+  }
+  SPLAT_FN u32 sum(u32 value) const {
+    u32 sum = 0;
+    for (int copy = 0; copy < copies; ++copy) sum += memory[int(value) * copies + copy];
+    return sum;
+  }
+};
+
+// counts [blocks values]: how often each value of the digit occurs in the share of each block. A block without
+// a share writes nothing. For ``count`` and ``capacity`` see ``usable``; ``items`` is the number of items of a
+// thread in a chunk.
+KERNEL(BLOCK)
+sort_count(const u32* __restrict__ keys, const u32* __restrict__ count, i64 capacity, i64 items, i64 shift,
+           i64 bits, u32* __restrict__ counts) {
+  __shared__ u32 shared[Counters::SIZE];
+  const Digit digit(shift, bits);
+  const Share share = share_of_block(u32(usable(count, capacity)), u32(items) * BLOCK);
+  if (share.begin >= share.end) return;
+  Counters counters(shared, digit);
+  counters.count(keys, share.begin, share.end, share.end, digit);
+  for (u32 d = threadIdx.x; d < digit.values(); d += BLOCK)
+    counts[blockIdx.x * digit.values() + d] = counters.sum(d);
 }
 
-// ``positions`` are the prefix sums of the counts. If ``values`` is null, the value of an item is its index.
+// Replaces the counts of each block by the sums over the blocks before it; totals [values]: the sums over all
+// blocks. A lane handles one value, and a warp 32 of the blocks, of which there are at most
+// 1024.
+KERNEL(COLUMN_BLOCK)
+sort_columns(const u32* __restrict__ count, i64 capacity, i64 items, i64 bits, i64 blocks,
+             u32* __restrict__ counts, u32* __restrict__ totals) {
+  __shared__ u32 sums[WARP][WARP];
+  const int lane = lane_index(), warp = int(threadIdx.x) / WARP;
+  const u32 n = u32(usable(count, capacity)), size = share_size(n, u32(blocks), u32(items) * BLOCK);
+  const u32 rows = n > 0 ? (n + size - 1) / size : 0;  // the other blocks have written nothing
+  const u32 values = 1u << bits, d = blockIdx.x * WARP + u32(lane), first = u32(warp) * COLUMN_ROWS;
+  u32 numbers[COLUMN_ROWS], sum = 0;
+#pragma unroll
+  for (int r = 0; r < COLUMN_ROWS; ++r)
+    numbers[r] = d < values && first + r < rows ? counts[(first + r) * values + d] : 0;
+#pragma unroll
+  for (int r = 0; r < COLUMN_ROWS; ++r) sum += numbers[r];
+  sums[warp][lane] = sum;
+  __syncthreads();
+  u32 before = 0, total = 0;
+  for (int w = 0; w < WARP; ++w) {
+    if (w == warp) before = total;
+    total += sums[w][lane];
+  }
+#pragma unroll
+  for (int r = 0; r < COLUMN_ROWS; ++r) {
+    if (d < values && first + r < rows) counts[(first + r) * values + d] = before;
+    before += numbers[r];
+  }
+  if (warp == 0 && d < values) totals[d] = total;
+}
+
+// Shared memory of sort_scatter, for three purposes in turn.
+union Stage {
+  u32 counters[Counters::SIZE];
+  u16 bins[WARPS * DIGITS];  // of each warp and value: the number of items, and then the place of the first
+  struct {
+    u32 keys[SORT_CHUNK], values[SORT_CHUNK];
+  } sorted;
+};
+
+// Writes to bases [values] the position of the first item of this block with each value of the digit.
+//
+// If there are ``totals``, sort_columns has added the ``counts``. If not, each block adds the counts of all
+// blocks itself, and without ``counts`` it counts the keys of all blocks itself. Both save a launch, which would
+// take longer if the keys are few. A block counts at most 2^15 keys, so a half of a counter is enough.
+SPLAT_FN void find_bases(const u32* keys, u32 n, u32 chunk, Share share, Digit digit, const u32* counts,
+                         const u32* totals, u32* memory, u32* bases, u32* sums) {
+  const u32 values = digit.values(), block = blockIdx.x;
+  const int rounds = digit.rounds();
+  int stride = 1;  // of the sums over the blocks before this one, in ``memory``
+  if (!counts) {
+    Counters counters(memory, digit);
+    counters.count(keys, 0, share.begin, n, digit);
+    stride = counters.copies;
+    for (int r = 0; r < rounds; ++r) {
+      const u32 d = striped(r, rounds);
+      if (d >= values) continue;
+      const u32 halves = counters.sum(d);
+      memory[int(d) * stride] = halves & 0xffff;
+      bases[d] = (halves & 0xffff) + (halves >> 16);
+    }
+  } else if (!totals) {
+    constexpr int BATCH = 16;
+    const u32 size = share_size(n, gridDim.x, chunk), rows = (n + size - 1) / size;
+    for (int r = 0; r < rounds; ++r) {
+      const u32 d = striped(r, rounds);
+      if (d >= values) continue;
+      u32 before = 0, all = 0;
+      for (u32 first = 0; first < rows; first += BATCH) {
+        u32 loaded[BATCH];
+#pragma unroll
+        for (int j = 0; j < BATCH; ++j) loaded[j] = first + j < rows ? counts[(first + j) * values + d] : 0;
+#pragma unroll
+        for (int j = 0; j < BATCH; ++j) {
+          before += first + j < block ? loaded[j] : 0;
+          all += loaded[j];
+        }
+      }
+      memory[d] = before, bases[d] = all;
+    }
+  } else {
+    for (u32 i = threadIdx.x; i < values; i += BLOCK)
+      memory[i] = counts[block * values + i], bases[i] = totals[i];
+    __syncthreads();
+  }
+  u32 numbers[SCAN_ITEMS];
+#pragma unroll
+  for (int r = 0; r < SCAN_ITEMS; ++r) {
+    const u32 d = striped(r, rounds);
+    numbers[r] = r < rounds && d < values ? bases[d] : 0;
+  }
+  block_scan(numbers, rounds, sums);
+#pragma unroll
+  for (int r = 0; r < SCAN_ITEMS; ++r) {
+    const u32 d = striped(r, rounds);
+    if (r < rounds && d < values) bases[d] = numbers[r] + memory[int(d) * stride];
+  }
+  __syncthreads();
+}
+
+// Returns the lanes of the warp that have the same value of a digit as this one, among those with an item.
+SPLAT_FN u32 find_peers(u32 value, bool is_item, Digit digit) {
+  u32 peers = __ballot_sync(ALL, is_item);
+#pragma unroll
+  for (int step = 1; step <= DIGIT_BITS; ++step) {
+    // Bits behind the last one change nothing. They are skipped, though not one by one, which would take longer.
+    if ((step == 8 || step == 10) && step > digit.bits) break;
+    const u32 is_set = value & digit.values() >> step, votes = __ballot_sync(ALL, is_set);
+    peers &= is_set ? votes : ~votes;
+  }
+  return peers;
+}
+
+// Moves each item to its position in the order of one digit. If ``values`` is null, the value of an item is its
+// index; if ``sorted_keys`` is null, only the values are needed. See ``find_bases`` for counts and totals.
 KERNEL(BLOCK)
-sort_scatter(const u32* keys, const u32* values, const u32* total, i64 capacity, i64 shift, i64 chunks,
-             const u32* positions, u32* sorted_keys, u32* sorted_values) {
-  __shared__ u32 bins[WARPS][BINS];  // first the number of items, then the position of the next one
-  const int t = int(threadIdx.x), lane = lane_index(), warp = t / WARP;
-  const i64 n = usable(total, capacity);
-  for (int w = 0; w < WARPS; ++w) bins[w][t] = 0;
-  __syncthreads();
-  const i64 begin = i64(blockIdx.x) * SORT_CHUNK + warp * (WARP * SORT_ROUNDS) + lane;
-  for (int round = 0; round < SORT_ROUNDS; ++round) {
-    const i64 i = begin + round * WARP;
-    if (i < n) atomicAdd(&bins[warp][digit_of(keys[i], shift)], 1u);
-  }
-  __syncthreads();
-  u32 position = positions[t * chunks + blockIdx.x];
-  for (int w = 0; w < WARPS; ++w) {
-    const u32 count = bins[w][t];
-    bins[w][t] = position;
-    position += count;
-  }
-  __syncthreads();
-  for (int round = 0; round < SORT_ROUNDS; ++round) {
-    const i64 i = begin + round * WARP;
-    const bool is_item = i < n;
-    const u32 key = is_item ? keys[i] : 0, digit = digit_of(key, shift);
-    u32 peers = __ballot_sync(ALL, is_item);  // lanes with the same digit
-    for (int bit = 0; bit < RADIX_BITS; ++bit) {
-      const bool is_set = (digit >> bit) & 1;
-      const u32 votes = __ballot_sync(ALL, is_set);
-      peers &= is_set ? votes : ~votes;
+sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const u32* __restrict__ count,
+             i64 capacity, i64 items, i64 shift, i64 bits, const u32* __restrict__ counts,
+             const u32* __restrict__ totals, u32* __restrict__ sorted_keys,
+             u32* __restrict__ sorted_values) {
+  __shared__ Stage stage;
+  __shared__ u32 bases[DIGITS];  // the position of the next item with a value, minus its place in the chunk
+  __shared__ u16 ends[DIGITS];   // the place behind the last item with a value
+  __shared__ u32 sums[WARPS];
+  const Digit digit(shift, bits);
+  const int t = int(threadIdx.x), lane = lane_index(), warp = t / WARP, rounds = int(items);
+  const u32 n = u32(usable(count, capacity)), size = u32(rounds) * BLOCK;
+  const Share share = share_of_block(n, size);
+  if (share.begin >= share.end) return;
+  find_bases(keys, n, size, share, digit, counts, totals, stage.counters, bases, sums);
+  for (u32 chunk = share.begin; chunk < share.end; chunk += size) {
+    const int many = int(chunk + size < share.end ? size : share.end - chunk);  // items of the chunk
+    const int begin = warp * rounds * WARP + lane, mine = many - begin;
+    const u32 first = chunk + u32(begin);  // item of this thread; the next ones follow at a distance of WARP
+    u32 key[SORT_ITEMS], value[SORT_ITEMS], place[SORT_ITEMS];
+#pragma unroll
+    for (int r = 0; r < SORT_ITEMS; ++r)
+      key[r] = r < rounds && r * WARP < mine ? (keys + first)[r * WARP] : 0;
+#pragma unroll
+    for (int r = 0; r < SORT_ITEMS; ++r)
+      value[r] = values && r < rounds && r * WARP < mine ? (values + first)[r * WARP] : first + r * WARP;
+    for (int i = t; i < int(digit.values()) * WARPS; i += BLOCK) stage.bins[i] = 0;
+    __syncthreads();
+    // The rank of each item among those of its warp with the same digit.
+    u16* const bins = stage.bins + warp * int(digit.values());
+#pragma unroll
+    for (int r = 0; r < SORT_ITEMS; ++r) {
+      place[r] = 0;
+      if (r >= rounds) continue;
+      const bool is_item = r * WARP < mine;
+      const u32 d = digit.of(key[r]), peers = find_peers(d, is_item, digit);
+      place[r] = bins[d] + u32(__popc(peers & ((1u << lane) - 1)));
+      __syncwarp();  // all lanes have read before the last of the peers advances the bin
+      if (is_item && peers >> lane == 1) bins[d] = u16(place[r] + 1);
+      __syncwarp();
     }
-    const u32 at = bins[warp][digit] + u32(__popc(peers & ((1u << lane) - 1)));
-    __syncwarp();  // all lanes have read before the last of the peers advances the bin
-    if (is_item && peers >> lane == 1) bins[warp][digit] = at + 1;
-    __syncwarp();
-    if (is_item) {
-      sorted_keys[at] = key;
-      sorted_values[at] = values ? values[i] : u32(i);
+    __syncthreads();
+    // Counts become places: value after value, and warp after warp.
+    u32 numbers[SCAN_ITEMS] = {};
+    const auto each_own = [&](const auto& visit) {
+#pragma unroll
+      for (int r = 0; r < SCAN_ITEMS; ++r) {
+        const u32 d = striped(r, digit.rounds());
+        if (r < digit.rounds() && d < digit.values()) visit(d, numbers[r]);
+      }
+    };
+#pragma unroll 1
+    for (int w = 0; w < WARPS; ++w)
+      each_own([&](u32 d, u32& number) { number += stage.bins[w * int(digit.values()) + int(d)]; });
+    block_scan(numbers, digit.rounds(), sums);
+    each_own([&](u32 d, u32 number) { bases[d] -= number; });
+#pragma unroll 1
+    for (int w = 0; w < WARPS; ++w)
+      each_own([&](u32 d, u32& number) {
+        u16& bin = stage.bins[w * int(digit.values()) + int(d)];
+        const u32 next = number + bin;
+        bin = u16(number), number = next;
+      });
+    each_own([&](u32 d, u32 number) { ends[d] = u16(number); });
+    __syncthreads();
+#pragma unroll
+    for (int r = 0; r < SORT_ITEMS; ++r) place[r] += bins[digit.of(key[r])];
+    __syncthreads();  // the bins have been read
+#pragma unroll
+    for (int r = 0; r < SORT_ITEMS; ++r)
+      if (r < rounds && r * WARP < mine) {
+        stage.sorted.keys[place[r]] = key[r];
+        stage.sorted.values[place[r]] = value[r];
+      }
+    __syncthreads();
+#pragma unroll 4
+    for (int i = t; i < many; i += BLOCK) {
+      const u32 sorted = stage.sorted.keys[i], to = bases[digit.of(sorted)] + u32(i);
+      if (sorted_keys) sorted_keys[to] = sorted;
+      sorted_values[to] = stage.sorted.values[i];
     }
+    __syncthreads();  // the bases and the items have been read
+    for (u32 d = threadIdx.x; d < digit.values(); d += BLOCK) bases[d] += ends[d];
+    // The barrier behind the next clearing of the bins follows before anything reads the bases.
   }
 }

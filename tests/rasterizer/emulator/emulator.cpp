@@ -28,8 +28,8 @@ static const struct {
     ENTRY(project_forward_4),   ENTRY(project_forward_9),  ENTRY(project_forward_16),
     ENTRY(project_backward_4),  ENTRY(project_backward_9), ENTRY(project_backward_16),
 #endif
-    ENTRY(centre_backward),     ENTRY(scan_short),         ENTRY(scan_reduce),
-    ENTRY(scan_apply),          ENTRY(sort_count),         ENTRY(sort_scatter),
+    ENTRY(centre_backward),     ENTRY(scan_reduce),        ENTRY(scan_apply),
+    ENTRY(sort_count),          ENTRY(sort_columns),       ENTRY(sort_scatter),
     ENTRY(tile_list),           ENTRY(tile_ranges),        ENTRY(blend_forward),
     ENTRY(blend_backward),      ENTRY(blend_backward_absolute),
     ENTRY(sum_absolutes),

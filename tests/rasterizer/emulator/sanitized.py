@@ -14,8 +14,8 @@ from splats import backgrounds, make_cameras, make_gaussians, make_weights, rend
 from cadam3d.rasterizer import cuda, cuda_sort
 
 CPU = torch.device("cpu")
-SCANNED = (1, 31, 33, 255, 257, cuda_sort.SCAN_CHUNK, cuda_sort.SCAN_CHUNK + 1, cuda_sort.SCAN_SHORT + 1)
-SORTED = (1, 33, 257, cuda_sort.SORT_CHUNK - 1, cuda_sort.SORT_CHUNK + 1)
+SCANNED = (1, 31, 33, 255, 257, cuda_sort.SCAN_CHUNK, cuda_sort.SCAN_CHUNK + 1, cuda_sort.FEW_NUMBERS + 1)
+SORTED = (1, 33, 257, 1023, 1025, cuda_sort.FEW_NUMBERS + 1)
 
 
 def run_everything(emulator: Emulator) -> None:
