@@ -370,8 +370,8 @@ def whole_record() -> Record:
     """Return a record with a result of every kind."""
     record = new_record()
     rows = [
-        ROW | {"backend": "gsplat", "forward_backward_ms": 0.9},
-        ROW | {"backend": "cuda", "forward_backward_ms": 0.45, "is_met": True},
+        ROW | {"backend": "gsplat", "step_ms": 0.9},
+        ROW | {"backend": "cuda", "step_ms": 0.45, "is_met": True},
     ]
     stages = [{"stage": "project", "launches": 2, "median_ms": 0.1, "bytes": 10**6, "floor_ms": 0.02}]
     stages += [{"stage": "rest", "launches": 0, "median_ms": 0.1, "bytes": None, "floor_ms": None}]
@@ -416,7 +416,7 @@ def test_the_markdown_has_one_table_with_every_result():
     assert len([line for line in table if set(line) <= set("|- ")]) == 1
     assert all(len(re.findall(r"(?<!\\)\|", line)) == 4 for line in table)
     for word in (
-        "0.45 (forward 0.20, backward 0.30, host 0.40); 3 MB; target 0.5 ms: met",
+        "0.45 (host 0.40, forward 0.20, backward 0.30); 3 MB; target 0.5 ms: met",
         "the GPU is busy 80% of the time",
         "0.100 in 2 launches; 5.0x the time of its 1.0 MB",
         "80,000 keys of 32 bits | 0.100, 0.200: 2.00x",

@@ -81,10 +81,10 @@ def scene(row: dict[str, Any]) -> str:
 
 def time_of(row: dict[str, Any]) -> str:
     """Return the times, the memory and the verdict of a row of ``bench_rasterizer``."""
-    if row["forward_backward_ms"] is None:
+    if row["step_ms"] is None:
         return "out of memory"
-    phases = [f"{phase} {row[f'{phase}_ms']:.2f}" for phase in ("forward", "backward", "host")]
-    words = [f"{row['forward_backward_ms']:.2f} ({', '.join(phases)})"]
+    phases = [f"{phase} {row[f'{phase}_ms']:.2f}" for phase in ("host", "forward", "backward")]
+    words = [f"{row['step_ms']:.2f} ({', '.join(phases)})"]
     if row["peak_bytes"] is not None:
         words.append(f"{row['peak_bytes'] / MB:.0f} MB")
     targets = [f"{row['demanded_ms']:g} ms"] if row["demanded_ms"] is not None else []
@@ -130,11 +130,11 @@ def verdicts(record: Record) -> list[dict[str, Any]]:
     scenes: dict[tuple[int, ...], list[dict[str, Any]]] = {}
     for entry in record.pieces.values():
         for row in (entry.result or {}).get("rows", []):
-            if row["forward_backward_ms"] is not None:
+            if row["step_ms"] is not None:
                 scenes.setdefault((row["count"], row["size"], row["views"], row["degree"]), []).append(row)
     found = []
     for (count, size, views, degree), timed in scenes.items():
-        first = min(timed, key=lambda row: row["forward_backward_ms"])
+        first = min(timed, key=lambda row: row["step_ms"])
         each = {"count": count, "size": size, "views": views, "degree": degree}
         found.append(each | {"fastest": first["backend"], "timed": [row["backend"] for row in timed]})
     return found

@@ -110,18 +110,26 @@ def _deviation(got: Tensor, want: Tensor) -> Tensor:
 
 
 def changes(rasterizer: Rasterizer, scene: Scene) -> list[str]:
-    """Return the results that are not the same to the last bit in every run."""
+    """Return the results that are not the same to the last bit in every run, and in every way to render."""
     first: dict[str, Tensor] = {}
     changed: set[str] = set()
     for _ in range(RUNS):
         scene.zero_grad()
         images = scene.render(rasterizer)
         scene.backward(images)
-        numbers = dict(zip(("rgb", "alpha", "depth"), images, strict=True))
-        numbers |= {f"the gradient of {name}": t.grad for name, t in scene.gaussians.tensors().items()}
+        numbers = dict(zip(("rgb", "alpha", "depth"), images, strict=True)) | gradients_of(scene)
+        scene.zero_grad()
+        scene.step(rasterizer)
+        ahead = gradients_of(scene)
         first = first or numbers
         changed |= {name for name, tensor in numbers.items() if not torch.equal(tensor, first[name])}
+        changed |= {name for name, tensor in ahead.items() if not torch.equal(tensor, first[name])}
     return [f"{name} is not the same in {RUNS} runs" for name in sorted(changed)]
+
+
+def gradients_of(scene: Scene) -> dict[str, Tensor]:
+    """Return the gradients of the parameters, which are not ``None``."""
+    return {f"the gradient of {name}": tensor.grad for name, tensor in scene.gaussians.tensors().items()}
 
 
 def check_long_sort(launcher: Launcher, device: torch.device, keys: int) -> list[str]:

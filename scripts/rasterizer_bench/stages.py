@@ -26,7 +26,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.rasterizer import cuda, cuda_sort
 from cadam3d.rasterizer.base import Rasterizer
-from cadam3d.rasterizer.cuda import rasterize
+from cadam3d.rasterizer.cuda import rasterize, rasterize_ahead
 from cadam3d.rasterizer.launcher import Launch, Launcher
 
 # The stages in order, with the prefixes of their kernels. Sorts and prefix sums belong to several stages.
@@ -67,6 +67,16 @@ class KernelRasterizer(Rasterizer):
     ) -> RenderOutput:
         """See :meth:`Rasterizer.render`."""
         return rasterize(self.launcher, gaussians, cameras, background, absgrad)
+
+    def render_ahead(
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        background: Float[Tensor, "v 3"],
+        absgrad: bool = False,
+    ) -> RenderOutput:
+        """See :meth:`Rasterizer.render_ahead`."""
+        return rasterize_ahead(self.launcher, gaussians, cameras, background, absgrad)
 
 
 @dataclass(frozen=True)
