@@ -317,6 +317,8 @@ def test_the_lines_of_benchmarks_are_accepted(tmp_path):
         (pieces.by_check, Finished(1, "check cuda: FAILED, not timed\n  needles: an image"), FAILED),
         (pieces.by_rows, Finished(0, "", {"rows": [{"is_met": True}, {"is_met": None}]}), PASSED),
         (pieces.by_rows, Finished(1, "Error", {"rows": [{"is_met": True}]}), FAILED),
+        (pieces.by_steps, Finished(0, "", {"here": [{"prior": "exact", "wall_ms": 1.0}]}), PASSED),
+        (pieces.by_steps, Finished(1, "error"), FAILED),
         (pieces.by_recipes, Finished(1, "Traceback\nKeyError: 3"), FAILED),
         (runner.by_result, Finished(0, "", {"says": "fine"}), PASSED),
         (runner.by_result, Finished(0, "", {"says": "no counters", "skipped": True}), SKIPPED),
@@ -382,6 +384,16 @@ def whole_record() -> Record:
         "kernels": {"scenes": [ROW | {"wall_ms": 0.5, "kernel_ms": 0.4, "stages": stages}]},
         "sorts": {"sorts": [{"keys": 80_000, "bits": 32, "ours_ms": 0.1, "torch_ms": 0.2}]},
         "ncu": {"counters": [{"kernel": "blend_forward", "metrics": {"Duration": "1 ms"}}]},
+        "step": {
+            "here": [
+                {
+                    "prior": "exact",
+                    "gaussians": 4000.0,
+                    "wall_ms": 9.0,
+                    "parts_ms": {"rest": 1.0, "render": 2.0},
+                }
+            ]
+        },
         "recipes": {
             "results": [
                 {
@@ -421,6 +433,7 @@ def test_the_markdown_has_one_table_with_every_result():
         "0.100 in 2 launches; 5.0x the time of its 1.0 MB",
         "80,000 keys of 32 bits | 0.100, 0.200: 2.00x",
         "counters of blend_forward",
+        "step, exact prior | 4,000 Gaussians | 9.00; parts render 2.00, rest 1.00",
         "200 per step (render 100); peak 3.0 GiB, estimated 3.0",
         "**ended by its time limit**: still running",
         "cuda of gsplat, cuda; auto uses gsplat, **which is slower**",

@@ -6,7 +6,6 @@ from typing import Any
 from gpu_run.record import PASSED, Record
 
 GIB, MB = 2**30, 1e6
-NOTHING = "**No GPU has run anything here yet.**"
 
 
 def show(record: Record) -> str:
@@ -61,16 +60,25 @@ def details(result: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     for found in result.get("counters", []):
         numbers = ", ".join(f"{name} {value}" for name, value in found["metrics"].items())
         yield f"counters of {found['kernel']}", "", numbers
+    for found in result.get("here", []):
+        yield f"step, {found['prior']} prior", f"{found['gaussians']:,.0f} Gaussians", parts_of(found)
     for found in result.get("results", []):
         peak = found["peak_bytes"] or 0
         yield f"recipe {found['recipe']}", f"vram={found['vram']}", recipe_time(found, peak)
 
 
 def recipe_time(found: dict[str, Any], peak: int) -> str:
+    """Return the time of a step of a recipe, of its stages, and the memory."""
     stages = ", ".join(f"{name} {1e3 * seconds:.0f}" for name, seconds in found["stages"].items())
     return f"{1e3 * found['seconds_per_step']:.0f} per step ({stages}); peak {peak / GIB:.1f} GiB, " + (
         f"estimated {found['estimate_bytes'] / GIB:.1f}"
     )
+
+
+def parts_of(found: dict[str, Any]) -> str:
+    """Return the time of a training step and of its parts, which are measured apart."""
+    parts = sorted(found["parts_ms"].items(), key=lambda part: -part[1])
+    return f"{found['wall_ms']:.2f}; parts " + ", ".join(f"{name} {ms:.2f}" for name, ms in parts)
 
 
 def scene(row: dict[str, Any]) -> str:

@@ -2,7 +2,6 @@
 
 import re
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -148,7 +147,6 @@ def explains(setup: Setup) -> list[Piece]:
     return [
         Piece("kernels", EXPLAINS, setup.own("kernels"), 150.0),
         Piece("sorts", EXPLAINS, setup.own("sorts"), 60.0),
-        *step(setup),
         Piece(
             "ncu",
             EXPLAINS,
@@ -156,6 +154,7 @@ def explains(setup: Setup) -> list[Piece]:
             150.0,
             missing=setup.lacks("ncu"),
         ),
+        *step(setup),
         Piece(
             "recipes",
             EXPLAINS,
@@ -167,10 +166,24 @@ def explains(setup: Setup) -> list[Piece]:
     ]
 
 
-def step(setup: Setup) -> Sequence[Piece]:
-    """Return the benchmark of a whole training step."""
-    words = ("--device", "cuda", "--json", RESULT)
-    return [Piece("step", EXPLAINS, setup.script("bench_step", *words), 150.0, judge=by_last_line(r".*"))]
+def step(setup: Setup) -> list[Piece]:
+    """Return the benchmark of whole training steps, with small priors and with networks of full size."""
+
+    def with_priors(*priors: str) -> tuple[str, ...]:
+        words = ("--device", "cuda", "--priors", *priors, "--json", RESULT)
+        return setup.script("bench_step", *words)
+
+    return [
+        Piece("step", EXPLAINS, with_priors("exact", "learned"), 120.0, judge=by_steps),
+        Piece(
+            "step of a network",
+            EXPLAINS,
+            with_priors("random"),
+            180.0,
+            missing=setup.lacks("diffusers"),
+            judge=by_steps,
+        ),
+    ]
 
 
 def by_pytest(finished: Finished) -> tuple[str, str]:
@@ -224,6 +237,14 @@ def by_recipes(finished: Finished) -> tuple[str, str]:
         return FAILED, f"exit code {finished.code}: {finished.last_line}"
     each = [f"{found['recipe']} {found['seconds_per_step']:.2f} s per step" for found in results]
     return PASSED, ", ".join(each)
+
+
+def by_steps(finished: Finished) -> tuple[str, str]:
+    """Judge ``bench_step`` by the milliseconds of whole steps."""
+    steps = (finished.result or {}).get("here", [])
+    if finished.code != 0 or not steps:
+        return FAILED, f"exit code {finished.code}: {finished.last_line}"
+    return PASSED, ", ".join(f"{found['prior']} prior {found['wall_ms']:.1f} ms per step" for found in steps)
 
 
 def by_last_line(pattern: str) -> Judge:
