@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.checks import require_range
+from cadam3d.core.device import upload
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 
@@ -71,10 +72,10 @@ class LucidAugmentation(Augmentation):
         seed = int(torch.randint(LARGEST_SEED, (1,), generator=generator))
         log_scales = gaussians.log_scales
         noise = torch.randn(log_scales.shape, generator=torch.Generator().manual_seed(seed))
-        factor = (1 + self.scale_noise * noise).clamp_min(LEAST).to(log_scales)
+        factor = (1 + self.scale_noise * noise).clamp_min(LEAST).to(log_scales.dtype)
         return Gaussians(
             means=gaussians.means,
-            log_scales=log_scales + factor.log(),
+            log_scales=log_scales + upload(factor, log_scales.device).log(),
             quats=gaussians.quats,
             opacity_logits=gaussians.opacity_logits,
             sh=gaussians.sh,

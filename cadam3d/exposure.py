@@ -15,10 +15,13 @@ class Exposure(ABC):
     """Checks the brightness of a step's renders. Holds frozen hyper-parameters; uses no random numbers."""
 
     @abstractmethod
-    def dimming(self, output: RenderOutput, background: Float[Tensor, "v 3"], step: int) -> float | None:
+    def dimming(
+        self, output: RenderOutput, background: Float[Tensor, "v 3"], step: int
+    ) -> Float[Tensor, ""] | None:
         """Return the factor for all colour coefficients after the ``step``-th step (1 is the first).
 
-        None leaves them unchanged. ``output`` was rendered over ``background`` before the step.
+        None or 1 leaves them unchanged. ``output`` was rendered over ``background`` before the step. The
+        trainer reads the factor from the device together with all else that it needs.
         """
 
 
@@ -26,9 +29,9 @@ class Exposure(ABC):
 class NoExposure(Exposure):
     """Accepts any brightness."""
 
-    def dimming(self, output: RenderOutput, background: Float[Tensor, "v 3"], step: int) -> float | None:
+    def dimming(self, output: RenderOutput, background: Float[Tensor, "v 3"], step: int) -> None:
         """Return None."""
-        return None
+        return
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,24 +63,21 @@ class BrightnessGuard(Exposure):
         require_range("exposure.threshold", self.threshold, low=0, example=0.9)
         require_range("exposure.rate", self.rate, above=0, below=1, example=0.8)
 
-    def dimming(self, output: RenderOutput, background: Float[Tensor, "v 3"], step: int) -> float | None:
-        """Return ``rate`` if the quantile over views of :meth:`brightness` exceeds the threshold.
-
-        Costs one synchronization with the device.
-        """
+    @torch.no_grad()
+    def dimming(
+        self, output: RenderOutput, background: Float[Tensor, "v 3"], step: int
+    ) -> Float[Tensor, ""] | None:
+        """Return ``rate`` if the quantile over views of :meth:`brightness` exceeds the threshold, else 1."""
         if not self.begin < step < self.end:
             return None
         views = self.brightness(output, background)
-        return self.rate if bool(views.quantile(self.quantile) > self.threshold) else None
+        return torch.where(views.quantile(self.quantile) > self.threshold, self.rate, 1.0)
 
     @torch.no_grad()
     def brightness(self, output: RenderOutput, background: Float[Tensor, "v 3"]) -> Float[Tensor, "v"]:
         """Return the quantile over the object's pixels (alpha > 0) of each view, or 0 if it has none."""
         behind = (1 - output.alpha)[..., None] * background[:, None, None]
         pixels = (output.rgb - behind).mean(dim=-1)
-        return torch.stack(
-            [
-                seen.quantile(self.quantile) if len(seen := view[alpha > 0]) else view.new_zeros(())
-                for view, alpha in zip(pixels, output.alpha, strict=True)
-            ]
-        )
+        # NaN marks pixels that do not count, because their number is unknown to the host.
+        seen = pixels.masked_fill(output.alpha <= 0, torch.nan).flatten(start_dim=1)
+        return seen.nanquantile(self.quantile, dim=1).nan_to_num(nan=0.0)

@@ -8,16 +8,14 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.optim.adam import adam
 
 from cadam3d.core.checks import require, require_range
 from cadam3d.core.edit import RowEdit
-from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled, settled_at
 
 # The tensors as Adam groups them: view-dependent colours are separate, because they learn more slowly.
 PARTS = ("means", "sh_dc", "sh_rest", "opacity", "scale", "quat")
-COLOR_PARTS = ("sh_dc", "sh_rest")
 MOMENTS = ("exp_avg", "exp_avg_sq")  # as torch names them
 
 
@@ -75,27 +73,42 @@ class GaussianOptimizer:
 
     def __init__(self, settings: AdamSettings, gaussians: Gaussians) -> None:
         self.settings = settings
-        moments = {kind: parts_of(gaussians.map(torch.zeros_like)) for kind in MOMENTS}
-        self._install(gaussians.map(lambda tensor: tensor.detach().clone()), {"steps": 0, **moments})
+        moments = {kind: gaussians.map(torch.zeros_like) for kind in MOMENTS}
+        self._install(gaussians.map(lambda tensor: tensor.detach().clone()), 0, moments)
 
     @property
     def gaussians(self) -> Gaussians:
         """Return the leaf tensors, whose ``grad`` ``backward()`` fills. :meth:`apply` replaces them."""
         return self._gaussians
 
+    @torch.no_grad()
     def step(self, step: int) -> None:
         """Do one Adam step at the learning rates of ``step`` (0 is the first), then clear the gradients.
 
         A tensor without a gradient has the gradient zero, so its moments decay like all others. With a
         ``clip_norm``, only Adam sees clipped gradients, because densifiers observe them before this step.
+
+        These are the operations of torch's Adam in their order, so results have the same bits on the CPU. But
+        each operation takes all tensors at once, where torch's function would have to be called for each
+        learning rate.
         """
+        self._steps += 1
+        beta1, beta2 = float(self.settings.beta1), float(self.settings.beta2)
+        gradients = list(self._gradients(step).tensors().values())
+        means, squares = (list(self._moments[kind].tensors().values()) for kind in MOMENTS)
+        torch._foreach_lerp_(means, gradients, 1 - beta1)
+        torch._foreach_mul_(squares, beta2)
+        torch._foreach_addcmul_(squares, gradients, gradients, 1 - beta2)
+        divisors = torch._foreach_sqrt(squares)
+        torch._foreach_div_(divisors, (1 - beta2**self._steps) ** 0.5)
+        torch._foreach_add_(divisors, float(self.settings.eps))
         rates = self.settings.learning_rates(step)
-        gradients = self._gaussians.map(
-            lambda tensor: torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
+        torch._foreach_addcdiv_(
+            self._moved(self._gaussians.detach()),
+            self._moved(self._moments["exp_avg"]),
+            self._moved(Gaussians(**dict(zip(FIELDS, divisors, strict=True)))),
+            [-rates[name] / (1 - beta1**self._steps) for name in self._moving],
         )
-        for name, gradient in parts_of(gradients).items():
-            bound = self.settings.largest_norm(name, step)
-            self._move(name, gradient if bound is None else _clipped(gradient, bound), rates[name])
         self.zero_grad()
 
     def zero_grad(self) -> None:
@@ -103,17 +116,19 @@ class GaussianOptimizer:
         for tensor in self._gaussians.tensors().values():
             tensor.grad = None
 
-    def finite_gradients(self) -> bool:
-        """Return whether no gradient contains NaN or infinity. Waits for the device once."""
-        gradients = [tensor.grad for tensor in self._gaussians.tensors().values() if tensor.grad is not None]
-        return not gradients or bool(torch.stack([grad.isfinite().all() for grad in gradients]).all())
+    def extreme_gradients(self) -> list[Float[Tensor, ""]]:
+        """Return the smallest and the largest element of each gradient, without waiting for the device.
+
+        If a gradient contains NaN, both are NaN. So all of these are finite if and only if all gradients are.
+        """
+        gradients = [tensor.grad for tensor in self._gaussians.tensors().values()]
+        present = [grad for grad in gradients if grad is not None and grad.numel() > 0]
+        return [extreme for grad in present for extreme in grad.aminmax()]
 
     def apply(self, edit: RowEdit) -> None:
         """Replace the rows as ``edit`` says; gradients are dropped."""
-        moments = self.state_dict()
-        for kind in MOMENTS:
-            moments[kind] = {name: edit.carry(rows) for name, rows in moments[kind].items()}
-        self._install(edit.apply(self._gaussians), moments)
+        moments = {kind: self._moments[kind].map(edit.carry) for kind in MOMENTS}
+        self._install(edit.apply(self._gaussians), self._steps, moments)
 
     @torch.no_grad()
     def displace(self, offsets: Float[Tensor, "n 3"]) -> None:
@@ -132,7 +147,7 @@ class GaussianOptimizer:
         lowered = rows & (logits > ceiling)
         logits.masked_fill_(lowered, ceiling)
         for kind in MOMENTS:
-            self._moments[kind]["opacity"].masked_fill_(rows, 0.0)
+            self._moments[kind].opacity_logits.masked_fill_(rows, 0.0)
         return int(lowered.sum())
 
     @torch.no_grad()
@@ -143,15 +158,17 @@ class GaussianOptimizer:
         (GCS-BEG). All other tensors and moments stay.
         """
         self._gaussians.sh.mul_(factor)
-        for part in COLOR_PARTS:
-            for kind in MOMENTS:
-                self._moments[kind][part].zero_()
+        for kind in MOMENTS:
+            self._moments[kind].sh.zero_()
 
     def state_dict(self) -> dict[str, Any]:
         """Return steps done and both moments by part, as numbers and tensors, without the Gaussians."""
         return {
-            "steps": int(self._steps["means"]),
-            **{kind: dict(self._moments[kind]) for kind in MOMENTS},
+            "steps": self._steps,
+            **{
+                kind: {name: part.contiguous() for name, part in parts_of(self._moments[kind]).items()}
+                for kind in MOMENTS
+            },
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -160,7 +177,7 @@ class GaussianOptimizer:
         Raises ``UserError`` if the moments are of other Gaussians.
         """
         parts = parts_of(self._gaussians.detach())
-        moments: dict[str, Any] = {"steps": state["steps"]}
+        moments: dict[str, Gaussians] = {}
         for kind in MOMENTS:
             for name, part in parts.items():
                 found = state[kind][name].shape
@@ -171,38 +188,37 @@ class GaussianOptimizer:
                     got=tuple(found),
                     example="resume=RUN/checkpoints/<an earlier one>",
                 )
-            moments[kind] = {name: state[kind][name].to(part, copy=True) for name, part in parts.items()}
-        self._install(self._gaussians.detach(), moments)
+            moments[kind] = joined(
+                {name: state[kind][name].to(part, copy=True) for name, part in parts.items()}
+            )
+        self._install(self._gaussians.detach(), state["steps"], moments)
 
-    @torch.no_grad()
-    def _move(self, part: str, gradient: Tensor, rate: float) -> None:
-        """Do one step of torch's Adam on one part.
-
-        This calls torch's function instead of its class, because the first object of the class loads torch's
-        compiler, which takes more than a second.
-        """
-        adam(
-            [self._parts[part]],
-            [gradient],
-            [self._moments["exp_avg"][part]],
-            [self._moments["exp_avg_sq"][part]],
-            [],
-            [self._steps[part]],
-            amsgrad=False,
-            beta1=float(self.settings.beta1),
-            beta2=float(self.settings.beta2),
-            lr=rate,
-            weight_decay=0.0,
-            eps=float(self.settings.eps),
-            maximize=False,
+    def _gradients(self, step: int) -> Gaussians:
+        """Return the gradients as Adam sees them at ``step``."""
+        gradients = self._gaussians.map(
+            lambda tensor: torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
         )
+        clipped = {}
+        for name, part in parts_of(gradients).items():
+            bound = self.settings.largest_norm(name, step)
+            if bound is None:
+                return gradients
+            clipped[name] = _clipped(part, bound)
+        return joined(clipped)
 
-    def _install(self, gaussians: Gaussians, moments: Mapping[str, Any]) -> None:
-        """Make ``gaussians`` the leaf tensors, and give Adam views into them, so that a step moves both."""
+    def _moved(self, gaussians: Gaussians) -> list[Tensor]:
+        """Return views of the parts that have any elements, each of which has its own learning rate."""
+        parts = parts_of(gaussians)
+        return [parts[name] for name in self._moving]
+
+    def _install(self, gaussians: Gaussians, steps: int, moments: Mapping[str, Gaussians]) -> None:
+        """Make ``gaussians`` the leaf tensors, with their moments after ``steps`` steps."""
         self._gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
-        self._parts = parts_of(self._gaussians.detach())
-        self._steps = {name: torch.tensor(float(moments["steps"])) for name in PARTS}
-        self._moments = {kind: {name: moments[kind][name].contiguous() for name in PARTS} for kind in MOMENTS}
+        self._steps = steps
+        self._moments = dict(moments)
+        # Without higher harmonics, the part of the others is empty.
+        parts = parts_of(self._gaussians)
+        self._moving = [name for name in PARTS if parts[name].shape[1:].numel() > 0]
 
 
 def parts_of(gaussians: Gaussians) -> dict[str, Tensor]:
@@ -216,6 +232,17 @@ def parts_of(gaussians: Gaussians) -> dict[str, Tensor]:
         gaussians.quats,
     )
     return dict(zip(PARTS, tensors, strict=True))
+
+
+def joined(parts: Mapping[str, Tensor]) -> Gaussians:
+    """Return the tensors that :func:`parts_of` has separated."""
+    return Gaussians(
+        means=parts["means"],
+        log_scales=parts["scale"],
+        quats=parts["quat"],
+        opacity_logits=parts["opacity"],
+        sh=torch.cat([parts["sh_dc"], parts["sh_rest"]], dim=1),
+    )
 
 
 def _clipped(gradient: Tensor, bound: float) -> Tensor:

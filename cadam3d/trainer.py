@@ -3,19 +3,24 @@
 It sees interfaces only, never a concrete component. ``docs/architecture.md`` has the same step as a picture.
 """
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from cadam3d.augmentation import Augmentation
 from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
+from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require_range
+from cadam3d.core.device import read_numbers, upload_together
+from cadam3d.core.edit import RowState
 from cadam3d.core.memory import is_out_of_memory
-from cadam3d.core.render import RenderFn
+from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.densifier.base import Densifier, GradientSignal
 from cadam3d.densifier.refine import Refine
 from cadam3d.exposure import Exposure
@@ -34,6 +39,19 @@ from cadam3d.state import (
     TrainState,
     start_generators,
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """What the gradients of a step say, before anything has moved."""
+
+    densifier: RowState  # after it has observed the gradients
+    loss: float
+    log: dict[str, float]  # of the guidance and the regularizers
+    is_finite: bool  # whether no gradient contains NaN or infinity
+    dimming: float  # factor for all colour coefficients
+    # Whether the rasterizer had reserved too little memory, so that everything else is meaningless.
+    overflowed: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,13 +83,53 @@ class Trainer:
 
         Callbacks are not called, and ``state.seconds`` does not change.
         """
+        draws_before = {name: generator.get_state() for name, generator in state.generators.items()}
+        evidence = self._differentiate(state, embedding, self.rasterizer.render_ahead)
+        if evidence.overflowed:
+            # Nothing has changed except the random numbers and the gradients.
+            state.optimizer.zero_grad()
+            for name, draws in draws_before.items():
+                state.generators[name].set_state(draws)
+            evidence = self._differentiate(state, embedding, self.rasterizer.render)
+
+        # A step with a NaN or infinite gradient moves nothing.
+        state.densifier = evidence.densifier
+        if evidence.is_finite:
+            state.optimizer.step(state.step)
+            lr = self.optimizer.learning_rates(state.step)["means"]
+            offsets = self.densifier.perturb(state.gaussians.detach(), lr, state.generators["densifier"])
+            if offsets is not None:
+                state.optimizer.displace(offsets)
+        else:
+            state.optimizer.zero_grad()
+            state.skipped += 1
+        if evidence.dimming != 1:
+            state.optimizer.scale_colors(evidence.dimming)
+            state.dimmed += 1
+        log = {**evidence.log, **({"dimmed": float(state.dimmed)} if state.dimmed else {})}
+        num_gaussians = len(state.gaussians)
+
+        refined = self._refine(state, state.step + 1)
+        state.step += 1
+        report = StepReport(step=state.step, loss=evidence.loss, log=log, num_gaussians=num_gaussians)
+        return report, refined
+
+    def _differentiate(
+        self, state: TrainState, embedding: PromptEmbedding, render: Callable[..., RenderOutput]
+    ) -> "Evidence":
+        """Render some views, differentiate the loss, and let the densifier observe the gradients.
+
+        This changes only the random numbers and the gradients of ``state``. It waits for the device once, at
+        its end, because the host is faster if it does not know the numbers before.
+        """
         gaussians, draw = state.gaussians, state.generators
 
         # Render the Gaussians from a few cameras.
-        cameras = self.camera.sample(state.step, self.views, draw["camera"]).to(gaussians.device)
-        background = self.background.sample(self.views, draw["background"]).to(gaussians.device)
+        cameras = self.camera.sample(state.step, self.views, draw["camera"])
+        background = self.background.sample(self.views, draw["background"])
+        cameras, background = _uploaded(cameras, background, gaussians.device)
         rendered = self.augmentation.perturb(gaussians, draw["augmentation"])
-        output = self.rasterizer.render(rendered, cameras, background, self.densifier.needs_absgrad)
+        output = render(rendered, cameras, background, self.densifier.needs_absgrad)
         images = self.augmentation.show(output, draw["augmentation"])
 
         # Compare the images with what the prior expects to see, and add the penalties.
@@ -80,39 +138,40 @@ class Trainer:
         penalties = {name: fn(rendered, output, state.step) for name, fn in self.regularizers.items()}
         loss = sum(penalties.values(), start=guided.loss)
 
-        # Differentiate. A densifier that ignores the penalties reads the gradients before these are added.
+        # Differentiate. A densifier that ignores the penalties reads the gradients before these are added. If
+        # a penalty depends on the images, each pass differentiates the rasterizer, and one pass could not do
+        # both: the densifier needs the gradients of one loss, and the optimizer those of another.
         if penalties and self.densifier.guidance_only:
             guided.loss.backward(retain_graph=True)
-            signal = GradientSignal.read(gaussians, output)
+            signal = GradientSignal.read(gaussians, output).copy()
             torch.stack(list(penalties.values())).sum().backward()
         else:
             loss.backward()
             signal = GradientSignal.read(gaussians, output)
+        observed = self.densifier.observe(state.densifier, signal)
 
-        # Let the densifier observe the gradients before the optimizer moves anything. A step with a NaN or
-        # infinite gradient moves nothing.
-        state.densifier = self.densifier.observe(state.densifier, signal)
-        if state.optimizer.finite_gradients():
-            state.optimizer.step(state.step)
-            lr = self.optimizer.learning_rates(state.step)["means"]
-            offsets = self.densifier.perturb(state.gaussians.detach(), lr, draw["densifier"])
-            if offsets is not None:
-                state.optimizer.displace(offsets)
-        else:
-            state.optimizer.zero_grad()
-            state.skipped += 1
-        factor = self.exposure.dimming(output, background, state.step + 1)
-        if factor is not None:
-            state.optimizer.scale_colors(factor)
-            state.dimmed += 1
-
-        refined = self._refine(state, state.step + 1)
-        state.step += 1
-        log = {**guided.log, **{name: float(penalty.detach()) for name, penalty in penalties.items()}}
-        if state.dimmed:
-            log["dimmed"] = float(state.dimmed)
-        report = StepReport(step=state.step, loss=float(loss.detach()), log=log, num_gaussians=len(gaussians))
-        return report, refined
+        # Read every number that the host needs.
+        dimming = self.exposure.dimming(output, background, state.step + 1)
+        overflowed, dimming, loss, *others = read_numbers(
+            [
+                False if output.overflowed is None else output.overflowed,
+                1.0 if dimming is None else dimming,
+                loss,
+                *guided.log.values(),
+                *penalties.values(),
+                *state.optimizer.extreme_gradients(),
+            ],
+            gaussians.device,
+        )
+        names = (*guided.log, *penalties)
+        return Evidence(
+            densifier=observed,
+            loss=loss,
+            log=dict(zip(names, others[: len(names)], strict=True)),
+            is_finite=all(map(math.isfinite, others[len(names) :])),
+            dimming=dimming,
+            overflowed=bool(overflowed),
+        )
 
     def _refine(self, state: TrainState, step: int) -> RefineReport | None:
         """Grow, prune and reset opacities if the schedule says so after step number ``step`` (from 1).
@@ -266,3 +325,23 @@ class Trainer:
     def renderer(self, state: TrainState) -> RenderFn:
         """Return a function that renders the current Gaussians of ``state``, without gradient."""
         return render_fn(self.rasterizer, lambda: state.gaussians)
+
+
+def _uploaded(cameras: Cameras, background: Tensor, device: torch.device) -> tuple[Cameras, Tensor]:
+    """Return cameras and background colours on ``device``, sent there in one copy."""
+    sent = (
+        cameras.world_to_camera,
+        cameras.intrinsics,
+        background,
+        cameras.azimuth_deg,
+        cameras.elevation_deg,
+    )
+    matrices, intrinsics, colors, azimuth_deg, elevation_deg = upload_together(sent, device)
+    there = replace(
+        cameras,
+        world_to_camera=matrices,
+        intrinsics=intrinsics,
+        azimuth_deg=azimuth_deg,
+        elevation_deg=elevation_deg,
+    )
+    return there, colors

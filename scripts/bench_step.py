@@ -5,7 +5,8 @@
     python scripts/bench_step.py --priors exact --base ../cadam3d-before
     python scripts/bench_step.py --priors exact densifier=baseline initializer.count=50000
 
-A step is that of ``cadam3d train`` with the settings on the line, callbacks included. There are three passes:
+A step is that of ``cadam3d train`` with the settings on the line, callbacks included. The command itself
+runs, but its training loop is replaced by three passes, which continue one another:
 
 1. The step as a whole, untouched. CPU time is that of the process, on all threads.
 2. Its parts, with a clock around each component. On CUDA the clock waits for the device before and after each
@@ -19,7 +20,7 @@ A step is that of ``cadam3d train`` with the settings on the line, callbacks inc
 Bytes per Gaussian are counted from the tensors. The networks of ``--priors random`` have the sizes of Stable
 Diffusion 2.1 (``scripts/bench_recipes.py``); ``--tiny`` replaces them by small ones.
 
-With ``--base`` both trees run in turn, each in processes of its own.
+Every prior has a process of its own. With ``--base`` both trees run in turn.
 """
 
 import argparse
@@ -35,9 +36,9 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -64,19 +65,28 @@ ORDER = (
     *("backward", "observe", "readback", "optimizer", "exposure", "refinement", "callbacks", "rest"),
 )
 COUNTED_STEPS = 3
+MOST_STEPS = 1_000_000  # until the first refinement
 
 
 def main(words: list[str] | None = None) -> None:
     args = read_arguments(words)
-    if args.base is None and args.tree is None:
-        results = {"here": [measure_here(prior, args) for prior in args.priors]}
-    elif args.tree is not None:
-        print(json.dumps([measure_here(prior, args) for prior in args.priors]))
+    if args.tree is not None:
+        args.out.write_text(json.dumps(measure_here(args.priors[0], args)))
         return
-    else:
-        results = measure_in_turn(args)
-    results = {tree: [found for found in each if found is not None] for tree, each in results.items()}
-    print("\n\n".join(as_text(results)))
+    trees = {"base": args.base, "here": HERE} if args.base else {"here": HERE}
+    results: dict[str, list[Any]] = {name: [] for name in trees}
+    for prior in args.priors:
+        turns: dict[str, list[Any]] = {name: [] for name in trees}
+        try:
+            for _ in range(args.repeats if args.base else 1):
+                for name, tree in trees.items():
+                    turns[name].append(measure_there(tree, prior, args))
+        except subprocess.CalledProcessError as error:
+            print(f"{prior} is left out: {error}")
+            continue
+        for name, found in turns.items():
+            results[name].append(middle(found))
+        print(as_table({name: found[-1] for name, found in results.items()}), flush=True)
     if args.json:
         args.json.write_text(json.dumps({"machine": machine(args.device), **results}, indent=2) + "\n")
 
@@ -92,7 +102,9 @@ def read_arguments(words: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--models", type=Path, help="folder that keeps the random networks")
     parser.add_argument("--base", type=lambda text: Path(text).resolve(), help="a checkout to compare with")
     parser.add_argument("--repeats", type=int, default=3, help="turns of each tree with --base (default: 3)")
+    # For the processes that measure one prior of one tree.
     parser.add_argument("--tree", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--json", type=Path, help="file for all numbers")
     parser.add_argument("settings", nargs="*", help="more settings of cadam3d train, such as steps=1000")
     args = parser.parse_intermixed_args(words)
@@ -101,30 +113,21 @@ def read_arguments(words: list[str] | None) -> argparse.Namespace:
     return args
 
 
-# -------------------------------------------------------------------------- several trees
+# -------------------------------------------------------------------------- processes
 
 
-def measure_in_turn(args: argparse.Namespace) -> dict[str, list[Any]]:
-    """Measure both trees in turn, and return the medians of their turns."""
-    trees = {"base": args.base, "here": HERE}
-    turns: dict[str, list[list[Any]]] = {name: [] for name in trees}
-    for _ in range(args.repeats):
-        for name, tree in trees.items():
-            turns[name].append(measure_there(tree, args))
-    return {name: [middle(list(each)) for each in zip(*found, strict=True)] for name, found in turns.items()}
-
-
-def measure_there(tree: Path, args: argparse.Namespace) -> list[Any]:
-    """Return the results of ``tree``, measured in a process of its own."""
-    line = [sys.executable, __file__, "--tree", str(tree), "--priors", *args.priors]
-    for name in ("device", "steps", "warmup", "threads", "models"):
-        value = getattr(args, name)
-        line += [] if value is None else [f"--{name}", str(value)]
-    line += [*(["--tiny"] if args.tiny else []), *(["--", *args.settings] if args.settings else [])]
-    done = subprocess.run(line, stdout=subprocess.PIPE, text=True, check=False)
-    if done.returncode != 0:
-        raise SystemExit(f"{tree}: exit code {done.returncode}")
-    return json.loads(done.stdout.splitlines()[-1])
+def measure_there(tree: Path, prior: str, args: argparse.Namespace) -> dict[str, Any]:
+    """Return the result of one prior in ``tree``, measured in a process of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "found.json"
+        line = [sys.executable, __file__, "--tree", str(tree), "--out", str(out), "--priors", prior]
+        for name in ("device", "steps", "warmup", "threads", "models"):
+            value = getattr(args, name)
+            line += [] if value is None else [f"--{name}", str(value)]
+        line += [*(["--tiny"] if args.tiny else []), *(["--", *args.settings] if args.settings else [])]
+        # What the run prints belongs to no result, but its errors are shown.
+        subprocess.run(line, stdout=subprocess.DEVNULL, check=True)
+        return json.loads(out.read_text())
 
 
 def middle(turns: list[Any]) -> Any:
@@ -136,7 +139,7 @@ def middle(turns: list[Any]) -> Any:
     return statistics.median(numbers) if len(numbers) == len(turns) else first
 
 
-# -------------------------------------------------------------------------- one tree
+# -------------------------------------------------------------------------- one prior of one tree
 
 
 class Watch:
@@ -146,12 +149,14 @@ class Watch:
         self.device = device
         self.is_on = False
         self.seconds = defaultdict[str, float](float)
+        self.calls = defaultdict[str, int](int)
         # The parts that are running, and the seconds of parts inside them.
         self.running: list[str] = []
         self.inside: list[float] = [0.0]
 
     def __call__(self, part: str, work: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*args: Any, **kwargs: Any) -> Any:
+            self.calls[part] += 1
             self.running.append(part)
             self.inside.append(0.0)
             started = self.now()
@@ -186,75 +191,79 @@ def timed(component: Any, methods: list[str], part: str, watch: Watch) -> Any:
     return copied
 
 
-def measure_here(prior: str, args: argparse.Namespace) -> dict[str, Any] | None:
-    """Measure the steps of one prior; ``None`` if something that it needs is not installed."""
-    sys.path.insert(0, str(args.tree or HERE))
+def measure_here(prior: str, args: argparse.Namespace) -> dict[str, Any]:
+    """Run ``cadam3d train`` in this process up to its training loop, and return what the passes find."""
+    sys.path.insert(0, str(args.tree))
     os.environ["TQDM_DISABLE"] = "1"
     import torch
 
-    from cadam3d.core.errors import UserError
+    from cadam3d import cli, trainer
+    from cadam3d.commands import train
 
     torch.set_num_threads(args.threads)
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            return measure(prior, args, Path(folder))
-    except (UserError, ImportError) as error:
-        print(f"{prior} is left out: {error}", file=sys.stderr)
-        return None
+    build, loop = train.build_trainer, trainer.Trainer.train
+    found: dict[str, Any] = {}
+
+    def build_trainer(*arguments: Any) -> Any:
+        built = build(*arguments)
+        if prior == "random":
+            import_module("bench_recipes").random_texts(built.prior)
+        return built
+
+    def instead(measured: Any, state: Any, embedding: Any, context: Any, *_: Any) -> None:
+        found.update(three_passes(Run(measured, state, embedding, context, loop), args))
+        raise SystemExit(0)
+
+    with tempfile.TemporaryDirectory() as folder, replaced([(train, "build_trainer", build_trainer)]):
+        words = [f"prompt={PROMPT}", *PRIORS[prior], *random_settings(prior, args, Path(folder))]
+        words += [f"device={args.device}", f"hydra.run.dir={folder}/run", *args.settings]
+        with replaced([(trainer.Trainer, "train", instead), (sys, "argv", ["cadam3d", "train", *words])]):
+            try:
+                cli.main()
+            except SystemExit as ended:
+                if not found:
+                    raise SystemExit(ended.code or 1) from None
+    return {"prior": prior, "settings": words[:-1], **found}
 
 
-def measure(prior: str, args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    import torch
+@dataclass(frozen=True)
+class Run:
+    """The arguments of the training loop that the command was about to start, and the loop."""
 
-    from cadam3d.commands import train
-    from cadam3d.core.device import resolve_device
-    from cadam3d.settings.compose import component, compose
+    trainer: Any
+    state: Any
+    embedding: Any
+    context: Any
+    loop: Callable[..., Any]
 
-    device = resolve_device(args.device)
-    lines = [f"prompt={PROMPT}", *PRIORS[prior], *random_settings(prior, args, folder), *args.settings]
-    cfg = compose(lines)
-    trainer = train.build_trainer(cfg, device)
-    if prior == "random":
-        import_module("bench_recipes").random_texts(trainer.prior)
-    backend = trainer.rasterizer.prepare(device)
-    embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
-    trainer.prior.load()
+    def steps(self, count: int, after: Callable[[int], None]) -> None:
+        """Do ``count`` steps with their callbacks, and call ``after`` with the number of each."""
+        done = iter(range(1, count + 1))
 
-    torch.set_deterministic_debug_mode("error" if device.type == "cpu" else "default")
+        def stop() -> bool:
+            number = next(done)
+            after(number)
+            return number == count
+
+        endless = replace(self.trainer, steps=self.state.step + count + 1)
+        self.loop(endless, self.state, self.embedding, self.context, stop)
+
+
+def three_passes(run: Run, args: argparse.Namespace) -> dict[str, Any]:
+    device = run.state.gaussians.device
     watch = Watch(device)
-    parts = split(trainer, watch)
-
-    def passes(measured: Any, shown: Any, work: Callable[..., Any]) -> Any:
-        state = measured.start(cfg.prompt, component(cfg.initializer), cfg.seed, device)
-        place = folder / str(len(list(folder.iterdir())))
-        place.mkdir()
-        context = train.run_context(cfg.prompt, measured, state, place)
-        for callback in measured.callbacks:
-            callback.on_start(context, state)
-
-        def one() -> None:
-            report, refined = measured.step(state, shown)
-            watch("callbacks", measured._report)(context, state, refined, report)
-
-        for _ in range(args.warmup):
-            one()
-        return work(measured, state, one)
-
-    whole = passes(trainer, embedding, partial(time_whole, steps=args.steps, device=device))
-    split_embedding = timed(embedding, ["at"], "condition", watch)
-    with clocks_around_functions(watch):
-        shares = passes(parts, split_embedding, partial(time_parts, args=args, watch=watch))
-        counts = passes(parts, split_embedding, partial(count_operations, watch=watch))
-    return {
-        "prior": prior,
-        "settings": lines,
-        "backend": backend.name,
-        "views": trainer.views,
-        "size": cfg.camera.get("size"),
-        **whole,
-        **shares,
-        **counts,
-    }
+    whole = time_whole(run, args, device)
+    embedding = timed(run.embedding, ["at"], "condition", watch)
+    parts = replace(run, trainer=split(run.trainer, watch), embedding=embedding)
+    with replaced(clocks_around_functions(watch)):
+        return {
+            "backend": run.trainer.rasterizer.prepare(device).name,
+            "views": run.trainer.views,
+            "size": getattr(run.trainer.camera, "size", None),
+            **whole,
+            **time_parts(parts, args, watch),
+            **count_operations(parts, watch),
+        }
 
 
 def random_settings(prior: str, args: argparse.Namespace, folder: Path) -> list[str]:
@@ -281,133 +290,146 @@ def split(trainer: Any, watch: Watch) -> Any:
     return replace(trainer, regularizers=regularizers, **parts)
 
 
-@contextmanager
-def clocks_around_functions(watch: Watch) -> Iterator[None]:
-    """Put clocks around the functions of a step that belong to no component, and remove them afterwards."""
+def clocks_around_functions(watch: Watch) -> list[tuple[Any, str, Any]]:
+    """Return the functions of a step that belong to no component, with clocks around them."""
     import torch
 
     from cadam3d import trainer
-    from cadam3d.densifier.base import GradientSignal
     from cadam3d.optimizer import GaussianOptimizer
 
     owners = {
         torch.Tensor: {"backward": "backward"},
-        GradientSignal: {"read": "observe"},
         GaussianOptimizer: {"step": "optimizer", "finite_gradients": "optimizer", "displace": "optimizer"},
-        trainer.Trainer: {"_refine": "refinement"},
+        trainer.Trainer: {"_refine": "refinement", "_report": "callbacks", "_tell": "callbacks"},
         trainer: {"read_numbers": "readback"},
     }
-    replaced = []
-    for owner, functions in owners.items():
-        for name, part in functions.items():
-            if name not in vars(owner):
-                continue
-            original = vars(owner)[name]
-            replaced.append((owner, name, original))
-            clocked = watch(part, getattr(original, "__func__", original))
-            setattr(owner, name, classmethod(clocked) if isinstance(original, classmethod) else clocked)
+    return [
+        (owner, name, watch(part, vars(owner)[name]))
+        for owner, functions in owners.items()
+        for name, part in functions.items()
+        if name in vars(owner)
+    ]
+
+
+@contextmanager
+def replaced(changes: list[tuple[Any, str, Any]]) -> Iterator[None]:
+    """Set attributes, given as owner, name and value, and restore them afterwards."""
+    before = [(owner, name, getattr(owner, name)) for owner, name, _ in changes]
+    for owner, name, value in changes:
+        setattr(owner, name, value)
     try:
         yield
     finally:
-        for owner, name, original in replaced:
-            setattr(owner, name, original)
+        for owner, name, value in before:
+            setattr(owner, name, value)
 
 
-def time_whole(
-    trainer: Any, state: Any, one: Callable[[], None], *, steps: int, device: Any
-) -> dict[str, Any]:
+def time_whole(run: Run, args: argparse.Namespace, device: Any) -> dict[str, Any]:
     """Return the milliseconds of untouched steps, and the peak of the memory in bytes on CUDA."""
     import torch
 
-    is_cuda = device.type == "cuda"
-    if is_cuda:
-        torch.cuda.synchronize(device)
-        torch.cuda.reset_peak_memory_stats(device)
-    walls, cpus = [], []
-    for _ in range(steps):
-        wall, cpu = time.perf_counter(), time.process_time()
-        one()
-        walls.append(time.perf_counter() - wall)
-        cpus.append(time.process_time() - cpu)
-    if is_cuda:
-        # The last step is still running on the device.
-        started = time.perf_counter()
-        torch.cuda.synchronize(device)
-        walls[-1] += time.perf_counter() - started
+    marks = []
+
+    def after(number: int) -> None:
+        is_end = number in (args.warmup, args.warmup + args.steps)
+        if is_end and device.type == "cuda":
+            # What the device still does belongs to the steps before this line.
+            torch.cuda.synchronize(device)
+            if number == args.warmup:
+                torch.cuda.reset_peak_memory_stats(device)
+        if number >= args.warmup:
+            marks.append((time.perf_counter(), time.process_time()))
+
+    run.steps(args.warmup + args.steps, after)
+    clocks = zip(*marks, strict=True)
+    walls, cpus = ([later - earlier for earlier, later in pairwise(clock)] for clock in clocks)
     return {
-        "wall_ms": 1e3 * (statistics.fmean(walls) if is_cuda else statistics.median(walls)),
+        # On CUDA the host may be ahead of the device in one step and wait for it in the next.
+        "wall_ms": 1e3 * (statistics.fmean(walls) if device.type == "cuda" else statistics.median(walls)),
         "cpu_ms": 1e3 * statistics.median(cpus),
-        "peak_bytes": torch.cuda.max_memory_allocated(device) if is_cuda else None,
+        "peak_bytes": torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None,
     }
 
 
-def time_parts(
-    trainer: Any, state: Any, one: Callable[[], None], *, args: argparse.Namespace, watch: Watch
-) -> dict[str, Any]:
+def time_parts(run: Run, args: argparse.Namespace, watch: Watch) -> dict[str, Any]:
     """Return the median milliseconds of each part, of a refinement, and the bytes per Gaussian."""
-    rows = []
-    for _ in range(args.steps):
-        watch.seconds.clear()
-        watch.is_on = True
-        started = watch.now()
-        one()
-        total = watch.now() - started
-        watch.is_on = False
-        rows.append({**watch.seconds, "rest": total - sum(watch.seconds.values())})
-    names = [name for name in ORDER if any(name in row for row in rows)]
-    parts = {name: 1e3 * statistics.median(row.get(name, 0.0) for row in rows) for name in names}
-    memory = count_bytes(trainer, state, one)
+    rows: list[dict[str, float]] = []
+    totals: list[float] = []
     watch.is_on = True
+
+    def after(number: int) -> None:
+        totals.append(watch.now())
+        rows.append(dict(watch.seconds))
+        watch.seconds.clear()
+
+    # The first row also has the start of the pass.
+    run.steps(args.steps + 1, after)
+    for row, (earlier, later) in zip(rows[1:], pairwise(totals), strict=True):
+        row["rest"] = later - earlier - sum(row.values())
+    names = [name for name in ORDER if any(name in row for row in rows)]
+    parts = {name: 1e3 * statistics.median(row.get(name, 0.0) for row in rows[1:]) for name in names}
+    gradients = gradient_bytes(run)
+    state, trainer = run.state, run.trainer
     started = watch.now()
-    refined = trainer._refine(state, next(iter(trainer.refine.refinements), state.step))
+    trainer._refine(state, next(filter(trainer.refine.refines_at, range(1, MOST_STEPS)), state.step))
     refinement = watch.now() - started
     watch.is_on = False
-    return {
-        "parts_ms": parts,
-        "gaussians": memory.pop("gaussians"),
-        "refinement_ms": None if refined is None else 1e3 * refinement,
-        "bytes_per_gaussian": memory,
-    }
-
-
-def count_bytes(trainer: Any, state: Any, one: Callable[[], None]) -> dict[str, Any]:
-    """Return the bytes per Gaussian of everything that has a row for each, from the tensors of one step."""
-    from cadam3d.optimizer import GaussianOptimizer
-
-    gradients = []
-    step = GaussianOptimizer.step
-
-    def observed(owner: Any, *args: Any) -> Any:
-        grads = [tensor.grad for tensor in owner.gaussians.tensors().values()]
-        gradients.append(sum(grad.nbytes for grad in grads if grad is not None))
-        return step(owner, *args)
-
-    GaussianOptimizer.step = observed
-    try:
-        one()
-    finally:
-        GaussianOptimizer.step = step
     n = len(state.gaussians)
     moments = [part for part in state.optimizer.state_dict().values() if isinstance(part, dict)]
     held = {
-        "parameters": sum(tensor.nbytes for tensor in state.gaussians.tensors().values()),
-        "gradients": gradients[-1],
-        "moments": sum(tensor.nbytes for part in moments for tensor in part.values()),
-        "densifier": sum(rows.nbytes for rows in state.densifier.to_dict().values()),
+        "parameters": sum(tensor.nbytes for tensor in state.gaussians.tensors().values()) / n,
+        "gradients": gradients,
+        "moments": sum(tensor.nbytes for part in moments for tensor in part.values()) / n,
+        "densifier": sum(rows.nbytes for rows in state.densifier.to_dict().values()) / n,
     }
-    return {"gaussians": n, **{name: size / n for name, size in held.items()}}
+    return {
+        "parts_ms": parts,
+        "gaussians": n,
+        "refinement_ms": 1e3 * refinement,
+        "bytes_per_gaussian": held,
+    }
 
 
-def count_operations(trainer: Any, state: Any, one: Callable[[], None], *, watch: Watch) -> dict[str, Any]:
+def gradient_bytes(run: Run) -> float:
+    """Return the bytes per Gaussian of the gradients that the optimizer finds in one step."""
+    from cadam3d.optimizer import GaussianOptimizer
+
+    found = []
+    step = GaussianOptimizer.step
+
+    def observed(owner: Any, *args: Any) -> Any:
+        gaussians = owner.gaussians
+        grads = [tensor.grad for tensor in gaussians.tensors().values()]
+        found.append(sum(grad.nbytes for grad in grads if grad is not None) / len(gaussians))
+        return step(owner, *args)
+
+    with replaced([(GaussianOptimizer, "step", observed)]):
+        run.steps(1, lambda _: None)
+    return found[-1]
+
+
+def count_operations(run: Run, watch: Watch) -> dict[str, Any]:
     """Return how many operations and readbacks each part of a step dispatches, on average."""
     counter = operation_counter(watch)
+    found = {}
+
+    def after(number: int) -> None:
+        # The first step also has the start of the pass, and the end of the pass follows the last one.
+        counter.is_on = number <= COUNTED_STEPS
+        if number == 1:
+            watch.calls.clear()
+        if counter.is_on:
+            return
+        if watch.calls["readback"]:
+            # On a CPU, reading numbers together is no operation.
+            counter.readbacks["readback"] = watch.calls["readback"]
+        for kind in ("operations", "readbacks"):
+            counts = vars(counter)[kind]
+            found[kind] = {name: count / COUNTED_STEPS for name, count in counts.items()}
+
     with counter:
-        for _ in range(COUNTED_STEPS):
-            one()
-    return {
-        "operations": {name: count / COUNTED_STEPS for name, count in counter.operations.items()},
-        "readbacks": {name: count / COUNTED_STEPS for name, count in counter.readbacks.items()},
-    }
+        run.steps(COUNTED_STEPS + 1, after)
+    return found
 
 
 def operation_counter(watch: Watch) -> Any:
@@ -430,12 +452,15 @@ def operation_counter(watch: Watch) -> Any:
     class Counter(TorchDispatchMode):
         def __init__(self) -> None:
             super().__init__()
+            self.is_on = False
             self.operations = defaultdict[str, int](int)
             self.readbacks = defaultdict[str, int](int)
 
         def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
             part = watch.running[-1] if watch.running else "rest"
-            if is_readback(func, args, kwargs or {}):
+            if not self.is_on:
+                pass
+            elif is_readback(func, args, kwargs or {}):
                 self.readbacks[part] += 1
             elif not (func.is_view or func.overloadpacket in shaping):
                 self.operations[part] += 1
@@ -445,12 +470,6 @@ def operation_counter(watch: Watch) -> Any:
 
 
 # -------------------------------------------------------------------------- output
-
-
-def as_text(results: dict[str, list[Any]]) -> list[str]:
-    """Return one table per prior."""
-    rows = range(len(results["here"]))
-    return [as_table({tree: found[row] for tree, found in results.items()}) for row in rows]
 
 
 def as_table(found: dict[str, Any]) -> str:

@@ -188,13 +188,17 @@ def test_a_zero_gradient_stays_zero_under_a_bound():
 def test_one_bad_gradient_is_noticed(name, bad):
     optimizer = settings().start(gaussians(4))
     push(optimizer, seed=0)
-    assert optimizer.finite_gradients()
+    assert all(extreme.isfinite() for extreme in optimizer.extreme_gradients())
     getattr(optimizer.gaussians, name).grad.view(-1)[-1] = bad
-    assert not optimizer.finite_gradients()
+    assert not all(extreme.isfinite() for extreme in optimizer.extreme_gradients())
 
 
-def test_missing_gradients_count_as_finite():
-    assert settings().start(gaussians(4)).finite_gradients()
+def test_missing_gradients_have_no_extremes():
+    assert settings().start(gaussians(4)).extreme_gradients() == []
+    empty = settings().start(gaussians(0))
+    push(empty, seed=0)
+    assert empty.extreme_gradients() == []
+    empty.step(0)
 
 
 def test_survivors_keep_values_and_moments_and_newborns_start_at_zero():

@@ -1,6 +1,13 @@
-"""Device: from the name that a user types to a device that works on this machine."""
+"""Device: from the name that a user types to one that works here, and data on the way to it and back.
+
+A host that does not wait for a CUDA device prepares the next kernels while the device computes.
+"""
+
+from collections.abc import Sequence
 
 import torch
+from jaxtyping import Shaped
+from torch import Tensor
 
 from cadam3d.core.checks import fail
 
@@ -21,3 +28,33 @@ def resolve_device(name: str) -> torch.device:
         expected = f"a device of this machine ({reason})"
         raise fail("device", expected=expected, got=name, example="device=cpu") from error
     return device
+
+
+def upload(tensor: Tensor, device: torch.device) -> Tensor:
+    """Return ``tensor`` on ``device``, without waiting for what the device is doing.
+
+    A copy from ordinary memory to CUDA would wait. From pinned memory it does not, and torch reuses that
+    memory only after the copy. On the device that it is on already, a tensor is returned as it is.
+    """
+    if device.type == "cuda" and tensor.device.type == "cpu":
+        tensor = tensor.pin_memory()
+    return tensor.to(device, non_blocking=True)
+
+
+def upload_together(tensors: Sequence[Tensor], device: torch.device) -> list[Tensor]:
+    """Return all tensors on ``device``, in one copy of which they are views, as :func:`upload` does.
+
+    They have one dtype and are on one device, such as the CPU.
+    """
+    if all(tensor.device == device for tensor in tensors):
+        return list(tensors)
+    flat = upload(torch.cat([tensor.reshape(-1) for tensor in tensors]), device)
+    pieces = flat.split([tensor.numel() for tensor in tensors])
+    return [piece.view(tensor.shape) for piece, tensor in zip(pieces, tensors, strict=True)]
+
+
+def read_numbers(numbers: Sequence[Shaped[Tensor, ""] | float], device: torch.device) -> list[float]:
+    """Return the numbers, of which some may be tensors on ``device``. Waits for the device once in all."""
+    tensors = [upload(number.detach(), device) for number in numbers if isinstance(number, Tensor)]
+    read = iter(torch.stack(tensors).tolist() if tensors else [])
+    return [float(next(read) if isinstance(number, Tensor) else number) for number in numbers]

@@ -1,7 +1,7 @@
 """Densifier: decides WHEN a Gaussian grows. HOW (clone, split, prune) is shared, see refine.py (sec. 4.4)."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import torch
@@ -32,7 +32,7 @@ class GradientSignal:
 
     @classmethod
     def read(cls, gaussians: Gaussians, output: RenderOutput) -> "GradientSignal":
-        """Copy the gradients of the last backward pass, because another pass would add to them in place."""
+        """Return the gradients of the last backward pass themselves; another pass would add to them."""
         return cls(
             means=_gradient_of(gaussians.means),
             means2d=_gradient_of(output.means2d),
@@ -41,6 +41,11 @@ class GradientSignal:
             width=output.rgb.shape[2],
             absgrad=None if output.absgrad is None else _gradient_of(output.absgrad),
         )
+
+    def copy(self) -> "GradientSignal":
+        """Return copies of the gradients, which no later backward pass changes."""
+        absgrad = None if self.absgrad is None else self.absgrad.clone()
+        return replace(self, means=self.means.clone(), means2d=self.means2d.clone(), absgrad=absgrad)
 
     @property
     def visible(self) -> Bool[Tensor, "v n"]:
@@ -197,5 +202,5 @@ class GradientFree(Densifier[RowCount]):
 
 
 def _gradient_of(tensor: Tensor) -> Tensor:
-    """Return a copy of the gradient that backward left on ``tensor``; zeros if it left none."""
-    return torch.zeros_like(tensor) if tensor.grad is None else tensor.grad.detach().clone()
+    """Return the gradient that backward left on ``tensor``; zeros if it left none."""
+    return torch.zeros_like(tensor) if tensor.grad is None else tensor.grad.detach()

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from cadam3d.core.checks import require_range, require_whole
+from cadam3d.core.device import upload
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.densifier.base import GradientFree, RowCount
@@ -84,7 +85,7 @@ class MCMC(GradientFree):
     def perturb(self, gaussians: Gaussians, lr: float, generator: torch.Generator) -> Float[Tensor, "n 3"]:
         """Return Langevin noise, stretched by each covariance and almost zero for opaque Gaussians."""
         means = gaussians.means
-        normal = torch.randn(means.shape, generator=generator, dtype=means.dtype).to(means.device)
+        normal = upload(torch.randn(means.shape, generator=generator, dtype=means.dtype), means.device)
         # Isotropic noise has the same distribution along the axes of each Gaussian, so it needs no rotation
         # first.
         along_axes = gaussians.scales.square() * normal

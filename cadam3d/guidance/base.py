@@ -1,10 +1,11 @@
 """Guidance: the interface that turns a prior's prediction about a render into a gradient."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from torch import Tensor
 
 from cadam3d.core.chart import Chart
@@ -16,7 +17,9 @@ class GuidanceOutput:
     """A surrogate loss, and numbers that show how training proceeds."""
 
     loss: Float[Tensor, ""]  # its gradient is the distillation gradient
-    log: dict[str, float]  # for reports; training never reads it
+    # For reports; training never reads it. The trainer reads the tensors from the device together with all
+    # else that it needs, because each separate reading waits for the device.
+    log: Mapping[str, Real[Tensor, ""] | float]
 
 
 class Guidance(ABC):

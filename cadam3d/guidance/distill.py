@@ -5,11 +5,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from cadam3d.core.chart import Chart, Curve
 from cadam3d.core.checks import require_choice, require_range
+from cadam3d.core.device import upload
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.guidance.base import GuidanceOutput
 from cadam3d.guidance.window import WindowedGuidance
@@ -139,10 +140,10 @@ class Distillation(WindowedGuidance):
         return GuidanceOutput(
             loss=surrogate(clean, gradient, DIVISORS[self.reduction](clean.shape)),
             log={
-                "t": float(t.mean()),
+                "t": t.mean(),
                 "guidance_rms": rms(gradient),
                 "residual_rms": rms(clean.detach() - found.clean),
-                "guidance_nonfinite": float(nonfinite),
+                "guidance_nonfinite": nonfinite,
             },
         )
 
@@ -187,7 +188,7 @@ def surrogate(
 def standard_normal(like: Float[Tensor, "v c h w"], generator: torch.Generator) -> Float[Tensor, "v c h w"]:
     """Draw noise with the shape, dtype and device of ``like``; the draws do not depend on device or dtype."""
     noise = torch.randn(like.shape, generator=generator, dtype=torch.float32, device=generator.device)
-    return noise.to(like)
+    return upload(noise.to(like.dtype), like.device)
 
 
 def offset_normal(
@@ -198,14 +199,13 @@ def offset_normal(
     return noise if offset == 0 else noise + offset * standard_normal(like[:1, :, :1, :1], generator)
 
 
-def finite(gradient: Tensor) -> tuple[Tensor, int]:
+def finite(gradient: Tensor) -> tuple[Tensor, Int[Tensor, ""]]:
     """Replace elements of ``gradient`` that are not finite by 0; return the result and their number."""
-    is_finite = gradient.isfinite()
-    return torch.where(is_finite, gradient, 0), int((~is_finite).sum())
+    replaced = gradient.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+    return replaced, (gradient != replaced).sum()
 
 
-def rms(values: Tensor) -> float:
+def rms(values: Tensor) -> Float[Tensor, ""]:
     """Return the root mean square of the finite elements, or 0 if there are none."""
-    is_finite = values.isfinite()
-    squares = torch.where(is_finite, values, 0).square().sum()
-    return float((squares / is_finite.sum().clamp_min(1)).sqrt())
+    replaced, nonfinite = finite(values)
+    return (replaced.square().sum() / (values.numel() - nonfinite).clamp_min(1)).sqrt()

@@ -147,13 +147,13 @@ class GCS(WindowedGuidance):
             loss=surrogate(clean, on_latents, divisor(clean.shape))
             + surrogate(rgb, on_pixels, divisor(rgb.shape)),
             log={
-                "t": float(levels.t.mean()),
+                "t": levels.t.mean(),
                 "guidance_rms": rms(on_latents),
                 "cc_rms": rms(cc),
                 "gc_rms": rms(gc),
                 "cp_rms": rms(cp),
                 "residual_rms": rms(clean.detach() - terms.clean),
-                "guidance_nonfinite": float(lost_latents + lost_pixels),
+                "guidance_nonfinite": lost_latents + lost_pixels,
             },
         )
 

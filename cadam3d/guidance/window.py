@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.checks import require, require_choice
+from cadam3d.core.device import upload
 from cadam3d.core.schedule import FAR_STEP, Schedule, as_schedule, require_scheduled
 from cadam3d.guidance.base import Guidance
 
@@ -57,4 +58,5 @@ class WindowedGuidance(Guidance):
         """
         views = clean.shape[0]
         drawn = torch.rand(1 if self.shared_t else views, generator=generator, dtype=torch.float32)
-        return drawn.to(clean.device, torch.promote_types(clean.dtype, torch.float32)).expand(views)
+        drawn = drawn.to(torch.promote_types(clean.dtype, torch.float32))
+        return upload(drawn, clean.device).expand(views)

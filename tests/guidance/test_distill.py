@@ -248,7 +248,7 @@ def test_numbers_that_are_not_finite_become_zero_and_are_counted(distillation, m
     torch.testing.assert_close(sick[~is_sick], healthy[~is_sick])
     assert before.log["guidance_nonfinite"] == 0
     assert after.log["guidance_nonfinite"] == 2
-    assert all(torch.tensor(value).isfinite() for value in after.log.values())
+    assert all(torch.as_tensor(value).isfinite() for value in after.log.values())
 
 
 def test_the_residual_is_measured_against_the_last_prediction(make, run, gaussian, one_image, rgb):

@@ -34,7 +34,7 @@ def test_gradient_equals_the_closed_form(scale, path, make, run, gaussian, means
 def test_gradient_is_the_residual_over_gamma(make, run, prior, means, rgb):
     """Paper eq. 4: G = w / gamma * (x0 - x0_hat), so with w = gamma its norm is that of the residual."""
     _, output = run(make("sds", weighting="gamma"), rgb, means, prior)
-    assert output.log["guidance_rms"] == pytest.approx(output.log["residual_rms"], rel=1e-9)
+    assert output.log["guidance_rms"] == pytest.approx(float(output.log["residual_rms"]), rel=1e-9)
 
 
 def test_mean_gradient_over_noise_is_linear_in_the_distance(make, run, gaussian, one_image, rgb):

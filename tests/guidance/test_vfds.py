@@ -40,7 +40,7 @@ def test_on_a_flow_the_target_is_noise_minus_render(make, run, gaussian, means, 
 
 def test_gradient_is_the_residual_over_b(make, run, prior, means, rgb):
     _, output = run(make("vfds", weighting="sigma"), rgb, means, prior)
-    assert output.log["guidance_rms"] == pytest.approx(output.log["residual_rms"], rel=1e-9)
+    assert output.log["guidance_rms"] == pytest.approx(float(output.log["residual_rms"]), rel=1e-9)
 
 
 def test_vfds_times_a_equals_sds(path, make, run, prior, means, rgb):
