@@ -61,7 +61,9 @@ def main(words: list[str] | None = None) -> int:
         return run(args)
     except NoGpuError as error:
         print(f"gpu: expected an NVIDIA GPU, got none: {error}. Try: nvidia-smi", file=sys.stderr)
-    except (TroubleError, OSError, ValueError) as error:
+    except OSError as error:
+        print(f"gpu: cannot use {error.filename}: {error.strerror}. Try: ls {FOLDER}", file=sys.stderr)
+    except (TroubleError, ValueError) as error:
         print(f"gpu: {error}", file=sys.stderr)
     except KeyboardInterrupt:
         print("gpu: stopped. The same line continues.", file=sys.stderr)

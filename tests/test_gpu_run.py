@@ -445,6 +445,7 @@ def test_the_markdown_has_one_table_with_every_result():
 def test_the_fastest_backend_of_each_scene_is_compared_with_the_choice_of_auto():
     [verdict] = markdown.verdicts(whole_record())
     assert (verdict["fastest"], verdict["timed"]) == ("cuda", ["gsplat", "cuda"])
+    assert (verdict["auto"], verdict["is_auto_fastest"]) == ("gsplat", False)
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"machine": {}, "state": "", "pieces": {"a": {}}}'])
@@ -455,6 +456,12 @@ def test_a_file_that_is_no_record_is_refused_in_one_line(content, tmp_path, caps
     error = capsys.readouterr().err
     assert "is not a record of this script" in error
     assert error.count("\n") == 1
+
+
+def test_a_file_that_is_missing_is_named_in_one_line(tmp_path, capsys):
+    assert gpu.main(["--markdown", str(tmp_path / "none.json")]) == 1
+    error = capsys.readouterr().err
+    assert re.fullmatch(r"gpu: cannot use .*none\.json: No such file or directory\. Try: ls .*\n", error)
 
 
 # -------------------------------------------------------------------------- sessions

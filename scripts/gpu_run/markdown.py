@@ -122,19 +122,20 @@ def stage_time(stage: dict[str, Any]) -> str:
 
 def fastest(record: Record) -> Iterator[tuple[str, str, str]]:
     """Yield which backend was fastest on each scene, and whether ``rasterizer=auto`` uses it."""
-    chosen = record.pieces.get("choice of auto")
-    choice = (chosen.result or {}).get("backend") if chosen else None
     for verdict in verdicts(record):
+        text = f"{verdict['fastest']} of {', '.join(verdict['timed'])}; "
+        text += f"auto uses {verdict['auto'] or 'an unknown one'}"
         yield (
             "fastest, and choice of `auto`",
             scene(verdict),
-            f"{verdict['fastest']} of {', '.join(verdict['timed'])}; auto uses {choice or 'an unknown one'}"
-            + ("" if choice is None or choice == verdict["fastest"] else ", **which is slower**"),
+            text + (", **which is slower**" if verdict["is_auto_fastest"] is False else ""),
         )
 
 
 def verdicts(record: Record) -> list[dict[str, Any]]:
-    """Return the fastest backend of each timed scene."""
+    """Return the fastest backend of each timed scene, and whether it is the one that ``auto`` uses."""
+    chosen = record.pieces.get("choice of auto")
+    auto = (chosen.result or {}).get("backend") if chosen else None
     scenes: dict[tuple[int, ...], list[dict[str, Any]]] = {}
     for entry in record.pieces.values():
         for row in (entry.result or {}).get("rows", []):
@@ -142,9 +143,19 @@ def verdicts(record: Record) -> list[dict[str, Any]]:
                 scenes.setdefault((row["count"], row["size"], row["views"], row["degree"]), []).append(row)
     found = []
     for (count, size, views, degree), timed in scenes.items():
-        first = min(timed, key=lambda row: row["step_ms"])
-        each = {"count": count, "size": size, "views": views, "degree": degree}
-        found.append(each | {"fastest": first["backend"], "timed": [row["backend"] for row in timed]})
+        first = min(timed, key=lambda row: row["step_ms"])["backend"]
+        found.append(
+            {
+                "count": count,
+                "size": size,
+                "views": views,
+                "degree": degree,
+                "timed": [row["backend"] for row in timed],
+                "fastest": first,
+                "auto": auto,
+                "is_auto_fastest": None if auto is None else auto == first,
+            }
+        )
     return found
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 SCENES = ((20_000, 512, 1, 0), (100_000, 512, 4, 0), (1_000_000, 1024, 4, 0))
-REPEATS = 20
+REPEATS = 10
 # Keys and bits: pairs of 1M Gaussians in 4 views by depth, and their slots by tile at 1024 px.
 SORTS = ((80_000, 32), (400_000, 32), (4_000_000, 32), (16_000_000, 17))
 COPY_BYTES = 2**30
@@ -39,7 +39,8 @@ def facts() -> dict[str, Any]:
 
     found: dict[str, Any] = {"torch": torch.__version__, "torch_cuda": torch.version.cuda}
     if torch.version.cuda is None:
-        return found | {"trouble": f"torch {torch.__version__} is built without CUDA. Try: pip install torch"}
+        trouble = f"torch {torch.__version__} is built without CUDA"
+        return found | {"trouble": f"{trouble}. Try: pip install --force-reinstall torch"}
     try:
         # The first operation finds out whether torch has kernels for this GPU.
         assert (torch.ones(2, device="cuda") + 1).sum().item() == 4

@@ -92,8 +92,14 @@ Watch = Callable[[Callable[[], object]], list[Kernel]]
 
 
 def profile(work: Callable[[], object]) -> list[Kernel]:
-    """Return the kernels and copies of ``work``, timed by the GPU."""
-    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profiler:
+    """Return the kernels and copies of ``work``, timed by the GPU.
+
+    Raises :class:`NoKernelsError` if this torch cannot do that.
+    """
+    gpu = torch.profiler.ProfilerActivity.CUDA
+    if gpu not in torch.profiler.supported_activities():
+        raise NoKernelsError("torch.profiler of this torch cannot time kernels")
+    with torch.profiler.profile(activities=[gpu]) as profiler:
         work()
         torch.cuda.synchronize()
     events = [e for e in profiler.events() or [] if e.device_type == torch.autograd.DeviceType.CUDA]
