@@ -21,12 +21,13 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
-from cadam3d.rasterizer import cuda
+from cadam3d.rasterizer import cuda, workspace
 from cadam3d.rasterizer.build import KERNELS, definitions, find_compiler
 from cadam3d.rasterizer.cuda import rasterize
 from cadam3d.rasterizer.cuda_sort import scan, scan_bytes, sort, sort_bytes
 from cadam3d.rasterizer.driver import Module
 from cadam3d.rasterizer.launcher import Launch, Launcher
+from cadam3d.rasterizer.workspace import Workspace
 
 SOURCE = Path(__file__).parent / "rasterizer" / "emulator" / "emulator.cpp"
 FLAGS = ("-std=c++17", "-shared", "-fPIC", "-ffp-contract=off", "-U_FORTIFY_SOURCE")
@@ -116,6 +117,14 @@ class Lists:
     ranges: torch.Tensor  # [tiles + 1, 2]
 
 
+def count_slots(launcher: Launcher, gaussians: Gaussians, cameras: Cameras) -> list[int]:
+    """Return the number of slots of each view."""
+    views = cuda._CudaPass(launcher, cameras, torch.device("cpu"))
+    with views:
+        views.project(list(gaussians.tensors().values()))
+    return views.read_slots()
+
+
 def list_tiles(launcher: Launcher, gaussians: Gaussians, cameras: Cameras) -> Lists:
     """Project the Gaussians and return the tile lists."""
     parameters = list(gaussians.tensors().values())
@@ -136,6 +145,34 @@ def list_tiles(launcher: Launcher, gaussians: Gaussians, cameras: Cameras) -> Li
         ranges=array("ranges").view(-1, 2),
         **{name: array(name) for name in ("counts", "first_slot", "slots", "pair_of_slot")},
     )
+
+
+@contextmanager
+def guard_zones() -> Iterator[Callable[[], bool]]:
+    """Give each array of a workspace an allocation of its own, between two zones that nothing may write.
+
+    Yield a function that returns whether all zones are intact. At first the arrays contain small numbers. The
+    largest number would be less harmful, because it cannot be mistaken for an index.
+    """
+    zone, mark, found = 256, 0xA5, []
+
+    def allocate(self: Workspace, device: torch.device) -> tuple[torch.Tensor, ...]:
+        blocks = []
+        for size in self.blocks:
+            whole = torch.full((size + 2 * zone,), mark, dtype=torch.uint8, device=device)
+            garbage = torch.arange(-(-size // 4), dtype=torch.int32, device=device).view(torch.uint8)
+            whole[zone : zone + size] = garbage[:size]
+            found.append(whole)
+            blocks.append(whole[zone : zone + size])
+        return tuple(blocks)
+
+    def intact() -> bool:
+        return all((end == mark).all() for whole in found for end in (whole[:zone], whole[-zone:]))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workspace, "APART", True)
+        patch.setattr(Workspace, "allocate", allocate)
+        yield intact
 
 
 def load_emulator(folder: Path, kernels: Path = KERNELS, optimize: str = "-O1") -> Emulator:

@@ -17,41 +17,70 @@ ONLY_DEGREE_0 = "#define EMULATOR_ONLY_DEGREE_0\n"
 RENDERING = {
     "the last row of tiles is forgotten": (
         "tiles.cuh",
-        "row <= rows.last / TILE",
-        "row <= rows.last / TILE - MUTANT",
+        "row <= last_row;",
+        "row <= last_row - MUTANT;",
     ),
     "a list that misses its last splat": ("tiles.cuh", "= u32(e + 1);", "= MUTANT ? u32(e) : u32(e + 1);"),
     "no wait for the stage": (
         "blend.cuh",
-        "    __syncwarp();\n    const int count",
-        "    if (!MUTANT) __syncwarp();\n    const int count",
+        "    __syncwarp();\n    const u32 count",
+        "    if (!MUTANT) __syncwarp();\n    const u32 count",
     ),
     "the last splat is off by one": (
         "blend.cuh",
-        "u32(base - begin) + j + 1)",
-        "u32(base - begin) + j + !MUTANT)",
+        "colour, mark)",
+        "colour, mark - MUTANT)",
     ),
-    "a pixel that never closes": ("blend.cuh", "pixel.is_open = false;", "pixel.is_open = MUTANT;"),
+    "a pixel that never closes": ("blend.cuh", ": -fabsf(before);", ": MUTANT ? before : -fabsf(before);"),
+    "a closed pixel that opens again": (
+        "blend.cuh",
+        ": -fabsf(before);",
+        ": MUTANT ? -before : -fabsf(before);",
+    ),
+    "the two pixels of a lane too far apart": (
+        "blend.cuh",
+        "__fmaf_rn(float(STRIDE), centre.w, o.u)",
+        "__fmaf_rn(float(STRIDE + MUTANT), centre.w, o.u)",
+    ),
+    "the second pixel of a lane instead of both": (
+        "blend.cuh",
+        "sum = IS_FIRST ? x * y :",
+        "sum = IS_FIRST || MUTANT ? x * y :",
+    ),
     "no gate at the largest alpha": (
         "blend.cuh",
-        "free <= float(SPLAT_ALPHA_MAX) ? -alpha * g_alpha : 0.0f",
-        "MUTANT || free <= float(SPLAT_ALPHA_MAX) ? -alpha * g_alpha : 0.0f",
+        "free <= float(SPLAT_ALPHA_MAX) ? slope : 0.0f",
+        "MUTANT || free <= float(SPLAT_ALPHA_MAX) ? slope : 0.0f",
     ),
     "a shuffle in a branch": (
         "blend.cuh",
-        "if (__any_sync(ALL, hit0 || hit1))",
-        "if (MUTANT ? hit0 || hit1 : __any_sync(ALL, hit0 || hit1))",
+        "if (__any_sync(ALL, any_hit))",
+        "if (MUTANT ? any_hit : __any_sync(ALL, any_hit))",
     ),
     "two sums are swapped": (
         "blend.cuh",
         "fold(b4, s.gt, s.green, 16)",
         "fold(b4, MUTANT ? s.green : s.gt, MUTANT ? s.gt : s.green, 16)",
     ),
-    "records are not cleared": (
+    "a sum that is not folded": ("blend.cuh", "q2 = fold_one(p2, 8)", "q2 = MUTANT ? p2 : fold_one(p2, 8)"),
+    "a sum in the place of another one": ("blend.cuh", "(b3 ? 4 : 1)", "(b3 != MUTANT ? 4 : 1)"),
+    "records are not cleared": ("blend.cuh", "e = dead + nth;", "e = MUTANT ? end : dead + nth;"),
+    "records are not cleared to their end": (
         "blend.cuh",
-        "e = begin + used + lane;",
-        "e = MUTANT ? end : begin + used + lane;",
+        "part = u32(lane) % (RECORD / 2),",
+        "part = u32(lane) % (RECORD / 2 - MUTANT),",
     ),
+    "a cut to another base than the whitening": (
+        "project.cuh",
+        "cut = LOG2_E * shape.log_cut",
+        "cut = (MUTANT ? 1 : LOG2_E) * shape.log_cut",
+    ),
+    "first moments to another base": (
+        "project.cuh",
+        "once = SQRT_LN_2,",
+        "once = MUTANT ? LN_2 : SQRT_LN_2,",
+    ),
+    "second moments to another base": ("project.cuh", "twice = LN_2;", "twice = MUTANT ? SQRT_LN_2 : LN_2;"),
     "half of a long run": (
         "project.cuh",
         "slot < from + many; slot += WARP",
@@ -61,13 +90,31 @@ RENDERING = {
 ABSOLUTE_GRADIENTS = {
     "absolute values that cancel": (
         "blend.cuh",
-        "absolutes.u += fabsf(gu);",
-        "absolutes.u += MUTANT ? gu : fabsf(gu);",
+        "(absolutes.u, fabsf(gu));",
+        "(absolutes.u, MUTANT ? gu : fabsf(gu));",
     ),
     "absolute values are not cleared": (
         "blend.cuh",
-        "j < ABSOLUTES; ++j) absolutes",
-        "j < (MUTANT ? 0 : ABSOLUTES); ++j) absolutes",
+        "e = dead + lane;",
+        "e = MUTANT ? end : dead + lane;",
+    ),
+    "absolute values to another base": (
+        "project.cuh",
+        "sum[0] *= SQRT_LN_2, sum[1] *= LN_2;",
+        "sum[0] *= SQRT_LN_2, sum[1] *= MUTANT ? 1 : LN_2;",
+    ),
+}
+# These need tiles of 8x4.
+SMALL_TILES = {
+    "tiles that are listed with another height than they are counted with": (
+        "tiles.cuh",
+        "grid = make_grid(height, width, tile_height);",
+        "grid = make_grid(height, width, MUTANT ? 8 : tile_height);",
+    ),
+    "tiles that are blended with another height than they are listed with": (
+        "blend.cuh",
+        "tile_height = PIXELS * STRIDE;",
+        "tile_height = (MUTANT ? 2 : PIXELS) * STRIDE;",
     ),
 }
 # This one must be harmless: a compiler might round differently where tiles are listed than where they are
@@ -79,6 +126,45 @@ ROUNDING = {
         "each_tile_row(s, grid, [&](int row, int first, int last) {"
         " if (MUTANT) last += pair % 3 == 0 ? 1 : pair % 3 == 1 ? -1 : 0;",
     ),
+}
+# Mistakes in the number of slots that is on the device.
+COUNTED = {
+    "a capacity that is one too small": (
+        "tiles.cuh",
+        "const bool fits = i64(*total) <= capacity;",
+        "const bool fits = i64(*total) <= capacity - MUTANT;",
+    ),
+    "a capacity that is one too large": (
+        "tiles.cuh",
+        "if (!fits) return;",
+        "if (!fits && !(MUTANT && i64(*total) == capacity + 1)) return;",
+    ),
+    "an overflow that is not reported": (
+        "tiles.cuh",
+        "*overflowed = !fits;",
+        "*overflowed = MUTANT ? false : !fits;",
+    ),
+    "ranges that are not cleared": (
+        "tiles.cuh",
+        "ranges[i] = 0;",
+        "ranges[i] = MUTANT ? ranges[i] : 0;",
+    ),
+    "a sort that believes a total that does not fit": (
+        "device.cuh",
+        "return i64(*total) <= capacity ? i64(*total) : 0;",
+        "return i64(*total) <= capacity || MUTANT ? i64(*total) : 0;",
+    ),
+    "gradients from records that do not exist": (
+        "project.cuh",
+        "const bool has_records = i64(*total_slots) <= capacity;",
+        "const bool has_records = MUTANT || i64(*total_slots) <= capacity;",
+    ),
+    "absolute gradients from records that do not exist": (
+        "project.cuh",
+        "const bool has_records = i64(*total) <= capacity;",
+        "const bool has_records = MUTANT || i64(*total) <= capacity;",
+    ),
+    "a report of the Gaussians alone": ("tiles.cuh", "<< 32 | *total;", "<< 32 | (MUTANT ? 0 : *total);"),
 }
 SORTING = {
     "sums that wrap around": ("sort.cuh", "a + b < a ? ALL", "a + b < a && !MUTANT ? ALL"),
@@ -190,7 +276,7 @@ SORTING = {
     ),
     "bases that do not move on": ("sort.cuh", "bases[d] += ends[d];", "bases[d] += MUTANT ? 0 : ends[d];"),
 }
-MUTANTS = RENDERING | ABSOLUTE_GRADIENTS | ROUNDING | SORTING
+MUTANTS = RENDERING | ABSOLUTE_GRADIENTS | SMALL_TILES | ROUNDING | COUNTED | SORTING
 NUMBERS = {name: number for number, name in enumerate(MUTANTS, start=1)}
 
 

@@ -36,12 +36,12 @@ from cadam3d.rasterizer.cuda_sort import BLOCK, scan, scan_bytes, sort, sort_byt
 from cadam3d.rasterizer.driver import Driver
 from cadam3d.rasterizer.forecast import Forecast, find_forecast
 from cadam3d.rasterizer.launcher import Launch, Launcher
-from cadam3d.rasterizer.native import RenderPass, require_shapes, run_pass, upload
+from cadam3d.rasterizer.native import RenderPass, outside_of_graphs, require_shapes, run_pass, upload
 from cadam3d.rasterizer.workspace import Workspace, plan
 
 # The kernels define the same constants (kernels/*.cuh).
 PROJECT_BLOCK, BLEND_BLOCK, WARP = 128, 128, 32  # threads
-TILE = 8  # pixels along the edge of a tile
+TILE_WIDTH = 8  # pixels
 SPLAT, RECORD, ABSOLUTES, CAMERA = 12, 10, 2, 25  # floats
 
 DEPTH_BITS = 32
@@ -49,6 +49,10 @@ DEPTH_BITS = 32
 MOST = 2**31 - 1
 # Bytes of the records of one group of views. A group has at least one view, whatever that view needs.
 RECORD_MEMORY = 256 * 2**20
+# With at most this number of tiles of 8x8 in a view, tiles are 8x4, which are more and have shorter lists.
+# Otherwise most of a large GPU would have nothing to do (docs/kernels.md has the arithmetic). The choice
+# depends on the size of a view alone, so a batch has the bits of its single views on every device.
+FEW_TILES = 1024
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,6 +110,7 @@ def load_kernels(cache_dir: str | None) -> Launcher:
     return Driver(kernels_dir(cache_dir))
 
 
+@outside_of_graphs
 def rasterize(
     launcher: Launcher,
     gaussians: Gaussians,
@@ -133,6 +138,7 @@ def rasterize(
     return run_pass(kernels, gaussians, moved[2])
 
 
+@outside_of_graphs
 def rasterize_ahead(
     launcher: Launcher,
     gaussians: Gaussians,
@@ -146,7 +152,7 @@ def rasterize_ahead(
         return rasterize(launcher, gaussians, cameras, background, absgrad)
     forecast = find_forecast(gaussians.device, v, cameras.height, cameras.width)
     capacity = forecast.capacity(n)
-    tiles = _pieces(cameras.height, TILE) * _pieces(cameras.width, TILE)
+    tiles = count_tiles(cameras.height, cameras.width)
     # If the views may need several groups, their numbers of slots must be known.
     most = MOST if v == 1 else most_slots(absgrad)
     if capacity is None or capacity > most or v * max(n, tiles) > MOST:
@@ -179,8 +185,11 @@ class _CudaPass(RenderPass):
         forecast: Forecast | None = None,
     ) -> None:
         super().__init__(cameras, device, absgrad)
+        self.tile_height = tile_height(self.height, self.width)
         # The number of tiles of one view.
-        self.tiles = _pieces(self.height, TILE) * _pieces(self.width, TILE)
+        self.tiles = count_tiles(self.height, self.width)
+        # The kernels of the blend that are for these tiles have this at the end of their name.
+        self.size_of_tiles = f"{TILE_WIDTH}x{self.tile_height}"
         # The number of slots that memory is reserved for before it is known. None: the host waits for it.
         self.capacity = capacity
         # This learns the number of slots, if given.
@@ -217,7 +226,7 @@ class _CudaPass(RenderPass):
         means, *_, sh = parameters
         v, n, at = self.views, means.shape[0], self.at
         means2d, radii = means.new_empty(v, n, 2), means.new_empty(v, n)
-        inputs = (*_addresses(parameters), at["cameras"], n, v, self.height, self.width)
+        inputs = (*_addresses(parameters), at["cameras"], n, v, self.height, self.width, self.tile_height)
         on_screen = (means2d.data_ptr(), radii.data_ptr())
         results = (at["splats"], *on_screen, self.scratch["depth_keys"], at["counts"])
         kernel = f"project_forward_{sh.shape[1]}"
@@ -237,7 +246,8 @@ class _CudaPass(RenderPass):
             pixel = group.views.start * self.height * self.width
             results = (images[0] + 12 * pixel, images[1] + 4 * pixel, images[2] + 4 * pixel)
             results += (self.at["transmittance"] + 4 * pixel, self.at["last"] + 4 * pixel)
-            _launch_each(self.launch, "blend_forward", group.tiles * WARP, BLEND_BLOCK, *inputs, *results)
+            kernel = f"blend_forward_{self.size_of_tiles}"
+            _launch_each(self.launch, kernel, group.tiles * WARP, BLEND_BLOCK, *inputs, *results)
             if keeps:
                 self.groups.append(group)
         return rgb, alpha, depth
@@ -297,7 +307,7 @@ class _CudaPass(RenderPass):
         total, capacity = at["totals"] + 4 * group.views.start, group.capacity
         tile_keys, ranges = scratch["tile_keys"], lists["ranges"]
         order = (ordered["order"], at["counts"] + first, ordered["offsets"], total, capacity, v * n, n)
-        inputs = (*order, at["splats"] + SPLAT * first, v, self.height, self.width)
+        inputs = (*order, at["splats"] + SPLAT * first, v, self.height, self.width, self.tile_height)
         results = (tile_keys, lists["pair_of_slot"], at["first_slot"] + first, ranges)
         overflowed = 0 if self.overflowed is None else self.overflowed.data_ptr()
         is_ahead = self.capacity is not None
@@ -349,10 +359,10 @@ class _CudaPass(RenderPass):
             # One more warp clears the slots that belong to no tile.
             warps = (group.tiles + 1) * WARP
             if absgrad is None:
-                _launch_each(launch, "blend_backward", warps, BLEND_BLOCK, *blend)
+                _launch_each(launch, f"blend_backward_{self.size_of_tiles}", warps, BLEND_BLOCK, *blend)
             else:
-                apart = scratch["absolutes"]
-                _launch_each(launch, "blend_backward_absolute", warps, BLEND_BLOCK, *blend, apart)
+                apart, absolute = scratch["absolutes"], f"blend_backward_absolute_{self.size_of_tiles}"
+                _launch_each(launch, absolute, warps, BLEND_BLOCK, *blend, apart)
                 pairs = (group.views.stop - first) * n
                 which = (
                     at["splats"] + 4 * SPLAT * pair,
@@ -478,6 +488,16 @@ def _temporary_sizes(sizes: Sequence[int]) -> dict[str, int]:
 def _temporary(scratch: dict[str, int]) -> list[int]:
     """Return the addresses of the temporary arrays of the sort."""
     return [address for name, address in scratch.items() if name.startswith("temporary")]
+
+
+def tile_height(height: int, width: int) -> int:
+    """Return the height of the tiles in pixels: 8, or 4 if those would be few."""
+    return 4 if _pieces(height, 8) * _pieces(width, TILE_WIDTH) <= FEW_TILES else 8
+
+
+def count_tiles(height: int, width: int) -> int:
+    """Return the number of tiles of one view."""
+    return _pieces(height, tile_height(height, width)) * _pieces(width, TILE_WIDTH)
 
 
 def most_slots(absgrad: bool) -> int:

@@ -77,9 +77,9 @@ def sort(
 ) -> int:
     """Sort unsigned keys by their lowest ``bits`` bits, and return the address of the sorted keys.
 
-    Their old positions go to ``order``; equal keys keep their order. ``keys`` is overwritten. ``total`` is the
-    address of the number of keys, which is 0 for all kernels if it exceeds ``capacity``. Without it, there
-    are ``capacity`` keys. The capacity is less than 2^31.
+    Their old positions go to ``order``; equal keys keep their order. ``keys`` is overwritten. ``total`` is
+    the address of the number of keys, which is 0 for all kernels if it exceeds ``capacity``. Without it,
+    there are ``capacity`` keys. The capacity is less than 2^31.
     """
     return _sort(launch, (keys, order, *temporary), (total, capacity), digit_bits(bits), writes_keys=True)
 

@@ -39,7 +39,9 @@ OPTIONS = (
 )
 PATTERN = "*nvrtc64_*.dll" if sys.platform == "win32" else "libnvrtc.so*"
 BUILTINS = "*nvrtc-builtins*.dll" if sys.platform == "win32" else "libnvrtc-builtins.so*"
-SYSTEM = ("libnvrtc.so", "libnvrtc.so.13", "libnvrtc.so.12")
+# The name without a number comes last. It belongs to whichever toolkit was installed with its headers, which
+# may be too old for the device.
+SYSTEM = ("libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so")
 # Architectures of embedded boards; no other device runs their code.
 EMBEDDED = (72, 87, 101)
 
@@ -64,8 +66,12 @@ class Cubin:
 
 @cache
 def find_compiler() -> Compiler | None:
-    """Return the first NVRTC that loads: of torch's CUDA version, of another one, or of the system."""
-    for path in (*sorted(_bundled(), key=_distance_from_torch), *SYSTEM):
+    """Return the first NVRTC that loads: first those of the wheels, then those of the system.
+
+    In each of the two groups, the ones of torch's CUDA version come first.
+    """
+    system = sorted(SYSTEM, key=lambda name: not _fits_torch(name))
+    for path in (*sorted(_bundled(), key=_distance_from_torch), *system):
         try:
             return _load(str(path))
         except OSError:
@@ -84,10 +90,13 @@ def _bundled() -> Iterator[Path]:
 
 
 def _distance_from_torch(path: Path) -> tuple[bool, bool, str]:
+    return ".alt." in path.name, not _fits_torch(path.name), path.name
+
+
+def _fits_torch(name: str) -> bool:
     # The driver is known to load the CUDA version that torch was built for.
     major = (torch.version.cuda or "").split(".")[0]
-    fits = bool(major) and (path.name.endswith(f".so.{major}") or f"64_{major}" in path.name)
-    return ".alt." in path.name, not fits, path.name
+    return bool(major) and (name.endswith(f".so.{major}") or f"64_{major}" in name)
 
 
 def _load(path: str) -> Compiler:

@@ -294,7 +294,7 @@ def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:
         visible=int(output.visible.sum()),
         slots=slots,
         pixels=views * height * width,
-        tiles=views * (-(-height // cuda.TILE)) * (-(-width // cuda.TILE)),
+        tiles=views * cuda.count_tiles(height, width),
     )
 
 

@@ -10,11 +10,14 @@ from mutants import MUTANTS, plant
 from splats import Backend
 
 from cadam3d.rasterizer import build as build_module
+from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.build import Build, build, find_compiler
 from cadam3d.rasterizer.cpu import CpuRasterizer
 from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
+# More tiles than any image of the tests has.
+MANY = 10**9
 NATIVE = ["cpu", "emulator", pytest.param("gpu", marks=pytest.mark.gpu)]
 REFERENCES = {
     "reference-float64": Backend(
@@ -62,6 +65,18 @@ def build_with_flags(build_cache, kernel_build):
         return build_once(build_cache / f"cpu-{key}", flags)
 
     return build_other
+
+
+@pytest.fixture(autouse=True)
+def large_tiles(monkeypatch):
+    """Use tiles of 8x8, in which a lane has two pixels, although the images of the tests are small."""
+    monkeypatch.setattr(cuda, "FEW_TILES", 0)
+
+
+@pytest.fixture
+def small_tiles(monkeypatch, large_tiles):
+    """Use tiles of 8x4 after all."""
+    monkeypatch.setattr(cuda, "FEW_TILES", MANY)
 
 
 @pytest.fixture(scope="session")

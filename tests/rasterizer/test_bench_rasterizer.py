@@ -284,8 +284,8 @@ def test_every_launch_belongs_to_a_known_stage(emulator):
     assert kernels["depth sort"] == ["sort_scatter"] * passes
     assert kernels["tile lists"] == ["scan_apply", "tile_list"]
     assert kernels["tile sort"] == ["sort_scatter", "tile_ranges"]
-    assert kernels["blend forward"] == ["blend_forward"]
-    assert kernels["blend backward"] == ["blend_backward"]
+    assert kernels["blend forward"] == ["blend_forward_8x8"]
+    assert kernels["blend backward"] == ["blend_backward_8x8"]
     assert kernels["project backward"] == ["project_backward_4", "centre_backward"]
 
 

@@ -1,9 +1,11 @@
 """The CUDA rasterizer: the same kernels on fibers on every machine, and on a GPU if there is one."""
 
+import ctypes
+
 import pytest
 import torch
-from emulation import Emulator, check_sort, list_tiles, passes
-from mutants import NUMBERS, RENDERING, ROUNDING
+from emulation import Emulator, build_emulator, check_sort, list_tiles, passes
+from mutants import NUMBERS, RENDERING, ROUNDING, SMALL_TILES, plant
 from splats import (
     assert_agrees,
     assert_same_bits,
@@ -27,6 +29,12 @@ from cadam3d.rasterizer.cuda import CudaRasterizer
 pytestmark = pytest.mark.usefixtures("garbage_in_new_memory")
 
 CPU = torch.device("cpu")
+# Gaussians, cameras, and the smallest share of pixels that are not on a step.
+HARD_SCENES = (
+    (saturated(40), make_cameras(1, 21, 27), 0.5),
+    (needles(60), make_cameras(1, 31, 43), 0.9),
+    (make_gaussians(4, seed=16, log_scale=1.5), make_cameras(1, 75, 70), 0.5),
+)
 
 
 # -------------------------------------------------------------------------- order and limits
@@ -39,6 +47,47 @@ def test_the_bits_do_not_depend_on_the_schedule_of_threads(emulator):
     ]
     for other in results[1:]:
         assert_same_bits(results[0], other)
+
+
+# -------------------------------------------------------------------------- the blend
+
+
+@pytest.mark.usefixtures("small_tiles")
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_tiles_of_8x4_agree_with_the_reference(emulator, absgrad):
+    for gaussians, cameras, most in HARD_SCENES:
+        assert_agrees(emulator.render, gaussians, cameras, most=most, absgrad=absgrad)
+
+
+@pytest.mark.usefixtures("small_tiles")
+def test_the_bits_of_tiles_of_8x4_do_not_depend_on_the_schedule_of_threads(emulator):
+    scene = saturated(60), make_cameras(2, 37, 50), backgrounds(2), make_weights(2, 37, 50)
+    results = [bits(*render_and_differentiate(emulator.shuffled(seed).render, *scene)) for seed in (0, 1)]
+    assert_same_bits(*results)
+
+
+def test_only_small_images_have_small_tiles(monkeypatch):
+    monkeypatch.undo()
+    assert [cuda.tile_height(size, size) for size in (1, 112, 256, 257, 512)] == [4, 4, 4, 8, 8]
+
+
+@pytest.fixture(scope="module")
+def rough(build_cache, tmp_path_factory):
+    """Return the kernels with results of the fast exponential and reciprocal that are off by some bits."""
+    kernels = plant({}, tmp_path_factory.mktemp("rough"))
+    return Emulator(ctypes.CDLL(str(build_emulator(build_cache, kernels, "-O1", ("-DEMULATOR_ROUGH",)))))
+
+
+# The documentation of PTX allows 2 units in the last place for the exponential, and 1 for the reciprocal.
+@pytest.mark.parametrize("few", [0, 10**9])
+def test_kernels_agree_with_the_reference_when_the_hardware_rounds_as_it_may(
+    rough, emulator, few, monkeypatch
+):
+    monkeypatch.setattr(cuda, "FEW_TILES", few)
+    for gaussians, cameras, most in HARD_SCENES:
+        output, _ = assert_agrees(rough.render, gaussians, cameras, most=most)
+        exact = emulator.render(gaussians, cameras, backgrounds(len(cameras)))
+        assert not torch.equal(output.rgb, exact.rgb), "the results are off"
 
 
 # The limits are below the number of pixels, and below the number of (splat, tile) pairs.
@@ -55,16 +104,46 @@ def test_more_items_than_indices_can_count_are_refused_before_memory_is_allocate
 def test_kernels_run_on_the_current_stream():
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
-    rasterizer, scene = CudaRasterizer(cache_dir=None), (make_cameras(1, 64, 64), backgrounds(1).cuda())
-    gaussians = make_gaussians(1000).to("cuda")
-    want = rasterizer.render(gaussians, *scene).rgb
+    # Everything is on the device beforehand, because an upload would wait for the device before any launch.
+    scene = make_cameras(1, 64, 64).to("cuda"), backgrounds(1).cuda()
+    rasterizer, gaussians = CudaRasterizer(cache_dir=None), make_gaussians(1000).to("cuda")
+    # The second call renders ahead.
+    renders = (rasterizer.render, rasterizer.render_ahead, rasterizer.render_ahead)
+    want = [render(gaussians, *scene).rgb for render in renders]
     torch.cuda.synchronize()
     with torch.cuda.stream(torch.cuda.Stream()):
-        # Kernels on another stream would overtake this pause.
-        torch.cuda._sleep(10**8)
-        got = rasterizer.render(gaussians.map(lambda tensor: tensor + 0), *scene).rgb
+        got = []
+        for render in renders:
+            late = gaussians.map(torch.zeros_like)
+            torch.cuda.current_stream().synchronize()
+            # Kernels on another stream would overtake this pause and read the zeros.
+            torch.cuda._sleep(10**8)
+            for name, tensor in late.tensors().items():
+                tensor.copy_(getattr(gaussians, name))
+            got.append(render(late, *scene).rgb)
     torch.cuda.synchronize()
-    assert torch.equal(got, want)
+    for a, b in zip(got, want, strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.gpu
+def test_rendering_ahead_does_not_wait_for_the_device():
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    scene = make_cameras(2, 64, 64).to("cuda"), backgrounds(2).cuda()
+    rasterizer = CudaRasterizer(cache_dir=None)
+    gaussians = make_gaussians(1000).to("cuda").map(lambda tensor: tensor.detach().requires_grad_())
+    for _ in range(2):
+        rasterizer.render_ahead(gaussians, *scene).rgb.sum().backward()
+    torch.cuda.synchronize()
+    pause = torch.cuda.Event()
+    torch.cuda._sleep(10**9)
+    pause.record()
+    output = rasterizer.render_ahead(gaussians, *scene)
+    output.rgb.sum().backward()
+    assert not pause.query(), "the device still pauses, while the host has done its work"
+    assert output.overflowed is not None
+    assert not output.overflowed
 
 
 def test_rendering_on_a_cpu_is_refused_with_a_hint():
@@ -92,25 +171,30 @@ def test_a_missing_cuda_device_is_reported_before_anything_is_compiled(monkeypat
         pytest.param(*at_tile_corners([-0.9, -1.9, -4.0]), id="ends at corners of tiles"),
     ],
 )
-def test_every_tile_with_a_pixel_in_reach_is_listed_and_few_others(emulator, gaussians, cameras):
+@pytest.mark.parametrize("tile_height", [4, 8])
+def test_every_tile_with_a_pixel_in_reach_is_listed_and_few_others(
+    emulator, gaussians, cameras, tile_height, monkeypatch
+):
+    monkeypatch.setattr(cuda, "FEW_TILES", 0 if tile_height == 8 else 10**9)
     v, n, height, width = len(cameras), len(gaussians), cameras.height, cameras.width
     lists = list_tiles(emulator, gaussians, cameras)
     listed = torch.zeros(len(lists.ranges) - 1, v * n, dtype=torch.bool)
     for tile, (begin, end) in enumerate(lists.ranges[:-1].tolist()):
         pairs = lists.pair_of_slot[lists.slots[begin:end].long()].long()
-        assert (lists.splats[pairs, 7].diff() >= 0).all(), "nearest first"
+        assert (lists.splats[pairs, 11].diff() >= 0).all(), "nearest first"
         listed[tile, pairs] = True
     assert listed.sum() == lists.slots.shape[0], "as many as were counted, and none of them twice"
     assert not lists.ranges[-1].any(), "no slot is left over"
 
-    x, y, l11, l12, l22, cut, *_ = lists.splats.double()[..., None, None].unbind(dim=1)
-    tiles_y, tiles_x = -(-height // cuda.TILE), -(-width // cuda.TILE)
-    rows, columns = (torch.arange(tiles * cuda.TILE)[None] + 0.5 for tiles in (tiles_y, tiles_x))
+    x, y, l11, l12, l22, _, cut, *_ = lists.splats.double()[..., None, None].unbind(dim=1)
+    tile = tile_height, cuda.TILE_WIDTH
+    tiles_y, tiles_x = -(-height // tile[0]), -(-width // tile[1])
+    rows, columns = (torch.arange(tiles_y * tile[0])[None] + 0.5, torch.arange(tiles_x * tile[1])[None] + 0.5)
     dx, dy = columns.double() - x, rows.double().mT - y
     is_reached = (l11 * dx + l12 * dy).square() + (l22 * dy).square() <= cut * (1 - 1e-5)
     is_reached &= (rows.mT < height) & (columns < width)
     is_seen = lists.is_seen
-    in_tile = is_reached.view(-1, tiles_y, cuda.TILE, tiles_x, cuda.TILE).any(dim=4).any(dim=2).flatten(1)
+    in_tile = is_reached.view(-1, tiles_y, tile[0], tiles_x, tile[1]).any(dim=4).any(dim=2).flatten(1)
     wanted = (in_tile & is_seen[:, None]).view(v, n, -1)
     want = torch.zeros_like(listed).view(v, -1, v, n)
     for view in range(v):
@@ -126,7 +210,7 @@ def test_constants_mirror_those_of_the_kernels():
         f"PROJECT_BLOCK = {cuda.PROJECT_BLOCK};",
         f"BLEND_BLOCK = {cuda.BLEND_BLOCK};",
         f"WARP = {cuda.WARP};",
-        f"TILE = {cuda.TILE};",
+        f"TILE_WIDTH = {cuda.TILE_WIDTH};",
         f"RECORD = {cuda.RECORD};",
         f"ABSOLUTES = {cuda.ABSOLUTES};",
         f"sizeof(Camera) == {cuda.CAMERA} * sizeof(float)",
@@ -155,6 +239,17 @@ def test_kernels_without_a_mistake_pass(emulator, mutants):
 
 @pytest.mark.parametrize("mutant", RENDERING)
 def test_a_mutant_is_caught(mutants, mutant):
+    assert not passes(mutants, judge, NUMBERS[mutant])
+
+
+@pytest.mark.usefixtures("small_tiles")
+def test_kernels_without_a_mistake_pass_with_small_tiles(mutants):
+    assert passes(mutants, judge)
+
+
+@pytest.mark.usefixtures("small_tiles")
+@pytest.mark.parametrize("mutant", SMALL_TILES)
+def test_a_mutant_is_caught_with_small_tiles(mutants, mutant):
     assert not passes(mutants, judge, NUMBERS[mutant])
 
 

@@ -26,10 +26,10 @@ PLANTED = {
         "if (e == slots - 1 || tile_keys[e + 1]",
         "if ((e == slots - 1 && !MUTANT) || tile_keys[e + 1]",
     ),
-    "index 3 out of bounds": (
+    "index 4 out of bounds": (
         "blend.cuh",
-        "stage[2][j]);\n      const u32",
-        "stage[MUTANT ? 3 : 2][j]);\n      const u32",
+        "at = stage[0];",
+        "at = stage[MUTANT ? 4 : 0];",
     ),
 }
 

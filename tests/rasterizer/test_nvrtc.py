@@ -23,19 +23,22 @@ ARCHITECTURES = (75, 80, 86, 87, 88, 89, 90, 100, 101, 103, 107, 110, 120, 121)
 # One of each generation, or all of them with CADAM3D_ARCHITECTURES=all.
 COMPILED = ARCHITECTURES if os.environ.get("CADAM3D_ARCHITECTURES") == "all" else (75, 86, 90, 100, 120)
 # The largest number of registers per thread on any of them, with the NVRTC of CUDA 12.6, 12.8, 13.0 and 13.5.
-# With 64 registers, half of an SM is in use; with those of the backward pass of degree 3, which holds 48
-# coefficients, less than a fifth.
+# With 64 registers, half of the threads of an SM are in use; with those of the backward pass of degree 3,
+# which holds 48 coefficients, less than a fifth.
 REGISTERS = {
-    "blend_backward": 64,
-    "blend_backward_absolute": 71,
-    "blend_forward": 64,
+    "blend_backward_8x4": 47,
+    "blend_backward_8x8": 57,
+    "blend_backward_absolute_8x4": 48,
+    "blend_backward_absolute_8x8": 60,
+    "blend_forward_8x4": 44,
+    "blend_forward_8x8": 52,
     "centre_backward": 42,
-    "prepare_cameras": 48,
+    "prepare_cameras": 41,
     "project_backward_1": 96,
-    "project_backward_4": 127,
+    "project_backward_4": 125,
     "project_backward_9": 128,
-    "project_backward_16": 168,
-    "project_forward_1": 62,
+    "project_backward_16": 167,
+    "project_forward_1": 64,
     "project_forward_4": 64,
     "project_forward_9": 64,
     "project_forward_16": 64,
@@ -44,9 +47,9 @@ REGISTERS = {
     "sort_columns": 64,
     "sort_count": 56,
     "sort_scatter": 128,
-    "sum_absolutes": 61,
-    "tile_list": 60,
-    "tile_ranges": 12,
+    "sum_absolutes": 54,
+    "tile_list": 62,
+    "tile_ranges": 16,
 }
 
 
@@ -165,6 +168,28 @@ def test_the_library_of_torchs_cuda_version_comes_first(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.version, "cuda", "12.8")
     names = ("libnvrtc.alt.so.12", "libnvrtc.so.13", "libnvrtc.so.12")
     assert min((tmp_path / name for name in names), key=nvrtc._distance_from_torch).name == "libnvrtc.so.12"
+
+
+@pytest.mark.parametrize(
+    ("version", "order"),
+    [
+        ("12.8", ["libnvrtc.so.12", "libnvrtc.so.13", "libnvrtc.so"]),
+        ("13.0", ["libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so"]),
+        (None, ["libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so"]),
+    ],
+)
+def test_a_library_of_the_system_without_a_version_is_the_last_choice(monkeypatch, version, order):
+    tried = []
+
+    def refuse(path):
+        tried.append(path)
+        raise OSError
+
+    monkeypatch.setattr(torch.version, "cuda", version)
+    monkeypatch.setattr(nvrtc, "_bundled", lambda: iter([Path("/wheels/libnvrtc.so.11")]))
+    monkeypatch.setattr(nvrtc, "_load", refuse)
+    assert nvrtc.find_compiler.__wrapped__() is None
+    assert tried == ["/wheels/libnvrtc.so.11", *order]
 
 
 def test_nvrtc_is_found_in_the_folders_of_wheels_for_cuda_12_and_13(monkeypatch, tmp_path):

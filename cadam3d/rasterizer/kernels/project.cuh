@@ -58,8 +58,10 @@ SPLAT_FN void project_gaussian(const float* means, const float* log_scales, cons
     float rgb[3];
     splat::colour(gaussian, cameras[v], rgb);
     const float *at = footprint.mean2d, *reach = footprint.reach, depth = footprint.centre[2];
-    const Splat s = {at[0],         at[1], footprint.l11, footprint.l12, footprint.l22, shape.log_cut,
-                     shape.opacity, depth, rgb[0],        rgb[1],        rgb[2],        reach[0]};
+    const float unit = SQRT_LOG2_E, cut = LOG2_E * shape.log_cut;
+    const float l11 = unit * footprint.l11, l12 = unit * footprint.l12, l22 = unit * footprint.l22;
+    const Splat s = {at[0],    at[1],  l11,    l12,    l22,  cut + LOG2_ALPHA_MIN, cut,
+                     reach[0], rgb[0], rgb[1], rgb[2], depth};
     store_splat(splats + 3 * pair, s);
     counts[pair] = count_tiles(s, grid);
     means2d[2 * pair] = at[0], means2d[2 * pair + 1] = at[1];
@@ -68,28 +70,32 @@ SPLAT_FN void project_gaussian(const float* means, const float* log_scales, cons
   }
 }
 
-constexpr i64 LONG_RUN = 64;  // records; a longer run is summed by the whole warp
+constexpr u32 LONG_RUN = 64;  // records; a longer run is summed by the whole warp
+
+template <int WIDTH>
+SPLAT_FN void add_record(const float2* records, u32 slot, float* sum) {
+#pragma unroll
+  for (int j = 0; j < WIDTH / 2; ++j) {
+    const float2 two = records[WIDTH / 2 * i64(slot) + j];
+    sum[2 * j] += two.x, sum[2 * j + 1] += two.y;
+  }
+}
 
 // Sums ``count`` records of WIDTH floats from ``first`` on; each lane has its own run. All lanes of a warp
 // must call this function.
 template <int WIDTH>
-SPLAT_FN void sum_records(const float* records, i64 first, i64 count, float* sum) {
+SPLAT_FN void sum_records(const float2* records, u32 first, u32 count, float* sum) {
   for (int j = 0; j < WIDTH; ++j) sum[j] = 0;
   if (count <= LONG_RUN)
-    for (i64 slot = first; slot < first + count; ++slot)
-#pragma unroll
-      for (int j = 0; j < WIDTH; ++j) sum[j] += records[WIDTH * slot + j];
+    for (u32 slot = first; slot < first + count; ++slot) add_record<WIDTH>(records, slot, sum);
   const int lane = lane_index();
   u32 waiting = __ballot_sync(ALL, count > LONG_RUN);
   while (waiting) {
     const int owner = __ffs(int(waiting)) - 1;
     waiting &= waiting - 1;
-    const i64 from = i64(__shfl_sync(ALL, u64(first), owner)),
-              many = i64(__shfl_sync(ALL, u64(count), owner));
+    const u32 from = __shfl_sync(ALL, first, owner), many = __shfl_sync(ALL, count, owner);
     float part[WIDTH] = {};
-    for (i64 slot = from + lane; slot < from + many; slot += WARP)
-#pragma unroll
-      for (int j = 0; j < WIDTH; ++j) part[j] += records[WIDTH * slot + j];
+    for (u32 slot = from + u32(lane); slot < from + many; slot += WARP) add_record<WIDTH>(records, slot, part);
 #pragma unroll
     for (int j = 0; j < WIDTH; ++j) {
 #pragma unroll
@@ -132,15 +138,14 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
                                 const float* opacity_logits, const float* sh, const Camera* cameras, i64 n,
                                 i64 views, i64 first_view, i64 end_view, const u32* first_slot,
                                 const u32* slot_count, const u32* total_slots, i64 capacity,
-                                const float* records, float* grad_means2d,
+                                const float2* records, float* grad_means2d,
                                 const Totals<COEFFICIENTS>& totals, float* grad_log_scales,
                                 float* grad_quats) {
   const i64 i = thread_index();
   const bool is_mine = i < n;  // threads without a Gaussian help with long runs
-  const bool has_records = i64(*total_slots) <= capacity;
-  bool is_seen = false;
-  for (i64 v = 0; v < views && is_mine && has_records; ++v)
-    is_seen = is_seen || slot_count[v * n + i] > 0;
+  bool is_seen = false;  // in any view, with records
+  if (is_mine && i64(*total_slots) <= capacity)
+    for (i64 v = 0; v < views; ++v) is_seen = is_seen || slot_count[v * n + i] > 0;
   // A thread without a Gaussian loads the first one and does not use it. This needs no branch, so the loops
   // unroll.
   const Gaussian<COEFFICIENTS> gaussian =
@@ -152,15 +157,18 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
   if (is_mine && first_view > 0) totals.load(i, total);
   for (i64 v = first_view; v < end_view; ++v) {
     const i64 pair = v * n + i;
-    const bool is_visible = is_mine && has_records && slot_count[pair] > 0;
+    const bool is_visible = is_seen && slot_count[pair] > 0;
     float sum[RECORD];
     sum_records<RECORD>(records, is_visible ? first_slot[pair] : 0, is_visible ? slot_count[pair] : 0, sum);
     float centre[2] = {0, 0};
     if (is_visible) {
       splat::Footprint<float> footprint;
       splat::project(gaussian, shape, cameras[v], footprint);
+      // The blend writes moments of y times sqrt(log2 e).
+      const float once = SQRT_LN_2, twice = LN_2;
       const splat::Moments<float> moments = {
-          sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], {sum[6], sum[7], sum[8]}, sum[9]};
+          sum[0],         once * sum[1],  once * sum[2],  twice * sum[3],
+          twice * sum[4], twice * sum[5], {sum[6], sum[7], sum[8]}, sum[9]};
       splat::mean2d_gradient(footprint, moments, centre);
       splat::project_backward(gaussian, shape, cameras[v], footprint, moments, total);
     }
@@ -178,7 +186,7 @@ SPLAT_FN void gaussian_backward(const float* means, const float* log_scales, con
 // absgrad [pairs 2]: the sum over the pixels of the absolute value of what each adds to the gradient of a
 // centre.
 KERNEL(BLOCK)
-sum_absolutes(i64 pairs, const u32* total, i64 capacity, const float* absolutes, const float4* splats,
+sum_absolutes(i64 pairs, const u32* total, i64 capacity, const float2* absolutes, const float4* splats,
               const u32* first_slot, const u32* slot_count, float* absgrad) {
   const i64 pair = thread_index();
   const bool has_records = i64(*total) <= capacity;
@@ -186,7 +194,9 @@ sum_absolutes(i64 pairs, const u32* total, i64 capacity, const float* absolutes,
   const bool is_visible = pair < pairs && has_records && slot_count[pair] > 0;
   float sum[ABSOLUTES], absolute[2] = {0, 0};
   sum_records<ABSOLUTES>(absolutes, is_visible ? first_slot[pair] : 0, is_visible ? slot_count[pair] : 0, sum);
-  if (is_visible) splat::mean2d_absolute(splats[3 * pair].z, sum, absolute);  // z: l11
+  // Both sums, and l11 (z), are in units of the scaled whitening.
+  sum[0] *= SQRT_LN_2, sum[1] *= LN_2;
+  if (is_visible) splat::mean2d_absolute(SQRT_LN_2 * splats[3 * pair].z, sum, absolute);
   if (pair >= pairs) return;
   for (int j = 0; j < 2; ++j) absgrad[2 * pair + j] = absolute[j];
 }
@@ -215,16 +225,17 @@ constexpr int PROJECT_BLOCK = 128;
   KERNEL(PROJECT_BLOCK)                                                                                      \
   project_forward_##COEFFICIENTS(const float* means, const float* log_scales, const float* quats,            \
                                  const float* opacity_logits, const float* sh, const Camera* cameras, i64 n, \
-                                 i64 views, i64 height, i64 width, float4* splats, float* means2d,           \
-                                 float* radii, u32* depth_keys, u32* counts) {                               \
+                                 i64 views, i64 height, i64 width, i64 tile_height, float4* splats,          \
+                                 float* means2d, float* radii, u32* depth_keys, u32* counts) {               \
     project_gaussian<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, cameras, n, views,          \
-                                   make_grid(height, width), splats, means2d, radii, depth_keys, counts);    \
+                                   make_grid(height, width, tile_height), splats, means2d, radii,            \
+                                   depth_keys, counts);                                                      \
   }                                                                                                          \
   KERNEL(PROJECT_BLOCK)                                                                                      \
   project_backward_##COEFFICIENTS(                                                                           \
       const float* means, const float* log_scales, const float* quats, const float* opacity_logits,          \
       const float* sh, const Camera* cameras, i64 n, i64 views, i64 first_view, i64 end_view,                \
-      const u32* first_slot, const u32* slot_count, const u32* total, i64 capacity, const float* records,    \
+      const u32* first_slot, const u32* slot_count, const u32* total, i64 capacity, const float2* records,   \
       float* grad_axes, float* grad_means2d, float* grad_means, float* grad_log_scales, float* grad_quats,   \
       float* grad_opacity_logits, float* grad_sh) {                                                          \
     gaussian_backward<COEFFICIENTS>(means, log_scales, quats, opacity_logits, sh, cameras, n, views,         \

@@ -7,12 +7,16 @@
 
 #include "device.cuh"
 
+// The tiles of a view. Their height is a power of two.
 struct Grid {
-  int tiles_x, tiles_y, width, height;
+  int tiles_x, tiles_y, width, height, tile_height, log2_tile_height;
 };
 
-SPLAT_FN Grid make_grid(i64 height, i64 width) {
-  return {int((width + TILE - 1) / TILE), int((height + TILE - 1) / TILE), int(width), int(height)};
+SPLAT_FN Grid make_grid(i64 height, i64 width, i64 tile_height) {
+  const int log2_tile_height = __ffs(int(tile_height)) - 1;
+  const int tiles_x = (int(width) + TILE_WIDTH - 1) / TILE_WIDTH;
+  const int tiles_y = int((height + tile_height - 1) >> log2_tile_height);
+  return {tiles_x, tiles_y, int(width), int(height), int(tile_height), log2_tile_height};
 }
 
 struct Range {
@@ -35,10 +39,12 @@ SPLAT_FN void each_tile_row(const Splat& s, const Grid& grid, const Visit& visit
   if (rows.last < rows.first) return;
   const float slope = -s.l12 / s.l11;  // the middle of the row at height d: slope * d
   const float extreme = slope * reach_y * (reach_y / reach_x);  // height of the rightmost point
-  const float cut = s.cut * (1 + 1e-5f) + 1e-6f;                // rounding matters most at the tips
-  for (int row = rows.first / TILE; row <= rows.last / TILE; ++row) {
-    const int top = row * TILE > rows.first ? row * TILE : rows.first;
-    const int bottom = row * TILE + TILE - 1 < rows.last ? row * TILE + TILE - 1 : rows.last;
+  const float cut = s.cut * (1 + 1e-5f) + 4e-6f;                // rounding matters most at the tips
+  const int last_row = rows.last >> grid.log2_tile_height;
+  for (int row = rows.first >> grid.log2_tile_height; row <= last_row; ++row) {
+    const int first_line = row << grid.log2_tile_height, last_line = first_line + grid.tile_height - 1;
+    const int top = first_line > rows.first ? first_line : rows.first;
+    const int bottom = last_line < rows.last ? last_line : rows.last;
     const float low = float(top) + 0.5f - s.y - 1e-3f, high = float(bottom) + 0.5f - s.y + 1e-3f;
     const float left = fminf(fmaxf(-extreme, low), high), right = fminf(fmaxf(extreme, low), high);
     const float left_t = s.l22 * left, right_t = s.l22 * right;
@@ -46,7 +52,7 @@ SPLAT_FN void each_tile_row(const Splat& s, const Grid& grid, const Visit& visit
     const float right_width = sqrtf(fmaxf(cut - right_t * right_t, 0.0f)) / s.l11;
     const Range columns = pixels_between(fmaxf(slope * left - left_width, -reach_x) + s.x,
                                          fminf(slope * right + right_width, reach_x) + s.x, grid.width);
-    if (columns.first <= columns.last) visit(row, columns.first / TILE, columns.last / TILE);
+    if (columns.first <= columns.last) visit(row, columns.first / TILE_WIDTH, columns.last / TILE_WIDTH);
   }
 }
 
@@ -80,10 +86,10 @@ constexpr u32 MANY_TILES = 32;  // a splat with more is listed by the whole warp
 // the host. Both may be null.
 KERNEL(BLOCK)
 tile_list(const u32* order, const u32* counts, const u32* offsets, const u32* total, i64 capacity, i64 pairs,
-          i64 n, const float4* splats, i64 views, i64 height, i64 width, u32* tile_keys, u32* pair_of_slot,
-          u32* first_slot, u32* ranges, bool* overflowed, u64* report) {
+          i64 n, const float4* splats, i64 views, i64 height, i64 width, i64 tile_height, u32* tile_keys,
+          u32* pair_of_slot, u32* first_slot, u32* ranges, bool* overflowed, u64* report) {
   const i64 k = thread_index();
-  const Grid grid = make_grid(height, width);
+  const Grid grid = make_grid(height, width, tile_height);
   const u32 tiles = u32(grid.tiles_x) * u32(grid.tiles_y), sentinel = u32(views) * tiles;
   const bool fits = i64(*total) <= capacity;
   for (i64 i = k; i < 2 * (i64(sentinel) + 1); i += i64(gridDim.x) * blockDim.x) ranges[i] = 0;
@@ -100,7 +106,7 @@ tile_list(const u32* order, const u32* counts, const u32* offsets, const u32* to
   }
   const auto fill = [&](u32 of_pair, u32 from, u32 many, int first_lane, int lanes) {
     const float4* at = splats + 3 * i64(of_pair);
-    fill_slots(make_splat(at[0], at[1], at[2]), grid, of_pair, u32(of_pair / n) * tiles, sentinel, from,
+    fill_slots(make_splat(at[0], at[1], float4()), grid, of_pair, u32(of_pair / n) * tiles, sentinel, from,
                from + many, first_lane, lanes, tile_keys, pair_of_slot);
   };
   if (count > 0 && count <= MANY_TILES) fill(pair, slot, count, 0, 1);

@@ -27,9 +27,14 @@ struct Index {
 };
 inline Index threadIdx, blockIdx, blockDim, gridDim;  // of the running thread
 
-struct float4 {
+// A GPU requires these alignments, and so do the sanitizers.
+struct alignas(8) float2 {
+  float x, y;
+};
+struct alignas(16) float4 {
   float x, y, z, w;
 };
+inline float2 make_float2(float x, float y) { return {x, y}; }
 inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
 
 namespace emulator {
@@ -147,12 +152,12 @@ inline void run_block(int threads) {
     ++machine.warps[size_t(i / WARP)].members;
     order.push_back(i);
   }
-  // Now and then one warp stands still until all others wait, or until another warp takes its place. Without
-  // that, all threads would take about as many steps, and a fast warp could never overtake a slow one.
+  // Now and then one warp stands still, in most cases until all others wait for it. Without that, all threads
+  // would take about as many steps, and a fast warp could never overtake a slow one.
   int stalled = -1;
   for (int alive = threads; alive > 0;) {
-    if (machine.is_shuffled && machine.random() % 64 == 0)
-      stalled = int(machine.random() % machine.warps.size());
+    if (machine.is_shuffled && machine.random() % (stalled < 0 ? 16 : 256) == 0)
+      stalled = stalled < 0 ? int(machine.random() % machine.warps.size()) : -1;
     if (machine.is_shuffled)
       for (size_t i = order.size() - 1; i > 0; --i) std::swap(order[i], order[machine.random() % (i + 1)]);
     bool has_run = false;
@@ -237,8 +242,6 @@ inline unsigned ballot(const char* reason, unsigned mask, bool vote) {
 #define __forceinline__ inline
 #define __launch_bounds__(threads)
 #define __shared__ static __attribute__((section("emulated_shared")))
-#define __expf(x) std::exp(float(x))
-#define __fdividef(a, b) ((a) / (b))
 #define __fmaf_rn(a, b, c) std::fmaf(a, b, c)
 #define __popc(x) __builtin_popcount(x)
 #define __ffs(x) __builtin_ffs(x)
@@ -247,6 +250,31 @@ inline unsigned __float_as_uint(float x) {
   unsigned bits;
   std::memcpy(&bits, &x, 4);
   return bits;
+}
+inline float __uint_as_float(unsigned bits) {
+  float x;
+  std::memcpy(&x, &bits, 4);
+  return x;
+}
+
+// The approximations of the hardware, for which device.cuh has the instructions. The hardware returns zero
+// instead of a denormal number. With EMULATOR_ROUGH a result is also off by up to ``ulps``, as a function of
+// its bits, which is as far as the hardware may be off.
+inline float approximately(float x, int ulps) {
+  if (!(std::fabs(x) >= 1.17549435e-38f) || std::isinf(x)) return std::isinf(x) ? x : 0.0f;
+#if defined(EMULATOR_ROUGH)
+  const unsigned bits = __float_as_uint(x);
+  return __uint_as_float(bits + (bits * 2654435769u >> 16) % unsigned(2 * ulps + 1) - unsigned(ulps));
+#else
+  (void)ulps;
+  return x;
+#endif
+}
+inline float exp2_approx(float x) { return approximately(std::exp2(x), 2); }
+inline float reciprocal_approx(float x) { return approximately(1 / x, 1); }
+template <class T>
+T keep_in_register(T x) {
+  return x;
 }
 inline void __syncthreads() { emulator::meet(emulator::machine.block, "__syncthreads", 0, 0); }
 inline void __syncwarp() { emulator::meet(emulator::warp(), "__syncwarp", emulator::lane(), 0); }

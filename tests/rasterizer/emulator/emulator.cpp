@@ -30,9 +30,9 @@ static const struct {
 #endif
     ENTRY(centre_backward),     ENTRY(scan_reduce),        ENTRY(scan_apply),
     ENTRY(sort_count),          ENTRY(sort_columns),       ENTRY(sort_scatter),
-    ENTRY(tile_list),           ENTRY(tile_ranges),        ENTRY(blend_forward),
-    ENTRY(blend_backward),      ENTRY(blend_backward_absolute),
-    ENTRY(sum_absolutes),
+    ENTRY(tile_list),           ENTRY(tile_ranges),        ENTRY(sum_absolutes),
+    ENTRY(blend_forward_8x4),   ENTRY(blend_backward_8x4), ENTRY(blend_backward_absolute_8x4),
+    ENTRY(blend_forward_8x8),   ENTRY(blend_backward_8x8), ENTRY(blend_backward_absolute_8x8),
 };
 
 enum Status : int { OK = 0, NOT_FOUND = 500, LAUNCH_FAILED = 719 };
