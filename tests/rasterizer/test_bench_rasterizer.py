@@ -371,6 +371,12 @@ def test_kernels_that_a_profiler_has_seen_become_stages(emulator):
     assert by_stage[stages.REST].median_ms == timing.wall_ms - timing.kernel_ms
 
 
+def test_a_torch_that_cannot_profile_kernels_is_reported(monkeypatch):
+    monkeypatch.setattr(torch.profiler, "supported_activities", set)
+    with pytest.raises(stages.NoKernelsError, match="of this torch cannot time kernels"):
+        stages.profile(lambda: None)
+
+
 def test_kernels_that_the_profiler_has_missed_are_reported(emulator):
     scene = make_scene(make_shell(60, 0, CPU), 20, 2)
     for lost in (1, 1000):
