@@ -67,8 +67,8 @@ int cuLaunchKernel(Kernel* kernel, unsigned, unsigned, unsigned, unsigned, unsig
   const bool is_projection = strncmp(kernel->name, "project_forward", 15) == 0;
   if (is_projection || (arguments && strcmp(kernel->name, "sort_scatter") == 0)) {
     const u64 begin = now();
-    const int last = is_projection ? 14 : 7;
-    unsigned* numbers = (unsigned*)(arguments ? *(u64*)arguments[last] : ((u64*)extra[1])[last]);
+    u64 to = arguments ? *(u64*)arguments[is_projection ? 14 : 7] : ((u64*)extra[1])[*(u64*)extra[3] / 8 - 1];
+    unsigned* numbers = (unsigned*)to;
     const unsigned number = is_projection ? tiles : 0;
     for (u64 i = 0; i < pairs; ++i) numbers[i] = number;
     stub_nanoseconds += now() - begin;

@@ -156,8 +156,8 @@ COUNTED = {
     ),
     "gradients from records that do not exist": (
         "project.cuh",
-        "const bool has_records = i64(*total_slots) <= capacity;",
-        "const bool has_records = MUTANT || i64(*total_slots) <= capacity;",
+        "is_mine && i64(*total_slots) <= capacity",
+        "is_mine && (MUTANT || i64(*total_slots) <= capacity)",
     ),
     "absolute gradients from records that do not exist": (
         "project.cuh",

@@ -259,7 +259,7 @@ sort_columns(const u32* __restrict__ count, i64 capacity, i64 items, i64 bits, i
 }
 
 // Shared memory of sort_scatter, for three purposes in turn.
-union Stage {
+union SortStage {
   u32 counters[Counters::SIZE];
   u16 bins[WARPS * DIGITS];  // of each warp and value: the number of items, and then the place of the first
   struct {
@@ -347,7 +347,7 @@ sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const
              i64 capacity, i64 items, i64 shift, i64 bits, const u32* __restrict__ counts,
              const u32* __restrict__ totals, u32* __restrict__ sorted_keys,
              u32* __restrict__ sorted_values) {
-  __shared__ Stage stage;
+  __shared__ SortStage stage;
   __shared__ u32 bases[DIGITS];  // the position of the next item with a value, minus its place in the chunk
   __shared__ u16 ends[DIGITS];   // the place behind the last item with a value
   __shared__ u32 sums[WARPS];
