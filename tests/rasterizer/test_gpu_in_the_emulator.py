@@ -28,7 +28,7 @@ from rasterizer_bench.stages import KernelRasterizer
 
 CPU = torch.device("cpu")
 PLANTED = "two sums are swapped"
-TINY = ["--counts", "60", "--sizes", "20", "--views", "2", "--degrees", "0", "--repeats", "2"]
+TINY = ["--counts", "30", "--sizes", "16", "--views", "2", "--degrees", "0", "--repeats", "1"]
 
 
 class Forks(Processes):
@@ -62,18 +62,18 @@ class Forks(Processes):
 
 def work_on(kernels: Emulator, truth: Emulator, words: list[str]) -> int:
     """Do the work of a piece as a process on a GPU does, with small scenes."""
-    check.SPLATS, check.SIZE, check.REPEATED = 40, 20, {"cpu": (40, 20)}
+    check.SPLATS, check.SIZE, check.REPEATED, check.RUNS = 24, 16, {"cpu": (24, 16)}, 2
     bench_rasterizer.make_backends = lambda *_: {"cuda": KernelRasterizer(kernels)}
     bench_rasterizer.load_kernels = lambda _: kernels
-    bench_rasterizer.LONG_SORT = 2**13
+    bench_rasterizer.LONG_SORT = 2000
     facts = {"device": "Fibers", "capability": "0.0", "memory_bytes": 2**30, "nvrtc": None}
     on_device.WORK |= {
         "facts": lambda: facts | {"torch": torch.__version__, "torch_cuda": None},
         "self-test": lambda: on_device.compare(KernelRasterizer(kernels), "cpu"),
         "stages": lambda: bisect.find_stage(kernels, CPU, truth),
         "auto": lambda: {"says": "uses cuda", "backend": "cuda"},
-        "kernels": lambda: on_device.explain(kernels, CPU, ((60, 20, 2, 0),), 2, 2**20),
-        "sorts": lambda: on_device.compare_sorts(kernels, CPU, ((500, 32), (500, 9)), 2),
+        "kernels": lambda: on_device.explain(kernels, CPU, ((30, 16, 2, 0),), 1, 2**20),
+        "sorts": lambda: on_device.compare_sorts(kernels, CPU, ((500, 32), (500, 9)), 1),
     }
     name, *rest = words
     if name != "bench_rasterizer":
