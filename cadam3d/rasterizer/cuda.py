@@ -11,7 +11,16 @@ A forward pass runs these kernels (``kernels/*.cuh``):
 
 The backward pass runs ``blend_backward``, which writes one record into each slot, and ``project_backward``,
 which sums the slots of each Gaussian in order. No kernel adds floats atomically, so the same input gives the
-same bits. The host waits for the device once, to read the number of slots.
+same bits.
+
+The number of slots is counted on the device, where every later kernel reads it and compares it with the
+``capacity``, the number that there is memory for. ``rasterize`` waits for the number and then reserves exactly
+as much memory. ``rasterize_ahead`` reserves what a forecast says and does not wait. Both run the same kernels
+in the same order. If the capacity is too small, all kernels behave as if there were no slots, and the caller
+finds ``overflowed`` in the output.
+
+Nearly all arrays are in a few blocks of memory (``workspace.py``). Those that the backward pass needs are
+saved by autograd like any other tensor, so they are freed after it.
 
 All views are processed together unless their records would fill more than ``RECORD_MEMORY``. In that case
 everything except the projection runs on one group of views after another, with the same bits.

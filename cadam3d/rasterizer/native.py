@@ -114,7 +114,7 @@ def run_pass(kernels: RenderPass, gaussians: Gaussians, background: Float[Tensor
     means, *others = (plain(tensor, device) for tensor in gaussians.tensors().values())
     keeps = torch.is_grad_enabled()
     with kernels:
-        means2d, radii = _Project.apply(kernels, means, *(tensor.detach() for tensor in others))
+        means2d, radii = _Project.apply(kernels, means, others)
         means2d = means2d.to(dtype)
         if keeps:
             means2d.requires_grad_().retain_grad()
@@ -138,8 +138,9 @@ class _Project(torch.autograd.Function):
     """Maps Gaussians to ``means2d`` and ``radii``; projected centres depend on the means alone."""
 
     @staticmethod
-    def forward(ctx, kernels: RenderPass, *parameters: Tensor) -> tuple[Tensor, Tensor]:
-        means2d, radii = kernels.project(list(parameters))
+    def forward(ctx, kernels: RenderPass, means: Tensor, others: list[Tensor]) -> tuple[Tensor, Tensor]:
+        parameters = [means, *others]
+        means2d, radii = kernels.project(parameters)
         ctx.kernels = kernels
         ctx.save_for_backward(*parameters, radii, *kernels.kept)
         ctx.mark_non_differentiable(radii)
@@ -150,13 +151,13 @@ class _Project(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad_means2d: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
         if grad_means2d is None:
-            return (None,) * 6
+            return None, None, None
         kernels, saved = ctx.kernels, ctx.saved_tensors
         *parameters, radii = saved[:6]
         with kernels:
             kernels.kept = saved[6:]
             grad_means = kernels.centre_backward(parameters, radii, grad_means2d.contiguous())
-        return None, grad_means, None, None, None, None
+        return None, grad_means, None
 
 
 class _Blend(torch.autograd.Function):

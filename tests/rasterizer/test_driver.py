@@ -207,6 +207,30 @@ def test_every_launch_is_on_the_stream_that_is_current_at_that_time(stub, built,
     assert streams_of_a_step(stub, launcher, 2**42) == {2**41}
 
 
+class Recorder:
+    """The functions of a driver, which also write their names down."""
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self.library, self.names = library, []
+
+    def __getattr__(self, name: str):
+        function = getattr(self.library, name)
+        return lambda *arguments: self.names.append(name) or function(*arguments)
+
+
+def test_a_step_that_is_not_the_first_only_launches_kernels(stub, built, tmp_path, monkeypatch):
+    """A CUDA graph may record launches, but no other work of a step."""
+    recorder = Recorder(stub)
+    monkeypatch.setattr(driver, "load_driver", lambda: recorder)
+    launcher = driver.Driver(tmp_path)
+    streams_of_a_step(stub, launcher, 2**41)
+    recorder.names.clear()
+    streams_of_a_step(stub, launcher, 2**41)
+    assert set(recorder.names) == {"cuCtxPushCurrent_v2", "cuCtxPopCurrent_v2", "cuLaunchKernel"}
+    # One context for the forward pass, and one for each of the two functions of the backward pass.
+    assert recorder.names.count("cuCtxPushCurrent_v2") == 3
+
+
 def test_counts_are_copied_and_waited_for_on_the_current_stream(monkeypatch):
     log, fake = [], FakeCuda()
 
