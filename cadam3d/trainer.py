@@ -329,19 +329,22 @@ class Trainer:
 
 def _uploaded(cameras: Cameras, background: Tensor, device: torch.device) -> tuple[Cameras, Tensor]:
     """Return cameras and background colours on ``device``, sent there in one copy."""
-    sent = (
+    if device.type == "cpu":
+        return cameras, background
+    columns = (
         cameras.world_to_camera,
         cameras.intrinsics,
         background,
         cameras.azimuth_deg,
         cameras.elevation_deg,
     )
-    matrices, intrinsics, colors, azimuth_deg, elevation_deg = upload_together(sent, device)
+    matrices, intrinsics, colors, azimuth_deg, elevation_deg = upload_together(columns, device)
     there = replace(
         cameras,
         world_to_camera=matrices,
         intrinsics=intrinsics,
         azimuth_deg=azimuth_deg,
         elevation_deg=elevation_deg,
+        drawn=cameras,
     )
     return there, colors

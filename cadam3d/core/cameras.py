@@ -1,7 +1,7 @@
 """Cameras: OpenCV axes (+x right, +y down, +z forward) in a world with +z up and the object's front at +x."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float, Int
@@ -18,6 +18,8 @@ class Cameras:
     width: int
     azimuth_deg: Float[Tensor, "v"]  # in [-180, 180]; 0 = front (+x), 90 = the +y side
     elevation_deg: Float[Tensor, "v"]  # in [-90, 90]; positive = from above
+    # The same views on the CPU, if they were drawn there: to read them, the host need not wait for a device.
+    drawn: "Cameras | None" = field(default=None, repr=False, compare=False)
 
     def __len__(self) -> int:
         return self.world_to_camera.shape[0]
@@ -49,6 +51,10 @@ class Cameras:
             azimuth_deg=self.azimuth_deg.to(target),
             elevation_deg=self.elevation_deg.to(target),
         )
+
+    def on_cpu(self) -> "Cameras":
+        """Return the same cameras on the CPU; waits for their device unless they were drawn on the CPU."""
+        return self.to("cpu") if self.drawn is None else self.drawn
 
     def resize(self, height: int, width: int) -> "Cameras":
         """Return the same views at another image size, with intrinsics scaled per axis."""
@@ -106,23 +112,23 @@ def look_at(
     forward = torch.nn.functional.normalize(target - position, dim=-1)
     right = torch.linalg.cross(forward, up, dim=-1)
     is_parallel = right.norm(dim=-1, keepdim=True) < 1e-6 * up.norm(dim=-1, keepdim=True)
-    spare = torch.nn.functional.one_hot(forward.abs().argmin(dim=-1), 3).to(forward)
-    right = torch.where(is_parallel, torch.linalg.cross(forward, spare, dim=-1), right)
+    if is_parallel.any():
+        spare = torch.nn.functional.one_hot(forward.abs().argmin(dim=-1), 3).to(forward)
+        right = torch.where(is_parallel, torch.linalg.cross(forward, spare, dim=-1), right)
     right = torch.nn.functional.normalize(right, dim=-1)
     down = torch.linalg.cross(forward, right, dim=-1)
     rotation = torch.stack([right, down, forward], dim=1)
-    matrix = torch.eye(4, dtype=position.dtype, device=position.device).repeat(position.shape[0], 1, 1)
-    matrix[:, :3, :3] = rotation
-    matrix[:, :3, 3] = -(rotation @ position[..., None])[..., 0]
-    return matrix
+    upper = torch.cat([rotation, -(rotation @ position[..., None])], dim=2)
+    last = upper.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(upper), 1, 4)
+    return torch.cat([upper, last], dim=1)
 
 
 def pinhole(fov_y_deg: Float[Tensor, "v"], height: int, width: int) -> Float[Tensor, "v 3 3"]:
     """Return intrinsics with square pixels, a centred principal point and this vertical field of view."""
     focal = 0.5 * height / torch.tan(torch.deg2rad(fov_y_deg) / 2)
-    matrix = torch.zeros(fov_y_deg.shape[0], 3, 3, dtype=fov_y_deg.dtype, device=fov_y_deg.device)
-    matrix[:, 0, 0] = matrix[:, 1, 1] = focal
-    matrix[:, 0, 2], matrix[:, 1, 2], matrix[:, 2, 2] = width / 2, height / 2, 1.0
+    fixed = [[0.0, 0.0, width / 2], [0.0, 0.0, height / 2], [0.0, 0.0, 1.0]]
+    matrix = fov_y_deg.new_tensor(fixed).repeat(len(focal), 1, 1)
+    matrix.diagonal(dim1=1, dim2=2)[:, :2] = focal[:, None]
     return matrix
 
 
@@ -134,13 +140,10 @@ def around(
     Up is the direction of growing elevation. It appears as +z in the image and is well defined at the poles
     too.
     """
-    azimuth, elevation = torch.deg2rad(azimuth_deg), torch.deg2rad(elevation_deg)
-    outward = torch.stack(
-        [elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()], dim=-1
-    )
-    up = torch.stack(
-        [-elevation.sin() * azimuth.cos(), -elevation.sin() * azimuth.sin(), elevation.cos()], dim=-1
-    )
+    angles = torch.deg2rad(torch.stack([azimuth_deg, elevation_deg]))
+    (cos_azimuth, cos_elevation), (sin_azimuth, sin_elevation) = angles.cos(), angles.sin()
+    outward = torch.stack([cos_elevation * cos_azimuth, cos_elevation * sin_azimuth, sin_elevation], dim=-1)
+    up = torch.stack([-sin_elevation * cos_azimuth, -sin_elevation * sin_azimuth, cos_elevation], dim=-1)
     return outward, up
 
 

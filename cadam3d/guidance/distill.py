@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cadam3d.core.chart import Chart, Curve
 from cadam3d.core.checks import require_choice, require_range
-from cadam3d.core.device import upload
+from cadam3d.core.device import upload, upload_together
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.guidance.base import GuidanceOutput
 from cadam3d.guidance.window import WindowedGuidance
@@ -56,6 +56,17 @@ class Case:
     prior: DiffusionPrior
     step: int
     generator: torch.Generator
+    # ``t`` on the CPU, where it was drawn; None if ``t`` is there itself.
+    drawn: Float[Tensor, "v"] | None = None
+
+    @property
+    def host_t(self) -> Float[Tensor, "v"]:
+        """Return the noise levels on the CPU, because they may decide how many predictions a step makes."""
+        return self.t if self.drawn is None else self.drawn
+
+    def on_device(self, *levels: Float[Tensor, "v"]) -> list[Float[Tensor, "v"]]:
+        """Return levels that were computed from :attr:`host_t` on the device of the renders, in one copy."""
+        return upload_together(levels, self.clean.device)
 
     def draw_noise(self) -> Float[Tensor, "v c h w"]:
         """Draw new noise for every view."""
@@ -131,8 +142,9 @@ class Distillation(WindowedGuidance):
         """
         clean = prior.encode(rgb)
         with torch.no_grad():
-            t = self.draw_t(clean, step, generator)
-            found = self.compare(Case(clean.detach(), t, condition, prior, step, generator))
+            drawn = self.draw_t(clean, step, generator)
+            t = upload(drawn, clean.device)
+            found = self.compare(Case(clean.detach(), t, condition, prior, step, generator, drawn))
             weights = self.weight * WEIGHTINGS[self.weighting](prior.noise_path, t)
             gradient, nonfinite = finite(per_view(weights) * found.difference)
             if (bound := self._bound(step)) is not None:
@@ -202,7 +214,8 @@ def offset_normal(
 def finite(gradient: Tensor) -> tuple[Tensor, Int[Tensor, ""]]:
     """Replace elements of ``gradient`` that are not finite by 0; return the result and their number."""
     replaced = gradient.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
-    return replaced, (gradient != replaced).sum()
+    # The difference is 0, infinite or NaN. This is faster than to compare or to test each element.
+    return replaced, (gradient - replaced).count_nonzero()
 
 
 def rms(values: Tensor) -> Float[Tensor, ""]:

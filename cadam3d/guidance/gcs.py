@@ -8,6 +8,7 @@ from torch import Tensor
 
 from cadam3d.core.chart import Chart, Curve
 from cadam3d.core.checks import require, require_choice, require_range
+from cadam3d.core.device import upload_together
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.guidance.base import GuidanceOutput
 from cadam3d.guidance.distill import DIVISORS, RESIDUAL, Case, finite, offset_normal, rms, surrogate
@@ -133,7 +134,8 @@ class GCS(WindowedGuidance):
         """
         clean = prior.encode(rgb)
         with torch.no_grad():
-            levels = self.draw_levels(clean, step, generator)
+            drawn = self.draw_levels(clean, step, generator)
+            levels = Levels(*upload_together([drawn.e, drawn.s, drawn.t], clean.device))
             case = Case(clean.detach(), levels.t, condition, prior, step, generator)
             terms = self.terms(case, levels, rgb)
             slope = per_view(prior.noise_path.a(levels.e))
@@ -162,7 +164,7 @@ class GCS(WindowedGuidance):
         return (TERMS, RESIDUAL)
 
     def draw_levels(self, clean: Float[Tensor, "v c h w"], step: int, generator: torch.Generator) -> Levels:
-        """Draw t from the window, raised to at least delta + 0.001, and s and e below it."""
+        """Draw t from the window, raised to at least delta + 0.001, and s and e below it, on the CPU."""
         delta = as_schedule(self.delta)(step)
         require_range("guidance.delta", delta, above=GAP, high=0.5, example=0.08)
         t = self.draw_t(clean, step, generator).clamp_min(delta + ROW)

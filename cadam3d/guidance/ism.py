@@ -45,13 +45,15 @@ class ISM(GuidedDistillation):
     def compare(self, case: Case) -> Comparison:
         """Subtract the noise at s without a prompt from the guided noise at t, on one trajectory."""
         prior, path, unprompted = case.prior, case.prior.noise_path, case.condition.unprompted()
-        start = case.t.clamp_max(self.initial_noise)
-        s = torch.maximum(case.t - self._interval(case.step), start)
+        start = case.host_t.clamp_max(self.initial_noise)
+        s = torch.maximum(case.host_t - self._interval(case.step), start)
+        levels = strides(start, s, self.inversion_stride)
+        start, s, *levels = case.on_device(start, s, *levels)
         at_start = case.clean
         if self.initial_noise > 0:
             noise = offset_normal(case.clean, case.generator, self.noise_offset)
             at_start = path.mix(case.clean, noise, start)
-        at_s = ddim(at_start, strides(start, s, self.inversion_stride), unprompted, prior)
+        at_s = ddim(at_start, levels, unprompted, prior)
         before = prior.predict(at_s, s, unprompted, UNGUIDED)
         at_t = path.mix(before.clean, before.noise, case.t)
         after = prior.predict(at_t, case.t, case.condition, self.scale)

@@ -72,8 +72,8 @@ class SDI(GuidedDistillation):
     def invert(self, case: Case) -> Float[Tensor, "v c h w"]:
         """Return the noise kappa of every render."""
         path, tau = case.prior.noise_path, self.overshoot * self.uniform(case.clean, case.generator)
-        beyond = (case.t + tau).clamp_max(1)
-        levels = self._levels(case.t, beyond)
+        beyond = (case.host_t + tau).clamp_max(1)
+        beyond, *levels = case.on_device(beyond, *self._levels(case.host_t, beyond))
         inverted = ddim(case.clean, levels, case.condition, case.prior, self.inversion_scale)
         noise = path.from_clean(inverted, case.clean, beyond).noise
         return noise + per_view(self.eta * path.b(beyond)) * case.draw_noise()

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.checks import require, require_choice
-from cadam3d.core.device import upload
 from cadam3d.core.schedule import FAR_STEP, Schedule, as_schedule, require_scheduled
 from cadam3d.guidance.base import Guidance
 
@@ -46,7 +45,7 @@ class WindowedGuidance(Guidance):
     def draw_t(
         self, clean: Float[Tensor, "v c h w"], step: int, generator: torch.Generator
     ) -> Float[Tensor, "v"]:
-        """Draw noise levels for the encoded renders ``clean``, as :meth:`uniform` does."""
+        """Draw noise levels for the encoded renders ``clean``, on the CPU, as :meth:`uniform` does."""
         low, high = self.window(step)
         uniform = self.uniform(clean, generator)
         return torch.lerp(torch.full_like(uniform, low), torch.full_like(uniform, high), uniform)
@@ -54,9 +53,8 @@ class WindowedGuidance(Guidance):
     def uniform(self, clean: Float[Tensor, "v c h w"], generator: torch.Generator) -> Float[Tensor, "v"]:
         """Draw uniformly from [0, 1): one number for all views with ``shared_t``, otherwise one for each.
 
-        The result is on the device of ``clean``, and in float32 or wider, since noise levels need precision.
+        The result is on the CPU, and in float32 or wider, since noise levels need precision.
         """
         views = clean.shape[0]
         drawn = torch.rand(1 if self.shared_t else views, generator=generator, dtype=torch.float32)
-        drawn = drawn.to(torch.promote_types(clean.dtype, torch.float32))
-        return upload(drawn, clean.device).expand(views)
+        return drawn.to(torch.promote_types(clean.dtype, torch.float32)).expand(views)

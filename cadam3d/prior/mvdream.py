@@ -41,7 +41,7 @@ class MultiviewEmbedding(LatentEmbedding):
 
     def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> TextCondition:
         """Return the condition of these views. Raises ``UserError`` unless they form groups of four."""
-        require_groups(cameras)
+        require_groups(cameras.on_cpu())
         return super().at(cameras, background)
 
 
@@ -118,14 +118,11 @@ class MVDream(StableDiffusion):
         self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: TextCondition, scale: float
     ) -> Prediction:
         """Predict every view, without gradient. Raises ``UserError`` if ``t`` differs within a group."""
-        levels = t.view(-1, VIEWS)
-        require(
-            bool((levels == levels[:, :1]).all()),
-            "guidance.shared_t",
-            expected="true, since prior=mvdream denoises four views together at one noise level",
-            got=False,
-            example="guidance.shared_t=true",
-        )
+        # To read a level waits for the device. There the first prediction is enough, because views have
+        # different levels in every step or in none.
+        if t.device.type == "cpu" or not vars(self).get("has_predicted"):
+            vars(self)["has_predicted"] = True
+            require_one_level(t)
         return super().predict(noisy, t, condition, scale)
 
     def tempered(
@@ -156,10 +153,23 @@ def camera_numbers(cameras: Cameras) -> Float[Tensor, "v 16"]:
     those of OpenGL: +x right, +y up, +z backward. Camera centres are moved to the unit sphere.
     """
     to_world = cameras.world_to_camera[:, :3, :3].transpose(1, 2)
-    axes = to_world * to_world.new_tensor([1.0, -1.0, -1.0])
+    axes = torch.cat([to_world[:, :, :1], -to_world[:, :, 1:]], dim=2)
     centres = torch.nn.functional.normalize(cameras.positions, dim=-1)
-    last = to_world.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(cameras), 1, 4)
+    views = len(cameras)
+    last = torch.cat([to_world.new_zeros(views, 1, 3), to_world.new_ones(views, 1, 1)], dim=2)
     return torch.cat([torch.cat([axes, centres[..., None]], dim=2), last], dim=1).flatten(1)
+
+
+def require_one_level(t: Float[Tensor, "v"]) -> None:
+    """Raise ``UserError`` unless the views of each group have one noise level."""
+    levels = t.view(-1, VIEWS)
+    require(
+        bool((levels == levels[:, :1]).all()),
+        "guidance.shared_t",
+        expected="true, since prior=mvdream denoises four views together at one noise level",
+        got=False,
+        example="guidance.shared_t=true",
+    )
 
 
 def require_whole_groups(views: int) -> None:

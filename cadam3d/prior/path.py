@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.checks import require_range, require_whole
+from cadam3d.core.device import upload
 
 # Bisections until an interval of length 1 reaches the resolution of double precision.
 HALVINGS = 53
@@ -146,7 +147,7 @@ class DDPM(NoisePath):
         return (t * self.train_steps - 1).clamp_min(0)
 
     def _log_alpha_bar(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        table = torch.as_tensor(_log_alpha_bars(self.train_steps, self.beta_start, self.beta_end)).to(t)
+        table = _log_alpha_bars(self.train_steps, self.beta_start, self.beta_end, t.dtype, t.device)
         position = t.clamp(0, 1) * self.train_steps
         below = position.floor().clamp_max(self.train_steps - 1).long()
         return torch.lerp(table[below], table[below + 1], position - below)
@@ -236,14 +237,16 @@ class Rows(NoisePath):
         return (t * self.rows).round() / self.rows
 
 
-@lru_cache(maxsize=8)
-def _log_alpha_bars(train_steps: int, beta_start: float, beta_end: float) -> np.ndarray:
-    """Return log(alpha_bar) at k = 0 ... train_steps.
-
-    The array is NumPy's, so that the cache does not depend on torch's modes and devices.
-    """
+@lru_cache(maxsize=32)
+def _log_alpha_bars(
+    train_steps: int, beta_start: float, beta_end: float, dtype: torch.dtype, device: torch.device
+) -> Float[Tensor, "k"]:
+    """Return log(alpha_bar) at k = 0 ... train_steps."""
     betas = np.linspace(beta_start**0.5, beta_end**0.5, train_steps) ** 2
-    return np.concatenate([[0.0], np.cumsum(np.log1p(-betas))])
+    table = np.concatenate([[0.0], np.cumsum(np.log1p(-betas))])
+    # A tensor that is made in torch's inference mode could not be used for training later.
+    with torch.inference_mode(False):
+        return upload(torch.as_tensor(table).to(dtype), device)
 
 
 def _reciprocal_or_zero(values: Float[Tensor, "v"]) -> Float[Tensor, "v"]:

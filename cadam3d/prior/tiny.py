@@ -11,6 +11,7 @@ from torch.nn import functional as F  # noqa: N812  (the usual name)
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require_choice, require_whole
+from cadam3d.core.device import upload
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import NoisePath, Prediction
 
@@ -109,7 +110,7 @@ class Tiny(DiffusionPrior):
         output = self.network(
             noisy.float().repeat(copies, 1, 1, 1),
             self.noise_path.timestep(t).float().repeat(copies),
-            torch.stack(prompts).to(noisy.device).repeat_interleave(noisy.shape[0], dim=0),
+            upload(torch.stack(prompts), noisy.device).repeat_interleave(noisy.shape[0], dim=0),
             condition.directions.to(noisy.device, torch.float32).repeat(copies, 1),
         )
         halves = output.to(noisy.dtype).chunk(copies)

@@ -1,0 +1,211 @@
+"""Laws of the host in a step: it waits for the device once, and repeats what did not fit into memory.
+
+The stand-in for a CUDA device is torch's "meta" device. Its tensors have no values, so everything that needs
+one on the host raises an exception: ``item()``, ``bool()``, ``tolist()``, ``cpu()``, ``nonzero()``, and masks
+as indices.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from composed import composed
+from test_trainer import SMALL, Recorder, go, make, same
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from cadam3d import trainer as loop
+from cadam3d.commands.train import build_trainer
+from cadam3d.core.device import read_numbers, upload_together
+from cadam3d.core.render import RenderOutput
+from cadam3d.rasterizer.base import Rasterizer, absgrad_probe
+from cadam3d.settings.compose import component
+
+CPU, META = torch.device("cpu"), torch.device("meta")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blobs(Rasterizer):
+    """Renders something that depends on every tensor, with operations that every device has."""
+
+    def render(self, gaussians, cameras, background, absgrad=False):
+        views, size = len(cameras), (cameras.height, cameras.width)
+        means2d = gaussians.means[None, :, :2].expand(views, -1, -1) * cameras.intrinsics[:, :1, :1]
+        if means2d.requires_grad:
+            means2d.retain_grad()
+        probe = absgrad_probe(means2d.detach(), absgrad)
+        others = [tensor.mean() for tensor in gaussians.tensors().values()]
+        level = torch.stack(others).mean() + means2d.mean(dim=(1, 2)) + (0 if probe is None else probe.sum())
+        alpha = level.sigmoid()[:, None, None].expand(views, *size)
+        rgb = alpha[..., None] + (1 - alpha)[..., None] * background[:, None, None]
+        return RenderOutput(
+            rgb=rgb, alpha=alpha, depth=alpha, means2d=means2d, radii=means2d[..., 0].detach(), absgrad=probe
+        )
+
+
+class Transfers(TorchDispatchMode):
+    """Records the copies from the CPU to another device: whether each is asynchronous."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.are_asynchronous: list[bool] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        if func is torch.ops.aten._to_copy.default and args[0].device != kwargs.get("device", args[0].device):
+            assert args[0].device.type == "cpu", "a copy from the device is a wait"
+            self.are_asynchronous.append(kwargs.get("non_blocking", False))
+        return func(*args, **kwargs)
+
+
+def step_without_values(monkeypatch, lines: Sequence[str]) -> tuple[int, list[bool]]:
+    """Do one step on a device without values. Return how often numbers were read, and the copies."""
+    has_prior = any(line.startswith("prior=") for line in lines)
+    cfg = composed(*(line for line in SMALL if not (has_prior and line.startswith("prior="))), *lines)
+    if has_prior:
+        # Embedded texts have values. This keeps them for the prior below.
+        build_trainer(cfg, CPU).prior.embed(cfg.prompt, cfg.negative_prompt)
+    trainer = replace(build_trainer(cfg, META), rasterizer=Blobs())
+    state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
+    gaussians = state.gaussians.to(META)
+    state.optimizer = trainer.optimizer.start(gaussians)
+    state.densifier = trainer.densifier.init_state(len(gaussians), META)
+    embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
+    trainer.prior.load()
+    # The first prediction of MVDream checks the noise levels.
+    vars(trainer.prior)["has_predicted"] = True
+    readings = []
+
+    def read(numbers, device):
+        assert all(number.device == META for number in numbers if isinstance(number, Tensor))
+        readings.append(len(numbers))
+        # It has not overflowed, nothing is dimmed, and all gradients are finite.
+        return [0.0, *[1.0] * (len(numbers) - 1)]
+
+    monkeypatch.setattr(loop, "read_numbers", read)
+    with Transfers() as transfers:
+        trainer.step(state, embedding)
+    assert (state.step, state.skipped, state.dimmed) == (1, 0, 0)
+    return len(readings), transfers.are_asynchronous
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        *([f"guidance={name}"] for name in ("sds", "csd", "ism", "sdi", "ucm", "vfds", "gcs")),
+        ["guidance=ism_luciddreamer"],
+        ["guidance=sdi_threestudio"],
+        *([f"densifier={name}"] for name in ("baseline", "absgrad", "none", "random", "mcmc", "cadam_open")),
+        ["regularizer=[mean_scale,mean_opacity,outside_ball,alpha_entropy,sparsity,squared_variation]"],
+        ["regularizer=[disparity_variation,total_variation]"],
+        ["densifier=cadam_open", "densifier.grad_source=guidance", "regularizer=[sparsity]"],
+        ["densifier=cadam_open", "densifier.nonfinite=skip_row", "densifier.invisible=skip"],
+        ["augmentation=lucid", "background=lucid", "camera=progressive"],
+        ["camera=multiview", "views=4", "background=black_or_white"],
+        ["exposure=beg", "exposure.begin=0"],
+        ["optimizer.clip_norm=0.1", "initializer.sh_degree=3"],
+    ],
+    ids=" ".join,
+)
+def test_a_step_waits_for_the_device_once(lines, monkeypatch):
+    readings, copies = step_without_values(monkeypatch, lines)
+    assert readings == 1
+    assert copies
+    assert all(copies), "a copy to the device waits for it"
+
+
+@pytest.mark.parametrize(
+    "work", [Tensor.item, bool, Tensor.tolist, Tensor.cpu, Tensor.nonzero, lambda t: t[t > 0]]
+)
+def test_the_stand_in_refuses_to_be_waited_for(work):
+    with pytest.raises((NotImplementedError, RuntimeError)):
+        work(torch.ones(1, device=META))
+
+
+def test_a_step_with_networks_waits_for_the_device_once(monkeypatch, tmp_path):
+    pytest.importorskip("diffusers")
+    lines = ["prior=shapes_mvdream", f"prior.cache_dir={tmp_path}", "camera.size=32"]
+    readings, copies = step_without_values(monkeypatch, lines)
+    assert readings == 1
+    assert all(copies), "a copy to the device waits for it"
+
+
+# -------------------------------------------------------------------------- overflow
+
+
+SPARSITY = "regularizer=[sparsity]"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ahead(Blobs):
+    """Has reserved too little memory at some steps, as a CUDA rasterizer may."""
+
+    overflows: frozenset[int]  # numbers of calls, from 0
+    calls: list[bool]  # whether each call of render_ahead has overflowed
+
+    def render_ahead(self, gaussians, cameras, background, absgrad=False):
+        output = self.render(gaussians, cameras, background, absgrad)
+        self.calls.append(len(self.calls) in self.overflows)
+        if not self.calls[-1]:
+            return replace(output, overflowed=torch.zeros((), dtype=torch.bool))
+        return replace(
+            output,
+            rgb=output.rgb * 0 + background[:, None, None],
+            alpha=output.alpha * 0,
+            depth=output.depth * 0,
+            radii=output.radii * 0,
+            overflowed=torch.ones((), dtype=torch.bool),
+        )
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["regularizer=[mean_scale,sparsity]"],
+        ["densifier=absgrad", "densifier.tau_pos=1e-9"],
+        ["densifier=mcmc", "regularizer=[mean_opacity]"],
+        [
+            "densifier=cadam_open",
+            "densifier.min_age=0",
+            "densifier.grad_source=guidance",
+            "regularizer=[sparsity]",
+        ],
+        ["augmentation=lucid", "camera=progressive", "camera.size=16", "background=lucid"],
+        ["exposure=beg", "exposure.begin=0", "exposure.threshold=0.01"],
+        ["guidance=ism", "guidance.shared_t=false"],
+    ],
+    ids=" ".join,
+)
+def test_steps_that_overflow_leave_no_trace(lines, tmp_path):
+    payloads, reports = [], []
+    for overflows in (frozenset(), frozenset({0, 1, 4, 7})):
+        trainer, state = make(lines)
+        rasterizer, recorder = Ahead(overflows=overflows, calls=[]), Recorder()
+        go(replace(trainer, rasterizer=rasterizer, callbacks=[recorder]), state, tmp_path)
+        assert rasterizer.calls == [number in overflows for number in range(8)]
+        payloads.append(state.to_payload())
+        reports.append(recorder.steps)
+    assert same(*payloads)
+    assert reports[0] == reports[1]
+
+
+def test_numbers_of_any_kind_are_read_exactly():
+    tensors = [
+        torch.tensor(0.1),
+        torch.tensor(True),
+        torch.tensor(3),
+        torch.tensor(1 / 3, dtype=torch.float64),
+    ]
+    found = read_numbers([2.5, *tensors, torch.tensor(0.1, requires_grad=True), False], CPU)
+    assert found == [2.5, float(tensors[0]), 1.0, 3.0, 1 / 3, float(tensors[0]), 0.0]
+    assert read_numbers([], CPU) == []
+
+
+def test_tensors_that_are_sent_together_keep_their_shapes_and_stay_where_they_are():
+    tensors = [torch.rand(2, 4, 4), torch.rand(2, 3), torch.rand(2)]
+    assert all(sent is tensor for sent, tensor in zip(upload_together(tensors, CPU), tensors, strict=True))
+    with Transfers() as transfers:
+        sent = upload_together(tensors, META)
+    assert [(each.device, each.shape) for each in sent] == [(META, tensor.shape) for tensor in tensors]
+    assert transfers.are_asynchronous == [True]
