@@ -6,11 +6,12 @@
     python scripts/gpu.py --markdown FILE     # show the JSON of a run as Markdown
 
 If a check fails, nothing is timed, and the stage of the kernels that is wrong is named. The same line
-continues where the last one stopped: what has passed is kept, unless the GPU, torch or the files of the
-project have changed. Results are in --folder: gpu.json, gpu.md, and logs. Without a GPU, one line says so.
+continues where the last one stopped: what has passed is kept, unless the GPU, a package or a file of the
+project has changed. Results are in --folder: gpu.json, gpu.md, and logs. Without a GPU, one line says so.
 """
 
 import argparse
+import signal
 import sys
 from pathlib import Path
 
@@ -83,6 +84,8 @@ def run(args: argparse.Namespace) -> int:
     if args.look:
         print(f"{device.name}, driver for CUDA up to {device.driver_cuda}")
         return 0
+    # What ends this process must end the process of a piece, too.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     return Session(args.folder.absolute(), device).run([part for part in PARTS if part in args.part])
 
 

@@ -26,11 +26,12 @@ from gpu_run.runner import RESULT, Piece, Processes, Runner
 
 AGAIN = "python scripts/gpu.py"
 FACTS = (sys.executable, "-m", "gpu_run.on_device", "facts", "--json", RESULT)
-# What a first import of torch on a slow disk may take.
-FACTS_SECONDS = 180.0
-STAGES_SECONDS = 150.0
+# The first import of torch from a slow disk takes long.
+FACTS_SECONDS = 60.0
+# Finding the wrong stage includes compiling the emulator.
+STAGES_SECONDS = 50.0
 # Facts that results depend on, beside the files of the project.
-STATE = ("device", "driver", "torch", "python", "packages")
+STATE = ("device", "driver", "driver_cuda", "torch", "python", "packages")
 
 
 class TroubleError(Exception):
@@ -128,7 +129,7 @@ class Session:
         old = self._path.with_name(f"gpu-{record.machine['date'].replace(':', '')[:17]}.json")
         self._path.replace(old)
         self._show(
-            f"The GPU, torch or the files of the project have changed, so {old.name} has the old results."
+            f"The GPU, a package or a file of the project has changed. The old results are in {old.name}."
         )
         return Record(machine, state)
 
@@ -137,7 +138,7 @@ class Session:
         open_gates = [piece.name for piece in gates if not record.passed(piece.name)]
         if open_gates:
             raise TroubleError(
-                f"expected that the checks have passed, got none for: {', '.join(open_gates)}. "
+                f"expected that the checks have passed, got no pass of: {', '.join(open_gates)}. "
                 f"Try: {AGAIN} --part checks"
             )
 
