@@ -38,7 +38,7 @@ def rows(record: Record) -> Iterator[tuple[str, str, str]]:
     for name, entry in record.pieces.items():
         says = entry.says if entry.status == PASSED else f"**{entry.status}**: {entry.says}"
         yield f"{entry.part}: {name}", "", says
-        if entry.result and entry.status == PASSED:
+        if entry.result:
             yield from details(entry.result)
     yield from fastest(record)
 

@@ -303,7 +303,9 @@ def main(words: list[str] | None = None) -> int:
 
         traceback.print_exc()
         first = (str(error).strip().splitlines() or [""])[0]
-        result = {"says": f"{type(error).__name__}: {first}", "failed": True}
+        # A UserError is a sentence already.
+        kind = type(error).__name__
+        result = {"says": first if kind == "UserError" else f"{kind}: {first}", "failed": True}
     print(result.get("says", ""))
     if args.json:
         args.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

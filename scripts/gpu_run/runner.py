@@ -18,6 +18,8 @@ from gpu_run.record import ENDED, FAILED, PASSED, SKIPPED, Entry, Record
 
 # In a command, the path of the JSON file with its results.
 RESULT = "{result}"
+# Of a line in the report; the log has the rest.
+MOST_LETTERS = 300
 # A piece that has less time left than this is not started.
 LEAST_SECONDS = 15
 
@@ -199,6 +201,7 @@ class Runner:
     def _keep(
         self, piece: Piece, status: str, says: str, seconds: float, result: dict[str, Any] | None = None
     ) -> None:
+        says = says if len(says) <= MOST_LETTERS else f"{says[:MOST_LETTERS]}..."
         self._show(f"  {piece.name}: {status}, {says}" + (f" ({seconds:.0f} s)" if seconds else ""))
         # A piece that runs again moves to the end, so the order is that of the run.
         self._record.pieces.pop(piece.name, None)
