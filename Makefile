@@ -1,6 +1,8 @@
 # make demo   install into .venv and train two objects: with the exact prior, and with a small network
 # make test   ruff, pyright and the whole test suite: everything that must hold before a merge
 # make check  ruff, pyright and the tests of what has changed since the last commit on main; less than a minute
+# make gpu    check, time and explain the CUDA kernels on the NVIDIA GPU of this machine, in at most 25 minutes;
+#             PART=checks, PART=times and PART=explains do it in three parts of less than ten minutes
 # make docs   build the documentation as a site into the folder site, strictly: no warning, no broken link
 # make clean  remove .venv and caches; outputs stay
 # PYTHON=python3.12 chooses the interpreter; JOBS=2 sets the number of test processes.
@@ -14,7 +16,7 @@ BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test check docs clean
+.PHONY: demo test check gpu docs clean
 
 demo: .venv/.installed
 	$(BIN)/cadam3d train prompt="a red and yellow checkered torus"
@@ -34,6 +36,12 @@ check: .venv/.installed-dev
 	@tests="$$($(BIN)/python scripts/changed_tests.py $(BASE))"; \
 	if [ -z "$$tests" ]; then echo "No tests belong to what has changed since $(BASE)."; \
 	else echo "Tests of what has changed since $(BASE): $$tests"; $(PYTEST) -m "not slow" $$tests; fi
+
+# Nothing is installed on a machine without a GPU.
+gpu:
+	@$(or $(wildcard $(BIN)/python),$(PYTHON),python3) scripts/gpu.py --look
+	@$(MAKE) --no-print-directory .venv/.installed-dev
+	$(BIN)/python scripts/gpu.py $(if $(PART),--part $(PART))
 
 docs: .venv/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build

@@ -18,10 +18,14 @@ from typing import NoReturn
 
 import torch
 from omegaconf import OmegaConf
+
+# The script measures the package that it stands beside, from any folder.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 from rasterizer_bench.check import check, check_long_sort
-from rasterizer_bench.report import HEADER, SceneStages, make_rows, show_stages, start_report
-from rasterizer_bench.scenes import make_scene, make_shell
-from rasterizer_bench.stages import copy_speed, time_stages
+from rasterizer_bench.report import HEADER, Report, SceneStages, make_rows, show_stages, start_report
+from rasterizer_bench.scenes import Scene, make_scene, make_shell
+from rasterizer_bench.stages import NoKernelsError, copy_speed, time_stages
 from rasterizer_bench.timing import OUT_OF_MEMORY, take_turns
 
 from cadam3d.core.errors import UserError
@@ -95,6 +99,7 @@ def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--threads", type=whole(1), default=1, metavar="N")
     parser.add_argument("--check", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--check-only", action="store_true", help="check the backends without timing them")
+    parser.add_argument("--stages", action=argparse.BooleanOptionalAction, default=True, help="of cuda")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write all results to this file")
     args = parser.parse_args(words)
     for name, value in DEFAULTS[args.device].items():
@@ -150,7 +155,7 @@ def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher
     """Time the backends on every scene, print the results, and write them to the JSON file."""
     device = torch.device(args.device)
     report = start_report(device, {name: value for name, value in vars(args).items() if name != "json"})
-    if launcher:
+    if launcher and args.stages:
         report.copy_bytes_per_ms = copy_speed(device, COPY_BYTES[device.type])
     name = str(report.device["name"])
     print(f"{name}, {args.threads} thread(s), {args.repeats} repetitions; milliseconds\n{HEADER}")
@@ -162,16 +167,26 @@ def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher
             rows = make_rows(at, timings, name)
             report.rows += rows
             print(*rows, sep="\n", flush=True)
-            if launcher and timings["cuda"]:
-                stages = time_stages(launcher, scene, args.repeats, report.copy_bytes_per_ms)
-                report.stages.append(SceneStages(*at, stages))
-                print(show_stages(stages), flush=True)
+            if launcher and args.stages and timings["cuda"]:
+                add_stages(report, at, launcher, scene)
             # The file is written after every scene, because a later one may exceed the memory.
             if args.json:
                 report.write(args.json)
     verdicts = [row.is_met for row in report.rows if row.is_met is not None]
     if verdicts:
         print(f"{sum(verdicts)} of {len(verdicts)} targets met")
+
+
+def add_stages(report: Report, at: tuple[int, int, int, int], launcher: Launcher, scene: Scene) -> None:
+    """Time the stages of a scene, add them to the report, and print them."""
+    assert report.copy_bytes_per_ms is not None
+    try:
+        timing = time_stages(launcher, scene, report.settings["repeats"], report.copy_bytes_per_ms)
+    except NoKernelsError as error:
+        print(f"no stages: {error}", flush=True)
+        return
+    report.stages.append(SceneStages(*at, timing.wall_ms, timing.kernel_ms, timing.stages))
+    print(show_stages(timing.stages), flush=True)
 
 
 def run(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher: Launcher | None) -> int:

@@ -10,6 +10,7 @@ like a real model, so that loading is timed too (Stable Diffusion 2.1: 1.9 GB, 3
 import argparse
 import json
 import subprocess
+import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -19,6 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+
+# The script measures the package that it stands beside, from any folder.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from cadam3d.commands.train import build_trainer, run_context
 from cadam3d.core.device import resolve_device

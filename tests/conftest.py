@@ -3,6 +3,7 @@
 import gc
 import os
 import pickle
+import re
 import sys
 from collections.abc import Callable
 from functools import cache
@@ -37,8 +38,15 @@ LONG = (
 )
 
 
-def pytest_configure():
-    _check_types()
+# With `-m gpu`, only files with one of these words are collected: the marker, or a fixture of the folder
+# rasterizer that has a GPU among its parameters.
+OF_GPU = re.compile(r"mark\.gpu\b|\b(any_)?backend\b")
+
+
+def pytest_configure(config):
+    # A machine with a GPU may have few packages, and the types are checked wherever the other tests run.
+    if config.option.markexpr != "gpu":
+        _check_types()
     # No test cuts the power, and on some disks each call waits for milliseconds.
     os.fsync = lambda _: None
 
@@ -56,6 +64,24 @@ def _check_types() -> None:
         if "from jaxtyping import" in path.read_text(encoding="utf-8")
     ]
     install_import_hook([".".join(parts).removesuffix(".__init__") for parts in names], "typechecker.check")
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Ignore files without tests of a GPU if only those run, because their imports may not be installed."""
+    if config.option.markexpr != "gpu" or not re.fullmatch(r"test_.*\.py", collection_path.name):
+        return None
+    return None if OF_GPU.search(collection_path.read_text(encoding="utf-8")) else True
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    """Skip tests that do not fit into the memory of this GPU."""
+    try:
+        return (yield)
+    except (MemoryError, RuntimeError) as error:
+        if item.get_closest_marker("gpu") and type(error).__name__ in ("MemoryError", "OutOfMemoryError"):
+            pytest.skip("not enough memory on this GPU")
+        raise
 
 
 def pytest_collection_modifyitems(items):

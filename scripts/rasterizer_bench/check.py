@@ -10,7 +10,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cuda_sort import sort, sort_bytes
-from cadam3d.rasterizer.launcher import Launcher
+from cadam3d.rasterizer.launcher import Launch, Launcher
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import GSPLAT, OWN, self_test
 
@@ -110,30 +110,49 @@ def _deviation(got: Tensor, want: Tensor) -> Tensor:
 
 
 def changes(rasterizer: Rasterizer, scene: Scene) -> list[str]:
-    """Return the results that are not the same to the last bit in every run."""
+    """Return the results that are not the same to the last bit in every run, and in every way to render."""
     first: dict[str, Tensor] = {}
     changed: set[str] = set()
     for _ in range(RUNS):
         scene.zero_grad()
         images = scene.render(rasterizer)
         scene.backward(images)
-        numbers = dict(zip(("rgb", "alpha", "depth"), images, strict=True))
-        numbers |= {f"the gradient of {name}": t.grad for name, t in scene.gaussians.tensors().items()}
+        numbers = dict(zip(("rgb", "alpha", "depth"), images, strict=True)) | gradients_of(scene)
+        scene.zero_grad()
+        scene.step(rasterizer)
+        ahead = gradients_of(scene)
         first = first or numbers
         changed |= {name for name, tensor in numbers.items() if not torch.equal(tensor, first[name])}
+        changed |= {name for name, tensor in ahead.items() if not torch.equal(tensor, first[name])}
     return [f"{name} is not the same in {RUNS} runs" for name in sorted(changed)]
+
+
+def gradients_of(scene: Scene) -> dict[str, Tensor]:
+    """Return the gradients of the parameters, which are not ``None``."""
+    return {f"the gradient of {name}": tensor.grad for name, tensor in scene.gaussians.tensors().items()}
 
 
 def check_long_sort(launcher: Launcher, device: torch.device, keys: int) -> list[str]:
     """Return a problem if the kernels sort ``keys`` random keys differently than torch does."""
-    generator = torch.Generator(device).manual_seed(0)
-    unsorted = torch.randint(0, 2**31 - 1, (keys,), dtype=torch.int32, device=device, generator=generator)
+    unsorted = make_keys(keys, cuda.DEPTH_BITS - 1, device)
     want, want_order = unsorted.sort(stable=True)
-    sizes, order = sort_bytes(keys, cuda.DEPTH_BITS), torch.empty_like(unsorted)
-    blocks = [unsorted, *(unsorted.new_empty(size, dtype=torch.uint8) for size in sizes)]
-    first, *temporary = (block.data_ptr() for block in blocks)
     with launcher.on(device) as launch:
-        found = sort(launch, first, order.data_ptr(), keys, cuda.DEPTH_BITS, temporary)
-    got = next(block for block in blocks if block.data_ptr() == found).view(torch.int32)[:keys]
+        got, order = sort_keys(launch, unsorted, cuda.DEPTH_BITS)
     is_right = torch.equal(got, want) and torch.equal(order, want_order.int())
     return [] if is_right else [f"{keys} keys are sorted wrongly"]
+
+
+def make_keys(count: int, bits: int, device: torch.device) -> Tensor:
+    """Return random numbers below ``2**bits``, of at most 31 bits."""
+    generator = torch.Generator(device).manual_seed(0)
+    return torch.randint(0, 2**bits - 1, (count,), dtype=torch.int32, device=device, generator=generator)
+
+
+def sort_keys(launch: Launch, keys: Tensor, bits: int) -> tuple[Tensor, Tensor]:
+    """Return the keys in the order of their lowest ``bits`` bits, and their old positions."""
+    count, order = len(keys), torch.empty_like(keys)
+    blocks = [keys.clone(), *(keys.new_empty(n, dtype=torch.uint8) for n in sort_bytes(count, bits))]
+    first, *temporary = (block.data_ptr() for block in blocks)
+    found = sort(launch, first, order.data_ptr(), count, bits, temporary)
+    block = next(block for block in blocks if block.data_ptr() == found)
+    return block.view(torch.int32)[:count], order

@@ -16,7 +16,7 @@ import cadam3d
 REPOSITORY = Path(__file__).parents[2]
 HEADER = (
     f"{'N':>9} {'pixels':>6} {'views':>5} {'SH':>2} {'backend':>10} {'forward':>9} {'backward':>9} "
-    f"{'both':>9} {'best':>9} {'ratio':>7} {'memory':>8}  target"
+    f"{'both':>9} {'step':>9} {'host':>9} {'best':>9} {'ratio':>7} {'memory':>8}  target"
 )
 
 
@@ -32,8 +32,10 @@ class Row:
     forward_ms: float | None = None
     backward_ms: float | None = None
     forward_backward_ms: float | None = None
+    step_ms: float | None = None  # forward and backward as a training step calls them
+    host_ms: float | None = None  # of these, until the calls have returned
     forward_backward_min_ms: float | None = None
-    ratio: float | None = None  # time of the first backend divided by this one's, forward + backward
+    ratio: float | None = None  # ``step_ms`` of the first backend divided by this one's
     peak_bytes: int | None = None
     demanded_ms: float | None = None
     demanded_ratio: float | None = None  # gsplat's time divided by this one's
@@ -43,7 +45,8 @@ class Row:
         scene = f"{self.count:>9} {self.size:>6} {self.views:>5} {self.degree:>2} {self.backend:>10}"
         if self.forward_backward_ms is None:
             return f"{scene}   out of memory"
-        times = (self.forward_ms, self.backward_ms, self.forward_backward_ms, self.forward_backward_min_ms)
+        times = (self.forward_ms, self.backward_ms, self.forward_backward_ms)
+        times += (self.step_ms, self.host_ms, self.forward_backward_min_ms)
         ratio = "" if self.ratio is None else f"{self.ratio:.2f}x"
         memory = "" if self.peak_bytes is None else f"{self.peak_bytes / 2**20:.0f} MB"
         cells = "".join(f" {time:>9.2f}" for time in times) + f" {ratio:>7} {memory:>8}"
@@ -61,29 +64,27 @@ def make_rows(
     scene: tuple[int, int, int, int], timings: dict[str, Timing | None], device_name: str
 ) -> list[Row]:
     """Return the rows of one scene (count, size, views, degree), in the order of ``timings``."""
-    both = {
-        name: timing.median_ms["forward_backward"] if timing else None for name, timing in timings.items()
-    }
-    first = next(iter(both.values()))
+    steps = {name: timing.median_ms["step"] if timing else None for name, timing in timings.items()}
+    first = next(iter(steps.values()))
     rows = []
     for name, timing in timings.items():
         if timing is None:
             rows.append(Row(*scene, name))
             continue
-        ratio = first / both[name] if first is not None else None
-        demands = judge(scene, both, device_name) if name == "cuda" else (None, None, None)
+        ratio = first / steps[name] if first is not None else None
+        demands = judge(scene, steps, device_name) if name == "cuda" else (None, None, None)
         times = (*timing.median_ms.values(), timing.min_ms["forward_backward"])
         rows.append(Row(*scene, name, *times, ratio, timing.peak_bytes, *demands))
     return rows
 
 
 def judge(
-    scene: tuple[int, int, int, int], both: dict[str, float | None], device_name: str
+    scene: tuple[int, int, int, int], steps: dict[str, float | None], device_name: str
 ) -> tuple[float | None, float | None, bool | None]:
     """Return the targets of ``cuda``, in milliseconds and as a ratio to gsplat, and whether they are met."""
     count, _, views, _ = scene
     most_ms, least_ratio = demanded_ms(device_name, *scene), demanded_ratio(count, views)
-    ours, gsplat = both["cuda"], both.get("gsplat")
+    ours, gsplat = steps["cuda"], steps.get("gsplat")
     if gsplat is None:
         least_ratio = None
     verdicts = [ours <= most_ms] if most_ms is not None else []
@@ -111,6 +112,8 @@ class SceneStages:
     size: int
     views: int
     degree: int
+    wall_ms: float
+    kernel_ms: float
     stages: list[StageTiming]
 
 

@@ -1,6 +1,7 @@
 """The scene of the benchmark: a bumpy shell of splats whose size is about the distance between neighbours."""
 
 import math
+import time
 from dataclasses import dataclass, replace
 
 import torch
@@ -26,6 +27,21 @@ class Scene:
         """Return rgb, alpha and depth."""
         output = rasterizer.render(self.gaussians, self.cameras, self.background)
         return output.rgb, output.alpha, output.depth
+
+    def step(self, rasterizer: Rasterizer) -> float:
+        """Render and run the backward pass as a training step does, which may not wait for the device.
+
+        Returns the seconds until both calls have returned. After that, a step finds out whether the reserved
+        memory was too small, and if so repeats both.
+        """
+        begin = time.perf_counter()
+        output = rasterizer.render_ahead(self.gaussians, self.cameras, self.background)
+        self.backward((output.rgb, output.alpha, output.depth))
+        host = time.perf_counter() - begin
+        if output.overflowed is not None and output.overflowed.item():
+            self.zero_grad()
+            self.backward(self.render(rasterizer))
+        return host
 
     def backward(self, images: tuple[Tensor, Tensor, Tensor]) -> None:
         """Run the backward pass from fixed gradients, so that no loss is part of the time."""

@@ -1,4 +1,7 @@
-"""Time the stages of the CUDA rasterizer: each launch is measured by two events and compared with a floor.
+"""The stages of the CUDA rasterizer: the time that the GPU spends in their kernels, beside a floor.
+
+Kernels are timed by the GPU itself, through ``torch.profiler``. Clocks around the launches would include the
+time in which an idle GPU waits for the host, which takes longer than a short kernel.
 
 The floor of a stage is the number of bytes that it must read and write at least once, divided by the measured
 speed of a plain copy. It considers bandwidth alone, so a stage that computes much per byte, as both blends
@@ -7,7 +10,7 @@ do, stays far above it. It also assumes that no tile becomes opaque before the e
 
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -23,7 +26,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.rasterizer import cuda, cuda_sort
 from cadam3d.rasterizer.base import Rasterizer
-from cadam3d.rasterizer.cuda import rasterize
+from cadam3d.rasterizer.cuda import rasterize, rasterize_ahead
 from cadam3d.rasterizer.launcher import Launch, Launcher
 
 # The stages in order, with the prefixes of their kernels. Sorts and prefix sums belong to several stages.
@@ -36,11 +39,17 @@ STAGES = {
     "blend backward": ("blend_backward",),
     "project backward": ("project_backward", "sum_absolutes", "centre_backward"),
 }
-# The time outside of launches: allocation, autograd, the host and one wait for the device.
+# Kernels and copies of torch, such as filling and adding.
+TORCH = "torch"
+# The wall clock without all kernels: the GPU waits for the host.
 REST = "rest"
 # The size of a float and of an index.
 WORD = 4  # bytes
 SPLAT, RECORD = WORD * cuda.SPLAT, WORD * cuda.RECORD
+
+
+class NoKernelsError(Exception):
+    """The profiler has not seen the kernels. The message says so in one line."""
 
 
 @dataclass(frozen=True)
@@ -59,74 +68,100 @@ class KernelRasterizer(Rasterizer):
         """See :meth:`Rasterizer.render`."""
         return rasterize(self.launcher, gaussians, cameras, background, absgrad)
 
+    def render_ahead(
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        background: Float[Tensor, "v 3"],
+        absgrad: bool = False,
+    ) -> RenderOutput:
+        """See :meth:`Rasterizer.render_ahead`."""
+        return rasterize_ahead(self.launcher, gaussians, cameras, background, absgrad)
+
 
 @dataclass(frozen=True)
-class Span:
-    """One launch, between two events."""
+class Kernel:
+    """A kernel or a copy that a device has run."""
 
-    kernel: str
-    stage: str
-    begin: object
-    end: object
+    name: str
+    ms: float
 
 
-class StageClock(Launcher):
-    """Passes every launch on and records when it began and ended."""
+# Calls a function, and returns what the device has run for it, in order.
+Watch = Callable[[Callable[[], object]], list[Kernel]]
+
+
+def profile(work: Callable[[], object]) -> list[Kernel]:
+    """Return the kernels and copies of ``work``, timed by the GPU.
+
+    Raises :class:`NoKernelsError` if this torch cannot do that.
+    """
+    gpu = torch.profiler.ProfilerActivity.CUDA
+    if gpu not in torch.profiler.supported_activities():
+        raise NoKernelsError("torch.profiler of this torch cannot time kernels")
+    with torch.profiler.profile(activities=[gpu]) as profiler:
+        work()
+        torch.cuda.synchronize()
+    events = [e for e in profiler.events() or [] if e.device_type == torch.autograd.DeviceType.CUDA]
+    events.sort(key=lambda event: event.time_range.start)
+    return [Kernel(event.name, event.time_range.elapsed_us() / 1e3) for event in events]
+
+
+class LaunchClock(Launcher):
+    """Passes every launch on, and notes the kernel and how long the launch takes on the host.
+
+    In the emulator that is the time of the kernel, because a launch returns when the kernel has ended.
+    """
 
     def __init__(self, inner: Launcher) -> None:
         self._inner = inner
-        self.spans: list[Span] = []
-        # The number of (splat, tile) pairs since ``spans`` was emptied.
+        self.launches: list[Kernel] = []
+        # The number of (splat, tile) pairs since ``launches`` was emptied.
         self.slots = 0
 
     @contextmanager
     def on(self, device: torch.device) -> Iterator[Launch]:
         """See :meth:`Launcher.on`."""
         with self._inner.on(device) as launch:
-            yield partial(self._launch, launch, _event if device.type == "cuda" else time.perf_counter)
+            yield partial(self._launch, launch)
 
-    def _launch(
-        self, launch: Launch, mark: Callable[[], object], kernel: str, blocks: int, threads: int, *arguments
-    ) -> None:
+    def _launch(self, launch: Launch, kernel: str, blocks: int, threads: int, *arguments) -> None:
         if kernel == "tile_ranges":
             self.slots += arguments[2]
-        begin = mark()
+        begin = time.perf_counter()
         launch(kernel, blocks, threads, *arguments)
-        stage = stage_of(kernel, self.spans[-1] if self.spans else None)
-        self.spans.append(Span(kernel, stage, begin, mark()))
+        self.launches.append(Kernel(kernel, (time.perf_counter() - begin) * 1e3))
 
-    def take(self) -> tuple[dict[str, float], dict[str, int]]:
-        """Return milliseconds and launches by stage since the last call; the device must be idle."""
-        times, launches = dict.fromkeys(STAGES, 0.0), dict.fromkeys(STAGES, 0)
-        for span in self.spans:
-            times[span.stage] = times.get(span.stage, 0.0) + _milliseconds(span)
-            launches[span.stage] = launches.get(span.stage, 0) + 1
-        self.spans.clear()
-        self.slots = 0
-        return times, launches
+    def watch(self, work: Callable[[], object]) -> list[Kernel]:
+        """Return the launches of ``work``; see :data:`Watch`."""
+        self.reset()
+        work()
+        return self.launches
+
+    def reset(self) -> None:
+        """Forget all launches."""
+        self.launches, self.slots = [], 0
 
 
-def stage_of(kernel: str, before: Span | None) -> str:
-    """Return the stage of a launch, given the previous launch; an unknown kernel is a separate stage."""
-    stage = before.stage if before else ""
+def stages_of(names: Sequence[str]) -> list[str]:
+    """Return the stage of each kernel, given the names of all kernels in order."""
+    stages: list[str] = []
+    before, stage = "", ""  # the last kernel that is not torch's
+    for name in names:
+        found = _stage_of(name, before, stage)
+        stages.append(found)
+        if found != TORCH:
+            before, stage = name, found
+    return stages
+
+
+def _stage_of(kernel: str, before: str, stage: str) -> str:
     if kernel.startswith("sort_"):
         return "tile sort" if stage in ("tile lists", "tile sort") else "depth sort"
     # A prefix sum is part of a sort, or it follows one and computes the first slot of each splat.
     if kernel.startswith("scan_"):
-        return "tile lists" if before and before.kernel == "sort_scatter" else stage
-    return next((name for name, prefixes in STAGES.items() if kernel.startswith(prefixes)), kernel)
-
-
-def _event() -> torch.cuda.Event:
-    event = torch.cuda.Event(enable_timing=True)
-    event.record()
-    return event
-
-
-def _milliseconds(span: Span) -> float:
-    if isinstance(span.begin, torch.cuda.Event):
-        return span.begin.elapsed_time(span.end)
-    return (span.end - span.begin) * 1e3
+        return "tile lists" if before == "sort_scatter" else stage
+    return next((name for name, prefixes in STAGES.items() if kernel.startswith(prefixes)), TORCH)
 
 
 @dataclass(frozen=True)
@@ -181,35 +216,70 @@ class StageTiming:
     stage: str
     launches: int
     median_ms: float
-    bytes: int | None  # None for ``REST``
-    floor_ms: float | None  # None for ``REST``
+    bytes: int | None  # None for ``TORCH`` and ``REST``
+    floor_ms: float | None  # None for ``TORCH`` and ``REST``
 
 
-def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: float) -> list[StageTiming]:
-    """Return the times of all stages, forward and backward; the last one is ``REST``."""
-    clock, device = StageClock(launcher), scene.gaussians.device
-    rasterizer, samples = KernelRasterizer(clock), []
-    launches, slots = {}, 0
+@dataclass(frozen=True)
+class SceneTiming:
+    """All stages of one scene, forward and backward."""
+
+    stages: list[StageTiming]
+    wall_ms: float  # without the profiler
+    kernel_ms: float  # the sum of all kernels and copies
+
+
+def time_stages(
+    launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: float, watch: Watch | None = None
+) -> SceneTiming:
+    """Return the times of all stages, as medians; the last two are ``TORCH`` and ``REST``.
+
+    On CUDA, ``watch`` is the profiler by default. Elsewhere, launches are timed. Raises
+    :class:`NoKernelsError` if not every launch was seen.
+    """
+    clock, device = LaunchClock(launcher), scene.gaussians.device
+    watch = watch or (profile if device.type == "cuda" else clock.watch)
+    wall = _time_wall(launcher, scene, repeats)
+    samples, launches = [], {}
+    for _ in range(repeats):
+        clock.reset()
+        scene.zero_grad()
+        seen = watch(lambda: scene.backward(scene.render(KernelRasterizer(clock))))
+        stages = stages_of([kernel.name for kernel in seen])
+        launches = {stage: stages.count(stage) for stage in stages}
+        ours = len(stages) - launches.get(TORCH, 0)
+        if ours != len(clock.launches):
+            raise NoKernelsError(f"torch.profiler has seen {ours} of {len(clock.launches)} kernels")
+        times = dict.fromkeys((*STAGES, TORCH), 0.0)
+        for stage, kernel in zip(stages, seen, strict=True):
+            times[stage] += kernel.ms
+        samples.append(times)
+    medians = {stage: statistics.median(times[stage] for times in samples) for stage in samples[0]}
+    kernel_ms = sum(medians.values())
+    needed = stage_bytes(measure_load(KernelRasterizer(launcher), scene, clock.slots))
+    timings = [
+        StageTiming(
+            stage,
+            launches.get(stage, 0),
+            milliseconds,
+            needed.get(stage),
+            needed[stage] / bytes_per_ms if stage in needed else None,
+        )
+        for stage, milliseconds in (medians | {REST: wall - kernel_ms}).items()
+    ]
+    return SceneTiming(timings, wall, kernel_ms)
+
+
+def _time_wall(launcher: Launcher, scene: Scene, repeats: int) -> float:
+    """Return the median of the wall clock of forward and backward in ms, without profiler and clocks."""
+    rasterizer, device, times = KernelRasterizer(launcher), scene.gaussians.device, []
     for _ in range(repeats + 1):
         scene.zero_grad()
         start = now(device)
         scene.backward(scene.render(rasterizer))
-        wall = (now(device) - start) * 1e3
-        slots = clock.slots
-        times, launches = clock.take()
-        samples.append(times | {REST: wall - sum(times.values())})
-    needed = stage_bytes(measure_load(rasterizer, scene, slots))
-    return [
-        StageTiming(
-            stage,
-            launches.get(stage, 0),
-            # The first sample warms up and is not counted.
-            statistics.median(times[stage] for times in samples[1:]),
-            needed.get(stage),
-            needed[stage] / bytes_per_ms if stage in needed else None,
-        )
-        for stage in samples[-1]
-    ]
+        times.append((now(device) - start) * 1e3)
+    # The first one warms up and is not counted.
+    return statistics.median(times[1:])
 
 
 def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:

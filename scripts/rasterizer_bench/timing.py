@@ -9,7 +9,9 @@ from rasterizer_bench.scenes import Scene
 
 from cadam3d.rasterizer.base import Rasterizer
 
-PHASES = ("forward", "backward", "forward_backward")
+# ``step`` is forward and backward as a training step calls them. ``host`` is the part of it in which the host
+# is busy, until it waits for the device.
+PHASES = ("forward", "backward", "forward_backward", "step", "host")
 OUT_OF_MEMORY = (torch.OutOfMemoryError, MemoryError)
 
 
@@ -59,7 +61,8 @@ def summarize(samples: list[dict[str, float]], peak: int | None) -> Timing:
 def time_phases(rasterizer: Rasterizer, scene: Scene) -> dict[str, float]:
     """Return the milliseconds of each phase.
 
-    Forward and backward together are timed separately, without waiting for the device between them.
+    Forward and backward together are timed separately, without waiting for the device between them, and once
+    more as a training step calls them.
     """
     device = scene.gaussians.device
     scene.zero_grad()
@@ -73,10 +76,16 @@ def time_phases(rasterizer: Rasterizer, scene: Scene) -> dict[str, float]:
     again = now(device)
     scene.backward(scene.render(rasterizer))
     whole = now(device) - again
+    scene.zero_grad()
+    start_of_step = now(device)
+    host = scene.step(rasterizer)
+    step = now(device) - start_of_step
     return {
         "forward": (middle - start) * 1e3,
         "backward": (end - middle) * 1e3,
         "forward_backward": whole * 1e3,
+        "step": step * 1e3,
+        "host": host * 1e3,
     }
 
 
@@ -90,6 +99,8 @@ def now(device: torch.device) -> float:
 def peak_memory(rasterizer: Rasterizer, scene: Scene) -> int | None:
     """Return the peak of bytes of forward and backward, including the gradients of the parameters.
 
+    It covers both ways to render, because the second one reserves memory ahead.
+
     Torch counts its allocations on a CUDA device exactly. On a CPU the system counts pages, and the allocator
     keeps freed memory, so the result would be unreliable and is ``None``.
     """
@@ -100,6 +111,8 @@ def peak_memory(rasterizer: Rasterizer, scene: Scene) -> int | None:
         before = torch.cuda.memory_allocated(device)
         torch.cuda.reset_peak_memory_stats(device)
     scene.backward(scene.render(rasterizer))
+    scene.zero_grad()
+    scene.step(rasterizer)
     if device.type != "cuda":
         return None
     torch.cuda.synchronize(device)

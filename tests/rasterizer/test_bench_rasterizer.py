@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import cycle
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.launcher import Launcher
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import GSPLAT, Agreement
+from cadam3d.rasterizer.workspace import Workspace
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))  # as Python does for a script
 
@@ -81,12 +82,13 @@ def test_every_backend_is_checked_timed_and_written_for_every_scene(kernel_build
     for row in written["rows"]:
         assert 0 < row["forward_backward_min_ms"] <= row["forward_backward_ms"]
         assert min(row["forward_ms"], row["backward_ms"]) > 0
+        assert 0 < row["host_ms"] <= row["step_ms"]
         # There is no reliable number for a CPU.
         assert row["peak_bytes"] is None
         assert f"{row['forward_backward_ms']:.2f}" in shown
     first, second = written["rows"][:2]
     assert first["ratio"] == 1
-    assert second["ratio"] == first["forward_backward_ms"] / second["forward_backward_ms"]
+    assert second["ratio"] == first["step_ms"] / second["step_ms"]
     assert written["device"]["name"]
     assert written["versions"]["torch"] == torch.__version__
     assert written["settings"]["counts"] == [50, 80]
@@ -105,8 +107,9 @@ def test_every_stage_of_the_kernels_is_timed(emulator, tmp_path, capsys):
     assert code == 0, shown
     written = json.loads(path.read_text())
     (of_scene,) = written["stages"]
-    assert [each["stage"] for each in of_scene["stages"]] == [*stages.STAGES, stages.REST]
-    for each in of_scene["stages"][:-1]:
+    assert [each["stage"] for each in of_scene["stages"]] == [*stages.STAGES, stages.TORCH, stages.REST]
+    assert sum(each["median_ms"] for each in of_scene["stages"]) == pytest.approx(of_scene["wall_ms"])
+    for each in of_scene["stages"][:-2]:
         assert min(each["launches"], each["median_ms"], each["bytes"], each["floor_ms"]) > 0
         assert each["floor_ms"] == pytest.approx(each["bytes"] / written["copy_bytes_per_ms"])
         assert each["stage"] in shown
@@ -171,6 +174,34 @@ def test_a_backend_that_promises_the_same_bits_must_give_them():
     assert all(f"not the same in {check.RUNS} runs" in trouble for trouble in troubles)
 
 
+def test_both_ways_to_render_must_give_the_same_bits():
+    @dataclass(frozen=True)
+    class Ahead(ReferenceRasterizer):
+        def render_ahead(self, gaussians, *rest):
+            moved = changed(gaussians, means=gaussians.means * (1 + 2e-7))
+            return self.render(moved, *rest)
+
+    scene = make_scene(make_shell(30, 0, CPU), 16, 1)
+    assert not check.changes(ReferenceRasterizer(), scene)
+    assert check.changes(Ahead(), scene)
+
+
+def test_a_step_without_enough_memory_is_repeated():
+    @dataclass(frozen=True)
+    class TooSmall(ReferenceRasterizer):
+        def render_ahead(self, gaussians, *rest):
+            output = self.render(gaussians.map(lambda tensor: tensor * 0), *rest)
+            return replace(output, overflowed=torch.tensor(True))
+
+    scene = make_scene(make_shell(30, 0, CPU), 16, 1)
+    scene.step(TooSmall())
+    got = check.gradients_of(scene)
+    scene.zero_grad()
+    scene.backward(scene.render(ReferenceRasterizer()))
+    for name, gradient in check.gradients_of(scene).items():
+        assert torch.equal(got[name], gradient), name
+
+
 def test_without_a_check_every_backend_is_timed(capsys):
     assert run([*TINY, "--no-check"], {"reference": ReferenceRasterizer()}) == 0
     assert "check" not in capsys.readouterr().out
@@ -178,8 +209,12 @@ def test_without_a_check_every_backend_is_timed(capsys):
 
 def test_a_sort_that_is_wrong_is_found(emulator, monkeypatch):
     assert not check.check_long_sort(emulator, CPU, 5000)
-    sort = cuda._sort
-    monkeypatch.setattr(cuda, "_sort", lambda launch, keys, bits: sort(launch, keys, bits - 8))
+    sort = check.sort
+    monkeypatch.setattr(
+        check,
+        "sort",
+        lambda launch, keys, order, n, bits, *rest: sort(launch, keys, order, n, bits - 8, *rest),
+    )
     assert check.check_long_sort(emulator, CPU, 5000) == ["5000 keys are sorted wrongly"]
 
 
@@ -237,12 +272,14 @@ def test_every_repetition_starts_without_gradients():
 
 def test_every_launch_belongs_to_a_known_stage(emulator):
     # The kernels are defined elsewhere, and a new one must be assigned to a stage.
-    clock = stages.StageClock(emulator)
+    clock = stages.LaunchClock(emulator)
     scene = make_scene(make_shell(300, 1, CPU), 24, 2)
-    scene.backward(scene.render(stages.KernelRasterizer(clock)))
+    names = [
+        k.name for k in clock.watch(lambda: scene.backward(scene.render(stages.KernelRasterizer(clock))))
+    ]
     kernels = {stage: [] for stage in stages.STAGES}
-    for span in clock.spans:
-        kernels[span.stage].append(span.kernel)  # KeyError: unknown
+    for name, stage in zip(names, stages.stages_of(names), strict=True):
+        kernels[stage].append(name)  # KeyError: unknown
     passes = len(cuda_sort.digit_bits(cuda.DEPTH_BITS))
     assert kernels["depth sort"] == ["sort_scatter"] * passes
     assert kernels["tile lists"] == ["scan_apply", "tile_list"]
@@ -253,7 +290,7 @@ def test_every_launch_belongs_to_a_known_stage(emulator):
 
 
 def test_the_load_of_a_scene_is_counted(emulator):
-    clock = stages.StageClock(emulator)
+    clock = stages.LaunchClock(emulator)
     gaussians = make_shell(1, 0, CPU).detach()
     gaussians.means.zero_()
     # The splat is larger than the screen, so it touches every tile in both views.
@@ -266,30 +303,90 @@ def test_the_load_of_a_scene_is_counted(emulator):
     )
 
 
-def test_the_bytes_of_a_stage_are_those_of_its_arguments(emulator):
+def test_the_bytes_of_a_stage_are_those_of_its_arguments(emulator, monkeypatch):
     """If every pair is visible and in one tile, a stage needs exactly the bytes of its arguments."""
-    given = dict.fromkeys(stages.STAGES, 0)
+    # An argument is an address, which either a tensor or a workspace has given out.
+    sizes, scales = {}, Scales(emulator)
+    point, places = torch.Tensor.data_ptr, Workspace.addresses
 
-    class Scales(stages.StageClock):
-        def _launch(self, launch, mark, kernel, blocks, threads, *arguments):
-            super()._launch(launch, mark, kernel, blocks, threads, *arguments)
-            tensors = [each for each in arguments if isinstance(each, torch.Tensor)]
-            given[self.spans[-1].stage] += sum(tensor.nbytes for tensor in tensors)
+    def note_tensor(tensor):
+        address = point(tensor)
+        sizes[address] = tensor.nbytes
+        return address
 
+    def note_arrays(workspace, blocks):
+        found = places(workspace, blocks)
+        sizes.update({found[name]: size for name, size in workspace.sizes.items() if size})
+        return found
+
+    monkeypatch.setattr(torch.Tensor, "data_ptr", note_tensor)
+    monkeypatch.setattr(Workspace, "addresses", note_arrays)
+    scales.sizes = sizes
     # With many splats, the bytes of cameras, bins and ranges hardly count.
     n = 2000
     gaussians = make_shell(n, 1, CPU).detach()
     gaussians.means.mul_(0.02)
     gaussians.log_scales.fill_(-9.0)
     gaussians.opacity_logits.fill_(-2.0)
-    clock = Scales(emulator)
     scene = make_scene(gaussians.map(lambda tensor: tensor.requires_grad_()), 7, 1)  # one tile
-    scene.backward(scene.render(stages.KernelRasterizer(clock)))
-    load = stages.measure_load(ReferenceRasterizer(), scene, clock.slots)
+    scene.backward(scene.render(stages.KernelRasterizer(scales)))
+    load = stages.measure_load(ReferenceRasterizer(), scene, scales.slots)
     assert load.visible == load.slots == n
-    needed = stages.stage_bytes(load)
+    needed, given = stages.stage_bytes(load), dict.fromkeys(stages.STAGES, 0)
+    names = [kernel.name for kernel in scales.launches]
+    for stage, size in zip(stages.stages_of(names), scales.given, strict=True):
+        given[stage] += size
     for stage in stages.STAGES:
         assert needed[stage] == pytest.approx(given[stage], rel=0.1), stage
+
+
+class Scales(stages.LaunchClock):
+    """Notes the bytes of the arrays of each launch."""
+
+    def __init__(self, inner):
+        super().__init__(inner)
+        self.sizes, self.given = {}, []
+
+    def _launch(self, launch, kernel, blocks, threads, *arguments):
+        super()._launch(launch, kernel, blocks, threads, *arguments)
+        self.given.append(sum(self.sizes.get(each, 0) for each in arguments))
+
+
+def test_kernels_that_a_profiler_has_seen_become_stages(emulator):
+    """The profiler of a GPU also sees kernels of torch; durations are those that it gives."""
+    scene = make_scene(make_shell(60, 0, CPU), 20, 2)
+    clock = stages.LaunchClock(emulator)
+
+    def profiled(work):
+        # The clock of the stages counts the launches, too.
+        names = [kernel.name for kernel in clock.watch(work)]
+        return [stages.Kernel("Memset (Device)", 5.0), *(stages.Kernel(name, 0.25) for name in names)]
+
+    timing = stages.time_stages(clock, scene, 3, 1e6, profiled)
+    by_stage = {stage.stage: stage for stage in timing.stages}
+    for name in stages.STAGES:
+        assert by_stage[name].median_ms == 0.25 * by_stage[name].launches > 0
+    assert (by_stage[stages.TORCH].launches, by_stage[stages.TORCH].median_ms) == (1, 5.0)
+    assert timing.kernel_ms == sum(by_stage[name].median_ms for name in (*stages.STAGES, stages.TORCH))
+    assert by_stage[stages.REST].median_ms == timing.wall_ms - timing.kernel_ms
+
+
+def test_a_torch_that_cannot_profile_kernels_is_reported(monkeypatch):
+    monkeypatch.setattr(torch.profiler, "supported_activities", set)
+    with pytest.raises(stages.NoKernelsError, match="of this torch cannot time kernels"):
+        stages.profile(lambda: None)
+
+
+def test_kernels_that_the_profiler_has_missed_are_reported(emulator):
+    scene = make_scene(make_shell(60, 0, CPU), 20, 2)
+    for lost in (1, 1000):
+
+        def incomplete(work, lost=lost):
+            work()
+            return [stages.Kernel("blend_forward", 0.1)] * max(0, 20 - lost)
+
+        with pytest.raises(stages.NoKernelsError, match=r"has seen \d+ of \d+ kernels"):
+            stages.time_stages(emulator, scene, 1, 1e6, incomplete)
 
 
 # -------------------------------------------------------------------------- targets

@@ -1,0 +1,143 @@
+"""Find the GPU, the tools and the packages of a machine, with Python alone."""
+
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).parents[2]
+DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+# Attributes of cuDeviceGetAttribute.
+MULTIPROCESSORS, MAJOR, MINOR = 16, 75, 76
+# Folders with tools of the CUDA toolkit that are often missing in PATH.
+TOOL_FOLDERS = (
+    "/usr/local/cuda/bin",
+    "/usr/local/cuda/compute-sanitizer",
+    "/opt/cuda/bin",
+    "/opt/nvidia/nsight-compute/*",
+)
+TOOLS = ("compute-sanitizer", "ncu", "nvcc", "nvidia-smi", "c++")
+# Packages whose versions affect a result, or whose absence is reported.
+PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "pytest", "pytest-xdist", "gsplat", "ninja")
+PACKAGES += ("imageio-ffmpeg", "diffusers", "nvidia-cuda-nvrtc")
+# Folders and kinds of files that determine the results.
+SOURCES = ("cadam3d", "configs", "scripts", "tests/rasterizer")
+SUFFIXES = (".py", ".cu", ".cuh", ".cpp", ".h", ".yaml")
+
+
+class NoGpuError(Exception):
+    """There is no usable NVIDIA GPU. The message says what was looked for."""
+
+
+@dataclass(frozen=True)
+class Device:
+    """The first NVIDIA GPU, as its driver describes it."""
+
+    name: str
+    capability: str
+    memory_bytes: int
+    multiprocessors: int
+    driver_cuda: str  # the newest CUDA version that the driver supports
+    count: int  # of devices that the driver offers
+
+
+def find_device(load: Callable[[str], Any] = ctypes.CDLL) -> Device:
+    """Return the first GPU that the CUDA driver offers. Raises :class:`NoGpuError` if there is none."""
+    try:
+        driver = load(DRIVER)
+    except OSError:
+        raise NoGpuError(f"{DRIVER}, the library of the NVIDIA driver, does not load") from None
+    count, newest = ctypes.c_int(), ctypes.c_int()
+    if status := driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count)):
+        raise NoGpuError(f"{DRIVER} loads, but finds no usable device ({_name_of(driver, status)})")
+    if count.value == 0:
+        raise NoGpuError(f"{DRIVER} loads, but offers no device")
+    driver.cuDriverGetVersion(ctypes.byref(newest))
+    name, memory = ctypes.create_string_buffer(256), ctypes.c_size_t()
+    driver.cuDeviceGetName(name, len(name), 0)
+    driver.cuDeviceTotalMem_v2(ctypes.byref(memory), 0)
+
+    def attribute(number: int) -> int:
+        value = ctypes.c_int()
+        driver.cuDeviceGetAttribute(ctypes.byref(value), number, 0)
+        return value.value
+
+    return Device(
+        name=name.value.decode(errors="replace"),
+        capability=f"{attribute(MAJOR)}.{attribute(MINOR)}",
+        memory_bytes=memory.value,
+        multiprocessors=attribute(MULTIPROCESSORS),
+        driver_cuda=f"{newest.value // 1000}.{newest.value % 1000 // 10}",
+        count=count.value,
+    )
+
+
+def _name_of(driver: Any, status: int) -> str:
+    text = ctypes.c_char_p()
+    driver.cuGetErrorName(status, ctypes.byref(text))
+    return f"{(text.value or b'error').decode()}, {status}"
+
+
+def find_tools(environment: Mapping[str, str] = os.environ) -> dict[str, str]:
+    """Return the paths of those of ``TOOLS`` that are installed."""
+    folders = [*environment.get("PATH", "").split(os.pathsep)]
+    folders += [
+        str(Path(environment[key]) / "bin") for key in ("CUDA_HOME", "CUDA_PATH") if key in environment
+    ]
+    for pattern in TOOL_FOLDERS:
+        folders += sorted(map(str, Path("/").glob(pattern.lstrip("/"))), reverse=True)
+    found = {name: shutil.which(name, path=os.pathsep.join(folders)) for name in TOOLS}
+    return {name: path for name, path in found.items() if path}
+
+
+def find_packages() -> dict[str, str]:
+    """Return the versions of those of ``PACKAGES`` that are installed."""
+    found = {}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def find_commit() -> tuple[str | None, bool]:
+    """Return the commit and whether files differ from it; ``None`` outside of a checkout."""
+    commit = first_line("git", "-C", str(REPOSITORY), "rev-parse", "HEAD")
+    changed = first_line("git", "-C", str(REPOSITORY), "status", "--porcelain", "--untracked-files=no")
+    return commit, changed is not None
+
+
+def first_line(*command: str) -> str | None:
+    """Return the first line that a command prints; ``None`` if it prints nothing or fails."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip().splitlines()[0] if done.stdout.strip() else None
+
+
+def hash_sources(repository: Path = REPOSITORY) -> str:
+    """Return a hash of the files that determine the results, also where there is no git."""
+    whole = hashlib.sha256()
+    for folder in SOURCES:
+        for path in sorted((repository / folder).rglob("*")):
+            if path.suffix in SUFFIXES:
+                whole.update(f"{path.relative_to(repository)}\0".encode() + path.read_bytes())
+    return whole.hexdigest()[:16]
+
+
+def processor() -> str:
+    """Return the name of the CPU, as far as the system reports it."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    found = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return found[0] if found else platform.processor() or platform.machine()

@@ -1,0 +1,153 @@
+"""A run: the machine, the parts that were requested, and their results."""
+
+import hashlib
+import os
+import platform
+import sys
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from gpu_run.machine import (
+    REPOSITORY,
+    Device,
+    find_commit,
+    find_packages,
+    find_tools,
+    first_line,
+    hash_sources,
+    processor,
+)
+from gpu_run.markdown import show, verdicts
+from gpu_run.pieces import CHECKS, PARTS, Setup, plan
+from gpu_run.record import ENDED, FAILED, Record, read_record
+from gpu_run.runner import RESULT, Piece, Processes, Runner
+
+AGAIN = "python scripts/gpu.py"
+FACTS = (sys.executable, "-m", "gpu_run.on_device", "facts", "--json", RESULT)
+# The first import of torch from a slow disk takes long.
+FACTS_SECONDS = 60.0
+# Finding the wrong stage includes compiling the emulator.
+STAGES_SECONDS = 50.0
+# Facts that results depend on, beside the files of the project.
+STATE = ("device", "driver", "driver_cuda", "torch", "python", "packages")
+
+
+class TroubleError(Exception):
+    """Something that ends the run; the message is one line with what to do."""
+
+
+class Session:
+    """One call of ``scripts/gpu.py``."""
+
+    def __init__(self, folder: Path, device: Device, show_line: Callable[[str], None] | None = None) -> None:
+        self._folder, self._device = folder, device
+        self._show = show_line or (lambda line: print(line, flush=True))
+        self._processes = Processes(folder / "logs", REPOSITORY)
+        self._path = folder / "gpu.json"
+        paths = [str(REPOSITORY), str(REPOSITORY / "scripts"), os.environ.get("PYTHONPATH", "")]
+        # The processes import the project beside this script, and not another one that is installed.
+        os.environ["PYTHONPATH"] = os.pathsep.join(path for path in paths if path)
+
+    def run(self, parts: Sequence[str]) -> int:
+        """Run the parts in order, and return the exit code."""
+        machine = self._machine()
+        self._show(f"{machine['device']}, torch {machine['torch']}, Python {machine['python']}")
+        record = self._continue(machine)
+        try:
+            for part in parts:
+                if part != CHECKS:
+                    self._require_checks(record)
+                self._show(f"{part}, at most {PARTS[part] / 60:.0f} minutes:")
+                if not self.run_part(record, part):
+                    self._show("The checks have failed, so nothing is timed.")
+                    return 1
+        finally:
+            self._finish(record)
+        is_whole = all(entry.status not in (FAILED, ENDED) for entry in record.pieces.values())
+        return 0 if is_whole else 1
+
+    def run_part(self, record: Record, part: str) -> bool:
+        """Run one part; if a check fails, find out which stage of the kernels is wrong."""
+        pieces = plan(self._setup(record), part)
+        runner = Runner(record, self._path, self._processes, self._show)
+        if runner.run(part, pieces, PARTS[part]):
+            return True
+        stages = self._setup(record).own("stages")
+        runner.run(CHECKS, [Piece("stages", CHECKS, stages, STAGES_SECONDS)], STAGES_SECONDS)
+        return False
+
+    def _setup(self, record: Record) -> Setup:
+        found = record.machine
+        return Setup(
+            self._folder,
+            found["tools"],
+            found["packages"],
+            found["memory_bytes"],
+            os.cpu_count() or 1,
+            record,
+        )
+
+    def _machine(self) -> dict[str, Any]:
+        """Return everything about the machine. Raises :class:`TroubleError` if torch cannot use the GPU."""
+        packages = find_packages()
+        if "torch" not in packages:
+            raise TroubleError(
+                f"expected torch in {sys.executable}, got none. Try: {sys.executable} -m pip install torch"
+            )
+        piece = Piece("machine", CHECKS, FACTS, FACTS_SECONDS)
+        finished = self._processes.wait(self._processes.start(piece), FACTS_SECONDS)
+        facts = finished.result or {"trouble": f"torch does not start: {finished.last_line}"}
+        if trouble := facts.pop("trouble", None):
+            raise TroubleError(f"{self._device.name}: {trouble}")
+        commit, is_changed = find_commit()
+        facts |= {
+            "driver": first_line("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"),
+            "driver_cuda": self._device.driver_cuda,
+            "devices": self._device.count,
+            "processor": processor(),
+            "python": platform.python_version(),
+            "system": platform.platform(),
+            "commit": commit,
+            "is_changed": is_changed,
+            "date": datetime.now().astimezone().isoformat(timespec="seconds"),
+            "tools": find_tools(),
+            "packages": packages,
+        }
+        return facts
+
+    def _continue(self, machine: dict[str, Any]) -> Record:
+        """Return the record of the folder if it still applies, and otherwise a new one."""
+        parts = [hash_sources(), *(str(machine[key]) for key in STATE)]
+        state = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
+        if not self._path.exists():
+            return Record(machine, state)
+        record = read_record(self._path)
+        if record.state == state:
+            return Record(machine, state, record.pieces)
+        old = self._path.with_name(f"gpu-{record.machine['date'].replace(':', '')[:17]}.json")
+        self._path.replace(old)
+        self._show(
+            f"The GPU, a package or a file of the project has changed. The old results are in {old.name}."
+        )
+        return Record(machine, state)
+
+    def _require_checks(self, record: Record) -> None:
+        gates = [piece for piece in plan(self._setup(record), CHECKS) if piece.is_gate and not piece.missing]
+        open_gates = [piece.name for piece in gates if not record.passed(piece.name)]
+        if open_gates:
+            raise TroubleError(
+                f"expected that the checks have passed, got no pass of: {', '.join(open_gates)}. "
+                f"Try: {AGAIN} --part checks"
+            )
+
+    def _finish(self, record: Record) -> None:
+        record.machine["fastest"] = verdicts(record)
+        record.write(self._path)
+        text = show(record)
+        self._path.with_suffix(".md").write_text(text, encoding="utf-8")
+        statuses = [entry.status for entry in record.pieces.values()]
+        counts = {status: statuses.count(status) for status in dict.fromkeys(statuses)}
+        said = ", ".join(f"{count} {status}" for status, count in counts.items()) or "nothing has run"
+        self._show(f"{said}. Results: {self._path} and {self._path.with_suffix('.md').name}")
