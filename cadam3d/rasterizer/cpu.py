@@ -120,15 +120,15 @@ class _CpuPass(RenderPass):
     ) -> list[Tensor | None]:
         """See :meth:`RenderPass.blend_backward`."""
         on_screen = (self.views, parameters[0].shape[0], 2)
-        grads = [torch.zeros(on_screen), torch.zeros(on_screen) if self.absgrad else None]
-        grads += [torch.zeros_like(tensor) for tensor in parameters]
+        grads = [torch.empty(on_screen), torch.empty(on_screen) if self.absgrad else None]
+        grads += [torch.empty_like(tensor) for tensor in parameters]
         scene = self.scene(parameters, background)
         self.call("cadam3d_blend_backward", ctypes.byref(scene), self.handle, *images, *grads)
         return grads
 
     def centre_backward(self, parameters: list[Tensor], radii: Tensor, grad_means2d: Tensor) -> Tensor:
         """See :meth:`RenderPass.centre_backward`."""
-        grad_means, scene = torch.zeros_like(parameters[0]), self.scene(parameters, None)
+        grad_means, scene = torch.empty_like(parameters[0]), self.scene(parameters, None)
         self.call("cadam3d_centre_backward", ctypes.byref(scene), radii, grad_means2d, grad_means)
         return grad_means
 
