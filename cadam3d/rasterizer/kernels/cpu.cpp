@@ -59,7 +59,7 @@ constexpr int AREA = TILE * TILE;
 constexpr int CELL = 4;  // pixels along the edge
 constexpr int CELLS = (TILE / CELL) * (TILE / CELL);
 constexpr int PARTS = CELL * CELL / LANES;  // vectors per cell
-constexpr int64_t BLOCK = 256;              // Gaussians per piece of work; a whole number of vectors
+constexpr int64_t BLOCK = 2048;             // Gaussians per piece of work; a whole number of vectors
 constexpr int RECORD = 16;   // floats that the backward pass writes per (Gaussian, tile): one cache line
 constexpr int64_t PIECE = 8192;  // Gaussians; a thread of its own for fewer costs more than it saves
 constexpr int MOMENTS = 10;  // the first floats of a record
@@ -205,7 +205,7 @@ struct Entry {
 struct View {
   splat::Camera<Wide> camera;
   Buffer<Block> blocks;
-  uint32_t slots;                // one per (Gaussian, tile), grouped by Gaussian
+  uint32_t visible, slots;       // Gaussians; (Gaussian, tile) pairs, grouped by Gaussian
   Buffer<uint32_t> first_entry;  // tiles + 1
   Buffer<Entry> entries;         // tile by tile, near to far
   Buffer<uint16_t> reached;      // entries; one bit for each cell that the entry reached
@@ -233,7 +233,8 @@ struct Scratch {
   size_t bytes() const { return items.bytes() + other.bytes() + counts.bytes() + next.bytes(); }
 };
 
-enum Stage : int { PROJECT, ORDER, LISTS, BLEND, BLEND_BACKWARD, GATHER, STAGES };
+// Mirrored by ``STAGES`` in cpu.py.
+enum Stage : int { PROJECT, ORDER, LISTS, BLEND, BLEND_BACKWARD, GATHER, CENTRE, STAGES };
 
 struct Frame {
   int64_t tiles_x = 0, tiles_y = 0;
@@ -420,13 +421,17 @@ struct Batch : Rows {
   Batch(const Batch&) = delete;  // ``gaussian`` points into this object
 };
 
+// Calls body(first) for the batches of a block.
+template <class Body>
+void each_batch(const Scene& scene, int64_t block, const Body& body) {
+  const int64_t end = std::min((block + 1) * BLOCK, scene.gaussians);
+  for (int64_t first = block * BLOCK; first < end; first += LANES) body(first);
+}
+
 // Calls body(first) for all batches; a thread processes one block of them at a time.
 template <class Body>
 void each_batch(Team& team, const Scene& scene, const Body& body) {
-  team.run(ceil_div(scene.gaussians, BLOCK), [&](int64_t block) {
-    const int64_t end = std::min((block + 1) * BLOCK, scene.gaussians);
-    for (int64_t first = block * BLOCK; first < end; first += LANES) body(first);
-  });
+  team.run(ceil_div(scene.gaussians, BLOCK), [&](int64_t block) { each_batch(scene, block, body); });
 }
 
 splat::Camera<Wide> camera_of(const Scene& scene, int64_t v) {
@@ -447,7 +452,9 @@ Ints touched_tiles(Floats centre, Floats reach, int64_t tiles, Mask is_seen) {
   return simd::select(simd::both(is_seen, simd::less(first, end)), first | end << 16, Ints{});
 }
 
-void project_batch(const Scene& scene, Frame& frame, int64_t first, float* means2d, float* radii) {
+// Projects LANES Gaussians into the views and adds them to the sums of their block, one per view.
+void project_batch(const Scene& scene, Frame& frame, int64_t first, float* means2d, float* radii,
+                   Block* sums) {
   const Batch batch(scene, first);
   splat::Shape<Wide> shape;
   const Truths is_sound = splat::make_shape(batch.gaussian, shape);
@@ -469,8 +476,7 @@ void project_batch(const Scene& scene, Frame& frame, int64_t first, float* means
     float radius[LANES], centre[2][LANES];
     simd::store(radius, simd::keep(is_seen, simd::max(reach[0], reach[1])));
     for (int j = 0; j < 2; ++j) simd::store(centre[j], simd::keep(is_seen, fields[j].lanes));
-    Block& block = frame.views[size_t(v)].blocks[first / BLOCK];
-    if (first % BLOCK == 0) block = Block{};
+    Block& sum = sums[v];
     const int64_t at = v * scene.gaussians + first;
     for (int lane = 0; lane < batch.count; ++lane) {
       char* out = reinterpret_cast<char*>(&frame.splats[at + lane]);
@@ -480,14 +486,23 @@ void project_batch(const Scene& scene, Frame& frame, int64_t first, float* means
       box.columns = uint32_t(columns[lane]), box.rows = uint32_t(rows[lane]);
       std::memcpy(&box.key, &frame.splats[at + lane].depth, 4);
       if (box.rows != 0) {
-        ++block.visible;
-        block.low = std::min(block.low, box.key), block.high = std::max(block.high, box.key);
-        block.slots += uint64_t(unpack(box.columns).size()) * unpack(box.rows).size();
+        ++sum.visible;
+        sum.low = std::min(sum.low, box.key), sum.high = std::max(sum.high, box.key);
+        sum.slots += uint64_t(unpack(box.columns).size()) * unpack(box.rows).size();
       }
       radii[at + lane] = radius[lane];
       for (int j = 0; j < 2; ++j) means2d[2 * (at + lane) + j] = centre[j][lane];
     }
   }
+}
+
+// The sums are a thread's own until its block is done; two threads that add to one cache line slow each other
+// down.
+void project_block(const Scene& scene, Frame& frame, int64_t block, float* means2d, float* radii) {
+  std::vector<Block> sums(size_t(scene.views));
+  each_batch(scene, block,
+             [&](int64_t first) { project_batch(scene, frame, first, means2d, radii, sums.data()); });
+  for (int64_t v = 0; v < scene.views; ++v) frame.views[size_t(v)].blocks[block] = sums[size_t(v)];
 }
 
 // ---------------------------------------------------------------------------------------------- tile lists
@@ -549,7 +564,7 @@ class Lister {
     }
     view_.blocks[blocks_] = sum;
     if (sum.slots > UINT32_MAX) throw Status(TOO_LARGE);
-    view_.slots = uint32_t(sum.slots);
+    view_.visible = sum.visible, view_.slots = uint32_t(sum.slots);
   }
 
   // Stable radix sort of the visible Gaussians by depth, least significant digit first, in as many passes as
@@ -1143,7 +1158,8 @@ EXPORT int cadam3d_project(const Scene* scene, float* means2d, float* radii, voi
       view.blocks.allocate(ceil_div(scene->gaussians, BLOCK) + 1);
     }
     Team team(scene->threads);
-    each_batch(team, *scene, [&](int64_t first) { project_batch(*scene, *frame, first, means2d, radii); });
+    team.run(ceil_div(scene->gaussians, BLOCK),
+             [&](int64_t block) { project_block(*scene, *frame, block, means2d, radii); });
     *out = frame.release();
   });
 }
@@ -1217,9 +1233,10 @@ EXPORT int cadam3d_blend_backward(const Scene* scene, void* handle, const float*
 }
 
 // dLoss/dmeans [n 3] through the projected centres, from dLoss/dmeans2d [v n 2]. A culled Gaussian gets zero.
-EXPORT int cadam3d_centre_backward(const Scene* scene, const float* radii, const float* grad_means2d,
-                                   float* grad_means) {
+EXPORT int cadam3d_centre_backward(const Scene* scene, void* handle, const float* radii,
+                                   const float* grad_means2d, float* grad_means) {
   return guarded([&] {
+    const Stopwatch watch(*static_cast<Frame*>(handle), CENTRE);
     std::vector<splat::Camera<Wide>> cameras;
     for (int64_t v = 0; v < scene->views; ++v) cameras.push_back(camera_of(*scene, v));
     Team team(scene->threads);
@@ -1241,10 +1258,14 @@ EXPORT int cadam3d_centre_backward(const Scene* scene, const float* radii, const
   });
 }
 
-// Writes the seconds that a pass has spent in each ``Stage`` so far.
-EXPORT void cadam3d_seconds(const void* handle, double* out) {
+// Writes the seconds that a pass has spent in each ``Stage`` so far, and the numbers of its visible (Gaussian,
+// view) pairs, its slots and the bytes that it holds.
+EXPORT void cadam3d_measure(const void* handle, double* seconds, int64_t* counts) {
   const Frame& frame = *static_cast<const Frame*>(handle);
-  for (int stage = 0; stage < STAGES; ++stage) out[stage] = double(frame.nanoseconds[stage].load()) * 1e-9;
+  for (int stage = 0; stage < STAGES; ++stage)
+    seconds[stage] = double(frame.nanoseconds[stage].load()) * 1e-9;
+  counts[0] = counts[1] = 0, counts[2] = int64_t(frame.bytes());
+  for (const View& view : frame.views) counts[0] += view.visible, counts[1] += view.slots;
 }
 
 // Ends a pass, and keeps its memory for the next one unless that is too much.
