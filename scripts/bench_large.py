@@ -311,9 +311,9 @@ def serve() -> None:
                 answer = time_pass(rasterizer, scene, cpu)
             case "peak":
                 rasterizer.prepare(torch.device("cpu"))
-                before = peak_of_process()
+                before = resident_bytes(reset=True)
                 answer = time_pass(rasterizer, scene, cpu)
-                answer["peak_bytes"] = peak_of_process() - before
+                answer["peak_bytes"] = resident_bytes() - before
             case other:
                 raise ValueError(other)
         print(json.dumps(answer), flush=True)
@@ -346,10 +346,18 @@ def time_pass(rasterizer, scene, cpu) -> dict:
     return answer
 
 
-def peak_of_process() -> int:
-    """Return the largest resident memory of this process so far, in bytes."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else 1024 * peak
+def resident_bytes(reset: bool = False) -> int:
+    """Return the peak of the resident memory of this process.
+
+    With ``reset`` the peak starts again from the memory at this moment, where the system can do that (Linux).
+    """
+    if sys.platform != "linux":
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else 1024 * peak
+    if reset:
+        Path("/proc/self/clear_refs").write_text("5")
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
 
 
 if __name__ == "__main__":

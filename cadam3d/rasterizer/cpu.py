@@ -78,6 +78,8 @@ def rasterize(
 
 # The stages of a pass, in the order of ``enum Stage`` in kernels/cpu.cpp.
 STAGES = ("project", "order", "lists", "blend", "blend backward", "gather", "centre backward")
+# What is wrong, by the ``enum Status`` of the kernels.
+FAILURES = {1: "not enough memory", 2: "2^32 or more pairs of a Gaussian and a tile are too many"}
 
 
 @dataclass(frozen=True)
@@ -117,11 +119,12 @@ class _CpuPass(RenderPass):
 
     def __init__(self, kernels: ctypes.CDLL, cameras: Cameras, absgrad: bool) -> None:
         super().__init__(cameras, torch.device("cpu"), absgrad)
-        self.kernels, self.handle = kernels, ctypes.c_void_p()
+        self.kernels, self.handle, self.count = kernels, ctypes.c_void_p(), 0
 
     def project(self, parameters: list[Tensor]) -> tuple[Tensor, Tensor]:
         """See :meth:`RenderPass.project`; also creates the memory that the kernels keep for this pass."""
         v, n = self.views, parameters[0].shape[0]
+        self.count = n
         means2d, radii = parameters[0].new_empty(v, n, 2), parameters[0].new_empty(v, n)
         scene = self.scene(parameters, None)
         self.call("cadam3d_project", ctypes.byref(scene), means2d, radii, ctypes.byref(self.handle))
@@ -178,5 +181,7 @@ class _CpuPass(RenderPass):
     def call(self, name: str, *arguments: object) -> None:
         """Call a kernel. A tensor is passed as its address, and ``None`` as a null pointer."""
         plain = (ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else a for a in arguments)
-        if getattr(self.kernels, name)(*plain) != 0:
-            raise MemoryError(f"rasterizer=cpu: not enough memory for {self.width} x {self.height} pixels")
+        status = getattr(self.kernels, name)(*plain)
+        if status != 0:
+            scene = f"{self.count:,} Gaussians in {self.views} views of {self.width} x {self.height} pixels"
+            raise MemoryError(f"rasterizer=cpu: {FAILURES[status]} for {scene}")

@@ -219,18 +219,13 @@ struct View {
   }
 };
 
-// A visible Gaussian, in the sort.
-struct Item {
-  uint32_t key, gaussian;
-};
-
 // The memory in which the lists of one view are made.
 struct Scratch {
-  Buffer<Item> items, other;
+  Buffer<Entry> order;      // visible Gaussians, near to far, with the key of the depth as ``slot``
   Buffer<uint32_t> counts;  // pieces x BINS
   Buffer<uint32_t> next;    // pieces x (tile rows + 1) x (tile columns + 1)
 
-  size_t bytes() const { return items.bytes() + other.bytes() + counts.bytes() + next.bytes(); }
+  size_t bytes() const { return order.bytes() + counts.bytes() + next.bytes(); }
 };
 
 // Mirrored by ``STAGES`` in cpu.py.
@@ -539,7 +534,6 @@ class Lister {
     }
     const Stopwatch watch(frame_, LISTS);
     count_entries();
-    view_.entries.allocate(view_.first_entry[frame_.tiles()]);
     team_.run(pieces_, [&](int64_t piece) { fill_entries(piece); });
   }
 
@@ -568,29 +562,36 @@ class Lister {
   }
 
   // Stable radix sort of the visible Gaussians by depth, least significant digit first, in as many passes as
-  // the depths have differing digits. The sorted items end up in scratch.items.
+  // the depths have differing digits. The memory of the lists, which are made later and are at least as long,
+  // serves as the second array. The first pass reads from the array that makes the last one write to
+  // ``order``.
   void sort() {
     const Block& all = view_.blocks[blocks_];
     const uint32_t low = all.low, differing = all.visible > 0 ? all.high - low : 0;
-    scratch_.items.allocate(all.visible), scratch_.other.allocate(all.visible);
+    scratch_.order.allocate(all.visible), view_.entries.allocate(int64_t(all.slots));
     scratch_.counts.allocate(pieces_ * BINS);
-    const auto bin = [low](const Item& item, int shift) { return (item.key - low) >> shift & (BINS - 1); };
+    const auto bin = [low](const Entry& item, int shift) { return (item.slot - low) >> shift & (BINS - 1); };
     const auto counts_of = [&](int64_t piece) { return scratch_.counts.data() + piece * BINS; };
+    int passes = 0;
+    while (passes * BITS < 32 && differing >> passes * BITS > 0) ++passes;
+    Entry *from = scratch_.order.data(), *to = view_.entries.data();
+    if (passes % 2 == 1) std::swap(from, to);
     team_.run(pieces_, [&](int64_t piece) {
       uint32_t* const counts = counts_of(piece);
       std::memset(counts, 0, BINS * sizeof(uint32_t));
-      each_visible(piece, [&](int64_t at, Item item) {
-        scratch_.items[at] = item;
+      each_visible(piece, [&](int64_t at, Entry item) {
+        from[at] = item;
         ++counts[bin(item, 0)];
       });
     });
-    for (int shift = 0; shift < 32 && differing >> shift > 0; shift += BITS) {
-      if (shift > 0) {
+    for (int pass = 0; pass < passes; ++pass, std::swap(from, to)) {
+      const int shift = pass * BITS;
+      if (pass > 0) {
         team_.run(pieces_, [&](int64_t piece) {
           uint32_t* const counts = counts_of(piece);
           std::memset(counts, 0, BINS * sizeof(uint32_t));
           const Span span = items_of(piece);
-          for (int64_t i = span.begin; i < span.end; ++i) ++counts[bin(scratch_.items[i], shift)];
+          for (int64_t i = span.begin; i < span.end; ++i) ++counts[bin(from[i], shift)];
         });
       }
       uint32_t sum = 0;
@@ -603,12 +604,8 @@ class Lister {
       team_.run(pieces_, [&](int64_t piece) {
         uint32_t* const counts = counts_of(piece);
         const Span span = items_of(piece);
-        for (int64_t i = span.begin; i < span.end; ++i) {
-          const Item item = scratch_.items[i];
-          scratch_.other[counts[bin(item, shift)]++] = item;
-        }
+        for (int64_t i = span.begin; i < span.end; ++i) to[counts[bin(from[i], shift)]++] = from[i];
       });
-      scratch_.items.swap(scratch_.other);
     }
   }
 
@@ -623,7 +620,7 @@ class Lister {
       box.slot = slot;
       if (box.rows == 0) continue;
       slot += box.slots();
-      visit(at++, Item{box.key, uint32_t(i)});
+      visit(at++, Entry{uint32_t(i), box.key});
     }
   }
 
@@ -632,8 +629,8 @@ class Lister {
   void each_sorted(int64_t piece, const Visit& visit) const {
     const Span span = items_of(piece);
     for (int64_t i = span.begin; i < span.end; ++i) {
-      if (i + BOXES_AHEAD < span.end) prefetch(&boxes_[scratch_.items[i + BOXES_AHEAD].gaussian]);
-      const uint32_t gaussian = scratch_.items[i].gaussian;
+      if (i + BOXES_AHEAD < span.end) prefetch(&boxes_[scratch_.order[i + BOXES_AHEAD].gaussian]);
+      const uint32_t gaussian = scratch_.order[i].gaussian;
       visit(gaussian, boxes_[gaussian]);
     }
   }
@@ -1229,6 +1226,7 @@ EXPORT int cadam3d_blend_backward(const Scene* scene, void* handle, const float*
       });
       begin = end;
     } while (begin < scene->views);
+    if (frame.bytes() > SPLAT_KEPT_BYTES) frame.records.release();
   });
 }
 
@@ -1258,8 +1256,8 @@ EXPORT int cadam3d_centre_backward(const Scene* scene, void* handle, const float
   });
 }
 
-// Writes the seconds that a pass has spent in each ``Stage`` so far, and the numbers of its visible (Gaussian,
-// view) pairs, its slots and the bytes that it holds.
+// Writes the seconds that a pass has spent in each ``Stage`` so far, and the numbers of its visible pairs of
+// a Gaussian and a view, of its slots and of the bytes that it holds.
 EXPORT void cadam3d_measure(const void* handle, double* seconds, int64_t* counts) {
   const Frame& frame = *static_cast<const Frame*>(handle);
   for (int stage = 0; stage < STAGES; ++stage)
