@@ -23,6 +23,8 @@ struct Input {
     };
     means = numbers(3, 0), log_scales = numbers(3, -3.5f), quats = numbers(4, 0), logits = numbers(1, 0);
     sh = numbers(3 * COEFFICIENTS, 0);
+    // The last third is behind the cameras, so that whole blocks are not on the screen.
+    for (int i = 2 * count / 3; i < count; ++i) means[size_t(3 * i + 2)] = -10;
     for (int v = 0; v < views; ++v) {
       const float side = 0.1f * float(v);
       for (float x : {1.f, 0.f, 0.f, side, 0.f, 1.f, 0.f, 0.f, 0.f, 0.f, 1.f, 2.f, 0.f, 0.f, 0.f, 1.f})
@@ -33,24 +35,26 @@ struct Input {
   }
 };
 
-// Returns all images and gradients, or nothing if a call fails.
+// Returns all images and gradients, or nothing if a call fails or leaves a number out.
 Numbers render(const Input& in, int count, int views, int threads) {
-  const Scene scene{count,           views,          COEFFICIENTS,       HEIGHT,
-                    WIDTH,           threads,        in.means.data(),    in.log_scales.data(),
-                    in.quats.data(), in.logits.data(), in.sh.data(),     in.matrices.data(),
-                    in.intrinsics.data(), in.background.data()};
+  const Scene scene{count, views, COEFFICIENTS, HEIGHT, WIDTH, threads, in.means.data(),
+                    in.log_scales.data(), in.quats.data(), in.logits.data(), in.sh.data(),
+                    in.matrices.data(), in.intrinsics.data(), in.background.data()};
   const size_t n = size_t(count), pairs = size_t(count * views), pixels = size_t(views * WIDTH * HEIGHT);
-  Numbers means2d(2 * pairs), radii(pairs), rgb(3 * pixels), alpha(pixels), depth(pixels), ones(3 * pixels, 1.f);
-  Numbers grads[] = {Numbers(2 * pairs), Numbers(2 * pairs), Numbers(3 * n),
-                     Numbers(3 * n),     Numbers(4 * n),     Numbers(n),
-                     Numbers(size_t(3 * COEFFICIENTS) * n),  Numbers(3 * n)};
+  Numbers means2d(2 * pairs), radii(pairs);
+  Numbers rgb(3 * pixels), alpha(pixels), depth(pixels), ones(3 * pixels, 1.f);
+  // Of means2d, absgrad, means, log-scales, quaternions, opacities, colours and again means. The kernels must
+  // write every number.
+  Numbers grads[8];
+  const size_t sizes[8] = {2 * pairs, 2 * pairs, 3 * n, 3 * n, 4 * n, n, 3 * COEFFICIENTS * n, 3 * n};
+  for (int i = 0; i < 8; ++i) grads[i].assign(sizes[i], NAN);
   void* frame = nullptr;
   if (cadam3d_project(&scene, means2d.data(), radii.data(), &frame) != OK) return {};
   int status = cadam3d_blend(&scene, frame, rgb.data(), alpha.data(), depth.data(), 1);
   if (status == OK)
-    status = cadam3d_blend_backward(&scene, frame, alpha.data(), depth.data(), ones.data(), nullptr, ones.data(),
-                                    grads[0].data(), grads[1].data(), grads[2].data(), grads[3].data(),
-                                    grads[4].data(), grads[5].data(), grads[6].data());
+    status = cadam3d_blend_backward(&scene, frame, alpha.data(), depth.data(), ones.data(), nullptr,
+                                    ones.data(), grads[0].data(), grads[1].data(), grads[2].data(),
+                                    grads[3].data(), grads[4].data(), grads[5].data(), grads[6].data());
   if (status == OK)
     status = cadam3d_centre_backward(&scene, frame, radii.data(), grads[0].data(), grads[7].data());
   cadam3d_free(frame);
@@ -58,6 +62,8 @@ Numbers render(const Input& in, int count, int views, int threads) {
   Numbers all = rgb;
   for (const Numbers* part : {&alpha, &depth}) all.insert(all.end(), part->begin(), part->end());
   for (const Numbers& part : grads) all.insert(all.end(), part.begin(), part.end());
+  for (float x : all)
+    if (!std::isfinite(x)) return {};
   return all;
 }
 

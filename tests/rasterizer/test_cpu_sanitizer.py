@@ -33,10 +33,7 @@ def compile_with(build_cache, tmp_path):
         facts = [*words, compiler.version, *(path.read_text(encoding="utf-8") for path in sources)]
 
         def make(path: Path) -> None:
-            # Another process never sees a file that is not finished.
-            made = path.with_suffix(".new")
-            subprocess.run([*words, "-o", str(made)], check=True)
-            made.replace(path)
+            subprocess.run([*words, "-o", str(path)], check=True)
 
         return make_once(build_cache / f"threads-{content_hash(*facts)}", make)
 
