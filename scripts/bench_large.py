@@ -32,7 +32,7 @@ SCRIPTS = Path(__file__).resolve().parent
 HERE = SCRIPTS.parent
 PHASES = ("forward", "backward", "both")
 # The copy is larger than the caches of most machines, and is the best of a few.
-COPY_BYTES, COPIES = 2**26, 5
+COPY_BYTES, COPIES = 2**27, 8
 # Passes that are not counted: the first ones get memory from the system.
 WARM_UP = 2
 
@@ -271,9 +271,10 @@ def arrays(case: Case, slots: int) -> dict[str, int]:
     pairs, pixels = case.count * case.views, case.size**2 * case.views
     gradients = 4 * (11 + 3 * (case.degree + 1) ** 2) * case.count
     return {
-        # Splat, box and the centre, its gradient and the radius. All items of a view are sorted at once.
-        "Gaussian and view": (64 + 16 + 8 + 8 + 4) * pairs + 16 * case.count,
-        "Gaussian": gradients + 12 * case.count,
+        # Splat, box, the centre, its gradient and the radius.
+        "Gaussian and view": (64 + 16 + 8 + 8 + 4) * pairs,
+        # The gradients, those of the means once more, and the depth order of one view.
+        "Gaussian": gradients + 12 * case.count + 8 * case.count,
         # The number of the Gaussian and of the slot, the bits of the cells, and the record.
         "slot": (8 + 2) * slots + min(64 * slots, max(256 * 2**20, 64 * slots // case.views)),
         "pixel": (20 + 8) * pixels,

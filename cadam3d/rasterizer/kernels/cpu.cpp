@@ -4,8 +4,8 @@
 // lists for each 16x16 tile the Gaussians with boxes that touch it, front to back, and blends the tiles. The
 // backward pass processes each tile back to front, writes one record per (Gaussian, tile), sums the records
 // of each Gaussian in a fixed order and applies the chain rule. No two threads ever add to the same number,
-// and the pieces of work do not depend on the number of threads. Therefore any number of threads gives the
-// same bits.
+// and no sum of floats depends on how the work is divided. Therefore any number of threads gives the same
+// bits.
 //
 // In the projection a vector holds LANES Gaussians. In the blending it holds LANES pixels of a cell of 4x4
 // pixels: splats are small, and on a square they leave fewer lanes unused than on a row.
@@ -59,10 +59,12 @@ constexpr int AREA = TILE * TILE;
 constexpr int CELL = 4;  // pixels along the edge
 constexpr int CELLS = (TILE / CELL) * (TILE / CELL);
 constexpr int PARTS = CELL * CELL / LANES;  // vectors per cell
-constexpr int64_t BLOCK = 2048;             // Gaussians per piece of work; a whole number of vectors
-constexpr int RECORD = 16;   // floats that the backward pass writes per (Gaussian, tile): one cache line
-constexpr int64_t PIECE = 8192;  // Gaussians; a thread of its own for fewer costs more than it saves
-constexpr int MOMENTS = 10;  // the first floats of a record
+// Gaussians that a thread processes at a time; a whole number of vectors. A core loads ahead, so with 256 it
+// takes cache lines from the core that writes the next block, and two threads are no faster than one.
+constexpr int64_t BLOCK = 2048;
+constexpr int64_t PIECE = 8192;  // Gaussians for which another thread pays when lists are made, at least
+constexpr int RECORD = 16;    // floats that the backward pass writes per (Gaussian, tile): one cache line
+constexpr int MOMENTS = 10;   // the first floats of a record
 constexpr int ABSOLUTES = 2;  // the next floats, used for absgrad
 static_assert(CELLS == CELL * CELL && BLOCK % LANES == 0, "a vector of cells is as long as one of pixels");
 
