@@ -76,6 +76,31 @@ def rasterize(
     return run_pass(_CpuPass(kernels, cameras, absgrad), gaussians, background)
 
 
+# The stages of a pass, in the order of ``enum Stage`` in kernels/cpu.cpp.
+STAGES = ("project", "order", "lists", "blend", "blend backward", "gather", "centre backward")
+# What is wrong, by the ``enum Status`` of the kernels.
+FAILURES = {1: "not enough memory", 2: "2^32 or more pairs of a Gaussian and a tile are too many"}
+
+
+@dataclass(frozen=True)
+class PassCosts:
+    """The costs of one render and its backward pass inside the kernels."""
+
+    seconds: dict[str, float]  # wall clock of each stage so far; small views that run at once add up
+    visible: int  # pairs of a Gaussian and a view
+    slots: int  # pairs of a visible Gaussian and a tile
+    held_bytes: int  # memory of the kernels, including what they may keep for the next pass
+
+
+def pass_costs(output: RenderOutput) -> PassCosts:
+    """Return the costs of a pass of ``rasterizer=cpu`` so far, from its images, which need a gradient."""
+    # The node of the graph is the context of ``native.py``, which holds the pass.
+    kernels = getattr(output.rgb.grad_fn, "kernels", None)
+    if not isinstance(kernels, _CpuPass):
+        raise ValueError("expected images of rasterizer=cpu in float32 that need a gradient")
+    return kernels.costs()
+
+
 class _Scene(ctypes.Structure):
     """Mirror of ``struct Scene`` in kernels/cpu.cpp: same order, same types."""
 
@@ -94,11 +119,12 @@ class _CpuPass(RenderPass):
 
     def __init__(self, kernels: ctypes.CDLL, cameras: Cameras, absgrad: bool) -> None:
         super().__init__(cameras, torch.device("cpu"), absgrad)
-        self.kernels, self.handle = kernels, ctypes.c_void_p()
+        self.kernels, self.handle, self.count = kernels, ctypes.c_void_p(), 0
 
     def project(self, parameters: list[Tensor]) -> tuple[Tensor, Tensor]:
         """See :meth:`RenderPass.project`; also creates the memory that the kernels keep for this pass."""
         v, n = self.views, parameters[0].shape[0]
+        self.count = n
         means2d, radii = parameters[0].new_empty(v, n, 2), parameters[0].new_empty(v, n)
         scene = self.scene(parameters, None)
         self.call("cadam3d_project", ctypes.byref(scene), means2d, radii, ctypes.byref(self.handle))
@@ -120,17 +146,25 @@ class _CpuPass(RenderPass):
     ) -> list[Tensor | None]:
         """See :meth:`RenderPass.blend_backward`."""
         on_screen = (self.views, parameters[0].shape[0], 2)
-        grads = [torch.zeros(on_screen), torch.zeros(on_screen) if self.absgrad else None]
-        grads += [torch.zeros_like(tensor) for tensor in parameters]
+        grads = [torch.empty(on_screen), torch.empty(on_screen) if self.absgrad else None]
+        grads += [torch.empty_like(tensor) for tensor in parameters]
         scene = self.scene(parameters, background)
         self.call("cadam3d_blend_backward", ctypes.byref(scene), self.handle, *images, *grads)
         return grads
 
     def centre_backward(self, parameters: list[Tensor], radii: Tensor, grad_means2d: Tensor) -> Tensor:
         """See :meth:`RenderPass.centre_backward`."""
-        grad_means, scene = torch.zeros_like(parameters[0]), self.scene(parameters, None)
-        self.call("cadam3d_centre_backward", ctypes.byref(scene), radii, grad_means2d, grad_means)
+        grad_means, scene = torch.empty_like(parameters[0]), self.scene(parameters, None)
+        self.call(
+            "cadam3d_centre_backward", ctypes.byref(scene), self.handle, radii, grad_means2d, grad_means
+        )
         return grad_means
+
+    def costs(self) -> PassCosts:
+        """Return what this pass has cost so far."""
+        seconds, counts = (ctypes.c_double * len(STAGES))(), (ctypes.c_int64 * 3)()
+        self.kernels.cadam3d_measure(self.handle, seconds, counts)
+        return PassCosts(dict(zip(STAGES, seconds, strict=True)), *counts)
 
     def scene(self, parameters: list[Tensor], background: Tensor | None) -> _Scene:
         """Return the arguments that all kernels share; they are valid as long as the tensors live."""
@@ -147,5 +181,7 @@ class _CpuPass(RenderPass):
     def call(self, name: str, *arguments: object) -> None:
         """Call a kernel. A tensor is passed as its address, and ``None`` as a null pointer."""
         plain = (ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else a for a in arguments)
-        if getattr(self.kernels, name)(*plain) != 0:
-            raise MemoryError(f"rasterizer=cpu: not enough memory for {self.width} x {self.height} pixels")
+        status = getattr(self.kernels, name)(*plain)
+        if status != 0:
+            scene = f"{self.count:,} Gaussians in {self.views} views of {self.width} x {self.height} pixels"
+            raise MemoryError(f"rasterizer=cpu: {FAILURES[status]} for {scene}")

@@ -4,20 +4,28 @@
 // lists for each 16x16 tile the Gaussians with boxes that touch it, front to back, and blends the tiles. The
 // backward pass processes each tile back to front, writes one record per (Gaussian, tile), sums the records
 // of each Gaussian in a fixed order and applies the chain rule. No two threads ever add to the same number,
-// and the pieces of work do not depend on the number of threads. Therefore any number of threads gives the
-// same bits.
+// and no sum of floats depends on how the work is divided. Therefore any number of threads gives the same
+// bits.
 //
 // In the projection a vector holds LANES Gaussians. In the blending it holds LANES pixels of a cell of 4x4
 // pixels: splats are small, and on a square they leave fewer lanes unused than on a row.
 #include <algorithm>
 #include <atomic>
+#include <chrono>
 #include <cmath>
+#include <condition_variable>
 #include <cstdint>
 #include <cstring>
 #include <memory>
+#include <mutex>
 #include <new>
 #include <thread>
+#include <utility>
 #include <vector>
+
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
 
 #include "simd.h"
 #include "splat_math.h"
@@ -51,9 +59,12 @@ constexpr int AREA = TILE * TILE;
 constexpr int CELL = 4;  // pixels along the edge
 constexpr int CELLS = (TILE / CELL) * (TILE / CELL);
 constexpr int PARTS = CELL * CELL / LANES;  // vectors per cell
-constexpr int64_t BLOCK = 256;              // Gaussians per piece of work; a whole number of vectors
-constexpr int RECORD = 16;   // floats that the backward pass writes per (Gaussian, tile): one cache line
-constexpr int MOMENTS = 10;  // the first floats of a record
+// Gaussians that a thread processes at a time; a whole number of vectors. A core loads ahead, so with 256 it
+// takes cache lines from the core that writes the next block, and two threads are no faster than one.
+constexpr int64_t BLOCK = 2048;
+constexpr int64_t PIECE = 8192;  // Gaussians for which another thread pays when lists are made, at least
+constexpr int RECORD = 16;    // floats that the backward pass writes per (Gaussian, tile): one cache line
+constexpr int MOMENTS = 10;   // the first floats of a record
 constexpr int ABSOLUTES = 2;  // the next floats, used for absgrad
 static_assert(CELLS == CELL * CELL && BLOCK % LANES == 0, "a vector of cells is as long as one of pixels");
 
@@ -61,6 +72,12 @@ static_assert(CELLS == CELL * CELL && BLOCK % LANES == 0, "a vector of cells is 
 // number.
 #if !defined(SPLAT_RECORD_BUDGET)
 #define SPLAT_RECORD_BUDGET (256 << 20)
+#endif
+
+// Bytes that the library keeps between calls, at most. With 0 every array is exactly as large as it must be
+// and is freed with its pass, so that a sanitizer sees each of them.
+#if !defined(SPLAT_KEPT_BYTES)
+#define SPLAT_KEPT_BYTES (512 << 20)
 #endif
 
 enum Status : int { OK = 0, OUT_OF_MEMORY = 1, TOO_LARGE = 2 };
@@ -77,10 +94,9 @@ struct alignas(64) Splat {
   float l11, l12, l22;        // whitening, see splat_math.h
   float cut, opacity, depth;  // alpha = opacity exp(-|y|^2) where |y|^2 <= cut
   float rgb[3];
-  uint32_t columns, rows;  // tiles that its box touches: first | end << 16; 0 = none
-  float spare[3];
+  float spare[5];
 };
-constexpr int SPLAT_FIELDS = 13;  // four bytes each; ``project_batch`` lists them in this order
+constexpr int SPLAT_FIELDS = 11;  // floats; ``project_batch`` lists them in this order
 
 struct Range {
   uint32_t first, end;
@@ -88,18 +104,94 @@ struct Range {
 };
 inline Range unpack(uint32_t range) { return {range & 0xffff, range >> 16}; }
 
-// Uninitialized memory; std::vector would first write zeros.
+// The data of a projected Gaussian that the lists are made from, separate because it is read in depth order.
+struct Box {
+  uint32_t columns, rows;  // tiles that the Gaussian touches: first | end << 16; 0 = none
+  uint32_t key;            // the bits of its depth, which are in the same order as positive depths
+  uint32_t slot;           // the first of its slots, one per tile, row by row
+  uint32_t slots() const { return unpack(columns).size() * unpack(rows).size(); }
+};
+
+// The sums over a block of Gaussians of one view. The lists replace them by the sums over all earlier blocks.
+struct Block {
+  uint64_t slots = 0;
+  uint32_t visible = 0, low = UINT32_MAX, high = 0;  // Gaussians; keys
+};
+
+// ---------------------------------------------------------------------------------------------- memory
+
+// A large array starts on a huge page and consists of huge pages where the system has them: the first write
+// to a page costs about a microsecond, and a large scene would touch tens of thousands of small pages.
+constexpr size_t HUGE_PAGE = size_t(2) << 20;
+
+// Uninitialized memory, which a new size replaces only if it does not fit. std::vector would first write
+// zeros.
 template <class T>
 class Buffer {
  public:
-  void allocate(int64_t count) { memory_.reset(new T[size_t(std::max<int64_t>(count, 1))]); }
-  T* data() { return memory_.get(); }
-  const T* data() const { return memory_.get(); }
-  T& operator[](int64_t i) { return memory_[size_t(i)]; }
-  const T& operator[](int64_t i) const { return memory_[size_t(i)]; }
+  Buffer() = default;
+  Buffer(Buffer&& other) noexcept { swap(other); }
+  Buffer& operator=(Buffer&& other) noexcept {
+    swap(other);
+    return *this;
+  }
+  ~Buffer() { release(); }
+  void swap(Buffer& other) noexcept {
+    std::swap(data_, other.data_), std::swap(bytes_, other.bytes_);
+  }
+
+  void allocate(int64_t count) {
+    const size_t wanted = size_t(std::max<int64_t>(count, 1)) * sizeof(T);
+    // Memory that is much too large goes back to the system, so that one large pass does not hold it forever.
+    if (wanted <= bytes_ && bytes_ / 4 <= wanted + HUGE_PAGE) return;
+    release();
+    // The next pass often needs a little more. Pages that are never touched cost nothing.
+    reserve(SPLAT_KEPT_BYTES > 0 ? wanted + wanted / 4 : wanted);
+  }
+  void release() {
+    if (!data_) return;
+#if defined(__linux__)
+    if (is_mapped(bytes_)) {
+      munmap(data_, bytes_);
+      data_ = nullptr, bytes_ = 0;
+      return;
+    }
+#endif
+    ::operator delete(data_, ALIGNMENT);
+    data_ = nullptr, bytes_ = 0;
+  }
+  size_t bytes() const { return bytes_; }
+  T* data() { return data_; }
+  const T* data() const { return data_; }
+  T& operator[](int64_t i) { return data_[i]; }
+  const T& operator[](int64_t i) const { return data_[i]; }
 
  private:
-  std::unique_ptr<T[]> memory_;
+  static constexpr std::align_val_t ALIGNMENT{64};
+  static bool is_mapped(size_t bytes) { return SPLAT_KEPT_BYTES > 0 && bytes >= 2 * HUGE_PAGE; }
+
+  void reserve(size_t bytes) {
+#if defined(__linux__)
+    if (is_mapped(bytes)) {
+      bytes = (bytes + HUGE_PAGE - 1) / HUGE_PAGE * HUGE_PAGE;
+      // The system chooses any page, so a map that is longer by one huge page contains the wanted one.
+      void* const all =
+          mmap(nullptr, bytes + HUGE_PAGE, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+      if (all == MAP_FAILED) throw std::bad_alloc();
+      char* const begin = static_cast<char*>(all);
+      const size_t before = (HUGE_PAGE - reinterpret_cast<uintptr_t>(all) % HUGE_PAGE) % HUGE_PAGE;
+      if (before > 0) munmap(begin, before);
+      munmap(begin + before + bytes, HUGE_PAGE - before);
+      madvise(begin + before, bytes, MADV_HUGEPAGE);
+      data_ = reinterpret_cast<T*>(begin + before), bytes_ = bytes;
+      return;
+    }
+#endif
+    data_ = static_cast<T*>(::operator new(bytes, ALIGNMENT)), bytes_ = bytes;
+  }
+
+  T* data_ = nullptr;
+  size_t bytes_ = 0;
 };
 
 struct alignas(64) Record {
@@ -114,43 +206,170 @@ struct Entry {
 // The data of one view that the backward pass needs again.
 struct View {
   splat::Camera<Wide> camera;
-  std::vector<uint32_t> order;   // Gaussians on the screen, near to far
-  Buffer<uint32_t> first_slot;   // gaussians + 1; one slot per (Gaussian, tile), grouped by Gaussian
+  Buffer<Block> blocks;
+  uint32_t visible, slots;       // Gaussians; (Gaussian, tile) pairs, grouped by Gaussian
   Buffer<uint32_t> first_entry;  // tiles + 1
   Buffer<Entry> entries;         // tile by tile, near to far
   Buffer<uint16_t> reached;      // entries; one bit for each cell that the entry reached
   Buffer<uint32_t> used;         // tiles; entries processed before every pixel was opaque
   Buffer<float> transmittance;   // tiles x AREA; after the last splat
   Buffer<int32_t> last;          // tiles x AREA; rank of the splat at which the pixel was opaque
+
+  size_t bytes() const {
+    return blocks.bytes() + first_entry.bytes() + entries.bytes() + reached.bytes() + used.bytes() +
+           transmittance.bytes() + last.bytes();
+  }
 };
+
+// The memory in which the lists of one view are made.
+struct Scratch {
+  Buffer<Entry> order;      // visible Gaussians, near to far, with the key of the depth as ``slot``
+  Buffer<uint32_t> counts;  // pieces x BINS
+  Buffer<uint32_t> next;    // pieces x (tile rows + 1) x (tile columns + 1)
+
+  size_t bytes() const { return order.bytes() + counts.bytes() + next.bytes(); }
+};
+
+// Mirrored by ``STAGES`` in cpu.py.
+enum Stage : int { PROJECT, ORDER, LISTS, BLEND, BLEND_BACKWARD, GATHER, CENTRE, STAGES };
 
 struct Frame {
   int64_t tiles_x = 0, tiles_y = 0;
   Buffer<Splat> splats;  // views x gaussians
+  Buffer<Box> boxes;     // views x gaussians
+  Buffer<Record> records;
   std::vector<View> views;
+  std::vector<Scratch> scratch;
+  std::atomic<int64_t> nanoseconds[STAGES] = {};  // time in each stage; views that run at once add up
+
   int64_t tiles() const { return tiles_x * tiles_y; }
+  size_t bytes() const {
+    size_t sum = splats.bytes() + boxes.bytes() + records.bytes();
+    for (const View& view : views) sum += view.bytes();
+    for (const Scratch& each : scratch) sum += each.bytes();
+    return sum;
+  }
 };
 
-// Runs body(0) .. body(items - 1), each once, on up to ``threads`` threads. The threads end with the call, so
-// that none exists when the process forks; starting them costs microseconds.
-template <class Body>
-void parallel_for(int64_t items, int64_t threads, const Body& body) {
-  std::atomic<int64_t> next{0};
-  const auto work = [&] {
-    for (int64_t i = next.fetch_add(1); i < items; i = next.fetch_add(1)) body(i);
-  };
-  std::vector<std::thread> team;
-  const int64_t helpers = std::min(threads, items) - 1;
-  if (helpers > 0) {
-    team.reserve(size_t(helpers));
+// The memory of the last pass that ended. The next one uses it again, because touching new pages takes a
+// large scene as long as half of its arithmetic.
+std::atomic<Frame*> spare_frame{nullptr};
+
+class Stopwatch {
+ public:
+  Stopwatch(Frame& frame, Stage stage) : total_(frame.nanoseconds[stage]) {}
+  ~Stopwatch() {
+    const auto time = std::chrono::steady_clock::now() - start_;
+    total_ += std::chrono::duration_cast<std::chrono::nanoseconds>(time).count();
+  }
+
+ private:
+  std::atomic<int64_t>& total_;
+  std::chrono::steady_clock::time_point start_ = std::chrono::steady_clock::now();
+};
+
+// ---------------------------------------------------------------------------------------------- threads
+
+// The threads of one call of the library. They start with the first work for more than one thread and end
+// with the call, so that none exists when the process forks.
+class Team {
+ public:
+  explicit Team(int64_t threads) : threads_(threads) {}
+  ~Team() {
+    if (helpers_.empty()) return;
+    publish(nullptr, nullptr, 0);
+    for (std::thread& helper : helpers_) helper.join();
+  }
+  Team(const Team&) = delete;
+
+  // Runs body(0) .. body(items - 1), each once. Throws the status of a body that fails.
+  template <class Body>
+  void run(int64_t items, const Body& body) {
+    if (std::min(items, threads_) <= 1) {
+      for (int64_t i = 0; i < items; ++i) body(i);
+      return;
+    }
+    start(std::min(items, threads_) - 1);
+    publish([](const void* data, int64_t i) { (*static_cast<const Body*>(data))(i); }, &body, items);
+    work();
+    wait(done_, [&] { return busy_.load() == 0; });
+    if (trouble_ != OK) throw Status(trouble_.exchange(OK));
+  }
+
+ private:
+  typedef void (*Call)(const void*, int64_t);
+
+  void start(int64_t count) {
+    if (is_refused_) return;
     try {
-      for (int64_t i = 0; i < helpers; ++i) team.emplace_back(work);
+      helpers_.reserve(size_t(count));
+      while (int64_t(helpers_.size()) < count)
+        helpers_.emplace_back([this, round = round_.load()] { help(round); });
     } catch (...) {  // the system refuses another thread, so the existing ones do the work
+      is_refused_ = true;
     }
   }
-  work();
-  for (std::thread& thread : team) thread.join();
-}
+  void publish(Call call, const void* body, int64_t items) {
+    call_ = call, body_ = body, items_ = items;
+    next_ = 0, busy_ = int64_t(helpers_.size());
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      ++round_;
+    }
+    begun_.notify_all();
+  }
+  void help(uint64_t round) {
+    for (;;) {
+      wait(begun_, [&] { return round_.load() != round; });
+      ++round;
+      if (!call_) return;
+      work();
+      if (--busy_ == 0) {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        done_.notify_one();
+      }
+    }
+  }
+  void work() {
+    for (int64_t i = next_++; i < items_; i = next_++) {
+      int status = OK;
+      try {
+        call_(body_, i);
+      } catch (Status failure) {  // an exception must not leave a thread
+        status = failure;
+      } catch (...) {
+        status = OUT_OF_MEMORY;
+      }
+      if (status != OK) trouble_ = status, next_ = items_;
+    }
+  }
+  // The next stage usually begins within microseconds, and waking a thread that sleeps takes longer.
+  template <class Ready>
+  void wait(std::condition_variable& changed, const Ready& is_ready) {
+    for (int spin = 0; spin < 4000; ++spin) {
+      if (is_ready()) return;
+#if defined(__x86_64__)
+      __builtin_ia32_pause();
+#elif defined(__aarch64__)
+      asm volatile("yield");
+#endif
+    }
+    std::unique_lock<std::mutex> lock(mutex_);
+    changed.wait(lock, is_ready);
+  }
+
+  int64_t threads_;
+  bool is_refused_ = false;
+  std::vector<std::thread> helpers_;
+  Call call_ = nullptr;
+  const void* body_ = nullptr;
+  int64_t items_ = 0;
+  std::atomic<int64_t> next_{0}, busy_{0};
+  std::atomic<uint64_t> round_{0};
+  std::atomic<int> trouble_{OK};
+  std::mutex mutex_;
+  std::condition_variable begun_, done_;
+};
 
 int64_t ceil_div(int64_t a, int64_t b) { return (a + b - 1) / b; }
 
@@ -168,10 +387,14 @@ struct Rows {
     for (int lane = 0; lane < LANES; ++lane) x[lane] = from[of_lane[lane] * stride];
     return simd::load(x);
   }
-  void add(float* to, int64_t stride, Wide x) const {
+  // Adds to what is there, or to zero.
+  void put(float* to, int64_t stride, Wide x, bool adds) const {
     float part[LANES];
     simd::store(part, x.lanes);
-    for (int lane = 0; lane < count; ++lane) to[(first + lane) * stride] += part[lane];
+    for (int lane = 0; lane < count; ++lane) {
+      float& here = to[(first + lane) * stride];
+      here = (adds ? here : 0.0f) + part[lane];
+    }
   }
 };
 
@@ -195,13 +418,17 @@ struct Batch : Rows {
   Batch(const Batch&) = delete;  // ``gaussian`` points into this object
 };
 
+// Calls body(first) for the batches of a block.
+template <class Body>
+void each_batch(const Scene& scene, int64_t block, const Body& body) {
+  const int64_t end = std::min((block + 1) * BLOCK, scene.gaussians);
+  for (int64_t first = block * BLOCK; first < end; first += LANES) body(first);
+}
+
 // Calls body(first) for all batches; a thread processes one block of them at a time.
 template <class Body>
-void each_batch(const Scene& scene, const Body& body) {
-  parallel_for(ceil_div(scene.gaussians, BLOCK), scene.threads, [&](int64_t block) {
-    const int64_t end = std::min((block + 1) * BLOCK, scene.gaussians);
-    for (int64_t first = block * BLOCK; first < end; first += LANES) body(first);
-  });
+void each_batch(Team& team, const Scene& scene, const Body& body) {
+  team.run(ceil_div(scene.gaussians, BLOCK), [&](int64_t block) { each_batch(scene, block, body); });
 }
 
 splat::Camera<Wide> camera_of(const Scene& scene, int64_t v) {
@@ -211,7 +438,7 @@ splat::Camera<Wide> camera_of(const Scene& scene, int64_t v) {
 
 // ---------------------------------------------------------------------------------------------- project
 
-// The tiles along one axis with pixel centres within ``reach`` of ``centre``, packed as in ``Splat``.
+// The tiles along one axis with pixel centres within ``reach`` of ``centre``, packed as in ``Box``.
 Ints touched_tiles(Floats centre, Floats reach, int64_t tiles, Mask is_seen) {
   const Floats slack = 1e-3f + 1e-6f * (simd::absolute(centre) + reach);  // more than the rounding error
   const auto tile = [&](Floats pixel) {
@@ -222,7 +449,9 @@ Ints touched_tiles(Floats centre, Floats reach, int64_t tiles, Mask is_seen) {
   return simd::select(simd::both(is_seen, simd::less(first, end)), first | end << 16, Ints{});
 }
 
-void project_batch(const Scene& scene, Frame& frame, int64_t first, float* means2d, float* radii) {
+// Projects LANES Gaussians into the views and adds them to the sums of their block, one per view.
+void project_batch(const Scene& scene, Frame& frame, int64_t first, float* means2d, float* radii,
+                   Block* sums) {
   const Batch batch(scene, first);
   splat::Shape<Wide> shape;
   const Truths is_sound = splat::make_shape(batch.gaussian, shape);
@@ -238,152 +467,248 @@ void project_batch(const Scene& scene, Frame& frame, int64_t first, float* means
     Ints rows = touched_tiles(y.lanes, reach[1], frame.tiles_y, is_seen);
     const Mask is_on_tiles = simd::both(simd::less(Ints{}, columns), simd::less(Ints{}, rows));
     columns = simd::select(is_on_tiles, columns, Ints{}), rows = simd::select(is_on_tiles, rows, Ints{});
-    // clang-format off
     const Wide fields[SPLAT_FIELDS] = {
         x, y, footprint.l11, footprint.l12, footprint.l22, shape.log_cut, shape.opacity, footprint.centre[2],
-        rgb[0], rgb[1], rgb[2], simd::as_floats(columns), simd::as_floats(rows)};
-    // clang-format on
+        rgb[0], rgb[1], rgb[2]};
     float radius[LANES], centre[2][LANES];
     simd::store(radius, simd::keep(is_seen, simd::max(reach[0], reach[1])));
     for (int j = 0; j < 2; ++j) simd::store(centre[j], simd::keep(is_seen, fields[j].lanes));
+    Block& sum = sums[v];
     const int64_t at = v * scene.gaussians + first;
     for (int lane = 0; lane < batch.count; ++lane) {
       char* out = reinterpret_cast<char*>(&frame.splats[at + lane]);
       for (int j = 0; j < SPLAT_FIELDS; ++j)
         std::memcpy(out + 4 * j, reinterpret_cast<const char*>(fields + j) + 4 * lane, 4);
+      Box& box = frame.boxes[at + lane];
+      box.columns = uint32_t(columns[lane]), box.rows = uint32_t(rows[lane]);
+      std::memcpy(&box.key, &frame.splats[at + lane].depth, 4);
+      if (box.rows != 0) {
+        ++sum.visible;
+        sum.low = std::min(sum.low, box.key), sum.high = std::max(sum.high, box.key);
+        sum.slots += uint64_t(unpack(box.columns).size()) * unpack(box.rows).size();
+      }
       radii[at + lane] = radius[lane];
       for (int j = 0; j < 2; ++j) means2d[2 * (at + lane) + j] = centre[j][lane];
     }
   }
 }
 
+// The sums are a thread's own until its block is done; two threads that add to one cache line slow each other
+// down.
+void project_block(const Scene& scene, Frame& frame, int64_t block, float* means2d, float* radii) {
+  std::vector<Block> sums(size_t(scene.views));
+  each_batch(scene, block,
+             [&](int64_t first) { project_batch(scene, frame, first, means2d, radii, sums.data()); });
+  for (int64_t v = 0; v < scene.views; ++v) frame.views[size_t(v)].blocks[block] = sums[size_t(v)];
+}
+
 // ---------------------------------------------------------------------------------------------- tile lists
 
-// Stable radix sort of ``order`` by positive depth, least significant digit first. It makes as many passes as
-// the depths have differing digits.
-void sort_by_depth(std::vector<uint32_t>& order, const Splat* splats) {
-  constexpr int BITS = 12, BINS = 1 << BITS;
-  struct Item {
-    uint32_t key, gaussian;
-  };
-  const size_t n = order.size();
-  if (n == 0) return;
-  Buffer<Item> items, swap;
-  items.allocate(int64_t(n)), swap.allocate(int64_t(n));
-  uint32_t low = UINT32_MAX, high = 0;
-  for (size_t i = 0; i < n; ++i) {
-    uint32_t key;
-    std::memcpy(&key, &splats[order[i]].depth, 4);
-    items[int64_t(i)] = {key, order[i]};
-    low = std::min(low, key), high = std::max(high, key);
-  }
-  for (int shift = 0; shift < 32 && (high - low) >> shift > 0; shift += BITS) {
-    uint32_t counts[BINS] = {}, sum = 0;
-    const auto bin = [&](const Item& item) { return (item.key - low) >> shift & (BINS - 1); };
-    for (size_t i = 0; i < n; ++i) ++counts[bin(items[int64_t(i)])];
-    for (uint32_t& count : counts) {
-      const uint32_t here = count;
-      count = sum;
-      sum += here;
-    }
-    for (size_t i = 0; i < n; ++i) swap[counts[bin(items[int64_t(i)])]++] = items[int64_t(i)];
-    std::swap(items, swap);
-  }
-  for (size_t i = 0; i < n; ++i) order[i] = items[int64_t(i)].gaussian;
-}
+constexpr int BITS = 12, BINS = 1 << BITS;  // a digit of the radix sort
 
-// Computes the depth order of the visible Gaussians, the slots of each, and the start of each tile's list.
-void order_view(const Scene& scene, const Frame& frame, View& view, const Splat* splats) {
-  const int64_t stride = frame.tiles_x + 1;
-  // The change of the list length from one tile to the next, along x and y: each box makes four changes.
-  std::vector<int64_t> change(size_t(stride * (frame.tiles_y + 1)), 0);
-  view.first_slot.allocate(scene.gaussians + 1);
-  view.order.resize(size_t(scene.gaussians));
-  uint64_t slots = 0;
-  size_t visible = 0;
-  for (int64_t i = 0; i < scene.gaussians; ++i) {
-    const Range columns = unpack(splats[i].columns), rows = unpack(splats[i].rows);
-    view.first_slot[i] = uint32_t(slots);
-    view.order[visible] = uint32_t(i);
-    visible += rows.size() > 0;
-    slots += uint64_t(columns.size()) * rows.size();
-    if (slots > UINT32_MAX) throw Status(TOO_LARGE);
-    ++change[size_t(rows.first * stride + columns.first)];
-    --change[size_t(rows.first * stride + columns.end)];
-    --change[size_t(rows.end * stride + columns.first)];
-    ++change[size_t(rows.end * stride + columns.end)];
-  }
-  view.first_slot[scene.gaussians] = uint32_t(slots);
-  view.order.resize(visible);
-  sort_by_depth(view.order, splats);
-
-  view.first_entry.allocate(frame.tiles() + 1);
-  uint32_t entries = 0;
-  for (int64_t row = 0; row < frame.tiles_y; ++row) {
-    int64_t here = 0;
-    for (int64_t column = 0; column < frame.tiles_x; ++column) {
-      view.first_entry[row * frame.tiles_x + column] = entries;
-      int64_t& along_y = change[size_t(row * stride + column)];
-      if (row > 0) along_y += change[size_t((row - 1) * stride + column)];
-      here += along_y;
-      entries += uint32_t(here);
-    }
-  }
-  view.first_entry[frame.tiles()] = entries;
-  view.entries.allocate(entries);
-}
-
-// Lists refer to scattered memory, so an item is prefetched ``AHEAD`` places before it is needed.
-constexpr int AHEAD = 6;
+// Data in depth order is scattered in memory, so an item is prefetched some places before it is needed. That
+// is farther ahead where there is less to do per item.
+constexpr int AHEAD = 6, BOXES_AHEAD = 24;
 inline void prefetch(const void* address) {
   __builtin_prefetch(address);
   asm volatile("" : : "r"(address));  // GCC would remove a function that only prefetches
 }
 
-// Writes the lists of the tile rows [row_begin, row_end). Near splats come first, so lists are in depth
-// order.
-void fill_entries(const Frame& frame, View& view, const Splat* splats, int64_t row_begin, int64_t row_end) {
-  std::vector<uint32_t> next(size_t((row_end - row_begin) * frame.tiles_x));
-  const int64_t first_tile = row_begin * frame.tiles_x;
-  for (size_t tile = 0; tile < next.size(); ++tile) next[tile] = view.first_entry[first_tile + int64_t(tile)];
-  const size_t n = view.order.size();
-  for (size_t nth = 0; nth < n; ++nth) {
-    if (nth + AHEAD < n) prefetch(&splats[view.order[nth + AHEAD]].columns);
-    const uint32_t i = view.order[nth];
-    const Range columns = unpack(splats[i].columns), rows = unpack(splats[i].rows);
-    const int64_t from = std::max<int64_t>(rows.first, row_begin), to = std::min<int64_t>(rows.end, row_end);
-    for (int64_t row = from; row < to; ++row) {
-      uint32_t slot = view.first_slot[i] + uint32_t(row - rows.first) * columns.size();
-      uint32_t* const of_row = next.data() + (row - row_begin) * frame.tiles_x;
-      for (uint32_t column = columns.first; column < columns.end; ++column)
-        view.entries[of_row[column]++] = {i, slot++};
+// Makes the lists of one view in pieces: each is a range of Gaussians, and later of the depth order. Pieces
+// write to different places, so the result does not depend on their number.
+class Lister {
+ public:
+  Lister(Team& team, int64_t pieces, const Scene& scene, Frame& frame, int64_t v, Scratch& scratch)
+      : team_(team),
+        pieces_(pieces),
+        gaussians_(scene.gaussians),
+        blocks_(ceil_div(scene.gaussians, BLOCK)),
+        frame_(frame),
+        view_(frame.views[size_t(v)]),
+        boxes_(frame.boxes.data() + v * scene.gaussians),
+        scratch_(scratch) {}
+
+  void make() {
+    {
+      const Stopwatch watch(frame_, ORDER);
+      sum_blocks();
+      sort();
+    }
+    const Stopwatch watch(frame_, LISTS);
+    count_entries();
+    team_.run(pieces_, [&](int64_t piece) { fill_entries(piece); });
+  }
+
+ private:
+  struct Span {
+    int64_t begin, end;
+  };
+  Span blocks_of(int64_t piece) const { return {piece * blocks_ / pieces_, (piece + 1) * blocks_ / pieces_}; }
+  // The part of the sorted items that belongs to a piece. It is as long as the piece's own visible Gaussians.
+  Span items_of(int64_t piece) const {
+    const Span blocks = blocks_of(piece);
+    return {view_.blocks[blocks.begin].visible, view_.blocks[blocks.end].visible};
+  }
+
+  void sum_blocks() {
+    Block sum;
+    for (int64_t b = 0; b < blocks_; ++b) {
+      Block& block = view_.blocks[b];
+      sum.low = std::min(sum.low, block.low), sum.high = std::max(sum.high, block.high);
+      std::swap(sum.slots, block.slots), std::swap(sum.visible, block.visible);
+      sum.slots += block.slots, sum.visible += block.visible;
+    }
+    view_.blocks[blocks_] = sum;
+    if (sum.slots > UINT32_MAX) throw Status(TOO_LARGE);
+    view_.visible = sum.visible, view_.slots = uint32_t(sum.slots);
+  }
+
+  // Stable radix sort of the visible Gaussians by depth, least significant digit first, in as many passes as
+  // the depths have differing digits. The memory of the lists, which are made later and are at least as long,
+  // serves as the second array. The first pass reads from the array that makes the last one write to
+  // ``order``.
+  void sort() {
+    const Block& all = view_.blocks[blocks_];
+    const uint32_t low = all.low, differing = all.visible > 0 ? all.high - low : 0;
+    scratch_.order.allocate(all.visible), view_.entries.allocate(int64_t(all.slots));
+    scratch_.counts.allocate(pieces_ * BINS);
+    const auto bin = [low](const Entry& item, int shift) { return (item.slot - low) >> shift & (BINS - 1); };
+    const auto counts_of = [&](int64_t piece) { return scratch_.counts.data() + piece * BINS; };
+    int passes = 0;
+    while (passes * BITS < 32 && differing >> passes * BITS > 0) ++passes;
+    Entry *from = scratch_.order.data(), *to = view_.entries.data();
+    if (passes % 2 == 1) std::swap(from, to);
+    team_.run(pieces_, [&](int64_t piece) {
+      uint32_t* const counts = counts_of(piece);
+      std::memset(counts, 0, BINS * sizeof(uint32_t));
+      each_visible(piece, [&](int64_t at, Entry item) {
+        from[at] = item;
+        ++counts[bin(item, 0)];
+      });
+    });
+    for (int pass = 0; pass < passes; ++pass, std::swap(from, to)) {
+      const int shift = pass * BITS;
+      if (pass > 0) {
+        team_.run(pieces_, [&](int64_t piece) {
+          uint32_t* const counts = counts_of(piece);
+          std::memset(counts, 0, BINS * sizeof(uint32_t));
+          const Span span = items_of(piece);
+          for (int64_t i = span.begin; i < span.end; ++i) ++counts[bin(from[i], shift)];
+        });
+      }
+      uint32_t sum = 0;
+      for (int64_t b = 0; b < BINS; ++b) {
+        for (int64_t piece = 0; piece < pieces_; ++piece) {
+          uint32_t& count = counts_of(piece)[b];
+          sum += std::exchange(count, sum);
+        }
+      }
+      team_.run(pieces_, [&](int64_t piece) {
+        uint32_t* const counts = counts_of(piece);
+        const Span span = items_of(piece);
+        for (int64_t i = span.begin; i < span.end; ++i) to[counts[bin(from[i], shift)]++] = from[i];
+      });
     }
   }
-}
 
-void build_tile_lists(const Scene& scene, Frame& frame) {
-  std::atomic<int> trouble{OK};  // collects failures, because an exception must not leave a thread
-  const auto each = [&](int64_t items, auto&& stage) {
-    parallel_for(items, scene.threads, [&](int64_t item) {
-      try {
-        stage(item);
-      } catch (Status status) {
-        trouble = status;
-      } catch (...) {
-        trouble = OUT_OF_MEMORY;
+  // Numbers the slots of a piece's Gaussians and calls visit(place, item) for those that are visible.
+  template <class Visit>
+  void each_visible(int64_t piece, const Visit& visit) {
+    const Span blocks = blocks_of(piece);
+    uint32_t slot = uint32_t(view_.blocks[blocks.begin].slots);
+    int64_t at = view_.blocks[blocks.begin].visible;
+    for (int64_t i = blocks.begin * BLOCK; i < std::min(blocks.end * BLOCK, gaussians_); ++i) {
+      Box& box = boxes_[i];
+      box.slot = slot;
+      if (box.rows == 0) continue;
+      slot += box.slots();
+      visit(at++, Entry{uint32_t(i), box.key});
+    }
+  }
+
+  // Calls visit(gaussian, box) for the items of a piece, near to far.
+  template <class Visit>
+  void each_sorted(int64_t piece, const Visit& visit) const {
+    const Span span = items_of(piece);
+    for (int64_t i = span.begin; i < span.end; ++i) {
+      if (i + BOXES_AHEAD < span.end) prefetch(&boxes_[scratch_.order[i + BOXES_AHEAD].gaussian]);
+      const uint32_t gaussian = scratch_.order[i].gaussian;
+      visit(gaussian, boxes_[gaussian]);
+    }
+  }
+
+  // Each piece has a table of tiles, with one more row and column.
+  int64_t stride() const { return frame_.tiles_x + 1; }
+  uint32_t* table_of(int64_t piece) { return scratch_.next.data() + piece * stride() * (frame_.tiles_y + 1); }
+
+  // Computes the start of each tile's list, and in the tables the start of each piece's part of it.
+  void count_entries() {
+    scratch_.next.allocate(pieces_ * stride() * (frame_.tiles_y + 1));
+    team_.run(pieces_, [&](int64_t piece) {
+      // The change of the list length from one tile to the next, along x and y: each box makes four changes.
+      // Unsigned numbers wrap around, and the sums come out right.
+      uint32_t* const table = table_of(piece);
+      std::memset(table, 0, size_t(stride() * (frame_.tiles_y + 1)) * sizeof(uint32_t));
+      each_sorted(piece, [&](uint32_t, const Box& box) {
+        const Range columns = unpack(box.columns), rows = unpack(box.rows);
+        ++table[rows.first * stride() + columns.first];
+        --table[rows.first * stride() + columns.end];
+        --table[rows.end * stride() + columns.first];
+        ++table[rows.end * stride() + columns.end];
+      });
+      for (int64_t row = 0; row < frame_.tiles_y; ++row) {
+        uint32_t* const here = table + row * stride();
+        for (int64_t column = 1; column < stride(); ++column) here[column] += here[column - 1];
+        if (row > 0)
+          for (int64_t column = 0; column < stride(); ++column) here[column] += here[column - stride()];
       }
     });
-    if (trouble != OK) throw Status(trouble.load());
-  };
-  const auto splats = [&](int64_t v) { return frame.splats.data() + v * scene.gaussians; };
-  each(scene.views, [&](int64_t v) { order_view(scene, frame, frame.views[size_t(v)], splats(v)); });
-  const int64_t bands = std::min(
-      frame.tiles_y, std::max<int64_t>(ceil_div(scene.threads, std::max<int64_t>(scene.views, 1)), 1));
-  each(scene.views * bands, [&](int64_t item) {
-    const int64_t v = item / bands, band = item % bands;
-    fill_entries(frame, frame.views[size_t(v)], splats(v), band * frame.tiles_y / bands,
-                 (band + 1) * frame.tiles_y / bands);
-  });
+    view_.first_entry.allocate(frame_.tiles() + 1);
+    uint32_t sum = 0;
+    for (int64_t row = 0; row < frame_.tiles_y; ++row) {
+      for (int64_t column = 0; column < frame_.tiles_x; ++column) {
+        view_.first_entry[row * frame_.tiles_x + column] = sum;
+        for (int64_t piece = 0; piece < pieces_; ++piece)
+          sum += std::exchange(table_of(piece)[row * stride() + column], sum);
+      }
+    }
+    view_.first_entry[frame_.tiles()] = sum;
+  }
+
+  void fill_entries(int64_t piece) {
+    uint32_t* const next = table_of(piece);
+    Entry* const entries = view_.entries.data();
+    each_sorted(piece, [&](uint32_t gaussian, const Box& box) {
+      const Range columns = unpack(box.columns), rows = unpack(box.rows);
+      uint32_t slot = box.slot;
+      for (uint32_t row = rows.first; row < rows.end; ++row) {
+        uint32_t* const of_row = next + row * stride();
+        for (uint32_t column = columns.first; column < columns.end; ++column)
+          entries[of_row[column]++] = {gaussian, slot++};
+      }
+    });
+  }
+
+  Team& team_;
+  const int64_t pieces_, gaussians_, blocks_;
+  Frame& frame_;
+  View& view_;
+  Box* const boxes_;
+  Scratch& scratch_;
+};
+
+// A large view is made by all threads together. Small views are made side by side, one by each thread.
+void build_tile_lists(Team& team, const Scene& scene, Frame& frame) {
+  const int64_t pieces = std::max<int64_t>(std::min(scene.gaussians / PIECE, scene.threads), 1);
+  frame.scratch.resize(size_t(pieces > 1 ? 1 : scene.views));
+  if (pieces > 1) {
+    for (int64_t v = 0; v < scene.views; ++v) Lister(team, pieces, scene, frame, v, frame.scratch[0]).make();
+  } else {
+    team.run(scene.views, [&](int64_t v) {
+      Team alone(1);
+      Lister(alone, 1, scene, frame, v, frame.scratch[size_t(v)]).make();
+    });
+  }
 }
 
 // ---------------------------------------------------------------------------------------------- blend
@@ -698,14 +1023,15 @@ struct ParameterGradients {
 };
 
 // Sums the records of one view over its tiles; returns false if no Gaussian of the batch is on the screen.
-bool gather_moments(const View& view, const Batch& batch, const Record* records,
+bool gather_moments(const Box* boxes, const Batch& batch, const Record* records,
                     splat::Moments<Wide>& moments, Wide (&absolutes)[ABSOLUTES]) {
-  if (view.first_slot[batch.first] == view.first_slot[batch.first + batch.count]) return false;
+  const Box& last = boxes[batch.first + batch.count - 1];
+  if (boxes[batch.first].slot == last.slot + last.slots()) return false;
   float sums[RECORD][LANES] = {};
   for (int lane = 0; lane < batch.count; ++lane) {
-    const int64_t i = batch.first + lane;
+    const Box& box = boxes[batch.first + lane];
     alignas(64) Record sum{};
-    for (uint32_t slot = view.first_slot[i]; slot < view.first_slot[i + 1]; ++slot)
+    for (uint32_t slot = box.slot, end = slot + box.slots(); slot < end; ++slot)
       for (int j = 0; j < RECORD; j += LANES)
         simd::store(sum.sums + j, simd::load(sum.sums + j) + simd::load(records[slot].sums + j));
     for (int j = 0; j < MOMENTS + ABSOLUTES; ++j) sums[j][lane] = sum.sums[j];
@@ -727,7 +1053,8 @@ void add_where(Truths condition, const splat::Gradient<Wide>& part, int64_t coef
   for (int64_t j = 0; j < 3 * coefficients; ++j) total.sh[j] += select(condition, part.sh[j], 0);
 }
 
-// Adds the gradients of LANES Gaussians from the views [view_begin, view_end).
+// Computes the gradients of LANES Gaussians from the views [view_begin, view_end), and adds them to those of
+// the views before.
 void batch_backward(const Scene& scene, const Frame& frame, int64_t view_begin, int64_t view_end,
                     int64_t first, const Record* const* records, const ParameterGradients& out) {
   const Batch batch(scene, first);
@@ -737,37 +1064,46 @@ void batch_backward(const Scene& scene, const Frame& frame, int64_t view_begin, 
   splat::clear(total, int(scene.coefficients));
   Truths has_any{simd::none()};
   for (int64_t v = view_begin; v < view_end; ++v) {
-    const View& view = frame.views[size_t(v)];
+    const auto put_centres = [&](float* to, Truths is_seen, const Wide (&centre)[2]) {
+      for (int j = 0; j < 2; ++j)
+        batch.put(to + 2 * v * scene.gaussians + j, 2, select(is_seen, centre[j], 0), false);
+    };
     splat::Moments<Wide> moments;
-    Wide absolutes[ABSOLUTES];
-    if (!gather_moments(view, batch, records[v], moments, absolutes)) continue;
+    Wide absolutes[ABSOLUTES], centre[2] = {0, 0};
+    if (!gather_moments(frame.boxes.data() + v * scene.gaussians, batch, records[v], moments, absolutes)) {
+      put_centres(out.means2d, is_sound, centre);
+      if (out.absgrad) put_centres(out.absgrad, is_sound, centre);
+      continue;
+    }
+    const splat::Camera<Wide>& camera = frame.views[size_t(v)].camera;
     splat::Footprint<Wide> footprint;
-    const Truths is_seen = is_sound & splat::project(batch.gaussian, shape, view.camera, footprint);
+    const Truths is_seen = is_sound & splat::project(batch.gaussian, shape, camera, footprint);
     has_any = has_any | is_seen;
-    Wide centre[2];
     splat::mean2d_gradient(footprint, moments, centre);
-    float* const means2d = out.means2d + 2 * v * scene.gaussians;
-    for (int j = 0; j < 2; ++j) batch.add(means2d + j, 2, select(is_seen, centre[j], 0));
+    put_centres(out.means2d, is_seen, centre);
     if (out.absgrad) {
       splat::mean2d_absolute(footprint.l11, absolutes, centre);
-      float* const absgrad = out.absgrad + 2 * v * scene.gaussians;
-      for (int j = 0; j < 2; ++j) batch.add(absgrad + j, 2, select(is_seen, centre[j], 0));
+      put_centres(out.absgrad, is_seen, centre);
     }
     splat::clear(of_view, int(scene.coefficients));
-    splat::project_backward(batch.gaussian, shape, view.camera, footprint, moments, of_view);
+    splat::project_backward(batch.gaussian, shape, camera, footprint, moments, of_view);
     add_where(is_seen, of_view, scene.coefficients, total);
   }
-  if (!simd::any(has_any.mask)) return;
-  Wide log_scale[3], quat[4];
-  splat::shape_backward(shape, batch.gaussian, total, log_scale, quat);
-  for (int j = 0; j < 3; ++j) {
-    batch.add(out.means + j, 3, total.mean[j]);
-    batch.add(out.log_scales + j, 3, select(has_any, log_scale[j], 0));
+  const bool adds = view_begin > 0;
+  Wide log_scale[3] = {0, 0, 0}, quat[4] = {0, 0, 0, 0};
+  if (simd::any(has_any.mask)) {
+    splat::shape_backward(shape, batch.gaussian, total, log_scale, quat);
+  } else if (adds) {
+    return;
   }
-  for (int j = 0; j < 4; ++j) batch.add(out.quats + j, 4, select(has_any, quat[j], 0));
-  batch.add(out.opacity_logits, 1, total.opacity_logit);
+  for (int j = 0; j < 3; ++j) {
+    batch.put(out.means + j, 3, total.mean[j], adds);
+    batch.put(out.log_scales + j, 3, select(has_any, log_scale[j], 0), adds);
+  }
+  for (int j = 0; j < 4; ++j) batch.put(out.quats + j, 4, select(has_any, quat[j], 0), adds);
+  batch.put(out.opacity_logits, 1, total.opacity_logit, adds);
   const int64_t stride = 3 * scene.coefficients;
-  for (int64_t j = 0; j < stride; ++j) batch.add(out.sh + j, stride, total.sh[j]);
+  for (int64_t j = 0; j < stride; ++j) batch.put(out.sh + j, stride, total.sh[j], adds);
 }
 
 // Returns the end of a group of views with records that fit the budget. A group has at least one view.
@@ -775,7 +1111,7 @@ int64_t group_end(const Scene& scene, const Frame& frame, int64_t begin, int64_t
   records = 0;
   int64_t v = begin;
   for (; v < scene.views; ++v) {
-    const int64_t of_view = frame.views[size_t(v)].first_slot[scene.gaussians];
+    const int64_t of_view = frame.views[size_t(v)].slots;
     if (v > begin && (records + of_view) * int64_t(sizeof(Record)) > SPLAT_RECORD_BUDGET) break;
     records += of_view;
   }
@@ -805,14 +1141,24 @@ EXPORT const char* cadam3d_instruction_set() { return SIMD_NAME; }
 // Projects the Gaussians and creates the data that the other calls need. means2d [v n 2], radii [v n].
 EXPORT int cadam3d_project(const Scene* scene, float* means2d, float* radii, void** out) {
   return guarded([&] {
-    auto frame = std::make_unique<Frame>();
+    std::unique_ptr<Frame> frame(spare_frame.exchange(nullptr));
+    if (!frame) frame = std::make_unique<Frame>();
+    for (auto& nanoseconds : frame->nanoseconds) nanoseconds = 0;
+    const Stopwatch watch(*frame, PROJECT);
     frame->tiles_x = ceil_div(scene->width, TILE), frame->tiles_y = ceil_div(scene->height, TILE);
     if (frame->tiles_x > INT16_MAX || frame->tiles_y > INT16_MAX || scene->gaussians >= UINT32_MAX)
       throw Status(TOO_LARGE);
     frame->splats.allocate(scene->views * scene->gaussians);
+    frame->boxes.allocate(scene->views * scene->gaussians);
     frame->views.resize(size_t(scene->views));
-    for (int64_t v = 0; v < scene->views; ++v) frame->views[size_t(v)].camera = camera_of(*scene, v);
-    each_batch(*scene, [&](int64_t first) { project_batch(*scene, *frame, first, means2d, radii); });
+    for (int64_t v = 0; v < scene->views; ++v) {
+      View& view = frame->views[size_t(v)];
+      view.camera = camera_of(*scene, v);
+      view.blocks.allocate(ceil_div(scene->gaussians, BLOCK) + 1);
+    }
+    Team team(scene->threads);
+    team.run(ceil_div(scene->gaussians, BLOCK),
+             [&](int64_t block) { project_block(*scene, *frame, block, means2d, radii); });
     *out = frame.release();
   });
 }
@@ -823,7 +1169,9 @@ EXPORT int cadam3d_blend(const Scene* scene, void* handle, float* rgb, float* al
                          int keeps) {
   return guarded([&] {
     Frame& frame = *static_cast<Frame*>(handle);
-    build_tile_lists(*scene, frame);
+    Team team(scene->threads);
+    build_tile_lists(team, *scene, frame);
+    const Stopwatch watch(frame, BLEND);
     if (keeps) {
       for (View& view : frame.views) {
         view.used.allocate(frame.tiles()), view.reached.allocate(view.first_entry[frame.tiles()]);
@@ -831,7 +1179,7 @@ EXPORT int cadam3d_blend(const Scene* scene, void* handle, float* rgb, float* al
       }
     }
     const int64_t pixels = scene->height * scene->width;
-    parallel_for(scene->views * frame.tiles(), scene->threads, [&](int64_t item) {
+    team.run(scene->views * frame.tiles(), [&](int64_t item) {
       const int64_t v = item / frame.tiles();
       blend_tile(*scene, frame, frame.views[size_t(v)], frame.splats.data() + v * scene->gaussians,
                  item % frame.tiles(), scene->background + 3 * v, rgb + 3 * v * pixels, alpha + v * pixels,
@@ -840,8 +1188,8 @@ EXPORT int cadam3d_blend(const Scene* scene, void* handle, float* rgb, float* al
   });
 }
 
-// Adds to gradients that the caller has set to zero. Each image gradient may be null, and so may absgrad:
-// then no absolute values are summed. The path through means2d ends in grad_means2d; cadam3d_centre_backward
+// Writes all gradients. Each image gradient may be null, and so may absgrad: then no absolute values are
+// summed. The path through means2d ends in grad_means2d; cadam3d_centre_backward
 // continues it.
 EXPORT int cadam3d_blend_backward(const Scene* scene, void* handle, const float* alpha, const float* depth,
                                   const float* grad_rgb, const float* grad_alpha, const float* grad_depth,
@@ -854,38 +1202,45 @@ EXPORT int cadam3d_blend_backward(const Scene* scene, void* handle, const float*
                                  grad_quats,   grad_opacity_logits, grad_sh};
     const auto blend_tile = absgrad ? blend_tile_backward<true> : blend_tile_backward<false>;
     const int64_t pixels = scene->height * scene->width, tiles = frame.tiles();
-    Buffer<Record> records;
     std::vector<Record*> of_view(size_t(scene->views));
-    for (int64_t begin = 0, end = 0; begin < scene->views; begin = end) {
+    Team team(scene->threads);
+    int64_t begin = 0, end = 0;
+    do {  // at least once, because gradients without any view are zero
       int64_t count = 0;
       end = group_end(*scene, frame, begin, count);
-      records.allocate(count);
-      for (int64_t v = begin, first = 0; v < end; ++v) {
-        of_view[size_t(v)] = records.data() + first;
-        first += frame.views[size_t(v)].first_slot[scene->gaussians];
+      {
+        const Stopwatch watch(frame, BLEND_BACKWARD);
+        frame.records.allocate(count);
+        for (int64_t v = begin, first = 0; v < end; first += frame.views[size_t(v)].slots, ++v)
+          of_view[size_t(v)] = frame.records.data() + first;
+        team.run((end - begin) * tiles, [&](int64_t item) {
+          const int64_t v = begin + item / tiles;
+          const Images images{
+              alpha + v * pixels, depth + v * pixels, grad_rgb ? grad_rgb + 3 * v * pixels : nullptr,
+              grad_alpha ? grad_alpha + v * pixels : nullptr, grad_depth ? grad_depth + v * pixels : nullptr};
+          blend_tile(*scene, frame, frame.views[size_t(v)], frame.splats.data() + v * scene->gaussians,
+                     item % tiles, scene->background + 3 * v, images, of_view[size_t(v)]);
+        });
       }
-      parallel_for((end - begin) * tiles, scene->threads, [&](int64_t item) {
-        const int64_t v = begin + item / tiles;
-        const Images images{
-            alpha + v * pixels, depth + v * pixels, grad_rgb ? grad_rgb + 3 * v * pixels : nullptr,
-            grad_alpha ? grad_alpha + v * pixels : nullptr, grad_depth ? grad_depth + v * pixels : nullptr};
-        blend_tile(*scene, frame, frame.views[size_t(v)], frame.splats.data() + v * scene->gaussians,
-                   item % tiles, scene->background + 3 * v, images, of_view[size_t(v)]);
-      });
-      each_batch(*scene, [&](int64_t first) {
+      const Stopwatch watch(frame, GATHER);
+      each_batch(team, *scene, [&](int64_t first) {
         batch_backward(*scene, frame, begin, end, first, of_view.data(), out);
       });
-    }
+      begin = end;
+    } while (begin < scene->views);
+    if (frame.bytes() > SPLAT_KEPT_BYTES) frame.records.release();
   });
 }
 
 // dLoss/dmeans [n 3] through the projected centres, from dLoss/dmeans2d [v n 2]. A culled Gaussian gets zero.
-EXPORT int cadam3d_centre_backward(const Scene* scene, const float* radii, const float* grad_means2d,
-                                   float* grad_means) {
+EXPORT int cadam3d_centre_backward(const Scene* scene, void* handle, const float* radii,
+                                   const float* grad_means2d, float* grad_means) {
   return guarded([&] {
+    const Stopwatch watch(*static_cast<Frame*>(handle), CENTRE);
     std::vector<splat::Camera<Wide>> cameras;
     for (int64_t v = 0; v < scene->views; ++v) cameras.push_back(camera_of(*scene, v));
-    each_batch(*scene, [&](int64_t first) {
+    Team team(scene->threads);
+    each_batch(team, *scene, [&](int64_t first) {
       const Rows rows(*scene, first);
       const Wide mean[3] = {rows.gather(scene->means, 3), rows.gather(scene->means + 1, 3),
                             rows.gather(scene->means + 2, 3)};
@@ -898,12 +1253,27 @@ EXPORT int cadam3d_centre_backward(const Scene* scene, const float* radii, const
         splat::centre_backward(cameras[size_t(v)], mean, gradient, part);
         for (int j = 0; j < 3; ++j) total[j] += select(is_seen, part[j], 0);
       }
-      for (int j = 0; j < 3; ++j) rows.add(grad_means + j, 3, total[j]);
+      for (int j = 0; j < 3; ++j) rows.put(grad_means + j, 3, total[j], false);
     });
   });
 }
 
-EXPORT void cadam3d_free(void* handle) { delete static_cast<Frame*>(handle); }
+// Writes the seconds that a pass has spent in each ``Stage`` so far, and the numbers of its visible pairs of
+// a Gaussian and a view, of its slots and of the bytes that it holds.
+EXPORT void cadam3d_measure(const void* handle, double* seconds, int64_t* counts) {
+  const Frame& frame = *static_cast<const Frame*>(handle);
+  for (int stage = 0; stage < STAGES; ++stage)
+    seconds[stage] = double(frame.nanoseconds[stage].load()) * 1e-9;
+  counts[0] = counts[1] = 0, counts[2] = int64_t(frame.bytes());
+  for (const View& view : frame.views) counts[0] += view.visible, counts[1] += view.slots;
+}
+
+// Ends a pass, and keeps its memory for the next one unless that is too much.
+EXPORT void cadam3d_free(void* handle) {
+  std::unique_ptr<Frame> frame(static_cast<Frame*>(handle));
+  if (frame->bytes() > SPLAT_KEPT_BYTES) frame->records.release();
+  if (frame->bytes() <= SPLAT_KEPT_BYTES) frame.reset(spare_frame.exchange(frame.release()));
+}
 
 // Returns 0 if this machine can run the compiled code: one splat passes every stage, forward and backward.
 EXPORT int cadam3d_self_test() {

@@ -1,0 +1,73 @@
+"""scripts/bench_large.py on tiny scenes: the tables are complete, and no time is asserted."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from splats import backgrounds, make_cameras, make_gaussians
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+
+import bench_large
+
+from cadam3d.io.cache import kernels_dir, make_private
+from cadam3d.rasterizer.cpu import STAGES, pass_costs
+from cadam3d.rasterizer.reference import ReferenceRasterizer
+
+
+@pytest.fixture(autouse=True)
+def _cached_kernels(kernel_build, tmp_path, monkeypatch):
+    """Let the processes of the script find the compiled kernels."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = kernels_dir(None)
+    make_private(folder)
+    shutil.copy2(kernel_build.path, folder)
+
+
+def test_every_scene_gets_times_stages_and_bytes(tmp_path, capsys):
+    words = ["--counts", "50", "300", "--sizes", "24", "--threads", "1", "2", "--repeats", "1"]
+    bench_large.main([*words, "--base", str(bench_large.HERE), "--json", str(tmp_path / "large.json")])
+    result = json.loads((tmp_path / "large.json").read_text())
+    assert [row["count"] for row in result["times"]] == [50, 300]
+    for row in result["times"]:
+        assert {name: list(ms) for name, ms in row["ms"].items()} == {"here": ["1", "2"], "base": ["1", "2"]}
+    for scene in result["stages"]:
+        assert [row["stage"] for row in scene["stages"]] == [*STAGES, "Python and autograd"]
+        assert all(row["mb"] > 0 for row in scene["stages"][:-1])
+    shown = capsys.readouterr().out
+    assert "base / here, 2 threads" in shown
+    assert "| blend backward |" in shown
+
+
+def test_memory_is_measured_beside_the_sum_of_the_arrays(tmp_path, capsys):
+    words = ["--memory", "--counts", "300", "--sizes", "24", "--views", "2", "--threads", "1"]
+    bench_large.main([*words, "--json", str(tmp_path / "memory.json")])
+    (row,) = json.loads((tmp_path / "memory.json").read_text())["memory"]
+    assert row["arrays"] > 300 * 2 * 100
+    assert row["here"]["peak_bytes"] >= 0
+    assert "bytes per Gaussian" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [["--counts", "0"], ["--threads", "-1"]])
+def test_a_number_that_makes_no_sense_is_one_message(words, capsys):
+    with pytest.raises(SystemExit):
+        bench_large.main(words)
+    assert "expected whole numbers >= 1" in capsys.readouterr().err
+
+
+def test_costs_count_the_slots_of_a_pass_of_this_rasterizer_only(cpu):
+    gaussians = make_gaussians(200).map(lambda tensor: tensor.requires_grad_())
+    scene = gaussians, make_cameras(2, 40, 40), backgrounds(2)
+    output = cpu.render(*scene)
+    costs = pass_costs(output)
+    assert costs.visible == output.visible.sum()
+    assert costs.slots >= costs.visible
+    assert costs.held_bytes > (64 + 16) * 2 * 200
+    assert all(costs.seconds[stage] > 0 for stage in ("project", "order", "lists", "blend"))
+    assert costs.seconds["gather"] == 0
+    output.rgb.sum().backward()
+    assert all(seconds > 0 for seconds in pass_costs(output).seconds.values())
+    with pytest.raises(ValueError, match="rasterizer=cpu"):
+        pass_costs(ReferenceRasterizer().render(*scene))
