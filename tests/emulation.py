@@ -16,12 +16,13 @@ import pytest
 import torch
 from filelock import FileLock
 
+from cadam3d.compiled.build import find_compiler
 from cadam3d.core.errors import UserError
 from cadam3d.core.render import RenderOutput
-from cadam3d.rasterizer.build import KERNELS, definitions, find_compiler
 from cadam3d.rasterizer.cuda import rasterize
 from cadam3d.rasterizer.driver import Module
 from cadam3d.rasterizer.launcher import Launch, Launcher
+from cadam3d.rasterizer.sources import KERNELS, definitions
 
 SOURCE = Path(__file__).parent / "rasterizer" / "emulator" / "emulator.cpp"
 FLAGS = ("-std=c++17", "-shared", "-fPIC", "-ffp-contract=off", "-U_FORTIFY_SOURCE")

@@ -9,8 +9,9 @@ from importlib.metadata import PackageNotFoundError, version
 import torch
 
 from cadam3d.commands.finding import Finding, Verdict, attempt
+from cadam3d.compiled import build
 from cadam3d.io.cache import kernels_dir
-from cadam3d.rasterizer import build, nvrtc
+from cadam3d.rasterizer import nvrtc
 from cadam3d.rasterizer.auto import AutoRasterizer
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cpu import CpuRasterizer, instruction_set
@@ -18,6 +19,7 @@ from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import ATOMIC, GSPLAT, OWN, Demands, self_test
+from cadam3d.rasterizer.sources import cpu_library
 
 CPU = torch.device("cpu")
 # Failures that do not end a training, because auto chooses another backend then.
@@ -50,7 +52,7 @@ def check_rasterizers() -> Iterator[Finding]:
 
 
 def _cpu_kernels() -> Finding:
-    built, compiler = build.build(kernels_dir(None)), build.find_compiler()
+    built, compiler = build.build(cpu_library(), kernels_dir(None)), build.find_compiler()
     instructions = instruction_set(build.load(built))
     version = compiler.version if compiler else None
     facts = {"compiler": version, "instruction_set": instructions, **_kept(built)}
