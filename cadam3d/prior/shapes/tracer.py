@@ -4,6 +4,9 @@ Every part is traced separately, in its local coordinates and only by rays that 
 nearest hit is visible. All parts of one kind are traced together, so that the number of tensor operations
 does not grow with the number of parts. Light depends on the surface and not on the view, so that an asset of
 SH degree 0 can match it.
+
+``kernels/trace.cpp`` does the same on vectors of rays, with the same operations in the same order. Therefore
+sums of three products are written out here: a matrix product may add them in any order.
 """
 
 import math
@@ -96,18 +99,18 @@ def _cast(cameras: Cameras, samples: int) -> _Rays:
     rows, columns = torch.arange(fine.height, **like), torch.arange(fine.width, **like)
     y, x = torch.meshgrid(rows + 0.5, columns + 0.5, indexing="ij")
     to_world = fine.world_to_camera[:, :3, :3].transpose(1, 2) @ torch.linalg.inv(fine.intrinsics)
-    direction = to_world @ torch.stack([x.flatten(), y.flatten(), torch.ones_like(x).flatten()])  # "v 3 r"
-    direction = direction * direction.square().sum(1, keepdim=True).rsqrt()
+    u, v, w = to_world[:, :, :, None].unbind(2)  # columns, "v 3 1" each
+    direction = _unit((u * x.flatten() + v * y.flatten() + w).transpose(0, 1))  # "3 v r"
 
     origins = fine.positions
-    along = (origins[:, None] @ direction)[:, 0]
-    apart = origins.square().sum(1, keepdim=True) - along.clamp_max(0).square()
+    along = _dot(origins.T[:, :, None], direction)
+    apart = _dot(origins.T, origins.T)[:, None] - along.clamp_max(0).square()
     view, sample = (apart <= BALL_RADIUS**2).nonzero(as_tuple=True)
     row = torch.div(sample, fine.width * samples, rounding_mode="floor")
     column = torch.div(sample % fine.width, samples, rounding_mode="floor")
     return _Rays(
         origins=origins,
-        directions=direction.transpose(0, 1).flatten(1).index_select(1, view * y.numel() + sample),
+        directions=direction.flatten(1).index_select(1, view * y.numel() + sample),
         views=view,
         pixels=(view * cameras.height + row) * cameras.width + column,
         per_view=tuple(torch.bincount(view, minlength=len(cameras)).tolist()),
@@ -133,7 +136,7 @@ def _first_hits(scene: Scene, rays: _Rays) -> _Hits:
     # The same rays in the local coordinates of the parts. The ray parameter stays in world units.
     start = torch.einsum("pij,vpj->ivp", scene.to_local, rays.origins[:, None] - scene.offsets[None])
     origin = start.flatten(1).index_select(1, rays.views[ray] * len(scene.radii) + part)
-    direction = torch.einsum("ijn,jn->in", _matrices(scene, part), rays.directions.index_select(1, ray))
+    direction = _dot(_matrices(scene, part).transpose(0, 1), rays.directions.index_select(1, ray)[:, None])
     begin, end = _box_interval(scene, part, origin, direction)
     inside = (begin < end).nonzero()[:, 0]
     part, ray, begin, end = part[inside], ray[inside], begin[inside], end[inside]
@@ -177,7 +180,7 @@ def _march(
     """Return the ray parameter of the first point on the surface, or infinity for a miss."""
     reached = torch.full_like(begin, torch.inf)
     rows = torch.arange(len(begin), device=begin.device)
-    t, speed = begin, direction.square().sum(0).rsqrt()
+    t, speed = begin, _dot(direction, direction).rsqrt()
     for step in range(MARCH_STEPS):
         advance = kind.sdf(origin + t * direction, sizes) * speed
         t = t + advance
@@ -216,9 +219,9 @@ def _shade(scene: Scene, hits: _Hits) -> tuple[Float[Tensor, "n"], Int[Tensor, "
     for kind, rows in _runs(scene, hits.part):
         normal[:, rows] = _gradient(kind, hits.local[:, rows], sizes[:, rows])
     # A normal is mapped to the world by the transposed inverse of the matrix that maps points.
-    normal = _unit(torch.einsum("ijn,in->jn", _matrices(scene, hits.part), normal))
+    normal = _unit(_dot(_matrices(scene, hits.part), normal[:, None]))
     light = _unit(normal.new_tensor(LIGHT))
-    facing = ((light @ normal + WRAP) / (1 + WRAP)).clamp_min(0)
+    facing = ((_dot(light, normal) + WRAP) / (1 + WRAP)).clamp_min(0)
     sent = AMBIENT + SKY * (0.5 + 0.5 * normal[2]) + DIFFUSE * facing
 
     is_second = torch.zeros_like(hits.part, dtype=torch.bool)
@@ -236,15 +239,20 @@ def _shade(scene: Scene, hits: _Hits) -> tuple[Float[Tensor, "n"], Int[Tensor, "
 
 def _unit(vectors: Tensor) -> Tensor:
     """Normalize vectors that have their components along the first axis."""
-    return vectors * vectors.square().sum(0).clamp_min(1e-30).rsqrt()
+    return vectors * _dot(vectors, vectors).clamp_min(1e-30).rsqrt()
+
+
+def _dot(one: Tensor, other: Tensor) -> Tensor:
+    """Return the products of vectors that have their components along the first axis, added in order."""
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
 def _gradient(kind: Kind, points: Tensor, sizes: Tensor) -> Tensor:
     """Return the gradient of the distance, up to a factor, from a tetrahedron of points around each point."""
     corners = points.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
     probes = points[:, None] + NORMAL_STEP * corners.T[:, :, None]
-    distance = kind.sdf(probes.flatten(1), sizes.repeat(1, 4)).reshape(4, -1)
-    return corners.T @ distance
+    a, b, c, d = kind.sdf(probes.flatten(1), sizes.repeat(1, 4)).reshape(4, -1)
+    return torch.stack([a + b - c - d, a - b + c - d, a - b - c + d])
 
 
 def _paint_second(
@@ -254,7 +262,7 @@ def _paint_second(
     centre, half = box
     unit = (p - centre) / half  # in [-1, 1]
     if kind.wrap == "ring":
-        turn, roll = torch.atan2(p[1], p[0]), torch.atan2(p[2], p[:2].square().sum(0).sqrt() - sizes[0])
+        turn, roll = torch.atan2(p[1], p[0]), torch.atan2(p[2], (p[0] * p[0] + p[1] * p[1]).sqrt() - sizes[0])
         return _ring_pattern(pattern, turn / torch.pi, roll / torch.pi)
     if pattern == "spotted":
         return (sphere_directions(SPOTS).to(p) @ _unit(unit)).amax(0) > SPOT_COSINE
@@ -264,7 +272,7 @@ def _paint_second(
         if pattern == "striped":
             return _is_odd((inner[2] + 1) * 3)
         return _is_odd_sum((inner + 1) * 2)
-    across = unit[:2].square().sum(0).sqrt().clamp_max(1)
+    across = (unit[0] * unit[0] + unit[1] * unit[1]).sqrt().clamp_max(1)
     if kind.name == "ball":
         band = 3 * torch.asin(unit[2].clamp(-1, 1)) / (torch.pi / 2)
     else:
