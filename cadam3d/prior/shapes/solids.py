@@ -91,11 +91,19 @@ def rotation(axis: str, degrees: float) -> Float[Tensor, "3 3"]:
     return matrix
 
 
+def root(x: Tensor) -> Tensor:
+    """Return the square root from operations that IEEE arithmetic rounds in one way.
+
+    ``torch.sqrt`` calls a library on some machines, which rounds differently.
+    """
+    return x * x.clamp_min(1e-30).rsqrt()
+
+
 # --- ball
 
 
 def _ball_sdf(p: Tensor, size: Tensor) -> Tensor:
-    return (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]).sqrt() - size[0]
+    return root(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]) - size[0]
 
 
 def _ball_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
@@ -119,7 +127,7 @@ def _box_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
 def _frustum_sdf(p: Tensor, size: Tensor) -> Tensor:
     bottom, top, half = size[0], size[1], size[2]
     slope = (bottom - top) / (2 * half)
-    radius = (p[0] * p[0] + p[1] * p[1]).sqrt()
+    radius = root(p[0] * p[0] + p[1] * p[1])
     side = (radius - (bottom + top) / 2 + slope * p[2]) * torch.rsqrt(1 + slope * slope)
     return torch.maximum(side, p[2].abs() - half)
 
@@ -135,7 +143,7 @@ def _frustum_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
 
 def _tube_sdf(p: Tensor, size: Tensor) -> Tensor:
     outer, inner, half = size[0], size[1], size[2]
-    radius = (p[0] * p[0] + p[1] * p[1]).sqrt()
+    radius = root(p[0] * p[0] + p[1] * p[1])
     wall = (radius - (outer + inner) / 2).abs() - (outer - inner) / 2
     return torch.maximum(wall, p[2].abs() - half)
 
@@ -148,8 +156,8 @@ def _tube_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
 
 
 def _torus_sdf(p: Tensor, size: Tensor) -> Tensor:
-    away = (p[0] * p[0] + p[1] * p[1]).sqrt() - size[0]
-    return (away * away + p[2] * p[2]).sqrt() - size[1]
+    away = root(p[0] * p[0] + p[1] * p[1]) - size[0]
+    return root(away * away + p[2] * p[2]) - size[1]
 
 
 def _torus_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
@@ -161,11 +169,11 @@ def _torus_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
 
 def _arc_sdf(p: Tensor, size: Tensor) -> Tensor:
     x, ring, sine, cosine = p[0].abs(), size[0], size[2], size[3]
-    away = (x * x + p[1] * p[1]).sqrt() - ring
+    away = root(x * x + p[1] * p[1]) - ring
     dx, dy = x - ring * sine, p[1] - ring * cosine
     # The sine of the difference between the angle of the point and that of the end.
     is_beyond = x * cosine > p[1] * sine
-    return (torch.where(is_beyond, dx * dx + dy * dy, away * away) + p[2] * p[2]).sqrt() - size[1]
+    return root(torch.where(is_beyond, dx * dx + dy * dy, away * away) + p[2] * p[2]) - size[1]
 
 
 def _arc_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
@@ -179,7 +187,7 @@ def _arc_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
 
 def _capsule_sdf(p: Tensor, size: Tensor) -> Tensor:
     beyond = (p[2].abs() - size[1]).clamp_min(0)
-    return (p[0] * p[0] + p[1] * p[1] + beyond * beyond).sqrt() - size[0]
+    return root(p[0] * p[0] + p[1] * p[1] + beyond * beyond) - size[0]
 
 
 def _capsule_support(d: Tensor, size: tuple[float, ...]) -> Tensor:

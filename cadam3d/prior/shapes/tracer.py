@@ -18,7 +18,7 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.prior.shapes.scene import PATTERN_NAMES, Scene, sphere_directions
-from cadam3d.prior.shapes.solids import Kind
+from cadam3d.prior.shapes.solids import Kind, root
 
 MARCH_STEPS = 48
 # Steps between removals of the rays that have hit or missed.
@@ -95,14 +95,13 @@ def trace(scene: Scene, cameras: Cameras, samples: int) -> Layers:
 def _cast(cameras: Cameras, samples: int) -> _Rays:
     """Return rays through a regular grid of points in every pixel, without those that miss the ball."""
     fine = cameras.resize(cameras.height * samples, cameras.width * samples)
+    origins, to_world = fine.positions, ray_matrices(fine)
     like = {"dtype": fine.intrinsics.dtype, "device": fine.intrinsics.device}
     rows, columns = torch.arange(fine.height, **like), torch.arange(fine.width, **like)
     y, x = torch.meshgrid(rows + 0.5, columns + 0.5, indexing="ij")
-    to_world = fine.world_to_camera[:, :3, :3].transpose(1, 2) @ torch.linalg.inv(fine.intrinsics)
     u, v, w = to_world[:, :, :, None].unbind(2)  # columns, "v 3 1" each
     direction = _unit((u * x.flatten() + v * y.flatten() + w).transpose(0, 1))  # "3 v r"
 
-    origins = fine.positions
     along = _dot(origins.T[:, :, None], direction)
     apart = _dot(origins.T, origins.T)[:, None] - along.clamp_max(0).square()
     view, sample = (apart <= BALL_RADIUS**2).nonzero(as_tuple=True)
@@ -117,15 +116,35 @@ def _cast(cameras: Cameras, samples: int) -> _Rays:
     )
 
 
+def ray_matrices(fine: Cameras) -> Float[Tensor, "v 3 3"]:
+    """Return the matrices that map (x, y, 1), in pixels, to the direction of a ray, of any length."""
+    return fine.world_to_camera[:, :3, :3].transpose(1, 2) @ torch.linalg.inv(fine.intrinsics)
+
+
+def local_origins(scene: Scene, origins: Float[Tensor, "v 3"]) -> Float[Tensor, "v p 3"]:
+    """Return the origins of the rays in the local coordinates of every part."""
+    return torch.einsum("pij,vpj->vpi", scene.to_local, origins[:, None] - scene.offsets[None])
+
+
+def ball_limits(
+    scene: Scene, origins: Float[Tensor, "v 3"]
+) -> tuple[Float[Tensor, "v p 3"], Float[Tensor, "v p"]]:
+    """Return the centres of the bounding balls as seen from each origin, and a limit for each ball.
+
+    A ray hits the ball if the product of its direction with the centre is at least the limit.
+    """
+    away = scene.centres - origins[:, None]
+    # The condition |away|^2 - towards^2 <= radius^2, solved for `towards`, which differs between rays.
+    beyond = away.square().sum(2) - scene.radii.square()
+    return away, torch.where(beyond > 0, beyond.clamp_min(0).sqrt(), -torch.inf)
+
+
 def _candidates(scene: Scene, rays: _Rays) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
     """Return the pairs (part, ray) in which the ray hits the bounding ball of the part, sorted by part."""
-    masks = []
-    for origin, direction in zip(rays.origins, rays.directions.split(rays.per_view, dim=1), strict=True):
-        away = scene.centres - origin
-        # The condition |away|^2 - towards^2 <= radius^2, solved for `towards`, which differs between rays.
-        beyond = away.square().sum(1, keepdim=True) - scene.radii[:, None].square()
-        least = torch.where(beyond > 0, beyond.clamp_min(0).sqrt(), -torch.inf)
-        masks.append(away @ direction >= least)
+    balls = zip(*ball_limits(scene, rays.origins), rays.directions.split(rays.per_view, dim=1), strict=True)
+    masks = [
+        _dot(away.T[:, :, None], direction[:, None]) >= least[:, None] for away, least, direction in balls
+    ]
     part, ray = torch.cat(masks, dim=1).nonzero(as_tuple=True)
     return part, ray
 
@@ -134,8 +153,8 @@ def _first_hits(scene: Scene, rays: _Rays) -> _Hits:
     """Return the first hit of every ray that hits a part."""
     part, ray = _candidates(scene, rays)
     # The same rays in the local coordinates of the parts. The ray parameter stays in world units.
-    start = torch.einsum("pij,vpj->ivp", scene.to_local, rays.origins[:, None] - scene.offsets[None])
-    origin = start.flatten(1).index_select(1, rays.views[ray] * len(scene.radii) + part)
+    start = local_origins(scene, rays.origins).flatten(0, 1).T
+    origin = start.index_select(1, rays.views[ray] * len(scene.radii) + part)
     direction = _dot(_matrices(scene, part).transpose(0, 1), rays.directions.index_select(1, ray)[:, None])
     begin, end = _box_interval(scene, part, origin, direction)
     inside = (begin < end).nonzero()[:, 0]
@@ -220,7 +239,7 @@ def _shade(scene: Scene, hits: _Hits) -> tuple[Float[Tensor, "n"], Int[Tensor, "
         normal[:, rows] = _gradient(kind, hits.local[:, rows], sizes[:, rows])
     # A normal is mapped to the world by the transposed inverse of the matrix that maps points.
     normal = _unit(_dot(_matrices(scene, hits.part), normal[:, None]))
-    light = _unit(normal.new_tensor(LIGHT))
+    light = light_direction(normal)
     facing = ((_dot(light, normal) + WRAP) / (1 + WRAP)).clamp_min(0)
     sent = AMBIENT + SKY * (0.5 + 0.5 * normal[2]) + DIFFUSE * facing
 
@@ -235,6 +254,11 @@ def _shade(scene: Scene, hits: _Hits) -> tuple[Float[Tensor, "n"], Int[Tensor, "
             box = ((scene.high + scene.low) / 2).T[:, part], ((scene.high - scene.low) / 2).T[:, part]
             is_second[chosen] = _paint_second(kind, name, hits.local[:, chosen], sizes[:, chosen], box)
     return sent, torch.where(is_second, scene.paints[hits.part, 1], scene.paints[hits.part, 0])
+
+
+def light_direction(like: Tensor) -> Float[Tensor, "3"]:
+    """Return the unit vector towards the light, on the device and in the dtype of ``like``."""
+    return _unit(like.new_tensor(LIGHT))
 
 
 def _unit(vectors: Tensor) -> Tensor:
@@ -262,7 +286,7 @@ def _paint_second(
     centre, half = box
     unit = (p - centre) / half  # in [-1, 1]
     if kind.wrap == "ring":
-        turn, roll = torch.atan2(p[1], p[0]), torch.atan2(p[2], (p[0] * p[0] + p[1] * p[1]).sqrt() - sizes[0])
+        turn, roll = torch.atan2(p[1], p[0]), torch.atan2(p[2], root(p[0] * p[0] + p[1] * p[1]) - sizes[0])
         return _ring_pattern(pattern, turn / torch.pi, roll / torch.pi)
     if pattern == "spotted":
         return (sphere_directions(SPOTS).to(p) @ _unit(unit)).amax(0) > SPOT_COSINE
@@ -272,7 +296,7 @@ def _paint_second(
         if pattern == "striped":
             return _is_odd((inner[2] + 1) * 3)
         return _is_odd_sum((inner + 1) * 2)
-    across = (unit[0] * unit[0] + unit[1] * unit[1]).sqrt().clamp_max(1)
+    across = root(unit[0] * unit[0] + unit[1] * unit[1]).clamp_max(1)
     if kind.name == "ball":
         band = 3 * torch.asin(unit[2].clamp(-1, 1)) / (torch.pi / 2)
     else:
