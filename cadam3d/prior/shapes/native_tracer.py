@@ -19,34 +19,37 @@ from cadam3d.prior.shapes.solids import KINDS, STAR_POINTS
 from cadam3d.prior.shapes.tracer import Layers, ball_limits, light_direction, local_origins, ray_matrices
 
 SOURCES = (Path(__file__).parent / "kernels" / "trace.cpp", SIMD)
-NAMES = Names("prior.tracer=native", fallback="prior.tracer=torch")
 # Numbers of tracer.py that the kernels use too.
 CONSTANTS = ("MARCH_STEPS", "COMPACT_EVERY", "HIT_DISTANCE", "GRAZE_DISTANCE", "BALL_RADIUS", "NEAR")
 CONSTANTS += ("NORMAL_STEP", "AMBIENT", "SKY", "DIFFUSE", "WRAP", "SPOTS", "SPOT_COSINE")
 
 
-def tracer_library() -> Library:
-    """Return the description of the native tracer. The numbers of kinds and patterns are definitions too."""
+def tracer_library(key: str = "prior.tracer") -> Library:
+    """Return the description of the native tracer, with ``key`` in its messages.
+
+    The numbers of kinds and patterns are definitions, like the constants.
+    """
     values = {name: getattr(tracer, name) for name in CONSTANTS} | {"STAR_POINTS": STAR_POINTS}
     values |= {f"KIND_{kind.name.upper()}": number for number, kind in enumerate(KINDS)}
     values |= {f"PATTERN_{name.upper()}": number for number, name in enumerate(PATTERN_NAMES)}
     definitions = tuple(f"-DTRACE_{name}={value!r}" for name, value in values.items())
-    return Library("tracer", NAMES, SOURCES, definitions, "cadam3d_trace_self_test")
+    names = Names(f"{key}=native", fallback=f"{key}=torch")
+    return Library("tracer", names, SOURCES, definitions, "cadam3d_trace_self_test")
 
 
-@cache
-def build_tracer() -> Build:
-    """Return the native tracer, and compile it if the user's cache folder lacks it. Runs once per process.
+def load_tracer(key: str = "prior.tracer") -> tuple[Build, ctypes.CDLL]:
+    """Return the native tracer, and compile it if the user's cache folder lacks it.
 
-    Raises ``UserError`` if it cannot be compiled.
+    Raises ``UserError``, which names ``key``, if it cannot be compiled.
     """
-    return build(tracer_library(), kernels_dir(None))
+    built = build(tracer_library(key), kernels_dir(None))
+    return built, load(built)
 
 
-@cache
-def load_tracer() -> ctypes.CDLL:
-    """Return the native tracer, loaded. Raises ``UserError`` if it cannot be compiled."""
-    return load(build_tracer())
+def instruction_set(library: ctypes.CDLL) -> str:
+    """Return the instruction set of the tracer, as for the rasterizer."""
+    library.cadam3d_trace_instructions.restype = ctypes.c_char_p
+    return library.cadam3d_trace_instructions().decode()
 
 
 class _Job(ctypes.Structure):
