@@ -33,7 +33,8 @@ ERROR_GRID = 8
 ERROR_FREQUENCY = 3.0
 
 
-@dataclass(frozen=True)
+# Compared by identity, because the maps of every size are kept per census.
+@dataclass(frozen=True, eq=False)
 class Census:
     """Moments of premultiplied RGB and alpha over all images of the world, per pixel of a small picture."""
 
@@ -48,12 +49,8 @@ class Census:
 
         Variances are at least ``floor``.
         """
-        maps = torch.cat(
-            [self.rgb, self.alpha[None], self.rgb_variance, self.alpha_variance[None], self.covariance]
-        )
-        sized = torch.nn.functional.interpolate(
-            maps[None].to(background), (cameras.height, cameras.width), mode="bilinear", align_corners=False
-        )
+        size = (cameras.height, cameras.width)
+        sized = _enlarged(self, size, background.dtype, background.device)
         rgb, alpha, rgb_variance, alpha_variance, covariance = sized.split([3, 1, 3, 1, 3], dim=1)
         backdrop = background[:, :, None, None]
         mean = rgb + (1 - alpha) * backdrop
@@ -248,6 +245,16 @@ def _bicubic(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tenso
     grid = torch.eye(ERROR_GRID, device=device, dtype=dtype)[None, None]
     rows = torch.nn.functional.interpolate(grid, (size, ERROR_GRID), mode="bicubic", align_corners=False)
     return rows[0, 0] / rows[0, 0].norm(dim=1, keepdim=True)
+
+
+@lru_cache(maxsize=8)
+def _enlarged(
+    census: Census, size: tuple[int, int], dtype: torch.dtype, device: torch.device
+) -> Float[Tensor, "1 11 h w"]:
+    """Return the maps of a census, in the order of their fields, at the size of an image."""
+    maps = [census.rgb, census.alpha[None], census.rgb_variance, census.alpha_variance[None]]
+    maps = torch.cat([*maps, census.covariance])[None].to(device, dtype)
+    return torch.nn.functional.interpolate(maps, size, mode="bilinear", align_corners=False)
 
 
 @lru_cache(maxsize=4)
