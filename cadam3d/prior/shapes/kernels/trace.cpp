@@ -49,8 +49,7 @@ constexpr int BLOCK_ROWS = LANES == 4 ? 2 : LANES == 8 ? 2 : 4, BLOCK_COLUMNS = 
 // Rows of pixels in a piece of work. Blocks of samples never cross the border between two pieces.
 constexpr int BAND = 4;
 static_assert(BAND % BLOCK_ROWS == 0, "a band is a whole number of blocks");
-// A part that a ray enters this far behind the nearest hit cannot be nearer. Rounding moves a ray back by
-// less, and the rays that begin inside a solid are not affected, because they enter all parts at NEAR.
+// A part that a ray enters this far behind the nearest hit cannot be nearer: rounding moves a ray back by less.
 constexpr float BEHIND = 1e-2f;  // world units
 
 enum Status : int { OK = 0, OUT_OF_MEMORY = 1 };
@@ -261,6 +260,9 @@ inline void with_solid(const Job& job, int64_t part, const Body& body) {
 struct Nearest {
   Floats reached = spread(INF);
   Ints part = spread(-1);
+
+  // Beyond this, no hit can be nearer. A ray that begins inside solids, at NEAR, moves back to their surfaces.
+  Floats limit() const { return max(reached, spread(float(TRACE_NEAR))) + BEHIND; }
 };
 
 struct Interval {
@@ -282,7 +284,7 @@ inline Interval box_interval(const float* low, const float* high, Vec origin, Ve
 template <class Solid>
 inline void march(const Solid& distance, int64_t part, Vec origin, Vec direction, Interval inside, Mask alive,
                   Nearest& nearest) {
-  const Floats speed = inverse_root(dot(direction, direction)), limit = nearest.reached + BEHIND;
+  const Floats speed = inverse_root(dot(direction, direction)), limit = nearest.limit();
   Floats t = inside.begin;
   for (int step = 0; step < TRACE_MARCH_STEPS; step += TRACE_COMPACT_EVERY) {
     Floats advance;
@@ -315,7 +317,7 @@ inline Nearest first_hits(const Job& job, int64_t view, Vec direction, Mask is_i
     const Vec local = product(job.to_local + 9 * part, direction);
     const Interval inside = box_interval(job.low + 3 * part, job.high + 3 * part, origin, local);
     alive = both(alive, greater(inside.end, inside.begin));
-    alive = both(alive, less_equal(inside.begin, nearest.reached + BEHIND));
+    alive = both(alive, less_equal(inside.begin, nearest.limit()));
     if (!any(alive)) continue;
     with_solid(job, part, [&](const auto& distance) {
       march(distance, part, origin, local, inside, alive, nearest);
