@@ -17,16 +17,17 @@ import pytest
 import torch
 from filelock import FileLock
 
+from cadam3d.compiled.build import find_compiler
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.rasterizer import cuda, workspace
-from cadam3d.rasterizer.build import KERNELS, definitions, find_compiler
 from cadam3d.rasterizer.cuda import rasterize
 from cadam3d.rasterizer.cuda_sort import scan, scan_bytes, sort, sort_bytes
 from cadam3d.rasterizer.driver import Module
 from cadam3d.rasterizer.launcher import Launch, Launcher
+from cadam3d.rasterizer.sources import KERNELS, definitions
 from cadam3d.rasterizer.workspace import Workspace
 
 SOURCE = Path(__file__).parent / "rasterizer" / "emulator" / "emulator.cpp"

@@ -20,6 +20,7 @@ FLOORS = {
     "": -1.0,  # the version
     **dict.fromkeys(("core",), 0.0),
     **dict.fromkeys(("io",), 0.5),
+    **dict.fromkeys(("compiled",), 0.6),
     **dict.fromkeys(("viewer",), 0.75),
     **dict.fromkeys(("camera", "background", "initializer", "rasterizer", "prior", "densifier"), 1.0),
     **dict.fromkeys(("augmentation", "optimizer", "exposure", "regularizer", "exporter", "metric"), 1.0),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cadam3d.rasterizer.build import find_compiler
+from cadam3d.compiled.build import find_compiler
 
 ROOT = Path(__file__).parents[1]
 SCRIPT = ROOT / "scripts" / "bench_host.py"

@@ -35,11 +35,11 @@ from splats import make_gaussians
 
 import cadam3d
 from cadam3d import cli
+from cadam3d.compiled.build import find_compiler
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.ply import write_ply
 from cadam3d.rasterizer import auto
-from cadam3d.rasterizer.build import find_compiler
 from cadam3d.rasterizer.cpu import load_kernels
 from cadam3d.settings.advice import LAUNCHERS
 from cadam3d.settings.compose import component, compose, config_dir, flatten

@@ -57,6 +57,7 @@ def examine() -> Iterator[Finding]:
         yield _guarded(check)
     yield from map(_compiler, COMPILERS)
     yield from _rasterizers()
+    yield _guarded(_tracer)
     yield from _priors()
     yield from map(_guarded, (_diffusers, _models))
 
@@ -167,6 +168,12 @@ def _rasterizers() -> Iterator[Finding]:
         yield Finding("rasterizers", Verdict.BROKEN, f"cannot be loaded: {reason}")
         return
     yield from check_rasterizers()
+
+
+def _tracer() -> Finding:
+    from cadam3d.commands.doctor_tracer import check_tracer
+
+    return check_tracer()
 
 
 def _priors() -> Iterator[Finding]:

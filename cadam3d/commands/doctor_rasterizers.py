@@ -9,8 +9,9 @@ from importlib.metadata import PackageNotFoundError, version
 import torch
 
 from cadam3d.commands.finding import Finding, Verdict, attempt
+from cadam3d.compiled import build
 from cadam3d.io.cache import kernels_dir
-from cadam3d.rasterizer import build, nvrtc
+from cadam3d.rasterizer import nvrtc
 from cadam3d.rasterizer.auto import AutoRasterizer
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cpu import CpuRasterizer, instruction_set
@@ -18,6 +19,7 @@ from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import ATOMIC, GSPLAT, OWN, Demands, self_test
+from cadam3d.rasterizer.sources import cpu_library
 
 CPU = torch.device("cpu")
 # Failures that do not end a training, because auto chooses another backend then.
@@ -50,11 +52,11 @@ def check_rasterizers() -> Iterator[Finding]:
 
 
 def _cpu_kernels() -> Finding:
-    built, compiler = build.build(kernels_dir(None)), build.find_compiler()
+    built, compiler = build.build(cpu_library(), kernels_dir(None)), build.find_compiler()
     instructions = instruction_set(build.load(built))
     version = compiler.version if compiler else None
-    facts = {"compiler": version, "instruction_set": instructions, **_kept(built)}
-    found = f"{instructions} by {version or 'a compiler that was removed'}, {_when(built)}"
+    facts = {"compiler": version, "instruction_set": instructions, **kept(built)}
+    found = f"{instructions} by {version or 'a compiler that was removed'}, {when(built)}"
     return Finding("kernels for cpu", Verdict.OK, found, facts=facts)
 
 
@@ -67,11 +69,11 @@ def _cuda_kernels(device: torch.device) -> Finding:
         "compute_capability": ".".join(map(str, capability)),
         "architecture": f"sm_{nvrtc.choose_architecture(capability, compiler)}",
         **_nvrtc(compiler),
-        **_kept(built),
+        **kept(built),
     }
     found = (
         f"{facts['architecture']} for {name} (compute capability {facts['compute_capability']}) "
-        f"by NVRTC {facts['nvrtc_version']} in {compiler.path}, {_when(built)}"
+        f"by NVRTC {facts['nvrtc_version']} in {compiler.path}, {when(built)}"
     )
     return Finding("kernels for cuda", Verdict.OK, found, facts=facts)
 
@@ -143,11 +145,13 @@ def _choice(device: torch.device) -> Finding:
     return Finding("rasterizer=auto", Verdict.NOTE, found, others[-1] if others else "", facts)
 
 
-def _kept(built: build.Build | nvrtc.Cubin) -> dict[str, object]:
+def kept(built: build.Build | nvrtc.Cubin) -> dict[str, object]:
+    """Return where a compiled file is and whether it was compiled now, as JSON values."""
     return {"path": str(built.path), "compiled_now": built.seconds > 0, "compile_seconds": built.seconds}
 
 
-def _when(built: build.Build | nvrtc.Cubin) -> str:
+def when(built: build.Build | nvrtc.Cubin) -> str:
+    """Return where a compiled file is and whether it was compiled now, in words."""
     how = f"compiled now in {built.seconds:.1f} s, kept in" if built.seconds else "from the cache in"
     return f"{how} {built.path.parent}"
 

@@ -9,14 +9,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cadam3d.compiled.build import build, load
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.io.cache import kernels_dir
 from cadam3d.rasterizer.base import Backend, Rasterizer
-from cadam3d.rasterizer.build import build, load
 from cadam3d.rasterizer.native import RenderPass, require_shapes, run_pass
+from cadam3d.rasterizer.sources import cpu_library
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +56,7 @@ class CpuRasterizer(Rasterizer):
 @cache
 def load_kernels(cache_dir: str | None) -> ctypes.CDLL:
     """Return the compiled kernels, and compile them if ``cache_dir`` lacks them. Runs once per process."""
-    return load(build(kernels_dir(cache_dir)))
+    return load(build(cpu_library(), kernels_dir(cache_dir)))
 
 
 def instruction_set(kernels: ctypes.CDLL) -> str:

@@ -3,8 +3,9 @@
 The result is always a cubin for a real architecture, never PTX, because a driver refuses PTX from a newer
 compiler. The name of a cached file contains the architecture and two hashes: of the sources, constants,
 options and compiler version, and of the file's own bytes. So a new release, another torch or a damaged file
-each lead to a fresh build. The file and its folder must belong to the user, as in ``build.py``. No lock is
-needed: every process renames its finished file into place, and any such file that matches its name is usable.
+each lead to a fresh build. The file and its folder must belong to the user, as in ``compiled/build.py``. No
+lock is needed: every process renames its finished file into place, and any such file that matches its name is
+usable.
 """
 
 import ctypes
@@ -18,16 +19,9 @@ from pathlib import Path
 
 import torch
 
+from cadam3d.compiled.build import build_folder, find_intact, keep, own_folder, short_hash
 from cadam3d.core.errors import UserError
-from cadam3d.rasterizer.build import (
-    KERNELS,
-    build_folder,
-    definitions,
-    find_intact,
-    keep,
-    own_folder,
-    short_hash,
-)
+from cadam3d.rasterizer.sources import CUDA_NAMES, KERNELS, definitions
 
 SOURCE = "cuda.cu"
 HEADERS = ("blend.cuh", "device.cuh", "project.cuh", "sort.cuh", "splat_math.h", "tiles.cuh")
@@ -149,13 +143,13 @@ def build(cache_dir: Path, capability: tuple[int, int]) -> Cubin:
         )
     architecture = choose_architecture(capability, compiler)
     name = f"rasterizer-{_key(compiler)}-sm{architecture}"
-    cache_dir = own_folder(cache_dir, "cuda")
+    cache_dir = own_folder(cache_dir, CUDA_NAMES)
     if cached := find_intact(cache_dir, f"{name}-*.cubin"):
         return Cubin(cached, 0.0)
     start = time.perf_counter()
     code = compile_kernels(compiler, architecture)
     final = cache_dir / f"{name}-{short_hash(code)}.cubin"
-    with build_folder(cache_dir, "cuda") as folder:
+    with build_folder(cache_dir, CUDA_NAMES) as folder:
         path = folder / "rasterizer.cubin"
         path.write_bytes(code)
         keep(path, final)

@@ -21,8 +21,8 @@ from rasterizer_bench.scenes import make_scene as bench_scene
 from rasterizer_bench.stages import KernelRasterizer, stages_of
 from torch import Tensor
 
+from cadam3d.compiled.build import find_compiler
 from cadam3d.core.gaussians import FIELDS
-from cadam3d.rasterizer.build import find_compiler
 from cadam3d.rasterizer.launcher import Launch, Launcher
 from cadam3d.rasterizer.selftest import IMAGES, Agreement, self_test
 from cadam3d.rasterizer.selftest import make_scene as self_test_scene

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from cadam3d.core.cameras import Cameras
 from cadam3d.io.atomic import replacing
 from cadam3d.prior.shapes.scene import build
-from cadam3d.prior.shapes.tracer import trace
+from cadam3d.prior.shapes.tracers import find_tracer
 
 GROUPS = 512  # per file, at most
 SAMPLES = 2  # rays per pixel, along each axis
@@ -140,7 +140,7 @@ def _render(path: Path, seed: int, groups: int, size: int) -> None:
 def _views(caption: str, cameras: Cameras, draw: Draw) -> Tensor:
     """Return the views of one caption as bytes; colours that it leaves open are drawn."""
     scene = build(caption).to(torch.device("cpu"), torch.float32)
-    layers = trace(scene, cameras, SAMPLES)
+    layers = find_tracer("auto").trace(scene, cameras, SAMPLES)
     mode = int(draw.uniform(0, len(scene.albedo)))
     colour = torch.einsum("vhwp,pc->vchw", layers.paints, scene.albedo[mode])
     rgba = torch.cat([colour, layers.alpha[:, None]], dim=1)

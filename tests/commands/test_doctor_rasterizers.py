@@ -13,15 +13,17 @@ import torch
 from cadam3d.commands import doctor_rasterizers
 from cadam3d.commands.doctor_rasterizers import check_rasterizers
 from cadam3d.commands.finding import Finding, Verdict
+from cadam3d.compiled import build
+from cadam3d.compiled.build import find_compiler
 from cadam3d.core.errors import UserError
 from cadam3d.io.cache import kernels_dir
-from cadam3d.rasterizer import auto, build, gsplat, nvrtc
+from cadam3d.rasterizer import auto, gsplat, nvrtc
 from cadam3d.rasterizer.base import Backend
-from cadam3d.rasterizer.build import find_compiler
 from cadam3d.rasterizer.cpu import load_kernels
 from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import ATOMIC, GSPLAT, OWN, Agreement, self_test
+from cadam3d.rasterizer.sources import cpu_library
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
 
@@ -82,8 +84,8 @@ def test_the_native_kernels_are_named_and_tested():
     ("seconds", "words"), [(0.0, "from the cache in "), (1.26, "compiled now in 1.3 s, kept in ")]
 )
 def test_the_finding_states_whether_kernels_were_compiled_now(seconds, words, monkeypatch):
-    built = replace(build.build(kernels_dir(None)), seconds=seconds)
-    monkeypatch.setattr(build, "build", lambda cache_dir: built)
+    built = replace(build.build(cpu_library(), kernels_dir(None)), seconds=seconds)
+    monkeypatch.setattr(build, "build", lambda library, cache_dir: built)
     finding = doctor_rasterizers._cpu_kernels()
     assert words in finding.found
     assert finding.facts["compiled_now"] is (seconds > 0)
@@ -219,7 +221,7 @@ def test_a_self_test_that_crashes_is_a_finding(monkeypatch):
 
 
 def test_an_error_of_the_compiler_is_one_line_and_a_hint(monkeypatch):
-    def fail(cache_dir):
+    def fail(library, cache_dir):
         raise UserError("rasterizer=cpu: c++ could not build the kernels:\nerror\nerror\nTry: another one")
 
     monkeypatch.setattr(build, "build", fail)

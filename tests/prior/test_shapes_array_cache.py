@@ -15,7 +15,7 @@ def cache(monkeypatch, tmp_path):
 
 
 def census() -> prior.Census:
-    return prior.take_census.__wrapped__(4)
+    return prior.take_census.__wrapped__(4, "auto")
 
 
 def equal(one, other) -> bool:
@@ -25,7 +25,7 @@ def equal(one, other) -> bool:
 def test_the_second_process_reads_the_bits_of_the_first(cache, monkeypatch):
     made = census()
     [path] = cache.iterdir()
-    monkeypatch.setattr(prior, "_measure", lambda size: pytest.fail("the arrays were in the cache"))
+    monkeypatch.setattr(prior, "_measure", lambda size, tracer: pytest.fail("the arrays were in the cache"))
     assert equal(census(), made)
     assert path.name.startswith("census-4-")
 
@@ -48,5 +48,5 @@ def test_a_damaged_file_is_made_again(content, cache):
 
 def test_arrays_are_computed_if_the_cache_cannot_be_written(monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
-    assert equal(census(), prior._measure(4))
+    assert equal(census(), prior._measure(4, "auto"))
     assert array_cache.default_cache_dir().parts[1] == "dev"

@@ -31,6 +31,7 @@ def prior(**changes: object) -> ShapesPrior:
         samples_per_pixel=2,
         census_size=12,
         seed=0,
+        tracer="auto",
     )
     return replace(exact, **changes)
 

@@ -6,11 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from cadam3d.compiled.build import find_compiler
 from cadam3d.core.cameras import Cameras, turntable
 from cadam3d.io.cache import TRACES
 from cadam3d.prior.shapes import trace_cache
 from cadam3d.prior.shapes.scene import Scene, build
-from cadam3d.prior.shapes.tracer import Layers, trace
+from cadam3d.prior.shapes.tracer import Layers
+from cadam3d.prior.shapes.tracers import Tracer, tracer_for
 
 FLOATS = {"device": torch.device("cpu"), "dtype": torch.float32}
 
@@ -34,12 +36,21 @@ def traced(monkeypatch) -> list[int]:
     """A list with one entry for each call of the tracer."""
     calls: list[int] = []
 
-    def count(scene: Scene, cameras: Cameras, samples: int) -> Layers:
-        calls.append(samples)
-        return trace(scene, cameras, samples)
+    def counting(setting: str, cameras: Cameras) -> Tracer:
+        chosen = tracer_for(setting, cameras)
 
-    monkeypatch.setattr(trace_cache, "trace", count)
+        def count(scene: Scene, cameras: Cameras, samples: int) -> Layers:
+            calls.append(samples)
+            return chosen.trace(scene, cameras, samples)
+
+        return replace(chosen, trace=count)
+
+    monkeypatch.setattr(trace_cache, "tracer_for", counting)
     return calls
+
+
+def trace(scene: Scene, cameras: Cameras, samples: int) -> Layers:
+    return tracer_for("auto", cameras).trace(scene, cameras, samples)
 
 
 def same(one: Layers, other: Layers) -> bool:
@@ -82,6 +93,14 @@ def test_scenes_that_differ_in_colour_share_a_trace(folder, traced) -> None:
     for prompt in ("a red cube", "a blue cube"):
         trace_cache.shared_trace(scene_of(prompt), cameras(), 1)
     assert len(traced) == 1
+
+
+def test_every_tracer_has_its_own_files(folder) -> None:
+    """The last bits may differ, and a trace must not depend on the runs before it."""
+    settings = ["torch", "native"] if find_compiler() else ["torch"]
+    for setting in settings:
+        trace_cache.shared_trace(scene_of("a cube"), cameras(), 1, setting)
+    assert len(list(folder.iterdir())) == len(settings)
 
 
 @pytest.mark.parametrize("damage", [b"", b"\x93NUMPY", b"no array at all"], ids=["empty", "cut", "other"])

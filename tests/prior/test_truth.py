@@ -21,7 +21,7 @@ def views(count: int = 3, size: int = 24) -> Cameras:
 
 
 def shapes(prompt: str = PROMPT, **changes) -> Truth:
-    source = ShapesTruth(**{"samples_per_pixel": 2, "turns": 24, **changes})
+    source = ShapesTruth(**{"samples_per_pixel": 2, "turns": 24, "tracer": "auto", **changes})
     return source.of(prompt, component(composed("prior=tiny").prior))
 
 

@@ -9,12 +9,13 @@ from filelock import FileLock
 from mutants import MUTANTS, plant
 from splats import Backend
 
-from cadam3d.rasterizer import build as build_module
+from cadam3d.compiled import build as build_module
+from cadam3d.compiled.build import Build, build, find_compiler
 from cadam3d.rasterizer import cuda
-from cadam3d.rasterizer.build import Build, build, find_compiler
 from cadam3d.rasterizer.cpu import CpuRasterizer
 from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
+from cadam3d.rasterizer.sources import cpu_library
 
 # More tiles than any image of the tests has.
 MANY = 10**9
@@ -43,7 +44,7 @@ def build_once(folder: Path, *machine_flags: tuple[str, ...]) -> Build:
         built = sorted(folder.glob(f"*{build_module.SUFFIX}"))
         if machine_flags and built:
             return Build(built[0], 0.0)
-        return build(folder, machine_flags or build_module.MACHINE_FLAGS)
+        return build(cpu_library(), folder, machine_flags or build_module.MACHINE_FLAGS)
 
 
 @pytest.fixture(scope="session")

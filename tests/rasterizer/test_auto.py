@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from cadam3d.commands import messages
+from cadam3d.compiled.build import find_compiler
 from cadam3d.core.cameras import turntable
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.rasterizer import auto, gsplat
 from cadam3d.rasterizer.auto import AutoRasterizer, checked_cuda, choose
 from cadam3d.rasterizer.base import Backend
-from cadam3d.rasterizer.build import find_compiler
 from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer

@@ -18,8 +18,8 @@ from splats import (
     render_and_differentiate,
 )
 
+from cadam3d.compiled.build import load
 from cadam3d.core.errors import UserError
-from cadam3d.rasterizer.build import load
 from cadam3d.rasterizer.cpu import instruction_set, rasterize
 
 

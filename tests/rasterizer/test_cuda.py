@@ -23,8 +23,8 @@ from splats import (
 
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import cuda
-from cadam3d.rasterizer.build import KERNELS
 from cadam3d.rasterizer.cuda import CudaRasterizer
+from cadam3d.rasterizer.sources import KERNELS
 
 pytestmark = pytest.mark.usefixtures("garbage_in_new_memory")
 

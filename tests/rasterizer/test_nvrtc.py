@@ -13,8 +13,8 @@ from emulation import content_hash, make_once
 
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import base, nvrtc
-from cadam3d.rasterizer.build import KERNELS
 from cadam3d.rasterizer.nvrtc import build, choose_architecture, compile_kernels, find_compiler
+from cadam3d.rasterizer.sources import KERNELS
 
 pytestmark = pytest.mark.slow
 

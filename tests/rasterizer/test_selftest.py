@@ -7,10 +7,10 @@ import pytest
 import torch
 from splats import undecided
 
+from cadam3d.compiled.build import find_compiler
 from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.rasterizer import reference
 from cadam3d.rasterizer.base import NEAR, Rasterizer
-from cadam3d.rasterizer.build import find_compiler
 from cadam3d.rasterizer.cpu import CpuRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import (

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
-from cadam3d.core.checks import fail, require_range, require_whole
+from cadam3d.core.checks import fail, require_choice, require_range, require_whole
 from cadam3d.core.render import Truth
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import NoisePath, Prediction, per_view
@@ -20,6 +20,7 @@ from cadam3d.prior.shapes.objects import known_objects, known_primitives
 from cadam3d.prior.shapes.scene import Scene, build
 from cadam3d.prior.shapes.trace_cache import shared_trace
 from cadam3d.prior.shapes.tracer import Layers
+from cadam3d.prior.shapes.tracers import TRACERS, find_tracer
 from cadam3d.prior.shapes.truth import true_scene
 
 CENSUS_VIEWS = 4  # per object, equally spaced in azimuth
@@ -32,7 +33,8 @@ ERROR_GRID = 8
 ERROR_FREQUENCY = 3.0
 
 
-@dataclass(frozen=True)
+# Compared by identity, because the maps of every size are kept per census.
+@dataclass(frozen=True, eq=False)
 class Census:
     """Moments of premultiplied RGB and alpha over all images of the world, per pixel of a small picture."""
 
@@ -47,12 +49,8 @@ class Census:
 
         Variances are at least ``floor``.
         """
-        maps = torch.cat(
-            [self.rgb, self.alpha[None], self.rgb_variance, self.alpha_variance[None], self.covariance]
-        )
-        sized = torch.nn.functional.interpolate(
-            maps[None].to(background), (cameras.height, cameras.width), mode="bilinear", align_corners=False
-        )
+        size = (cameras.height, cameras.width)
+        sized = _enlarged(self, size, background.dtype, background.device)
         rgb, alpha, rgb_variance, alpha_variance, covariance = sized.split([3, 1, 3, 1, 3], dim=1)
         backdrop = background[:, :, None, None]
         mean = rgb + (1 - alpha) * backdrop
@@ -107,6 +105,7 @@ class ShapesPrior(DiffusionPrior):
     samples_per_pixel: int  # along each axis
     census_size: int  # pixels per side
     seed: int
+    tracer: str  # of TRACERS
 
     def __post_init__(self) -> None:
         require_range("prior.spread", self.spread, low=0, high=10, example=0.1)
@@ -115,20 +114,23 @@ class ShapesPrior(DiffusionPrior):
         require_whole("prior.samples_per_pixel", self.samples_per_pixel, low=1, high=8, example=2)
         require_whole("prior.census_size", self.census_size, low=2, high=256, example=24)
         require_whole("prior.seed", self.seed, low=0, high=2**62, example=0)
+        require_choice("prior.tracer", self.tracer, TRACERS)
 
     def embed(self, prompt: str, negative: str) -> ShapesEmbedding:
         """Parse both prompts; an empty negative prompt allows every object of the world.
 
-        Raises ``UserError`` for an empty prompt and for words that the grammar does not know.
+        Raises ``UserError`` for an empty prompt, for words that the grammar does not know, and if a native
+        tracer is wanted and cannot be compiled. It is compiled here, and not in the first step.
         """
         if not prompt.strip():
             raise fail("prompt", expected="an object", got=prompt, example=f'prompt="{EXAMPLE}"')
         positive = build(prompt)
+        find_tracer(self.tracer)
         return ShapesEmbedding(
             prior=self,
             positive=positive,
             negative=build(negative, "negative_prompt") if negative.strip() else None,
-            census=take_census(self.census_size),
+            census=take_census(self.census_size, self.tracer),
         )
 
     def encode(self, rgb: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v 3 h w"]:
@@ -181,11 +183,11 @@ class ShapesPrior(DiffusionPrior):
         The outlines are left out, because ``metric=outline`` is meant for priors that may be wrong about the
         object. ``truth=shapes`` has them.
         """
-        return replace(true_scene(build(prompt), self.samples_per_pixel), alpha=None)
+        return replace(true_scene(build(prompt), self.samples_per_pixel, tracer=self.tracer), alpha=None)
 
     def _layers(self, scene: Scene, cameras: Cameras) -> tuple[Layers, Scene]:
         scene = scene.to(cameras.intrinsics.device, cameras.intrinsics.dtype)
-        return shared_trace(scene, cameras, self.samples_per_pixel), scene
+        return shared_trace(scene, cameras, self.samples_per_pixel, self.tracer), scene
 
     def _guess(self, noisy: Tensor, t: Tensor, mixture: Mixture, branch: int) -> tuple[Tensor, Tensor]:
         a, b = self.noise_path.a(t), self.noise_path.b(t)
@@ -245,14 +247,25 @@ def _bicubic(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tenso
     return rows[0, 0] / rows[0, 0].norm(dim=1, keepdim=True)
 
 
+@lru_cache(maxsize=8)
+def _enlarged(
+    census: Census, size: tuple[int, int], dtype: torch.dtype, device: torch.device
+) -> Float[Tensor, "1 11 h w"]:
+    """Return the maps of a census, in the order of their fields, at the size of an image."""
+    maps = [census.rgb, census.alpha[None], census.rgb_variance, census.alpha_variance[None]]
+    maps = torch.cat([*maps, census.covariance])[None].to(device, dtype)
+    return torch.nn.functional.interpolate(maps, size, mode="bilinear", align_corners=False)
+
+
 @lru_cache(maxsize=4)
-def take_census(size: int) -> Census:
+def take_census(size: int, tracer: str) -> Census:
     """Return the moments over all objects of the world, a few views of each and all modes, equally likely."""
-    return cached_arrays(Census, f"census-{size}", lambda: _measure(size))
+    name = f"census-{size}-{find_tracer(tracer).identity}"
+    return cached_arrays(Census, name, lambda: _measure(size, tracer))
 
 
-def _measure(size: int) -> Census:
-    """Compute the census by tracing every object, which takes a quarter of a second."""
+def _measure(size: int, tracer: str) -> Census:
+    """Compute the census by tracing every object."""
     cameras = turntable(
         CENSUS_VIEWS,
         elevation_deg=CENSUS_ELEVATION_DEG,
@@ -266,7 +279,7 @@ def _measure(size: int) -> Census:
     names = (*known_primitives(), *known_objects())
     for name in names:
         scene = build(name).to(torch.device("cpu"), torch.float32)
-        layers = shared_trace(scene, cameras, samples=1)
+        layers = shared_trace(scene, cameras, 1, tracer)
         images = layers.images(scene.albedo, black).double()
         alpha = layers.alpha.double()
         rgb_sum += images.mean(dim=(0, 1))

@@ -5,6 +5,10 @@ parameter under an affine map, so sphere tracing in local coordinates is exact f
 ellipsoid is a stretched ball and needs no approximate distance. Every function here is 1-Lipschitz and has
 the right sign, which is all that sphere tracing requires (Hart 1996, sec. 2). Many are the maximum of a few
 planes.
+
+``kernels/trace.cpp`` has the same functions for vectors of rays. Both use the same operations of IEEE
+arithmetic in the same order and no trigonometry, so that in float32 both find the same bits. A change of one
+is therefore a change of both, and ``tests/prior/test_native_tracer.py`` compares them.
 """
 
 import math
@@ -87,11 +91,19 @@ def rotation(axis: str, degrees: float) -> Float[Tensor, "3 3"]:
     return matrix
 
 
+def root(x: Tensor) -> Tensor:
+    """Return the square root from operations that IEEE arithmetic rounds in one way.
+
+    ``torch.sqrt`` calls a library on some machines, which rounds differently.
+    """
+    return x * x.clamp_min(1e-30).rsqrt()
+
+
 # --- ball
 
 
 def _ball_sdf(p: Tensor, size: Tensor) -> Tensor:
-    return p.square().sum(0).sqrt() - size[0]
+    return root(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]) - size[0]
 
 
 def _ball_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
@@ -115,7 +127,7 @@ def _box_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
 def _frustum_sdf(p: Tensor, size: Tensor) -> Tensor:
     bottom, top, half = size[0], size[1], size[2]
     slope = (bottom - top) / (2 * half)
-    radius = p[:2].square().sum(0).sqrt()
+    radius = root(p[0] * p[0] + p[1] * p[1])
     side = (radius - (bottom + top) / 2 + slope * p[2]) * torch.rsqrt(1 + slope * slope)
     return torch.maximum(side, p[2].abs() - half)
 
@@ -131,7 +143,7 @@ def _frustum_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
 
 def _tube_sdf(p: Tensor, size: Tensor) -> Tensor:
     outer, inner, half = size[0], size[1], size[2]
-    radius = p[:2].square().sum(0).sqrt()
+    radius = root(p[0] * p[0] + p[1] * p[1])
     wall = (radius - (outer + inner) / 2).abs() - (outer - inner) / 2
     return torch.maximum(wall, p[2].abs() - half)
 
@@ -144,27 +156,29 @@ def _tube_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
 
 
 def _torus_sdf(p: Tensor, size: Tensor) -> Tensor:
-    away = p[:2].square().sum(0).sqrt() - size[0]
-    return (away * away + p[2] * p[2]).sqrt() - size[1]
+    away = root(p[0] * p[0] + p[1] * p[1]) - size[0]
+    return root(away * away + p[2] * p[2]) - size[1]
 
 
 def _torus_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
     return size[0] * d[:2].norm(dim=0) + size[1] * d.norm(dim=0)
 
 
-# --- arc: a torus within an angle (radians) of +y, with round ends: ring radius, pipe radius, angle
+# --- arc: a torus within an angle of +y, with round ends: ring radius, pipe radius, sine and cosine of it
 
 
 def _arc_sdf(p: Tensor, size: Tensor) -> Tensor:
-    x = p[0].abs()
-    angle = torch.minimum(torch.atan2(x, p[1]), size[2])
-    dx, dy = x - size[0] * angle.sin(), p[1] - size[0] * angle.cos()
-    return (dx * dx + dy * dy + p[2] * p[2]).sqrt() - size[1]
+    x, ring, sine, cosine = p[0].abs(), size[0], size[2], size[3]
+    away = root(x * x + p[1] * p[1]) - ring
+    dx, dy = x - ring * sine, p[1] - ring * cosine
+    # The sine of the difference between the angle of the point and that of the end.
+    is_beyond = x * cosine > p[1] * sine
+    return root(torch.where(is_beyond, dx * dx + dy * dy, away * away) + p[2] * p[2]) - size[1]
 
 
 def _arc_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
     x = d[0].abs()
-    angle = torch.atan2(x, d[1]).clamp(max=size[2])
+    angle = torch.atan2(x, d[1]).clamp(max=math.atan2(size[2], size[3]))
     return size[0] * (angle.sin() * x + angle.cos() * d[1]) + size[1] * d.norm(dim=0)
 
 
@@ -173,7 +187,7 @@ def _arc_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
 
 def _capsule_sdf(p: Tensor, size: Tensor) -> Tensor:
     beyond = (p[2].abs() - size[1]).clamp_min(0)
-    return (p[0] * p[0] + p[1] * p[1] + beyond * beyond).sqrt() - size[0]
+    return root(p[0] * p[0] + p[1] * p[1] + beyond * beyond) - size[0]
 
 
 def _capsule_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
@@ -185,15 +199,14 @@ def _capsule_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
 
 def _star_sdf(p: Tensor, size: Tensor) -> Tensor:
     # Fold the plane into one half of one point. Reflections keep distances, so the result is still a bound.
-    sector = math.pi / STAR_POINTS
-    angle = torch.atan2(p[1], p[2])
-    folded = (torch.remainder(angle + sector, 2 * sector) - sector).abs()
-    radius = (p[1] * p[1] + p[2] * p[2]).sqrt()
-    along, across = radius * folded.cos(), radius * folded.sin()
+    across, along, sector = p[1].abs(), p[2], math.pi / STAR_POINTS
+    for angle in (3 * sector, sector):
+        beyond = 2 * (across * math.cos(angle) - along * math.sin(angle)).clamp_min(0)
+        across, along = across - beyond * math.cos(angle), along + beyond * math.sin(angle)
     # The edge runs from the tip (outer, 0) to the notch (inner cos sector, inner sin sector).
     edge_x, edge_y = size[1] * math.cos(sector) - size[0], size[1] * math.sin(sector)
-    side = (edge_y * (along - size[0]) - edge_x * across) * torch.rsqrt(edge_x * edge_x + edge_y * edge_y)
-    return torch.maximum(side, p[0].abs() - size[2])
+    side = edge_y * (along - size[0]) - edge_x * across.abs()
+    return torch.maximum(side * torch.rsqrt(edge_x * edge_x + edge_y * edge_y), p[0].abs() - size[2])
 
 
 def _star_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
@@ -202,18 +215,34 @@ def _star_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
     return (tips @ d[1:]).amax(0) + size[2] * d[0].abs()
 
 
-# --- polytopes: the maximum of their planes; only their matrix changes their shape
+# --- polytopes: the maximum of their planes; they have no sizes, and only their matrix changes their shape
+
+_ROOT2, _ROOT3, _ROOT5 = math.sqrt(2), math.sqrt(3), math.sqrt(5)
 
 
-def _polytope(name: str, planes: list[list[float]], corners: list[list[float]]) -> Kind:
-    """Return the kind with these planes, rows (nx, ny, nz, d) with n . p <= d inside, for n of any length."""
-    rows = torch.tensor(planes, dtype=torch.float64)
-    rows = rows / rows[:, :3].norm(dim=1, keepdim=True)
+def _pyramid_sdf(p: Tensor, size: Tensor) -> Tensor:
+    side = (2 * torch.maximum(p[0].abs(), p[1].abs()) + p[2] - 1) * (1 / _ROOT5)
+    return torch.maximum(side, -1 - p[2])
+
+
+def _gable_sdf(p: Tensor, size: Tensor) -> Tensor:
+    slope = (2 * p[1].abs() + p[2] - 1) * (1 / _ROOT5)
+    return torch.maximum(torch.maximum(slope, p[0].abs() - 1), -1 - p[2])
+
+
+def _tetrahedron_sdf(p: Tensor, size: Tensor) -> Tensor:
+    rise = p[2] * (1 / 3)
+    sides = p[0] * (_ROOT2 / 3) + p[1].abs() * (_ROOT2 / _ROOT3) + rise
+    return torch.maximum(torch.maximum(sides, rise - p[0] * (2 * _ROOT2 / 3)), -p[2]) - 1 / 3
+
+
+def _octahedron_sdf(p: Tensor, size: Tensor) -> Tensor:
+    return (p[0].abs() + p[1].abs() + p[2].abs() - 1) * (1 / _ROOT3)
+
+
+def _polytope(name: str, sdf: SdfFn, corners: list[list[float]]) -> Kind:
+    """Return the kind with this distance and these corners."""
     points = torch.tensor(corners, dtype=torch.float64)
-
-    def sdf(p: Tensor, size: Tensor) -> Tensor:
-        faces = rows.to(p)
-        return (faces[:, :3] @ p - faces[:, 3:]).amax(0)
 
     def support(d: Tensor, size: tuple[float, ...]) -> Tensor:
         return (points.to(d) @ d).amax(0)
@@ -221,8 +250,6 @@ def _polytope(name: str, planes: list[list[float]], corners: list[list[float]]) 
     return Kind(name, sdf, support, "flat")
 
 
-_ROOT2 = math.sqrt(2)
-_ROOT3 = math.sqrt(3)
 BALL = Kind("ball", _ball_sdf, _ball_support, "round")
 BOX = Kind("box", _box_sdf, _box_support, "flat")
 FRUSTUM = Kind("frustum", _frustum_sdf, _frustum_support, "round")
@@ -232,26 +259,15 @@ ARC = Kind("arc", _arc_sdf, _arc_support, "ring")
 CAPSULE = Kind("capsule", _capsule_sdf, _capsule_support, "round")
 STAR = Kind("star", _star_sdf, _star_support, "flat")
 # A square base of side 2 at z = -1 and an apex at z = 1.
-PYRAMID = _polytope(
-    "pyramid",
-    [[0, 0, -1, 1], [2, 0, 1, 1], [-2, 0, 1, 1], [0, 2, 1, 1], [0, -2, 1, 1]],
-    [[0, 0, 1], [1, 1, -1], [1, -1, -1], [-1, 1, -1], [-1, -1, -1]],
-)
+PYRAMID = _polytope("pyramid", _pyramid_sdf, [[0, 0, 1], [1, 1, -1], [1, -1, -1], [-1, 1, -1], [-1, -1, -1]])
 # A roof: a base of side 2 at z = -1 and a ridge along x at z = 1.
 GABLE = _polytope(
-    "gable",
-    [[0, 0, -1, 1], [1, 0, 0, 1], [-1, 0, 0, 1], [0, 2, 1, 1], [0, -2, 1, 1]],
-    [[1, 0, 1], [-1, 0, 1], [1, 1, -1], [1, -1, -1], [-1, 1, -1], [-1, -1, -1]],
+    "gable", _gable_sdf, [[1, 0, 1], [-1, 0, 1], [1, 1, -1], [1, -1, -1], [-1, 1, -1], [-1, -1, -1]]
 )
 # A regular tetrahedron of circumradius 1, with one face below.
 TETRAHEDRON = _polytope(
     "tetrahedron",
-    [
-        [0, 0, -1, 1 / 3],
-        [-2 * _ROOT2 / 3, 0, 1 / 3, 1 / 3],
-        [_ROOT2 / 3, -_ROOT2 / _ROOT3, 1 / 3, 1 / 3],
-        [_ROOT2 / 3, _ROOT2 / _ROOT3, 1 / 3, 1 / 3],
-    ],
+    _tetrahedron_sdf,
     [
         [0, 0, 1],
         [2 * _ROOT2 / 3, 0, -1 / 3],
@@ -261,7 +277,7 @@ TETRAHEDRON = _polytope(
 )
 OCTAHEDRON = _polytope(
     "octahedron",
-    [[x, y, z, 1] for x in (1, -1) for y in (1, -1) for z in (1, -1)],
+    _octahedron_sdf,
     [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]],
 )
 KINDS = (
@@ -330,7 +346,8 @@ def torus(ring: float, pipe: float) -> Solid:
 
 def arc(ring: float, pipe: float, degrees: float) -> Solid:
     """Return the part of a torus about z within ``degrees`` to either side of +y."""
-    return _solid(ARC, ring, pipe, math.radians(degrees))
+    angle = math.radians(degrees)
+    return _solid(ARC, ring, pipe, math.sin(angle), math.cos(angle))
 
 
 def capsule(radius: float, length: float) -> Solid:

@@ -1,7 +1,8 @@
 """A cache of traced views for runs that trace the same views of the same scene, such as the jobs of a sweep.
 
 Tracing takes most of the time of a step with ``prior=shapes``. If an environment variable names a folder,
-traced views are stored in it, and other runs read them instead of tracing. The numbers are bit-identical.
+traced views are stored in it, and other runs read them instead of tracing. The numbers are bit-identical, and
+each tracer has its own files.
 """
 
 import hashlib
@@ -16,32 +17,38 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.io.cache import TRACES
-from cadam3d.prior.shapes import solids, tracer
+from cadam3d.prior.shapes import native_tracer, solids, tracer
 from cadam3d.prior.shapes.scene import Scene
-from cadam3d.prior.shapes.tracer import Layers, trace
+from cadam3d.prior.shapes.tracer import Layers
+from cadam3d.prior.shapes.tracers import tracer_for
 
 # Space of the disk that stays free.
 SPARE = 2 * 1024**3  # bytes
 # Part of the identity of a trace, since a folder may outlive the code that wrote it.
-CODE = b"".join(Path(str(module.__file__)).read_bytes() for module in (tracer, solids))
+CODE = b"".join(Path(str(module.__file__)).read_bytes() for module in (tracer, native_tracer, solids))
 
 
-def shared_trace(scene: Scene, cameras: Cameras, samples: int) -> Layers:
-    """Return the result of :func:`~cadam3d.prior.shapes.tracer.trace`, from the cache if it is there."""
+def shared_trace(scene: Scene, cameras: Cameras, samples: int, setting: str = "auto") -> Layers:
+    """Return the result of :func:`~cadam3d.prior.shapes.tracer.trace`, from the cache if it is there.
+
+    ``setting`` chooses the tracer (``tracers.py``).
+    """
+    chosen = tracer_for(setting, cameras)
     folder = os.environ.get(TRACES)
     if not folder or cameras.intrinsics.dtype != torch.float32:
-        return trace(scene, cameras, samples)
-    path = Path(folder) / f"{_identity(scene, cameras, samples)}.npy"
+        return chosen.trace(scene, cameras, samples)
+    path = Path(folder) / f"{_identity(scene, cameras, samples, chosen.identity)}.npy"
     layers = _read(path, scene, cameras)
     if layers is None:
-        layers = trace(scene, cameras, samples)
+        layers = chosen.trace(scene, cameras, samples)
         _store(path, layers)
     return layers
 
 
-def _identity(scene: Scene, cameras: Cameras, samples: int) -> str:
+def _identity(scene: Scene, cameras: Cameras, samples: int, of_tracer: str) -> str:
     """Return a name that identifies everything a trace depends on; it does not depend on colours."""
     digest = hashlib.sha256(CODE)
+    digest.update(of_tracer.encode())
     kinds = [(kind.name, count) for kind, count in scene.kinds]
     digest.update(repr((kinds, scene.albedo.shape[1], cameras.height, cameras.width, samples)).encode())
     rows = (scene.to_local, scene.offsets, scene.sizes, scene.low, scene.high, scene.centres, scene.radii)

@@ -4,6 +4,9 @@ Every part is traced separately, in its local coordinates and only by rays that 
 nearest hit is visible. All parts of one kind are traced together, so that the number of tensor operations
 does not grow with the number of parts. Light depends on the surface and not on the view, so that an asset of
 SH degree 0 can match it.
+
+``kernels/trace.cpp`` does the same on vectors of rays, with the same operations in the same order. Therefore
+sums of three products are written out here: a matrix product may add them in any order.
 """
 
 import math
@@ -15,7 +18,7 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.prior.shapes.scene import PATTERN_NAMES, Scene, sphere_directions
-from cadam3d.prior.shapes.solids import Kind
+from cadam3d.prior.shapes.solids import Kind, root
 
 MARCH_STEPS = 48
 # Steps between removals of the rays that have hit or missed.
@@ -92,37 +95,56 @@ def trace(scene: Scene, cameras: Cameras, samples: int) -> Layers:
 def _cast(cameras: Cameras, samples: int) -> _Rays:
     """Return rays through a regular grid of points in every pixel, without those that miss the ball."""
     fine = cameras.resize(cameras.height * samples, cameras.width * samples)
+    origins, to_world = fine.positions, ray_matrices(fine)
     like = {"dtype": fine.intrinsics.dtype, "device": fine.intrinsics.device}
     rows, columns = torch.arange(fine.height, **like), torch.arange(fine.width, **like)
     y, x = torch.meshgrid(rows + 0.5, columns + 0.5, indexing="ij")
-    to_world = fine.world_to_camera[:, :3, :3].transpose(1, 2) @ torch.linalg.inv(fine.intrinsics)
-    direction = to_world @ torch.stack([x.flatten(), y.flatten(), torch.ones_like(x).flatten()])  # "v 3 r"
-    direction = direction * direction.square().sum(1, keepdim=True).rsqrt()
+    u, v, w = to_world[:, :, :, None].unbind(2)  # columns, "v 3 1" each
+    direction = _unit((u * x.flatten() + v * y.flatten() + w).transpose(0, 1))  # "3 v r"
 
-    origins = fine.positions
-    along = (origins[:, None] @ direction)[:, 0]
-    apart = origins.square().sum(1, keepdim=True) - along.clamp_max(0).square()
+    along = _dot(origins.T[:, :, None], direction)
+    apart = _dot(origins.T, origins.T)[:, None] - along.clamp_max(0).square()
     view, sample = (apart <= BALL_RADIUS**2).nonzero(as_tuple=True)
     row = torch.div(sample, fine.width * samples, rounding_mode="floor")
     column = torch.div(sample % fine.width, samples, rounding_mode="floor")
     return _Rays(
         origins=origins,
-        directions=direction.transpose(0, 1).flatten(1).index_select(1, view * y.numel() + sample),
+        directions=direction.flatten(1).index_select(1, view * y.numel() + sample),
         views=view,
         pixels=(view * cameras.height + row) * cameras.width + column,
         per_view=tuple(torch.bincount(view, minlength=len(cameras)).tolist()),
     )
 
 
+def ray_matrices(fine: Cameras) -> Float[Tensor, "v 3 3"]:
+    """Return the matrices that map (x, y, 1), in pixels, to the direction of a ray, of any length."""
+    return fine.world_to_camera[:, :3, :3].transpose(1, 2) @ torch.linalg.inv(fine.intrinsics)
+
+
+def local_origins(scene: Scene, origins: Float[Tensor, "v 3"]) -> Float[Tensor, "v p 3"]:
+    """Return the origins of the rays in the local coordinates of every part."""
+    return torch.einsum("pij,vpj->vpi", scene.to_local, origins[:, None] - scene.offsets[None])
+
+
+def ball_limits(
+    scene: Scene, origins: Float[Tensor, "v 3"]
+) -> tuple[Float[Tensor, "v p 3"], Float[Tensor, "v p"]]:
+    """Return the centres of the bounding balls as seen from each origin, and a limit for each ball.
+
+    A ray hits the ball if the product of its direction with the centre is at least the limit.
+    """
+    away = scene.centres - origins[:, None]
+    # The condition |away|^2 - towards^2 <= radius^2, solved for `towards`, which differs between rays.
+    beyond = away.square().sum(2) - scene.radii.square()
+    return away, torch.where(beyond > 0, beyond.clamp_min(0).sqrt(), -torch.inf)
+
+
 def _candidates(scene: Scene, rays: _Rays) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
     """Return the pairs (part, ray) in which the ray hits the bounding ball of the part, sorted by part."""
-    masks = []
-    for origin, direction in zip(rays.origins, rays.directions.split(rays.per_view, dim=1), strict=True):
-        away = scene.centres - origin
-        # The condition |away|^2 - towards^2 <= radius^2, solved for `towards`, which differs between rays.
-        beyond = away.square().sum(1, keepdim=True) - scene.radii[:, None].square()
-        least = torch.where(beyond > 0, beyond.clamp_min(0).sqrt(), -torch.inf)
-        masks.append(away @ direction >= least)
+    balls = zip(*ball_limits(scene, rays.origins), rays.directions.split(rays.per_view, dim=1), strict=True)
+    masks = [
+        _dot(away.T[:, :, None], direction[:, None]) >= least[:, None] for away, least, direction in balls
+    ]
     part, ray = torch.cat(masks, dim=1).nonzero(as_tuple=True)
     return part, ray
 
@@ -131,9 +153,9 @@ def _first_hits(scene: Scene, rays: _Rays) -> _Hits:
     """Return the first hit of every ray that hits a part."""
     part, ray = _candidates(scene, rays)
     # The same rays in the local coordinates of the parts. The ray parameter stays in world units.
-    start = torch.einsum("pij,vpj->ivp", scene.to_local, rays.origins[:, None] - scene.offsets[None])
-    origin = start.flatten(1).index_select(1, rays.views[ray] * len(scene.radii) + part)
-    direction = torch.einsum("ijn,jn->in", _matrices(scene, part), rays.directions.index_select(1, ray))
+    start = local_origins(scene, rays.origins).flatten(0, 1).T
+    origin = start.index_select(1, rays.views[ray] * len(scene.radii) + part)
+    direction = _dot(_matrices(scene, part).transpose(0, 1), rays.directions.index_select(1, ray)[:, None])
     begin, end = _box_interval(scene, part, origin, direction)
     inside = (begin < end).nonzero()[:, 0]
     part, ray, begin, end = part[inside], ray[inside], begin[inside], end[inside]
@@ -177,7 +199,7 @@ def _march(
     """Return the ray parameter of the first point on the surface, or infinity for a miss."""
     reached = torch.full_like(begin, torch.inf)
     rows = torch.arange(len(begin), device=begin.device)
-    t, speed = begin, direction.square().sum(0).rsqrt()
+    t, speed = begin, _dot(direction, direction).rsqrt()
     for step in range(MARCH_STEPS):
         advance = kind.sdf(origin + t * direction, sizes) * speed
         t = t + advance
@@ -216,9 +238,9 @@ def _shade(scene: Scene, hits: _Hits) -> tuple[Float[Tensor, "n"], Int[Tensor, "
     for kind, rows in _runs(scene, hits.part):
         normal[:, rows] = _gradient(kind, hits.local[:, rows], sizes[:, rows])
     # A normal is mapped to the world by the transposed inverse of the matrix that maps points.
-    normal = _unit(torch.einsum("ijn,in->jn", _matrices(scene, hits.part), normal))
-    light = _unit(normal.new_tensor(LIGHT))
-    facing = ((light @ normal + WRAP) / (1 + WRAP)).clamp_min(0)
+    normal = _unit(_dot(_matrices(scene, hits.part), normal[:, None]))
+    light = light_direction(normal)
+    facing = ((_dot(light, normal) + WRAP) / (1 + WRAP)).clamp_min(0)
     sent = AMBIENT + SKY * (0.5 + 0.5 * normal[2]) + DIFFUSE * facing
 
     is_second = torch.zeros_like(hits.part, dtype=torch.bool)
@@ -234,17 +256,27 @@ def _shade(scene: Scene, hits: _Hits) -> tuple[Float[Tensor, "n"], Int[Tensor, "
     return sent, torch.where(is_second, scene.paints[hits.part, 1], scene.paints[hits.part, 0])
 
 
+def light_direction(like: Tensor) -> Float[Tensor, "3"]:
+    """Return the unit vector towards the light, on the device and in the dtype of ``like``."""
+    return _unit(like.new_tensor(LIGHT))
+
+
 def _unit(vectors: Tensor) -> Tensor:
     """Normalize vectors that have their components along the first axis."""
-    return vectors * vectors.square().sum(0).clamp_min(1e-30).rsqrt()
+    return vectors * _dot(vectors, vectors).clamp_min(1e-30).rsqrt()
+
+
+def _dot(one: Tensor, other: Tensor) -> Tensor:
+    """Return the products of vectors that have their components along the first axis, added in order."""
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
 def _gradient(kind: Kind, points: Tensor, sizes: Tensor) -> Tensor:
     """Return the gradient of the distance, up to a factor, from a tetrahedron of points around each point."""
     corners = points.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
     probes = points[:, None] + NORMAL_STEP * corners.T[:, :, None]
-    distance = kind.sdf(probes.flatten(1), sizes.repeat(1, 4)).reshape(4, -1)
-    return corners.T @ distance
+    a, b, c, d = kind.sdf(probes.flatten(1), sizes.repeat(1, 4)).reshape(4, -1)
+    return torch.stack([a + b - c - d, a - b + c - d, a - b - c + d])
 
 
 def _paint_second(
@@ -254,7 +286,7 @@ def _paint_second(
     centre, half = box
     unit = (p - centre) / half  # in [-1, 1]
     if kind.wrap == "ring":
-        turn, roll = torch.atan2(p[1], p[0]), torch.atan2(p[2], p[:2].square().sum(0).sqrt() - sizes[0])
+        turn, roll = torch.atan2(p[1], p[0]), torch.atan2(p[2], root(p[0] * p[0] + p[1] * p[1]) - sizes[0])
         return _ring_pattern(pattern, turn / torch.pi, roll / torch.pi)
     if pattern == "spotted":
         return (sphere_directions(SPOTS).to(p) @ _unit(unit)).amax(0) > SPOT_COSINE
@@ -264,7 +296,7 @@ def _paint_second(
         if pattern == "striped":
             return _is_odd((inner[2] + 1) * 3)
         return _is_odd_sum((inner + 1) * 2)
-    across = unit[:2].square().sum(0).sqrt().clamp_max(1)
+    across = root(unit[0] * unit[0] + unit[1] * unit[1]).clamp_max(1)
     if kind.name == "ball":
         band = 3 * torch.asin(unit[2].clamp(-1, 1)) / (torch.pi / 2)
     else:

@@ -1,4 +1,4 @@
-"""Build the native CPU kernels with a compiler of this machine, and keep them in the user's cache folder.
+"""Build native libraries with a C++ compiler of this machine, and keep them in the user's cache folder.
 
 The name of a cached file contains three hashes: of the sources, flags and machine; of the compiler; and of
 the bytes of the file. So a copied home folder, a new release, another compiler or a damaged file each lead to
@@ -28,10 +28,9 @@ from pathlib import Path
 from cadam3d.core.errors import UserError
 from cadam3d.io.cache import make_private, other_writers
 from cadam3d.io.run_folder import spare, typed_path
-from cadam3d.rasterizer import base
 
-KERNELS = Path(__file__).parent / "kernels"
-SOURCES = ("cpu.cpp", "simd.h", "splat_math.h")
+# A header that libraries may include: vectors of the width of this machine.
+SIMD = Path(__file__).parent / "simd.h"
 FLAGS = (
     "-std=c++17",
     "-O3",
@@ -39,8 +38,8 @@ FLAGS = (
     "-fPIC",
     "-pthread",
     "-fvisibility=hidden",
-    # Multiplications and additions are fused only where the source calls fma, because the forward and the
-    # backward pass must compute the same bits.
+    # Multiplications and additions are fused only where the source calls fma, because some pairs of functions
+    # must compute the same bits: a forward and a backward pass, or the same formula here and in torch.
     "-ffp-contract=off",
     # Makes sqrt a single instruction; the values stay IEEE.
     "-fno-math-errno",
@@ -53,11 +52,31 @@ FLAGS = (
 STATIC = ("-static-libstdc++", "-static-libgcc")
 # Tried in turn until one compiles and runs, because not every compiler knows every flag.
 MACHINE_FLAGS = (("-march=native", *STATIC), ("-march=native",), ("-mcpu=native",), ())
-CONSTANTS = ("BLUR", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN", "NEAR", "FAR", "FRUSTUM_MARGIN")
 SUFFIX = ".dll" if sys.platform == "win32" else ".so"
-SELF_TEST = "import ctypes, sys; sys.exit(ctypes.CDLL(sys.argv[1]).cadam3d_self_test())"
+SELF_TEST = "import ctypes, sys; sys.exit(getattr(ctypes.CDLL(sys.argv[1]), sys.argv[2])())"
 # Most compilers need three seconds; the first run of `zig c++` needs minutes.
 TIMEOUT = 900  # seconds
+
+
+@dataclass(frozen=True)
+class Names:
+    """The names that messages use for something that is compiled, and the words that avoid it."""
+
+    key: str  # the setting that asks for it, as in "rasterizer=cpu"
+    fallback: str  # what to type to do without it
+    cache_key: str | None = None  # the setting for the folder of compiled files, if there is one
+
+
+@dataclass(frozen=True)
+class Library:
+    """A native library: what it is made of, and how it is tested."""
+
+    name: str  # the beginning of the names of its files
+    names: Names
+    sources: tuple[Path, ...]  # the first is compiled, and it may include the others
+    definitions: tuple[str, ...]  # flags such as "-DNAME=1"
+    self_test: str  # the function without arguments that returns 0 if the library runs on this machine
+    flags: tuple[str, ...] = FLAGS
 
 
 @dataclass(frozen=True)
@@ -89,45 +108,45 @@ def find_compiler() -> Compiler | None:
     return None
 
 
-def find_cached(cache_dir: Path, compiler: Compiler | None) -> Path | None:
-    """Return an intact library for these sources and this machine, or ``None`` if there is none.
+def find_cached(library: Library, cache_dir: Path, compiler: Compiler | None) -> Path | None:
+    """Return an intact file for these sources and this machine, or ``None`` if there is none.
 
-    Only libraries built by ``compiler`` count, or by any compiler if that is ``None``.
+    Only files built by ``compiler`` count, or by any compiler if that is ``None``.
     """
     by = short_hash(compiler.version) if compiler else "*"
-    return find_intact(cache_dir, f"rasterizer-{_key()}-{by}-*{SUFFIX}")
+    return find_intact(cache_dir, f"{library.name}-{_key(library)}-{by}-*{SUFFIX}")
 
 
-def build(cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAGS) -> Build:
+def build(library: Library, cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAGS) -> Build:
     """Return the library in ``cache_dir``, and compile it if it is missing.
 
     ``machine_flags`` are alternatives, tried in turn. Raises :class:`UserError` if there is neither a cached
-    library nor a compiler, if the compiler fails, if the folder cannot be written, or if others can write it.
+    file nor a compiler, if the compiler fails, if the folder cannot be written, or if others can write it.
     """
-    cache_dir = own_folder(cache_dir, "cpu")
+    cache_dir = own_folder(cache_dir, library.names)
     compiler = find_compiler()
-    cached = find_cached(cache_dir, compiler) if tuple(machine_flags) == MACHINE_FLAGS else None
+    cached = find_cached(library, cache_dir, compiler) if tuple(machine_flags) == MACHINE_FLAGS else None
     if cached:
         return Build(cached, 0.0)
     if compiler is None:
         raise UserError(
-            "rasterizer=cpu: expected a C++ compiler ($CXX, c++, g++ or clang++) to build the kernels once, "
-            "got none. `apt install g++` or `xcode-select --install` installs one, and so does pip. "
+            f"{library.names.key}: expected a C++ compiler ($CXX, c++, g++ or clang++) to build the kernels "
+            "once, got none. `apt install g++` or `xcode-select --install` installs one, and so does pip. "
             "Try: pip install 'cadam3d[compiler]'"
         )
     start = time.perf_counter()
-    with build_folder(cache_dir, "cpu") as folder:
-        path = _compile(compiler, folder / f"rasterizer{SUFFIX}", machine_flags)
+    with build_folder(cache_dir, library.names) as folder:
+        path = _compile(library, compiler, folder / f"{library.name}{SUFFIX}", machine_flags)
         by, digest = short_hash(compiler.version), short_hash(path.read_bytes())
-        final = cache_dir / f"rasterizer-{_key()}-{by}-{digest}{SUFFIX}"
+        final = cache_dir / f"{library.name}-{_key(library)}-{by}-{digest}{SUFFIX}"
         keep(path, final)
     return Build(final, time.perf_counter() - start)
 
 
-def own_folder(cache_dir: Path, name: str) -> Path:
+def own_folder(cache_dir: Path, names: Names) -> Path:
     """Return ``cache_dir`` without links. It may not exist yet.
 
-    Raises :class:`UserError` if another user may have put files for rasterizer=``name`` there.
+    Raises :class:`UserError`, in these ``names``, if another user may have put files there.
     """
     folder = typed_path(str(cache_dir))
     try:
@@ -138,20 +157,20 @@ def own_folder(cache_dir: Path, name: str) -> Path:
         reason = error.strerror or str(error)
     if reason:
         raise UserError(
-            f"rasterizer={name}: expected a folder for compiled kernels that no other user can write, got "
-            f"{folder} ({reason}). Try: {_own_advice(folder, name)}"
+            f"{names.key}: expected a folder for compiled kernels that no other user can write, got "
+            f"{folder} ({reason}). Try: {_own_advice(folder, names)}"
         )
     return folder
 
 
-def _own_advice(folder: Path, name: str) -> str:
+def _own_advice(folder: Path, names: Names) -> str:
     """Return what to type if others can write a folder: take their permission back, or another folder."""
     # Folders that are meant for all users, such as /tmp, have the sticky bit.
     with suppress(OSError):
         facts = folder.stat()
         if facts.st_uid == os.geteuid() and not facts.st_mode & stat.S_ISVTX:
             return f"chmod go-w {shlex.quote(str(folder))}"
-    return another_cache(name)
+    return another_cache(names)
 
 
 def find_intact(cache_dir: Path, pattern: str) -> Path | None:
@@ -169,10 +188,10 @@ def keep(path: Path, final: Path) -> None:
 
 
 @contextmanager
-def build_folder(cache_dir: Path, name: str) -> Iterator[Path]:
-    """Yield an empty folder in ``cache_dir`` for files of rasterizer=``name`` that are not finished yet.
+def build_folder(cache_dir: Path, names: Names) -> Iterator[Path]:
+    """Yield an empty folder in ``cache_dir`` for files that are not finished yet.
 
-    Raises :class:`UserError` if ``cache_dir`` cannot be written.
+    Raises :class:`UserError`, in these ``names``, if ``cache_dir`` cannot be written.
     """
     try:
         make_private(cache_dir)
@@ -180,23 +199,20 @@ def build_folder(cache_dir: Path, name: str) -> Iterator[Path]:
             yield Path(folder)
     except OSError as error:
         raise UserError(
-            f"rasterizer={name}: expected a folder for compiled kernels that can be written, got {cache_dir} "
-            f"({error}). Try: {another_cache(name)}"
+            f"{names.key}: expected a folder for compiled kernels that can be written, got {cache_dir} "
+            f"({error}). Try: {another_cache(names)}"
         ) from error
 
 
-def another_cache(name: str) -> str:
-    """Return the words that make rasterizer=``name`` keep its kernels in a new folder for temporary files.
+def another_cache(names: Names) -> str:
+    """Return the words that put compiled files in a new folder for temporary files, or that avoid them.
 
-    They name the rasterizer too, because ``rasterizer=auto`` has no ``cache_dir``.
+    They contain the key too, because ``rasterizer=auto`` has no ``cache_dir``.
     """
+    if names.cache_key is None:
+        return names.fallback
     folder = spare("cadam3d-kernels")
-    return f"rasterizer={name} {shlex.quote(f'rasterizer.cache_dir={folder}')}"
-
-
-def definitions() -> list[str]:
-    """Return the compiler flags that define the constants of the image formation model."""
-    return [f"-DSPLAT_{name}={getattr(base, name)!r}" for name in CONSTANTS]
+    return f"{names.key} {shlex.quote(f'{names.cache_key}={folder}')}"
 
 
 def short_hash(content: str | bytes) -> str:
@@ -204,20 +220,23 @@ def short_hash(content: str | bytes) -> str:
     return hashlib.sha256(content.encode() if isinstance(content, str) else content).hexdigest()[:16]
 
 
-def _compile(compiler: Compiler, target: Path, machine_flags: Sequence[Sequence[str]]) -> Path:
-    source = str(KERNELS / SOURCES[0])
+def _compile(
+    library: Library, compiler: Compiler, target: Path, machine_flags: Sequence[Sequence[str]]
+) -> Path:
+    folders = dict.fromkeys(f"-I{path.parent}" for path in library.sources)
     complaint = ""
     for flags in machine_flags:
-        answer = _run([*compiler.command, *FLAGS, *flags, *definitions(), source, "-o", str(target)])
+        options = [*library.flags, *flags, *library.definitions, *folders]
+        answer = _run([*compiler.command, *options, str(library.sources[0]), "-o", str(target)])
         if answer.returncode == 0:
             # The test runs in another process, which an instruction unknown to this machine would end.
-            answer = _run([sys.executable, "-I", "-S", "-c", SELF_TEST, str(target)])
+            answer = _run([sys.executable, "-I", "-S", "-c", SELF_TEST, str(target), library.self_test])
             if answer.returncode == 0:
                 return target
         complaint = answer.stderr.strip()[-2000:] or f"exit code {answer.returncode}"
     raise UserError(
-        f"rasterizer=cpu: {' '.join(compiler.command)} ({compiler.version}) could not build the kernels:\n"
-        f"{complaint}\nThe variable $CXX chooses another compiler. Try: rasterizer=reference"
+        f"{library.names.key}: {' '.join(compiler.command)} ({compiler.version}) could not build the "
+        f"kernels:\n{complaint}\nThe variable $CXX chooses another compiler. Try: {library.names.fallback}"
     )
 
 
@@ -228,9 +247,9 @@ def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
         return subprocess.CompletedProcess(command, 1, "", str(error))
 
 
-def _key() -> str:
-    parts = [(KERNELS / name).read_text() for name in SOURCES]
-    parts += [repr((FLAGS, MACHINE_FLAGS)), repr([getattr(base, name) for name in CONSTANTS])]
+def _key(library: Library) -> str:
+    parts = [path.read_text() for path in library.sources]
+    parts += [repr((library.flags, MACHINE_FLAGS)), *library.definitions]
     return short_hash("\0".join([*parts, _machine()]))
 
 

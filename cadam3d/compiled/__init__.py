@@ -1,0 +1,1 @@
+"""Native libraries: how C++ sources of the package become libraries for this machine."""

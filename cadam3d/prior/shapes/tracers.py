@@ -1,0 +1,54 @@
+"""The choice between the ray tracers: the native one, or the one in torch.
+
+They find the same hits and the same light. The one in torch works in every dtype, on every device and without
+a compiler, and the native one takes a small part of its time.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+
+import torch
+
+from cadam3d.core.cameras import Cameras
+from cadam3d.core.errors import UserError
+from cadam3d.prior.shapes.native_tracer import load_tracer, trace_natively
+from cadam3d.prior.shapes.scene import Scene
+from cadam3d.prior.shapes.tracer import Layers, trace
+
+TRACERS = ("auto", "native", "torch")
+
+
+@dataclass(frozen=True)
+class Tracer:
+    """A ray tracer, and why it is not a faster one."""
+
+    name: str  # "native" or "torch"
+    identity: str  # differs between tracers whose last bits may differ
+    trace: Callable[[Scene, Cameras, int], Layers]
+    reason: str | None = None  # why it is not the native one, if that was wanted
+
+
+@cache
+def find_tracer(setting: str, key: str = "prior.tracer") -> Tracer:
+    """Return the tracer for float32 on the CPU that a setting of :data:`TRACERS` chooses.
+
+    The first call may compile the native tracer. Raises ``UserError``, which names ``key``, if the setting
+    is ``native`` and this machine cannot compile it.
+    """
+    if setting == "torch":
+        return Tracer("torch", "torch", trace)
+    try:
+        built, library = load_tracer(key)
+    except UserError as error:
+        if setting == "native":
+            raise
+        return Tracer("torch", "torch", trace, reason=str(error))
+    return Tracer("native", built.path.stem, partial(trace_natively, library))
+
+
+def tracer_for(setting: str, cameras: Cameras) -> Tracer:
+    """Return the tracer for the device and the dtype of the cameras."""
+    like = cameras.intrinsics
+    is_native = like.device.type == "cpu" and like.dtype == torch.float32
+    return find_tracer(setting if is_native else "torch")

@@ -1,0 +1,130 @@
+"""Compare the two ray tracers of the embedded prior: their times, or their images.
+
+    python scripts/bench_tracer.py                # times, in turns, and their ratio
+    python scripts/bench_tracer.py --agreement    # how their images differ, over the whole vocabulary
+
+Times are those of one call. One thread is timed by the clock of the process, which leaves out other
+processes, and several threads by the clock on the wall. The smallest of several calls is printed. The images
+are those of every object, plain and with every pattern, from views above, beside and below.
+"""
+
+import argparse
+import ctypes
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import torch
+
+from cadam3d.core.cameras import Cameras, fitting_distance, turntable
+from cadam3d.prior.shapes.native_tracer import instruction_set, load_tracer, trace_natively
+from cadam3d.prior.shapes.objects import known_objects, known_primitives
+from cadam3d.prior.shapes.scene import PATTERN_NAMES, Scene, build
+from cadam3d.prior.shapes.tracer import Layers, trace
+
+PROMPTS = ("a red and yellow checkered torus", "a lighthouse")
+FOV_DEG = 40.0
+ELEVATIONS_DEG = (-35.0, 15.0, 70.0)
+# Images count as different above this. The order of sums alone changes less.
+TOLERANCE = 1e-4
+
+
+def scene_of(prompt: str) -> Scene:
+    """Return the scene of a prompt in float32 on the CPU."""
+    return build(prompt).to(torch.device("cpu"), torch.float32)
+
+
+def views(count: int, size: int, elevation_deg: float = 15.0) -> Cameras:
+    """Return views all around."""
+    distance = fitting_distance(FOV_DEG)
+    return turntable(count, elevation_deg=elevation_deg, distance=distance, fov_y_deg=FOV_DEG, size=size)
+
+
+def seconds(call: Callable[[], object], threads: int) -> float:
+    """Return the time of one call."""
+    clock = time.process_time if threads == 1 else time.perf_counter
+    start = clock()
+    call()
+    return clock() - start
+
+
+def compare_times(args: argparse.Namespace, library: ctypes.CDLL) -> None:
+    """Print one row for each prompt, size and number of threads."""
+    print("| prompt | parts | size | views | threads | torch [ms] | native [ms] | ratio |")
+    print("|---|---|---|---|---|---|---|---|")
+    for prompt in args.prompts:
+        scene = scene_of(prompt)
+        for size in args.sizes:
+            cameras = views(args.views, size)
+            calls = (
+                partial(trace, scene, cameras, args.samples),
+                partial(trace_natively, library, scene, cameras, args.samples),
+            )
+            for threads in args.threads:
+                torch.set_num_threads(threads)
+                torch_times, native_times = [], []
+                for _ in range(args.repeats):
+                    torch_times.append(seconds(calls[0], threads))
+                    # Five calls, because one is short.
+                    native_times += [seconds(calls[1], threads) for _ in range(5)]
+                slow, fast = 1e3 * min(torch_times), 1e3 * min(native_times)
+                print(
+                    f"| {prompt} | {len(scene.radii)} | {size} | {args.views} | {threads} | {slow:.2f} | "
+                    f"{fast:.3f} | {slow / fast:.1f} |",
+                    flush=True,
+                )
+
+
+def compare_images(args: argparse.Namespace, library: ctypes.CDLL) -> None:
+    """Print how many samples and pixels differ for each pattern, and by how much."""
+    print("| pattern | samples | other coverage | other paint | mean difference | largest difference |")
+    print("|---|---|---|---|---|---|")
+    names = args.objects or (*known_primitives(), *known_objects())
+    for pattern in PATTERN_NAMES:
+        count, covered, painted, total, largest = 0, 0, 0, 0.0, 0.0
+        for name in names:
+            scene = scene_of(f"a {pattern} {name}")
+            for elevation_deg in ELEVATIONS_DEG:
+                # One sample per pixel, so that a pixel that differs is a sample that differs.
+                cameras = views(args.views, max(args.sizes), elevation_deg)
+                ours, expected = trace_natively(library, scene, cameras, 1), trace(scene, cameras, 1)
+                difference = largest_differences(ours, expected)
+                count += difference.numel()
+                covered += int((ours.alpha != expected.alpha).sum())
+                painted += int((difference > TOLERANCE).sum())
+                total, largest = total + float(difference.sum()), max(largest, float(difference.max()))
+        print(
+            f"| {pattern} | {count:,} | {covered} | {painted} | {total / count:.1e} | {largest:.1e} |",
+            flush=True,
+        )
+
+
+def largest_differences(ours: Layers, expected: Layers) -> torch.Tensor:
+    """Return the largest difference of the light of any paint, for each pixel."""
+    return (ours.paints - expected.paints).abs().amax(-1).double()
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Read the command line and print a table."""
+    parser = argparse.ArgumentParser(
+        "bench_tracer", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--agreement", action="store_true", help="compare images instead of times")
+    parser.add_argument("--prompts", nargs="+", default=PROMPTS, help="scenes that are timed")
+    parser.add_argument("--objects", nargs="+", help="objects whose images are compared; default: all")
+    parser.add_argument("--sizes", nargs="+", type=int, default=[112, 512], help="pixels along an edge")
+    parser.add_argument("--views", type=int, default=2, help="images per call")
+    parser.add_argument("--samples", type=int, default=2, help="rays per pixel along each axis, for times")
+    parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
+    parser.add_argument("--repeats", type=int, default=10, help="turns for each row")
+    args = parser.parse_args(words)
+    built, library = load_tracer()
+    how = f"compiled now in {built.seconds:.1f} s" if built.seconds else "compiled earlier"
+    print(
+        f"native tracer: {instruction_set(library)}, {how}; {args.samples} x {args.samples} rays per pixel\n"
+    )
+    (compare_images if args.agreement else compare_times)(args, library)
+
+
+if __name__ == "__main__":
+    main()

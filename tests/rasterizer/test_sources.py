@@ -1,0 +1,47 @@
+"""The descriptions of the native rasterizers: every constant of the model reaches the kernels."""
+
+import re
+
+import pytest
+
+from cadam3d.compiled.build import find_cached, find_compiler, load
+from cadam3d.rasterizer import base, sources
+from cadam3d.rasterizer.sources import CONSTANTS, CPU_SOURCES, KERNELS, cpu_library
+
+
+def test_the_kernels_run(kernel_build):
+    assert load(kernel_build).cadam3d_self_test() == 0
+    assert find_cached(cpu_library(), kernel_build.path.parent, find_compiler()) == kernel_build.path
+
+
+def test_the_constants_of_the_model_are_passed_to_the_compiler():
+    flags = cpu_library().definitions
+    assert [f"-DSPLAT_{name}={getattr(base, name)!r}" for name in CONSTANTS] == list(flags)
+
+
+def test_the_kernels_use_every_constant_of_the_model():
+    declared = {name for name, value in vars(base).items() if isinstance(value, float)}
+    text = "".join(path.read_text(encoding="utf-8") for path in CPU_SOURCES)
+    assert set(CONSTANTS) == declared
+    assert not [name for name in declared if not re.search(rf"(?:Real|float|spread)\(SPLAT_{name}\)", text)]
+
+
+@pytest.mark.parametrize("name", CONSTANTS)
+def test_another_constant_leads_to_another_build(name, monkeypatch):
+    before = cpu_library()
+    monkeypatch.setattr(sources.base, name, getattr(base, name) / 2)
+    assert cpu_library().definitions != before.definitions
+
+
+def test_the_headers_of_the_kernels_are_among_their_sources():
+    included = {
+        name
+        for path in CPU_SOURCES
+        for name in re.findall(r'#include "(.*)"', path.read_text(encoding="utf-8"))
+    }
+    assert included == {path.name for path in CPU_SOURCES[1:]}
+
+
+def test_the_shared_maths_needs_no_header():
+    source = (KERNELS / "splat_math.h").read_text()
+    assert "#include" not in source, "a run-time CUDA compiler has no headers"
