@@ -43,7 +43,7 @@ from cadam3d.state import (
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What the gradients of a step say, before anything has moved."""
+    """Result of differentiating the loss of a step, before anything has moved."""
 
     densifier: RowState  # after it has observed the gradients
     loss: float

@@ -72,9 +72,10 @@ class RowCount(RowState):
 class Densifier(ABC, Generic[State]):
     """Frozen hyper-parameters; the per-Gaussian tensors are in a state that the trainer holds.
 
-    Every method is pure: it returns a new state and leaves its arguments alone, so a step that fails half way
-    has changed nothing. Working in place would save CAdam about a third of 11 ms per million Gaussians on one
-    core, where the cheapest step takes 770 ms (``scripts/bench_densifier.py``).
+    Every method is pure: it returns a new state and leaves its arguments alone. So a step that fails half way
+    has changed nothing, and a step for which the rasterizer had reserved too little memory can be repeated.
+    Working in place would save CAdam about a third of 11 ms per million Gaussians on one core, where the
+    cheapest step takes 770 ms (``scripts/bench_densifier.py``).
     """
 
     @property
