@@ -332,7 +332,7 @@ def copy_speed(torch) -> float:
 
 
 def time_pass(rasterizer, scene, cpu) -> dict:
-    """Return the seconds of a render and of its backward pass, and what the kernels say about them."""
+    """Return the seconds of a render and of its backward pass, and what the kernels report about them."""
     scene.zero_grad()
     start = time.perf_counter()
     output = rasterizer.render(scene.gaussians, scene.cameras, scene.background)

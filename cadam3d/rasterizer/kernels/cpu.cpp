@@ -124,6 +124,18 @@ struct Block {
 // to a page costs about a microsecond, and a large scene would touch tens of thousands of small pages.
 constexpr size_t HUGE_PAGE = size_t(2) << 20;
 
+// Suggests huge pages for a large array that the caller is about to receive, if its pages are new.
+void prefer_huge_pages(float* array, int64_t count) {
+#if defined(__linux__)
+  if (!array || size_t(count) * sizeof(float) < 2 * HUGE_PAGE) return;
+  const uintptr_t begin = reinterpret_cast<uintptr_t>(array), end = begin + size_t(count) * sizeof(float);
+  const uintptr_t first = (begin + HUGE_PAGE - 1) / HUGE_PAGE * HUGE_PAGE, last = end / HUGE_PAGE * HUGE_PAGE;
+  madvise(reinterpret_cast<void*>(first), last - first, MADV_HUGEPAGE);
+#else
+  (void)array, (void)count;
+#endif
+}
+
 // Uninitialized memory, which a new size replaces only if it does not fit. std::vector would first write
 // zeros.
 template <class T>
@@ -1201,7 +1213,10 @@ EXPORT int cadam3d_blend_backward(const Scene* scene, void* handle, const float*
     const ParameterGradients out{grad_means2d, absgrad,             grad_means, grad_log_scales,
                                  grad_quats,   grad_opacity_logits, grad_sh};
     const auto blend_tile = absgrad ? blend_tile_backward<true> : blend_tile_backward<false>;
-    const int64_t pixels = scene->height * scene->width, tiles = frame.tiles();
+    const int64_t pixels = scene->height * scene->width, tiles = frame.tiles(), n = scene->gaussians;
+    prefer_huge_pages(grad_means2d, 2 * scene->views * n), prefer_huge_pages(absgrad, 2 * scene->views * n);
+    prefer_huge_pages(grad_means, 3 * n), prefer_huge_pages(grad_log_scales, 3 * n);
+    prefer_huge_pages(grad_quats, 4 * n), prefer_huge_pages(grad_sh, 3 * scene->coefficients * n);
     std::vector<Record*> of_view(size_t(scene->views));
     Team team(scene->threads);
     int64_t begin = 0, end = 0;
