@@ -68,7 +68,8 @@ class _Job(ctypes.Structure):
 @torch.no_grad()
 def trace_natively(library: ctypes.CDLL, scene: Scene, cameras: Cameras, samples: int) -> Layers:
     """Return the result of :func:`~cadam3d.prior.shapes.tracer.trace`, in float32 on the CPU."""
-    assert (cameras.intrinsics.dtype, cameras.intrinsics.device.type) == (torch.float32, "cpu")
+    for tensor in (scene.to_local, cameras.intrinsics):
+        assert (tensor.dtype, tensor.device.type) == (torch.float32, "cpu")
     fine = cameras.resize(cameras.height * samples, cameras.width * samples)
     origins, shape = fine.positions, (len(cameras), cameras.height, cameras.width)
     alpha, layers = torch.zeros(shape), torch.zeros(*shape, scene.albedo.shape[1])

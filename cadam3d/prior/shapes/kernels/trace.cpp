@@ -1,12 +1,13 @@
 // The ray tracer of the embedded prior: from rays to the light and the coverage of every pixel, in one pass.
 //
 // This is ``tracer.py`` for vectors of rays. A vector holds LANES neighbouring samples, which mostly hit the
-// same parts after the same number of steps. All operations that decide where a ray hits, and how much light
-// is there, are the same IEEE operations in the same order as in ``tracer.py`` and ``solids.py``, so both find
-// the same bits. Only atan2 and asin, which place the borders of patterns, differ in their last bits.
+// same parts after the same number of steps. Everything that decides where a ray hits, and how much light is
+// there, uses the same IEEE operations in the same order as ``tracer.py`` and ``solids.py``, so both find the
+// same bits. Only atan2 and asin, which place the borders of patterns, may differ in their last bits.
 //
 // A piece of work is a band of rows of pixels of one view. The bands do not depend on the number of threads,
 // and no two of them write to the same pixel. Therefore any number of threads gives the same bits.
+#include <algorithm>
 #include <atomic>
 #include <cmath>
 #include <cstdint>
@@ -49,7 +50,7 @@ constexpr int BLOCK_ROWS = LANES == 4 ? 2 : LANES == 8 ? 2 : 4, BLOCK_COLUMNS = 
 // Rows of pixels in a piece of work. Blocks of samples never cross the border between two pieces.
 constexpr int BAND = 4;
 static_assert(BAND % BLOCK_ROWS == 0, "a band is a whole number of blocks");
-// A part that a ray enters this far behind the nearest hit cannot be nearer: rounding moves a ray back by less.
+// A part that a ray enters this far behind the nearest hit cannot be nearer: rounding moves a ray by less.
 constexpr float BEHIND = 1e-2f;  // world units
 
 enum Status : int { OK = 0, OUT_OF_MEMORY = 1 };
@@ -93,8 +94,8 @@ inline Floats floor(Floats x) {
   return select(greater(whole, x), whole - 1.0f, whole);
 }
 
-// The angle of (x, y) in radians, with an error of a few units in the last place; 0 for (0, 0). The polynomial
-// is the minimax approximation of atan(a) / a in a^2 for a up to tan(pi / 8) (Lawson).
+// The angle of (x, y) in radians, with an error of a few units in the last place; 0 for (0, 0). The
+// polynomial is the minimax approximation of atan(a) / a in a^2 for a up to tan(pi / 8) (Lawson).
 inline Floats atan2(Floats y, Floats x) {
   const Floats wide = absolute(x), high = absolute(y), largest = max(wide, high);
   const Floats ratio = min(wide, high) / select(greater(largest, Floats{}), largest, spread(1.0f));
@@ -261,7 +262,7 @@ struct Nearest {
   Floats reached = spread(INF);
   Ints part = spread(-1);
 
-  // Beyond this, no hit can be nearer. A ray that begins inside solids, at NEAR, moves back to their surfaces.
+  // Beyond this, no hit can be nearer. A ray that begins inside solids, at NEAR, moves back to their surface.
   Floats limit() const { return max(reached, spread(float(TRACE_NEAR))) + BEHIND; }
 };
 
@@ -458,7 +459,8 @@ void trace_band(const Job& job, int64_t view, int64_t first_row) {
           {m[0] * x + m[1] * y + m[2], m[3] * x + m[4] * y + m[5], m[6] * x + m[7] * y + m[8]});
       const Floats along = min(dot(o, direction), Floats{}), apart = square - along * along;
       Mask is_inside = less_equal(apart, spread(float(TRACE_BALL_RADIUS * TRACE_BALL_RADIUS)));
-      is_inside = both(is_inside, both(greater(spread(float(end)), rows), greater(spread(float(columns)), of_lane)));
+      is_inside = both(is_inside, greater(spread(float(end)), rows));
+      is_inside = both(is_inside, greater(spread(float(columns)), of_lane));
       if (!any(is_inside)) continue;
       const Nearest nearest = first_hits(job, view, direction, is_inside);
       const unsigned hits = bits(simd::less(spread(-1), nearest.part));
@@ -477,8 +479,10 @@ void trace_band(const Job& job, int64_t view, int64_t first_row) {
       }
     }
   }
-  const int64_t last = std::min(first_row + BAND, job.height);
-  for (int64_t at = (view * job.height + first_row) * job.width; at < (view * job.height + last) * job.width; ++at) {
+  // The rounded shares of a pixel may add up to slightly more than one.
+  const int64_t count = std::min<int64_t>(BAND, job.height - first_row);
+  const int64_t first = view * job.height + first_row;
+  for (int64_t at = first * job.width; at < (first + count) * job.width; ++at) {
     job.alpha[at] = std::fmin(job.alpha[at], 1.0f);
   }
 }
