@@ -8,7 +8,8 @@
 
 #include "splat_math.h"
 
-#define KERNEL(threads) extern "C" __global__ void __launch_bounds__(threads)
+// The threads of a block, and perhaps how many blocks must fit on a multiprocessor.
+#define KERNEL(...) extern "C" __global__ void __launch_bounds__(__VA_ARGS__)
 
 typedef unsigned int u32;
 typedef unsigned long long u64;
