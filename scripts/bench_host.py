@@ -111,7 +111,7 @@ def read_arguments() -> argparse.Namespace:
 
 
 def compile_stub(folder: Path) -> Path:
-    from cadam3d.rasterizer.build import find_compiler
+    from cadam3d.compiled.build import find_compiler
 
     compiler = find_compiler()
     if compiler is None:
