@@ -117,6 +117,14 @@ class Lists:
     ranges: torch.Tensor  # [tiles + 1, 2]
 
 
+def count_slots(launcher: Launcher, gaussians: Gaussians, cameras: Cameras) -> list[int]:
+    """Return the number of slots of each view."""
+    views = cuda._CudaPass(launcher, cameras, torch.device("cpu"))
+    with views:
+        views.project(list(gaussians.tensors().values()))
+    return views.read_slots()
+
+
 def list_tiles(launcher: Launcher, gaussians: Gaussians, cameras: Cameras) -> Lists:
     """Project the Gaussians and return the tile lists."""
     parameters = list(gaussians.tensors().values())

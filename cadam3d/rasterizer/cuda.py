@@ -11,7 +11,16 @@ A forward pass runs these kernels (``kernels/*.cuh``):
 
 The backward pass runs ``blend_backward``, which writes one record into each slot, and ``project_backward``,
 which sums the slots of each Gaussian in order. No kernel adds floats atomically, so the same input gives the
-same bits. The host waits for the device once, to read the number of slots.
+same bits.
+
+The number of slots is counted on the device, where every later kernel reads it and compares it with the
+``capacity``, the number that there is memory for. ``rasterize`` waits for the number and then reserves
+exactly as much memory. ``rasterize_ahead`` reserves what a forecast says and does not wait. Both run the same
+kernels in the same order. If the capacity is too small, all kernels behave as if there were no slots, and the
+caller finds ``overflowed`` in the output.
+
+Nearly all arrays are in a few blocks of memory (``workspace.py``). Those that the backward pass needs are
+saved by autograd like any other tensor, so they are freed after it.
 
 All views are processed together unless their records would fill more than ``RECORD_MEMORY``. In that case
 everything except the projection runs on one group of views after another, with the same bits.
@@ -36,7 +45,7 @@ from cadam3d.rasterizer.cuda_sort import BLOCK, scan, scan_bytes, sort, sort_byt
 from cadam3d.rasterizer.driver import Driver
 from cadam3d.rasterizer.forecast import Forecast, find_forecast
 from cadam3d.rasterizer.launcher import Launch, Launcher
-from cadam3d.rasterizer.native import RenderPass, require_shapes, run_pass, upload
+from cadam3d.rasterizer.native import RenderPass, outside_of_graphs, require_shapes, run_pass, upload
 from cadam3d.rasterizer.workspace import Workspace, plan
 
 # The kernels define the same constants (kernels/*.cuh).
@@ -110,6 +119,7 @@ def load_kernels(cache_dir: str | None) -> Launcher:
     return Driver(kernels_dir(cache_dir))
 
 
+@outside_of_graphs
 def rasterize(
     launcher: Launcher,
     gaussians: Gaussians,
@@ -137,6 +147,7 @@ def rasterize(
     return run_pass(kernels, gaussians, moved[2])
 
 
+@outside_of_graphs
 def rasterize_ahead(
     launcher: Launcher,
     gaussians: Gaussians,
@@ -199,11 +210,11 @@ class _CudaPass(RenderPass):
         self.launch = self._context.__enter__()
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *_: object) -> None:
         """See :meth:`RenderPass.__exit__`."""
-        super().__exit__(*error)
+        super().__exit__()
         self.scratch_blocks = ()
-        self._context.__exit__(*error)
+        self._context.__exit__(None, None, None)
 
     def project(self, parameters: list[Tensor]) -> tuple[Tensor, Tensor]:
         """See :meth:`RenderPass.project`; also reserves memory, and fills the arrays with a row per pair."""

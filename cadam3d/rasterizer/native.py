@@ -5,7 +5,9 @@ is an ordinary node of the graph: it can retain its gradient, and a loss may use
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import ParamSpec, TypeVar, cast
 
 import torch
 from jaxtyping import Float
@@ -19,6 +21,9 @@ from cadam3d.rasterizer.base import absgrad_probe
 
 # The numbers of coefficients of degree 0 to 3.
 SH_SIZES = (1, 4, 9, 16)
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class RenderPass(ABC):
@@ -45,7 +50,7 @@ class RenderPass(ABC):
         """Enter the context in which the other methods must be called."""
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *_: object) -> None:
         """Leave that context. From here on, only autograd keeps the memory."""
         self.kept = ()
 
@@ -82,6 +87,23 @@ class RenderPass(ABC):
         """Return the gradient of the means that arrives through means2d."""
 
 
+def outside_of_graphs(function: Callable[P, R]) -> Callable[P, R]:
+    """Return the function for callers that ``torch.compile`` compiles: it is called, but not compiled itself.
+
+    Kernels work on addresses, which a compiled graph must not contain. ``torch.compiler.disable`` alone, as a
+    decorator, would do the same, but using it takes a second, which every start of the program would pay.
+    """
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.compiler.is_compiling():
+            return cast(Callable[P, R], torch.compiler.disable(function))(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return call
+
+
+@outside_of_graphs
 def run_pass(kernels: RenderPass, gaussians: Gaussians, background: Float[Tensor, "v 3"]) -> RenderOutput:
     """Render with the kernels of one pass, with autocast off; see ``Rasterizer.render``."""
     # Entering this context takes longer than all of the ordinary checks together.
@@ -92,7 +114,7 @@ def run_pass(kernels: RenderPass, gaussians: Gaussians, background: Float[Tensor
     means, *others = (plain(tensor, device) for tensor in gaussians.tensors().values())
     keeps = torch.is_grad_enabled()
     with kernels:
-        means2d, radii = _Project.apply(kernels, means, *(tensor.detach() for tensor in others))
+        means2d, radii = _Project.apply(kernels, means, others)
         means2d = means2d.to(dtype)
         if keeps:
             means2d.requires_grad_().retain_grad()
@@ -116,8 +138,9 @@ class _Project(torch.autograd.Function):
     """Maps Gaussians to ``means2d`` and ``radii``; projected centres depend on the means alone."""
 
     @staticmethod
-    def forward(ctx, kernels: RenderPass, *parameters: Tensor) -> tuple[Tensor, Tensor]:
-        means2d, radii = kernels.project(list(parameters))
+    def forward(ctx, kernels: RenderPass, means: Tensor, others: list[Tensor]) -> tuple[Tensor, Tensor]:
+        parameters = [means, *others]
+        means2d, radii = kernels.project(parameters)
         ctx.kernels = kernels
         ctx.save_for_backward(*parameters, radii, *kernels.kept)
         ctx.mark_non_differentiable(radii)
@@ -128,13 +151,13 @@ class _Project(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad_means2d: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
         if grad_means2d is None:
-            return (None,) * 6
+            return None, None, None
         kernels, saved = ctx.kernels, ctx.saved_tensors
         *parameters, radii = saved[:6]
         with kernels:
             kernels.kept = saved[6:]
             grad_means = kernels.centre_backward(parameters, radii, grad_means2d.contiguous())
-        return None, grad_means, None, None, None, None
+        return None, grad_means, None
 
 
 class _Blend(torch.autograd.Function):

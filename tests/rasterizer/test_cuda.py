@@ -104,16 +104,46 @@ def test_more_items_than_indices_can_count_are_refused_before_memory_is_allocate
 def test_kernels_run_on_the_current_stream():
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
-    rasterizer, scene = CudaRasterizer(cache_dir=None), (make_cameras(1, 64, 64), backgrounds(1).cuda())
-    gaussians = make_gaussians(1000).to("cuda")
-    want = rasterizer.render(gaussians, *scene).rgb
+    # Everything is on the device beforehand, because an upload would wait for the device before any launch.
+    scene = make_cameras(1, 64, 64).to("cuda"), backgrounds(1).cuda()
+    rasterizer, gaussians = CudaRasterizer(cache_dir=None), make_gaussians(1000).to("cuda")
+    # The second call renders ahead.
+    renders = (rasterizer.render, rasterizer.render_ahead, rasterizer.render_ahead)
+    want = [render(gaussians, *scene).rgb for render in renders]
     torch.cuda.synchronize()
     with torch.cuda.stream(torch.cuda.Stream()):
-        # Kernels on another stream would overtake this pause.
-        torch.cuda._sleep(10**8)
-        got = rasterizer.render(gaussians.map(lambda tensor: tensor + 0), *scene).rgb
+        got = []
+        for render in renders:
+            late = gaussians.map(torch.zeros_like)
+            torch.cuda.current_stream().synchronize()
+            # Kernels on another stream would overtake this pause and read the zeros.
+            torch.cuda._sleep(10**8)
+            for name, tensor in late.tensors().items():
+                tensor.copy_(getattr(gaussians, name))
+            got.append(render(late, *scene).rgb)
     torch.cuda.synchronize()
-    assert torch.equal(got, want)
+    for a, b in zip(got, want, strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.gpu
+def test_rendering_ahead_does_not_wait_for_the_device():
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    scene = make_cameras(2, 64, 64).to("cuda"), backgrounds(2).cuda()
+    rasterizer = CudaRasterizer(cache_dir=None)
+    gaussians = make_gaussians(1000).to("cuda").map(lambda tensor: tensor.detach().requires_grad_())
+    for _ in range(2):
+        rasterizer.render_ahead(gaussians, *scene).rgb.sum().backward()
+    torch.cuda.synchronize()
+    pause = torch.cuda.Event()
+    torch.cuda._sleep(10**9)
+    pause.record()
+    output = rasterizer.render_ahead(gaussians, *scene)
+    output.rgb.sum().backward()
+    assert not pause.query(), "the device still pauses, while the host has done its work"
+    assert output.overflowed is not None
+    assert not output.overflowed
 
 
 def test_rendering_on_a_cpu_is_refused_with_a_hint():

@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 import torch
-from emulation import Emulator
+from emulation import Emulator, count_slots
 from splats import (
     assert_same_bits,
     backgrounds,
@@ -64,13 +64,6 @@ def differentiate(launcher: Launcher, scene):
     return render_and_differentiate(partial(rasterize, launcher), *scene)
 
 
-def slots_per_view(emulator, gaussians, cameras) -> list[int]:
-    views = cuda._CudaPass(emulator, cameras, CPU)
-    with views:
-        views.project(list(gaussians.tensors().values()))
-    return views.read_slots()
-
-
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_the_bits_do_not_depend_on_the_memory_for_records(emulator, degree, monkeypatch):
     scene = make_scene(degree)
@@ -78,7 +71,7 @@ def test_the_bits_do_not_depend_on_the_memory_for_records(emulator, degree, monk
     visible = whole[0].visible
     assert (visible.any(dim=0) & ~visible[-1]).any(), "some Gaussian is visible, but not in the last view"
     assert (~visible.any(dim=0)).any(), "some Gaussian is not visible at all"
-    slots = slots_per_view(emulator, *scene[:2])
+    slots = count_slots(emulator, *scene[:2])
     for most_slots, groups in ((sum(slots), 1), (sum(slots[:3]), 2), (max(slots), VIEWS), (0, VIEWS)):
         monkeypatch.setattr(cuda, "RECORD_MEMORY", 4 * cuda.RECORD * most_slots)
         spy = Spy(emulator)
@@ -102,7 +95,7 @@ def test_the_bits_do_not_depend_on_the_memory_for_records(emulator, degree, monk
 def test_the_bits_do_not_depend_on_how_much_32_bits_can_count(emulator, n, log_scale, size, monkeypatch):
     gaussians, cameras = make_gaussians(n, degree=1, log_scale=log_scale), make_cameras(VIEWS, *size)
     scene = gaussians, cameras, backgrounds(VIEWS), make_weights(VIEWS, *size)
-    whole, slots = differentiate(emulator, scene), slots_per_view(emulator, gaussians, cameras)
+    whole, slots = differentiate(emulator, scene), count_slots(emulator, gaussians, cameras)
     # One view just fits, two views do not.
     monkeypatch.setattr(cuda, "MOST", max(n, *slots, size[0] * size[1]))
     assert 2 * max(n, min(slots)) > cuda.MOST

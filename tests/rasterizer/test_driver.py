@@ -4,6 +4,7 @@ import ctypes
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,18 +15,25 @@ from splats import backgrounds, make_cameras, make_gaussians
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import driver
 from cadam3d.rasterizer.build import find_compiler
-from cadam3d.rasterizer.cuda import BLEND_BLOCK, MOST, WARP, CudaRasterizer, _launch_each
+from cadam3d.rasterizer.cuda import (
+    BLEND_BLOCK,
+    MOST,
+    WARP,
+    CudaRasterizer,
+    _launch_each,
+    _start_reading,
+    rasterize,
+)
 from cadam3d.rasterizer.driver import Module, load_driver
 from cadam3d.rasterizer.nvrtc import Cubin
 
-# A driver with the kernels "works" and "full". It records the launches of the first kernel, and it has no
-# memory for the second.
+# A driver with all kernels except "unknown". It records launches, and it has no memory for the kernel "full".
 STUB = """
 #include <string.h>
 extern "C" {
 static int pushed = 0;
 static void* current = 0;
-unsigned long long stub_launched[9];
+unsigned long long stub_launched[9], stub_streams[256], stub_arguments[32], stub_count = 0;
 int stub_pushed() { return pushed; }
 int cuInit(unsigned) { return 0; }
 int cuDeviceGet(int* device, int ordinal) { *device = ordinal; return 0; }
@@ -35,13 +43,15 @@ int cuCtxPopCurrent_v2(void**) { --pushed; return 0; }
 int cuModuleLoadData(void**, const char* cubin) { return strcmp(cubin, "foreign") == 0 ? 209 : 0; }
 int cuModuleGetFunction(void** function, void*, const char* name) {
   *function = &pushed;
-  return strcmp(name, "works") == 0 ? 0 : strcmp(name, "full") == 0 ? 2 : 500;
+  return strcmp(name, "unknown") == 0 ? 500 : strcmp(name, "full") == 0 ? 2 : 0;
 }
 int cuLaunchKernel(void*, unsigned x, unsigned y, unsigned z, unsigned threads_x, unsigned threads_y,
-                   unsigned threads_z, unsigned shared, void* stream, void**, void**) {
+                   unsigned threads_z, unsigned shared, void* stream, void**, void** extra) {
   const unsigned long long all[] = {x, y, z, threads_x, threads_y, threads_z, shared,
                                     (unsigned long long)stream, (unsigned long long)current};
   memcpy(stub_launched, all, sizeof(all));
+  stub_streams[stub_count++ % 256] = all[7];
+  memcpy(stub_arguments, extra[1], *(unsigned long long*)extra[3]);
   return 0;
 }
 int cuGetErrorString(int status, const char** text) {
@@ -93,11 +103,26 @@ def test_a_missing_driver_is_reported_with_a_hint(monkeypatch):
         load_driver()
 
 
+def test_arguments_are_packed_with_eight_bytes_each(stub):
+    numbers = [2**40, 0, -1, 2**63 - 1]
+    with Module(stub, 0, b"").launching(0) as launch:
+        launch("works", 1, 32, *numbers)
+    assert list((ctypes.c_longlong * 32).in_dll(stub, "stub_arguments"))[:4] == numbers
+
+
+def test_two_threads_never_share_a_buffer_of_arguments(stub):
+    module = Module(stub, 0, b"")
+    with module.launching(0) as one, module.launching(0) as other:
+        assert one is not other
+    with module.launching(0) as again:
+        assert again in (one, other), "a buffer is used again"
+
+
 class FakeCuda:
     """A replacement of ``torch.cuda`` with two devices; number 0 is current, and each has a side stream."""
 
     def __init__(self) -> None:
-        self.index = 0
+        self.index, self.stream = 0, 2**40  # a handle has more than 32 bits
 
     def current_device(self) -> int:
         return self.index
@@ -112,7 +137,7 @@ class FakeCuda:
         return (8, index)
 
     def current_stream(self, index: int) -> SimpleNamespace:
-        return SimpleNamespace(cuda_stream=2**40 + index)  # a handle has more than 32 bits
+        return SimpleNamespace(cuda_stream=self.stream + index)
 
 
 @pytest.fixture
@@ -159,6 +184,82 @@ def test_kernels_are_loaded_once_for_each_device(stub, built, tmp_path):
     assert launched(stub)["context"] == 101
 
 
+def streams_of_a_step(stub, launcher, stream: int) -> set[int]:
+    """Return the streams of all launches of a forward and backward pass while ``stream`` is current."""
+    torch.cuda.stream = stream
+    count = ctypes.c_ulonglong.in_dll(stub, "stub_count")
+    count.value = 0
+    gaussians = make_gaussians(50).map(lambda tensor: tensor.detach().requires_grad_())
+    output = rasterize(launcher, gaussians, make_cameras(2, 9, 17), backgrounds(2), capacity=100)
+    images = (output.rgb, output.alpha, output.depth)
+    torch.autograd.backward(images, [torch.ones_like(image) for image in images])
+    assert 10 < count.value < 256
+    return set((ctypes.c_ulonglong * 256).in_dll(stub, "stub_streams")[: count.value])
+
+
+def test_every_launch_is_on_the_stream_that_is_current_at_that_time(stub, built, tmp_path, monkeypatch):
+    launcher = driver.Driver(tmp_path)
+    for stream in (2**41, 2**42, 2**41):
+        assert streams_of_a_step(stub, launcher, stream) == {stream}
+    # A stream that is remembered from another call would be wrong, and this is noticed.
+    launching = Module.launching
+    monkeypatch.setattr(Module, "launching", lambda module, _: launching(module, 2**41))
+    assert streams_of_a_step(stub, launcher, 2**42) == {2**41}
+
+
+class Recorder:
+    """The functions of a driver, which also write their names down."""
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self.library, self.names = library, []
+
+    def __getattr__(self, name: str):
+        function = getattr(self.library, name)
+        return lambda *arguments: self.names.append(name) or function(*arguments)
+
+
+def test_a_step_that_is_not_the_first_only_launches_kernels(stub, built, tmp_path, monkeypatch):
+    """A CUDA graph may record launches, but no other work of a step."""
+    recorder = Recorder(stub)
+    monkeypatch.setattr(driver, "load_driver", lambda: recorder)
+    launcher = driver.Driver(tmp_path)
+    streams_of_a_step(stub, launcher, 2**41)
+    recorder.names.clear()
+    streams_of_a_step(stub, launcher, 2**41)
+    assert set(recorder.names) == {"cuCtxPushCurrent_v2", "cuCtxPopCurrent_v2", "cuLaunchKernel"}
+    # One context for the forward pass, and one for each of the two functions of the backward pass.
+    assert recorder.names.count("cuCtxPushCurrent_v2") == 3
+
+
+def test_counts_are_copied_and_waited_for_on_the_current_stream(monkeypatch):
+    log, fake = [], FakeCuda()
+
+    class Event:
+        def record(self, stream=None):
+            log.append(("record", fake.stream if stream is None else stream))
+
+        def synchronize(self):
+            log.append("wait")
+
+    def empty_like(numbers, device, pin_memory):
+        assert (device, pin_memory) == ("cpu", True), "a copy to ordinary memory would wait"
+
+        def copy(source, non_blocking):
+            assert source is numbers
+            log.append(("copy", fake.stream, non_blocking))
+
+        return SimpleNamespace(copy_=copy, tolist=lambda: [3, 4])
+
+    fake.Event = Event
+    monkeypatch.setattr(torch, "cuda", fake)
+    monkeypatch.setattr(torch, "empty_like", empty_like)
+    fake.stream = 2**41
+    read = _start_reading(SimpleNamespace(device=SimpleNamespace(type="cuda")))
+    assert log == [("copy", 2**41, True), ("record", 2**41)]
+    assert read() == [3, 4]
+    assert log[2:] == ["wait"]
+
+
 def test_the_largest_grid_has_one_dimension(stub):
     blocks = []
     _launch_each(lambda kernel, count, *_: blocks.append(count), "any", MOST * WARP, BLEND_BLOCK)
@@ -172,9 +273,11 @@ def test_the_largest_grid_has_one_dimension(stub):
 # -------------------------------------------------------------------------- on real devices
 
 
-def differentiate(gaussians, cameras, device):
-    output = CudaRasterizer(cache_dir=None).render(gaussians, cameras, backgrounds(2).to(device))
-    (output.rgb.square().sum() + output.depth.sum()).backward()
+def differentiate(gaussians, cameras, background, before_backward=lambda: None):
+    output = CudaRasterizer(cache_dir=None).render(gaussians, cameras, background)
+    loss = output.rgb.square().sum() + output.depth.sum()
+    before_backward()
+    loss.backward()
     return [output.rgb.detach(), *(tensor.grad for tensor in gaussians.tensors().values())]
 
 
@@ -186,16 +289,20 @@ def leaves(device):
 def test_forward_and_backward_run_on_the_current_stream():
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
-    cameras = make_cameras(2, 64, 80)
-    want = differentiate(leaves("cuda"), cameras, "cuda")
+    # Everything is on the device beforehand, because an upload would wait for the device before any launch.
+    scene = make_cameras(2, 64, 80).to("cuda"), backgrounds(2).cuda()
+    want = differentiate(leaves("cuda"), *scene)
     source, late = leaves("cuda"), leaves("cuda").map(torch.zeros_like)
     torch.cuda.synchronize()
     with torch.cuda.stream(torch.cuda.Stream()):
-        # A kernel on another stream would read the zeros.
+        # A kernel on another stream would overtake the pause and read the zeros.
         torch.cuda._sleep(10**8)
         for name, tensor in late.tensors().items():
             tensor.copy_(getattr(source, name).detach())
-        got = differentiate(late.map(lambda tensor: tensor.requires_grad_()), cameras, "cuda")
+        # A backward pass on another stream would overtake the pause before it, and read gradients and records
+        # of the images that are not there yet.
+        pause = partial(torch.cuda._sleep, 10**8)
+        got = differentiate(late.map(lambda tensor: tensor.requires_grad_()), *scene, pause)
     torch.cuda.synchronize()
     for a, b in zip(got, want, strict=True):
         assert torch.equal(a, b)
@@ -208,7 +315,9 @@ def test_a_second_device_gives_the_same_bits_and_leaves_the_first_current():
     if torch.cuda.get_device_name(0) != torch.cuda.get_device_name(1):
         pytest.skip("two kinds of devices")
     cameras = make_cameras(2, 64, 80)
-    want, got = (differentiate(leaves(device), cameras, device) for device in ("cuda:0", "cuda:1"))
+    want, got = (
+        differentiate(leaves(device), cameras, backgrounds(2).to(device)) for device in ("cuda:0", "cuda:1")
+    )
     assert torch.cuda.current_device() == 0
     for a, b in zip(got, want, strict=True):
         assert b.device.index == 0

@@ -267,7 +267,7 @@ sort_columns(const u32* __restrict__ count, i64 capacity, i64 items, i64 bits, i
 // Shared memory of sort_scatter, for three purposes in turn. A bin counts the items of a warp with one value of
 // the digit, and then it is the place of the first of them in the chunk. Bins are also handled in pairs, the
 // first of them in the lower half of a number; no half overflows, because a chunk has fewer than 2^16 items.
-union Stage {
+union SortStage {
   u32 counters[Counters::SIZE];
   u16 bins[WARPS * DIGITS];
   u32 pairs[WARPS * DIGITS / 2];
@@ -356,7 +356,7 @@ sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const
              i64 capacity, i64 items, i64 shift, i64 bits, const u32* __restrict__ counts,
              const u32* __restrict__ totals, u32* __restrict__ sorted_keys,
              u32* __restrict__ sorted_values) {
-  __shared__ Stage stage;
+  __shared__ SortStage stage;
   __shared__ u32 bases[DIGITS];     // the position of the next item with a value, minus its place in the chunk
   __shared__ u32 ends[DIGITS / 2];  // the places behind the last items with two values, in halves
   __shared__ u32 sums[WARPS];

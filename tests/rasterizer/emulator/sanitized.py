@@ -6,9 +6,10 @@ before each planted mistake, so that the findings of the sanitizers can be disti
 
 import ctypes
 import sys
+from functools import partial
 
 import torch
-from emulation import Emulator, scan_tensor, sort_tensor
+from emulation import Emulator, count_slots, scan_tensor, sort_tensor
 from splats import backgrounds, make_cameras, make_gaussians, make_weights, render_and_differentiate
 
 from cadam3d.rasterizer import cuda, cuda_sort
@@ -31,6 +32,10 @@ def run_everything(emulator: Emulator) -> None:
         # Tiles of 8x4 or of 8x8.
         cuda.FEW_TILES = 10**9 if degree % 2 else 0
         render(emulator, 33, degree, -1.0, (2, 9 + degree, 17), absgrad=degree > 0)
+    # Memory that is reserved ahead: just enough, one slot too little, none.
+    slots = sum(count_slots(emulator, make_gaussians(33, log_scale=-1.0), make_cameras(2, 9, 17)))
+    for capacity in (slots, slots - 1, 0):
+        render(emulator, 33, 0, -1.0, (2, 9, 17), absgrad=True, capacity=capacity)
     # These splats touch more tiles, and have more records, than one thread handles alone.
     for absgrad in (False, True):
         cuda.FEW_TILES = 10**9 if absgrad else 0
@@ -38,11 +43,17 @@ def run_everything(emulator: Emulator) -> None:
 
 
 def render(
-    emulator: Emulator, n: int, degree: int, log_scale: float, size: tuple[int, int, int], absgrad: bool
+    emulator: Emulator,
+    n: int,
+    degree: int,
+    log_scale: float,
+    size: tuple[int, int, int],
+    absgrad: bool,
+    capacity: int | None = None,
 ) -> None:
     gaussians, cameras = make_gaussians(n, degree=degree, log_scale=log_scale), make_cameras(*size)
     scene = gaussians, cameras, backgrounds(size[0]), make_weights(*size)
-    render_and_differentiate(emulator.render, *scene, absgrad=absgrad)
+    render_and_differentiate(partial(cuda.rasterize, emulator, capacity=capacity), *scene, absgrad=absgrad)
 
 
 def main(library: str, mistakes: int) -> None:
