@@ -210,11 +210,11 @@ class _CudaPass(RenderPass):
         self.launch = self._context.__enter__()
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *_: object) -> None:
         """See :meth:`RenderPass.__exit__`."""
-        super().__exit__(*error)
+        super().__exit__()
         self.scratch_blocks = ()
-        self._context.__exit__(*error)
+        self._context.__exit__(None, None, None)
 
     def project(self, parameters: list[Tensor]) -> tuple[Tensor, Tensor]:
         """See :meth:`RenderPass.project`; also reserves memory, and fills the arrays with a row per pair."""

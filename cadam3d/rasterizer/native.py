@@ -7,7 +7,7 @@ is an ordinary node of the graph: it can retain its gradient, and a loss may use
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar, cast
 
 import torch
 from jaxtyping import Float
@@ -50,7 +50,7 @@ class RenderPass(ABC):
         """Enter the context in which the other methods must be called."""
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *_: object) -> None:
         """Leave that context. From here on, only autograd keeps the memory."""
         self.kept = ()
 
@@ -97,7 +97,7 @@ def outside_of_graphs(function: Callable[P, R]) -> Callable[P, R]:
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_compiling():
-            return torch.compiler.disable(function)(*args, **kwargs)
+            return cast(Callable[P, R], torch.compiler.disable(function))(*args, **kwargs)
         return function(*args, **kwargs)
 
     return call

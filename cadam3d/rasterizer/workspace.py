@@ -42,9 +42,10 @@ def plan(sizes: Mapping[str, int], apart: bool) -> Workspace:
     """Return a workspace with an array of so many bytes for each name, in one block or in one block each."""
     if apart:
         places = {name: (block, 0) for block, name in enumerate(sizes)}
-        return Workspace(places, sizes, tuple(sizes.values()))
+        # No block is empty, because the address of nothing would look like an array that is left out.
+        return Workspace(places, sizes, tuple(max(size, 1) for size in sizes.values()))
     places, end = {}, 0
     for name, size in sizes.items():
         places[name] = (0, end)
         end += -(-size // ALIGNMENT) * ALIGNMENT
-    return Workspace(places, sizes, (end,))
+    return Workspace(places, sizes, (max(end, 1),))
