@@ -39,9 +39,9 @@ SPLAT_FN Place<PIXELS> make_place(u32 tile, i64 height, i64 width) {
 }
 
 // The splats that a warp has loaded. The vectors are those of store_splat.
-typedef float4 Stage[3][WARP];
+typedef float4 StagedSplats[3][WARP];
 
-SPLAT_FN void load_splat(Stage& stage, int lane, const float4* from) {
+SPLAT_FN void load_splat(StagedSplats& stage, int lane, const float4* from) {
   for (int part = 0; part < 3; ++part) stage[part][lane] = from[part];
 }
 
@@ -90,11 +90,11 @@ template <int PIXELS>
 SPLAT_FN void blend_tile(const float4* splats, const u32* slots, const u32* pair_of_slot, const u32* ranges,
                          i64 tiles, const float* background, i64 height, i64 width, float* rgb, float* alpha,
                          float* depth, float* transmittance, u32* last) {
-  __shared__ float4 stages[BLEND_WARPS][3][WARP];
+  __shared__ StagedSplats stages[BLEND_WARPS];
   const i64 tile = thread_index() / WARP;
   if (tile >= tiles) return;
   const int lane = lane_index();
-  Stage& stage = stages[threadIdx.x / WARP];
+  StagedSplats& stage = stages[threadIdx.x / WARP];
   const Place<PIXELS> place = make_place<PIXELS>(u32(tile), height, width);
   Pixel pixels[PIXELS];
   for (int p = 0; p < PIXELS; ++p) pixels[p] = {place.is_inside[p] ? 1.0f : -1.0f, 0, 0, 0, 0, 0, 0};
@@ -268,13 +268,13 @@ SPLAT_FN void blend_tile_backward(const float4* splats, const u32* slots, const 
                                   const float* alpha, const float* depth, const float* transmittance,
                                   const u32* last, const float* grad_rgb, const float* grad_alpha,
                                   const float* grad_depth, float* records, float* absolutes) {
-  __shared__ float4 stages[BLEND_WARPS][3][WARP];
+  __shared__ StagedSplats stages[BLEND_WARPS];
   const i64 tile = thread_index() / WARP;
   if (tile > tiles) return;
   const int lane = lane_index(), component = component_of(lane);
   const Bits bits = make_bits(lane);
   float* const record = keep_in_register(records + component);
-  Stage& stage = stages[threadIdx.x / WARP];
+  StagedSplats& stage = stages[threadIdx.x / WARP];
   const Place<PIXELS> place = make_place<PIXELS>(u32(tile), height, width);
   PixelBackward pixels[PIXELS] = {};
   u32 used = 0;  // number of splats up to the last one that reached a pixel of the tile

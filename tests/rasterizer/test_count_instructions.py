@@ -1,0 +1,90 @@
+"""The script that counts the instructions of the CUDA kernels."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from cadam3d.rasterizer.nvrtc import find_compiler
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))  # as Python does for a script
+
+import count_instructions
+
+# A loop with two exponentials of two pixels each, so it is unrolled twice, and one for the padding.
+LISTING = """
+	.section	.text.blend,"ax",@progbits
+.text.blend:
+        /*0000*/                   S2R R0, SR_TID.X ;
+.L_loop:
+        /*0010*/                   LDS.128 R4, [R8] ;
+        /*0020*/              @P0 BRA `(.L_no_hit) ;
+        /*0030*/                   FADD R1, R1, R2 ;
+        /*0040*/              @P1 BRA `(.L_first) ;
+        /*0050*/                   MUFU.EX2 R1, R2 ;
+        /*0060*/                   FMUL R1, R1, R2 ;
+.L_first:
+        /*0070*/              @P2 BRA `(.L_second) ;
+        /*0080*/                   MUFU.EX2 R1, R3 ;
+.L_second:
+        /*0090*/                   SHFL.BFLY PT, R1, R1, 0x10, 0x1f ;
+.L_no_hit:
+        /*00a0*/                   IADD3 R8, R8, 0x10, RZ ;
+        /*00b0*/              @P3 BRA `(.L_loop) ;
+        /*00c0*/                   EXIT ;
+.L_end:
+        /*00d0*/                   BRA `(.L_end);
+        /*00e0*/                   NOP;
+"""
+LOG = """ptxas info    : Compiling entry function 'blend' for 'sm_90'
+ptxas info    : Function properties for blend
+    0 bytes stack frame, 8 bytes spill stores, 8 bytes spill loads
+ptxas info    : Used 54 registers, used 1 barriers, 6144 bytes smem
+"""
+
+
+def test_a_loop_is_divided_into_slot_sums_and_pixels():
+    (kernel,) = count_instructions.count_kernels(LISTING, LOG).values()
+    assert (kernel.registers, kernel.spilled, kernel.shared) == (54, 8, 6144)
+    assert kernel.instructions == 14, "without the padding"
+    slots = kernel.slots
+    assert (slots.slot, slots.sums, slots.pixel, slots.all) == (4, 4, 1.5, 11)
+
+
+def test_a_kernel_without_an_exponential_has_no_slots():
+    listing = LISTING.replace("MUFU.EX2", "MUFU.RCP")
+    assert count_instructions.count_kernels(listing, LOG)["blend"].slots is None
+
+
+def test_the_table_has_the_numbers_of_both_trees():
+    before = count_instructions.count_kernels(LISTING, LOG)
+    now = count_instructions.count_kernels(
+        LISTING.replace(".blend", ".blend_8x8"), LOG.replace("'blend'", "'blend_8x8'")
+    )
+    text = count_instructions.as_text(90, {"base": before, "here": now})
+    assert "| `blend_8x8` | 14, 14 | 54, 54 | 8, 8 | 6144, 6144 |" in text
+    assert "| `blend_8x8` | 4, 4 | 4, 4 | 1.5, 1.5 | 11, 11 |" in text
+
+
+def test_a_missing_disassembler_is_reported_with_what_to_install(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["count_instructions.py"])
+    monkeypatch.setattr(count_instructions, "find_nvdisasm", lambda: None)
+    with pytest.raises(SystemExit, match="Try: pip install nvidia-cuda-nvrtc nvidia-cuda-nvdisasm"):
+        count_instructions.main()
+
+
+@pytest.mark.slow
+def test_the_kernels_are_counted(monkeypatch, capsys):
+    if find_compiler() is None or count_instructions.find_nvdisasm() is None:
+        pytest.skip("no NVRTC or no nvdisasm")
+    monkeypatch.setattr(sys, "argv", ["count_instructions.py", "--json"])
+    count_instructions.main()
+    kernels = json.loads(capsys.readouterr().out)["here"]
+    small, large = kernels["blend_backward_8x4"], kernels["blend_backward_8x8"]
+    for kernel in (small, large):
+        slots = kernel["slots"]
+        assert 0 < slots["slot"] < slots["all"] < kernel["instructions"]
+        assert slots["sums"] > 12, "twelve shuffles"
+    assert large["slots"]["all"] > small["slots"]["all"] + small["slots"]["pixel"] / 2
+    assert kernels["tile_ranges"]["slots"] is None
