@@ -24,6 +24,7 @@ from splats import (
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.cuda import CudaRasterizer
+from cadam3d.rasterizer.forecast import find_forecast
 from cadam3d.rasterizer.sources import KERNELS
 
 pytestmark = pytest.mark.usefixtures("garbage_in_new_memory")
@@ -144,6 +145,9 @@ def test_rendering_ahead_does_not_wait_for_the_device():
     assert not pause.query(), "the device still pauses, while the host has done its work"
     assert output.overflowed is not None
     assert not output.overflowed
+    report = find_forecast(gaussians.device, 2, 64, 64).report
+    torch.cuda.synchronize()
+    assert int(report) >> 32 == 1000, "kernels write what they count to memory of the host"
 
 
 def test_rendering_on_a_cpu_is_refused_with_a_hint():
