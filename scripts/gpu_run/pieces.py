@@ -69,7 +69,7 @@ def checks(setup: Setup) -> list[Piece]:
     parallel = ("-n", str(processes)) if "pytest-xdist" in setup.packages and processes > 1 else ()
     run = datetime.now().strftime("demo-%Y%m%d-%H%M%S")
     line = ["train", f"prompt={DEMO}", "steps=100", "device=cuda", f"hydra.run.dir={setup.folder / run}"]
-    line += [] if "imageio-ffmpeg" in setup.packages else ["callback=[progress]"]
+    line += [] if "imageio-ffmpeg" in setup.packages else ["callback=[progress]", "exporter=[ply]"]
     return [
         Piece(
             "gsplat",
