@@ -31,6 +31,8 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parents[1]
 # Each Gaussian touches this many tiles in each view.
 TILES = 16
+# Options of mallopt.
+M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4
 WAYS = {"exact": "rasterize", "ahead": "rasterize_ahead"}
 STUB = """
 #include <string.h>
@@ -126,10 +128,7 @@ def start(tree: Path, stub: Path, args: argparse.Namespace) -> dict[str, dict[st
     """Return what :func:`measure` returns in a process that imports the sources of ``tree``."""
     sizes = [f"--{name}={getattr(args, name)}" for name in ("count", "size", "views", "steps")]
     command = [sys.executable, str(Path(__file__).resolve()), f"--stub={stub}", *sizes]
-    # Freed memory stays in the process, as in torch's allocator of device memory. Only blocks of up to 32 MiB
-    # can do that.
-    memory = {"MALLOC_MMAP_THRESHOLD_": str(2**25), "MALLOC_TRIM_THRESHOLD_": str(2**40)}
-    environment = os.environ | memory | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise SystemExit(f"{tree}: {done.stderr}")
@@ -143,6 +142,7 @@ def measure(args: argparse.Namespace) -> dict[str, dict[str, float]]:
     from cadam3d.rasterizer import cuda
 
     torch.set_num_threads(1)
+    keep_memory()
     stub = ctypes.CDLL(args.stub)
     stub.stub_start(TILES, ctypes.c_uint64(args.views * args.count))
     launcher = StubLauncher(stub)
@@ -151,10 +151,17 @@ def measure(args: argparse.Namespace) -> dict[str, dict[str, float]]:
         if not hasattr(cuda, function):
             continue
         forward, backward = make_step(getattr(cuda, function), launcher, args)
-        for _ in range(20):
+        for _ in range(args.steps):
             backward(forward())
         found[way] = time_step(forward, backward, stub, args.steps) | count_step(forward, backward, stub)
     return found
+
+
+def keep_memory() -> None:
+    """Keep freed memory in the process, as torch's allocator of device memory does, if this is glibc."""
+    if hasattr(ctypes.CDLL(None), "mallopt"):
+        for option, value in ((M_TRIM_THRESHOLD, 2**31 - 1), (M_MMAP_MAX, 0)):
+            ctypes.CDLL(None).mallopt(option, value)
 
 
 class StubLauncher:
@@ -263,7 +270,7 @@ def counted_waits(calls: Counter[str]) -> Iterator[None]:
             setattr(torch.Tensor, name, original)
 
 
-def summarize(rounds: list[dict]) -> dict[str, object]:
+def summarize(rounds: list[dict]) -> dict[str, dict[str, float]]:
     """Return the medians over all processes, and the ratios to the exact way of the other tree."""
     found: dict[str, dict] = {}
     for tree, ways in rounds[0].items():

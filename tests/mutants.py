@@ -156,8 +156,8 @@ COUNTED = {
     ),
     "gradients from records that do not exist": (
         "project.cuh",
-        "is_mine && i64(*total_slots) <= capacity",
-        "is_mine && (MUTANT || i64(*total_slots) <= capacity)",
+        "if (is_mine && i64(*total_slots) <= capacity)",
+        "if (is_mine && (MUTANT || i64(*total_slots) <= capacity))",
     ),
     "absolute gradients from records that do not exist": (
         "project.cuh",
@@ -240,8 +240,8 @@ SORTING = {
     ),
     "no barrier behind cleared bins": (
         "sort.cuh",
-        "stage.bins[i] = 0;\n    __syncthreads();",
-        "stage.bins[i] = 0;\n    if (!MUTANT) __syncthreads();",
+        "stage.pairs[i] = 0;\n    __syncthreads();",
+        "stage.pairs[i] = 0;\n    if (!MUTANT) __syncthreads();",
     ),
     "no wait before a bin moves on": (
         "sort.cuh",
@@ -256,8 +256,8 @@ SORTING = {
     ),
     "no barrier before places are read": (
         "sort.cuh",
-        "ends[d] = u16(number); });\n    __syncthreads();",
-        "ends[d] = u16(number); });\n    if (!MUTANT) __syncthreads();",
+        "places[r] = next;\n      });\n    __syncthreads();",
+        "places[r] = next;\n      });\n    if (!MUTANT) __syncthreads();",
     ),
     "no barrier before items replace bins": (
         "sort.cuh",
@@ -274,7 +274,11 @@ SORTING = {
         "    __syncthreads();  // the bases and",
         "    if (!MUTANT) __syncthreads();  // the bases and",
     ),
-    "bases that do not move on": ("sort.cuh", "bases[d] += ends[d];", "bases[d] += MUTANT ? 0 : ends[d];"),
+    "bases that do not move on": (
+        "sort.cuh",
+        "+= ends[pair] & 0xffff,",
+        "+= MUTANT ? 0 : ends[pair] & 0xffff,",
+    ),
 }
 MUTANTS = RENDERING | ABSOLUTE_GRADIENTS | SMALL_TILES | ROUNDING | COUNTED | SORTING
 NUMBERS = {name: number for number, name in enumerate(MUTANTS, start=1)}

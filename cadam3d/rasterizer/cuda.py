@@ -14,10 +14,10 @@ which sums the slots of each Gaussian in order. No kernel adds floats atomically
 same bits.
 
 The number of slots is counted on the device, where every later kernel reads it and compares it with the
-``capacity``, the number that there is memory for. ``rasterize`` waits for the number and then reserves exactly
-as much memory. ``rasterize_ahead`` reserves what a forecast says and does not wait. Both run the same kernels
-in the same order. If the capacity is too small, all kernels behave as if there were no slots, and the caller
-finds ``overflowed`` in the output.
+``capacity``, the number that there is memory for. ``rasterize`` waits for the number and then reserves
+exactly as much memory. ``rasterize_ahead`` reserves what a forecast says and does not wait. Both run the same
+kernels in the same order. If the capacity is too small, all kernels behave as if there were no slots, and the
+caller finds ``overflowed`` in the output.
 
 Nearly all arrays are in a few blocks of memory (``workspace.py``). Those that the backward pass needs are
 saved by autograd like any other tensor, so they are freed after it.

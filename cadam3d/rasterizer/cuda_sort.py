@@ -15,7 +15,7 @@ DIGIT_BITS = 11  # at most
 SORT_ITEMS = 16  # keys of one thread at a time, at most
 
 # No more blocks divide the numbers of an array among them; a block may process several chunks.
-MOST_BLOCKS = 1024
+MOST_BLOCKS = 512
 # Fewer keys per thread use more of the device if there are not enough keys for this many blocks.
 WANTED_BLOCKS, FEWEST_ITEMS = 128, 4
 # If there are no more numbers, each block adds all of those before its own, or counts all keys, because that

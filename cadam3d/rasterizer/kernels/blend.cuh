@@ -342,16 +342,20 @@ SPLAT_FN void blend_tile_backward(const float4* splats, const u32* slots, const 
   }
 }
 
+// Blocks of a multiprocessor: 32 warps, which may have 64 registers per thread. Without this number, some
+// compilers store registers in slow memory to make room for more warps.
+constexpr int BLENDS_AT_ONCE = 8;
+
 // The kernels for tiles of 8 x (4 PIXELS).
 #define KERNELS_FOR_TILES(SIZE, PIXELS)                                                                      \
-  KERNEL(BLEND_BLOCK)                                                                                        \
+  KERNEL(BLEND_BLOCK, BLENDS_AT_ONCE)                                                                        \
   blend_forward_##SIZE(const float4* splats, const u32* slots, const u32* pair_of_slot, const u32* ranges,   \
                        i64 tiles, const float* background, i64 height, i64 width, float* rgb, float* alpha,  \
                        float* depth, float* transmittance, u32* last) {                                      \
     blend_tile<PIXELS>(splats, slots, pair_of_slot, ranges, tiles, background, height, width, rgb, alpha,    \
                        depth, transmittance, last);                                                          \
   }                                                                                                          \
-  KERNEL(BLEND_BLOCK)                                                                                        \
+  KERNEL(BLEND_BLOCK, BLENDS_AT_ONCE)                                                                        \
   blend_backward_##SIZE(const float4* splats, const u32* slots, const u32* pair_of_slot, const u32* ranges,  \
                         i64 tiles, const float* background, i64 height, i64 width, const float* alpha,       \
                         const float* depth, const float* transmittance, const u32* last,                     \
@@ -361,7 +365,7 @@ SPLAT_FN void blend_tile_backward(const float4* splats, const u32* slots, const 
                                        width, alpha, depth, transmittance, last, grad_rgb, grad_alpha,       \
                                        grad_depth, records, nullptr);                                        \
   }                                                                                                          \
-  KERNEL(BLEND_BLOCK)                                                                                        \
+  KERNEL(BLEND_BLOCK, BLENDS_AT_ONCE)                                                                        \
   blend_backward_absolute_##SIZE(                                                                            \
       const float4* splats, const u32* slots, const u32* pair_of_slot, const u32* ranges, i64 tiles,         \
       const float* background, i64 height, i64 width, const float* alpha, const float* depth,                \

@@ -8,7 +8,8 @@
 
 #include "splat_math.h"
 
-#define KERNEL(threads) extern "C" __global__ void __launch_bounds__(threads)
+// KERNEL(threads of a block), or KERNEL(threads of a block, blocks that must fit into a multiprocessor at once)
+#define KERNEL(...) extern "C" __global__ void __launch_bounds__(__VA_ARGS__)
 
 typedef unsigned int u32;
 typedef unsigned long long u64;

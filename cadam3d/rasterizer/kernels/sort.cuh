@@ -1,15 +1,20 @@
 // Prefix sums that saturate, and a stable radix sort of 32-bit keys with 32-bit values.
 //
-// The sort handles one digit of the keys per pass, least significant first. A pass counts the digits in the
-// share of each block (sort_count), adds the counts of the shares before each one (sort_columns), and then
-// moves the items to their places (sort_scatter). Within a chunk a warp owns consecutive items and ranks them
-// by votes, so equal keys keep their order. No block waits for another one within a kernel, so no result
-// depends on when a store becomes visible to other blocks: the end of a kernel is the only fence between them.
+// The sort handles one digit of the keys per pass, the least significant one first. A pass counts the values
+// of the digit in the share of each block (sort_count), adds the counts of the blocks before each one
+// (sort_columns), and moves the items to their positions (sort_scatter). A warp owns consecutive items of a
+// chunk and ranks them by votes, so equal keys keep their order.
 //
 // Digits have up to 11 bits, because three passes over a depth move 13 words per key where four passes of
-// 8 bits move 18, and the number of a tile never takes more than two. The counters of the warps have 16 bits
-// and share their memory with a chunk of 8192 keys, so a block needs 44 KiB, two blocks fit into an SM (one on
-// Turing), and items leave a chunk sorted, in runs of four per digit even if all digits are random.
+// 8 bits would move 18, and the number of a tile takes no more than two. The counters of the warps have 16 bits
+// and share their memory with the items of a chunk, which leave it in order and so in fewer, larger pieces; a
+// block needs 44 KiB and at most 128 registers per thread, so two of them fit on a multiprocessor (on Turing,
+// one).
+//
+// No kernel reads what another block of the same launch has written, so blocks need neither fences nor tickets:
+// the end of a launch makes its stores visible to the next one on the stream. Within a block, __syncthreads
+// separates the stores to shared memory from the loads of other warps. Within a warp, votes and shuffles do not
+// order memory, but __syncwarp does.
 #pragma once
 
 #include "device.cuh"
@@ -18,13 +23,13 @@ typedef unsigned short u16;
 
 constexpr int WARPS = BLOCK / WARP;             // of a block
 constexpr int SCAN_ITEMS = 8;                   // of one thread
-constexpr int SCAN_CHUNK = BLOCK * SCAN_ITEMS;  // items that a block adds at a time; mirrored in ../cuda_sort.py
+constexpr int SCAN_CHUNK = BLOCK * SCAN_ITEMS;  // of a block at a time; mirrored in ../cuda_sort.py
 constexpr int DIGIT_BITS = 11;                  // at most; mirrored in ../cuda_sort.py
 constexpr int DIGITS = 1 << DIGIT_BITS;         // at most
 constexpr int SORT_ITEMS = 16;                  // of one thread, at most; mirrored in ../cuda_sort.py
-constexpr int SORT_CHUNK = BLOCK * SORT_ITEMS;  // items that a block sorts at a time, at most
+constexpr int SORT_CHUNK = BLOCK * SORT_ITEMS;  // of a block at a time, at most
 constexpr int COLUMN_BLOCK = 1024;              // threads of sort_columns; mirrored in ../cuda_sort.py
-constexpr int COLUMN_ROWS = 32;                 // rows of one warp there, so 1024 rows at most
+constexpr int COLUMN_ROWS = 16;                 // of one warp there; its 32 warps handle 512 blocks
 static_assert(DIGITS == BLOCK * SCAN_ITEMS, "a block scans all digits at once");
 
 // Returns a + b, or the largest number if that needs more than 32 bits. So a total that is too large is never
@@ -47,18 +52,19 @@ SPLAT_FN Share share_of_block(u32 n, u32 chunk) {
   return {begin, begin + size < n ? begin + size : n};
 }
 
-// Number r of a thread, of ``rounds`` each: consecutive numbers of a warp belong to consecutive lanes.
+// The index of number r of a thread if each has ``rounds`` of them: neighbours belong to neighbouring lanes.
 SPLAT_FN u32 striped(int r, int rounds) {
   return u32((int(threadIdx.x) / WARP * rounds + r) * WARP + lane_index());
 }
 
 // Replaces the numbers of a block by the sums of those before them, in the order of ``striped``, and returns
 // the sum of all. ``sums`` is shared memory for WARPS numbers.
-SPLAT_FN u32 block_scan(u32 (&numbers)[SCAN_ITEMS], int rounds, u32* sums) {
+template <int MOST>
+SPLAT_FN u32 block_scan(u32 (&numbers)[MOST], int rounds, u32* sums) {
   const int lane = lane_index(), warp = int(threadIdx.x) / WARP;
   u32 carry = 0;
 #pragma unroll
-  for (int r = 0; r < SCAN_ITEMS; ++r) {
+  for (int r = 0; r < MOST; ++r) {
     if (r >= rounds) break;
     u32 inclusive = numbers[r];
 #pragma unroll
@@ -79,14 +85,14 @@ SPLAT_FN u32 block_scan(u32 (&numbers)[SCAN_ITEMS], int rounds, u32* sums) {
     total = add_saturating(total, sums[w]);
   }
 #pragma unroll
-  for (int r = 0; r < SCAN_ITEMS; ++r) numbers[r] = add_saturating(before, numbers[r]);
+  for (int r = 0; r < MOST; ++r) numbers[r] = add_saturating(before, numbers[r]);
   __syncthreads();  // after this, the shared memory may be used again
   return total;
 }
 
 // Returns the sum of one number of each thread.
 SPLAT_FN u32 block_sum(u32 number, u32* sums) {
-  u32 numbers[SCAN_ITEMS] = {number};
+  u32 numbers[1] = {number};
   return block_scan(numbers, 1, sums);
 }
 
@@ -130,8 +136,8 @@ scan_reduce(const u32* __restrict__ in, const u32* __restrict__ index, i64 n, u3
   if (threadIdx.x == 0) sums[blockIdx.x] = total;
 }
 
-// Exclusive prefix sums, and the sum of all numbers in ``total``, which may be null. ``sums`` are the results of
-// scan_reduce with the same grid. If ``sums`` is null, each block adds all numbers before its share itself,
+// Exclusive prefix sums, and the sum of all numbers in ``total``, which may be null. ``sums`` are the results
+// of scan_reduce with the same grid. If ``sums`` is null, each block adds all numbers before its share itself,
 // which saves a launch for short arrays. ``out`` may be ``in`` if there are ``sums`` and no index, because then
 // each thread reads only the numbers that it replaces.
 KERNEL(BLOCK)
@@ -167,10 +173,11 @@ struct Digit {
   SPLAT_FN Digit(i64 shift, i64 bits) : shift(int(shift)), bits(int(bits)) {}
   SPLAT_FN u32 values() const { return 1u << bits; }
   SPLAT_FN u32 of(u32 key) const { return key >> shift & (values() - 1); }
-  // The values are divided among the threads of a block in the order of ``striped``. This is the number of
-  // values of a thread. If there are more threads than values, some have none, and their value is too large.
-  SPLAT_FN int rounds() const { return values() > BLOCK ? int(values() / BLOCK) : 1; }
 };
+
+// The number of items of a thread if a block divides ``count`` of them in the order of ``striped``. If there are
+// fewer items than threads, the index of some threads is too large. The count is a power of two.
+SPLAT_FN int rounds_for(u32 count) { return count > BLOCK ? int(count / BLOCK) : 1; }
 
 // Counters of digits in shared memory. Many keys may have the same digit, and atomics on one address wait for
 // one another. So the lanes of a warp spread over copies of each counter, as many as there is memory for.
@@ -185,8 +192,8 @@ struct Counters {
     for (int i = int(threadIdx.x); i < int(digit.values()) * copies; i += BLOCK) memory[i] = 0;
     __syncthreads();
   }
-  // Counts the keys in [begin, end): those before ``middle`` in the lower half of a counter, if it is not
-  // ``end``, and all others in the upper half.
+  // Adds 1 for each key in [begin, middle), and 2^16 for each key in [middle, end). All keys of a batch are
+  // loaded before the first one is counted.
   SPLAT_FN void count(const u32* keys, u32 begin, u32 middle, u32 end, Digit digit) {
     constexpr int BATCH = 16;
     const int copy = lane_index() & (copies - 1);
@@ -211,8 +218,8 @@ struct Counters {
 };
 
 // counts [blocks values]: how often each value of the digit occurs in the share of each block. A block without
-// a share writes nothing. For ``count`` and ``capacity`` see ``usable``; ``items`` is the number of items of a
-// thread in a chunk.
+// a share writes nothing. For ``count`` and ``capacity`` see ``usable``; ``items`` is the number of items of
+// a thread in a chunk.
 KERNEL(BLOCK)
 sort_count(const u32* __restrict__ keys, const u32* __restrict__ count, i64 capacity, i64 items, i64 shift,
            i64 bits, u32* __restrict__ counts) {
@@ -227,8 +234,7 @@ sort_count(const u32* __restrict__ keys, const u32* __restrict__ count, i64 capa
 }
 
 // Replaces the counts of each block by the sums over the blocks before it; totals [values]: the sums over all
-// blocks. A lane handles one value, and a warp 32 of the blocks, of which there are at most
-// 1024.
+// blocks. A lane handles one value, and a warp 16 of the blocks.
 KERNEL(COLUMN_BLOCK)
 sort_columns(const u32* __restrict__ count, i64 capacity, i64 items, i64 bits, i64 blocks,
              u32* __restrict__ counts, u32* __restrict__ totals) {
@@ -258,10 +264,13 @@ sort_columns(const u32* __restrict__ count, i64 capacity, i64 items, i64 bits, i
   if (warp == 0 && d < values) totals[d] = total;
 }
 
-// Shared memory of sort_scatter, for three purposes in turn.
+// Shared memory of sort_scatter, for three purposes in turn. A bin counts the items of a warp with one value of
+// the digit, and then it is the place of the first of them in the chunk. Bins are also handled in pairs, the
+// first of them in the lower half of a number; no half overflows, because a chunk has fewer than 2^16 items.
 union SortStage {
   u32 counters[Counters::SIZE];
-  u16 bins[WARPS * DIGITS];  // of each warp and value: the number of items, and then the place of the first
+  u16 bins[WARPS * DIGITS];
+  u32 pairs[WARPS * DIGITS / 2];
   struct {
     u32 keys[SORT_CHUNK], values[SORT_CHUNK];
   } sorted;
@@ -270,12 +279,12 @@ union SortStage {
 // Writes to bases [values] the position of the first item of this block with each value of the digit.
 //
 // If there are ``totals``, sort_columns has added the ``counts``. If not, each block adds the counts of all
-// blocks itself, and without ``counts`` it counts the keys of all blocks itself. Both save a launch, which would
-// take longer if the keys are few. A block counts at most 2^15 keys, so a half of a counter is enough.
+// blocks itself, and without ``counts`` it counts the keys of all blocks itself. For few keys, a launch more
+// would take longer. A block counts at most 2^15 keys, so a half of a counter is enough.
 SPLAT_FN void find_bases(const u32* keys, u32 n, u32 chunk, Share share, Digit digit, const u32* counts,
                          const u32* totals, u32* memory, u32* bases, u32* sums) {
   const u32 values = digit.values(), block = blockIdx.x;
-  const int rounds = digit.rounds();
+  const int rounds = rounds_for(values);
   int stride = 1;  // of the sums over the blocks before this one, in ``memory``
   if (!counts) {
     Counters counters(memory, digit);
@@ -332,7 +341,7 @@ SPLAT_FN u32 find_peers(u32 value, bool is_item, Digit digit) {
   u32 peers = __ballot_sync(ALL, is_item);
 #pragma unroll
   for (int step = 1; step <= DIGIT_BITS; ++step) {
-    // Bits behind the last one change nothing. They are skipped, though not one by one, which would take longer.
+    // Bits behind the last one change nothing. A branch for each of them would take longer than voting.
     if ((step == 8 || step == 10) && step > digit.bits) break;
     const u32 is_set = value & digit.values() >> step, votes = __ballot_sync(ALL, is_set);
     peers &= is_set ? votes : ~votes;
@@ -340,19 +349,20 @@ SPLAT_FN u32 find_peers(u32 value, bool is_item, Digit digit) {
   return peers;
 }
 
-// Moves each item to its position in the order of one digit. If ``values`` is null, the value of an item is its
-// index; if ``sorted_keys`` is null, only the values are needed. See ``find_bases`` for counts and totals.
+// Moves each item to its position in the order of one digit. If ``values`` is null, the value of an item is
+// its index; if ``sorted_keys`` is null, only the values are needed. See ``find_bases`` for counts and totals.
 KERNEL(BLOCK)
 sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const u32* __restrict__ count,
              i64 capacity, i64 items, i64 shift, i64 bits, const u32* __restrict__ counts,
              const u32* __restrict__ totals, u32* __restrict__ sorted_keys,
              u32* __restrict__ sorted_values) {
   __shared__ SortStage stage;
-  __shared__ u32 bases[DIGITS];  // the position of the next item with a value, minus its place in the chunk
-  __shared__ u16 ends[DIGITS];   // the place behind the last item with a value
+  __shared__ u32 bases[DIGITS];     // the position of the next item with a value, minus its place in the chunk
+  __shared__ u32 ends[DIGITS / 2];  // the places behind the last items with two values, in halves
   __shared__ u32 sums[WARPS];
   const Digit digit(shift, bits);
   const int t = int(threadIdx.x), lane = lane_index(), warp = t / WARP, rounds = int(items);
+  const int pairs = int(digit.values() / 2), pair_rounds = rounds_for(u32(pairs));
   const u32 n = u32(usable(count, capacity)), size = u32(rounds) * BLOCK;
   const Share share = share_of_block(n, size);
   if (share.begin >= share.end) return;
@@ -368,10 +378,10 @@ sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const
 #pragma unroll
     for (int r = 0; r < SORT_ITEMS; ++r)
       value[r] = values && r < rounds && r * WARP < mine ? (values + first)[r * WARP] : first + r * WARP;
-    for (int i = t; i < int(digit.values()) * WARPS; i += BLOCK) stage.bins[i] = 0;
+    for (int i = t; i < pairs * WARPS; i += BLOCK) stage.pairs[i] = 0;
     __syncthreads();
     // The rank of each item among those of its warp with the same digit.
-    u16* const bins = stage.bins + warp * int(digit.values());
+    u16* const bins = stage.bins + warp * pairs * 2;
 #pragma unroll
     for (int r = 0; r < SORT_ITEMS; ++r) {
       place[r] = 0;
@@ -381,31 +391,37 @@ sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const
       place[r] = bins[d] + u32(__popc(peers & ((1u << lane) - 1)));
       __syncwarp();  // all lanes have read before the last of the peers advances the bin
       if (is_item && peers >> lane == 1) bins[d] = u16(place[r] + 1);
-      __syncwarp();
+      __syncwarp();  // that store comes before the loads of the next round
     }
     __syncthreads();
     // Counts become places: value after value, and warp after warp.
-    u32 numbers[SCAN_ITEMS] = {};
+    constexpr int OWN = DIGITS / 2 / BLOCK;  // pairs of a thread, at most
+    u32 counted[OWN] = {}, places[OWN];
     const auto each_own = [&](const auto& visit) {
 #pragma unroll
-      for (int r = 0; r < SCAN_ITEMS; ++r) {
-        const u32 d = striped(r, digit.rounds());
-        if (r < digit.rounds() && d < digit.values()) visit(d, numbers[r]);
+      for (int r = 0; r < OWN; ++r) {
+        const int pair = int(striped(r, pair_rounds));
+        if (r < pair_rounds && pair < pairs) visit(r, pair);
       }
     };
-#pragma unroll 1
+#pragma unroll 2
     for (int w = 0; w < WARPS; ++w)
-      each_own([&](u32 d, u32& number) { number += stage.bins[w * int(digit.values()) + int(d)]; });
-    block_scan(numbers, digit.rounds(), sums);
-    each_own([&](u32 d, u32 number) { bases[d] -= number; });
-#pragma unroll 1
+      each_own([&](int r, int pair) { counted[r] += stage.pairs[w * pairs + pair]; });
+#pragma unroll
+    for (int r = 0; r < OWN; ++r) places[r] = (counted[r] & 0xffff) + (counted[r] >> 16);
+    block_scan(places, pair_rounds, sums);
+    each_own([&](int r, int pair) {
+      const u32 begin = places[r], middle = begin + (counted[r] & 0xffff);
+      bases[2 * pair] -= begin, bases[2 * pair + 1] -= middle;
+      places[r] = begin | middle << 16;
+      ends[pair] = places[r] + counted[r];
+    });
+#pragma unroll 2
     for (int w = 0; w < WARPS; ++w)
-      each_own([&](u32 d, u32& number) {
-        u16& bin = stage.bins[w * int(digit.values()) + int(d)];
-        const u32 next = number + bin;
-        bin = u16(number), number = next;
+      each_own([&](int r, int pair) {
+        const u32 next = places[r] + stage.pairs[w * pairs + pair];
+        stage.pairs[w * pairs + pair] = places[r], places[r] = next;
       });
-    each_own([&](u32 d, u32 number) { ends[d] = u16(number); });
     __syncthreads();
 #pragma unroll
     for (int r = 0; r < SORT_ITEMS; ++r) place[r] += bins[digit.of(key[r])];
@@ -424,7 +440,8 @@ sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const
       sorted_values[to] = stage.sorted.values[i];
     }
     __syncthreads();  // the bases and the items have been read
-    for (u32 d = threadIdx.x; d < digit.values(); d += BLOCK) bases[d] += ends[d];
+    for (int pair = t; pair < pairs; pair += BLOCK)
+      bases[2 * pair] += ends[pair] & 0xffff, bases[2 * pair + 1] += ends[pair] >> 16;
     // The barrier behind the next clearing of the bins follows before anything reads the bases.
   }
 }

@@ -240,7 +240,7 @@ inline unsigned ballot(const char* reason, unsigned mask, bool vote) {
 #define __global__
 #define __device__ static
 #define __forceinline__ inline
-#define __launch_bounds__(threads)
+#define __launch_bounds__(...)
 #define __shared__ static __attribute__((section("emulated_shared")))
 #define __fmaf_rn(a, b, c) std::fmaf(a, b, c)
 #define __popc(x) __builtin_popcount(x)
