@@ -18,7 +18,7 @@ UNCACHED = {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
 SANITIZERS = {"memcheck": 120.0, "racecheck": 120.0, "synccheck": 90.0}
 # Some calls of torch fail on purpose, so only what kernels do is judged.
 REPORTS = {"memcheck": ("--report-api-errors", "no")}
-# The scenes of targets.py whose times are taken: Gaussians, pixels, views and SH degree.
+# The scenes of targets.py that are timed: Gaussians, pixels, views and SH degree.
 TIMED = {
     "times": ("20000 100000 1000000", "512 1024", "1 4", "0"),
     "times of 3.4 M": ("3400000", "512 1024", "4", "0"),
