@@ -115,7 +115,7 @@ def test_the_driver_describes_the_first_device():
     assert find_device(lambda _: FakeDriver()) == DEVICE
 
 
-def test_without_a_device_it_is_said_what_was_looked_for():
+def test_without_a_device_the_message_names_what_was_looked_for():
     with pytest.raises(NoGpuError, match=r"finds no usable device \(CUDA_ERROR_NO_DEVICE, 100\)"):
         find_device(lambda _: FakeDriver(status=100))
     with pytest.raises(NoGpuError, match="offers no device"):
@@ -613,7 +613,6 @@ def closure(name: str) -> set[str]:
 
 def test_the_checks_and_the_times_need_only_the_listed_packages():
     listed = {package.name for package in wheels.PACKAGES if package.purpose == wheels.CHECKS}
-    # The tests that are not installed are those of an optional package, and of types.
     allowed = sorted(listed | closure("torch"))
     paths = [str(REPOSITORY), str(REPOSITORY / "scripts"), str(REPOSITORY / "tests")]
     code = BLOCKED.format(allowed=allowed, paths=paths) + RUNS

@@ -31,7 +31,7 @@ from cadam3d.rasterizer.workspace import Workspace
 TESTS = Path(__file__).parents[2] / "tests"
 # Arrays of floats, and the keys, which are the bits of floats; all other arrays are whole numbers.
 FLOATS = ("cameras", "splats", "depth_keys", "transmittance", "records", "absolutes", "axes")
-# What is left in these depends on the passes of a sort, whose result is in other arrays.
+# What is left in these depends on the passes of a sort. Its result is in other arrays.
 IGNORED = ("temporary", "sums_of_chunks")
 # Relative to the largest number of an array.
 MOST = 1e-3

@@ -25,7 +25,7 @@ TOOL_FOLDERS = (
     "/opt/nvidia/nsight-compute/*",
 )
 TOOLS = ("compute-sanitizer", "ncu", "nvcc", "nvidia-smi", "c++")
-# Packages whose versions affect a result, or whose absence is reported.
+# Packages that affect a result by their version, or that are reported if they are missing.
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "pytest", "pytest-xdist", "gsplat", "ninja")
 PACKAGES += ("imageio-ffmpeg", "diffusers", "nvidia-cuda-nvrtc")
 # Folders and kinds of files that determine the results.

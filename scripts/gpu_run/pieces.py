@@ -18,7 +18,7 @@ UNCACHED = {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
 SANITIZERS = {"memcheck": 120.0, "racecheck": 120.0, "synccheck": 90.0}
 # Some calls of torch fail on purpose, so only what kernels do is judged.
 REPORTS = {"memcheck": ("--report-api-errors", "no")}
-# The scenes of targets.py whose times are taken: Gaussians, pixels, views and SH degree.
+# The scenes of targets.py that are timed: Gaussians, pixels, views and SH degree.
 TIMED = {
     "times": ("20000 100000 1000000", "512 1024", "1 4", "0"),
     "times of 3.4 M": ("3400000", "512 1024", "4", "0"),
@@ -69,7 +69,7 @@ def checks(setup: Setup) -> list[Piece]:
     parallel = ("-n", str(processes)) if "pytest-xdist" in setup.packages and processes > 1 else ()
     run = datetime.now().strftime("demo-%Y%m%d-%H%M%S")
     line = ["train", f"prompt={DEMO}", "steps=100", "device=cuda", f"hydra.run.dir={setup.folder / run}"]
-    line += [] if "imageio-ffmpeg" in setup.packages else ["callback=[progress]"]
+    line += [] if "imageio-ffmpeg" in setup.packages else ["callback=[progress]", "exporter=[ply]"]
     return [
         Piece(
             "gsplat",
