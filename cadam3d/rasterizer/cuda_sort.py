@@ -102,6 +102,7 @@ def _sort(
     _, capacity = counted
     if capacity == 0:
         return keys
+    assert capacity < 2**31, "the kernels index with 32 bits"
     items = min(max(_pieces(capacity, BLOCK * WANTED_BLOCKS), FEWEST_ITEMS), SORT_ITEMS)
     blocks = min(_pieces(capacity, BLOCK * items), MOST_BLOCKS)
     rows = counts if capacity > FEW_NUMBERS else 0

@@ -135,7 +135,7 @@ def test_the_sort_touches_only_as_many_keys_as_the_device_has_counted(emulator, 
 def test_the_sort_does_nothing_if_there_are_more_keys_than_room(emulator, name, total):
     counted = as_signed(torch.tensor(total)).item()
     with layout(name), emulator.on(CPU) as launch:
-        _, order = sort_tensor(launch, torch.arange(5000, dtype=torch.int32), 16, counted)
+        _, order = sort_tensor(launch, torch.arange(5000, dtype=torch.int32), 16, int(counted))
     assert (order == UNTOUCHED).all()
 
 

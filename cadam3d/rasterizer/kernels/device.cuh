@@ -8,7 +8,7 @@
 
 #include "splat_math.h"
 
-// KERNEL(threads of a block), or KERNEL(threads of a block, blocks that must fit into a multiprocessor)
+// The threads of a block, and perhaps how many blocks must fit on a multiprocessor.
 #define KERNEL(...) extern "C" __global__ void __launch_bounds__(__VA_ARGS__)
 
 typedef unsigned int u32;

@@ -351,7 +351,7 @@ SPLAT_FN u32 find_peers(u32 value, bool is_item, Digit digit) {
 
 // Moves each item to its position in the order of one digit. If ``values`` is null, the value of an item is
 // its index; if ``sorted_keys`` is null, only the values are needed. See ``find_bases`` for counts and totals.
-KERNEL(BLOCK)
+KERNEL(BLOCK, 2)
 sort_scatter(const u32* __restrict__ keys, const u32* __restrict__ values, const u32* __restrict__ count,
              i64 capacity, i64 items, i64 shift, i64 bits, const u32* __restrict__ counts,
              const u32* __restrict__ totals, u32* __restrict__ sorted_keys,

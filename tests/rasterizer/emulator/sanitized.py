@@ -15,17 +15,20 @@ from splats import backgrounds, make_cameras, make_gaussians, make_weights, rend
 from cadam3d.rasterizer import cuda, cuda_sort
 
 CPU = torch.device("cpu")
-SCANNED = (1, 31, 33, 255, 257, cuda_sort.SCAN_CHUNK, cuda_sort.SCAN_CHUNK + 1, cuda_sort.FEW_NUMBERS + 1)
-SORTED = (1, 33, 257, 1023, 1025, cuda_sort.FEW_NUMBERS + 1)
+SCANNED = (1, 31, 33, 257, cuda_sort.SCAN_CHUNK, cuda_sort.SCAN_CHUNK + 1)
+SORTED = (1, 33, 257, 1023, 2049)
+# The numbers up to which blocks count and add alone, and the largest number of blocks.
+LAYOUTS = ((2**15, 2**15, 512), (0, 2**15, 512), (0, 0, 1))
 
 
 def run_everything(emulator: Emulator) -> None:
-    with emulator.on(CPU) as launch:
-        for n in SCANNED:
-            assert scan_tensor(launch, torch.ones(n, dtype=torch.int32))[-1] == n
-        for n in SORTED:
-            keys = torch.arange(n, 0, -1, dtype=torch.int32)
-            assert torch.equal(sort_tensor(launch, keys, 16)[0].long(), keys.long().sort().values)
+    for cuda_sort.FEW_NUMBERS, cuda_sort.FEW_COUNTS, cuda_sort.MOST_BLOCKS in LAYOUTS:
+        with emulator.on(CPU) as launch:
+            for n in SCANNED:
+                assert scan_tensor(launch, torch.ones(n, dtype=torch.int32))[-1] == n
+            for n in SORTED:
+                keys = torch.arange(n, 0, -1, dtype=torch.int32)
+                assert torch.equal(sort_tensor(launch, keys, 16)[0].long(), keys.long().sort().values)
     for degree in range(4):
         # One group per view, or one for all views.
         cuda.RECORD_MEMORY = 0 if degree == 1 else 256 * 2**20
