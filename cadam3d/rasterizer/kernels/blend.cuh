@@ -1,5 +1,5 @@
-// Blending and its gradient: one warp per tile, which is 8 pixels wide. A lane has one pixel of a tile of 8x4,
-// or two of a tile of 8x8, four rows apart.
+// Blending and its gradient: one warp per tile, which is 8 pixels wide. A lane has one pixel of a tile of
+// 8x4, or two of a tile of 8x8, four rows apart.
 //
 // A warp loads 32 splats at once, one per lane, and then all lanes loop over them. Lanes never wait for
 // another warp. The backward pass goes back to front with one running sum per pixel. It writes ten sums over
