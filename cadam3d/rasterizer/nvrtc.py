@@ -30,6 +30,8 @@ OPTIONS = (
     # Multiplications and additions are fused only where the source calls fma, because the forward and the
     # backward pass must compute the same bits.
     "--fmad=false",
+    # Without this, the NVRTC of CUDA 12.8 and 13.0 takes generic lambdas for functions of the host.
+    "--device-as-default-execution-space",
 )
 PATTERN = "*nvrtc64_*.dll" if sys.platform == "win32" else "libnvrtc.so*"
 BUILTINS = "*nvrtc-builtins*.dll" if sys.platform == "win32" else "libnvrtc-builtins.so*"
