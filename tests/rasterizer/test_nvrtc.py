@@ -55,7 +55,9 @@ REGISTERS = {
 
 @pytest.fixture(scope="module")
 def compiler():
-    found = find_compiler()
+    """Return the NVRTC of the environment, or the library that the variable CADAM3D_NVRTC names."""
+    chosen = os.environ.get("CADAM3D_NVRTC")
+    found = nvrtc._load(chosen) if chosen else find_compiler()
     if found is None:
         pytest.skip("no NVRTC: pip install nvidia-cuda-nvrtc")
     return found
