@@ -36,9 +36,9 @@ class Forecast:
     def capacity(self, gaussians: int) -> int | None:
         """Return the number of slots to reserve; ``None`` if nothing is known yet."""
         if reported := self._reported.value:
-            # A report counts once. Renders that do not go ahead make no report, and a large number that counts
-            # again and again would keep them from going ahead for ever. A report that arrives between these
-            # lines is lost, but the next render makes another one.
+            # A report counts once. Renders that do not go ahead make no report, and a large number that
+            # counts again and again would keep them from going ahead for ever. A report that arrives between
+            # these lines is lost, but the next render makes another one.
             self._reported.value = 0
             self.learn(reported & 0xFFFFFFFF, reported >> 32)
         if self._gaussians == 0:
