@@ -258,6 +258,12 @@ def test_gates_come_before_what_may_use_up_the_time(tmp_path):
     assert order == sorted(order, reverse=True)
 
 
+def test_processes_of_tests_do_not_compete_for_cores(tmp_path):
+    found = [piece for part in PARTS for piece in plan(setup(tmp_path), part) if "pytest" in piece.command]
+    assert len(found) == 3
+    assert all(piece.environment == {"OMP_NUM_THREADS": "1"} for piece in found)
+
+
 def test_no_test_of_gsplat_runs_while_gsplat_is_built(tmp_path):
     """The first use of gsplat deletes a build that another process has begun."""
     for piece in plan(setup(tmp_path), CHECKS):

@@ -13,6 +13,9 @@ from gpu_run.runner import RESULT, Finished, Judge, Piece
 CHECKS, TIMES, EXPLAINS = "checks", "times", "explains"
 # Seconds. Together they take less than 25 minutes, and each less than ten, whatever comes before and after.
 PARTS = {CHECKS: 480.0, TIMES: 480.0, EXPLAINS: 420.0}
+# The tests compute what is right with torch on the CPU, in several processes. With the threads of all cores in
+# each of them, they would mostly wait for one another.
+ONE_THREAD = {"OMP_NUM_THREADS": "1"}
 # The sanitizers see every tensor only if torch allocates each of them separately.
 UNCACHED = {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
 SANITIZERS = {"memcheck": 120.0, "racecheck": 120.0, "synccheck": 90.0}
@@ -104,6 +107,7 @@ def checks(setup: Setup) -> list[Piece]:
             is_gate=True,
             missing=setup.lacks("pytest"),
             judge=by_pytest,
+            environment=ONE_THREAD,
         ),
         Piece(
             "difficult scenes and the long sort",
@@ -143,6 +147,7 @@ def checks(setup: Setup) -> list[Piece]:
             120.0,
             missing=setup.lacks("pytest"),
             judge=by_pytest,
+            environment=ONE_THREAD,
         ),
     ]
 
@@ -190,6 +195,7 @@ def explains(setup: Setup) -> list[Piece]:
             60.0,
             missing=setup.lacks("pytest") or (None if setup.has_gsplat else "gsplat is not built"),
             judge=by_pytest,
+            environment=ONE_THREAD,
         ),
     ]
 
