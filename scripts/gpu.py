@@ -34,7 +34,7 @@ from gpu_run.machine import (
 from gpu_run.markdown import show
 from gpu_run.pieces import PARTS
 from gpu_run.record import read_record
-from gpu_run.session import Session
+from gpu_run.session import AGAIN, Session
 from gpu_run.wheels import describe
 
 FOLDER = REPOSITORY / "outputs" / "gpu"
@@ -91,7 +91,7 @@ def advise(error: OSError) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return "df -h"
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return "python scripts/gpu.py --folder /tmp/gpu"
+        return f"{AGAIN} --folder /tmp/gpu"
     return f"ls {FOLDER}"
 
 

@@ -568,7 +568,10 @@ def test_a_file_that_is_missing_is_named_in_one_line(tmp_path, capsys):
     ("error", "advice"),
     [
         (OSError(errno.ENOSPC, "No space left on device"), "df -h"),
-        (PermissionError(errno.EACCES, "Permission denied", "gpu.part"), "python scripts/gpu.py --folder .*"),
+        (
+            PermissionError(errno.EACCES, "Permission denied", "gpu.part"),
+            ".*python.* scripts/gpu.py --folder .*",
+        ),
     ],
 )
 def test_a_folder_that_cannot_be_written_is_reported_in_one_line(
@@ -628,7 +631,7 @@ def test_a_run_can_be_made_in_three_parts(started, tmp_path):
 
 def test_nothing_is_timed_before_the_checks_have_passed(started):
     message, _ = started(TIMES)
-    assert message.endswith("Try: python scripts/gpu.py --part checks")
+    assert message.endswith(f"Try: {sys.executable} scripts/gpu.py --part checks")
 
 
 def test_a_failed_check_stops_the_run_and_names_the_stage(started, tmp_path):
@@ -654,7 +657,9 @@ def test_a_torch_that_starts_slowly_is_not_called_broken(tmp_path, monkeypatch):
     monkeypatch.setattr(session, "FACTS", (sys.executable, "-c", "import time; time.sleep(60)"))
     monkeypatch.setattr(session, "FACTS_SECONDS", 0.2)
     monkeypatch.setenv("PYTHONPATH", "")
-    with pytest.raises(session.TroubleError, match=r"torch has not started in .* Try: python scripts/gpu"):
+    with pytest.raises(
+        session.TroubleError, match=r"torch has not started in .* Try: .*python.* scripts/gpu"
+    ):
         session.Session(tmp_path, DEVICE)._machine()
 
 

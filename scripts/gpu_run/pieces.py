@@ -13,8 +13,8 @@ from gpu_run.runner import RESULT, Finished, Judge, Piece
 CHECKS, TIMES, EXPLAINS = "checks", "times", "explains"
 # Seconds. Together they take less than 25 minutes, and each less than ten, whatever comes before and after.
 PARTS = {CHECKS: 480.0, TIMES: 480.0, EXPLAINS: 420.0}
-# The tests compute what is right with torch on the CPU, in several processes. With the threads of all cores in
-# each of them, they would mostly wait for one another.
+# The tests compute what is right with torch on the CPU, in several processes. With the threads of all cores
+# in each of them, they would mostly wait for one another.
 ONE_THREAD = {"OMP_NUM_THREADS": "1"}
 # The sanitizers see every tensor only if torch allocates each of them separately.
 UNCACHED = {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}

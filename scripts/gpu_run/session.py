@@ -3,6 +3,7 @@
 import hashlib
 import os
 import platform
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -32,7 +33,8 @@ from gpu_run.pieces import CHECKS, PARTS, Setup, plan
 from gpu_run.record import ENDED, FAILED, Record, read_record
 from gpu_run.runner import RESULT, Piece, Processes, Runner
 
-AGAIN = "python scripts/gpu.py"
+# The interpreter of this run has the packages, and the one that is called python may not exist.
+AGAIN = f"{shlex.quote(sys.executable)} scripts/gpu.py"
 FACTS = (sys.executable, "-m", "gpu_run.on_device", "facts", "--json", RESULT)
 # The first import of torch from a slow disk takes long.
 FACTS_SECONDS = 60.0
