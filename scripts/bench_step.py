@@ -42,7 +42,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-HERE = Path(__file__).resolve().parents[1]
+from checkouts import HERE, add_base, find_trees
+
 PROMPT = "a red and yellow checkered torus"
 PRIORS = {
     "exact": ["prior=shapes"],
@@ -73,7 +74,7 @@ def main(words: list[str] | None = None) -> None:
     if args.tree is not None:
         args.out.write_text(json.dumps(measure_here(args.priors[0], args)))
         return
-    trees = {"base": args.base, "here": HERE} if args.base else {"here": HERE}
+    trees = find_trees(args.base)
     results: dict[str, list[Any]] = {name: [] for name in trees}
     for prior in args.priors:
         turns: dict[str, list[Any]] = {name: [] for name in trees}
@@ -100,7 +101,7 @@ def read_arguments(words: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--threads", type=int, default=1, help="threads of torch (default: 1)")
     parser.add_argument("--tiny", action="store_true", help="small networks for --priors random")
     parser.add_argument("--models", type=Path, help="folder that keeps the random networks")
-    parser.add_argument("--base", type=lambda text: Path(text).resolve(), help="a checkout to compare with")
+    add_base(parser)
     parser.add_argument("--repeats", type=int, default=3, help="turns of each tree with --base (default: 3)")
     # For the processes that measure one prior of one tree.
     parser.add_argument("--tree", type=Path, help=argparse.SUPPRESS)
