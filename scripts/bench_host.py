@@ -232,7 +232,7 @@ def count_step(forward: Callable, backward: Callable, stub: ctypes.CDLL) -> dict
     class Count(TorchDispatchMode):
         def __torch_dispatch__(self, func, types, args=(), kwargs=None):
             name = func.__name__.partition(".")[0]
-            # Views and aliases cost time on the host, but nothing on a device.
+            # Views count too: they take no time on a device, but they do on the host.
             calls["operations"] += 1
             calls["allocations"] += name in ("empty", "new_empty", "empty_like", "empty_strided", "zeros")
             return func(*args, **(kwargs or {}))

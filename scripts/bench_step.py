@@ -147,7 +147,7 @@ def middle(turns: list[Any]) -> Any:
 
 
 class LeftOutError(Exception):
-    """A prior cannot be measured here, because a package or something else is missing; the text says what."""
+    """A prior that cannot be measured here. The message says what is missing."""
 
 
 class Watch:
@@ -305,6 +305,7 @@ def clocks_around_functions(watch: Watch) -> list[tuple[Any, str, Any]]:
     from cadam3d import trainer
     from cadam3d.optimizer import GaussianOptimizer
 
+    # Older checkouts have functions that this one lacks, and lack some that it has.
     owners = {
         torch.Tensor: {"backward": "backward"},
         GaussianOptimizer: {
@@ -346,7 +347,7 @@ def time_whole(run: Run, args: argparse.Namespace, device: Any) -> dict[str, Any
     def after(number: int) -> None:
         is_end = number in (args.warmup, args.warmup + args.steps)
         if is_end and device.type == "cuda":
-            # What the device still does belongs to the steps before this line.
+            # The work that the device has not finished belongs to the steps up to here.
             torch.cuda.synchronize(device)
             if number == args.warmup:
                 torch.cuda.reset_peak_memory_stats(device)
