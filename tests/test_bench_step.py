@@ -10,6 +10,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 import bench_step
+from step_bench.clocks import Watch
 
 from cadam3d.optimizer import GaussianOptimizer
 from cadam3d.trainer import Trainer
@@ -65,7 +66,7 @@ def test_two_trees_are_compared_part_by_part(capsys):
 
 def test_a_part_inside_another_one_is_subtracted_from_it(monkeypatch):
     clock = iter([0.0, 1.0, 4.0, 10.0])
-    watch = bench_step.Watch(torch.device("cpu"))
+    watch = Watch(torch.device("cpu"))
     monkeypatch.setattr(watch, "now", lambda: next(clock))
     inner = watch("prior", lambda: None)
     watch("guidance", inner)()
