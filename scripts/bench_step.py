@@ -68,28 +68,46 @@ def main(words: list[str] | None = None) -> None:
         print(as_table({name: found[-1] for name, found in results.items()}), flush=True)
     if args.json:
         args.json.write_text(json.dumps({"machine": machine(args.device), **results}, indent=2) + "\n")
+    if not results["here"]:
+        raise SystemExit(1)
 
 
 def read_arguments(words: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--priors", nargs="+", choices=list(PRIORS), help="default: all, random on CUDA only")
     parser.add_argument("--device", default="cpu", help="cpu (default), cuda or auto")
-    parser.add_argument("--steps", type=int, default=40, help="steps of each of the first two passes")
-    parser.add_argument("--warmup", type=int, default=5, help="steps before them that are not timed")
-    parser.add_argument("--threads", type=int, default=1, help="threads of torch (default: 1)")
+    parser.add_argument("--steps", type=positive, default=40, help="steps of each of the first two passes")
+    parser.add_argument("--warmup", type=positive, default=5, help="steps before them that are not timed")
+    parser.add_argument("--threads", type=positive, default=1, help="threads of torch (default: 1)")
     parser.add_argument("--tiny", action="store_true", help="small networks for --priors random")
     parser.add_argument("--models", type=Path, help="folder that keeps the random networks")
     add_base(parser)
-    parser.add_argument("--repeats", type=int, default=3, help="turns of each tree with --base (default: 3)")
+    parser.add_argument(
+        "--repeats", type=positive, default=3, help="turns of each tree with --base (default: 3)"
+    )
     # For the processes that measure one prior of one tree.
     parser.add_argument("--tree", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--json", type=Path, help="file for all numbers")
     parser.add_argument("settings", nargs="*", help="more settings of cadam3d train, such as steps=1000")
+    # Settings come first, because the list of priors would swallow those after it.
+    words = sorted(sys.argv[1:] if words is None else words, key=lambda word: not is_setting(word))
     args = parser.parse_intermixed_args(words)
+    if args.json and not args.json.absolute().parent.is_dir():
+        parser.error(f"argument --json: expected a file in a folder that exists, got {args.json}")
     if args.priors is None:
-        args.priors = [name for name in PRIORS if name != "random" or args.device != "cpu"]
+        args.priors = [name for name in PRIORS if name != "random" or args.device.startswith("cuda")]
     return args
+
+
+def is_setting(word: str) -> bool:
+    return "=" in word and not word.startswith("-")
+
+
+def positive(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text}")
+    return int(text)
 
 
 # -------------------------------------------------------------------------- processes
@@ -103,10 +121,11 @@ def measure_there(tree: Path, prior: str, args: argparse.Namespace) -> dict[str,
         for name in ("device", "steps", "warmup", "threads", "models"):
             value = getattr(args, name)
             line += [] if value is None else [f"--{name}", str(value)]
-        line += [*(["--tiny"] if args.tiny else []), *(["--", *args.settings] if args.settings else [])]
+        line += [*(["--tiny"] if args.tiny else []), *args.settings]
         done = subprocess.run(line, capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            raise LeftOutError(done.stderr.strip().splitlines()[-1])
+            lines = done.stderr.strip().splitlines()
+            raise LeftOutError(lines[-1] if lines else f"the process ended with code {done.returncode}")
         return json.loads(out.read_text())
 
 
@@ -153,14 +172,15 @@ def measure_here(prior: str, args: argparse.Namespace) -> dict[str, Any]:
 
     with tempfile.TemporaryDirectory() as folder, replaced([(train, "build_trainer", build_trainer)]):
         words = [f"prompt={PROMPT}", *PRIORS[prior], *random_settings(prior, args, Path(folder))]
-        words += [f"device={args.device}", f"hydra.run.dir={folder}/run", *args.settings]
-        with replaced([(trainer.Trainer, "train", instead), (sys, "argv", ["cadam3d", "train", *words])]):
+        words += [f"device={args.device}", *args.settings]
+        line = ["cadam3d", "train", f"hydra.run.dir={folder}/run", *words]
+        with replaced([(trainer.Trainer, "train", instead), (sys, "argv", line)]):
             try:
                 cli.main()
             except SystemExit as ended:
                 if not found:
                     raise SystemExit(ended.code or 1) from None
-    return {"prior": prior, "settings": words[:-1], **found}
+    return {"prior": prior, "settings": words, **found}
 
 
 def random_settings(prior: str, args: argparse.Namespace, folder: Path) -> list[str]:

@@ -32,9 +32,12 @@ class GradientSignal:
 
     @classmethod
     def read(cls, gaussians: Gaussians, output: RenderOutput) -> "GradientSignal":
-        """Return the gradients of the last backward pass themselves; another pass would add to them."""
+        """Return the gradients of the last backward pass; another pass would add to those of the images.
+
+        The gradient of the means is a copy, because the optimizer reads it after the densifier.
+        """
         return cls(
-            means=_gradient_of(gaussians.means),
+            means=_gradient_of(gaussians.means).clone(),
             means2d=_gradient_of(output.means2d),
             radii=output.radii.detach(),
             height=output.rgb.shape[1],
@@ -43,9 +46,9 @@ class GradientSignal:
         )
 
     def copy(self) -> "GradientSignal":
-        """Return copies of the gradients, which no later backward pass changes."""
+        """Return gradients that no later backward pass changes."""
         absgrad = None if self.absgrad is None else self.absgrad.clone()
-        return replace(self, means=self.means.clone(), means2d=self.means2d.clone(), absgrad=absgrad)
+        return replace(self, means2d=self.means2d.clone(), absgrad=absgrad)
 
     @property
     def visible(self) -> Bool[Tensor, "v n"]:
