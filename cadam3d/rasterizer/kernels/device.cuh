@@ -53,7 +53,7 @@ SPLAT_FN constexpr double log2_of(double x) {
 }
 constexpr float LOG2_ALPHA_MIN = float(log2_of(SPLAT_ALPHA_MIN));
 
-// The approximations of the hardware, without the instructions that care for denormal numbers: 2^x within 2
+// The approximations of the hardware, without the instructions that handle denormal numbers: 2^x within 2
 // ulp, and 1 / x within 1 ulp. The emulator of the tests has its own.
 #if defined(__CUDACC__)
 SPLAT_FN float exp2_approx(float x) {
@@ -67,8 +67,8 @@ SPLAT_FN float reciprocal_approx(float x) {
   return y;
 }
 
-// Returns its argument. The compiler does not see from what it was made, so it cannot make it anew in every
-// round of a loop.
+// Returns its argument, and hides from the compiler how it was computed. Otherwise the compiler may compute it
+// again in every round of a loop.
 SPLAT_FN int keep_in_register(int x) {
   asm("" : "+r"(x));
   return x;
