@@ -37,9 +37,13 @@ check: .venv/.installed-dev
 	if [ -z "$$tests" ]; then echo "No tests belong to what has changed since $(BASE)."; \
 	else echo "Tests of what has changed since $(BASE): $$tests"; $(PYTEST) -m "not slow" $$tests; fi
 
-# Nothing is installed on a machine without a GPU.
+# Nothing is installed on a machine without a GPU. The newest torch does not run with every driver, so the one that
+# does is installed first.
 gpu:
 	@$(or $(wildcard $(BIN)/python),$(PYTHON),python3) scripts/gpu.py --look
+	@$(MAKE) --no-print-directory $(BIN)/python
+	@torch="$$($(BIN)/python scripts/gpu.py --torch)"; \
+	if [ -n "$$torch" ]; then $(BIN)/python -m pip install --quiet --constraint constraints.txt "$$torch"; fi
 	@$(MAKE) --no-print-directory .venv/.installed-dev
 	$(BIN)/python scripts/gpu.py $(if $(PART),--part $(PART))
 

@@ -11,6 +11,7 @@ project has changed. Results are in --folder: gpu.json, gpu.md, and logs. Withou
 """
 
 import argparse
+import errno
 import signal
 import sys
 from pathlib import Path
@@ -22,11 +23,18 @@ if sys.version_info < (3, 11):  # noqa: UP036
         )
     )
 
-from gpu_run.machine import REPOSITORY, NoGpuError, find_device
+from gpu_run.machine import (
+    REPOSITORY,
+    NoGpuError,
+    TroubleError,
+    find_device,
+    find_packages,
+    fitting_torch,
+)
 from gpu_run.markdown import show
 from gpu_run.pieces import PARTS
 from gpu_run.record import read_record
-from gpu_run.session import Session, TroubleError
+from gpu_run.session import AGAIN, Session
 from gpu_run.wheels import describe
 
 FOLDER = REPOSITORY / "outputs" / "gpu"
@@ -48,6 +56,9 @@ def parse(words: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--folder", type=Path, default=FOLDER, help="for results; %(default)s by default")
     parser.add_argument("--look", action="store_true", help="only look for a GPU")
+    parser.add_argument(
+        "--torch", action="store_true", help="only print which torch to install; nothing if there is one"
+    )
     parser.add_argument("--wheels", action="store_true", help="only list the packages to copy")
     parser.add_argument(
         "--markdown", type=Path, metavar="FILE", help="only show the JSON of a run as Markdown"
@@ -63,13 +74,25 @@ def main(words: list[str] | None = None) -> int:
     except NoGpuError as error:
         print(f"gpu: expected an NVIDIA GPU, got none: {error}. Try: nvidia-smi", file=sys.stderr)
     except OSError as error:
-        print(f"gpu: cannot use {error.filename}: {error.strerror}. Try: ls {FOLDER}", file=sys.stderr)
+        print(
+            f"gpu: cannot use {error.filename or args.folder}: {error.strerror}. Try: {advise(error)}",
+            file=sys.stderr,
+        )
     except (TroubleError, ValueError) as error:
         print(f"gpu: {error}", file=sys.stderr)
     except KeyboardInterrupt:
         print("gpu: stopped. The same line continues.", file=sys.stderr)
         return 130
     return 1
+
+
+def advise(error: OSError) -> str:
+    """Return what to type after an error of the file system."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "df -h"
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"{AGAIN} --folder /tmp/gpu"
+    return f"ls {FOLDER}"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -81,7 +104,13 @@ def run(args: argparse.Namespace) -> int:
         print(show(read_record(args.markdown)), end="")
         return 0
     device = find_device()
+    if args.torch:
+        if "torch" not in find_packages():
+            print(fitting_torch(device.driver_cuda))
+        return 0
     if args.look:
+        # A driver that is too old for every torch ends the run before anything is downloaded.
+        fitting_torch(device.driver_cuda)
         print(f"{device.name}, driver for CUDA up to {device.driver_cuda}")
         return 0
     # A signal that ends this process must end the process of a piece, too.

@@ -1,7 +1,9 @@
 """The first run on a GPU, without a GPU: pieces, records, reports and packages."""
 
 import ctypes
+import errno
 import json
+import os
 import re
 import subprocess
 import sys
@@ -137,12 +139,32 @@ def test_a_machine_without_a_gpu_gets_one_line_and_needs_no_package(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("driver_cuda", "requirement"), [("12.0", "torch<2.11"), ("12.9", "torch<2.11"), ("13.0", "torch")]
+)
+def test_the_torch_that_is_installed_runs_with_the_driver(driver_cuda, requirement, monkeypatch, capsys):
+    monkeypatch.setattr(gpu, "find_device", lambda: replace(DEVICE, driver_cuda=driver_cuda))
+    monkeypatch.setattr(gpu, "find_packages", dict)
+    assert gpu.main(["--torch"]) == 0
+    assert capsys.readouterr().out == f"{requirement}\n"
+    monkeypatch.setattr(gpu, "find_packages", lambda: {"torch": "2.9.0+cu128"})
+    assert gpu.main(["--torch"]) == 0
+    assert capsys.readouterr().out == "", "the one that is there stays"
+
+
+def test_a_driver_that_is_too_old_is_reported_before_anything_is_installed(monkeypatch, capsys):
+    monkeypatch.setattr(gpu, "find_device", lambda: replace(DEVICE, driver_cuda="11.8"))
+    assert gpu.main(["--look"]) == 1
+    assert re.fullmatch(r"gpu: expected a driver for CUDA 12 .*11\.8\. Try: .*\n", capsys.readouterr().err)
+
+
 def test_make_looks_for_a_gpu_before_it_installs_anything():
     done = subprocess.run(
         ["make", "-n", "gpu", "PART=times"], cwd=REPOSITORY, capture_output=True, text=True, check=True
     )
     lines = [line for line in done.stdout.splitlines() if "gpu.py" in line or "pip" in line]
     assert lines[0].endswith("scripts/gpu.py --look")
+    assert "scripts/gpu.py --torch" in lines[1], "the torch is chosen before another one is installed"
     assert lines[-1].endswith("scripts/gpu.py --part times")
 
 
@@ -223,6 +245,42 @@ def test_work_in_the_background_runs_beside_the_others(tmp_path):
     assert run.status("sets") == (PASSED, "touched")
 
 
+@pytest.mark.skipif(not hasattr(os, "getpriority"), reason="the system has no such priorities")
+def test_work_in_the_background_does_not_slow_down_the_others(tmp_path):
+    code = "import os, time\nwhile os.getpriority(os.PRIO_PROCESS, 0) < 19: time.sleep(0.01)\n"
+    run = Run(tmp_path)
+    assert run(python(code + says("slow"), in_background=True, seconds=10.0))
+    assert run.status() == (PASSED, "slow")
+
+
+def test_gates_come_before_what_may_use_up_the_time(tmp_path):
+    order = [piece.is_gate for piece in plan(setup(tmp_path), CHECKS) if not piece.in_background]
+    assert order == sorted(order, reverse=True)
+
+
+def test_processes_of_tests_do_not_compete_for_cores(tmp_path):
+    found = [piece for part in PARTS for piece in plan(setup(tmp_path), part) if "pytest" in piece.command]
+    assert len(found) == 3
+    assert all(piece.environment == {"OMP_NUM_THREADS": "1"} for piece in found)
+
+
+def test_no_test_of_gsplat_runs_while_gsplat_is_built(tmp_path):
+    """The first use of gsplat deletes a build that another process has begun."""
+    for piece in plan(setup(tmp_path), CHECKS):
+        if "pytest" in piece.command:
+            assert {f"--ignore={path}" for path in pieces.GSPLAT_TESTS} <= set(piece.command), piece.name
+    assert all((REPOSITORY / path).is_file() for path in pieces.GSPLAT_TESTS)
+
+    def after(result):
+        record = new_record()
+        record.pieces["gsplat"] = Entry(CHECKS, PASSED, "", 1.0, "", result=result)
+        return next(p for p in plan(setup(tmp_path, record=record), EXPLAINS) if p.name == "tests of gsplat")
+
+    assert after(None).missing == "gsplat is not built"
+    assert after({"is_built": True}).missing is None
+    assert set(pieces.GSPLAT_TESTS) < set(after(None).command)
+
+
 def test_parts_take_at_most_25_minutes_and_each_less_than_ten(tmp_path):
     before, after = session.FACTS_SECONDS, session.STAGES_SECONDS
     assert sum(PARTS.values()) + before + after <= 25 * 60
@@ -236,8 +294,8 @@ def test_every_script_and_every_work_of_a_piece_exists(tmp_path):
 
     for part in PARTS:
         for piece in plan(setup(tmp_path), part):
-            scripts = [word for word in piece.command if word.endswith(".py")]
-            assert all(Path(script).is_file() for script in scripts), piece
+            scripts = [word.removeprefix("--ignore=") for word in piece.command if word.endswith(".py")]
+            assert all((REPOSITORY / script).is_file() for script in scripts), piece
             if "gpu_run.on_device" in piece.command:
                 assert piece.command[piece.command.index("gpu_run.on_device") + 1] in WORK
 
@@ -478,6 +536,12 @@ def test_the_markdown_has_one_table_with_every_result():
         assert word in text, word
 
 
+def test_a_message_of_several_lines_is_one_cell():
+    assert markdown.table(("a",), [("NVRTC reports\n  an error | here\n",)])[-1] == (
+        "| NVRTC reports an error \\| here |"
+    )
+
+
 def test_the_fastest_backend_of_each_scene_is_compared_with_the_choice_of_auto():
     [verdict] = markdown.verdicts(whole_record())
     assert (verdict["fastest"], verdict["timed"]) == ("cuda", ["gsplat", "cuda"])
@@ -498,6 +562,30 @@ def test_a_file_that_is_missing_is_named_in_one_line(tmp_path, capsys):
     assert gpu.main(["--markdown", str(tmp_path / "none.json")]) == 1
     error = capsys.readouterr().err
     assert re.fullmatch(r"gpu: cannot use .*none\.json: No such file or directory\. Try: ls .*\n", error)
+
+
+@pytest.mark.parametrize(
+    ("error", "advice"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "df -h"),
+        (
+            PermissionError(errno.EACCES, "Permission denied", "gpu.part"),
+            ".*python.* scripts/gpu.py --folder .*",
+        ),
+    ],
+)
+def test_a_folder_that_cannot_be_written_is_reported_in_one_line(
+    error, advice, monkeypatch, capsys, tmp_path
+):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(gpu, "find_device", lambda: DEVICE)
+    monkeypatch.setattr(session.Session, "run", fail)
+    monkeypatch.setattr(gpu.signal, "signal", lambda *_: None)
+    assert gpu.main(["--folder", str(tmp_path)]) == 1
+    where = error.filename or tmp_path
+    assert re.fullmatch(rf"gpu: cannot use {where}: .*\. Try: {advice}\n", capsys.readouterr().err)
 
 
 # -------------------------------------------------------------------------- sessions
@@ -543,7 +631,7 @@ def test_a_run_can_be_made_in_three_parts(started, tmp_path):
 
 def test_nothing_is_timed_before_the_checks_have_passed(started):
     message, _ = started(TIMES)
-    assert message.endswith("Try: python scripts/gpu.py --part checks")
+    assert message.endswith(f"Try: {sys.executable} scripts/gpu.py --part checks")
 
 
 def test_a_failed_check_stops_the_run_and_names_the_stage(started, tmp_path):
@@ -554,6 +642,25 @@ def test_a_failed_check_stops_the_run_and_names_the_stage(started, tmp_path):
     assert list(record.pieces) == ["self-test", "stages"]
     assert record.pieces["stages"].says == "stage"
     assert any("nothing is timed" in line for line in shown)
+
+
+@pytest.mark.skipif(session.fcntl is None, reason="the system has no such locks")
+def test_two_runs_do_not_share_a_folder(started, tmp_path):
+    with session.alone(tmp_path):
+        message, _ = started(CHECKS)
+    assert message.startswith(f"another run uses {tmp_path}")
+    assert not (tmp_path / "gpu.json").exists()
+    assert started(CHECKS)[0] == 0, "the end of the other run frees the folder"
+
+
+def test_a_torch_that_starts_slowly_is_not_called_broken(tmp_path, monkeypatch):
+    monkeypatch.setattr(session, "FACTS", (sys.executable, "-c", "import time; time.sleep(60)"))
+    monkeypatch.setattr(session, "FACTS_SECONDS", 0.2)
+    monkeypatch.setenv("PYTHONPATH", "")
+    with pytest.raises(
+        session.TroubleError, match=r"torch has not started in .* Try: .*python.* scripts/gpu"
+    ):
+        session.Session(tmp_path, DEVICE)._machine()
 
 
 def test_another_driver_starts_over_and_keeps_the_old_results(started, tmp_path):

@@ -162,9 +162,10 @@ def rasterize_ahead(
     forecast = find_forecast(gaussians.device, v, cameras.height, cameras.width)
     capacity = forecast.capacity(n)
     tiles = count_tiles(cameras.height, cameras.width)
-    # If the views may need several groups, their numbers of slots must be known.
-    most = MOST if v == 1 else most_slots(absgrad)
-    if capacity is None or capacity > most or v * max(n, tiles) > MOST:
+    # If the views may need several groups, their numbers of slots must be known. The slots of a single view
+    # are counted too if they are as many: a forecast would reserve much more memory than most renders need,
+    # for long after a single large one, and the device is busy for longer than the wait takes.
+    if capacity is None or capacity > most_slots(absgrad) or v * max(n, tiles) > MOST:
         capacity = None
     return rasterize(launcher, gaussians, cameras, background, absgrad, capacity, forecast)
 

@@ -77,8 +77,12 @@ class Module:
 
     def launching(self, stream: int) -> AbstractContextManager[Launch]:
         """Return a context with the launch function (see :meth:`Launcher.on`) for a stream of the device."""
-        # Autograd runs the backward pass in another thread, and two threads must not share a buffer.
-        launch = self.idle.pop() if self.idle else _Launch(self)
+        # Autograd runs the backward pass in another thread, and two threads must not share a buffer. A look
+        # at the list before the pop would be useless, because another thread may come in between.
+        try:
+            launch = self.idle.pop()
+        except IndexError:
+            launch = _Launch(self)
         launch.stream.value = stream
         return launch
 

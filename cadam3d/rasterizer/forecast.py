@@ -23,7 +23,7 @@ class Forecast:
 
     def __init__(self, device: torch.device) -> None:
         # The number of Gaussians in the upper half, that of slots in the lower half; 0 before any report.
-        self.report = torch.zeros(1, dtype=torch.int64, pin_memory=device.type == "cuda")
+        self.report = torch.zeros(1, dtype=torch.int64, device="cpu", pin_memory=device.type == "cuda")
         self._reported = ctypes.c_uint64.from_address(self.report.data_ptr())
         # The largest recent number of slots per Gaussian, and the latest number of Gaussians.
         self._density, self._gaussians = 0.0, 0
@@ -36,6 +36,10 @@ class Forecast:
     def capacity(self, gaussians: int) -> int | None:
         """Return the number of slots to reserve; ``None`` if nothing is known yet."""
         if reported := self._reported.value:
+            # A report counts once. Renders that do not go ahead make no report, and a large number that
+            # counts again and again would keep them from going ahead for ever. A report that arrives between
+            # these lines is lost, but the next render makes another one.
+            self._reported.value = 0
             self.learn(reported & 0xFFFFFFFF, reported >> 32)
         if self._gaussians == 0:
             return None

@@ -207,7 +207,9 @@ def upload(tensors: Sequence[Tensor], device: torch.device) -> Sequence[Tensor]:
     # A copy of ordinary memory would wait for the device. Torch does not give pinned memory to others before
     # the copy is done.
     is_pinned = device.type == "cuda"
-    packed = torch.empty(sum(t.numel() for t in moving), pin_memory=is_pinned)
+    size = sum(t.numel() for t in moving)
+    # Torch may have another default device or dtype.
+    packed = torch.empty(size, dtype=torch.float32, device="cpu", pin_memory=is_pinned)
     torch.cat([t.flatten().float() for t in moving], out=packed)
     pieces = iter(packed.to(device, non_blocking=True).split([t.numel() for t in moving]))
     return [next(pieces).view(t.shape) if any(t is each for each in moving) else t for t in tensors]

@@ -37,6 +37,10 @@ class NoGpuError(Exception):
     """There is no usable NVIDIA GPU. The message says what was looked for."""
 
 
+class TroubleError(Exception):
+    """Something that ends the run; the message is one line with what to do."""
+
+
 @dataclass(frozen=True)
 class Device:
     """The first NVIDIA GPU, as its driver describes it."""
@@ -78,6 +82,21 @@ def find_device(load: Callable[[str], Any] = ctypes.CDLL) -> Device:
         driver_cuda=f"{newest.value // 1000}.{newest.value % 1000 // 10}",
         count=count.value,
     )
+
+
+def fitting_torch(driver_cuda: str) -> str:
+    """Return the requirement of the newest torch of the usual registry that runs with a driver.
+
+    From 2.11 on, it is built for CUDA 13, which no driver for CUDA 12 can run. Raises :class:`TroubleError`
+    if the driver is too old for every torch that the project accepts.
+    """
+    major = int(driver_cuda.partition(".")[0])
+    if major < 12:
+        raise TroubleError(
+            f"expected a driver for CUDA 12 or newer, got one for CUDA {driver_cuda}. "
+            "Try: a machine with driver 525 or newer"
+        )
+    return "torch" if major >= 13 else "torch<2.11"
 
 
 def _name_of(driver: Any, status: int) -> str:

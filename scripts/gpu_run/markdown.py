@@ -162,4 +162,8 @@ def verdicts(record: Record) -> list[dict[str, Any]]:
 def table(header: Sequence[str], body: Iterable[Sequence[str]]) -> list[str]:
     """Return the lines of a table."""
     lines = [header, ["---"] * len(header), *body]
-    return ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines]
+    # A message of a compiler has several lines, and a cell has one.
+    return [
+        "| " + " | ".join(" ".join(cell.split()).replace("|", "\\|") for cell in line) + " |"
+        for line in lines
+    ]

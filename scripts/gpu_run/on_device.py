@@ -39,8 +39,7 @@ def facts() -> dict[str, Any]:
 
     found: dict[str, Any] = {"torch": torch.__version__, "torch_cuda": torch.version.cuda}
     if torch.version.cuda is None:
-        trouble = f"torch {torch.__version__} is built without CUDA"
-        return found | {"trouble": f"{trouble}. Try: pip install --force-reinstall torch"}
+        return found | {"trouble": f"torch {torch.__version__} is built without CUDA. {_other_torch()}"}
     try:
         # The first operation finds out whether torch has kernels for this GPU.
         assert (torch.ones(2, device="cuda") + 1).sum().item() == 4
@@ -48,7 +47,7 @@ def facts() -> dict[str, Any]:
         reason = (str(error).strip().splitlines() or ["an addition is wrong"])[0]
         return found | {
             "trouble": f"torch {torch.__version__} (CUDA {torch.version.cuda}) cannot use this GPU: "
-            f"{reason}. Try: a torch for the CUDA version of the driver"
+            f"{reason.rstrip('.')}. {_other_torch()}"
         }
     properties = torch.cuda.get_device_properties(0)
     return found | {
@@ -58,6 +57,19 @@ def facts() -> dict[str, Any]:
         "multiprocessors": properties.multi_processor_count,
         "nvrtc": nvrtc(),
     }
+
+
+def _other_torch() -> str:
+    """Return what to type for a torch that runs with the driver of this machine."""
+    from gpu_run.machine import NoGpuError, TroubleError, find_device, fitting_torch
+
+    try:
+        torch = fitting_torch(find_device().driver_cuda)
+    except NoGpuError:
+        torch = "torch"
+    except TroubleError as error:
+        return str(error)
+    return f"Try: {sys.executable} -m pip install --force-reinstall '{torch}'"
 
 
 def nvrtc() -> str | None:

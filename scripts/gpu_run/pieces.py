@@ -13,6 +13,9 @@ from gpu_run.runner import RESULT, Finished, Judge, Piece
 CHECKS, TIMES, EXPLAINS = "checks", "times", "explains"
 # Seconds. Together they take less than 25 minutes, and each less than ten, whatever comes before and after.
 PARTS = {CHECKS: 480.0, TIMES: 480.0, EXPLAINS: 420.0}
+# The tests compute what is right with torch on the CPU, in several processes. With the threads of all cores
+# in each of them, they would mostly wait for one another.
+ONE_THREAD = {"OMP_NUM_THREADS": "1"}
 # The sanitizers see every tensor only if torch allocates each of them separately.
 UNCACHED = {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
 SANITIZERS = {"memcheck": 120.0, "racecheck": 120.0, "synccheck": 90.0}
@@ -28,6 +31,9 @@ GIB = 2**30
 # Each process of the tests needs this much memory of the GPU.
 TEST_MEMORY = 4 * GIB
 MOST_PROCESSES = 6
+# The first use of gsplat in a process deletes a build of its kernels that another process has begun. So these
+# tests do not run beside the build.
+GSPLAT_TESTS = ("tests/rasterizer/test_gsplat.py", "tests/plugins/test_gsplat.py")
 DEMO = "a red and yellow checkered torus"
 
 
@@ -47,6 +53,16 @@ class Setup:
         """Return the command of a script of the project."""
         return (self.python, str(REPOSITORY / "scripts" / f"{name}.py"), *words)
 
+    def tests(self, *words: str) -> tuple[str, ...]:
+        """Return the command that runs the tests that need a GPU."""
+        return (self.python, "-m", "pytest", "-m", "gpu", "-rs", "-p", "no:cacheprovider", *words)
+
+    @property
+    def has_gsplat(self) -> bool:
+        """Return whether the kernels of gsplat are built."""
+        gsplat = self.record.pieces.get("gsplat")
+        return bool(gsplat and gsplat.result and gsplat.result.get("is_built"))
+
     def own(self, name: str, *words: str) -> tuple[str, ...]:
         """Return the command of a part of :mod:`gpu_run.on_device`."""
         return (self.python, "-m", "gpu_run.on_device", name, "--json", RESULT, *words)
@@ -63,8 +79,11 @@ def plan(setup: Setup, part: str) -> list[Piece]:
 
 
 def checks(setup: Setup) -> list[Piece]:
-    """Return the checks. If one of the gates fails, nothing is timed."""
-    tests = (setup.python, "-m", "pytest", "-m", "gpu", "-rs", "-p", "no:cacheprovider")
+    """Return the checks. If one of the gates fails, nothing is timed.
+
+    The gates come first: if the time of the part is over before the last piece, the times may follow anyway.
+    """
+    tests = setup.tests(*(f"--ignore={path}" for path in GSPLAT_TESTS))
     processes = min(MOST_PROCESSES, setup.processors, setup.memory_bytes // TEST_MEMORY)
     parallel = ("-n", str(processes)) if "pytest-xdist" in setup.packages and processes > 1 else ()
     run = datetime.now().strftime("demo-%Y%m%d-%H%M%S")
@@ -88,6 +107,22 @@ def checks(setup: Setup) -> list[Piece]:
             is_gate=True,
             missing=setup.lacks("pytest"),
             judge=by_pytest,
+            environment=ONE_THREAD,
+        ),
+        Piece(
+            "difficult scenes and the long sort",
+            CHECKS,
+            setup.script("bench_rasterizer", "--device", "cuda", "--backends", "cuda", "--check-only"),
+            120.0,
+            is_gate=True,
+            judge=by_check,
+        ),
+        Piece(
+            "demo",
+            CHECKS,
+            (setup.python, "-m", "cadam3d", *line),
+            120.0,
+            judge=by_last_line(r"finished after .*"),
         ),
         *(
             Piece(
@@ -106,37 +141,21 @@ def checks(setup: Setup) -> list[Piece]:
             for tool, seconds in SANITIZERS.items()
         ),
         Piece(
-            "difficult scenes and the long sort",
-            CHECKS,
-            setup.script("bench_rasterizer", "--device", "cuda", "--backends", "cuda", "--check-only"),
-            120.0,
-            is_gate=True,
-            judge=by_check,
-        ),
-        Piece(
-            "demo",
-            CHECKS,
-            (setup.python, "-m", "cadam3d", *line),
-            120.0,
-            judge=by_last_line(r"finished after .*"),
-        ),
-        Piece(
             "other tests",
             CHECKS,
             (*tests, "--ignore=tests/rasterizer"),
             120.0,
             missing=setup.lacks("pytest"),
             judge=by_pytest,
+            environment=ONE_THREAD,
         ),
     ]
 
 
 def times(setup: Setup) -> list[Piece]:
     """Return the times. The checks have passed, so they are not repeated."""
-    gsplat = setup.record.pieces.get("gsplat")
     # A gsplat that is built is timed, even if it does not agree with the reference; the report says so.
-    with_gsplat = bool(gsplat and gsplat.result and gsplat.result.get("is_built"))
-    backends = ["gsplat", "cuda"] if with_gsplat else ["cuda"]
+    backends = ["gsplat", "cuda"] if setup.has_gsplat else ["cuda"]
     pieces = [Piece("choice of auto", TIMES, setup.own("auto"), 120.0)]
     for name, (counts, sizes, views, degrees) in TIMED.items():
         scenes = ["--counts", *counts.split(), "--sizes", *sizes.split(), "--views", *views.split()]
@@ -168,6 +187,15 @@ def explains(setup: Setup) -> list[Piece]:
             300.0,
             missing=setup.lacks("diffusers"),
             judge=by_recipes,
+        ),
+        Piece(
+            "tests of gsplat",
+            EXPLAINS,
+            setup.tests(*GSPLAT_TESTS),
+            60.0,
+            missing=setup.lacks("pytest") or (None if setup.has_gsplat else "gsplat is not built"),
+            judge=by_pytest,
+            environment=ONE_THREAD,
         ),
     ]
 

@@ -51,5 +51,6 @@ def read_record(path: Path) -> Record:
         return Record(data["machine"], data["state"], pieces)
     except (json.JSONDecodeError, UnicodeDecodeError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(
-            f"{path} is not a record of this script ({type(error).__name__}: {error})"
+            f"{path} is not a record of this script ({type(error).__name__}: {error}). "
+            f"Try: mv {path} {path}.old"
         ) from error

@@ -112,6 +112,10 @@ class Processes:
                 env={**os.environ, **piece.environment},
                 start_new_session=True,
             )
+        if piece.in_background and hasattr(os, "setpriority"):
+            # It must not slow down the others so much that they meet their time limits. It may have ended.
+            with suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, process.pid, 19)
         return Job(piece, process, log, result, time.monotonic())
 
     def wait(self, job: Job, seconds: float) -> Finished:

@@ -3,15 +3,24 @@
 import hashlib
 import os
 import platform
+import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+try:
+    import fcntl
+except ImportError:
+    # Windows has no such locks.
+    fcntl = None
+
 from gpu_run.machine import (
     REPOSITORY,
     Device,
+    TroubleError,
     find_commit,
     find_packages,
     find_tools,
@@ -24,7 +33,8 @@ from gpu_run.pieces import CHECKS, PARTS, Setup, plan
 from gpu_run.record import ENDED, FAILED, Record, read_record
 from gpu_run.runner import RESULT, Piece, Processes, Runner
 
-AGAIN = "python scripts/gpu.py"
+# The interpreter of this run has the packages, and the one that is called python may not exist.
+AGAIN = f"{shlex.quote(sys.executable)} scripts/gpu.py"
 FACTS = (sys.executable, "-m", "gpu_run.on_device", "facts", "--json", RESULT)
 # The first import of torch from a slow disk takes long.
 FACTS_SECONDS = 60.0
@@ -34,8 +44,20 @@ STAGES_SECONDS = 50.0
 STATE = ("device", "driver", "driver_cuda", "torch", "python", "packages")
 
 
-class TroubleError(Exception):
-    """Something that ends the run; the message is one line with what to do."""
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Keep other runs out of the folder, because each would falsify the times and the record of the other.
+
+    Raises :class:`TroubleError` if another one is there. Its end frees the folder, whatever ends it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        if fcntl is not None:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise TroubleError(f"another run uses {folder}. Try: ps aux | grep gpu.py") from None
+        yield
 
 
 class Session:
@@ -52,6 +74,10 @@ class Session:
 
     def run(self, parts: Sequence[str]) -> int:
         """Run the parts in order, and return the exit code."""
+        with alone(self._folder):
+            return self._run(parts)
+
+    def _run(self, parts: Sequence[str]) -> int:
         machine = self._machine()
         self._show(f"{machine['device']}, torch {machine['torch']}, Python {machine['python']}")
         record = self._continue(machine)
@@ -98,7 +124,11 @@ class Session:
             )
         piece = Piece("machine", CHECKS, FACTS, FACTS_SECONDS)
         finished = self._processes.wait(self._processes.start(piece), FACTS_SECONDS)
-        facts = finished.result or {"trouble": f"torch does not start: {finished.last_line}"}
+        says = f"torch does not start: {finished.last_line}"
+        if finished.code is None:
+            # What is read from a disk once is read faster the next time.
+            says = f"torch has not started in {FACTS_SECONDS:.0f} s. Try: {AGAIN}"
+        facts = finished.result or {"trouble": says}
         if trouble := facts.pop("trouble", None):
             raise TroubleError(f"{self._device.name}: {trouble}")
         commit, is_changed = find_commit()

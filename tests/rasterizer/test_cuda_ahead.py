@@ -142,9 +142,16 @@ def test_views_that_may_need_several_groups_are_counted_first(emulator, monkeypa
     assert render(*scene[:3]).overflowed is None
     want = bits(*render_and_differentiate(emulator.render, *scene))
     assert_same_bits(want, bits(*render_and_differentiate(render, *scene)))
-    one = make_scene(views=1)
-    render(*one[:3])
-    assert render(*one[:3]).overflowed is not None, "a single view is always one group"
+
+
+def test_many_slots_of_a_single_view_are_counted_first(emulator, monkeypatch):
+    """A forecast reserves too much for long after one large render, so it may not reserve without a limit."""
+    scene = make_scene(views=1)
+    render = partial(rasterize_ahead, emulator)
+    render(*scene[:3])
+    assert render(*scene[:3]).overflowed is not None
+    monkeypatch.setattr(cuda, "RECORD_MEMORY", 4 * cuda.RECORD * LEAST)
+    assert render(*scene[:3]).overflowed is None
 
 
 def test_a_forecast_leaves_a_margin_and_grows_with_the_gaussians():
@@ -176,6 +183,17 @@ def test_a_forecast_takes_few_different_values():
         one.learn(slots, 1000)
         values.add(one.capacity(1000))
     assert len(values) < 12
+
+
+def test_a_report_counts_once():
+    """Renders that do not go ahead make no report, so the last one must not keep them from it for ever."""
+    one = Forecast(CPU)
+    one.report.fill_(1000 << 32 | 80_000)
+    largest = one.capacity(1000)
+    for _ in range(5000):
+        one.learn(20_000, 1000)
+        one.capacity(1000)
+    assert one.capacity(1000) < 0.4 * largest
 
 
 def test_a_report_of_the_device_is_read_without_a_wait():
@@ -271,6 +289,18 @@ def test_cameras_and_backgrounds_on_the_cpu_move_in_one_copy():
     for before, after in zip(tensors, moved, strict=True):
         assert (after.device.type, after.dtype, after.shape) == ("meta", torch.float32, before.shape)
         assert after.is_contiguous()
+
+
+def test_another_default_device_or_dtype_of_torch_changes_nothing():
+    tensors = [torch.rand(2, 3), torch.rand(4)]
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.device("meta"):
+            moved, report = upload(tensors, torch.device("meta")), Forecast(CPU).report
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert all(each.dtype == torch.float32 for each in moved)
+    assert report.device == CPU, "the host reads its address"
 
 
 def test_tensors_that_are_there_or_have_a_gradient_are_left_alone():

@@ -198,10 +198,13 @@ def test_the_sort_handles_more_than_2_to_27_keys(tmp_path):
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     n = 2**27 + 1
-    keys = torch.randint(0, 2**31 - 1, (n,), dtype=torch.int32, device="cuda")
-    with cuda.load_kernels(str(tmp_path)).on(keys.device) as launch:
-        got, order = sort_tensor(launch, keys, 32)
-    want, want_order = keys.sort(stable=True)
+    try:
+        keys = torch.randint(0, 2**31 - 1, (n,), dtype=torch.int32, device="cuda")
+        with cuda.load_kernels(str(tmp_path)).on(keys.device) as launch:
+            got, order = sort_tensor(launch, keys, 32)
+        want, want_order = keys.sort(stable=True)
+    except torch.OutOfMemoryError as error:
+        pytest.skip(f"not enough memory: {error}".splitlines()[0])
     assert torch.equal(got, want)
     assert torch.equal(order.long(), want_order)
 

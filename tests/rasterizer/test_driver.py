@@ -118,6 +118,19 @@ def test_two_threads_never_share_a_buffer_of_arguments(stub):
         assert again in (one, other), "a buffer is used again"
 
 
+def test_a_thread_may_take_the_last_buffer_while_another_one_looks(stub):
+    class Contested(list):
+        """Has a buffer for those that look, which is gone when they take it."""
+
+        def __len__(self) -> int:
+            return 1
+
+    module = Module(stub, 0, b"")
+    module.idle = Contested()
+    with module.launching(3) as launch:
+        launch("works", 1, 32)
+
+
 class FakeCuda:
     """A replacement of ``torch.cuda`` with two devices; number 0 is current, and each has a side stream."""
 

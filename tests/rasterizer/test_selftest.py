@@ -12,6 +12,8 @@ from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.rasterizer import reference
 from cadam3d.rasterizer.base import NEAR, Rasterizer
 from cadam3d.rasterizer.cpu import CpuRasterizer
+from cadam3d.rasterizer.cuda import rasterize_ahead
+from cadam3d.rasterizer.forecast import find_forecast
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import (
     GSPLAT,
@@ -81,9 +83,27 @@ def test_the_cuda_kernels_pass_in_the_emulator(emulator):
         def render(self, gaussians, cameras, background, absgrad=False):
             return emulator.render(gaussians, cameras, background, absgrad)
 
+        def render_ahead(self, gaussians, cameras, background, absgrad=False):
+            output = rasterize_ahead(emulator, gaussians, cameras, background, absgrad)
+            ahead.append(output.overflowed is not None)
+            return output
+
+    ahead = []
+    find_forecast.cache_clear()
     agreement = self_test(Emulated(), CPU)
     assert agreement.holds, agreement
     assert agreement.repeats
+    assert ahead == [False, True, True], "what training does is tested, too"
+
+
+def test_rendering_ahead_with_other_bits_is_noticed():
+    @dataclass(frozen=True)
+    class Overflowing(ReferenceRasterizer):
+        def render_ahead(self, gaussians, cameras, background, absgrad=False):
+            output = self.render(gaussians, cameras, background, absgrad)
+            return replace(output, rgb=background[:, None, None].expand_as(output.rgb))
+
+    assert not self_test(Overflowing(), CPU).passes
 
 
 # -------------------------------------------------------------------------- the scene
