@@ -115,6 +115,11 @@ def read_arguments(words: Sequence[str] | None) -> argparse.Namespace:
     numbers = (args.counts, args.sizes, args.views, args.threads, [args.repeats])
     if any(number < 1 for each in numbers for number in each):
         parser.error("counts, sizes, views, threads and repeats: expected whole numbers >= 1")
+    # A worker in any other folder would import an installed cadam3d, and measure that.
+    if args.base and not (args.base / "cadam3d" / "__init__.py").is_file():
+        parser.error(f"--base: expected a checkout of cadam3d, got {args.base}")
+    if args.json and not args.json.absolute().parent.is_dir():
+        parser.error(f"--json: expected a file in a folder that exists, got {args.json}")
     return args
 
 

@@ -4,8 +4,9 @@
     python scripts/bench_tracer.py --agreement    # how their images differ, over the whole vocabulary
 
 Times are those of one call. One thread is timed by the clock of the process, which leaves out other
-processes, and several threads by the clock on the wall. The smallest of several calls is printed. The images
-are those of every object, plain and with every pattern, from views above, beside and below.
+processes, and several threads by the clock on the wall. A turn is one call of the tracer in torch and five of
+the native one, which count with their mean. The smallest of the turns is printed. The images are those of
+every object, plain and with every pattern, from views above, beside and below, with one ray per pixel.
 """
 
 import argparse
@@ -22,6 +23,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
+from cadam3d.core.errors import UserError
 from cadam3d.prior.shapes.native_tracer import instruction_set, load_tracer, trace_natively
 from cadam3d.prior.shapes.objects import known_objects, known_primitives
 from cadam3d.prior.shapes.scene import PATTERN_NAMES, Scene, build
@@ -70,8 +72,8 @@ def compare_times(args: argparse.Namespace, library: ctypes.CDLL) -> None:
                 torch_times, native_times = [], []
                 for _ in range(args.repeats):
                     torch_times.append(seconds(calls[0], threads))
-                    # Five calls, because one is short.
-                    native_times += [seconds(calls[1], threads) for _ in range(5)]
+                    # The mean of five calls, because one is short. The smallest of five would flatter it.
+                    native_times.append(sum(seconds(calls[1], threads) for _ in range(5)) / 5)
                 slow, fast = 1e3 * min(torch_times), 1e3 * min(native_times)
                 print(
                     f"| {prompt} | {len(scene.radii)} | {size} | {args.views} | {threads} | {slow:.2f} | "
@@ -123,11 +125,15 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
     parser.add_argument("--repeats", type=int, default=10, help="turns for each row")
     args = parser.parse_args(words)
-    built, library = load_tracer()
+    if min(*args.sizes, args.views, args.samples, *args.threads, args.repeats) < 1:
+        parser.error("sizes, views, samples, threads and repeats: expected whole numbers >= 1")
+    try:
+        built, library = load_tracer()
+    except UserError as error:
+        sys.exit(f"bench_tracer: {error}")
     how = f"compiled now in {built.seconds:.1f} s" if built.seconds else "compiled earlier"
-    print(
-        f"native tracer: {instruction_set(library)}, {how}; {args.samples} x {args.samples} rays per pixel\n"
-    )
+    samples = 1 if args.agreement else args.samples
+    print(f"native tracer: {instruction_set(library)}, {how}; {samples} x {samples} rays per pixel\n")
     (compare_images if args.agreement else compare_times)(args, library)
 
 

@@ -176,8 +176,10 @@ def _own_advice(folder: Path, names: Names) -> str:
 def find_intact(cache_dir: Path, pattern: str) -> Path | None:
     """Return a file of this user with a name like ``pattern`` that ends in the hash of its bytes, or None."""
     for path in sorted(cache_dir.glob(pattern)):
-        if path.is_file() and not other_writers(path) and path.stem.endswith(short_hash(path.read_bytes())):
-            return path
+        # A file of root, from a run with sudo, may be unreadable. A file that is built again replaces it.
+        with suppress(OSError):
+            if not other_writers(path) and path.stem.endswith(short_hash(path.read_bytes())):
+                return path
     return None
 
 
@@ -242,7 +244,10 @@ def _compile(
 
 def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
     try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=False)
+        # A compiler may write in another encoding than that of this process.
+        return subprocess.run(
+            command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT, check=False
+        )
     except (OSError, subprocess.TimeoutExpired) as error:
         return subprocess.CompletedProcess(command, 1, "", str(error))
 

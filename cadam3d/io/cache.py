@@ -4,15 +4,26 @@ import os
 import stat
 from pathlib import Path
 
+from cadam3d.core.errors import UserError
+
 # The environment variable with the folder that the jobs of a sweep share.
 TRACES = "CADAM3D_TRACES"
 ROOT = 0  # the number of the user that may write any file
 
 
 def default_cache_dir() -> Path:
-    """Return ``cadam3d`` in the user's cache folder (``$XDG_CACHE_HOME``, else ``~/.cache``)."""
+    """Return ``cadam3d`` in the user's cache folder (``$XDG_CACHE_HOME``, else ``~/.cache``).
+
+    Raises ``UserError`` if the user has no home folder, as in some containers and services.
+    """
     root = os.environ.get("XDG_CACHE_HOME")
-    return (Path(root) if root else Path("~/.cache").expanduser()) / "cadam3d"
+    try:
+        return (Path(root) if root else Path("~/.cache").expanduser()) / "cadam3d"
+    except RuntimeError as error:
+        raise UserError(
+            "$HOME: expected a home folder, which holds the cache of this user, got none. "
+            'Try: export XDG_CACHE_HOME="$PWD/.cache"'
+        ) from error
 
 
 def kernels_dir(chosen: str | None) -> Path:

@@ -129,7 +129,9 @@ class _CpuPass(RenderPass):
         means2d, radii = parameters[0].new_empty(v, n, 2), parameters[0].new_empty(v, n)
         scene = self.scene(parameters, None)
         self.call("cadam3d_project", ctypes.byref(scene), means2d, radii, ctypes.byref(self.handle))
-        weakref.finalize(self, self.kernels.cadam3d_free, self.handle)
+        # When the program ends, another thread may still be in a kernel of this pass. The system frees the
+        # memory then.
+        weakref.finalize(self, self.kernels.cadam3d_free, self.handle).atexit = False
         return means2d, radii
 
     def blend(

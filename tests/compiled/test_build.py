@@ -180,6 +180,12 @@ def test_a_cached_library_needs_no_compiler(library, fake_compiler, tmp_path, mo
     assert build(library, tmp_path / "cache").path == built.path
 
 
+def test_the_output_of_a_compiler_may_have_another_encoding(library, fake_compiler, tmp_path):
+    fake_compiler(body=r"printf 'Fehler \374\n' >&2; exit 1", version="gcc \xe4")
+    with pytest.raises(UserError, match=r"could not build the kernels:\nFehler"):
+        build(library, tmp_path / "cache")
+
+
 def test_the_output_of_a_failing_compiler_is_shown(library, fake_compiler, tmp_path):
     fake_compiler(body="echo 'error: no such thing' >&2; exit 1")
     with pytest.raises(UserError, match=r"(?s)fake 1\.0.*no such thing.*rasterizer=reference"):
@@ -238,6 +244,28 @@ def test_a_file_that_another_user_can_write_is_not_loaded(cached):
     for mode in (0o720, 0o702, 0o777):
         cached.chmod(mode)
         assert find_intact(cached.parent, "small-*.so") is None
+
+
+def test_a_file_that_cannot_be_read_is_built_again(library, fake_compiler, tmp_path, monkeypatch):
+    fake_compiler()
+    path, read = build(library, tmp_path / "cache").path, Path.read_bytes
+
+    def read_bytes(self: Path) -> bytes:
+        if self == path:
+            raise PermissionError(13, "Permission denied", str(self))
+        return read(self)
+
+    monkeypatch.setattr(Path, "read_bytes", read_bytes)
+    again = build(library, tmp_path / "cache")
+    assert again.path == path
+    assert again.seconds > 0
+
+
+def test_without_a_home_folder_the_message_names_another_folder(monkeypatch):
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    with pytest.raises(UserError, match=r"^\$HOME: .* Try: export XDG_CACHE_HOME="):
+        default_cache_dir()
 
 
 @pytest.mark.parametrize("mode", [0o720, 0o702, 0o777, 0o1777])

@@ -57,6 +57,13 @@ def test_a_number_that_makes_no_sense_is_one_message(words, capsys):
     assert "expected whole numbers >= 1" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("key", ["--base", "--json"])
+def test_a_folder_that_does_not_exist_is_one_message_before_any_measurement(key, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        bench_large.main([key, str(tmp_path / "missing" / "large.json")])
+    assert f"{key}: expected" in capsys.readouterr().err
+
+
 def test_costs_count_the_slots_of_a_pass_of_this_rasterizer_only(cpu):
     gaussians = make_gaussians(200).map(lambda tensor: tensor.requires_grad_())
     scene = gaussians, make_cameras(2, 40, 40), backgrounds(2)

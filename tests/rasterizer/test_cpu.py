@@ -2,6 +2,7 @@
 
 import resource
 import sys
+import weakref
 from functools import partial
 from pathlib import Path
 
@@ -58,6 +59,20 @@ def test_memory_that_is_used_again_changes_no_bits(cpu):
     held = cpu.render(make_gaussians(700), make_cameras(2, 40, 40), backgrounds(2))
     assert_same_bits(first, result(500, 2, 40))
     assert held.rgb.isfinite().all()
+
+
+def test_a_pass_is_not_freed_while_the_program_ends(cpu, monkeypatch):
+    # A thread that the program does not wait for may still be rendering it.
+    finalize, made = weakref.finalize, []
+
+    def record(*arguments):
+        made.append(finalize(*arguments))
+        return made[-1]
+
+    monkeypatch.setattr(weakref, "finalize", record)
+    output = cpu.render(make_gaussians(5), make_cameras(1, 8, 8), backgrounds(1))
+    assert [(each.alive, each.atexit) for each in made] == [(True, False)]
+    del output
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits the memory of a process")
