@@ -116,7 +116,7 @@ class Trainer:
 
     def _differentiate(
         self, state: TrainState, embedding: PromptEmbedding, render: Callable[..., RenderOutput]
-    ) -> "Evidence":
+    ) -> Evidence:
         """Render some views, differentiate the loss, and let the densifier observe the gradients.
 
         This changes only the random numbers and the gradients of ``state``. It waits for the device once, at

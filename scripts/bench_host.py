@@ -17,7 +17,6 @@ take turns. The counts are of one forward and backward pass.
 import argparse
 import ctypes
 import json
-import os
 import statistics
 import subprocess
 import sys
@@ -28,7 +27,8 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parents[1]
+from checkouts import add_base, environment_of, find_trees
+
 # Each Gaussian touches this many tiles in each view.
 TILES = 16
 # Options of mallopt.
@@ -87,7 +87,7 @@ def main() -> None:
     if args.stub:
         print(json.dumps(measure(args)))
         return
-    trees = {"base": args.base, "here": HERE} if args.base else {"here": HERE}
+    trees = find_trees(args.base)
     with tempfile.TemporaryDirectory() as folder:
         stub = compile_stub(Path(folder))
         rounds = [
@@ -99,7 +99,7 @@ def main() -> None:
 
 def read_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--base", type=lambda text: Path(text).resolve(), help="a checkout to compare with")
+    add_base(parser)
     parser.add_argument("--count", type=int, default=20_000, help="Gaussians (default: 20000)")
     parser.add_argument("--size", type=int, default=512, help="pixels along an edge (default: 512)")
     parser.add_argument("--views", type=int, default=1, help="views (default: 1)")
@@ -128,7 +128,7 @@ def start(tree: Path, stub: Path, args: argparse.Namespace) -> dict[str, dict[st
     """Return what :func:`measure` returns in a process that imports the sources of ``tree``."""
     sizes = [f"--{name}={getattr(args, name)}" for name in ("count", "size", "views", "steps")]
     command = [sys.executable, str(Path(__file__).resolve()), f"--stub={stub}", *sizes]
-    environment = os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
+    environment = environment_of(tree) | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise SystemExit(f"{tree}: {done.stderr}")
@@ -232,7 +232,7 @@ def count_step(forward: Callable, backward: Callable, stub: ctypes.CDLL) -> dict
     class Count(TorchDispatchMode):
         def __torch_dispatch__(self, func, types, args=(), kwargs=None):
             name = func.__name__.partition(".")[0]
-            # Views and aliases cost time on the host, but nothing on a device.
+            # Views count too: they take no time on a device, but they do on the host.
             calls["operations"] += 1
             calls["allocations"] += name in ("empty", "new_empty", "empty_like", "empty_strided", "zeros")
             return func(*args, **(kwargs or {}))

@@ -28,8 +28,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from checkouts import HERE, add_base, find_trees
+
 SCRIPTS = Path(__file__).resolve().parent
-HERE = SCRIPTS.parent
 PHASES = ("forward", "backward", "both")
 # The copy is larger than the caches of most machines, and is the best of a few.
 COPY_BYTES, COPIES = 2**27, 8
@@ -46,10 +47,9 @@ class Case:
     views: int
     degree: int  # of spherical harmonics
 
-    @property
-    def name(self) -> str:
-        """Return the first cells of a row."""
-        return f"{self.count:,} | {self.size} | {self.views}"
+    def cells(self) -> list[str]:
+        """Return the first cells of a row: N, pixels and views."""
+        return [f"{self.count:,}", str(self.size), str(self.views)]
 
 
 class Worker:
@@ -93,7 +93,7 @@ def main(words: Sequence[str] | None = None) -> None:
         serve()
         return
     cases = [Case(n, size, v, args.degree) for n in args.counts for size in args.sizes for v in args.views]
-    trees = {"here": HERE} | ({"base": args.base} if args.base else {})
+    trees = {"here": HERE, **find_trees(args.base)}
     result = measure_memory(cases, trees, args.threads) if args.memory else measure_times(cases, trees, args)
     if args.json:
         args.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
@@ -107,7 +107,7 @@ def read_arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--degree", type=int, default=0, choices=range(4), help="of spherical harmonics")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--repeats", type=int, default=7, help="passes that are counted (default: 7)")
-    parser.add_argument("--base", type=lambda text: Path(text).resolve(), help="a checkout to compare with")
+    add_base(parser)
     parser.add_argument("--memory", action="store_true", help="measure memory instead of time")
     parser.add_argument("--json", type=Path, help="also write the numbers to this file")
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
@@ -217,16 +217,17 @@ def show_times(rows: Sequence[dict], trees: Sequence[str], threads: Sequence[int
         columns += [f"{prefix}{t} thread{'s' * (t > 1)}: forward + backward" for t in threads]
         columns += [f"{prefix}{first} / {last}"]
     columns += [f"base / here, {t} thread{'s' * (t > 1)}" for t in threads if "base" in trees]
-    print("\n| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
+    body = []
     for row in rows:
-        cells = [Case(row["count"], row["size"], row["views"], row["degree"]).name]
+        cells = Case(row["count"], row["size"], row["views"], row["degree"]).cells()
         for name in trees:
             ms = row["ms"][name]
             cells += [f"{ms[t]['forward']:.1f} + {ms[t]['backward']:.1f}" for t in threads]
             cells += [f"{ms[first]['both'] / ms[last]['both']:.2f}"]
         if "base" in trees:
             cells += [f"{row['ms']['base'][t]['both'] / row['ms']['here'][t]['both']:.2f}" for t in threads]
-        print("| " + " | ".join(cells) + " |")
+        body.append(cells)
+    show_table(columns, body)
 
 
 def show_stages(case: Case, table: Sequence[dict], threads: Sequence[int]) -> None:
@@ -235,13 +236,21 @@ def show_stages(case: Case, table: Sequence[dict], threads: Sequence[int]) -> No
     print(f"\n{case.count:,} Gaussians, {case.size} px, {case.views} views, SH degree {case.degree}")
     columns = ["stage", *(f"{t} thread{'s' * (t > 1)}" for t in threads), f"{first} / {last}", "MB"]
     columns += [f"floor, {t} thread{'s' * (t > 1)}" for t in threads]
-    print("\n| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
+    body = []
     for row in table:
         cells = [row["stage"], *(f"{row['ms'][t]:.2f}" for t in threads)]
         cells += [f"{row['ms'][first] / max(row['ms'][last], 1e-9):.2f}"]
         has_bytes = "mb" in row
         cells += [f"{row['mb']:.1f}" if has_bytes else ""]
         cells += [f"{row['floor_ms'][t]:.2f}" if has_bytes else "" for t in threads]
+        body.append(cells)
+    show_table(columns, body)
+
+
+def show_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table in Markdown."""
+    print("\n| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
+    for cells in rows:
         print("| " + " | ".join(cells) + " |")
 
 
@@ -261,13 +270,14 @@ def measure_memory(cases: Sequence[Case], trees: dict[str, Path], threads: Seque
         row["arrays"] = sum(arrays(case, row["here"]["slots"]).values())
         rows.append(row)
     columns = ["N", "pixels", "views", "arrays, MB", *(f"{name}: peak, MB" for name in trees)]
-    print("| " + " | ".join([*columns, "here: bytes per Gaussian", "slots"]) + " |")
-    print("|---" * (len(columns) + 2) + "|")
+    columns += ["here: bytes per Gaussian", "slots"]
+    body = []
     for case, row in zip(cases, rows, strict=True):
-        cells = [case.name, f"{row['arrays'] / 1e6:.0f}"]
+        cells = [*case.cells(), f"{row['arrays'] / 1e6:.0f}"]
         cells += [f"{row[name]['peak_bytes'] / 1e6:.0f}" for name in trees]
         cells += [f"{row['here']['peak_bytes'] / case.count:.0f}", f"{row['here']['slots']:,}"]
-        print("| " + " | ".join(cells) + " |")
+        body.append(cells)
+    show_table(columns, body)
     return {"memory": rows}
 
 

@@ -18,7 +18,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parents[1]
+from checkouts import add_base, environment_of, find_trees
+
 DEMO = "a red and yellow checkered torus"
 POLL_SECONDS = 0.002
 LONGEST_SECONDS = 120.0
@@ -34,7 +35,7 @@ class Timing:
 
 def main() -> None:
     args = read_arguments()
-    trees = {"base": args.base, "here": HERE} if args.base else {"here": HERE}
+    trees = find_trees(args.base)
     for tree in trees.values():
         # The first run fills the caches of bytecode, compiled kernels and the disk.
         measure(tree, args.settings)
@@ -47,7 +48,7 @@ def main() -> None:
 
 def read_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--base", type=lambda text: Path(text).resolve(), help="a checkout to compare with")
+    add_base(parser)
     parser.add_argument("--repeats", type=int, default=7, help="starts of each tree (default: 7)")
     parser.add_argument("--json", action="store_true", help="print numbers for programs")
     parser.add_argument("settings", nargs="*", help="further settings of the training, such as prior=tiny")
@@ -63,7 +64,7 @@ def measure(tree: Path, settings: list[str]) -> Timing:
         process = subprocess.Popen(
             [sys.executable, "-m", "cadam3d", "train", *words],
             cwd=place,
-            env={**os.environ, "PYTHONPATH": str(tree)},
+            env=environment_of(tree),
             stdout=console,
             stderr=subprocess.STDOUT,
         )

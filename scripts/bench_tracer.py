@@ -15,8 +15,12 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 
 import torch
+
+# The script measures the package that it stands beside, from any folder.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
 from cadam3d.core.errors import UserError

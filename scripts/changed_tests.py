@@ -53,6 +53,8 @@ def tests_of_path(path: Path) -> set[Path]:
             names = (path.stem, path.parent.name)
             selected = {test for name in names for test in TESTS.rglob(f"test_{name}.py")}
             selected |= set((REPOSITORY / path).parent.glob("test_*.py"))
+            if path.parts[0] == "scripts":
+                selected |= importers_of_script(path)
         case "pyproject.toml" | "Makefile" | "constraints.txt":
             selected = {TESTS / "test_packaging.py"}
         case "mkdocs.yml" | "CITATION.cff":
@@ -66,6 +68,13 @@ def importers(path: Path) -> set[Path]:
     """Return the test files that import a module of the package directly."""
     module = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
     return {test for test in TESTS.rglob("test_*.py") if module in imported_modules(test)}
+
+
+def importers_of_script(path: Path) -> set[Path]:
+    """Return the test files that import a script, or any module of its folder."""
+    name = Path(path.parts[1]).stem
+    modules = {test: set(imported_modules(test)) for test in TESTS.rglob("test_*.py")}
+    return {test for test, found in modules.items() if any(each.partition(".")[0] == name for each in found)}
 
 
 def mirror(parts: tuple[str, ...]) -> set[Path]:

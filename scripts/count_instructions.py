@@ -27,7 +27,8 @@ import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parents[1]
+from checkouts import add_base, environment_of, find_trees
+
 INSTALL = "pip install nvidia-cuda-nvrtc nvidia-cuda-nvdisasm"
 # Runs in either checkout: writes the cubin, and prints the log of the assembler.
 COMPILE = """
@@ -82,7 +83,7 @@ def main() -> None:
     nvdisasm = find_nvdisasm()
     if nvdisasm is None:
         raise SystemExit(f"count_instructions: expected nvdisasm, found none. Try: {INSTALL}")
-    trees = {"base": args.base, "here": HERE} if args.base else {"here": HERE}
+    trees = find_trees(args.base)
     counts = {name: count_tree(tree, args.architecture, nvdisasm) for name, tree in trees.items()}
     if args.json:
         found = {
@@ -95,7 +96,7 @@ def main() -> None:
 
 def read_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--base", type=lambda text: Path(text).resolve(), help="a checkout to compare with")
+    add_base(parser)
     parser.add_argument("--architecture", type=int, default=90, help="90 is sm_90, a H200 (default: 90)")
     parser.add_argument("--json", action="store_true", help="print numbers for programs")
     return parser.parse_args()
@@ -114,7 +115,7 @@ def count_tree(tree: Path, architecture: int, nvdisasm: str) -> dict[str, Kernel
         cubin = Path(folder) / "kernels.cubin"
         log = run(
             [sys.executable, "-c", COMPILE, str(architecture), str(cubin)],
-            {**os.environ, "PYTHONPATH": str(tree)},
+            environment_of(tree),
             folder,
         )
         listing = run([nvdisasm, "--print-code", str(cubin)], dict(os.environ), folder)

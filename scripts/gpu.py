@@ -2,7 +2,7 @@
 
     python scripts/gpu.py                     # checks, then times, then explanations
     python scripts/gpu.py --part checks       # one of the three parts, each less than ten minutes
-    python scripts/gpu.py --wheels            # what a machine without a package registry must bring along
+    python scripts/gpu.py --wheels            # packages to copy to a machine without a package registry
     python scripts/gpu.py --markdown FILE     # show the JSON of a run as Markdown
 
 If a check fails, nothing is timed, and the stage of the kernels that is wrong is named. The same line
@@ -59,7 +59,7 @@ def parse(words: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--torch", action="store_true", help="only print which torch to install; nothing if there is one"
     )
-    parser.add_argument("--wheels", action="store_true", help="only list packages to bring along")
+    parser.add_argument("--wheels", action="store_true", help="only list the packages to copy")
     parser.add_argument(
         "--markdown", type=Path, metavar="FILE", help="only show the JSON of a run as Markdown"
     )
@@ -113,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
         fitting_torch(device.driver_cuda)
         print(f"{device.name}, driver for CUDA up to {device.driver_cuda}")
         return 0
-    # What ends this process must end the process of a piece, too.
+    # A signal that ends this process must end the process of a piece, too.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     return Session(args.folder.absolute(), device).run([part for part in PARTS if part in args.part])
 

@@ -246,6 +246,12 @@ class Result(NamedTuple):
         return lines[0].removeprefix("cadam3d: ")
 
 
+@pytest.fixture(autouse=True)
+def _scripts_find_their_folder(monkeypatch):
+    """Reset a variable that the command line sets, because with it a script cannot import its own folder."""
+    monkeypatch.setenv("PYTHONSAFEPATH", "")
+
+
 @pytest.fixture
 def type_line(monkeypatch, capsys, tmp_path) -> Callable[..., Result]:
     """Return a function that runs ``cadam3d ...`` in an empty folder, in this process."""

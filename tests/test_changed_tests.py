@@ -26,6 +26,8 @@ import changed_tests  # noqa: E402
         ("mkdocs.yml", "tests/test_site.py"),
         ("scripts/site/pages.py", "tests/test_site.py"),
         ("scripts/bench_recipes.py", "tests/test_bench_recipes.py"),
+        ("scripts/rasterizer_bench/check.py", "tests/rasterizer/test_bench_rasterizer.py"),
+        ("scripts/checkouts.py", "tests/test_checkouts.py"),
         ("tests/io/test_ply.py", "tests/io/test_ply.py"),
     ],
 )

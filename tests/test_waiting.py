@@ -17,8 +17,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from cadam3d import trainer as loop
 from cadam3d.commands.train import build_trainer
-from cadam3d.core.device import read_numbers, upload_together
+from cadam3d.core.device import read_numbers, upload, upload_together
 from cadam3d.core.render import RenderOutput
+from cadam3d.densifier.baseline import Baseline
+from cadam3d.exposure import NoExposure
+from cadam3d.prior.mvdream import CHECKED
 from cadam3d.rasterizer.base import Rasterizer, absgrad_probe
 from cadam3d.settings.compose import component
 
@@ -73,8 +76,8 @@ def step_without_values(monkeypatch, lines: Sequence[str]) -> tuple[int, list[bo
     state.densifier = trainer.densifier.init_state(len(gaussians), META)
     embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
     trainer.prior.load()
-    # The first prediction of MVDream checks the noise levels.
-    vars(trainer.prior)["has_predicted"] = True
+    # The first predictions of MVDream check the noise levels.
+    vars(trainer.prior)["checked"] = CHECKED
     readings = []
 
     def read(numbers, device):
@@ -200,6 +203,7 @@ def test_numbers_of_any_kind_are_read_exactly():
     found = read_numbers([2.5, *tensors, torch.tensor(0.1, requires_grad=True), False], CPU)
     assert found == [2.5, float(tensors[0]), 1.0, 3.0, 1 / 3, float(tensors[0]), 0.0]
     assert read_numbers([], CPU) == []
+    assert read_numbers([torch.ones(1), torch.ones(1, 1), torch.ones(())], CPU) == [1.0, 1.0, 1.0]
 
 
 def test_tensors_that_are_sent_together_keep_their_shapes_and_stay_where_they_are():
@@ -209,3 +213,76 @@ def test_tensors_that_are_sent_together_keep_their_shapes_and_stay_where_they_ar
         sent = upload_together(tensors, META)
     assert [(each.device, each.shape) for each in sent] == [(META, tensor.shape) for tensor in tensors]
     assert transfers.are_asynchronous == [True]
+
+
+def test_tensors_that_are_sent_together_keep_their_dtypes_and_may_be_there_already():
+    tensors = [torch.rand(2, 3), torch.arange(4), torch.empty(5, device=META), torch.rand(2).double()]
+    sent = upload_together(tensors, META)
+    assert sent[2] is tensors[2]
+    assert [(each.dtype, each.shape) for each in sent] == [(tensor.dtype, tensor.shape) for tensor in tensors]
+    assert all(each.device == META for each in sent)
+
+
+def test_a_copy_that_the_host_reads_is_not_asynchronous(monkeypatch):
+    asked = []
+
+    def to(self, device, non_blocking):
+        asked.append(non_blocking)
+        return self
+
+    monkeypatch.setattr(Tensor, "to", to)
+    upload(torch.empty(1, device=META), CPU)
+    upload(torch.ones(1), META)
+    assert asked == [False, True]
+
+
+# -------------------------------------------------------------------------- components of users
+
+
+@dataclass(frozen=True, kw_only=True)
+class InPlace(Baseline):
+    """A densifier that changes the gradients that it has read, against its interface."""
+
+    def observe(self, state, signal):
+        signal.means.zero_()
+        signal.means2d.zero_()
+        return super().observe(state, signal)
+
+
+@pytest.mark.parametrize("penalties", [[], ["regularizer=[mean_opacity]"]])
+def test_a_densifier_cannot_change_what_the_optimizer_sees(penalties, tmp_path):
+    means = []
+    for kind in (Baseline, InPlace):
+        trainer, state = make(["densifier=baseline", "refine.start=50", *penalties])
+        go(replace(trainer, densifier=kind(**vars(trainer.densifier)), steps=2), state, tmp_path)
+        means.append(state.gaussians.means.detach())
+    assert torch.equal(*means)
+
+
+def test_numbers_of_components_may_be_floats_or_have_a_dimension(tmp_path):
+    """Components of others return floats, or sums that keep a dimension."""
+
+    class Dims(NoExposure):
+        def dimming(self, output, background, step):
+            return torch.full((1,), 0.5)
+
+    class Logs(type(make()[0].guidance)):
+        def __call__(self, *args):
+            output = super().__call__(*args)
+            return replace(output, log={**output.log, "mine": 2})
+
+    trainer, state = make()
+    recorder = Recorder()
+    trainer = replace(
+        trainer,
+        guidance=Logs(**vars(trainer.guidance)),
+        exposure=Dims(),
+        regularizers={"size": lambda gaussians, output, step: gaussians.log_scales.exp().mean()[None]},
+        callbacks=[recorder],
+        steps=2,
+    )
+    go(trainer, state, tmp_path)
+    assert state.dimmed == 2
+    report = recorder.steps[0]
+    assert report.log["mine"] == 2
+    assert all(type(value) is float for value in (report.loss, *report.log.values()))

@@ -1,4 +1,4 @@
-"""The check of ``cadam3d doctor`` of the ray tracer that draws the images of the embedded prior."""
+"""The check of ``cadam3d doctor`` for the ray tracer that draws the images of the embedded prior."""
 
 import torch
 
@@ -12,7 +12,7 @@ from cadam3d.prior.shapes.scene import build
 from cadam3d.prior.shapes.tracer import trace
 
 TOPIC = "prior.tracer=auto"
-# Several kinds of solids, without a pattern, whose borders may move by a sample.
+# Several kinds of solids. There is no pattern, because its borders may differ by a sample.
 PROMPT = "a red mug next to a tree"
 TOLERANCE = 1e-4  # of the light, in [0, 1]
 

@@ -62,7 +62,7 @@ TIMEOUT = 900  # seconds
 class Names:
     """The names that messages use for something that is compiled, and the words that avoid it."""
 
-    key: str  # the setting that asks for it, as in "rasterizer=cpu"
+    key: str  # the setting that needs it, as in "rasterizer=cpu"
     fallback: str  # what to type to do without it
     cache_key: str | None = None  # the setting for the folder of compiled files, if there is one
 

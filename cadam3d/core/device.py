@@ -6,7 +6,6 @@ A host that does not wait for a CUDA device prepares the next kernels while the 
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Shaped
 from torch import Tensor
 
 from cadam3d.core.checks import fail
@@ -34,27 +33,35 @@ def upload(tensor: Tensor, device: torch.device) -> Tensor:
     """Return ``tensor`` on ``device``, without waiting for what the device is doing.
 
     A copy from ordinary memory to CUDA would wait. From pinned memory it does not, and torch reuses that
-    memory only after the copy. On the device that it is on already, a tensor is returned as it is.
+    memory only after the copy. On the device that it is on already, a tensor is returned as it is. A copy to
+    the CPU waits, because the host could otherwise read it before it is complete.
     """
     if device.type == "cuda" and tensor.device.type == "cpu":
         tensor = tensor.pin_memory()
-    return tensor.to(device, non_blocking=True)
+    return tensor.to(device, non_blocking=device.type != "cpu")
 
 
 def upload_together(tensors: Sequence[Tensor], device: torch.device) -> list[Tensor]:
-    """Return all tensors on ``device``, in one copy of which they are views, as :func:`upload` does.
+    """Return all tensors on ``device``, sent there in one copy as :func:`upload` does.
 
-    They have one dtype and are on one device, such as the CPU.
+    Those that are there already are returned as they are. The others are views of the copy, except that each
+    tensor keeps its dtype.
     """
-    if all(tensor.device == device for tensor in tensors):
+    away = [tensor for tensor in tensors if tensor.device != device]
+    if not away:
         return list(tensors)
-    flat = upload(torch.cat([tensor.reshape(-1) for tensor in tensors]), device)
-    pieces = flat.split([tensor.numel() for tensor in tensors])
-    return [piece.view(tensor.shape) for piece, tensor in zip(pieces, tensors, strict=True)]
+    flat = upload(torch.cat([tensor.reshape(-1) for tensor in away]), device)
+    pieces = iter(flat.split([tensor.numel() for tensor in away]))
+    return [
+        tensor if tensor.device == device else next(pieces).view(tensor.shape).to(tensor.dtype)
+        for tensor in tensors
+    ]
 
 
-def read_numbers(numbers: Sequence[Shaped[Tensor, ""] | float], device: torch.device) -> list[float]:
-    """Return the numbers, of which some may be tensors on ``device``. Waits for the device once in all."""
-    tensors = [upload(number.detach(), device) for number in numbers if isinstance(number, Tensor)]
+def read_numbers(numbers: Sequence[Tensor | float], device: torch.device) -> list[float]:
+    """Return the numbers, of which some may be tensors with one element. Waits for ``device`` once in all."""
+    tensors = [
+        upload(number.detach().reshape(()), device) for number in numbers if isinstance(number, Tensor)
+    ]
     read = iter(torch.stack(tensors).tolist() if tensors else [])
     return [float(next(read) if isinstance(number, Tensor) else number) for number in numbers]

@@ -32,9 +32,12 @@ class GradientSignal:
 
     @classmethod
     def read(cls, gaussians: Gaussians, output: RenderOutput) -> "GradientSignal":
-        """Return the gradients of the last backward pass themselves; another pass would add to them."""
+        """Return the gradients of the last backward pass; another pass would add to those of the images.
+
+        The gradient of the means is a copy, because the optimizer reads it after the densifier.
+        """
         return cls(
-            means=_gradient_of(gaussians.means),
+            means=_gradient_of(gaussians.means).clone(),
             means2d=_gradient_of(output.means2d),
             radii=output.radii.detach(),
             height=output.rgb.shape[1],
@@ -43,9 +46,9 @@ class GradientSignal:
         )
 
     def copy(self) -> "GradientSignal":
-        """Return copies of the gradients, which no later backward pass changes."""
+        """Return gradients that no later backward pass changes."""
         absgrad = None if self.absgrad is None else self.absgrad.clone()
-        return replace(self, means=self.means.clone(), means2d=self.means2d.clone(), absgrad=absgrad)
+        return replace(self, means2d=self.means2d.clone(), absgrad=absgrad)
 
     @property
     def visible(self) -> Bool[Tensor, "v n"]:
@@ -74,8 +77,8 @@ class Densifier(ABC, Generic[State]):
 
     Every method is pure: it returns a new state and leaves its arguments alone. So a step that fails half way
     has changed nothing, and a step for which the rasterizer had reserved too little memory can be repeated.
-    Working in place would save CAdam about a third of 11 ms per million Gaussians on one core, where the
-    cheapest step takes 770 ms (``scripts/bench_densifier.py``).
+    Working in place could save CAdam only a part of 4 ms per million Gaussians on one core, where the
+    cheapest step takes 340 ms (``scripts/bench_densifier.py``).
     """
 
     @property

@@ -21,6 +21,9 @@ from cadam3d.prior.path import Prediction, per_view
 from cadam3d.prior.stable_diffusion import StableDiffusion
 
 VIEWS = 4  # per group
+# To read a noise level waits for a GPU, so only the first predictions of a run are checked there. These are
+# more than those of one step, because an inversion may begin at one level for all views.
+CHECKED = 100
 # The network reads a camera as a matrix of four by four numbers.
 CAMERA = 16
 # Largest deviation from a quarter turn between the views of a group, and of their elevations.
@@ -113,15 +116,19 @@ class MVDream(StableDiffusion):
         matrices = camera_numbers(cameras).to(noisy)
         return self.network(noisy, timestep, encoder_hidden_states=texts.tokens, class_labels=matrices).sample
 
+    def load(self) -> None:
+        """Load the autoencoder and the denoiser; the noise levels of a new run are checked again."""
+        super().load()
+        vars(self)["checked"] = 0
+
     @torch.no_grad()
     def predict(
         self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: TextCondition, scale: float
     ) -> Prediction:
         """Predict every view, without gradient. Raises ``UserError`` if ``t`` differs within a group."""
-        # To read a level waits for the device. There the first prediction is enough, because views have
-        # different levels in every step or in none.
-        if t.device.type == "cpu" or not vars(self).get("has_predicted"):
-            vars(self)["has_predicted"] = True
+        checked = vars(self).get("checked", 0)
+        if t.device.type == "cpu" or checked < CHECKED:
+            vars(self)["checked"] = checked + 1
             require_one_level(t)
         return super().predict(noisy, t, condition, scale)
 

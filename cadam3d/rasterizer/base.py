@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -46,6 +47,16 @@ class Backend:
 
 class Rasterizer(ABC):
     """Renders Gaussians. A component is its hyper-parameters, so it holds no tensors."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Let :meth:`render_ahead` follow a :meth:`render` that a subclass overrides alone.
+
+        Training would otherwise use the inherited ``render_ahead``, and thus other images than all else.
+        """
+        super().__init_subclass__(**kwargs)
+        overriding = next(owner for owner in cls.__mro__ if {"render", "render_ahead"} & vars(owner).keys())
+        if "render_ahead" not in vars(overriding):
+            cls.render_ahead = Rasterizer.render_ahead
 
     @abstractmethod
     def render(

@@ -17,7 +17,7 @@ LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 OUT_OF_MEMORY = 2  # CUDA_ERROR_OUT_OF_MEMORY
 # Labels in the list of extra options of a launch: CU_LAUNCH_PARAM_END and so on.
 END, BUFFER_POINTER, BUFFER_SIZE = 0, 1, 2
-# Functions that write so many whole numbers of eight bytes into a buffer.
+# By number of arguments: the function that writes them into a buffer, as whole numbers of eight bytes.
 MOST_ARGUMENTS = 32
 PACKERS = [struct.Struct(f"{count}q").pack_into for count in range(MOST_ARGUMENTS + 1)]
 
@@ -115,7 +115,7 @@ class Module:
 
 
 class _Functions(dict[str, ctypes.c_void_p]):
-    """The handles of kernels by name, each of which the driver is asked for once."""
+    """The handles of kernels by name. Each is requested from the driver at its first use."""
 
     def __init__(self, find: Callable[[str], ctypes.c_void_p]) -> None:
         super().__init__()

@@ -7,9 +7,9 @@ import torch
 
 # More slots are reserved than any recent render needed, by this factor.
 MARGIN = 1.25
-# What a render needed counts less with every later one: half after 700 of them.
+# The weight of a render decreases with every later one. After 700 of them it is a half.
 DECAY = 0.999
-# At least so many slots are reserved, which take less memory than a small image.
+# The smallest number of slots that is reserved. They take less memory than a small image.
 LEAST = 4096
 
 

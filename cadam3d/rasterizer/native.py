@@ -197,7 +197,7 @@ def plain(tensor: Tensor, device: torch.device) -> Tensor:
 
 
 def upload(tensors: Sequence[Tensor], device: torch.device) -> Sequence[Tensor]:
-    """Return the tensors as float32 on ``device``: what is on the CPU moves in one copy, without a wait.
+    """Return the tensors as float32 on ``device``. Those on the CPU move in one copy, without a wait.
 
     A tensor with a gradient or on another device stays where it is.
     """

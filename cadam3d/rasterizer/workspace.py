@@ -1,4 +1,4 @@
-"""Memory of kernels: many named arrays in a single allocation, which saves most of the time of allocating."""
+"""Memory of kernels: many named arrays in one allocation, which takes less time than one for each."""
 
 import os
 from collections.abc import Mapping
@@ -42,7 +42,7 @@ def plan(sizes: Mapping[str, int], apart: bool) -> Workspace:
     """Return a workspace with an array of so many bytes for each name, in one block or in one block each."""
     if apart:
         places = {name: (block, 0) for block, name in enumerate(sizes)}
-        # No block is empty, because the address of nothing would look like an array that is left out.
+        # A block has at least one byte. Otherwise its address would be 0, which means a missing array.
         return Workspace(places, sizes, tuple(max(size, 1) for size in sizes.values()))
     places, end = {}, 0
     for name, size in sizes.items():

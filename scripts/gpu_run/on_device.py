@@ -179,7 +179,7 @@ def sorts() -> dict[str, Any]:
 
 
 def compare_sorts(launcher: Any, device: Any, sizes: Any, repeats: int) -> dict[str, Any]:
-    """Return the times of both sorts; they take turns."""
+    """Return the times of both sorts, which take turns."""
     import statistics
 
     from rasterizer_bench.check import make_keys, sort_keys
@@ -205,7 +205,7 @@ def compare_sorts(launcher: Any, device: Any, sizes: Any, repeats: int) -> dict[
         ours, theirs = (statistics.median(each) for each in zip(*times[1:], strict=True))
         found.append({"keys": count, "bits": bits, "ours_ms": ours, "torch_ms": theirs})
     ratios = [f"{each['torch_ms'] / each['ours_ms']:.2f}x" for each in found]
-    says = f"as fast as torch.sort(stable=True) times {', '.join(ratios)}"
+    says = f"the speed of torch.sort(stable=True) times {', '.join(ratios)}"
     return {"says": "; ".join([says, *lacking]), "sorts": found}
 
 
@@ -236,7 +236,7 @@ def ncu(tool: str) -> dict[str, Any]:
         return {"says": f"counters of {len(found)} kernels at {SCENES[-1][0]:,} Gaussians", "counters": found}
     lines = [line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip()]
     errors = [line for line in lines if "ERR" in line or "error" in line.lower()]
-    reason = (errors or lines or ["it printed nothing"])[-1 if not errors else 0]
+    reason = (errors or lines or ["no output"])[-1 if not errors else 0]
     return {"says": f"ncu does not work on this machine: {reason}", "skipped": True}
 
 

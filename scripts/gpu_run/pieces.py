@@ -239,10 +239,10 @@ def by_sanitizer(finished: Finished) -> tuple[str, str]:
 
 
 def _quoted(log: str) -> str:
-    """Return the line of a log that tells most: the last one of the tool, or else the last one."""
+    """Return the most useful line of a log: the last one of the tool, or else the last one."""
     lines = [line.strip("= \n") for line in log.splitlines()]
     of_tool = [line.strip("= ") for line in log.splitlines() if line.startswith("====")]
-    return next((line for line in reversed([*lines, *of_tool]) if line), "it printed nothing")
+    return next((line for line in reversed([*lines, *of_tool]) if line), "no output")
 
 
 def by_check(finished: Finished) -> tuple[str, str]:

@@ -26,7 +26,7 @@ LEAST_SECONDS = 15
 
 @dataclass(frozen=True)
 class Finished:
-    """What a process left behind; ``code`` is ``None`` if it met its time limit."""
+    """The result of a process; ``code`` is ``None`` if the process reached its time limit."""
 
     code: int | None
     log: str
@@ -36,10 +36,10 @@ class Finished:
     def last_line(self) -> str:
         """Return the last line of the log that is not empty."""
         lines = [line.strip() for line in self.log.splitlines() if line.strip()]
-        return lines[-1] if lines else "it printed nothing"
+        return lines[-1] if lines else "no output"
 
 
-def excuse(log: str) -> str | None:
+def missing_in(log: str) -> str | None:
     """Return what a machine lacks for a piece that has failed; ``None`` if the log does not say so."""
     if missing := re.findall(r"^E?\s*ModuleNotFoundError: No module named '([^']+)'", log, re.MULTILINE):
         return f"not installed: {', '.join(dict.fromkeys(missing))}"
@@ -119,7 +119,7 @@ class Processes:
         return Job(piece, process, log, result, time.monotonic())
 
     def wait(self, job: Job, seconds: float) -> Finished:
-        """Return what the process leaves behind, after at most ``seconds``."""
+        """Return the result of the process, and end the process after ``seconds``."""
         try:
             code = job.process.wait(timeout=max(seconds, 0.0))
         except subprocess.TimeoutExpired:
@@ -198,7 +198,7 @@ class Runner:
             status, says = ENDED, f"still running after {took:.0f} s; its last line: {finished.last_line}"
         else:
             status, says = job.piece.judge(finished)
-            if status == FAILED and not job.piece.is_gate and (reason := excuse(finished.log)):
+            if status == FAILED and not job.piece.is_gate and (reason := missing_in(finished.log)):
                 status, says = SKIPPED, reason
         self._keep(job.piece, status, says, took, finished.result)
 

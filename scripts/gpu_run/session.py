@@ -1,4 +1,4 @@
-"""A run: the machine, the parts that were requested, and their results."""
+"""One call of ``scripts/gpu.py``: looks at the machine, continues the record and runs the requested parts."""
 
 import hashlib
 import os
@@ -61,7 +61,7 @@ def alone(folder: Path) -> Iterator[None]:
 
 
 class Session:
-    """One call of ``scripts/gpu.py``."""
+    """One call of the command line, which may continue the results of earlier calls."""
 
     def __init__(self, folder: Path, device: Device, show_line: Callable[[str], None] | None = None) -> None:
         self._folder, self._device = folder, device
@@ -179,5 +179,5 @@ class Session:
         self._path.with_suffix(".md").write_text(text, encoding="utf-8")
         statuses = [entry.status for entry in record.pieces.values()]
         counts = {status: statuses.count(status) for status in dict.fromkeys(statuses)}
-        said = ", ".join(f"{count} {status}" for status, count in counts.items()) or "nothing has run"
-        self._show(f"{said}. Results: {self._path} and {self._path.with_suffix('.md').name}")
+        summary = ", ".join(f"{count} {status}" for status, count in counts.items()) or "nothing has run"
+        self._show(f"{summary}. Results: {self._path} and {self._path.with_suffix('.md').name}")

@@ -1,4 +1,4 @@
-"""The packages that a machine without a package registry must bring along, beside Python and torch."""
+"""The packages to copy to a machine without a package registry, beside Python and torch."""
 
 import re
 import tomllib
@@ -8,7 +8,7 @@ from pathlib import Path
 from gpu_run.machine import REPOSITORY
 
 PYTHON = "3.12"
-# pip does not know that a newer one of these systems can use wheels for an older one.
+# The system of the wheel, newest first; pip accepts an older one only if it is listed too.
 PLATFORMS = ("manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64")
 
 
@@ -20,13 +20,14 @@ class Package:
     purpose: str
     # A pure wheel fits every Python and system. Others are for one Python version and one kind of machine.
     is_pure: bool = True
-    # If the project does not ask for the package itself, the versions that the packages above accept.
+    # The versions that the packages above accept, if the project does not require the package itself.
     bounds: str = ""
     has_wheel: bool = True
 
 
 CHECKS, GSPLAT, DEMO, RECIPES = "checks and times", "gsplat", "the demo", "the recipes"
-# Packages that the project does not ask for itself come with those above them. Torch brings filelock.
+# A package that the project does not require itself is below the one that requires it. Filelock comes with
+# torch.
 PACKAGES = (
     Package("numpy", CHECKS, is_pure=False),
     Package("jaxtyping", CHECKS),

@@ -20,6 +20,7 @@ from torch.nn.functional import normalize
 from cadam3d.camera.multiview import Multiview
 from cadam3d.core.cameras import orbit, turntable
 from cadam3d.core.errors import UserError
+from cadam3d.prior import mvdream
 from cadam3d.prior.mvdream import MVDream, camera_numbers
 from cadam3d.prior.prompting import Plain
 
@@ -153,6 +154,19 @@ def test_the_front_is_encoded_as_published():
 
 def test_latents_are_those_of_the_autoencoder(prior, pipe):
     encodes_like_the_autoencoder(prior, pipe.vae)
+
+
+def test_on_a_gpu_the_levels_of_the_first_predictions_of_a_run_are_checked(prior, monkeypatch):
+    """An inversion begins at one level for all views, so the first prediction would not be enough."""
+    checked = []
+    condition, nothing = condition_of(prior, views()), guess_of(prior, normal(4, 4, 8, 8), views())
+    monkeypatch.setattr(mvdream, "require_one_level", checked.append)
+    monkeypatch.setattr(mvdream.StableDiffusion, "predict", lambda *arguments: nothing)
+    for _ in range(2):
+        prior.load()
+        for _ in range(mvdream.CHECKED + 2):
+            prior.predict(normal(4, 4, 8, 8), torch.zeros(4, device="meta"), condition, 1.0)
+    assert len(checked) == 2 * mvdream.CHECKED
 
 
 def test_micro_batch_does_not_change_results(prior):

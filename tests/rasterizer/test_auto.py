@@ -12,7 +12,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.rasterizer import auto, gsplat
 from cadam3d.rasterizer.auto import AutoRasterizer, checked_cuda, choose
-from cadam3d.rasterizer.base import Backend
+from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
@@ -129,6 +129,32 @@ def test_a_rasterizer_that_cannot_render_ahead_just_renders():
     ahead, exact = ReferenceRasterizer().render_ahead(*arguments), ReferenceRasterizer().render(*arguments)
     assert ahead.overflowed is None
     assert torch.equal(ahead.rgb, exact.rgb)
+
+
+def test_a_subclass_that_overrides_render_alone_also_trains_with_it(monkeypatch):
+    class Ahead(ReferenceRasterizer):
+        def render_ahead(self, gaussians, cameras, background, absgrad=False):
+            raise AssertionError("these are the images of another class")
+
+    class Own(Ahead):
+        def render(self, gaussians, cameras, background, absgrad=False):
+            return super().render(gaussians.index(slice(0, 0)), cameras, background, absgrad)
+
+    class Mixin:
+        render = Own.render
+
+    class Mixed(Mixin, Ahead):
+        pass
+
+    class Deeper(Own):
+        pass
+
+    cameras = turntable(1, elevation_deg=0.0, distance=2.0, fov_y_deg=40.0, size=8)
+    for kind in (Own, Deeper):
+        assert kind().render_ahead(a_ball(), cameras, torch.zeros(1, 3)).alpha.max() == 0
+    assert Mixed.render_ahead is Own.render_ahead is Rasterizer.render_ahead
+    # A class that overrides both keeps both.
+    assert AutoRasterizer.render_ahead is not Rasterizer.render_ahead
 
 
 # -------------------------------------------------------------------------- the gate before CUDA

@@ -54,7 +54,7 @@ def test_both_ways_give_the_same_bits_if_there_is_room(emulator, views, absgrad)
     scene = make_scene(views=views)
     want = bits(*render_and_differentiate(emulator.render, *scene, absgrad=absgrad))
     slots = sum(count_slots(emulator, *scene[:2]))
-    # 4096 slots are one chunk of the sort, and a little more than 16384 counts need three kernels to add up.
+    # The last capacity is so large that the sort counts the slots in a kernel of its own.
     for capacity in (slots, slots + 1, 4097, 70_000):
         assert not overflow(emulator, scene, capacity)
         render = partial(rasterize, emulator, capacity=capacity)

@@ -1,6 +1,6 @@
 """The native ray tracer: vectorised and threaded C++ (``kernels/trace.cpp``), compiled at its first use.
 
-It has the hits, the light and the patterns of ``tracer.py``, at a small part of the time.
+It finds the same hits and the same light as ``tracer.py`` in a small part of the time.
 """
 
 import ctypes

@@ -1,7 +1,7 @@
 """The choice between the ray tracers: the native one, or the one in torch.
 
 They find the same hits and the same light. The one in torch works in every dtype, on every device and without
-a compiler, and the native one takes a small part of its time.
+a compiler. The native one is many times faster, but it needs a compiler, float32 and a CPU.
 """
 
 from collections.abc import Callable
@@ -21,12 +21,12 @@ TRACERS = ("auto", "native", "torch")
 
 @dataclass(frozen=True)
 class Tracer:
-    """A ray tracer, and why it is not a faster one."""
+    """A ray tracer, and why it is not the native one."""
 
     name: str  # "native" or "torch"
-    identity: str  # differs between tracers whose last bits may differ
+    identity: str  # differs if the last bits of the images may differ
     trace: Callable[[Scene, Cameras, int], Layers]
-    reason: str | None = None  # why it is not the native one, if that was wanted
+    reason: str | None = None  # why the native one cannot be compiled, if auto tried it
 
 
 @cache

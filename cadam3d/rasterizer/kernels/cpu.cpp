@@ -62,7 +62,8 @@ constexpr int PARTS = CELL * CELL / LANES;  // vectors per cell
 // Gaussians that a thread processes at a time; a whole number of vectors. A core loads ahead, so with 256 it
 // takes cache lines from the core that writes the next block, and two threads are no faster than one.
 constexpr int64_t BLOCK = 2048;
-constexpr int64_t PIECE = 8192;  // Gaussians for which another thread pays when lists are made, at least
+// Gaussians of each thread when lists are made, at least. With fewer, another thread saves no time.
+constexpr int64_t PIECE = 8192;
 constexpr int RECORD = 16;    // floats that the backward pass writes per (Gaussian, tile): one cache line
 constexpr int MOMENTS = 10;   // the first floats of a record
 constexpr int ABSOLUTES = 2;  // the next floats, used for absgrad

@@ -3,7 +3,8 @@
 // This is ``tracer.py`` for vectors of rays. A vector holds LANES neighbouring samples, which mostly hit the
 // same parts after the same number of steps. Everything that decides where a ray hits, and how much light is
 // there, uses the same IEEE operations in the same order as ``tracer.py`` and ``solids.py``, so both find the
-// same bits. Only atan2 and asin, which place the borders of patterns, may differ in their last bits.
+// same bits. Only atan2, asin and the matrix product with the spots, which place the borders of patterns, may
+// differ in their last bits.
 //
 // A piece of work is a band of rows of pixels of one view. The bands do not depend on the number of threads,
 // and no two of them write to the same pixel. Therefore any number of threads gives the same bits.

@@ -9,7 +9,7 @@ import pytest
 
 from cadam3d.compiled.build import find_compiler
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "scripts" / "bench_host.py"
 TINY = ("--count=10", "--size=9", "--views=2", "--steps=2", "--repeats=1")
 
