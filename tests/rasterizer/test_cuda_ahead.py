@@ -3,6 +3,7 @@
 import weakref
 from functools import partial
 
+import jaxtyping
 import pytest
 import torch
 from emulation import Emulator, count_slots, guard_zones, passes
@@ -242,8 +243,9 @@ def test_depths_are_sorted_before_the_host_waits(emulator, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_compiled_function_may_render(emulator):
+def test_a_compiled_function_may_render(emulator, monkeypatch):
     """The graph that torch.compile makes ends before rendering and continues after it."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as outside of the test suite
     gaussians, cameras, background, _ = make_scene(n=20, views=1)
     render, graphs = partial(rasterize_ahead, emulator), []
 

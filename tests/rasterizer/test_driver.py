@@ -247,6 +247,11 @@ def test_a_step_that_is_not_the_first_only_launches_kernels(stub, built, tmp_pat
 def test_counts_are_copied_and_waited_for_on_the_current_stream(monkeypatch):
     log, fake = [], FakeCuda()
 
+    class OnDevice(torch.Tensor):
+        device = SimpleNamespace(type="cuda")
+
+    counts = torch.zeros(2).as_subclass(OnDevice)
+
     class Event:
         def record(self, stream=None):
             log.append(("record", fake.stream if stream is None else stream))
@@ -258,7 +263,7 @@ def test_counts_are_copied_and_waited_for_on_the_current_stream(monkeypatch):
         assert (device, pin_memory) == ("cpu", True), "a copy to ordinary memory would wait"
 
         def copy(source, non_blocking):
-            assert source is numbers
+            assert source is numbers is counts
             log.append(("copy", fake.stream, non_blocking))
 
         return SimpleNamespace(copy_=copy, tolist=lambda: [3, 4])
@@ -267,7 +272,7 @@ def test_counts_are_copied_and_waited_for_on_the_current_stream(monkeypatch):
     monkeypatch.setattr(torch, "cuda", fake)
     monkeypatch.setattr(torch, "empty_like", empty_like)
     fake.stream = 2**41
-    read = _start_reading(SimpleNamespace(device=SimpleNamespace(type="cuda")))
+    read = _start_reading(counts)
     assert log == [("copy", 2**41, True), ("record", 2**41)]
     assert read() == [3, 4]
     assert log[2:] == ["wait"]
