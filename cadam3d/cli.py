@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 from cadam3d import __version__
 from cadam3d.core.errors import UserError
+from cadam3d.core.openmp import waiting
 
 COMMANDS = {  # the purpose of each, and a line to paste
     "train": ("optimise an asset for a prompt", 'cadam3d train prompt="a red torus"'),
@@ -32,9 +33,7 @@ COMPLETION_FLAGS = ("--shell-completion", "-sc")
 def main() -> None:
     """Run the command line of this process and exit: 0 for success, 1 for an error, 130 for an interrupt."""
     wants_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1"
-    # This must be set before torch loads OpenMP. If idle threads spin instead of sleeping, two busy programs
-    # slow each other tenfold.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.update(waiting(os.environ))
     # Python processes that this one starts, such as the workers of a launcher, would import modules from the
     # current folder, where a file may be called yaml.py.
     os.environ["PYTHONSAFEPATH"] = "1"

@@ -27,7 +27,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-from checkouts import add_base, environment_of, find_trees
+from checkouts import HERE, add_base, environment_of, find_trees
 
 # Each Gaussian touches this many tiles in each view.
 TILES = 16
@@ -111,6 +111,8 @@ def read_arguments() -> argparse.Namespace:
 
 
 def compile_stub(folder: Path) -> Path:
+    # The script also runs where another cadam3d is installed, or none.
+    sys.path.insert(0, str(HERE))
     from cadam3d.compiled.build import find_compiler
 
     compiler = find_compiler()

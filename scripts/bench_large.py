@@ -56,9 +56,10 @@ class Worker:
     """A process with the sources of one checkout, which answers one question at a time."""
 
     def __init__(self, tree: Path) -> None:
-        # Threads of torch that spin would take the processor from the threads of the rasterizer.
+        # As the command line sets it: threads of torch that spin would take the processor from the others.
         environment = {
             "OMP_WAIT_POLICY": "PASSIVE",
+            "GOMP_SPINCOUNT": "3000",
             **os.environ,
             "PYTHONPATH": f"{tree}{os.pathsep}{SCRIPTS}",
         }

@@ -58,15 +58,24 @@ AWKWARD = (
 )
 
 
-@pytest.mark.parametrize(("before", "after"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
-def test_idle_threads_sleep_unless_the_user_sets_another_policy(before, after, type_line, monkeypatch):
-    monkeypatch.setenv("OMP_WAIT_POLICY", "to be restored")
-    if before is None:
-        monkeypatch.delenv("OMP_WAIT_POLICY")
-    else:
-        monkeypatch.setenv("OMP_WAIT_POLICY", before)
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ((None, None), ("PASSIVE", "3000")),
+        (("ACTIVE", None), ("ACTIVE", None)),
+        ((None, "7"), ("PASSIVE", "7")),
+    ],
+)
+def test_idle_threads_spin_briefly_and_sleep_unless_the_user_decides(before, after, type_line, monkeypatch):
+    names = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
+    for name, value in zip(names, before, strict=True):
+        monkeypatch.setenv(name, "to be restored")
+        if value is None:
+            monkeypatch.delenv(name)
+        else:
+            monkeypatch.setenv(name, value)
     type_line("--version")
-    assert os.environ["OMP_WAIT_POLICY"] == after
+    assert tuple(os.environ.get(name) for name in names) == after
 
 
 @pytest.fixture(scope="session")

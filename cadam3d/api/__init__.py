@@ -3,23 +3,25 @@
 import os
 import sys
 
-OPENMP = "OMP_WAIT_POLICY"
+from cadam3d.core.openmp import waiting
 
 
 def _load_torch() -> None:
     """Load torch with threads that sleep while they wait, as the command line does.
 
-    OpenMP reads the variable once, while torch is loaded, so nothing can be done if torch is loaded already
-    or if the user has set the variable. Spinning threads slow two busy programs on one machine tenfold. The
-    environment is restored, because programs that the user starts later should not notice.
+    OpenMP reads its variables once, while torch is loaded, so nothing can be done if torch is loaded already
+    or if the user has chosen a policy. The environment is restored, because programs that the user starts
+    later should not notice.
     """
-    if "torch" in sys.modules or OPENMP in os.environ:
+    added = waiting(os.environ)
+    if "torch" in sys.modules or not added:
         return
-    os.environ[OPENMP] = "PASSIVE"
+    os.environ.update(added)
     try:
         import torch  # noqa: F401  (loaded for its effect)
     finally:
-        del os.environ[OPENMP]
+        for name in added:
+            del os.environ[name]
 
 
 _load_torch()

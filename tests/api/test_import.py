@@ -12,12 +12,13 @@ import cadam3d
 
 REPOSITORY = Path(__file__).parents[2]
 HEAVY = {"torch", "numpy", "hydra", "omegaconf", "matplotlib", "scipy", "jaxtyping"}
+OPENMP = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
 NAMES = {"Asset", "Callback", "Run", "Trainer", "UserError", "compose", "load", "train"}
 
 
 def python(code: str, folder: Path = REPOSITORY, **changes: str) -> str:
     """Run ``code`` in a new process that finds modules in ``folder`` first, and return its output."""
-    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    environment = {name: value for name, value in os.environ.items() if name not in OPENMP}
     environment |= {"PYTHONPATH": f"{folder}{os.pathsep}{REPOSITORY}", **changes}
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
@@ -58,16 +59,17 @@ def test_type_checkers_see_the_same_names():
 
 
 # A module that takes the place of torch and records what OpenMP would read.
-TORCH = "import os\nprint(os.environ.get('OMP_WAIT_POLICY'))\n"
-LOOK = "import os, cadam3d.api; print(os.environ.get('OMP_WAIT_POLICY'))"
+SHOW = f"print(*[os.environ.get(name) for name in {OPENMP}])"
+TORCH = f"import os\n{SHOW}\n"
+LOOK = f"import os, cadam3d.api; {SHOW}"
 
 
 def test_torch_is_loaded_with_threads_that_sleep_and_the_environment_stays(tmp_path):
     (tmp_path / "torch.py").write_text(TORCH)
-    assert python(LOOK, tmp_path).split() == ["PASSIVE", "None"]
+    assert python(LOOK, tmp_path).split() == ["PASSIVE", "3000", "None", "None"]
 
 
 def test_the_choice_of_the_user_and_a_loaded_torch_stay(tmp_path):
     (tmp_path / "torch.py").write_text(TORCH)
-    assert python(LOOK, tmp_path, OMP_WAIT_POLICY="ACTIVE").split() == ["ACTIVE"]
-    assert python(f"import torch; {LOOK}", tmp_path).split() == ["None", "None"]
+    assert python(LOOK, tmp_path, OMP_WAIT_POLICY="ACTIVE").split() == ["ACTIVE", "None"]
+    assert python(f"import torch; {LOOK}", tmp_path).split() == ["None"] * 4
