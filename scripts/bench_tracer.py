@@ -11,16 +11,22 @@ every object, plain and with every pattern, from views above, beside and below, 
 
 import argparse
 import ctypes
+import os
 import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-import torch
-
 # The script measures the package that it stands beside, from any folder.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from cadam3d.core.openmp import waiting
+
+# As on the command line, and before torch is loaded: idle threads of torch leave the processor to others.
+os.environ.update(waiting(os.environ))
+
+import torch
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
 from cadam3d.core.errors import UserError
