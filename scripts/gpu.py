@@ -11,6 +11,7 @@ project has changed. Results are in --folder: gpu.json, gpu.md, and logs. Withou
 """
 
 import argparse
+import os
 import errno
 import signal
 import sys
@@ -73,6 +74,9 @@ def main(words: list[str] | None = None) -> int:
         return run(args)
     except NoGpuError as error:
         print(f"gpu: expected an NVIDIA GPU, got none: {error}. Try: nvidia-smi", file=sys.stderr)
+    except BrokenPipeError:
+        # The reader, such as head, has seen enough. Python would complain once more when it flushes the rest.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
         print(
             f"gpu: cannot use {error.filename or args.folder}: {error.strerror}. Try: {advise(error)}",
