@@ -11,8 +11,8 @@ project has changed. Results are in --folder: gpu.json, gpu.md, and logs. Withou
 """
 
 import argparse
-import os
 import errno
+import os
 import signal
 import sys
 from pathlib import Path
