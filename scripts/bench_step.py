@@ -18,8 +18,8 @@ runs, but its training loop is replaced by three passes, which continue one anot
    device. On a CPU, tensors that never leave the host count too.
 
 Bytes per Gaussian are counted from the tensors. The networks of ``--priors random`` have the sizes of Stable
-Diffusion 2.1 (``scripts/bench_recipes.py``); ``--tiny`` replaces them by small ones. On a CPU, add smaller images
-too (``--priors random --tiny camera.size=64 prior.size=64``), because at 512 pixels a step takes minutes.
+Diffusion 2.1 (``scripts/bench_recipes.py``); ``--tiny`` replaces them by small ones. On a CPU, add smaller
+images too (``--priors random --tiny camera.size=64 prior.size=64``): at 512 pixels, a step takes minutes.
 
 Every prior has a process of its own. With ``--base`` both trees run in turn.
 """
