@@ -122,6 +122,7 @@ def test_a_step_waits_for_the_device_once(lines, monkeypatch):
     "work", [Tensor.item, bool, Tensor.tolist, Tensor.cpu, Tensor.nonzero, lambda t: t[t > 0]]
 )
 def test_the_stand_in_refuses_to_be_waited_for(work):
+    # Torch raises the first for operations that have no version without values, and the second for the rest.
     with pytest.raises((NotImplementedError, RuntimeError)):
         work(torch.ones(1, device=META))
 
@@ -213,6 +214,28 @@ def test_tensors_that_are_sent_together_keep_their_shapes_and_stay_where_they_ar
         sent = upload_together(tensors, META)
     assert [(each.device, each.shape) for each in sent] == [(META, tensor.shape) for tensor in tensors]
     assert transfers.are_asynchronous == [True]
+
+
+def test_tensors_that_are_sent_together_keep_their_numbers_and_gradients(monkeypatch):
+    """Pretend that another device is the CPU."""
+    tensors = [torch.rand(2, 3).T, torch.rand(4, requires_grad=True), torch.rand(())]
+    with monkeypatch.context() as patch:
+        patch.setattr(Tensor, "to", lambda tensor, *_, **__: tensor.clone())
+        sent = upload_together(tensors, META)
+    assert all(torch.equal(before, after) for before, after in zip(tensors, sent, strict=True))
+    sent[1].sum().backward()
+    assert torch.equal(tensors[1].grad, torch.ones(4))
+
+
+def test_another_default_device_or_dtype_of_torch_changes_nothing_that_is_sent():
+    tensors = [torch.rand(2, 3), torch.rand(4)]
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.device("meta"):
+            sent = upload_together(tensors, META)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert all(each.dtype == torch.float32 for each in sent)
 
 
 def test_tensors_that_are_sent_together_keep_their_dtypes_and_may_be_there_already():

@@ -35,6 +35,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
+from cadam3d.core.device import upload_together
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
@@ -45,7 +46,7 @@ from cadam3d.rasterizer.cuda_sort import BLOCK, scan, scan_bytes, sort, sort_byt
 from cadam3d.rasterizer.driver import Driver
 from cadam3d.rasterizer.forecast import Forecast, find_forecast
 from cadam3d.rasterizer.launcher import Launch, Launcher
-from cadam3d.rasterizer.native import RenderPass, outside_of_graphs, require_shapes, run_pass, upload
+from cadam3d.rasterizer.native import RenderPass, outside_of_graphs, require_shapes, run_pass
 from cadam3d.rasterizer.workspace import Workspace, plan
 
 # The kernels define the same constants (kernels/*.cuh).
@@ -141,10 +142,11 @@ def rasterize(
             f"rasterizer=cuda: expected at most {MOST} Gaussians, and as many pixels in a view, got "
             f"{n} and {pixels}. Try: camera.size=512"
         )
-    moved = upload((cameras.world_to_camera, cameras.intrinsics, background), device)
-    cameras = replace(cameras, world_to_camera=moved[0], intrinsics=moved[1])
+    columns = (cameras.world_to_camera, cameras.intrinsics, background)
+    matrices, intrinsics, background = upload_together(columns, device)
+    cameras = replace(cameras, world_to_camera=matrices, intrinsics=intrinsics)
     kernels = _CudaPass(launcher, cameras, device, absgrad, capacity, forecast)
-    return run_pass(kernels, gaussians, moved[2])
+    return run_pass(kernels, gaussians, background)
 
 
 @outside_of_graphs

@@ -5,7 +5,7 @@ is an ordinary node of the graph: it can retain its gradient, and a loss may use
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import wraps
 from typing import ParamSpec, TypeVar, cast
 
@@ -194,25 +194,6 @@ def plain(tensor: Tensor, device: torch.device) -> Tensor:
     if tensor.dtype is torch.float32 and tensor.device == device and tensor.is_contiguous():
         return tensor
     return tensor.to(device, torch.float32).contiguous()
-
-
-def upload(tensors: Sequence[Tensor], device: torch.device) -> Sequence[Tensor]:
-    """Return the tensors as float32 on ``device``. Those on the CPU move in one copy, without a wait.
-
-    A tensor with a gradient or on another device stays where it is.
-    """
-    moving = [t for t in tensors if t.device.type == "cpu" and not t.requires_grad]
-    if device.type == "cpu" or not moving:
-        return tensors
-    # A copy of ordinary memory would wait for the device. Torch does not give pinned memory to others before
-    # the copy is done.
-    is_pinned = device.type == "cuda"
-    size = sum(t.numel() for t in moving)
-    # Torch may have another default device or dtype.
-    packed = torch.empty(size, dtype=torch.float32, device="cpu", pin_memory=is_pinned)
-    torch.cat([t.flatten().float() for t in moving], out=packed)
-    pieces = iter(packed.to(device, non_blocking=True).split([t.numel() for t in moving]))
-    return [next(pieces).view(t.shape) if any(t is each for each in moving) else t for t in tensors]
 
 
 def require_shapes(gaussians: Gaussians, cameras: Cameras, background: Tensor) -> None:

@@ -17,12 +17,10 @@ from splats import (
     make_weights,
     render_and_differentiate,
 )
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from cadam3d.rasterizer import cuda, forecast
 from cadam3d.rasterizer.cuda import rasterize, rasterize_ahead
 from cadam3d.rasterizer.forecast import DECAY, LEAST, MARGIN, Forecast
-from cadam3d.rasterizer.native import upload
 from cadam3d.rasterizer.workspace import Workspace
 
 pytestmark = pytest.mark.usefixtures("garbage_in_new_memory")
@@ -269,60 +267,13 @@ def test_a_compiled_function_may_render(emulator, monkeypatch):
     assert not any("empty" in graph for graph in graphs), "no memory of kernels is in a graph"
 
 
-# -------------------------------------------------------------------------- uploads
+# -------------------------------------------------------------------------- the default device
 
 
-class Copies(TorchDispatchMode):
-    """Count the copies from one device to another."""
-
-    count = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.count += func is torch.ops.aten._to_copy.default
-        return func(*args, **(kwargs or {}))
-
-
-def test_cameras_and_backgrounds_on_the_cpu_move_in_one_copy():
-    cameras, background = make_cameras(3, 9, 17), backgrounds(3).double()
-    tensors = (cameras.world_to_camera, cameras.intrinsics, background)
-    with Copies() as copies:
-        moved = upload(tensors, torch.device("meta"))
-    assert copies.count == 2, "one to float32, one to the device"
-    for before, after in zip(tensors, moved, strict=True):
-        assert (after.device.type, after.dtype, after.shape) == ("meta", torch.float32, before.shape)
-        assert after.is_contiguous()
-
-
-def test_another_default_device_or_dtype_of_torch_changes_nothing():
-    tensors = [torch.rand(2, 3), torch.rand(4)]
-    torch.set_default_dtype(torch.float64)
-    try:
-        with torch.device("meta"):
-            moved, report = upload(tensors, torch.device("meta")), Forecast(CPU).report
-    finally:
-        torch.set_default_dtype(torch.float32)
-    assert all(each.dtype == torch.float32 for each in moved)
+def test_another_default_device_of_torch_changes_no_report():
+    with torch.device("meta"):
+        report = Forecast(CPU).report
     assert report.device == CPU, "the host reads its address"
-
-
-def test_tensors_that_are_there_or_have_a_gradient_are_left_alone():
-    there, learned = torch.zeros(2, device="meta"), torch.zeros(2, requires_grad=True)
-    with Copies() as copies:
-        assert upload((there,), torch.device("meta"))[0] is there
-        assert upload((learned, there), torch.device("meta"))[0] is learned
-        on_cpu = (torch.zeros(2), torch.zeros(3))
-        assert upload(on_cpu, CPU) is on_cpu
-    assert copies.count == 0
-
-
-def test_what_moves_in_one_copy_keeps_its_numbers(monkeypatch):
-    """Pretend that another device is the CPU."""
-    tensors = [torch.rand(2, 3).T, torch.rand(4, dtype=torch.float64), torch.rand(())]
-    with monkeypatch.context() as patch:
-        patch.setattr(torch.Tensor, "to", lambda tensor, *_, **__: tensor.clone())
-        moved = upload(tensors, torch.device("meta"))
-    for before, after in zip(tensors, moved, strict=True):
-        assert torch.equal(before.float(), after)
 
 
 # -------------------------------------------------------------------------- memory
