@@ -6,7 +6,7 @@
 A backend that disagrees with the reference, or with itself from run to run, is not timed. The script prints
 the differences, times the other backends, and ends with exit code 1. Times are medians in milliseconds, and
 `best` is the shortest time. The ratio is the time of the first backend divided by that of the row's backend.
-docs/performance.md describes the measurement.
+docs/notes/performance.md describes the measurement.
 """
 
 import argparse

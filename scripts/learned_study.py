@@ -4,7 +4,7 @@
 
 All differences are within cells (one prompt, seed, prior and scale of guidance). A median has the 95 %
 interval of a bootstrap over prompts and the p-value of a sign test over prompts, as in the report of a sweep
-(docs/comparison.md). PSNR is that at the best turn.
+(docs/sweeps.md). PSNR is that at the best turn.
 """
 
 import argparse

@@ -152,7 +152,7 @@ def test_a_notebook_becomes_text_code_and_outputs(pages):
 
 def test_the_two_citations_agree():
     cff = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text(encoding="utf-8"))
-    page = (REPOSITORY / "docs/cite.md").read_text(encoding="utf-8")
+    page = (REPOSITORY / "docs/index.md").read_text(encoding="utf-8")
     bibtex = re.sub(r"[{}]", "", page)
     paper = cff["preferred-citation"]
     names = " and ".join(f"{each['family-names']}, {each['given-names']}" for each in paper["authors"])

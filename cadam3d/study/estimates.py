@@ -3,7 +3,7 @@
 The answers of one rater resemble each other, and so do the answers about one prompt. A formula for
 independent answers would give intervals that are far too narrow. All intervals here have one form: an
 estimate in log-odds, plus and minus a quantile of Student's t times a standard error that clusters the
-answers by rater and by prompt. ``docs/study_statistics.md`` has the measured coverage.
+answers by rater and by prompt. ``docs/notes/study_statistics.md`` has the measured coverage.
 """
 
 from collections.abc import Hashable, Sequence

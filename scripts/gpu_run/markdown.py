@@ -1,4 +1,4 @@
-"""The record of a run as Markdown, for ``docs/performance.md``."""
+"""The record of a run as Markdown, for ``docs/notes/performance.md``."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any

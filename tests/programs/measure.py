@@ -1,4 +1,4 @@
-"""Print the table of ``docs/programs.md``: every format in every program.
+"""Print the table of ``docs/notes/programs.md``: every format in every program.
 
 python tests/programs/measure.py
 """

@@ -1,4 +1,4 @@
-"""The examples of docs/comparison.md run, and the page names every figure that a sweep can have."""
+"""The examples of docs/sweeps.md run, and the page names every figure that a sweep can have."""
 
 import re
 from pathlib import Path
@@ -7,7 +7,7 @@ import pytest
 
 from cadam3d.report.sweep_page import KINDS
 
-PAGE = (Path(__file__).parent.parent.parent / "docs" / "comparison.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parent.parent.parent / "docs" / "sweeps.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
 
 
@@ -16,7 +16,7 @@ def test_the_examples_run(example, bench, tmp_path, monkeypatch):
     (tmp_path / "multirun").mkdir()
     (tmp_path / "multirun/mine").symlink_to(bench)
     monkeypatch.chdir(tmp_path)
-    exec(compile(example, "comparison.md", "exec"), {})
+    exec(compile(example, "sweeps.md", "exec"), {})
 
 
 @pytest.mark.parametrize("name", KINDS)
