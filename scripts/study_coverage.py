@@ -4,7 +4,8 @@
 
 A simulated rater chooses arm i over arm j of a prompt with the probability ``expit(u[i] - u[j])``, where u is
 the strength of the arm plus an effect of the rater plus an effect of the prompt on this arm. The effects are
-normal. The true rate is the one over all raters and all prompts. ``docs/notes/study_statistics.md`` has the result.
+normal. The true rate is the one over all raters and all prompts. ``docs/notes/study_statistics.md`` has the
+result.
 """
 
 import argparse

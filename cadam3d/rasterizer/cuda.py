@@ -60,8 +60,8 @@ MOST = 2**31 - 1
 # Bytes of the records of one group of views. A group has at least one view, whatever that view needs.
 RECORD_MEMORY = 256 * 2**20
 # With at most this number of tiles of 8x8 in a view, tiles are 8x4, which are more and have shorter lists.
-# Otherwise most of a large GPU would have nothing to do (docs/notes/kernels.md has the arithmetic). The choice
-# depends on the size of a view alone, so a batch has the bits of its single views on every device.
+# Otherwise most of a large GPU would have nothing to do (docs/notes/kernels.md has the arithmetic). The
+# choice depends on the size of a view alone, so a batch has the bits of its single views on every device.
 FEW_TILES = 1024
 
 
