@@ -234,9 +234,19 @@ def test_the_yaml_of_a_page_names_its_file(page):
     assert not [body for language, body in FENCE.findall(text) if language == "yaml"]
 
 
-def test_the_readme_is_short_and_shows_the_two_commands():
+def test_a_user_reads_at_most_fourteen_pages():
+    pages = sorted(path.stem for path in (REPOSITORY / "docs").glob("*.md") if path.stem != "components")
+    assert len(pages) <= 14, pages
+
+
+def test_every_note_names_its_date_and_its_commit():
+    for page in (REPOSITORY / "docs" / "notes").glob("*.md"):
+        dated = page.read_text(encoding="utf-8").splitlines()[2]
+        assert re.search(r"\b20\d\d\b.*\b[0-9a-f]{7}\b", dated), page.name
+
+
+def test_the_readme_shows_the_two_commands():
     text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 65
     assert re.search(r"^ *make demo$", text, re.MULTILINE)
     assert re.search(r"^ *make test$", text, re.MULTILINE)
 
