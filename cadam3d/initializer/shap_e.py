@@ -29,7 +29,7 @@ from cadam3d.initializer.points import (
     require_points,
 )
 from cadam3d.io.frames import turned_points
-from cadam3d.io.pretrained import DTYPES, Pretrained, Source
+from cadam3d.io.pretrained import DTYPES, ModelSource, Pretrained
 
 KIND = "ShapEPipeline"
 # Colours of the model: as in its own pictures, or in linear light, as its decoder returns them.
@@ -217,8 +217,8 @@ class ShapE(Initializer):
         weights = weights[..., None]
         return PointCloud((weights * corners[faces]).sum(dim=1), (weights * colors[faces]).sum(dim=1))
 
-    def _source(self) -> Source:
-        return Source("initializer", self.path, self.ids, self.revision, self.variant)
+    def _source(self) -> ModelSource:
+        return ModelSource("initializer", self.path, self.ids, self.revision, self.variant)
 
 
 def _refuse_empty_mesh(_decoder: object, _inputs: object, mesh: Any) -> None:

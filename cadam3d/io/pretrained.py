@@ -5,7 +5,6 @@ a text encoder, a tokenizer) is loaded separately and when it is needed. Unused 
 """
 
 import json
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -14,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from cadam3d.core.checks import require
+from cadam3d.core.checks import fail, require
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json
 
@@ -32,7 +32,7 @@ DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.
 
 
 @dataclass(frozen=True)
-class Source:
+class ModelSource:
     """The places to search for a model. ``key`` is their node in the configuration, for messages."""
 
     key: str  # such as "prior"
@@ -92,44 +92,23 @@ class Source:
         suitable = [model for model in models if model.index.get("_class_name") in kinds]
         if not suitable:
             got = ", ".join(f"{model.where} (a {model.index.get('_class_name')})" for model in models)
-            words = shlex.quote(f"{self.key}.path=[{','.join([*paths, 'DIR'])}]")
             raise UserError(
-                f"{self.key}.path: expected a {' or '.join(kinds)} in the list, got {got}. Try: {words}"
+                f"{self.key}.path: expected a {' or '.join(kinds)} in the list, got {got}. "
+                f"Try: {self.key}.path=DIR"
             )
         return suitable[0]
 
     def _local(self) -> "Pretrained":
-        folder = self._folder()
-        if not (folder / INDEX).is_file():
-            what = "nothing there"
-            if folder.exists():
-                what = f"no {INDEX} in it" if folder.is_dir() else "that is a file"
-            hub = f", or {self.key}.path=null for {' or '.join(self.ids)}" if self.ids else ""
-            raise UserError(
-                f"{self.key}.path: expected a folder with a {INDEX} (a model in the layout of diffusers), "
-                f"got {str(self.path)!r}: {what}. Try: {self.key}.path=DIR{hub}"
-            )
-        return Pretrained(self, str(folder), None, folder / INDEX, _read_entries(self.key, folder / INDEX))
-
-    def _folder(self) -> Path:
-        """Return the folder that ``path`` names. Raises ``UserError`` for a model that the package lacks."""
         path = str(self.path)
-        if not path.startswith(PACKAGE):
-            return Path(path).expanduser()
-        name = path.removeprefix(PACKAGE)
-        here = sorted(index.parent.name for index in MODELS.glob(f"*/{INDEX}"))
-        if name in here:
-            return MODELS / name
-        if not here:
-            raise UserError(
-                f"{self.key}.path: expected a folder, since no model comes with this installation, got "
-                f"{path!r}. Try: {self.key}.path=DIR"
-            )
-        # The option that is named after a model also chooses the format that reads it.
-        raise UserError(
-            f"{self.key}.path: expected one of {', '.join(PACKAGE + each for each in here)}, got {path!r}. "
-            f"Try: {self.key}={here[0]} {self.key}.path={PACKAGE}{here[0]}"
-        )
+        is_packaged = path.startswith(PACKAGE)
+        folder = MODELS / path.removeprefix(PACKAGE) if is_packaged else Path(path).expanduser()
+        if not (folder / INDEX).is_file():
+            expected = f"a folder with a {INDEX} (a model in the layout of diffusers)"
+            if is_packaged:
+                here = [PACKAGE + index.parent.name for index in sorted(MODELS.glob(f"*/{INDEX}"))]
+                expected = f"a model of this installation ({', '.join(here) or 'it has none'})"
+            raise fail(f"{self.key}.path", expected=expected, got=path, example=f"{self.key}.path=DIR")
+        return Pretrained(self, str(folder), None, folder / INDEX, _read_entries(self.key, folder / INDEX))
 
     def _remote(self, can_ask: bool) -> "Pretrained":
         require(
@@ -158,7 +137,7 @@ class Source:
 class Pretrained:
     """A model that was found. :meth:`part` loads its parts."""
 
-    source: Source
+    source: ModelSource
     where: str  # a folder, or an id on the hub
     revision: str | None
     file: Path  # the index on this disk
@@ -183,9 +162,8 @@ class Pretrained:
         except (OSError, ValueError, KeyError, RuntimeError, TypeError) as error:
             if isinstance(error, torch.OutOfMemoryError):
                 raise
-            reason = " ".join(str(error).split())[:300]
             raise UserError(
-                f"{self.source.key}: {name} of {self.where} cannot be loaded ({reason}). "
+                f"{self.source.key}: {name} of {self.where} cannot be loaded ({short(error)}). "
                 f"Try: download it again, or another {self.source.key}.variant (now {self.source.variant})"
             ) from error
         if isinstance(loaded, torch.nn.Module):
@@ -339,10 +317,44 @@ def fetch_file(
     except EntryNotFoundError:
         reason = f"has no {file}: {lacking}"
     except (HfHubHTTPError, OSError) as error:
-        reason = " ".join(str(error).split())[:120]
+        reason = short(error)
     finally:
         utils.logging.set_verbosity(verbosity)
     return None, reason, can_ask
+
+
+def read_tensors(key: str, file: Path) -> Mapping[str, Tensor]:
+    """Return the tensors of a file by name. If possible the file is mapped, so that only used data is read.
+
+    Nothing in the file is executed. Raises ``UserError``, which names the setting ``key``, if the file cannot
+    be read.
+    """
+    from safetensors.torch import load_file
+
+    try:
+        if file.suffix == ".safetensors":
+            return load_file(file)
+        content = _unpickle(file)
+        tensors = content.get("state_dict", content)
+        return {name: tensor for name, tensor in tensors.items() if torch.is_tensor(tensor)}
+    # A damaged file makes its reader raise almost anything.
+    except Exception as error:
+        raise UserError(
+            f"{key}: {file} is not a file of tensors ({short(error)}). "
+            f"Try: download it again, or use another {key}"
+        ) from error
+
+
+def _unpickle(file: Path) -> Any:
+    try:
+        return torch.load(file, map_location="cpu", weights_only=True, mmap=True)
+    except RuntimeError:  # an old format that torch cannot map
+        return torch.load(file, map_location="cpu", weights_only=True)
+
+
+def short(error: Exception) -> str:
+    """Return the message of another library's error in one line of at most 200 characters."""
+    return " ".join(str(error).split())[:200]
 
 
 def _silence() -> None:

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from cadam3d.io.transformer import TransformerFolder, TransformerSource
 from cadam3d.metric.scoring import ModelMetric, Scorer, cut_off
+from cadam3d.metric.transformer import TransformerFolder, TransformerSource
 
 # The number of models in memory. With them, several metrics and all jobs of a sweep load each model once.
 KEPT = 2

@@ -9,12 +9,11 @@ import torch
 
 from cadam3d.core.checks import require, require_choice
 from cadam3d.core.errors import UserError
-from cadam3d.io.ldm import read_tensors
-from cadam3d.io.open_clip import clip_model
-from cadam3d.io.pretrained import fetch_file
-from cadam3d.io.transformer import TransformerFolder, TransformerSource, sha256_of
+from cadam3d.io.pretrained import fetch_file, read_tensors
 from cadam3d.metric.clip import Clip, ClipMetric, assembled, check_clip, load_clip
+from cadam3d.metric.open_clip import clip_model
 from cadam3d.metric.scoring import Scorer
+from cadam3d.metric.transformer import TransformerFolder, TransformerSource, sha256_of
 
 # The file of each version in the repository of the authors, xswu/HPSv2.
 FILES = {"v2.0": "HPS_v2_compressed.pt", "v2.1": "HPS_v2.1_compressed.pt"}
@@ -56,7 +55,7 @@ class Hps(ClipMetric):
         else:
             check_clip(self._base())
             # The file is mapped, so this reads little of it.
-            read_tensors(self.node, self._file(self.source())[0], "model")
+            read_tensors(f"{self.node}.model", self._file(self.source())[0])
 
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a score in [-1, 1]."""
@@ -104,7 +103,7 @@ def _loaded(
 ) -> Clip:
     """Return the model in a file. ``facts`` has the hash of the file, so a changed file is read again."""
     try:
-        model = clip_model(read_tensors(Hps.node, file, "model"), base.config())
+        model = clip_model(read_tensors(f"{Hps.node}.model", file), base.config())
     except (ValueError, RuntimeError, TypeError, KeyError) as error:
         if isinstance(error, torch.OutOfMemoryError):
             raise

@@ -16,8 +16,8 @@ from torch import Tensor
 from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
 from cadam3d.io.image import to_uint8
-from cadam3d.io.transformer import sha256_of
 from cadam3d.metric.scoring import ScoreMetric, Scorer, cut_off
+from cadam3d.metric.transformer import sha256_of
 
 MODULE, PACKAGE = "ImageReward", "image-reward"
 NAME = "ImageReward-v1.0"

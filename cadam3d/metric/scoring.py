@@ -16,9 +16,9 @@ from torch import Tensor
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.memory import is_out_of_memory
-from cadam3d.io.transformer import TransformerFolder, TransformerSource
 from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.protocol import ModelName, Protocol
+from cadam3d.metric.transformer import TransformerFolder, TransformerSource
 
 LEVEL = 0.95  # of the interval
 

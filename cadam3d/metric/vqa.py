@@ -11,11 +11,11 @@ from torch import Tensor
 
 from cadam3d.core.checks import require, require_choice
 from cadam3d.core.errors import UserError
-from cadam3d.io import transformer
 from cadam3d.io.image import to_uint8
 from cadam3d.io.pretrained import DTYPES
-from cadam3d.io.transformer import TransformerFolder, TransformerSource
+from cadam3d.metric import transformer
 from cadam3d.metric.scoring import ModelMetric, Scorer
+from cadam3d.metric.transformer import TransformerFolder, TransformerSource
 
 # Chat templates and the vocabularies of older models are in separate files.
 NEEDED = (*transformer.NEEDED, "*.jinja", "tokenizer.model")

@@ -24,7 +24,7 @@ from cadam3d.core.checks import require, require_choice, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
 from cadam3d.io.cache import default_cache_dir
-from cadam3d.io.pretrained import DTYPES, Pretrained, Source
+from cadam3d.io.pretrained import DTYPES, VOCABULARY, ModelSource, Pretrained
 from cadam3d.prior.base import Condition, DiffusionPrior, MemoryEstimate, PromptEmbedding
 from cadam3d.prior.memory import working_bytes
 from cadam3d.prior.path import DDPM, NoisePath, Prediction, Rows
@@ -321,9 +321,9 @@ class LatentPrior(DiffusionPrior):
         return DTYPES[self.half] if self.device.type == "cuda" else torch.float32
 
     @cached_property
-    def source(self) -> Source:
+    def source(self) -> ModelSource:
         """Return the folder or the hub names where the model is searched."""
-        return Source("prior", self.path, self.ids, self.revision, self.variant)
+        return ModelSource("prior", self.path, self.ids, self.revision, self.variant)
 
     @cached_property
     def found(self) -> Pretrained:
@@ -334,7 +334,8 @@ class LatentPrior(DiffusionPrior):
     def lexicon(self) -> Lexicon | None:
         """Return the words that the model knows; None for models that read free text."""
         content = self.found.vocabulary()
-        return None if content is None else Lexicon.read(content, self.found.name, "prior.path")
+        file = str(self.found.file.parent / VOCABULARY)
+        return None if content is None else Lexicon.read(content, self.found.name, file)
 
     @cached_property
     def trained_size(self) -> int | None:

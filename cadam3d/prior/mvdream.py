@@ -13,10 +13,10 @@ from torch import Tensor
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require, require_range
 from cadam3d.core.errors import UserError
-from cadam3d.io.ldm import SingleFile, with_ldm_unet
 from cadam3d.io.pretrained import Pretrained
 from cadam3d.prior.base import MemoryEstimate
 from cadam3d.prior.latent import PRIORS, LatentEmbedding, TextCondition, Texts
+from cadam3d.prior.ldm import SingleFile, with_ldm_unet
 from cadam3d.prior.path import Prediction, per_view
 from cadam3d.prior.stable_diffusion import StableDiffusion
 
@@ -89,7 +89,7 @@ class MVDream(StableDiffusion):
         Raises ``UserError`` if its network does not read cameras.
         """
         if isinstance(self.path, str) and Path(self.path).expanduser().is_file():
-            found = SingleFile.open(self.source, SCHEDULER, self.tokenizer, "prior.tokenizer")
+            found = SingleFile.open(self.source, SCHEDULER, self.tokenizer)
         else:
             found = with_ldm_unet(self.source.find(self.kinds, PRIORS))
         if found.config("unet").get("projection_class_embeddings_input_dim") != CAMERA:

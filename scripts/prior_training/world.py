@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import torch
 
 from cadam3d.core.cameras import Cameras, orbit
-from cadam3d.prior.shapes.words import with_article
 
 PRIMITIVES = ("sphere", "cube", "torus", "cylinder", "cone", "capsule", "pyramid", "star", "arch", "ring")
 OBJECTS = (
@@ -133,3 +132,8 @@ class Draw:
         azimuth = (self.uniform(-180.0, 180.0) + 90.0 * torch.arange(VIEWS) + 180.0) % 360.0 - 180.0
         one = torch.ones(VIEWS)
         return orbit(azimuth, elevation * one, max(distance, 1.5) * one, fov * one, size, size)
+
+
+def with_article(phrase: str) -> str:
+    """Return a noun phrase with "a" or "an" before it."""
+    return f"{'an' if phrase[0] in 'aeiou' else 'a'} {phrase}"

@@ -8,7 +8,7 @@ import torch
 
 from cadam3d.core.errors import UserError
 from cadam3d.io import pretrained
-from cadam3d.io.pretrained import Source
+from cadam3d.io.pretrained import ModelSource
 
 huggingface_hub = pytest.importorskip("huggingface_hub")
 pytest.importorskip("diffusers")
@@ -19,7 +19,7 @@ OTHERS = {"StableDiffusion3Pipeline": "prior=stable_diffusion_3"}
 
 def source(**changes):
     keys = {"key": "prior", "path": None, "ids": ["one/model"], "revision": None, "variant": None}
-    return Source(**keys | changes)
+    return ModelSource(**keys | changes)
 
 
 @pytest.fixture(scope="module")
@@ -106,12 +106,8 @@ def test_the_identity_changes_with_the_files(model, tmp_path):
 
 def test_a_wrong_folder_is_reported_in_one_line(tmp_path):
     (tmp_path / "file").write_text("x")
-    for path, what in (
-        ("/nowhere", "nothing there"),
-        (tmp_path, "no model_index.json in it"),
-        (tmp_path / "file", "a file"),
-    ):
-        with pytest.raises(UserError, match=what) as caught:
+    for path in ("/nowhere", tmp_path, tmp_path / "file"):
+        with pytest.raises(UserError, match=r"a folder with a model_index\.json") as caught:
             source(path=str(path)).find(KINDS, OTHERS)
         assert "\n" not in str(caught.value)
         assert "Try: prior.path=DIR" in str(caught.value)
@@ -134,9 +130,9 @@ def test_a_list_of_folders_serves_priors_of_different_kinds(model, tmp_path):
     assert both.find(KINDS, OTHERS).where == str(model)
     assert both.find(KINDS, OTHERS).identity == source(path=str(model)).find(KINDS, OTHERS).identity
     assert both.find(("StableDiffusion3Pipeline",), {}).where == str(other)
-    with pytest.raises(UserError, match=r"expected a SDXL in the list, got .* Try: 'prior\.path=\[/"):
+    with pytest.raises(UserError, match=r"expected a SDXL in the list, got .* Try: prior\.path=DIR"):
         both.find(("SDXL",), {})
-    with pytest.raises(UserError, match="nothing there"):
+    with pytest.raises(UserError, match=r"got .*typo"):
         source(path=[str(model), str(tmp_path / "typo")]).find(KINDS, OTHERS)
     for wrong in ([], [""]):
         with pytest.raises(UserError, match="expected a folder, a list of folders or null"):

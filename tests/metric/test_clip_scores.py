@@ -14,13 +14,13 @@ from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.render import RenderOutput
-from cadam3d.io import transformer
 from cadam3d.io.records import Score, difference
-from cadam3d.io.transformer import TransformerFolder, sha256_of
+from cadam3d.metric import transformer
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.clip_r_precision import ClipRPrecision, read_candidates
 from cadam3d.metric.clip_score import ClipScore
 from cadam3d.metric.pick_score import PickScore
+from cadam3d.metric.transformer import TransformerFolder, sha256_of
 
 PROMPT = "a red cube"
 PROTOCOL = ring(

@@ -5,13 +5,13 @@ relation = "on" | "under" | "above" | "next to" | "in front of" | "behind" | "an
 phrase   = (article | number | size | colour | "and" | pattern)* noun
 """
 
+import difflib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
-from cadam3d.prior.shapes.suggestion import near_meaning, near_spelling, nearest_prompt
 from cadam3d.prior.shapes.vocabulary import (
     ARTICLES,
     COLOUR_ALIASES,
@@ -35,11 +35,12 @@ from cadam3d.prior.shapes.words import (
 )
 
 EXAMPLE = "a red and yellow checkered torus"
-FREE_TEXT = "Other priors read free text; `cadam3d doctor` lists those that are ready to use here."
 MAX_COLOURS = 2
 MAX_OBJECTS = 200  # of one prompt; sentences nest, and Python limits how deeply
 MAX_NAMED = 20  # unknown words in one message
 MAX_SHOWN = 300  # characters of a prompt in a message
+LIST = "docs/shapes.md"  # the page that lists all words
+SIMILAR = 0.78  # of difflib's ratio, in [0, 1]; one letter of five may differ, but not one of four
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Sentence:
 def parse(prompt: str, key: str = "prompt") -> Sentence:
     """Parse the prompt that the setting ``key`` holds.
 
-    Raises ``UserError`` that names every unknown word, with the nearest known words, or the missing part of
+    Raises ``UserError`` that names the unknown words, each with the nearest known one, or the missing part of
     the sentence.
     """
     words = words_of(prompt)
@@ -147,52 +148,38 @@ class _Reader:
         return self.words[self.position] if self.position < len(self.words) else None
 
     def fail(self, expected: str) -> UserError:
-        return fail(self.key, expected=expected, got=shown(self.prompt), example=_line(self.key, self.prompt))
+        return fail(self.key, expected=expected, got=shown(self.prompt), example=f'{self.key}="{EXAMPLE}"')
 
 
 def _reject_unknown(key: str, prompt: str, words: list[str]) -> None:
-    unknown = [word for word in dict.fromkeys(words) if not is_known(word)]
+    typed = {word.lower(): word for word in typed_words(prompt)}
+    unknown = [typed.get(word, word) for word in dict.fromkeys(words) if not is_known(word)]
     if unknown:
-        typed = {word.lower(): word for word in typed_words(prompt)}
-        unknown = [typed.get(word, word) for word in unknown]
-        raise unknown_words(key, prompt, unknown, "prior=shapes", known_words(), _named, _line(key, prompt))
+        known = [word for group in known_words().values() for word in group]
+        raise unknown_words(key, unknown, known, "prior=shapes", LIST, f'{key}="{EXAMPLE}"')
 
 
 def unknown_words(
-    key: str,
-    prompt: str,
-    unknown: Sequence[str],
-    reader: str,
-    known: Mapping[str, Sequence[str]],
-    named: Callable[[str], str],
-    line: str,
+    key: str, unknown: Sequence[str], known: Collection[str], reader: str, listed: str, example: str
 ) -> UserError:
     """Return the error for words of a prompt that ``reader``, such as ``prior=shapes``, does not know.
 
-    ``known`` are all known words by part of speech, ``named`` returns an unknown word with the nearest known
-    one, and ``line`` is what to type.
+    ``listed`` is the file that lists the ``known`` words, and ``example`` is what to type.
     """
-    names = ", ".join(map(named, unknown[:MAX_NAMED]))
+    names = ", ".join(_named(word, known) for word in unknown[:MAX_NAMED])
     if len(unknown) > MAX_NAMED:
         names += f" and {len(unknown) - MAX_NAMED} more"
-    listed = "\n".join(f"  {group}: {', '.join(words)}" for group, words in known.items())
     return UserError(
-        f"{key}: expected words that {reader} knows, got {shown(prompt)!r}. Unknown: {names}. "
-        f"Known words:\n{listed}\n{FREE_TEXT} Try: {line}"
+        f"{key}: expected words that {reader} knows, got {names}. {listed} lists all of them; "
+        f"most other priors read free text. Try: {example}"
     )
 
 
-def _named(word: str) -> str:
-    """Return an unknown word with the known words that may be meant."""
-    if meaning := near_meaning(word.lower()):
-        return f"{shown(word)!r} (nearest: {meaning})"
-    similar = near_spelling(word.lower())
-    return f"{shown(word)!r}" + (f" (did you mean {' or '.join(similar)}?)" if similar else "")
-
-
-def _line(key: str, prompt: str) -> str:
-    """Return the nearest prompt that can be parsed, as it is typed."""
-    return f'{key}="{nearest_prompt(prompt) or EXAMPLE}"'
+def _named(word: str, known: Collection[str]) -> str:
+    """Return an unknown word with the known word of the nearest spelling."""
+    # Sorted, since the order of a set differs between processes and decides between equally near words.
+    near = difflib.get_close_matches(word.lower(), sorted(known), n=1, cutoff=SIMILAR)
+    return f"{shown(word)!r}" + (f" (nearest: {near[0]})" if near else "")
 
 
 def shown(text: str) -> str:

@@ -48,10 +48,7 @@ class ShapesTruth(TruthSource):
         try:
             scene = build(prompt)
         except UserError as error:
-            # The reason ends where the lists of known words begin, or else with the suggestion.
-            first, *others = str(error).splitlines()
-            reason = first.removesuffix(". Known words:") if others else first.rpartition(". Try: ")[0]
-            reason = reason.removeprefix("prompt: ")
+            reason = str(error).removeprefix("prompt: ").partition(" Try: ")[0].removesuffix(".")
             raise UserError(
                 "truth: expected a prompt of the embedded world, which truth=shapes draws, got another one "
                 f"({reason}). Try: truth=prior"

@@ -95,12 +95,6 @@ def is_plural(word: str) -> bool:
     return word not in ALIASES and word not in _nouns()
 
 
-def plural_of(noun: str) -> str:
-    """Return the plural of a known noun in the singular."""
-    irregular = {singular: plural for plural, singular in IRREGULAR_PLURALS.items()}
-    return irregular.get(noun, f"{noun}es" if noun.endswith("s") else f"{noun}s")
-
-
 @cache
 def _nouns() -> frozenset[str]:
     return frozenset({*known_primitives(), *known_objects()})
@@ -114,8 +108,3 @@ def _belongs_to_word(text: str, i: int) -> bool:
         return text[i - 1 : i].isalnum() and behind[:1] == "s" and not behind[1:].isalnum()
     is_mark = unicodedata.category(letter) in ("Mn", "Mc") and ord(letter) not in VARIATION_SELECTORS
     return letter.isalnum() or is_mark
-
-
-def with_article(phrase: str) -> str:
-    """Return a noun phrase with "a" or "an" before it."""
-    return f"{'an' if phrase[0] in 'aeiou' else 'a'} {phrase}"

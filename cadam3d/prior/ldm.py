@@ -14,11 +14,18 @@ import torch
 from torch import Tensor, nn
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.pretrained import LIBRARIES, Pretrained, Source, require_extra
+from cadam3d.io.pretrained import (
+    LIBRARIES,
+    ModelSource,
+    Pretrained,
+    fetch_file,
+    read_tensors,
+    require_extra,
+    short,
+)
 
 HEAD = 64  # channels of one attention head, in the UNet and in the text encoder
 SCALING = 0.18215  # factor of the latents
-SAFE = ".safetensors"
 # For each part its class, and the prefix of its tensors' names in a file with a whole model.
 PARTS = {
     "unet": (("diffusers", "UNet2DConditionModel"), "model.diffusion_model."),
@@ -69,14 +76,13 @@ class LatentDiffusion(Pretrained):
 
     def _tensors(self, name: str) -> dict[str, Tensor]:
         file, prefix = self.files[name]
-        tensors = read_tensors(self.source.key, file)
+        tensors = read_tensors(f"{self.source.key}.path", file)
         return {k.removeprefix(prefix): tensor for k, tensor in tensors.items() if k.startswith(prefix)}
 
     def _unlike(self, name: str, error: Exception) -> UserError:
-        reason = " ".join(str(error).split())[:200]
         return UserError(
             f"{self.source.key}: {self.files[name][0]} contains no {name} of the Stable Diffusion 2 family "
-            f"({reason}). Try: another {self.source.key}.path"
+            f"({short(error)}). Try: another {self.source.key}.path"
         )
 
 
@@ -86,12 +92,9 @@ class SingleFile(LatentDiffusion):
 
     scheduler: Mapping[str, Any]  # configuration of the noise schedule
     tokenizer: str  # folder or name on the hub, with CLIP's vocabulary
-    tokenizer_key: str  # configuration key of the tokenizer, for messages
 
     @staticmethod
-    def open(
-        source: Source, scheduler: Mapping[str, Any], tokenizer: str, tokenizer_key: str
-    ) -> "SingleFile":
+    def open(source: ModelSource, scheduler: Mapping[str, Any], tokenizer: str) -> "SingleFile":
         """Return the model in ``source.path``. Its tensors are read when a part is loaded."""
         require_extra(source.key)
         file = Path(str(source.path)).expanduser()
@@ -104,7 +107,6 @@ class SingleFile(LatentDiffusion):
             files={name: (file, prefix) for name, (_, prefix) in PARTS.items()},
             scheduler=scheduler,
             tokenizer=tokenizer,
-            tokenizer_key=tokenizer_key,
         )
 
     def part(self, name: str, dtype: torch.dtype | None = None) -> Any:
@@ -125,22 +127,23 @@ class SingleFile(LatentDiffusion):
         from transformers import CLIPTokenizer
 
         config = self.config("text_encoder")
-        loaded: Any = ()
-        reason = "its vocabulary is different"
-        length = config["max_position_embeddings"]
+        pieces, length = config["vocab_size"], config["max_position_embeddings"]
         try:
             loaded = CLIPTokenizer.from_pretrained(self.tokenizer, model_max_length=length)
         except (OSError, ValueError) as error:
-            reason = " ".join(str(error).split())[:200]
+            raise self._no_tokenizer(pieces, short(error)) from error
         # If the files are missing, transformers silently makes a tokenizer that knows no word.
-        if len(loaded) != config["vocab_size"]:
-            raise UserError(
-                f"{self.tokenizer_key}: expected the {config['vocab_size']} pieces that the text encoder of "
-                f"{self.file} reads, got {self.tokenizer!r} ({reason}). Try: {self.tokenizer_key}=DIR, "
-                f"a folder with CLIP's vocab.json and merges.txt"
-            )
+        if len(loaded) != pieces:
+            raise self._no_tokenizer(pieces, f"it knows {len(loaded)}")
         loaded.pad_token_id = 0
         return loaded
+
+    def _no_tokenizer(self, pieces: int, reason: str) -> UserError:
+        key = f"{self.source.key}.tokenizer"
+        return UserError(
+            f"{key}: expected the {pieces} pieces that the text encoder of {self.file} reads, got "
+            f"{self.tokenizer!r} ({reason}). Try: {key}=DIR, a folder with CLIP's vocab.json and merges.txt"
+        )
 
 
 def with_ldm_unet(found: Pretrained) -> Pretrained:
@@ -153,64 +156,22 @@ def with_ldm_unet(found: Pretrained) -> Pretrained:
     return LatentDiffusion(found.source, found.where, found.revision, found.file, index, {"unet": (file, "")})
 
 
-def read_tensors(key: str, file: Path, setting: str = "path") -> Mapping[str, Tensor]:
-    """Return the tensors of a file by name. If possible the file is mapped, so that only used data is read.
-
-    Nothing in the file is executed. Raises ``UserError`` if it cannot be read. For the message, ``key`` is
-    the configuration node of the model, and ``setting`` names the file in it.
-    """
-    from safetensors.torch import load_file
-
-    try:
-        if file.suffix == SAFE:
-            return load_file(file)
-        content = _unpickle(file)
-        tensors = content.get("state_dict", content)
-        return {name: tensor for name, tensor in tensors.items() if torch.is_tensor(tensor)}
-    # A damaged file makes its reader raise almost anything.
-    except Exception as error:
-        reason = " ".join(str(error).split())[:120]
-        raise UserError(
-            f"{key}: {file} is not a file of tensors ({reason}). Try: download it again, or use another "
-            f"{key}.{setting}"
-        ) from error
-
-
-def _unpickle(file: Path) -> Any:
-    try:
-        return torch.load(file, map_location="cpu", weights_only=True, mmap=True)
-    except RuntimeError:  # an old format that torch cannot map
-        return torch.load(file, map_location="cpu", weights_only=True)
-
-
 def _weights_file(found: Pretrained, part: str) -> Path:
     """Return the file with the tensors of one part of a model in the layout of diffusers."""
     stems = [f"{part}/diffusion_pytorch_model{v}" for v in (f".{found.source.variant}", "")]
-    names = [stem + suffix for suffix in (SAFE, ".bin") for stem in stems[found.source.variant is None :]]
+    stems = stems[found.source.variant is None :]
+    names = [stem + suffix for suffix in (".safetensors", ".bin") for stem in stems]
+    reason = "no such file"
     for name in names:
-        file = Path(found.where) / name if Path(found.where).is_dir() else _download(found, name)
+        file = Path(found.where) / name
+        if not Path(found.where).is_dir():
+            file, reason, _ = fetch_file(found.where, name, found.revision, True, lacking="not this format")
         if file is not None and file.is_file():
             return file
     raise UserError(
-        f"{found.source.key}: {found.where} has none of {', '.join(names)}. "
+        f"{found.source.key}: {found.where} has none of {', '.join(names)} ({reason}). "
         f"Try: download it again, or another {found.source.key}.path"
     )
-
-
-def _download(found: Pretrained, name: str) -> Path | None:
-    from huggingface_hub import hf_hub_download
-    from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError
-
-    try:
-        return Path(hf_hub_download(found.where, name, revision=found.revision))
-    except EntryNotFoundError:
-        return None
-    except (HfHubHTTPError, OSError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise UserError(
-            f"{found.source.key}: {name} of {found.where} is not available ({reason}). "
-            f"Try, with a network connection: hf download {found.where}"
-        ) from error
 
 
 # --- configurations from shapes -----------------------------------------------------------------------------
