@@ -3,8 +3,9 @@
     python scripts/count_size.py              # a table in Markdown, as in docs/architecture.md
     python scripts/count_size.py ../other     # of another checkout
 
-A room is a folder of the package; the modules beside the folders are two rooms, the shell (``cli``,
-``launch`` and their neighbours) and the rest. Nodes are counted too, because longer lines do not make fewer of them.
+A room is a folder of the package. The modules beside the folders are two rooms: the shell (``cli``,
+``launch`` and their neighbours) and the rest. Nodes are counted too, because longer lines do not make fewer
+nodes.
 """
 
 import ast
