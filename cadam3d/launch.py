@@ -16,7 +16,7 @@ from omegaconf.errors import InterpolationResolutionError
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import JOBS, OVERRIDES, expanded, has_file, typed_path
 from cadam3d.settings.advice import explain, is_refused_path, line_of, require_values, reraise_interrupt
-from cadam3d.settings.compose import LONGEST_KEY, TEXT_KEYS, config_dir
+from cadam3d.settings.compose import LONGEST_KEY, TEXT_KEYS
 from cadam3d.settings.declared import require_settings
 from cadam3d.settings.help_page import help_text
 from cadam3d.settings.hydra import (
@@ -39,6 +39,7 @@ from cadam3d.settings.line import (
     split,
     text_of,
 )
+from cadam3d.settings.options import config_dir
 from cadam3d.settings.place import occupied
 from cadam3d.settings.target import require_target
 from cadam3d.settings.trust import judge_composition, require_trust, targets_in

@@ -24,7 +24,8 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.densifier.base import Densifier, GradientSignal
 from cadam3d.optimizer import GaussianOptimizer
 from cadam3d.rasterizer.base import Rasterizer
-from cadam3d.settings.compose import component, compose, config_dir
+from cadam3d.settings.compose import component, compose
+from cadam3d.settings.options import config_dir
 
 RADIUS = 0.6  # world units, of the shell
 

@@ -32,7 +32,8 @@ from cadam3d.core.errors import UserError
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cuda import load_kernels
 from cadam3d.rasterizer.launcher import Launcher
-from cadam3d.settings.compose import component, config_dir
+from cadam3d.settings.compose import component
+from cadam3d.settings.options import config_dir, option_names
 
 DEFAULTS = {
     "cpu": {
@@ -85,7 +86,7 @@ def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
         "bench_rasterizer", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     several = {"nargs": "+", "metavar": "N"}
-    known = sorted(path.stem for path in (config_dir() / "rasterizer").glob("*.yaml"))
+    known = option_names("rasterizer")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--backends", nargs="+", choices=known, help="ratios are relative to the first one")
     parser.add_argument("--counts", type=whole(1), **several, help="numbers of Gaussians")

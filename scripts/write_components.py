@@ -9,8 +9,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from cadam3d.settings.compose import config_dir
 from cadam3d.settings.documentation import Library, Option, Setting
+from cadam3d.settings.options import config_dir
 
 PAGE = Path(__file__).parent.parent / "docs" / "components.md"
 PART = re.compile(r"(<!-- begin generated: (\S+) -->\n).*?(<!-- end generated -->)", re.DOTALL)

@@ -109,7 +109,7 @@ def _read_settings_once() -> None:
     from hydra._internal.sources_registry import SourcesRegistry
     from hydra.core.plugins import Plugins
 
-    from cadam3d.settings.compose import config_dir
+    from cadam3d.settings.options import config_dir
 
     Plugins.instance()
     parsed = {}
@@ -176,7 +176,7 @@ def _compose_once() -> None:
     """
     from hydra._internal.config_loader_impl import ConfigLoaderImpl
 
-    from cadam3d.settings.compose import config_dir
+    from cadam3d.settings.options import config_dir
 
     compose = ConfigLoaderImpl.load_configuration
     of_package = {str(config_dir()), f"file://{config_dir()}", "pkg://hydra.conf", "structured://"}

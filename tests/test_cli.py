@@ -27,12 +27,12 @@ from cadam3d import cli
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import OVERRIDES, claim
 from cadam3d.launch import launch
-from cadam3d.settings import advice, hydra
+from cadam3d.settings import advice, hydra, options
 from cadam3d.settings import compose as settings
 from cadam3d.settings.line import PATH_KEYS, quoted, resumed, split, text_of
 
 REPOSITORY = Path(__file__).parent.parent
-DENSIFIERS = sorted(path.stem for path in (settings.config_dir() / "densifier").glob("*.yaml"))
+DENSIFIERS = sorted(path.stem for path in (options.config_dir() / "densifier").glob("*.yaml"))
 AWKWARD = (
     "a corgi, front view",
     "what's up",
@@ -95,7 +95,7 @@ def small_configs(tmp_path_factory) -> Path:
 @pytest.fixture
 def jobs(monkeypatch, small_configs):
     """Replace training: record the configuration, fail on seeds 7 and 8, else write a summary."""
-    for module in (settings, hydra, advice):
+    for module in (settings, hydra, advice, options):
         monkeypatch.setattr(module, "config_dir", lambda: small_configs)
     seen = []
 
@@ -147,7 +147,7 @@ def test_help_is_instant_and_imports_nothing_heavy():
 @pytest.mark.parametrize("command", list(cli.COMMANDS))
 def test_every_command_has_a_module_and_a_file_of_settings(command):
     assert (REPOSITORY / f"cadam3d/commands/{command}.py").is_file()
-    assert (settings.config_dir() / f"{command}.yaml").is_file()
+    assert (options.config_dir() / f"{command}.yaml").is_file()
 
 
 @pytest.mark.parametrize("command", ["train", "doctor"])

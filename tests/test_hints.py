@@ -42,7 +42,8 @@ from cadam3d.io.ply import write_ply
 from cadam3d.rasterizer import auto
 from cadam3d.rasterizer.cpu import load_kernels
 from cadam3d.settings.advice import LAUNCHERS
-from cadam3d.settings.compose import component, compose, config_dir, flatten
+from cadam3d.settings.compose import component, compose, flatten
+from cadam3d.settings.options import config_dir
 from cadam3d.sweep.folder import Plan, write_plan
 
 PACKAGE = Path(cadam3d.__file__).parent

@@ -173,7 +173,7 @@ def test_the_installed_program_composes_from_an_empty_folder(installed, tmp_path
 
 
 def test_the_installed_package_reads_its_own_configs(installed, tmp_path):
-    code = "from cadam3d.settings.compose import config_dir; print(config_dir())"
+    code = "from cadam3d.settings.options import config_dir; print(config_dir())"
     done = run(installed, tmp_path, sys.executable, "-c", code)
     assert Path(done.stdout.strip()) == installed / "cadam3d" / "configs", done.stderr
 

@@ -14,7 +14,8 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.schedule import as_schedule
 from cadam3d.densifier.refine import Refine
 from cadam3d.io.jsonl import read_json
-from cadam3d.settings.compose import component, compose, config_dir, parts
+from cadam3d.settings.compose import component, compose, parts
+from cadam3d.settings.options import config_dir
 
 PROMPT = "prompt=a red cube"
 # Every short length; of the longer ones a sample that meets each remainder of the parts of a run.

@@ -19,8 +19,9 @@ from cadam3d.commands.messages import keeping_others
 from cadam3d.commands.train import build_trainer, require_unused, require_views
 from cadam3d.core.errors import UserError
 from cadam3d.core.memory import is_out_of_memory, require_memory
-from cadam3d.settings.compose import component, components, compose, config_dir
+from cadam3d.settings.compose import component, components, compose
 from cadam3d.settings.declared import require_settings
+from cadam3d.settings.options import config_dir
 from cadam3d.sweep.grid import MOST_JOBS, expand, read_grid, read_line
 
 # Options, and their keys that count something.
@@ -185,7 +186,7 @@ def refuses(choice: str, line: str) -> None:
         build(choice, line)
     message = str(raised.value)
     assert message.startswith(f"{key}: expected ")
-    assert f"{key}=" in message.partition("Try: ")[2]
+    assert key.partition(".")[0] in message.partition("Try: ")[2]
     assert "\n" not in message
 
 
@@ -270,8 +271,7 @@ def options() -> Iterator[tuple[str, str]]:
     seen = set()
     for path in sorted(config_dir().glob("*/*.yaml")):
         group, name = path.parent.name, path.stem
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-        node = values.get(name, values) if group == "regularizer" else values
+        node = yaml.safe_load(path.read_text(encoding="utf-8"))
         if group not in NOT_COMPONENTS and "_target_" in node and node["_target_"] not in seen:
             seen.add(node["_target_"])
             yield f"{group}.{name}" if group in SEVERAL else group, f"{group}/{name}"
@@ -287,7 +287,6 @@ def with_option(node: str, file: str) -> DictConfig:
     OmegaConf.set_struct(cfg, False)
     if not is_alone:
         return cfg
-    option = option.get(file.rpartition("/")[2], option)
     option.pop("defaults", None)
     if OmegaConf.is_missing(option, "path"):
         option.path = "a.ply"

@@ -18,7 +18,8 @@ from omegaconf import DictConfig
 
 from cadam3d import __version__
 from cadam3d.commands.finding import Finding, Verdict, attempt
-from cadam3d.settings.compose import component, compose, config_dir
+from cadam3d.settings.compose import component, compose
+from cadam3d.settings.options import config_dir, option_names
 
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "fast-simplification", "imageio", "imageio-ffmpeg")
 PACKAGES += ("jaxtyping", "jinja2", "kornia", "matplotlib", "pillow", "pyyaml", "scikit-image", "scipy")
@@ -177,8 +178,8 @@ def _tracer() -> Finding:
 
 
 def _priors() -> Iterator[Finding]:
-    for path in sorted((config_dir() / "prior").glob("*.yaml")):
-        topic = f"prior={path.stem}"
+    for name in option_names("prior"):
+        topic = f"prior={name}"
         yield attempt(topic, partial(_prior, topic))
 
 

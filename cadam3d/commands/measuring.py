@@ -15,7 +15,7 @@ from cadam3d.metric.base import Measurand, Metric
 from cadam3d.metric.protocol import Protocol
 from cadam3d.metric.turn import facing
 from cadam3d.settings.compose import component, components, compose
-from cadam3d.settings.declared import config_dir
+from cadam3d.settings.options import option_names
 from cadam3d.state import start_generators
 
 CHANGED = "changed"  # the entry of a protocol's record that lists what differs from the shipped one
@@ -81,7 +81,7 @@ def _with_changes(record: dict[str, Any]) -> dict[str, Any]:
 @cache
 def _shipped_protocol(name: str) -> dict[str, Any] | None:
     """Return the settings of a protocol of this package; None if it has none of this name."""
-    if name not in {path.stem for path in (config_dir() / "protocol").glob("*.yaml")}:
+    if name not in option_names("protocol"):
         return None
     protocol: Protocol = component(compose([f"protocol={name}", "prompt=any"]).protocol, Protocol)
     return protocol.record()

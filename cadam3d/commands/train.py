@@ -69,8 +69,8 @@ from cadam3d.regularizer import Regularizer
 from cadam3d.report import write_report
 from cadam3d.report.declarations import write_declarations
 from cadam3d.settings.compose import component, components, flatten, load_config
-from cadam3d.settings.declared import TARGET
 from cadam3d.settings.line import NOT_OF_A_RUN
+from cadam3d.settings.options import TARGET
 from cadam3d.state import Outcome, PayloadError, RunContext, TrainState
 from cadam3d.trainer import Trainer
 

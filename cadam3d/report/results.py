@@ -30,7 +30,8 @@ from cadam3d.io.records import (
 )
 from cadam3d.io.run_folder import CONFIG
 from cadam3d.report.formatting import number
-from cadam3d.settings.compose import compose, config_dir, flatten
+from cadam3d.settings.compose import compose, flatten
+from cadam3d.settings.options import option_names
 from cadam3d.sweep.folder import UNFINISHED, load
 
 # The other outcomes leave nothing to measure.
@@ -349,7 +350,7 @@ def _shipped(arm: str) -> Mapping[str, Any]:
     number.
     """
     # The name of an arm may be any text, also the path of another file.
-    if arm not in {file.stem for file in (config_dir() / ARM).glob("*.yaml")}:
+    if arm not in option_names(ARM):
         return {}
     node = compose([f"{ARM}={arm}", "prompt=any"])[ARM]
     plain = OmegaConf.to_container(node, resolve=True)

@@ -15,8 +15,9 @@ from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseExceptio
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_yaml
 from cadam3d.io.run_folder import CONFIG, HYDRA_SETTINGS, OVERRIDES, suggestion
-from cadam3d.settings.compose import NO_NAME_COMPLAINT, compose, config_dir, flatten, quote
+from cadam3d.settings.compose import NO_NAME_COMPLAINT, compose, flatten, quote
 from cadam3d.settings.line import OF_ATTEMPTS, key_of, quoted, text_of
+from cadam3d.settings.options import config_dir
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
 # The package of each option of hydra/launcher that Hydra itself lacks.

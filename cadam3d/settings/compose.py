@@ -24,7 +24,8 @@ from omegaconf.errors import OmegaConfBaseException, UnsupportedValueType
 from cadam3d.core.checks import fail, require_choice
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_yaml
-from cadam3d.settings.declared import config_dir, require_declared
+from cadam3d.settings.declared import require_declared
+from cadam3d.settings.options import config_dir, option_names, read_option
 
 # Hydra behaves like this version even if a newer one is installed.
 VERSION_BASE = "1.3"
@@ -156,19 +157,17 @@ def option(group: str, name: str, kind: type, changes: Mapping[str, Any] = Mappi
     ``changes`` replace values of the file. Raises ``UserError`` for an unknown option and for the mistakes
     that :func:`component` reports.
     """
-    files = {path.stem: path for path in sorted((config_dir() / group).glob("*.yaml"))}
-    require_choice(group, name, list(files))
-    content = read_yaml(files[name]) | {key: escaped(value) for key, value in changes.items()}
-    # A group of which several options can be chosen has each of them under its name.
-    is_one_of_several = f"# @package {group}.{name}" in files[name].read_text(encoding="utf-8")
+    require_choice(group, name, option_names(group))
+    values = read_option(group, name)
+    values[group].get(name, values[group]).update({key: escaped(value) for key, value in changes.items()})
     try:
-        cfg = OmegaConf.create({group: {name: content} if is_one_of_several else content})
+        node = OmegaConf.create(values)[group]
     except UnsupportedValueType as error:
         expected = "a number, a text or a list of them"
         raise fail(
             error.full_key or group, expected=expected, got=dict(changes), example=f"{group}={name}"
         ) from None
-    return component(cfg[group][name] if is_one_of_several else cfg[group], kind, group)
+    return component(node.get(name, node), kind, group)
 
 
 def components(group: Any, kind: type = object, key: str = "") -> dict[str, Any]:

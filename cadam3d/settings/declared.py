@@ -6,12 +6,10 @@ elsewhere too. The ranges of the values belong to the constructors.
 
 import difflib
 import inspect
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import is_dataclass
 from functools import cache
-from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -22,15 +20,14 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import LATEST
+from cadam3d.settings.options import TARGET, argument, example_word, option_word
 
 Kinds = tuple[type, ...]  # a value must be of one of them
 
-TARGET = "_target_"
 # The parser in C is ten times as fast, if PyYAML has it.
 LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 # Integers beyond this fit into no tensor.
 LARGEST_WHOLE = 2**63 - 1
-CALL = re.compile(r"\$\{[\w.]+:")  # an interpolation that calls a function
 # Control characters that a text may have.
 BLANKS = "\n\t\r"
 # The settings outside of all components, over all commands.
@@ -78,13 +75,6 @@ LIMITS = {int: "below 2^63", str: "without control characters"}
 SPARE = {int: 1, float: 0.5, str: "text", bool: True, NoneType: None}
 
 
-def config_dir() -> Path:
-    """Return the folder of YAML files: inside the installed package, or ``configs/`` of a checkout."""
-    package = Path(__file__).parent.parent
-    packaged = package / "configs"
-    return packaged if packaged.is_dir() else package.parent / "configs"
-
-
 def require_settings(values: Mapping[Any, Any]) -> None:
     """Raise ``UserError`` unless all settings outside of components have values of their types.
 
@@ -105,14 +95,8 @@ def require_declared(node: Any, kind: type, key: str) -> None:
     The class in ``_target_`` is loaded but not called. ``key`` is the place of the node, such as ``camera``.
     """
     if not _is_described(node):
-        raise _refusal(key, kind, _plain(node), replacement(key))
+        raise _refusal(key, kind, _plain(node), option_word(key))
     _require_described(node, (kind,), key)
-
-
-def argument(key: str, value: Any) -> str:
-    """Return ``key=value`` as it is typed into a shell, with ``value`` in Hydra's grammar."""
-    text = f"{key}={_grammar(value)}"
-    return f"'{text}'" if any(character in text for character in " [{$(") else text
 
 
 def _require_described(node: DictConfig, kinds: Kinds, key: str) -> None:
@@ -197,7 +181,7 @@ def _loaded(target: Any, kinds: Kinds, key: str) -> type:
     """Return the class that ``_target_`` names. Raises ``UserError`` unless it is one of ``kinds``."""
     where, expected = f"{key}.{TARGET}", f"the path of a class ({_in_words(kinds)})"
     if not isinstance(target, str):
-        raise UserError(f"{where}: expected {expected}, got {target!r}. Try: {replacement(key)}")
+        raise UserError(f"{where}: expected {expected}, got {target!r}. Try: {option_word(key)}")
     try:
         found = get_object(target)
     # A module can raise anything while it is imported.
@@ -205,7 +189,7 @@ def _loaded(target: Any, kinds: Kinds, key: str) -> type:
         reason = (str(error.__cause__ or error).splitlines() or [type(error).__name__])[-1]
         raise UserError(f"{where}: cannot be loaded ({reason}). Try: cadam3d doctor") from error
     if not inspect.isclass(found) or not issubclass(found, kinds) or inspect.isabstract(found):
-        raise UserError(f"{where}: expected {expected}, got {target!r}. Try: {replacement(key)}")
+        raise UserError(f"{where}: expected {expected}, got {target!r}. Try: {option_word(key)}")
     return found
 
 
@@ -262,61 +246,10 @@ def _plain(value: Any) -> Any:
 
 def _example(key: str, target: str, cls: type, name: str, hints: Mapping[str, Any]) -> str:
     """Return an argument with the value that this package gives to a setting, or one of the right type."""
-    if (config_dir() / key.replace(".", "/")).is_dir():
-        return replacement(key)
-    if (target, name) in (known := _known_values(config_dir())):
-        return argument(key, known[target, name])
+    if word := example_word(key.lstrip("+")):
+        return word
     default = inspect.signature(cls).parameters[name].default
     if default is not inspect.Parameter.empty:
         return argument(f"+{key}", default)
-    # A group with its own place in the configuration, to which a setting refers, such as ${prompting}.
-    if (config_dir() / name).is_dir():
-        return argument(key, f"${{{name}}}")
     kinds = _alternatives(hints.get(name, float))
     return argument(key, next((SPARE[each] for each in kinds if each in SPARE), [0.5, 0.5]))
-
-
-@cache
-def _known_values(folder: Path) -> dict[tuple[str, str], Any]:
-    """Return a value of each setting in the YAML files of a folder, by the path of its class and its name."""
-    known: dict[tuple[str, str], Any] = {}
-    for path in sorted(folder.rglob("*.yaml")):
-        for node in _nodes(yaml.load(path.read_text(encoding="utf-8"), LOADER)):
-            for name, value in node.items():
-                # A call such as ${oc.select:prompt,null} is not a value that a user types.
-                if not CALL.search(str(value)):
-                    known.setdefault((str(node.get(TARGET)), name), value)
-    return known
-
-
-def replacement(key: str) -> str:
-    """Return an argument that chooses an option for the slot ``key``."""
-    folder = config_dir() / key.replace(".", "/")
-    options = sorted(path.stem for path in folder.glob("*.yaml"))
-    if options:
-        train = yaml.safe_load((config_dir() / "train.yaml").read_text(encoding="utf-8"))
-        chosen = {
-            name: option for each in train["defaults"] if each != "_self_" for name, option in each.items()
-        }
-        return argument(key.replace(".", "/"), chosen.get(key) or options[0])
-    return f"~{key}"
-
-
-def _nodes(node: Any) -> list[dict[str, Any]]:
-    """Return all dicts in plain YAML, the outer ones first."""
-    if not isinstance(node, dict):
-        return []
-    return [node, *(inner for value in node.values() for inner in _nodes(value))]
-
-
-def _grammar(value: Any) -> str:
-    """Return a plain value in Hydra's grammar of overrides."""
-    if isinstance(value, Mapping):
-        return "{" + ",".join(f"{key}:{_grammar(each)}" for key, each in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ",".join(map(_grammar, value)) + "]"
-    if value is None or isinstance(value, bool):
-        return yaml.safe_dump(value).splitlines()[0]
-    # Between quotation marks, Hydra's grammar reads an interpolation inside another one, and braces as text.
-    text = str(value)
-    return '"' + text.replace('"', '\\"') + '"' if "{" in text else text

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from cadam3d.core.errors import UserError
 from cadam3d.settings.advice import did_you_mean
-from cadam3d.settings.compose import config_dir
 from cadam3d.settings.documentation import Group, Library, Setting
+from cadam3d.settings.options import config_dir
 
 NARROWEST, WIDEST = 60, 120  # characters per line
 # Characters. The description of a longer key begins on the next line.

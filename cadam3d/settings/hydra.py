@@ -23,9 +23,9 @@ from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
 from cadam3d.settings.advice import default_option, did_you_mean, line_of
-from cadam3d.settings.compose import VERSION_BASE, compose, config_dir, quote, register_resolvers
-from cadam3d.settings.declared import TARGET, replacement
+from cadam3d.settings.compose import VERSION_BASE, compose, quote, register_resolvers
 from cadam3d.settings.line import RUN_FOLDER, key_of
+from cadam3d.settings.options import TARGET, config_dir, option_word
 
 # A reference to other settings, such as ${steps}.
 REFERENCE = re.compile(r"\$\{[^}]*")
@@ -69,7 +69,7 @@ def refuse_missing_settings(cfg: DictConfig, command: str, overrides: Sequence[s
             line = line_of("train" if command == "sweep" else command, rest)
             raise UserError(f"~{key}: a setting can be changed but not removed. Try: {line}")
         if override.endswith("=[]") and key not in cfg and default_option(key, command):
-            raise UserError(f"{key}: expected the name of an option, got []. Try: {replacement(key)}")
+            raise UserError(f"{key}: expected the name of an option, got []. Try: {option_word(key)}")
     raw = OmegaConf.to_container(cfg, resolve=False)
     assert isinstance(raw, dict)
     # Plain values come first, so that the message names the wrong value and not a setting that refers to it.
@@ -113,7 +113,7 @@ def refuse_unread_settings(cfg: DictConfig, command: str, overrides: Sequence[st
         if not isinstance(node, dict) or override.startswith("~"):
             continue
         if not rest and override.endswith("={}"):
-            raise UserError(f"{key}: {{}} changes nothing. Try: {replacement(key)}")
+            raise UserError(f"{key}: {{}} changes nothing. Try: {option_word(key)}")
         member = rest.partition(".")[0]
         if group in LISTS and isinstance(node.get(member), dict) and TARGET not in node[member]:
             if not any((folder / group / f"{member}.yaml").is_file() for folder in folders):

@@ -11,7 +11,8 @@ from omegaconf import OmegaConf
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import OVERRIDES, has_file, suggestion, typed_path
-from cadam3d.settings.compose import TEXT_KEYS, config_dir, quote
+from cadam3d.settings.compose import TEXT_KEYS, quote
+from cadam3d.settings.options import config_dir
 from cadam3d.settings.trust import is_trusted, judge_overrides, read_overrides, require_contained
 
 RUN_FOLDER = "hydra.run.dir"

@@ -37,9 +37,9 @@ from cadam3d.core import schedule
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import KINDS, read_yaml
-from cadam3d.settings.compose import LONGEST_KEY, config_dir, escaped
+from cadam3d.settings.compose import LONGEST_KEY, escaped
+from cadam3d.settings.options import TARGET, config_dir
 
-TARGET = "_target_"
 LISTS = (list, tuple)  # OmegaConf makes lists of both
 # The last part of a key that names a folder from which this machine loads what it has computed earlier.
 CACHE = "cache_dir"

@@ -24,8 +24,9 @@ from cadam3d.io.jsonl import read_json, write_json
 from cadam3d.io.lock import taking_turns
 from cadam3d.io.mesh import mesh_facts
 from cadam3d.io.ply import read_ply, write_ply
-from cadam3d.settings.compose import compose, config_dir
+from cadam3d.settings.compose import compose
 from cadam3d.settings.line import EXPORTERS, exporting, suffix_of
+from cadam3d.settings.options import config_dir
 
 TARGETS = sorted(path.stem for path in (config_dir() / "for").glob("*.yaml"))
 SUMMARY = {"prompt": "a red cube", "seed": 3, "steps": 40, "densifier": "cadam", "guidance": "sds"}

@@ -11,7 +11,7 @@ from cadam3d.metric.janus import Janus
 from cadam3d.metric.niqe import Niqe
 from cadam3d.metric.pick_score import PickScore
 from cadam3d.metric.vqa import Vqa
-from cadam3d.settings.compose import config_dir
+from cadam3d.settings.options import config_dir
 
 
 def test_every_metric_that_can_be_chosen_has_a_number_in_the_list():

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from cadam3d.densifier.base import GradientSignal
-from cadam3d.settings.compose import component, compose, config_dir
+from cadam3d.settings.compose import component, compose
+from cadam3d.settings.options import config_dir
 
 CPU = torch.device("cpu")
 OPTIONS = sorted(path.stem for path in (config_dir() / "densifier").glob("*.yaml"))

@@ -16,8 +16,9 @@ from cadam3d.core.errors import UserError
 from cadam3d.io import pretrained
 from cadam3d.io.jsonl import read_json
 from cadam3d.io.reading import read_yaml
-from cadam3d.settings.compose import component, compose, config_dir, flatten
+from cadam3d.settings.compose import component, compose, flatten
 from cadam3d.settings.hydra import read_flags
+from cadam3d.settings.options import config_dir
 from cadam3d.sweep.plan import Composer, compose_all, read_sweep
 
 KINDS = {"shapes_sd": "stable_diffusion", "shapes_mvdream": "mvdream", "shapes_sd3": "stable_diffusion_3"}

@@ -7,8 +7,8 @@ import pytest
 
 from cadam3d import cli
 from cadam3d.core.errors import UserError
-from cadam3d.settings.compose import config_dir
 from cadam3d.settings.documentation import Library, first_sentence, read_page
+from cadam3d.settings.options import config_dir
 
 REPOSITORY = Path(__file__).parents[2]
 LIBRARY = Library([config_dir()])

@@ -17,8 +17,9 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.ply import write_ply
 from cadam3d.settings import trust
-from cadam3d.settings.compose import compose, config_dir, flatten
+from cadam3d.settings.compose import compose, flatten
 from cadam3d.settings.line import key_of, resumed
+from cadam3d.settings.options import config_dir
 from cadam3d.settings.trust import (
     Registry,
     judge_composition,

@@ -1,0 +1,239 @@
+"""Options: read the YAML files of the groups, for everything that asks what can be chosen.
+
+A group such as ``densifier`` is a folder of YAML files, and each file is an option. ``folders`` are the
+folders with groups, in the order in which Hydra searches them: that of ``--config-dir`` before those of the
+package. Nothing is composed here.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from functools import cache
+from inspect import isabstract, isclass
+from pathlib import Path
+from typing import Any
+
+from hydra.utils import get_object
+
+from cadam3d.core.errors import UserError
+from cadam3d.io.reading import read_text, read_yaml
+from cadam3d.io.run_folder import LATEST
+
+TARGET = "_target_"
+NOTHING = "???"  # a value that the user has to give
+# Examples of what has no default, because it is chosen for each run.
+CHOSEN = {"prompt": "a red torus", "run": LATEST, "resume": LATEST}
+# What Hydra reads in the first line of a YAML file.
+PACKAGE = re.compile(r"#\s*@package\s+(\S+)")
+REFERENCE = re.compile(r"\$\{([\w.]+)\}")
+
+
+def config_dir() -> Path:
+    """Return the folder of YAML files: inside the installed package, or ``configs/`` of a checkout."""
+    package = Path(__file__).parent.parent
+    packaged = package / "configs"
+    return packaged if packaged.is_dir() else package.parent / "configs"
+
+
+def option_names(group: str, folders: Sequence[Path] = ()) -> list[str]:
+    """Return the sorted names of the options of a group, such as ``camera`` or ``initializer/fallback``."""
+    places = folders or (config_dir(),)
+    return sorted({path.stem for folder in places for path in (folder / group).glob("*.yaml")})
+
+
+def option_file(group: str, name: str, folders: Sequence[Path] = ()) -> Path:
+    """Return the file of an option. Raises ``UserError`` for an unknown one."""
+    for folder in folders or (config_dir(),):
+        if (path := folder / group / f"{name}.yaml").is_file():
+            return path
+    known = "|".join(option_names(group, folders))
+    raise UserError(f"{group}: expected one of {known}, got {name!r}. Try: {option_word(group)}")
+
+
+def read_option(group: str, name: str, folders: Sequence[Path] = ()) -> dict[str, Any]:
+    """Return the plain values of an option by their place, such as ``{"camera": {"size": 112}}``.
+
+    Those of the options that it builds on are merged. Interpolations stay text. Raises ``UserError`` for an
+    option that is unknown or is no dict of YAML.
+    """
+    place, values = _read(group, name, folders)
+    return _nested(place, values)
+
+
+def option_class(group: str, name: str, folders: Sequence[Path] = ()) -> type | None:
+    """Return the class that an option builds, or None if it builds nothing, as ``regularizer=none``.
+
+    Raises ``UserError`` if there is no such option, or if its class cannot be imported.
+    """
+    place, values = _read(group, name, folders)
+    node = _inside(values, group.split("/")) if not place else values
+    target = node.get(TARGET) if isinstance(node, dict) else None
+    return None if target is None else load_class(target, f"{group}={name}")
+
+
+def load_class(target: object, key: str) -> type:
+    """Return the class with the path ``target``, which is a value of ``key``. Nothing is called.
+
+    Raises ``UserError`` unless it can be imported and is a class that can be built.
+    """
+    if not isinstance(target, str):
+        raise UserError(f"{key}: expected the path of a class, got {target!r}. Try: {option_word(key)}")
+    try:
+        found = get_object(target)
+    # A module can raise anything while it is imported.
+    except Exception as error:
+        reason = (str(error.__cause__ or error).splitlines() or [type(error).__name__])[-1]
+        raise UserError(f"{key}: {target} cannot be loaded ({reason}). Try: cadam3d doctor") from error
+    if not isclass(found) or isabstract(found):
+        raise UserError(f"{key}: expected the path of a class, got {target!r}. Try: {option_word(key)}")
+    return found
+
+
+def default_options(command: str = "train") -> dict[str, str | list[str] | None]:
+    """Return the option that each group of a command has by default: a list where several can be chosen.
+
+    Groups of the command that it builds on come first, so those of ``sweep`` begin with those of ``train``.
+    """
+    found: dict[str, Any] = {}
+    for entry in read_yaml(config_dir() / f"{command}.yaml").get("defaults", ()):
+        if isinstance(entry, Mapping):
+            found |= entry
+        elif entry != "_self_":
+            found |= default_options(entry)
+    return found
+
+
+def default_option(group: str, command: str = "train") -> str | list[str] | None:
+    """Return the option of a group that a command has by default; None if it has none."""
+    return default_options(command).get(group)
+
+
+def option_word(key: str, command: str = "train") -> str:
+    """Return an argument that chooses an option for the slot ``key``, such as ``camera=orbit``.
+
+    It removes the slot if it belongs to no group.
+    """
+    group = key.removesuffix(f".{TARGET}").replace(".", "/")
+    if names := option_names(group):
+        return argument(group, default_option(group, command) or names[0])
+    return f"~{key}"
+
+
+def example_value(key: str) -> Any:
+    """Return a value of the setting ``key``, such as ``densifier.tau_Q``, from the YAML files of the package.
+
+    This is the value of the default option, or of another one of its group. Raises ``LookupError`` if no file
+    has a value that a user can type.
+    """
+    for values in _places(key):
+        found = _inside(values, key.split("."))
+        if reference := REFERENCE.fullmatch(str(found)):
+            with suppress(LookupError):
+                return example_value(reference.group(1))
+        if _is_typed(found):
+            return found
+    raise LookupError(key)
+
+
+def example_word(key: str) -> str:
+    """Return ``key=value`` with an example, as it is typed into a shell.
+
+    For the slot of a group, and without an example, this is an argument that chooses an option of the group;
+    "" outside of all groups.
+    """
+    if option_names(key.replace(".", "/")):
+        return option_word(key)
+    try:
+        return argument(key, example_value(key))
+    except LookupError:
+        root = key.partition(".")[0]
+        return option_word(root) if option_names(root) else ""
+
+
+def argument(key: str, value: Any) -> str:
+    """Return ``key=value`` as it is typed into a shell, with ``value`` in Hydra's grammar."""
+    text = f"{key}={_grammar(value)}"
+    return f"'{text}'" if any(character in text for character in " [{$(") else text
+
+
+def _read(group: str, name: str, folders: Sequence[Path]) -> tuple[list[str], dict[str, Any]]:
+    """Return the place of an option in the configuration, and its values with those that it builds on."""
+    path = option_file(group, name, folders)
+    content = read_yaml(path)
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: expected keys with values, got other data. Try: {option_word(group)}")
+    package = PACKAGE.match(read_text(path))
+    place = package.group(1).split(".") if package else group.split("/")
+    merged: dict[str, Any] = {}
+    for base in content.pop("defaults", ()):
+        if isinstance(base, str) and base != "_self_":
+            file, _, below = base.partition("@")
+            other, _, option = file.rpartition("/")
+            _, values = _read(other.lstrip("/") or group, option, folders)
+            merged = _merged(
+                merged, _nested([part for part in [below] if part not in ("", "_here_")], values)
+            )
+    return [part for part in place if part != "_global_"], _merged(merged, content)
+
+
+def _nested(place: Sequence[str], values: dict[str, Any]) -> dict[str, Any]:
+    """Return ``values`` inside dicts with the keys ``place``."""
+    for part in reversed(place):
+        values = {part: values}
+    return values
+
+
+def _merged(base: Any, changes: Any) -> Any:
+    """Return ``base`` with ``changes``, as Hydra merges them: dicts key by key, other values as a whole."""
+    if not isinstance(base, dict) or not isinstance(changes, dict):
+        return changes
+    return base | {key: _merged(base.get(key), value) for key, value in changes.items()}
+
+
+def _places(key: str) -> Iterator[dict[str, Any]]:
+    """Yield the nested values of every YAML file that may have a setting, the likeliest first."""
+    yield CHOSEN
+    group, _, rest = key.partition(".")
+    member = rest.partition(".")[0]
+    if not option_names(group):
+        for path in sorted(config_dir().glob("*.yaml"), key=lambda path: path.stem != "train"):
+            yield read_yaml(path)
+    chosen = default_option(group)
+    for name in sorted(option_names(group), key=lambda name: (name != member, name != chosen)):
+        yield _known(group, name)
+    for name in option_names(f"{group}/{member}"):
+        yield _known(f"{group}/{member}", name)
+
+
+@cache
+def _known(group: str, name: str) -> dict[str, Any]:
+    """Return the values of an option of the package, which do not change."""
+    return read_option(group, name)
+
+
+def _inside(values: Any, parts: Sequence[str]) -> Any:
+    """Return the value at a path in nested dicts, or ``NOTHING``."""
+    for part in parts:
+        if not isinstance(values, dict) or part not in values:
+            return NOTHING
+        values = values[part]
+    return values
+
+
+def _is_typed(value: Any) -> bool:
+    """Return whether a value can be an example: no object, and no call such as ``${parts:9,12,${steps}}``."""
+    text = str(value)
+    return NOTHING not in text and TARGET not in text and not ("${" in text and ":" in text)
+
+
+def _grammar(value: Any) -> str:
+    """Return a plain value in Hydra's grammar of overrides."""
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}:{_grammar(each)}" for key, each in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ",".join(map(_grammar, value)) + "]"
+    if value is None or isinstance(value, bool):
+        return str(value).lower().replace("none", "null")
+    # Between quotation marks, Hydra's grammar reads an interpolation inside another one, and braces as text.
+    text = str(value)
+    return '"' + text.replace('"', '\\"') + '"' if "{" in text else text
