@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_range
+from cadam3d.core.checks import require, require_range, unless_none
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled, settled_at
@@ -41,8 +41,7 @@ class AdamSettings:
         require_range("optimizer.beta1", self.beta1, low=0, below=1, example=0.9)
         require_range("optimizer.beta2", self.beta2, low=0, below=1, example=0.999)
         require_range("optimizer.eps", self.eps, above=0, example=1e-15)
-        if self.clip_norm is not None:
-            require_scheduled("optimizer.clip_norm", self.clip_norm, above=0, example="null")
+        unless_none(require_scheduled, "optimizer.clip_norm", self.clip_norm, above=0, example="null")
         require_range("optimizer.clip_unit", self.clip_unit, above=0, example=1.0)
 
     def start(self, gaussians: Gaussians) -> "GaussianOptimizer":

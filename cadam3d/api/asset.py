@@ -35,8 +35,8 @@ from cadam3d.core.checks import require, require_whole
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.mesh.surface import SurfaceSettings
 from cadam3d.core.render import RenderFn, RenderOutput, Subject
-from cadam3d.core.surface import SurfaceSettings
 from cadam3d.exporter.html import UNTITLED
 from cadam3d.exporter.images import ImagesExporter
 from cadam3d.exporter.mesh import MeshExporter

@@ -156,7 +156,7 @@ def when(built: build.Build | nvrtc.Cubin) -> str:
     return f"{how} {built.path.parent}"
 
 
-def _nvrtc(compiler: nvrtc.Compiler) -> dict[str, object]:
+def _nvrtc(compiler: nvrtc.Nvrtc) -> dict[str, object]:
     return {"nvrtc": compiler.path, "nvrtc_version": ".".join(map(str, compiler.version))}
 
 

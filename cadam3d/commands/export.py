@@ -11,7 +11,7 @@ from cadam3d import __version__
 from cadam3d.commands.asset import Asset, Output, export_all, open_asset, write_files
 from cadam3d.commands.messages import note
 from cadam3d.core.errors import UserError
-from cadam3d.core.surface import SurfaceFacts
+from cadam3d.core.mesh.surface import SurfaceFacts
 from cadam3d.exporter.programs import FORMATS, OTHER, hint_of, judge, loss_of
 from cadam3d.io.asset_record import (
     FileEntry,

@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TypeGuard
 
 from cadam3d.core.errors import UserError
@@ -58,6 +58,12 @@ def require_whole(
         bounds = [f"{sign} {bound}" for sign, bound in ((">=", low), ("<=", high)) if math.isfinite(bound)]
         expected = " ".join(["a whole number", " and ".join(bounds)]).rstrip()
         raise fail(key, expected=expected, got=value, example=f"{key}={example}")
+
+
+def unless_none(check: Callable[..., None], key: str, value: object, **bounds: object) -> None:
+    """Call ``check(key, value, **bounds)``, which is one of the functions here, unless ``value`` is None."""
+    if value is not None:
+        check(key, value, **bounds)
 
 
 def require_choice(key: str, value: object, choices: Sequence[object]) -> None:

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cadam3d.core.chart import Chart, Curve
-from cadam3d.core.checks import require_choice, require_range
+from cadam3d.core.checks import require_choice, require_range, unless_none
 from cadam3d.core.edit import RowEdit, RowState
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.densifier.base import Densifier, GradientSignal
@@ -56,8 +56,7 @@ class Baseline(Densifier[BaselineState]):
         require_scheduled("densifier.tau_pos", self.tau_pos, above=0, example=2e-4)
         require_choice("densifier.views", self.views, VIEWS)
         require_range("densifier.grad_multiplier", self.grad_multiplier, above=0, example=1.0)
-        if self.screen_px is not None:
-            require_range("densifier.screen_px", self.screen_px, above=0, example=20)
+        unless_none(require_range, "densifier.screen_px", self.screen_px, above=0, example=20)
 
     def init_state(self, n: int, device: torch.device) -> BaselineState:
         """Return sums and sizes of zero."""

@@ -10,62 +10,95 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_choice, require_range
+from cadam3d.core.checks import require, require_choice, require_range, unless_none
 from cadam3d.core.edit import RowEdit
+from cadam3d.core.reductions import all_finite, quantile
 from cadam3d.densifier.base import GradientSignal
-from cadam3d.densifier.cadam import CAdam, CAdamState, all_finite, quantile
+from cadam3d.densifier.cadam import CAdam, CAdamState
 from cadam3d.densifier.noise_floor import snr_threshold
 
-EPS_MODE = ("abs", "rel_median")
-GRAD_SOURCE = ("total", "guidance")
-INVISIBLE = ("zero", "skip")
-QUANTILE_OVER = ("all", "mature", "seen")
-GRAD_NORM = ("none", "per_step_rms")
-NONFINITE = ("skip_step", "skip_row")
-CHILD_STATE = ("zero", "inherit", "inherit_half")
-PARENT_STATE = ("keep", "reset")
+CHOICES = {
+    "grad_source": ("total", "guidance"),
+    "grad_norm": ("none", "per_step_rms"),
+    "invisible": ("zero", "skip"),
+    "nonfinite": ("skip_step", "skip_row"),
+    "quantile_over": ("all", "mature", "seen"),
+    "eps_mode": ("abs", "rel_median"),
+    "child_state": ("zero", "inherit", "inherit_half"),
+    "parent_state": ("keep", "reset"),
+    "reset_moments": (False, True),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class CAdamOpen(CAdam):
     """CAdam with other evidence, other gates, another inheritance or another reset."""
 
-    # Evidence: which gradients the moments average.
-    grad_source: str  # one of GRAD_SOURCE
-    grad_norm: str  # one of GRAD_NORM
-    invisible: str  # one of INVISIBLE
-    nonfinite: str  # one of NONFINITE
+    # The values of each text are in CHOICES. Evidence: which gradients the moments average.
+    grad_source: str
+    grad_norm: str
+    invisible: str
+    nonfinite: str
     # Gates: which Gaussians are candidates.
-    quantile_over: str  # one of QUANTILE_OVER
+    quantile_over: str
     tau_m: float | None  # >= 0, loss per world unit
     alpha: float | None  # in (0, 1), replaces tau_SNR
-    eps_mode: str  # one of EPS_MODE
+    eps_mode: str
     # Histories: moments and ages after a refinement.
-    child_state: str  # one of CHILD_STATE
-    parent_state: str  # one of PARENT_STATE
+    child_state: str
+    parent_state: str
     # Resets.
     tau_reset: float | None  # >= 0, null = tau_SNR
     reset_moments: bool
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_choice("densifier.grad_source", self.grad_source, GRAD_SOURCE)
-        require_choice("densifier.grad_norm", self.grad_norm, GRAD_NORM)
-        require_choice("densifier.invisible", self.invisible, INVISIBLE)
-        require_choice("densifier.nonfinite", self.nonfinite, NONFINITE)
-        require_choice("densifier.quantile_over", self.quantile_over, QUANTILE_OVER)
-        if self.tau_m is not None:
-            require_range("densifier.tau_m", self.tau_m, low=0, example=1e-4)
-        self._check_alpha()
-        require_choice("densifier.eps_mode", self.eps_mode, EPS_MODE)
-        require_choice("densifier.child_state", self.child_state, CHILD_STATE)
-        require_choice("densifier.parent_state", self.parent_state, PARENT_STATE)
-        require_choice("densifier.reset_moments", self.reset_moments, (False, True))
+        for name, choices in CHOICES.items():
+            require_choice(f"densifier.{name}", getattr(self, name), choices)
+        unless_none(require_range, "densifier.tau_m", self.tau_m, low=0, example=1e-4)
+        unless_none(require_range, "densifier.tau_reset", self.tau_reset, low=0, example=0.1)
+        require(
+            self.tau_reset is None or self.reset == "unreliable",
+            "densifier.tau_reset",
+            expected=f"null, because it has no effect with densifier.reset={self.reset}",
+            got=self.tau_reset,
+            example="densifier.tau_reset=null",
+        )
+        if self.alpha is not None:
+            self._check_alpha(self.alpha)
+
+    def _check_alpha(self, alpha: float) -> None:
+        require_range("densifier.alpha", alpha, above=0, below=1, example=0.05)
+        require(
+            self.tau_SNR is None,
+            "densifier.tau_SNR",
+            expected=f"null, because densifier.alpha={alpha:g} sets the SNR that candidates exceed",
+            got=self.tau_SNR,
+            example="densifier.tau_SNR=null densifier.tau_reset=0.1",
+        )
+        # A small tolerance, so that 0.81 may be written for 0.9**2.
+        require(
+            self.beta2 >= self.beta1**2 - 1e-6,
+            "densifier.beta2",
+            expected=f"at least beta1^2 = {self.beta1**2:g}, because densifier.alpha is not calibrated below",
+            got=self.beta2,
+            example=f"densifier.beta2={max(self.beta1**2, 0.99):g}",
+        )
 
     @property
     def guidance_only(self) -> bool:
         """Return whether ``grad_source`` is ``guidance``."""
         return self.grad_source == "guidance"
+
+    @property
+    def limits_drift(self) -> bool:
+        """Return whether ``tau_Q`` or ``tau_m`` is set."""
+        return self.tau_m is not None or super().limits_drift
+
+    @property
+    def least_reliable(self) -> float | None:
+        """Return ``tau_reset``, or else ``tau_SNR``."""
+        return super().least_reliable if self.tau_reset is None else self.tau_reset
 
     def observe(self, state: CAdamState, signal: GradientSignal) -> CAdamState:
         """Return the moments after one more step of the chosen evidence, without waiting for the device."""
@@ -82,6 +115,46 @@ class CAdamOpen(CAdam):
             v=torch.where(is_updated[:, None], after.v, state.v),
             age=torch.where(is_updated, after.age, state.age),
         )
+
+    def _updated_rows(self, signal: GradientSignal) -> Bool[Tensor, "n"] | None:
+        """Return the mask of Gaussians that this step updates; ``None`` if it updates all or none."""
+        skips_rows, skips_invisible = self.nonfinite == "skip_row", self.invisible == "skip"
+        if not (skips_rows or skips_invisible):
+            return None
+        is_finite = _finite_rows(signal.means) if skips_rows else all_finite(signal.means)
+        return is_finite & signal.visible.any(dim=0) if skips_invisible else is_finite
+
+    def strengths(self, state: CAdamState) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+        """Return drift and noise, to which ``eps`` is added in the unit that ``eps_mode`` chooses.
+
+        The median is that of the Gaussians that ever had a gradient.
+        """
+        if self.eps_mode == "abs":
+            return super().strengths(state)
+        noise = state.noise(self.beta2)
+        touched = noise[noise > 0]
+        unit = quantile(touched, 0.5) if len(touched) else 1.0
+        return state.drift(self.beta1), noise + self.eps * unit
+
+    def thresholds(
+        self, state: CAdamState, drift: Float[Tensor, "n"], step: int
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, "n"]]:
+        """Return the larger of ``tau_m`` and the quantile over the chosen population, and the SNR.
+
+        Under ``alpha`` the SNR depends on the age.
+        """
+        ranked = drift if self.quantile_over == "all" else drift[self._population(state)]
+        least_drift, _ = super().thresholds(state, ranked, step)
+        least_snr = torch.full_like(drift, self.tau_SNR or 0.0)
+        if self.tau_m is not None:
+            least_drift = least_drift.clamp_min(self.tau_m)
+        if self.alpha is not None:
+            least_snr = snr_threshold(self.alpha, float(self.beta1), float(self.beta2), state.age)
+        return least_drift, least_snr
+
+    def _population(self, state: CAdamState) -> Bool[Tensor, "n"]:
+        """Return the mask of Gaussians that the quantile ranks, unless it ranks all."""
+        return state.age >= self.min_age if self.quantile_over == "mature" else (state.v > 0).any(dim=-1)
 
     def after_reset(self, state: CAdamState, rows: Bool[Tensor, "n"]) -> CAdamState:
         """Return the state after an opacity reset of ``rows``; ``reset_moments`` makes these rows newborn."""
@@ -112,81 +185,6 @@ class CAdamOpen(CAdam):
             for rows in carried.to_dict().values():
                 rows[:kept][is_parent] = 0
         return carried
-
-    def _updated_rows(self, signal: GradientSignal) -> Bool[Tensor, "n"] | None:
-        """Return the mask of Gaussians that this step updates; ``None`` if it updates all or none."""
-        skips_rows, skips_invisible = self.nonfinite == "skip_row", self.invisible == "skip"
-        if not (skips_rows or skips_invisible):
-            return None
-        is_finite = _finite_rows(signal.means) if skips_rows else all_finite(signal.means)
-        return is_finite & signal.visible.any(dim=0) if skips_invisible else is_finite
-
-    def _drift_threshold(self, state: CAdamState, drift: Float[Tensor, "n"], step: int) -> Float[Tensor, ""]:
-        """Return the larger of ``tau_m`` and the quantile over the chosen population."""
-        population = drift if self.quantile_over == "all" else drift[self._population(state)]
-        threshold = super()._drift_threshold(state, population, step)
-        return threshold if self.tau_m is None else threshold.clamp_min(self.tau_m)
-
-    def _limits_drift(self) -> bool:
-        return self.tau_m is not None or super()._limits_drift()
-
-    def _snr_threshold(self, state: CAdamState) -> Float[Tensor, "n"]:
-        """Return the SNR that each candidate exceeds; under ``alpha`` it depends on the age."""
-        if self.alpha is None:
-            return super()._snr_threshold(state)
-        return snr_threshold(self.alpha, float(self.beta1), float(self.beta2), state.age)
-
-    def _reset_threshold(self) -> float:
-        return super()._reset_threshold() if self.tau_reset is None else self.tau_reset
-
-    def _eps(self, noise: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-        """Return ``eps`` in loss per world unit; the median is of the Gaussians that ever had a gradient."""
-        if self.eps_mode == "abs":
-            return super()._eps(noise)
-        touched = noise[noise > 0]
-        return self.eps * (quantile(touched, 0.5) if len(touched) else noise.new_tensor(1.0))
-
-    def _population(self, state: CAdamState) -> Bool[Tensor, "n"]:
-        """Return the mask of Gaussians that the quantile ranks, unless it ranks all."""
-        return state.age >= self.min_age if self.quantile_over == "mature" else (state.v > 0).any(dim=-1)
-
-    def _check_reset_threshold(self) -> None:
-        if self.tau_reset is not None:
-            require_range("densifier.tau_reset", self.tau_reset, low=0, example=0.1)
-        require(
-            self.tau_reset is None or self.reset == "unreliable",
-            "densifier.tau_reset",
-            expected=f"null, because it has no effect with densifier.reset={self.reset}",
-            got=self.tau_reset,
-            example="densifier.tau_reset=null",
-        )
-        require(
-            self.reset != "unreliable" or self.tau_reset is not None or self.tau_SNR is not None,
-            "densifier.tau_reset",
-            expected="a number, because densifier.reset=unreliable needs one and densifier.tau_SNR is null",
-            got=self.tau_reset,
-            example="densifier.tau_reset=0.1",
-        )
-
-    def _check_alpha(self) -> None:
-        if self.alpha is None:
-            return
-        require_range("densifier.alpha", self.alpha, above=0, below=1, example=0.05)
-        require(
-            self.tau_SNR is None,
-            "densifier.tau_SNR",
-            expected=f"null, because densifier.alpha={self.alpha:g} sets the SNR that candidates exceed",
-            got=self.tau_SNR,
-            example="densifier.tau_SNR=null densifier.tau_reset=0.1",
-        )
-        # A small tolerance, so that 0.81 may be written for 0.9**2.
-        require(
-            self.beta2 >= self.beta1**2 - 1e-6,
-            "densifier.beta2",
-            expected=f"at least beta1^2 = {self.beta1**2:g}, because densifier.alpha is not calibrated below",
-            got=self.beta2,
-            example=f"densifier.beta2={max(self.beta1**2, 0.99):g}",
-        )
 
 
 def _finite_rows(values: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_range, require_whole
+from cadam3d.core.checks import require, require_range, require_whole, unless_none
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians, concatenate
 from cadam3d.core.schedule import FAR_STEP
@@ -62,8 +62,7 @@ class Refine:
 
     def __post_init__(self) -> None:
         require_whole("refine.steps", self.steps, low=1, high=FAR_STEP, example="'${steps}'")
-        if self.made_for is not None:
-            require_whole("refine.made_for", self.made_for, low=1, high=FAR_STEP, example="null")
+        unless_none(require_whole, "refine.made_for", self.made_for, low=1, high=FAR_STEP, example="null")
         require_whole("refine.start", self.start, low=0, example=100)
         require_whole("refine.end", self.end, low=0, example=450)
         require_whole("refine.interval", self.interval, low=1, example=50)
@@ -71,13 +70,10 @@ class Refine:
         require_whole("refine.split_children", self.split_children, low=2, high=16, example=2)
         require_range("refine.split_shrink", self.split_shrink, low=1, example=1.6)
         require_range("refine.min_opacity", self.min_opacity, low=0, below=1, example=0.005)
-        if self.max_scale is not None:
-            require_range("refine.max_scale", self.max_scale, above=0, example=0.35)
-        if self.last_max_scale is not None:
-            require_range("refine.last_max_scale", self.last_max_scale, above=0, example=0.1)
+        unless_none(require_range, "refine.max_scale", self.max_scale, above=0, example=0.35)
+        unless_none(require_range, "refine.last_max_scale", self.last_max_scale, above=0, example=0.1)
         require_whole("refine.prune_from", self.prune_from, low=0, example=300)
-        if self.max_gaussians is not None:
-            require_whole("refine.max_gaussians", self.max_gaussians, low=1, example=500_000)
+        unless_none(require_whole, "refine.max_gaussians", self.max_gaussians, low=1, example=500_000)
         self._check_reset()
 
     def _check_reset(self) -> None:

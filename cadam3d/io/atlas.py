@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.surface import Surface
+from cadam3d.core.mesh.surface import Surface
 from cadam3d.io.mesh import Texture
 
 # From points of a surface and its normals there to sRGB colours in [0, 1].

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int, UInt8
 
 from cadam3d import __version__
 from cadam3d.core.errors import UserError
-from cadam3d.core.surface import Surface, SurfaceFacts, facts
+from cadam3d.core.mesh.surface import Surface, SurfaceFacts, facts
 from cadam3d.io.atomic import replacing
 from cadam3d.io.frames import points_to_file
 

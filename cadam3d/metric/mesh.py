@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cadam3d.core.checks import require_range, require_whole
-from cadam3d.core.surface import SurfaceSettings, areas, outer_shell
+from cadam3d.core.mesh.surface import SurfaceSettings, areas, outer_shell
 from cadam3d.metric.base import Measurand, Measurement, Metric
 
 # The true surface is marched in the cube [-1, 1]^3, which holds every object, with this many nodes per side.

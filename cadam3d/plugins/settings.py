@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass, fields
 
-from cadam3d.core.checks import fail, require
 from cadam3d.core.errors import UserError
-from cadam3d.densifier.cadam import RESET, CAdam
+from cadam3d.densifier.cadam import CAdam
 
 
 @dataclass(kw_only=True)
@@ -29,15 +28,6 @@ class CAdamSettings:
 
     def _cadam(self, reset_min_age: int) -> CAdam:
         """Return the densifier with these settings. Raises :class:`UserError` for a wrong value."""
-        if self.reset not in RESET:
-            raise fail("reset", expected=f"one of {'|'.join(RESET)}", got=self.reset, example='reset="none"')
-        require(
-            self.tau_SNR is not None or self.reset != "unreliable",
-            "tau_SNR",
-            expected='a number, because reset="unreliable" compares with it too',
-            got=self.tau_SNR,
-            example='tau_SNR=None, reset="none"',
-        )
         chosen = {field.name: getattr(self, field.name) for field in fields(CAdamSettings)}
         try:
             return CAdam(**chosen, reset_min_age=reset_min_age)

@@ -55,14 +55,14 @@ class AutoRasterizer(Rasterizer):
 
 
 @dataclass(frozen=True)
-class Choice:
+class Chosen:
     """A rasterizer that works on a device, and its name."""
 
     rasterizer: Rasterizer
     backend: Backend
 
 
-def choose(device: torch.device) -> Choice:
+def choose(device: torch.device) -> Chosen:
     """Return the rasterizer that ``rasterizer=auto`` uses on ``device``."""
     if device.type == "cuda" and device.index is None and torch.cuda.is_available():
         device = torch.device("cuda", torch.cuda.current_device())
@@ -70,18 +70,18 @@ def choose(device: torch.device) -> Choice:
 
 
 @cache
-def _choose(device: torch.device) -> Choice:
+def _choose(device: torch.device) -> Chosen:
     failures: list[str] = []
     for name, candidate in FASTEST.get(device.type, {}).items():
         try:
             rasterizer = candidate(device)
             backend = rasterizer.prepare(device)
-            return Choice(rasterizer, replace(backend, reason=_reason(failures)))
+            return Chosen(rasterizer, replace(backend, reason=_reason(failures)))
         except UserError as error:
             _refuse_broken(name, device)
             failures.append(str(error))
     reference = ReferenceRasterizer()
-    return Choice(reference, replace(reference.prepare(device), reason=_reason(failures)))
+    return Chosen(reference, replace(reference.prepare(device), reason=_reason(failures)))
 
 
 def _reason(failures: Sequence[str]) -> str | None:

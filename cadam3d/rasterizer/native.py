@@ -121,7 +121,7 @@ def run_pass(kernels: RenderPass, gaussians: Gaussians, background: Float[Tensor
         probe = absgrad_probe(means2d, kernels.absgrad)
         tensors = (means, *others, plain(background, device))
         probed = None if probe is None else plain(probe, device)
-        images = _Blend.apply(kernels, keeps, plain(means2d, device), probed, *tensors)
+        images = _BlendViews.apply(kernels, keeps, plain(means2d, device), probed, *tensors)
     rgb, alpha, depth = (image.to(dtype) for image in images)
     return RenderOutput(
         rgb=rgb,
@@ -160,7 +160,7 @@ class _Project(torch.autograd.Function):
         return None, grad_means, None
 
 
-class _Blend(torch.autograd.Function):
+class _BlendViews(torch.autograd.Function):
     """Maps ``means2d``, the probe for ``absgrad``, the raw parameters and the backgrounds to images."""
 
     @staticmethod

@@ -43,7 +43,7 @@ EMBEDDED = (72, 87, 101)
 
 
 @dataclass(frozen=True)
-class Compiler:
+class Nvrtc:
     """A loaded NVRTC library."""
 
     library: ctypes.CDLL
@@ -61,7 +61,7 @@ class Cubin:
 
 
 @cache
-def find_compiler() -> Compiler | None:
+def find_compiler() -> Nvrtc | None:
     """Return the first NVRTC that loads: first those of the wheels, then those of the system.
 
     In each of the two groups, the ones of torch's CUDA version come first.
@@ -95,7 +95,7 @@ def _fits_torch(name: str) -> bool:
     return bool(major) and (name.endswith(f".so.{major}") or f"64_{major}" in name)
 
 
-def _load(path: str) -> Compiler:
+def _load(path: str) -> Nvrtc:
     # Some releases search for their built-in functions on the loader's path only, so they are loaded first.
     for builtins in sorted(Path(path).parent.glob(BUILTINS)) if Path(path).is_absolute() else ():
         if ".alt." not in builtins.name:
@@ -107,10 +107,10 @@ def _load(path: str) -> Compiler:
     _check(library, library.nvrtcGetNumSupportedArchs(ctypes.byref(count)))
     architectures = (ctypes.c_int * count.value)()
     _check(library, library.nvrtcGetSupportedArchs(architectures))
-    return Compiler(library, path, (major.value, minor.value), tuple(sorted(architectures)))
+    return Nvrtc(library, path, (major.value, minor.value), tuple(sorted(architectures)))
 
 
-def choose_architecture(capability: tuple[int, int], compiler: Compiler) -> int:
+def choose_architecture(capability: tuple[int, int], compiler: Nvrtc) -> int:
     """Return the newest architecture that the compiler supports and that a device of this capability runs.
 
     Raises :class:`UserError` if there is none.
@@ -158,9 +158,7 @@ def build(cache_dir: Path, capability: tuple[int, int]) -> Cubin:
     return Cubin(final, time.perf_counter() - start)
 
 
-def compile_kernels(
-    compiler: Compiler, architecture: int, show: Callable[[str], object] | None = None
-) -> bytes:
+def compile_kernels(compiler: Nvrtc, architecture: int, show: Callable[[str], object] | None = None) -> bytes:
     """Return a cubin with all kernels for ``sm_<architecture>``; ``show`` is called with the compiler's log.
 
     Raises :class:`UserError`, which quotes the log, if the compilation fails.
@@ -192,7 +190,7 @@ def compile_kernels(
         library.nvrtcDestroyProgram(ctypes.byref(program))
 
 
-def _fetch(compiler: Compiler, what: str, program: ctypes.c_void_p) -> bytes:
+def _fetch(compiler: Nvrtc, what: str, program: ctypes.c_void_p) -> bytes:
     library, size = compiler.library, ctypes.c_size_t()
     _check(library, getattr(library, f"{what}Size")(program, ctypes.byref(size)))
     content = ctypes.create_string_buffer(size.value)
@@ -206,6 +204,6 @@ def _check(library: ctypes.CDLL, status: int, log: str = "") -> None:
         raise UserError(f"rasterizer=cuda: NVRTC reports {reason}. {log}\nTry: rasterizer=reference")
 
 
-def _key(compiler: Compiler) -> str:
+def _key(compiler: Nvrtc) -> str:
     parts = [(KERNELS / name).read_text() for name in (SOURCE, *HEADERS)]
     return short_hash("\0".join([*parts, *OPTIONS, *definitions(), repr(compiler.version)]))

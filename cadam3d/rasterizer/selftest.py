@@ -96,7 +96,7 @@ class Agreement:
 
 
 @dataclass(frozen=True)
-class Scene:
+class ProbeScene:
     """The scene of the self-test, and the weights of the pixels in the loss."""
 
     gaussians: Gaussians
@@ -135,7 +135,7 @@ def self_test(rasterizer: Rasterizer, device: torch.device, demands: Demands = O
     )
 
 
-def make_scene(most_opacity: float = 1.0) -> Scene:
+def make_scene(most_opacity: float = 1.0) -> ProbeScene:
     """Return a scene that is the same on every machine, with opacities of at most ``most_opacity``.
 
     Python guarantees the numbers of its random generator, torch does not. The Gaussians are thin and thick,
@@ -158,7 +158,7 @@ def make_scene(most_opacity: float = 1.0) -> Scene:
     views = len(azimuth)
     background = (noise(views, 3) + 1) / 2
     weights = (noise(views, HEIGHT, WIDTH, 3), noise(views, HEIGHT, WIDTH), noise(views, HEIGHT, WIDTH))
-    return Scene(
+    return ProbeScene(
         gaussians=gaussians.to(torch.float32),
         cameras=orbit(azimuth, elevation, distance, fov_y, HEIGHT, WIDTH),
         background=background.float(),
@@ -168,7 +168,7 @@ def make_scene(most_opacity: float = 1.0) -> Scene:
 
 def _render(
     render: Callable[..., RenderOutput],
-    scene: Scene,
+    scene: ProbeScene,
     device: torch.device,
     dtype: torch.dtype,
     absgrad: bool = False,

@@ -285,7 +285,7 @@ def test_an_impossible_value_of_an_open_choice_is_refused_by_name(key, value):
     ("changes", "key"),
     [
         ({"tau_reset": 0.1, "reset": "all"}, "tau_reset"),  # it would have no effect
-        ({"tau_SNR": None}, "tau_reset"),  # a selective reset needs a threshold
+        ({"tau_SNR": None}, "reset"),  # a selective reset needs a threshold
         ({"alpha": 0.05}, "tau_SNR"),  # two gates on one ratio
         ({"alpha": 1.0, "tau_SNR": None, "tau_reset": 0.1}, "alpha"),
         ({"alpha": 0.05, "tau_SNR": None, "tau_reset": 0.1, "beta2": 0.8}, "beta2"),

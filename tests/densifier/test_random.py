@@ -8,9 +8,9 @@ import torch
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.reductions import quantile
 from cadam3d.core.schedule import Linear
 from cadam3d.densifier.base import GradientSignal
-from cadam3d.densifier.cadam import quantile
 from cadam3d.densifier.random import RandomGrowth
 from cadam3d.settings.compose import component, compose
 

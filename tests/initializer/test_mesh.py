@@ -8,8 +8,8 @@ from PIL import Image
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.mesh.surface import Surface
 from cadam3d.core.sh import SH_C0
-from cadam3d.core.surface import Surface
 from cadam3d.initializer.mesh import Mesh
 from cadam3d.io.mesh import Texture, write_glb, write_mesh_ply, write_obj
 

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from scipy.ndimage import map_coordinates
 
-from cadam3d.core.surface import Surface
+from cadam3d.core.mesh.surface import Surface
 from cadam3d.io.atlas import nearest_points, paint
 
 STRIPES = 3.0

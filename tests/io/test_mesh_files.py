@@ -10,7 +10,7 @@ import trimesh
 from PIL import Image
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.surface import Surface, facts, vertex_normals
+from cadam3d.core.mesh.surface import Surface, facts, vertex_normals
 from cadam3d.io.frames import AXES
 from cadam3d.io.mesh import Texture, linear, mesh_facts, write_glb, write_mesh_ply, write_obj
 

@@ -67,7 +67,7 @@ def test_all_architectures_of_the_compiler_are_tested(compiler):
     assert {each for each in compiler.architectures if each >= 75} <= set(ARCHITECTURES)
 
 
-def compile_verbosely(compiler: nvrtc.Compiler, architecture: int, folder: Path) -> str:
+def compile_verbosely(compiler: nvrtc.Nvrtc, architecture: int, folder: Path) -> str:
     """Return the log of a compilation. A log in ``folder`` is used if nothing has changed since."""
     key = content_hash(nvrtc._key(compiler), Path(nvrtc.__file__).read_text())
 
@@ -120,13 +120,13 @@ def test_a_damaged_file_is_built_again(compiler, tmp_path, monkeypatch):
     [((7, 5), 75), ((8, 0), 80), ((8, 6), 86), ((8, 7), 87), ((8, 8), 86), ((10, 3), 100), ((12, 1), 120)],
 )
 def test_the_newest_architecture_that_runs_on_the_device_is_chosen(capability, wanted):
-    compiler = nvrtc.Compiler(ctypes.CDLL(None), "", (13, 0), (75, 80, 86, 87, 90, 100, 101, 120))
+    compiler = nvrtc.Nvrtc(ctypes.CDLL(None), "", (13, 0), (75, 80, 86, 87, 90, 100, 101, 120))
     assert choose_architecture(capability, compiler) == wanted
 
 
 @pytest.mark.parametrize("capability", [(6, 1), (7, 0), (11, 0)])
 def test_a_device_that_the_compiler_does_not_support_is_refused(capability):
-    compiler = nvrtc.Compiler(ctypes.CDLL(None), "", (13, 0), (75, 80, 86, 87, 90, 100, 101, 120))
+    compiler = nvrtc.Nvrtc(ctypes.CDLL(None), "", (13, 0), (75, 80, 86, 87, 90, 100, 101, 120))
     with pytest.raises(UserError, match=rf"CUDA 13\.0 .* capability {capability[0]}\.{capability[1]}"):
         choose_architecture(capability, compiler)
 

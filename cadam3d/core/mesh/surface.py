@@ -15,10 +15,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cadam3d.core.checks import require_range, require_whole
-from cadam3d.core.density import BLUR, CUTOFF, Blobs, Grid, blobs, density, grid_around, near
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import require_memory
+from cadam3d.core.mesh.density import BLUR, CUTOFF, Blobs, Lattice, blobs, density, grid_around, near
 from cadam3d.core.sh import evaluate_sh
 
 # The extent of the object is found on coarse grids, blurred by a whole cell, so that nothing is missed
@@ -160,7 +160,7 @@ class SurfaceSettings:
 
 
 def _large_regions(
-    is_dense: Bool[np.ndarray, "x y z"], some: Blobs, grid: Grid, smallest: float
+    is_dense: Bool[np.ndarray, "x y z"], some: Blobs, grid: Lattice, smallest: float
 ) -> Int[np.ndarray, "k 3"]:
     """Return the nodes of all connected regions except specks.
 
@@ -364,7 +364,7 @@ class Painter:
 
     sh: Float[Tensor, "n k 3"]  # of the Gaussians in ``some``
     some: Blobs
-    grid: Grid
+    grid: Lattice
 
     def colors(
         self, points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"]

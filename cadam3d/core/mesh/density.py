@@ -38,7 +38,7 @@ LARGEST = 1e30  # world units
 
 
 @dataclass(frozen=True)
-class Grid:
+class Lattice:
     """Nodes at ``origin + cell * (i, j, k)``; each axis has a multiple of 2**LEVELS cells."""
 
     origin: Float[Tensor, "3"]  # float64, world units
@@ -50,13 +50,13 @@ class Grid:
         """Return the number of nodes."""
         return math.prod(self.nodes)
 
-    def coarser(self, level: int) -> "Grid":
+    def coarser(self, level: int) -> "Lattice":
         """Return the grid with ``2**level`` times larger cells and the same corners."""
         x, y, z = ((nodes - 1) // 2**level + 1 for nodes in self.nodes)
-        return Grid(self.origin, self.cell * 2**level, (x, y, z))
+        return Lattice(self.origin, self.cell * 2**level, (x, y, z))
 
 
-def grid_around(low: Float[Tensor, "3"], high: Float[Tensor, "3"], resolution: int) -> Grid:
+def grid_around(low: Float[Tensor, "3"], high: Float[Tensor, "3"], resolution: int) -> Lattice:
     """Return a grid with ``resolution`` cells along the longest side of a box and its margin of two cells."""
     low, high = low.double(), high.double()
     cell = max(float((high - low).max()) / max(resolution - 4, 1), 1e-30)
@@ -64,7 +64,7 @@ def grid_around(low: Float[Tensor, "3"], high: Float[Tensor, "3"], resolution: i
     x, y, z = (unit * math.ceil((round(side, 6) + 4) / unit) + 1 for side in ((high - low) / cell).tolist())
     nodes = (x, y, z)
     centre = (low + high) / 2
-    return Grid(centre - cell * (torch.tensor(nodes) - 1) / 2, cell, nodes)
+    return Lattice(centre - cell * (torch.tensor(nodes) - 1) / 2, cell, nodes)
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def blobs(gaussians: Gaussians) -> Blobs:
     )
 
 
-def density(some: Blobs, grid: Grid, blur: float = BLUR) -> Float[Tensor, "x y z"]:
+def density(some: Blobs, grid: Lattice, blur: float = BLUR) -> Float[Tensor, "x y z"]:
     """Return the density at every node, in float32; ``blur`` is in cells."""
     smallest = (some.smallest / grid.cell).clamp_min(1e-30)
     levels = (smallest / COARSE).log2().floor().clamp(0, LEVELS).long()
@@ -127,7 +127,7 @@ def density(some: Blobs, grid: Grid, blur: float = BLUR) -> Float[Tensor, "x y z
     return torch.zeros(grid.nodes) if total is None else total
 
 
-def _add(values: Float[Tensor, "nodes"], some: Blobs, grid: Grid, blur: float) -> None:
+def _add(values: Float[Tensor, "nodes"], some: Blobs, grid: Lattice, blur: float) -> None:
     """Add the density of ``some`` to ``values``, in place."""
     for runs in _runs(some, grid, blur, longest=grid.nodes[2]):
         run, step = _expand(runs.lengths)
@@ -149,7 +149,7 @@ class _Runs:
     opacity: Float[Tensor, "r"]
 
 
-def _runs(some: Blobs, grid: Grid, blur: float, longest: int) -> Iterator[_Runs]:
+def _runs(some: Blobs, grid: Lattice, blur: float, longest: int) -> Iterator[_Runs]:
     """Yield the runs of all Gaussians, at most ``AT_ONCE / longest`` of them at once."""
     means = (some.means - grid.origin) / grid.cell
     covariances = some.covariances / grid.cell**2 + blur**2 * torch.eye(3, dtype=torch.float64)
@@ -212,7 +212,7 @@ def _expand(lengths: Int[Tensor, "r"]) -> tuple[Int[Tensor, "e"], Int[Tensor, "e
 
 
 def near(
-    some: Blobs, grid: Grid, points: Float[Tensor, "p 3"]
+    some: Blobs, grid: Lattice, points: Float[Tensor, "p 3"]
 ) -> Iterator[tuple[Int[Tensor, "pairs"], Int[Tensor, "pairs"]]]:
     """Yield pairs (blob, point) in which the blurred Gaussian reaches the node nearest to the point.
 
@@ -234,7 +234,7 @@ def near(
             yield inside[blob], batch[point]
 
 
-def _reaching(some: Blobs, grid: Grid) -> Int[Tensor, "nodes"]:
+def _reaching(some: Blobs, grid: Lattice) -> Int[Tensor, "nodes"]:
     """Return the number of blurred Gaussians that reach each node."""
     change = torch.zeros(grid.count + 1, dtype=torch.int64)
     for runs in _runs(some, grid, BLUR, longest=8):
@@ -244,7 +244,7 @@ def _reaching(some: Blobs, grid: Grid) -> Int[Tensor, "nodes"]:
 
 
 def _pairs(
-    some: Blobs, grid: Grid, number: Int[Tensor, "p"]
+    some: Blobs, grid: Lattice, number: Int[Tensor, "p"]
 ) -> Iterator[tuple[Int[Tensor, "pairs"], Int[Tensor, "pairs"]]]:
     """Yield all pairs (blob, point) at once; ``number`` is the node of each point, in ascending order."""
     # The points of a run of nodes are consecutive: from ``starts[first]`` up to ``starts[first + length]``.

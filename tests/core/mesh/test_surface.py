@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from cadam3d.core.density import CUTOFF, blobs, density, grid_around, near
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians, concatenate
+from cadam3d.core.mesh.density import CUTOFF, blobs, density, grid_around, near
+from cadam3d.core.mesh.surface import SurfaceSettings, facts, is_watertight, separated, simplified
 from cadam3d.core.sh import rgb_to_sh0
-from cadam3d.core.surface import SurfaceSettings, facts, is_watertight, separated, simplified
 
 RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.2, 0.9)
 
