@@ -241,7 +241,7 @@ def _composed(line: Line) -> DictConfig:
     require_settings(cfg)
     _refuse_several_runs(cfg, line)
     if line.command == "train":
-        require_attempts(cfg.get("attempts", 1), cfg.get("select"))
+        require_attempts(cfg.get("attempts", 1))
     return cfg
 
 

@@ -2,7 +2,7 @@
 
 import sys
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from cadam3d import report
 from cadam3d.commands.linking import link_best, link_latest
 from cadam3d.core.errors import UserError
-from cadam3d.core.quality import QUALITIES
+from cadam3d.core.number import Number
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.run_folder import ASSET, BEST, CHOICE, REPORT, shown
 from cadam3d.settings.line import setting_word
@@ -21,8 +21,9 @@ from cadam3d.sweep.attempts import (
     read_attempts,
     require_measured,
     require_one_method,
+    selectable_numbers,
 )
-from cadam3d.sweep.choice import PREFERRED, Choice, choose
+from cadam3d.sweep.choice import Choice, choose, preferred
 from cadam3d.sweep.folder import load
 from cadam3d.sweep.start import folder_of, run_sweep
 
@@ -43,7 +44,8 @@ def run(
     sweep, composer = read_attempts(cfg, overrides, options, words)
     folder = folder_of(sweep)
     existing = existing_attempts(sweep, folder)
-    require_measured(select, list(cfg.get("metric") or ()), existing, folder, words)
+    numbers = selectable_numbers(options)
+    require_measured(select, numbers, list(cfg.get("metric") or ()), existing, folder, words)
     ended = run_sweep(sweep, composer, words, flags, on_start=link_latest)
     if ended.was_dry:
         return ended.code
@@ -58,7 +60,7 @@ def run(
     if choice is not None:
         _print(choice, ended.folder)
     elif any(attempt.measured for attempt in attempts):
-        raise _nothing_to_choose_by(select, ended.folder)
+        raise _nothing_to_choose_by(select, numbers, ended.folder)
     return ended.code
 
 
@@ -68,7 +70,7 @@ def _keep(choice: Choice, folder: Path) -> None:
     facts = {
         "best": name,
         "seed": choice.best,
-        "select": choice.quality.name,
+        "select": choice.number.name,
         "values": {f"seed={seed}": value for seed, value in choice.values.items()},
         "without": [f"seed={seed}" for seed in choice.without],
         "why": choice.sentence,
@@ -105,10 +107,12 @@ def _print(choice: Choice, folder: Path) -> None:
     print(f"  {'next':<9}cadam3d view {word}\n  {'':<9}cadam3d export {word}", flush=True)
 
 
-def _nothing_to_choose_by(select: str | None, folder: Path) -> UserError:
+def _nothing_to_choose_by(select: str | None, numbers: Mapping[str, Number], folder: Path) -> UserError:
     """Return the error for attempts of which none has the number to compare by."""
-    wanted = f"one of {', '.join(PREFERRED)}" if select is None else select
-    line = measuring_line(folder, "clip_score" if select is None else QUALITIES[select].metric)
+    names = preferred(numbers.values()) if select is None else [select]
+    wanted = f"one of {', '.join(names)}" if select is None else select
+    # The last of several needs no truth.
+    line = measuring_line(folder, numbers[names[-1]])
     return UserError(
         f"select: no attempt has {wanted}. All of them are kept: measure them, and then type the same line "
         f"again. Try: {line}"

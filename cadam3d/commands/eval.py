@@ -19,7 +19,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.jsonl import write_json
-from cadam3d.io.records import MEASUREMENTS, Score, psnr_of, read_summary, scores_in, with_earlier
+from cadam3d.io.records import MEASUREMENTS, NUMBERS, Score, psnr_of, read_summary, scores_in, with_earlier
 from cadam3d.io.run_folder import ASSET, CONFIG, EVALUATION, copying, shown, suggestion, typed_path
 from cadam3d.metric.base import Measurand
 from cadam3d.prior.base import DiffusionPrior
@@ -108,7 +108,7 @@ def _as_text(result: Mapping[str, Any]) -> str:
     scores = scores_in(result)
     lines = []
     for name, value in result.items():
-        if name != MEASUREMENTS:
+        if name not in (MEASUREMENTS, NUMBERS):
             text = f"{value:.4f}" if isinstance(value, float) else str(value)
             note = f"   {_explained(scores[name])}" if name in scores else ""
             lines.append(f"{name:<20}{text}{note}")

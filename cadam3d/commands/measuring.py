@@ -10,7 +10,7 @@ import torch
 from cadam3d.commands.messages import keeping_others, note, warn
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
-from cadam3d.io.records import MEASUREMENTS
+from cadam3d.io.records import MEASUREMENTS, NUMBERS
 from cadam3d.metric.base import Measurand, Metric
 from cadam3d.metric.protocol import Protocol
 from cadam3d.metric.turn import facing
@@ -37,7 +37,8 @@ def measure(
 ) -> dict[str, Any]:
     """Return the numbers of all metrics. If a metric fails, only its own are missing, and a warning is added.
 
-    The records of how numbers were measured are under ``MEASUREMENTS``, which is missing if there are none.
+    What the metrics declare about these numbers is under ``NUMBERS``. The records of how numbers were
+    measured are under ``MEASUREMENTS``, which is missing if there are none.
     ``start`` returns the Gaussians at the start of the run. If it is None, they are not measured.
     """
     numbers: dict[str, Any] = {}
@@ -60,7 +61,13 @@ def measure(
             )
             for metric in metrics.values():
                 numbers |= metric.measure_start(beginning)
-    return numbers | (
+    declarations = {
+        number.name: replace(number, metric=name).declaration()
+        for name, metric in metrics.items()
+        for number in metric.numbers
+        if number.name in numbers
+    }
+    return {**numbers, NUMBERS: declarations} | (
         {MEASUREMENTS: {name: _with_changes(each) for name, each in details.items()}} if details else {}
     )
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from cadam3d.core.errors import UserError
+from cadam3d.core.number import COUNT, Number
 from cadam3d.core.outcome import Outcome
-from cadam3d.core.quality import QUALITIES
 from cadam3d.io.jsonl import is_number, is_whole, read_json, read_jsonl
 from cadam3d.io.reading import read_yaml
 from cadam3d.io.run_folder import EVALUATION, HISTOGRAMS, METRICS, SUMMARY
@@ -21,20 +21,10 @@ from cadam3d.io.run_folder import EVALUATION, HISTOGRAMS, METRICS, SUMMARY
 MOST_BINS = 1000  # per decade
 DECADES = 300  # powers of ten below and above 1
 
-# Entries of summary.json and of eval.json that compare an asset with the true object.
-QUALITY = (
-    "psnr",
-    "psnr_min",
-    "ssim",
-    "psnr_turned",
-    "ssim_turned",
-    "turn_deg",
-    "psnr_start",
-    "iou",
-    "iou_start",
-    "colour_error",
-)
-
+# The entry of summary.json and of eval.json with what metrics declare about their numbers, by name.
+NUMBERS = "numbers"
+MOST_DIGITS = 10
+LONGEST_TEXT = 200  # characters of a label
 # The entry of summary.json and of eval.json with a record of how each number was measured, by its name.
 MEASUREMENTS = "measurements"
 # Entries of such a record that may differ between the assets of one table. All others describe how the number
@@ -54,7 +44,33 @@ def read_summary(run: Path) -> dict[str, Any]:
     is_summary = isinstance(summary, dict) and all(
         is_entry(summary[name]) for name, is_entry in SUMMARY_ENTRIES.items() if name in summary
     )
-    return summary if is_summary else {}
+    return summary if is_summary and all(map(_is_number_or_none, _measured(summary))) else {}
+
+
+def _measured(summary: Mapping[str, Any]) -> list[Any]:
+    return [summary.get(name) for name in declared(summary)]
+
+
+def declared(facts: Mapping[str, Any]) -> dict[str, Number]:
+    """Return what a ``summary.json`` or an ``eval.json`` declares about its numbers, by name.
+
+    Declarations of another form than :meth:`Number.declaration` returns are left out.
+    """
+    entries = facts.get(NUMBERS)
+    found = (
+        {}
+        if not isinstance(entries, dict)
+        else {name: Number(name=name, **entry) for name, entry in entries.items() if _is_declaration(entry)}
+    )
+    return {COUNT.name: COUNT} | found
+
+
+def _is_declaration(entry: Any) -> bool:
+    return (
+        isinstance(entry, dict)
+        and DECLARED.keys() >= entry.keys() >= {"label", "digits", "is_more_better"}
+        and all(DECLARED[key](value) for key, value in entry.items())
+    )
 
 
 def psnr_of(summary: Mapping[str, Any]) -> float | None:
@@ -89,28 +105,28 @@ def with_earlier(fresh: Mapping[str, Any], run: Path, metrics: Collection[str]) 
     other metrics that ``eval.json`` has already are kept with their records.
     """
     earlier = read_evaluation(run, fresh)
+    numbers = declared(earlier)
     known = {
         name: value
         for name, value in earlier.items()
-        if name in QUALITIES and QUALITIES[name].metric not in metrics and is_number(value)
+        if name in numbers and numbers[name].metric not in metrics and is_number(value) and name not in fresh
     }
-    # Metrics that do not belong to this package have other names.
-    known |= {name: earlier[name] for name in scores_in(earlier) if name not in QUALITIES}
-    known = {name: value for name, value in known.items() if name not in fresh}
+    declarations = {name: numbers[name].declaration() for name in known} | fresh.get(NUMBERS, {})
     records = {name: score.record for name, score in scores_in(earlier).items() if name in known}
     records |= fresh.get(MEASUREMENTS, {})
-    return {**known, **fresh} | ({MEASUREMENTS: records} if records else {})
+    return {**known, **fresh, NUMBERS: declarations} | ({MEASUREMENTS: records} if records else {})
 
 
 def read_quality(run: Path, summary: Mapping[str, Any]) -> dict[str, float]:
-    """Return the quality in ``eval.json`` of a run that has measured none itself.
+    """Return the comparisons with the truth in ``eval.json`` of a run that has measured none itself.
 
     Returns {} if the summary has a PSNR, or if the evaluation is of another asset or cannot be believed.
     """
     if psnr_of(summary) is not None:
         return {}
     evaluation = read_evaluation(run, summary)
-    return {name: evaluation[name] for name in QUALITY if is_number(evaluation.get(name))}
+    names = [name for name, number in declared(evaluation).items() if number.needs_truth]
+    return {name: evaluation[name] for name in names if is_number(evaluation.get(name))}
 
 
 @dataclass(frozen=True)
@@ -119,6 +135,7 @@ class Score:
 
     value: float
     record: Mapping[str, Any]
+    metric: str = ""  # the option of ``metric=`` that has measured it, as far as known
 
     @property
     def method(self) -> dict[str, str]:
@@ -132,9 +149,9 @@ class Score:
 
 def scores_in(numbers: Mapping[str, Any]) -> dict[str, Score]:
     """Return the numbers of a ``summary.json`` or an ``eval.json`` that have a record, by name."""
-    records = numbers.get(MEASUREMENTS)
+    records, known = numbers.get(MEASUREMENTS), declared(numbers)
     return {
-        name: Score(float(numbers[name]), record)
+        name: Score(float(numbers[name]), record, known[name].metric if name in known else "")
         for name, record in (records.items() if isinstance(records, dict) else ())
         if is_number(numbers.get(name)) and isinstance(record, dict)
     }
@@ -251,6 +268,10 @@ def _is_text_or_none(value: object) -> bool:
     return value is None or isinstance(value, str)
 
 
+def _is_label(value: object) -> bool:
+    return isinstance(value, str) and 0 < len(value) <= LONGEST_TEXT and value.isprintable()
+
+
 def _is_number_or_none(value: object) -> bool:
     return value is None or is_number(value)
 
@@ -272,8 +293,16 @@ SUMMARY_ENTRIES: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("rasterizer", "camera", "refine", "optimizer", "initializer_note"), _is_text_or_none),
     **dict.fromkeys(("steps", "steps_asked", "num_gaussians", "num_gaussians_initial"), is_whole),
     **dict.fromkeys(("skipped_steps", "dimmed_steps", "asset_bytes"), is_whole),
-    **dict.fromkeys((*QUALITY, "asset_mib", "bytes_per_gaussian"), _is_number_or_none),
+    **dict.fromkeys(("psnr", "ssim", "psnr_turned", "ssim_turned"), _is_number_or_none),
     "truth": _is_text_or_none,
-    **dict.fromkeys(("median_scale", "median_opacity"), _is_number_or_none),
     **dict.fromkeys(("memory_estimate_gib", "memory_peak_gib"), _is_number_or_none),
+}
+
+# The kinds of the entries of a declaration (``Number``).
+DECLARED: dict[str, Callable[[Any], bool]] = {
+    **dict.fromkeys(("label", "unit", "explained", "replaces", "metric"), _is_label),
+    "digits": lambda value: is_whole(value) and value <= MOST_DIGITS,
+    "is_more_better": lambda value: value is None or isinstance(value, bool),
+    "preference": is_whole,
+    "needs_truth": lambda value: isinstance(value, bool),
 }

@@ -3,9 +3,10 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.number import Number
 from cadam3d.core.render import RenderFn, Truth
 
 
@@ -38,6 +39,9 @@ class Measurement:
 
 class Metric(ABC):
     """Interface of all metrics. A subclass is a frozen dataclass of its settings."""
+
+    # What the metric can measure. Tables, reports and ``select=`` read this from the files of a run.
+    numbers: ClassVar[tuple[Number, ...]]
 
     def prepare(self) -> None:  # noqa: B027 (most metrics need nothing)
         """Raise ``UserError`` if something is missing that the metric needs, such as the files of a model.

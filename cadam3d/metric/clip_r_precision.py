@@ -13,6 +13,7 @@ from torch import Tensor
 
 from cadam3d.core.checks import fail, require
 from cadam3d.core.errors import UserError
+from cadam3d.core.number import Number
 from cadam3d.io.prompts import set_file, set_names
 from cadam3d.io.reading import read_text, read_yaml
 from cadam3d.metric.clip import ClipMetric, load_clip
@@ -36,7 +37,9 @@ class ClipRPrecision(ClipMetric):
     """
 
     node: ClassVar[str] = "metric.clip_r_precision"
-    number: ClassVar[str] = "clip_r_precision"
+    numbers: ClassVar[tuple[Number, ...]] = (
+        Number(name="clip_r_precision", label="CLIP R-precision", digits=3, is_more_better=True),
+    )
     kind: ClassVar[str] = "clip"
 
     prompts: str  # a set of this package, or a file with one prompt per line or with a list in YAML

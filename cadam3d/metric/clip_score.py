@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import torch
 
+from cadam3d.core.number import Number
 from cadam3d.metric.clip import ClipMetric, load_clip
 from cadam3d.metric.scoring import Scorer
 
@@ -20,7 +21,9 @@ class ClipScore(ClipMetric):
     """
 
     node: ClassVar[str] = "metric.clip_score"
-    number: ClassVar[str] = "clip_score"
+    numbers: ClassVar[tuple[Number, ...]] = (
+        Number(name="clip_score", label="CLIP score", digits=2, is_more_better=True, preference=31),
+    )
     kind: ClassVar[str] = "clip"
 
     def scorer(self, device: torch.device) -> Scorer:

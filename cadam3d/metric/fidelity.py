@@ -1,7 +1,7 @@
 """Fidelity: how close the renders are to the true images, if those are known."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.checks import require_whole
+from cadam3d.core.number import Number
 from cadam3d.core.render import RenderFn, Truth
 from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.held_out import HeldOutSettings
@@ -16,6 +17,18 @@ from cadam3d.metric.held_out import HeldOutSettings
 SSIM_WINDOW = 11  # pixels (Wang et al. 2004)
 # In dB. The PSNR of equal images is infinite, which can neither be averaged nor written as JSON.
 PSNR_MAX = 100.0
+
+PSNR = Number(
+    name="psnr", label="PSNR", unit="dB", digits=2, is_more_better=True, preference=10, needs_truth=True
+)
+PSNR_START = replace(
+    PSNR,
+    name="psnr_start",
+    label="PSNR at the start",
+    explained="PSNR of the Gaussians at the start (dB)",
+    preference=None,
+)
+SSIM = Number(name="ssim", label="SSIM", digits=4, is_more_better=True, needs_truth=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +41,30 @@ class Fidelity(HeldOutSettings, Metric):
     """
 
     node: ClassVar[str] = "metric.fidelity"
+    numbers: ClassVar[tuple[Number, ...]] = (
+        PSNR,
+        replace(PSNR, name="psnr_min", label="PSNR of the worst view", preference=None),
+        SSIM,
+        Number(
+            name="mode",
+            label="best-matching mode of the truth",
+            digits=0,
+            is_more_better=None,
+            needs_truth=True,
+        ),
+        # If the asset may face any side, these two replace numbers that may compare with a wrong side.
+        replace(PSNR, name="psnr_turned", label="PSNR at the best turn", replaces="psnr"),
+        replace(SSIM, name="ssim_turned", label="SSIM at the best turn", replaces="ssim"),
+        Number(
+            name="turn_deg",
+            label="best turn about the vertical axis",
+            unit="degrees",
+            digits=0,
+            is_more_better=None,
+            needs_truth=True,
+        ),
+        PSNR_START,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -9,6 +9,7 @@ import torch
 
 from cadam3d.core.checks import require, require_choice
 from cadam3d.core.errors import UserError
+from cadam3d.core.number import Number
 from cadam3d.io.pretrained import fetch_file, read_tensors
 from cadam3d.metric.clip import Clip, ClipMetric, assembled, check_clip, load_clip
 from cadam3d.metric.open_clip import clip_model
@@ -32,7 +33,9 @@ class Hps(ClipMetric):
     """
 
     node: ClassVar[str] = "metric.hps"
-    number: ClassVar[str] = "hps"
+    numbers: ClassVar[tuple[Number, ...]] = (
+        Number(name="hps", label="HPS v2", digits=3, is_more_better=True, preference=21),
+    )
     kind: ClassVar[str] = "hps"
 
     version: str  # of the file, if the model is an id on the hub: "v2.0" or "v2.1"

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
+from cadam3d.core.number import Number
 from cadam3d.io.image import to_uint8
 from cadam3d.metric.scoring import ScoreMetric, Scorer, cut_off
 from cadam3d.metric.transformer import sha256_of
@@ -43,7 +44,9 @@ class ImageReward(ScoreMetric):
     metric alone (``INSTALL``).
     """
 
-    number: ClassVar[str] = "image_reward"
+    numbers: ClassVar[tuple[Number, ...]] = (
+        Number(name="image_reward", label="ImageReward", digits=3, is_more_better=True, preference=20),
+    )
     node: ClassVar[str] = "metric.image_reward"
 
     model: str | None  # a folder with WEIGHTS and SETTINGS; None = the cache of the package

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
 from cadam3d.core.checks import require_choice, require_range, require_whole
+from cadam3d.core.number import Number
 from cadam3d.metric.base import Measurand, Measurement
 from cadam3d.metric.clip import ClipMetric, load_clip
 from cadam3d.metric.scoring import Scorer
@@ -65,9 +66,11 @@ class Janus(ClipMetric):
     """The number of fronts of an asset, by the true object or by a model of pictures and texts."""
 
     node: ClassVar[str] = "metric.janus"
-    number: ClassVar[str] = "janus"
+    numbers: ClassVar[tuple[Number, ...]] = (
+        Number(name="janus", label="Janus score", digits=3, is_more_better=False),
+        Number(name="janus_fronts", label="fronts", digits=0, is_more_better=None),
+    )
     kind: ClassVar[str] = "clip"
-    less_is_better: ClassVar[bool] = True
 
     by: str  # auto | truth | model
     views: int  # azimuths that the model sees

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from cadam3d.core.checks import require_range, require_whole
 from cadam3d.core.mesh.surface import SurfaceSettings, areas, outer_shell
+from cadam3d.core.number import Number
 from cadam3d.metric.base import Measurand, Measurement, Metric
 
 # The true surface is marched in the cube [-1, 1]^3, which holds every object, with this many nodes per side.
@@ -22,6 +23,10 @@ COARSE_NODES = 32
 # Samples of a surface that lead to the triangles near a point.
 GUIDES = 200_000
 NEIGHBOURS = 8
+
+FSCORE = Number(
+    name="mesh_fscore", label="F-score of the mesh", digits=3, is_more_better=True, needs_truth=True
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +48,19 @@ class MeshMetric(SurfaceSettings, Metric):
     """
 
     node: ClassVar[str] = "metric.mesh"
+    numbers: ClassVar[tuple[Number, ...]] = (
+        Number(
+            name="mesh_chamfer",
+            label="Chamfer distance of the mesh",
+            unit="world units",
+            digits=4,
+            is_more_better=False,
+            needs_truth=True,
+        ),
+        FSCORE,
+        replace(FSCORE, name="mesh_precision", label="precision of the mesh"),
+        replace(FSCORE, name="mesh_recall", label="recall of the mesh"),
+    )
 
     threshold: float  # world units
     samples: int

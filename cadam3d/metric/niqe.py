@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cadam3d.core.checks import require, require_choice
 from cadam3d.core.errors import UserError
+from cadam3d.core.number import Number
 from cadam3d.metric import natural
 from cadam3d.metric.base import Measurand, Measurement
 from cadam3d.metric.scoring import ScoreMetric, Scorer
@@ -30,8 +31,9 @@ class Niqe(ScoreMetric):
     record of every number names them. See ``natural`` for what is computed.
     """
 
-    number: ClassVar[str] = "niqe"
-    less_is_better: ClassVar[bool] = True
+    numbers: ClassVar[tuple[Number, ...]] = (
+        Number(name="niqe", label="NIQE", digits=3, is_more_better=False),
+    )
 
     parameters: str | None  # a file such as basicsr's niqe_pris_params.npz; None = those of this package
     plain_blocks: str  # "keep" or "drop"

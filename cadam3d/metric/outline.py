@@ -1,18 +1,42 @@
 """Outline: whether an asset has the true silhouette and the true colour, which PSNR alone does not say."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from cadam3d.core.number import Number
 from cadam3d.core.render import RenderFn, Truth
 from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.held_out import HeldOutSettings
 
 # The alpha above which a pixel belongs to the object.
 INSIDE = 0.5
+
+IOU = Number(
+    name="iou",
+    label="IoU",
+    digits=3,
+    is_more_better=True,
+    explained="Overlap of the outlines (IoU)",
+    needs_truth=True,
+)
+IOU_START = replace(
+    IOU,
+    name="iou_start",
+    label="IoU at the start",
+    explained="Overlap of the outlines at the start (IoU)",
+)
+COLOUR_ERROR = Number(
+    name="colour_error",
+    label="colour error",
+    digits=1,
+    is_more_better=False,
+    explained="Colour error (delta E)",
+    needs_truth=True,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +55,7 @@ class Outline(HeldOutSettings, Metric):
     """
 
     node: ClassVar[str] = "metric.outline"
+    numbers: ClassVar[tuple[Number, ...]] = (IOU, IOU_START, COLOUR_ERROR)
 
     def measure(self, measurand: Measurand) -> Measurement:
         """Return ``iou`` in [0, 1] and ``colour_error``; nothing if the true outlines are not known.

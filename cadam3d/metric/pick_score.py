@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import torch
 
+from cadam3d.core.number import Number
 from cadam3d.metric.clip import ClipMetric, load_clip
 from cadam3d.metric.scoring import Scorer
 
@@ -18,7 +19,9 @@ class PickScore(ClipMetric):
     """
 
     node: ClassVar[str] = "metric.pick_score"
-    number: ClassVar[str] = "pick_score"
+    numbers: ClassVar[tuple[Number, ...]] = (
+        Number(name="pick_score", label="PickScore", digits=2, is_more_better=True, preference=22),
+    )
     kind: ClassVar[str] = "pick"
 
     def scorer(self, device: torch.device) -> Scorer:

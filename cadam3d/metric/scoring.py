@@ -16,6 +16,7 @@ from torch import Tensor
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.memory import is_out_of_memory
+from cadam3d.core.number import Number
 from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.protocol import ModelName, Protocol
 from cadam3d.metric.transformer import TransformerFolder, TransformerSource
@@ -39,13 +40,15 @@ class Scorer:
 class ScoreMetric(Metric):
     """One number from the scores of single pictures, which are taken as a protocol says.
 
-    A subclass sets ``number`` and returns its model from :meth:`scorer`.
+    The number is the first of ``numbers``. A subclass returns its model from :meth:`scorer`.
     """
 
-    number: ClassVar[str]  # the name of the number, such as "clip_score"
-    less_is_better: ClassVar[bool] = False
-
     protocol: Protocol
+
+    @property
+    def number(self) -> Number:
+        """Return what is declared about the number."""
+        return self.numbers[0]
 
     @abstractmethod
     def scorer(self, device: torch.device) -> Scorer:
@@ -78,19 +81,22 @@ class ScoreMetric(Metric):
                 raise
             reason = " ".join(str(error).split())[:200]
             raise UserError(
-                f"metric.{self.number}: the model cannot score this prompt ({reason}). Try: another model"
+                f"metric.{self.number.name}: the model cannot score this prompt ({reason}). "
+                "Try: another model"
             ) from error
 
     def require_finite(self, values: Tensor) -> None:
         """Raise ``UserError`` if a model has returned something other than numbers."""
         if not values.isfinite().all():
-            raise UserError(f"metric.{self.number}: its model returns NaN or infinity. Try: another model")
+            raise UserError(
+                f"metric.{self.number.name}: its model returns NaN or infinity. Try: another model"
+            )
 
     def measurement(
         self, values: Float[Tensor, "v"], text: str | None, facts: Mapping[str, Any]
     ) -> Measurement:
         """Return the number that the values of all views become, with its record."""
-        value = self.protocol.aggregate(values, less_is_better=self.less_is_better)
+        value = self.protocol.aggregate(values, less_is_better=not self.number.is_more_better)
         record = {
             "value": value,
             "protocol": self.protocol.record(),
@@ -100,7 +106,7 @@ class ScoreMetric(Metric):
             "mean": float(values.mean()),
             "interval": self.interval(values) if self.protocol.is_mean else None,
         }
-        return Measurement({self.number: value}, {self.number: record})
+        return Measurement({self.number.name: value}, {self.number.name: record})
 
     def interval(self, values: Float[Tensor, "v"]) -> dict[str, Any] | None:
         """Return the 95 % interval of the mean over viewpoints; None for fewer than two views.

@@ -1,7 +1,9 @@
 """Size: how many Gaussians an asset has, and how many bytes its file takes."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
+from cadam3d.core.number import COUNT, Number
 from cadam3d.metric.base import Measurand, Measurement, Metric
 
 MIB = 1 << 20  # bytes
@@ -10,6 +12,15 @@ MIB = 1 << 20  # bytes
 @dataclass(frozen=True, kw_only=True)
 class Size(Metric):
     """Number of Gaussians, and size of the written file including any padding."""
+
+    numbers: ClassVar[tuple[Number, ...]] = (
+        COUNT,
+        Number(name="asset_bytes", label="size of asset.ply", unit="bytes", digits=0, is_more_better=False),
+        Number(name="asset_mib", label="size of asset.ply", unit="MiB", digits=2, is_more_better=False),
+        Number(name="bytes_per_gaussian", label="bytes per Gaussian", digits=0, is_more_better=None),
+        Number(name="median_scale", label="median scale", unit="world units", digits=4, is_more_better=None),
+        Number(name="median_opacity", label="median opacity", digits=3, is_more_better=None),
+    )
 
     def measure(self, measurand: Measurand) -> Measurement:
         """Return counts, sizes and medians.

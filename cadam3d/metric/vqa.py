@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cadam3d.core.checks import require, require_choice
 from cadam3d.core.errors import UserError
+from cadam3d.core.number import Number
 from cadam3d.io.image import to_uint8
 from cadam3d.io.pretrained import DTYPES
 from cadam3d.metric import transformer
@@ -56,7 +57,16 @@ class Vqa(ModelMetric):
     """
 
     node: ClassVar[str] = "metric.vqa"
-    number: ClassVar[str] = "vqa"
+    numbers: ClassVar[tuple[Number, ...]] = (
+        Number(
+            name="vqa",
+            label="VQA score",
+            digits=3,
+            is_more_better=True,
+            explained="Probability that a vision-language model answers yes",
+            preference=30,
+        ),
+    )
     kind: ClassVar[str] = "vqa"
 
     question: str  # {} is the text of the protocol

@@ -14,7 +14,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import binomtest
 
-from cadam3d.core.quality import QUALITIES, Quality
+from cadam3d.core.number import Number
+from cadam3d.metric import fidelity
 from cadam3d.report.results import NOISE, PROMPT, SEED, ArmSetting, Cell, JobResult, measured
 
 NO_GROWTH = "none"  # the arm that gains are measured from
@@ -34,32 +35,32 @@ MOST_LISTED = 4  # values that are listed one by one
 class Compared:
     """A quality by which settings are compared; more is better."""
 
-    quality: Quality
+    number: Number
     of: Callable[[JobResult], float | None]
 
     @property
     def digits(self) -> int:
         """Return the number of digits after the point, in tables."""
-        return self.quality.decimals
+        return self.number.digits
 
     @property
     def unit(self) -> str:
         """Return the unit; empty if there is none."""
-        return self.quality.unit
+        return self.number.unit
 
     @property
     def axis(self) -> str:
         """Return the label of an axis: the name with its unit."""
-        return self.quality.heading
+        return self.number.heading
 
     @property
     def gain(self) -> str:
         """Return the label of the difference to the job without growth, with its unit."""
-        return replace(self.quality, label=f"{self.quality.label} gained by growth").heading
+        return replace(self.number, label=f"{self.number.label} gained by growth").heading
 
 
-PSNR = Compared(QUALITIES["psnr"], lambda result: result.psnr)
-SSIM = Compared(QUALITIES["ssim"], lambda result: result.ssim)
+PSNR = Compared(fidelity.PSNR, lambda result: result.psnr)
+SSIM = Compared(fidelity.SSIM, lambda result: result.ssim)
 
 
 @dataclass(frozen=True)

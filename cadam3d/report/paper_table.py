@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from cadam3d.core.quality import AT_BEST_TURN, QUALITIES
+from cadam3d.core.number import Number
 from cadam3d.io import records
 from cadam3d.io.run_folder import shown
 from cadam3d.report.formatting import plural
@@ -75,14 +75,19 @@ class Section:
 class PaperTable:
     """The paper's table 1 of a sweep."""
 
-    names: list[str]  # of the numbers, one for each column
+    numbers: list[Number]  # one for each column
     sections: list[Section]
     notes: list[str]  # sentences below it
 
     @property
     def headings(self) -> list[str]:
         """Return the labels of the columns of numbers."""
-        return [QUALITIES[name].heading for name in self.names]
+        return [number.heading for number in self.numbers]
+
+    @property
+    def names(self) -> list[str]:
+        """Return the names of the columns of numbers."""
+        return [number.name for number in self.numbers]
 
 
 @dataclass(frozen=True)
@@ -116,16 +121,16 @@ def paper_table(results: Sequence[JobResult], folder: Path) -> PaperTable | None
     if not usable:
         return None
     left_out = mixed(usable)
-    names = [name for name in columns(_rows_of_jobs(usable)) if name not in left_out]
+    numbers = [number for number in columns(_rows_of_jobs(usable)) if number.name not in left_out]
     categories = [each for each in dict.fromkeys(result.category for result in results) if each]
-    sections = [Section("", _rows(results, names, with_published=True))]
+    sections = [Section("", _rows(results, numbers, with_published=True))]
     for category in categories:
         members = [result for result in results if result.category == category]
-        sections.append(Section(category, _rows(members, names, with_published=False)))
-    notes = [*_notes(results, usable, names), *_again(left_out, usable, folder)]
+        sections.append(Section(category, _rows(members, numbers, with_published=False)))
+    notes = [*_notes(results, usable, numbers), *_again(left_out, usable, folder)]
     if not any(name in result.numbers for result in usable for name in PAPER_SCORES):
         notes.append(f"The paper's scores are not measured yet. Try: {_line(PAPER_SCORES, folder)}")
-    return PaperTable(names, sections, notes)
+    return PaperTable(numbers, sections, notes)
 
 
 def with_asset(results: Iterable[JobResult]) -> list[JobResult]:
@@ -133,12 +138,14 @@ def with_asset(results: Iterable[JobResult]) -> list[JobResult]:
     return [result for result in results if result.outcome in WITH_ASSET and result.count]
 
 
-def columns(rows: Iterable[Sequence[JobResult]]) -> list[str]:
-    """Return the names of the numbers that every row has, each a sequence of jobs, in order."""
+def columns(rows: Sequence[Sequence[JobResult]]) -> list[Number]:
+    """Return the numbers that every row has, each a sequence of jobs, in order."""
     known = [{name for job in jobs for name in job.numbers} for jobs in rows]
     shared = set.intersection(*known) if known else set()
-    names = [name for name in (*SCORES, *OF_TRUTH, *SIZES) if name in shared]
-    return [name for name in names if AT_BEST_TURN.get(name) not in shared]
+    declared = {name: number for jobs in rows for job in jobs for name, number in job.declared.items()}
+    names = [name for name in (*SCORES, *OF_TRUTH, *SIZES) if name in shared and name in declared]
+    replaced = {declared[name].replaces for name in names}
+    return [declared[name] for name in names if name not in replaced]
 
 
 def mixed(results: Sequence[JobResult]) -> dict[str, str]:
@@ -167,15 +174,15 @@ def mixed(results: Sequence[JobResult]) -> dict[str, str]:
 
 def _again(left_out: Mapping[str, str], results: Sequence[JobResult], folder: Path) -> list[str]:
     """Return the sentences about numbers that are left out, with the line that measures all scores anew."""
-    scores = {name for result in results for name in result.scores}
-    line = _line([name for name in SCORES if name in scores], folder)
+    scores = {name: score.metric or name for result in results for name, score in result.scores.items()}
+    line = _line([scores[name] for name in SCORES if name in scores], folder)
     return [f"{problem}, so it is not in the table. Try: {line}" for problem in left_out.values()]
 
 
-def _line(names: Iterable[str], folder: Path) -> str:
-    """Return the command that measures numbers of all jobs of the sweep in ``folder``."""
-    metrics = dict.fromkeys(QUALITIES[name].metric for name in names)
-    return f"cadam3d eval {setting_word('run', shown(folder))} 'metric=[{','.join(metrics)}]'"
+def _line(metrics: Iterable[str], folder: Path) -> str:
+    """Return the command that measures with some metrics all jobs of the sweep in ``folder``."""
+    chosen = ",".join(dict.fromkeys(metrics))
+    return f"cadam3d eval {setting_word('run', shown(folder))} 'metric=[{chosen}]'"
 
 
 def _groups(results: Sequence[JobResult]) -> list[Group]:
@@ -204,39 +211,41 @@ def _rows_of_jobs(results: Sequence[JobResult]) -> list[list[JobResult]]:
     return [group.of(setting) for group in _groups(results) for setting in group.settings]
 
 
-def _rows(results: Sequence[JobResult], names: Sequence[str], *, with_published: bool) -> list[TableRow]:
+def _rows(results: Sequence[JobResult], numbers: Sequence[Number], *, with_published: bool) -> list[TableRow]:
     rows: list[TableRow] = []
     groups = _groups(results)
     for position, group in enumerate(groups):
-        rows += [_row(group.objective, setting.name, group.of(setting), names) for setting in group.settings]
+        rows += [
+            _row(group.objective, setting.name, group.of(setting), numbers) for setting in group.settings
+        ]
         ours, theirs = group.standard(OURS), group.standard(THEIRS)
         if ours and theirs:
-            rows.append(_difference_row(group.objective, group.of(ours), group.of(theirs), names))
+            rows.append(_difference_row(group.objective, group.of(ours), group.of(theirs), numbers))
         is_last = group.family not in [other.family for other in groups[position + 1 :]]
         if with_published and is_last:
-            rows += _published_rows(group.family, names)
+            rows += _published_rows(group.family, [number.name for number in numbers])
     return rows
 
 
-def _row(objective: str, method: str, jobs: Sequence[JobResult], names: Sequence[str]) -> TableRow:
+def _row(objective: str, method: str, jobs: Sequence[JobResult], numbers: Sequence[Number]) -> TableRow:
     usable = with_asset(jobs)
     cells = {}
-    for name in names:
-        found = mean(_by_prompt(usable, name))
-        decimals = QUALITIES[name].decimals
-        cells[name] = TableCell() if found is None else _cell(found, decimals)
+    for number in numbers:
+        found = mean(_by_prompt(usable, number.name))
+        cells[number.name] = TableCell() if found is None else _cell(found, number.digits)
     return TableRow(objective, method, MINE, _prompts(_names(usable), _names(jobs)), cells)
 
 
 def _difference_row(
-    objective: str, ours: Sequence[JobResult], theirs: Sequence[JobResult], names: Sequence[str]
+    objective: str, ours: Sequence[JobResult], theirs: Sequence[JobResult], numbers: Sequence[Number]
 ) -> TableRow:
     """Return the row of the differences, over the prompts and seeds that both have."""
     usable, others = with_asset(ours), with_asset(theirs)
     both = {job.cell for job in usable} & {job.cell for job in others}
     usable, others = ([job for job in jobs if job.cell in both] for jobs in (usable, others))
     cells = {}
-    for name in names:
+    for number in numbers:
+        name = number.name
         measured = [{job.cell for job in jobs if name in job.numbers} for jobs in (usable, others)]
         shared = set.intersection(*measured)
         first, second = (
@@ -247,9 +256,7 @@ def _difference_row(
             cells[name] = TableCell() if found is None else _change_cell(found)
         else:
             found = difference(first, second)
-            cells[name] = (
-                TableCell() if found is None else _cell(found, QUALITIES[name].decimals, signed=True)
-            )
+            cells[name] = TableCell() if found is None else _cell(found, number.digits, signed=True)
     planned = _names(ours) | _names(theirs)
     return TableRow(objective, DIFFERENCE, MINE, _prompts(_names(usable), planned), cells)
 
@@ -312,7 +319,7 @@ def _prompts(found: set[str], planned: set[str]) -> str:
     return f"{len(found)}" if len(found) == len(planned) else f"{len(found)} of {len(planned)}"
 
 
-def _notes(results: Sequence[JobResult], usable: Sequence[JobResult], names: Sequence[str]) -> list[str]:
+def _notes(results: Sequence[JobResult], usable: Sequence[JobResult], numbers: Sequence[Number]) -> list[str]:
     seeds = len({result.cell[SEED] for result in usable})
     each = f" of the means over {plural(seeds, 'seed')}" if seeds > 1 else ""
     notes = [
@@ -324,7 +331,7 @@ def _notes(results: Sequence[JobResult], usable: Sequence[JobResult], names: Seq
         score.method.get("protocol.name")
         for job in usable
         for name, score in job.scores.items()
-        if name in names
+        if name in [number.name for number in numbers]
     )
     if known := [name for name in protocols if name]:
         notes.append(f"Learned scores: protocol={', '.join(known)}, as eval.json of each job records it.")

@@ -14,11 +14,11 @@ from typing import Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from cadam3d.core.number import Number
 from cadam3d.core.outcome import Outcome
-from cadam3d.core.quality import QUALITIES
 from cadam3d.io.records import (
-    QUALITY,
     Score,
+    declared,
     latest_scores,
     psnr_of,
     read_config,
@@ -110,6 +110,7 @@ class JobResult:
     # from the end of training, except that comparisons with a truth all come from one of the two, as in
     # sweep.csv.
     numbers: Mapping[str, float] = field(repr=False)
+    declared: Mapping[str, Number] = field(repr=False)  # what their metrics declare about them
     scores: Mapping[str, Score] = field(repr=False)
 
     @property
@@ -183,7 +184,10 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
     size = numbers.get("asset_bytes")
     # Whether a comparison with a truth comes from training or from eval.json is the same for all tables.
     evaluation = read_evaluation(job.folder, job.summary)
-    evaluation = {name: value for name, value in evaluation.items() if name not in QUALITY}
+    known = declared(summary) | declared(evaluation)
+    evaluation = {
+        name: value for name, value in evaluation.items() if name not in known or not known[name].needs_truth
+    }
     sources = (summary, evaluation)
     given = {key: value for key, value in job.overrides.items() if key.startswith(PREFIX)}
     return JobResult(
@@ -207,17 +211,15 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
         seconds=numbers.get("seconds"),
         objective=str(job.overrides.get(GUIDANCE) or job.summary.get(GUIDANCE) or ""),
         category=job.category,
-        numbers=_numbers(sources),
+        numbers=_numbers(sources, known),
+        declared=known,
         scores=latest_scores(sources),
     )
 
 
-def _numbers(sources: Iterable[Mapping[str, Any]]) -> dict[str, float]:
-    found = {name: number(each.get(name)) for each in sources for name in QUALITIES if name in each}
-    known = {name: value for name, value in found.items() if value is not None}
-    if "asset_bytes" in known:
-        known.setdefault("asset_mib", known["asset_bytes"] / (1 << 20))
-    return known
+def _numbers(sources: Iterable[Mapping[str, Any]], declared: Iterable[str]) -> dict[str, float]:
+    found = {name: number(each.get(name)) for each in sources for name in declared if name in each}
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def _cell(job: _KnownJob, axes: Sequence[str]) -> Cell:

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from cadam3d.core.chart import Chart
-from cadam3d.core.quality import QUALITIES
-from cadam3d.io.records import MEASUREMENTS, psnr_of, ssim_of
+from cadam3d.io.records import MEASUREMENTS, NUMBERS, declared, psnr_of, ssim_of
 from cadam3d.io.run_folder import ASSET, CONFIG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE
 from cadam3d.report.charts import other_plots, sections
 from cadam3d.report.declarations import write_declarations
@@ -18,15 +17,18 @@ from cadam3d.viewer.page import script, style
 
 EMBED_BYTES = 8 << 20  # a larger video is linked, not embedded
 FILES = (ASSET, TURNTABLE, PREVIEW, SUMMARY, METRICS, CONFIG)
-HIDDEN = ("warnings", MEASUREMENTS)  # entries of the summary that are no facts
+HIDDEN = ("warnings", MEASUREMENTS, NUMBERS)  # entries of the summary that are no facts
 COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "device")
-LABELS = {
+# The labels of the facts before those of metrics, and after them.
+FIRST_LABELS = {
     "prompt": "Prompt",
     "negative_prompt": "Negative prompt",
     "outcome": "Outcome",
     "num_gaussians_initial": "Gaussians at the start",
     "initializer_note": "Fallback of the initializer",
-    **{name: quality.fact for name, quality in QUALITIES.items()},
+}
+LAST_LABELS = {
+    "asset_bytes": "Size of asset.ply (bytes)",
     "backend": "Rasterizer backend",
     "backend_reason": "Why not a faster backend",
     "seconds": "Seconds",
@@ -134,8 +136,10 @@ def _video_source(path: Path) -> str:
 
 def _facts(summary: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """Return the label and the value of every fact, the known ones first."""
-    ordered = [*(key for key in LABELS if key in summary), *(key for key in summary if key not in LABELS)]
-    return [(LABELS.get(key) or key.replace("_", " "), summary[key]) for key in ordered if key not in HIDDEN]
+    measured = {name: each.fact for name, each in declared(summary).items()}
+    labels = FIRST_LABELS | measured | {key: text for key, text in LAST_LABELS.items() if key not in measured}
+    ordered = [*(key for key in labels if key in summary), *(key for key in summary if key not in labels)]
+    return [(labels.get(key) or key.replace("_", " "), summary[key]) for key in ordered if key not in HIDDEN]
 
 
 def _flat(line: Mapping[str, Any]) -> dict[str, Any]:

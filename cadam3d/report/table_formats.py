@@ -4,7 +4,6 @@ import csv
 import io
 from collections.abc import Sequence
 
-from cadam3d.core.quality import QUALITIES
 from cadam3d.report.paper_table import PaperTable, Section, TableCell, TableRow
 
 FIRST = ("objective", "method", "source", "prompts")
@@ -28,7 +27,7 @@ LATEX = {
 
 def headings(table: PaperTable) -> list[str]:
     """Return the titles of all columns, with an arrow towards the better numbers."""
-    arrows = [ARROWS[QUALITIES[name].is_more_better] for name in table.names]
+    arrows = [ARROWS[number.is_more_better] for number in table.numbers]
     return [
         *FIRST,
         *(f"{title} {arrow}".strip() for title, arrow in zip(table.headings, arrows, strict=True)),

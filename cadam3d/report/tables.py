@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cadam3d.core.quality import QUALITIES
 from cadam3d.io.atomic import replacing
+from cadam3d.metric.fidelity import PSNR_START
+from cadam3d.metric.outline import COLOUR_ERROR, IOU, IOU_START
 from cadam3d.report.claims import (
     PSNR,
     SSIM,
@@ -27,8 +28,7 @@ NO_RATIO: dict[float | None, str] = {math.inf: "never", 0.0: "always"}
 
 # Columns of results that are compared with a named truth: the field of the result, and its decimal places.
 OF_TRUTH = {
-    quality.heading: (quality.name, quality.decimals)
-    for quality in map(QUALITIES.__getitem__, ("psnr_start", "iou", "iou_start", "colour_error"))
+    number.heading: (number.name, number.digits) for number in (PSNR_START, IOU, IOU_START, COLOUR_ERROR)
 }
 
 

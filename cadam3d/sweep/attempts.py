@@ -2,21 +2,23 @@
 
 import shlex
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from omegaconf import DictConfig
 
-from cadam3d.core.checks import require_whole
+from cadam3d.core.checks import require_choice, require_whole
 from cadam3d.core.errors import UserError
+from cadam3d.core.number import COUNT, Number
 from cadam3d.core.outcome import Outcome
-from cadam3d.core.quality import QUALITIES
 from cadam3d.io.jsonl import is_number
-from cadam3d.io.records import difference, read_evaluation, read_scores
+from cadam3d.io.records import declared, difference, read_evaluation, read_scores
 from cadam3d.io.run_folder import LATEST, expanded, shown
 from cadam3d.settings.compose import slug
 from cadam3d.settings.line import RUN_FOLDER, key_of
-from cadam3d.sweep.choice import PREFERRED, SELECTABLE, Attempt, Choice, choose
+from cadam3d.settings.options import config_dir, option_class, option_names
+from cadam3d.sweep.choice import Attempt, Choice, choose, preferred
 from cadam3d.sweep.folder import PlannedJob, Row, rows_of
 from cadam3d.sweep.grid import Axes, Grid, Job, read_line, sweep_name
 from cadam3d.sweep.plan import Composer, Sweep, compose_sweep, search_path, sort_overrides
@@ -25,10 +27,6 @@ SEED = "seed="  # the name of the folder of an attempt begins with it
 PARENT = Path(LATEST).parent
 # The settings of a line that are not those of a single attempt.
 OF_THE_LINE = ("attempts", "select", RUN_FOLDER)
-# Metrics that compare with the true object.
-OF_TRUTH = ("fidelity", "outline", "mesh")
-# Numbers that every summary has, whichever metrics were chosen.
-IN_EVERY_SUMMARY = ("num_gaussians",)
 
 
 def read_attempts(
@@ -86,36 +84,58 @@ def attempt_of(row: Row) -> Attempt:
     seed, summary = row.swept["seed"], row.summary
     if not row.has_result or row.outcome == Outcome.VANISHED or not summary.get("num_gaussians"):
         return Attempt(seed)
+    evaluation = read_evaluation(row.folder, summary)
+    numbers = {
+        name: number
+        for name, number in (declared(evaluation) | declared(summary)).items()
+        if number.is_more_better is not None
+    }
     measured, evaluated = (
-        {name: float(known[name]) for name in SELECTABLE if is_number(known.get(name))}
-        for known in (summary, read_evaluation(row.folder, summary))
+        {name: float(known[name]) for name in numbers if is_number(known.get(name))}
+        for known in (summary, evaluation)
     )
     # As in the tables, scores of an evaluation replace those of training. ``require_one_method`` then refuses
     # to compare scores that were measured in different ways.
     scores = {name: score.value for name, score in read_scores(row.folder, summary).items()}
-    return Attempt(seed, measured | {name: scores[name] for name in SELECTABLE if name in scores}, evaluated)
+    own = measured | {name: scores[name] for name in numbers if name in scores}
+    return Attempt(seed, own, evaluated, numbers)
 
 
 def require_one_method(choice: Choice, rows: Sequence[Row], folder: Path) -> None:
     """Raise ``UserError`` if the numbers that a choice compares were measured in different ways."""
-    name, metric = choice.quality.name, choice.quality.metric
+    name = choice.number.name
     compared = [row for row in rows if row.swept["seed"] in choice.values]
     scores = [read_scores(row.folder, row.summary).get(name) for row in compared]
     problem = difference(name, [score for score in scores if score is not None])
     if problem is not None:
-        line = measuring_line(folder, metric)
+        line = measuring_line(folder, choice.number)
         raise UserError(f"select: {problem}. Measure all attempts in one way. Try: {line}")
 
 
-def measuring_line(folder: Path, metric: str) -> str:
-    """Return the line that measures all attempts in a folder with one metric."""
-    # A run that did not measure these numbers may know no truth, so the line names one.
-    truth = ["truth=shapes"] if metric in OF_TRUTH else []
-    return shlex.join(["cadam3d", "eval", f"run={shown(folder)}", f"metric=[{metric}]", *truth])
+def measuring_line(folder: Path, number: Number) -> str:
+    """Return the line that measures a number of all attempts in a folder."""
+    # A run that did not measure this number may know no truth, so the line names one.
+    truth = ["truth=shapes"] if number.needs_truth else []
+    return shlex.join(["cadam3d", "eval", f"run={shown(folder)}", f"metric=[{number.metric}]", *truth])
+
+
+def selectable_numbers(options: Namespace) -> dict[str, Number]:
+    """Return the numbers by which attempts can be compared, whichever metrics are chosen, by name.
+
+    These are the numbers of which more or less is better, of all metrics of the package and ``--config-dir``.
+    """
+    folders = [*([Path(options.config_dir)] if options.config_dir else []), config_dir()]
+    found = [
+        replace(number, metric=name)
+        for name in option_names("metric", folders)
+        for number in getattr(option_class("metric", name, folders), "numbers", ())
+    ]
+    return {number.name: number for number in found if number.is_more_better is not None}
 
 
 def require_measured(
     select: str | None,
+    known: Mapping[str, Number],
     chosen: Sequence[str],
     attempts: Sequence[Attempt],
     folder: Path,
@@ -123,20 +143,23 @@ def require_measured(
 ) -> None:
     """Raise ``UserError`` if the attempts will lack the number that they are compared by.
 
-    ``chosen`` are the metrics of the line, and ``words`` is the line as it was typed. ``attempts`` are those
-    that are in ``folder`` already, where ``cadam3d eval`` may have measured the number.
+    ``known`` are the numbers by which attempts can be compared, whichever metrics were chosen. ``chosen`` are
+    the metrics of the line, and ``words`` is the line as it was typed. ``attempts`` are those that are in
+    ``folder`` already, where ``cadam3d eval`` may have measured the number.
     """
-    names = PREFERRED if select is None else (select,)
-    metrics = [QUALITIES[name].metric for name in names]
-    if set(metrics) & set(chosen) or set(names) & set(IN_EVERY_SUMMARY):
+    if select is not None:
+        require_choice("select", select, tuple(known))
+    names = preferred(known.values()) if select is None else [select]
+    metrics = [known[name].metric for name in names]
+    if set(metrics) & set(chosen) or select == COUNT.name:
         return
-    known = choose(attempts, select)
-    if known is not None and not known.without:
+    choice = choose(attempts, select)
+    if choice is not None and not choice.without:
         return
-    numbers = f"one of {', '.join(PREFERRED)}" if select is None else select
+    numbers = f"one of {', '.join(names)}" if select is None else select
     got = ", ".join(chosen) or "none"
     if all(attempt.measured for attempt in attempts):
-        line = measuring_line(folder, metrics[0])
+        line = measuring_line(folder, known[names[0]])
         then = " The attempts exist: measure them, and type this again."
     else:
         kept = [word for word in words if key_of(word) != "metric"]

@@ -3,19 +3,14 @@
 All functions are pure.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import mean
 
-from cadam3d.core.checks import require_choice, require_whole
-from cadam3d.core.quality import AT_BEST_TURN, QUALITIES, Quality
+from cadam3d.core.checks import require_whole
+from cadam3d.core.number import Number
 
-# Without select=, the first of these numbers that an attempt has decides: a comparison with the truth, then
-# the preferences of people, then agreement with the prompt.
-PREFERRED = ("psnr", "image_reward", "hps", "pick_score", "vqa", "clip_score")
 MOST_ATTEMPTS = 1000
-# The numbers by which attempts can be compared.
-SELECTABLE = tuple(name for name, quality in QUALITIES.items() if quality.is_more_better is not None)
 
 
 @dataclass(frozen=True)
@@ -25,13 +20,14 @@ class Attempt:
     seed: int
     measured: Mapping[str, float] = field(default_factory=dict)
     evaluated: Mapping[str, float] = field(default_factory=dict)  # by cadam3d eval, after training
+    declared: Mapping[str, Number] = field(default_factory=dict)  # what is known about these numbers
 
 
 @dataclass(frozen=True)
 class Choice:
     """The best of several attempts."""
 
-    quality: Quality
+    number: Number
     values: Mapping[int, float]  # by seed, the best first; at least one
     without: Sequence[int]  # the seeds of the attempts that do not have this number
 
@@ -44,7 +40,7 @@ class Choice:
     def sentence(self) -> str:
         """Say which attempt is the best, by how much, and how far its number can be trusted."""
         (best, value), *others = self.values.items()
-        written = self.quality.written
+        written = self.number.written
         left_out = f" Without this number: {_seeds(self.without)}." if self.without else ""
         if not others:
             return f"seed={best} is the only attempt with {self._label}: {written(value)}.{left_out}"
@@ -64,43 +60,50 @@ class Choice:
 
     @property
     def _label(self) -> str:
-        return self.quality.label if self.quality.is_more_better else f"{self.quality.label} (less is better)"
+        return self.number.label if self.number.is_more_better else f"{self.number.label} (less is better)"
 
 
-def require_attempts(attempts: object, select: object) -> None:
-    """Raise ``UserError`` for wrong values of the settings ``attempts`` and ``select``."""
+def require_attempts(attempts: object) -> None:
+    """Raise ``UserError`` for a wrong value of the setting ``attempts``."""
     require_whole("attempts", attempts, low=1, high=MOST_ATTEMPTS, example=4)
-    if select is not None:
-        require_choice("select", select, SELECTABLE)
 
 
 def choose(attempts: Sequence[Attempt], select: str | None) -> Choice | None:
     """Return the best attempt by the number ``select``; None if no attempt has that number.
 
-    ``None`` stands for the first of ``PREFERRED`` that an attempt has. The numbers of an evaluation after
-    training count only if training has measured none of them in any attempt, because both may have been
-    measured with different settings. Of attempts with equal numbers, the one with the lowest seed is the
-    best.
+    ``None`` stands for the most preferred number that an attempt has (``Number.preference``). The numbers of
+    an evaluation after training count only if training has measured none of them in any attempt, because both
+    may have been measured with different settings. Of attempts with equal numbers, the one with the lowest
+    seed is the best.
     """
-    for name in PREFERRED if select is None else (select,):
-        for key in filter(None, (AT_BEST_TURN.get(name), name)):
+    known = {name: number for attempt in attempts for name, number in attempt.declared.items()}
+    for name in preferred(known.values()) if select is None else (select,):
+        replacing = [number.name for number in known.values() if number.replaces == name]
+        for key in (*replacing, name):
             for numbers in (
                 {attempt.seed: attempt.measured for attempt in attempts},
                 {attempt.seed: attempt.evaluated for attempt in attempts},
             ):
-                values = {seed: known[key] for seed, known in numbers.items() if key in known}
+                values = {seed: own[key] for seed, own in numbers.items() if key in own}
                 if values:
-                    merit = QUALITIES[key].merit
+                    merit = known[key].merit
                     ordered = sorted(values, key=lambda seed: (-merit(values[seed]), seed))
                     without = sorted(seed for seed in numbers if seed not in values)
-                    return Choice(QUALITIES[key], {seed: values[seed] for seed in ordered}, without)
+                    return Choice(known[key], {seed: values[seed] for seed in ordered}, without)
     return None
 
 
 def known_numbers(attempts: Sequence[Attempt]) -> list[str]:
     """Return the numbers by which these attempts can be compared, which at least one of them has."""
     known = {name for attempt in attempts for name in (*attempt.measured, *attempt.evaluated)}
-    return [name for name in SELECTABLE if name in known]
+    declared = dict.fromkeys(name for attempt in attempts for name in attempt.declared)
+    return [name for name in declared if name in known]
+
+
+def preferred(numbers: Iterable[Number]) -> list[str]:
+    """Return the names of the numbers that decide without ``select=``, the most preferred first."""
+    ranks = {each.name: each.preference for each in numbers if each.preference is not None}
+    return sorted(ranks, key=lambda name: ranks[name])
 
 
 def _seeds(seeds: Sequence[int]) -> str:

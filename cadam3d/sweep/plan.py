@@ -286,7 +286,7 @@ def compose_all(sweep: Sweep, composer: Composer) -> list[Composed]:
 def _refuse_attempts(job: Composed) -> None:
     """Refuse a job that would be several attempts. A train.yaml from elsewhere may lack this setting."""
     attempts = job.values.get("attempts", 1)
-    require_attempts(attempts, job.values.get("select"))
+    require_attempts(attempts)
     if attempts > 1:
         raise UserError(
             f"attempts: expected 1 in a sweep, whose jobs may have different seeds, got {attempts}. "

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cadam3d.core.quality import QUALITIES
 from cadam3d.io.atomic import replacing
 from cadam3d.io.jsonl import to_json
-from cadam3d.io.records import QUALITY, Score, difference, psnr_of, read_scores
+from cadam3d.io.records import Score, declared, difference, psnr_of, read_scores
 from cadam3d.io.run_folder import TABLE, shown
 from cadam3d.settings.line import setting_word
 from cadam3d.sweep.folder import Row, load
@@ -18,8 +17,6 @@ FACTS = ("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "a
 BRIEF = 80  # characters
 # Columns that only jobs with a prompt of a file or a set have.
 LABELS = ("prompt_name", "category")
-# Columns that only jobs with a named truth have.
-MORE_FACTS = tuple(name for name in QUALITY if name not in ("psnr", "psnr_min", "ssim"))
 # Columns of the table in the terminal, besides the outcome and the settings in which jobs differ.
 SHOWN = ("num_gaussians", "psnr", "seconds")
 
@@ -79,8 +76,7 @@ def scores_of(jobs: Sequence[Mapping[str, Score]], sweep: Path) -> Scores:
         if problem is None:
             columns[name] = [None if score is None else score.value for score in found]
         else:
-            # Some metrics measure several numbers. Those from elsewhere are not in the list.
-            metric = QUALITIES[name].metric if name in QUALITIES else name
+            metric = next(score.metric for score in found if score is not None) or name
             again = f"cadam3d eval {setting_word('run', shown(sweep))} 'metric=[{metric}]'"
             left_out.append(f"{problem}, so it is not in the table. Try: {again}")
     return Scores(columns, left_out)
@@ -119,7 +115,7 @@ def _write(path: Path, rows: Sequence[Row]) -> None:
     keys = _swept_keys(rows)
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        names = [*FACTS, *(name for name in MORE_FACTS if any(name in row.summary for row in rows))]
+        names = [*FACTS, *_comparisons(rows)]
         labels = [name for name in LABELS if any(getattr(row, name) for row in rows)]
         scores = _scores(rows).columns
         writer.writerow(["job", "arm", *labels, *keys, "outcome", *names, *scores, "folder"])
@@ -129,6 +125,12 @@ def _write(path: Path, rows: Sequence[Row]) -> None:
             facts = [row.summary.get(name) for name in names]
             facts += [column[index] for column in scores.values()]
             writer.writerow([row.number, row.arm, *said, *swept, row.outcome, *facts, row.folder.name])
+
+
+def _comparisons(rows: Sequence[Row]) -> list[str]:
+    """Return the numbers that compare an asset with the truth, without those in ``FACTS``."""
+    known = {name: number for row in rows for name, number in declared(row.summary).items()}
+    return [name for name, number in known.items() if number.needs_truth and name not in FACTS]
 
 
 def _swept_keys(rows: Sequence[Row]) -> list[str]:

@@ -84,9 +84,9 @@ def test_an_evaluation_keeps_what_others_have_measured(tmp_path, type_line, clip
     after = read_json(run / "eval.json")
     assert "clip_score" not in out
     assert set(after["measurements"]) == {"clip_score", "niqe"}
-    assert [after[name] for name in before if name not in ("measurements", "warnings")] == [
-        before[name] for name in before if name not in ("measurements", "warnings")
-    ]
+    kept = [name for name in before if name not in ("measurements", "numbers", "warnings")]
+    assert [after[name] for name in kept] == [before[name] for name in kept]
+    assert after["numbers"] == before["numbers"] | {"niqe": after["numbers"]["niqe"]}
     # What is measured again is new, and numbers of another asset are not kept.
     type_line("eval", "run=run", "metric=[clip_score]", clip, *SMALL, "protocol.name=mine")
     again = read_json(run / "eval.json")["measurements"]
@@ -218,6 +218,8 @@ def test_records_of_an_unknown_kind_are_not_used(tmp_path, records):
 
 
 def test_the_advice_about_a_number_names_the_metric_that_measures_it():
-    jobs = [{"janus_fronts": Score(1.0, {"protocol": {"name": name}})} for name in ("truth", "paper")]
+    jobs = [
+        {"janus_fronts": Score(1.0, {"protocol": {"name": name}}, "janus")} for name in ("truth", "paper")
+    ]
     [sentence] = scores_of(jobs, Path("sweep")).left_out
     assert sentence.endswith("Try: cadam3d eval run=sweep 'metric=[janus]'")

@@ -10,6 +10,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import yaml
+from declarations import declared
 
 from cadam3d.core.chart import Chart, Curve, Level
 from cadam3d.io import run_folder
@@ -88,13 +89,14 @@ class Jobs:
             "ssim": 0.9,
             "steps": 120,
             "asset_bytes": 68 * round(n),
+            "asset_mib": 68 * round(n) / (1 << 20),
             "seconds": 1.5,
             "densifier": densifier,
             "guidance": given.get("guidance", "sds"),
             "warnings": [],
             **summary,
         }
-        (folder / run_folder.SUMMARY).write_text(json.dumps(facts))
+        (folder / run_folder.SUMMARY).write_text(json.dumps(declared(facts)))
         return folder
 
     def files(self, folder: Path, n: float, shake: float = 0.2) -> None:

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from declarations import declared
 
 from cadam3d.core.errors import UserError
 from cadam3d.report.results import ArmSetting, at_noise, counts, histograms, in_noise_order, measured, read
@@ -85,7 +86,9 @@ def test_a_job_without_a_psnr_has_that_of_its_evaluation(jobs):
     """An evaluation of another asset, and one that cannot be read, do not count."""
     for count, psnr in ((100, None), (100, 20.0), (99, None)):
         folder = jobs.add("cadam", f"seed={count}", n=100, psnr=psnr)
-        (folder / "eval.json").write_text(json.dumps({"num_gaussians": count, "psnr": 15.0, "iou": "much"}))
+        (folder / "eval.json").write_text(
+            json.dumps(declared({"num_gaussians": count, "psnr": 15.0, "iou": "much"}))
+        )
     (jobs.add("cadam", "seed=3", n=100, psnr=None) / "eval.json").write_text("[1")
     results = read(jobs.folder)
     assert [result.psnr for result in results] == [15.0, 20.0, None, None]

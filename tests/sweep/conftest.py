@@ -37,6 +37,8 @@ prompt = "a cube" if "resume" in given else given.get("prompt", "'a cube'").stri
 steps, seed = int(given.get("steps", 5)), int(given.get("seed", 0))
 summary = dict(prompt=prompt, seed=seed, num_gaussians_initial=4, num_gaussians=steps, seconds=1.5)
 summary |= dict(steps=steps, steps_asked=steps)
+psnr = dict(label="PSNR", unit="dB", digits=2, is_more_better=True, preference=10, metric="fidelity")
+summary["numbers"] = dict(psnr=psnr | dict(needs_truth=True))
 
 def write(outcome, **more):
     (folder / "summary.json").write_text(json.dumps(dict(summary, outcome=outcome) | more))
