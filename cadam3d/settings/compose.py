@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException, UnsupportedValueType
 from cadam3d.core.checks import fail, require_choice
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_yaml
-from cadam3d.settings.declared import require_declared
+from cadam3d.settings.check import require_declared
 from cadam3d.settings.options import config_dir, option_names, read_option
 
 # Hydra behaves like this version even if a newer one is installed.
@@ -114,7 +114,7 @@ def component(node: Any, kind: type = object, key: str = "") -> Any:
     """
     try:
         place = node._get_full_key("") if OmegaConf.is_config(node) else ""
-        require_declared(node, kind, place or key or "configuration")
+        require_declared(node, (kind,), place or key or "configuration")
         return instantiate(_resolved(node), _convert_="all")
     except InstantiationException as error:
         raise _construction_error(error, node) from error

@@ -22,7 +22,7 @@ from cadam3d.io.prompts import set_file, set_names
 from cadam3d.io.reading import parse_yaml, read_bytes
 from cadam3d.io.run_folder import expanded
 from cadam3d.settings.advice import did_you_mean
-from cadam3d.settings.declared import is_readable
+from cadam3d.settings.check import is_readable
 
 KEY, FILE = "prompts", "prompts.file"
 SHARD, CATEGORY, FIRST = "prompts.shard", "prompts.category", "prompts.first"

@@ -1,0 +1,205 @@
+"""Check: compare the configuration with the types that the code declares, before anything is built.
+
+A component declares the type of each of its settings, and pydantic compares, so that one check serves all
+components, those from elsewhere too. The ranges of the values belong to the constructors. A setting outside
+of all components has the type of its value in the YAML files.
+
+On two cores, pydantic needs about 0.1 s to load and 0.03 s for the 150 settings of a run. beartype needs as
+much time, but accepts true as a number and looks at one item of a list only; Hydra's structured configs read
+no types such as ``float | Schedule``. It is loaded when the first value is compared, not for a help page.
+"""
+
+import difflib
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import is_dataclass
+from functools import cache, reduce
+from operator import or_
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from omegaconf import DictConfig, OmegaConf
+
+from cadam3d.core.checks import fail
+from cadam3d.core.errors import UserError
+from cadam3d.io.reading import read_yaml
+from cadam3d.settings.options import (
+    NOTHING,
+    REFERENCE,
+    TARGET,
+    config_dir,
+    example_word,
+    load_class,
+    option_word,
+)
+
+# Integers beyond this fit into no tensor.
+LARGEST_WHOLE = 2**63 - 1
+# Control characters that a text may have.
+BLANKS = "\n\t\r"
+# The types of settings that are null or missing in the YAML files. The others are texts.
+OF_NULL = {
+    **dict.fromkeys(("run", "runs", "answers"), str | Sequence[str]),
+    **dict.fromkeys(("labels", "arms"), Sequence[str]),
+    **dict.fromkeys(("pairs", "job"), int),
+}
+WORDS: dict[Any, str] = {
+    int: "a whole number",
+    float: "a finite number",
+    str: "a text",
+    bool: "true or false",
+    NoneType: "null",
+    object: "a component",
+    Sequence[int]: "a list of whole numbers",
+    Sequence[float]: "a list of numbers",
+    Sequence[str]: "a list of texts",
+}
+
+
+def require_settings(values: Mapping[Any, Any]) -> None:
+    """Raise ``UserError`` unless all settings outside of components have values of their types.
+
+    ``values`` has the value of each setting by its name. A prompt needs something to make.
+    """
+    for name, declared in _types_of_settings().items():
+        if name in values:
+            _require(values[name], declared, name)
+    if not values.get("prompt", "unused").strip():
+        raise fail("prompt", expected="what to make", got=values["prompt"], example=example_word("prompt"))
+
+
+def require_declared(node: Any, kinds: tuple[type, ...], key: str) -> None:
+    """Raise ``UserError`` unless ``node`` describes an object of these classes with values of their types.
+
+    The class in ``_target_`` is loaded but not called. ``key`` is the place of the node, such as ``camera``.
+    """
+    if not _is_described(node):
+        raise fail(key, expected=_in_words(kinds), got=_plain(node), example=option_word(key))
+    raw = _plain(node)
+    cls = load_class(raw[TARGET], f"{key}.{TARGET}")
+    if not issubclass(cls, kinds):
+        expected = f"the path of a class ({_in_words(kinds)})"
+        raise fail(f"{key}.{TARGET}", expected=expected, got=raw[TARGET], example=option_word(key))
+    parameters, hints = _signature(cls)
+    names = [name for name in map(str, node) if name != TARGET]
+    _require_keys(names, parameters, key)
+    for name in names:
+        reference = REFERENCE.fullmatch(str(raw[name]))
+        # The user changes the node to which a setting refers, such as ${prompting}.
+        place = reference.group(1) if reference and OmegaConf.is_config(node[name]) else f"{key}.{name}"
+        _require(node[name], hints.get(name, Any), place)
+
+
+def is_readable(text: str) -> bool:
+    """Return whether a text can be written into a file and shown: Unicode without control characters."""
+    return all(
+        character in BLANKS or (character >= " " and not "\x7f" <= character <= "\x9f") for character in text
+    ) and not any("\ud800" <= character <= "\udfff" for character in text)
+
+
+def _require_keys(names: Sequence[str], parameters: Mapping[str, inspect.Parameter], key: str) -> None:
+    """Raise ``UserError`` unless ``names`` are the parameters of a class; those with a default may lack."""
+    kinds = {each.kind for each in parameters.values()}
+    unknown = [name for name in names if name not in parameters]
+    if unknown and inspect.Parameter.VAR_KEYWORD not in kinds:
+        near = difflib.get_close_matches(unknown[0], list(parameters), n=1)
+        meant = f" Did you mean {key}.{near[0]}?" if near else ""
+        raise UserError(f"{key}: there is no key {unknown[0]}.{meant} Try: cadam3d train --cfg job")
+    variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+    needed = [
+        name for name, each in parameters.items() if each.default is each.empty and each.kind not in variable
+    ]
+    if missing := [name for name in needed if name not in names]:
+        place = f"{key}.{missing[0]}"
+        example = example_word(place).replace(place, f"+{place}", 1)
+        raise UserError(f"{key}: no value for {', '.join(missing)}. Try: {example}")
+
+
+def _require(value: Any, declared: Any, key: str) -> None:
+    """Raise ``UserError`` unless ``value`` is of the declared type; the settings of an object are checked."""
+    members = get_args(declared) if get_origin(declared) in (Union, UnionType) else (declared,)
+    classes = tuple(each for each in members if inspect.isclass(each) and each.__module__ != "builtins")
+    classes = tuple(each for each in classes if get_origin(each) is None)
+    if _is_described(value) and classes:
+        require_declared(value, classes, key)
+        return
+    types = [each for each in members if each not in classes]
+    plain, expected = _plain(value, resolve=True), _in_words(members)
+    if types and _is_of_type(plain, reduce(or_, types)):
+        if declared is Any or _is_usable(plain):
+            return
+        expected += ", below 2^63 and without control characters"
+    raise fail(key, expected=expected, got=_plain(value), example=example_word(key))
+
+
+def _is_of_type(value: Any, declared: Any) -> bool:
+    """Return whether plain data is of a type. True is no number, and NaN and infinity are none either."""
+    from pydantic import ValidationError
+
+    try:
+        _adapter(declared).validate_python(value)
+    except ValidationError:
+        return False
+    return True
+
+
+@cache
+def _adapter(declared: Any) -> Any:
+    """Return what compares values with a type."""
+    from pydantic import ConfigDict, TypeAdapter
+
+    config = ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
+    return TypeAdapter(declared, config=config)
+
+
+def _is_usable(value: Any) -> bool:
+    """Return whether torch reads all integers in plain data, and a file can hold all its texts."""
+    if isinstance(value, dict | list):
+        return all(map(_is_usable, [*value, *(value.values() if isinstance(value, dict) else ())]))
+    if isinstance(value, str):
+        return is_readable(value)
+    return not isinstance(value, int) or abs(value) <= LARGEST_WHOLE
+
+
+@cache
+def _signature(cls: type) -> tuple[Mapping[str, inspect.Parameter], Mapping[str, Any]]:
+    """Return the parameters of a class and their types."""
+    hints = get_type_hints(cls if is_dataclass(cls) else cls.__init__)
+    return inspect.signature(cls).parameters, hints
+
+
+@cache
+def _types_of_settings() -> dict[str, Any]:
+    """Return the types of the settings outside of all groups, over all commands."""
+    found: dict[str, Any] = {}
+    for path in config_dir().glob("*.yaml"):
+        for name, value in read_yaml(path).items():
+            if name != "defaults" and not isinstance(value, dict):
+                declared = _type_of(name, value)
+                found[name] = found[name] | declared if name in found else declared
+    return dict(sorted(found.items()))
+
+
+def _type_of(name: str, value: Any) -> Any:
+    """Return the type of a setting with this value in the YAML files."""
+    if value is None or value == NOTHING:
+        declared = OF_NULL.get(name, str)
+        return declared | None if value is None else declared
+    return Sequence[type(value[0])] if isinstance(value, list) else type(value)
+
+
+def _is_described(node: Any) -> bool:
+    return isinstance(node, DictConfig) and TARGET in node
+
+
+def _in_words(types: Sequence[Any]) -> str:
+    """Return a description of types, such as ``a whole number or null``."""
+    words = [
+        WORDS.get(each) or (f"an object of class {each.__name__}" if inspect.isclass(each) else str(each))
+        for each in types
+    ]
+    return " or ".join(dict.fromkeys(words))
+
+
+def _plain(value: Any, *, resolve: bool = False) -> Any:
+    return OmegaConf.to_container(value, resolve=resolve) if OmegaConf.is_config(value) else value
