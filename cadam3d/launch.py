@@ -16,8 +16,8 @@ from omegaconf.errors import InterpolationResolutionError
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import JOBS, OVERRIDES, expanded, has_file, typed_path
 from cadam3d.settings.advice import explain, is_refused_path, line_of, require_values, reraise_interrupt
-from cadam3d.settings.compose import LONGEST_KEY, TEXT_KEYS
 from cadam3d.settings.check import require_settings
+from cadam3d.settings.compose import LONGEST_KEY, TEXT_KEYS
 from cadam3d.settings.help_page import help_text
 from cadam3d.settings.hydra import (
     compose_line,
