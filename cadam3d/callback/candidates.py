@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -14,7 +13,7 @@ from cadam3d.core.checks import require_range, require_whole
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.pictures import PictureSettings
 from cadam3d.core.sh import rgb_to_sh0
-from cadam3d.io.image import step_picture, step_pictures, write_png
+from cadam3d.io.image import drop_step_pictures, step_picture, write_png
 from cadam3d.io.jsonl import append_jsonl, truncate_after
 from cadam3d.io.run_folder import CANDIDATES, HISTOGRAMS
 from cadam3d.state import RefineReport, RunContext, TrainState
@@ -54,9 +53,7 @@ class Candidates(PictureSettings, Callback):
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Delete lines and pictures that a killed run wrote after its last checkpoint."""
         truncate_after(context.folder / HISTOGRAMS, state.step)
-        for step, path in pictures(context.folder):
-            if step > state.step:
-                path.unlink()
+        drop_step_pictures(context.folder / CANDIDATES, state.step)
 
     def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
         """Write the histograms, and at multiples of ``every`` the picture too."""
@@ -119,8 +116,3 @@ def histogram(
         "selected": (bins - first)[is_selected[has_log]].bincount(minlength=len(counts)).tolist(),
         "without_log": int((~has_log).sum()),
     }
-
-
-def pictures(run_folder: Path) -> list[tuple[int, Path]]:
-    """Return step and path of every picture of a run, in order."""
-    return step_pictures(run_folder / CANDIDATES)

@@ -7,12 +7,14 @@ out what the buttons request, and ``cadam3d/live/`` has the server and the page.
 import logging
 import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from cadam3d.callback.base import Callback
-from cadam3d.callback.layers import Layers
+from cadam3d.callback.row_history import RowHistory
 from cadam3d.core.checks import require_range
 from cadam3d.io.live import Watch, begin, publish, publish_state
 from cadam3d.io.run_folder import LIVE_SNAPSHOT
@@ -27,8 +29,8 @@ LOOK_SECONDS = 0.25  # between two looks at whether a page is open
 class Live(Callback):
     """Write ``live/snapshot.bin`` and ``live/state.json`` while a page shows the run, and nothing otherwise.
 
-    A snapshot has the layers of ``callback/layers.py``. This callback never draws a random number, and a full
-    disk ends the live view but not the run.
+    A snapshot has the layers of ``callback/row_history.py``. This callback never draws a random number, and
+    a full disk ends the live view but not the run.
     """
 
     seconds: float  # >= 0.1, between two snapshots
@@ -42,7 +44,7 @@ class Live(Callback):
     # The step of the last snapshot, and whether the run was paused then.
     _shown: tuple[int, bool] = field(default=(-1, False), init=False, repr=False)
     _loss: float | None = field(default=None, init=False, repr=False)
-    _layers: Layers = field(default_factory=Layers, init=False, repr=False)
+    _history: RowHistory = field(default_factory=RowHistory, init=False, repr=False)
 
     def __post_init__(self) -> None:
         require_range("callback.live.seconds", self.seconds, low=0.1, example=1)
@@ -50,19 +52,17 @@ class Live(Callback):
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Create ``live/`` and write the first numbers, so that a page finds them."""
-        self._layers.start(state)
+        self._history.start(state)
         self._watch, self._works = Watch(context.folder), True
         self._look_at = self._due = 0.0
         self._shown, self._loss = (-1, False), None
-        try:
+        with self._writing():
             begin(context.folder)
             self._write_state(context, state)
-        except OSError as error:
-            self._give_up(error)
 
     def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
         """Follow the rows through the refinement."""
-        self._layers.follow(report)
+        self._history.follow(report)
 
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
         """Write a snapshot if a page is open and one is due."""
@@ -76,10 +76,8 @@ class Live(Callback):
     def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
         """Write the last numbers, with which a page can show that the outputs are being written."""
         if self._works and outcome is not Outcome.OUT_OF_MEMORY:
-            try:
+            with self._writing():
                 self._write_state(context, state, has_ended=True)
-            except OSError as error:
-                self._give_up(error)
 
     def _show(self, context: RunContext, state: TrainState, *, is_paused: bool) -> None:
         now = time.monotonic()
@@ -89,12 +87,10 @@ class Live(Callback):
         self._look_at = now + LOOK_SECONDS
         if not self._watch.is_watched() or (now < self._due and not is_news):
             return
-        try:
+        with self._writing():
             if state.step != self._shown[0]:
-                publish(context.folder / LIVE_SNAPSHOT, self._layers.snapshot(context, state))
+                publish(context.folder / LIVE_SNAPSHOT, self._history.snapshot(context, state))
             self._write_state(context, state, is_paused=is_paused)
-        except OSError as error:
-            self._give_up(error)
         self._shown = (state.step, is_paused)
         ended = time.monotonic()
         # A snapshot that took long is followed by a long time without one.
@@ -116,6 +112,11 @@ class Live(Callback):
         }
         publish_state(context.folder, entries)
 
-    def _give_up(self, error: OSError) -> None:
-        self._works = False
-        log.warning("the live view has ended, because its files cannot be written: %s", error)
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """End the live view, but not the run, if a file cannot be written."""
+        try:
+            yield
+        except OSError as error:
+            self._works = False
+            log.warning("the live view has ended, because its files cannot be written: %s", error)

@@ -25,17 +25,20 @@ class Metrics(Callback):
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
         """Write a line at multiples of ``every``, and for the first and the last step."""
         if report.step % self.every == 0 or report.step in (1, context.total_steps):
-            line = {
-                "kind": "step",
-                "step": report.step,
-                "loss": report.loss,
-                "num_gaussians": report.num_gaussians,
-                "seconds": round(state.seconds, 3),
-                **report.log,
-            }
-            append_jsonl(context.folder / METRICS, line)
+            numbers = step_numbers(state, report)
+            append_jsonl(context.folder / METRICS, {"kind": "step", "step": report.step, **numbers})
 
     def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
         """Write a line for every refinement and reset, without the Gaussians themselves."""
         numbers = {name: each for name, each in vars(report).items() if name not in ("population", "edit")}
         append_jsonl(context.folder / METRICS, {"kind": "refine", **numbers})
+
+
+def step_numbers(state: TrainState, report: StepReport) -> dict[str, float]:
+    """Return the numbers of one step, as ``metrics.jsonl`` and the trackers record them."""
+    return {
+        "loss": report.loss,
+        "num_gaussians": report.num_gaussians,
+        "seconds": round(state.seconds, 3),
+        **report.log,
+    }

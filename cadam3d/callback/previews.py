@@ -7,7 +7,7 @@ from cadam3d.callback.base import Callback
 from cadam3d.core.checks import require_range, require_whole
 from cadam3d.core.memory import PIXEL
 from cadam3d.core.pictures import PictureSettings
-from cadam3d.io.image import contact_sheet, step_picture, step_pictures, write_png
+from cadam3d.io.image import contact_sheet, drop_step_pictures, step_picture, write_png
 from cadam3d.io.run_folder import PREVIEWS
 from cadam3d.state import RunContext, StepReport, TrainState
 
@@ -34,9 +34,7 @@ class Previews(PictureSettings, Callback):
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Delete pictures that a killed run drew after its last checkpoint."""
-        for step, path in step_pictures(context.folder / PREVIEWS):
-            if step > state.step:
-                path.unlink()
+        drop_step_pictures(context.folder / PREVIEWS, state.step)
 
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
         """Draw the current Gaussians at multiples of ``every``."""

@@ -4,7 +4,7 @@ import logging
 from dataclasses import dataclass, field
 
 from cadam3d.callback.base import Callback
-from cadam3d.callback.layers import Layers
+from cadam3d.callback.row_history import RowHistory
 from cadam3d.core.checks import require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
@@ -20,12 +20,12 @@ class Snapshots(Callback):
 
     The start, multiples of ``every`` and the last step are recorded. Nothing is rendered, so a snapshot of a
     few thousand Gaussians takes a few milliseconds. Populations above ``largest`` are left out. A snapshot
-    that cannot be written costs the run nothing except this snapshot.
+    that cannot be written does not stop the run.
     """
 
     every: int  # steps
     largest: int  # Gaussians
-    _layers: Layers = field(default_factory=Layers, init=False, repr=False)
+    _history: RowHistory = field(default_factory=RowHistory, init=False, repr=False)
 
     def __post_init__(self) -> None:
         require_whole("callback.snapshots.every", self.every, low=1, example=50)
@@ -36,13 +36,13 @@ class Snapshots(Callback):
         for step, path in snapshots(context.folder).items():
             if step > state.step:
                 path.unlink()
-        self._layers.start(state)
+        self._history.start(state)
         if state.step == 0:
             self._record(context, state)
 
     def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
         """Follow the rows through the refinement."""
-        self._layers.follow(report)
+        self._history.follow(report)
 
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
         """Record the current Gaussians at multiples of ``every`` and after the last step."""
@@ -54,6 +54,6 @@ class Snapshots(Callback):
             return
         try:
             with replacing(context.folder / SNAPSHOTS / snapshot_name(state.step)) as temporary:
-                temporary.write_bytes(self._layers.snapshot(context, state))
+                temporary.write_bytes(self._history.snapshot(context, state))
         except UserError as error:
             log.warning("no snapshot of step %d: %s", state.step, error)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from cadam3d.callback.base import Callback
+from cadam3d.callback.metrics import step_numbers
 from cadam3d.core.checks import require_whole
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
@@ -77,12 +78,7 @@ class Tracking(Callback):
         """Keep the numbers of a multiple of ``every``, and of the first and the last step."""
         self._pass_on(context, report.step)
         if report.step % self.every == 0 or report.step in (1, context.total_steps):
-            numbers = {
-                "loss": report.loss,
-                "num_gaussians": report.num_gaussians,
-                "seconds": state.seconds,
-                **report.log,
-            }
+            numbers = step_numbers(state, report)
             self._numbers |= {f"train/{name}": number for name, number in numbers.items()}
 
     def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from cadam3d.callback.tracking import Tracking
-from cadam3d.core.checks import require, require_choice, require_range
+from cadam3d.core.checks import require_choice, require_range
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import is_whole, read_json, write_json
@@ -27,8 +27,6 @@ from cadam3d.state import RunContext
 MODES = ("auto", "offline")
 # The modes of wandb that send nothing; "disabled" records nothing either.
 SILENT_MODES = ("offline", "dryrun", "disabled")
-# Characters that the name of a project must not have.
-RESERVED = frozenset("/\\#?%:")
 LONGEST_NAME = 128  # characters, of runs and groups
 FLUSH_SECONDS = 5.0
 
@@ -54,13 +52,6 @@ class Wandb(Tracking):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(
-            self.project != "" and not RESERVED & set(self.project),
-            "callback.wandb.project",
-            expected="a name without / \\ # ? % :",
-            got=self.project,
-            example="callback.wandb.project=cadam3d",
-        )
         require_choice("callback.wandb.mode", self.mode, MODES)
         require_range("callback.wandb.timeout", self.timeout, low=1, example=30)
 
@@ -165,12 +156,11 @@ def known_run(path: Path) -> tuple[str, int]:
     """Return the id of a run of wandb and the last step that was recorded; a new id if there is none yet."""
     try:
         content = read_json(path)
-    except UserError:
-        content = None
-    content = content if isinstance(content, dict) else {}
-    name, recorded = content.get("id"), content.get("recorded")
-    if isinstance(name, str) and re.fullmatch("[0-9a-f]{16}", name) and is_whole(recorded):
-        return name, recorded
+        name, recorded = content["id"], content["recorded"]
+        if re.fullmatch("[0-9a-f]{16}", name) and is_whole(recorded):
+            return name, recorded
+    except (UserError, LookupError, TypeError):
+        pass
     return secrets.token_hex(8), 0
 
 

@@ -7,32 +7,20 @@ import torch
 
 from cadam3d.core.checks import require_color, require_range
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.initializer.base import Initializer
-from cadam3d.initializer.points import (
-    PointCloud,
-    gaussians_at,
-    one_color,
-    points_in_ball,
-    require_count,
-    require_points,
-)
+from cadam3d.initializer.points import FromPoints, PointCloud, one_color, points_in_ball, require_count
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ball(Initializer):
+class Ball(FromPoints):
     """``count`` Gaussians at uniformly random points of a ball; the prompt is not used."""
 
     count: int
     radius: float  # world units
-    scale: float | None  # world units
-    scale_law: str  # one of SCALE_LAWS
-    opacity: float  # in (0, 1)
-    sh_degree: int  # 0 to 3
     color: Sequence[float]  # mean RGB, in [0, 1]
     color_noise: float  # in [0, 1]
 
     def __post_init__(self) -> None:
-        require_points(self.count, self.scale, self.scale_law, self.opacity, self.sh_degree)
+        super().__post_init__()
         require_count(self.count, self.sh_degree)
         require_range("initializer.radius", self.radius, above=0, high=1, example=0.6)
         require_range("initializer.color_noise", self.color_noise, low=0, high=1, example=0.1)
@@ -43,7 +31,4 @@ class Ball(Initializer):
         points = points_in_ball(self.count, self.radius, generator)
         deviation = self.color_noise * (2 * torch.rand(self.count, 3, generator=generator) - 1)
         rgb = (one_color(self.color, self.count) + deviation).clamp(0, 1)
-        cloud = PointCloud(points, rgb).to(device)
-        return gaussians_at(
-            cloud, scale=self.scale, opacity=self.opacity, sh_degree=self.sh_degree, law=self.scale_law
-        )
+        return self.gaussians_at(PointCloud(points, rgb), device)

@@ -1,6 +1,5 @@
 """Mesh: Gaussians on the surface of a mesh file, with its colours."""
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,18 +13,14 @@ from torch import Tensor
 from cadam3d.core.checks import require_choice, require_color
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.initializer.base import Initializer
 from cadam3d.initializer.points import (
+    FromObject,
     PointCloud,
     another_file,
     found_file,
-    gaussians_at,
     one_color,
-    placement,
     points_on_surface,
     require_count,
-    require_place,
-    require_points,
 )
 from cadam3d.io.frames import points_to_world, turned_points
 from cadam3d.io.mesh import linear, srgb
@@ -41,7 +36,7 @@ VERTEX_LIGHT = "vertex light"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mesh(Initializer):
+class Mesh(FromObject):
     """``count`` Gaussians at uniformly random points of a surface; the prompt is not used.
 
     Reads PLY, OBJ, STL, GLB, glTF and OFF files, with vertex, face or texture colours.
@@ -49,22 +44,13 @@ class Mesh(Initializer):
 
     path: str
     up: str  # one of UPS
-    turn_deg: int  # one of TURNS
-    radius: float | None  # world units
-    factor: float | None  # world units per unit of the file
-    lift: float  # world units
     count: int
-    scale: float | None  # world units
-    scale_law: str  # one of SCALE_LAWS
-    opacity: float  # in (0, 1)
-    sh_degree: int  # 0 to 3
     color: Sequence[float]  # RGB in [0, 1]
 
     def __post_init__(self) -> None:
-        require_points(self.count, self.scale, self.scale_law, self.opacity, self.sh_degree)
+        super().__post_init__()
         require_count(self.count, self.sh_degree)
         require_choice("initializer.up", self.up, UPS)
-        require_place(self.turn_deg, self.radius, self.factor, self.lift)
         require_color("initializer.color", self.color)
 
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
@@ -77,10 +63,7 @@ class Mesh(Initializer):
         corners = self._place(corners.flatten(end_dim=1)).view_as(corners)
         faces, weights = points_on_surface(corners, self.count, generator)
         points = (weights[..., None] * corners[faces]).sum(dim=1)
-        cloud = PointCloud(points, self._colors(parts, faces, weights)).to(device)
-        return gaussians_at(
-            cloud, scale=self.scale, opacity=self.opacity, sh_degree=self.sh_degree, law=self.scale_law
-        )
+        return self.gaussians_at(PointCloud(points, self._colors(parts, faces, weights)), device)
 
     def _load(self) -> list[trimesh.Trimesh]:
         """Return the surfaces of the file, each at its place in the scene and with its own colours."""
@@ -100,21 +83,16 @@ class Mesh(Initializer):
             ) from error
         is_finite = all(np.isfinite(part.vertices).all() for part in parts)
         if not is_finite or sum(float(part.area) for part in parts) <= 0:
-            vertices = sum(len(part.vertices) for part in parts)
-            faces = sum(len(part.faces) for part in parts)
-            is_cloud = faces == 0 and path.suffix.lower() == ".ply"
-            words = ["initializer=ply", f"initializer.path={self.path}"]
-            example = shlex.join(words) if is_cloud else another_file(self.path, "mesh", SUFFIXES)
             raise UserError(
-                f"initializer.path: expected a mesh with triangles, got {self.path!r}, which has no surface "
-                f"({vertices} vertices, {faces} faces). Try: {example}"
+                f"initializer.path: expected a mesh with triangles, got {self.path!r}, which has no surface. "
+                "Try: initializer=ply, if it holds points"
             )
         return parts
 
     def _place(self, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
         """Return the world positions of points of the file."""
         upright = turned_points(points_to_world(points, f"+{self.up}"), self.turn_deg)
-        return placement(upright, self.radius, self.factor, self.lift).of(upright)
+        return self.placement(upright).of(upright)
 
     def _colors(
         self, parts: Sequence[trimesh.Trimesh], faces: Int[Tensor, "n"], weights: Float[Tensor, "n 3"]

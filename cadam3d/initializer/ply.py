@@ -9,21 +9,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_choice, require_color
+from cadam3d.core.checks import require, require_choice, require_color, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.initializer.base import Initializer
 from cadam3d.initializer.points import (
+    FromObject,
     PointCloud,
     another_file,
     found_file,
-    gaussians_at,
     one_color,
-    placement,
     replicated,
     require_copies,
-    require_place,
-    require_points,
     rows_of,
 )
 from cadam3d.io.asset_file import PLY, SUFFIXES, file_format, read_gaussians
@@ -38,7 +34,7 @@ SURFACES = ("face", "tristrips")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ply(Initializer):
+class Ply(FromObject):
     """The Gaussians of a file, or the points of a PLY file; the prompt is not used.
 
     Gaussians (PLY, compressed PLY, .splat or SPZ, any SH degree, written by any program) keep their shapes,
@@ -48,26 +44,18 @@ class Ply(Initializer):
 
     path: str
     up: str | None  # one of UPS
-    turn_deg: int  # one of TURNS
-    radius: float | None  # world units
-    factor: float | None  # world units per unit of the file
-    lift: float  # world units
     count: int | None  # largest number of rows
-    sh_degree: int | None  # 0 to 3
     replicate: int  # Gaussians per point
     replicate_radius: float  # world units
     replicate_law: str  # one of REPLICATE_LAWS
-    scale: float | None  # world units
-    scale_law: str  # one of SCALE_LAWS
-    opacity: float  # in (0, 1)
     color: Sequence[float]  # RGB in [0, 1]
 
     def __post_init__(self) -> None:
-        count = 1 if self.count is None else self.count
-        require_points(count, self.scale, self.scale_law, self.opacity, self.sh_degree or 0)
+        super().__post_init__()
+        if self.count is not None:
+            require_whole("initializer.count", self.count, low=1, example=2000)
         if self.up is not None:
             require_choice("initializer.up", self.up, UPS)
-        require_place(self.turn_deg, self.radius, self.factor, self.lift)
         require_copies(self.replicate, self.replicate_radius, self.replicate_law)
         require_color("initializer.color", self.color)
 
@@ -92,7 +80,7 @@ class Ply(Initializer):
         asset = turned(read_gaussians(path, up=self.up), self.turn_deg)
         _require_finite(path, "means", asset.means)
         asset = asset.index(rows_of(len(asset), self.count, generator))
-        place = placement(asset.means, self.radius, self.factor, self.lift)
+        place = self.placement(asset.means)
         return replace(
             asset,
             means=place.of(asset.means),
@@ -105,16 +93,10 @@ class Ply(Initializer):
         points = turned_points(points_to_world(points, self.up or UP_OF_POINTS), self.turn_deg)
         rows = rows_of(len(points), self.count, generator)
         points = points[rows]
-        place = placement(points, self.radius, self.factor, self.lift)
+        place = self.placement(points)
         cloud = PointCloud(place.of(points), rgb[rows])
         cloud = replicated(cloud, self.replicate, self.replicate_radius, generator, self.replicate_law)
-        return gaussians_at(
-            cloud.to(device),
-            scale=self.scale,
-            opacity=self.opacity,
-            sh_degree=self.sh_degree or 0,
-            law=self.scale_law,
-        )
+        return self.gaussians_at(cloud, device)
 
     def _read_points(self, path: Path) -> tuple[Tensor, Tensor]:
         """Return positions in the axes of the file, and RGB in [0, 1]."""

@@ -1,9 +1,9 @@
-"""From coloured points to Gaussians: functions shared by the initializers that start from a point cloud."""
+"""From coloured points to Gaussians: what the initializers share that start from points or from an object."""
 
 import difflib
 import math
+import os
 import shlex
-import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,13 +13,12 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_choice, require_range, require_whole
-from cadam3d.core.errors import UserError
+from cadam3d.core.checks import fail, require, require_choice, require_range, require_whole
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import require_memory
 from cadam3d.core.sh import MAX_DEGREE, rgb_to_sh0
+from cadam3d.initializer.base import Initializer
 from cadam3d.io.frames import TURNS
-from cadam3d.io.reading import KINDS
 
 # As in 3DGS (Kerbl et al. 2023, sec. 5.1).
 NEIGHBOURS = 3
@@ -60,6 +59,66 @@ class Placement:
         if self.lift:
             moved[:, 2] += self.lift
         return moved
+
+
+@dataclass(frozen=True, kw_only=True)
+class FromPoints(Initializer):
+    """Base of the initializers that put round Gaussians at points."""
+
+    scale: float | None  # world units
+    scale_law: str  # one of SCALE_LAWS
+    opacity: float  # in (0, 1)
+    sh_degree: int | None  # 0 to 3
+
+    def __post_init__(self) -> None:
+        if self.scale is not None:
+            require_range("initializer.scale", self.scale, above=0, example=0.03)
+        require_choice("initializer.scale_law", self.scale_law, SCALE_LAWS)
+        require_range("initializer.opacity", self.opacity, above=0, below=1, example=0.1)
+        require_whole("initializer.sh_degree", self.sh_degree or 0, low=0, high=MAX_DEGREE, example=0)
+
+    def gaussians_at(self, cloud: PointCloud, device: torch.device) -> Gaussians:
+        """Return Gaussians on ``device`` at the points of a cloud."""
+        degree = self.sh_degree or 0
+        return gaussians_at(
+            cloud.to(device), scale=self.scale, opacity=self.opacity, sh_degree=degree, law=self.scale_law
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FromObject(FromPoints):
+    """Base of the initializers that move an object of its own size and front into the world."""
+
+    turn_deg: int  # one of TURNS
+    radius: float | None  # world units
+    factor: float | None  # world units per unit of the object
+    lift: float  # world units
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_choice("initializer.turn_deg", self.turn_deg, TURNS)
+        if self.radius is not None:
+            require_range("initializer.radius", self.radius, above=0, high=1, example=0.9)
+        if self.factor is not None:
+            require_range("initializer.factor", self.factor, above=0, high=1000, example="null")
+            require(
+                self.radius is None,
+                "initializer.radius",
+                expected=f"null or initializer.factor=null, since factor {self.factor:g} sets the size",
+                got=self.radius,
+                example="initializer.radius=null",
+            )
+        require_range("initializer.lift", self.lift, low=-1, high=1, example=0)
+
+    def placement(self, points: Float[Tensor, "n 3"]) -> Placement:
+        """Return how to move the points of the object into the world.
+
+        They are fitted to ``radius`` (:func:`fit`). With a ``factor`` they are multiplied by it instead, and
+        not centred. Then they are lifted.
+        """
+        if self.factor is not None:
+            return Placement(torch.zeros_like(points[0]), self.factor, self.lift)
+        return Placement(*fit(points, self.radius), self.lift)
 
 
 def gaussians_at(
@@ -193,111 +252,44 @@ def fit(points: Float[Tensor, "n 3"], radius: float | None) -> tuple[Float[Tenso
         return torch.zeros_like(points[0]), 1.0
     center = (points.amin(dim=0) + points.amax(dim=0)) / 2
     farthest = float((points - center).norm(dim=-1).max())
-    require(
-        math.isfinite(farthest),
-        "initializer.path",
-        expected="points at distances below 1e19",
-        got=float(points.abs().max()),
-        example="initializer.radius=null",
-    )
+    if not math.isfinite(farthest):
+        got, example = float(points.abs().max()), "initializer.radius=null"
+        raise fail("initializer.path", expected="points at distances below 1e19", got=got, example=example)
     return center, radius / farthest if farthest > 0 else 1.0
-
-
-def placement(
-    points: Float[Tensor, "n 3"], radius: float | None, factor: float | None, lift: float
-) -> Placement:
-    """Return how to move the points of an object into the world.
-
-    They are fitted to ``radius`` (:func:`fit`). With a ``factor`` they are multiplied by it instead, and not
-    centred. Then they are lifted.
-    """
-    if factor is not None:
-        return Placement(torch.zeros_like(points[0]), factor, lift)
-    return Placement(*fit(points, radius), lift)
 
 
 def found_file(path: str, option: str, suffixes: Sequence[str]) -> Path:
     """Return the path that ``initializer.path`` names. Raises ``UserError`` unless it is a file."""
     found = Path(path).expanduser()
-    # The system refuses some names, such as one that is too long.
-    try:
-        kind = stat.S_IFMT(found.stat().st_mode)
-    except (OSError, ValueError):
-        kind = 0
-    if kind != stat.S_IFREG:
-        what = f"is {KINDS.get(kind, 'no file')}" if kind else "does not exist"
-        raise UserError(
-            f"initializer.path: expected a file, got {path!r}, which {what}. "
-            f"Try: {another_file(path, option, suffixes)}"
-        )
+    # Unlike Path.is_file, this is False for names that the system refuses, such as one that is too long.
+    if not os.path.isfile(found):  # noqa: PTH113
+        example = another_file(path, option, suffixes)
+        raise fail("initializer.path", expected="a file", got=path, example=example)
     return found
 
 
 def another_file(path: str, option: str, suffixes: Sequence[str]) -> str:
     """Return what to type instead of a file that initializer=``option`` cannot read.
 
-    This is the file with the nearest name and one of ``suffixes``, in the same folder or in the current one.
-    If there is none, it is the help of the option.
+    This is the file with the nearest name and one of ``suffixes`` in the same folder, or else the help of the
+    option.
     """
     wrong = Path(path).expanduser()
-    files = [*(_content(wrong) or _content(wrong.parent)), *_content(Path())]
-    known = {
-        file.name: file
-        for file in reversed(files)
-        if file.suffix.lower() in suffixes and file != wrong and file.is_file()
-    }
-    near = difflib.get_close_matches(wrong.name, list(known), n=1, cutoff=0.0)
+    files = sorted(wrong.parent.iterdir()) if os.path.isdir(wrong.parent) else []  # noqa: PTH112
+    names = [file.name for file in files if file.suffix.lower() in suffixes and file != wrong]
+    near = difflib.get_close_matches(wrong.name, names, n=1, cutoff=0.0)
     if not near:
         return f"cadam3d train --help initializer={option}"
-    return shlex.quote(f"initializer.path={known[near[0]]}")
+    return shlex.quote(f"initializer.path={wrong.parent / near[0]}")
 
 
-def _content(folder: Path) -> list[Path]:
-    """Return the sorted content of a folder; nothing for a path that the system cannot list as a folder."""
-    try:
-        return sorted(folder.iterdir())
-    # ValueError: the path has a null byte.
-    except (OSError, ValueError):
-        return []
-
-
-def require_points(count: int, scale: object, scale_law: object, opacity: object, sh_degree: object) -> None:
-    """Raise ``UserError`` unless these keys of an initializer are in their ranges."""
-    require_whole("initializer.count", count, low=1, example=2000)
-    if scale is not None:
-        require_range("initializer.scale", scale, above=0, example=0.03)
-    require_choice("initializer.scale_law", scale_law, SCALE_LAWS)
-    require_range("initializer.opacity", opacity, above=0, below=1, example=0.1)
-    require_whole("initializer.sh_degree", sh_degree, low=0, high=MAX_DEGREE, example=0)
-
-
-def require_place(turn_deg: object, radius: object, factor: object, lift: object) -> None:
-    """Raise ``UserError`` unless the keys that place an object are in their ranges.
-
-    The turn is a multiple of 90 degrees, the radius None or in (0, 1], the factor None or in (0, 1000], and
-    the lift in [-1, 1]. Of radius and factor at least one is None.
-    """
-    require_choice("initializer.turn_deg", turn_deg, TURNS)
-    if radius is not None:
-        require_range("initializer.radius", radius, above=0, high=1, example=0.9)
-    if factor is not None:
-        require_range("initializer.factor", factor, above=0, high=1000, example="null")
-        require(
-            radius is None,
-            "initializer.radius",
-            expected=f"null or initializer.factor=null, since the factor {factor:g} sets the size too",
-            got=radius,
-            example="initializer.radius=null",
-        )
-    require_range("initializer.lift", lift, low=-1, high=1, example=0)
-
-
-def require_count(count: int, sh_degree: int) -> None:
+def require_count(count: int, sh_degree: int | None) -> None:
     """Raise ``UserError`` unless that many Gaussians can be trained in the memory of this machine.
 
     Each number of a Gaussian is stored with its gradient and its two moments, in single precision.
     """
-    numbers = 11 + 3 * (sh_degree + 1) ** 2
+    require_whole("initializer.count", count, low=1, example=2000)
+    numbers = 11 + 3 * ((sh_degree or 0) + 1) ** 2
     require_memory("initializer.count", count, unit=16 * numbers, example=2000)
 
 

@@ -16,17 +16,14 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import require_memory
 from cadam3d.initializer.base import Beginning, Initializer
 from cadam3d.initializer.points import (
+    FromObject,
     PointCloud,
-    gaussians_at,
     grown,
     one_color,
-    placement,
     points_on_surface,
     replicated,
     require_copies,
     require_count,
-    require_place,
-    require_points,
 )
 from cadam3d.io.frames import turned_points
 from cadam3d.io.pretrained import DTYPES, ModelSource, Pretrained
@@ -48,7 +45,7 @@ class ColoredMesh:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShapE(Initializer):
+class ShapE(FromObject):
     """Gaussians at the vertices, or at random points, of the mesh that Shap-E generates from the prompt.
 
     The points can be grown or replicated. The parts of the model are loaded one after the other and freed
@@ -65,10 +62,6 @@ class ShapE(Initializer):
     steps: int
     guidance_scale: float  # >= 1
     grid_size: int  # cells per side
-    turn_deg: int  # one of TURNS
-    radius: float | None  # world units
-    factor: float | None  # world units per unit of Shap-E
-    lift: float  # world units
     count: int | None
     grow_points: int  # candidates
     grow_distance: float  # Shap-E's units
@@ -78,13 +71,10 @@ class ShapE(Initializer):
     replicate: int  # Gaussians per point
     replicate_radius: float  # world units
     replicate_law: str  # one of REPLICATE_LAWS
-    scale: float | None  # world units
-    scale_law: str  # one of SCALE_LAWS
-    opacity: float  # in (0, 1)
-    sh_degree: int  # 0 to 3
     fallback: Initializer | None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self._source()
         require_choice("initializer.dtype", self.dtype, ("auto", *DTYPES))
         is_text = self.prompt is None or (isinstance(self.prompt, str) and self.prompt.strip() != "")
@@ -94,10 +84,7 @@ class ShapE(Initializer):
         require_range("initializer.guidance_scale", self.guidance_scale, low=1, example=15)
         require_whole("initializer.grid_size", self.grid_size, low=2, example=128)
         require_memory("initializer.grid_size", self.grid_size, unit=4, power=3, example=128)
-        require_place(self.turn_deg, self.radius, self.factor, self.lift)
-        count = 1 if self.count is None else self.count
-        require_points(count, self.scale, self.scale_law, self.opacity, self.sh_degree)
-        require_count(count, self.sh_degree)
+        require_count(1 if self.count is None else self.count, self.sh_degree)
         require_whole("initializer.grow_points", self.grow_points, low=0, example=1000000)
         require_memory("initializer.grow_points", self.grow_points, unit=12, example=1000000)
         require_range("initializer.grow_distance", self.grow_distance, above=0, example=0.01)
@@ -199,15 +186,9 @@ class ShapE(Initializer):
             cloud = grown(cloud, self.grow_points, self.grow_distance, self.grow_noise, generator)
         upright = turned_points(cloud.points, self.turn_deg)
         rgb = cloud.rgb if self.color is None else one_color(self.color, len(cloud))
-        cloud = PointCloud(placement(upright, self.radius, self.factor, self.lift).of(upright), rgb)
+        cloud = PointCloud(self.placement(upright).of(upright), rgb)
         cloud = replicated(cloud, self.replicate, self.replicate_radius, generator, self.replicate_law)
-        return gaussians_at(
-            cloud.to(device),
-            scale=self.scale,
-            opacity=self.opacity,
-            sh_degree=self.sh_degree,
-            law=self.scale_law,
-        )
+        return self.gaussians_at(cloud, device)
 
     def _points(self, mesh: ColoredMesh, generator: torch.Generator) -> PointCloud:
         if self.count is None:

@@ -71,6 +71,13 @@ def step_pictures(folder: Path) -> list[tuple[int, Path]]:
     return sorted((int(name.group(1)), path) for name, path in named if name is not None)
 
 
+def drop_step_pictures(folder: Path, step: int) -> None:
+    """Delete the images of the steps after ``step``, which a resumed run draws again."""
+    for drawn_at, path in step_pictures(folder):
+        if drawn_at > step:
+            path.unlink()
+
+
 def read_png(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """Return a picture that :func:`write_png` has written. Raises ``UserError`` if it cannot be read."""
     content = read_bytes(path, largest=LARGEST_PNG)

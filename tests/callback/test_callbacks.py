@@ -1,50 +1,19 @@
 """The files that callbacks write into the run folder."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
 from cadam3d.callback.checkpoint import Checkpoint
 from cadam3d.callback.metrics import Metrics
-from cadam3d.callback.progress import Progress
-from cadam3d.commands.train import build_trainer
 from cadam3d.core.errors import UserError
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import append_jsonl, read_jsonl
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.settings.compose import component, compose
-from cadam3d.state import Outcome, RunContext
-
-CPU = torch.device("cpu")
+from cadam3d.state import Outcome
 
 
-def train(tmp_path, callbacks, steps: int = 7, outcome: Outcome = Outcome.FINISHED):
-    cfg = compose(
-        [
-            "prompt=a red cube",
-            "prior=tiny",
-            "rasterizer=reference",
-            f"steps={steps}",
-            "camera.size=12",
-            "initializer.count=20",
-            "refine.start=0",
-            "refine.end=100",
-            "refine.interval=3",
-            "callback=[]",
-        ]
-    )
-    trainer = replace(build_trainer(cfg, CPU), callbacks=callbacks)
-    state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
-    context = RunContext(
-        tmp_path, cfg.prompt, trainer.steps, trainer.renderer(state), trainer.rasterizer, trainer.densifier
-    )
-    assert trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context) is outcome
-    return state
-
-
-def test_checkpoints_appear_at_multiples_and_at_the_end_and_old_ones_are_deleted(tmp_path):
-    state = train(tmp_path, [Checkpoint(every=2, keep=2)])
+def test_checkpoints_appear_at_multiples_and_at_the_end_and_old_ones_are_deleted(train, tmp_path):
+    state, _ = train(tmp_path, callbacks=[Checkpoint(every=2, keep=2)])
     folder = tmp_path / "checkpoints"
     assert sorted(path.name for path in folder.iterdir()) == ["step_0000006.pt", "step_0000007.pt"]
     newest = latest_checkpoint(folder, load_checkpoint, lambda error: None)[1]
@@ -52,23 +21,23 @@ def test_checkpoints_appear_at_multiples_and_at_the_end_and_old_ones_are_deleted
     assert torch.equal(newest["gaussians"]["means"], state.gaussians.means)
 
 
-def test_a_checkpoint_at_the_last_step_is_not_written_twice(tmp_path, monkeypatch):
+def test_a_checkpoint_at_the_last_step_is_not_written_twice(train, tmp_path, monkeypatch):
     written = []
     monkeypatch.setattr(
         "cadam3d.callback.checkpoint.save_checkpoint", lambda path, _: written.append(path.name)
     )
-    train(tmp_path, [Checkpoint(every=2, keep=9)], steps=4)
+    train(tmp_path, "steps=4", callbacks=[Checkpoint(every=2, keep=9)])
     assert written == ["step_0000002.pt", "step_0000004.pt"]
 
 
-def test_checkpoints_of_later_steps_are_deleted(tmp_path):
-    train(tmp_path, [Checkpoint(every=2, keep=9)], steps=6)
-    train(tmp_path, [Checkpoint(every=3, keep=9)], steps=5)  # another run, from step 0
+def test_checkpoints_of_later_steps_are_deleted(train, tmp_path):
+    train(tmp_path, "steps=6", callbacks=[Checkpoint(every=2, keep=9)])
+    train(tmp_path, "steps=5", callbacks=[Checkpoint(every=3, keep=9)])  # another run, from step 0
     names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     assert names == ["step_0000003.pt", "step_0000005.pt"]
 
 
-def test_after_running_out_of_memory_the_last_checkpoint_stays(tmp_path, monkeypatch):
+def test_after_running_out_of_memory_the_last_checkpoint_stays(train, tmp_path, monkeypatch):
     calls = iter(range(100))
 
     def exhausted(self, *args, real=ReferenceRasterizer.render):
@@ -77,13 +46,14 @@ def test_after_running_out_of_memory_the_last_checkpoint_stays(tmp_path, monkeyp
         return real(self, *args)
 
     monkeypatch.setattr(ReferenceRasterizer, "render", exhausted)
-    train(tmp_path, [Checkpoint(every=2, keep=9)], outcome=Outcome.OUT_OF_MEMORY)
+    _, outcome = train(tmp_path, callbacks=[Checkpoint(every=2, keep=9)])
+    assert outcome is Outcome.OUT_OF_MEMORY
     names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     assert names == ["step_0000002.pt", "step_0000004.pt"]
 
 
-def test_metrics_have_one_line_per_logged_step_and_per_refinement(tmp_path):
-    train(tmp_path, [Metrics(every=3)])
+def test_metrics_have_one_line_per_logged_step_and_per_refinement(train, tmp_path):
+    train(tmp_path, "refine.interval=3", callbacks=[Metrics(every=3)])
     lines = read_jsonl(tmp_path / "metrics.jsonl")
     assert [(line["kind"], line["step"]) for line in lines] == [
         ("step", 1),
@@ -107,21 +77,13 @@ def test_metrics_have_one_line_per_logged_step_and_per_refinement(tmp_path):
     assert {"loss", "num_gaussians", "seconds"} <= lines[0].keys()
 
 
-def test_lines_of_steps_that_will_be_repeated_are_deleted(tmp_path):
+def test_lines_of_steps_that_will_be_repeated_are_deleted(train, tmp_path):
     for step in (1, 2, 3):
         append_jsonl(tmp_path / "metrics.jsonl", {"kind": "step", "step": step, "old": True})
-    train(tmp_path, [Metrics(every=1)], steps=2)
+    train(tmp_path, "steps=2", "refine.interval=3", callbacks=[Metrics(every=1)])
     lines = read_jsonl(tmp_path / "metrics.jsonl")
     assert not any(line.get("old") for line in lines)
     assert [line["step"] for line in lines] == [1, 2]
-
-
-def test_the_bar_counts_every_step_and_shows_the_gaussians(tmp_path, capsys):
-    train(tmp_path, [Progress(refresh_seconds=0.0, line_seconds=10.0)], steps=3)
-    shown = capsys.readouterr().err
-    assert "3/3" in shown
-    assert "N=20" in shown
-    assert "loss=" in shown
 
 
 @pytest.mark.parametrize(

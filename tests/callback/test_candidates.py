@@ -1,27 +1,19 @@
 """Candidates: pictures and histograms, written without changing the run."""
 
-from dataclasses import replace
-
 import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
-from composed import composed
 
-from cadam3d.callback.candidates import OTHERS, SELECTED, Candidates, histogram, marked, pictures
-from cadam3d.commands.train import build_trainer
+from cadam3d.callback.candidates import OTHERS, SELECTED, Candidates, histogram, marked
 from cadam3d.core.cameras import turntable
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.io.image import step_pictures
 from cadam3d.io.jsonl import append_jsonl, read_jsonl
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.settings.compose import component
-from cadam3d.state import Outcome, RunContext
 
-CPU = torch.device("cpu")
 LINE = (
-    *("prompt=a red cube", "prior=tiny", "rasterizer=reference", "steps=7", "camera.size=12"),
-    *("initializer.count=30", "refine.start=0", "refine.end=100", "refine.interval=2"),
     *("densifier.min_age=0", "callback=[candidates]", "callback.candidates.every=4"),
     *("callback.candidates.size=16", "callback.candidates.azimuths_deg=[30,210]"),
 )
@@ -37,60 +29,43 @@ CALLBACK = {
 }
 
 
-def train(folder, *, with_callback: bool):
-    cfg = composed(*LINE)
-    trainer = build_trainer(cfg, CPU)
-    if not with_callback:
-        trainer = replace(trainer, callbacks=[])
-    state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
-    context = RunContext(
-        folder, cfg.prompt, trainer.steps, trainer.renderer(state), trainer.rasterizer, trainer.densifier
-    )
-    assert trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context) is Outcome.FINISHED
-    return state
+@pytest.fixture(scope="module")
+def watched(train, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    return folder, train(folder, *LINE)[0]
 
 
-def test_a_run_with_the_callback_equals_one_without(tmp_path):
-    watched, alone = train(tmp_path, with_callback=True), train(tmp_path, with_callback=False)
-    assert len(watched.gaussians) != 30, "nothing grew, so this test proves little"
-    for name, tensor in alone.gaussians.tensors().items():
-        assert torch.equal(watched.gaussians.tensors()[name], tensor), name
-    for name, rows in alone.densifier.to_dict().items():
-        assert torch.equal(watched.densifier.to_dict()[name], rows), name
-    for name, generator in alone.generators.items():
-        assert torch.equal(watched.generators[name].get_state(), generator.get_state()), name
+def test_a_run_with_the_callback_equals_one_without(watched, train, alike, tmp_path):
+    alike(watched[1], train(tmp_path, "densifier.min_age=0")[0])
 
 
-def test_pictures_come_at_multiples_and_histograms_at_every_refinement(tmp_path):
-    train(tmp_path, with_callback=True)
-    assert [step for step, _ in pictures(tmp_path)] == [4]
-    lines = read_jsonl(tmp_path / "candidates/histograms.jsonl")
+def test_pictures_come_at_multiples_and_histograms_at_every_refinement(watched):
+    assert [step for step, _ in step_pictures(watched[0] / "candidates")] == [4]
+    lines = read_jsonl(watched[0] / "candidates/histograms.jsonl")
     assert {line["step"] for line in lines} == {2, 4, 6}
     assert {line["score"] for line in lines} >= {"snr", "drift"}
 
 
-def test_a_picture_has_a_render_and_a_selection_for_each_view(tmp_path):
-    train(tmp_path, with_callback=True)
-    image = imageio.imread(pictures(tmp_path)[0][1])
+def test_a_picture_has_a_render_and_a_selection_for_each_view(watched):
+    image = imageio.imread(watched[0] / "candidates/step_000004.png")
     assert image.shape == (16, 2 * 16 * 2, 3)
 
 
-def test_every_histogram_counts_the_whole_population(tmp_path):
-    state = train(tmp_path, with_callback=True)
-    lines = read_jsonl(tmp_path / "candidates/histograms.jsonl")
+def test_every_histogram_counts_the_whole_population(watched):
+    lines = read_jsonl(watched[0] / "candidates/histograms.jsonl")
     for line in lines:
         assert all(s <= n for s, n in zip(line["selected"], line["counts"], strict=True))
     first = [line for line in lines if line["step"] == 2]
-    assert {sum(line["counts"]) + line["without_log"] for line in first} == {state.num_initial}
+    assert {sum(line["counts"]) + line["without_log"] for line in first} == {watched[1].num_initial}
 
 
-def test_files_of_a_killed_run_after_its_checkpoint_are_deleted(tmp_path):
+def test_files_of_a_killed_run_after_its_checkpoint_are_deleted(train, tmp_path):
     folder = tmp_path / "candidates"
     folder.mkdir()
     (folder / "step_000099.png").write_bytes(b"old")
     append_jsonl(folder / "histograms.jsonl", {"step": 99, "score": "old"})
-    train(tmp_path, with_callback=True)
-    assert 99 not in [step for step, _ in pictures(tmp_path)]
+    train(tmp_path, *LINE)
+    assert 99 not in [step for step, _ in step_pictures(folder)]
     assert "old" not in {line["score"] for line in read_jsonl(folder / "histograms.jsonl")}
 
 

@@ -5,17 +5,14 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
 import torch
-from composed import composed
 
 from cadam3d.callback import live as module
 from cadam3d.callback.base import Callback
 from cadam3d.callback.live import Live
-from cadam3d.commands.train import build_trainer, run_context
 from cadam3d.io import live
-from cadam3d.settings.compose import component
 
-CPU = torch.device("cpu")
 STEPS = 12
 
 
@@ -39,8 +36,8 @@ class Page(Callback):
         self.rows.append(
             (
                 state.step,
-                self.live._layers.born.clone(),
-                self.live._layers.is_selected.clone(),
+                self.live._history.born.clone(),
+                self.live._history.is_selected.clone(),
                 len(state.gaussians),
             )
         )
@@ -52,26 +49,24 @@ class Page(Callback):
             os.utime(self.folder / "live/watched", (step, step))
 
 
-def train(folder: Path, monkeypatch, *overrides: str, with_live=True, is_open=True, share=1.0):
-    """Train a few steps, with an open page or without, and return the state and the page."""
+@pytest.fixture
+def watch(train, monkeypatch):
+    """Return a function that trains a few steps, with an open page or without, and returns state and page."""
     monkeypatch.setattr(module, "LOOK_SECONDS", 0.0)
-    small = ("prompt=a red cube", "prior=tiny", "rasterizer=reference", f"steps={STEPS}", "camera.size=12")
-    schedule = ("refine.start=0", "refine.end=100", "refine.interval=4", "initializer.count=30")
-    cfg = composed(*small, *schedule, "callback=[]", *overrides)
-    trainer = build_trainer(cfg, CPU)
-    callback = Live(seconds=0.1, share=share)
-    callback.seconds = 0.0
-    page = Page(callback, folder, is_open)
-    if with_live:
-        trainer.callbacks.extend([callback, page])
-    state = trainer.start(cfg.prompt, component(cfg.initializer), cfg.seed, CPU)
-    trainer.train(state, trainer.prior.embed(cfg.prompt, ""), run_context(cfg.prompt, trainer, state, folder))
-    return state, page
+
+    def run(folder: Path, *line: str, with_live=True, is_open=True, share=1.0):
+        callback = Live(seconds=0.1, share=share)
+        callback.seconds = 0.0
+        page = Page(callback, folder, is_open)
+        line = (f"steps={STEPS}", "refine.interval=4", *line)
+        return train(folder, *line, callbacks=[callback, page] if with_live else [])[0], page
+
+    return run
 
 
-def test_the_run_is_the_same_with_and_without_live_and_with_an_open_page(tmp_path, monkeypatch):
+def test_the_run_is_the_same_with_and_without_live_and_with_an_open_page(watch, tmp_path):
     states = [
-        train(tmp_path / name, monkeypatch, with_live=name != "off", is_open=name == "open")[0]
+        watch(tmp_path / name, with_live=name != "off", is_open=name == "open")[0]
         for name in ("off", "closed", "open")
         if (tmp_path / name).mkdir() is None
     ]
@@ -82,22 +77,22 @@ def test_the_run_is_the_same_with_and_without_live_and_with_an_open_page(tmp_pat
             assert torch.equal(generator.get_state(), states[0].generators[name].get_state())
 
 
-def test_without_a_page_no_snapshot_is_written(tmp_path, monkeypatch):
-    _, page = train(tmp_path, monkeypatch, is_open=False)
+def test_without_a_page_no_snapshot_is_written(watch, tmp_path):
+    _, page = watch(tmp_path, is_open=False)
     assert page.snapshots == [None] * STEPS
     assert sorted(path.name for path in (tmp_path / "live").iterdir()) == ["state.json"]
 
 
-def test_an_open_page_gets_snapshots_that_change_with_the_layers_of_the_densifier(tmp_path, monkeypatch):
-    state, page = train(tmp_path, monkeypatch)
+def test_an_open_page_gets_snapshots_that_change_with_the_layers_of_the_densifier(watch, tmp_path):
+    state, page = watch(tmp_path)
     assert len(set(page.snapshots)) > STEPS // 2
     assert struct.unpack_from("<I", page.snapshots[-1], 12) == (len(state.gaussians),)
     for layer in (b"snr", b"drift", b"age", b"selected"):
         assert layer in page.snapshots[-1]
 
 
-def test_age_counts_the_steps_since_the_birth_of_each_row(tmp_path, monkeypatch):
-    _, page = train(tmp_path, monkeypatch, "densifier=random")
+def test_age_counts_the_steps_since_the_birth_of_each_row(watch, tmp_path):
+    _, page = watch(tmp_path, "densifier=random")
     for step, born, selected, n in page.rows:
         assert len(born) == len(selected) == n
         # Newborns are the last rows, and no row is older than the run.
@@ -106,16 +101,16 @@ def test_age_counts_the_steps_since_the_birth_of_each_row(tmp_path, monkeypatch)
     assert {0, 4, 8, 12} == set(page.rows[-1][1].tolist())
 
 
-def test_the_children_and_the_surviving_parents_of_the_last_refinement_are_selected(tmp_path, monkeypatch):
+def test_the_children_and_the_surviving_parents_of_the_last_refinement_are_selected(watch, tmp_path):
     # The scale above which a parent is replaced is so large that each one survives.
-    _, page = train(tmp_path, monkeypatch, "densifier=random", "refine.tau_scale=100")
+    _, page = watch(tmp_path, "densifier=random", "refine.tau_scale=100")
     _, born, selected, _ = page.rows[-1]
     assert selected[born == STEPS].all()
     assert int(selected.sum()) == 2 * int((born == STEPS).sum()) > 0
 
 
-def test_the_last_numbers_say_that_training_has_ended(tmp_path, monkeypatch):
-    state, _ = train(tmp_path, monkeypatch)
+def test_the_last_numbers_say_that_training_has_ended(watch, tmp_path):
+    state, _ = watch(tmp_path)
     written = live.read_state(tmp_path)
     assert written is not None
     assert written["has_ended"]
@@ -123,14 +118,14 @@ def test_the_last_numbers_say_that_training_has_ended(tmp_path, monkeypatch):
     assert "snr_p50" in written["statistics"]
 
 
-def test_a_snapshot_that_takes_long_is_followed_by_a_long_time_without_one(tmp_path, monkeypatch):
-    _, page = train(tmp_path, monkeypatch, share=1e-6)
+def test_a_snapshot_that_takes_long_is_followed_by_a_long_time_without_one(watch, tmp_path):
+    _, page = watch(tmp_path, share=1e-6)
     assert len(set(page.snapshots)) <= 2
 
 
-def test_a_folder_that_cannot_be_written_ends_the_live_view_and_not_the_run(tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_written_ends_the_live_view_and_not_the_run(watch, tmp_path, monkeypatch):
     (tmp_path / "live").write_text("in the way")
     monkeypatch.setattr(live, "touch_watched", lambda run: None)
-    state, page = train(tmp_path, monkeypatch, is_open=False)
+    state, page = watch(tmp_path, is_open=False)
     assert state.step == STEPS
     assert not page.live._works

@@ -3,7 +3,6 @@
 import math
 import re
 import time
-from functools import partial
 
 import pytest
 import torch
@@ -11,10 +10,8 @@ from _pytest.capture import CaptureIO
 
 from cadam3d.callback import progress
 from cadam3d.callback.progress import Progress, clock, peak_memory
-from cadam3d.commands.train import build_trainer
 from cadam3d.core.errors import UserError
-from cadam3d.settings.compose import component, compose
-from cadam3d.state import Outcome, RunContext, StepReport
+from cadam3d.state import Outcome, StepReport
 
 CPU = torch.device("cpu")
 NOON = time.mktime((2026, 3, 4, 12, 0, 0, 0, 0, -1))  # local time, a Wednesday
@@ -55,13 +52,9 @@ def at_noon(monkeypatch) -> Clock:
 
 
 @pytest.fixture
-def run(tmp_path):
-    cfg = compose(["prompt=a red cube", "prior=tiny", "rasterizer=reference", "initializer.count=5"])
-    trainer = build_trainer(cfg, CPU)
-    state = trainer.start(cfg.prompt, component(cfg.initializer), 0, CPU)
-    return RunContext(
-        tmp_path, cfg.prompt, 10, trainer.renderer(state), trainer.rasterizer, trainer.densifier
-    ), state
+def run(begin, tmp_path):
+    _, state, _, context = begin(tmp_path, "steps=10")
+    return context, state
 
 
 def step(bar: Progress, run, number: int) -> None:
@@ -124,25 +117,6 @@ def test_the_lines_leave_a_pause_out(lines, at_noon, run, capsys):
     assert "done=13:10" in line
 
 
-def test_a_finished_run_shows_no_time_of_the_end(bar, at_noon, run, capsys):
-    bar.on_start(*run)
-    for number in range(1, 11):
-        at_noon.now += 1
-        step(bar, run, number)
-    line = last_line(capsys)
-    assert "10/10" in line
-    assert "done=" not in line
-
-
-def test_in_a_terminal_there_are_no_lines(at_noon, run, bar, capsys):
-    bar.on_start(*run)
-    for number in range(1, 11):
-        at_noon.now += 60
-        step(bar, run, number)
-    bar.on_end(*run, Outcome.FINISHED)
-    assert capsys.readouterr().err.count("\n") == 1
-
-
 def test_elsewhere_there_is_a_whole_line_for_the_first_and_last_step_and_every_few_seconds(
     at_noon, run, lines, capsys
 ):
@@ -186,14 +160,6 @@ def test_disabled_progress_prints_nothing(run, lines, capsys, monkeypatch):
     lines.on_start(*run)
     step(lines, run, 1)
     lines.on_abort(run[0])
-    assert capsys.readouterr().err == ""
-
-
-def test_a_disabled_bar_raises_no_error(run, bar, capsys, monkeypatch):
-    monkeypatch.setattr(progress, "tqdm", partial(progress.tqdm, disable=True))
-    bar.on_start(*run)
-    step(bar, run, 1)
-    bar.on_abort(run[0])
     assert capsys.readouterr().err == ""
 
 

@@ -4,31 +4,12 @@ import struct
 from pathlib import Path
 
 import pytest
-import torch
-from composed import composed
 
 from cadam3d.callback.snapshots import Snapshots
-from cadam3d.commands.train import build_trainer, run_context
 from cadam3d.core.errors import UserError
-from cadam3d.initializer.base import Initializer
 from cadam3d.io.run_folder import snapshots
-from cadam3d.settings.compose import component
 
-CPU = torch.device("cpu")
-SMALL = ("prompt=a red cube", "prior=tiny", "rasterizer=reference", "camera.size=12", "initializer.count=30")
-GROWING = ("steps=10", "refine.start=0", "refine.end=100", "refine.interval=4", "callback=[]")
-
-
-def train(folder: Path, callback: Snapshots | None, *overrides: str):
-    """Train a few steps and return the state."""
-    cfg = composed(*SMALL, *GROWING, *overrides)
-    trainer = build_trainer(cfg, CPU)
-    if callback is not None:
-        trainer.callbacks.append(callback)
-    embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
-    state = trainer.start(cfg.prompt, component(cfg.initializer, Initializer, "initializer"), cfg.seed, CPU)
-    trainer.train(state, embedding, run_context(cfg.prompt, trainer, state, folder))
-    return state
+TEN = ("steps=10", "densifier.min_age=0")
 
 
 def count(path: Path) -> int:
@@ -37,9 +18,9 @@ def count(path: Path) -> int:
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
+def recorded(train, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    return folder, train(folder, Snapshots(every=4, largest=1000))
+    return folder, train(folder, *TEN, callbacks=[Snapshots(every=4, largest=1000)])[0]
 
 
 def test_the_start_the_multiples_and_the_last_step_are_recorded(recorded):
@@ -56,29 +37,27 @@ def test_a_snapshot_has_the_scores_of_the_densifier_and_the_age(recorded):
         assert name in content
 
 
-def test_recording_does_not_change_the_run(recorded, tmp_path):
-    alone = train(tmp_path, None)
-    for name, tensor in alone.gaussians.tensors().items():
-        assert torch.equal(tensor, recorded[1].gaussians.tensors()[name]), name
+def test_recording_does_not_change_the_run(recorded, train, alike, tmp_path):
+    alike(recorded[1], train(tmp_path, *TEN)[0])
 
 
-def test_a_large_population_is_not_recorded(tmp_path):
-    train(tmp_path, Snapshots(every=4, largest=29), "steps=4")
+def test_a_large_population_is_not_recorded(train, tmp_path):
+    train(tmp_path, "steps=4", callbacks=[Snapshots(every=4, largest=29)])
     assert snapshots(tmp_path) == {}
 
 
-def test_a_folder_that_cannot_be_written_costs_the_snapshots_and_not_the_run(tmp_path, caplog):
+def test_a_folder_that_cannot_be_written_costs_the_snapshots_and_not_the_run(train, tmp_path, caplog):
     (tmp_path / "snapshots").write_text("a file")
-    assert train(tmp_path, Snapshots(every=4, largest=1000), "steps=4").step == 4
+    assert train(tmp_path, "steps=4", callbacks=[Snapshots(every=4, largest=1000)])[0].step == 4
     assert "no snapshot of step 4" in caplog.text
 
 
-def test_a_resumed_run_removes_what_was_recorded_after_its_checkpoint(tmp_path):
-    train(tmp_path, Snapshots(every=2, largest=1000), "steps=4")
+def test_a_resumed_run_removes_what_was_recorded_after_its_checkpoint(train, tmp_path):
+    train(tmp_path, "steps=4", callbacks=[Snapshots(every=2, largest=1000)])
     stale = tmp_path / "snapshots/step_0000900.bin"
     stale.write_bytes(b"")
     (tmp_path / "snapshots/notes.txt").write_text("mine")
-    train(tmp_path, Snapshots(every=2, largest=1000), "steps=4")
+    train(tmp_path, "steps=4", callbacks=[Snapshots(every=2, largest=1000)])
     assert not stale.exists()
     assert (tmp_path / "snapshots/notes.txt").exists()
 

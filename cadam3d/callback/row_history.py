@@ -1,4 +1,4 @@
-"""Layers: numbers per Gaussian, such as the age, by which a page can colour a snapshot of a run."""
+"""RowHistory: the age of each Gaussian and other numbers, by which a page can colour a snapshot of a run."""
 
 import torch
 from jaxtyping import Bool, Int
@@ -8,7 +8,7 @@ from cadam3d.state import RefineReport, RunContext, TrainState
 from cadam3d.viewer.pack import pack
 
 
-class Layers:
+class RowHistory:
     """Ages and selections. A callback updates them at every refinement, because nothing else keeps them."""
 
     def __init__(self) -> None:
