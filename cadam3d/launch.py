@@ -32,7 +32,6 @@ from cadam3d.settings.line import (
     DRY_RUN,
     LAUNCHER_KEY,
     RUN_FOLDER,
-    exporting,
     key_of,
     quoted,
     resumed,
@@ -40,6 +39,7 @@ from cadam3d.settings.line import (
     text_of,
 )
 from cadam3d.settings.options import config_dir
+from cadam3d.settings.output import exporting
 from cadam3d.settings.place import occupied
 from cadam3d.settings.target import require_target
 from cadam3d.settings.trust import judge_composition, require_trust, targets_in
@@ -164,13 +164,13 @@ def read_line(command: str, overrides: list[str], flags: list[str], options: Nam
         require_target(overrides)
     words = overrides
     overrides = typed = [quoted(override, is_sweep=is_sweep) for override in overrides]
+    folders = [Path(options.config_path) if options.config_path else config_dir()]
+    folders += [Path(options.config_dir)] if options.config_dir else []
     if command in TRAINING:
         _refuse_resumed_jobs(typed)
-        folders = [Path(options.config_path) if options.config_path else config_dir()]
-        folders += [Path(options.config_dir)] if options.config_dir else []
         overrides = resumed(typed, is_sweep=is_sweep, folders=folders, retry=trusting)
     elif command in EXPORTING:
-        overrides = exporting(typed)
+        overrides = exporting(typed, folders)
     return Line(command, overrides, flags, options, is_sweep, typed, words, trusting)
 
 

@@ -361,7 +361,10 @@ def test_the_class_of_a_component_is_never_checked():
 FILE_NAMES = {
     value
     for name, value in vars(run_folder).items()
-    if name.isupper() and re.search(r"[./]", value) and value != run_folder.CHECKPOINT_PATTERN
+    if name.isupper()
+    and isinstance(value, str)
+    and re.search(r"[./]", value)
+    and value != run_folder.CHECKPOINT_PATTERN
 }
 
 

@@ -27,9 +27,9 @@ from cadam3d.api.guest import (
     require_words,
     usual_modes,
 )
-from cadam3d.commands import asset as files
-from cadam3d.commands.export import require_apart, set_title
+from cadam3d.commands.export import export, set_title
 from cadam3d.commands.messages import note_backend
+from cadam3d.commands.opened import OpenedAsset, find_asset, find_run
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require, require_whole
 from cadam3d.core.device import resolve_device
@@ -37,16 +37,15 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.mesh.surface import SurfaceSettings
 from cadam3d.core.render import RenderFn, RenderOutput, Subject
-from cadam3d.exporter.html import UNTITLED
+from cadam3d.exporter.html import UNTITLED, HtmlExporter
 from cadam3d.exporter.images import ImagesExporter
 from cadam3d.exporter.mesh import MeshExporter
 from cadam3d.exporter.pictures import paint
-from cadam3d.exporter.programs import FORMATS
 from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.asset_record import facts_of
 from cadam3d.io.atomic import replacing
 from cadam3d.io.image import to_uint8
-from cadam3d.io.run_folder import VIEWER, expanded, shown
+from cadam3d.io.run_folder import expanded, shown
 from cadam3d.launch import Task, compose_checked, explaining, read_words, run_line
 from cadam3d.rasterizer.base import Rasterizer, render_fn
 from cadam3d.settings.compose import option
@@ -80,8 +79,8 @@ def load(
     renders = option("rasterizer", rasterizer, Rasterizer)
     # The name of something that does not exist means a folder if it has no suffix.
     if place.is_dir() or not (place.suffix or place.exists()):
-        folder = files.find_run(str(place))
-        place, prompt = files.find_asset(folder), facts_of(folder)["prompt"]
+        folder = find_run(str(place))
+        place, prompt = find_asset(folder), facts_of(folder)["prompt"]
         # A stranger may have written the folder.
         title = prompt if isinstance(prompt, str) else None
     else:
@@ -203,9 +202,8 @@ class Asset:
     def export(self, path: str | os.PathLike[str], *overrides: str) -> list[Path]:
         """Write the asset for another program, and return the paths of the files.
 
-        This is ``cadam3d export output=PATH OVERRIDES``. The suffix of ``path`` chooses the format: ``.ply``,
-        ``.compressed.ply``, ``.splat``, ``.spz``, ``.ksplat``, ``.sog``, ``.glb``, ``.html``, ``.obj``,
-        ``.png``, ``.mp4``, ``.webm`` or ``.gif``. An override chooses another one of the same suffix or
+        This is ``cadam3d export output=PATH OVERRIDES``. The suffix of ``path`` chooses the exporter, such as
+        ``.ply``, ``.spz``, ``.glb`` or ``.html``. An override chooses another one of the same suffix or
         changes its settings, such as ``"exporter=[mesh]"`` or ``"exporter.ply.up=+z"``. A path without a
         suffix is a folder for the files of ``exporter=[...]`` or ``for=...``.
 
@@ -262,7 +260,7 @@ class Asset:
             frame = FRAME.format(page=html.escape(page), title=html.escape(title), height=height)
             display({"text/html": frame, "text/plain": repr(self)}, raw=True)
             return None
-        path = Path(tempfile.mkdtemp(prefix="cadam3d-"), VIEWER)
+        path = Path(tempfile.mkdtemp(prefix="cadam3d-"), *HtmlExporter.files)
         with replacing(path) as temporary:
             temporary.write_text(page, encoding="utf-8")
         print(f"Open this in a browser: {path}")
@@ -291,11 +289,6 @@ class _Export(Task):
         """Write the files."""
         self.has_started = True
         source = self.asset.source or Path("asset")
-        asset = files.Asset(self.asset.gaussians, ply=source, folder=source.parent)
-        if self.asset.title is not None:
-            set_title(cfg, self.asset.title)
-        if self.asset.source is not None:
-            target = expanded(str(cfg.output))
-            inside = [target / FORMATS[name].file for name in cfg.exporter if name in FORMATS]
-            require_apart(asset, [target, *inside])
-        self.written = [output.path for output in files.write_files(cfg, asset, "")]
+        set_title(cfg, self.asset.title)
+        opened = OpenedAsset(self.asset.gaussians, file=source, folder=source.parent)
+        self.written = [output.path for output in export(cfg, opened, "", has_record=False)]

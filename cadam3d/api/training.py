@@ -24,7 +24,7 @@ from cadam3d.api.guest import (
 )
 from cadam3d.callback.base import Callback
 from cadam3d.commands import train as command
-from cadam3d.commands.asset import find_run
+from cadam3d.commands.opened import find_run
 from cadam3d.io.records import psnr_of, read_config, read_metrics, read_summary
 from cadam3d.io.run_folder import CONFIG, LOG, REPORT, shown
 from cadam3d.launch import Task, compose_checked, explaining, read_words, run_line

@@ -12,8 +12,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from cadam3d import report
-from cadam3d.commands.asset import find_run, open_run, renderer, run_components
 from cadam3d.commands.measuring import CHANGED, build_metrics, measure, rebuild_start
+from cadam3d.commands.opened import find_run, open_run, renderer, run_components
 from cadam3d.core.checks import require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -88,7 +88,7 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
             render=renderer(own.rasterizer, asset.gaussians),
             prompt=own.prompt,
             truth=truth,
-            asset=asset.ply,
+            asset=asset.file,
         ),
         partial(start_of, folder, device, is_trusted=is_trusted) if source.measures_start else None,
         warnings,

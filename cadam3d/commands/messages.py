@@ -52,9 +52,3 @@ def note_backend(backend: Backend) -> None:
     """Print a note if another backend renders because a faster one is not available."""
     if backend.reason:
         note(f"rendering with rasterizer={backend.name}{backend.remark}: {backend.reason}")
-
-
-def note_omission(name: str, omission: str | None) -> None:
-    """Print a note if the files of an exporter cannot hold everything; ``name`` is its key."""
-    if omission:
-        note(f"{name}: {omission}")

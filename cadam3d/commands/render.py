@@ -6,16 +6,9 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from cadam3d.commands.asset import (
-    Asset,
-    Output,
-    find_run,
-    open_asset,
-    open_run,
-    renderer,
-    run_exporters,
-    write_files,
-)
+from cadam3d.commands.export import export
+from cadam3d.commands.opened import find_run, open_asset, open_run, renderer
+from cadam3d.commands.writing import Output, chosen_exporters, run_exporters, write_files
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.core.render import Subject
@@ -42,7 +35,7 @@ def run(cfg: DictConfig) -> None:
         if cfg.labels is not None:
             raise UserError("labels: expected null for a single asset, which has no label. Try: labels=null")
         asset = open_asset(cfg)
-        outputs, of = write_files(cfg, asset, "render"), f"{len(asset.gaussians)} Gaussians"
+        outputs, of = export(cfg, asset, "render", has_record=False), f"{len(asset.gaussians)} Gaussians"
     files = "1 file" if len(outputs) == 1 else f"{len(outputs)} files"
     print(f"{files} of {of}" if OmegaConf.is_list(cfg.run) else f"{files} of {of}:")
     for output in outputs:
@@ -74,14 +67,16 @@ def _compare(cfg: DictConfig) -> tuple[list[Output], list[Subject]]:
         for asset, label in zip(assets, labels, strict=True)
     ]
 
-    def write(cfg: DictConfig, _: Asset, folder: Path) -> list[Output]:
-        def compare(_: str, exporter: Exporter) -> list[Path]:
+    exporters = chosen_exporters(cfg)
+
+    def write(folder: Path) -> list[Output]:
+        def compare(exporter: Exporter) -> list[Path]:
             return exporter.compare(subjects, folder)
 
-        return run_exporters(cfg, compare)
+        return run_exporters(exporters, assets[0].gaussians, compare)[0]
 
     name = f"compare/{'+'.join(folder.name for folder in folders[1:])[:LONGEST_NAME]}"
-    return write_files(cfg, assets[0], name, into_folder=write, into_file=write), subjects
+    return write_files(cfg.output, assets[0], name, write, write), subjects
 
 
 def default_labels(folders: Sequence[Path]) -> list[str]:

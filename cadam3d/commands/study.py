@@ -10,8 +10,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from cadam3d.commands.asset import open_run, renderer
 from cadam3d.commands.messages import note
+from cadam3d.commands.opened import open_run, renderer
 from cadam3d.core.checks import require_range, require_whole
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError

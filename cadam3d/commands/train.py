@@ -26,8 +26,9 @@ from cadam3d.camera.base import CameraSampler
 from cadam3d.commands.control import Control
 from cadam3d.commands.linking import link_latest
 from cadam3d.commands.measuring import build_metrics, measure, rebuild_start
-from cadam3d.commands.messages import keeping_others, note, note_backend, note_omission
+from cadam3d.commands.messages import note, note_backend
 from cadam3d.commands.timetable import describe
+from cadam3d.commands.writing import run_exporters
 from cadam3d.core.chart import Chart
 from cadam3d.core.checks import require, require_whole
 from cadam3d.core.console import say
@@ -35,7 +36,6 @@ from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import CAMERA, PIXEL, require_memory
-from cadam3d.core.render import RenderFn
 from cadam3d.core.schedule import FAR_STEP
 from cadam3d.densifier.base import Densifier
 from cadam3d.densifier.baseline import Baseline
@@ -152,8 +152,13 @@ def _train(
         # The summary is written before the exports, which may fail.
         write_json(folder / SUMMARY, summary)
         gaussians = state.gaussians.detach()
-        written, warnings = export(exporters, gaussians, context.render, folder)
-        asset = folder / ASSET if folder / ASSET in written else None
+        outputs, warnings = run_exporters(
+            exporters,
+            gaussians,
+            lambda exporter: exporter.export(gaussians, context.render, folder),
+            is_needed=False,
+        )
+        asset = folder / ASSET if any(output.path == folder / ASSET for output in outputs) else None
         measurand = Measurand(
             gaussians=gaussians, render=context.render, prompt=cfg.prompt, truth=truth, asset=asset
         )
@@ -400,19 +405,6 @@ def summarize(cfg: DictConfig, state: TrainState, outcome: Outcome, backend: Bac
         "backend": backend.name,
         **({"backend_reason": backend.reason} if backend.reason else {}),
     }
-
-
-def export(
-    exporters: Mapping[str, Exporter], gaussians: Gaussians, render: RenderFn, folder: Path
-) -> tuple[list[Path], list[str]]:
-    """Run all exporters; return the paths that they have written and a warning for each one that failed."""
-    written: list[Path] = []
-    warnings: list[str] = []
-    for name, exporter in exporters.items():
-        with keeping_others(f"exporter.{name}", warnings):
-            written += exporter.export(gaussians, render, folder)
-            note_omission(f"exporter.{name}", exporter.omission(gaussians))
-    return written, warnings
 
 
 def print_result(folder: Path, summary: Mapping[str, Any], report: Path) -> None:

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from omegaconf import DictConfig
 
 from cadam3d import report
-from cadam3d.commands.asset import find_asset, find_run, require_one
+from cadam3d.commands.opened import find_asset, find_run, require_one
 from cadam3d.core.checks import require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.io.asset_file import read_gaussians

@@ -7,15 +7,16 @@ from typing import ClassVar
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.exporter.base import AssetExporter
 from cadam3d.io.compressed_ply import write_compressed_ply
-from cadam3d.io.run_folder import ASSET_COMPRESSED_PLY
 
 
 @dataclass(frozen=True, kw_only=True)
 class CompressedPlyExporter(AssetExporter):
     """Write ``asset.compressed.ply``; ``io/compressed_ply.py`` describes the layout and what is lost."""
 
-    node: ClassVar[str] = "exporter.compressed_ply"
-    file_name: ClassVar[str] = ASSET_COMPRESSED_PLY
+    node: ClassVar = "exporter.compressed_ply"
+    files: ClassVar = ("asset.compressed.ply",)
+    loss: ClassVar = "rounds positions, scales and rotations to 10 or 11 bits, colours and opacities to 8"
+    sh_loss: ClassVar = "view-dependent colours to 8"
 
     def write(self, path: Path, gaussians: Gaussians) -> None:
         """Write the file atomically.

@@ -7,15 +7,15 @@ from typing import ClassVar
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.exporter.base import AssetExporter
 from cadam3d.io.glb import write_glb
-from cadam3d.io.run_folder import ASSET_GLB
 
 
 @dataclass(frozen=True, kw_only=True)
 class GlbExporter(AssetExporter):
     """Write ``asset.glb`` with the extension ``KHR_gaussian_splatting`` (``io/glb.py``)."""
 
-    node: ClassVar[str] = "exporter.glb"
-    file_name: ClassVar[str] = ASSET_GLB
+    node: ClassVar = "exporter.glb"
+    files: ClassVar = ("asset.glb",)
+    hint: ClassVar = "needs a program that knows KHR_gaussian_splatting; for triangles type 'exporter=[mesh]'"
 
     def write(self, path: Path, gaussians: Gaussians) -> None:
         """Write the file atomically. Raises ``UserError`` if it cannot be written."""

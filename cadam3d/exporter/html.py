@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from cadam3d.core.checks import require_color, require_range
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderFn
-from cadam3d.exporter.base import Exporter
+from cadam3d.exporter.base import Contents, Exporter, gaussians_in
 from cadam3d.io.atomic import replacing
-from cadam3d.io.run_folder import VIEWER
 from cadam3d.viewer.pack import pack
 from cadam3d.viewer.page import viewer_page
 
@@ -19,6 +19,9 @@ UNTITLED = "3D Gaussians"
 @dataclass(frozen=True, kw_only=True)
 class HtmlExporter(Exporter):
     """Write ``viewer.html``, which contains the asset and everything that draws it."""
+
+    files: ClassVar = ("viewer.html",)
+    hint: ClassVar = "opens in any browser, without a network"
 
     title: str | None  # None = UNTITLED
     azimuth_deg: float  # 0 = front
@@ -40,7 +43,11 @@ class HtmlExporter(Exporter):
             elevation_deg=self.elevation_deg,
             background=self.background,
         )
-        path = folder / VIEWER
+        path = folder / self.file_name
         with replacing(path) as temporary:
             temporary.write_text(page, encoding="utf-8")
         return [path]
+
+    def contents(self, path: Path, gaussians: Gaussians) -> Contents:
+        """Return the number of Gaussians and their SH degree; a page turns them upright itself."""
+        return gaussians_in(gaussians, up=None, sh_degree=gaussians.sh_degree)

@@ -13,8 +13,8 @@ from cadam3d.exporter.pictures import KINDS, PictureExporter, captions_of, paint
 from cadam3d.io.atomic import replacing_series
 from cadam3d.io.caption import side_by_side
 from cadam3d.io.image import to_uint8, write_png_bytes
-from cadam3d.io.run_folder import IMAGES
 
+FOLDER = "images"
 # The names of the pictures: number, azimuth and elevation, and the kind unless it is rgb.
 NAME = re.compile(r"\d{3,}_az\d{3}_el[+-]\d{2}(_depth|_alpha|_normal)?\.png")
 
@@ -51,7 +51,7 @@ class ImagesExporter(CutoutSettings, PictureExporter):
     def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Render and write view by view, so that memory does not grow with the number of views."""
         names: list[str] = []
-        target, number = folder / IMAGES, 0
+        target, number = folder / FOLDER, 0
         captions, paper = captions_of(subjects), paper_of(self.background)
         with replacing_series(target, lambda name: NAME.fullmatch(name) is not None) as temporary:
             for elevation_deg in self.elevations_deg:

@@ -7,15 +7,16 @@ from typing import ClassVar
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.exporter.base import AssetExporter
 from cadam3d.io.gaussforge import KSPLAT_SH_DEGREE, require_gaussforge, write_ksplat
-from cadam3d.io.run_folder import ASSET_KSPLAT
 
 
 @dataclass(frozen=True, kw_only=True)
 class KsplatExporter(AssetExporter):
     """Write ``asset.ksplat`` with the optional package gaussforge (``io/gaussforge.py``)."""
 
-    node: ClassVar[str] = "exporter.ksplat"
-    file_name: ClassVar[str] = ASSET_KSPLAT
+    node: ClassVar = "exporter.ksplat"
+    files: ClassVar = ("asset.ksplat",)
+    max_degree: ClassVar = KSPLAT_SH_DEGREE
+    loss: ClassVar = "rounds colours and opacities to 8 bits"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -24,9 +25,3 @@ class KsplatExporter(AssetExporter):
     def write(self, path: Path, gaussians: Gaussians) -> None:
         """Write the file atomically. Raises ``UserError`` if it cannot be written."""
         write_ksplat(path, gaussians, up=self.up)
-
-    def omission(self, gaussians: Gaussians) -> str | None:
-        """Return a note if the SH degree is higher than that of the format."""
-        if gaussians.sh_degree <= KSPLAT_SH_DEGREE:
-            return None
-        return f"{self.file_name} has SH degree {KSPLAT_SH_DEGREE}, so it loses degree {gaussians.sh_degree}"

@@ -10,13 +10,11 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import require_memory
 from cadam3d.core.mesh.surface import SurfaceSettings
 from cadam3d.core.render import RenderFn
-from cadam3d.exporter.base import Exporter
+from cadam3d.exporter.base import Contents, Exporter
 from cadam3d.io.atlas import paint, require_xatlas
 from cadam3d.io.frames import UPS
-from cadam3d.io.mesh import FORMATS, write_glb, write_mesh_ply, write_obj
-from cadam3d.io.run_folder import ASSET_MESH_GLB, ASSET_MESH_OBJ, ASSET_MESH_PLY
+from cadam3d.io.mesh import FORMATS, mesh_facts, write_glb, write_mesh_ply, write_obj
 
-NAMES: dict[str, str] = dict(zip(FORMATS, (ASSET_MESH_GLB, ASSET_MESH_OBJ, ASSET_MESH_PLY), strict=True))
 # Bytes for each texel while a texture is painted, at least.
 TEXEL_BYTES = 40
 
@@ -26,6 +24,11 @@ class MeshExporter(SurfaceSettings, Exporter):
     """Write ``asset_mesh.glb``, ``.obj`` or ``.ply``: the outer surface with its colours."""
 
     node: ClassVar[str] = "exporter.mesh"
+    files: ClassVar = tuple(f"asset_mesh.{each}" for each in FORMATS)
+    suffix_setting: ClassVar = "format"
+    yields: ClassVar = True
+    loss: ClassVar = "a closed surface in place of Gaussians"
+    sh_loss: ClassVar = "without view-dependent colours"
 
     format: str  # one of FORMATS
     up: str  # up axis of the file, one of UPS
@@ -50,6 +53,11 @@ class MeshExporter(SurfaceSettings, Exporter):
             )
         require_xatlas()
 
+    @property
+    def variant(self) -> str:
+        """Return the format if it is not glb, because obj and ply do not define their axes."""
+        return "" if self.format == "glb" else self.format
+
     def most_triangles(self) -> int | None:
         """Return the most triangles that the surface may have.
 
@@ -67,7 +75,7 @@ class MeshExporter(SurfaceSettings, Exporter):
         """
         surface, painter = self.surface(gaussians)
         texture = None if self.texture is None else paint(surface, painter.colors, self.texture)
-        path = folder / NAMES[self.format]
+        path = folder / self.file_name
         if self.format == "obj":
             return write_obj(path, surface, up=self.up, texture=texture)
         if self.format == "ply":
@@ -75,3 +83,13 @@ class MeshExporter(SurfaceSettings, Exporter):
         else:
             write_glb(path, surface, up=self.up, texture=texture)
         return [path]
+
+    def contents(self, path: Path, gaussians: Gaussians) -> Contents:
+        """Return the number of triangles and the axes; a texture or a material has none.
+
+        Raises ``UserError`` if the file cannot be read.
+        """
+        if path.suffix.removeprefix(".") != self.format:
+            return Contents(words="belongs to the mesh")
+        facts = mesh_facts(path)
+        return Contents(words=str(facts), up=self.up, triangles=facts.triangles)

@@ -7,7 +7,7 @@ from typing import ClassVar
 from cadam3d.core.checks import require_choice
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE
-from cadam3d.exporter.base import AssetExporter
+from cadam3d.exporter.base import AssetExporter, Contents, gaussians_in
 from cadam3d.io.ply import write_ply
 from cadam3d.io.run_folder import ASSET
 
@@ -16,8 +16,8 @@ from cadam3d.io.run_folder import ASSET
 class PlyExporter(AssetExporter):
     """Write ``asset.ply`` in the de-facto 3DGS layout; ``io/ply.py`` lists what reads back bit for bit."""
 
-    node: ClassVar[str] = "exporter.ply"
-    file_name: ClassVar[str] = ASSET
+    node: ClassVar = "exporter.ply"
+    files: ClassVar = (ASSET,)
 
     pad_sh: int  # 0 to 3
 
@@ -28,3 +28,8 @@ class PlyExporter(AssetExporter):
     def write(self, path: Path, gaussians: Gaussians) -> None:
         """Write the file atomically. Raises ``UserError`` if it cannot be written."""
         write_ply(path, gaussians, up=self.up, pad_sh=self.pad_sh)
+
+    def contents(self, path: Path, gaussians: Gaussians) -> Contents:
+        """Return the number of Gaussians, their SH degree with the padding, and the axes of the file."""
+        degree = max(gaussians.sh_degree, self.pad_sh)
+        return gaussians_in(gaussians, up=self.up, sh_degree=degree)

@@ -27,6 +27,7 @@ class PreviewExporter(PictureSettings, PictureExporter):
     """
 
     node: ClassVar[str] = "exporter.preview"
+    files: ClassVar = (PREVIEW,)
 
     views: int  # >= 1, per elevation
     elevations_deg: Sequence[float]  # in [-90, 90]
@@ -42,7 +43,7 @@ class PreviewExporter(PictureSettings, PictureExporter):
 
     def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Render row by row and write the sheet."""
-        path = folder / PREVIEW
+        path = folder / self.file_name
         columns = self.views if len(subjects) == 1 else self._columns()
         sheets = [self._sheet(subject, columns) for subject in subjects]
         write_png_bytes(path, side_by_side(sheets, captions_of(subjects), paper_of(self.background)))

@@ -1,4 +1,4 @@
-"""Programs: in which axes other programs show our files upright, and what each format loses.
+"""Programs: in which axes other programs show our files upright.
 
 No format of Gaussians states its axes, except glTF, so this is a matter of measurement or of what a program
 documents about itself. This module is the only place with such facts. ``docs/exporting.md`` prints them, and
@@ -6,20 +6,10 @@ documents about itself. This module is the only place with such facts. ``docs/ex
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from cadam3d.io.run_folder import (
-    ASSET,
-    ASSET_COMPRESSED_PLY,
-    ASSET_GLB,
-    ASSET_KSPLAT,
-    ASSET_MESH_GLB,
-    ASSET_SOG,
-    ASSET_SPLAT,
-    ASSET_SPZ,
-    VIEWER,
-)
-
+# How a program shows a file.
+UPRIGHT, UPSIDE_DOWN, ON_ITS_SIDE = "upright", "upside down", "on its side"
 GLTF = "glTF 2.0, section 3.4: +Y is up"
 # Pairs of up axes that are half a turn apart.
 OPPOSITE = {("-y", "+y"), ("+y", "-y")}
@@ -37,17 +27,6 @@ class Program:
     is_measured: bool  # else documented by the program itself
     source: str
     target: str  # the option of for= that writes for this program
-
-
-@dataclass(frozen=True, kw_only=True)
-class Format:
-    """Properties of the files of one exporter."""
-
-    file: str  # the usual name
-    max_degree: int | None = None  # largest SH degree that the format can hold; None = all
-    loss: str = ""  # what is rounded or left out; "" if nothing is
-    sh_loss: str = ""  # the same for SH degrees above 0, as a continuation of the sentence
-    hint: str = ""  # printed with the file
 
 
 # Measured means that the program has drawn an object without symmetry, in Node or in headless Chromium, and
@@ -122,39 +101,6 @@ PROGRAMS: tuple[Program, ...] = (
     ),
 )
 
-FORMATS: Mapping[str, Format] = {
-    "ply": Format(
-        file=ASSET,
-    ),
-    "compressed_ply": Format(
-        file=ASSET_COMPRESSED_PLY,
-        loss="rounds positions, scales and rotations to 10 or 11 bits, colours and opacities to 8",
-        sh_loss="view-dependent colours to 8",
-    ),
-    "splat": Format(file=ASSET_SPLAT, max_degree=0, loss="rounds colours, opacities and rotations to 8 bits"),
-    "spz": Format(
-        file=ASSET_SPZ,
-        loss="rounds positions to 24 bits, rotations to 10, colours, opacities and scales to 8",
-        sh_loss="view-dependent colours to 4 or 5",
-    ),
-    "glb": Format(
-        file=ASSET_GLB,
-        hint="needs a program that knows KHR_gaussian_splatting; for triangles type 'exporter=[mesh]'",
-    ),
-    "sog": Format(
-        file=ASSET_SOG, loss="rounds positions to 16 bits, and the rest to code books of 256 values"
-    ),
-    "ksplat": Format(file=ASSET_KSPLAT, max_degree=2, loss="rounds colours and opacities to 8 bits"),
-    "mesh": Format(
-        file=ASSET_MESH_GLB,
-        loss="a closed surface in place of Gaussians",
-        sh_loss="without view-dependent colours",
-    ),
-    "html": Format(file=VIEWER, hint="opens in any browser, without a network"),
-}
-# The files of an exporter that is not part of cadam3d.
-OTHER = Format(file="")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Unknown:
@@ -184,35 +130,18 @@ UNKNOWN: Mapping[str, Unknown] = {
 }
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """The known programs that read a file, grouped by how they show it."""
+def shown_as(exporter: str, up: str) -> dict[str, list[Program]]:
+    """Return the programs that read a file of ``exporter``, by how they show it if its up axis is ``up``.
 
-    upright: list[Program] = field(default_factory=list)
-    upside_down: list[Program] = field(default_factory=list)
-    on_its_side: list[Program] = field(default_factory=list)
-
-
-def judge(exporter: str, up: str) -> Verdict:
-    """Return how known programs show a file of ``exporter`` whose up axis is ``up``."""
-    verdict = Verdict()
+    The keys are ``UPRIGHT``, ``UPSIDE_DOWN`` and ``ON_ITS_SIDE``.
+    """
+    ways: dict[str, list[Program]] = {UPRIGHT: [], UPSIDE_DOWN: [], ON_ITS_SIDE: []}
     for program in PROGRAMS:
         wanted = program.upright.get(exporter)
         if wanted == up:
-            verdict.upright.append(program)
+            ways[UPRIGHT].append(program)
         elif (wanted, up) in OPPOSITE:
-            verdict.upside_down.append(program)
+            ways[UPSIDE_DOWN].append(program)
         elif wanted is not None:
-            verdict.on_its_side.append(program)
-    return verdict
-
-
-def loss_of(exporter: str, sh_degree: int) -> str:
-    """Return what a file of ``exporter`` loses of Gaussians with SH degree ``sh_degree``; "" if nothing."""
-    format_ = FORMATS.get(exporter, OTHER)
-    return ", ".join(part for part in (format_.loss, format_.sh_loss if sh_degree else "") if part)
-
-
-def hint_of(exporter: str) -> str:
-    """Return what else to know about a file of ``exporter``; "" if nothing."""
-    return FORMATS.get(exporter, OTHER).hint
+            ways[ON_ITS_SIDE].append(program)
+    return ways

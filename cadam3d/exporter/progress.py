@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import UInt8
@@ -16,7 +17,7 @@ from cadam3d.exporter.base import Exporter
 from cadam3d.io.caption import Caption, side_by_side
 from cadam3d.io.image import read_png, step_pictures
 from cadam3d.io.records import read_metrics, read_summary
-from cadam3d.io.run_folder import PREVIEWS, PROGRESS, shown, typed_path, video_name
+from cadam3d.io.run_folder import PREVIEWS, shown, typed_path
 from cadam3d.io.video import CODECS, FORMATS, write_video
 
 LONGEST_HOLD = 60  # seconds
@@ -25,6 +26,10 @@ LONGEST_HOLD = 60  # seconds
 @dataclass(frozen=True, kw_only=True)
 class ProgressExporter(Exporter):
     """Write ``progress.mp4``, ``.webm`` or ``.gif``: the previews of a run with the step and the count."""
+
+    files: ClassVar = ("progress.mp4", "progress.webm", "progress.gif")
+    suffix_setting: ClassVar = "codec"
+    yields: ClassVar = True
 
     # The folder of the run; None: the folder to which this exporter writes. A list of runs, which render
     # compares, has no single folder, and ``compare`` refuses it.
@@ -45,7 +50,7 @@ class ProgressExporter(Exporter):
         pictures = step_pictures(run / PREVIEWS)
         if not pictures:
             raise UserError(f"{shown(run)}: has no {PREVIEWS}/. Try: {training_with_previews(run)}")
-        path = folder / video_name(PROGRESS, self.codec)
+        path = folder / self.file_name
         write_video(path, self._frames(pictures, counts_in(run)), fps=self.fps)
         return [path]
 

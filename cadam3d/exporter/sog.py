@@ -7,15 +7,15 @@ from typing import ClassVar
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.exporter.base import AssetExporter
 from cadam3d.io.gaussforge import require_gaussforge, write_sog
-from cadam3d.io.run_folder import ASSET_SOG
 
 
 @dataclass(frozen=True, kw_only=True)
 class SogExporter(AssetExporter):
     """Write ``asset.sog`` with the optional package gaussforge (``io/gaussforge.py``)."""
 
-    node: ClassVar[str] = "exporter.sog"
-    file_name: ClassVar[str] = ASSET_SOG
+    node: ClassVar = "exporter.sog"
+    files: ClassVar = ("asset.sog",)
+    loss: ClassVar = "rounds positions to 16 bits, and the rest to code books of 256 values"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -8,7 +8,6 @@ from cadam3d.core.checks import require_choice
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.exporter.base import AssetExporter
 from cadam3d.io.gaussforge import require_gaussforge, write_spz4
-from cadam3d.io.run_folder import ASSET_SPZ
 from cadam3d.io.spz import write_spz
 
 
@@ -16,8 +15,10 @@ from cadam3d.io.spz import write_spz
 class SpzExporter(AssetExporter):
     """Write ``asset.spz``: version 3 (``io/spz.py``), or version 4 with gaussforge (``io/gaussforge.py``)."""
 
-    node: ClassVar[str] = "exporter.spz"
-    file_name: ClassVar[str] = ASSET_SPZ
+    node: ClassVar = "exporter.spz"
+    files: ClassVar = ("asset.spz",)
+    loss: ClassVar = "rounds positions to 24 bits, rotations to 10, colours, opacities and scales to 8"
+    sh_loss: ClassVar = "view-dependent colours to 4 or 5"
 
     version: int  # 3 or 4
 
@@ -26,6 +27,11 @@ class SpzExporter(AssetExporter):
         require_choice("exporter.spz.version", self.version, (3, 4))
         if self.version == 4:
             require_gaussforge("exporter.spz.version")
+
+    @property
+    def variant(self) -> str:
+        """Return the version if it is 4, which fewer programs read."""
+        return "" if self.version == 3 else str(self.version)
 
     def write(self, path: Path, gaussians: Gaussians) -> None:
         """Write the file atomically. Raises ``UserError`` if it cannot be written."""

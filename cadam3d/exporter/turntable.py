@@ -16,7 +16,7 @@ from cadam3d.core.render import Subject
 from cadam3d.exporter.pictures import PictureExporter, captions_of, paint, paper_of
 from cadam3d.io.caption import side_by_side
 from cadam3d.io.image import to_uint8
-from cadam3d.io.run_folder import TURNTABLE, video_name
+from cadam3d.io.run_folder import TURNTABLE
 from cadam3d.io.video import CODECS, FORMATS, write_video
 
 # A frame may be as wide as the codecs allow. With a second picture beside it, the largest size just fits.
@@ -31,6 +31,8 @@ class TurntableExporter(CutoutSettings, PictureExporter):
     """Write ``turntable.mp4``, ``.webm`` or ``.gif``: the camera circles the object, first at its front."""
 
     node: ClassVar[str] = "exporter.turntable"
+    files: ClassVar = (TURNTABLE, "turntable.webm", "turntable.gif")
+    suffix_setting: ClassVar = "codec"
 
     views: int  # in [1, 100000], frames
     turns: float  # in [-100, 100]; negative = the other way round
@@ -65,7 +67,7 @@ class TurntableExporter(CutoutSettings, PictureExporter):
             got=self.size,
             example=f"exporter.turntable.size={min(256, most)}",
         )
-        path = folder / video_name(TURNTABLE, self.codec)
+        path = folder / self.file_name
         write_video(path, self._frames(self.cameras(), subjects), fps=self.fps)
         return [path]
 

@@ -23,8 +23,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from cadam3d import __version__
 from cadam3d.core.errors import UserError
-from cadam3d.io.frames import AXES, UPS
+from cadam3d.io.frames import AXES
 from cadam3d.io.jsonl import is_whole, read_json, write_json
 from cadam3d.io.reading import opened
 from cadam3d.io.records import read_config, read_summary
@@ -32,8 +35,6 @@ from cadam3d.io.run_folder import ASSET_RECORD, CONFIG, numbered, shown
 
 SCHEMA = 1
 LONGEST_TEXT = 10_000  # characters of a prompt
-LONGEST_NAME = 255  # bytes of a file name
-LONGEST_WORD = 100  # characters of a format or a hash
 MOST_FILES = 1000
 CHUNK_BYTES = 1 << 20
 # Entries of the record, and the names under which a summary has them.
@@ -46,22 +47,6 @@ VERSIONS = ("cadam3d", "torch")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Frame:
-    """The axes of a file."""
-
-    up: str  # one of UPS
-    front: str  # to which the front of the object points
-    handedness: str = "right"
-
-    @classmethod
-    def of(cls, up: str) -> "Frame":
-        """Return the axes of a file with the up axis ``up`` (see ``frames.py``)."""
-        # The front of the object is the +x axis of the world: the first column of the matrix.
-        [axis] = [number for number, row in enumerate(AXES[up]) if row[0]]
-        return cls(up=up, front=("+" if AXES[up][axis][0] > 0 else "-") + "xyz"[axis])
-
-
-@dataclass(frozen=True, kw_only=True)
 class FileEntry:
     """One file, as asset.json describes it."""
 
@@ -69,21 +54,18 @@ class FileEntry:
     format: str
     bytes: int
     sha256: str
-    frame: Frame | None
+    frame: Mapping[str, str] | None  # of :func:`axes_of`
     sh_degree: int | None
     gaussians: int | None
     triangles: int | None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Source:
-    """The asset that was exported."""
-
-    name: str
-    sha256: str
-    gaussians: int
-    sh_degree: int
-    run: Path | None  # the folder of its run
+def axes_of(up: str) -> dict[str, str]:
+    """Return the axes of a file with the up axis ``up`` (see ``frames.py``), as asset.json has them."""
+    # The front of the object is the +x axis of the world: the first column of the matrix.
+    [axis] = [number for number, row in enumerate(AXES[up]) if row[0]]
+    front = ("+" if AXES[up][axis][0] > 0 else "-") + "xyz"[axis]
+    return {"up": up, "front": front, "handedness": "right"}
 
 
 def sha256_of(path: Path) -> str:
@@ -106,27 +88,25 @@ def require_own_record(folder: Path) -> None:
 
 
 def write_record(
-    folder: Path, source: Source, entries: Sequence[FileEntry], *, exported_with: Mapping[str, str]
+    folder: Path, source: Mapping[str, Any], entries: Sequence[FileEntry], *, run: Path | None
 ) -> Path:
     """Write asset.json with ``entries`` and those of earlier exports of ``source``, and return its path.
 
-    Raises ``UserError`` if a file cannot be read or written.
+    ``source`` is that entry of the record, and ``run`` the folder of the run that made the asset. Raises
+    ``UserError`` if a file cannot be read or written.
     """
     path = folder / ASSET_RECORD
-    read = {name: getattr(source, name) for name in ("name", "sha256", "gaussians", "sh_degree")}
     files = {entry.name: asdict(entry) for entry in entries}
-    before = _read(path) or {}
-    if before.get("source", {}).get("sha256") == read["sha256"]:
-        files |= {
-            entry["name"]: entry
-            for entry in before["files"]
-            if entry["name"] not in files and _is_unchanged(folder / entry["name"], entry)
-        }
+    before = _read(path)
+    if before is not None and before["source"].get("sha256") == source["sha256"]:
+        for entry in before["files"][:MOST_FILES]:
+            if _is_unchanged(folder, entry):
+                files.setdefault(entry["name"], entry)
     record = {
         "schema": SCHEMA,
-        "source": read,
-        **facts_of(source.run),
-        "exported_with": dict(exported_with),
+        "source": dict(source),
+        **facts_of(run),
+        "exported_with": {"cadam3d": __version__, "torch": torch.__version__},
         "files": [files[name] for name in sorted(files)],
     }
     write_json(path, record)
@@ -156,43 +136,26 @@ def _plain(value: object) -> str | int | None:
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    """Return an earlier record with its valid entries; None if the file is not a record."""
+    """Return an earlier record; None if the file is not one."""
     try:
         record = read_json(path)
     except UserError:
         return None
     if not isinstance(record, dict) or record.get("schema") != SCHEMA:
         return None
-    source, files = record.get("source"), record.get("files")
-    if not isinstance(source, dict) or not isinstance(files, list):
-        return None
-    return {"source": source, "files": [entry for entry in files[:MOST_FILES] if _is_entry(entry)]}
+    is_record = isinstance(record.get("source"), dict) and isinstance(record.get("files"), list)
+    return record if is_record else None
 
 
-def _is_entry(entry: Any) -> bool:
-    """Return whether an entry of a record is one that this module could have written."""
-    names = FileEntry.__dataclass_fields__
-    if not isinstance(entry, dict) or entry.keys() != names.keys():
+def _is_unchanged(folder: Path, entry: Any) -> bool:
+    """Return whether an entry of an earlier record describes a file in ``folder`` as it is now."""
+    if not isinstance(entry, dict) or entry.keys() != FileEntry.__dataclass_fields__.keys():
         return False
-    name, frame, words = entry["name"], entry["frame"], (entry["format"], entry["sha256"])
-    counts = [entry[key] for key in ("sh_degree", "gaussians", "triangles")]
-    return (
-        isinstance(name, str)
-        and all(isinstance(word, str) and len(word) <= LONGEST_WORD for word in words)
-        and is_whole(entry["bytes"])
-        and all(count is None or is_whole(count) for count in counts)
-        and (frame is None or any(frame == asdict(Frame.of(up)) for up in UPS))
-        and name.isprintable()
-        and len(name.encode()) <= LONGEST_NAME
-        and name not in (".", "..")
-        and not set(name) & set("/\\")
-    )
-
-
-def _is_unchanged(path: Path, entry: Mapping[str, Any]) -> bool:
-    """Return whether ``path`` is still the file that an entry describes."""
+    name = entry["name"]
+    if not isinstance(name, str) or Path(name).name != name:
+        return False
     try:
-        is_same_size = not path.is_symlink() and path.stat().st_size == entry["bytes"]
-        return is_same_size and sha256_of(path) == entry["sha256"]
-    except (OSError, UserError):
+        path = folder / name
+        return not path.is_symlink() and sha256_of(path) == entry["sha256"]
+    except UserError:
         return False

@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 from cadam3d.core.errors import UserError
@@ -23,21 +24,9 @@ METRICS = "metrics.jsonl"
 OVERRIDES = ".hydra/overrides.yaml"  # what was typed
 SUMMARY = "summary.json"
 
-# Written by exporters and callbacks.
-ASSET_COMPRESSED_PLY = "asset.compressed.ply"
-ASSET_GLB = "asset.glb"
-ASSET_KSPLAT = "asset.ksplat"
-ASSET_MESH_GLB = "asset_mesh.glb"
-ASSET_MESH_MTL = "asset_mesh.mtl"  # beside the obj, if that has a texture
-ASSET_MESH_OBJ = "asset_mesh.obj"
-ASSET_MESH_PLY = "asset_mesh.ply"
-ASSET_MESH_PNG = "asset_mesh.png"  # the texture of the obj
-ASSET_SOG = "asset.sog"
-ASSET_SPLAT = "asset.splat"
-ASSET_SPZ = "asset.spz"
+# Written by exporters and callbacks. The other names of an exporter are in its class.
 CANDIDATES = "candidates"  # a folder
 HISTOGRAMS = "candidates/histograms.jsonl"
-IMAGES = "images"  # a folder
 PREVIEW = "preview.png"
 PREVIEWS = "previews"  # a folder
 LIVE = "live"  # a folder, removed when training ends: what a run and a page that shows it tell each other
@@ -52,9 +41,7 @@ SAVED = "saved"  # a folder: assets and states that a user has saved during trai
 TENSORBOARD = "tensorboard"  # a folder: event files
 WANDB = "wandb"  # a folder: what Weights & Biases keeps of the run on this disk
 WANDB_RUN = "wandb/cadam3d.json"  # under which id it is known there, and the last step that was recorded
-PROGRESS = "progress.mp4"  # or .webm or .gif
 TURNTABLE = "turntable.mp4"  # or .webm or .gif
-VIEWER = "viewer.html"
 
 # Written by ``cadam3d export``.
 ASSET_RECORD = "asset.json"
@@ -93,6 +80,15 @@ LATEST = "outputs/latest"  # a link to the newest run, beside the runs that have
 CHECKPOINT_PATTERN = r"step_([0-9]{7,12})\.pt"
 SAVED_PATTERN = r"step_([0-9]{7,12})\.ply"
 SNAPSHOT_PATTERN = r"step_([0-9]{7,12})\.bin"
+
+
+# What training, its callbacks and its exporters write, and eval. Many exporters write other files too, whose
+# names begin with EXPORTED.
+WRITTEN_BY_RUNS = (
+    *(ASSET, CHARTS, CONFIG, EVALUATION, LOG, METRICS, PREVIEW, REPORT, SUMMARY, "images", "viewer.html"),
+    *(CANDIDATES, CHECKPOINTS, HYDRA, LIVE, PREVIEWS, SAVED, SNAPSHOTS, TENSORBOARD, WANDB),
+)
+EXPORTED = ("asset.", "asset_mesh.", "turntable.", "progress.")
 
 
 def checkpoint_name(step: int) -> str:
@@ -148,7 +144,10 @@ def occupant(folder: Path) -> str | None:
 
     Files with other names may be in the folder of a run, because no run touches them.
     """
-    return next((name for name in (*_written_by_runs(), JOBS) if os.path.lexists(folder / name)), None)
+    names = [JOBS, *WRITTEN_BY_RUNS]
+    with suppress(OSError):
+        names += sorted(path.name for path in folder.iterdir() if path.name.startswith(EXPORTED))
+    return next((name for name in names if os.path.lexists(folder / name)), None)
 
 
 def occupant_of_sweep(folder: Path) -> str | None:
@@ -156,21 +155,6 @@ def occupant_of_sweep(folder: Path) -> str | None:
     tables = (TABLE, PAPER_TABLE_CSV, PAPER_TABLE_MARKDOWN, PAPER_TABLE_LATEX)
     names = (*tables, REPORT, EVALUATION, FIGURES, MULTIRUN, SHARED, STOP, BEST, CHOICE)
     return next((name for name in names if os.path.lexists(folder / name)), None)
-
-
-def _written_by_runs() -> tuple[str, ...]:
-    """Return every name in the folder of a run that training, its exporters, its callbacks or eval write."""
-    files = (ASSET, CHARTS, CONFIG, EVALUATION, LOG, METRICS, PREVIEW, REPORT, SUMMARY, VIEWER)
-    videos = [video_name(name, codec) for name in (TURNTABLE, PROGRESS) for codec in ("mp4", "webm", "gif")]
-    formats = (ASSET_COMPRESSED_PLY, ASSET_GLB, ASSET_KSPLAT, ASSET_SOG, ASSET_SPLAT, ASSET_SPZ)
-    meshes = (ASSET_MESH_GLB, ASSET_MESH_MTL, ASSET_MESH_OBJ, ASSET_MESH_PLY, ASSET_MESH_PNG)
-    folders = (CANDIDATES, CHECKPOINTS, HYDRA, IMAGES, LIVE, PREVIEWS, SAVED, SNAPSHOTS, TENSORBOARD)
-    return (*files, *videos, *formats, *meshes, *folders, WANDB)
-
-
-def video_name(name: str, codec: str) -> str:
-    """Return the name of a video in the format ``codec``, such as turntable.webm."""
-    return str(Path(name).with_suffix(f".{codec}"))
 
 
 def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:

@@ -44,26 +44,6 @@ QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
 SWEEP_CALL = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)", re.DOTALL)
 # The text up to a comma that is not followed by a space.
 PIECE = re.compile(r"(?:[^,]|,(?=\s|$))*", re.DOTALL)
-# The exporters that write a single file with this suffix. The first one is chosen if the line names none.
-EXPORTERS: dict[str, tuple[str, ...]] = {
-    ".compressed.ply": ("compressed_ply",),
-    ".glb": ("glb", "mesh"),
-    ".gif": ("turntable", "progress"),
-    ".html": ("html",),
-    ".ksplat": ("ksplat",),
-    ".mp4": ("turntable", "progress"),
-    ".obj": ("mesh",),
-    ".ply": ("ply", "mesh"),
-    ".png": ("preview",),
-    ".sog": ("sog",),
-    ".splat": ("splat",),
-    ".spz": ("spz",),
-    ".webm": ("turntable", "progress"),
-}
-# The setting of an exporter that is the suffix of its file.
-SUFFIX_SETTINGS = {"mesh": "format", "turntable": "codec", "progress": "codec"}
-# What render writes of several runs, if the line names no exporter: one picture and one video.
-COMPARING = ("preview", "turntable")
 FLAGS_WITH_VALUE = (
     *("--cfg", "-c", "--package", "-p", "--info", "-i", "--experimental-rerun"),
     *("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
@@ -157,41 +137,10 @@ def resumed(
     return list(merged.values())
 
 
-def suffix_of(name: str) -> str:
-    """Return the suffix of a file in lower case: the longest one in ``EXPORTERS``, or else the last one."""
-    name = Path(name).name.lower()
-    known = [suffix for suffix in EXPORTERS if name.endswith(suffix) and name != suffix]
-    return max(known, key=len, default=Path(name).suffix)
-
-
 def is_list(override: str) -> bool:
     """Return whether the value of an override is a list in brackets, not the path of such a name."""
     _, _, value = override.partition("=")
     return value.startswith("[") and value.endswith("]") and not os.path.lexists(value)
-
-
-def exporting(overrides: Sequence[str]) -> list[str]:
-    """Choose the exporter for a file that ``output=`` names by its suffix.
-
-    A line does not change if it names no such file, or if it chooses the exporter in another way: with
-    ``for=``, with ``exporter=``, or by setting an exporter that writes no such file.
-    """
-    given = {key_of(override): override for override in overrides}
-    name = text_of(given["output"]) if "output" in given else ""
-    suffix = suffix_of(name)
-    named = {key.split(".")[1] for key in given if key.startswith("exporter.")}
-    if name.endswith("/") or suffix not in EXPORTERS or "for" in given:
-        is_comparison = is_list(given.get("run", "")) and "exporter" not in given and named <= set(COMPARING)
-        return [*overrides, *([f"exporter=[{','.join(COMPARING)}]"] if is_comparison else [])]
-    named |= _options(given["exporter"]) if "exporter" in given else set()
-    chosen = next((each for each in EXPORTERS[suffix] if named <= {each}), None)
-    if chosen is None or given.get("exporter", "").endswith("=[]"):
-        return list(overrides)
-    words = [] if "exporter" in given else [f"exporter=[{chosen}]"]
-    key = f"exporter.{chosen}.{SUFFIX_SETTINGS.get(chosen)}"
-    if chosen in SUFFIX_SETTINGS and key not in given:
-        words.append(f"{key}={suffix.removeprefix('.')}")
-    return [*overrides, *words]
 
 
 def resume_word(place: str | Path) -> str:
@@ -220,12 +169,6 @@ def _item(text: str) -> str:
     """Return one item of a list, quoted for Hydra if it is not quoted already."""
     text = text.strip()
     return text if QUOTED.fullmatch(text) else quote(text)
-
-
-def _options(override: str) -> set[str]:
-    """Return the options that an override chooses."""
-    value = OverridesParser.create().parse_override(override).value()
-    return set(map(str, value)) if isinstance(value, list) else {str(value)}
 
 
 def _entry(override: str) -> str:

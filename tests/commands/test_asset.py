@@ -4,7 +4,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from cadam3d.commands.asset import open_asset
+from cadam3d.commands.opened import open_asset
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.compressed_ply import write_compressed_ply

@@ -1,0 +1,132 @@
+"""Opened assets: the results of a run, or a single file, for all commands that use them."""
+
+import os
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from jaxtyping import Float
+from omegaconf import DictConfig
+from torch import Tensor
+
+from cadam3d.commands.messages import note_backend
+from cadam3d.core.cameras import Cameras
+from cadam3d.core.checks import require_choice
+from cadam3d.core.device import resolve_device
+from cadam3d.core.errors import UserError
+from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.outcome import Outcome
+from cadam3d.core.render import RenderFn, RenderOutput
+from cadam3d.io.asset_file import read_gaussians
+from cadam3d.io.frames import UPS
+from cadam3d.io.records import read_summary
+from cadam3d.io.run_folder import ASSET, CONFIG, expanded, has_file, shown, suggestion, typed_path
+from cadam3d.rasterizer.base import Rasterizer, render_fn
+from cadam3d.settings.compose import component
+from cadam3d.settings.line import resume_word, setting_word
+from cadam3d.settings.trust import read_components, search_folders
+from cadam3d.sweep.folder import is_sweep
+
+
+@dataclass(frozen=True)
+class OpenedAsset:
+    """Gaussians from a file of any format, on the requested device."""
+
+    gaussians: Gaussians
+    file: Path
+    folder: Path  # of the run, or named after a single file
+
+
+def open_asset(cfg: DictConfig) -> OpenedAsset:
+    """Return the asset that ``run=`` or ``ply=`` names; exactly one of them must be given."""
+    require_one(cfg)
+    if cfg.run is not None:
+        return open_run(find_run(str(cfg.run)), cfg.device)
+    ply = expanded(str(cfg.ply))
+    gaussians = read_gaussians(ply, up=cfg.ply_up).to(resolve_device(cfg.device))
+    return OpenedAsset(gaussians=gaussians, file=ply, folder=ply.with_suffix(""))
+
+
+def require_one(cfg: DictConfig) -> None:
+    """Raise ``UserError`` unless exactly one of ``run=`` and ``ply=`` is given.
+
+    The value of ``ply=`` must not be the folder of a run, and that of ``ply_up=`` must be an axis or null.
+    """
+    if (cfg.run is None) == (cfg.ply is None):
+        got, line = ("neither", suggestion("", "run", ASSET)) if cfg.run is None else ("both", "ply=null")
+        raise UserError(f"run, ply: expected one of them, got {got}. Try: {line}")
+    if cfg.ply is not None and has_file(expanded(str(cfg.ply)), CONFIG):
+        line = f"ply=null {setting_word('run', cfg.ply)}"
+        raise UserError(f"ply: expected a file, got {str(cfg.ply)!r}, the folder of a run. Try: {line}")
+    if cfg.ply_up is not None:
+        require_choice("ply_up", cfg.ply_up, UPS)
+
+
+def find_asset(folder: Path) -> Path:
+    """Return the path of the asset of the run in ``folder``. Raises ``UserError`` if it has none yet."""
+    ply = folder / ASSET
+    if not has_file(ply):
+        line = f"cadam3d train {resume_word(shown(folder))}"
+        # A run that has finished without the file was asked for other formats, or for none.
+        if read_summary(folder).get("outcome") == Outcome.FINISHED:
+            line += " 'exporter=[ply]'"
+        raise UserError(f"{shown(folder)}: has no {ASSET} yet. Try: {line}")
+    return ply
+
+
+def open_run(folder: Path, device: str) -> OpenedAsset:
+    """Return the asset of the run in ``folder``."""
+    ply = find_asset(folder)
+    return OpenedAsset(gaussians=read_gaussians(ply).to(resolve_device(device)), file=ply, folder=folder)
+
+
+def find_run(text: str) -> Path:
+    """Return the folder of the run that ``text`` names. Raises ``UserError`` if it does not hold a run."""
+    folder = typed_path(text)
+    if has_file(folder, CONFIG):
+        return folder
+    example = suggestion("", "run", CONFIG)
+    if not os.path.lexists(folder):
+        reason = "no such folder"
+    elif has_file(folder):
+        reason = "it is a file"
+    elif is_sweep(folder):
+        reason = "it is a sweep, which has many runs"
+        started = [config.parent for config in sorted(folder.glob(f"*/{CONFIG}"))]
+        example = setting_word("run", shown(started[0])) if started else example
+    else:
+        reason = f"it has no {CONFIG}"
+    raise UserError(f"run: expected the folder of a run, got {text!r} ({reason}). Try: {example}")
+
+
+def run_components(
+    folder: Path, *names: str, is_trusted: bool, retry: str, optional: Collection[str] = ()
+) -> DictConfig:
+    """Return the prompt, the seed and the components ``names`` of the run in ``folder``.
+
+    Those of ``optional`` may be missing. Raises ``UserError`` if they are not of this package or of
+    ``--config-dir``, unless the run is trusted. ``retry`` is the line that trusts it.
+    """
+    return read_components(
+        folder / CONFIG,
+        names,
+        search_folders(HydraConfig.get().runtime.config_sources),
+        is_trusted=is_trusted,
+        retry=retry,
+        optional=optional,
+    )
+
+
+def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:
+    """Return a function that renders ``gaussians`` and prepares the configured rasterizer at first use."""
+    built: Rasterizer = component(rasterizer, Rasterizer, "rasterizer")
+    render = render_fn(built, lambda: gaussians)
+
+    def render_with_note(
+        cameras: Cameras, background: Float[Tensor, "v 3"], shown: Gaussians | None = None
+    ) -> RenderOutput:
+        note_backend(built.prepare(gaussians.device))
+        return render(cameras, background, shown)
+
+    return render_with_note
