@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.run_folder import JOBS, OVERRIDES, expanded, has_file, typed_path
+from cadam3d.io.run_folder import JOBS, expanded, has_file, typed_path
 from cadam3d.settings.advice import explain, is_refused_path, line_of, require_values, reraise_interrupt
 from cadam3d.settings.check import require_settings
 from cadam3d.settings.compose import LONGEST_KEY, TEXT_KEYS
@@ -42,7 +42,6 @@ from cadam3d.settings.options import config_dir
 from cadam3d.settings.output import exporting
 from cadam3d.settings.place import occupied
 from cadam3d.settings.target import require_target
-from cadam3d.settings.trust import judge_composition, require_trust, targets_in
 from cadam3d.sweep.choice import require_attempts
 
 TRAINING = ("train", "sweep")  # the commands that have a run folder
@@ -232,9 +231,6 @@ def compose_checked(line: Line) -> DictConfig:
 def _composed(line: Line) -> DictConfig:
     """Return the configuration of a line. Raises ``UserError`` and Hydra's exceptions."""
     cfg = compose_line(line.command, [*line.overrides, "hydra.mode=RUN"], line.options)
-    if not require_trust(cfg.get("trust", False)) and cfg.get("resume") is not None:
-        overrides = Path(cfg.hydra.run.dir) / OVERRIDES
-        judge_composition(cfg, overrides, targets_in(line.typed), line.trusting)
     require_values(cfg)
     refuse_missing_settings(cfg, line.command, line.overrides)
     refuse_unread_settings(cfg, line.command, line.overrides)

@@ -26,7 +26,7 @@ from cadam3d.prior.base import DiffusionPrior
 from cadam3d.prior.truth import PriorTruth, TruthSource
 from cadam3d.settings.compose import component
 from cadam3d.settings.line import setting_word
-from cadam3d.settings.trust import require_contained, require_trust
+from cadam3d.settings.trust import require_contained
 from cadam3d.sweep.folder import is_sweep, load
 from cadam3d.sweep.table import aligned, scores_of, write_table
 
@@ -40,7 +40,7 @@ def run(cfg: DictConfig) -> None:
         raise UserError(f"run: expected a finished run or a sweep, got nothing. Try: {line}")
     folder = typed_path(str(cfg.run))
     if folder.is_dir():
-        require_contained(folder, None if require_trust(cfg.trust) else trusting())
+        require_contained(folder, None if cfg.trust else trusting())
     # If a model is missing, this stops with one message, instead of one for every job.
     build_metrics(cfg.metric)
     if is_sweep(folder):
@@ -63,7 +63,7 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     the run names components that must not be built without ``trust=true``, and for a prompt that the truth
     cannot read.
     """
-    is_trusted = require_trust(cfg.trust)
+    is_trusted = cfg.trust
     own = run_components(
         folder, "prior", "rasterizer", "truth", is_trusted=is_trusted, retry=trusting(), optional=("truth",)
     )

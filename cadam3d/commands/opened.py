@@ -25,7 +25,7 @@ from cadam3d.io.run_folder import ASSET, CONFIG, expanded, has_file, shown, sugg
 from cadam3d.rasterizer.base import Rasterizer, render_fn
 from cadam3d.settings.compose import component
 from cadam3d.settings.line import resume_word, setting_word
-from cadam3d.settings.trust import read_components, search_folders
+from cadam3d.settings.trust import read_components
 from cadam3d.sweep.folder import is_sweep
 
 
@@ -111,7 +111,7 @@ def run_components(
     return read_components(
         folder / CONFIG,
         names,
-        search_folders(HydraConfig.get().runtime.config_sources),
+        [Path(each.path) for each in HydraConfig.get().runtime.config_sources if each.schema == "file"],
         is_trusted=is_trusted,
         retry=retry,
         optional=optional,

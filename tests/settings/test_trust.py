@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +15,11 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.ply import write_ply
-from cadam3d.settings import trust
-from cadam3d.settings.compose import compose, flatten
+from cadam3d.prior.base import DiffusionPrior
+from cadam3d.settings.compose import component, compose, flatten
 from cadam3d.settings.line import key_of, resumed
 from cadam3d.settings.options import config_dir
-from cadam3d.settings.trust import (
-    Registry,
-    judge_composition,
-    judge_overrides,
-    read_components,
-    require_contained,
-    targets_in,
-)
+from cadam3d.settings.trust import MACHINERY, judge_overrides, read_components, require_contained
 
 CONFIGS = config_dir()
 EXPERIMENTS = sorted(path.stem for path in (CONFIGS / "experiment").glob("*.yaml"))
@@ -73,29 +65,9 @@ def run_folder(tmp_path) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def honest() -> DictConfig:
-    """Return a composition with a component in every group."""
-    words = ["prompt=a", "densifier=cadam_annealed", "camera=progressive", "initializer=luciddreamer"]
-    return compose([*words, "regularizer=[sparsity]", *EVERYTHING], with_hydra=True)
-
-
 def add_override(folder: Path, *lines: str) -> None:
     path = folder / ".hydra/overrides.yaml"
     path.write_text(yaml.safe_dump([*yaml.safe_load(path.read_text()), *lines]), encoding="utf-8")
-
-
-def masked(cfg: DictConfig) -> DictConfig:
-    """Return a composition without Hydra's own settings."""
-    return OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
-
-
-def inner_places(node: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield every dict and list in plain data with each of its keys or positions."""
-    keys = list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ()
-    for key in keys:
-        yield from inner_places(node[key])
-        yield node, key
 
 
 def judged(*lines: str) -> list[str]:
@@ -106,111 +78,26 @@ def content(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-# --- components -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_every_recipe_is_accepted(experiment):
-    cfg = compose(["prompt=a", f"experiment={experiment}", *EVERYTHING], with_hydra=True)
-    judge_composition(cfg, Path("overrides.yaml"), (), RETRY)
-
-
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*/**/*.yaml")), ids=lambda path: path.stem)
-def test_every_option_names_only_targets_that_are_accepted_in_its_place(path):
-    registry = Registry.of([CONFIGS])
-    for where, value in trust._leaves(*trust._content(path, CONFIGS)):
-        if where[-1] == "_target_":
-            assert registry.accepts(where[:-1], value)
-
-
-def test_a_payload_is_refused_wherever_it_is_in_a_configuration(honest):
-    plain = OmegaConf.to_container(masked(honest), resolve=True)
-    registry = Registry.of([CONFIGS])
-    trust._judge_targets(plain, (), registry, Path("config.yaml"), RETRY)
-    planted = 0
-    for holder, key in inner_places(plain):
-        before = holder[key]
-        for payload in (
-            {"_target_": PAYLOAD},
-            [[{"_target_": PAYLOAD}]],
-            {"a": {"b": {"_target_": PAYLOAD}}},
-        ):
-            holder[key] = payload
-            with pytest.raises(UserError, match="planted"):
-                trust._judge_targets(plain, (), registry, Path("config.yaml"), RETRY)
-            planted += 1
-        holder[key] = before
-    assert planted > 600
-
-
-def test_a_composed_payload_is_refused(honest):
-    judge_composition(honest, Path("overrides.yaml"), (), RETRY)
-    for key in ("densifier", "exporter.ply", "camera.size", "metric.new", "views", "prior.prompting"):
-        cfg = honest.copy()
-        OmegaConf.update(cfg, key, {"_target_": PAYLOAD}, merge=False, force_add=True)
-        with pytest.raises(UserError, match="planted"):
-            judge_composition(cfg, Path("overrides.yaml"), (), RETRY)
-
-
-@pytest.mark.parametrize(
-    "target",
-    [
-        *(PAYLOAD, "builtins.eval", "", " cadam3d.camera.orbit.Orbit", "cadam3d.camera.orbit.Orbit\n"),
-        *("cadam3d.camera.orbit", "cadam3d.camera.orbit.math.exp", "cadam3d.camera.\u1d52rbit.Orbit"),
-        *("cadam3d.exporter.ply.PlyExporter", "cadam3d.core.schedule.Linear"),
-        *(None, 3, True, {}, [], {"_target_": "x"}),
-    ],
-)
-def test_a_target_counts_only_as_written_and_only_in_its_place(target):
-    registry = Registry.of([CONFIGS])
-    assert registry.accepts(("camera",), "cadam3d.camera.orbit.Orbit")
-    node = {"_target_": target, "size": 8}
-    with pytest.raises(UserError):
-        trust._judge_targets(node, ("camera",), registry, Path("config.yaml"), RETRY)
-
-
-def test_a_schedule_may_be_anywhere_inside_a_component():
-    registry = Registry.of([CONFIGS])
-    for name in ("Constant", "Linear", "LogLinear", "Steps"):
-        target = f"cadam3d.core.schedule.{name}"
-        assert registry.accepts(("refine", "tau_scale"), target)
-        assert registry.accepts(("published_baseline", "tau_pos"), target)
-        assert not registry.accepts(("refine",), target)
-        assert not registry.accepts(("exporter", "ply"), target)
-        assert not registry.accepts(("prior", "noise_path"), target)
-
-
-def test_a_folder_of_this_line_registers_its_components_for_their_groups(tmp_path):
-    (tmp_path / "exporter").mkdir()
-    (tmp_path / "exporter/xyz.yaml").write_text("# @package exporter.xyz\n_target_: mine.Xyz\n")
-    (tmp_path / "experiment").mkdir()
-    (tmp_path / "experiment/x.yaml").write_text(
-        "# @package _global_\nprior: {noise_path: {_target_: mine.P}}\n"
-    )
-    (tmp_path / "camera").mkdir()
-    (tmp_path / "camera/broken.yaml").write_text("a: [")
-    (tmp_path / "camera/empty.yaml").write_text("# @package _global_\n")
-    # A run folder in the same place is not a folder of options.
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run/config.yaml").write_text("# @package _global_\nrasterizer: {_target_: mine.Evil}\n")
-    registry = Registry.of([CONFIGS, tmp_path])
-    assert registry.accepts(("exporter", "any_name"), "mine.Xyz")
-    assert registry.accepts(("prior", "noise_path"), "mine.P")
-    assert not registry.accepts(("prior",), "mine.P")
-    assert not registry.accepts(("rasterizer",), "mine.Evil")
-
-
-def test_targets_of_this_line_are_accepted(honest):
-    named = targets_in(["prior._target_=mine.Prior", "+callback.x={_target_: mine.Callback, every: 3}"])
-    assert named == {"mine.Prior", "mine.Callback"}
-    cfg = honest.copy()
-    OmegaConf.update(cfg, "prior._target_", "mine.Prior")
-    judge_composition(cfg, Path("overrides.yaml"), named, RETRY)
-
-
 # --- overrides --------------------------------------------------------------------------------------------
 
 HOSTILE = [
+    # An unknown target, or one that is not exactly as a YAML file names it.
+    "densifier._target_=planted.run",
+    "camera._target_=builtins.eval",
+    "camera._target_=''",
+    "camera._target_=' cadam3d.camera.orbit.Orbit'",
+    "camera._target_=cadam3d.camera.orbit",
+    "camera._target_=cadam3d.camera.orbit.math.exp",
+    "camera._target_='cadam3d.camera.\u1d52rbit.Orbit'",
+    "camera._target_=null",
+    "camera._target_=3",
+    "camera._target_=[]",
+    "camera._target_={_target_: x}",
+    "camera._target_=${prompt}",
+    "camera.size={_target_: planted.run}",
+    "camera.size=[[{_target_: planted.run}]]",
+    "+metric.x={a: {b: {_target_: planted.run}}}",
+    "+callback.x={_target_: planted.run}",
     "hydra.mode=MULTIRUN",
     "+hydra.callbacks.x={_target_: planted.run}",
     "++hydra.callbacks={x: {_target_: planted.run}}",
@@ -271,6 +158,9 @@ HOSTILE = [
     "prompt='${now:%Y}'",
     "camera.distance=[1,'${oc.create:planted}']",
     "+camera.x={y: '${oc.select:a}'}",
+    "++densifier.tau_Q='${span:0.43,${refine.start},${refine.end},${steps}}'",
+    "prompt='${slug:a}'",
+    "prompt=${hydra.runtime.cwd}",
     "mystery=3",
     "+mystery.key=3",
     "",
@@ -282,9 +172,7 @@ HOSTILE = [
 
 @pytest.mark.parametrize("line", HOSTILE)
 def test_an_override_that_is_more_than_a_setting_of_training_is_refused(line):
-    with pytest.raises(
-        UserError, match=r"overrides\.yaml: expected .* Try: cadam3d train resume=run trust=true"
-    ):
+    with pytest.raises(UserError, match=r"overrides\.yaml: .* Try: cadam3d train resume=run trust=true"):
         judged("steps=3", line)
 
 
@@ -300,8 +188,8 @@ def test_honest_overrides_are_kept_as_they_are():
         "camera=null",
         "initializer/fallback=ball",
         "initializer.fallback=null",
-        "++densifier.tau_Q='${span:0.43,${refine.start},${refine.end},${steps}}'",
         "refine.end=${steps}",
+        "camera._target_=cadam3d.camera.orbit.Orbit",
         "~callback.progress",
         "densifier.tau_Q={_target_: cadam3d.core.schedule.Linear, start: 0.5, end: 0.9, steps: 300}",
         "camera.distance=[3.0,4.0]",
@@ -309,10 +197,17 @@ def test_honest_overrides_are_kept_as_they_are():
     assert judged(*lines) == lines
 
 
-def test_accepted_overrides_do_not_change_hydras_own_settings(honest):
-    lines = ["prompt=b", "experiment=smoke", "noise=weak", "exporter=[ply]", "~callback.progress"]
-    cfg = compose(judged(*lines), with_hydra=True)
-    ours, theirs = (dict(flatten(OmegaConf.to_container(each.hydra))) for each in (honest, cfg))
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_recipe_can_be_resumed_and_measured(experiment, tmp_path):
+    words = [f"experiment={experiment}", "noise=weak", *EVERYTHING]
+    cfg = compose(["prompt=a", *judged(*words)])
+    assert components_of(OmegaConf.to_container(cfg, resolve=True), tmp_path).prior._target_
+
+
+def test_accepted_overrides_do_not_change_hydras_own_settings():
+    words = ["prompt=b", "experiment=smoke", "noise=weak", "exporter=[ply]", "~callback.progress"]
+    nodes = [compose(lines, with_hydra=True).hydra for lines in (["prompt=a"], judged(*words))]
+    ours, theirs = (dict(flatten(OmegaConf.to_container(node))) for node in nodes)
     changed = {key for key in ours.keys() | theirs.keys() if ours.get(key) != theirs.get(key)}
     assert {key for key in changed if not key.startswith(("overrides.", "runtime.choices."))} <= {
         "job.override_dirname"
@@ -320,10 +215,26 @@ def test_accepted_overrides_do_not_change_hydras_own_settings(honest):
 
 
 def test_no_option_that_a_run_can_choose_sets_anything_of_hydra():
-    for path in trust._options(CONFIGS):
+    groups = [path for path in CONFIGS.iterdir() if path.is_dir() and path.name not in MACHINERY]
+    for path in [path for group in groups for path in group.rglob("*.yaml")]:
         raw = yaml.safe_load(path.read_text(encoding="utf-8"))
         assert "hydra" not in raw, path
         assert not any("hydra" in str(entry) for entry in raw.get("defaults", ())), path
+
+
+def test_a_folder_of_this_line_adds_its_components_of_groups_and_nothing_else(tmp_path):
+    for name, target in {"exporter/xyz": "mine.Xyz", "run/config": "mine.Evil"}.items():
+        path = tmp_path / f"{name}.yaml"
+        path.parent.mkdir()
+        path.write_text(f"_target_: {target}\n")
+    for target in ("mine.Xyz", "mine.Evil"):
+        with pytest.raises(UserError):
+            judged(f"+exporter.x._target_={target}")
+    folders = [tmp_path, CONFIGS]
+    path = Path("overrides.yaml")
+    assert judge_overrides(["+exporter.x._target_=mine.Xyz"], path, (), folders, RETRY)
+    with pytest.raises(UserError):
+        judge_overrides(["+exporter.x._target_=mine.Evil"], path, (), folders, RETRY)
 
 
 def test_a_cache_of_the_run_is_ignored_with_a_note_unless_this_line_names_it(run_folder, capsys):
@@ -412,14 +323,19 @@ def test_a_payload_in_a_component_that_is_built_is_refused(config, tmp_path):
     [
         *(("_args_", ["x"]), ("_partial_", True), ("_recursive_", False), ("_convert_", "none")),
         *((3, 4), (None, 1), ("an_old_key", 1), ("${oc.env:HOME}", 1)),
+        # Known classes in wrong places, and what is no class.
+        *(("_target_", "cadam3d.exporter.ply.PlyExporter"), ("_target_", "cadam3d.core.schedule.Linear")),
+        *(("_target_", "cadam3d.core.schedule.math.exp"), ("_target_", "cadam3d.prior.path")),
     ],
 )
-def test_keys_that_a_component_does_not_have_are_refused(key, value, config, tmp_path):
+def test_what_a_component_does_not_have_is_refused_before_it_is_built(key, value, config, tmp_path):
     for node in (config["prior"], config["prior"]["noise_path"]):
+        before = dict(node)
         node[key] = value
-        with pytest.raises(UserError, match=r"config\.yaml: .*Try: "):
-            components_of(config, tmp_path)
-        del node[key]
+        with pytest.raises(UserError):
+            component(components_of(config, tmp_path).prior, DiffusionPrior)
+        node.clear()
+        node.update(before)
 
 
 @pytest.mark.parametrize(
@@ -454,12 +370,6 @@ def test_only_plain_yaml_is_read(value, config, tmp_path, marker):
     with pytest.raises(UserError, match=r"config\.yaml: expected"):
         read_components(path, ("prior", "rasterizer"), [CONFIGS], is_trusted=False, retry=RETRY)
     assert not marker.exists()
-
-
-@pytest.mark.parametrize("payload", [({"_target_": PAYLOAD},), [({"a": ({"_target_": PAYLOAD},)},)]])
-def test_a_payload_in_a_tuple_is_refused_too(payload):
-    with pytest.raises(UserError, match="planted"):
-        trust._judge_targets(payload, ("prior", "x"), Registry.of([CONFIGS]), Path("config.yaml"), RETRY)
 
 
 def test_text_that_looks_like_an_interpolation_stays_text(config, tmp_path):
@@ -608,7 +518,7 @@ def test_a_component_of_config_dir_is_measured_without_trust(tmp_path, monkeypat
     assert "config.yaml" not in refused.partition("Try:")[2]
     # The run has no asset, which is the next thing that a command needs.
     assert "has no asset.ply" in type_line("eval", "run=run", "--config-dir", "mine").err
-    assert "got 'rasterizer._target_=own_rasterizer.Own'" in refused
+    assert "own_rasterizer.Own" in refused
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid"), reason="Windows has no modes")
