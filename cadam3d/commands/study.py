@@ -41,11 +41,11 @@ from cadam3d.study.answers import (
     find_files,
     read_files,
 )
-from cadam3d.study.clips import LEAST_VISIBLE, Clip, ClipSettings, film, ruined
+from cadam3d.study.clips import LEAST_VISIBLE, ClipSettings, FilmedTurn, film, ruined
 from cadam3d.study.key import KEY, PAGE, RESULTS, TABLE, Key, read_key, write_key
-from cadam3d.study.page import study_id, study_page
-from cadam3d.study.plan import Plan, catch_count, make_plan
-from cadam3d.study.runs import Found, Pair, Run, draw_pairs, find_runs, pair_runs, select
+from cadam3d.study.rater_page import study_id, study_page
+from cadam3d.study.runs import Found, RunPair, StudyRun, draw_pairs, find_runs, pair_runs, select
+from cadam3d.study.trials import StudyPlan, catch_count, make_plan
 
 LARGEST_PAGE = 100_000_000  # bytes; above this, some mail servers and phones refuse a page
 LARGEST_CONSENT = 1 << 16  # bytes
@@ -120,7 +120,7 @@ def _consent(path: str | None) -> str:
         raise UserError(f"consent: expected a text file, got {reason}. Try: consent=null") from error
 
 
-def _generator(seed: int, pairs: Sequence[Pair]) -> Random:
+def _generator(seed: int, pairs: Sequence[RunPair]) -> Random:
     """Return what draws the order, the sides and the numbers of the clips.
 
     A rater may know this program and guess the seed. The draws also depend on the assets, which a page does
@@ -131,7 +131,7 @@ def _generator(seed: int, pairs: Sequence[Pair]) -> Random:
     return Random(f"{seed} {' '.join(hashes)}")
 
 
-def _pairs(cfg: DictConfig) -> list[Pair]:
+def _pairs(cfg: DictConfig) -> list[RunPair]:
     """Return all pairs of runs, and print a note if runs are left out."""
     found = find_runs(_texts(cfg.runs), None if cfg.labels is None else _texts(cfg.labels))
     runs = select(found.runs, None if cfg.arms is None else _texts(cfg.arms), _prompts(cfg.prompts))
@@ -149,7 +149,7 @@ def _prompts(source: str | None) -> set[str] | None:
     return {prompt.text for prompt in read_prompts(str(source))}
 
 
-def _note_left(found: Found, runs: Sequence[Run], pairs: Sequence[Pair]) -> None:
+def _note_left(found: Found, runs: Sequence[StudyRun], pairs: Sequence[RunPair]) -> None:
     if found.without_asset:
         note(f"{plural(found.without_asset, 'run')} left no asset and cannot be shown")
     single = [run for run in runs if not any(run in pair.runs for pair in pairs)]
@@ -191,7 +191,9 @@ def _output(cfg: DictConfig) -> Iterator[Path]:
         remove_empty(folder, existing)
 
 
-def _film_all(pairs: Sequence[Pair], cfg: DictConfig, settings: ClipSettings) -> dict[Run, Clip]:
+def _film_all(
+    pairs: Sequence[RunPair], cfg: DictConfig, settings: ClipSettings
+) -> dict[StudyRun, FilmedTurn]:
     """Return a clip of every run, rendered in the same way."""
     runs = list(dict.fromkeys(run for pair in pairs for run in pair.runs))
     clips = {}
@@ -202,7 +204,9 @@ def _film_all(pairs: Sequence[Pair], cfg: DictConfig, settings: ClipSettings) ->
     return clips
 
 
-def _plan(cfg: DictConfig, pairs: Sequence[Pair], clips: dict[Run, Clip], generator: Random) -> Plan:
+def _plan(
+    cfg: DictConfig, pairs: Sequence[RunPair], clips: dict[StudyRun, FilmedTurn], generator: Random
+) -> StudyPlan:
     """Return the trials. Raises ``UserError`` if no clip shows enough for a catch trial."""
     catches = catch_count(len(pairs), cfg.catch_share)
     visible = [run for run, clip in clips.items() if clip.visible >= LEAST_VISIBLE]
@@ -214,7 +218,7 @@ def _plan(cfg: DictConfig, pairs: Sequence[Pair], clips: dict[Run, Clip], genera
     return make_plan(pairs, visible, catches, generator)
 
 
-def _print_page(folder: Path, pairs: Sequence[Pair], plan: Plan, settings: ClipSettings) -> None:
+def _print_page(folder: Path, pairs: Sequence[RunPair], plan: StudyPlan, settings: ClipSettings) -> None:
     met = Counter(pair.arms for pair in pairs)
     for (one, other), count in sorted(met.items()):
         print(f"{one} and {other}: {plural(count, 'pair')}")
@@ -239,43 +243,42 @@ def _print_page(folder: Path, pairs: Sequence[Pair], plan: Plan, settings: ClipS
 def _evaluate(cfg: DictConfig) -> None:
     """Analyse the answers, print the result, and write ``study.json`` and ``study.md`` beside the key."""
     from cadam3d.study.analysis import analyse
-    from cadam3d.study.summary import Bullets, markdown, text
+    from cadam3d.study.summary import bullets, markdown
 
     require_range("least_caught", cfg.least_caught, low=0, high=1, example=0.8)
     paths = find_files(_texts(cfg.answers))
     files, left = read_files(paths)
-    for each in left:
-        _warn(each)
     if not files:
-        raise UserError(
-            f"answers: expected files that raters have saved, got {plural(len(paths), 'file')} without any. "
-            "Try: cadam3d study --help"
-        )
+        _warn_all(left)
+        raise _no_answers(f"{plural(len(paths), 'file')} without any")
     place, key = _find_key(cfg, files)
     collected = collect(files, key)
-    for each in collected.left_out:
-        _warn(each)
     left += collected.left_out
+    _warn_all(left)
     if not collected.raters:
-        raise UserError(
-            f"answers: expected answers to the study of {shown(place)}, got none. The reasons are above. "
-            "Try: cadam3d study --help"
-        )
+        raise _no_answers(f"none to the study of {shown(place)}, for the reasons above")
     analysis = analyse(collected.raters, least_caught=float(cfg.least_caught))
-    print(text(analysis))
+    page = markdown(analysis)
+    print(page)
     folder = place.parent
+    listed = [{"file": plain(each.path.name), "reason": plain(each.reason)} for each in left]
     facts = {"study": key.study, "catch_trials": key.catch_trials, "trials": len(key.trials)}
-    reasons = [each.printed for each in left]
-    listed = [{"file": name, "reason": reason} for name, reason in reasons]
-    result = {"kind": RESULTS_KIND, **facts, "left_out": listed, **analysis.to_json()}
-    write_json(folder / RESULTS, result)
+    write_json(folder / RESULTS, {"kind": RESULTS_KIND, **facts, "left_out": listed, **analysis.to_json()})
+    if listed:
+        lines = bullets([f"{each['file']}: {each['reason']}" for each in listed])
+        page += f"\nFiles that are left out:\n\n{lines}\n"
     with replacing(folder / TABLE) as temporary:
-        page = markdown(analysis)
-        if reasons:
-            lines = Bullets([f"{name}: {reason}" for name, reason in reasons])
-            page += f"\nFiles that are left out:\n\n{lines.markdown()}\n"
         temporary.write_text(page, encoding="utf-8")
-    print(f"\n{shown(folder / RESULTS)}, {shown(folder / TABLE)}")
+    print(f"{shown(folder / RESULTS)}, {shown(folder / TABLE)}")
+
+
+def _warn_all(left: Sequence[LeftOut]) -> None:
+    for each in left:
+        say(plain(f"Warning: {shown(each.path)} is left out: {each.reason}"))
+
+
+def _no_answers(got: str) -> UserError:
+    return UserError(f"answers: expected files that raters have saved, got {got}. Try: cadam3d study --help")
 
 
 def _find_key(cfg: DictConfig, files: Sequence[AnswerFile]) -> tuple[Path, Key]:
@@ -283,37 +286,19 @@ def _find_key(cfg: DictConfig, files: Sequence[AnswerFile]) -> tuple[Path, Key]:
     if cfg.key is not None:
         path = expanded(cfg.key)
         return path, read_key(path / KEY if path.is_dir() else path)
-    folders = [expanded(str(cfg.output)), *(place for file in files for place in _around(file.path))]
-    paths = [path for folder in dict.fromkeys(folders) if (path := folder / KEY).is_file()]
-    keys: dict[Path, Key] = {}
-    problem: UserError | None = None
-    for path in paths:
-        try:
-            keys[path] = read_key(path)
-        except UserError as error:
-            problem = problem or error
+    around = [place for file in files for place in list(file.path.absolute().parents)[:2]]
+    paths = [folder / KEY for folder in dict.fromkeys([expanded(str(cfg.output)), *around])]
+    keys = {path: read_key(path) for path in paths if path.is_file()}
     for study, _ in Counter(file.study for file in files).most_common():
         for path, key in keys.items():
             if key.study == study:
                 return path, key
-    if problem is not None:
-        raise problem
-    others = ", ".join(dict.fromkeys(str(shown(path)) for path in paths))
-    got = f"only keys of other studies in {others}" if paths else "none"
+    others = ", ".join(str(shown(path)) for path in keys)
     raise UserError(
         f"key: expected the key of the study {files[0].study!r} in {cfg.output}/, beside the answers or in "
-        f"the folder above, got {got}. Its name is {KEY}. Try: cadam3d study --help"
+        f"the folder above, got {f'keys of other studies in {others}' if keys else 'none'}. "
+        "Try: cadam3d study --help"
     )
-
-
-def _around(path: Path) -> tuple[Path, Path]:
-    """Return the folder of a file, and the folder above."""
-    folder = path.absolute().parent
-    return folder, folder.parent
-
-
-def _warn(left: LeftOut) -> None:
-    say(plain(f"Warning: {shown(left.path)} is left out: {left.reason}"))
 
 
 def _texts(value: Any) -> list[str]:

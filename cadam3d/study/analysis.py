@@ -67,7 +67,7 @@ class Rate:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ComparedPair:
     """Two arms and the answers to one question about them."""
 
     first: str
@@ -113,7 +113,7 @@ class QuestionResult:
     prompts: int
     answers: int
     rates: tuple[Rate, ...]  # one for each arm that was compared, by name
-    comparisons: tuple[Comparison, ...]  # one for each pair of arms that was compared
+    comparisons: tuple[ComparedPair, ...]  # one for each pair of arms that was compared
     ranking: Ranking | None  # None for two arms, because the rates say the same
     agreement: float | None  # Krippendorff's alpha of the raters, for two arms
 
@@ -235,11 +235,11 @@ def _rate(arm: str, answers: Sequence[Answer]) -> Rate:
     return Rate(arm, int(chosen.sum()), len(chosen), float(chosen.mean()), interval)
 
 
-def _comparison(first: str, second: str, answers: Sequence[Answer]) -> Comparison:
+def _comparison(first: str, second: str, answers: Sequence[Answer]) -> ComparedPair:
     chosen, clusters = _is_chosen(first, answers), _clusters(answers)
     over_prompts, over_raters = sign_test(chosen, clusters.prompts), sign_test(chosen, clusters.raters)
     p_value = max(over_prompts.p_value, over_raters.p_value)
-    return Comparison(
+    return ComparedPair(
         first,
         second,
         rate=_rate(first, answers),

@@ -55,7 +55,7 @@ class Rater:
 
 
 @dataclass(frozen=True)
-class Choice:
+class Pick:
     """An answer in a file: the clip that was chosen."""
 
     trial: int
@@ -72,7 +72,7 @@ class AnswerFile:
     rater: str
     session: str  # drawn by the page when the rater began
     saves: int  # how often the rater had saved, this time included
-    choices: tuple[Choice, ...]
+    choices: tuple[Pick, ...]
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,6 @@ class LeftOut:
 
     path: Path
     reason: str
-
-    @property
-    def printed(self) -> tuple[str, str]:
-        """Return the name of the file, which a stranger has chosen, and the reason, safe to print."""
-        return plain(self.path.name), plain(self.reason)
 
 
 @dataclass(frozen=True)
@@ -211,14 +206,14 @@ def _file(path: Path, value: Any) -> AnswerFile:
     return AnswerFile(path, study, rater, session, value["saves"], choices)
 
 
-def _choice(value: Any) -> Choice:
+def _choice(value: Any) -> Pick:
     if not isinstance(value, dict) or value["question"] not in QUESTION_NAMES:
         raise ValueError("an answer has no known question")
     if not is_whole(value["trial"]) or not is_whole(value["chosen"]):
         raise ValueError("an answer has no trial or no choice")
     if not is_number(value.get("seconds", 0)):
         raise ValueError("seconds: expected a number")
-    return Choice(value["trial"], value["question"], value["chosen"])
+    return Pick(value["trial"], value["question"], value["chosen"])
 
 
 def _short(value: dict[str, Any], name: str, longest: int) -> str:

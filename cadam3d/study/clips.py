@@ -65,7 +65,7 @@ class ClipSettings:
 
 
 @dataclass(frozen=True)
-class Clip:
+class FilmedTurn:
     """The frames of one turn, each as the bytes of a WebP file."""
 
     frames: tuple[bytes, ...]
@@ -73,7 +73,7 @@ class Clip:
     visible: float  # share of the pixels of all frames that differ from the background, in [0, 1]
 
 
-def film(render: RenderFn, settings: ClipSettings) -> Clip:
+def film(render: RenderFn, settings: ClipSettings) -> FilmedTurn:
     """Return one turn of an object."""
     cameras, color = settings.cameras(), torch.tensor([float(channel) for channel in settings.backdrop])
     backdrop = to_uint8(color[None, None])
@@ -86,10 +86,10 @@ def film(render: RenderFn, settings: ClipSettings) -> Clip:
             image = Image.fromarray(picture)
             small.append(np.asarray(image.resize((RUINED_SIZE, RUINED_SIZE), Image.Resampling.BOX)))
             frames.append(encoded(image, settings.quality))
-    return Clip(tuple(frames), np.stack(small), float(np.mean(visible)))
+    return FilmedTurn(tuple(frames), np.stack(small), float(np.mean(visible)))
 
 
-def ruined(clip: Clip, settings: ClipSettings, seed: int) -> tuple[bytes, ...]:
+def ruined(clip: FilmedTurn, settings: ClipSettings, seed: int) -> tuple[bytes, ...]:
     """Return the frames of a clip, blurred and noisy until nothing can be recognised.
 
     The noise is the same in all frames, so that the clip turns as calmly as the others.

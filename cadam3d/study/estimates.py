@@ -12,11 +12,12 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.optimize import minimize
 from scipy.sparse.csgraph import connected_components
-from scipy.special import bdtr, expit, log_expit, logit, stdtrit
+from scipy.special import expit, log_expit, logit, stdtrit
+from scipy.stats import binomtest
 
 CONFIDENCE = 0.95
-MOST_STEPS = 200  # of Newton's method, which usually converges in fewer than ten
 TOLERANCE = 1e-10  # of the gradient of the log-likelihood, per answer
 
 
@@ -141,7 +142,7 @@ def sign_test(chosen: Bool[np.ndarray, "n"], units: Int[np.ndarray, "n"]) -> Sig
     """Return the sign test of "neither arm has more majorities", in which each unit has one vote."""
     margins = np.bincount(units, weights=np.where(chosen, 1, -1))
     wins, losses = int((margins > 0).sum()), int((margins < 0).sum())
-    p_value = min(1.0, 2 * float(bdtr(min(wins, losses), wins + losses, 1 / 2)))
+    p_value = float(binomtest(wins, wins + losses).pvalue) if wins + losses else 1.0
     return SignTest(wins, losses, len(margins) - wins - losses, p_value)
 
 
@@ -184,36 +185,28 @@ def fit_strengths(wins: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k"]:
     :func:`unranked` finds nothing.
     """
     assert not unranked(wins)
-    strengths = np.zeros(len(wins))
-    for _ in range(MOST_STEPS):
-        gradient = _gradient(wins, strengths)
-        if np.abs(gradient).max() <= TOLERANCE * wins.sum():
-            break
-        step = np.linalg.pinv(_information(wins, strengths)) @ gradient
-        # The likelihood is concave, so a short enough step always improves it.
-        while _likelihood(wins, strengths + step) < _likelihood(wins, strengths) - 1e-12 * wins.sum():
-            step /= 2
-        strengths = strengths + step
-    return strengths - strengths.mean()
 
+    def loss(strengths: Float[np.ndarray, "k"]) -> tuple[float, Float[np.ndarray, "k"]]:
+        """Return the negative log-likelihood and its gradient."""
+        apart = strengths[:, None] - strengths[None, :]
+        return -float((wins * log_expit(apart)).sum()), ((wins + wins.T) * expit(apart) - wins).sum(1)
 
-def _difference(strengths: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k k"]:
-    return strengths[:, None] - strengths[None, :]
-
-
-def _likelihood(wins: Float[np.ndarray, "k k"], strengths: Float[np.ndarray, "k"]) -> float:
-    return float((wins * log_expit(_difference(strengths))).sum())
-
-
-def _gradient(wins: Float[np.ndarray, "k k"], strengths: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
-    return (wins - (wins + wins.T) * expit(_difference(strengths))).sum(1)
+    found = minimize(
+        loss,
+        np.zeros(len(wins)),
+        jac=True,
+        hess=lambda strengths: _information(wins, strengths),
+        method="trust-exact",
+        options={"gtol": TOLERANCE * wins.sum()},
+    )
+    return found.x - found.x.mean()
 
 
 def _information(
     wins: Float[np.ndarray, "k k"], strengths: Float[np.ndarray, "k"]
 ) -> Float[np.ndarray, "k k"]:
     """Return the negative Hessian of the log-likelihood, whose null space is a shift of all strengths."""
-    chance = expit(_difference(strengths))
+    chance = expit(strengths[:, None] - strengths[None, :])
     weights = (wins + wins.T) * chance * (1 - chance)
     return np.diag(weights.sum(1)) - weights
 

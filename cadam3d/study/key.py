@@ -11,7 +11,7 @@ from cadam3d.io.caption import plain
 from cadam3d.io.jsonl import is_whole, parse_json, write_json
 from cadam3d.io.reading import read_bytes
 from cadam3d.io.run_folder import shown
-from cadam3d.study.plan import Plan, Trial
+from cadam3d.study.trials import StudyPlan, Trial
 
 KEY = "key.json"
 PAGE = "study.html"
@@ -37,7 +37,7 @@ class Key:
         return sum(trial.right is not None for trial in self.trials)
 
 
-def write_key(path: Path, study: str, plan: Plan, *, seed: int) -> None:
+def write_key(path: Path, study: str, plan: StudyPlan, *, seed: int) -> None:
     """Write the key of a study. Raises ``UserError`` if the file cannot be written."""
     write_json(
         path,

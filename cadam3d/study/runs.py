@@ -4,11 +4,10 @@ An *arm* is what is compared, such as a densifier. Two runs of different arms ar
 prompt and agree in everything else that varies, such as the seed or the objective.
 """
 
-import shlex
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import chain, combinations, pairwise
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -18,7 +17,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.caption import plain
 from cadam3d.io.records import read_summary
 from cadam3d.io.run_folder import ASSET, CONFIG, has_file, shown, typed_path
-from cadam3d.report.results import PROMPT, SEED, JobResult, read
+from cadam3d.report.results import PROMPT, SEED, read
 from cadam3d.settings.line import setting_word
 from cadam3d.sweep.folder import is_sweep
 
@@ -27,7 +26,7 @@ LONGEST_LABEL = 80  # characters
 
 
 @dataclass(frozen=True)
-class Run:
+class StudyRun:
     """A finished run as one arm of a study."""
 
     folder: Path
@@ -40,10 +39,10 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Pair:
+class RunPair:
     """Two runs of different arms that a rater compares."""
 
-    runs: tuple[Run, Run]  # in the order of the names of their arms
+    runs: tuple[StudyRun, StudyRun]  # in the order of the names of their arms
 
     @property
     def prompt(self) -> str:
@@ -60,7 +59,7 @@ class Pair:
 class Found:
     """The runs that a line names and that left an asset, and the number of those that left none."""
 
-    runs: list[Run]
+    runs: list[StudyRun]
     without_asset: int
 
 
@@ -79,16 +78,12 @@ def find_runs(places: Sequence[str], labels: Sequence[str] | None) -> Found:
                 "labels: expected null for a sweep, because its arms have names already. Try: labels=null"
             )
         return _arms_of_sweep(folders[0])
-    if not 2 <= len(folders) <= MOST_ARMS:
+    if not 2 <= len(set(folders)) == len(folders) <= MOST_ARMS:
         raise UserError(
-            f"runs: expected the folder of a sweep, or a list of 2 to {MOST_ARMS} folders, each of which is "
-            f"an arm, got {len(folders)}. Try: {_example(folders)}"
+            f"runs: expected the folder of a sweep, or a list of 2 to {MOST_ARMS} different folders, each of "
+            f"which is an arm, got {', '.join(str(shown(each)) for each in folders)}. "
+            "Try: cadam3d study --help"
         )
-    if len(set(folders)) < len(folders):
-        different = [str(shown(folder)) for folder in dict.fromkeys(folders)]
-        word = setting_word("runs", f"[{','.join(different)}]")
-        example = word if len(different) > 1 else "cadam3d study --help"
-        raise UserError(f"runs: expected different folders, got one of them twice. Try: {example}")
     results = [_results(place, folder) for place, folder in zip(places, folders, strict=True)]
     names = _default_labels(folders, results) if labels is None else [plain(label) for label in labels]
     are_names = all(0 < len(name) <= LONGEST_LABEL for name in names)
@@ -100,7 +95,7 @@ def find_runs(places: Sequence[str], labels: Sequence[str] | None) -> Found:
             example="labels=null",
         )
     runs = [
-        Run(folder, name, str(summary["prompt"]), int(summary["seed"]))
+        StudyRun(folder, name, str(summary["prompt"]), int(summary["seed"]))
         for name, summaries in zip(names, results, strict=True)
         for folder, summary in summaries.items()
         if has_file(folder, ASSET)
@@ -108,7 +103,9 @@ def find_runs(places: Sequence[str], labels: Sequence[str] | None) -> Found:
     return Found(runs, sum(map(len, results)) - len(runs))
 
 
-def select(found: Sequence[Run], arms: Collection[str] | None, prompts: Collection[str] | None) -> list[Run]:
+def select(
+    found: Sequence[StudyRun], arms: Collection[str] | None, prompts: Collection[str] | None
+) -> list[StudyRun]:
     """Return the runs of some arms and prompts; None stands for all.
 
     Raises ``UserError`` if an arm has no run, or if none of the prompts has one.
@@ -116,12 +113,10 @@ def select(found: Sequence[Run], arms: Collection[str] | None, prompts: Collecti
     known = sorted({run.arm for run in found})
     wanted = known if arms is None else list(arms)
     if missing := [arm for arm in wanted if arm not in known]:
-        listed = ", ".join(known) or "none with an asset"
-        raise UserError(f"arms: expected some of {listed}, got {missing[0]!r}. Try: arms=null")
+        raise UserError(f"arms: expected some of {', '.join(known)}, got {missing[0]!r}. Try: arms=null")
     if len(set(wanted)) < 2:
         listed = ", ".join(map(repr, wanted)) or "none"
-        try_line = "cadam3d study --help" if arms is None else "arms=null"
-        raise UserError(f"runs: expected at least two arms with assets, got {listed}. Try: {try_line}")
+        raise UserError(f"arms: expected at least two with assets, got {listed}. Try: arms=null")
     runs = [run for run in found if run.arm in wanted and (prompts is None or run.prompt in prompts)]
     if not runs:
         some = ", ".join(sorted({repr(run.prompt) for run in found})[:3])
@@ -131,38 +126,41 @@ def select(found: Sequence[Run], arms: Collection[str] | None, prompts: Collecti
     return runs
 
 
-def pair_runs(runs: Sequence[Run], *, same_seed: bool) -> list[Pair]:
+def pair_runs(runs: Sequence[StudyRun], *, same_seed: bool) -> list[RunPair]:
     """Return every pair of runs of different arms with the same prompt, conditions and seed.
 
     Without ``same_seed``, the runs of a prompt are paired in the order of their seeds: the first run of an
     arm with the first run of another one. Raises ``UserError`` if an arm has two runs of one prompt and seed
     under the same conditions, or if there is no pair.
     """
-    groups: dict[tuple, dict[str, list[Run]]] = defaultdict(lambda: defaultdict(list))
+    groups: dict[tuple, dict[str, list[StudyRun]]] = defaultdict(lambda: defaultdict(list))
     for run in sorted(runs, key=lambda run: (run.prompt, run.conditions, run.seed, run.arm)):
         groups[run.prompt, run.conditions, run.seed if same_seed else None][run.arm].append(run)
     pairs = []
     for arms in groups.values():
-        for members in arms.values():
-            seeds = [run.seed for run in members]
-            if len(set(seeds)) < len(seeds):
-                raise _ambiguous(members)
+        for one, other in chain(*(pairwise(members) for members in arms.values())):
+            if one.seed == other.seed:
+                raise UserError(
+                    f"runs: expected one run of each prompt and seed in the arm {one.arm!r}, got two of "
+                    f"{one.prompt!r} with seed {one.seed}: {one.folder.name} and {other.folder.name}. "
+                    f"Try: {setting_word('runs', f'[{shown(one.folder)},{shown(other.folder)}]')}"
+                )
         for one, other in combinations(sorted(arms), 2):
             # An arm may have more runs of a prompt than another one; the rest has no partner.
-            pairs += [Pair(both) for both in zip(arms[one], arms[other], strict=False)]
+            pairs += [RunPair(both) for both in zip(arms[one], arms[other], strict=False)]
     if not pairs:
         raise _no_pair(runs, same_seed=same_seed)
     return pairs
 
 
-def draw_pairs(pairs: Sequence[Pair], most: int | None, generator: Random) -> list[Pair]:
+def draw_pairs(pairs: Sequence[RunPair], most: int | None, generator: Random) -> list[RunPair]:
     """Return at most ``most`` pairs, drawn so that every two arms meet equally often; None stands for all.
 
     Prompts repeat only after each of them has been drawn for these two arms.
     """
     if most is None or most >= len(pairs):
         return list(pairs)
-    queues: dict[tuple[str, str], list[Pair]] = defaultdict(list)
+    queues: dict[tuple[str, str], list[RunPair]] = defaultdict(list)
     for pair in generator.sample(list(pairs), len(pairs)):
         queues[pair.arms].append(pair)
     ordered = [_prompts_first(queues[arms]) for arms in sorted(queues)]
@@ -171,7 +169,7 @@ def draw_pairs(pairs: Sequence[Pair], most: int | None, generator: Random) -> li
     return [pair for pair in pairs if pair in chosen]
 
 
-def _prompts_first(pairs: Sequence[Pair]) -> list[Pair]:
+def _prompts_first(pairs: Sequence[RunPair]) -> list[RunPair]:
     """Return the pairs with the first one of every prompt in front, then the second ones, and so on."""
     seen: dict[str, int] = defaultdict(int)
     turns = []
@@ -190,12 +188,10 @@ def _arms_of_sweep(folder: Path) -> Found:
             left += 1
             continue
         arm = plain(job.setting.name)
-        runs.append(Run(job.folder, arm, summary["prompt"], summary["seed"], _conditions(job)))
+        runs.append(
+            StudyRun(job.folder, arm, summary["prompt"], summary["seed"], job.cell.without(PROMPT, SEED).axes)
+        )
     return Found(runs, left)
-
-
-def _conditions(job: JobResult) -> tuple[tuple[str, str], ...]:
-    return job.cell.without(PROMPT, SEED).axes
 
 
 def _results(place: str, folder: Path) -> Mapping[Path, Mapping[str, Any]]:
@@ -224,44 +220,22 @@ def _default_labels(
     densifiers = [
         {plain(str(facts.get("densifier") or "")) for facts in summaries.values()} for summaries in results
     ]
-    by_densifier = ["" if len(names) != 1 else next(iter(names)) for names in densifiers]
+    by_densifier = [min(names) if len(names) == 1 else "" for names in densifiers]
     for names in (by_densifier, [plain(folder.name) for folder in folders]):
         if all(names) and len(set(names)) == len(names):
             return [name[:LONGEST_LABEL] for name in names]
     return [plain(str(shown(folder)))[-LONGEST_LABEL:] for folder in folders]
 
 
-def _ambiguous(members: Sequence[Run]) -> UserError:
-    one, other = next((one, other) for one, other in combinations(members, 2) if one.seed == other.seed)
-    word = setting_word("runs", f"[{shown(one.folder)},{shown(other.folder)}]")
-    return UserError(
-        f"runs: expected one run of each prompt and seed in the arm {one.arm!r}, got two of {one.prompt!r} "
-        f"with seed {one.seed}: {one.folder.name} and {other.folder.name}. To compare these two, try: {word}"
-    )
-
-
-def _no_pair(runs: Sequence[Run], *, same_seed: bool) -> UserError:
+def _no_pair(runs: Sequence[StudyRun], *, same_seed: bool) -> UserError:
     """Return the message for arms of which no two share a prompt and a seed."""
     prompts: dict[str, set[str]] = defaultdict(set)
     for run in runs:
         prompts[run.prompt].add(run.arm)
-    shares_prompt = any(len(arms) > 1 for arms in prompts.values())
-    if same_seed and shares_prompt:
-        return UserError(
-            "runs: expected runs of different arms with the same prompt and seed, got different seeds in "
-            "each arm. Try: same_seed=false"
-        )
-    some = "; ".join(
-        f"{arm}: {prompt!r}" for prompt, arms in list(prompts.items())[:2] for arm in sorted(arms)
-    )
+    if same_seed and any(len(arms) > 1 for arms in prompts.values()):
+        expected, got, example = "the same prompt and seed", "different seeds", "same_seed=false"
+    else:
+        expected, got, example = "the same prompt", "different prompts", "cadam3d sweep --help"
     return UserError(
-        "runs: expected runs of different arms with the same prompt, got different prompts in each arm "
-        f"({some[:200]}). Try: cadam3d sweep --help"
+        f"runs: expected runs of different arms with {expected}, got {got} in each arm. Try: {example}"
     )
-
-
-def _example(folders: Sequence[Path]) -> str:
-    """Return a line that shows the form of ``runs=``."""
-    if len(folders) > MOST_ARMS:
-        return shlex.quote(f"runs=[{','.join(str(shown(folder)) for folder in folders[:MOST_ARMS])}]")
-    return "cadam3d study --help"

@@ -162,9 +162,9 @@ def test_answers_become_a_table_and_files_beside_the_key(arms, type_line, tmp_pa
     (tmp_path / "study/answers/broken.json").write_text("{", encoding="utf-8")
     code, out, err = type_line("study", "answers=study/answers/*.json")
     assert code == 0
-    assert "2 raters, 3 prompts, 2 arms and 30 answers" in out
-    assert re.search(r"^ibis +100\.0", out, re.MULTILINE)
-    assert "Excluded 1 rater" in out
+    assert "2 arms, 2 raters, 3 prompts, 30 answers." in out
+    assert re.search(r"^\| ibis +\| 100\.0", out, re.MULTILINE)
+    assert "right answers in catch trials: 3 (0 of 10)." in out
     assert "broken.json is left out: it is not a complete file of answers" in err
     result = read_json(tmp_path / "study/study.json")
     assert (result["study"], result["catch_trials"], result["answers"]) == (key["study"], 2, 30)
@@ -254,7 +254,7 @@ def test_a_text_of_consent_is_shown_as_text(arms, type_line, tmp_path):
         (("runs=[a,b]", "labels=x"), "labels: expected a list of texts or null, got 'x'. Try: labels=null"),
         (("runs=[a,b]", "arms=x"), "arms: expected a list of texts or null, got 'x'. Try: arms=null"),
         (("runs=[a,b]", "backdrop=red"), "backdrop: expected a list of numbers, got 'red'. Try: 'backdrop="),
-        (("runs=[a,a]",), "runs: expected different folders, got one of them twice. Try: cadam3d study --"),
+        (("runs=[a,a]",), "runs: expected the folder of a sweep, or a list of 2 to 12 different folders"),
         (("a.json", "b.json"), "'a.json': expected key=value. Try: cadam3d study 'answers=[a.json,b.json]'"),
         (("a", "b"), "'a': expected key=value. Try: cadam3d study 'runs=[a,b]'"),
     ],

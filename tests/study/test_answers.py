@@ -9,9 +9,9 @@ import pytest
 from cadam3d.core.errors import UserError
 from cadam3d.study.answers import LARGEST_FILE, collect, find_files, read_files
 from cadam3d.study.key import Key, read_key, write_key
-from cadam3d.study.plan import Trial, make_plan
 from cadam3d.study.questions import QUESTION_NAMES
-from cadam3d.study.runs import Pair, Run
+from cadam3d.study.runs import RunPair, StudyRun
+from cadam3d.study.trials import Trial, make_plan
 
 STUDY = "0123456789abcdef"
 # Clips 0 and 2 are of heron, 1 and 3 of stork, and 4 is a ruined one. Trial 1 is a catch trial.
@@ -217,8 +217,8 @@ def test_a_pattern_without_a_file_is_one_message(tmp_path, monkeypatch, pattern)
 
 
 def test_a_key_is_read_as_it_was_written(tmp_path):
-    runs = [Run(Path(arm), arm, "a cube", 0) for arm in ("heron", "stork")]
-    plan = make_plan([Pair((runs[0], runs[1]))], runs, 1, Random(0))
+    runs = [StudyRun(Path(arm), arm, "a cube", 0) for arm in ("heron", "stork")]
+    plan = make_plan([RunPair((runs[0], runs[1]))], runs, 1, Random(0))
     write_key(tmp_path / "key.json", STUDY, plan, seed=0)
     key = read_key(tmp_path / "key.json")
     assert key.trials == plan.trials
@@ -245,9 +245,9 @@ def test_a_key_is_read_as_it_was_written(tmp_path):
     ids=str,
 )
 def test_a_damaged_key_is_one_message(tmp_path, changes):
-    runs = [Run(Path(arm), arm, "a cube", 0) for arm in ("heron", "stork")]
+    runs = [StudyRun(Path(arm), arm, "a cube", 0) for arm in ("heron", "stork")]
     path = tmp_path / "key.json"
-    write_key(path, STUDY, make_plan([Pair((runs[0], runs[1]))], runs, 1, Random(0)), seed=0)
+    write_key(path, STUDY, make_plan([RunPair((runs[0], runs[1]))], runs, 1, Random(0)), seed=0)
     path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | changes), encoding="utf-8")
     with pytest.raises(UserError, match="key: expected the key of a study"):
         read_key(path)

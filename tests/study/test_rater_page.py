@@ -16,10 +16,10 @@ from PIL import Image
 from cadam3d.study.answers import collect, find_files, read_files
 from cadam3d.study.clips import encoded
 from cadam3d.study.key import read_key, write_key
-from cadam3d.study.page import study_id, study_page
-from cadam3d.study.plan import make_plan
 from cadam3d.study.questions import QUESTIONS
-from cadam3d.study.runs import Pair, Run
+from cadam3d.study.rater_page import study_id, study_page
+from cadam3d.study.runs import RunPair, StudyRun
+from cadam3d.study.trials import make_plan
 
 FRAMES = 6
 SECONDS = 0.6  # of one turn
@@ -35,8 +35,10 @@ def browser() -> Iterator:
 def folder(tmp_path_factory) -> Path:
     """Return a folder with a page of two pairs and a catch trial, and with its key."""
     folder = tmp_path_factory.mktemp("study")
-    runs = {(arm, prompt): Run(Path(arm), arm, prompt, 0) for arm in ("heron", "ibis") for prompt in "ab"}
-    pairs = [Pair((runs["heron", prompt], runs["ibis", prompt])) for prompt in "ab"]
+    runs = {
+        (arm, prompt): StudyRun(Path(arm), arm, prompt, 0) for arm in ("heron", "ibis") for prompt in "ab"
+    }
+    pairs = [RunPair((runs["heron", prompt], runs["ibis", prompt])) for prompt in "ab"]
     plan = make_plan(pairs, list(runs.values()), 1, Random(0))
     draw = np.random.default_rng(0)
     clips = [

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from cadam3d.study.plan import Trial
 from cadam3d.study.questions import QUESTIONS
+from cadam3d.study.trials import Trial
 
 SOURCES = Path(__file__).parent
 ID_LENGTH = 16  # characters
@@ -47,14 +47,14 @@ def study_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    code, look = _source("page.js"), _source("page.css")
+    code, look = _source("rater_page.js"), _source("rater_page.css")
     data = {
         "study": study,
         "seconds": seconds,
         "questions": [{"name": question.name, "text": question.text} for question in QUESTIONS],
         "trials": json.loads(_trials_json(trials)),
     }
-    return environment.get_template("page.html.jinja").render(
+    return environment.get_template("rater_page.html.jinja").render(
         style=look,
         style_hash=_hash(look),
         script=code,

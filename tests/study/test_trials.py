@@ -8,30 +8,30 @@ from random import Random
 
 import pytest
 
-from cadam3d.study.plan import Plan, catch_count, make_plan
-from cadam3d.study.runs import Pair, Run, draw_pairs
+from cadam3d.study.runs import RunPair, StudyRun, draw_pairs
+from cadam3d.study.trials import StudyPlan, catch_count, make_plan
 
 ARMS = ("heron", "ibis", "stork")
 
 
-def runs_of(arms=ARMS, prompts=5, seeds=1) -> list[Run]:
+def runs_of(arms=ARMS, prompts=5, seeds=1) -> list[StudyRun]:
     return [
-        Run(Path(arm, f"{prompt}_{seed}"), arm, f"prompt {prompt}", seed)
+        StudyRun(Path(arm, f"{prompt}_{seed}"), arm, f"prompt {prompt}", seed)
         for arm in arms
         for prompt in range(prompts)
         for seed in range(seeds)
     ]
 
 
-def pairs_of(runs: list[Run]) -> list[Pair]:
+def pairs_of(runs: list[StudyRun]) -> list[RunPair]:
     return [
-        Pair((one, other) if one.arm < other.arm else (other, one))
+        RunPair((one, other) if one.arm < other.arm else (other, one))
         for one, other in combinations(runs, 2)
         if one.arm != other.arm and (one.prompt, one.seed) == (other.prompt, other.seed)
     ]
 
 
-def planned(arms=ARMS, prompts=5, catches=3, seed=0) -> tuple[list[Pair], Plan]:
+def planned(arms=ARMS, prompts=5, catches=3, seed=0) -> tuple[list[RunPair], StudyPlan]:
     runs = runs_of(arms, prompts)
     pairs = pairs_of(runs)
     return pairs, make_plan(pairs, runs, catches, Random(seed))

@@ -1,4 +1,4 @@
-"""Plan: what a rater sees, in which order and on which side, drawn from a seed.
+"""Trials: what a rater sees, in which order and on which side, drawn from a seed.
 
 A *trial* is a description and two clips, about which a rater answers all questions. A *catch trial* shows a
 clip beside a ruined clip of another object, so that each of its questions has one right answer.
@@ -9,16 +9,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from random import Random
 
-from cadam3d.study.runs import Pair, Run
+from cadam3d.study.runs import RunPair, StudyRun
 
 LEAST_CATCHES = 2
 
 
 @dataclass(frozen=True)
-class Source:
+class ClipSource:
     """The run that a clip shows, and whether it is ruined."""
 
-    run: Run
+    run: StudyRun
     is_ruined: bool  # so blurred and noisy that nothing can be recognised
 
 
@@ -32,10 +32,10 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Plan:
+class StudyPlan:
     """All trials in their order, and the source of each clip by its number."""
 
-    sources: tuple[Source, ...]
+    sources: tuple[ClipSource, ...]
     trials: tuple[Trial, ...]
 
 
@@ -44,8 +44,8 @@ class _Sides:
     """A trial before its clips have numbers."""
 
     prompt: str
-    sources: tuple[Source, Source]
-    right: Source | None = None
+    sources: tuple[ClipSource, ClipSource]
+    right: ClipSource | None = None
 
 
 def catch_count(pairs: int, share: float) -> int:
@@ -56,7 +56,9 @@ def catch_count(pairs: int, share: float) -> int:
     return max(LEAST_CATCHES, round(share * pairs)) if share > 0 else 0
 
 
-def make_plan(pairs: Sequence[Pair], visible: Sequence[Run], catches: int, generator: Random) -> Plan:
+def make_plan(
+    pairs: Sequence[RunPair], visible: Sequence[StudyRun], catches: int, generator: Random
+) -> StudyPlan:
     """Return the trials of a study: every pair once, and ``catches`` catch trials spread among them.
 
     Of any two arms, each is on the first side equally often, up to one trial. Catch trials show runs in
@@ -75,7 +77,7 @@ def make_plan(pairs: Sequence[Pair], visible: Sequence[Run], catches: int, gener
     )
     generator.shuffle(sources)
     numbers = {source: number for number, source in enumerate(sources)}
-    return Plan(
+    return StudyPlan(
         tuple(sources),
         tuple(
             Trial(
@@ -88,21 +90,21 @@ def make_plan(pairs: Sequence[Pair], visible: Sequence[Run], catches: int, gener
     )
 
 
-def _balanced(pairs: Sequence[Pair], generator: Random) -> list[_Sides]:
+def _balanced(pairs: Sequence[RunPair], generator: Random) -> list[_Sides]:
     """Return every pair as a trial, with sides that are drawn evenly for each two arms."""
-    of_arms: dict[tuple[str, str], list[Pair]] = defaultdict(list)
+    of_arms: dict[tuple[str, str], list[RunPair]] = defaultdict(list)
     for pair in pairs:
         of_arms[pair.arms].append(pair)
     trials = []
     for arms in sorted(of_arms):
         members = of_arms[arms]
         for pair, is_turned in zip(members, _evenly(len(members), generator), strict=True):
-            one, other = (Source(run, is_ruined=False) for run in pair.runs)
+            one, other = (ClipSource(run, is_ruined=False) for run in pair.runs)
             trials.append(_Sides(pair.prompt, (other, one) if is_turned else (one, other)))
     return trials
 
 
-def _catch_trials(visible: Sequence[Run], count: int, generator: Random) -> list[_Sides]:
+def _catch_trials(visible: Sequence[StudyRun], count: int, generator: Random) -> list[_Sides]:
     """Return catch trials. Runs repeat only after each of them has been shown."""
     drawn = generator.sample(list(visible), len(visible))
     trials = []
@@ -110,8 +112,8 @@ def _catch_trials(visible: Sequence[Run], count: int, generator: Random) -> list
         run = drawn[number % len(drawn)]
         # A ruined clip of another object also fails to match the description.
         others = [other for other in drawn if other.prompt != run.prompt]
-        right = Source(run, is_ruined=False)
-        wrong = Source(generator.choice(others or [run]), is_ruined=True)
+        right = ClipSource(run, is_ruined=False)
+        wrong = ClipSource(generator.choice(others or [run]), is_ruined=True)
         trials.append(_Sides(run.prompt, (wrong, right) if is_turned else (right, wrong), right))
     return trials
 
