@@ -42,7 +42,7 @@ from cadam3d.settings.options import config_dir
 from cadam3d.settings.output import exporting
 from cadam3d.settings.place import occupied
 from cadam3d.settings.target import require_target
-from cadam3d.sweep.choice import require_attempts
+from cadam3d.sweep.plan import require_attempts
 
 TRAINING = ("train", "sweep")  # the commands that have a run folder
 EXPORTING = ("render", "export")  # the commands with output=
@@ -260,11 +260,9 @@ def _sweep(line: Line, task: Task) -> int:
     if line.options.cfg:
         from cadam3d.sweep.plan import read_sweep
 
-        sweep, _ = read_sweep(line.command, line.overrides, line.options)
-        parts = sweep.parts
+        sweep = read_sweep(line.command, line.overrides, line.options)
         flags = [flag for flag in line.flags if flag not in ("-m", "--multirun")]
-        own = [*parts.grid, *parts.launcher, *parts.folder]
-        run_hydra("sweep", [*own, *sweep.jobs[0].overrides, *flags], task)
+        run_hydra("sweep", [*sweep.parts.own, *sweep.jobs[0].overrides, *flags], task)
         return 0
     from cadam3d.commands import sweep as command
 

@@ -20,13 +20,13 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d import cli, regularizer
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json, read_jsonl
+from cadam3d.io.prompts import read_prompts
 from cadam3d.settings import advice
 from cadam3d.settings.compose import component, components, compose, flatten, quote
 from cadam3d.settings.hydra import read_flags
 from cadam3d.settings.options import config_dir
 from cadam3d.sweep import plan
-from cadam3d.sweep.plan import compose_all, read_sweep
-from cadam3d.sweep.prompts import read_prompts
+from cadam3d.sweep.plan import read_sweep
 
 CONFIGS = config_dir()
 SEVERAL = ("exporter", "callback", "metric")  # groups with several choices
@@ -256,11 +256,9 @@ ORIGINAL_COMPOSE_LINE = plan.compose_line
 
 @pytest.mark.parametrize("grid", GRIDS)
 def test_every_arm_of_a_grid_composes(grid, monkeypatch):
-    """Compose enough jobs that each arm and each choice occurs at least once.
+    """Of the prompts, seeds and noises that all arms share, and of a set, only the first is composed.
 
-    Of the prompts, seeds and noises that all arms share, and of a set of prompts, only the first is
-    composed. The number of jobs that the file claims is compared with the product of all. Values of single
-    settings are not choices, because composing does not depend on them.
+    The number of jobs that the file claims is compared with the product of all.
     """
     monkeypatch.setattr(plan, "compose_line", lambda command, line, _: line_of_jobs(command, tuple(line)))
     text = (CONFIGS / "grid" / f"{grid}.yaml").read_text(encoding="utf-8")
@@ -276,22 +274,14 @@ def test_every_arm_of_a_grid_composes(grid, monkeypatch):
     named = yaml.safe_load(text).get("prompts")
     line += [] if "prompt" in axes else ["prompts.first=1" if named else PROMPT]
     of_set = len(read_prompts(named)) if named else 1
-    sweep, composer = read_sweep("sweep", line, NO_FLAGS)
+    sweep = read_sweep("sweep", line, NO_FLAGS)
     assert len(sweep.jobs) > 1
     claimed = re.search(r": ([\d,]+) jobs", text)
     counted = len(sweep.jobs) * math.prod(len(values) for values in axes.values()) * of_set
     assert claimed is None or int(claimed.group(1).replace(",", "")) == counted
-    seen: set[str] = set()
-    covering = []
-    for job in sweep.jobs:
-        choices = {f"arm {job.arm}", *map(choice_of, job.overrides)}
-        if not choices <= seen:
-            seen |= choices
-            covering.append(job)
-    last = compose_all(dataclasses.replace(sweep, jobs=covering), composer)[-1]
-    cfg = OmegaConf.to_container(compose(covering[-1].overrides), resolve=True)
+    cfg = OmegaConf.to_container(compose(sweep.jobs[-1].overrides), resolve=True)
     # A setting that names another node, such as prior.prompting, keeps that node as its value in a sweep.
-    assert dict(flatten(last.values)) == dict(flatten(cfg))
+    assert dict(flatten(sweep.composed[-1].values)) == dict(flatten(cfg))
 
 
 @pytest.mark.parametrize("path", sorted((CONFIGS / "launcher").glob("*.yaml")), ids=lambda path: path.stem)

@@ -283,7 +283,7 @@ ELSEWHERE: dict[str, str] = {
     "sweep/folder.py": "needs a damaged sweep",
     "sweep/grid.py": "needs a wrong grid; see tests/sweep",
     "sweep/start.py::_locked": "needs a second process",
-    "sweep/attempts.py::require_one_method": "needs attempts that were measured; see tests/sweep",
+    "sweep/choice.py::require_one_method": "needs attempts that were measured; see tests/sweep",
     "sweep/start.py::_refuse_occupied": "needs files in the way; see tests/sweep",
     "sweep/start.py::_refuse_other_settings": "needs the results of a sweep; see tests/sweep",
 }

@@ -14,18 +14,19 @@ from cadam3d.core.number import Number
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.run_folder import ASSET, BEST, CHOICE, REPORT, shown
 from cadam3d.settings.line import setting_word
-from cadam3d.sweep.attempts import (
+from cadam3d.sweep.choice import (
+    Choice,
     attempt_of,
-    existing_attempts,
+    choose,
     measuring_line,
+    preferred,
     read_attempts,
     require_measured,
     require_one_method,
     selectable_numbers,
 )
-from cadam3d.sweep.choice import Choice, choose, preferred
-from cadam3d.sweep.folder import load
-from cadam3d.sweep.start import folder_of, run_sweep
+from cadam3d.sweep.folder import load, rows_of
+from cadam3d.sweep.start import run_sweep
 
 
 def run(
@@ -41,12 +42,10 @@ def run(
     attempt has a result and one was chosen, or after a dry run.
     """
     select = cfg.get("select")
-    sweep, composer = read_attempts(cfg, overrides, options, words)
-    folder = folder_of(sweep)
-    existing = existing_attempts(sweep, folder)
-    numbers = selectable_numbers(options)
-    require_measured(select, numbers, list(cfg.get("metric") or ()), existing, folder, words)
-    ended = run_sweep(sweep, composer, words, flags, on_start=link_latest)
+    sweep, numbers = read_attempts(cfg, overrides, options), selectable_numbers(options)
+    existing = [attempt_of(row) for row in rows_of(sweep.folder, sweep.jobs)]
+    require_measured(select, numbers, list(cfg.get("metric") or ()), existing, sweep.folder)
+    ended = run_sweep(sweep, words, flags, on_start=link_latest)
     if ended.was_dry:
         return ended.code
     rows = load(ended.folder)

@@ -8,12 +8,13 @@ from pathlib import Path
 from cadam3d import report
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import shown
-from cadam3d.sweep.start import start
+from cadam3d.sweep.plan import read_sweep
+from cadam3d.sweep.start import run_sweep
 
 
 def run(command: str, overrides: Sequence[str], flags: Sequence[str], options: Namespace) -> int:
     """Run the sweep of a line and report on it. Return 0 if every job has a result, or after a dry run."""
-    ended = start(command, overrides, flags, options)
+    ended = run_sweep(read_sweep(command, overrides, options), overrides, flags)
     if not (ended.was_stopped or ended.was_dry):
         write_report(ended.folder)
     return ended.code

@@ -7,6 +7,7 @@ can describe gigabytes), and with a limited depth.
 
 import os
 import stat
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,7 @@ from cadam3d.core.errors import UserError
 LARGEST_TEXT = 1 << 28
 LARGEST_YAML = 1 << 22
 DEEPEST = 64  # levels of YAML
+BLANKS = "\n\t\r"  # the control characters that a text may have
 KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a named pipe",
@@ -38,6 +40,15 @@ class _Loader(_SAFE):
 
     yaml_implicit_resolvers: ClassVar = {
         first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
+        for first, resolvers in _SAFE.yaml_implicit_resolvers.items()
+    }
+
+
+class _TextLoader(_SAFE):
+    """Reads every value except null as text."""
+
+    yaml_implicit_resolvers: ClassVar = {
+        first: [(tag, pattern) for tag, pattern in resolvers if tag.endswith(":null")]
         for first, resolvers in _SAFE.yaml_implicit_resolvers.items()
     }
 
@@ -126,13 +137,21 @@ def read_yaml(path: Path) -> Any:
         raise unusable(path, f"expected plain YAML, got {reason}") from error
 
 
-def parse_yaml(text: str) -> yaml.Node | None:
-    """Return the tree of nodes of plain YAML, in which every value has its line and its spelling.
+def parse_text_yaml(text: str) -> Any:
+    """Return the data of plain YAML, in which every value except null is text, as it is spelled.
 
-    Raises ``yaml.YAMLError`` for what is not YAML, and ``ValueError`` for what is not plain data.
+    Raises ``ValueError`` for anything else.
     """
-    _require_plain(text)
-    return yaml.compose(text, _Loader)
+    try:
+        _require_plain(text)
+        return yaml.load(text, _TextLoader)
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from error
+
+
+def is_readable(text: str) -> bool:
+    """Return whether a text can be written into a file and shown: Unicode without control characters."""
+    return not any(unicodedata.category(each) in ("Cc", "Cs") and each not in BLANKS for each in text)
 
 
 def _require_plain(text: str) -> None:

@@ -4,25 +4,20 @@ import hashlib
 import math
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import fail, require
-from cadam3d.core.errors import UserError
+from cadam3d.core.checks import require
 from cadam3d.core.number import Number
-from cadam3d.io.prompts import set_file, set_names
-from cadam3d.io.reading import read_text, read_yaml
+from cadam3d.io.prompts import read_prompts
 from cadam3d.metric.clip import ClipMetric, load_clip
 from cadam3d.metric.scoring import Scorer, interval_record
 
 KEY = "metric.clip_r_precision.prompts"
 EXAMPLE = f"{KEY}=paper50"
-YAML = (".yaml", ".yml")
-LARGEST = 1 << 22  # bytes of a file
 NORMAL = 1.959963984540054  # the 97.5 % quantile of the normal distribution
 BATCH = 64  # texts that are read at once
 
@@ -89,37 +84,11 @@ class ClipRPrecision(ClipMetric):
 def read_candidates(source: str) -> list[str]:
     """Return the prompts of a set of this package or of a file, each once, in order.
 
-    A text file has one prompt per line; empty lines and lines that begin with # do not count. A file in YAML
-    has a list of texts, or of entries with a ``prompt``. Raises ``UserError`` for other files, and for fewer
-    than two prompts.
+    Raises ``UserError`` for other files, and for fewer than two prompts.
     """
-    path = set_file(source) if source in set_names() else Path(source).expanduser()
-    if not path.is_file():
-        expected = f"a file, or one of the sets {'|'.join(set_names())}"
-        raise fail(KEY, expected=expected, got=source, example=EXAMPLE)
-    if path.suffix.lower() in YAML:
-        found = [_text(entry, path) for entry in _entries(path)]
-    else:
-        lines = read_text(path, largest=LARGEST).removeprefix("\ufeff").splitlines()
-        found = [line.strip() for line in lines]
-        found = [line for line in found if line and line[0] != "#"]
-    candidates = list(dict.fromkeys(found))
-    require(len(candidates) > 1, KEY, expected="at least two prompts", got=str(path), example=EXAMPLE)
+    candidates = [prompt.text for prompt in read_prompts(source, KEY)]
+    require(len(candidates) > 1, KEY, expected="at least two prompts", got=source, example=EXAMPLE)
     return candidates
-
-
-def _entries(path: Path) -> list[Any]:
-    entries = read_yaml(path)
-    if not isinstance(entries, list):
-        raise fail(KEY, expected="a list in YAML", got=str(path), example=EXAMPLE)
-    return entries
-
-
-def _text(entry: Any, path: Path) -> str:
-    text = entry.get("prompt") if isinstance(entry, dict) else entry
-    if not isinstance(text, str) or not text.strip():
-        raise UserError(f"{KEY}: {path}: expected prompts, got {entry!r:.60}. Try: {EXAMPLE}")
-    return text.strip()
 
 
 def _hash(texts: list[str]) -> str:

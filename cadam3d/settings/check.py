@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
-from cadam3d.io.reading import read_yaml
+from cadam3d.io.reading import is_readable, read_yaml
 from cadam3d.settings.options import (
     NOTHING,
     REFERENCE,
@@ -35,8 +35,6 @@ from cadam3d.settings.options import (
 
 # Integers beyond this fit into no tensor.
 LARGEST_WHOLE = 2**63 - 1
-# Control characters that a text may have.
-BLANKS = "\n\t\r"
 # The types of settings that are null or missing in the YAML files. The others are texts.
 OF_NULL = {
     **dict.fromkeys(("run", "runs", "answers"), str | Sequence[str]),
@@ -88,13 +86,6 @@ def require_declared(node: Any, kinds: tuple[type, ...], key: str) -> None:
         # The user changes the node to which a setting refers, such as ${prompting}.
         place = reference.group(1) if reference and OmegaConf.is_config(node[name]) else f"{key}.{name}"
         _require(node[name], hints.get(name, Any), place)
-
-
-def is_readable(text: str) -> bool:
-    """Return whether a text can be written into a file and shown: Unicode without control characters."""
-    return all(
-        character in BLANKS or (character >= " " and not "\x7f" <= character <= "\x9f") for character in text
-    ) and not any("\ud800" <= character <= "\udfff" for character in text)
 
 
 def _require_keys(names: Sequence[str], parameters: Mapping[str, inspect.Parameter], key: str) -> None:

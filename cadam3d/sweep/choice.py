@@ -1,16 +1,40 @@
-"""Choice: the best of several attempts at one run by one number, and the sentence that says why it is.
+"""Choice: several seeds of one run as the jobs of a sweep, and the best of them by one number."""
 
-All functions are pure.
-"""
-
+import shlex
+from argparse import Namespace
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from statistics import mean
 
-from cadam3d.core.checks import require_whole
-from cadam3d.core.number import Number
+from omegaconf import DictConfig
 
-MOST_ATTEMPTS = 1000
+from cadam3d.core.checks import fail, require_choice, require_whole
+from cadam3d.core.errors import UserError
+from cadam3d.core.number import COUNT, Number
+from cadam3d.core.outcome import Outcome
+from cadam3d.io.jsonl import is_number
+from cadam3d.io.records import declared, difference, read_evaluation, read_scores
+from cadam3d.io.run_folder import LATEST, shown
+from cadam3d.settings.compose import slug
+from cadam3d.settings.line import RUN_FOLDER, key_of
+from cadam3d.settings.options import config_dir, option_class, option_names
+from cadam3d.sweep.folder import Job, Row
+from cadam3d.sweep.grid import read_line, sweep_name
+from cadam3d.sweep.plan import (
+    Composer,
+    Sweep,
+    compose_all,
+    compose_sweep,
+    folder_of,
+    search_path,
+    sort_overrides,
+)
+
+SEED = "seed="  # the name of the folder of an attempt begins with it
+PARENT = Path(LATEST).parent
+# The settings of a line that are not those of a single attempt.
+OF_THE_LINE = ("attempts", "select", RUN_FOLDER)
 
 
 @dataclass(frozen=True)
@@ -38,34 +62,73 @@ class Choice:
 
     @property
     def sentence(self) -> str:
-        """Say which attempt is the best, by how much, and how far its number can be trusted."""
-        (best, value), *others = self.values.items()
+        """Say which attempt is the best, and give the numbers of all."""
         written = self.number.written
-        left_out = f" Without this number: {_seeds(self.without)}." if self.without else ""
-        if not others:
-            return f"seed={best} is the only attempt with {self._label}: {written(value)}.{left_out}"
-        second, runner_up = others[0]
-        if runner_up == value:
-            ahead = f"the same as seed={second}, and of equal attempts the one with the lowest seed is chosen"
-        else:
-            ahead = f"ahead of seed={second} with {written(runner_up)}"
-        low, high = min(self.values.values()), max(self.values.values())
-        average = written(mean(self.values.values()))
+        listed = ", ".join(f"{written(value)} (seed={seed})" for seed, value in self.values.items())
+        missing = "".join(f"; seed={seed} has none" for seed in self.without)
         return (
-            f"The best of {len(self.values)} attempts by {self._label} is seed={best} with {written(value)}, "
-            f"{ahead}. All of them have {written(low)} to {written(high)}, {average} on average, "
-            "which is what to expect of another seed: the best of several is partly luck."
-            f"{left_out}"
+            f"Best of {len(self.values)} by {self.number.label}: seed={self.best}. All: {listed}{missing}. "
+            f"Mean: {written(mean(self.values.values()))}."
         )
 
-    @property
-    def _label(self) -> str:
-        return self.number.label if self.number.is_more_better else f"{self.number.label} (less is better)"
+
+def read_attempts(cfg: DictConfig, overrides: Sequence[str], options: Namespace) -> Sweep:
+    """Return the attempts that a line of ``cadam3d train`` asks for as a sweep.
+
+    ``cfg`` is the configuration of the line, and ``overrides`` are quoted for Hydra. The folder is that of
+    ``hydra.run.dir=`` in the line. Otherwise its name follows from the line without ``attempts=`` and
+    ``select=``, so that more attempts, or a choice by another number, find the attempts that exist. Raises
+    ``UserError`` for settings that cannot be combined with attempts.
+    """
+    require_whole("seed", cfg.seed, low=0, example=3)
+    if cfg.get("resume") is not None:
+        raise fail("attempts", expected="1 with resume=", got=cfg.attempts, example="attempts=1")
+    parts = sort_overrides([override for override in overrides if key_of(override) not in OF_THE_LINE])
+    common = [override for override in parts.jobs if key_of(override) != "seed"]
+    # Attempts that YAML files ask for would otherwise start attempts themselves.
+    common += [] if any(key_of(override) == "attempts" for override in overrides) else ["attempts=1"]
+    seeds = range(cfg.seed, cfg.seed + cfg.attempts)
+    jobs = [
+        Job("", f"{SEED}{seed}", [*common, f"seed={seed}"], {"prompt": cfg.prompt, "seed": seed})
+        for seed in seeds
+    ]
+    own = compose_sweep(parts, options)
+    place = Path(str(cfg.hydra.run.dir))
+    if not any(key_of(override) == RUN_FOLDER for override in overrides):
+        # The prompt, and a digest of everything typed.
+        digest = sweep_name(None, read_line(parts.jobs)).rpartition("_")[2]
+        place = PARENT / f"{slug(str(cfg.prompt))}_{digest}"
+    return Sweep(
+        cfg=own,
+        parts=parts,
+        folder=folder_of(own, parts, place),
+        jobs=jobs,
+        composed=compose_all(jobs, Composer(options, search_path(overrides))),
+        figures=["growth"],
+        command="train",
+    )
 
 
-def require_attempts(attempts: object) -> None:
-    """Raise ``UserError`` for a wrong value of the setting ``attempts``."""
-    require_whole("attempts", attempts, low=1, high=MOST_ATTEMPTS, example=4)
+def attempt_of(row: Row) -> Attempt:
+    """Return an attempt with its numbers; it has none if it has left no asset."""
+    seed, summary = row.swept["seed"], row.summary
+    if not row.has_result or row.outcome == Outcome.VANISHED or not summary.get("num_gaussians"):
+        return Attempt(seed)
+    evaluation = read_evaluation(row.folder, summary)
+    numbers = {
+        name: number
+        for name, number in (declared(evaluation) | declared(summary)).items()
+        if number.is_more_better is not None
+    }
+    measured, evaluated = (
+        {name: float(known[name]) for name in numbers if is_number(known.get(name))}
+        for known in (summary, evaluation)
+    )
+    # As in the tables, scores of an evaluation replace those of training. ``require_one_method`` then refuses
+    # to compare scores that were measured in different ways.
+    scores = {name: score.value for name, score in read_scores(row.folder, summary).items()}
+    own = measured | {name: scores[name] for name in numbers if name in scores}
+    return Attempt(seed, own, evaluated, numbers)
 
 
 def choose(attempts: Sequence[Attempt], select: str | None) -> Choice | None:
@@ -93,18 +156,68 @@ def choose(attempts: Sequence[Attempt], select: str | None) -> Choice | None:
     return None
 
 
-def known_numbers(attempts: Sequence[Attempt]) -> list[str]:
-    """Return the numbers by which these attempts can be compared, which at least one of them has."""
-    known = {name for attempt in attempts for name in (*attempt.measured, *attempt.evaluated)}
-    declared = dict.fromkeys(name for attempt in attempts for name in attempt.declared)
-    return [name for name in declared if name in known]
-
-
 def preferred(numbers: Iterable[Number]) -> list[str]:
     """Return the names of the numbers that decide without ``select=``, the most preferred first."""
     ranks = {each.name: each.preference for each in numbers if each.preference is not None}
     return sorted(ranks, key=lambda name: ranks[name])
 
 
-def _seeds(seeds: Sequence[int]) -> str:
-    return ", ".join(f"seed={seed}" for seed in seeds)
+def selectable_numbers(options: Namespace) -> dict[str, Number]:
+    """Return the numbers by which attempts can be compared, whichever metrics are chosen, by name.
+
+    These are the numbers of which more or less is better, of all metrics of the package and ``--config-dir``.
+    """
+    folders = [*([Path(options.config_dir)] if options.config_dir else []), config_dir()]
+    found = [
+        replace(number, metric=name)
+        for name in option_names("metric", folders)
+        for number in getattr(option_class("metric", name, folders), "numbers", ())
+    ]
+    return {number.name: number for number in found if number.is_more_better is not None}
+
+
+def require_measured(
+    select: str | None,
+    known: Mapping[str, Number],
+    chosen: Sequence[str],
+    attempts: Sequence[Attempt],
+    folder: Path,
+) -> None:
+    """Raise ``UserError`` if the attempts will lack the number that they are compared by.
+
+    ``known`` are the numbers by which attempts can be compared, whichever metrics were chosen. ``chosen`` are
+    the metrics of the line. ``attempts`` are those that are in ``folder`` already, where ``cadam3d eval`` may
+    have measured the number.
+    """
+    if select is not None:
+        require_choice("select", select, tuple(known))
+    names = preferred(known.values()) if select is None else [select]
+    metrics = [known[name].metric for name in names]
+    if set(metrics) & set(chosen) or select == COUNT.name:
+        return
+    choice = choose(attempts, select)
+    if choice is not None and not choice.without:
+        return
+    example = f"'metric=[{','.join([*chosen, metrics[0]])}]'"
+    if all(attempt.measured for attempt in attempts):
+        example = measuring_line(folder, known[names[0]])
+    expected = f"metrics that measure {' or '.join(names)}"
+    raise fail("select", expected=expected, got=", ".join(chosen) or "none", example=example)
+
+
+def require_one_method(choice: Choice, rows: Sequence[Row], folder: Path) -> None:
+    """Raise ``UserError`` if the numbers that a choice compares were measured in different ways."""
+    name = choice.number.name
+    compared = [row for row in rows if row.swept["seed"] in choice.values]
+    scores = [read_scores(row.folder, row.summary).get(name) for row in compared]
+    problem = difference(name, [score for score in scores if score is not None])
+    if problem is not None:
+        line = measuring_line(folder, choice.number)
+        raise UserError(f"select: {problem}. Measure all attempts in one way. Try: {line}")
+
+
+def measuring_line(folder: Path, number: Number) -> str:
+    """Return the line that measures a number of all attempts in a folder."""
+    # A run that did not measure this number may know no truth, so the line names one.
+    truth = ["truth=shapes"] if number.needs_truth else []
+    return shlex.join(["cadam3d", "eval", f"run={shown(folder)}", f"metric=[{number.metric}]", *truth])

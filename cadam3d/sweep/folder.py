@@ -4,7 +4,7 @@ No state is kept elsewhere. However a sweep ends, its state can be read from thi
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,14 +24,14 @@ RESULTS = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.VANISHED, Outcome.OU
 
 
 @dataclass(frozen=True)
-class PlannedJob:
-    """A job that a sweep has to run."""
+class Job:
+    """One run of a sweep."""
 
     arm: str  # "" without a grid
-    folder: str  # relative to that of the sweep
+    name: str  # of its folder; depends only on its arm and its settings
     overrides: list[str]  # of ``cadam3d train``
     # The prompt, the seed, and the values of all other keys in which jobs of this sweep differ.
-    swept: dict[str, Any]
+    swept: dict[str, Any] = field(default_factory=dict)
     # What the file or the set of prompts says about the prompt; "" if it says nothing.
     prompt_name: str = ""
     category: str = ""
@@ -45,26 +45,20 @@ class Plan:
     cwd: str  # to which the paths in the line are relative
     flags: list[str]  # of every job, such as --config-dir
     threads: int | None  # OpenMP threads of a job; None: the default of its machine
-    jobs: list[PlannedJob]
+    jobs: list[Job]
     figures: list[str] | None = None  # of the report; None: all for which there are data
     line: list[str] = field(default_factory=list)  # what was typed after ``cadam3d COMMAND``
     paper_table: bool = False  # whether the paper's table 1 is made of its jobs
     command: str = "sweep"  # of the line; "train" if the jobs are several attempts at one run
 
 
-@dataclass(frozen=True)
-class Row:
-    """One job and its result so far."""
+@dataclass(frozen=True, kw_only=True)
+class Row(Job):
+    """A job with its result so far."""
 
     number: int
-    arm: str
     folder: Path
-    overrides: list[str]
-    swept: dict[str, Any]
     summary: dict[str, Any] = field(repr=False)  # {} if there is none yet
-    prompt_name: str = ""  # from the file or the set of prompts; "" if it gives none
-    category: str = ""
-    brought: list[str] = field(default_factory=list)  # keys of the settings that come with the prompt
 
     @property
     def outcome(self) -> str:
@@ -91,21 +85,12 @@ def load(sweep: Path) -> list[Row]:
     return rows_of(sweep, read_plan(sweep).jobs)
 
 
-def rows_of(sweep: Path, jobs: Sequence[PlannedJob]) -> list[Row]:
+def rows_of(sweep: Path, jobs: Sequence[Job]) -> list[Row]:
     """Return ``jobs`` with their results on disk. Jobs that have never started have an empty summary."""
+    folders = [sweep / job.name for job in jobs]
     return [
-        Row(
-            number=number,
-            arm=job.arm,
-            folder=sweep / job.folder,
-            overrides=job.overrides,
-            swept=job.swept,
-            summary=read_summary(sweep / job.folder),
-            prompt_name=job.prompt_name,
-            category=job.category,
-            brought=job.brought,
-        )
-        for number, job in enumerate(jobs)
+        Row(**vars(job), number=number, folder=folder, summary=read_summary(folder))
+        for number, (job, folder) in enumerate(zip(jobs, folders, strict=True))
     ]
 
 
@@ -114,51 +99,41 @@ def is_sweep(folder: Path) -> bool:
     return (folder / JOBS).is_file()
 
 
+def write_plan(sweep: Path, plan: Plan) -> None:
+    """Write ``jobs.json`` atomically."""
+    write_json(sweep / JOBS, asdict(plan))
+
+
 def read_plan(sweep: Path) -> Plan:
     """Return the plan of a sweep. Raises ``UserError`` if the folder has none that can be read."""
     content = read_json(sweep / JOBS)
     try:
-        _require_plan(content)
-        return Plan(**{**content, "jobs": [PlannedJob(**job) for job in content["jobs"]]})
-    except (TypeError, KeyError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
+        _require_entries(content, PLAN_ENTRIES)
+        for job in content["jobs"]:
+            _require_entries(job, JOB_ENTRIES)
+        names = [job["name"] for job in content["jobs"]]
+        if len(set(names)) != len(names):
+            raise ValueError("name: expected a different one for each job")
+    except ValueError as error:
         raise UserError(
-            f"{sweep / JOBS}: not the plan of a sweep ({reason}); the command of the sweep writes it again. "
+            f"{sweep / JOBS}: not the plan of a sweep ({error}); the command of the sweep writes it again. "
             "Try: cadam3d sweep --help"
         ) from error
+    return Plan(**{**content, "jobs": [Job(**job) for job in content["jobs"]]})
 
 
-def _require_plan(content: Any) -> None:
-    """Raise an exception unless every entry of a plan has the type that its class declares."""
-    _require(isinstance(content, dict) and isinstance(content["jobs"], list), "jobs: expected a list")
-    _require(_is_text(content["cwd"]), "cwd: expected a folder")
-    threads, figures = content.get("threads"), content.get("figures")
-    is_count = is_whole(threads) and 1 <= threads <= MOST_THREADS
-    _require(threads is None or is_count, "threads: expected a whole number")
-    _require(figures is None or _are_texts(figures), "figures: expected names")
-    _require(type(content.get("paper_table", False)) is bool, "paper_table: expected true or false")
-    _require(content.get("command", "sweep") in ("sweep", "train"), "command: expected sweep or train")
-    for name in ("flags", "line"):
-        _require(_are_texts(content.get(name, [])), f"{name}: expected words")
-    for job in content["jobs"]:
-        _require(isinstance(job, dict) and _is_text(job["arm"]), "arm: expected a name")
-        _require(_are_texts(job["overrides"]), "overrides: expected a list of key=value")
-        _require(isinstance(job["swept"], dict), "swept: expected keys and values")
-        for name in ("prompt_name", "category"):
-            _require(_is_text(job.get(name, "")), f"{name}: expected a text")
-        _require(_are_texts(job.get("brought", [])), "brought: expected keys")
-        # A name that leads elsewhere would let the sweep write there.
-        folder = job["folder"]
-        is_inside = _is_text(folder) and folder not in ("", ".", "..") and not set("/\\") & set(folder)
-        is_inside = is_inside and len(os.fsencode(folder)) <= LONGEST_NAME
-        _require(is_inside, "folder: expected the name of a folder in that of the sweep")
-    folders = [job["folder"] for job in content["jobs"]]
-    _require(len(set(folders)) == len(folders), "folder: expected a different name for each job")
+def is_complete(summary: Mapping[str, Any]) -> bool:
+    """Return whether training has written its whole summary, of which ``warnings`` is the last entry."""
+    return "warnings" in summary
 
 
-def _require(claim: bool, problem: str) -> None:
-    if not claim:
-        raise ValueError(problem)
+def _require_entries(content: Any, entries: Mapping[str, Callable[[Any], bool]]) -> None:
+    """Raise ``ValueError`` unless ``content`` has these entries, each of its type."""
+    if not isinstance(content, dict) or content.keys() != entries.keys():
+        raise ValueError(f"expected the keys {', '.join(entries)}")
+    for key, is_sound in entries.items():
+        if not is_sound(content[key]):
+            raise ValueError(f"{key}: unexpected {str(content[key])[:80]!r}")
 
 
 def _is_text(value: Any) -> bool:
@@ -169,17 +144,28 @@ def _are_texts(value: Any) -> bool:
     return isinstance(value, list) and all(map(_is_text, value))
 
 
-def write_plan(sweep: Path, plan: Plan) -> None:
-    """Write ``jobs.json`` atomically."""
-    write_json(sweep / JOBS, asdict(plan))
+def _is_name(value: Any) -> bool:
+    """Return whether a value names a folder. A path that leads elsewhere would let the sweep write there."""
+    is_file_name = _is_text(value) and value not in ("", ".", "..") and not set("/\\") & set(value)
+    return is_file_name and len(os.fsencode(value)) <= LONGEST_NAME
 
 
-def is_complete(summary: dict[str, Any]) -> bool:
-    """Return whether training has written its whole summary, of which ``warnings`` is the last entry."""
-    return "warnings" in summary
-
-
-def outcomes(rows: Sequence[Row]) -> dict[str, int]:
-    """Return how often each outcome occurred among the jobs without a result."""
-    left = [row.outcome for row in rows if not row.has_result]
-    return {outcome: left.count(outcome) for outcome in dict.fromkeys(left)}
+PLAN_ENTRIES: Mapping[str, Callable[[Any], bool]] = {
+    "cwd": _is_text,
+    "flags": _are_texts,
+    "threads": lambda value: value is None or (is_whole(value) and 1 <= value <= MOST_THREADS),
+    "jobs": lambda value: isinstance(value, list),
+    "figures": lambda value: value is None or _are_texts(value),
+    "line": _are_texts,
+    "paper_table": lambda value: isinstance(value, bool),
+    "command": lambda value: value in ("sweep", "train"),
+}
+JOB_ENTRIES: Mapping[str, Callable[[Any], bool]] = {
+    "arm": _is_text,
+    "name": _is_name,
+    "overrides": _are_texts,
+    "swept": lambda value: isinstance(value, dict),
+    "prompt_name": _is_text,
+    "category": _is_text,
+    "brought": _are_texts,
+}

@@ -9,20 +9,22 @@ import hashlib
 import json
 import math
 import re
-import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice, product
+from itertools import product
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override, RangeSweep
 
+from cadam3d.core.checks import fail, require
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import to_json
+from cadam3d.io.prompts import Prompt
 from cadam3d.settings.compose import TEXT_KEYS, quote, slug
 from cadam3d.settings.line import NOT_OF_A_RUN
-from cadam3d.sweep.prompts import FIRST, Prompt, PromptChoice
+from cadam3d.sweep.folder import Job
+from cadam3d.sweep.prompts import PromptChoice
 
 # Text that Hydra reads the same way with and without quotes, apart from the reserved words.
 IDENTIFIER = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)
@@ -33,6 +35,7 @@ ALWAYS_SHOWN = ("prompt", "seed")
 # alone take a day, and the table is too long to read.
 MOST_JOBS = 10_000
 KEYS = ("each", "arms", "prompts", "figures", "paper_table")  # of a grid
+A_RANGE = "range(0,3)"
 # Lists the grids of the package, for messages about one that cannot be read.
 EXAMPLE = "cadam3d sweep --help grid"
 
@@ -75,17 +78,6 @@ class Grid:
     paper_table: bool = False  # whether the sweep ends with the paper's table 1 of its jobs
 
 
-@dataclass(frozen=True)
-class Job:
-    """One run of a sweep."""
-
-    arm: str
-    name: str  # of its folder; depends only on its arm and its settings
-    overrides: tuple[str, ...]  # of ``cadam3d train``
-    prompt: Prompt | None  # None if its prompt is not one of a file or a set
-    brought: tuple[str, ...]  # keys of the settings that come with the prompt
-
-
 HasSetting = Callable[[Sequence[str], str], bool]
 
 
@@ -96,28 +88,23 @@ def read_grid(node: Any) -> Grid:
     """
     if node is None:
         return Grid(each={}, arms={"": {}})
-    if not isinstance(node, dict) or not node or not node.keys() <= set(KEYS):
-        got = "|".join(map(str, node)) if isinstance(node, dict) else node
-        raise UserError(f"grid: expected {', '.join(KEYS)}, got {got}. Try: {EXAMPLE}")
-    arms = node.get("arms")
-    arms = {"": {}} if arms is None else arms
-    if not isinstance(arms, dict) or not arms:
-        raise UserError(f"grid.arms: expected named arms, got {arms}. Try: {EXAMPLE}")
-    figures = node.get("figures")
-    if figures is not None and not (isinstance(figures, list) and all(isinstance(f, str) for f in figures)):
-        raise UserError(
-            f"grid.figures: expected a list of names, got {figures}. Try: 'grid.figures=[frontier]'"
-        )
-    has_table = node.get("paper_table", False)
-    if not isinstance(has_table, bool):
-        raise UserError(
-            f"grid.paper_table: expected true or false, got {has_table}. Try: grid.paper_table=true"
-        )
-    prompts = node.get("prompts")
-    if not (prompts is None or isinstance(prompts, str)):
-        raise UserError(f"grid.prompts: expected a file or a set, got {prompts}. Try: grid.prompts=paper50")
+    is_grid = isinstance(node, dict) and bool(node) and node.keys() <= set(KEYS)
+    require(is_grid, "grid", expected=", ".join(KEYS), got=node, example=EXAMPLE)
+    given = {name: value for name, value in node.items() if value is not None}
+    arms = given.get("arms", {"": {}})
+    is_named = isinstance(arms, dict) and bool(arms)
+    require(is_named, "grid.arms", expected="named arms", got=arms, example=EXAMPLE)
+    figures = given.get("figures")
+    are_names = figures is None or (isinstance(figures, list) and all(isinstance(f, str) for f in figures))
+    example = "'grid.figures=[frontier]'"
+    require(are_names, "grid.figures", expected="a list of names", got=figures, example=example)
+    has_table, key = given.get("paper_table", False), "grid.paper_table"
+    require(isinstance(has_table, bool), key, expected="true or false", got=has_table, example=f"{key}=true")
+    prompts, key = given.get("prompts"), "grid.prompts"
+    is_source = prompts is None or isinstance(prompts, str)
+    require(is_source, key, expected="a file or a set", got=prompts, example=f"{key}=paper50")
     return Grid(
-        each=_axes(node.get("each"), "grid.each"),
+        each=_axes(given.get("each"), "grid.each"),
         arms={str(name): _axes(axes, f"grid.arms.{name}") for name, axes in arms.items()},
         prompts=prompts,
         figures=figures,
@@ -164,15 +151,8 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
     arms = {
         name: {key: line.get(key, axis) for key, axis in axes.items()} for name, axes in grid.arms.items()
     }
+    _require_few_jobs(common, arms)
     foreign = _foreign(grid, line, arms, has_setting)
-    number = math.prod(map(len, common.values()))
-    number *= sum(math.prod(map(len, axes.values())) for axes in arms.values())
-    if number > MOST_JOBS:
-        axes_of = {key: axis for axes in (*arms.values(), common) for key, axis in axes.items()}
-        longest = max(axes_of, key=lambda key: len(axes_of[key]))
-        example = axes_of[longest][0]
-        word = f"{FIRST}=1" if example.prompt else shlex.quote(example.line)
-        raise UserError(f"{longest}: expected at most {MOST_JOBS} jobs in a sweep, got {number}. Try: {word}")
     named, counted = _named(grid, line), swept_keys(grid, line)
     found: dict[frozenset[str], Job] = {}
     for shared in product(*common.values()):
@@ -182,6 +162,7 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
                 typed = (*taken, *own)
                 brought = _brought(typed, has_setting)
                 settings = (*typed, *brought)
+                prompt = next((setting.prompt for setting in typed if setting.prompt), None)
                 job = Job(
                     arm=name,
                     name=_folder_name(
@@ -189,20 +170,16 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
                         [setting for setting in typed if setting.key in named],
                         [setting for setting in settings if setting.key in counted],
                     ),
-                    overrides=tuple(setting.line for setting in settings),
-                    prompt=next((setting.prompt for setting in typed if setting.prompt), None),
-                    brought=tuple(setting.key for setting in brought),
+                    overrides=[setting.line for setting in settings],
+                    prompt_name=prompt.name if prompt else "",
+                    category=prompt.category if prompt else "",
+                    brought=[setting.key for setting in brought],
                 )
                 other = found.setdefault(frozenset(setting.identity for setting in settings), job)
                 if other.arm != name and (causes := [key for key in axes if key in line]):
-                    # An arm that has the value without the line is the one that the line is about.
-                    values = [each.value for each in grid.arms[name].get(causes[0], ())]
-                    wanted = [each.value for each in line[causes[0]]]
-                    left_out = other.arm if values == wanted else name
                     raise UserError(
                         f"{causes[0]}: the arms {other.arm} and {name} differ in this setting, so the line "
-                        f"cannot set it for both. Leave out {causes[0]} or an arm. "
-                        f"Try: '~grid.arms.{left_out}'"
+                        f"cannot set it for both. Try: '~grid.arms.{name}'"
                     )
     return list(found.values())
 
@@ -282,29 +259,33 @@ def _alternatives(line: str) -> list[str]:
     key, sweep = override.get_key_element(), override.value()
     if not override.is_discrete_sweep() or isinstance(sweep, Glob):
         what = "a pattern" if isinstance(sweep, Glob) else "an interval"
-        raise UserError(f"{key}: expected values one by one, got {what}. Try: '{key}=range(0,1,0.25)'")
+        raise fail(key, expected="values one by one", got=what, example=f"'{key}={A_RANGE}'")
     if isinstance(sweep, RangeSweep):
-        _require_range(key, sweep)
-    values = [f"{key}={value}" for value in override.sweep_string_iterator()]
-    _require_few(key, len(values))
-    return values
+        _require_few(key, _length(sweep))
+    return [f"{key}={value}" for value in override.sweep_string_iterator()]
 
 
-def _require_range(key: str, sweep: RangeSweep) -> None:
-    """Raise ``UserError`` unless the range has values, and few enough. At most ``MOST_JOBS`` are made."""
-    numbers = (sweep.start, sweep.stop, sweep.step)
-    is_range = all(number is not None and math.isfinite(number) for number in numbers) and sweep.step != 0
-    count = sum(1 for _ in islice(sweep.range(), MOST_JOBS + 1)) if is_range else 0
-    if count == 0:
-        got = "range({},{},{})".format(*numbers)
-        raise UserError(f"{key}: expected a range with values, got {got}. Try: '{key}=range(0,3)'")
-    _require_few(key, count)
+def _length(sweep: RangeSweep) -> int:
+    """Return how many values a range has, without making them; 0 for one without a plain number of them."""
+    try:
+        return math.ceil((sweep.stop - sweep.start) / sweep.step)  # pyright: ignore[reportOperatorIssue]
+    except (TypeError, ValueError, ArithmeticError):
+        return 0
 
 
 def _require_few(key: str, count: int) -> None:
-    if count > MOST_JOBS:
-        many = f"at least {count}" if count == MOST_JOBS + 1 else str(count)
-        raise UserError(f"{key}: expected at most {MOST_JOBS} values, got {many}. Try: '{key}=range(0,3)'")
+    expected, example = f"from 1 to {MOST_JOBS} values", f"'{key}={A_RANGE}'"
+    require(1 <= count <= MOST_JOBS, key, expected=expected, got=count, example=example)
+
+
+def _require_few_jobs(common: Axes, arms: Mapping[str, Axes]) -> None:
+    """Raise ``UserError`` for too many jobs. It names the key with most values."""
+    number = math.prod(map(len, common.values()))
+    number *= sum(math.prod(map(len, axes.values())) for axes in arms.values())
+    if number > MOST_JOBS:
+        longest = max((axis for axes in (common, *arms.values()) for axis in axes.values()), key=len)[0].key
+        expected, example = f"at most {MOST_JOBS} jobs in a sweep", "cadam3d sweep --help"
+        raise fail(longest, expected=expected, got=number, example=example)
 
 
 def _setting(line: str) -> AxisValue:

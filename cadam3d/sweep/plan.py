@@ -2,9 +2,9 @@
 
 import re
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,31 +13,34 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
-from cadam3d.core.checks import require
+from cadam3d.core.checks import fail, require, require_whole
 from cadam3d.core.errors import UserError
+from cadam3d.io.run_folder import typed_path
 from cadam3d.settings.advice import RefusedJobError, line_of, require_values
 from cadam3d.settings.check import require_settings
 from cadam3d.settings.compose import flatten
 from cadam3d.settings.hydra import compose_line, refuse_missing_settings, refuse_unread_settings
 from cadam3d.settings.line import DRY_RUN, LAUNCHER_KEY, RUN_FOLDER, SWEEP_FOLDER, key_of
-from cadam3d.sweep.choice import require_attempts
+from cadam3d.sweep.folder import Job
 from cadam3d.sweep.grid import (
     ALWAYS_SHOWN,
     Axes,
     Grid,
-    Job,
     expand,
     prompt_axis,
     read_grid,
     read_line,
+    sweep_name,
     swept_keys,
 )
 from cadam3d.sweep.prompts import FILE, KEY, PromptChoice, read_choice
 
-# An override that is neither an addition nor a deletion and names no package.
-PLAIN_KEY = re.compile(r"[A-Za-z_][\w.]*=")
+PARENT = Path("multirun")
+# An override that is neither an addition nor a deletion, names no package and refers to no other setting.
+VALUE = re.compile(r"[A-Za-z_][\w.]*=(?!.*\$\{)", re.DOTALL)
 GRID_KEY = re.compile(r"(grid|prompts)($|\.)")
 REFUSED_KEY = re.compile(r"hydra\.run\.dir$|hydra\.sweep\.subdir$|hydra[./]sweeper($|\.)")
+MOST_ATTEMPTS = 1000
 NOTHING_TO_SWEEP = "sweep: nothing to sweep over. Try: densifier=baseline,cadam"
 
 
@@ -50,40 +53,10 @@ class Parts:
     folder: list[str]
     jobs: list[str]
 
-
-@dataclass(frozen=True)
-class Sweep:
-    """A sweep that a line describes."""
-
-    cfg: DictConfig  # the grid, the launcher, Hydra's node
-    parts: Parts  # of the line
-    grid: Grid
-    axes: Axes  # of the line
-    prompts: PromptChoice | None  # None if the line and the grid name no file or set of prompts
-    jobs: list[Job]
-    command: str = "sweep"  # of the line; "train" if the jobs are several attempts at one run
-    # The folder, unless the line has one; None stands for a name that says what is swept.
-    place: Path | None = None
-
     @property
-    def grid_name(self) -> str | None:
-        """Return the name of the grid in the line; None without one."""
-        return self.cfg.hydra.runtime.choices.get("grid")
-
-    @property
-    def is_dry(self) -> bool:
-        """Return whether the jobs are only listed."""
-        return self.cfg[DRY_RUN]
-
-    @property
-    def folder_key(self) -> str:
-        """Return the setting that chooses the folder."""
-        return RUN_FOLDER if self.command == "train" else SWEEP_FOLDER
-
-    @property
-    def noun(self) -> str:
-        """Return what a job is called in messages."""
-        return "attempt" if self.command == "train" else "job"
+    def own(self) -> list[str]:
+        """Return the overrides of the sweep itself."""
+        return [*self.grid, *self.launcher, *self.folder]
 
 
 @dataclass(frozen=True)
@@ -97,6 +70,35 @@ class Composed:
     def get(self, key: str) -> Any:
         """Return a value, or the option chosen of a group; None if the job has no such key."""
         return self.choices[key] if key in self.choices else self.values.get(key)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep that a line describes, planned but not started."""
+
+    cfg: DictConfig  # the grid, the launcher, Hydra's node
+    parts: Parts  # of the line
+    folder: Path  # which may not exist yet
+    jobs: list[Job]
+    composed: list[Composed]  # the settings of each job
+    figures: list[str] | None = None  # of its report; None: all for which there are data
+    paper_table: bool = False
+    command: str = "sweep"  # of the line; "train" if the jobs are several attempts at one run
+
+    @property
+    def is_dry(self) -> bool:
+        """Return whether the jobs are only listed."""
+        return self.cfg[DRY_RUN]
+
+    @property
+    def folder_key(self) -> str:
+        """Return the setting that chooses the folder."""
+        return RUN_FOLDER if self.command == "train" else SWEEP_FOLDER
+
+    def count(self, number: int) -> str:
+        """Return a number of jobs in words."""
+        noun = "attempt" if self.command == "train" else "job"
+        return f"1 {noun}" if number == 1 else f"{number} {noun}s"
 
 
 @dataclass(frozen=True)
@@ -148,39 +150,32 @@ class Composer:
         self._options, self._common = options, list(common)
         self._bases: dict[tuple[str, ...], Base] = {}
         self._keys: dict[tuple[str, ...], list[str]] = {}  # settings and groups, by overrides
-        self._leaves = set(self._base([]).plain)
+        self._leaves = self._base([]).plain.keys()
 
     def compose(self, overrides: Sequence[str]) -> Composed:
         """Return the settings under ``overrides``. Raises if they cannot be composed or lack a value."""
-        # Values of keys that not every option has are set on a composed job too, unless they replace a part.
-        dotted = [line for line in overrides if self._is_value(line) or self._may_be_value(line)]
-        plain = [line for line in dotted if self._is_value(line)]
-        base = self._base_of(overrides, dotted)
-        if not {key_of(line) for line in dotted} <= base.plain.keys():
-            base, dotted = self._base_of(overrides, plain), plain
-        composed = base.composed({key_of(line): _value(line) for line in dotted})
+        # An override that chooses an option, or replaces a part, is no value of the composed job.
+        lines = {key_of(line): line for line in overrides if self._may_be_value(line)}
+        while not lines.keys() <= (base := self._base_without(lines.values(), overrides)).plain.keys():
+            lines = {key: line for key, line in lines.items() if key in base.plain}
+        composed = base.composed({key: _value(line) for key, line in lines.items()})
         require_settings(composed.values)
         return composed
 
     def has(self, overrides: Sequence[str], key: str) -> bool:
         """Return whether a job under ``overrides`` has a setting or a group called ``key``."""
         # Which settings there are does not depend on plain values.
-        arm = tuple(line for line in overrides if not self._is_value(line))
+        arm = tuple(line for line in overrides if not self._may_be_value(line))
         if arm not in self._keys:
             base = self._base(arm)
             self._keys[arm] = [*base.plain, *base.referring, *base.cfg.hydra.runtime.choices]
         return any(f"{known}.".startswith(f"{key}.") for known in self._keys[arm])
 
-    def _is_value(self, line: str) -> bool:
-        """Return whether an override sets a plain value that the jobs have by default."""
-        return bool(PLAIN_KEY.match(line)) and key_of(line) in self._leaves and "${" not in line
+    def _may_be_value(self, line: str) -> bool:
+        """Return whether an override may set a plain value, and surely chooses no option."""
+        return bool(VALUE.match(line)) and ("." in (key := key_of(line)) or key in self._leaves)
 
-    @staticmethod
-    def _may_be_value(line: str) -> bool:
-        """Return whether an override may set a plain value of an option, and surely chooses no option."""
-        return bool(PLAIN_KEY.match(line)) and "." in key_of(line) and "${" not in line
-
-    def _base_of(self, overrides: Sequence[str], values: Sequence[str]) -> Base:
+    def _base_without(self, values: Collection[str], overrides: Sequence[str]) -> Base:
         """Return a job under ``overrides`` that differs from others in ``values``, composed only once."""
         known = tuple(key_of(line) if line in values else line for line in overrides)
         if known not in self._bases:
@@ -195,10 +190,11 @@ class Composer:
         return Base.of(compose_line("train", [*self._common, *overrides], self._options))
 
 
-def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> tuple[Sweep, Composer]:
-    """Return the sweep that a line describes, and the composer of its jobs.
+def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> Sweep:
+    """Return the sweep that a line describes.
 
-    Raises ``UserError`` for a line with a single job or with settings that a sweep cannot have.
+    Raises ``UserError`` for a line with a single job or with settings that a sweep cannot have, and
+    ``RefusedJobError`` for the first job that cannot run.
     """
     parts = sort_overrides(overrides)
     cfg = compose_sweep(parts, options)
@@ -212,7 +208,21 @@ def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> tu
     jobs = expand(grid, axes, composer.has)
     if command == "sweep" and node is None and prompts is None and len(jobs) == 1:
         raise UserError(NOTHING_TO_SWEEP)
-    return Sweep(cfg=cfg, parts=parts, grid=grid, axes=axes, prompts=prompts, jobs=jobs), composer
+    composed = compose_all(jobs, composer)
+    keys = dict.fromkeys([*ALWAYS_SHOWN, *swept_keys(grid, axes)])
+    name = sweep_name(cfg.hydra.runtime.choices.get("grid"), axes, prompts)
+    return Sweep(
+        cfg=cfg,
+        parts=parts,
+        folder=folder_of(cfg, parts, PARENT / name),
+        jobs=[
+            replace(job, swept={key: settings.get(key) for key in keys})
+            for job, settings in zip(jobs, composed, strict=True)
+        ],
+        composed=composed,
+        figures=grid.figures,
+        paper_table=grid.paper_table,
+    )
 
 
 def compose_sweep(parts: Parts, options: Namespace) -> DictConfig:
@@ -222,12 +232,20 @@ def compose_sweep(parts: Parts, options: Namespace) -> DictConfig:
     """
     # The flag --config-name is for the jobs and not for the sweep itself.
     own = Namespace(**{**vars(options), "config_name": None})
-    cfg = compose_line("sweep", [*parts.grid, *parts.launcher, *parts.folder], own)
+    cfg = compose_line("sweep", parts.own, own)
     # A wrong setting of the launcher is found now, and not when the jobs are there.
     OmegaConf.to_container(cfg.hydra.launcher, resolve=True)
     is_answer = isinstance(cfg[DRY_RUN], bool)
     require(is_answer, DRY_RUN, expected="true or false", got=cfg[DRY_RUN], example=f"{DRY_RUN}=true")
     return cfg
+
+
+def folder_of(cfg: DictConfig, parts: Parts, usual: Path) -> Path:
+    """Return the folder that a line chooses for a sweep, or else the ``usual`` one."""
+    text = OmegaConf.select(cfg, SWEEP_FOLDER) if parts.folder else str(usual)
+    if not text:
+        raise fail(SWEEP_FOLDER, expected="a folder", got=text, example=f"{SWEEP_FOLDER}=multirun/mine")
+    return typed_path(str(text))
 
 
 def _read_prompts(cfg: DictConfig, grid: Grid, axes: Axes, overrides: Sequence[str]) -> PromptChoice | None:
@@ -248,13 +266,12 @@ def _read_prompts(cfg: DictConfig, grid: Grid, axes: Axes, overrides: Sequence[s
 
 def sort_overrides(overrides: Sequence[str]) -> Parts:
     """Separate the overrides of jobs from those of the sweep. Raises ``UserError`` for keys of neither."""
-    parts = Parts(grid=[], launcher=[], folder=[], jobs=[])
+    parts = Parts(grid=search_path(overrides), launcher=[], folder=[], jobs=[])
     for override in overrides:
         key = key_of(override)
         if REFUSED_KEY.match(key):
-            kept = [other for other in overrides if key_of(other) not in (key, SWEEP_FOLDER)]
-            line = line_of("sweep", [*kept, f"{SWEEP_FOLDER}=multirun/mine"])
-            raise UserError(f"{key}: not for sweeps; their jobs share one folder. Try: {line}")
+            example = f"cadam3d sweep {SWEEP_FOLDER}=multirun/mine"
+            raise UserError(f"{key}: not for sweeps; their jobs share one folder. Try: {example}")
         if key == "hydra.mode":
             continue
         if key == KEY and "=" in override:
@@ -267,14 +284,13 @@ def sort_overrides(overrides: Sequence[str]) -> Parts:
             parts.folder.append(override)
         else:
             parts.jobs.append(override)
-    parts.grid.extend(search_path(overrides))
     return parts
 
 
-def compose_all(sweep: Sweep, composer: Composer) -> list[Composed]:
+def compose_all(jobs: Sequence[Job], composer: Composer) -> list[Composed]:
     """Return the settings of every job. Raises ``RefusedJobError`` for the first one that cannot run."""
     composed = []
-    for job in sweep.jobs:
+    for job in jobs:
         try:
             composed.append(composer.compose(job.overrides))
             _refuse_attempts(composed[-1])
@@ -283,20 +299,18 @@ def compose_all(sweep: Sweep, composer: Composer) -> list[Composed]:
     return composed
 
 
+def require_attempts(attempts: object) -> None:
+    """Raise ``UserError`` for a wrong value of the setting ``attempts``."""
+    require_whole("attempts", attempts, low=1, high=MOST_ATTEMPTS, example=4)
+
+
 def _refuse_attempts(job: Composed) -> None:
     """Refuse a job that would be several attempts. A train.yaml from elsewhere may lack this setting."""
     attempts = job.values.get("attempts", 1)
     require_attempts(attempts)
     if attempts > 1:
-        raise UserError(
-            f"attempts: expected 1 in a sweep, whose jobs may have different seeds, got {attempts}. "
-            f"Try: attempts=1 'seed=range(0,{attempts})'"
-        )
-
-
-def shown_keys(sweep: Sweep) -> list[str]:
-    """Return the keys whose values a table of this sweep must show."""
-    return list(dict.fromkeys([*ALWAYS_SHOWN, *swept_keys(sweep.grid, sweep.axes)]))
+        example = f"attempts=1 'seed=range(0,{attempts})'"
+        raise fail("attempts", expected="1 in a sweep", got=attempts, example=example)
 
 
 def search_path(overrides: Sequence[str]) -> list[str]:

@@ -52,7 +52,7 @@ def run_job(sweep: Path, number: int) -> None:
     _end_with_sweep()
     if stop.exists():
         return
-    folder = sweep / plan.jobs[number].folder
+    folder = sweep / plan.jobs[number].name
     folder.mkdir(parents=True, exist_ok=True)
     with _locked(folder, stop) as lock:
         # The row is read under the lock, because the previous holder of the lock may have changed it.

@@ -8,12 +8,11 @@ import shlex
 import shutil
 import signal
 import sys
-from argparse import Namespace
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from types import FrameType
 
 from hydra.errors import HydraException
@@ -31,28 +30,24 @@ from cadam3d.io.run_folder import (
     STOP,
     TABLE,
     claim,
-    expanded,
     has_file,
     holds_run,
     numbered,
     occupant_of_sweep,
     shown,
     spare,
-    typed_path,
 )
 from cadam3d.settings.compose import flatten, quote
 from cadam3d.settings.hydra import run_hydra
-from cadam3d.settings.line import NOT_OF_A_RUN, SWEEP_FOLDER, key_of, setting_word
+from cadam3d.settings.line import NOT_OF_A_RUN, SWEEP_FOLDER, setting_word
 from cadam3d.settings.place import in_use
 from cadam3d.settings.trust import is_trusted, require_contained
-from cadam3d.sweep import preview, worker
-from cadam3d.sweep.folder import Plan, PlannedJob, Row, is_sweep, outcomes, rows_of, write_plan
-from cadam3d.sweep.grid import sweep_name
-from cadam3d.sweep.plan import Composed, Composer, Sweep, compose_all, read_sweep, shown_keys
-from cadam3d.sweep.table import as_text, write_table
-from cadam3d.sweep.watch import Watch
+from cadam3d.sweep import worker
+from cadam3d.sweep.folder import Plan, Row, is_sweep, load, rows_of, write_plan
+from cadam3d.sweep.plan import Composed, Sweep, search_path
+from cadam3d.sweep.progress import reporting, time_left
+from cadam3d.sweep.table import as_text, listing, write_table
 
-PARENT = Path("multirun")
 LONGEST = 40  # rows of a table in the terminal
 FOLDER_FLAGS = ("--config-dir", "-cd", "--config-path", "-cp")
 # The flags of a sweep that its jobs need too.
@@ -65,99 +60,47 @@ class Ended:
 
     folder: Path
     code: int  # exit code; 0 if every job has a result
-    was_stopped: bool  # by a signal
+    was_stopped: bool = False  # by a signal
     was_dry: bool = False  # nothing has run, and the folder may not exist
-
-
-def start(command: str, overrides: Sequence[str], flags: Sequence[str], options: Namespace) -> Ended:
-    """Run the sweep of a line until all jobs have ended or a signal stops it.
-
-    With ``dry_run=true`` only list the jobs. Raises an exception before anything runs if a job cannot be
-    composed, and ``UserError`` if the folder has results that were made with other settings.
-    """
-    return run_sweep(*read_sweep(command, overrides, options), overrides, flags)
 
 
 def run_sweep(
     sweep: Sweep,
-    composer: Composer,
     overrides: Sequence[str],
     flags: Sequence[str],
-    on_start: Callable[[Path], None] | None = None,
+    on_start: Callable[[Path], None] = lambda _: None,
 ) -> Ended:
-    """Run a sweep that a line with these ``overrides`` and ``flags`` describes, as :func:`start` says.
+    """Run the sweep that a line with these ``overrides`` and ``flags`` describes.
 
-    ``on_start`` is called with the folder before the first job starts, and not in a dry run.
+    It ends when all jobs have ended, or when a signal stops it. A dry run only lists the jobs. ``on_start``
+    is called with the folder before the first job starts. Raises ``UserError`` if the folder has results that
+    were made with other settings.
     """
-    composed = compose_all(sweep, composer)
-    folder = folder_of(sweep)
+    folder = sweep.folder
+    _refuse_occupied(folder, sweep.folder_key)
     if folder.is_dir() and not is_trusted(overrides):
         require_contained(folder, shlex.join(["cadam3d", sweep.command, *overrides, *flags, "trust=true"]))
-    jobs = _planned(sweep, composed)
-    _refuse_other_settings(folder, rows_of(folder, jobs), composed, sweep.folder_key)
+    rows = rows_of(folder, sweep.jobs)
+    _refuse_other_settings(rows, sweep.composed, folder, sweep.folder_key)
     if sweep.is_dry:
-        return _preview(folder, sweep, jobs, composed, flags)
+        print(f"{_title(sweep, rows)}\n\n{listing(rows)}\n\n{time_left(rows)}")
+        return Ended(folder, 0, was_dry=True)
     claim(folder, sweep.folder_key, is_chosen=True)
     with _locked(folder, sweep.folder_key), _stoppable(folder) as stop:
         _refuse_occupied(folder, sweep.folder_key)
-        rows = rows_of(folder, jobs)
-        pending = [row for row in rows if not row.has_result]
-        plan = Plan(
-            cwd=str(Path.cwd()),
-            flags=_flags_named(flags, JOB_FLAGS),
-            threads=_threads(sweep.cfg, len(pending)),
-            jobs=jobs,
-            figures=sweep.grid.figures,
-            line=[*_flags_named(flags, JOB_FLAGS), *overrides],
-            paper_table=sweep.grid.paper_table,
-            command=sweep.command,
-        )
-        write_plan(folder, plan)
-        if on_start is not None:
-            on_start(folder)
-        done = len(rows) - len(pending)
-        already = f"; {done} already {_has(done)} a result" if done else ""
-        print(f"{_jobs(len(rows), sweep.noun)} in {shown(folder)}{already}")
-        problem = ""
+        _write_plan(sweep, overrides, flags)
+        on_start(folder)
+        rows, problem = load(folder), ""
+        print(_title(sweep, rows))
         try:
-            if pending:
-                with Watch(rows, pending):
-                    problem = _launch(folder, sweep, pending, flags)
+            with reporting(rows):
+                problem = _launch(sweep, rows, flags)
         finally:
             shutil.rmtree(folder / SHARED, ignore_errors=True)
-            code = _report_results(folder, write_table(folder), problem, sweep.noun)
+            code = _report_results(sweep, write_table(folder), problem)
     if stop.received is not None:
         return Ended(folder, 128 + stop.received, was_stopped=True)
-    return Ended(folder, code, was_stopped=False)
-
-
-def _preview(
-    folder: Path,
-    sweep: Sweep,
-    jobs: list[PlannedJob],
-    composed: Sequence[Composed],
-    flags: Sequence[str],
-) -> Ended:
-    """List the jobs and estimate their time. Nothing is written except in a temporary folder."""
-    rows = rows_of(folder, jobs)
-    pending = sum(not row.has_result for row in rows)
-    done = len(rows) - pending
-    print(f"{_jobs(len(rows), sweep.noun)} in {shown(folder)}; {done} already {_has(done)} a result")
-    print(f"\n{preview.listing(rows)}\n", flush=True)
-    plan = Plan(
-        cwd=str(Path.cwd()),
-        flags=_flags_named(flags, JOB_FLAGS),
-        threads=_threads(sweep.cfg, pending),
-        jobs=jobs,
-    )
-    steps = [job.get("steps") for job in composed]
-    # Hydra's own launcher runs one job after another.
-    is_alone = sweep.cfg.hydra.runtime.choices.get("hydra/launcher") == "basic"
-    at_a_time = 1 if is_alone else _side_by_side(sweep.cfg)
-    with TemporaryDirectory(prefix="cadam3d-") as name, _stoppable(Path(name)) as stop:
-        print(preview.estimate(rows, steps, plan, at_a_time, Path(name)))
-    code = 0 if stop.received is None else 128 + stop.received
-    return Ended(folder, code, was_stopped=stop.received is not None, was_dry=True)
+    return Ended(folder, code)
 
 
 class Stop:
@@ -182,19 +125,6 @@ class Stop:
         )
 
 
-def folder_of(sweep: Sweep) -> Path:
-    """Return the folder of the sweep, which may not exist yet."""
-    place = sweep.place or PARENT / sweep_name(sweep.grid_name, sweep.axes, sweep.prompts)
-    if sweep.parts.folder:
-        text = OmegaConf.select(sweep.cfg, SWEEP_FOLDER)
-        if not text:
-            example = shlex.quote(f"{SWEEP_FOLDER}={place}")
-            raise UserError(f"{SWEEP_FOLDER}: expected a folder, got nothing. Try: {example}")
-        place = expanded(str(text))
-    _refuse_occupied(place, sweep.folder_key)
-    return typed_path(str(place))
-
-
 def _refuse_occupied(folder: Path, key: str) -> None:
     """Refuse the folder of a run, and one with something that a sweep would overwrite or remove."""
     name = occupant_of_sweep(folder)
@@ -209,59 +139,58 @@ def _beside(folder: Path, key: str) -> str:
     return setting_word(key, shown(numbered(folder)))
 
 
-def _planned(sweep: Sweep, composed: Sequence[Composed]) -> list[PlannedJob]:
-    keys = shown_keys(sweep)
-    return [
-        PlannedJob(
-            arm=job.arm,
-            folder=job.name,
-            overrides=list(job.overrides),
-            swept={key: settings.get(key) for key in keys},
-            prompt_name=job.prompt.name if job.prompt else "",
-            category=job.prompt.category if job.prompt else "",
-            brought=list(job.brought),
-        )
-        for job, settings in zip(sweep.jobs, composed, strict=True)
-    ]
-
-
-def _refuse_other_settings(
-    folder: Path, rows: Sequence[Row], composed: Sequence[Composed], folder_key: str
-) -> None:
+def _refuse_other_settings(rows: Sequence[Row], composed: Sequence[Composed], folder: Path, key: str) -> None:
     """Refuse results on disk that were made with other settings, because the table would mislabel them."""
     for row, now in zip(rows, composed, strict=True):
         config = row.folder / CONFIG
         if not config.is_file() or not (row.has_result or row.has_checkpoint):
             continue
         before = dict(flatten(read_config(config)))
-        for key in sorted((before.keys() | now.values.keys()) - now.unknown - {*NOT_OF_A_RUN}):
-            if before.get(key) != now.values.get(key):
+        for name in sorted((before.keys() | now.values.keys()) - now.unknown - {*NOT_OF_A_RUN}):
+            if before.get(name) != now.values.get(name):
                 raise UserError(
-                    f"{key}: was {before.get(key)} in {shown(row.folder)}, is {now.values.get(key)} now. "
+                    f"{name}: was {before.get(name)} in {shown(row.folder)}, is {now.values.get(name)} now. "
                     "The earlier settings or another folder are possible. "
-                    f"Try: {_beside(folder, folder_key)}"
+                    f"Try: {_beside(folder, key)}"
                 )
+
+
+def _title(sweep: Sweep, rows: Sequence[Row]) -> str:
+    """Return how many jobs a sweep has, where, and how many of them are done."""
+    done = sum(row.has_result for row in rows)
+    return f"{sweep.count(len(rows))} in {shown(sweep.folder)}" + (f", {done} with a result" if done else "")
+
+
+def _write_plan(sweep: Sweep, overrides: Sequence[str], flags: Sequence[str]) -> None:
+    pending = sum(not row.has_result for row in rows_of(sweep.folder, sweep.jobs))
+    of_jobs = _flags_named(flags, JOB_FLAGS)
+    plan = Plan(
+        cwd=str(Path.cwd()),
+        flags=of_jobs,
+        threads=_threads(sweep.cfg, pending),
+        jobs=sweep.jobs,
+        figures=sweep.figures,
+        line=[*of_jobs, *overrides],
+        paper_table=sweep.paper_table,
+        command=sweep.command,
+    )
+    write_plan(sweep.folder, plan)
 
 
 def _threads(cfg: DictConfig, pending: int) -> int | None:
     """Return the OpenMP threads of a job: a share of the cores, unless the user has chosen a number."""
+    launcher = cfg.get("launcher") or {}
     if "OMP_NUM_THREADS" in os.environ:
         return None
-    if threads := (cfg.get("launcher") or {}).get("threads"):
+    if threads := launcher.get("threads"):
         return threads
-    side_by_side = _side_by_side(cfg)
-    return None if side_by_side is None else max(1, _cores() // max(1, min(side_by_side, pending)))
-
-
-def _side_by_side(cfg: DictConfig) -> int | None:
-    """Return how many jobs the launcher runs at a time; None if it has no such setting."""
-    number = OmegaConf.select(cfg, "hydra.launcher.n_jobs") or (cfg.get("launcher") or {}).get("n_jobs")
+    at_once = OmegaConf.select(cfg, "hydra.launcher.n_jobs") or launcher.get("n_jobs")
+    if at_once is None:
+        return None
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     # In joblib, -1 means all cores, -2 all except one, and so on.
-    return number if number is None or number >= 0 else max(1, _cores() + 1 + number)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    at_once = at_once if at_once >= 0 else cores + 1 + at_once
+    return max(1, cores // max(1, min(at_once, pending)))
 
 
 def _flags_named(flags: Sequence[str], names: Sequence[str]) -> list[str]:
@@ -273,11 +202,13 @@ def _flags_named(flags: Sequence[str], names: Sequence[str]) -> list[str]:
     return kept
 
 
-def _launch(folder: Path, sweep: Sweep, pending: Sequence[Row], flags: Sequence[str]) -> str:
-    """Run the jobs with Hydra, and return what went wrong with the launcher itself."""
-    numbers = ",".join(str(row.number) for row in pending)
-    overrides = [override for override in sweep.parts.grid if key_of(override) == "hydra.searchpath"]
-    overrides += [*sweep.parts.launcher, f"job={numbers}", f"{SWEEP_FOLDER}={quote(str(folder))}"]
+def _launch(sweep: Sweep, rows: Sequence[Row], flags: Sequence[str]) -> str:
+    """Run the jobs without a result with Hydra, and return what went wrong with the launcher itself."""
+    numbers = ",".join(str(row.number) for row in rows if not row.has_result)
+    if not numbers:
+        return ""
+    overrides = [*search_path(sweep.parts.grid), *sweep.parts.launcher, f"job={numbers}"]
+    overrides += [f"{SWEEP_FOLDER}={quote(str(sweep.folder))}"]
     try:
         run_hydra("jobs", [*overrides, *_flags_named(flags, FOLDER_FLAGS), "--multirun"], worker.run)
     except (UserError, HydraException, KeyboardInterrupt):
@@ -289,26 +220,23 @@ def _launch(folder: Path, sweep: Sweep, pending: Sequence[Row], flags: Sequence[
     return ""
 
 
-def _report_results(folder: Path, rows: Sequence[Row], problem: str, noun: str) -> int:
+def _report_results(sweep: Sweep, rows: Sequence[Row], problem: str) -> int:
     """Print the table and what is left to do. A long table is cut down to the jobs without a result."""
-    listed = rows if len(rows) <= LONGEST else [row for row in rows if not row.has_result][:LONGEST]
+    left = [row for row in rows if not row.has_result]
+    listed = rows if len(rows) <= LONGEST else left[:LONGEST]
     table = f"\n{as_text(listed)}\n" if listed else ""
-    print(f"{table}\n{_jobs(len(rows), noun)}: {shown(folder / TABLE)}", flush=True)
+    print(f"{table}\n{sweep.count(len(rows))}: {shown(sweep.folder / TABLE)}", flush=True)
     if problem:
         print(f"cadam3d: {problem}", file=sys.stderr)
-    left = outcomes(rows)
     if not left:
         return 0
-    count = sum(left.values())
-    which = ", ".join(f"{number} {outcome}" for outcome, number in left.items())
-    consoles = [
-        row.folder / CONSOLE for row in rows if not row.has_result and (row.folder / CONSOLE).is_file()
-    ]
+    counts = Counter(row.outcome for row in left)
+    which = ", ".join(f"{number} {outcome}" for outcome, number in counts.items())
+    consoles = [row.folder / CONSOLE for row in left if (row.folder / CONSOLE).is_file()]
     see = f"; see {shown(consoles[0])}" if consoles else ""
-    them = "it" if count == 1 else "them"
     print(
-        f"cadam3d: {count} of {_jobs(len(rows), noun)} {_has(count)} no result ({which}){see}. "
-        f"Rerun the same command to retry {them}.",
+        f"cadam3d: {len(left)} of {sweep.count(len(rows))} without a result ({which}){see}. "
+        "Type the same line again to continue.",
         file=sys.stderr,
     )
     return 1
@@ -321,10 +249,8 @@ def _locked(folder: Path, key: str) -> Iterator[None]:
         try:
             stack.enter_context(locked(folder / LOCK, lambda holder: in_use(folder, holder, key)))
         except OSError as error:
-            raise UserError(
-                f"{key}: cannot write to {shown(folder)} ({error.strerror or error}). "
-                f"Try: {setting_word(key, spare('cadam3d'))}"
-            ) from error
+            reason, example = error.strerror or error, setting_word(key, spare("cadam3d"))
+            raise UserError(f"{key}: cannot write to {shown(folder)} ({reason}). Try: {example}") from error
         yield
 
 
@@ -339,11 +265,3 @@ def _stoppable(folder: Path) -> Iterator[Stop]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-def _jobs(count: int, noun: str) -> str:
-    return f"1 {noun}" if count == 1 else f"{count} {noun}s"
-
-
-def _has(count: int) -> str:
-    return "has" if count == 1 else "have"

@@ -48,18 +48,26 @@ def as_text(rows: Sequence[Row]) -> str:
 
     Sentences below it say which scores it leaves out.
     """
-    keys = varying_keys(rows)
-    has_arms = any(row.arm for row in rows)
     scores = _scores(rows)
-    lines: list[list[Any]] = [
-        ["job", *(["arm"] if has_arms else []), *keys, "outcome", *SHOWN, *scores.columns]
+    shown = [row.summary | {"psnr": psnr_of(row.summary), "outcome": row.outcome} for row in rows]
+    columns = {name: [facts.get(name) for facts in shown] for name in ("outcome", *SHOWN)}
+    return "\n".join([_table(rows, {**columns, **scores.columns}), *scores.left_out])
+
+
+def listing(rows: Sequence[Row]) -> str:
+    """Return a table of the jobs: arm, settings in which they differ, what is to be done, and folder."""
+    states = [
+        row.outcome if row.has_result else "to continue" if row.has_checkpoint else "to run" for row in rows
     ]
-    for index, row in enumerate(rows):
-        values = [row.number, *([row.arm] if has_arms else []), *(brief(row.swept.get(key)) for key in keys)]
-        shown = row.summary | {"psnr": psnr_of(row.summary)}
-        facts = [row.outcome, *(shown.get(name) for name in SHOWN)]
-        lines.append([*values, *facts, *(column[index] for column in scores.columns.values())])
-    return "\n".join([aligned(lines), *scores.left_out])
+    return _table(rows, {"state": states, "folder": [row.name for row in rows]})
+
+
+def _table(rows: Sequence[Row], columns: Mapping[str, Sequence[Any]]) -> str:
+    """Return a table that begins with the number, the arm and the settings of each job."""
+    arms = {"arm": [row.arm for row in rows]} if any(row.arm for row in rows) else {}
+    swept = {key: [brief(row.swept.get(key)) for row in rows] for key in varying_keys(rows)}
+    whole = {"job": [row.number for row in rows], **arms, **swept, **columns}
+    return aligned([list(whole), *zip(*whole.values(), strict=True)])
 
 
 def scores_of(jobs: Sequence[Mapping[str, Score]], sweep: Path) -> Scores:
@@ -112,19 +120,23 @@ def varying_keys(rows: Sequence[Row]) -> list[str]:
 
 
 def _write(path: Path, rows: Sequence[Row]) -> None:
-    keys = _swept_keys(rows)
+    columns: dict[str, Sequence[Any]] = {
+        "job": [row.number for row in rows],
+        "arm": [row.arm for row in rows],
+        **{name: [getattr(row, name) for row in rows] for name in LABELS},
+        **{key: [_plain(row.swept.get(key)) for row in rows] for key in _swept_keys(rows)},
+        "outcome": [row.outcome for row in rows],
+        **{name: [row.summary.get(name) for row in rows] for name in (*FACTS, *_comparisons(rows))},
+        **_scores(rows).columns,
+        "folder": [row.name for row in rows],
+    }
+    for name in LABELS:
+        if not any(columns[name]):
+            del columns[name]
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        names = [*FACTS, *_comparisons(rows)]
-        labels = [name for name in LABELS if any(getattr(row, name) for row in rows)]
-        scores = _scores(rows).columns
-        writer.writerow(["job", "arm", *labels, *keys, "outcome", *names, *scores, "folder"])
-        for index, row in enumerate(rows):
-            said = [getattr(row, name) for name in labels]
-            swept = [_plain(row.swept.get(key)) for key in keys]
-            facts = [row.summary.get(name) for name in names]
-            facts += [column[index] for column in scores.values()]
-            writer.writerow([row.number, row.arm, *said, *swept, row.outcome, *facts, row.folder.name])
+        writer.writerow(columns)
+        writer.writerows(zip(*columns.values(), strict=True))
 
 
 def _comparisons(rows: Sequence[Row]) -> list[str]:

@@ -20,7 +20,7 @@ from cadam3d.io.caption import Caption
 from cadam3d.io.image import write_png_bytes
 from cadam3d.io.jsonl import read_json, write_json
 from cadam3d.io.ply import read_ply, write_ply
-from cadam3d.sweep.folder import Plan, PlannedJob, write_plan
+from cadam3d.sweep.folder import Job, Plan, write_plan
 
 SMALL = ("metric.fidelity.views=2", "metric.fidelity.elevations_deg=[0]", "metric.fidelity.size=24")
 
@@ -247,7 +247,7 @@ def test_eval_notes_which_numbers_are_missing_without_true_images(tmp_path, gaus
 
 def make_sweep(folder: Path, *names: str) -> Path:
     folder.mkdir()
-    jobs = [PlannedJob("", name, [], {}) for name in names]
+    jobs = [Job("", name, [], {}) for name in names]
     write_plan(folder, Plan(cwd=str(folder), flags=[], threads=None, jobs=jobs))
     return folder
 

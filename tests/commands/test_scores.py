@@ -13,7 +13,7 @@ from splats import make_gaussians
 from cadam3d.io.jsonl import read_json, write_json
 from cadam3d.io.ply import write_ply
 from cadam3d.io.records import Score, difference, read_scores
-from cadam3d.sweep.folder import Plan, PlannedJob, load, write_plan
+from cadam3d.sweep.folder import Job, Plan, load, write_plan
 from cadam3d.sweep.table import as_text, scores_of, write_table
 
 SMALL = ("protocol.views=2", "protocol.size=24")
@@ -43,7 +43,7 @@ def make_run(folder: Path) -> Path:
 def make_sweep(folder: Path, *names: str) -> Path:
     for name in names:
         make_run(folder / name)
-    jobs = [PlannedJob("", name, [], {}) for name in names]
+    jobs = [Job("", name, [], {}) for name in names]
     write_plan(folder, Plan(cwd=str(folder), flags=[], threads=None, jobs=jobs))
     return folder
 

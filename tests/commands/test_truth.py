@@ -11,7 +11,7 @@ from splats import make_gaussians
 from cadam3d.io.jsonl import read_json, write_json
 from cadam3d.io.ply import write_ply
 from cadam3d.metric import turn
-from cadam3d.sweep.folder import Plan, PlannedJob, write_plan
+from cadam3d.sweep.folder import Job, Plan, write_plan
 
 EYES = ["metric.fidelity.views=2", "metric.fidelity.elevations_deg=[0]", "metric.fidelity.size=24"]
 EYES += ["metric.outline.views=2", "metric.outline.elevations_deg=[0]", "metric.outline.size=24"]
@@ -147,7 +147,7 @@ def test_a_sweep_that_names_no_truth_gets_one_from_eval(type_line, tmp_path):
             "warnings": [],
         }
         write_json(sweep / name / "summary.json", {**summary, "densifier": name})
-    jobs = [PlannedJob(name, name, [f"densifier={name}"], {}) for name in names]
+    jobs = [Job(name, name, [f"densifier={name}"], {}) for name in names]
     write_plan(sweep, Plan(cwd=str(tmp_path), flags=[], threads=None, jobs=jobs, figures=["growth"]))
     result = type_line("eval", "run=sweep", *EYES, "truth=shapes")
     assert result.code == 0

@@ -327,8 +327,8 @@ def test_a_protocol_may_name_no_model(make, measurand):
     ("name", "content", "message"),
     [
         ("a.txt", "only one\n", "at least two prompts"),
-        ("a.yaml", "prompt: one\n", "a list in YAML"),
-        ("a.yaml", "- 1\n- two\n", "expected prompts, got 1"),
+        ("a.yaml", "prompt: one\n", "a list of prompts"),
+        ("a.yaml", "- [1]\n- two\n", "expected a prompt as plain text"),
         ("missing.txt", None, "a file, or one of the sets"),
     ],
 )

@@ -19,7 +19,7 @@ from cadam3d.io.reading import read_yaml
 from cadam3d.settings.compose import component, compose, flatten
 from cadam3d.settings.hydra import read_flags
 from cadam3d.settings.options import config_dir
-from cadam3d.sweep.plan import Composer, compose_all, read_sweep
+from cadam3d.sweep.plan import Composer, read_sweep
 
 KINDS = {"shapes_sd": "stable_diffusion", "shapes_mvdream": "mvdream", "shapes_sd3": "stable_diffusion_3"}
 FEW = ("steps=2", "initializer.count=50", "exporter=[ply]", "metric=[size]", "callback=[checkpoint]")
@@ -92,11 +92,13 @@ def test_unknown_words_are_refused_before_anything_is_written(models, type_line,
     line = ("train", "prior=shapes_sd", *FEW, f"prior.cache_dir={tmp_path}/c")
     message = type_line(*line, "prompt=a gray ball").err
     assert message.startswith(
-        "cadam3d: prompt: expected words that prior=shapes_sd knows, got 'gray', 'ball'."
+        "cadam3d: prompt: expected words that prior=shapes_sd knows, got 'a gray ball'."
     )
-    assert message.endswith('Try: prompt="a red sphere"\n')
+    assert "Unknown: 'gray' (nearest: grey), 'ball' (nearest: sphere)" in message
+    assert message.endswith('Try: prompt="a grey sphere"\n')
     message = type_line(*line, "prompt=a red cube", "negative_prompt=ugly, bad").err
     assert message.startswith("cadam3d: negative_prompt: expected words that prior=shapes_sd knows")
+    assert message.endswith('Try: negative_prompt="ugly"\n')
     assert not list(tmp_path.glob("outputs/*/*"))
 
 
@@ -110,7 +112,7 @@ def test_a_folder_of_the_user_with_words_is_checked_in_the_same_way(models, tmp_
 
 def test_a_sentence_unlike_the_captions_gets_a_note(models, tmp_path):
     prior = built("prior=shapes_sd", f"prior.cache_dir={tmp_path}")
-    assert "'a red sphere'" in prior.embed("sphere red", "").notice()
+    assert 'prompt="a red sphere"' in prior.embed("sphere red", "").notice()
     assert prior.embed("a red sphere", "").notice() is None
 
 
@@ -165,14 +167,20 @@ def test_a_model_that_does_not_say_its_size_is_used_at_any(models, tmp_path):
 
 def test_a_model_that_is_not_in_the_package_is_named(models):
     lacking = built("prior=stable_diffusion", "prior.path=package:shapes_xl").lacks()
-    assert "package:shapes_mvdream, package:shapes_sd, package:shapes_sd3" in lacking
-    assert "got 'package:shapes_xl'" in lacking
+    assert lacking == (
+        "prior.path: expected one of package:shapes_mvdream, package:shapes_sd, package:shapes_sd3, got "
+        "'package:shapes_xl'. Try: prior=shapes_mvdream prior.path=package:shapes_mvdream"
+    )
+    # The name of a model is not a path.
+    assert (
+        "expected one of package:" in built("prior=stable_diffusion", "prior.path=package:../models").lacks()
+    )
 
 
 def test_a_package_without_models_is_reported(tmp_path, monkeypatch):
     pytest.importorskip("diffusers")
     monkeypatch.setattr(pretrained, "MODELS", tmp_path)
-    assert "a model of this installation (it has none)" in built("prior=shapes_sd").lacks()
+    assert "no model comes with this installation" in built("prior=shapes_sd").lacks()
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -192,8 +200,7 @@ def test_doctor_lists_the_models_of_the_package_as_ready(name, models):
 
 def test_a_sweep_compares_an_exact_and_a_learned_prior():
     words = ["prompt=a red cube", "prior=shapes,shapes_mvdream", "densifier=none,cadam"]
-    sweep, composer = read_sweep("sweep", words, read_flags([]))
-    jobs = compose_all(sweep, composer)
+    jobs = read_sweep("sweep", words, read_flags([])).composed
     seen = [(job.get("prior"), job.get("camera"), job.get("views")) for job in jobs]
     assert seen[::2] == seen[1::2] == [("shapes", "orbit", 2), ("shapes_mvdream", "shapes_mvdream", 4)]
 

@@ -16,7 +16,7 @@ from cadam3d.core.chart import Chart, Curve, Level
 from cadam3d.io import run_folder
 from cadam3d.report.declarations import write_declarations
 from cadam3d.report.results import JobResult, read
-from cadam3d.sweep.folder import Plan, PlannedJob, write_plan
+from cadam3d.sweep.folder import Job, Plan, write_plan
 
 SIZE = 12  # pixels of a picture
 STEPS = (40, 80, 120)
@@ -41,12 +41,12 @@ class Jobs:
         self.line: list[str] = []
         self.paper_table = False
         self.category = ""  # of the prompts of the jobs that are added next
-        self.planned: list[PlannedJob] = []
+        self.planned: list[Job] = []
 
     def plan(self, arm: str, overrides: Sequence[str], name: str = "") -> Path:
         """Add a job to the plan and return its folder, which does not exist yet."""
         name = name or f"{len(self.planned)}_{overrides[0].partition('=')[2]}"
-        job = PlannedJob(arm=arm, folder=name, overrides=list(overrides), swept={}, category=self.category)
+        job = Job(arm=arm, name=name, overrides=list(overrides), swept={}, category=self.category)
         self.planned.append(job)
         self.write_plan()
         return self.folder / name

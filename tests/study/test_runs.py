@@ -7,7 +7,7 @@ import pytest
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import write_json
 from cadam3d.study.runs import Found, find_runs, pair_runs, select
-from cadam3d.sweep.folder import Plan, PlannedJob, write_plan
+from cadam3d.sweep.folder import Job, Plan, write_plan
 
 
 def make_run(folder: Path, prompt="a cube", seed=0, **facts) -> Path:
@@ -27,7 +27,7 @@ def make_sweep(folder: Path, jobs) -> Path:
             f"{key}='{value}'" if key == "prompt" else f"{key}={value}" for key, value in swept.items()
         ]
         make_run(folder / f"job{number}", prompt, seed, densifier=arm, warnings=[])
-        planned.append(PlannedJob(arm=arm, folder=f"job{number}", overrides=overrides, swept=swept))
+        planned.append(Job(arm=arm, name=f"job{number}", overrides=overrides, swept=swept))
     write_plan(folder, Plan(cwd=str(folder), flags=[], threads=None, jobs=planned))
     return folder
 

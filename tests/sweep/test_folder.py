@@ -8,9 +8,9 @@ import pytest
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import write_json
-from cadam3d.sweep.folder import Plan, PlannedJob, read_plan, write_plan
+from cadam3d.sweep.folder import Job, Plan, read_plan, write_plan
 
-JOB = PlannedJob(arm="cadam", folder="cadam_seed=1", overrides=["prompt=a cube"], swept={"seed": 1})
+JOB = Job(arm="cadam", name="cadam_seed=1", overrides=["prompt=a cube"], swept={"seed": 1})
 PLAN = Plan(cwd="/tmp", flags=[], threads=2, jobs=[JOB], figures=None, line=["prompt=a cube"])
 WRONG = [None, True, 7, 0.5, "x\0", [7], [None], {"a": 1}, [["x"]], -1]
 
@@ -36,7 +36,7 @@ def test_no_entry_of_a_plan_has_another_type(tmp_path: Path, key: str):
         if any(type(value) is type(wrong) and value == wrong for value in plausible):
             read_plan(tmp_path)
             continue
-        with pytest.raises(UserError, match=rf"not the plan of a sweep \(({name}|arm): expected"):
+        with pytest.raises(UserError, match="not the plan of a sweep"):
             read_plan(tmp_path)
 
 
@@ -50,7 +50,7 @@ def test_other_json_is_not_a_plan(tmp_path: Path, content):
 @pytest.mark.parametrize("name", ["", ".", "..", "../x", "/tmp/x", "a/b", "a\\b", "x\0"])
 def test_the_folder_of_a_job_is_inside_that_of_the_sweep(tmp_path: Path, name: str):
     content = asdict(PLAN)
-    content["jobs"][0]["folder"] = name
+    content["jobs"][0]["name"] = name
     write_json(tmp_path / "jobs.json", content)
     with pytest.raises(UserError, match="not the plan of a sweep"):
         read_plan(tmp_path)
@@ -58,5 +58,5 @@ def test_the_folder_of_a_job_is_inside_that_of_the_sweep(tmp_path: Path, name: s
 
 def test_two_jobs_do_not_share_a_folder(tmp_path: Path):
     write_json(tmp_path / "jobs.json", asdict(PLAN) | {"jobs": [asdict(JOB), asdict(JOB)]})
-    with pytest.raises(UserError, match="different name"):
+    with pytest.raises(UserError, match="a different one"):
         read_plan(tmp_path)

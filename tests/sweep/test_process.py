@@ -18,7 +18,7 @@ from cadam3d import job
 from cadam3d.io.lock import try_lock
 from cadam3d.io.run_folder import STOP
 from cadam3d.sweep import process
-from cadam3d.sweep.folder import Plan, PlannedJob, Row, load, write_plan
+from cadam3d.sweep.folder import Job, Plan, Row, load, write_plan
 from cadam3d.sweep.process import run_job
 
 REPOSITORY = Path(__file__).parents[2]
@@ -34,7 +34,7 @@ def sweep(tmp_path, stand_in, monkeypatch):
     (folder / "config.yaml").touch()
 
     def make(prompt: str, **plan) -> Path:
-        job = PlannedJob("cadam", "job_1", [f"prompt='{prompt}'", "seed=3"], {"prompt": prompt, "seed": 3})
+        job = Job("cadam", "job_1", [f"prompt='{prompt}'", "seed=3"], {"prompt": prompt, "seed": 3})
         write_plan(
             folder, Plan(**{"cwd": str(tmp_path), "flags": [], "threads": None, "jobs": [job], **plan})
         )

@@ -1,21 +1,18 @@
 """Prompts of sweeps: files, sets, shards, and the settings that come with a prompt."""
 
 import json
-from collections import Counter
-from pathlib import Path
 
 import pytest
 
 from cadam3d.core.errors import UserError
-from cadam3d.prior.shapes.grammar import parse
+from cadam3d.io.prompts import Prompt
 from cadam3d.report import results
 from cadam3d.settings.hydra import read_flags
 from cadam3d.settings.line import quoted
-from cadam3d.sweep import prompts as module
-from cadam3d.sweep.folder import Plan, PlannedJob, load, write_plan
-from cadam3d.sweep.grid import Grid, Job, expand, prompt_axis, read_grid, read_line, sweep_name
-from cadam3d.sweep.plan import compose_all, read_sweep
-from cadam3d.sweep.prompts import Prompt, PromptChoice, read_choice, read_prompts
+from cadam3d.sweep.folder import Job, Plan, load, write_plan
+from cadam3d.sweep.grid import Grid, expand, prompt_axis, read_grid, read_line, sweep_name
+from cadam3d.sweep.plan import read_sweep
+from cadam3d.sweep.prompts import PromptChoice, read_choice
 from cadam3d.sweep.table import brief
 
 # What commas, quotes, brackets, references and other scripts would change if they were not quoted.
@@ -42,177 +39,8 @@ HARSH = [
 LINES = ["one\ntwo", "one\r\n\u2028 two"]
 
 
-def texts(prompts) -> list[str]:
-    return [each.text for each in prompts]
-
-
-def read(tmp_path: Path, content: str | bytes, name: str = "prompts.yaml") -> tuple[Prompt, ...]:
-    path = tmp_path / name
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return read_prompts(str(path))
-
-
 def jobs_of(prompts, grid: Grid | None = None, line=(), has_setting=lambda *_: True) -> list[Job]:
     return expand(grid or read_grid(None), {"prompt": prompt_axis(prompts)} | read_line(line), has_setting)
-
-
-# --- files ------------------------------------------------------------------------------------------------
-
-
-FORMATS = {
-    "lines.txt": "# mine\n\n" + "".join(f"  {text}\n" for text in HARSH),
-    "windows.TXT": "\ufeff" + "\r\n".join(["#", *HARSH]),
-    "no_suffix": "\r".join(HARSH),
-    "library.json": json.dumps({"dreamfusion": HARSH}, indent=4),
-    "list.json": json.dumps(HARSH, ensure_ascii=False),
-    "entries.json": json.dumps([{"prompt": text} for text in HARSH]),
-    "list.yaml": "\n".join(f"- {json.dumps(text, ensure_ascii=False)} # one" for text in HARSH),
-    "entries.yml": "prompts:\n" + "\n".join(f"- prompt: {json.dumps(text)}" for text in HARSH[:14]),
-}
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_every_format_gives_the_same_prompts(name, tmp_path):
-    wanted = [text.strip() for text in HARSH]
-    assert texts(read(tmp_path, FORMATS[name], name)) == wanted[: 14 if name == "entries.yml" else None]
-
-
-def test_a_prompt_of_yaml_is_text_as_it_is_spelled(tmp_path):
-    assert texts(read(tmp_path, "- 012\n- yes\n- 2026-01-01\n- >\n  two\n  lines\n")) == [
-        *("012", "yes", "2026-01-01", "two lines")
-    ]
-
-
-def test_the_keys_of_an_entry_are_its_prompt_its_settings_and_its_labels(tmp_path):
-    content = """
-    - prompt: a fox of glass
-      negative_prompt: blurry
-      initializer_prompt: a fox
-      name: fox
-      category: Material
-    - {prompt: a cat, negative_prompt: "", category: null}
-    """
-    assert read(tmp_path, content) == (
-        Prompt(
-            text="a fox of glass",
-            settings=(("negative_prompt", "blurry"), ("initializer.prompt", "a fox")),
-            name="fox",
-            category="Material",
-        ),
-        Prompt(text="a cat", settings=(("negative_prompt", ""),)),
-    )
-
-
-def test_the_names_of_several_lists_are_categories(tmp_path):
-    found = read(
-        tmp_path, '{"Material": ["a", {"prompt": "b", "category": "other"}], "Concept": ["c"]}', "x.json"
-    )
-    assert [(each.text, each.category) for each in found] == [
-        ("a", "Material"),
-        ("b", "other"),
-        ("c", "Concept"),
-    ]
-
-
-def test_a_repeated_prompt_counts_once(tmp_path):
-    assert texts(read(tmp_path, "a cat\na dog\na cat\n", "x.txt")) == ["a cat", "a dog"]
-
-
-LONG = "x" * (module.LONGEST + 1)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "expected"),
-    [
-        ("x.txt", b"a\n\xff\xfeb", "x.txt, line 2: expected UTF-8 text, got the byte 0xff"),
-        ("x.txt", "a\nb\0c", "x.txt, line 2: expected text without control characters, got 'b\\x00c'"),
-        ("x.yaml", "- a\n- b\x1b[31m", "x.yaml, line 2: expected text without control characters"),
-        ("x.json", '["a\\u0000b"]', "x.json, entry 1: expected a prompt without control characters"),
-        ("x.json", '["a", "\\ud800"]', "x.json, entry 2: expected a prompt without control characters"),
-        ("x.txt", f"a\n{LONG}", "x.txt, line 2: expected a prompt of at most 10000 characters, got 10001"),
-        ("x.txt", "# only this\n", "x.txt: expected prompts, got none"),
-        ("x.yaml", "", "expected a list of prompts, or names with lists of prompts, got nothing"),
-        ("x.yaml", "a prompt", "x.yaml, line 1: expected a list of prompts"),
-        ("x.yaml", "- a\n- [b]", "x.yaml, line 2: expected a prompt as text, got a list"),
-        ("x.yaml", "- a\n-\n- b", "x.yaml, line 2: expected a prompt as text, got nothing"),
-        ("x.yaml", "- a\n- ' '", "x.yaml, line 2: expected a prompt, got ''"),
-        ("x.yaml", "- a\n- b: c", "x.yaml, line 2: expected one of the keys prompt, negative_prompt"),
-        ("x.yaml", "- prompt: a\n  negativ_prompt: b", "line 2: expected one of the keys"),
-        ("x.yaml", "- name: a", "x.yaml, line 1: expected the key prompt, got name"),
-        ("x.yaml", "- prompt: a\n  prompt: b", "x.yaml, line 2: expected each key once, got 'prompt'"),
-        ("x.yaml", "- prompt: a\n- prompt: a\n  name: b", "line 2: expected what line 1 says about this"),
-        ("x.yaml", "- a\n- {prompt: b", "x.yaml, line 3: expected plain YAML"),
-        ("x.yaml", "- &a b\n- *a", "expected plain YAML, got something else (an alias, *a, in line 2)"),
-        ("x.yaml", "- a\n- !!python/object/apply:os.getcwd []", "(a tag, tag:yaml.org,2002:python/object"),
-        ("x.yaml", "[" * 5000, "expected plain YAML"),
-        ("x.yaml", "- a\n---\n- b", "expected plain YAML"),
-        ("x.json", '{"a": ["b",\n]}', "x.json, line 2: expected plain JSON"),
-        (
-            "x.json",
-            '{"a": ["b"],\n"a": ["c"]}',
-            "expected plain JSON, got something else (the key 'a' twice)",
-        ),
-        ("x.json", '{"a": ["b", 3]}', "x.json, 'a', entry 2: expected a prompt as text, got 3"),
-        ("x.json", "[" * 5000, "expected plain JSON"),
-        ("x.json", '{"a\\u0000": ["b"], "c": ["d"]}', "expected a category as the name without control"),
-        ("x.json", '["lib:corgi_hat"]', "entry 1: expected a prompt, and not a reference to threestudio's"),
-        ("x.txt", "???", "x.txt, line 1: expected a prompt, got '???'"),
-        ("x.csv", "a", "expected a file with one of the suffixes .txt, .text, .yaml, .yml, .json, or none"),
-    ],
-)
-def test_a_mistake_in_a_file_is_one_message_with_its_line(name, content, expected, tmp_path):
-    with pytest.raises(UserError) as caught:
-        read(tmp_path, content, name)
-    message = str(caught.value)
-    assert message.startswith("prompts: ")
-    assert expected in message
-    assert message.endswith(". Try: prompts=paper50")
-    assert message.isprintable()
-
-
-def test_files_with_too_many_prompts_and_files_that_are_too_large_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "MOST", 2)
-    with pytest.raises(UserError, match="expected at most 2 prompts, got 3"):
-        read(tmp_path, "a\nb\nc", "x.txt")
-    monkeypatch.setattr(module, "LARGEST", 2)
-    with pytest.raises(UserError, match="expected at most 2 bytes"):
-        read(tmp_path, "abc", "x.txt")
-
-
-# --- sets -------------------------------------------------------------------------------------------------
-
-
-def test_a_set_is_found_before_a_file_of_its_name_and_a_path_finds_the_file(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for name in ("paper50", "paper50.txt", "mine"):
-        Path(name).write_text(f"{name}\n")
-    assert len(read_prompts("paper50")) == 50
-    assert texts(read_prompts("./paper50")) == ["paper50"]
-    assert texts(read_prompts("paper50.txt")) == ["paper50.txt"]
-    assert texts(read_prompts("mine")) == ["mine"]
-
-
-@pytest.mark.parametrize("name", ["paper5", "paper5.txt", "/none/paper50", "x" * 5000, "a\0b"])
-def test_an_unknown_name_is_answered_with_the_sets(name):
-    with pytest.raises(UserError, match=r"expected a file, or one of the sets paper50\|shapes6, got"):
-        read_prompts(name)
-
-
-def test_the_fifty_prompts_are_balanced_and_all_different():
-    prompts = read_prompts("paper50")
-    assert Counter(each.category for each in prompts) == {"Material": 17, "Structure": 17, "Concept": 16}
-    assert len({each.text for each in prompts}) == len({each.name for each in prompts}) == 50
-    # Every first part and every shard is balanced too.
-    for count in range(1, 51):
-        numbers = Counter(each.category for each in prompts[:count])
-        assert max(numbers.values()) - min([numbers[each.category] for each in prompts[:3]]) <= 1
-
-
-def test_the_prompts_for_the_shapes_prior_can_be_read_by_it():
-    prompts = read_prompts("shapes6")
-    for each in prompts:
-        parse(each.text)
-    assert Counter(each.category for each in prompts) == {"Material": 2, "Structure": 2, "Concept": 2}
 
 
 # --- a part of the prompts --------------------------------------------------------------------------------
@@ -259,15 +87,12 @@ def test_a_category_and_a_number_choose_a_part(tmp_path):
         ({"first": True}, "prompts.first: expected a whole number"),
         (
             {"category": "Matter"},
-            "expected one of Material|Structure|Concept, got 'Matter'. Try: prompts.category=",
+            "expected one of Material|Structure|Concept, got 'Matter'",
         ),
         ({"category": ""}, "prompts.category: expected a category"),
         ({"file": ""}, "prompts: expected a file, or one of the sets"),
         ({"file": 7}, "prompts: expected a file, or one of the sets"),
-        (
-            {"file": None, "shard": "1/2"},
-            "prompts.shard: expected prompts=FILE too, got '1/2'. Try: prompts=paper50",
-        ),
+        ({"file": None, "shard": "1/2"}, "prompts.shard: expected prompts=FILE too, got '1/2'"),
     ],
 )
 def test_wrong_parts_are_refused(node, expected):
@@ -314,9 +139,8 @@ def test_the_settings_of_a_prompt_count_for_its_folder_and_not_for_those_of_othe
     [second, dog] = jobs_of([negative, other])
     assert first.name != second.name
     assert dog.name == jobs_of([other])[0].name
-    assert second.overrides == ("prompt='a cat'", "negative_prompt='blurry'")
-    assert (first.brought, second.brought) == ((), ("negative_prompt",))
-    assert second.prompt == negative
+    assert second.overrides == ["prompt='a cat'", "negative_prompt='blurry'"]
+    assert (first.brought, second.brought) == ([], ["negative_prompt"])
 
 
 def test_the_settings_of_one_prompt_change_no_folder_of_another_in_any_arm():
@@ -330,13 +154,13 @@ def test_the_line_and_the_grid_take_precedence_over_the_settings_of_a_prompt():
     prompts = [Prompt(text="a cat", settings=(("negative_prompt", "own"),)), Prompt(text="a dog")]
     lines = [job.overrides for job in jobs_of(prompts, line=["negative_prompt='typed'"])]
     assert lines == [
-        ("prompt='a cat'", "negative_prompt='typed'"),
-        ("prompt='a dog'", "negative_prompt='typed'"),
+        ["prompt='a cat'", "negative_prompt='typed'"],
+        ["prompt='a dog'", "negative_prompt='typed'"],
     ]
     grid = read_grid({"arms": {"own": {"seed": 1}, "none": {"seed": 1, "negative_prompt": ""}}})
     assert [job.overrides[2:] for job in jobs_of(prompts[:1], grid)] == [
-        ("negative_prompt='own'",),
-        ("negative_prompt=''",),
+        ["negative_prompt='own'"],
+        ["negative_prompt=''"],
     ]
 
 
@@ -345,8 +169,8 @@ def test_a_setting_of_a_prompt_reaches_only_jobs_that_have_it():
     prompts = [Prompt(text="a cat", settings=(("initializer.prompt", "an animal"),))]
     jobs = jobs_of(prompts, grid, has_setting=lambda lines, key: "initializer=shap_e" in lines)
     assert [(job.arm, job.overrides[2:]) for job in jobs] == [
-        ("ball", ()),
-        ("shap_e", ("initializer.prompt='an animal'",)),
+        ("ball", []),
+        ("shap_e", ["initializer.prompt='an animal'"]),
     ]
 
 
@@ -365,9 +189,9 @@ def test_a_sweep_is_named_by_its_file_and_a_shard_has_a_folder_of_its_own(tmp_pa
 
 def test_jobs_of_a_prompt_are_compared_whether_or_not_they_have_its_settings(tmp_path):
     jobs = [
-        PlannedJob(
+        Job(
             arm=arm,
-            folder=f"{arm}_{prompt}",
+            name=f"{arm}_{prompt}",
             overrides=[f"prompt='{prompt}'", *([f"initializer.prompt='{prompt}s'"] if brought else [])],
             swept={},
             brought=brought,
@@ -393,8 +217,8 @@ def test_every_prompt_reaches_its_job_literally_with_its_settings(tmp_path):
     ]
     path.write_text(json.dumps(entries))
     line = [quoted(f"prompts={path}", is_sweep=True), "initializer=ball,shap_e"]
-    sweep, composer = read_sweep("sweep", line, read_flags([]))
-    composed = compose_all(sweep, composer)
+    sweep = read_sweep("sweep", line, read_flags([]))
+    composed = sweep.composed
     wanted = [(text.strip(), name) for text in [*HARSH, *LINES] for name in ("ball", "shap_e")]
     assert [(job.get("prompt"), job.get("initializer")) for job in composed] == wanted
     assert [job.get("negative_prompt") for job in composed] == [text for text, _ in wanted]
@@ -403,4 +227,4 @@ def test_every_prompt_reaches_its_job_literally_with_its_settings(tmp_path):
     ]
     # The process of a job reads its words with the same function as a line that was typed.
     for job in sweep.jobs:
-        assert [quoted(word, is_sweep=False) for word in job.overrides] == list(job.overrides)
+        assert [quoted(word, is_sweep=False) for word in job.overrides] == job.overrides
