@@ -231,11 +231,8 @@ def test_an_attempt_that_lost_every_gaussian_is_never_the_best(train):
 def test_a_number_that_no_chosen_metric_measures_is_refused_before_anything_runs(train):
     code, _, err = train(*LINE, "select=clip_score")
     assert code == 1
-    assert err == (
-        "cadam3d: select: expected metrics that measure clip_score, got fidelity. "
-        "Try: cadam3d train 'prompt=an attempt' attempts=4 select=clip_score "
-        "'metric=[fidelity,clip_score]'\n"
-    )
+    assert "select: expected metrics that measure clip_score, got 'fidelity'." in err
+    assert err.endswith("Try: 'metric=[fidelity,clip_score]'\n")
     assert not Path("outputs").exists()
 
 
@@ -284,7 +281,7 @@ def test_resuming_the_folder_of_attempts_is_refused_with_the_line_that_continues
         (["attempts=2", "select=turn_deg"], "select: expected one of "),
         (
             ["attempts=2", "metric=[]"],
-            "Try: cadam3d train 'prompt=an attempt' attempts=2 'metric=[fid",
+            "Try: 'metric=[fidelity]'",
         ),
         (["attempts=2", "--multirun"], "attempts: expected 1 in a sweep"),
         (["attempts=1", "dry_run=true"], "dry_run: expected a sweep or several attempts"),
