@@ -138,13 +138,12 @@ def complete(words: Sequence[str]) -> int:
         *done, last = [*typed[1:], ""] if is_new_word else typed[1:]
         plain = [word for word in done if " " not in word and not word.startswith(("prompt=", "negative_"))]
         os.environ["COMP_LINE"] = " ".join(["cadam3d", *plain, last])
-    from cadam3d.launch import Task
     from cadam3d.settings.hydra import run_hydra
 
     command = typed[0] if action == "query" else "train"
     # A line that is wrong so far has no completions.
     with contextlib.suppress(Exception):
-        run_hydra(command, list(words), Task(command))
+        run_hydra(command, words)
     return 0
 
 

@@ -19,12 +19,13 @@ import torch
 from omegaconf import OmegaConf
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from cadam3d.build import component
 from cadam3d.core.cameras import turntable
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.densifier.base import Densifier, GradientSignal
 from cadam3d.optimizer import GaussianOptimizer
 from cadam3d.rasterizer.base import Rasterizer
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 from cadam3d.settings.options import config_dir
 
 RADIUS = 0.6  # world units, of the shell

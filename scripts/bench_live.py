@@ -16,13 +16,14 @@ from pathlib import Path
 
 import torch
 
+from cadam3d.build import build_trainer, component
 from cadam3d.callback import live as callback
 from cadam3d.callback.live import Live
 from cadam3d.commands import control
+from cadam3d.commands.beginning import run_context
 from cadam3d.commands.control import Control
-from cadam3d.commands.train import build_trainer, run_context
 from cadam3d.io.live import touch_watched
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 from cadam3d.state import StepReport
 
 LOOKS = 1 / callback.LOOK_SECONDS  # per second

@@ -16,6 +16,7 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
+from cadam3d.build import component
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
@@ -25,7 +26,7 @@ from cadam3d.io.ply import read_ply
 from cadam3d.io.run_folder import ASSET, CONFIG
 from cadam3d.metric.mesh import MeshMetric, distances_between, f_score, true_surfaces
 from cadam3d.prior.shapes.scene import build, signed_distance
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 
 HEADER = "| prompt | triangles | parts | watertight | Chamfer | F at 0.01 | F at 0.02 | seconds |"
 

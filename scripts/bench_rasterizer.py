@@ -28,11 +28,11 @@ from rasterizer_bench.scenes import Scene, make_scene, make_shell
 from rasterizer_bench.stages import NoKernelsError, copy_speed, time_stages
 from rasterizer_bench.timing import OUT_OF_MEMORY, take_turns
 
+from cadam3d.build import component
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cuda import load_kernels
 from cadam3d.rasterizer.launcher import Launcher
-from cadam3d.settings.compose import component
 from cadam3d.settings.options import config_dir, option_names
 
 DEFAULTS = {

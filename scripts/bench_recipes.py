@@ -24,10 +24,11 @@ import torch
 # The script measures the package that it stands beside, from any folder.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from cadam3d.commands.train import build_trainer, run_context
+from cadam3d.build import build_trainer, component
+from cadam3d.commands.beginning import run_context
 from cadam3d.core.device import resolve_device
 from cadam3d.prior.base import amount
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 from cadam3d.trainer import Trainer
 
 RECIPES = {"luciddreamer": "stable_diffusion", "flowdreamer": "stable_diffusion_3"}

@@ -11,6 +11,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.types import Override
+from hydra.core.singleton import Singleton
+from hydra.core.utils import JobReturn
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from cadam3d.io import run_folder
 
@@ -28,6 +33,7 @@ FLOORS = {
     **dict.fromkeys(("state", "callback", "guidance"), 2.0),
     **dict.fromkeys(("trainer",), 3.0),
     **dict.fromkeys(("settings",), 4.0),
+    **dict.fromkeys(("build",), 4.5),
     **dict.fromkeys(("sweep",), 5.0),
     **dict.fromkeys(("report",), 6.0),
     **dict.fromkeys(("live", "study"), 6.5),
@@ -221,6 +227,44 @@ def test_an_import_of_hydra_is_noticed(tmp_path):
 
 def imports_hydra(path: Path, package: Path = PACKAGE) -> bool:
     return any(module.split(".")[0] in ("hydra", "omegaconf") for module, _ in imports(path, package))
+
+
+def private_uses(source: str) -> list[str]:
+    """Return the private modules and attributes of Hydra and OmegaConf that a source uses."""
+    classes = (DictConfig, ListConfig, OmegaConf, Override, JobReturn, GlobalHydra, Singleton)
+    attributes = {name for each in classes for name in (*dir(each), *getattr(each, "__annotations__", ()))}
+    private = {name for name in attributes if name.startswith("_") and not name.startswith("__")}
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module]
+            names = [part for module in modules if module for part in module.split(".")]
+            names += [alias.name for alias in node.names]
+            if names[0] in ("hydra", "omegaconf"):
+                found += [name for name in names if name.startswith("_")]
+        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) not in ("self", "cls"):
+            found += [node.attr] if node.attr in private else []
+    return found
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_only_public_parts_of_hydra_and_omegaconf_are_used(path):
+    assert not private_uses(path.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from hydra._internal.hydra import Hydra",
+        "import hydra._internal.utils",
+        "node._get_full_key('')",
+        "job._return_value",
+        "Singleton._instances",
+        "BaseContainer._resolvers.clear()",
+    ],
+)
+def test_a_private_part_of_hydra_is_noticed(line):
+    assert private_uses(line)
 
 
 def test_core_imports_only_array_packages_and_the_standard_library():

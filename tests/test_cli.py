@@ -513,7 +513,7 @@ def test_the_message_for_a_run_on_a_read_only_disk_has_a_line_that_continues_a_c
         if folder == run_folder:
             raise OSError(errno.EROFS, "Read-only file system")
 
-    monkeypatch.setattr("cadam3d.settings.place.require_writable", refuse)
+    monkeypatch.setattr("cadam3d.io.occupied.require_writable", refuse)
     message = type_line("train", f"resume={run_folder}/checkpoints/000010.pt").message
     assert message.startswith("resume: cannot write to outputs/")
     assert "(Read-only file system). Try: cp -rL " in message

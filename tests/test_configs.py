@@ -18,12 +18,13 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import cli, regularizer
+from cadam3d.build import component, components
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json, read_jsonl
 from cadam3d.io.prompts import read_prompts
 from cadam3d.settings import advice
-from cadam3d.settings.compose import component, components, compose, flatten, quote
-from cadam3d.settings.hydra import read_flags
+from cadam3d.settings.compose import compose, flatten, quote
+from cadam3d.settings.line import read_flags
 from cadam3d.settings.options import config_dir
 from cadam3d.sweep import plan
 from cadam3d.sweep.plan import read_sweep

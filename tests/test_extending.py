@@ -65,7 +65,8 @@ def run(place) -> Path:
 def energy(place, monkeypatch):
     """Build the densifier of the page with the values of its YAML file."""
     monkeypatch.syspath_prepend(str(place))
-    from cadam3d.settings.compose import component, load_config
+    from cadam3d.build import component
+    from cadam3d.settings.compose import load_config
 
     yield component(load_config(place / "myconfigs/densifier/energy.yaml"))
     for name in [name for name in sys.modules if name.partition(".")[0] == "mypackage"]:

@@ -35,6 +35,7 @@ from splats import make_gaussians
 
 import cadam3d
 from cadam3d import cli
+from cadam3d.build import component
 from cadam3d.compiled.build import find_compiler
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import write_json
@@ -42,7 +43,7 @@ from cadam3d.io.ply import write_ply
 from cadam3d.rasterizer import auto
 from cadam3d.rasterizer.cpu import load_kernels
 from cadam3d.settings.advice import LAUNCHERS
-from cadam3d.settings.compose import component, compose, flatten
+from cadam3d.settings.compose import compose, flatten
 from cadam3d.settings.options import config_dir
 from cadam3d.sweep.folder import Plan, write_plan
 

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from cadam3d.commands.train import build_trainer, run_context
+from cadam3d.build import build_trainer, component
+from cadam3d.commands.beginning import run_context
 from cadam3d.core.cameras import turntable
 from cadam3d.initializer.base import Initializer
 from cadam3d.prior.shapes.vocabulary import COLOURS
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 
 pytest.importorskip("diffusers")
 pytestmark = pytest.mark.slow

@@ -3,10 +3,11 @@
 import pytest
 import torch
 
+from cadam3d.build import component
 from cadam3d.core.schedule import as_schedule
 from cadam3d.core.sh import SH_C0
 from cadam3d.initializer.shap_e import ColoredMesh
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 
 UNITS = {"gaussiandreamer": 1.5, "lucid": 0.5, "dreamgaussian": 1.0}  # of theirs in one of ours
 EXTENT = {"gaussiandreamer": 4.0, "lucid": 3.5, "dreamgaussian": 4.0}  # theirs

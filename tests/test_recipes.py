@@ -5,9 +5,10 @@ import sys
 import pytest
 
 from cadam3d import cli
+from cadam3d.build import component
 from cadam3d.core.schedule import as_schedule
 from cadam3d.io.jsonl import read_json
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 
 pytestmark = pytest.mark.slow
 

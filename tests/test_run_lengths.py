@@ -9,12 +9,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from cadam3d.commands.train import build_trainer
+from cadam3d.build import build_trainer, component
 from cadam3d.core.errors import UserError
 from cadam3d.core.schedule import as_schedule
 from cadam3d.densifier.refine import Refine
 from cadam3d.io.jsonl import read_json
-from cadam3d.settings.compose import component, compose, parts
+from cadam3d.settings.compose import compose, parts
 from cadam3d.settings.options import config_dir
 
 PROMPT = "prompt=a red cube"

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import torch
 
+from cadam3d.build import component
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.densifier.base import RowCount
 from cadam3d.densifier.cadam import CAdamState
 from cadam3d.io.checkpoint import FORMAT, VERSION, DamagedCheckpointError, load_checkpoint, save_checkpoint
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 from cadam3d.state import PayloadError, TrainState, start_generators
 
 CPU = torch.device("cpu")

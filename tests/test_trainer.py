@@ -10,12 +10,12 @@ import torch
 from composed import composed
 
 from cadam3d.augmentation import LucidAugmentation
+from cadam3d.build import build_trainer, component
 from cadam3d.callback.base import Callback
-from cadam3d.commands.train import build_trainer
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.regularizer import MeanScale
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState, start_generators
 from cadam3d.trainer import Trainer
 

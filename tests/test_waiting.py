@@ -16,14 +16,13 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from cadam3d import trainer as loop
-from cadam3d.commands.train import build_trainer
+from cadam3d.build import build_trainer, component
 from cadam3d.core.device import read_numbers, upload, upload_together
 from cadam3d.core.render import RenderOutput
 from cadam3d.densifier.baseline import Baseline
 from cadam3d.exposure import NoExposure
 from cadam3d.prior.mvdream import CHECKED
 from cadam3d.rasterizer.base import Rasterizer, absgrad_probe
-from cadam3d.settings.compose import component
 
 CPU, META = torch.device("cpu"), torch.device("meta")
 

@@ -15,12 +15,12 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import cli
+from cadam3d.build import build_trainer, component, components, require_unused, require_views
 from cadam3d.commands.messages import keeping_others
-from cadam3d.commands.train import build_trainer, require_unused, require_views
 from cadam3d.core.errors import UserError
 from cadam3d.core.memory import is_out_of_memory, require_memory
 from cadam3d.settings.check import require_settings
-from cadam3d.settings.compose import component, components, compose
+from cadam3d.settings.compose import compose
 from cadam3d.settings.options import config_dir
 from cadam3d.sweep.grid import MOST_JOBS, expand, read_grid, read_line
 

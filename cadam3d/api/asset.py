@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from omegaconf import DictConfig
 from torch import Tensor
 
 from cadam3d.api.guest import (
@@ -27,6 +26,7 @@ from cadam3d.api.guest import (
     require_words,
     usual_modes,
 )
+from cadam3d.build import option
 from cadam3d.commands.export import export, set_title
 from cadam3d.commands.messages import note_backend
 from cadam3d.commands.opened import OpenedAsset, find_asset, find_run
@@ -46,9 +46,8 @@ from cadam3d.io.asset_record import facts_of
 from cadam3d.io.atomic import replacing
 from cadam3d.io.image import to_uint8
 from cadam3d.io.run_folder import expanded, shown
-from cadam3d.launch import Task, compose_checked, explaining, read_words, run_line
+from cadam3d.launch import prepare
 from cadam3d.rasterizer.base import Rasterizer, render_fn
-from cadam3d.settings.compose import option
 from cadam3d.viewer.pack import pack
 from cadam3d.viewer.page import viewer_page
 
@@ -213,11 +212,12 @@ class Asset:
         place = path_text("output", path, 'export("asset.ply")')
         require_free(overrides, {"output": place, "run": self, "ply": self})
         words = [literal("output", place), *overrides]
-        job = _Export("export", asset=self)
-        with as_guest(), explaining(job, words):
-            line = read_words("export", words)
-            run_line(line, compose_checked(line), job, has_log=False)
-        return job.written
+        with as_guest():
+            cfg, _ = prepare("export", words)
+            source = self.source or Path("asset")
+            set_title(cfg, self.title)
+            opened = OpenedAsset(self.gaussians, file=source, folder=source.parent)
+            return [output.path for output in export(cfg, opened, "", has_record=False)]
 
     @usual_modes()
     def mesh(self, **settings: Any) -> "trimesh.Trimesh":
@@ -276,19 +276,3 @@ def is_notebook() -> bool:
     """Return whether this process runs the cells of a notebook, which can show HTML."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return hasattr(shell, "kernel")
-
-
-@dataclass
-class _Export(Task):
-    """An export of one asset. It keeps the paths that it has written."""
-
-    asset: Asset = field(kw_only=True)
-    written: list[Path] = field(default_factory=list, init=False)
-
-    def __call__(self, cfg: DictConfig) -> None:
-        """Write the files."""
-        self.has_started = True
-        source = self.asset.source or Path("asset")
-        set_title(cfg, self.asset.title)
-        opened = OpenedAsset(self.asset.gaussians, file=source, folder=source.parent)
-        self.written = [output.path for output in export(cfg, opened, "", has_record=False)]

@@ -1,34 +1,27 @@
 """Guest: run a command inside somebody else's program, and leave that program as it was.
 
 The command line owns its process; a library does not. Everything of the process that training changes is
-restored here: Hydra's global state, torch's modes, logging, and where messages go.
+restored here: torch's modes, and where messages go.
 """
 
-import logging
 import os
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from cadam3d.commands.beginning import messages
 from cadam3d.commands.messages import note
 from cadam3d.core.checks import fail
 from cadam3d.core.console import heard_by
 from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import quote
-from cadam3d.settings.hydra import keeping_globals
 from cadam3d.settings.line import QUOTED, key_of
 
-log = logging.getLogger("cadam3d")
-# The messages that the command line prints. They are not part of train.log.
-messages = logging.getLogger("cadam3d.messages")
-# As Hydra writes train.log.
-LOG_LINE = "[%(asctime)s][%(name)s][%(levelname)s] - %(message)s"
 # Hydra has one configuration per process, so that threads take turns.
 _turn = threading.RLock()
 
@@ -39,7 +32,7 @@ def as_guest() -> Iterator[None]:
 
     Messages go to the logger ``cadam3d.messages``. Only one thread at a time is in such a block.
     """
-    with _turn, keeping_globals(), logging_messages(), usual_modes():
+    with _turn, logging_messages(), usual_modes():
         yield
 
 
@@ -75,40 +68,6 @@ def usual_modes() -> Iterator[None]:
         stack.enter_context(torch.inference_mode(False))
         stack.enter_context(torch.enable_grad())
         yield
-
-
-@contextmanager
-def logged_to(path: Path) -> Iterator[None]:
-    """Write what cadam3d logs into ``path``, from the level INFO on, while the block runs.
-
-    The handlers of the caller get no record that they would not get otherwise.
-    """
-    file = logging.FileHandler(path, encoding="utf-8")
-    file.setFormatter(logging.Formatter(LOG_LINE))
-    file.addFilter(lambda record: record.name != messages.name)
-    onward = _Onward(log.getEffectiveLevel())
-    level, is_propagating = log.level, log.propagate
-    log.addHandler(file)
-    if is_propagating:
-        log.addHandler(onward)
-    log.setLevel(min(logging.INFO, onward.level))
-    log.propagate = False
-    try:
-        yield
-    finally:
-        log.setLevel(level)
-        log.propagate = is_propagating
-        log.removeHandler(onward)
-        log.removeHandler(file)
-        file.close()
-
-
-class _Onward(logging.Handler):
-    """Passes records on to the handlers of the root, as propagation does, but not those of lower levels."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Pass one record on."""
-        logging.getLogger().callHandlers(record)
 
 
 def _pass_on(text: str, level: int) -> None:

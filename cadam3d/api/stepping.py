@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Any, cast
 
 import torch
-from omegaconf import OmegaConf, open_dict
+from omegaconf import OmegaConf
 from torch import Tensor
 
 from cadam3d import trainer as loop
@@ -15,8 +15,9 @@ from cadam3d.api.asset import Asset
 from cadam3d.api.guest import as_guest, logging_messages, require_object, require_words, usual_modes
 from cadam3d.augmentation import Augmentation
 from cadam3d.background import Background
+from cadam3d.build import build_trainer, component
 from cadam3d.camera.base import CameraSampler
-from cadam3d.commands.train import build_trainer, deterministic, note_beginning, require_unused
+from cadam3d.commands.beginning import deterministic, load_prior
 from cadam3d.core.checks import require_whole
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
@@ -26,11 +27,10 @@ from cadam3d.densifier.refine import Refine
 from cadam3d.exposure import Exposure
 from cadam3d.guidance.base import Guidance
 from cadam3d.initializer.base import Initializer
-from cadam3d.launch import Task, compose_checked, explaining, read_words
+from cadam3d.launch import prepare
 from cadam3d.optimizer import AdamSettings
 from cadam3d.prior.base import DiffusionPrior, PromptEmbedding
 from cadam3d.rasterizer.base import Rasterizer
-from cadam3d.settings.compose import component
 from cadam3d.settings.line import key_of
 from cadam3d.state import RefineReport, StepReport, TrainState
 
@@ -91,11 +91,8 @@ class Trainer:
         require_whole("seed", seed, low=0, example=3)
         with logging_messages(), usual_modes(), deterministic(self.device):
             backend = self.parts.rasterizer.prepare(self.device)
-            notice = self._embedding.notice()
             state = self.parts.start(self.prompt, self.initializer, seed, self.device)
-            # The prior is loaded last, because an initializer may have needed the memory and has freed it.
-            self.parts.prior.load()
-            note_beginning((self.parts.prior.notice(), notice, state.initial_note), backend)
+            load_prior(self.parts, self._embedding, state, backend)
         return state
 
     def step(self, state: TrainState) -> Step:
@@ -175,14 +172,10 @@ def compose(  # noqa: PLR0913  (one argument per component)
             raise UserError(
                 'resume: only a whole run continues another. Try: cadam3d.train(None, "resume=RUN")'
             )
-    task = Task("train")
-    with as_guest(), explaining(task, overrides):
-        cfg = compose_checked(read_words("train", overrides))
-        with open_dict(cfg):
-            cfg.pop("hydra")
+    with as_guest():
+        cfg, _ = prepare("train", overrides)
         device = resolve_device(cfg.device)
         require_whole("seed", cfg.seed, low=0, example=3)
-        require_unused(cfg)
         trainer = build_trainer(cfg, device, given)
         if initializer is None:
             initializer = component(cfg.initializer, Initializer, "initializer")

@@ -5,30 +5,25 @@ import shlex
 import signal
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 
 from cadam3d.api.asset import Asset, load
 from cadam3d.api.guest import (
     as_guest,
     literal,
-    logged_to,
     path_text,
     require_free,
     require_object,
     require_words,
 )
 from cadam3d.callback.base import Callback
-from cadam3d.commands import train as command
+from cadam3d.commands.control import StopOnSignal
 from cadam3d.commands.opened import find_run
+from cadam3d.commands.train import optimise
 from cadam3d.io.records import psnr_of, read_config, read_metrics, read_summary
-from cadam3d.io.run_folder import CONFIG, LOG, REPORT, shown
-from cadam3d.launch import Task, compose_checked, explaining, read_words, run_line
-from cadam3d.settings.line import RUN_FOLDER
+from cadam3d.io.run_folder import CONFIG, REPORT, RUN_FOLDER, shown
+from cadam3d.launch import prepare
 
 
 class Run:
@@ -114,31 +109,15 @@ def train(
     require_object("callbacks", callbacks, Sequence, "callbacks=[]")
     for callback in callbacks:
         require_object("callbacks", callback, Callback, "callbacks=[]")
-    job = _Training("train", callbacks=callbacks)
-    with as_guest(), explaining(job, words):
-        line = read_words("train", words)
-        run_line(line, compose_checked(line), job, has_log=False)
-    run = Run(job.folder)
-    if job.stop.received is not None:
+    stop = StopOnSignal(_signals())
+    with as_guest():
+        cfg, call = prepare("train", words)
+        folder, _ = optimise(cfg, call, stop, callbacks)
+    run = Run(folder)
+    if stop.received is not None:
         again = f"cadam3d train {shlex.quote(f'resume={shown(run.folder)}')}"
         raise KeyboardInterrupt(f"Everything is saved. Continue with: {again}")
     return run
-
-
-@dataclass
-class _Training(Task):
-    """A run in this process. It keeps its folder and whether it was interrupted."""
-
-    callbacks: Sequence[Callback] = ()
-    folder: Path = field(default=Path(), init=False)
-    stop: command.StopOnSignal = field(default_factory=lambda: command.StopOnSignal(_signals()), init=False)
-
-    def __call__(self, cfg: DictConfig) -> None:
-        """Train. The signal that ends a program stays that of the caller."""
-        self.has_started = True
-        self.folder = Path(HydraConfig.get().runtime.output_dir)
-        with logged_to(self.folder / LOG):
-            command.train(cfg, self.stop, self.callbacks)
 
 
 def _signals() -> tuple[int, ...]:

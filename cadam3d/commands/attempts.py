@@ -12,8 +12,7 @@ from cadam3d.commands.linking import link_best, link_latest
 from cadam3d.core.errors import UserError
 from cadam3d.core.number import Number
 from cadam3d.io.jsonl import write_json
-from cadam3d.io.run_folder import ASSET, BEST, CHOICE, REPORT, shown
-from cadam3d.settings.line import setting_word
+from cadam3d.io.run_folder import ASSET, BEST, CHOICE, REPORT, setting_word, shown
 from cadam3d.sweep.choice import (
     Choice,
     attempt_of,

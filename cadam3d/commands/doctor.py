@@ -17,8 +17,9 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from cadam3d import __version__
+from cadam3d.build import component
 from cadam3d.commands.finding import Finding, Verdict, attempt
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import Call, compose
 from cadam3d.settings.options import config_dir, option_names
 
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "fast-simplification", "imageio", "imageio-ffmpeg")
@@ -34,7 +35,7 @@ COMPILERS = {
 SECONDS = 60  # longest wait for a program
 
 
-def run(cfg: DictConfig) -> None:
+def run(cfg: DictConfig, _call: Call) -> None:
     """Print every finding; exit with 1 if one of them is broken."""
     findings = list(examine())
     broken = [finding for finding in findings if finding.verdict is Verdict.BROKEN]

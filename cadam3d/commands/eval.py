@@ -2,51 +2,59 @@
 
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from cadam3d import report
+from cadam3d.build import component
 from cadam3d.commands.measuring import CHANGED, build_metrics, measure, rebuild_start
-from cadam3d.commands.opened import find_run, open_run, renderer, run_components
+from cadam3d.commands.opened import find_run, open_run, renderer
 from cadam3d.core.checks import require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.records import MEASUREMENTS, NUMBERS, Score, psnr_of, read_summary, scores_in, with_earlier
-from cadam3d.io.run_folder import ASSET, CONFIG, EVALUATION, copying, shown, suggestion, typed_path
+from cadam3d.io.run_folder import (
+    ASSET,
+    CONFIG,
+    EVALUATION,
+    copying,
+    setting_word,
+    shown,
+    suggestion,
+    typed_path,
+)
 from cadam3d.metric.base import Measurand
 from cadam3d.prior.base import DiffusionPrior
 from cadam3d.prior.truth import PriorTruth, TruthSource
-from cadam3d.settings.compose import component
-from cadam3d.settings.line import setting_word
-from cadam3d.settings.trust import require_contained
+from cadam3d.settings.compose import Call
+from cadam3d.settings.trust import read_components, require_contained
 from cadam3d.sweep.folder import is_sweep, load
 from cadam3d.sweep.table import aligned, scores_of, write_table
 
 SHORT = 7  # characters of a commit, as git abbreviates it
 
 
-def run(cfg: DictConfig) -> None:
+def run(cfg: DictConfig, call: Call) -> None:
     """Measure ``run=`` and write its ``eval.json``; for a sweep, measure every job and write its report."""
     if cfg.run is None:
         line = suggestion("cadam3d eval", "run", CONFIG, ASSET)
         raise UserError(f"run: expected a finished run or a sweep, got nothing. Try: {line}")
     folder = typed_path(str(cfg.run))
     if folder.is_dir():
-        require_contained(folder, None if cfg.trust else trusting())
+        require_contained(folder, None if cfg.trust else trusting(call))
     # If a model is missing, this stops with one message, instead of one for every job.
     build_metrics(cfg.metric)
     if is_sweep(folder):
-        _evaluate_sweep(cfg, folder)
+        _evaluate_sweep(cfg, call, folder)
         return
-    result = evaluate(cfg, find_run(str(cfg.run)))
+    result = evaluate(cfg, call, find_run(str(cfg.run)))
     print(_as_text(result))
     try:
         write_json(folder / EVALUATION, with_earlier(result, folder, cfg.metric))
@@ -55,7 +63,7 @@ def run(cfg: DictConfig) -> None:
     print(f"\n{shown(folder / EVALUATION)}")
 
 
-def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
+def evaluate(cfg: DictConfig, call: Call, folder: Path) -> dict[str, Any]:
     """Return what the metrics of ``cfg`` measure of the run in ``folder``, for its ``eval.json``.
 
     The rasterizer and the prior are those of the run, and so is the truth unless ``cfg`` names another one.
@@ -63,10 +71,14 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     the run names components that must not be built without ``trust=true``, and for a prompt that the truth
     cannot read.
     """
-    is_trusted = cfg.trust
-    own = run_components(
-        folder, "prior", "rasterizer", "truth", is_trusted=is_trusted, retry=trusting(), optional=("truth",)
+    components_of = partial(
+        read_components,
+        folder / CONFIG,
+        folders=call.folders,
+        is_trusted=cfg.trust,
+        retry=trusting(call),
     )
+    own = components_of(("prior", "rasterizer", "truth"), optional=("truth",))
     asset = open_run(folder, cfg.device)
     device = asset.gaussians.device
     prior = component(own.prior, DiffusionPrior, "prior").to(device)
@@ -90,7 +102,7 @@ def evaluate(cfg: DictConfig, folder: Path) -> dict[str, Any]:
             truth=truth,
             asset=asset.file,
         ),
-        partial(start_of, folder, device, is_trusted=is_trusted) if source.measures_start else None,
+        partial(start_of, components_of, device) if source.measures_start else None,
         warnings,
     )
     if warnings:
@@ -137,26 +149,26 @@ def _explained(score: Score) -> str:
     return ", ".join(parts)
 
 
-def start_of(folder: Path, device: torch.device, *, is_trusted: bool) -> Gaussians:
-    """Return the Gaussians that the run in ``folder`` has started from, built again from its settings."""
-    source = run_components(folder, "initializer", is_trusted=is_trusted, retry=trusting())
+def start_of(components_of: Callable[[tuple[str, ...]], DictConfig], device: torch.device) -> Gaussians:
+    """Return the Gaussians that a run has started from, built again from its settings."""
+    source = components_of(("initializer",))
     require_whole("seed", source.seed, low=0, example=3)
     initializer: Initializer = component(source.initializer, Initializer, "initializer")
     return rebuild_start(source.prompt, initializer, source.seed, device)
 
 
-def trusting() -> str:
+def trusting(call: Call) -> str:
     """Return this command line with ``trust=true``."""
-    return shlex.join(["cadam3d", "eval", *HydraConfig.get().overrides.task, "trust=true"])
+    return shlex.join(["cadam3d", "eval", *call.words, "trust=true"])
 
 
-def _evaluate_sweep(cfg: DictConfig, folder: Path) -> None:
+def _evaluate_sweep(cfg: DictConfig, call: Call, folder: Path) -> None:
     """Measure every job of a sweep, and write the ``eval.json`` and the report of the sweep."""
     results, written, failures = [], [], 0
     problem: UserError | None = None
     for job in (row.folder for row in load(folder)):
         try:
-            results.append(evaluate(cfg, find_run(str(job))))
+            results.append(evaluate(cfg, call, find_run(str(job))))
         except UserError as error:
             failures += 1
             results.append({"run": str(shown(job)), "message": str(error)})

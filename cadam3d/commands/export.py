@@ -14,14 +14,22 @@ from cadam3d.exporter.base import Contents, Exporter
 from cadam3d.exporter.programs import UPSIDE_DOWN, shown_as
 from cadam3d.io.asset_record import FileEntry, axes_of, facts_of, require_own_record, sha256_of, write_record
 from cadam3d.io.lock import taking_turns
-from cadam3d.io.run_folder import CONFIG, EXPORTS, expanded, has_file, numbered, shown, typed_path
-from cadam3d.settings.compose import escape
-from cadam3d.settings.line import setting_word
+from cadam3d.io.run_folder import (
+    CONFIG,
+    EXPORTS,
+    expanded,
+    has_file,
+    numbered,
+    setting_word,
+    shown,
+    typed_path,
+)
+from cadam3d.settings.compose import Call, escape
 
 INDENT = "  "
 
 
-def run(cfg: DictConfig) -> None:
+def run(cfg: DictConfig, _call: Call) -> None:
     """Write ``output``: a file if it has a suffix, else a folder (by default ``exports`` beside the asset).
 
     Print a few lines about each file.

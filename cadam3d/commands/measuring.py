@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from cadam3d.build import component, components
 from cadam3d.commands.messages import keeping_others, note, warn
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
@@ -14,7 +15,7 @@ from cadam3d.io.records import MEASUREMENTS, NUMBERS
 from cadam3d.metric.base import Measurand, Metric
 from cadam3d.metric.protocol import Protocol
 from cadam3d.metric.turn import facing
-from cadam3d.settings.compose import component, components, compose
+from cadam3d.settings.compose import compose
 from cadam3d.settings.options import option_names
 from cadam3d.state import start_generators
 

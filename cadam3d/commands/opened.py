@@ -1,15 +1,14 @@
 """Opened assets: the results of a run, or a single file, for all commands that use them."""
 
 import os
-from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor
 
+from cadam3d.build import component
 from cadam3d.commands.messages import note_backend
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require_choice
@@ -21,11 +20,18 @@ from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.frames import UPS
 from cadam3d.io.records import read_summary
-from cadam3d.io.run_folder import ASSET, CONFIG, expanded, has_file, shown, suggestion, typed_path
+from cadam3d.io.run_folder import (
+    ASSET,
+    CONFIG,
+    expanded,
+    has_file,
+    resume_word,
+    setting_word,
+    shown,
+    suggestion,
+    typed_path,
+)
 from cadam3d.rasterizer.base import Rasterizer, render_fn
-from cadam3d.settings.compose import component
-from cadam3d.settings.line import resume_word, setting_word
-from cadam3d.settings.trust import read_components
 from cadam3d.sweep.folder import is_sweep
 
 
@@ -98,24 +104,6 @@ def find_run(text: str) -> Path:
     else:
         reason = f"it has no {CONFIG}"
     raise UserError(f"run: expected the folder of a run, got {text!r} ({reason}). Try: {example}")
-
-
-def run_components(
-    folder: Path, *names: str, is_trusted: bool, retry: str, optional: Collection[str] = ()
-) -> DictConfig:
-    """Return the prompt, the seed and the components ``names`` of the run in ``folder``.
-
-    Those of ``optional`` may be missing. Raises ``UserError`` if they are not of this package or of
-    ``--config-dir``, unless the run is trusted. ``retry`` is the line that trusts it.
-    """
-    return read_components(
-        folder / CONFIG,
-        names,
-        [Path(each.path) for each in HydraConfig.get().runtime.config_sources if each.schema == "file"],
-        is_trusted=is_trusted,
-        retry=retry,
-        optional=optional,
-    )
 
 
 def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:

@@ -16,6 +16,7 @@ from cadam3d.exporter.base import Exporter
 from cadam3d.io.caption import plain
 from cadam3d.io.records import read_summary
 from cadam3d.io.run_folder import LATEST, shown
+from cadam3d.settings.compose import Call
 
 # Runs side by side. The pictures of more would be too small for their captions.
 MOST_RUNS = 12
@@ -23,7 +24,7 @@ LONGEST_LABEL = 80  # characters
 LONGEST_NAME = 120  # characters of the folder of a comparison
 
 
-def run(cfg: DictConfig) -> None:
+def run(cfg: DictConfig, _call: Call) -> None:
     """Write ``output``: a file if it has a suffix, else a folder (by default ``render`` beside the asset).
 
     The pictures of several runs are by default in the folder ``compare`` of the first one.

@@ -28,11 +28,12 @@ from cadam3d.io.run_folder import (
     occupant,
     remove_empty,
     require_writable,
+    setting_word,
     shown,
     typed_path,
 )
 from cadam3d.report.formatting import plural
-from cadam3d.settings.line import setting_word
+from cadam3d.settings.compose import Call
 from cadam3d.study.answers import (
     RESULTS_KIND,
     AnswerFile,
@@ -55,7 +56,7 @@ This page sends nothing. Your answers, the time that each of them took, and the 
 below stay in this browser until you save them as a file. You decide whether you send that file."""
 
 
-def run(cfg: DictConfig) -> None:
+def run(cfg: DictConfig, _call: Call) -> None:
     """Write the page and the key of a study of ``runs=``, or evaluate the files in ``answers=``."""
     if (cfg.runs is None) == (cfg.answers is None):
         got = "neither" if cfg.runs is None else "both"

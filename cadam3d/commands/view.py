@@ -21,10 +21,11 @@ from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.run_folder import REPORT, expanded, has_file, shown, typed_path
 from cadam3d.live.server import HOST, Server
 from cadam3d.live.subject import Run, Subject
+from cadam3d.settings.compose import Call
 from cadam3d.sweep.folder import is_sweep
 
 
-def run(cfg: DictConfig) -> None:
+def run(cfg: DictConfig, _call: Call) -> None:
     """Serve the page of ``run=`` or ``ply=`` until Ctrl-C. For a sweep, open its report instead."""
     require_whole("port", cfg.port, low=0, high=65535, example=0)
     require_one(cfg)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from cadam3d.build import components
 from cadam3d.commands.messages import keeping_others, note
 from cadam3d.commands.opened import OpenedAsset
 from cadam3d.core.checks import fail
@@ -21,12 +22,11 @@ from cadam3d.io.run_folder import (
     numbered,
     remove_empty,
     require_writable,
+    setting_word,
     shown,
     spare,
     typed_path,
 )
-from cadam3d.settings.compose import components
-from cadam3d.settings.line import setting_word
 from cadam3d.settings.output import names_file
 from cadam3d.settings.trust import require_contained
 

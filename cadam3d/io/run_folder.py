@@ -18,6 +18,7 @@ CHARTS = "charts.json"  # the charts that the densifier and the objective declar
 CHECKPOINTS = "checkpoints"  # a folder
 CONFIG = "config.yaml"  # every setting, resolved
 HYDRA = ".hydra"  # a folder: the settings as Hydra has read them
+HYDRA_CONFIG = ".hydra/config.yaml"  # every setting, with its references to others
 HYDRA_SETTINGS = ".hydra/hydra.yaml"  # how Hydra was set up, with the folders of YAML files
 LOG = "train.log"
 METRICS = "metrics.jsonl"
@@ -73,6 +74,9 @@ ENDED = "job.json"  # exit code and seconds
 
 # In the folder of every run and of every sweep.
 LOCK = ".lock"  # held by the process that works there
+
+# The setting that names the folder of a run.
+RUN_FOLDER = "hydra.run.dir"
 
 LATEST = "outputs/latest"  # a link to the newest run, beside the runs that have no other place
 
@@ -251,6 +255,16 @@ def suggestion(command: str, key: str, *needed: str) -> str:
     if run is None:
         return 'cadam3d train prompt="a red torus"'
     return f"{command} {shlex.quote(f'{key}={run}')}".strip()
+
+
+def resume_word(place: str | Path) -> str:
+    """Return ``resume=PLACE`` as it is typed into a shell."""
+    return setting_word("resume", place)
+
+
+def setting_word(key: str, value: object) -> str:
+    """Return ``KEY=VALUE`` as it is typed into a shell."""
+    return shlex.quote(f"{key}={value}")
 
 
 def expanded(text: str) -> Path:

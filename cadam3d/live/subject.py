@@ -32,12 +32,12 @@ from cadam3d.io.run_folder import (
     SAVED_PATTERN,
     SUMMARY,
     TURNTABLE,
+    resume_word,
     saved_name,
     shown,
 )
 from cadam3d.live.curves import Curves
 from cadam3d.report.declarations import read_declarations
-from cadam3d.settings.line import resume_word
 from cadam3d.viewer.pack import pack
 
 LARGEST_SNAPSHOT = 1 << 30  # bytes; ten million Gaussians of SH degree 3 have less

@@ -12,13 +12,12 @@ from pathlib import Path
 
 from cadam3d.core.number import Number
 from cadam3d.io import records
-from cadam3d.io.run_folder import shown
+from cadam3d.io.run_folder import setting_word, shown
 from cadam3d.report.formatting import plural
 from cadam3d.report.means import Mean, change, difference, mean
 from cadam3d.report.published import ROWS, PublishedRow
 from cadam3d.report.results import GUIDANCE, PROMPT, RECIPE, SEED, WITH_ASSET, ArmSetting, Cell, JobResult
 from cadam3d.report.verdicts import OURS, THEIRS
-from cadam3d.settings.line import setting_word
 
 # The columns, in order, of which a table has those that were measured: the paper's scores, other scores, then
 # comparisons with a truth.

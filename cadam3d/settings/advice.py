@@ -90,7 +90,7 @@ def explain(
         case InterpolationResolutionError():
             reason = _unresolved(error, command, words)
         case OSError() if is_refused_path(error):
-            reason = _refused_path(error, command, words)
+            reason = refused_path(error, command, words)
         case yaml.YAMLError() | UnicodeDecodeError() | RecursionError():
             text = " ".join(str(error).split())
             reason = UserError(f"configuration: cannot be read ({text}). Try: cadam3d {command} --help")
@@ -149,8 +149,10 @@ def _missing_values(keys: Sequence[str], command: str, words: Sequence[str]) -> 
     return UserError(f"{', '.join(keys)}: no value given. Try: {line}")
 
 
-def _refused_path(error: OSError, command: str, words: Sequence[str]) -> UserError:
-    """Explain that the system refuses a path for its form, with the line without the setting that has it."""
+def refused_path(error: OSError, command: str, words: Sequence[str]) -> UserError | None:
+    """Explain that the system refuses a path for its form; None for any other exception."""
+    if not is_refused_path(error):
+        return None
     path, reason = str(error.filename), error.strerror
     wrong = max(
         (word for word in words if _value(word) in path), key=lambda word: len(_value(word)), default=""

@@ -1,31 +1,29 @@
-"""Compose: read the YAML files, apply the overrides of a command line, and build the objects."""
+"""Compose: read the YAML files and apply the overrides of a command line, as Hydra does."""
 
 import difflib
 import math
 import re
 import shlex
 import unicodedata
+from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
-from hydra import version
-from hydra._internal.hydra import Hydra
-from hydra._internal.utils import create_config_search_path
-from hydra.core.config_search_path import SearchPathQuery
+import hydra
 from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException, InstantiationException
-from hydra.types import RunMode
-from hydra.utils import instantiate
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.utils import JobRuntime
+from hydra.errors import HydraException
+from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict
-from omegaconf.errors import OmegaConfBaseException, UnsupportedValueType
+from omegaconf.errors import OmegaConfBaseException
 
-from cadam3d.core.checks import fail, require_choice
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_yaml
-from cadam3d.settings.check import require_declared
-from cadam3d.settings.options import config_dir, option_names, read_option
+from cadam3d.settings.options import config_dir
 
 # Hydra behaves like this version even if a newer one is installed.
 VERSION_BASE = "1.3"
@@ -33,10 +31,43 @@ VERSION_BASE = "1.3"
 NO_NAME_COMPLAINT = "Config group override must be a string or a list"
 # Values of these keys are always text, so the user need not quote them for Hydra.
 TEXT_KEYS = ("prompt", "negative_prompt")
+# More folders of YAML files.
+SEARCH_PATH = "hydra.searchpath"
 # Characters. At three bytes each they still fit into a file name.
 SLUG_LENGTH = 60
 # Characters of a key. Hydra looks for a folder with the name of every key.
 LONGEST_KEY = 200
+
+
+@dataclass(frozen=True)
+class Call:
+    """How a command was called, apart from the settings."""
+
+    words: Sequence[str]  # the overrides as they were typed
+    hydra: DictConfig  # Hydra's own node
+    folder: Path  # of a run, as the settings name it
+    has_chosen_folder: bool  # whether the line names it
+
+    @property
+    def choices(self) -> Mapping[str, str]:
+        """Return the chosen option of each group."""
+        return self.hydra.runtime.choices
+
+    @property
+    def folders(self) -> list[Path]:
+        """Return the folders in which Hydra has searched for YAML files. Nothing from a run changes them."""
+        return [Path(source.path) for source in self.hydra.runtime.config_sources if source.schema == "file"]
+
+
+def compose_line(config_name: str, overrides: Sequence[str], options: Namespace) -> DictConfig:
+    """Return the configuration of a line, with Hydra's own node. Raises Hydra's exceptions."""
+    return compose(
+        overrides,
+        options.config_name or config_name,
+        folder=Path(options.config_path) if options.config_path else None,
+        search_path=options.config_dir,
+        with_hydra=True,
+    )
 
 
 def compose(
@@ -53,20 +84,18 @@ def compose(
     keeps Hydra's own node. Raises Hydra's exceptions; ``cadam3d.settings.advice`` explains them to the user.
     """
     register_resolvers()
-    require_files(folder or config_dir(), "--config-path")
-    places = create_config_search_path(str((folder or config_dir()).resolve()))
+    place = (folder or config_dir()).resolve()
+    require_files(place, "--config-path")
+    words = list(overrides)
     if search_path is not None:
-        own = Path(search_path).absolute()
-        require_files(own, "--config-dir")
-        places.prepend("command-line", f"file://{own}", anchor=SearchPathQuery(provider="schema"))
-    # A command that runs inside Hydra may compose too, so Hydra's global state is restored afterwards.
-    outer = GlobalHydra.instance().hydra
-    GlobalHydra.instance().clear()
-    version.setbase(VERSION_BASE)
+        require_files(Path(search_path), "--config-dir")
+        words = [word for word in words if not word.startswith(f"{SEARCH_PATH}=")]
+        more = [each for word in overrides if word not in words for each in _parsed(word)]
+        places = [f"file://{Path(search_path).absolute()}", *more]
+        words.append(f"{SEARCH_PATH}=[{','.join(map(quote, places))}]")
     try:
-        cfg = Hydra.create_main_hydra2("cadam3d", places).compose_config(
-            config_name, list(overrides), run_mode=RunMode.RUN, from_shell=False
-        )
+        with _own_hydra(place):
+            cfg = hydra.compose(config_name, words, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, UserError):
         raise
     # A wrong YAML file, or a deeply nested value, raises an exception of a parser, of a codec or of Python.
@@ -74,14 +103,30 @@ def compose(
         if str(error).startswith(NO_NAME_COMPLAINT):
             raise
         reason = " ".join(str(error).split())[:300] or type(error).__name__
-        place = "--config-dir" if search_path is not None else "configuration"
-        raise UserError(f"{place}: cannot be read ({reason}). Try: cadam3d {config_name} --help") from error
-    finally:
-        GlobalHydra.instance().hydra = outer
+        where = "--config-dir" if search_path is not None else "configuration"
+        raise UserError(f"{where}: cannot be read ({reason}). Try: cadam3d {config_name} --help") from error
     if not with_hydra:
         with open_dict(cfg):
             cfg.pop("hydra", None)
     return cfg
+
+
+@contextmanager
+def _own_hydra(folder: Path) -> Iterator[None]:
+    """Initialize Hydra with a folder of YAML files, and restore that of the calling program afterwards."""
+    outer, version = GlobalHydra.instance().hydra, VersionBase.instance().version_base
+    GlobalHydra.instance().clear()
+    try:
+        name = JobRuntime.instance().get("name")
+        with hydra.initialize_config_dir(str(folder), job_name=name, version_base=VERSION_BASE):
+            yield
+    finally:
+        GlobalHydra.instance().hydra = outer
+        VersionBase.instance().version_base = version
+
+
+def _parsed(override: str) -> Any:
+    return OverridesParser.create().parse_override(override).value()
 
 
 def require_files(folder: Path, flag: str) -> None:
@@ -102,87 +147,6 @@ def _folder_like(flag: str, missing: Path) -> str:
     beside = sorted(place.name for place in missing.parent.glob("*/") if place.is_dir())
     near = difflib.get_close_matches(missing.name, beside, n=1)
     return shlex.quote(f"{flag}={missing.with_name(near[0]) if near else '.'}")
-
-
-def component(node: Any, kind: type = object, key: str = "") -> Any:
-    """Build the object that ``node._target_`` names, and nested ones; lists and dicts become plain Python.
-
-    ``kind`` is the class of the object; ``key`` is the place of the node, in case that it is not a dict.
-    Raises ``UserError`` for mistakes in the configuration: values of a wrong type or out of range, unknown
-    keys, missing keys, a target that cannot be imported or is of another kind. Nothing is built if a type is
-    wrong. A bug in a constructor raises its own exception.
-    """
-    try:
-        place = node._get_full_key("") if OmegaConf.is_config(node) else ""
-        require_declared(node, (kind,), place or key or "configuration")
-        return instantiate(_resolved(node), _convert_="all")
-    except InstantiationException as error:
-        raise _construction_error(error, node) from error
-    except OmegaConfBaseException as error:
-        reason = str(error.msg).splitlines()[0]
-        raise UserError(
-            f"{error.full_key or 'configuration'}: {reason}. Try: cadam3d train --cfg job"
-        ) from error
-
-
-def _resolved(node: Any) -> Any:
-    """Return ``node``, or a copy of it if a text in it would become an interpolation once it is resolved.
-
-    Hydra resolves a component twice. A prompt such as ``${oc.env:HOME}``, which is plain text after the first
-    time, would be replaced the second time, so the copy is escaped twice.
-    """
-    if not OmegaConf.is_config(node):
-        return node
-    content = OmegaConf.to_container(node, resolve=True)
-    if not any(isinstance(value, str) and "${" in value for value in _values(content)):
-        return node
-    copy = OmegaConf.create(escaped(escaped(content)))
-    copy._set_parent(node._get_parent())
-    copy._set_key(node._key())
-    return copy
-
-
-def _values(content: Any) -> Iterator[Any]:
-    """Yield every value of nested dicts and lists."""
-    inner = content.values() if isinstance(content, dict) else content if isinstance(content, list) else None
-    if inner is None:
-        yield content
-    for item in inner or ():
-        yield from _values(item)
-
-
-def option(group: str, name: str, kind: type, changes: Mapping[str, Any] = MappingProxyType({})) -> Any:
-    """Build one option of a group from its YAML file in this package, without a command line.
-
-    ``changes`` replace values of the file. Raises ``UserError`` for an unknown option and for the mistakes
-    that :func:`component` reports.
-    """
-    require_choice(group, name, option_names(group))
-    values = read_option(group, name)
-    values[group].get(name, values[group]).update({key: escaped(value) for key, value in changes.items()})
-    try:
-        node = OmegaConf.create(values)[group]
-    except UnsupportedValueType as error:
-        expected = "a number, a text or a list of them"
-        raise fail(
-            error.full_key or group, expected=expected, got=dict(changes), example=f"{group}={name}"
-        ) from None
-    return component(node.get(name, node), kind, group)
-
-
-def components(group: Any, kind: type = object, key: str = "") -> dict[str, Any]:
-    """Build every chosen member of a group of which several can be chosen, by name.
-
-    An experiment may tune a member that the line has not chosen; such a node has keys but no ``_target_``.
-    """
-    if not isinstance(group, DictConfig):
-        raise fail(key, expected="a list of options", got=group, example=f"'{key}=[]'")
-    place = group._get_full_key("") or key
-    return {
-        str(name): component(node, kind, f"{place}.{name}")
-        for name, node in group.items()
-        if not isinstance(node, DictConfig) or "_target_" in node
-    }
 
 
 def load_config(path: Path) -> DictConfig:
@@ -209,14 +173,14 @@ def flatten(node: object, prefix: str = "", *, with_nodes: bool = False) -> Iter
 
 
 def register_resolvers() -> None:
-    """Register the functions that YAML files call, as in ``${parts:9,12,${steps}}``.
+    """Register the functions that YAML files call, as in ``${cadam3d.parts:9,12,${steps}}``.
 
     It is safe to call this again.
     """
-    OmegaConf.register_new_resolver("copies", copies, replace=True)
-    OmegaConf.register_new_resolver("parts", parts, replace=True)
-    OmegaConf.register_new_resolver("slug", slug, replace=True)
-    OmegaConf.register_new_resolver("span", span, replace=True)
+    OmegaConf.register_new_resolver("cadam3d.copies", copies, replace=True)
+    OmegaConf.register_new_resolver("cadam3d.parts", parts, replace=True)
+    OmegaConf.register_new_resolver("cadam3d.slug", slug, replace=True)
+    OmegaConf.register_new_resolver("cadam3d.span", span, replace=True)
 
 
 def parts(count: int, pieces: int, steps: object, least: int = 1) -> int:
@@ -277,39 +241,3 @@ def quote(text: str) -> str:
     escaped = re.sub(r"(\\*)'", lambda match: match.group(1) * 2 + r"\'", escape(text))
     trailing = len(escaped) - len(escaped.rstrip("\\"))
     return "'" + escaped + "\\" * trailing + "'"
-
-
-def _construction_error(error: InstantiationException, node: Any) -> BaseException:
-    """Return ``UserError`` for a mistake in the configuration, or else the exception of the constructor."""
-    cause = error.__cause__
-    key = re.search(r"full_key: (\S+)", str(error))
-    where = _typed_place(node, key.group(1)) if key else "configuration"
-    if isinstance(cause, UserError):
-        return _placed(cause, where)
-    if cause is None:
-        return UserError(f"{where}: {str(error).splitlines()[0]}. Try: cadam3d train --cfg job")
-    return cause
-
-
-def _typed_place(node: Any, where: str) -> str:
-    """Return the place at which the user types a setting of the node ``where``, which is in ``node``.
-
-    It is another place if the inner node is an interpolation: ``protocol`` for ``metric.niqe.protocol``.
-    """
-    if not isinstance(node, DictConfig):
-        return where
-    name = where.removeprefix(f"{node._get_full_key('')}.")
-    raw: Any = OmegaConf.to_container(node, resolve=False)
-    taken = re.fullmatch(r"\$\{([\w.]+)\}", str(raw.get(name)))
-    return taken.group(1) if taken else where
-
-
-def _placed(error: UserError, where: str) -> UserError:
-    """Return the error of a constructor with the place of its node, which the constructor cannot know.
-
-    A schedule, for example, writes ``schedule.steps``, which is ``optimizer.means_lr.steps`` here.
-    """
-    text = str(error)
-    if not (named := re.match(r"([\w.*]+)\.\w+: ", text)) or f"{named.group(1)}.".startswith(f"{where}."):
-        return error
-    return UserError(text.replace(f"{named.group(1)}.", f"{where}."))

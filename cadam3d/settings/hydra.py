@@ -1,65 +1,32 @@
-"""Hydra: read its flags, compose the configuration of a line, and run a command as one of its jobs."""
+"""Hydra: refuse settings that have no effect, and run Hydra's main function for its pages and launchers."""
 
 import os
 import re
 import sys
-from argparse import Namespace
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
+import hydra
 import yaml  # comes with OmegaConf
-from hydra import main as hydra_main
-from hydra._internal.callbacks import Callbacks
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.utils import create_config_search_path, get_args_parser
-from hydra.core.utils import JobRuntime, JobStatus, configure_log, run_job
-from hydra.types import HydraContext
-from hydra.version import VersionBase
-from omegaconf import DictConfig, OmegaConf, open_dict
-from omegaconf.basecontainer import BaseContainer
-from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
+from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.core.errors import UserError
 from cadam3d.settings.advice import default_option, did_you_mean, line_of
-from cadam3d.settings.compose import VERSION_BASE, compose, quote, register_resolvers
-from cadam3d.settings.line import RUN_FOLDER, key_of
+from cadam3d.settings.compose import VERSION_BASE, register_resolvers
+from cadam3d.settings.line import key_of
 from cadam3d.settings.options import TARGET, config_dir, option_word
 
 # A reference to other settings, such as ${steps}.
 REFERENCE = re.compile(r"\$\{[^}]*")
 # The groups of which several options can be chosen.
 LISTS = ("regularizer", "exporter", "callback", "metric")
-Run = Callable[[DictConfig], Any]  # a command, given its composed configuration
-
-
-def read_flags(flags: Sequence[str]) -> Namespace:
-    """Parse the flags of a line. Raises ``UserError`` for unknown ones and for conflicting ones."""
-    parser = get_args_parser()
-    parser.error = _refuse_flags  # type: ignore[method-assign]
-    options = parser.parse_args(list(flags))
-    modes = [options.run, options.multirun and not options.cfg, bool(options.cfg), options.info is not None]
-    if sum(map(bool, modes)) > 1:
-        raise UserError(f"{' '.join(flags)}: these flags cannot be combined. Try: cadam3d --help")
-    return options
-
-
-def compose_line(config_name: str, overrides: Sequence[str], options: Namespace) -> DictConfig:
-    """Return the configuration of a line, with Hydra's own node. Raises Hydra's exceptions."""
-    return compose(
-        overrides,
-        options.config_name or config_name,
-        folder=Path(options.config_path) if options.config_path else None,
-        search_path=options.config_dir,
-        with_hydra=True,
-    )
 
 
 def refuse_missing_settings(cfg: DictConfig, command: str, overrides: Sequence[str]) -> None:
-    """Refuse a line that removes a top-level setting or refers to a setting that does not exist.
+    """Refuse a line that removes a top-level setting or refers to something that does not exist.
 
-    Raises ``UserError`` for the former and OmegaConf's ``InterpolationKeyError`` for the latter.
+    Raises ``UserError`` for the former and OmegaConf's ``InterpolationResolutionError`` for the latter.
     """
     for override in overrides:
         key = key_of(override)
@@ -74,17 +41,8 @@ def refuse_missing_settings(cfg: DictConfig, command: str, overrides: Sequence[s
     assert isinstance(raw, dict)
     # Plain values come first, so that the message names the wrong value and not a setting that refers to it.
     for key in sorted(raw, key=lambda key: isinstance(raw[key], dict)):
-        # Hydra's own node refers to values that exist only in a running job.
-        if key == "hydra" or "${" not in str(raw[key]):
-            continue
-        try:
-            value = cfg[key]
-            if OmegaConf.is_config(value):
-                OmegaConf.to_container(value, resolve=True)
-        except InterpolationKeyError:
-            raise
-        except InterpolationResolutionError:
-            continue  # such as ${hydra:...}, which only a running job can resolve
+        if key != "hydra" and "${" in str(raw[key]) and OmegaConf.is_config(value := cfg[key]):
+            OmegaConf.to_container(value, resolve=True)
 
 
 def refuse_unread_settings(cfg: DictConfig, command: str, overrides: Sequence[str]) -> None:
@@ -122,62 +80,17 @@ def refuse_unread_settings(cfg: DictConfig, command: str, overrides: Sequence[st
             raise UserError(f"{group}.{member}: is not chosen. Try: '{group}=[{chosen}]'")
 
 
-def place_run(cfg: DictConfig, folder: Path) -> None:
-    """Change ``cfg``, in place, as if the line had set ``hydra.run.dir`` to ``folder``."""
-    with open_dict(cfg):
-        cfg.hydra.run.dir = str(folder)
-        kept = [override for override in cfg.hydra.overrides.hydra if key_of(override) != RUN_FOLDER]
-        cfg.hydra.overrides.hydra = [f"{RUN_FOLDER}={quote(str(folder))}", *kept]
+def print_nothing(_cfg: DictConfig) -> None:
+    """Do nothing, as the function that Hydra does not call when it prints a page."""
 
 
-def run_composed(cfg: DictConfig, run: Run, *, has_log: bool = True) -> None:
-    """Run a command on its composed configuration as a job of Hydra.
+def run_hydra(
+    command: str, arguments: Sequence[str], run: Callable[[DictConfig], Any] = print_nothing
+) -> None:
+    """Run Hydra's main function on ``arguments`` and the YAML of ``command``.
 
-    The job has its ``.hydra`` folder, ``HydraConfig`` and, if it ``has_log``, its log, for which Hydra
-    replaces the handlers of this process. Raises whatever the command raises, which Hydra itself would print
-    before it exits.
-    """
-    if has_log:
-        configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)
-    name, callbacks = cfg.hydra.job.config_name, Callbacks(cfg)
-    callbacks.on_run_start(config=cfg, config_name=name)
-    loader = ConfigLoaderImpl(config_search_path=create_config_search_path(str(config_dir())))
-    job = run_job(
-        task_function=run,
-        config=cfg,
-        job_dir_key=RUN_FOLDER,
-        job_subdir_key=None,
-        hydra_context=HydraContext(config_loader=loader, callbacks=callbacks),
-        configure_logging=has_log,
-    )
-    callbacks.on_run_end(config=cfg, config_name=name, job_return=job)
-    if job.status is JobStatus.FAILED:
-        # The property ``return_value`` would print a line first.
-        raise job._return_value
-
-
-@contextmanager
-def keeping_globals() -> Iterator[None]:
-    """Restore the global state of Hydra and OmegaConf after the block, for programs that use them too.
-
-    This is the version whose behaviour Hydra has, the name of the job, and the functions that YAML files can
-    call. :func:`cadam3d.settings.compose.compose` and Hydra itself restore the rest.
-    """
-    version, runtime = VersionBase.instance(), JobRuntime.instance()
-    base, name, resolvers = version.version_base, runtime.get("name"), dict(BaseContainer._resolvers)
-    try:
-        yield
-    finally:
-        version.version_base = base
-        runtime.set("name", name)
-        BaseContainer._resolvers.clear()
-        BaseContainer._resolvers.update(resolvers)
-
-
-def run_hydra(command: str, arguments: Sequence[str], run: Run) -> None:
-    """Run Hydra's main function on ``arguments`` and the YAML of ``command``, for a page or for many jobs.
-
-    Raises Hydra's exceptions.
+    It prints one of Hydra's pages, or lets a launcher call ``run`` for each of many jobs. Raises Hydra's
+    exceptions.
     """
     register_resolvers()
     arguments_before, switch_before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
@@ -185,7 +98,7 @@ def run_hydra(command: str, arguments: Sequence[str], run: Run) -> None:
     # Otherwise Hydra would print exceptions and exit.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
-        hydra_main(version_base=VERSION_BASE, config_path=str(config_dir()), config_name=command)(run)()
+        hydra.main(version_base=VERSION_BASE, config_path=str(config_dir()), config_name=command)(run)()
     finally:
         sys.argv = arguments_before
         os.environ["HYDRA_FULL_ERROR"] = switch_before or "0"
@@ -201,7 +114,3 @@ def _declared_names(command: str) -> set[str]:
         elif entry != "_self_":
             names |= _declared_names(entry)
     return names
-
-
-def _refuse_flags(message: str) -> NoReturn:
-    raise UserError(f"{message}. Try: cadam3d --help")

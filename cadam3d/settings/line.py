@@ -1,21 +1,23 @@
 """Line: read the words after ``cadam3d COMMAND``: overrides, flags, quoting, and resuming a run."""
 
+import argparse
 import os
 import re
 import shlex
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.run_folder import OVERRIDES, has_file, suggestion, typed_path
+from cadam3d.io.run_folder import OVERRIDES, RUN_FOLDER, has_file, resume_word, suggestion, typed_path
 from cadam3d.settings.compose import TEXT_KEYS, quote
 from cadam3d.settings.options import config_dir
 from cadam3d.settings.trust import is_trusted, judge_overrides, read_overrides, require_contained
 
-RUN_FOLDER = "hydra.run.dir"
 SWEEP_FOLDER = "hydra.sweep.dir"
 # Values of these keys are quoted if necessary: paths, and a text that may be null.
 PATH_KEYS = (
@@ -45,9 +47,78 @@ SWEEP_CALL = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)", 
 # The text up to a comma that is not followed by a space.
 PIECE = re.compile(r"(?:[^,]|,(?=\s|$))*", re.DOTALL)
 FLAGS_WITH_VALUE = (
-    *("--cfg", "-c", "--package", "-p", "--info", "-i", "--experimental-rerun"),
+    *("--cfg", "-c", "--package", "-p", "--info", "-i"),
     *("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
 )
+# The settings of Hydra that have an effect.
+HYDRA_KEYS = re.compile(
+    r"hydra\.(run\.dir|sweep\.dir|sweep\.subdir|searchpath|mode)$|hydra[./](launcher|sweeper)\b"
+)
+
+
+@dataclass(frozen=True)
+class Line:
+    """The parsed command line after ``cadam3d``."""
+
+    command: str
+    overrides: list[str]  # quoted for Hydra
+    flags: list[str]
+    options: argparse.Namespace  # the flags, parsed
+    is_sweep: bool
+    words: list[str]  # the overrides as they were typed
+
+    @property
+    def trusting(self) -> str:
+        """Return what to type to trust the folder of a resumed run."""
+        return shlex.join(["cadam3d", self.command, *self.words, *self.flags, "trust=true"])
+
+    @property
+    def wants_page(self) -> bool:
+        """Return whether the line asks for a page, and not for work."""
+        return bool(self.wants_page_of_hydra or self.options.help or self.options.cfg)
+
+    @property
+    def wants_page_of_hydra(self) -> bool:
+        """Return whether the line asks for one of the pages about Hydra itself."""
+        options = self.options
+        return bool(options.hydra_help or options.info or options.shell_completion)
+
+
+class _Flags(argparse.ArgumentParser):
+    """The flags of every command, which are those of Hydra that are of use here."""
+
+    def __init__(self) -> None:
+        super().__init__(add_help=False, allow_abbrev=False)
+        for names in (
+            ("--help", "-h"),
+            ("--hydra-help",),
+            ("--multirun", "-m"),
+            ("--resolve",),
+            ("--shell-completion", "-sc"),
+        ):
+            self.add_argument(*names, action="store_true")
+        for names in (
+            ("--package", "-p"),
+            ("--config-path", "-cp"),
+            ("--config-name", "-cn"),
+            ("--config-dir", "-cd"),
+        ):
+            self.add_argument(*names)
+        self.add_argument("--cfg", "-c", choices=("job", "hydra", "all"))
+        pages = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+        self.add_argument("--info", "-i", nargs="?", const="all", choices=pages)
+
+    def error(self, message: str) -> NoReturn:
+        """Raise ``UserError``."""
+        raise UserError(f"{message}. Try: cadam3d --help")
+
+
+def read_flags(flags: Sequence[str]) -> argparse.Namespace:
+    """Parse the flags of a line. Raises ``UserError`` for unknown ones and for conflicting ones."""
+    options = _Flags().parse_args(list(flags))
+    if sum(map(bool, (options.multirun and not options.cfg, options.cfg, options.info))) > 1:
+        raise UserError(f"{' '.join(flags)}: these flags cannot be combined. Try: cadam3d --help")
+    return options
 
 
 def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -141,16 +212,6 @@ def is_list(override: str) -> bool:
     """Return whether the value of an override is a list in brackets, not the path of such a name."""
     _, _, value = override.partition("=")
     return value.startswith("[") and value.endswith("]") and not os.path.lexists(value)
-
-
-def resume_word(place: str | Path) -> str:
-    """Return ``resume=PLACE`` as it is typed into a shell."""
-    return shlex.quote(f"resume={place}")
-
-
-def setting_word(key: str, value: object) -> str:
-    """Return ``KEY=VALUE`` as it is typed into a shell."""
-    return shlex.quote(f"{key}={value}")
 
 
 def _items(text: str) -> list[str]:

@@ -221,7 +221,7 @@ def _inside(values: Any, parts: Sequence[str]) -> Any:
 
 
 def _is_typed(value: Any) -> bool:
-    """Return whether a value can be an example: no object, and no call such as ``${parts:9,12,${steps}}``."""
+    """Return whether a value can be an example: no object, and no call such as ``${now:%Y}``."""
     text = str(value)
     return NOTHING not in text and TARGET not in text and not ("${" in text and ":" in text)
 

@@ -7,8 +7,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from cadam3d.core.checks import fail
 from cadam3d.exporter.base import Exporter, exporters_by_suffix
-from cadam3d.io.run_folder import expanded
-from cadam3d.settings.line import is_list, key_of, setting_word, text_of
+from cadam3d.io.run_folder import expanded, setting_word
+from cadam3d.settings.line import is_list, key_of, text_of
 from cadam3d.settings.options import option_class, option_names
 
 GROUP = "exporter"

@@ -16,9 +16,8 @@ from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.io.caption import plain
 from cadam3d.io.records import read_summary
-from cadam3d.io.run_folder import ASSET, CONFIG, has_file, shown, typed_path
+from cadam3d.io.run_folder import ASSET, CONFIG, has_file, setting_word, shown, typed_path
 from cadam3d.report.results import PROMPT, SEED, read
-from cadam3d.settings.line import setting_word
 from cadam3d.sweep.folder import is_sweep
 
 MOST_ARMS = 12

@@ -15,9 +15,9 @@ from cadam3d.core.number import COUNT, Number
 from cadam3d.core.outcome import Outcome
 from cadam3d.io.jsonl import is_number
 from cadam3d.io.records import declared, difference, read_evaluation, read_scores
-from cadam3d.io.run_folder import LATEST, shown
+from cadam3d.io.run_folder import LATEST, RUN_FOLDER, shown
 from cadam3d.settings.compose import slug
-from cadam3d.settings.line import RUN_FOLDER, key_of
+from cadam3d.settings.line import key_of
 from cadam3d.settings.options import config_dir, option_class, option_names
 from cadam3d.sweep.folder import Job, Row
 from cadam3d.sweep.grid import read_line, sweep_name

@@ -22,9 +22,8 @@ from cadam3d.io.cache import TRACES
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.lock import INHERITED, describe_holder, take, unlock
 from cadam3d.io.records import read_summary
-from cadam3d.io.run_folder import CONSOLE, ENDED, LOCK, SHARED, STOP, SUMMARY
+from cadam3d.io.run_folder import CONSOLE, ENDED, LOCK, RUN_FOLDER, SHARED, STOP, SUMMARY
 from cadam3d.settings.compose import quote
-from cadam3d.settings.line import RUN_FOLDER
 from cadam3d.sweep.folder import Plan, Row, is_complete, read_plan, rows_of
 
 # The folder from which this program imports cadam3d.

@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.lock import locked
+from cadam3d.io.occupied import in_use
 from cadam3d.io.records import read_config
 from cadam3d.io.run_folder import (
     CONFIG,
@@ -34,13 +35,13 @@ from cadam3d.io.run_folder import (
     holds_run,
     numbered,
     occupant_of_sweep,
+    setting_word,
     shown,
     spare,
 )
 from cadam3d.settings.compose import flatten, quote
 from cadam3d.settings.hydra import run_hydra
-from cadam3d.settings.line import NOT_OF_A_RUN, SWEEP_FOLDER, setting_word
-from cadam3d.settings.place import in_use
+from cadam3d.settings.line import NOT_OF_A_RUN, SWEEP_FOLDER
 from cadam3d.settings.trust import is_trusted, require_contained
 from cadam3d.sweep import worker
 from cadam3d.sweep.folder import Plan, Row, is_sweep, load, rows_of, write_plan

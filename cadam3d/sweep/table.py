@@ -9,8 +9,7 @@ from typing import Any
 from cadam3d.io.atomic import replacing
 from cadam3d.io.jsonl import to_json
 from cadam3d.io.records import Score, declared, difference, psnr_of, read_scores
-from cadam3d.io.run_folder import TABLE, shown
-from cadam3d.settings.line import setting_word
+from cadam3d.io.run_folder import TABLE, setting_word, shown
 from cadam3d.sweep.folder import Row, load
 
 FACTS = ("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "asset_bytes", "message")

@@ -20,9 +20,10 @@ from torch import Tensor, nn
 from torch.multiprocessing.spawn import spawn
 from tqdm import tqdm
 
+from cadam3d.build import component
 from cadam3d.io.atomic import replacing
 from cadam3d.prior.base import DiffusionPrior
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 
 AUTOENCODER_RATE = 1.5e-3
 VIEWS_FILE = "views.json"

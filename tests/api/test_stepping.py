@@ -7,9 +7,9 @@ import torch
 from composed import composed
 
 import cadam3d
+from cadam3d.build import component
 from cadam3d.core.edit import RowState
 from cadam3d.densifier.base import Densifier
-from cadam3d.settings.compose import component
 
 SMALL = ("prompt=a red cube", "prior=tiny", "rasterizer=reference", "steps=4", "views=1", "camera.size=8")
 SMALL += ("initializer.count=20", "refine.start=0", "refine.end=9", "refine.interval=2", "seed=3")

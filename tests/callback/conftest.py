@@ -6,9 +6,9 @@ import pytest
 import torch
 from composed import composed
 
-from cadam3d.commands.train import build_trainer, run_context
+from cadam3d.build import build_trainer, component
+from cadam3d.commands.beginning import run_context
 from cadam3d.initializer.base import Initializer
-from cadam3d.settings.compose import component
 
 SMALL = ("prompt=a red cube", "prior=tiny", "rasterizer=reference", "camera.size=12", "initializer.count=30")
 GROWING = ("steps=7", "refine.start=0", "refine.end=100", "refine.interval=2")

@@ -10,6 +10,7 @@ import pytest
 import torch
 from composed import as_yaml, composed
 
+from cadam3d.build import components
 from cadam3d.callback import tracking
 from cadam3d.callback.previews import Previews
 from cadam3d.callback.tensorboard import TensorBoard
@@ -18,7 +19,6 @@ from cadam3d.callback.wandb import Wandb, brings_settings, known_run, refused
 from cadam3d.core.console import heard_by
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import JOBS, occupant
-from cadam3d.settings.compose import components
 from cadam3d.settings.trust import require_contained
 from cadam3d.state import RunContext
 

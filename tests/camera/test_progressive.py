@@ -6,10 +6,11 @@ from itertools import pairwise
 import pytest
 import torch
 
+from cadam3d.build import component
 from cadam3d.camera.progressive import Progressive, Widening
 from cadam3d.core.cameras import Cameras, around
 from cadam3d.core.errors import UserError
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 
 STILL = {"position_jitter": 0.0, "target_jitter": 0.0, "up_jitter": 0.0}
 

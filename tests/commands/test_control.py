@@ -3,12 +3,12 @@
 import pytest
 import torch
 
+from cadam3d.build import build_trainer, component
 from cadam3d.commands import control
 from cadam3d.commands.control import Control
-from cadam3d.commands.train import build_trainer
 from cadam3d.io import live
 from cadam3d.io.ply import read_ply
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 
 
 class Run:

@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from cadam3d.commands.train import TOGETHER_SECONDS, StopOnSignal
+from cadam3d.commands.control import TOGETHER_SECONDS, StopOnSignal
 
 BOTH = (signal.SIGINT, signal.SIGTERM)
 
@@ -13,7 +13,7 @@ BOTH = (signal.SIGINT, signal.SIGTERM)
 @pytest.fixture
 def clock(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr("cadam3d.commands.train.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("cadam3d.commands.control.time.monotonic", lambda: now[0])
     return now
 
 

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from cadam3d.build import build_trainer, component
 from cadam3d.commands.timetable import describe
-from cadam3d.commands.train import build_trainer
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 
 CPU = torch.device("cpu")
 

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from cadam3d.build import component
 from cadam3d.densifier.base import GradientSignal
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 from cadam3d.settings.options import config_dir
 
 CPU = torch.device("cpu")

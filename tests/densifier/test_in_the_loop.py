@@ -9,11 +9,11 @@ import torch
 from composed import composed
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from cadam3d.build import build_trainer, component
 from cadam3d.callback.base import Callback
-from cadam3d.commands.train import build_trainer
 from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.densifier.base import GradientSignal
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 from cadam3d.state import Outcome, RefineReport, RunContext, TrainState
 
 CPU = torch.device("cpu")

@@ -8,12 +8,13 @@ import pytest
 import torch
 from scipy.integrate import quad
 
+from cadam3d.build import component
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.mcmc import MCMC, draw, share
 from cadam3d.densifier.refine import Refine
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 
 CPU = torch.device("cpu")
 LATE = 10_000  # a step at which nothing is scheduled

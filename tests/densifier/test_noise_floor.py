@@ -11,11 +11,12 @@ import pytest
 import torch
 from composed import composed
 
+from cadam3d.build import component
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.cadam import CAdam, CAdamState
 from cadam3d.densifier.noise_floor import snr_threshold, squared_weights, white_noise_snr
 from cadam3d.prior.path import DDPM
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 
 CPU = torch.device("cpu")
 STEP = 100  # of a refinement; only schedules depend on it

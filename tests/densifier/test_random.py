@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from cadam3d.build import component
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -12,7 +13,7 @@ from cadam3d.core.reductions import quantile
 from cadam3d.core.schedule import Linear
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.random import RandomGrowth
-from cadam3d.settings.compose import component, compose
+from cadam3d.settings.compose import compose
 
 CPU = torch.device("cpu")
 STEP = 100  # of a refinement; only schedules depend on it

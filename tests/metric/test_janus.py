@@ -8,6 +8,7 @@ import torch
 from composed import composed
 from splats import make_gaussians
 
+from cadam3d.build import component, components
 from cadam3d.core.cameras import turntable
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians, concatenate
@@ -16,7 +17,6 @@ from cadam3d.metric.base import Measurand, Measurement
 from cadam3d.metric.janus import VIEWS, Janus
 from cadam3d.metric.scoring import Scorer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.settings.compose import component, components
 
 SETTINGS = dict(components(composed("prompt=a", "metric=[janus]").metric, key="metric"))
 ONE = make_gaussians(1)

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from cadam3d.build import option
 from cadam3d.core.errors import UserError
 from cadam3d.core.render import RenderOutput
 from cadam3d.metric.protocol import ModelName, Protocol, RingProtocol, SphereProtocol
-from cadam3d.settings.compose import option
 
 PICTURES = {
     "distance": 2.2,
@@ -172,6 +172,7 @@ def test_a_protocol_has_its_own_name_and_its_published_number_of_views(name, vie
 
 
 def composed(name):
-    from cadam3d.settings.compose import component, compose
+    from cadam3d.build import component
+    from cadam3d.settings.compose import compose
 
     return component(compose([f"protocol={name}", "prompt=a cube"]).protocol, Protocol)

@@ -23,12 +23,12 @@ pytest.importorskip("gsplat", reason="pip install -e .[dev]")
 
 from gsplat import DefaultStrategy, MCMCStrategy
 
+from cadam3d.build import component
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.plugins import gsplat as plugin
 from cadam3d.plugins.gsplat import CAdamStrategy
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.settings.compose import component
 
 EXACT = {"rtol": 0, "atol": 0}
 # Rates of the optimizers, which are high, because the runs are short.

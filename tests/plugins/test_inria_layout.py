@@ -11,8 +11,8 @@ from composed import composed
 from evidence import CPU, DRAWS, noise, signal
 from splats import make_gaussians
 
+from cadam3d.build import component
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.settings.compose import component
 
 PAGE = Path(__file__).parents[2] / "docs/your_trainer.md"
 SETTINGS = {"tau_Q": 0.6, "tau_SNR": 0.25, "min_age": 4, "reset_min_age": 4}

@@ -11,11 +11,11 @@ from composed import composed
 from evidence import CPU, DRAWS, STEP, edit_of, noise, signal
 
 import cadam3d
+from cadam3d.build import component
 from cadam3d.core.errors import UserError
 from cadam3d.densifier.cadam import CAdam
 from cadam3d.plugins import CAdamTracker, reset_opacities
 from cadam3d.plugins.settings import CAdamSettings
-from cadam3d.settings.compose import component
 
 PACKAGE = Path(cadam3d.__file__).parent
 N = 12

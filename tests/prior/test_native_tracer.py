@@ -209,7 +209,7 @@ def no_compiler(monkeypatch, tmp_path):
 def shapes(tracer: str) -> ShapesPrior:
     from composed import composed
 
-    from cadam3d.settings.compose import component
+    from cadam3d.build import component
 
     return component(composed("prior=shapes", "prior.census_size=4", f"prior.tracer={tracer}").prior)
 

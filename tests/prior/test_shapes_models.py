@@ -11,13 +11,14 @@ import torch
 from omegaconf import OmegaConf
 from pipelines import VOCABULARY
 
+from cadam3d.build import component
 from cadam3d.commands import doctor
 from cadam3d.core.errors import UserError
 from cadam3d.io import pretrained
 from cadam3d.io.jsonl import read_json
 from cadam3d.io.reading import read_yaml
-from cadam3d.settings.compose import component, compose, flatten
-from cadam3d.settings.hydra import read_flags
+from cadam3d.settings.compose import compose, flatten
+from cadam3d.settings.line import read_flags
 from cadam3d.settings.options import config_dir
 from cadam3d.sweep.plan import Composer, read_sweep
 

@@ -52,7 +52,7 @@ def test_the_page_of_an_option_lists_its_settings():
             assert each.key in text
             assert each.words in flat(text)
     assert "camera.fov_y_deg=[40.0,45.0]" in text
-    assert "guidance.t_max: Linear(start=0.98, end=0.5, steps=${parts:10,12,${steps}})" in text
+    assert "guidance.t_max: Linear(start=0.98, end=0.5, steps=${cadam3d.parts:10,12,${steps}})" in text
     assert "densifier" not in text.replace("densifier.tau_pos", "")
 
 

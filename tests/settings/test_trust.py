@@ -12,11 +12,12 @@ import torch
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
+from cadam3d.build import component
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.ply import write_ply
 from cadam3d.prior.base import DiffusionPrior
-from cadam3d.settings.compose import component, compose, flatten
+from cadam3d.settings.compose import compose, flatten
 from cadam3d.settings.line import key_of, resumed
 from cadam3d.settings.options import config_dir
 from cadam3d.settings.trust import MACHINERY, judge_overrides, read_components, require_contained
@@ -149,7 +150,7 @@ HOSTILE = [
     "seed=interval(0,1)",
     "prompt=${oc.env:HOME}",
     "prompt='a ${oc.decode:planted}'",
-    "prompt='${slug:${oc.env:HOME}}'",
+    "prompt='${cadam3d.slug:${oc.env:HOME}}'",
     r"prompt='a \\${oc.env:HOME}'",
     r"prompt='\${a}${oc.env:HOME}'",
     "prompt='${${a}:b}'",

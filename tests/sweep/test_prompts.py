@@ -7,8 +7,7 @@ import pytest
 from cadam3d.core.errors import UserError
 from cadam3d.io.prompts import Prompt
 from cadam3d.report import results
-from cadam3d.settings.hydra import read_flags
-from cadam3d.settings.line import quoted
+from cadam3d.settings.line import quoted, read_flags
 from cadam3d.sweep.folder import Job, Plan, load, write_plan
 from cadam3d.sweep.grid import Grid, expand, prompt_axis, read_grid, read_line, sweep_name
 from cadam3d.sweep.plan import read_sweep

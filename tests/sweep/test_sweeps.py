@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from cadam3d import cli
@@ -22,7 +21,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import JOBS
 from cadam3d.settings import advice, hydra, options
 from cadam3d.settings import compose as settings
-from cadam3d.settings.hydra import read_flags
+from cadam3d.settings.line import read_flags
 from cadam3d.sweep import plan, start
 from cadam3d.sweep.folder import Row, load, read_plan
 from cadam3d.sweep.process import run_job
@@ -322,19 +321,6 @@ def test_other_settings_in_the_same_folder_are_refused_with_the_key(sweep, calls
     assert (folder / "sweep.csv").read_bytes() == table
     assert not Path("multirun/densifiers-2").exists()
     assert len(calls(folder)) == 3
-
-
-def test_values_that_only_a_running_job_knows_are_not_compared(sweep, monkeypatch):
-    line = ("prompt=a cube", "grid=densifiers", "optimizer.steps=${hydra:runtime.output_dir}")
-    assert sweep(*line).code == 0
-    for row in load(Path("multirun/densifiers")):
-        config = yaml_of(sweep, "prompt=a cube", row.overrides[-1])
-        (row.folder / "config.yaml").write_text(
-            config.replace("optimizer:\n  steps: 5", "optimizer:\n  steps: x")
-        )
-    monkeypatch.setattr(HydraConfig.instance(), "cfg", None)  # as in a new process
-    result = sweep(*line)
-    assert (result.code, "3 with a result" in result.out) == (0, True), result.err
 
 
 def test_a_job_that_failed_may_run_with_other_settings(sweep):

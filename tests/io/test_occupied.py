@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from cadam3d.core.errors import UserError
+from cadam3d.io.occupied import occupied
 from cadam3d.io.run_folder import LOCK, claim, occupant
-from cadam3d.settings.place import occupied
 from cadam3d.sweep import process
 
 REPOSITORY = Path(__file__).parents[2]
@@ -41,7 +41,7 @@ RACER = """
 import sys
 from pathlib import Path
 from cadam3d.core.errors import UserError
-from cadam3d.settings.place import occupied
+from cadam3d.io.occupied import occupied
 print("ready", flush=True)
 for line in sys.stdin:
     kind, name = line.split()

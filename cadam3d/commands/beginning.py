@@ -1,0 +1,133 @@
+"""Beginning: what training prints and writes before its first step."""
+
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from cadam3d.commands.linking import link_latest
+from cadam3d.commands.messages import note, note_backend
+from cadam3d.io.atomic import remove_leftovers, replacing
+from cadam3d.io.lock import INHERITED
+from cadam3d.io.run_folder import CONFIG, HYDRA_CONFIG, HYDRA_SETTINGS, LOG, OVERRIDES
+from cadam3d.prior.base import PromptEmbedding
+from cadam3d.rasterizer.base import Backend
+from cadam3d.settings.compose import Call
+from cadam3d.state import RunContext, TrainState
+from cadam3d.trainer import Trainer
+
+log = logging.getLogger("cadam3d")
+# The messages that the command line prints. They are not part of train.log.
+messages = logging.getLogger("cadam3d.messages")
+LOG_LINE = "[%(asctime)s][%(name)s][%(levelname)s] - %(message)s"
+
+
+@contextmanager
+def deterministic(device: torch.device) -> Iterator[None]:
+    """Let torch refuse operations without reproducible results on the CPU, where training needs none.
+
+    This has the effect of ``use_deterministic_algorithms``, which would load torch's compiler first and thus
+    take more than a second. The mode of the process is restored afterwards.
+    """
+    before = torch.get_deterministic_debug_mode()
+    torch.set_deterministic_debug_mode("error" if device.type == "cpu" else "default")
+    try:
+        yield
+    finally:
+        torch.set_deterministic_debug_mode(before)
+
+
+def load_prior(trainer: Trainer, embedding: PromptEmbedding, state: TrainState, backend: Backend) -> None:
+    """Load the prior, and print what the user must know about it, the prompt, the start and the rasterizer.
+
+    The prior is loaded last, because an initializer may have needed the memory and has freed it now.
+    """
+    trainer.prior.load()
+    for text in filter(None, (trainer.prior.notice(), embedding.notice(), state.initial_note)):
+        note(text)
+    note_backend(backend)
+
+
+def note_memory(cfg: DictConfig, trainer: Trainer) -> dict[str, float]:
+    """Return the memory that the prior will need, in GiB, and print it before the work begins."""
+    size = cfg.camera.get("size")
+    estimate = trainer.prior.memory(cfg.prompt, cfg.negative_prompt, trainer.views, size)
+    if estimate is None:
+        return {}
+    note(f"The prior will need about {estimate}. To reduce this, set vram=low or fewer views.")
+    return {"memory_estimate_gib": round(estimate.total / 2**30, 3)}
+
+
+def run_context(prompt: str, trainer: Trainer, state: TrainState, folder: Path) -> RunContext:
+    """Return what callbacks may use of a run in ``folder``."""
+    return RunContext(
+        folder=folder,
+        prompt=prompt,
+        total_steps=trainer.steps,
+        render=trainer.renderer(state),
+        rasterizer=trainer.rasterizer,
+        densifier=trainer.densifier,
+    )
+
+
+@contextmanager
+def begun(cfg: DictConfig, call: Call, folder: Path) -> Iterator[str]:
+    """Write the settings into the folder of a run, and its log while the block runs; yield the settings.
+
+    All files appear together, or none of them does. Raises ``UserError`` if one cannot be written.
+    """
+    remove_leftovers(folder)
+    config_text = OmegaConf.to_yaml(cfg, resolve=True)
+    texts = {
+        HYDRA_CONFIG: OmegaConf.to_yaml(cfg),
+        HYDRA_SETTINGS: OmegaConf.to_yaml({"hydra": call.hydra}),
+        OVERRIDES: OmegaConf.to_yaml(call.hydra.overrides.task),
+        CONFIG: config_text,
+    }
+    with logged_to(folder / LOG):
+        with ExitStack() as files:
+            for name, text in texts.items():
+                temporary = files.enter_context(replacing(folder / name))
+                temporary.write_text(text, encoding="utf-8")
+        # This is for single runs: a sweep locks the folders of its jobs and passes the locks on.
+        if INHERITED not in os.environ:
+            link_latest(folder)
+        yield config_text
+
+
+@contextmanager
+def logged_to(path: Path) -> Iterator[None]:
+    """Write what cadam3d logs into ``path``, from the level INFO on, while the block runs.
+
+    The handlers of the root logger get no record that they would not get otherwise.
+    """
+    file = logging.FileHandler(path, encoding="utf-8")
+    file.setFormatter(logging.Formatter(LOG_LINE))
+    file.addFilter(lambda record: record.name != messages.name)
+    onward = _Onward(log.getEffectiveLevel())
+    level, is_propagating = log.level, log.propagate
+    log.addHandler(file)
+    if is_propagating:
+        log.addHandler(onward)
+    log.setLevel(min(logging.INFO, onward.level))
+    log.propagate = False
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+        log.propagate = is_propagating
+        log.removeHandler(onward)
+        log.removeHandler(file)
+        file.close()
+
+
+class _Onward(logging.Handler):
+    """Passes records on to the handlers of the root, as propagation does, but not those of lower levels."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Pass one record on."""
+        logging.getLogger().callHandlers(record)
