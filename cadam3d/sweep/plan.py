@@ -18,8 +18,8 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import RUN_FOLDER, typed_path
 from cadam3d.settings.advice import RefusedJobError, line_of, require_values
 from cadam3d.settings.check import require_settings
-from cadam3d.settings.compose import flatten
-from cadam3d.settings.hydra import compose_line, refuse_missing_settings, refuse_unread_settings
+from cadam3d.settings.compose import compose_line, flatten
+from cadam3d.settings.hydra import refuse_missing_settings, refuse_unread_settings
 from cadam3d.settings.line import DRY_RUN, LAUNCHER_KEY, SWEEP_FOLDER, key_of
 from cadam3d.sweep.folder import Job
 from cadam3d.sweep.grid import (
