@@ -1,20 +1,16 @@
 """Checkpoints: plain tensors, numbers and names in one file that appears whole or not at all.
 
 The file is the archive of ``torch.save``: a ZIP of stored (not compressed) entries, of which one is a pickle
-and each other one holds the bytes of a tensor. It is not read with ``torch.load``, whose safe mode still
-builds sparse, quantized or enormous tensors if a file asks for them. The small reader in this module knows
-only what :func:`save_checkpoint` writes, so no other thing can come out of a file, and it never allocates
-more than the size of the file.
+and each other one holds the bytes of a tensor. It is read by ``torch.load`` with ``weights_only=True``, which
+executes nothing from a file. Torch does not verify the checksums of the archive and builds sparse or
+quantized tensors too, so both are checked here.
 """
 
 import io
-import pickle
-import sys
 import zipfile
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import torch
 from torch import Tensor
@@ -27,30 +23,11 @@ from cadam3d.io.run_folder import checkpoint_step, checkpoints
 FORMAT = "cadam3d-checkpoint"
 # This number increases when old payloads can no longer be read.
 VERSION = 1
-PICKLE = "data.pkl"
-LARGEST_PICKLE = 1 << 20  # bytes; that of a run has some three thousand
-# What the pickle may name: the storages of dense tensors, by the type of their numbers.
-DTYPES = {
-    "FloatStorage": torch.float32,
-    "DoubleStorage": torch.float64,
-    "HalfStorage": torch.float16,
-    "BFloat16Storage": torch.bfloat16,
-    "LongStorage": torch.int64,
-    "IntStorage": torch.int32,
-    "ShortStorage": torch.int16,
-    "CharStorage": torch.int8,
-    "ByteStorage": torch.uint8,
-    "BoolStorage": torch.bool,
-}
-# The operations of pickle that write dicts, lists, tuples, numbers, text and tensors, and no others.
-OPERATIONS = (
-    *(pickle.PROTO, pickle.STOP, pickle.MARK, pickle.NONE, pickle.NEWTRUE, pickle.NEWFALSE),
-    *(pickle.BININT, pickle.BININT1, pickle.BININT2, pickle.LONG1, pickle.BINFLOAT, pickle.BINUNICODE),
-    *(pickle.EMPTY_DICT, pickle.SETITEM, pickle.SETITEMS, pickle.EMPTY_LIST, pickle.APPEND, pickle.APPENDS),
-    *(pickle.EMPTY_TUPLE, pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3),
-    *(pickle.BINPUT, pickle.LONG_BINPUT, pickle.BINGET, pickle.LONG_BINGET),
-    *(pickle.GLOBAL, pickle.REDUCE, pickle.BINPERSID),
+DTYPES = (
+    *(torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.bool),
+    *(torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8),
 )
+PLAIN = (bool, int, float, str, type(None))
 
 Content = TypeVar("Content")
 
@@ -84,25 +61,24 @@ def load_checkpoint(path: Path) -> Any:
     ``DamagedCheckpointError`` if the file is missing, damaged (checksums are verified), not a checkpoint of
     cadam3d or of another version.
     """
-    # A damaged archive or pickle makes the readers of Python raise almost anything.
+    # A damaged archive or pickle makes its readers raise almost anything.
     try:
-        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-            content = _read(archive, size=file.seek(0, io.SEEK_END))
+        with open_regular(path) as file:
+            _require_sound(file)
+            file.seek(0)
+            content = torch.load(file, map_location="cpu", weights_only=True)
+        _require_plain(content)
     except FileNotFoundError as error:
         raise DamagedCheckpointError(path, "no such checkpoint") from error
     except UserError as error:
         raise DamagedCheckpointError(path, "it is not a regular file") from error
     except Exception as error:
-        is_flipped = isinstance(error, zipfile.BadZipFile) and "CRC" in str(error)
-        reason = "a checksum does not match" if is_flipped else error
-        raise DamagedCheckpointError(path, reason) from error
-    if type(content) is not dict or set(content) != {"format", "version", "payload"}:
+        raise DamagedCheckpointError(path, error) from error
+    is_own = type(content) is dict and set(content) == {"format", "version", "payload"}
+    if not is_own or type(content["format"]) is not str or content["format"] != FORMAT:
         raise DamagedCheckpointError(path, "not a cadam3d checkpoint")
-    if type(content["format"]) is not str or content["format"] != FORMAT:
-        raise DamagedCheckpointError(path, "not a cadam3d checkpoint")
-    version = content["version"]
-    if type(version) is not int or version != VERSION:
-        written = str(version)[:20] if isinstance(version, int) and abs(version) < 10**9 else "unknown"
+    if type(content["version"]) is not int or content["version"] != VERSION:
+        written = str(content["version"])[:20]
         raise DamagedCheckpointError(path, f"version {written}, this cadam3d reads {VERSION}")
     return content["payload"]
 
@@ -146,75 +122,45 @@ def prune_checkpoints(folder: Path, *, keep: int) -> None:
         path.unlink(missing_ok=True)
 
 
-def _read(archive: zipfile.ZipFile, size: int) -> Any:
-    """Return what the pickle of an archive describes. Raises any exception if the archive is damaged."""
-    entries = archive.infolist()
-    # A compressed entry could be a thousand times as large as the file, and so could entries that overlap.
-    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
-        raise ValueError("it is compressed")
-    if sum(entry.file_size for entry in entries) > size:
-        raise ValueError("its entries are larger than the file")
-    # Reading an entry to its end compares its checksum.
-    for entry in entries:
-        if not entry.filename.endswith(f"/{PICKLE}") and "/data/" not in entry.filename:
-            archive.read(entry)
-    (name,) = (entry.filename for entry in entries if entry.filename.endswith(f"/{PICKLE}"))
-    root = name.removesuffix(PICKLE)
-    order = archive.read(f"{root}byteorder").decode("ascii")
-    if order != sys.byteorder:
-        raise ValueError(f"it was written on a computer with {order} numbers")
-    if archive.getinfo(name).file_size > LARGEST_PICKLE:
-        raise ValueError("its description is too large")
-    return _Reader(archive, root).load()
+def _require_sound(file: BinaryIO) -> None:
+    """Raise an exception unless ``file`` is an archive whose entries are in the file as they were written."""
+    with zipfile.ZipFile(file) as archive:
+        entries = archive.infolist()
+        # A compressed entry could be a thousand times as large as the file, and so could those that overlap.
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+            raise ValueError("it is compressed")
+        if sum(entry.file_size for entry in entries) > file.seek(0, io.SEEK_END):
+            raise ValueError("its entries are larger than the file")
+        if archive.testzip() is not None:
+            raise ValueError("a checksum does not match")
 
 
-class _Reader(pickle._Unpickler):  # the pickle module's reader in Python, whose operations can be restricted
-    """Reads the pickle of a checkpoint. No name in it leads to code, except to that of this class."""
+def _require_plain(content: Any) -> None:
+    """Raise ``ValueError`` unless ``content`` consists of plain data and of dense tensors."""
+    seen, rest = set(), [content]
+    while rest:
+        value = rest.pop()
+        if isinstance(value, Tensor):
+            if not _is_plain_tensor(value):
+                raise ValueError("it holds a tensor that is not plain")
+        elif type(value) in (dict, list, tuple):
+            # Few lines of a pickle can describe a huge tree of containers that appear many times in it.
+            if id(value) not in seen:
+                rest += [*value, *value.values()] if isinstance(value, dict) else value
+            seen.add(id(value))
+        elif type(value) not in PLAIN:
+            raise ValueError(f"it holds something other than plain data: {type(value).__name__}")
 
-    dispatch: ClassVar = {code[0]: pickle._Unpickler.dispatch[code[0]] for code in OPERATIONS}
 
-    def __init__(self, archive: zipfile.ZipFile, root: str) -> None:
-        super().__init__(io.BytesIO(archive.read(root + PICKLE)))
-        self._archive = archive
-        self._root = root
-        self._storages: dict[str, Tensor] = {}
-
-    def find_class(self, module: str, name: str) -> Any:
-        """Return a number type, or the function of this class that replaces what the pickle names."""
-        if module == "torch" and name in DTYPES:
-            return DTYPES[name]
-        if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
-            return self._tensor
-        if (module, name) == ("collections", "OrderedDict"):
-            return OrderedDict
-        raise ValueError(f"it holds something other than plain data: {module[:80]}.{name[:80]}")
-
-    def persistent_load(self, pid: Any) -> Tensor:
-        """Return the numbers of one entry of the archive as a vector."""
-        kind, dtype, key, device, count = pid
-        if (kind, device) != ("storage", "cpu") or not key.isdecimal():
-            raise ValueError("it holds a storage of another kind")
-        if key not in self._storages:
-            content = bytearray(self._archive.read(f"{self._root}data/{key}"))
-            if dtype is torch.bool and content.translate(None, b"\0\1"):
-                raise ValueError("it holds truth values that are neither true nor false")
-            # torch.frombuffer refuses an empty buffer.
-            empty = torch.empty(0, dtype=dtype)
-            self._storages[key] = torch.frombuffer(content, dtype=dtype) if content else empty
-        if len(self._storages[key]) != count or self._storages[key].dtype != dtype:
-            raise ValueError("the size of a tensor is not that of its numbers")
-        return self._storages[key]
-
-    def _tensor(self, storage: Tensor, *layout: Any) -> Tensor:
-        """Return a dense tensor that uses all numbers of ``storage`` in their order."""
-        offset, size, strides, requires_grad, hooks = layout
-        tensor = storage.view(torch.Size(size))
-        # The stride along an axis of length 1 has no meaning.
-        wanted = zip(size, tensor.stride(), strides, strict=True)
-        is_dense = tensor.numel() == 0 or all(length == 1 or a == b for length, a, b in wanted)
-        if offset != 0 or not is_dense or requires_grad is not False or hooks:
-            raise ValueError("it holds a tensor that is not plain")
-        return tensor
+def _is_plain_tensor(tensor: Tensor) -> bool:
+    """Return whether a tensor is one that :func:`save_checkpoint` could have written."""
+    if tensor.layout != torch.strided or tensor.device.type != "cpu" or tensor.dtype not in DTYPES:
+        return False
+    is_dense = tensor.is_contiguous() and tensor.untyped_storage().nbytes() == tensor.nbytes
+    if not is_dense or tensor.requires_grad:
+        return False
+    # Torch calculates nonsense with truth values that are neither 0 nor 1.
+    return tensor.dtype != torch.bool or not bool((tensor.view(torch.uint8) > 1).any())
 
 
 def _another(path: Path) -> str:
