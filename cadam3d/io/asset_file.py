@@ -1,10 +1,8 @@
 """Files of Gaussians of any format that this program reads, recognised by what is in them.
 
-| format | recognised by | up axis, if the file does not record it |
-|---|---|---|
-| PLY and compressed PLY | ``ply`` at the beginning; packed properties | -y |
-| SPZ | a gzip stream, or ``NGSP`` at the beginning | +y |
-| ``.splat`` | the suffix, because the format has no header | -y |
+A PLY begins with ``ply``, and a compressed PLY has packed properties. SPZ is a gzip stream or begins with
+``NGSP``. A ``.splat`` has no header, so its suffix decides. The usual up axis of a format is the default of
+its reader.
 
 Only files of this project record their axes, in a comment of a PLY.
 """
@@ -16,7 +14,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.compressed_ply import is_compressed, read_compressed_ply
 from cadam3d.io.frames import UPS
-from cadam3d.io.gaussforge import conversion
+from cadam3d.io.gaussforge import CONVERSION
 from cadam3d.io.ply import read_ply
 from cadam3d.io.ply_tables import read_header
 from cadam3d.io.reading import opened, unusable
@@ -25,12 +23,10 @@ from cadam3d.io.spz import GZIP_MAGIC, MAGIC, read_spz
 
 PLY, COMPRESSED_PLY, SPLAT, SPZ = "ply", "compressed ply", "splat", "spz"
 READERS = {PLY: read_ply, COMPRESSED_PLY: read_compressed_ply, SPLAT: read_splat, SPZ: read_spz}
-# Up axes of files that do not record them.
-USUAL_UP = {PLY: "-y", COMPRESSED_PLY: "-y", SPLAT: "-y", SPZ: "+y"}
 SUFFIXES = (".ply", ".splat", ".spz")
 GLB = b"glTF"
-# Formats that the package gaussforge converts into a PLY, by suffix.
-CONVERTIBLE = {".sog": "sog", ".ksplat": "ksplat"}
+# Formats that the package gaussforge converts into a PLY.
+CONVERTIBLE = (".sog", ".ksplat")
 
 
 def read_gaussians(path: Path, *, up: str | None = None) -> Gaussians:
@@ -41,8 +37,8 @@ def read_gaussians(path: Path, *, up: str | None = None) -> Gaussians:
     """
     if up is not None:
         require_choice("up", up, UPS)
-    kind = file_format(path)
-    return READERS[kind](path, up=up or USUAL_UP[kind])
+    read = READERS[file_format(path)]
+    return read(path) if up is None else read(path, up=up)
 
 
 def file_format(path: Path) -> str:
@@ -55,10 +51,7 @@ def file_format(path: Path) -> str:
         return SPZ
     suffix = path.suffix.lower()
     if suffix in CONVERTIBLE:
-        raise UserError(
-            f"{path}: expected {'|'.join(SUFFIXES)}, got {suffix}. "
-            f"Try: {conversion(path, path.with_suffix('.ply'), CONVERTIBLE[suffix], 'ply')}"
-        )
+        raise UserError(f"{path}: expected {'|'.join(SUFFIXES)}, got {suffix}. Try: {CONVERSION}")
     if begin == GLB:
         raise unusable(path, f"expected {'|'.join(SUFFIXES)}, got glb")
     if suffix == ".splat":

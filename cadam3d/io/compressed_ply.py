@@ -34,7 +34,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from cadam3d import __version__
 from cadam3d.core.checks import require_choice
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -52,7 +51,7 @@ from cadam3d.io.encoding import (
 from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
 from cadam3d.io.ply import REST_SIZES, VERTEX, rest_size
-from cadam3d.io.ply_tables import LITTLE, PlyHeader, read_header, read_tables
+from cadam3d.io.ply_tables import PlyHeader, header_text, read_header, read_tables
 from cadam3d.io.reading import unusable
 
 CHUNK_ROWS = 256
@@ -100,8 +99,17 @@ def write_compressed_ply(path: Path, gaussians: Gaussians, *, up: str) -> None:
 
     size = REST_SIZES[local.sh_degree]
     rest = local.sh[:, 1:].numpy().transpose(0, 2, 1).reshape(len(local), size)
+    elements = {
+        "chunk": (
+            len(starts),
+            [f"float {name}" for name in (*POSITION_BOUNDS, *SCALE_BOUNDS, *COLOR_BOUNDS)],
+        ),
+        VERTEX: (len(local), [f"uint {name}" for name in PACKED]),
+    }
+    if size:
+        elements["sh"] = (len(local), [f"uchar f_rest_{i}" for i in range(size)])
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(len(starts), len(local), size, up).encode("ascii"))
+        file.write(header_text(up, elements))
         for block in (bounds, words, _sh_bytes(rest)):
             file.write(block.tobytes())
 
@@ -198,24 +206,6 @@ def _require_types(path: Path, wanted: str, properties: list[tuple[str, str]]) -
         if kind != wanted:
             problem = f"expected {names[wanted]} for property {name[:40]}, got another type"
             raise unusable(path, f"not a compressed ply: {problem}")
-
-
-def _header(num_chunks: int, num_gaussians: int, num_rest: int, up: str) -> str:
-    bounds = [*POSITION_BOUNDS, *SCALE_BOUNDS, *COLOR_BOUNDS]
-    lines = [
-        "ply",
-        f"format {LITTLE}",
-        f"comment cadam3d {__version__}",
-        f"comment cadam3d up={up}",
-        f"element chunk {num_chunks}",
-        *(f"property float {name}" for name in bounds),
-        f"element vertex {num_gaussians}",
-        *(f"property uint {name}" for name in PACKED),
-    ]
-    if num_rest:
-        lines += [f"element sh {num_gaussians}"]
-        lines += [f"property uchar f_rest_{i}" for i in range(num_rest)]
-    return "\n".join([*lines, "end_header"]) + "\n"
 
 
 def _require_finite(path: Path, gaussians: Gaussians) -> None:

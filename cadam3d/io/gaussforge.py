@@ -26,7 +26,6 @@ Sources: the metadata of gaussforge 0.6.0 on pypi.org, and comparisons of its fi
 3.7.0, Spark 2.2.0 and three.js r187 read.
 """
 
-import shlex
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -48,6 +47,8 @@ LARGEST_LOG = 20.0  # of scales and opacities
 LARGEST_SH = 20.0
 FARTHEST_SPZ4 = 2047.0  # 24 bits, of which 12 are fractional
 KSPLAT_SH_DEGREE = 2
+# How a user reads what cadam3d does not read.
+CONVERSION = f"pip install {PACKAGE}, which converts it into a ply"
 
 
 def require_gaussforge(key: str) -> None:
@@ -56,21 +57,6 @@ def require_gaussforge(key: str) -> None:
         raise UserError(
             f"{key}: needs {PACKAGE}, which is not installed. Try: pip install 'cadam3d[formats]'"
         )
-
-
-def conversion(source: Path, target: Path, kind: str, new_kind: str, **options: int) -> str:
-    """Return a shell command with which a user installs gaussforge and converts a file.
-
-    ``kind`` and ``new_kind`` are gaussforge's names of the formats, and ``options`` those of its ``convert``.
-    """
-    more = "".join(f", {name}={value!r}" for name, value in options.items())
-    code = (
-        "from gaussforge import GaussForge; from pathlib import Path; "
-        f"old = Path({str(source)!r}).read_bytes(); "
-        f"new = GaussForge().convert(old, {kind!r}, {new_kind!r}{more}); "
-        f"Path({str(target)!r}).write_bytes(new['data'])"
-    )
-    return f"pip install {PACKAGE} && {shlex.join(['python', '-c', code])}"
 
 
 def _imported(key: str) -> Any:

@@ -23,6 +23,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.mesh.surface import Surface, SurfaceFacts, facts
 from cadam3d.io.atomic import replacing
 from cadam3d.io.frames import points_to_file
+from cadam3d.io.ply_tables import header_text
 
 FORMATS = ("glb", "obj", "ply")
 # glTF 2.0, sec. 4.4 and 5.
@@ -77,19 +78,11 @@ def write_mesh_ply(path: Path, surface: Surface, *, up: str) -> None:
     vertex["rgb"] = _bytes(mesh.colors)
     face = np.zeros(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
     face["count"], face["corners"] = 3, mesh.faces
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"comment cadam3d {__version__}",
-        f"element vertex {len(vertex)}",
-        *(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")),
-        *(f"property uchar {name}" for name in ("red", "green", "blue")),
-        f"element face {len(face)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-    ]
+    columns = [f"float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
+    columns += [f"uchar {name}" for name in ("red", "green", "blue")]
+    elements = {"vertex": (len(vertex), columns), "face": (len(face), ["list uchar int vertex_indices"])}
     with replacing(path) as temporary:
-        temporary.write_bytes(("\n".join(lines) + "\n").encode("ascii") + vertex.tobytes() + face.tobytes())
+        temporary.write_bytes(header_text(None, elements) + vertex.tobytes() + face.tobytes())
 
 
 def write_obj(path: Path, surface: Surface, *, up: str, texture: Texture | None = None) -> list[Path]:

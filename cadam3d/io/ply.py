@@ -25,7 +25,6 @@ from pathlib import Path
 
 import numpy as np
 
-from cadam3d import __version__
 from cadam3d.core.checks import require_choice
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE
@@ -33,7 +32,7 @@ from cadam3d.io.atomic import replacing
 from cadam3d.io.encoding import as_tensor, in_file_axes
 from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
-from cadam3d.io.ply_tables import LITTLE, PlyHeader, read_header, read_tables
+from cadam3d.io.ply_tables import PlyHeader, header_text, read_header, read_tables
 from cadam3d.io.reading import unusable
 
 VERTEX = "vertex"
@@ -78,9 +77,11 @@ def write_ply(path: Path, gaussians: Gaussians, *, up: str, pad_sh: int) -> None
         arrays["log_scales"],
         arrays["quats"],
     ]
+    names = [*COLUMNS["means"], *NORMALS, *SH0, *(f"f_rest_{i}" for i in range(rest_size))]
+    names += [*COLUMNS["opacity_logits"], *COLUMNS["log_scales"], *COLUMNS["quats"]]
     body = np.concatenate(columns, axis=1).astype("<f4", copy=False)
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(len(local), rest_size, up).encode("ascii"))
+        file.write(header_text(up, {VERTEX: (len(local), [f"float {name}" for name in names])}))
         file.write(body.tobytes())
 
 
@@ -161,25 +162,6 @@ def _color_bytes(values: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
         scaled = np.rint(values * (255 / largest))
     return np.nan_to_num(np.clip(scaled, 0, 255)).astype(np.uint8)
-
-
-def _names(rest_size: int) -> list[str]:
-    rest = [f"f_rest_{i}" for i in range(rest_size)]
-    last = [*COLUMNS["opacity_logits"], *COLUMNS["log_scales"], *COLUMNS["quats"]]
-    return [*COLUMNS["means"], *NORMALS, *SH0, *rest, *last]
-
-
-def _header(num_gaussians: int, rest_size: int, up: str) -> str:
-    lines = [
-        "ply",
-        f"format {LITTLE}",
-        f"comment cadam3d {__version__}",
-        f"comment cadam3d up={up}",
-        f"element vertex {num_gaussians}",
-        *(f"property float {name}" for name in _names(rest_size)),
-        "end_header",
-    ]
-    return "\n".join(lines) + "\n"
 
 
 def _rest_size(header: PlyHeader) -> int:

@@ -4,11 +4,11 @@ A PLY file has a header in ASCII, which declares elements ("vertex", "face"). An
 and a list of properties, each with a name and a numeric type. The rows follow the header as text, one row on
 each line, or as little-endian or big-endian binary records (G. Turk, "The PLY Polygon File Format", 1994).
 
-Nothing is allocated because of a count in a header: the rows must be in the file first. Text is read in
-blocks of lines, so the memory needed is a few times the size of the file, whatever the file contains.
+Nothing is allocated because of a count in a header: the rows must be in the file first.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from cadam3d import __version__
 from cadam3d.core.errors import UserError
 from cadam3d.io.frames import UPS
 from cadam3d.io.reading import opened, unusable
@@ -25,8 +26,6 @@ LITTLE = "binary_little_endian 1.0"
 BIG = "binary_big_endian 1.0"
 ENCODINGS = (ASCII, LITTLE, BIG)
 MAX_HEADER_BYTES = 1 << 16
-MAX_LINE_BYTES = 1 << 20  # of text after the header
-MAX_BLOCK_BYTES = 1 << 19  # of text that is parsed at once
 MAX_DIGITS = 15  # of a number of rows
 # Numpy types without their byte order.
 NUMPY_TYPES = {
@@ -75,6 +74,19 @@ class PlyHeader:
     def element(self, name: str) -> Element | None:
         """Return the element called ``name``, or None."""
         return next((element for element in self.elements if element.name == name), None)
+
+
+def header_text(up: str | None, elements: Mapping[str, tuple[int, Sequence[str]]]) -> bytes:
+    """Return the header of a little-endian file of this project.
+
+    ``elements`` are the numbers of rows and the types and names of properties, such as ``float x``, by the
+    name of the element. ``up`` is the up axis to record, if any.
+    """
+    lines = ["ply", f"format {LITTLE}", f"comment cadam3d {__version__}"]
+    lines += [] if up is None else [f"comment cadam3d up={up}"]
+    for name, (count, properties) in elements.items():
+        lines += [f"element {name} {count}", *(f"property {each}" for each in properties)]
+    return "\n".join([*lines, "end_header\n"]).encode("ascii")
 
 
 def read_header(path: Path) -> PlyHeader:
@@ -214,68 +226,44 @@ def _read_text(
     path: Path, file: BinaryIO, element: Element, names: Sequence[str] | None
 ) -> np.ndarray | None:
     """Return the rows of an element in text and move to its end; None if nothing of it is wanted."""
-    lines = _lines(path, file)
     # An element without properties has empty lines, which are skipped everywhere.
     count = element.count if element.properties else 0
+    lines = islice(_lines(file), count)
     if names is None:
-        found = sum(1 for _ in islice(lines, count))
-        if found < count:
+        if (found := sum(1 for _ in lines)) < count:
             raise _truncated(path, element, found)
         return None
+    numbers = _parsed(path, lines, element, count)
     kinds = dict(element.properties)
-    record = np.dtype([(name, kinds[name]) for name in names])
-    blocks: list[np.ndarray] = []
-    found = 0
-    while found < count:
-        block = list(_block(lines, count - found))
-        if not block:
-            raise _truncated(path, element, found)
-        numbers = _parsed(path, block, element, found)
-        table = np.empty(len(block), dtype=record)
-        for name in names:
-            table[name] = _typed(path, numbers[:, element.names.index(name)], name, kinds[name])
-        blocks.append(table)
-        found += len(block)
-    return np.concatenate(blocks) if blocks else np.empty(0, dtype=record)
+    table = np.empty(count, dtype=[(name, kinds[name]) for name in names])
+    for name in names:
+        table[name] = _typed(path, numbers[:, element.names.index(name)], name, kinds[name])
+    return table
 
 
-def _lines(path: Path, file: BinaryIO) -> Iterator[str]:
+def _lines(file: BinaryIO) -> Iterator[bytes]:
     """Yield the lines that are not empty."""
-    while line := file.readline(MAX_LINE_BYTES):
-        if not line.endswith(b"\n") and len(line) == MAX_LINE_BYTES:
-            raise unusable(path, f"expected lines of at most {MAX_LINE_BYTES:,} bytes, got a longer one")
-        if text := line.decode("ascii", errors="replace").strip():
-            yield text
+    return (line for line in file if line.strip())
 
 
-def _block(lines: Iterator[str], count: int) -> Iterator[str]:
-    """Yield at most ``count`` lines, and no more than are worth parsing at once."""
-    size = 0
-    for line in islice(lines, count):
-        yield line
-        size += len(line) + 1
-        if size > MAX_BLOCK_BYTES:
-            return
-
-
-def _parsed(path: Path, lines: Sequence[str], element: Element, found: int) -> np.ndarray:
-    """Return the numbers of ``lines`` as a matrix of float64, one row for each line."""
+def _parsed(path: Path, lines: Iterable[bytes], element: Element, count: int) -> np.ndarray:
+    """Return the numbers of ``count`` lines as a matrix of float64, one row for each line."""
+    width = len(element.properties)
+    if count == 0:
+        return np.empty((0, width))
     try:
-        numbers = np.loadtxt(lines, dtype=np.float64, comments=None, ndmin=2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # about a file without any row
+            numbers = np.loadtxt(lines, dtype=np.float64, comments=None, ndmin=2, encoding="latin-1")
     except ValueError as error:
-        raise unusable(path, f"rows {found:,} to {found + len(lines):,}: {_short(error)}") from error
-    if numbers.shape != (len(lines), len(element.properties)):
-        raise unusable(
-            path,
-            f"expected {len(element.properties)} numbers in each row of element {element.name}, "
-            f"got {numbers.size / len(lines):g}",
-        )
+        # The rest is advice to programmers.
+        raise unusable(path, f"element {element.name}: {str(error).split(';')[0][:120]}") from error
+    if len(numbers) < count:
+        raise _truncated(path, element, len(numbers))
+    if numbers.shape[1] != width:
+        expected = f"expected {width} numbers in each row of element {element.name}"
+        raise unusable(path, f"{expected}, got {numbers.shape[1]}")
     return numbers
-
-
-def _short(error: Exception) -> str:
-    # The rest is advice to programmers.
-    return str(error).split(";")[0][:120]
 
 
 def _typed(path: Path, numbers: np.ndarray, name: str, kind: str) -> np.ndarray:
@@ -295,7 +283,7 @@ def _require_end(header: PlyHeader, file: BinaryIO) -> None:
     last = header.elements[-1]
     what = _rows(last)
     if header.encoding == ASCII:
-        if next(_lines(header.path, file), None) is not None:
+        if next(_lines(file), None) is not None:
             raise unusable(header.path, f"the header promises {last.count} {what}, but more lines follow")
         return
     start = file.tell()

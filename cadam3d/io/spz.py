@@ -37,7 +37,6 @@ import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
@@ -57,7 +56,7 @@ from cadam3d.io.encoding import (
 )
 from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
-from cadam3d.io.gaussforge import conversion
+from cadam3d.io.gaussforge import CONVERSION
 from cadam3d.io.reading import opened, unusable
 
 # The first bytes of the unzipped header. Version 4 is not a gzip stream, and begins with them directly.
@@ -77,7 +76,6 @@ GZIP_LEVEL = 6  # 9 gives files that are 1 % smaller, in three to five times the
 # promised 64 MB is for decoding a block of rows (measured: 36 MB at SH degree 3).
 MOST_EXPANSION = 20
 SPARE_BYTES = 24 << 20
-PIECE_BYTES = 1 << 18  # read or decompressed at once
 
 
 def write_spz(path: Path, gaussians: Gaussians, *, up: str) -> None:
@@ -118,7 +116,7 @@ def read_spz(path: Path, *, up: str = "+y") -> Gaussians:
     require_choice("up", up, UPS)
     try:
         with opened(path) as file:
-            header, packed = _unzipped(path, file)
+            header, packed = _unzipped(path, file.read())
     except zlib.error as error:
         raise unusable(path, f"a damaged gzip stream ({error})") from error
     blocks = _blocks(header, packed)
@@ -151,58 +149,27 @@ class _Header:
         return 4 * self.count * (11 + 3 * (self.degree + 1) ** 2)
 
 
-class _Stream:
-    """A gzip stream that is decompressed only as far as it is read."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self._inflate = zlib.decompressobj(wbits=31)  # gzip, whose checksum is verified
-        self._pending = b""
-
-    def read_into(self, target: memoryview) -> int:
-        """Fill ``target``, and return the number of bytes, which is less at the end of the stream."""
-        filled = 0
-        while filled < len(target) and not self._inflate.eof:
-            piece = self._pending or self._file.read(PIECE_BYTES)
-            out = self._inflate.decompress(piece, min(len(target) - filled, PIECE_BYTES))
-            self._pending = self._inflate.unconsumed_tail
-            if not piece and not out:
-                break
-            target[filled : filled + len(out)] = out
-            filled += len(out)
-        return filled
-
-    def ends_here(self) -> bool:
-        """Return whether the stream is complete, and the file has nothing after it."""
-        is_empty = self.read_into(memoryview(bytearray(1))) == 0
-        return is_empty and self._inflate.eof and not self._inflate.unused_data and not self._file.read(1)
-
-
-def _unzipped(path: Path, file: BinaryIO) -> tuple[_Header, bytearray]:
-    """Return the header and the bytes of all blocks."""
-    begin = file.read(len(MAGIC))
-    if begin == MAGIC:
-        raise UserError(
-            f"{path}: expected SPZ version 2 or 3, got version 4 or later. "
-            f"Try: {conversion(path, path.with_stem(f'{path.stem}_v3'), 'spz', 'spz', spz_version=3)}"
-        )
-    if begin[: len(GZIP_MAGIC)] != GZIP_MAGIC:
-        raise unusable(path, f"not an spz file: it begins with {begin!r}")
-    size = file.seek(0, 2)
-    file.seek(0)
-    stream = _Stream(file)
-    start = bytearray(HEADER.size)
-    if stream.read_into(memoryview(start)) < len(start):
+def _unzipped(path: Path, content: bytes) -> tuple[_Header, bytes]:
+    """Return the header and the bytes of all blocks. Nothing is decompressed beyond what is needed."""
+    if content.startswith(MAGIC):
+        raise UserError(f"{path}: expected SPZ version 2 or 3, got version 4 or later. Try: {CONVERSION}")
+    if not content.startswith(GZIP_MAGIC):
+        raise unusable(path, f"not an spz file: it begins with {content[:4]!r}")
+    inflate = zlib.decompressobj(wbits=31)  # gzip, whose checksum is verified
+    start = inflate.decompress(content, HEADER.size)
+    if len(start) < HEADER.size:
         raise unusable(path, "truncated: the header has no end")
-    header = _parsed(path, bytes(start))
-    if header.packed_bytes + header.unpacked_bytes > MOST_EXPANSION * size + SPARE_BYTES:
-        problem = f"its header promises {header.count:,} Gaussians, too many for {size:,} bytes"
+    header = _parsed(path, start)
+    if header.packed_bytes + header.unpacked_bytes > MOST_EXPANSION * len(content) + SPARE_BYTES:
+        problem = f"its header promises {header.count:,} Gaussians, too many for {len(content):,} bytes"
         raise unusable(path, problem)
-    packed = bytearray(header.packed_bytes)
-    if (length := stream.read_into(memoryview(packed))) < len(packed):
-        problem = f"truncated: the header promises {len(packed):,} bytes, the stream holds {length:,}"
-        raise unusable(path, problem)
-    if not header.has_extensions and not stream.ends_here():
+    # A limit of 0 would be none at all. One byte more shows whether the stream goes on.
+    packed = inflate.decompress(inflate.unconsumed_tail, header.packed_bytes + 1)
+    if len(packed) < header.packed_bytes:
+        promised = f"the header promises {header.packed_bytes:,} bytes"
+        raise unusable(path, f"truncated: {promised}, the stream holds {len(packed):,}")
+    is_at_end = len(packed) == header.packed_bytes and inflate.eof and not inflate.unused_data
+    if not header.has_extensions and not is_at_end:
         raise unusable(path, f"the stream does not end after the {header.count:,} Gaussians of its header")
     return header, packed
 
@@ -218,7 +185,7 @@ def _parsed(path: Path, start: bytes) -> _Header:
     return _Header(version, count, degree, fractional_bits, bool(flags & HAS_EXTENSIONS))
 
 
-def _blocks(header: _Header, packed: bytearray) -> list[np.ndarray]:
+def _blocks(header: _Header, packed: bytes) -> list[np.ndarray]:
     """Return the blocks of a file as bytes, one row for each Gaussian."""
     blocks, start = [], 0
     for size in header.sizes:

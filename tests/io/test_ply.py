@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import cadam3d
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io import ply
@@ -152,7 +153,7 @@ def test_the_default_axes_have_up_at_minus_y(tmp_path):
 def test_the_header_contains_the_version_and_the_up_axis(tmp_path):
     write_ply(tmp_path / "a.ply", random_gaussians(), up="+y", pad_sh=0)
     header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode()
-    assert f"comment cadam3d {ply.__version__}\n" in header
+    assert f"comment cadam3d {cadam3d.__version__}\n" in header
     assert "comment cadam3d up=+y\n" in header
 
 
@@ -265,7 +266,6 @@ ROW = "0 1 2 3 4 5 6 7 8 9 10 11 12 13"
         (as_text(ROW.replace("5", "-1"), kinds="uchar"), "expected 0 to 255 in property f_dc_2, got -1"),
         (as_text(ROW.replace("5", "1.5"), kinds="int"), r"in property f_dc_2, got 1\.5"),
         (as_text(ROW, ROW.replace("5", "\xe9")), "could not convert"),
-        (as_text("0" * (1 << 21)), "expected lines of at most"),
     ],
 )
 def test_damaged_text_is_one_message(tmp_path, content, message):
@@ -400,7 +400,7 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
     def fails(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(ply, "_header", fails)
+    monkeypatch.setattr(ply, "header_text", fails)
     with pytest.raises(UserError, match="No space left"):
         write_ply(tmp_path / "a.ply", random_gaussians(seed=1), up="-y", pad_sh=0)
     assert (tmp_path / "a.ply").read_bytes() == before

@@ -1,10 +1,7 @@
 """SPZ files: the published encodings, bounded memory, and one message for each broken file."""
 
 import gzip
-import shlex
 import struct
-import subprocess
-import sys
 import tracemalloc
 import zlib
 
@@ -218,16 +215,3 @@ def test_memory_is_bounded_by_the_size_of_the_file(tmp_path):
     assert peak(zeros_after(one_gaussian)) < 1 << 21
     millions = struct.pack("<4sIIBBBB", b"NGSP", 3, 5_000_000, 0, 12, 0, 0)
     assert peak(zeros_after(millions)) < 1 << 21
-
-
-def test_the_message_about_version_4_converts_the_file(tmp_path):
-    gaussians = random_gaussians(30)
-    path = tmp_path / "it's new.spz"
-    path.write_bytes(gaussforge_writes(gaussians, "spz", 4))
-    with pytest.raises(UserError, match=r"expected SPZ version 2 or 3, got version 4") as caught:
-        read_spz(path)
-    install, _, convert = str(caught.value).partition("Try: ")[2].partition(" && ")
-    assert install == "pip install gaussforge"
-    _, *words = shlex.split(convert)
-    subprocess.run([sys.executable, *words], check=True, capture_output=True)
-    assert errors(read_spz(tmp_path / "it's new_v3.spz", up="+z"), gaussians)["means"] < 1e-3
