@@ -21,12 +21,13 @@ def run(command: str, overrides: Sequence[str], flags: Sequence[str], options: N
 
 
 def write_report(folder: Path) -> None:
-    """Write the report of the sweep in ``folder`` and print its verdict. A failure is printed, not raised."""
+    """Write the report of the sweep in ``folder`` and print its table. A failure is printed, not raised."""
     try:
         # The page lists the files of the table.
         table = report.write_paper_table(folder)
         page = report.write_sweep(folder)
-        print("".join(f"\n{sentence}\n" for sentence in report.verdict(folder)))
+        if differences := report.comparison(folder):
+            print(f"\nDifferences between arms, medians within cells:\n{differences}\n")
         print(f"report: {shown(page)}", flush=True)
         if table:
             print(f"\n{table}", flush=True)

@@ -77,6 +77,7 @@ def optimise(
                 log.info("%s after %d steps: %d Gaussians", outcome, state.step, len(state.gaussians))
                 summary = summarize(cfg, call.choices, state, outcome, backend)
                 summary |= memory | measure_memory(device) | {"schedule": timetable}
+                summary["grows"] = trainer.densifier.grows_from is not None
                 results.write(context, state.gaussians.detach(), start, summary)
                 for callback in trainer.callbacks:
                     callback.on_result(context, summary)

@@ -288,6 +288,7 @@ SUMMARY_ENTRIES: dict[str, Callable[[Any], bool]] = {
     "warnings": lambda value: _are(_is_text, value),
     "seconds": lambda value: is_number(value) and value >= 0,
     "seed": lambda value: type(value) is int and value >= 0,
+    "grows": lambda value: isinstance(value, bool),
     **dict.fromkeys(("prompt", "message", "device", "backend"), _is_text),
     **dict.fromkeys(("negative_prompt", "densifier", "guidance", "prior", "initializer"), _is_text_or_none),
     **dict.fromkeys(("rasterizer", "camera", "refine", "optimizer", "initializer_note"), _is_text_or_none),

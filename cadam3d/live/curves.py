@@ -5,23 +5,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from cadam3d.core.chart import Chart, Curve
+from cadam3d.core.chart import Chart
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import is_number, parse_json
 from cadam3d.io.reading import open_contained, signature
 from cadam3d.io.records import is_metrics
 from cadam3d.io.run_folder import METRICS
+from cadam3d.report.declarations import GAUSSIANS, LOSS
 
 # Limits of what is kept in memory and of what is sent to a page.
 MOST_KEYS, MOST_POINTS, MOST_SENT = 200, 4096, 500
 MOST_CHARTS, MOST_CURVES = 20, 8
 LARGEST_PIECE = 1 << 24  # bytes that are read at once; what remains is read at the next call
 LONGEST_LINE = 1 << 20  # bytes
-# The charts that every run has.
-COMMON = (
-    Chart(title="Gaussians", caption="", curves=(Curve(key="num_gaussians"),)),
-    Chart(title="Loss", caption="", curves=(Curve(key="loss"),), log_y=True),
-)
 Points = list[tuple[int, float]]  # steps, ascending, and values
 
 
@@ -69,7 +65,7 @@ class Curves:
     def drawn(self, charts: Iterable[Chart]) -> list[dict[str, Any]]:
         """Return the common charts and ``charts``, with their numbers so far, as plain data."""
         found = []
-        for chart in (*COMMON, *charts)[:MOST_CHARTS]:
+        for chart in (GAUSSIANS, LOSS, *charts)[:MOST_CHARTS]:
             facts = {name: getattr(chart, name) for name in ("title", "caption", "log_y", "percent")}
             bounds = [{"key": key, "points": self._sent(key)} for key in chart.band or ()]
             curves = [

@@ -1,4 +1,4 @@
-"""Report: the page of a run and the page of a sweep, with their charts, figures, tables and verdicts.
+"""Report: the page of a run and the page of a sweep, with their charts, figures and tables.
 
 The functions here import what they need when they are called: matplotlib, SciPy and Jinja2 take about a
 second to load, and a command that writes no report should not wait for them.
@@ -29,11 +29,14 @@ def write_report(
     return write(folder, summary=summary, metrics=metrics, config_text=config_text, charts=charts)
 
 
-def write_sweep(folder: Path) -> Path:
-    """Write ``report.html`` and ``figures/`` of the sweep in ``folder`` and return the path of the page."""
+def write_sweep(folder: Path, baseline: str | None = None) -> Path:
+    """Write ``report.html`` and ``figures/`` of the sweep in ``folder`` and return the path of the page.
+
+    The other arms are compared with the arm ``baseline``, by default the first one that adds Gaussians.
+    """
     from cadam3d.report.sweep_page import write
 
-    return write(folder)
+    return write(folder, baseline=baseline)
 
 
 def write_paper_table(folder: Path) -> str:
@@ -42,14 +45,17 @@ def write_paper_table(folder: Path) -> str:
     Returns "" if its grid does not ask for the table or no job has left an asset. Raises ``UserError`` if a
     file cannot be written.
     """
-    from cadam3d.report.table_files import write
+    from cadam3d.report.paper_formats import write
 
     return write(folder)
 
 
-def verdict(folder: Path) -> list[str]:
-    """Return the sentences that open the page of the sweep in ``folder``; empty if nothing is comparable."""
+def comparison(folder: Path, baseline: str | None = None) -> str:
+    """Return the table of a sweep that compares its arms, as text; "" if nothing is comparable."""
     from cadam3d.report.results import read
-    from cadam3d.report.verdicts import headline
+    from cadam3d.report.tables import as_texts, comparison_table
+    from cadam3d.sweep.table import aligned
 
-    return headline(read(folder))
+    results = read(folder)
+    lines = as_texts(comparison_table(results, baseline), results)
+    return aligned([list(lines[0]), *(list(line.values()) for line in lines)]) if lines else ""

@@ -1,190 +1,200 @@
-"""Charts of a run: which plots its page has, made from what was logged and from what was declared.
+"""Charts of a run: what a run declared and logged, drawn as small SVG pictures.
 
-Some plots exist for every run: the count, the loss, the refinements, the resets and the share of selected
-Gaussians. The plots of statistics are those that the densifier and the objective declare. Numbers that belong
-to neither get a plain plot each, so nothing that was logged is hidden.
+Every run has the charts of ``COMMON``; the others are those that its densifier and its objective declare.
+Numbers that belong to none of them get a plain chart each, so nothing that was logged is hidden. All pictures
+have the same size and margins, so that they line up on the page, which writes the title, the caption and the
+legend of each.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from cadam3d.core.chart import Chart
-from cadam3d.report.formatting import number
-from cadam3d.report.plots import Band, Bar, Plot, Point, Section, Series, smooth
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
+from cadam3d.core.chart import Chart, Curve
+from cadam3d.report.declarations import GAUSSIANS, LOSS
+from cadam3d.report.formatting import number
+from cadam3d.report.palette import SERIES_COLORS, SOFT
+from cadam3d.report.style import inline, label_axis, styled, svg_of
+
+Point = tuple[float, float]
 Lines = Sequence[Mapping[str, Any]]
 
-SMOOTHING = 15  # the running median covers one part in 15 of a noisy curve
-# Keys that the plots of every run show already, or that are not numbers to plot.
-ALWAYS_PLOTTED = ("kind", "step", "loss", "num_gaussians", "seconds")
-ALWAYS_PLOTTED += ("before", "after", "selected", "cloned", "split", "pruned", "reset")
-CURVE_COLORS = (1, 2, 3)
+REFINEMENTS = Chart(
+    title="Refinements",
+    caption="Gaussians that each refinement cloned, split and pruned.",
+    curves=tuple(Curve(key=key, label=key) for key in ("cloned", "split", "pruned")),
+)
+RESETS = Chart(
+    title="Opacity resets",
+    caption="Gaussians whose opacity each reset lowered.",
+    curves=(Curve(key="reset"),),
+)
+# Keys that these charts show already, or that are not numbers to draw.
+COMMON = (GAUSSIANS, LOSS, REFINEMENTS, RESETS)
+NOT_DRAWN = ("kind", "step", "seconds", "before", "after", "selected")
+
+DPI = 72  # one pixel of matplotlib is then one unit of the SVG
+WIDTH, HEIGHT = 560, 250  # units; the picture scales with the page
+LEFT, RIGHT, TOP, BOTTOM = 58, 12, 12, 40  # margins around the plotting area
+FONT = 11.5  # units
 THRESHOLD_COLOR = 4
 
 
-def sections(steps: Lines, refinements: Lines, charts: Sequence[Chart]) -> list[Section]:
-    """Return the plots of a run under their headings; those without data are left out.
+@dataclass(frozen=True)
+class DrawnChart:
+    """A chart as a part of the page."""
 
-    ``steps`` and ``refinements`` are the two kinds of lines of ``metrics.jsonl``, the statistics of the
-    refinements on the same level as their counts. A declared chart is looked up in the refinements first,
+    title: str
+    caption: str
+    legend: list[tuple[str, str, int]]  # label, kind and number of the colour; empty for a single curve
+    svg: str
+
+
+def sections(metrics: Lines, charts: Sequence[Chart]) -> dict[str, list[DrawnChart]]:
+    """Return the charts of a run by heading; those without data are left out.
+
+    ``metrics`` are the lines of ``metrics.jsonl``. A declared chart is looked up in the refinements first,
     where the densifier logs, and then in the steps, where the objective does.
     """
-    x_range = _x_range(steps, refinements)
-    by_densifier = [plot_of(chart, refinements, x_range) for chart in charts]
+    steps, refinements = lines_of(metrics)
+    last = _last_step(metrics)
+    growth = [
+        draw(
+            GAUSSIANS,
+            [dict(zip(("step", "num_gaussians"), point, strict=True)) for point in counts(metrics)],
+            last,
+        ),
+        draw(LOSS, steps, last),
+        draw(REFINEMENTS, refinements, last),
+        draw(RESETS, [line for line in refinements if line.get("reset")], last),
+    ]
+    by_densifier = [draw(chart, refinements, last) for chart in charts]
     by_objective = [
-        plot_of(chart, steps, x_range)
-        for chart, plot in zip(charts, by_densifier, strict=True)
-        if plot.is_empty
+        draw(chart, steps, last) for chart, drawn in zip(charts, by_densifier, strict=True) if drawn is None
     ]
-    found = [
-        Section("Growth", _growth_plots(steps, refinements, x_range)),
-        Section("Densifier", [_selected_plot(refinements, x_range), *by_densifier]),
-        Section("Objective", by_objective),
-    ]
-    filled = [Section(each.title, [plot for plot in each.plots if not plot.is_empty]) for each in found]
-    return [section for section in filled if section.plots]
+    found = {"Growth": growth, "Densifier": by_densifier, "Objective": by_objective}
+    filled = {title: [each for each in drawn if each is not None] for title, drawn in found.items()}
+    return {title: drawn for title, drawn in filled.items() if drawn}
 
 
-def other_plots(steps: Lines, refinements: Lines, charts: Sequence[Chart]) -> list[Plot]:
-    """Return one plain plot for each number that was logged and that no other plot of the page shows."""
-    declared = {key for chart in charts for key in _keys(chart)}
-    x_range = _x_range(steps, refinements)
-    plots = []
-    for lines in (steps, refinements):
+def other_charts(metrics: Lines, charts: Sequence[Chart]) -> list[DrawnChart]:
+    """Return one plain chart for each number that was logged and that no other chart of the page shows."""
+    shown = {*NOT_DRAWN, *(key for chart in (*COMMON, *charts) for key in _keys(chart))}
+    found = []
+    for lines in lines_of(metrics):
         for key in dict.fromkeys(key for line in lines for key in line):
-            if key not in ALWAYS_PLOTTED and key not in declared and (points := _points(lines, key)):
-                series = Series(label="", points=points, color=3)
-                plots.append(Plot(title=key, series=[series], x_range=x_range))
-    return plots
+            chart = Chart(title=key, caption="", curves=(Curve(key=key),))
+            if key not in shown and (drawn := draw(chart, lines, _last_step(metrics))) is not None:
+                found.append(drawn)
+    return found
 
 
-def plot_of(chart: Chart, lines: Lines, x_range: Point) -> Plot:
-    """Return what a declared chart shows of ``lines``; empty if these lines have none of its keys."""
+def lines_of(metrics: Lines) -> tuple[list[Mapping[str, Any]], list[Mapping[str, Any]]]:
+    """Return the lines of steps and those of refinements, with their statistics beside their counts."""
+    steps = [line for line in metrics if line.get("kind") == "step"]
+    return steps, [_flat(line) for line in metrics if line.get("kind") == "refine"]
+
+
+def counts(metrics: Lines) -> list[Point]:
+    """Return steps and Gaussians over time; a refinement is two points at its step.
+
+    The line of a step holds the count before the refinement of that step.
+    """
+    points: list[tuple[float, int, float]] = []
+    for key, order in (("num_gaussians", 0), ("before", 0), ("after", 1)):
+        points += [(step, order, value) for step, value in _points(metrics, key)]
+    return [(step, value) for step, _, value in sorted(points)]
+
+
+def draw(chart: Chart, lines: Lines, last_step: float) -> DrawnChart | None:
+    """Draw what a chart shows of ``lines``; None if these lines have none of its keys."""
     factor = 100 if chart.percent else 1
-
-    def points(key: str) -> list[Point]:
-        return [(step, factor * value) for step, value in _points(lines, key)]
-
-    is_alone = len(chart.curves) == 1 and chart.band is None
-    colors = iter(CURVE_COLORS * len(chart.curves))
-    series = [
-        Series(
-            label=curve.label or ("" if is_alone else curve.key),
-            points=points(curve.key),
-            color=THRESHOLD_COLOR if curve.is_threshold else next(colors),
-            is_dashed=curve.is_threshold,
+    points = {
+        key: [(step, factor * value) for step, value in _points(lines, key) if value > 0 or not chart.log_y]
+        for key in _keys(chart)
+    }
+    if not any(points.values()):
+        return None
+    with styled({"font.size": FONT}):
+        figure = Figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI)
+        axes = figure.add_axes(
+            (LEFT / WIDTH, BOTTOM / HEIGHT, 1 - (LEFT + RIGHT) / WIDTH, 1 - (TOP + BOTTOM) / HEIGHT)
         )
+        axes.set_yscale("log" if chart.log_y else "linear")
+        legend = [_draw_curve(axes, curve, color, points[curve.key]) for curve, color in _colored(chart)]
+        if chart.band is not None and (shared := [dict(points[key]) for key in chart.band]) and all(shared):
+            low, high = shared
+            steps = sorted(low.keys() & high.keys())
+            color = SERIES_COLORS[0]
+            axes.fill_between(
+                steps, [low[x] for x in steps], [high[x] for x in steps], color=color, alpha=0.18, lw=0
+            )
+            legend.append((chart.band_label or "range", "area", 1))
+        axes.set_xlim(0, last_step)
+        if not chart.log_y:
+            axes.set_ylim(min(0.0, axes.get_ylim()[0]), max(0.0, axes.get_ylim()[1]))
+        _finish(axes, "%" if chart.percent else "")
+        svg = inline(svg_of(figure, chart.title, DPI))
+    entries = [entry for entry in legend if entry is not None]
+    return DrawnChart(chart.title, chart.caption, entries if len(entries) > 1 else [], svg)
+
+
+def _colored(chart: Chart) -> list[tuple[Curve, int]]:
+    """Return the curves with the numbers of their colours; the last colour is that of thresholds."""
+    others = [curve for curve in chart.curves if not curve.is_threshold]
+    colors = len(SERIES_COLORS) - any(curve.is_threshold for curve in chart.curves)
+    return [
+        (curve, THRESHOLD_COLOR if curve.is_threshold else 1 + others.index(curve) % colors)
         for curve in chart.curves
     ]
-    bands = []
-    if chart.band is not None:
-        low, high = map(points, chart.band)
-        bands.append(Band(label=chart.band_label or "range", low=low, high=high, color=1))
-    return Plot(
-        title=chart.title,
-        caption=chart.caption,
-        series=series,
-        bands=bands,
-        x_range=x_range,
-        log_y=chart.log_y,
-        from_zero=not chart.log_y,
-        unit="%" if chart.percent else "",
+
+
+def _draw_curve(axes: Axes, curve: Curve, color: int, points: Sequence[Point]) -> tuple[str, str, int] | None:
+    """Draw a curve and return its entry in the legend; None if it has no points."""
+    if not points:
+        return None
+    axes.plot(
+        *zip(*points, strict=True),
+        color=SERIES_COLORS[color - 1],
+        lw=2,
+        ls=(0, (2.5, 2)) if curve.is_threshold else "-",
+        marker="o" if len(points) == 1 else None,
+        clip_on=False,
+        zorder=3,
     )
+    return curve.label or curve.key, "dashed" if curve.is_threshold else "plain", color
 
 
-def _x_range(steps: Lines, refinements: Lines) -> Point:
-    """Return the range of the steps of all plots, which is not empty even if nothing was logged."""
-    return 0, max((number(line.get("step")) or 0 for line in (*steps, *refinements)), default=0) or 1
+def _finish(axes: Axes, unit: str) -> None:
+    """Label both axes of a complete chart."""
+    label_axis(axes.xaxis)
+    label_axis(axes.yaxis, unit)
+    axes.tick_params(length=0, pad=6)
+    axes.grid(visible=False, axis="x")
+    axes.spines["left"].set_visible(False)
+    place = 1 - RIGHT / WIDTH, 3 / HEIGHT
+    axes.text(*place, "step", transform=axes.figure.transFigure, ha="right", color=SOFT)
+
+
+def _last_step(metrics: Lines) -> float:
+    """Return the last step, or 1 if none was logged, so that no axis is empty."""
+    return max((number(line.get("step")) or 0 for line in metrics), default=0) or 1
 
 
 def _keys(chart: Chart) -> list[str]:
     return [*(curve.key for curve in chart.curves), *(chart.band or ())]
 
 
-def _growth_plots(steps: Lines, refinements: Lines, x_range: Point) -> list[Plot]:
-    loss = _points(steps, "loss")
-    window = len(loss) // SMOOTHING
-    smoothed = Series(label="running median", points=smooth(loss, window), color=1)
-    logged = Series(label="logged", points=loss, color=1, is_faint=window > 1)
-    resets = [(step, count) for step, count in _points(refinements, "reset") if count > 0]
-    return [
-        Plot(
-            title="Gaussians",
-            caption="The number of Gaussians; marks on the axis are refinements.",
-            series=[Series(label="", points=_counts(steps, refinements), color=1)],
-            marks=[step for step, _ in _points(refinements, "after")],
-            x_range=x_range,
-            from_zero=True,
-        ),
-        Plot(
-            title="Loss",
-            caption="Half the squared norm of the guidance gradient plus regularizers.",
-            series=[logged, smoothed] if window > 1 else [logged],
-            log_y=True,
-            x_range=x_range,
-        ),
-        Plot(
-            title="Refinements",
-            caption="Gaussians that each refinement cloned and split (up) and pruned (down).",
-            bars=_refinement_bars(refinements),
-            bar_labels=[("cloned", 1), ("split", 2), ("pruned", 4)],
-            x_range=x_range,
-            from_zero=True,
-        ),
-        Plot(
-            title="Opacity resets",
-            caption="Gaussians whose opacity each reset lowered.",
-            bars=[
-                Bar(x=step, start=0, stop=count, color=3, hint=f"{count:,.0f} reset at step {step:g}")
-                for step, count in resets
-            ],
-            x_range=x_range,
-            from_zero=True,
-        ),
-    ]
-
-
-def _selected_plot(refinements: Lines, x_range: Point) -> Plot:
-    before = dict(_points(refinements, "before"))
-    shares = [
-        (step, 100 * count / before[step])
-        for step, count in _points(refinements, "selected")
-        if before.get(step)
-    ]
-    return Plot(
-        title="Selected Gaussians",
-        caption="Share of all Gaussians that each refinement selected for growth.",
-        series=[Series(label="", points=shares, color=2)],
-        x_range=x_range,
-        from_zero=True,
-        unit="%",
-    )
-
-
-def _counts(steps: Lines, refinements: Lines) -> list[Point]:
-    """Return the count over steps, with a vertical jump at each refinement.
-
-    The line of a step holds the count before the refinement of that step.
-    """
-    counts = [(step, 0, count) for step, count in _points(steps, "num_gaussians")]
-    counts += [(step, 0, count) for step, count in _points(refinements, "before")]
-    counts += [(step, 1, count) for step, count in _points(refinements, "after")]
-    return [(step, count) for step, _, count in sorted(counts)]
-
-
-def _refinement_bars(refinements: Lines) -> list[Bar]:
-    bars = []
-    for line in refinements:
-        step = number(line.get("step"))
-        cloned, split, pruned = (number(line.get(key)) or 0.0 for key in ("cloned", "split", "pruned"))
-        if step is not None and cloned + split + pruned > 0:
-            hint = f"step {step:g}: {cloned:,.0f} cloned, {split:,.0f} split, {pruned:,.0f} pruned"
-            bars.append(Bar(x=step, start=0, stop=cloned, color=1, hint=hint))
-            bars.append(Bar(x=step, start=cloned, stop=cloned + split, color=2, hint=hint))
-            bars.append(Bar(x=step, start=0, stop=-pruned, color=4, hint=hint))
-    return bars
-
-
-def _points(lines: Iterable[Mapping[str, Any]], key: str) -> list[Point]:
+def _points(lines: Lines, key: str) -> list[Point]:
     pairs = ((number(line.get("step")), number(line.get(key))) for line in lines)
     return [(step, value) for step, value in pairs if step is not None and value is not None]
+
+
+def _flat(line: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the line of a refinement with the densifier's statistics on the same level as the counts."""
+    statistics = line.get("statistics")
+    rest = {key: value for key, value in line.items() if key != "statistics"}
+    return {**rest, **statistics} if isinstance(statistics, Mapping) else rest

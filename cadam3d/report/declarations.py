@@ -14,6 +14,15 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import is_number, read_json, write_json
 from cadam3d.io.run_folder import CHARTS
 
+# The charts that every run has, whatever it declares.
+GAUSSIANS = Chart(title="Gaussians", caption="The number of Gaussians.", curves=(Curve(key="num_gaussians"),))
+LOSS = Chart(
+    title="Loss",
+    caption="Half the squared norm of the guidance gradient plus regularizers.",
+    curves=(Curve(key="loss"),),
+    log_y=True,
+)
+
 
 def write_declarations(folder: Path, charts: Sequence[Chart]) -> None:
     """Write ``charts.json`` into the folder of a run. Raises ``UserError`` if that is impossible."""

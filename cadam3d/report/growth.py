@@ -1,10 +1,10 @@
 """Growth: the snapshots of a run that its page contains, to turn the object and to watch it grow."""
 
-import base64
 from dataclasses import dataclass
 from pathlib import Path
 
 from cadam3d.core.errors import UserError
+from cadam3d.io.html import encoded
 from cadam3d.io.ply import read_ply
 from cadam3d.io.reading import read_bytes
 from cadam3d.io.run_folder import ASSET, has_file, snapshots
@@ -14,14 +14,14 @@ LARGEST = 8 << 20  # bytes of all snapshots in a page; base64 makes a third more
 
 
 @dataclass(frozen=True)
-class Frame:
+class ShownSnapshot:
     """One snapshot, as text of a page."""
 
     step: int
     data: str  # base64
 
 
-def frames(folder: Path, steps: int) -> list[Frame]:
+def frames(folder: Path, steps: int) -> list[ShownSnapshot]:
     """Return snapshots of the run in ``folder``, in order; the last one is the object after ``steps`` steps.
 
     They have at most ``LARGEST`` bytes together. If there are more, every second of them is left out, or two
@@ -42,5 +42,5 @@ def frames(folder: Path, steps: int) -> list[Frame]:
     for stride in range(1, len(backwards) + 1):
         kept = sorted(backwards[::stride])
         if sum(len(found[step]) for step in kept) <= LARGEST:
-            return [Frame(step, base64.b64encode(found[step]).decode("ascii")) for step in kept]
+            return [ShownSnapshot(step, encoded(found[step])) for step in kept]
     return []

@@ -1,26 +1,21 @@
-"""HTML pages made from the templates beside this module. Nothing is fetched.
+"""Pages: the parts that the page of a run and the page of a sweep share. Nothing in a page is fetched."""
 
-Autoescape is always on: whatever a user typed reaches a page as text, never as markup. Only drawings, the
-styles and the program of the 3D view are marked as safe, in the templates.
-"""
-
-import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
 from cadam3d import __version__
 from cadam3d.io.atomic import replacing
+from cadam3d.io.html import fill
 from cadam3d.report.formatting import show
 from cadam3d.report.palette import css
 
 TEMPLATES = Path(__file__).with_name("templates")
 GOOD, BAD = ("finished",), ("failed", "vanished")  # the other outcomes stopped early with an asset
+# What the templates call.
+FUNCTIONS: dict[str, Any] = {"show": show, "zip": zip, "link": lambda path: quote(str(path))}
 
 
 @dataclass(frozen=True)
@@ -73,15 +68,12 @@ def write_page(path: Path, template: str, **content: Any) -> Path:
 
     Raises ``UserError`` if the file cannot be written.
     """
-    text = _environment().get_template(template).render(version=__version__, **content)
+    text = fill(
+        TEMPLATES / template, version=__version__, color_variables=css(), mood=mood, **FUNCTIONS, **content
+    )
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
-
-
-def data_url(path: Path, kind: str) -> str:
-    """Return the content of a file as a URL, so that it becomes part of the page; ``kind`` is a MIME type."""
-    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
 
 
 def mood(outcome: str) -> str:
@@ -95,24 +87,9 @@ def _cell(value: Any, digits: int) -> str:
 
 
 def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and not value.endswith("%")
+    # An estimate is text that begins with a sign.
+    return isinstance(value, str) and value[:1] not in ("+", "-")
 
 
 def _decimals(value: Any) -> int:
     return len(repr(value).partition(".")[2]) if isinstance(value, float) else 0
-
-
-@cache
-def _environment() -> Environment:
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters |= {"show": show, "mood": mood, "link": lambda path: quote(str(path))}
-    environment.globals["zip"] = zip
-    environment.globals["color_variables"] = css()
-    return environment

@@ -18,13 +18,13 @@ SERIES = {  # the curves of a chart, in order
     "#c2395b": ("series-4", "#f07a97"),
 }
 SERIES_COLORS = tuple(SERIES)
-# The arms of a sweep. The first seven are those of Okabe and Ito or close to them, which people with any kind
-# of colour vision can tell apart; markers differ too, for print in grey.
+# The arms of a sweep, in order. The first ones are those of Okabe and Ito or close to them, which people with
+# any kind of colour vision can tell apart; markers differ too, for print in grey.
 ARMS = {
-    **{"#767676": "#a3a7ad", "#d55e00": "#ff9150", "#0072b2": "#62b3f0", "#009e73": "#3fcfa4"},
-    **{"#cc79a7": "#e5a0c8", "#8c1c46": "#e2607f", "#8a5a44": "#c99a84"},
-    **{"#56b4e9": "#8fd0f7", "#b07d00": "#e3b04b", "#6a5acd": "#a99ff0", "#5c7a00": "#a9c94f"},
-    **{"#00838f": "#4fc3cd", "#1f2d6b": "#8ea0e8", "#b5179e": "#ee6fd8", "#5b2c6f": "#c9a0dc"},
+    **{"#d55e00": "#ff9150", "#0072b2": "#62b3f0", "#009e73": "#3fcfa4", "#cc79a7": "#e5a0c8"},
+    **{"#767676": "#a3a7ad", "#8c1c46": "#e2607f", "#8a5a44": "#c99a84", "#56b4e9": "#8fd0f7"},
+    **{"#b07d00": "#e3b04b", "#6a5acd": "#a99ff0", "#5c7a00": "#a9c94f", "#00838f": "#4fc3cd"},
+    **{"#1f2d6b": "#8ea0e8", "#b5179e": "#ee6fd8", "#5b2c6f": "#c9a0dc"},
 }
 VARIABLES = {  # colour -> name of its CSS variable
     **{color: name for color, (name, _) in {**PAGE, **SERIES}.items()},

@@ -5,29 +5,29 @@ table.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 
 from cadam3d.core.number import Number
 from cadam3d.io import records
 from cadam3d.io.run_folder import setting_word, shown
+from cadam3d.report.compare import Mean, change, difference, main_setting, mean, references
 from cadam3d.report.formatting import plural
-from cadam3d.report.means import Mean, change, difference, mean
-from cadam3d.report.published import ROWS, PublishedRow
-from cadam3d.report.results import GUIDANCE, PROMPT, RECIPE, SEED, WITH_ASSET, ArmSetting, Cell, JobResult
-from cadam3d.report.verdicts import OURS, THEIRS
+from cadam3d.report.published import ROWS, SCORES, SIZES, PublishedRow
+from cadam3d.report.results import (
+    GUIDANCE,
+    PROMPT,
+    RECIPE,
+    SEED,
+    ArmSetting,
+    Cell,
+    JobResult,
+    arms_of,
+    measured,
+)
 
-# The columns, in order, of which a table has those that were measured: the paper's scores, other scores, then
-# comparisons with a truth.
-PAPER_SCORES = ("clip_score", "image_reward", "hps", "niqe")
-SCORES = (*PAPER_SCORES, "clip_r_precision", "pick_score", "vqa", "janus")
-OF_TRUTH = ("psnr", "ssim", "psnr_turned", "ssim_turned", "iou", "colour_error")
-# The numbers by whose ratio two settings are compared.
-SIZES = ("num_gaussians", "asset_mib")
 MINE, PUBLISHED = "this sweep", "published"
-DIFFERENCE = f"{OURS} - {THEIRS}"
 MISSING = "-"
 
 
@@ -59,11 +59,11 @@ class TableRow:
     method: str
     source: str  # MINE or PUBLISHED
     prompts: str  # how many have a result, such as "49 of 50"; empty for a published row
-    cells: Mapping[str, TableCell]  # by the name of a number
+    cells: list[TableCell]  # one for each number of the table
 
 
 @dataclass(frozen=True)
-class Section:
+class TablePart:
     """The rows of all prompts, or of the prompts of one category."""
 
     category: str  # empty: all prompts
@@ -75,76 +75,67 @@ class PaperTable:
     """The paper's table 1 of a sweep."""
 
     numbers: list[Number]  # one for each column
-    sections: list[Section]
+    parts: list[TablePart]
     notes: list[str]  # sentences below it
-
-    @property
-    def headings(self) -> list[str]:
-        """Return the labels of the columns of numbers."""
-        return [number.heading for number in self.numbers]
-
-    @property
-    def names(self) -> list[str]:
-        """Return the names of the columns of numbers."""
-        return [number.name for number in self.numbers]
 
 
 @dataclass(frozen=True)
-class Group:
+class ObjectiveJobs:
     """The jobs of one objective; they differ in arm, prompt and seed only."""
 
     objective: str  # a label
     family: str  # such as SDS; empty if no job says so
     results: list[JobResult] = field(repr=False)
 
-    @cached_property
+    @property
     def settings(self) -> list[ArmSetting]:
-        """Return the settings of all arms: no growth first, then the baseline, then the others."""
+        """Return the settings of all arms, in the order of the sweep."""
+        arms = dict.fromkeys(result.arm for result in self.results)
         found = {result.setting for result in self.results}
-        return sorted(found, key=lambda each: (each.arm != "none", each.arm != THEIRS, each.order))
+        return sorted(found, key=lambda each: (list(arms).index(each.arm), each.order))
 
     def of(self, setting: ArmSetting) -> list[JobResult]:
         """Return the jobs of a setting."""
         return [result for result in self.results if result.setting == setting]
 
-    def standard(self, arm: str) -> ArmSetting | None:
-        """Return the setting of ``arm`` with the shipped thresholds, or its only one, or else None."""
-        own = [result for result in self.results if result.arm == arm]
-        found = {result.setting for result in own if result.is_standard} or {each.setting for each in own}
-        return found.pop() if len(found) == 1 else None
-
 
 def paper_table(results: Sequence[JobResult], folder: Path) -> PaperTable | None:
     """Return the table of the jobs of the sweep in ``folder``; None if none has left an asset."""
-    usable = with_asset(results)
+    usable = measured(results)
     if not usable:
         return None
     left_out = mixed(usable)
-    numbers = [number for number in columns(_rows_of_jobs(usable)) if number.name not in left_out]
+    numbers = [number for number in columns(usable) if number.name not in left_out]
     categories = [each for each in dict.fromkeys(result.category for result in results) if each]
-    sections = [Section("", _rows(results, numbers, with_published=True))]
+    parts = [TablePart("", _rows(results, numbers, with_published=True))]
     for category in categories:
         members = [result for result in results if result.category == category]
-        sections.append(Section(category, _rows(members, numbers, with_published=False)))
+        parts.append(TablePart(category, _rows(members, numbers, with_published=False)))
     notes = [*_notes(results, usable, numbers), *_again(left_out, usable, folder)]
-    if not any(name in result.numbers for result in usable for name in PAPER_SCORES):
-        notes.append(f"The paper's scores are not measured yet. Try: {_line(PAPER_SCORES, folder)}")
-    return PaperTable(numbers, sections, notes)
+    papers = [number.name for number in SCORES]
+    if not any(name in result.numbers for result in usable for name in papers):
+        notes.append(f"The paper's scores are not measured yet. Try: {_line(papers, folder)}")
+    return PaperTable(numbers, parts, notes)
 
 
-def with_asset(results: Iterable[JobResult]) -> list[JobResult]:
-    """Return the jobs that have left an asset with Gaussians."""
-    return [result for result in results if result.outcome in WITH_ASSET and result.count]
+def columns(results: Sequence[JobResult]) -> list[Number]:
+    """Return the numbers that every row of the table has, in order.
 
-
-def columns(rows: Sequence[Sequence[JobResult]]) -> list[Number]:
-    """Return the numbers that every row has, each a sequence of jobs, in order."""
+    These are the paper's scores, then other numbers that have a record of how they were measured or by which
+    assets are chosen, then the paper's sizes.
+    """
+    rows = [group.of(setting) for group in _groups(results) for setting in group.settings]
     known = [{name for job in jobs for name in job.numbers} for jobs in rows]
     shared = set.intersection(*known) if known else set()
-    declared = {name: number for jobs in rows for job in jobs for name, number in job.declared.items()}
-    names = [name for name in (*SCORES, *OF_TRUTH, *SIZES) if name in shared and name in declared]
-    replaced = {declared[name].replaces for name in names}
-    return [declared[name] for name in names if name not in replaced]
+    recorded = {name for result in results for name in result.scores}
+    declared = {each.name: each for result in results for each in result.declared.values()}
+    papers = {number.name for number in (*SCORES, *SIZES)}
+    others = [
+        number
+        for name, number in declared.items()
+        if name not in papers and (name in recorded or number.preference is not None)
+    ]
+    return [number for number in (*SCORES, *others, *SIZES) if number.name in shared]
 
 
 def mixed(results: Sequence[JobResult]) -> dict[str, str]:
@@ -155,7 +146,7 @@ def mixed(results: Sequence[JobResult]) -> dict[str, str]:
     """
     problems: dict[str, str] = {}
     protocol: dict[str, str] = {}
-    for name in SCORES:
+    for name in (number.name for number in columns(results)):
         found = [job.scores.get(name) for job in results if name in job.numbers]
         scores = [score for score in found if score is not None]
         if not scores:
@@ -173,18 +164,17 @@ def mixed(results: Sequence[JobResult]) -> dict[str, str]:
 
 def _again(left_out: Mapping[str, str], results: Sequence[JobResult], folder: Path) -> list[str]:
     """Return the sentences about numbers that are left out, with the line that measures all scores anew."""
-    scores = {name: score.metric or name for result in results for name, score in result.scores.items()}
-    line = _line([scores[name] for name in SCORES if name in scores], folder)
+    metrics = {score.metric for result in results for score in result.scores.values()}
+    line = _line(sorted(metrics), folder)
     return [f"{problem}, so it is not in the table. Try: {line}" for problem in left_out.values()]
 
 
 def _line(metrics: Iterable[str], folder: Path) -> str:
-    """Return the command that measures with some metrics all jobs of the sweep in ``folder``."""
-    chosen = ",".join(dict.fromkeys(metrics))
-    return f"cadam3d eval {setting_word('run', shown(folder))} 'metric=[{chosen}]'"
+    """Return the command that measures all jobs of the sweep in ``folder``."""
+    return f"cadam3d eval {setting_word('run', shown(folder))} 'metric=[{','.join(metrics)}]'"
 
 
-def _groups(results: Sequence[JobResult]) -> list[Group]:
+def _groups(results: Sequence[JobResult]) -> list[ObjectiveJobs]:
     axes: dict[str, set[str]] = {}
     of_prompts: dict[tuple[str, str], set[str]] = {}
     for result in results:
@@ -199,15 +189,11 @@ def _groups(results: Sequence[JobResult]) -> list[Group]:
     return [_group(cell, jobs) for cell, jobs in members.items()]
 
 
-def _group(cell: Cell, jobs: list[JobResult]) -> Group:
+def _group(cell: Cell, jobs: list[JobResult]) -> ObjectiveJobs:
     families = dict.fromkeys(job.objective.partition("_")[0].upper() for job in jobs if job.objective)
     family = "/".join(families)
     others = [value if key == RECIPE else f"{key}={value}" for key, value in cell.axes if key != GUIDANCE]
-    return Group(", ".join(filter(None, [family, *others])) or MISSING, family, jobs)
-
-
-def _rows_of_jobs(results: Sequence[JobResult]) -> list[list[JobResult]]:
-    return [group.of(setting) for group in _groups(results) for setting in group.settings]
+    return ObjectiveJobs(", ".join(filter(None, [family, *others])) or MISSING, family, jobs)
 
 
 def _rows(results: Sequence[JobResult], numbers: Sequence[Number], *, with_published: bool) -> list[TableRow]:
@@ -217,85 +203,87 @@ def _rows(results: Sequence[JobResult], numbers: Sequence[Number], *, with_publi
         rows += [
             _row(group.objective, setting.name, group.of(setting), numbers) for setting in group.settings
         ]
-        ours, theirs = group.standard(OURS), group.standard(THEIRS)
-        if ours and theirs:
-            rows.append(_difference_row(group.objective, group.of(ours), group.of(theirs), numbers))
+        rows += _difference_rows(group, numbers)
         is_last = group.family not in [other.family for other in groups[position + 1 :]]
         if with_published and is_last:
-            rows += _published_rows(group.family, [number.name for number in numbers])
+            rows += _published_rows(group.family, numbers)
     return rows
 
 
 def _row(objective: str, method: str, jobs: Sequence[JobResult], numbers: Sequence[Number]) -> TableRow:
-    usable = with_asset(jobs)
-    cells = {}
-    for number in numbers:
-        found = mean(_by_prompt(usable, number.name))
-        cells[number.name] = TableCell() if found is None else _cell(found, number.digits)
+    usable = measured(jobs)
+    cells = [_cell(mean(_by_prompt(usable, number.name)), number.digits) for number in numbers]
     return TableRow(objective, method, MINE, _prompts(_names(usable), _names(jobs)), cells)
 
 
-def _difference_row(
-    objective: str, ours: Sequence[JobResult], theirs: Sequence[JobResult], numbers: Sequence[Number]
-) -> TableRow:
-    """Return the row of the differences, over the prompts and seeds that both have."""
-    usable, others = with_asset(ours), with_asset(theirs)
-    both = {job.cell for job in usable} & {job.cell for job in others}
-    usable, others = ([job for job in jobs if job.cell in both] for jobs in (usable, others))
-    cells = {}
-    for number in numbers:
-        name = number.name
-        measured = [{job.cell for job in jobs if name in job.numbers} for jobs in (usable, others)]
-        shared = set.intersection(*measured)
-        first, second = (
-            _by_prompt([job for job in jobs if job.cell in shared], name) for jobs in (usable, others)
-        )
-        if name in SIZES:
-            found = change(first, second)
-            cells[name] = TableCell() if found is None else _change_cell(found)
-        else:
-            found = difference(first, second)
-            cells[name] = TableCell() if found is None else _cell(found, number.digits, signed=True)
-    planned = _names(ours) | _names(theirs)
-    return TableRow(objective, DIFFERENCE, MINE, _prompts(_names(usable), planned), cells)
-
-
-def _published_rows(family: str, names: Sequence[str]) -> list[TableRow]:
-    """Return the published rows of an objective, and their differences; [] for other objectives."""
-    found = [row for row in ROWS if row.objective == family]
-    rows = [
-        TableRow(
-            f"{row.objective}, {row.recipe}",
-            row.arm,
-            PUBLISHED,
-            "",
-            {name: TableCell(row.texts[name]) if name in row.texts else TableCell() for name in names},
-        )
-        for row in found
-    ]
-    by_arm = {row.arm: row for row in found}
-    if OURS in by_arm and THEIRS in by_arm:
-        cells = {name: _published_difference(by_arm[OURS], by_arm[THEIRS], name) for name in names}
-        rows.append(TableRow(rows[0].objective, DIFFERENCE, PUBLISHED, "", cells))
+def _difference_rows(group: ObjectiveJobs, numbers: Sequence[Number]) -> list[TableRow]:
+    """Return a row for each other arm: its differences from the baseline, over what both have."""
+    rows = []
+    for baseline in references(group.results)[:1]:
+        theirs = group.of(main_setting(group.results, baseline))
+        for arm in (arm for arm in arms_of(group.results) if arm != baseline):
+            ours = group.of(main_setting(group.results, arm))
+            cells = [_difference(ours, theirs, number) for number in numbers]
+            both = {job.cell for job in measured(ours)} & {job.cell for job in measured(theirs)}
+            prompts = _prompts({cell[PROMPT] for cell in both}, _names(ours) | _names(theirs))
+            rows.append(TableRow(group.objective, f"{arm} - {baseline}", MINE, prompts, cells))
     return rows
 
 
-def _published_difference(ours: PublishedRow, theirs: PublishedRow, name: str) -> TableCell:
+def _difference(ours: Sequence[JobResult], theirs: Sequence[JobResult], number: Number) -> TableCell:
+    """Return the difference of a number over the prompts and seeds in which both have it."""
+    having = [
+        {job.cell: job for job in measured(jobs) if number.name in job.numbers} for jobs in (ours, theirs)
+    ]
+    shared = having[0].keys() & having[1].keys()
+    first, second = (_by_prompt([jobs[cell] for cell in shared], number.name) for jobs in having)
+    if number in SIZES:
+        return _change_cell(change(first, second))
+    return _cell(difference(first, second), number.digits, signed=True)
+
+
+def _published_rows(family: str, numbers: Sequence[Number]) -> list[TableRow]:
+    """Return the published rows of an objective, and their differences; [] for other objectives."""
+    found = [row for row in ROWS if row.objective == family]
+    rows = [_published(row, row.arm, numbers, lambda name, row=row: row.texts.get(name)) for row in found]
+    for theirs, ours in zip(found[:1] * len(found), found[1:], strict=False):
+        rows.append(
+            _published(
+                ours,
+                f"{ours.arm} - {theirs.arm}",
+                numbers,
+                lambda name, ours=ours, theirs=theirs: _published_difference(ours, theirs, name),
+            )
+        )
+    return rows
+
+
+def _published(
+    row: PublishedRow, method: str, numbers: Sequence[Number], text: Callable[[str], str | None]
+) -> TableRow:
+    cells = [TableCell(text(number.name) or MISSING) for number in numbers]
+    return TableRow(f"{row.objective}, {row.recipe}", method, PUBLISHED, "", cells)
+
+
+def _published_difference(ours: PublishedRow, theirs: PublishedRow, name: str) -> str | None:
     first, second = ours.number(name), theirs.number(name)
     if first is None or second is None:
+        return None
+    if name in (number.name for number in SIZES):
+        return _change_cell(Mean(first / second - 1, None, 0)).text
+    return f"{first - second:+.{len(ours.texts[name].partition('.')[2])}f}"
+
+
+def _cell(found: Mean | None, digits: int, *, signed: bool = False) -> TableCell:
+    if found is None:
         return TableCell()
-    if name in SIZES:
-        return TableCell(_change_cell(Mean(first / second - 1, None, 0)).text)
-    return TableCell(f"{first - second:+.{len(ours.texts[name].partition('.')[2])}f}")
+    half = "" if found.half is None else f"{found.half:.{digits}f}"
+    return TableCell(f"{found.value:{'+' if signed else ''}.{digits}f}", half, found.prompts)
 
 
-def _cell(found: Mean, decimals: int, *, signed: bool = False) -> TableCell:
-    sign = "+" if signed else ""
-    half = "" if found.half is None else f"{found.half:.{decimals}f}"
-    return TableCell(f"{found.value:{sign}.{decimals}f}", half, found.prompts)
-
-
-def _change_cell(found: Mean) -> TableCell:
+def _change_cell(found: Mean | None) -> TableCell:
+    if found is None:
+        return TableCell()
     word = "more" if found.value > 0 else "fewer"
     half = "" if found.half is None else f"{100 * found.half:.1f}"
     return TableCell(f"{100 * abs(found.value):.1f} % {word}", half, found.prompts)
@@ -323,16 +311,14 @@ def _notes(results: Sequence[JobResult], usable: Sequence[JobResult], numbers: S
     each = f" of the means over {plural(seeds, 'seed')}" if seeds > 1 else ""
     notes = [
         f"Means over prompts{each}; after ±, half the width of the 95 % interval over prompts (Student's t).",
-        f"{DIFFERENCE}: the same prompts and seeds under both. Gaussians and sizes are compared by their "
-        "means, as in the paper: 90 % fewer means that the mean is a tenth.",
+        "Rows of differences compare the same prompts and seeds under both arms. Gaussians and sizes are "
+        "compared by their means, as in the paper: 90 % fewer means that the mean is a tenth.",
     ]
-    protocols = dict.fromkeys(
-        score.method.get("protocol.name")
-        for job in usable
-        for name, score in job.scores.items()
-        if name in [number.name for number in numbers]
-    )
-    if known := [name for name in protocols if name]:
+    names = {number.name for number in numbers}
+    scores = [score for job in usable for name, score in job.scores.items() if name in names]
+    if known := [
+        name for name in dict.fromkeys(score.method.get("protocol.name") for score in scores) if name
+    ]:
         notes.append(f"Learned scores: protocol={', '.join(known)}, as eval.json of each job records it.")
     if any(group.family == row.objective for group in _groups(results) for row in ROWS):
         notes.append(

@@ -7,6 +7,20 @@ beside ours and never combined with them. Its "MB" are MiB: 1706K Gaussians of 6
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from cadam3d.core.number import COUNT, Number
+
+# The columns of the paper: CLIP, ImgRwd, HPS v2, NIQE, # Gaussians, Storage.
+SCORES = (
+    Number(name="clip_score", label="CLIP score", digits=2, is_more_better=True),
+    Number(name="image_reward", label="ImageReward", digits=3, is_more_better=True),
+    Number(name="hps", label="HPS v2", digits=3, is_more_better=True),
+    Number(name="niqe", label="NIQE", digits=3, is_more_better=False),
+)
+SIZES = (
+    COUNT,
+    Number(name="asset_mib", label="size of asset.ply", unit="MiB", digits=2, is_more_better=False),
+)
+
 
 @dataclass(frozen=True)
 class PublishedRow:
@@ -24,11 +38,11 @@ class PublishedRow:
 
 
 def _row(objective: str, recipe: str, arm: str, line: str) -> PublishedRow:
-    return PublishedRow(objective, recipe, arm, dict(zip(NUMBERS, line.split(), strict=True)))
+    names = [each.name for each in (*SCORES, *SIZES)]
+    return PublishedRow(objective, recipe, arm, dict(zip(names, line.split(), strict=True)))
 
 
-# The columns of the paper: CLIP, ImgRwd, HPS v2, NIQE, # Gaussians, Storage.
-NUMBERS = ("clip_score", "image_reward", "hps", "niqe", "num_gaussians", "asset_mib")
+# The first row of each objective is that of the baseline.
 ROWS = (
     _row("SDS", "gaussiandreamer", "baseline", "30.14 -0.125 0.194 9.908 1067K 46.4MB"),
     _row("SDS", "gaussiandreamer", "cadam", "29.95 -0.028 0.185 9.643 143K 6.1MB"),

@@ -14,19 +14,16 @@ from typing import Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from cadam3d.core.number import Number
+from cadam3d.core.number import COUNT, Number
 from cadam3d.core.outcome import Outcome
 from cadam3d.io.records import (
     Score,
     declared,
     latest_scores,
-    psnr_of,
     read_config,
     read_evaluation,
     read_histograms,
-    read_metrics,
     read_quality,
-    ssim_of,
 )
 from cadam3d.io.run_folder import CONFIG
 from cadam3d.report.formatting import number
@@ -66,8 +63,8 @@ class ArmSetting:
 
     @property
     def order(self) -> tuple:
-        """Return a sorting key: by arm, then by threshold, numbers before words."""
-        return (self.arm, *((key, isinstance(value, str), value) for key, value in self.thresholds))
+        """Return a sorting key within an arm: by threshold, numbers before words."""
+        return tuple((key, isinstance(value, str), value) for key, value in self.thresholds)
 
 
 @dataclass(frozen=True, order=True)
@@ -94,23 +91,16 @@ class JobResult:
     cell: Cell
     outcome: str
     message: str  # the reason of a failure; empty otherwise
-    count: float | None  # Gaussians at the end
-    psnr: float | None  # dB
-    ssim: float | None
-    is_turned: bool  # the asset may face any side, and PSNR and SSIM are those at the best turn
-    psnr_start: float | None  # dB; of the Gaussians at the start
-    iou: float | None
-    iou_start: float | None
-    colour_error: float | None
-    mib: float | None  # size of asset.ply
+    grows: bool  # whether its densifier may add Gaussians
     seconds: float | None
     objective: str  # the option of ``guidance`` it ran with; empty if that is not known
     category: str  # of its prompt; empty if it has none
-    # All numbers that were measured, and those that have a record of how. Those of eval.json replace those
-    # from the end of training, except that comparisons with a truth all come from one of the two, as in
-    # sweep.csv.
+    # The numbers of its asset, what their metrics have declared about them, and those that have a record of
+    # how they were measured. Those of eval.json replace those from the end of training, except that
+    # comparisons with a truth all come from one of the two, as in sweep.csv. A number that another one
+    # replaces is left out.
     numbers: Mapping[str, float] = field(repr=False)
-    declared: Mapping[str, Number] = field(repr=False)  # what their metrics declare about them
+    declared: Mapping[str, Number] = field(repr=False)
     scores: Mapping[str, Score] = field(repr=False)
 
     @property
@@ -119,9 +109,14 @@ class JobResult:
         return self.setting.arm
 
     @property
+    def count(self) -> float | None:
+        """Return the number of Gaussians at the end."""
+        return self.numbers.get(COUNT.name)
+
+    @property
     def is_measured(self) -> bool:
-        """Return whether the job left an asset whose count and quality may be compared."""
-        return self.outcome in WITH_ASSET and bool(self.count) and self.psnr is not None
+        """Return whether the job left an asset that may be compared."""
+        return self.outcome in WITH_ASSET and bool(self.count)
 
     @property
     def is_unfinished(self) -> bool:
@@ -180,11 +175,9 @@ def _known(job: Any) -> _KnownJob:
 def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> JobResult:
     shipped = _shipped(job.densifier)
     summary = {**job.summary, **read_quality(job.folder, job.summary)}
-    numbers = {key: number(value) for key, value in summary.items()}
-    size = numbers.get("asset_bytes")
     # Whether a comparison with a truth comes from training or from eval.json is the same for all tables.
     evaluation = read_evaluation(job.folder, job.summary)
-    known = declared(summary) | declared(evaluation)
+    known = declared(evaluation) | declared(job.summary)
     evaluation = {
         name: value for name, value in evaluation.items() if name not in known or not known[name].needs_truth
     }
@@ -199,16 +192,8 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
         cell=_cell(job, axes),
         outcome=job.outcome,
         message=str(job.summary.get("message") or ""),
-        count=numbers.get("num_gaussians"),
-        psnr=psnr_of(numbers),
-        ssim=ssim_of(numbers),
-        is_turned=numbers.get("psnr_turned") is not None,
-        psnr_start=numbers.get("psnr_start"),
-        iou=numbers.get("iou"),
-        iou_start=numbers.get("iou_start"),
-        colour_error=numbers.get("colour_error"),
-        mib=size / (1 << 20) if size is not None else None,
-        seconds=numbers.get("seconds"),
+        grows=summary.get("grows") is not False,
+        seconds=number(summary.get("seconds")),
         objective=str(job.overrides.get(GUIDANCE) or job.summary.get(GUIDANCE) or ""),
         category=job.category,
         numbers=_numbers(sources, known),
@@ -217,9 +202,12 @@ def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> J
     )
 
 
-def _numbers(sources: Iterable[Mapping[str, Any]], declared: Iterable[str]) -> dict[str, float]:
-    found = {name: number(each.get(name)) for each in sources for name in declared if name in each}
-    return {name: value for name, value in found.items() if value is not None}
+def _numbers(sources: Iterable[Mapping[str, Any]], known: Mapping[str, Number]) -> dict[str, float]:
+    """Return the declared numbers, later sources first, without those that another one replaces."""
+    merged = {name: number(each[name]) for each in sources for name in known if name in each}
+    found = {name: value for name, value in merged.items() if value is not None}
+    replaced = {known[name].replaces for name in found}
+    return {name: value for name, value in found.items() if name not in replaced}
 
 
 def _cell(job: _KnownJob, axes: Sequence[str]) -> Cell:
@@ -250,18 +238,6 @@ def _varied(jobs: Sequence[_KnownJob]) -> list[str]:
 def _pair(line: str) -> tuple[str, Any]:
     override = OverridesParser.create().parse_override(line)
     return override.get_key_element().lstrip("+~"), override.value()
-
-
-def counts(result: JobResult) -> list[tuple[float, float]]:
-    """Return steps and Gaussians of a job over time; a refinement is two points at its step."""
-    points: list[tuple[float, int, float]] = []
-    for line in read_metrics(result.folder):
-        step = number(line.get("step"))
-        for key, order in (("num_gaussians", 0), ("before", 0), ("after", 1)):
-            value = number(line.get(key))
-            if step is not None and value is not None:
-                points.append((step, order, value))
-    return [(step, value) for step, _, value in sorted(points)]
 
 
 @dataclass(frozen=True)
@@ -296,9 +272,8 @@ def config(result: JobResult) -> dict[str, Any]:
 
 
 def arms_of(results: Iterable[JobResult]) -> list[str]:
-    """Return the arms that left something to measure: none, then baseline, then the others by name."""
-    found = {result.arm for result in measured(results)}
-    return sorted(found, key=lambda arm: (arm != "none", arm != "baseline", arm))
+    """Return the arms that left something to measure, in the order of the sweep."""
+    return list(dict.fromkeys(result.arm for result in measured(results)))
 
 
 def levels_of(results: Iterable[JobResult]) -> list[str]:
@@ -322,11 +297,6 @@ def in_noise_order(levels: Iterable[str]) -> list[str]:
 def at_noise(results: Iterable[JobResult], level: str) -> list[JobResult]:
     """Return the results at one noise level."""
     return [result for result in results if result.cell[NOISE] == level]
-
-
-def with_noise(results: Sequence[JobResult]) -> Sequence[JobResult]:
-    """Return the results with noisy gradients, which the paper is about; all results if there are none."""
-    return [result for result in results if result.cell[NOISE] != NO_NOISE] or results
 
 
 def objective_axis(results: Iterable[JobResult]) -> str:

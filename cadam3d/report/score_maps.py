@@ -12,10 +12,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cadam3d.core.chart import Chart, Level
-from cadam3d.report.claims import by_cell, standard_setting
+from cadam3d.report.compare import by_cell, main_setting
 from cadam3d.report.declarations import read_declarations
 from cadam3d.report.results import JobResult, arms_of, at_noise, histograms, level_title, levels_of, measured
-from cadam3d.report.style import label_log_axis, new_figure
+from cadam3d.report.style import label_axis, new_figure
 
 MAX_COLUMNS = 3  # maps in one line, unless there are more noise levels
 LEAST_SHARE = 0.002  # of the Gaussians; emptier bins do not widen the axis
@@ -36,13 +36,13 @@ def declared_scores(results: Iterable[JobResult]) -> dict[str, Chart]:
 
 
 def score_figure(results: Sequence[JobResult], chart: Chart) -> Figure | None:
-    """Draw a map per arm and noise level of the score of ``chart``, each arm at its standard setting.
+    """Draw a map per arm and noise level of the score of ``chart``, each arm at its main setting.
 
     There is a column per level and a line per arm; if there is room, several arms share a line. Arms whose
     jobs have no such score are left out. ``None`` if none has.
     """
     levels = levels_of(results)
-    chosen = {arm: setting for arm in arms_of(results) if (setting := standard_setting(results, arm))}
+    chosen = {arm: main_setting(results, arm) for arm in arms_of(results)}
     maps = {
         (arm, level): found
         for arm, setting in chosen.items()
@@ -64,7 +64,7 @@ def score_figure(results: Sequence[JobResult], chart: Chart) -> Figure | None:
             _draw(axes, found)
     shown = [found.shown for found in maps.values()]
     panels[0, 0].set_ylim(min(low for low, _ in shown) / 1.5, max(high for _, high in shown) * 2)
-    label_log_axis(panels[0, 0].yaxis)
+    label_axis(panels[0, 0].yaxis)
     sides = [found.sides for found in maps.values()]
     panels[0, 0].set_xlim(min(low for low, _ in sides), max(high for _, high in sides))
     for axes in panels[:, 0]:

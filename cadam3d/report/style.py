@@ -1,9 +1,8 @@
 """The one style of everything that matplotlib draws, and how a drawing becomes part of a page."""
 
 import io
-import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,27 +11,18 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from cadam3d.io.atomic import replacing
 from cadam3d.report.formatting import short
-from cadam3d.report.palette import INK, LINE, PAPER, SOFT, VARIABLES
+from cadam3d.report.palette import ARMS, INK, LINE, PAPER, SOFT, VARIABLES
 
-KNOWN = {  # arm -> colour, marker
-    "none": ("#767676", "X"),
-    "baseline": ("#d55e00", "o"),
-    "cadam": ("#0072b2", "s"),
-    "cadam_calibrated": ("#009e73", "D"),
-    "cadam_annealed": ("#cc79a7", "^"),
-    "cadam_selective": ("#8c1c46", "P"),
-    "random": ("#8a5a44", "v"),
-}
-SPARE_COLORS = ("#56b4e9", "#b07d00", "#6a5acd", "#5c7a00", "#00838f", "#1f2d6b", "#b5179e", "#5b2c6f")
-# With eight colours, a pair repeats after 24 arms.
-SPARE_MARKERS = ("<", ">", "p", "*", "d", "h")
+COLORS = tuple(ARMS)
+MARKERS = ("o", "s", "D", "^", "X", "P", "v", "<", ">", "p", "*", "d", "h")
 INCH = 2.9  # height of a panel
 LEAST_TEXT = 10.0  # CSS pixels; no text of a figure on a page is smaller, on whatever screen
-TICKS = 5  # approximate number per axis
+TICKS = 6  # at most, on a linear axis
+SHORT_RANGE = 1e3  # a logarithmic axis over less has 1, 2 and 5 times the powers of ten
 # The type is Any, because matplotlib types the names of its settings one by one.
 RC: Any = {
     "font.family": "sans-serif",
@@ -70,17 +60,14 @@ class Look:
 
 
 def looks(arms: Iterable[str]) -> dict[str, Look]:
-    """Return the look of each arm: fixed for the common ones, in alphabetical order for others.
+    """Return the look of each arm, by its position. Pass all arms of a sweep in the order of the sweep.
 
-    Pass all arms of a sweep at once. Otherwise two arms without a fixed look may get the same one.
+    There are 15 colours and 13 markers, so a pair repeats after 195 arms.
     """
-    arms = list(arms)
-    others = sorted(set(arms) - set(KNOWN))
-    spare = {
-        arm: (SPARE_COLORS[i % len(SPARE_COLORS)], SPARE_MARKERS[i % len(SPARE_MARKERS)])
-        for i, arm in enumerate(others)
+    return {
+        arm: Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)])
+        for i, arm in enumerate(dict.fromkeys(arms))
     }
-    return {arm: Look(*(KNOWN.get(arm) or spare[arm])) for arm in arms}
 
 
 def new_figure(columns: int, lines: int = 1, *, width: float = 0.0, height: float = INCH) -> Figure:
@@ -105,55 +92,18 @@ def hide_axes(axes: Axes) -> None:
         spine.set_visible(False)
 
 
-def spread_labels(places: Mapping[str, float], least: float) -> dict[str, float]:
-    """Return heights for labels, lowest first, at least ``least`` apart and on average where they were."""
-    moved: dict[str, float] = {}
-    for name, height in sorted(places.items(), key=lambda item: item[1]):
-        moved[name] = max(height, max(moved.values(), default=-float("inf")) + least)
-    excess = sum(moved[name] - places[name] for name in places) / max(len(places), 1)
-    return {name: height - excess for name, height in moved.items()}
+def label_axis(axis: Axis, unit: str = "") -> None:
+    """Put round numbers on an axis, written short such as 500, 1k or 20k, with ``unit`` behind each.
 
-
-# Ticks: round numbers, written short.
-
-
-def round_ticks(low: float, high: float) -> list[float]:
-    """Return round numbers in [low, high] that are 1, 2 or 5 times a power of ten apart."""
-    rough = (high - low) / TICKS
-    power = 10.0 ** math.floor(math.log10(rough))
-    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough * 0.999)
-    first, last = math.ceil(low / step - 1e-6), math.floor(high / step + 1e-6)
-    return [i * step for i in range(first, last + 1)]
-
-
-def log_ticks(low: float, high: float) -> list[float]:
-    """Return round numbers between ``10**low`` and ``10**high``.
-
-    A wide range has powers of ten only, perhaps not all of them. A narrower one has 1, 2 and 5 times those,
-    and the narrowest has round numbers at equal distances.
+    Call this when the axis has its scale and its limits.
     """
-    if high - low < 0.8:
-        return round_ticks(10.0**low, 10.0**high)
-    factors = (1.0,) if high - low >= 2 else (1.0, 2.0, 5.0)
-    every = max(1, math.ceil((high - low) / TICKS))
-    exponents = range(math.floor(low), math.ceil(high) + 1)
-    ticks = [factor * 10.0**e for e in exponents if e % every == 0 for factor in factors]
-    return [tick for tick in ticks if low - 1e-9 <= math.log10(tick) <= high + 1e-9]
-
-
-def label_ticks(axis: Axis, ticks: Sequence[float], unit: str = "") -> None:
-    """Put ticks on an axis, labelled with short numbers such as 500, 1k or 20k, and the unit."""
-    axis.set_major_locator(FixedLocator(list(ticks)))
-    axis.set_major_formatter(FixedFormatter([short(tick) + unit for tick in ticks]))
-    axis.set_minor_locator(NullLocator())
-
-
-def label_log_axis(axis: Axis, *, room: float = 1.0) -> None:
-    """Label a logarithmic axis with short numbers, not powers of ten; ``room`` widens it by a factor."""
-    low, high = axis.get_view_interval()
-    low, high = low / room, high * room
-    label_ticks(axis, log_ticks(math.log10(low), math.log10(high)))
-    axis.axes.set(**{f"{axis.axis_name}lim": (low, high)})  # pyright: ignore[reportAttributeAccessIssue]
+    if axis.get_scale() == "log":
+        low, high = axis.get_view_interval()
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < SHORT_RANGE * low else (1.0,)))
+        axis.set_minor_locator(NullLocator())
+    else:
+        axis.set_major_locator(MaxNLocator(TICKS, steps=[1, 2, 5, 10]))
+    axis.set_major_formatter(lambda value, _: f"{short(value)}{unit}")
 
 
 # From a figure to files and to a part of a page.
@@ -184,9 +134,9 @@ def svg_of(figure: Figure, name: str, dpi: float) -> str:
 def inline(svg: str) -> str:
     """Return an SVG file as a part of an HTML page.
 
-    Left out is what a page does not need: the prolog, metadata, namespaces, names of groups, fonts (those of
-    the page are used) and decimals beyond a hundredth of a point. Colours become variables of the page. The
-    variable ``--least`` holds the smallest width at which the text of the drawing is legible.
+    The prolog, metadata, names of groups, fonts (those of the page are used) and decimals beyond a hundredth
+    of a point are left out, and colours become variables of the page. The variable ``--least`` holds the
+    smallest width at which the text of the drawing is legible.
     """
     text = svg[svg.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>", "", text, flags=re.DOTALL)
@@ -201,8 +151,6 @@ def inline(svg: str) -> str:
     text = re.sub(r' xmlns(:\w+)?="[^"]*"| version="1.1"', "", text, count=3)
     text = re.sub(r'<g id="[^"]*"', "<g", text)
     text = re.sub(r" font-family: [^;\"]*;", "", text)
-    text = re.sub(r"<defs>\s*</defs>", "", text)
-    text = re.sub(r' transform="rotate\(-0 [^"]*"', "", text)
     text = re.sub(r'(?<= d=")[^"]*', lambda found: _compact(found.group()), text)
     text = re.sub(r">\s+<", "><", text)
     for color, variable in VARIABLES.items():

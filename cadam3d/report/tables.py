@@ -1,151 +1,140 @@
-"""Tables of a sweep as lists of plain lines, written as CSV and shown on its page."""
+"""Tables of a sweep as lists of plain lines, written as CSV and shown on its page and in the terminal."""
 
 import csv
-import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from cadam3d.core.number import COUNT, Number
 from cadam3d.io.atomic import replacing
-from cadam3d.metric.fidelity import PSNR_START
-from cadam3d.metric.outline import COLOUR_ERROR, IOU, IOU_START
-from cadam3d.report.claims import (
-    PSNR,
-    SSIM,
+from cadam3d.report.compare import (
+    Estimate,
+    above_frontier,
     by_cell,
     compare,
-    frontier,
-    has_no_growth,
-    standard_setting,
-    standings,
+    gain_over,
+    main_setting,
+    over_seeds,
+    qualities,
+    references,
+    settings_of,
+    value_of,
 )
-from cadam3d.report.results import JobResult, arms_of, at_noise, levels_of, measured, objective_axis
-from cadam3d.report.verdicts import OURS, THEIRS
+from cadam3d.report.results import (
+    ArmSetting,
+    JobResult,
+    arms_of,
+    at_noise,
+    levels_of,
+    measured,
+    objective_axis,
+)
 
 Line = dict[str, Any]
-# Infinite: the other arm never reaches the quality; 0: it always exceeds it.
-NO_RATIO: dict[float | None, str] = {math.inf: "never", 0.0: "always"}
-
-# Columns of results that are compared with a named truth: the field of the result, and its decimal places.
-OF_TRUTH = {
-    number.heading: (number.name, number.digits) for number in (PSNR_START, IOU, IOU_START, COLOUR_ERROR)
-}
 
 
-def objectives_table(results: Sequence[JobResult]) -> list[Line]:
-    """Return the standard setting of each arm by objective and noise, medians over cells (paper table 1)."""
-    lines, axis = [], objective_axis(results)
+def comparison_table(results: Sequence[JobResult], baseline: str | None = None) -> list[Line]:
+    """Return how every setting differs from each reference arm, by noise level.
+
+    The differences are paired within cells: an :class:`Estimate` of the count in percent, of the numbers by
+    which assets are chosen, and of the seconds. The last estimate compares with the best setting of the
+    reference arm at equal count, if it has several.
+    """
+    against = references(results, baseline)
+    lines = []
+    for level in levels_of(results):
+        here = at_noise(results, level)
+        for position, arm in enumerate(against):
+            for other in (each for each in arms_of(here) if each not in against[: position + 1]):
+                for setting in settings_of(here, other):
+                    if line := _difference(here, setting, arm):
+                        lines.append({"noise": level, **line})
+    return _without_empty(lines)
+
+
+def _difference(results: Sequence[JobResult], setting: ArmSetting, arm: str) -> Line | None:
+    """Return how a setting differs from the main setting of an arm; None if no cell has both."""
+    if not settings_of(results, arm):
+        return None
+    found = compare(results, setting, main_setting(results, arm))
+    if found is None:
+        return None
+    line: Line = {"setting": setting.name, "against": found.theirs.name, "cells": len(found.pairs)}
+    line["Gaussians (%)"] = found.count
+    for quality in qualities(results):
+        line[quality.heading] = found.difference(value_of(quality))
+    line["seconds"] = found.difference(lambda result: result.seconds)
+    for quality in qualities(results)[:1]:
+        above = above_frontier(results, setting, arm, value_of(quality))
+        if len(settings_of(results, arm)) > 1:
+            line[f"{quality.heading} at equal count"] = Estimate.of(above) if above else None
+        line[f"{quality.heading} over seeds"] = _rounded(
+            over_seeds(
+                {
+                    pair.cell: difference
+                    for pair in found.pairs
+                    if (difference := pair.difference(value_of(quality))) is not None
+                }
+            ),
+            quality.digits,
+        )
+    return line | {"unpaired": found.unpaired or None, "ended early": found.early or None}
+
+
+def as_texts(lines: Sequence[Line], results: Sequence[JobResult]) -> list[Line]:
+    """Return lines of :func:`comparison_table` with every estimate as text."""
+    digits = {each.heading: each.digits for each in qualities(results)}
+    digits |= {f"{heading} at equal count": count for heading, count in digits.items()}
+
+    def text(key: str, value: Any) -> Any:
+        return value.written(digits.get(key, 1)) if isinstance(value, Estimate) else value
+
+    return [{key: text(key, value) for key, value in line.items()} for line in lines]
+
+
+def medians_table(results: Sequence[JobResult], *, only_main: bool = False) -> list[Line]:
+    """Return medians over cells of every setting by objective and noise (paper table 1).
+
+    With ``only_main``, each arm has its main setting only.
+    """
+    lines, axis, numbers = [], objective_axis(results), _compared(results)
+    main = {arm: main_setting(results, arm) for arm in arms_of(results)}
     for objective in sorted({result.cell[axis] for result in measured(results)}):
         of_objective = [result for result in results if result.cell[axis] == objective]
         for level in levels_of(of_objective):
             here = at_noise(of_objective, level)
-            theirs = standard_setting(here, THEIRS)
-            for arm in arms_of(here):
-                setting = standard_setting(here, arm)
-                if setting is None:
-                    continue
-                members = list(by_cell(here, setting).values())
-                pair = compare(here, setting, theirs) if theirs and theirs != setting else None
-                lines.append(
-                    {
-                        "objective": objective,
-                        "noise": level,
-                        "arm": arm,
-                        "cells": len(members),
-                        PSNR.axis: _median([result.psnr for result in members], PSNR.digits),
-                        SSIM.axis: _median([result.ssim for result in members], SSIM.digits),
-                        **{
-                            title: _median([getattr(result, name) for result in members], digits)
-                            for title, (name, digits) in OF_TRUTH.items()
-                        },
-                        "Gaussians": _median([result.count for result in members], 0),
-                        "MiB": _median([result.mib for result in members], 3),
-                        "seconds": _median([result.seconds for result in members], 1),
-                        f"fewer than {THEIRS}": f"{pair.reduction.median:.1%}" if pair else None,
-                        "ended early": sum(result.ended_early for result in members),
-                        "unpaired": (pair.unpaired or None) if pair else None,
-                    }
-                )
+            settings = [each for arm in arms_of(here) for each in settings_of(here, arm)]
+            for setting in settings:
+                if not only_main or setting == main[setting.arm]:
+                    lines.append({"objective": objective, "noise": level, **_medians(here, setting, numbers)})
     return _without_empty(lines)
 
 
-def frontier_table(results: Sequence[JobResult]) -> list[Line]:
-    """Return every setting at every noise level: medians and spreads over cells and over seeds."""
-    lines = []
-    for level in levels_of(results):
-        here = at_noise(results, level)
-        gains = has_no_growth(here)
-        quality, ssim_title = ("gain", "SSIM gain") if gains else ("PSNR", "SSIM")
-        for arm in arms_of(here):
-            ssims = {point.setting: point.gain for point in frontier(here, arm, quality=SSIM)}
-            for point in frontier(here, arm):
-                ssim = ssims.get(point.setting)
-                lines.append(
-                    {
-                        "noise": level,
-                        "setting": point.setting.name,
-                        "cells": point.cells,
-                        "ended early": point.early,
-                        "Gaussians": round(point.count.median),
-                        "over cells": point.count.described(lambda value: f"{value:.0f}"),
-                        f"{quality} (dB)": round(point.gain.median, 2),
-                        f"{quality} over cells (dB)": point.gain.described(lambda value: f"{value:.2f}"),
-                        "over seeds (dB)": _rounded(point.gain_over_seeds, 2),
-                        ssim_title: _rounded(ssim.median if ssim else None, SSIM.digits),
-                        "left out": point.left_out or None,
-                    }
-                )
-    return _without_empty(lines)
-
-
-def standings_table(results: Sequence[JobResult]) -> list[Line]:
-    """Return every setting of our arms compared with the whole frontier of the baseline, by noise level."""
-    lines = []
-    for level in levels_of(results):
-        here = at_noise(results, level)
-        for arm in (arm for arm in arms_of(here) if arm.startswith(OURS)):
-            for each in standings(here, arm, THEIRS):
-                estimate = each.psnr
-                lines.append(
-                    {
-                        "noise": level,
-                        "setting": each.setting.name,
-                        "dB above at equal count": _rounded(estimate.median if estimate else None, 2),
-                        "low (95 %)": _rounded(estimate.low if estimate else None, 2),
-                        "high": _rounded(estimate.high if estimate else None, 2),
-                        "sign test p": _rounded(estimate.p_value if estimate else None, 3),
-                        "over seeds (dB)": _rounded(each.psnr_over_seeds, 2),
-                        "above in": f"{each.above} of {estimate.cells if estimate else 0}",
-                        "fewer than any": each.fewer,
-                        "more than any": each.more,
-                        f"{THEIRS} needs times": NO_RATIO.get(
-                            each.count_ratio, _rounded(each.count_ratio, 2)
-                        ),
-                        "never reaches": each.never,
-                        "always exceeds": each.always,
-                        "unpaired": each.unpaired or None,
-                    }
-                )
-    return _without_empty(lines) if any(line["dB above at equal count"] is not None for line in lines) else []
+def _medians(results: Sequence[JobResult], setting: ArmSetting, numbers: Sequence[Number]) -> Line:
+    members = list(by_cell(results, setting).values())
+    line: Line = {"setting": setting.name, "cells": len(members)}
+    for each in numbers:
+        line[each.heading] = _median(map(value_of(each), members), each.digits)
+    for quality in qualities(results)[:1]:
+        if any(not result.grows for result in measured(results)):
+            gain = gain_over(results, value_of(quality))
+            line[f"{quality.label} over no growth"] = _median(map(gain, members), quality.digits)
+    line["seconds"] = _median((result.seconds for result in members), 1)
+    return line | {"ended early": sum(result.ended_early for result in members) or None}
 
 
 def jobs_table(results: Sequence[JobResult]) -> list[Line]:
-    """Return every job with its outcome. The columns of a named truth are left out if no job has one."""
-    known = {
-        title: column
-        for title, column in OF_TRUTH.items()
-        if any(getattr(result, column[0]) is not None for result in results)
-    }
+    """Return every job with its outcome and all its numbers of which more or less is better."""
+    numbers = _compared(results)
     return [
         {
             "job": result.folder.name,
             "setting": result.setting.name,
             **{key: value for key, value in result.cell.axes if value},
             "outcome": result.outcome,
-            "Gaussians": None if result.count is None else round(result.count),
-            PSNR.axis: _rounded(result.psnr, PSNR.digits),
-            SSIM.axis: _rounded(result.ssim, SSIM.digits),
-            **{title: _rounded(getattr(result, name), digits) for title, (name, digits) in known.items()},
+            **{each.heading: _rounded(result.numbers.get(each.name), each.digits) for each in numbers},
             "seconds": result.seconds,
         }
         for result in results
@@ -153,26 +142,43 @@ def jobs_table(results: Sequence[JobResult]) -> list[Line]:
 
 
 def write_csv(path: Path, lines: Sequence[Line]) -> None:
-    """Write a table atomically; an empty one writes no file."""
+    """Write a table atomically, an estimate as three columns; an empty table writes no file."""
     if not lines:
         return
-    columns = list(dict.fromkeys(key for line in lines for key in line))
+    plain = [_columns(line) for line in lines]
+    columns = list(dict.fromkeys(key for line in plain for key in line))
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
-        writer.writerows(lines)
+        writer.writerows(plain)
 
 
-def _median(values: Sequence[float | None], digits: int) -> float | int | None:
-    known = sorted(value for value in values if value is not None)
-    if not known:
-        return None
-    middle = (known[(len(known) - 1) // 2] + known[len(known) // 2]) / 2
-    return round(middle) if digits == 0 else round(middle, digits)
+def _columns(line: Line) -> Line:
+    found: Line = {}
+    for key, value in line.items():
+        if isinstance(value, Estimate):
+            found |= {key: value.median, f"{key}: low": value.low, f"{key}: high": value.high}
+        else:
+            found[key] = value
+    return found
 
 
-def _rounded(value: float | None, digits: int) -> float | None:
-    return None if value is None else round(value, digits)
+def _compared(results: Iterable[JobResult]) -> list[Number]:
+    """Return the numbers of these results of which more or less is better, the count first."""
+    results = list(results)
+    known = {each.name: each for result in results for each in result.declared.values()}
+    named = {name for result in results for name in result.numbers}
+    found = [each for name, each in known.items() if each.is_more_better is not None and name in named]
+    return sorted(found, key=lambda each: each.name != COUNT.name)
+
+
+def _median(values: Iterable[float | None], digits: int) -> float | int | None:
+    known = [value for value in values if value is not None]
+    return _rounded(float(np.median(known)), digits) if known else None
+
+
+def _rounded(value: float | None, digits: int) -> float | int | None:
+    return None if value is None else round(value, digits) if digits else round(value)
 
 
 def _without_empty(lines: list[Line]) -> list[Line]:

@@ -4,16 +4,13 @@ The page contains descriptions, clips and questions. It contains no names of arm
 Gaussians. Each clip has a random number, and only the key of the study says what it shows.
 """
 
-import base64
 import hashlib
 import json
 import math
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
+from cadam3d.io.html import content_hash, encoded, fill, source
 from cadam3d.study.questions import QUESTIONS
 from cadam3d.study.trials import Trial
 
@@ -40,28 +37,22 @@ def study_page(
     ``seconds`` is the time of one turn. ``consent`` is text that is shown before the start; an empty line
     begins a paragraph. A policy in the page forbids every request and every other script.
     """
-    environment = Environment(
-        loader=FileSystemLoader(SOURCES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    code, look = _source("rater_page.js"), _source("rater_page.css")
+    code, look = source(SOURCES / "rater_page.js"), source(SOURCES / "rater_page.css")
     data = {
         "study": study,
         "seconds": seconds,
         "questions": [{"name": question.name, "text": question.text} for question in QUESTIONS],
         "trials": json.loads(_trials_json(trials)),
     }
-    return environment.get_template("rater_page.html.jinja").render(
+    return fill(
+        SOURCES / "rater_page.html.jinja",
         style=look,
-        style_hash=_hash(look),
+        style_hash=content_hash(look),
         script=code,
-        script_hash=_hash(code),
+        script_hash=content_hash(code),
         # Inside a script, a browser reads everything up to the next "</script" as it is.
         data=json.dumps(data, ensure_ascii=False).replace("<", "\\u003c"),
-        clips=["\n".join(base64.b64encode(frame).decode() for frame in clip) for clip in clips],
+        clips=["\n".join(encoded(frame) for frame in clip) for clip in clips],
         consent=[text.strip() for text in consent.split("\n\n") if text.strip()],
         pairs=len(trials),
         questions=len(QUESTIONS),
@@ -72,12 +63,3 @@ def study_page(
 def _trials_json(trials: Sequence[Trial]) -> str:
     """Return the trials as the page has them, which does not include which of them are catch trials."""
     return json.dumps([{"prompt": trial.prompt, "clips": trial.clips} for trial in trials])
-
-
-@cache
-def _source(name: str) -> str:
-    return (SOURCES / name).read_text(encoding="utf-8")
-
-
-def _hash(text: str) -> str:
-    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

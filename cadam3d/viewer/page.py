@@ -1,25 +1,22 @@
 """Make HTML pages that show Gaussians: one file, without a library and without a request to the network."""
 
-import base64
-import hashlib
 import json
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from cadam3d.io.html import content_hash, encoded, fill, source
 
 SOURCES = Path(__file__).parent
 
 
 def script() -> str:
     """Return the JavaScript that defines the class ``SplatView``, which other pages can contain too."""
-    return _source("splat_view.js")
+    return source(SOURCES / "splat_view.js")
 
 
 def style() -> str:
     """Return the CSS of the controls that ``SplatView.controls`` makes."""
-    return _source("splat_view.css")
+    return source(SOURCES / "splat_view.css")
 
 
 def viewer_page(
@@ -37,34 +34,25 @@ def viewer_page(
     those of the first view. ``background`` is RGB in [0, 1]; None means white, or dark for readers who prefer
     dark pages. A policy in the page forbids every request and every other script.
     """
-    code, look = f"{script()}{_source('page.js')}", f"{style()}{_source('page.css')}"
-    environment = Environment(loader=FileSystemLoader(SOURCES), autoescape=True, undefined=StrictUndefined)
-    return environment.get_template("page.html.jinja").render(
+    code, look = f"{script()}{source(SOURCES / 'page.js')}", f"{style()}{source(SOURCES / 'page.css')}"
+    return fill(
+        SOURCES / "page.html.jinja",
         title=_printable(title),
         caption=_printable(caption),
         style=look,
-        style_hash=_hash(look),
+        style_hash=content_hash(look),
         script=code,
-        script_hash=_hash(code),
+        script_hash=content_hash(code),
         options=json.dumps(
             {
                 "camera": {"azimuth": azimuth_deg, "elevation": elevation_deg},
                 "background": None if background is None else [float(channel) for channel in background],
             }
         ),
-        data=base64.b64encode(packed).decode(),
+        data=encoded(packed),
     )
-
-
-@cache
-def _source(name: str) -> str:
-    return (SOURCES / name).read_text(encoding="utf-8")
 
 
 def _printable(text: str) -> str:
     """Return ``text`` with a question mark for each byte of a command line that is not UTF-8."""
     return text.encode(errors="replace").decode()
-
-
-def _hash(text: str) -> str:
-    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

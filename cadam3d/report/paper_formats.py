@@ -3,8 +3,13 @@
 import csv
 import io
 from collections.abc import Sequence
+from pathlib import Path
 
-from cadam3d.report.paper_table import PaperTable, Section, TableCell, TableRow
+from cadam3d.io.atomic import replacing
+from cadam3d.io.run_folder import PAPER_TABLE_CSV, PAPER_TABLE_LATEX, PAPER_TABLE_MARKDOWN
+from cadam3d.report.paper_table import PaperTable, TableCell, TablePart, TableRow, paper_table
+from cadam3d.report.results import read
+from cadam3d.sweep.folder import read_plan
 
 FIRST = ("objective", "method", "source", "prompts")
 ALL = "all prompts"
@@ -27,22 +32,12 @@ LATEX = {
 
 def headings(table: PaperTable) -> list[str]:
     """Return the titles of all columns, with an arrow towards the better numbers."""
-    arrows = [ARROWS[number.is_more_better] for number in table.numbers]
-    return [
-        *FIRST,
-        *(f"{title} {arrow}".strip() for title, arrow in zip(table.headings, arrows, strict=True)),
-    ]
+    return [*FIRST, *(f"{each.heading} {ARROWS[each.is_more_better]}".strip() for each in table.numbers)]
 
 
-def texts(row: TableRow, names: Sequence[str]) -> list[str]:
+def texts(row: TableRow) -> list[str]:
     """Return the text of every cell of a row, for readers."""
-    return [
-        row.objective,
-        row.method,
-        row.source,
-        row.prompts,
-        *(text(row.cells[name], row) for name in names),
-    ]
+    return [row.objective, row.method, row.source, row.prompts, *(text(cell, row) for cell in row.cells)]
 
 
 def text(cell: TableCell, row: TableRow) -> str:
@@ -55,12 +50,12 @@ def text(cell: TableCell, row: TableRow) -> str:
 def markdown(table: PaperTable) -> str:
     """Return the table as Markdown, one part for all prompts and one for each category."""
     lines = []
-    for section in table.sections:
-        if len(table.sections) > 1:
-            lines += [f"**{_in_markdown(section.category or ALL)}**", ""]
+    for part in table.parts:
+        if len(table.parts) > 1:
+            lines += [f"**{_in_markdown(part.category or ALL)}**", ""]
         lines += [_markdown_line(headings(table))]
-        lines += [_markdown_line([*["---"] * len(FIRST), *["---:"] * len(table.names)])]
-        lines += [_markdown_line(texts(row, table.names)) for row in section.rows] + [""]
+        lines += [_markdown_line([*["---"] * len(FIRST), *["---:"] * len(table.numbers)])]
+        lines += [_markdown_line(texts(row)) for row in part.rows] + [""]
     return "\n".join([*lines, *(f"- {' '.join(note.split())}" for note in table.notes)]) + "\n"
 
 
@@ -68,34 +63,34 @@ def comma_separated(table: PaperTable) -> str:
     """Return the table as CSV: each number with half the width of its interval and its count of prompts."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
-    columns = [column for title in table.headings for column in (title, f"{title}: ±", f"{title}: prompts")]
+    titles = [number.heading for number in table.numbers]
+    columns = [column for title in titles for column in (title, f"{title}: ±", f"{title}: prompts")]
     writer.writerow(["category", *FIRST, *columns])
-    for section in table.sections:
-        for row in section.rows:
-            cells = [row.cells[name] for name in table.names]
-            numbers = [entry for cell in cells for entry in (cell.text, cell.half, cell.prompts)]
+    for part in table.parts:
+        for row in part.rows:
+            numbers = [entry for cell in row.cells for entry in (cell.text, cell.half, cell.prompts)]
             writer.writerow(
-                [section.category or ALL, row.objective, row.method, row.source, row.prompts, *numbers]
+                [part.category or ALL, row.objective, row.method, row.source, row.prompts, *numbers]
             )
     return file.getvalue()
 
 
 def latex(table: PaperTable) -> str:
     """Return the table as LaTeX that needs no package; the parts follow each other in one file."""
-    parts = [_latex_section(table, section) for section in table.sections]
+    parts = [_latex_part(table, part) for part in table.parts]
     notes = "\n".join(f"% {' '.join(note.split())}" for note in table.notes)
     return "\n".join([*parts, notes]) + "\n"
 
 
-def _latex_section(table: PaperTable, section: Section) -> str:
+def _latex_part(table: PaperTable, part: TablePart) -> str:
     lines = [r"\begin{table}", r"\centering"]
-    lines += [rf"\caption{{{in_latex(section.category or ALL)}}}"]
-    lines += [rf"\begin{{tabular}}{{{'l' * len(FIRST)}{'r' * len(table.names)}}}", r"\hline"]
+    lines += [rf"\caption{{{in_latex(part.category or ALL)}}}"]
+    lines += [rf"\begin{{tabular}}{{{'l' * len(FIRST)}{'r' * len(table.numbers)}}}", r"\hline"]
     lines += [_latex_line(headings(table)), r"\hline"]
-    for position, row in enumerate(section.rows):
-        if position and row.objective != section.rows[position - 1].objective:
+    for position, row in enumerate(part.rows):
+        if position and row.objective != part.rows[position - 1].objective:
             lines.append(r"\hline")
-        lines.append(_latex_line(texts(row, table.names)))
+        lines.append(_latex_line(texts(row)))
     return "\n".join([*lines, r"\hline", r"\end{tabular}", r"\end{table}", ""])
 
 
@@ -115,3 +110,28 @@ def _markdown_line(cells: Sequence[str]) -> str:
 def _in_markdown(plain: str) -> str:
     line = " ".join(plain.split())
     return "".join(f"\\{character}" if character in r"\|*_`<[" else character for character in line)
+
+
+FORMATS = {PAPER_TABLE_MARKDOWN: markdown, PAPER_TABLE_CSV: comma_separated, PAPER_TABLE_LATEX: latex}
+
+
+def read_table(sweep: Path) -> PaperTable | None:
+    """Return the table of a sweep; None if its grid does not ask for it or no job has left an asset."""
+    return paper_table(read(sweep), sweep) if read_plan(sweep).paper_table else None
+
+
+def write(sweep: Path) -> str:
+    """Write the table in all formats, and return it as Markdown; "" if there is none.
+
+    Raises ``UserError`` if a file cannot be written.
+    """
+    table = read_table(sweep)
+    if table is None:
+        # Files that an earlier line wrote would be mistaken for the table of the present jobs.
+        for name in FORMATS:
+            (sweep / name).unlink(missing_ok=True)
+        return ""
+    for name, write_as in FORMATS.items():
+        with replacing(sweep / name) as temporary:
+            temporary.write_text(write_as(table), encoding="utf-8")
+    return markdown(table)
