@@ -8,21 +8,22 @@ interval of a bootstrap over prompts and the p-value of a sign test over prompts
 """
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 
 from cadam3d.io.records import read_metrics
-from cadam3d.report.claims import (
+from cadam3d.report.compare import (
     Estimate,
-    Pair,
+    Value,
+    above_frontier,
+    arms_without_growth,
     compare,
     gain_over,
+    main_setting,
     settings_of,
-    standard_setting,
-    standings,
 )
 from cadam3d.report.results import JobResult, arms_of, measured, read
 
@@ -69,37 +70,37 @@ def parts(results: Sequence[JobResult]) -> Iterator[tuple[str, list[JobResult]]]
     yield "all", list(results)
 
 
-def written(estimate: Estimate, digits: int, factor: float = 1.0) -> str:
-    """Return a median with its interval and p-value."""
-    numbers = [
-        f"{factor * value:+.{digits}f}"
-        for value in (estimate.median, estimate.low, estimate.high)
-        if value is not None
-    ]
-    interval = f" ({numbers[1]} to {numbers[2]})" if len(numbers) == 3 else ""
+def written(estimate: Estimate | None, digits: int) -> str:
+    """Return a median with its interval and p-value; empty if there is none."""
+    if estimate is None:
+        return ""
     p_value = "" if estimate.p_value is None else f", p = {estimate.p_value:.2g}"
-    return f"{numbers[0]}{interval}{p_value}"
+    return f"{estimate.written(digits)}{p_value}"
 
 
-def median(numbers: Sequence[float]) -> float:
+def psnr(result: JobResult) -> float | None:
+    """Return the PSNR of a result, at the best turn if its asset may face any side."""
+    return result.numbers.get("psnr_turned", result.numbers.get("psnr"))
+
+
+def median(numbers: Sequence[float | None]) -> float:
     """Return the median of the numbers that are known; NaN if none is."""
-    known = [number for number in numbers if not np.isnan(number)]
+    known = [number for number in numbers if number is not None]
     return float(np.median(known)) if known else np.nan
 
 
 def levels(results: Sequence[JobResult]) -> str:
     """Return a table of all settings: medians of the count, the PSNR, the gain over no growth and the IoU."""
-    gain = gain_over(results)
+    numbers: list[Value] = [
+        lambda each: each.count,
+        psnr,
+        gain_over(results, psnr),
+        lambda each: each.numbers.get("iou"),
+    ]
     rows = []
     for arm in arms_of(results):
         for setting in settings_of(results, arm):
             own = [each for each in measured(results) if each.setting == setting]
-            numbers: list[Callable[[JobResult], float]] = [
-                lambda each: each.count or np.nan,
-                lambda each: each.psnr if each.psnr is not None else np.nan,
-                gain,
-                lambda each: each.iou if each.iou is not None else np.nan,
-            ]
             medians = [median([number(each) for each in own]) for number in numbers]
             early = sum(each.ended_early for each in own)
             cells = [f"{len(own)}" + (f" ({early} ended early)" if early else ""), f"{medians[0]:,.0f}"]
@@ -113,47 +114,29 @@ def differences(results: Sequence[JobResult]) -> str:
     """Return a table of the paired differences that answer the questions."""
     rows = []
     for ours, theirs in QUESTIONS:
-        first, second = standard_setting(results, ours), standard_setting(results, theirs)
-        if first is None or second is None:
+        if not {ours, theirs} <= set(arms_of(results)):
             continue
         for name, own in parts(results):
-            found = compare(own, first, second)
-            if found is None:
-                continue
-
-            def estimate(
-                number: Callable[[Pair], float], pairs: Sequence[Pair] = tuple(found.pairs)
-            ) -> Estimate:
-                return Estimate.of({each.cell: number(each) for each in pairs})
-
-            psnr, fewer = estimate(lambda each: each.psnr), estimate(lambda each: each.reduction)
-            rows.append(
-                [
-                    f"`{ours}` over `{theirs}`",
-                    name,
-                    f"{found.cells}",
-                    written(psnr, 2),
-                    written(fewer, 1, 100),
-                ]
-            )
-    return table(["comparison", "where", "cells", "PSNR (dB)", "fewer Gaussians (%)"], rows)
+            found = compare(own, main_setting(results, ours), main_setting(results, theirs))
+            if found is not None:
+                numbers = [f"{len(found.pairs)}", written(found.difference(psnr), 2), written(found.count, 1)]
+                rows.append([f"`{ours}` over `{theirs}`", name, *numbers])
+    return table(["comparison", "where", "cells", "PSNR (dB)", "Gaussians (%)"], rows)
 
 
 def frontier(results: Sequence[JobResult]) -> str:
     """Return a table of how far the settings are above the frontier of the baseline, at equal count."""
     seeded = [each for each in results if each.cell[SEED] == FRONTIER_SEED]
     rows = []
-    for arm in arms_of(seeded):
-        if arm in (FRONTIER, "none"):
-            continue
+    others = [arm for arm in arms_of(seeded) if arm != FRONTIER and arm not in arms_without_growth(seeded)]
+    for arm in others:
         for name, own in parts(seeded):
-            for each in standings(own, arm, FRONTIER):
-                above = (
-                    "" if each.psnr is None else f"{written(each.psnr, 2)}, {each.above} of {each.psnr.cells}"
-                )
-                ratio = "" if each.count_ratio is None else f"{each.count_ratio:.2f}"
-                rows.append([f"`{arm}`", name, above, f"{each.fewer}", ratio])
-    return table(["arm", "where", "above the frontier (dB)", "fewer than all", "baseline needs times"], rows)
+            for setting in settings_of(own, arm):
+                above = above_frontier(own, setting, FRONTIER, psnr)
+                better = f", {sum(each > 0 for each in above.values())} of {len(above)}" if above else ""
+                text = written(Estimate.of(above) if above else None, 2)
+                rows.append([f"`{arm}`", name, f"{text}{better}"])
+    return table(["arm", "where", "above the frontier (dB)"], rows)
 
 
 def over_time(results: Sequence[JobResult], arm: str) -> str:

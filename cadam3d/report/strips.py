@@ -12,7 +12,7 @@ from cadam3d.io.image import read_png, step_pictures
 from cadam3d.io.run_folder import CANDIDATES, PREVIEW
 from cadam3d.report.compare import by_cell, main_setting, qualities
 from cadam3d.report.figures import arm_of_two_thresholds
-from cadam3d.report.palette import SOFT
+from cadam3d.report.palette import INK, SOFT
 from cadam3d.report.results import (
     NOISE,
     RECIPE,
@@ -189,18 +189,18 @@ def _draw(
     columns = max(map(len, lines.values()))
     figure = new_figure(columns, len(lines), width=inch * columns + 0.4, height=inch * 1.25)
     panels = figure.subplots(len(lines), columns, squeeze=False)
-    style = looks(result.arm for result in results)
+    colors = {arm: look.color for arm, look in looks(result.arm for result in results).items()}
     for axes in panels.flat:
         hide_axes(axes)
     for i, (row, (name, tiles)) in enumerate(zip(panels, lines.items(), strict=True)):
-        color = style[name].color if name in style else SOFT
-        row[0].set_ylabel(name.replace("_", "\n"), fontsize=8.5, fontweight="bold", color=color)
+        row[0].set_ylabel(name.replace("_", "\n"), fontsize=8.5, weight="bold", color=colors.get(name, SOFT))
         for axes, tile in zip(row, tiles, strict=False):
             if tile.image is not None:
                 axes.imshow(tile.image, interpolation="antialiased")
             axes.set_xlabel(tile.caption, fontsize=7.5, color=SOFT, labelpad=2)
             if i == 0:
-                axes.set_title(tile.title, fontsize=8.5, fontweight="normal", loc="center")
+                color = colors.get(tile.title, INK)
+                axes.set_title(tile.title, fontsize=8.5, weight="normal", loc="center", color=color)
     words = [cell["prompt"], level_title(cell[NOISE]), f"seed {cell['seed']}"]
     title = ", ".join(word for word in words if word)
     text = textwrap.fill(title, int(TITLE_CHARACTERS_PER_INCH * figure.get_figwidth()))

@@ -228,8 +228,9 @@ def _title(plan: Plan, results: Sequence[JobResult]) -> str:
         name = plural(len(results), "attempt")
     elif not name:
         varied = [ARM] if len({result.arm for result in results}) > 1 else []
-        axes = dict.fromkeys(key for result in results for key, _ in result.cell.axes if key != PROMPT)
-        varied += [key for key in axes if len({result.cell[key] for result in results}) > 1]
+        axes = [dict([*result.setting.thresholds, *result.cell.axes]) for result in results]
+        keys = dict.fromkeys(key for each in axes for key in each if key != PROMPT)
+        varied += [key for key in keys if len({each.get(key) for each in axes}) > 1]
         name = f"Sweep of {', '.join(varied)}" if varied else "Sweep"
     prompts = list(filter(None, dict.fromkeys(result.cell[PROMPT] for result in results)))
     shown = [shorten(text, LONGEST_PROMPT, placeholder=" ...") for text in prompts[:MOST_PROMPTS]]

@@ -92,6 +92,7 @@ class Jobs:
             "asset_mib": 68 * round(n) / (1 << 20),
             "seconds": 1.5,
             "densifier": densifier,
+            "grows": densifier != "none",
             "guidance": given.get("guidance", "sds"),
             "warnings": [],
             **summary,

@@ -47,11 +47,11 @@ def printed(jobs, capsys) -> str:
 
 
 def test_differences_are_paired_within_cells_and_have_intervals_over_prompts(printed):
-    one = "| `cadam_no_snr` over `cadam` | `one` | 6 | -0.25 (-0.25 to -0.25), p = 0.031 |"
-    two = "| `cadam_no_snr` over `cadam` | `two` | 6 | +0.25 (+0.25 to +0.25), p = 0.031 |"
+    one = "| `cadam_no_snr` over `cadam` | `one` | 6 | -0.25 [-0.25, -0.25], p = 0.031 |"
+    two = "| `cadam_no_snr` over `cadam` | `two` | 6 | +0.25 [+0.25, +0.25], p = 0.031 |"
     assert one in printed
     assert two in printed
-    assert f"{one} -25.0 (-25.0 to -25.0), p = 0.031 |" in printed
+    assert f"{one} +25.0 [+25.0, +25.0], p = 0.031 |" in printed
 
 
 def test_every_setting_has_its_medians_of_count_and_gain(printed):

@@ -12,12 +12,12 @@ from declarations import all_numbers, declared
 
 from cadam3d import report
 from cadam3d.io import run_folder
-from cadam3d.report import table_files
-from cadam3d.report.means import change, difference, mean
+from cadam3d.report import paper_formats
+from cadam3d.report.compare import change, difference, mean
+from cadam3d.report.paper_formats import comma_separated, headings, in_latex, latex, markdown, texts
 from cadam3d.report.paper_table import columns, paper_table
-from cadam3d.report.published import NUMBERS, ROWS
+from cadam3d.report.published import ROWS, SCORES, SIZES
 from cadam3d.report.results import read
-from cadam3d.report.table_formats import comma_separated, headings, in_latex, latex, markdown, texts
 
 # The body of the paper's table 1, as its source has it.
 TEX = r"""
@@ -62,10 +62,14 @@ def table_of(folder):
     return table
 
 
-def row_of(table, objective, method, source="this sweep", section=0):
+def cell_of(table, row, name):
+    return row.cells[[number.name for number in table.numbers].index(name)]
+
+
+def row_of(table, objective, method, source="this sweep", part=0):
     found = [
         row
-        for row in table.sections[section].rows
+        for row in table.parts[part].rows
         if (row.objective.partition(",")[0], row.method, row.source) == (objective, method, source)
     ]
     assert len(found) == 1
@@ -79,29 +83,32 @@ def test_the_published_numbers_are_those_of_the_source():
     for line, row in zip(lines, ROWS, strict=True):
         objective = line[0] or objective
         assert (row.objective, row.arm) == (objective, line[1].lower())
-        assert [row.texts[name] for name in NUMBERS] == line[2:]
+        assert [row.texts[number.name] for number in (*SCORES, *SIZES)] == line[2:]
 
 
 def test_means_and_intervals_equal_those_computed_by_hand(three):
     table = table_of(three)
     baseline, cadam = row_of(table, "SDS", "baseline"), row_of(table, "SDS", "cadam")
-    assert baseline.cells["num_gaussians"].text == "2000"
+    assert cell_of(table, baseline, "num_gaussians").text == "2000"
     # The standard deviation of 1000, 2000 and 3000 is 1000.
-    assert float(baseline.cells["num_gaussians"].half) == pytest.approx(T2 * 1000 / math.sqrt(3), abs=1)
-    assert cadam.cells["num_gaussians"].text == "200"
-    assert baseline.cells["psnr"].text == "22.00"
-    assert cadam.cells["psnr"].text == "21.80"
+    assert float(cell_of(table, baseline, "num_gaussians").half) == pytest.approx(
+        T2 * 1000 / math.sqrt(3), abs=1
+    )
+    assert cell_of(table, cadam, "num_gaussians").text == "200"
+    assert cell_of(table, baseline, "psnr").text == "22.00"
+    assert cell_of(table, cadam, "psnr").text == "21.80"
 
 
 def test_differences_are_paired_by_prompt(three):
-    row = row_of(table_of(three), "SDS", "cadam - baseline")
+    table = table_of(three)
+    row = row_of(table, "SDS", "cadam - baseline")
     # PSNR differs by -0.1, -0.3 and -0.2 dB, with a standard deviation of 0.1 dB.
-    assert row.cells["psnr"].text == "-0.20"
-    assert float(row.cells["psnr"].half) == pytest.approx(T2 * 0.1 / math.sqrt(3), abs=0.006)
+    assert cell_of(table, row, "psnr").text == "-0.20"
+    assert float(cell_of(table, row, "psnr").half) == pytest.approx(T2 * 0.1 / math.sqrt(3), abs=0.006)
     # 600 of 6,000 Gaussians remain. The residuals 100 - 100, 300 - 200 and 200 - 300 have a deviation of 100.
-    assert row.cells["num_gaussians"].text == "90.0 % fewer"
+    assert cell_of(table, row, "num_gaussians").text == "90.0 % fewer"
     half = 100 * T2 * 100 / math.sqrt(3) / 2000
-    assert float(row.cells["num_gaussians"].half) == pytest.approx(half, abs=0.06)
+    assert float(cell_of(table, row, "num_gaussians").half) == pytest.approx(half, abs=0.06)
 
 
 def test_missing_jobs_are_counted_and_left_out_of_pairs(three):
@@ -110,7 +117,7 @@ def test_missing_jobs_are_counted_and_left_out_of_pairs(three):
     assert row_of(table, "VFDS", "cadam").prompts == "3"
     difference_row = row_of(table, "VFDS", "cadam - baseline")
     assert difference_row.prompts == "2 of 3"
-    assert difference_row.cells["num_gaussians"].text == "86.7 % fewer"
+    assert cell_of(table, difference_row, "num_gaussians").text == "86.7 % fewer"
     assert any("1 of 12 jobs" in note for note in table.notes)
 
 
@@ -120,18 +127,19 @@ def test_differences_of_a_number_use_the_seeds_in_which_both_have_it(jobs):
         where = ("prompt=cube", "guidance=sds", f"seed={seed}")
         jobs.add("baseline", *where, n=100, psnr=20, arm="baseline", **scored(theirs))
         jobs.add("cadam", *where, n=50, psnr=20, arm="cadam", **({} if ours is None else scored(ours)))
-    row = row_of(table_of(jobs.folder), "SDS", "cadam - baseline")
-    assert row.cells["clip_score"].text == "+1.00"
+    table = table_of(jobs.folder)
+    row = row_of(table, "SDS", "cadam - baseline")
+    assert cell_of(table, row, "clip_score").text == "+1.00"
 
 
 def test_a_truth_that_eval_compares_with_does_not_replace_that_of_training(three):
-    before = row_of(table_of(three), "SDS", "baseline").cells["psnr"]
+    before = cell_of(table_of(three), row_of(table_of(three), "SDS", "baseline"), "psnr")
     folder = read(three)[0].folder
     numbers = json.loads((folder / run_folder.SUMMARY).read_text())
     (folder / run_folder.EVALUATION).write_text(
         json.dumps(declared(numbers | {"psnr": 90.0, "clip_score": 30.0}))
     )
-    assert row_of(table_of(three), "SDS", "baseline").cells["psnr"] == before
+    assert cell_of(table_of(three), row_of(table_of(three), "SDS", "baseline"), "psnr") == before
     assert read(three)[0].numbers["clip_score"] == 30.0
 
 
@@ -140,38 +148,43 @@ def test_seeds_are_averaged_within_a_prompt_first(jobs):
     for prompt, seeds in (("a cube", (10, 20, 60)), ("a torus", (90,))):
         for seed, psnr in enumerate(seeds):
             jobs.add("cadam", f"prompt={prompt}", f"seed={seed}", n=100, psnr=psnr, arm="cadam")
-    assert row_of(table_of(jobs.folder), "SDS", "cadam").cells["psnr"].text == "60.00"
+    assert (
+        cell_of(table_of(jobs.folder), row_of(table_of(jobs.folder), "SDS", "cadam"), "psnr").text == "60.00"
+    )
 
 
 def test_published_rows_keep_their_text_and_never_share_a_cell(three):
     table = table_of(three)
     published = row_of(table, "VFDS", "cadam", "published")
-    assert published.cells["num_gaussians"].value == "82K"
-    assert published.cells["asset_mib"].value == "5.3MB"
-    assert published.cells["psnr"].text == "-"
-    assert row_of(table, "SDS", "cadam - baseline", "published").cells["num_gaussians"].text == "86.6 % fewer"
-    assert not any(row.source == "published" for section in table.sections[1:] for row in section.rows)
+    assert cell_of(table, published, "num_gaussians").value == "82K"
+    assert cell_of(table, published, "asset_mib").value == "5.3MB"
+    assert cell_of(table, published, "psnr").text == "-"
+    assert (
+        cell_of(table, row_of(table, "SDS", "cadam - baseline", "published"), "num_gaussians").text
+        == "86.6 % fewer"
+    )
+    assert not any(row.source == "published" for part in table.parts[1:] for row in part.rows)
     assert any("another protocol" in note for note in table.notes)
 
 
 def test_objectives_that_the_paper_lacks_have_no_published_rows(jobs):
     jobs.add("cadam", "guidance=gcs", n=10, psnr=20, arm="cadam")
     table = table_of(jobs.folder)
-    assert [row.source for row in table.sections[0].rows] == ["this sweep"]
+    assert [row.source for row in table.parts[0].rows] == ["this sweep"]
     assert not any("published" in note for note in table.notes)
 
 
 def test_each_category_has_its_own_part(three):
     table = table_of(three)
-    assert [section.category for section in table.sections] == ["", "Material", "Structure & 100 %"]
-    assert row_of(table, "SDS", "baseline", section=1).cells["num_gaussians"].text == "1000"
-    assert row_of(table, "SDS", "baseline", section=1).cells["num_gaussians"].half == ""
-    assert row_of(table, "SDS", "baseline", section=2).prompts == "2"
+    assert [part.category for part in table.parts] == ["", "Material", "Structure & 100 %"]
+    assert cell_of(table, row_of(table, "SDS", "baseline", part=1), "num_gaussians").text == "1000"
+    assert cell_of(table, row_of(table, "SDS", "baseline", part=1), "num_gaussians").half == ""
+    assert row_of(table, "SDS", "baseline", part=2).prompts == "2"
 
 
 def test_all_formats_show_the_same_cells(three):
     table = table_of(three)
-    wanted = [texts(row, table.names) for section in table.sections for row in section.rows]
+    wanted = [texts(row) for part in table.parts for row in part.rows]
 
     lines = [line for line in markdown(table).splitlines() if line.startswith("| ")]
     shown = [[cell.replace("\\", "") for cell in re.split(r" (?<!\\)\| ", line[2:-2])] for line in lines]
@@ -188,7 +201,7 @@ def test_all_formats_show_the_same_cells(three):
             assert cell.replace(",", "") == f"{number}{interval}{own}"
 
     body = [line for line in latex(table).splitlines() if line.endswith(r"\\")]
-    assert len(body) == len(wanted) + len(table.sections)
+    assert len(body) == len(wanted) + len(table.parts)
     for line in wanted:
         assert " & ".join(map(in_latex, line)) + r" \\" in body
 
@@ -218,8 +231,8 @@ def test_the_page_of_the_sweep_shows_the_table_with_escaped_text(three):
     (three / run_folder.JOBS).write_text(json.dumps({**plan, "figures": ["no such"]}))
     page = report.write_sweep(three).read_text(encoding="utf-8")
     assert "<h3>&lt;b&gt;</h3>" in page
-    for row in table_of(three).sections[0].rows:
-        assert all(html.escape(cell) in page for cell in texts(row, table_of(three).names))
+    for row in table_of(three).parts[0].rows:
+        assert all(html.escape(cell) in page for cell in texts(row))
 
 
 def test_columns_are_the_numbers_that_every_row_has(jobs):
@@ -227,15 +240,16 @@ def test_columns_are_the_numbers_that_every_row_has(jobs):
         more = {"iou": 0.5} if arm == "cadam" else {}
         jobs.add(arm, n=100, psnr=20, arm=arm, ssim_turned=0.8, psnr_turned=21.0, **scored(30.0), **more)
     results = read(jobs.folder)
-    assert [number.name for number in columns([[result] for result in results])] == [
+    assert [number.name for number in columns(results)] == [
         "clip_score",
         "psnr_turned",
-        "ssim_turned",
         "num_gaussians",
         "asset_mib",
     ]
     assert all(heading in headings(table_of(jobs.folder)) for heading in ("CLIP score ↑", "Gaussians ↓"))
-    assert set(NUMBERS) <= set(all_numbers())
+    for number in (*SCORES, *SIZES):
+        declared_number = all_numbers()[number.name]
+        assert (number.heading, number.digits) == (declared_number.heading, declared_number.digits)
 
 
 @pytest.mark.parametrize(
@@ -250,12 +264,12 @@ def test_columns_are_the_numbers_that_every_row_has(jobs):
 def test_numbers_of_different_methods_are_not_put_into_one_table(jobs, other, expected):
     jobs.add("baseline", n=100, psnr=20, arm="baseline", **scored(31.0))
     folder = jobs.add("cadam", n=10, psnr=20, arm="cadam", **scored(30.0))
-    assert table_of(jobs.folder).names[0] == "clip_score"
+    assert table_of(jobs.folder).numbers[0].name == "clip_score"
     summary = json.loads((folder / run_folder.SUMMARY).read_text())
     (folder / run_folder.SUMMARY).write_text(json.dumps({**summary, **other}))
     table = table_of(jobs.folder)
-    assert "clip_score" not in table.names
-    assert "num_gaussians" in table.names
+    assert "clip_score" not in [number.name for number in table.numbers]
+    assert "num_gaussians" in [number.name for number in table.numbers]
     [note] = [note for note in table.notes if expected in note]
     assert note.endswith("'metric=[clip_score]'")
     assert "31.00" not in markdown(table) + latex(table) + comma_separated(table)
@@ -268,8 +282,8 @@ def test_scores_of_one_table_belong_to_one_protocol(jobs):
         both["measurements"]["niqe"] = {"protocol": {"name": "t3bench", "views": 12}, "weights_sha256": "cc"}
         jobs.add(arm, n=100, psnr=20, arm=arm, **both)
     table = table_of(jobs.folder)
-    assert "clip_score" in table.names
-    assert "niqe" not in table.names
+    assert "clip_score" in [number.name for number in table.numbers]
+    assert "niqe" not in [number.name for number in table.numbers]
     assert any("niqe belongs to another protocol" in note for note in table.notes)
 
 
@@ -284,7 +298,7 @@ def test_a_table_without_scores_says_how_to_measure_them(jobs):
 def test_settings_that_come_with_prompts_do_not_split_the_rows(jobs):
     for prompt, negative in (("a cube", "blurry"), ("a torus", "ugly")):
         jobs.add("cadam", f"prompt={prompt}", f"negative_prompt={negative}", n=10, psnr=20, arm="cadam")
-    rows = [row for row in table_of(jobs.folder).sections[0].rows if row.source == "this sweep"]
+    rows = [row for row in table_of(jobs.folder).parts[0].rows if row.source == "this sweep"]
     assert [(row.objective, row.prompts) for row in rows] == [("SDS", "2")]
 
 
@@ -294,16 +308,19 @@ def test_eval_replaces_the_numbers_of_training(jobs):
     evaluation = declared({"num_gaussians": 10, **scored(25.0, {"name": "t3bench"})})
     (folder / run_folder.EVALUATION).write_text(json.dumps(evaluation))
     table = table_of(jobs.folder)
-    assert row_of(table, "SDS", "cadam").cells["clip_score"].text == "25.00"
+    assert cell_of(table, row_of(table, "SDS", "cadam"), "clip_score").text == "25.00"
     assert any("protocol=t3bench" in note for note in table.notes)
     # An evaluation of another asset does not count.
     (folder / run_folder.EVALUATION).write_text(json.dumps({**evaluation, "num_gaussians": 11}))
-    assert row_of(table_of(jobs.folder), "SDS", "cadam").cells["clip_score"].text == "30.00"
+    assert (
+        cell_of(table_of(jobs.folder), row_of(table_of(jobs.folder), "SDS", "cadam"), "clip_score").text
+        == "30.00"
+    )
 
 
 def test_a_sweep_has_a_table_only_if_its_grid_asks_for_it(jobs):
     jobs.add("cadam", n=10, psnr=20, arm="cadam")
-    assert table_files.write(jobs.folder) == ""
+    assert paper_formats.write(jobs.folder) == ""
     assert not (jobs.folder / run_folder.PAPER_TABLE_CSV).exists()
 
 
@@ -312,7 +329,7 @@ def test_recipes_are_objectives(jobs):
     recipes = {"gaussiandreamer": "sds_gaussiandreamer", "flowdreamer": "vfds_flowdreamer"}
     for recipe, objective in recipes.items():
         jobs.add("cadam", f"experiment={recipe}", n=10, psnr=20, arm="cadam", guidance=objective)
-    labels = [row.objective for row in table_of(jobs.folder).sections[0].rows if row.source == "this sweep"]
+    labels = [row.objective for row in table_of(jobs.folder).parts[0].rows if row.source == "this sweep"]
     assert labels == ["SDS, gaussiandreamer", "VFDS, flowdreamer"]
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from cadam3d import report
-from cadam3d.report.plots import WIDTH
+from cadam3d.report.charts import WIDTH
 from cadam3d.report.style import LEAST_TEXT, inline, least_width, styled, svg_of
 from cadam3d.report.sweep_page import KINDS
 

@@ -2,8 +2,8 @@
 
 import csv
 import html
+import json
 import re
-import shlex
 
 import pytest
 
@@ -23,14 +23,11 @@ def text_of(content: str) -> str:
     return " ".join(re.sub(r"<[^>]*>", " ", content).split())
 
 
-def test_a_whole_comparison_has_verdict_figures_tables_failures_and_command(whole, bench):
+def test_a_whole_comparison_has_tables_figures_failures_and_command(whole, bench):
     text = text_of(whole)
     for expected in (
         *("finished 144", "failed 1", "3 noise levels"),
-        *(
-            "fewer Gaussians than baseline (tau_pos 0.0002)",
-            "At strong noise: cadam (tau_Q 0.9, tau_SNR 0.1)",
-        ),
+        *("Differences between arms", "PSNR (dB) at equal count", "Medians of every arm"),
         *("Quality against count", "Gaussians over time", "Selected Gaussians", "Arms side by side"),
         *("Shaking of the Gaussians", "How much each Gaussian shakes.", "tau_shake 0.1"),
         *("Jobs that ended early, failed or are not done", "failed (no &lt;b&gt;)", "All 146 jobs"),
@@ -43,15 +40,15 @@ def test_the_line_of_the_sweep_comes_before_those_of_its_jobs(jobs):
     jobs.line = ["grid=mine", "prompt=a cube"]
     jobs.add("cadam", "prompt=a cube", n=100, psnr=20.0)
     text = html.unescape(report.write_sweep(jobs.folder).read_text(encoding="utf-8"))
-    assert 'cadam3d sweep grid=mine "prompt=a cube"\ncadam3d train densifier=cadam "prompt=a cube"' in text
+    assert "cadam3d sweep grid=mine 'prompt=a cube'\ncadam3d train densifier=cadam 'prompt=a cube'" in text
 
 
 def test_figures_and_tables_are_files_too(whole, bench):
     names = {path.name for path in (bench / "figures").iterdir()}
-    drawn = {"frontier", "frontier_ssim", "growth", "shake", "masks", "thresholds", "regimes", "ablation"}
+    drawn = {"frontier", "growth", "shake", "masks", "thresholds", "regimes", "ablation"}
     assert {f"{name}.{kind}" for name in drawn for kind in ("svg", "png")} <= names
-    assert {"objectives.csv", "frontiers.csv", "standings.csv"} <= names
-    with (bench / "figures/frontiers.csv").open(newline="") as file:
+    assert {"medians.csv", "comparison.csv"} <= names
+    with (bench / "figures/medians.csv").open(newline="") as file:
         lines = list(csv.DictReader(file))
     assert len(lines) == 3 * 8
     assert {line["noise"] for line in lines} == {"none", "medium", "strong"}
@@ -117,7 +114,7 @@ def test_the_title_of_a_list_names_the_keys_that_vary_and_some_prompts(jobs):
         for arm in ("baseline", "cadam"):
             for seed in (0, 1):
                 jobs.add(arm, f"prompt='{prompt}'", f"seed={seed}", n=100, psnr=20.0)
-    assert heading(jobs.folder) == "Sweep of densifier and seed: a red torus, a blue cube, a <b> and 2 more"
+    assert heading(jobs.folder) == "Sweep of densifier, seed: a red torus, a blue cube, a <b> and 2 more"
 
 
 def test_the_title_of_a_list_of_prompts_has_no_other_key(jobs):
@@ -126,18 +123,13 @@ def test_the_title_of_a_list_of_prompts_has_no_other_key(jobs):
     assert heading(jobs.folder) == f"Sweep: a cube, {'long ' * 11}..."
 
 
-@pytest.mark.parametrize("prompts", [1, 2, 4, 5])
-def test_a_page_shows_quartiles_only_with_enough_prompts(jobs, prompts):
+@pytest.mark.parametrize("prompts", [5, 6])
+def test_a_page_has_intervals_only_with_enough_prompts(jobs, prompts):
     for prompt in range(prompts):
-        for seed in range(3):
-            for arm, n in (("none", 50), ("baseline", 1000), ("cadam", 100)):
-                words = (f"prompt=thing {prompt}", f"seed={seed}")
-                jobs.files(jobs.add(arm, *words, n=n + seed + prompt, psnr=20.0 + seed), n)
+        for arm, n in (("baseline", 1000), ("cadam", 100)):
+            jobs.add(arm, f"prompt=thing {prompt}", n=n + prompt, psnr=20.0)
     page = report.write_sweep(jobs.folder).read_text(encoding="utf-8")
-    # The captions state the rule.
-    numbers = text_of(page.replace(html.escape(sweep_page.SPREAD), ""))
-    assert ("quartiles" in numbers) == (prompts == 5)
-    assert ("lowest" in numbers) == (prompts in (2, 4))
+    assert ("[+0.00, +0.00]" in page) == (prompts == 6)
 
 
 def test_a_folder_that_is_not_a_sweep_is_refused(tmp_path):
@@ -185,10 +177,13 @@ def test_damaged_declarations_leave_out_the_score_and_nothing_else(jobs, content
     assert "Shaking" not in text
 
 
-def test_commands_can_be_pasted():
-    words = ["densifier=cadam", "prompt='a cube'", "prompt='it''s $5'", "seed=0"]
-    assert [shlex.split(sweep_page.for_shell(word)) for word in words] == [[word] for word in words]
-    assert sweep_page.for_shell("prompt='a cube'") == "\"prompt='a cube'\""
+def test_the_frontier_of_any_number_can_be_requested(jobs):
+    jobs.figures = ["frontier_ssim"]
+    for arm in ("baseline", "cadam"):
+        jobs.add(arm, n=100, psnr=20.0, psnr_turned=21.0, ssim_turned=0.8)
+    assert "SSIM at the best turn against count" in report.write_sweep(jobs.folder).read_text(
+        encoding="utf-8"
+    )
 
 
 def test_a_figure_can_be_requested_by_name(jobs):
@@ -200,70 +195,74 @@ def test_a_figure_can_be_requested_by_name(jobs):
 # Tables.
 
 
-def test_standings_show_the_spread_over_seeds_and_what_is_out_of_reach(jobs):
-    for seed, psnr in enumerate((9.0, 9.2)):
+def test_the_comparison_has_an_estimate_of_every_difference(jobs):
+    for i in range(6):
+        where = (f"prompt=object {i}", "seed=0")
         for tau, n, best in ((0.001, 100, 10.0), (0.0002, 10000, 20.0)):
-            jobs.add("baseline", f"densifier.tau_pos={tau}", f"seed={seed}", n=n, psnr=best)
-        jobs.add("cadam", f"seed={seed}", n=1000, psnr=psnr)
-    jobs.add("cadam", "seed=2", n=1000, psnr=9.0)
-    [line] = tables.standings_table(read(jobs.folder))
-    assert line["over seeds (dB)"] == 0.14
-    assert (line["baseline needs times"], line["always exceeds"], line["never reaches"]) == ("always", 2, 0)
-    assert line["unpaired"] == 1
+            jobs.add("baseline", f"densifier.tau_pos={tau}", *where, n=n, psnr=best + i, seconds=4.0)
+        jobs.add("cadam", *where, n=1000, psnr=15.5 + i, seconds=3.0)
+    jobs.add("cadam", "prompt=another", "seed=0", n=1000, psnr=9.0)
+    results = read(jobs.folder)
+    [line] = tables.as_texts(tables.comparison_table(results), results)
+    assert line == {
+        "setting": "cadam",
+        "against": "baseline (tau_pos 0.0002)",
+        "cells": 6,
+        "Gaussians (%)": "-90.0 [-90.0, -90.0]",
+        "PSNR (dB)": "-4.50 [-4.50, -4.50]",
+        "seconds": "-1.0 [-1.0, -1.0]",
+        "PSNR (dB) at equal count": "+0.50 [+0.50, +0.50]",
+        "unpaired": 1,
+    }
+    assert "-4.50 [-4.50, -4.50]" in report.comparison(jobs.folder)
 
 
-def test_an_arm_without_a_standard_setting_is_named_below_the_key_table(jobs):
+def test_any_two_arms_are_compared_whatever_their_names(jobs):
+    for arm, n in (("red", 1000), ("green", 100), ("blue", 10)):
+        jobs.add("cadam", n=n, psnr=20.0, arm=arm)
+    results = read(jobs.folder)
+    pairs = [(line["setting"], line["against"]) for line in tables.comparison_table(results)]
+    assert pairs == [("green", "red"), ("blue", "red")]
+    pairs = [(line["setting"], line["against"]) for line in tables.comparison_table(results, "blue")]
+    assert pairs == [("red", "blue"), ("green", "blue")]
+
+
+def test_numbers_of_a_metric_from_elsewhere_are_in_the_tables(jobs):
+    entry = {"label": "shine", "unit": "lx", "digits": 1, "is_more_better": True, "preference": 1}
+    for arm, shine in (("baseline", 2.0), ("cadam", 3.5)):
+        folder = jobs.add(arm, n=100, psnr=20.0)
+        summary = json.loads((folder / "summary.json").read_text())
+        summary["numbers"]["shine"] = entry
+        (folder / "summary.json").write_text(json.dumps({**summary, "shine": shine}))
+    results = read(jobs.folder)
+    [line] = tables.comparison_table(results)
+    assert line["shine (lx)"].median == 1.5
+    assert [line["shine (lx)"] for line in tables.medians_table(results)] == [2.0, 3.5]
+    assert [line["shine (lx)"] for line in tables.jobs_table(results)] == [2.0, 3.5]
+
+
+def test_every_arm_is_in_the_table_of_medians(jobs):
     jobs.add("cadam", n=100, psnr=20.0)
     for growth in (0.1, 0.2):
         jobs.add("mcmc", f"densifier.growth={growth}", n=100, psnr=20.0)
-    text = text_of(report.write_sweep(jobs.folder).read_text(encoding="utf-8"))
-    assert "mcmc has no standard setting and appears only in the table of all settings." in text
-
-
-@pytest.mark.parametrize(("zero", "title", "expected"), [(True, "SSIM gain", 0.15), (False, "SSIM", 0.85)])
-def test_the_table_of_frontiers_has_ssim(jobs, zero, title, expected):
-    for seed, ssim in enumerate((0.8, 0.85, 0.95)):
-        jobs.add("cadam", f"seed={seed}", n=100, psnr=20.0, ssim=ssim)
-        if zero:
-            jobs.add("none", f"seed={seed}", n=10, psnr=10.0, ssim=0.7)
-    line = next(line for line in tables.frontier_table(read(jobs.folder)) if line["setting"] == "cadam")
-    assert line[title] == pytest.approx(expected)
-
-
-def test_the_table_of_frontiers_counts_cells_that_it_left_out(jobs):
-    jobs.add("none", "seed=0", n=10, psnr=10.0)
-    for seed in (0, 1):
-        jobs.add("cadam", f"seed={seed}", n=100, psnr=20.0)
-    lines = {line["setting"]: line for line in tables.frontier_table(read(jobs.folder))}
-    assert (lines["cadam"]["cells"], lines["cadam"]["left out"]) == (1, 1)
-    assert lines["none"]["left out"] is None
-
-
-def test_the_key_table_counts_cells_that_only_one_of_two_has(jobs):
-    for seed in (0, 1):
-        jobs.add("baseline", f"seed={seed}", n=1000, psnr=20.0)
-    jobs.add("cadam", "seed=0", n=100, psnr=20.0)
-    jobs.add("cadam", "seed=1", n=100, psnr=None, outcome="failed")
-    assert [line["unpaired"] for line in tables.objectives_table(read(jobs.folder))] == [None, 1]
-
-
-def test_the_key_table_has_a_line_per_objective_level_and_arm(jobs):
-    for guidance in ("sds", "ism"):
-        for arm, n in (("baseline", 1000), ("cadam", 100)):
-            jobs.add(arm, f"guidance={guidance}", n=n, psnr=20.0)
-    lines = tables.objectives_table(read(jobs.folder))
-    assert [(line["objective"], line["arm"]) for line in lines] == [
-        *(("ism", "baseline"), ("ism", "cadam"), ("sds", "baseline"), ("sds", "cadam")),
+    results = read(jobs.folder)
+    assert [line["setting"] for line in tables.medians_table(results, only_main=True)] == [
+        *("cadam", "mcmc (growth 0.1)")
     ]
-    assert lines[1]["fewer than baseline"] == "90.0%"
-    assert lines[1]["MiB"] == pytest.approx(68 * 100 / 2**20, abs=1e-3)
+    assert len(tables.medians_table(results)) == 3
 
 
-def test_empty_columns_are_left_out(jobs):
-    jobs.add("cadam", n=100, psnr=20.0)
-    lines = tables.objectives_table(read(jobs.folder))
+def test_the_medians_have_a_line_per_objective_level_and_arm(jobs):
+    for guidance in ("sds", "ism"):
+        for arm, n in (("none", 10), ("cadam", 100)):
+            jobs.add(arm, f"guidance={guidance}", n=n, psnr=20.0 + n)
+    lines = tables.medians_table(read(jobs.folder))
+    assert [(line["objective"], line["setting"]) for line in lines] == [
+        *(("ism", "none"), ("ism", "cadam"), ("sds", "none"), ("sds", "cadam")),
+    ]
+    assert lines[1]["PSNR over no growth"] == 90.0
+    assert lines[1]["size of asset.ply (MiB)"] == pytest.approx(68 * 100 / 2**20, abs=0.01)
     assert "noise" not in lines[0]
-    assert "fewer than baseline" not in lines[0]
 
 
 def test_numbers_of_a_column_have_the_same_decimals():
@@ -271,12 +270,6 @@ def test_numbers_of_a_column_have_the_same_decimals():
     assert content.lines == [["20.90", "12,345"], ["21.25", "1"]]
 
 
-def test_text_is_aligned_to_the_left_and_percentages_like_numbers():
-    content = table([{"arm": "cadam", "fewer": "94.2%", "n": 1}, {"arm": "none", "fewer": None, "n": None}])
-    assert [column.is_text for column in content.columns] == [True, False, False]
-
-
-def test_standings_need_a_frontier(jobs):
-    jobs.add("cadam", n=100, psnr=20.0)
-    jobs.add("baseline", n=1000, psnr=20.0)
-    assert tables.standings_table(read(jobs.folder)) == []
+def test_text_is_aligned_to_the_left_and_estimates_like_numbers():
+    content = table([{"arm": "cadam", "fewer": "-94.2 [-95, -93]"}, {"arm": "none", "fewer": None}])
+    assert [column.is_text for column in content.columns] == [True, False]

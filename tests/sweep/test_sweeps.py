@@ -73,7 +73,7 @@ def hydra_sweep(monkeypatch, capfd, tmp_path, small_configs, stand_in):
         monkeypatch.setattr(module, "config_dir", lambda: small_configs)
     monkeypatch.setattr(sys, "executable", str(stand_in))
     monkeypatch.setattr("cadam3d.report.write_sweep", lambda folder: folder / "report.html")
-    monkeypatch.setattr("cadam3d.report.verdict", lambda folder: [])
+    monkeypatch.setattr("cadam3d.report.comparison", lambda folder: "")
 
     def run(*words: str, command: str = "sweep") -> Result:
         monkeypatch.setattr(sys, "argv", ["cadam3d", command, *words])
@@ -778,15 +778,15 @@ def test_an_invalid_plan_is_named_in_the_message(tmp_path):
         load(tmp_path)
 
 
-def test_the_report_and_its_verdict_follow_the_sweep(sweep, monkeypatch):
+def test_the_report_and_its_table_follow_the_sweep(sweep, monkeypatch):
     made = []
     monkeypatch.setattr(
         "cadam3d.report.write_sweep", lambda folder: (made.append(folder), folder / "report.html")[1]
     )
-    monkeypatch.setattr("cadam3d.report.verdict", lambda folder: ["Ours is better."])
+    monkeypatch.setattr("cadam3d.report.comparison", lambda folder: "a table")
     out = sweep("prompt=a cube", "grid=densifiers").out
     assert made == [Path("multirun/densifiers").resolve()]
-    assert out.endswith("sweep.csv\n\nOurs is better.\n\nreport: multirun/densifiers/report.html\n")
+    assert out.endswith("within cells:\na table\n\nreport: multirun/densifiers/report.html\n")
 
 
 def test_a_report_that_fails_is_a_message_and_the_sweep_keeps_its_exit_code(sweep, monkeypatch):
