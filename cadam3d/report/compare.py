@@ -73,7 +73,7 @@ def _interval(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
         n_resamples=RESAMPLES,
         confidence_level=CONFIDENCE,
         method="percentile",
-        random_state=np.random.default_rng(BOOTSTRAP_SEED),
+        rng=np.random.default_rng(BOOTSTRAP_SEED),
     ).confidence_interval
     return float(found.low), float(found.high)
 
