@@ -20,16 +20,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.records import MEASUREMENTS, NUMBERS, Score, psnr_of, read_summary, scores_in, with_earlier
-from cadam3d.io.run_folder import (
-    ASSET,
-    CONFIG,
-    EVALUATION,
-    copying,
-    setting_word,
-    shown,
-    suggestion,
-    typed_path,
-)
+from cadam3d.io.run_folder import ASSET, CONFIG, EVALUATION, shown, suggestion, typed_path
 from cadam3d.metric.base import Measurand
 from cadam3d.prior.base import DiffusionPrior
 from cadam3d.prior.truth import PriorTruth, TruthSource
@@ -56,10 +47,7 @@ def run(cfg: DictConfig, call: Call) -> None:
         return
     result = evaluate(cfg, call, find_run(str(cfg.run)))
     print(_as_text(result))
-    try:
-        write_json(folder / EVALUATION, with_earlier(result, folder, cfg.metric))
-    except UserError as error:
-        raise _not_saved(folder, error) from error
+    write_json(folder / EVALUATION, with_earlier(result, folder, cfg.metric))
     print(f"\n{shown(folder / EVALUATION)}")
 
 
@@ -164,37 +152,26 @@ def trusting(call: Call) -> str:
 
 def _evaluate_sweep(cfg: DictConfig, call: Call, folder: Path) -> None:
     """Measure every job of a sweep, and write the ``eval.json`` and the report of the sweep."""
-    results, written, failures = [], [], 0
-    problem: UserError | None = None
+    results: list[dict[str, Any]] = []
     for job in (row.folder for row in load(folder)):
         try:
-            results.append(evaluate(cfg, call, find_run(str(job))))
+            measured = evaluate(cfg, call, find_run(str(job)))
         except UserError as error:
-            failures += 1
             results.append({"run": str(shown(job)), "message": str(error)})
-            written.append(results[-1])
             print(f"cadam3d: {job.name}: {error}", file=sys.stderr)
             continue
-        psnr = psnr_of(results[-1])
+        psnr = psnr_of(measured)
         quality = "no psnr" if psnr is None else f"{psnr:6.2f} dB"
-        print(f"{quality}  {results[-1].get('num_gaussians', '-'):>8} Gaussians  {job.name}", flush=True)
-        try:
-            written.append(with_earlier(results[-1], job, cfg.metric))
-            write_json(job / EVALUATION, written[-1])
-        except UserError as error:
-            problem = problem or error
-    if failures == len(results):
+        print(f"{quality}  {measured['num_gaussians']:>8} Gaussians  {job.name}", flush=True)
+        results.append(with_earlier(measured, job, cfg.metric))
+        write_json(job / EVALUATION, results[-1])
+    if all("message" in result for result in results):
         raise UserError(
             f"run={cfg.run}: no job of this sweep could be measured, and the reasons are above. "
             "Run the sweep again, after a look at this machine. Try: cadam3d doctor"
         )
-    try:
-        write_json(folder / EVALUATION, written)
-    except UserError as error:
-        problem = problem or error
     print(_table(results, folder))
-    if problem is not None:
-        raise _not_saved(folder, problem) from problem
+    write_json(folder / EVALUATION, results)
     write_table(folder)
     table = report.write_paper_table(folder)
     print(f"\n{len(results)} jobs: {shown(folder / EVALUATION)}\nreport: {shown(report.write_sweep(folder))}")
@@ -214,13 +191,3 @@ def _table(results: Sequence[Mapping[str, Any]], sweep: Path) -> str:
     known = [[value for value in column if value is not None] for column in scores.columns.values()]
     lines.append(["mean", *(sum(values) / len(values) for values in known)])
     return "\n".join(["", aligned(lines), *scores.left_out])
-
-
-def _not_saved(folder: Path, error: UserError) -> UserError:
-    """Return the error for numbers that are printed already but cannot be written into ``folder``."""
-    reason = getattr(error.__cause__, "strerror", None) or error
-    line, copy = copying(folder)
-    return UserError(
-        f"run: cannot write to {shown(folder)} ({reason}), so the numbers above are not saved. "
-        f"Try: {line} && cadam3d eval {setting_word('run', copy)}"
-    )

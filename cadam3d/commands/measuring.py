@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import torch
@@ -13,10 +13,8 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.records import MEASUREMENTS, NUMBERS
 from cadam3d.metric.base import Measurand, Metric
-from cadam3d.metric.protocol import Protocol
 from cadam3d.metric.turn import facing
-from cadam3d.settings.compose import compose
-from cadam3d.settings.options import option_names
+from cadam3d.settings.options import option_names, read_option
 from cadam3d.state import start_generators
 
 CHANGED = "changed"  # the entry of a protocol's record that lists what differs from the shipped one
@@ -79,20 +77,11 @@ def _with_changes(record: dict[str, Any]) -> dict[str, Any]:
     Settings are changed if they differ from the shipped protocol of the same name.
     """
     protocol = record.get("protocol")
-    shipped = _shipped_protocol(str(protocol.get("name"))) if isinstance(protocol, dict) else None
-    if not isinstance(protocol, dict) or shipped is None:
+    if not isinstance(protocol, dict) or protocol.get("name") not in option_names("protocol"):
         return record
-    changed = sorted(key for key in protocol if protocol[key] != shipped.get(key))
+    shipped = read_option("protocol", protocol["name"])["protocol"]
+    changed = sorted(key for key, value in protocol.items() if value != shipped.get(key))
     return record | {"protocol": protocol | ({CHANGED: changed} if changed else {})}
-
-
-@cache
-def _shipped_protocol(name: str) -> dict[str, Any] | None:
-    """Return the settings of a protocol of this package; None if it has none of this name."""
-    if name not in option_names("protocol"):
-        return None
-    protocol: Protocol = component(compose([f"protocol={name}", "prompt=any"]).protocol, Protocol)
-    return protocol.record()
 
 
 def rebuild_start(prompt: str, initializer: Initializer, seed: int, device: torch.device) -> Gaussians:

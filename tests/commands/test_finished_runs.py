@@ -1,10 +1,8 @@
 """The commands render, export, eval and view, with a run folder, a sweep folder or a single file."""
 
-import errno
 import json
 import shlex
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -324,36 +322,18 @@ def test_view_shows_the_report_of_a_sweep_and_writes_it_if_it_is_missing(tmp_pat
     assert written == [sweep]
 
 
-def test_numbers_that_cannot_be_saved_are_printed_with_a_line_that_works(
-    run_folder, type_line, monkeypatch, tmp_path
-):
-    make_sweep(tmp_path / "sweep", "a", "b")
-    for name in ("a", "b"):
-        shutil.copytree(run_folder, tmp_path / "sweep" / name)
-    monkeypatch.setattr("cadam3d.report.write_sweep", lambda folder: folder / "report.html")
+def test_numbers_that_cannot_be_saved_are_printed(run_folder, type_line, monkeypatch, tmp_path):
+    make_sweep(tmp_path / "sweep", "a")
+    shutil.copytree(run_folder, tmp_path / "sweep" / "a")
 
     def refuse(path, value):
-        if path.is_relative_to(tmp_path):
-            raise UserError("x") from OSError(errno.EROFS, "Read-only file system")
-        write_json(path, value)
+        raise UserError(f"{path.name}: cannot be written")
 
     monkeypatch.setattr("cadam3d.commands.eval.write_json", refuse)
     for place, printed in (("a run", "psnr   "), ("sweep", " dB  ")):
         result = type_line("eval", f"run={place}", *SMALL)
-        assert result.code == 1
+        assert (result.code, result.message) == (1, "eval.json: cannot be written")
         assert printed in result.out
-        assert (
-            f"run: cannot write to {place} (Read-only file system), so the numbers above are not saved"
-            in (result.err)
-        )
-        copy, _, ours = result.message.rpartition("Try: ")[2].rpartition(" && ")
-        subprocess.run(["sh", "-c", copy], check=True)
-        target = Path(shlex.split(copy)[3])
-        try:
-            assert type_line(*shlex.split(ours)[1:], *SMALL).code == 0
-            assert (target / "eval.json").is_file()
-        finally:
-            shutil.rmtree(target)
 
 
 @pytest.mark.parametrize("make", [lambda path: path.write_text("a file"), lambda path: path.mkdir()])
