@@ -1,6 +1,7 @@
 """Cameras: OpenCV axes (+x right, +y down, +z forward) in a world with +z up and the object's front at +x."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import torch
@@ -40,6 +41,11 @@ class Cameras:
             azimuth_deg=self.azimuth_deg[views],
             elevation_deg=self.elevation_deg[views],
         )
+
+    def parts(self, most: int) -> Iterator["Cameras"]:
+        """Yield the views in order, at most ``most`` at a time, which bounds the memory of rendering."""
+        for first in range(0, len(self), most):
+            yield self.index(slice(first, first + most))
 
     def to(self, target: torch.device | torch.dtype | str) -> "Cameras":
         """Return the same cameras on another device or in another dtype."""

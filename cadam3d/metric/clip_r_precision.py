@@ -1,7 +1,6 @@
 """ClipRPrecision: whether a CLIP model finds the prompt of an asset among many, from its pictures."""
 
 import hashlib
-import math
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar
@@ -14,11 +13,10 @@ from cadam3d.core.checks import require
 from cadam3d.core.number import Number
 from cadam3d.io.prompts import read_prompts
 from cadam3d.metric.clip import ClipMetric, load_clip
-from cadam3d.metric.scoring import Scorer, interval_record
+from cadam3d.metric.scoring import LEVEL, Scorer, interval_record
 
 KEY = "metric.clip_r_precision.prompts"
 EXAMPLE = f"{KEY}=paper50"
-NORMAL = 1.959963984540054  # the 97.5 % quantile of the normal distribution
 BATCH = 64  # texts that are read at once
 
 
@@ -72,13 +70,10 @@ class ClipRPrecision(ClipMetric):
 
     def interval(self, values: Float[Tensor, "v"]) -> dict[str, Any] | None:
         """Return the 95 % interval of the share over viewpoints, by Wilson's formula for a proportion."""
-        count, share = len(values), float(values.mean())
-        middle = share + NORMAL**2 / (2 * count)
-        half = NORMAL * math.sqrt(share * (1 - share) / count + (NORMAL / (2 * count)) ** 2)
-        total = 1 + NORMAL**2 / count
-        # Rounding must not put the share itself outside.
-        low, high = min(share, (middle - half) / total), max(share, (middle + half) / total)
-        return interval_record(low, high, "the share over viewpoints, by Wilson's formula")
+        from scipy.stats import binomtest  # slow to import
+
+        found = binomtest(round(float(values.sum())), len(values)).proportion_ci(LEVEL, method="wilson")
+        return interval_record(found.low, found.high, "the share over viewpoints, by Wilson's formula")
 
 
 def read_candidates(source: str) -> list[str]:

@@ -44,7 +44,5 @@ class HeldOutSettings(PictureSettings):
 
     def parts(self) -> Iterator[tuple[Cameras, Float[Tensor, "v 3"]]]:
         """Yield the held-out views and their backgrounds, a few views at a time."""
-        cameras = self.cameras()
-        for first in range(0, len(cameras), VIEWS_AT_ONCE):
-            some = cameras.index(slice(first, first + VIEWS_AT_ONCE))
+        for some in self.cameras().parts(VIEWS_AT_ONCE):
             yield some, self.backgrounds(len(some))

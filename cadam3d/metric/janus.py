@@ -121,8 +121,7 @@ class Janus(ClipMetric):
         texts = [f"{side} view of {measurand.prompt}" for side in SIDES]
         cameras = self.protocol.ring(self.views, self.elevation_deg)
         logits = []
-        for view in range(self.views):
-            one = cameras.index(slice(view, view + 1))
+        for one in cameras.parts(1):
             images = measurand.render(one, self.protocol.backgrounds(1)).rgb.detach().float().clamp(0, 1)
             logits.append(torch.cat([self._score(scorer, images, text) for text in texts]))
         fronts = torch.stack(logits).detach().double().cpu().softmax(dim=1)[:, 0]
@@ -231,8 +230,7 @@ def _features(images: Callable[[Cameras, Tensor], Tensor]) -> Float[Tensor, "m v
         VIEWS, elevation_deg=ELEVATION_DEG, distance=fitting_distance(FOV_DEG), fov_y_deg=FOV_DEG, size=SIZE
     )
     parts = []
-    for first in range(0, VIEWS, VIEWS_AT_ONCE):
-        some = cameras.index(slice(first, first + VIEWS_AT_ONCE))
+    for some in cameras.parts(VIEWS_AT_ONCE):
         black, white = (
             images(some, torch.full((len(some), 3), level)).detach().cpu().double().clamp(0, 1)
             for level in (0.0, 1.0)

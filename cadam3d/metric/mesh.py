@@ -180,29 +180,13 @@ def _distances(
     guide_faces: Int[np.ndarray, "g"],
 ) -> Float[np.ndarray, "p"]:
     """Return the distances of points to a mesh, whose sampled points find the triangles near each."""
-    from scipy.spatial import KDTree  # slow to import
+    from scipy.spatial import KDTree  # both are slow to import
+    from trimesh.triangles import closest_point
 
     vertices, faces = mesh
     _, nearest = KDTree(guides).query(points, k=NEIGHBOURS)
     best = np.full(len(points), np.inf)
     for column in guide_faces[nearest].T:
-        np.minimum(best, _to_triangles(points, vertices[faces[column]]), out=best)
+        away = points - closest_point(vertices[faces[column]], points)
+        np.minimum(best, np.linalg.norm(away, axis=1), out=best)
     return best
-
-
-def _to_triangles(
-    points: Float[np.ndarray, "p 3"], corners: Float[np.ndarray, "p 3 3"]
-) -> Float[np.ndarray, "p"]:
-    """Return the distance of each point to its triangle."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normal, axis=1)
-    is_above = length > 0
-    result = np.full(len(points), np.inf)
-    for corner in range(3):
-        a, b = corners[:, corner], corners[:, (corner + 1) % 3]
-        edge, away = b - a, points - a
-        share = (away * edge).sum(1) / np.maximum((edge * edge).sum(1), 1e-300)
-        result = np.minimum(result, np.linalg.norm(away - share.clip(0, 1)[:, None] * edge, axis=1))
-        is_above &= (np.cross(normal, edge) * away).sum(1) >= 0
-    height = np.abs(((points - corners[:, 0]) * normal).sum(1)) / np.where(length > 0, length, 1)
-    return np.where(is_above, height, result)

@@ -5,7 +5,6 @@ by more than the difference between methods. A protocol therefore has a name, an
 record of every number that was measured with it.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -15,7 +14,7 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import interpolate, normalize
+from torch.nn.functional import interpolate
 
 from cadam3d.core.cameras import Cameras, orbit
 from cadam3d.core.checks import require, require_choice, require_whole
@@ -98,8 +97,7 @@ class Protocol(PictureSettings, ABC):
 
     def images(self, render: RenderFn) -> Iterator[Float[Tensor, "v h w 3"]]:
         """Yield the pictures of the asset that ``render`` shows, in [0, 1], a few views at a time."""
-        for first in range(0, len(self.cameras), VIEWS_AT_ONCE):
-            some = self.cameras.index(slice(first, first + VIEWS_AT_ONCE))
+        for some in self.cameras.parts(VIEWS_AT_ONCE):
             output = render(some, self.backgrounds(len(some)))
             yield self._cropped(output)
 
@@ -205,8 +203,14 @@ class SphereProtocol(Protocol):
 
     @cached_property
     def _mesh(self) -> tuple[Float[Tensor, "p 3"], Int[Tensor, "f 3"]]:
-        """Return the vertices on the unit sphere, and the triangles."""
-        return _icosphere(self.subdivisions)
+        """Return the vertices on the unit sphere, and the triangles.
+
+        The sphere stands on an edge: the poles are in the middle of two edges of the undivided icosahedron.
+        """
+        from trimesh.creation import icosphere  # slow to import
+
+        mesh = icosphere(subdivisions=self.subdivisions)
+        return torch.tensor(mesh.vertices, dtype=torch.float64), torch.tensor(mesh.faces, dtype=torch.long)
 
     @property
     def _vertices(self) -> Float[Tensor, "p 3"]:
@@ -221,46 +225,6 @@ class SphereProtocol(Protocol):
             near[faces[:, a], faces[:, b]] = 1
             near[faces[:, b], faces[:, a]] = 1
         return near
-
-
-def _icosphere(subdivisions: int) -> tuple[Float[Tensor, "p 3"], Int[Tensor, "f 3"]]:
-    """Return an icosahedron on the unit sphere whose triangles are repeatedly divided into four.
-
-    It stands on an edge: the poles are in the middle of two edges of the undivided icosahedron.
-    """
-    golden = (1 + math.sqrt(5)) / 2
-    signs = [(a, b) for a in (-1.0, 1.0) for b in (-golden, golden)]
-    corners = [c for a, b in signs for c in ((a, b, 0.0), (0.0, a, b), (b, 0.0, a))]
-    points = normalize(torch.tensor(corners, dtype=torch.float64), dim=1)
-    apart = torch.cdist(points, points)
-    # The corners of a triangle are neighbours, which are the five nearest corners of each.
-    joined = (apart > 0) & (apart < 1.1 * apart[apart > 0].min())
-    count = range(len(points))
-    faces = torch.tensor(
-        [
-            (a, b, c)
-            for a in count
-            for b in count[a + 1 :]
-            for c in count[b + 1 :]
-            if joined[a, b] and joined[b, c] and joined[a, c]
-        ]
-    )
-    for _ in range(subdivisions):
-        points, faces = _divided(points, faces)
-    return points, faces
-
-
-def _divided(
-    points: Float[Tensor, "p 3"], faces: Int[Tensor, "f 3"]
-) -> tuple[Float[Tensor, "q 3"], Int[Tensor, "g 3"]]:
-    """Return the mesh with a new vertex in the middle of every edge, moved onto the unit sphere."""
-    a, b, c = faces.unbind(dim=1)
-    edges = torch.cat([torch.stack(pair, dim=1).sort(dim=1).values for pair in ((a, b), (b, c), (c, a))])
-    unique, middle = torch.unique(edges, dim=0, return_inverse=True)
-    ab, bc, ca = (middle + len(points)).split(len(faces))
-    new = normalize(points[unique].sum(dim=1), dim=1)
-    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-    return torch.cat([points, new]), torch.cat([torch.stack(part, dim=1) for part in parts])
 
 
 def _best(values: Tensor, less_is_better: bool) -> Tensor:

@@ -5,6 +5,7 @@ asset may be anywhere. All metrics compare at one turn, which is searched here, 
 on no setting of a metric.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -39,8 +40,8 @@ def facing(truth: Truth, render: RenderFn) -> Truth:
         return truth
     step = 360.0 / truth.turns
     coarse = _rings(truth.turns)
-    asset = _rendered(render, coarse)
-    true = _true_images(truth, coarse)
+    asset = _over_white(lambda cameras, white: render(cameras, white).rgb, coarse).clamp(0, 1)
+    true = _over_white(truth.images, coarse)
     # A ring has one view per turn, so an object that turns by one step moves every image to the next view.
     turned = [_psnr(asset, true.roll(number, dims=2)) for number in range(truth.turns)]
     best = step * int(torch.stack(turned).argmax())
@@ -50,7 +51,7 @@ def facing(truth: Truth, render: RenderFn) -> Truth:
     fine, asset = coarse.index(views), asset[:, chosen]
 
     def quality(turn_deg: float) -> float:
-        return float(_psnr(asset, _true_images(truth, fine.turned(-turn_deg))))
+        return float(_psnr(asset, _over_white(truth.images, fine.turned(-turn_deg))))
 
     known = {turn_deg: quality(turn_deg) for turn_deg in {0.0, best}}
     for offsets in REFINEMENTS:
@@ -68,21 +69,14 @@ def _rings(views: int) -> Cameras:
     return orbit(azimuth, elevation, full * fitting_distance(FOV_DEG), full * FOV_DEG, SIZE, SIZE)
 
 
-def _rendered(render: RenderFn, cameras: Cameras) -> Float[Tensor, "rings n h w 3"]:
-    """Return the images of an asset over white, in [0, 1]."""
-    parts = [render(some, torch.ones(len(some), 3)).rgb.detach().float().cpu() for some in _parts(cameras)]
-    return torch.cat(parts).clamp(0, 1).unflatten(0, (len(ELEVATIONS_DEG), -1))
-
-
-def _true_images(truth: Truth, cameras: Cameras) -> Float[Tensor, "m rings n h w 3"]:
-    """Return the true images of each mode over white."""
-    parts = [truth.images(some, torch.ones(len(some), 3)).detach().float().cpu() for some in _parts(cameras)]
-    return torch.cat(parts, dim=1).unflatten(1, (len(ELEVATIONS_DEG), -1))
-
-
-def _parts(cameras: Cameras) -> list[Cameras]:
-    count = len(cameras)
-    return [cameras.index(slice(first, first + VIEWS_AT_ONCE)) for first in range(0, count, VIEWS_AT_ONCE)]
+def _over_white(
+    images: Callable[[Cameras, Tensor], Tensor], cameras: Cameras
+) -> Float[Tensor, "*m rings n h w 3"]:
+    """Return images over white, ring by ring."""
+    parts = [
+        images(some, torch.ones(len(some), 3)).detach().float().cpu() for some in cameras.parts(VIEWS_AT_ONCE)
+    ]
+    return torch.cat(parts, dim=-4).unflatten(-4, (len(ELEVATIONS_DEG), -1))
 
 
 def _psnr(asset: Float[Tensor, "rings n h w 3"], true: Float[Tensor, "m rings n h w 3"]) -> Tensor:

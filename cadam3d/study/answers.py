@@ -10,20 +10,20 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
+
+from pydantic import Field, TypeAdapter
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.caption import plain
-from cadam3d.io.jsonl import is_number, is_whole, parse_json
+from cadam3d.io.jsonl import parse_json
 from cadam3d.io.reading import read_bytes
 from cadam3d.io.run_folder import expanded, shown
 from cadam3d.study.key import KIND as KEY_KIND
 from cadam3d.study.key import Key
 from cadam3d.study.questions import QUESTION_NAMES
 
-KIND = "study answers"
 RESULTS_KIND = "study results"
-VERSION = 1
 LARGEST_FILE = 1 << 22  # bytes; an answer has about a hundred
 LONGEST_NAME = 60  # characters, as on the page
 LONGEST_ID = 64  # characters
@@ -58,7 +58,7 @@ class Rater:
 class Pick:
     """An answer in a file: the clip that was chosen."""
 
-    trial: int
+    trial: Annotated[int, Field(ge=0)]
     question: str
     chosen: int
 
@@ -134,12 +134,12 @@ def read_files(paths: Sequence[Path]) -> tuple[list[AnswerFile], list[LeftOut]]:
             value = parse_json(content)
             if isinstance(value, dict) and value.get("kind") in (KEY_KIND, RESULTS_KIND):
                 continue
-            files.append(_file(path, value))
+            files.append(_file(path, content))
         except UserError as error:
             # Its beginning is the path, and its end is a hint to use another file.
             reason = str(error).removeprefix(f"{path}: ").partition(". Try: ")[0]
             left.append(LeftOut(path, reason))
-        except (ValueError, TypeError, KeyError, RecursionError) as error:
+        except (ValueError, RecursionError) as error:
             reason = " ".join(str(error).split())[:100]
             left.append(LeftOut(path, f"it is not a complete file of answers ({reason})"))
     return files, left
@@ -184,43 +184,29 @@ def collect(files: Sequence[AnswerFile], key: Key) -> Collected:
     return Collected(sorted(raters, key=lambda rater: rater.name.casefold()), left)
 
 
-def _file(path: Path, value: Any) -> AnswerFile:
-    """Return the answers in plain JSON. Raises ``ValueError`` and the like for any other value."""
-    if not isinstance(value, dict) or value.get("kind") != KIND:
-        raise ValueError(f"it has no kind {KIND!r}")
-    if value["version"] != VERSION:
-        raise ValueError(f"version {value['version']!r}; this program reads version {VERSION}")
-    answers = value["answers"]
-    if not isinstance(answers, list):
-        raise ValueError("answers: expected a list")
-    if not is_whole(value["saves"]):
-        raise ValueError("saves: expected a whole number")
-    choices = tuple(map(_choice, answers))
-    if len({(choice.trial, choice.question) for choice in choices}) < len(choices):
+@dataclass(frozen=True)
+class _Saved:
+    """The entries of a file that are read."""
+
+    kind: Literal["study answers"]
+    version: Literal[1]
+    study: Annotated[str, Field(min_length=1, max_length=LONGEST_ID)]
+    rater: Annotated[str, Field(min_length=1, max_length=LONGEST_NAME)]
+    session: Annotated[str, Field(min_length=1, max_length=LONGEST_ID)]
+    saves: Annotated[int, Field(ge=0)]
+    answers: tuple[Pick, ...]
+
+
+def _file(path: Path, content: bytes) -> AnswerFile:
+    """Return the answers in the bytes of a file. Raises ``ValueError`` for any other content."""
+    saved = TypeAdapter(_Saved).validate_json(content, strict=True)
+    if len({(pick.trial, pick.question) for pick in saved.answers}) < len(saved.answers):
         raise ValueError("a question is answered twice")
-    study, session = (_short(value, name, LONGEST_ID) for name in ("study", "session"))
     # A name may have characters that cannot be seen, such as those inside some emoji and Persian words.
-    rater = plain(_short(value, "rater", LONGEST_NAME))
-    if not all((rater, study.isprintable(), session.isprintable())):
+    rater = plain(saved.rater)
+    if not all((rater, saved.study.isprintable(), saved.session.isprintable())):
         raise ValueError("rater, study, session: expected texts that can be printed")
-    return AnswerFile(path, study, rater, session, value["saves"], choices)
-
-
-def _choice(value: Any) -> Pick:
-    if not isinstance(value, dict) or value["question"] not in QUESTION_NAMES:
-        raise ValueError("an answer has no known question")
-    if not is_whole(value["trial"]) or not is_whole(value["chosen"]):
-        raise ValueError("an answer has no trial or no choice")
-    if not is_number(value.get("seconds", 0)):
-        raise ValueError("seconds: expected a number")
-    return Pick(value["trial"], value["question"], value["chosen"])
-
-
-def _short(value: dict[str, Any], name: str, longest: int) -> str:
-    text = value[name]
-    if not isinstance(text, str) or not 0 < len(text.strip()) <= longest:
-        raise ValueError(f"{name}: expected a text of 1 to {longest} characters")
-    return text
+    return AnswerFile(path, saved.study, rater, saved.session, saved.saves, saved.answers)
 
 
 def _problem(file: AnswerFile, key: Key) -> str:
@@ -230,7 +216,8 @@ def _problem(file: AnswerFile, key: Key) -> str:
     if not file.choices:
         return "it has no answers"
     for choice in file.choices:
-        if choice.trial >= len(key.trials) or choice.chosen not in key.trials[choice.trial].clips:
+        is_known = choice.question in QUESTION_NAMES and choice.trial < len(key.trials)
+        if not is_known or choice.chosen not in key.trials[choice.trial].clips:
             return "an answer does not fit the study"
     return ""
 

@@ -78,8 +78,7 @@ def film(render: RenderFn, settings: ClipSettings) -> FilmedTurn:
     cameras, color = settings.cameras(), torch.tensor([float(channel) for channel in settings.backdrop])
     backdrop = to_uint8(color[None, None])
     frames, small, visible = [], [], []
-    for first in range(0, settings.frames, VIEWS_AT_ONCE):
-        some = cameras.index(slice(first, first + VIEWS_AT_ONCE))
+    for some in cameras.parts(VIEWS_AT_ONCE):
         for picture in to_uint8(render(some, color.expand(len(some), 3)).rgb):
             change = np.abs(picture.astype(np.int16) - backdrop).max(axis=-1)
             visible.append(float((change >= VISIBLE_CHANGE).mean()))

@@ -130,7 +130,9 @@ def test_a_folder_cannot_choose_a_truth_that_runs_its_own_code(type_line, tmp_pa
     evil = text.replace("cadam3d.prior.truth.PriorTruth", "builtins.print")
     assert evil != text
     (folder / "config.yaml").write_text(evil, encoding="utf-8")
-    assert "truth._target_=builtins.print" in type_line("eval", "run=run", *EYES).message
+    message = type_line("eval", "run=run", *EYES).message
+    assert "builtins.print" in message
+    assert message.endswith("trust=true")
 
 
 def test_a_sweep_that_names_no_truth_gets_one_from_eval(type_line, tmp_path):

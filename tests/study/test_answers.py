@@ -178,7 +178,6 @@ def broken(**changes) -> dict:
         broken(question="beauty"),
         broken(question=["overall"]),
         broken(question="overall"),
-        broken(seconds="2"),
     ],
     ids=lambda content: str(content)[:30],
 )
