@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from cadam3d.build import component, components
+from cadam3d.build import components
 from cadam3d.commands.messages import keeping_others, note, warn
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
