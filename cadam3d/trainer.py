@@ -17,18 +17,19 @@ from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require_range
-from cadam3d.core.device import read_numbers, upload_together
+from cadam3d.core.device import upload_together
 from cadam3d.core.edit import RowState
+from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import is_out_of_memory
 from cadam3d.core.render import RenderFn, RenderOutput
 from cadam3d.densifier.base import Densifier, GradientSignal
-from cadam3d.densifier.refine import Refine
+from cadam3d.densifier.refine import Refine, RefinePlan
 from cadam3d.exposure import Exposure
 from cadam3d.guidance.base import Guidance
 from cadam3d.initializer.base import Initializer
 from cadam3d.optimizer import AdamSettings
 from cadam3d.prior.base import DiffusionPrior, PromptEmbedding
-from cadam3d.rasterizer.base import Rasterizer, render_fn
+from cadam3d.rasterizer.base import Rasterizer, Render, render_fn
 from cadam3d.regularizer import Regularizer
 from cadam3d.state import (
     Outcome,
@@ -41,17 +42,39 @@ from cadam3d.state import (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
+class Shot:
+    """What a step has rendered."""
+
+    cameras: Cameras
+    background: Tensor  # one RGB colour per view
+    gaussians: Gaussians  # after augmentation
+    output: RenderOutput
+
+
+@dataclass(frozen=True)
+class Losses:
+    """The loss of a step: what the prior wants, and the penalties of the regularizers."""
+
+    guidance: Tensor  # one number
+    penalties: Mapping[str, Tensor]
+    log: Mapping[str, Tensor | float]  # of the guidance and the regularizers
+
+    @property
+    def total(self) -> Tensor:
+        """Return the sum of all."""
+        return sum(self.penalties.values(), start=self.guidance)
+
+
+@dataclass(frozen=True)
 class Evidence:
-    """Result of differentiating the loss of a step, before anything has moved."""
+    """What a step has learned before anything moves."""
 
     densifier: RowState  # after it has observed the gradients
     loss: float
     log: dict[str, float]  # of the guidance and the regularizers
     is_finite: bool  # whether no gradient contains NaN or infinity
     dimming: float  # factor for all colour coefficients
-    # Whether the rasterizer had reserved too little memory, so that everything else is meaningless.
-    overflowed: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,16 +106,81 @@ class Trainer:
 
         Callbacks are not called, and ``state.seconds`` does not change.
         """
-        draws_before = {name: generator.get_state() for name, generator in state.generators.items()}
-        evidence = self._differentiate(state, embedding, self.rasterizer.render_ahead)
-        if evidence.overflowed:
-            # Nothing has changed except the random numbers and the gradients.
-            state.optimizer.zero_grad()
-            for name, draws in draws_before.items():
-                state.generators[name].set_state(draws)
-            evidence = self._differentiate(state, embedding, self.rasterizer.render)
 
-        # A step with a NaN or infinite gradient moves nothing.
+        def look(render: Render) -> Evidence:
+            shot = self._render(state, render)
+            losses = self._guide(state, shot, embedding)
+            signal = self._backward(state, shot, losses)
+            return self._observe(state, shot, losses, signal)
+
+        # Looking changes only the random numbers and the gradients of ``state``, so it can be repeated.
+        evidence = self.rasterizer.ahead(look, state.generators.values())
+        self._move(state, evidence)
+        count = len(state.gaussians)
+        refined = self._refine(state, state.step + 1)
+        state.step += 1
+        log = evidence.log | ({"dimmed": float(state.dimmed)} if state.dimmed else {})
+        return StepReport(step=state.step, loss=evidence.loss, log=log, num_gaussians=count), refined
+
+    def _render(self, state: TrainState, render: Render) -> Shot:
+        """Render the Gaussians from a few cameras."""
+        draw = state.generators
+        cameras = self.camera.sample(state.step, self.views, draw["camera"])
+        background = self.background.sample(self.views, draw["background"])
+        cameras, background = _uploaded(cameras, background, state.gaussians.device)
+        gaussians = self.augmentation.perturb(state.gaussians, draw["augmentation"])
+        output = render(gaussians, cameras, background, self.densifier.needs_absgrad)
+        return Shot(cameras, background, gaussians, output)
+
+    def _guide(self, state: TrainState, shot: Shot, embedding: PromptEmbedding) -> Losses:
+        """Compare the images with what the prior expects to see, and add the penalties."""
+        draw = state.generators
+        images = self.augmentation.show(shot.output, draw["augmentation"])
+        condition = embedding.at(shot.cameras, shot.background)
+        guided = self.guidance(images, condition, self.prior, state.step, draw["guidance"])
+        penalties = {
+            name: penalty(shot.gaussians, shot.output, state.step)
+            for name, penalty in self.regularizers.items()
+        }
+        return Losses(guided.loss, penalties, {**guided.log, **penalties})
+
+    def _backward(self, state: TrainState, shot: Shot, losses: Losses) -> GradientSignal:
+        """Differentiate the loss, and return the gradients for the densifier.
+
+        A densifier that ignores the penalties reads the gradients before these are added. If a penalty
+        depends on the images, each pass differentiates the rasterizer, and one pass could not do both: the
+        densifier needs the gradients of one loss, and the optimizer those of another.
+        """
+        state.optimizer.zero_grad()
+        if not (losses.penalties and self.densifier.guidance_only):
+            losses.total.backward()
+            return GradientSignal.read(state.gaussians, shot.output)
+        losses.guidance.backward(retain_graph=True)
+        signal = GradientSignal.read(state.gaussians, shot.output).copy()
+        torch.stack(list(losses.penalties.values())).sum().backward()
+        return signal
+
+    def _observe(self, state: TrainState, shot: Shot, losses: Losses, signal: GradientSignal) -> Evidence:
+        """Let the densifier observe the gradients, and read every number that the host needs.
+
+        This waits for the device once, because the host is faster if it does not know the numbers before.
+        """
+        observed = self.densifier.observe(state.densifier, signal)
+        dimming = self.exposure.dimming(shot.output, shot.background, state.step + 1)
+        dimming, loss, *others = shot.output.read(
+            [
+                1.0 if dimming is None else dimming,
+                losses.total.detach(),
+                *losses.log.values(),
+                *state.optimizer.extreme_gradients(),
+            ]
+        )
+        log = dict(zip(losses.log, others, strict=False))
+        is_finite = all(map(math.isfinite, others[len(log) :]))
+        return Evidence(observed, loss, log, is_finite, dimming)
+
+    def _move(self, state: TrainState, evidence: Evidence) -> None:
+        """Move the Gaussians; a step with a NaN or infinite gradient moves none."""
         state.densifier = evidence.densifier
         if evidence.is_finite:
             state.optimizer.step(state.step)
@@ -106,81 +194,13 @@ class Trainer:
         if evidence.dimming != 1:
             state.optimizer.scale_colors(evidence.dimming)
             state.dimmed += 1
-        log = {**evidence.log, **({"dimmed": float(state.dimmed)} if state.dimmed else {})}
-        num_gaussians = len(state.gaussians)
-
-        refined = self._refine(state, state.step + 1)
-        state.step += 1
-        report = StepReport(step=state.step, loss=evidence.loss, log=log, num_gaussians=num_gaussians)
-        return report, refined
-
-    def _differentiate(
-        self, state: TrainState, embedding: PromptEmbedding, render: Callable[..., RenderOutput]
-    ) -> Evidence:
-        """Render some views, differentiate the loss, and let the densifier observe the gradients.
-
-        This changes only the random numbers and the gradients of ``state``. It waits for the device once, at
-        its end, because the host is faster if it does not know the numbers before.
-        """
-        gaussians, draw = state.gaussians, state.generators
-
-        # Render the Gaussians from a few cameras.
-        cameras = self.camera.sample(state.step, self.views, draw["camera"])
-        background = self.background.sample(self.views, draw["background"])
-        cameras, background = _uploaded(cameras, background, gaussians.device)
-        rendered = self.augmentation.perturb(gaussians, draw["augmentation"])
-        output = render(rendered, cameras, background, self.densifier.needs_absgrad)
-        images = self.augmentation.show(output, draw["augmentation"])
-
-        # Compare the images with what the prior expects to see, and add the penalties.
-        condition = embedding.at(cameras, background)
-        guided = self.guidance(images, condition, self.prior, state.step, draw["guidance"])
-        penalties = {name: fn(rendered, output, state.step) for name, fn in self.regularizers.items()}
-        loss = sum(penalties.values(), start=guided.loss)
-
-        # Differentiate. A densifier that ignores the penalties reads the gradients before these are added. If
-        # a penalty depends on the images, each pass differentiates the rasterizer, and one pass could not do
-        # both: the densifier needs the gradients of one loss, and the optimizer those of another.
-        if penalties and self.densifier.guidance_only:
-            guided.loss.backward(retain_graph=True)
-            signal = GradientSignal.read(gaussians, output).copy()
-            torch.stack(list(penalties.values())).sum().backward()
-        else:
-            loss.backward()
-            signal = GradientSignal.read(gaussians, output)
-        observed = self.densifier.observe(state.densifier, signal)
-
-        # Read every number that the host needs.
-        dimming = self.exposure.dimming(output, background, state.step + 1)
-        overflowed, dimming, loss, *others = read_numbers(
-            [
-                False if output.overflowed is None else output.overflowed,
-                1.0 if dimming is None else dimming,
-                loss,
-                *guided.log.values(),
-                *penalties.values(),
-                *state.optimizer.extreme_gradients(),
-            ],
-            gaussians.device,
-        )
-        names = (*guided.log, *penalties)
-        return Evidence(
-            densifier=observed,
-            loss=loss,
-            log=dict(zip(names, others[: len(names)], strict=True)),
-            is_finite=all(map(math.isfinite, others[len(names) :])),
-            dimming=dimming,
-            overflowed=bool(overflowed),
-        )
 
     def _refine(self, state: TrainState, step: int) -> RefineReport | None:
         """Grow, prune and reset opacities if the schedule says so after step number ``step`` (from 1).
 
-        With ``refine.last_max_scale``, a last step that does not refine still prunes.
-
-        A refinement is decided first and then applied to all three owners of rows: Gaussians, optimizer
-        moments and densifier state. One that would exceed ``max_gaussians`` changes nothing except
-        ``state.refused``.
+        With ``refine.last_max_scale``, a last step that does not refine still prunes. A refinement is decided
+        first and then applied to all three owners of rows: Gaussians, optimizer moments and densifier state.
+        One that would exceed ``max_gaussians`` changes nothing except ``state.refused``.
         """
         refines, resets = self.refine.refines_at(step), self.refine.resets_at(step)
         prunes = self.refine.prunes_at(step)
@@ -189,29 +209,25 @@ class Trainer:
             return None
         before, seen = state.gaussians.detach(), state.densifier
         statistics, scores = self.densifier.statistics(seen, step), self.densifier.scores(seen)
-        is_selected = torch.zeros(len(before), dtype=torch.bool, device=before.device)
-        cloned = split = pruned = reset = 0
-        edit = None
+        plan = RefinePlan(is_selected=torch.zeros(len(before), dtype=torch.bool, device=before.device))
 
-        if refines or prunes:
-            generator = state.generators["refine"]
-            draws_before = generator.get_state()
-            if refines:
-                plan = self.densifier.plan(state.densifier, state.gaussians, step, self.refine, generator)
-            else:
-                plan = self.refine.plan(state.gaussians, is_selected, step, generator)
-            is_selected = plan.is_selected
-            state.refused = self.refine.exceeds(plan)
-            if state.refused:
-                generator.set_state(draws_before)
-            else:
-                # The state changes last: if memory runs out before, all owners still have the old rows.
-                carried = self.densifier.carry(state.densifier, plan.edit)
-                state.optimizer.apply(plan.edit)
-                state.densifier = carried
-                edit = plan.edit
-                cloned, split, pruned = plan.cloned, plan.split, plan.pruned
+        generator = state.generators["refine"]
+        draws_before = generator.get_state()
+        if refines:
+            plan = self.densifier.plan(seen, state.gaussians, step, self.refine, generator)
+        elif prunes:
+            plan = self.refine.plan(state.gaussians, plan.is_selected, step, generator)
+        state.refused = self.refine.exceeds(plan)
+        if state.refused:
+            generator.set_state(draws_before)
+            plan = RefinePlan(is_selected=plan.is_selected)
+        if plan.edit is not None:
+            # The state changes last: if memory runs out before, all owners still have the old rows.
+            carried = self.densifier.carry(seen, plan.edit)
+            state.optimizer.apply(plan.edit)
+            state.densifier = carried
 
+        reset = 0
         if resets and not state.refused:
             unreliable = self.densifier.unreliable(state.densifier)
             reset = state.optimizer.reset_opacity(unreliable, self.refine.reset_value)
@@ -221,14 +237,14 @@ class Trainer:
             step=step,
             before=len(before),
             after=len(state.gaussians),
-            selected=int(is_selected.sum()),
-            cloned=cloned,
-            split=split,
-            pruned=pruned,
+            selected=plan.selected,
+            cloned=plan.cloned,
+            split=plan.split,
+            pruned=plan.pruned,
             reset=reset,
             statistics=statistics,
-            population=Population(gaussians=before, is_selected=is_selected, scores=scores),
-            edit=edit,
+            population=Population(gaussians=before, is_selected=plan.is_selected, scores=scores),
+            edit=plan.edit,
         )
 
     def start(self, prompt: str, initializer: Initializer, seed: int, device: torch.device) -> TrainState:
@@ -267,7 +283,18 @@ class Trainer:
         for callback in self.callbacks:
             callback.on_start(context, state)
         try:
-            outcome = self._loop(state, embedding, context, stop)
+            # A resumed run first repeats the refinement that ended it, because max_gaussians may be larger.
+            if state.refused:
+                self._report(context, state, self._refine(state, state.step), None)
+            outcome = self.outcome(state)
+            while outcome is None:
+                started = time.perf_counter()
+                report, refined = self.step(state, embedding)
+                state.seconds += time.perf_counter() - started
+                self._report(context, state, refined, report)
+                outcome = self.outcome(state)
+                if outcome is None and stop():
+                    outcome = Outcome.INTERRUPTED
         except BaseException as error:
             if not is_out_of_memory(error):
                 for callback in self.callbacks:
@@ -282,23 +309,6 @@ class Trainer:
         """Call the callbacks between two steps of a run that is paused."""
         for callback in self.callbacks:
             callback.on_pause(context, state)
-
-    def _loop(
-        self, state: TrainState, embedding: PromptEmbedding, context: RunContext, stop: Callable[[], bool]
-    ) -> Outcome:
-        # A resumed run first repeats the refinement that ended it, because max_gaussians may be larger now.
-        if state.refused:
-            self._report(context, state, self._refine(state, state.step), None)
-        outcome = self.outcome(state)
-        while outcome is None:
-            started = time.perf_counter()
-            report, refined = self.step(state, embedding)
-            state.seconds += time.perf_counter() - started
-            self._report(context, state, refined, report)
-            outcome = self.outcome(state)
-            if outcome is None and stop():
-                outcome = Outcome.INTERRUPTED
-        return outcome
 
     def outcome(self, state: TrainState) -> Outcome | None:
         """Return how the run has ended, or ``None`` if it goes on."""
@@ -329,22 +339,6 @@ class Trainer:
 
 def _uploaded(cameras: Cameras, background: Tensor, device: torch.device) -> tuple[Cameras, Tensor]:
     """Return cameras and background colours on ``device``, sent there in one copy."""
-    if device.type == "cpu":
-        return cameras, background
-    columns = (
-        cameras.world_to_camera,
-        cameras.intrinsics,
-        background,
-        cameras.azimuth_deg,
-        cameras.elevation_deg,
-    )
-    matrices, intrinsics, colors, azimuth_deg, elevation_deg = upload_together(columns, device)
-    there = replace(
-        cameras,
-        world_to_camera=matrices,
-        intrinsics=intrinsics,
-        azimuth_deg=azimuth_deg,
-        elevation_deg=elevation_deg,
-        drawn=cameras,
-    )
-    return there, colors
+    tensors = cameras.tensors()
+    *there, background = upload_together([*tensors.values(), background], device)
+    return replace(cameras, **dict(zip(tensors, there, strict=True)), drawn=cameras), background

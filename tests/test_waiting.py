@@ -15,7 +15,6 @@ from test_trainer import SMALL, Recorder, go, make, same
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from cadam3d import trainer as loop
 from cadam3d.build import build_trainer, component
 from cadam3d.core.device import read_numbers, upload, upload_together
 from cadam3d.core.render import RenderOutput
@@ -85,7 +84,7 @@ def step_without_values(monkeypatch, lines: Sequence[str]) -> tuple[int, list[bo
         # It has not overflowed, nothing is dimmed, and all gradients are finite.
         return [0.0, *[1.0] * (len(numbers) - 1)]
 
-    monkeypatch.setattr(loop, "read_numbers", read)
+    monkeypatch.setattr("cadam3d.core.render.read_numbers", read)
     with Transfers() as transfers:
         trainer.step(state, embedding)
     assert (state.step, state.skipped, state.dimmed) == (1, 0, 0)

@@ -1,12 +1,15 @@
 """Cameras: OpenCV axes (+x right, +y down, +z forward) in a world with +z up and the object's front at +x."""
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+TENSORS = ("world_to_camera", "intrinsics", "azimuth_deg", "elevation_deg")
 
 
 @dataclass(frozen=True)
@@ -31,16 +34,18 @@ class Cameras:
         rotation, translation = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3]
         return -(rotation.transpose(1, 2) @ translation[..., None])[..., 0]
 
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the four tensors by field name, without copying."""
+        return {name: getattr(self, name) for name in TENSORS}
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> "Cameras":
+        """Return new cameras, each tensor replaced by ``change(tensor)``."""
+        changed: dict[str, Any] = {name: change(tensor) for name, tensor in self.tensors().items()}
+        return replace(self, **changed, drawn=None)
+
     def index(self, views: Int[Tensor, "views"] | slice) -> "Cameras":
         """Return the chosen views, in the given order."""
-        return Cameras(
-            world_to_camera=self.world_to_camera[views],
-            intrinsics=self.intrinsics[views],
-            height=self.height,
-            width=self.width,
-            azimuth_deg=self.azimuth_deg[views],
-            elevation_deg=self.elevation_deg[views],
-        )
+        return self.map(lambda tensor: tensor[views])
 
     def parts(self, most: int) -> Iterator["Cameras"]:
         """Yield the views in order, at most ``most`` at a time, which bounds the memory of rendering."""
@@ -49,14 +54,7 @@ class Cameras:
 
     def to(self, target: torch.device | torch.dtype | str) -> "Cameras":
         """Return the same cameras on another device or in another dtype."""
-        return Cameras(
-            world_to_camera=self.world_to_camera.to(target),
-            intrinsics=self.intrinsics.to(target),
-            height=self.height,
-            width=self.width,
-            azimuth_deg=self.azimuth_deg.to(target),
-            elevation_deg=self.elevation_deg.to(target),
-        )
+        return self.map(lambda tensor: tensor.to(target))
 
     def on_cpu(self) -> "Cameras":
         """Return the same cameras on the CPU; waits for their device unless they were drawn on the CPU."""
@@ -65,24 +63,16 @@ class Cameras:
     def resize(self, height: int, width: int) -> "Cameras":
         """Return the same views at another image size, with intrinsics scaled per axis."""
         scale = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
-        return Cameras(
-            world_to_camera=self.world_to_camera,
-            intrinsics=self.intrinsics * scale[None, :, None],
-            height=height,
-            width=width,
-            azimuth_deg=self.azimuth_deg,
-            elevation_deg=self.elevation_deg,
-        )
+        intrinsics = self.intrinsics * scale[None, :, None]
+        return replace(self, intrinsics=intrinsics, height=height, width=width, drawn=None)
 
     def turned(self, turn_deg: float) -> "Cameras":
         """Return the views from cameras that are carried around the vertical axis, to larger azimuths."""
-        return Cameras(
+        return replace(
+            self,
             world_to_camera=self.world_to_camera @ vertical_turn(-turn_deg, self.world_to_camera),
-            intrinsics=self.intrinsics,
-            height=self.height,
-            width=self.width,
             azimuth_deg=wrapped(self.azimuth_deg + turn_deg),
-            elevation_deg=self.elevation_deg,
+            drawn=None,
         )
 
     def rays(self) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "v h w 3"]]:

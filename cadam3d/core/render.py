@@ -1,6 +1,6 @@
 """RenderOutput: the result of every rasterizer. RenderFn: renders Gaussians. Truth: the true object."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
@@ -9,12 +9,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, vertical_turn
+from cadam3d.core.device import read_numbers
 from cadam3d.core.gaussians import Gaussians
 
 # Alpha from which a pixel counts as object when disparities are stretched to [0, 1].
 SOLID = 0.9
 # Spread of inverse depths, per world unit, below which disparities are not stretched.
 FLAT = 1e-6
+
+
+class OverflowedError(Exception):
+    """Too little memory was reserved for a render, so its images and gradients are meaningless."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,17 @@ class RenderOutput:
     def visible(self) -> Bool[Tensor, "v n"]:
         """Return the mask of Gaussians that touched each view."""
         return self.radii > 0
+
+    def read(self, numbers: Sequence[Tensor | float]) -> list[float]:
+        """Return numbers that follow from the images, after waiting once for the device that renders.
+
+        Raises :class:`OverflowedError` if the images are meaningless, which is known only then.
+        """
+        flag = False if self.overflowed is None else self.overflowed
+        overflowed, *read = read_numbers([flag, *numbers], self.rgb.device)
+        if overflowed:
+            raise OverflowedError
+        return read
 
     def disparity(self) -> Float[Tensor, "v h w"]:
         """Return closeness as a grey image in [0, 1], with gradient; the nearest point of the object is 1.

@@ -109,7 +109,7 @@ class CAdam(CAdamCharts[CAdamState]):
 
     def unreliable(self, state: CAdamState) -> Bool[Tensor, "n"]:
         """Return the mask of Gaussians whose opacity a reset lowers: those dominated by noise (eq. 13)."""
-        if self.reset != "unreliable":
+        if self.reset != "unreliable" or self.least_reliable is None:
             return torch.full_like(state.age, self.reset == "all", dtype=torch.bool)
         drift, noise = self.strengths(state)
         return (drift < self.least_reliable * noise) & (state.age >= self.reset_min_age)

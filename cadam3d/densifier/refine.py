@@ -20,12 +20,12 @@ class RefinePlan:
     its own "how" may give one parent many copies.
     """
 
-    edit: RowEdit
     is_selected: Bool[Tensor, "n"]  # rows before the edit that get children
+    edit: RowEdit | None = None  # None if no row changes
     # Children that are added beside their parent: one for each selected parent that is not split.
-    cloned: int
-    split: int  # parents replaced by their children
-    pruned: int  # removed survivors and newborns
+    cloned: int = 0
+    split: int = 0  # parents replaced by their children
+    pruned: int = 0  # removed survivors and newborns
 
     @property
     def selected(self) -> int:
@@ -200,7 +200,9 @@ class Refine:
         Such a plan must not be applied: the run ends there, with the outcome ``max_gaussians`` and the
         Gaussians it had. Limiting the growth instead would hide that a densifier grows without bound.
         """
-        return self.max_gaussians is not None and plan.edit.rows_after > self.max_gaussians
+        if self.max_gaussians is None or plan.edit is None:
+            return False
+        return plan.edit.rows_after > self.max_gaussians
 
     def _split(self, parents: Gaussians, generator: torch.Generator) -> Gaussians:
         """Return ``split_children`` smaller Gaussians per parent, at positions drawn from the parent."""

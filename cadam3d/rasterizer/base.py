@@ -1,9 +1,9 @@
 """Rasterizer: the interface that renders Gaussians into images, differentiably."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -11,7 +11,11 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderFn, RenderOutput
+from cadam3d.core.render import OverflowedError, RenderFn, RenderOutput
+
+# The signature of :meth:`Rasterizer.render`.
+Render = Callable[[Gaussians, Cameras, Tensor, bool], RenderOutput]
+T = TypeVar("T")
 
 # Constants of the image formation model, shared by every backend and compatible with gsplat.
 
@@ -91,10 +95,25 @@ class Rasterizer(ABC):
         """Render as :meth:`render` does, with the same bits, but if possible without waiting for the device.
 
         Memory is then reserved before its size is known. If it is too small, ``output.overflowed`` is true:
-        the images show only the background, all gradients are zero, and the caller must repeat the work with
-        :meth:`render`. By default this is :meth:`render`, which never overflows.
+        the images show only the background, all gradients are zero, and the work must be repeated with
+        :meth:`render`, which :meth:`ahead` does. By default this is :meth:`render`, which never overflows.
         """
         return self.render(gaussians, cameras, background, absgrad)
+
+    def ahead(self, work: Callable[[Render], T], generators: Iterable[torch.Generator]) -> T:
+        """Return ``work(render)``, where ``render`` does not wait for the device if possible.
+
+        If ``work`` finds that too little memory was reserved, when it calls :meth:`RenderOutput.read`, it is
+        done again with the same random numbers and with exactly as much memory as needed. So ``work`` may
+        change nothing that a repetition does not overwrite, except its ``generators``.
+        """
+        draws_before = [(generator, generator.get_state()) for generator in generators]
+        try:
+            return work(self.render_ahead)
+        except OverflowedError:
+            for generator, draws in draws_before:
+                generator.set_state(draws)
+        return work(self.render)
 
     def prepare(self, device: torch.device) -> Backend:
         """Compile and load everything that rendering on ``device`` needs, and return the backend for it.
