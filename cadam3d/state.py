@@ -1,8 +1,7 @@
 """TrainState: everything that a run needs to continue, and the reports that callbacks see."""
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,12 @@ from torch import Tensor
 
 from cadam3d.core.checks import require
 from cadam3d.core.edit import RowEdit, RowState
-from cadam3d.core.gaussians import FIELDS, Gaussians
+from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.outcome import Outcome
 from cadam3d.core.render import RenderFn
 from cadam3d.core.sh import MAX_DEGREE
 from cadam3d.densifier.base import Densifier
-from cadam3d.optimizer import MOMENTS, AdamSettings, GaussianOptimizer, parts_of
+from cadam3d.optimizer import AdamSettings, GaussianOptimizer
 from cadam3d.rasterizer.base import Rasterizer
 
 __all__ = ["Outcome", "Population", "RefineReport", "RunContext", "StepReport", "TrainState"]
@@ -35,9 +34,12 @@ GENERATORS = (
     "densifier",
     "augmentation",
 )
+# The entries of a checkpoint that are neither tensors nor dicts.
+PLAIN = ("step", "seconds", "num_initial", "initial_note", "skipped", "dimmed", "refused", "seed")
+SH_SIZES = tuple((degree + 1) ** 2 for degree in range(MAX_DEGREE + 1))
 # Limits of what a checkpoint may claim. Nothing real comes near them.
 MOST_STEPS = 10**12
-MOST_DIGITS = 4000  # of a seed; Python refuses to write much longer numbers
+MOST = 10**4000  # for a seed too; Python refuses to write much longer numbers
 LONGEST_NOTE = 10_000  # characters
 
 
@@ -73,14 +75,7 @@ class TrainState:
     def to_payload(self) -> dict[str, Any]:
         """Return the content of a checkpoint file: plain tensors, numbers and dicts."""
         return {
-            "step": self.step,
-            "seconds": self.seconds,
-            "num_initial": self.num_initial,
-            "initial_note": self.initial_note,
-            "skipped": self.skipped,
-            "dimmed": self.dimmed,
-            "refused": self.refused,
-            "seed": self.seed,
+            **{name: getattr(self, name) for name in PLAIN},
             "gaussians": self.gaussians.detach().tensors(),
             "optimizer": self.optimizer.state_dict(),
             "densifier": self.densifier.to_dict(),
@@ -89,23 +84,19 @@ class TrainState:
 
     @classmethod
     def restore(
-        cls,
-        payload: Any,
-        optimizer: AdamSettings,
-        densifier: Densifier,
-        device: torch.device,
+        cls, payload: Any, optimizer: AdamSettings, densifier: Densifier, device: torch.device
     ) -> "TrainState":
         """Return the state on ``device`` that :meth:`to_payload` described.
 
         Raises ``PayloadError`` if any entry is not what :meth:`to_payload` writes, and ``UserError`` if the
         checkpoint belongs to another kind of densifier.
         """
-        gaussians = _checked(payload)
-        _require_densifier(payload["densifier"], densifier, len(gaussians), payload["step"])
-        gaussians = gaussians.to(device)
-        owner = optimizer.start(gaussians)
+        blank = _blank(payload, optimizer, densifier)
+        _require_like("", payload, blank.to_payload())
+        rows = type(blank.densifier)(**payload["densifier"])
+        _require_reachable(payload, rows)
+        owner = optimizer.start(Gaussians(**payload["gaussians"]).to(device))
         owner.load_state_dict(payload["optimizer"])
-        blank = densifier.init_state(len(gaussians), device)
         generators = start_generators(payload["seed"])
         for name, generator in generators.items():
             try:
@@ -113,16 +104,9 @@ class TrainState:
             except RuntimeError as error:
                 raise PayloadError(f"generators.{name}: expected the state of a generator") from error
         return cls(
-            step=payload["step"],
-            seconds=payload["seconds"],
-            num_initial=payload["num_initial"],
-            initial_note=payload["initial_note"],
-            skipped=payload["skipped"],
-            dimmed=payload["dimmed"],
-            refused=payload["refused"],
-            seed=payload["seed"],
+            **{name: payload[name] for name in PLAIN},
             optimizer=owner,
-            densifier=type(blank)(**{name: rows.to(device) for name, rows in payload["densifier"].items()}),
+            densifier=type(rows)(**{name: tensor.to(device) for name, tensor in rows.to_dict().items()}),
             generators=generators,
         )
 
@@ -192,88 +176,84 @@ def start_generators(seed: int) -> dict[str, torch.Generator]:
     }
 
 
-def _checked(payload: Any) -> Gaussians:
-    """Check every entry of a checkpoint except the densifier's, and return its Gaussians on the CPU.
+def _blank(payload: Any, optimizer: AdamSettings, densifier: Densifier) -> TrainState:
+    """Return a state without values that is as large as a checkpoint claims to be.
 
-    This is the one place that declares what :meth:`TrainState.to_payload` writes. Raises ``PayloadError``.
+    Raises ``PayloadError`` if it claims no size, and ``UserError`` if it belongs to another densifier.
     """
-    _require_keys("the checkpoint", payload, [field.name for field in fields(TrainState)] + ["gaussians"])
-    for name in ("step", "num_initial", "skipped", "dimmed"):
-        _require_whole(name, payload[name], MOST_STEPS)
-    for name in ("skipped", "dimmed"):
-        _require_whole(name, payload[name], payload["step"])
-    _require_whole("seed", payload["seed"], 10**MOST_DIGITS)
-    seconds, note = payload["seconds"], payload["initial_note"]
-    _require(type(seconds) is float and 0 <= seconds < math.inf, "seconds", "a finite number >= 0")
-    _require(type(payload["refused"]) is bool, "refused", "true or false")
-    is_note = note is None or (type(note) is str and len(note) <= LONGEST_NOTE and note.isprintable())
-    _require(is_note, "initial_note", "a printable text or nothing")
-
-    tensors = payload["gaussians"]
-    _require_keys("gaussians", tensors, FIELDS)
-    _require(type(tensors["sh"]) is Tensor and tensors["sh"].ndim == 3, "gaussians.sh", "a tensor of 3 axes")
-    n, coefficients, _ = tensors["sh"].shape
-    squares = [(degree + 1) ** 2 for degree in range(MAX_DEGREE + 1)]
-    _require(coefficients in squares, "gaussians.sh", f"one of {squares} coefficients")
+    sh, rows = _entry(_entry(payload, "gaussians"), "sh"), _entry(payload, "densifier")
+    _require(type(sh) is Tensor and sh.ndim == 3, "gaussians.sh", "a tensor of 3 axes")
+    n, coefficients, _ = sh.shape
+    _require(coefficients in SH_SIZES, "gaussians.sh", f"one of {SH_SIZES} coefficients")
     shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "opacity_logits": (n,)}
-    for name, shape in {**shapes, "sh": (n, coefficients, 3)}.items():
-        _require_tensor(f"gaussians.{name}", tensors[name], torch.zeros(()).expand(shape))
-    gaussians = Gaussians(**tensors)
-
-    _require_keys("optimizer", payload["optimizer"], ("steps", *MOMENTS))
-    _require_whole("optimizer.steps", payload["optimizer"]["steps"], payload["step"])
-    parts = parts_of(gaussians)
-    for kind in MOMENTS:
-        moments = payload["optimizer"][kind]
-        _require_keys(f"optimizer.{kind}", moments, parts)
-        for name, part in parts.items():
-            _require_tensor(f"optimizer.{kind}.{name}", moments[name], part)
-    for name, squared in payload["optimizer"]["exp_avg_sq"].items():
-        _require(bool((squared >= 0).all()), f"optimizer.exp_avg_sq.{name}", "numbers >= 0")
-
-    _require_keys("generators", payload["generators"], GENERATORS)
-    for name, state in payload["generators"].items():
-        _require_tensor(f"generators.{name}", state, torch.Generator().get_state())
-    return gaussians
-
-
-def _require_densifier(rows: Any, densifier: Densifier, n: int, step: int) -> None:
-    """Raise ``PayloadError`` for a damaged state, and ``UserError`` for that of another densifier."""
+    shapes["sh"] = (n, coefficients, 3)
+    gaussians = {name: torch.empty(shape, device="meta") for name, shape in shapes.items()}
+    blank = densifier.init_state(n, torch.device("meta"))
     _require(type(rows) is dict and all(type(name) is str for name in rows), "densifier", "names and tensors")
-    blank = densifier.init_state(n, torch.device("cpu"))
-    expected = {field.name for field in fields(blank)}
+    expected = sorted(blank.to_dict())
     require(
-        expected == set(rows),
+        expected == sorted(rows),
         "densifier",
         expected=f"the one of the checkpoint (state: {sorted(rows)})",
-        got=sorted(expected),
+        got=expected,
         example="resume without densifier=...",
     )
-    for name, like in blank.to_dict().items():
-        _require_tensor(f"densifier.{name}", rows[name], like)
-    state = type(blank)(**{name: rows[name] for name in expected})
-    _require(state.is_possible(step), "densifier", f"numbers that {step} steps can lead to")
+    return TrainState(
+        step=0,
+        seconds=0.0,
+        num_initial=0,
+        initial_note=None,
+        skipped=0,
+        dimmed=0,
+        refused=False,
+        seed=0,
+        optimizer=optimizer.start(Gaussians(**gaussians)),
+        densifier=blank,
+        generators=start_generators(0),
+    )
+
+
+def _entry(entries: Any, name: str) -> Any:
+    _require(type(entries) is dict and name in entries, name, "an entry")
+    return entries[name]
+
+
+def _require_like(name: str, value: Any, like: Any) -> None:
+    """Raise ``PayloadError`` unless ``value`` has the structure, the types and the shapes of ``like``.
+
+    Numbers are finite, and those that are not in tensors are not negative.
+    """
+    if isinstance(like, dict):
+        is_dict = type(value) is dict and all(type(key) is str for key in value)
+        wanted = f"the entries {', '.join(sorted(like))}"
+        _require(is_dict and sorted(value) == sorted(like), name or "the checkpoint", wanted)
+        for key, each in like.items():
+            _require_like(f"{name}.{key}".lstrip("."), value[key], each)
+    elif isinstance(like, Tensor):
+        wanted = f"{str(like.dtype).removeprefix('torch.')} of shape {tuple(like.shape)}, all finite"
+        is_dense = type(value) is Tensor and value.layout is torch.strided and value.device.type != "meta"
+        _require(is_dense and value.dtype == like.dtype and value.shape == like.shape, name, wanted)
+        _require(bool(value.isfinite().all()), name, wanted)
+    elif like is None:
+        is_note = type(value) is str and len(value) <= LONGEST_NOTE and value.isprintable()
+        _require(value is None or is_note, name, "a printable text or nothing")
+    else:
+        is_alike = type(value) is type(like) and 0 <= value < (math.inf if type(like) is float else MOST)
+        _require(is_alike, name, f"a {type(like).__name__} in its range")
+
+
+def _require_reachable(payload: dict[str, Any], rows: RowState) -> None:
+    """Raise ``PayloadError`` unless as many steps as were done can lead to the other numbers."""
+    step = payload["step"]
+    _require(step <= MOST_STEPS, "step", "a number of steps")
+    for name in ("skipped", "dimmed"):
+        _require(payload[name] <= step, name, f"at most {step}")
+    _require(payload["optimizer"]["steps"] <= step, "optimizer.steps", f"at most {step}")
+    for name, squared in payload["optimizer"]["exp_avg_sq"].items():
+        _require(bool((squared >= 0).all()), f"optimizer.exp_avg_sq.{name}", "numbers >= 0")
+    _require(rows.is_possible(step), "densifier", f"numbers that {step} steps can lead to")
 
 
 def _require(claim: bool, name: str, expected: str) -> None:
     if not claim:
         raise PayloadError(f"{name}: expected {expected}")
-
-
-def _require_keys(name: str, entries: Any, expected: Iterable[str]) -> None:
-    keys = sorted(expected)
-    is_dict = type(entries) is dict and all(type(key) is str for key in entries)
-    _require(is_dict and sorted(entries) == keys, name, f"the entries {', '.join(keys)}")
-
-
-def _require_whole(name: str, value: Any, most: int) -> None:
-    _require(type(value) is int and 0 <= value <= most, name, "a whole number in its range")
-
-
-def _require_tensor(name: str, value: Any, like: Tensor) -> None:
-    """Raise ``PayloadError`` unless ``value`` is a tensor of finite numbers with the form of ``like``."""
-    wanted = f"{str(like.dtype).removeprefix('torch.')} of shape {tuple(like.shape)}"
-    _require(type(value) is Tensor, name, wanted)
-    is_dense = value.layout is torch.strided and value.device.type != "meta"
-    _require(is_dense and value.dtype == like.dtype and value.shape == like.shape, name, wanted)
-    _require(bool(value.isfinite().all()), name, "finite numbers")

@@ -16,13 +16,6 @@ def test_a_constant_background_is_its_color_for_every_view():
     assert colors.tolist() == [[0.25, 0.5, 1.0]] * 3
 
 
-def test_a_constant_background_draws_nothing():
-    generator = draw()
-    before = generator.get_state()
-    ConstantBackground(color=[0.0, 0.0, 0.0]).sample(3, generator)
-    assert torch.equal(generator.get_state(), before)
-
-
 @pytest.mark.parametrize("probability", [0.0, 0.3, 1.0])
 def test_a_random_background_is_random_with_its_probability(probability):
     constant = torch.tensor([2.0**-20, 0.5, 1.0])
@@ -62,27 +55,6 @@ def test_black_or_white_gives_only_these_two_and_white_with_its_probability(whit
     assert set(colors.unique().tolist()) <= {0.0, 1.0}
     assert (colors == colors[:, :1]).all()
     assert float(colors.mean()) == pytest.approx(white, abs=0.01)
-
-
-def test_views_are_drawn_independently():
-    colors = RandomBackground(probability=1.0, color=[0.0, 0.0, 0.0], shared=False).sample(5, draw())
-    assert len(colors.unique(dim=0)) == 5
-    lucid = LucidBackground(probability=1.0, black=0.0, color=[0.0, 0.0, 0.0])
-    assert len(lucid.sample(5, draw()).unique(dim=0)) == 5
-    assert len(BlackOrWhite(white=0.5).sample(20, draw()).unique(dim=0)) == 2
-
-
-CHANGING = [
-    RandomBackground(probability=0.5, color=[0.0, 0.0, 0.0], shared=False),
-    LucidBackground(probability=0.66, black=0.5, color=[1.0, 1.0, 1.0]),
-    BlackOrWhite(white=0.5),
-]
-
-
-@pytest.mark.parametrize("background", CHANGING, ids=lambda background: type(background).__name__)
-def test_results_depend_on_the_generator_alone(background):
-    assert torch.equal(background.sample(9, draw(1)), background.sample(9, draw(1)))
-    assert not torch.equal(background.sample(9, draw(1)), background.sample(9, draw(2)))
 
 
 def after(background) -> torch.Tensor:

@@ -12,7 +12,6 @@ from composed import composed
 from cadam3d.augmentation import LucidAugmentation
 from cadam3d.build import build_trainer, component
 from cadam3d.callback.base import Callback
-from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.regularizer import MeanScale
 from cadam3d.settings.compose import compose
@@ -110,16 +109,6 @@ def test_the_fallback_of_an_initializer_is_recorded_in_checkpoints():
     assert restore(trainer, state.to_payload()).initial_note == state.initial_note
 
 
-def test_another_seed_gives_another_result(tmp_path):
-    results = []
-    for seed in (0, 1):
-        trainer, state = make([f"seed={seed}"])
-        go(trainer, state, tmp_path)
-        results.append(state.to_payload())
-    assert not torch.equal(results[0]["generators"]["camera"], results[1]["generators"]["camera"])
-    assert not torch.equal(results[0]["gaussians"]["means"][:10], results[1]["gaussians"]["means"][:10])
-
-
 @pytest.mark.parametrize("densifier", ["cadam", "baseline", "random", "mcmc"])
 @pytest.mark.parametrize("cut", [1, 4, 5])
 def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, densifier, cut):
@@ -208,17 +197,6 @@ def test_guidance_gets_the_shown_images_and_regularizers_the_rendered_ones(tmp_p
     assert seen.keys() == {"perturbed", "output", "shown"}
 
 
-def test_an_augmented_run_resumes_to_the_bit(tmp_path):
-    trainer, whole = make(AUGMENTED)
-    go(trainer, whole, tmp_path)
-    _, state = make(AUGMENTED)
-    go(replace(trainer, steps=3), state, tmp_path)
-    torch.save(state.to_payload(), tmp_path / "half.pt")
-    resumed = restore(trainer, torch.load(tmp_path / "half.pt", weights_only=True))
-    go(trainer, resumed, tmp_path)
-    assert same(whole.to_payload(), resumed.to_payload())
-
-
 ALWAYS = ["exposure=beg", "exposure.begin=2", "exposure.end=6", "exposure.threshold=0", "exposure.rate=0.5"]
 
 
@@ -301,14 +279,6 @@ def test_the_last_pruning_leaves_no_large_gaussian_whether_the_last_step_refines
     if end == 5:
         assert (last.selected, last.cloned, last.split) == (0, 0, 0)
         assert last.pruned > 0
-
-
-def test_callbacks_see_every_step_once_and_the_end(tmp_path):
-    trainer, state = make()
-    recorder = Recorder()
-    go(replace(trainer, callbacks=[recorder]), state, tmp_path)
-    assert [report.step for report in recorder.steps] == list(range(1, 9))
-    assert recorder.ends == [Outcome.FINISHED]
 
 
 def test_a_stop_signal_ends_the_run_after_the_current_step(tmp_path):
@@ -408,17 +378,6 @@ def test_owners_of_rows_agree_even_if_memory_runs_out_within_a_refinement(tmp_pa
     assert state.optimizer.state_dict()["exp_avg"]["means"].shape[0] == rows
 
 
-def test_another_runtime_error_is_raised(tmp_path, monkeypatch):
-    trainer, state = make()
-
-    def broken(*_args):
-        raise RuntimeError("a bug")
-
-    monkeypatch.setattr(type(trainer.rasterizer), "render", broken)
-    with pytest.raises(RuntimeError, match="a bug"):
-        go(trainer, state, tmp_path)
-
-
 @pytest.mark.parametrize("densifier", ["cadam", "mcmc"])
 def test_a_step_with_a_non_finite_gradient_changes_nothing_but_is_counted(tmp_path, densifier):
     trainer, state = make(["steps=1", f"densifier={densifier}"])
@@ -443,18 +402,6 @@ def test_a_checkpoint_of_another_densifier_is_refused():
     other, _ = make(["densifier=cadam"])
     with pytest.raises(UserError, match="densifier"):
         restore(other, state.to_payload())
-
-
-def test_a_number_of_views_that_the_cameras_cannot_give_is_refused_before_the_start():
-    with pytest.raises(UserError, match=r"^views: .* Try: views=4$"):
-        make(["camera=multiview", "views=2"])
-    make(["camera=multiview", "views=4"])
-
-
-def test_the_error_for_an_unknown_device_suggests_the_cpu():
-    with pytest.raises(UserError, match=r"^device: expected .*, got 'toaster'\. Try: device=cpu$"):
-        resolve_device("toaster")
-    assert resolve_device("cpu") == CPU
 
 
 def test_a_loop_that_raises_calls_on_abort(tmp_path, monkeypatch):

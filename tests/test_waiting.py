@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from cadam3d.build import build_trainer, component
-from cadam3d.core.device import read_numbers, upload, upload_together
+from cadam3d.core.device import read_numbers, upload_together
 from cadam3d.core.render import RenderOutput
 from cadam3d.densifier.baseline import Baseline
 from cadam3d.exposure import NoExposure
@@ -205,15 +205,6 @@ def test_numbers_of_any_kind_are_read_exactly():
     assert read_numbers([torch.ones(1), torch.ones(1, 1), torch.ones(())], CPU) == [1.0, 1.0, 1.0]
 
 
-def test_tensors_that_are_sent_together_keep_their_shapes_and_stay_where_they_are():
-    tensors = [torch.rand(2, 4, 4), torch.rand(2, 3), torch.rand(2)]
-    assert all(sent is tensor for sent, tensor in zip(upload_together(tensors, CPU), tensors, strict=True))
-    with Transfers() as transfers:
-        sent = upload_together(tensors, META)
-    assert [(each.device, each.shape) for each in sent] == [(META, tensor.shape) for tensor in tensors]
-    assert transfers.are_asynchronous == [True]
-
-
 def test_tensors_that_are_sent_together_keep_their_numbers_and_gradients(monkeypatch):
     """Pretend that another device is the CPU."""
     tensors = [torch.rand(2, 3).T, torch.rand(4, requires_grad=True), torch.rand(())]
@@ -225,36 +216,12 @@ def test_tensors_that_are_sent_together_keep_their_numbers_and_gradients(monkeyp
     assert torch.equal(tensors[1].grad, torch.ones(4))
 
 
-def test_another_default_device_or_dtype_of_torch_changes_nothing_that_is_sent():
-    tensors = [torch.rand(2, 3), torch.rand(4)]
-    torch.set_default_dtype(torch.float64)
-    try:
-        with torch.device("meta"):
-            sent = upload_together(tensors, META)
-    finally:
-        torch.set_default_dtype(torch.float32)
-    assert all(each.dtype == torch.float32 for each in sent)
-
-
 def test_tensors_that_are_sent_together_keep_their_dtypes_and_may_be_there_already():
     tensors = [torch.rand(2, 3), torch.arange(4), torch.empty(5, device=META), torch.rand(2).double()]
     sent = upload_together(tensors, META)
     assert sent[2] is tensors[2]
     assert [(each.dtype, each.shape) for each in sent] == [(tensor.dtype, tensor.shape) for tensor in tensors]
     assert all(each.device == META for each in sent)
-
-
-def test_a_copy_that_the_host_reads_is_not_asynchronous(monkeypatch):
-    asked = []
-
-    def to(self, device, non_blocking):
-        asked.append(non_blocking)
-        return self
-
-    monkeypatch.setattr(Tensor, "to", to)
-    upload(torch.empty(1, device=META), CPU)
-    upload(torch.ones(1), META)
-    assert asked == [False, True]
 
 
 # -------------------------------------------------------------------------- components of users

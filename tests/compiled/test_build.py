@@ -25,7 +25,6 @@ from cadam3d.compiled.build import (
     short_hash,
 )
 from cadam3d.core.errors import UserError
-from cadam3d.io.cache import default_cache_dir
 
 NAMES = Names("rasterizer=cpu", fallback="rasterizer=reference", cache_key="rasterizer.cache_dir")
 SOURCE = (
@@ -99,25 +98,10 @@ def test_a_library_is_compiled_once_and_then_read_from_the_cache(library, fake_c
     assert list((tmp_path / "cache").iterdir()) == [first.path], "there are no temporary files"
 
 
-def test_the_real_compiler_builds_a_library_that_runs(library, tmp_path):
-    built = build(library, tmp_path / "cache")
-    assert load(built).test() == 0
-    assert built.path.name.startswith("small-")
-
-
 def test_a_library_that_fails_its_own_test_is_refused(library, tmp_path):
     wrong = replace(library, sources=write_sources(tmp_path / "wrong", answer="1"))
     with pytest.raises(UserError, match=r"(?s)^rasterizer=cpu: .*\nexit code 1\n.*=reference$"):
         build(wrong, tmp_path / "cache", machine_flags=((),))
-
-
-def test_the_definitions_and_folders_of_headers_are_passed_to_the_compiler(library, fake_compiler, tmp_path):
-    calls = fake_compiler()
-    build(library, tmp_path / "cache")
-    words = calls()[0].split()
-    assert {"-DZERO=0", f"-I{SIMD.parent}", f"-I{library.sources[0].parent}", str(library.sources[0])} < {
-        *words
-    }
 
 
 @pytest.mark.parametrize("damage", [b"", b"not a library", None])
@@ -180,12 +164,6 @@ def test_a_cached_library_needs_no_compiler(library, fake_compiler, tmp_path, mo
     assert build(library, tmp_path / "cache").path == built.path
 
 
-def test_the_output_of_a_compiler_may_have_another_encoding(library, fake_compiler, tmp_path):
-    fake_compiler(body=r"printf 'Fehler \374\n' >&2; exit 1", version="gcc \xe4")
-    with pytest.raises(UserError, match=r"could not build the kernels:\nFehler"):
-        build(library, tmp_path / "cache")
-
-
 def test_the_output_of_a_failing_compiler_is_shown(library, fake_compiler, tmp_path):
     fake_compiler(body="echo 'error: no such thing' >&2; exit 1")
     with pytest.raises(UserError, match=r"(?s)fake 1\.0.*no such thing.*rasterizer=reference"):
@@ -214,17 +192,6 @@ def test_a_folder_that_cannot_be_written_is_reported_with_its_key(library, fake_
         build(library, tmp_path / "file")
 
 
-def test_environment_variables_choose_the_compiler_and_the_cache(fake_compiler, tmp_path, monkeypatch):
-    fake_compiler(version="fake 3.0")
-    compiler = find_compiler()
-    assert compiler is not None
-    assert compiler.version == "fake 3.0"
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert default_cache_dir() == tmp_path / "cadam3d"
-    monkeypatch.setenv("XDG_CACHE_HOME", "")
-    assert default_cache_dir().is_absolute()
-
-
 # --- owners of files --------------------------------------------------------------------------------------
 
 
@@ -244,28 +211,6 @@ def test_a_file_that_another_user_can_write_is_not_loaded(cached):
     for mode in (0o720, 0o702, 0o777):
         cached.chmod(mode)
         assert find_intact(cached.parent, "small-*.so") is None
-
-
-def test_a_file_that_cannot_be_read_is_built_again(library, fake_compiler, tmp_path, monkeypatch):
-    fake_compiler()
-    path, read = build(library, tmp_path / "cache").path, Path.read_bytes
-
-    def read_bytes(self: Path) -> bytes:
-        if self == path:
-            raise PermissionError(13, "Permission denied", str(self))
-        return read(self)
-
-    monkeypatch.setattr(Path, "read_bytes", read_bytes)
-    again = build(library, tmp_path / "cache")
-    assert again.path == path
-    assert again.seconds > 0
-
-
-def test_without_a_home_folder_the_message_names_another_folder(monkeypatch):
-    monkeypatch.setattr("os.path.expanduser", lambda path: path)
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    with pytest.raises(UserError, match=r"^\$HOME: .* Try: export XDG_CACHE_HOME="):
-        default_cache_dir()
 
 
 @pytest.mark.parametrize("mode", [0o720, 0o702, 0o777, 0o1777])
@@ -294,13 +239,6 @@ def test_files_of_another_user_are_refused_also_behind_a_link(place, cached, tmp
         monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
         monkeypatch.setattr("cadam3d.io.cache.ROOT", -1)
         assert find_intact(link, "small-*.so") is None
-
-
-@pytest.mark.parametrize("name", ["circle", "x" * 300])
-def test_a_folder_that_the_system_refuses_is_one_message(name, tmp_path):
-    (tmp_path / "circle").symlink_to("circle")
-    with pytest.raises(UserError, match=r"expected a folder for compiled kernels.*Try: rasterizer=cpu"):
-        own_folder(tmp_path / name, NAMES)
 
 
 def test_a_new_folder_and_a_new_library_belong_to_the_user_alone(library, fake_compiler, tmp_path):

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from cadam3d.core.checks import fail, require, require_choice, require_color, require_range, require_whole
+from cadam3d.core.checks import fail, require_choice, require_color, require_range, require_whole
 from cadam3d.core.errors import UserError
 
 
@@ -13,26 +13,10 @@ def test_a_message_has_key_expected_got_and_what_to_type():
     assert message == "densifier.tau_Q: expected a number >= 0, got -1. Try: densifier.tau_Q=0.9"
 
 
-def test_a_true_claim_passes_and_a_false_one_is_a_user_error():
-    require(True, "key", expected="x", got="y", example="key=x")
-    with pytest.raises(UserError, match=r"key: expected x, got 'y'\. Try: key=x"):
-        require(False, "key", expected="x", got="y", example="key=x")
-
-
-@pytest.mark.parametrize("value", [0, 0.0, 0.5, 0.999])
-def test_numbers_in_range_pass(value):
-    require_range("key", value, low=0, below=1, example=0.5)
-
-
 @pytest.mark.parametrize("value", [-1e-9, 1, 1.0, math.nan, math.inf, -math.inf, None, "0.5", True, [0.5]])
 def test_numbers_out_of_range_and_other_values_are_refused(value):
     with pytest.raises(UserError, match=r"key: expected a number >= 0 and < 1, got .*\. Try: key=0.5"):
         require_range("key", value, low=0, below=1, example=0.5)
-
-
-def test_a_truth_value_is_not_a_number():
-    with pytest.raises(UserError, match="got True"):
-        require_range("key", True, low=0, high=1, example=1)
 
 
 def test_bounds_are_closed_or_open_as_declared():
@@ -54,30 +38,12 @@ def test_without_bounds_any_finite_number_passes(value, is_fine):
             require_range("key", value, example=1)
 
 
-def test_an_infinite_number_never_passes_a_one_sided_bound():
-    with pytest.raises(UserError, match="key"):
-        require_range("key", math.inf, low=0, example=1)
-
-
-@pytest.mark.parametrize("value", [2, 3, 16])
-def test_whole_numbers_in_range_pass(value):
-    require_whole("key", value, low=2, high=16, example=2)
-
-
 @pytest.mark.parametrize("value", [1, 17, 2.0, 2.5, True, False, None, "3", [3], math.nan, math.inf])
 def test_everything_except_whole_numbers_in_range_is_refused(value):
     with pytest.raises(
         UserError, match=r"^key: expected a whole number >= 2 and <= 16, got .*\. Try: key=2$"
     ):
         require_whole("key", value, low=2, high=16, example=2)
-
-
-def test_bounds_of_whole_numbers_are_optional():
-    require_whole("key", -(10**400), example=0)
-    with pytest.raises(UserError, match=r"^key: expected a whole number, got 0\.5\. Try: key=0$"):
-        require_whole("key", 0.5, example=0)
-    with pytest.raises(UserError, match=r"^key: expected a whole number >= 1, got True\. Try: key=5$"):
-        require_whole("key", True, low=1, example=5)
 
 
 @pytest.mark.parametrize(
@@ -93,25 +59,6 @@ def test_a_refused_choice_lists_the_options():
     require_choice("prior", "tiny", ["shapes", "tiny"])
     with pytest.raises(UserError, match=r"prior: expected one of shapes\|tiny, got 'tin'. Try: prior=tiny"):
         require_choice("prior", "tin", ["shapes", "tiny"])
-
-
-@pytest.mark.parametrize(
-    ("value", "choices", "suggested"),
-    [
-        ("tinny", ("shapes", "tiny"), "tiny"),
-        ("everything", ("unreliable", "all", "none"), "unreliable"),
-        ("nome", ("unreliable", "all", "none"), "none"),
-        (91, (0, 90, 180), "90"),
-        (0, (True, False), "false"),
-        ("no", (True, False), "true"),
-        (float("nan"), range(4), "0"),
-        (None, ("a", "b"), "a"),
-    ],
-)
-def test_a_refused_choice_is_answered_with_the_nearest_one_or_the_first(value, choices, suggested):
-    with pytest.raises(UserError) as raised:
-        require_choice("key", value, choices)
-    assert str(raised.value).endswith(f"Try: key={suggested}")
 
 
 def test_a_colour_is_three_numbers_between_zero_and_one():

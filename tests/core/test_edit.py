@@ -70,22 +70,6 @@ def test_an_edit_does_not_modify_its_arguments():
     assert state.age.tolist() == [1] * 5
 
 
-def test_edited_gaussians_have_no_autograd_history():
-    gaussians, edit = numbered(0, 5), edit_of([1], born=1)
-    for part in (gaussians, edit.children):
-        part.map(lambda tensor: tensor.requires_grad_())
-    assert not any(tensor.requires_grad for tensor in edit.apply(gaussians).tensors().values())
-
-
 def test_every_child_has_one_parent():
     with pytest.raises(AssertionError, match="parent"):
         RowEdit(keep=torch.arange(2), children=numbered(0, 2), parents=torch.tensor([0]))
-
-
-def test_a_state_can_be_converted_to_a_dict_and_back():
-    state = Statistics(strength=torch.rand(4, 3), age=torch.arange(4))
-    payload = state.to_dict()
-    assert list(payload) == ["strength", "age"]
-    again = Statistics(**payload)
-    assert torch.equal(again.strength, state.strength)
-    assert torch.equal(again.age, state.age)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from cadam3d.core.gaussians import FIELDS, Gaussians, concatenate
+from cadam3d.core.gaussians import FIELDS, Gaussians
 
 
 def make(n: int, degree: int = 1, seed: int = 0) -> Gaussians:
@@ -66,11 +66,6 @@ def test_rotations_are_rotations():
     torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(50))
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_the_sh_degree_follows_from_the_number_of_coefficients(degree):
-    assert make(2, degree).sh_degree == degree
-
-
 @pytest.mark.parametrize(
     "rows",
     [torch.tensor([3, 0, 3]), torch.tensor([True, False, True, True]), slice(1, 3)],
@@ -81,24 +76,6 @@ def test_index_picks_the_same_rows_of_every_tensor(rows):
     picked = gaussians.index(rows)
     for name in FIELDS:
         assert torch.equal(getattr(picked, name), getattr(gaussians, name)[rows])
-
-
-def test_concatenate_undoes_a_split():
-    gaussians = make(6)
-    assert_same(concatenate([gaussians.index(slice(0, 2)), gaussians.index(slice(2, 6))]), gaussians)
-
-
-def test_zero_gaussians_are_allowed():
-    assert len(make(0)) == 0
-    assert make(0).rotations.shape == (0, 3, 3)
-    assert_same(concatenate([make(0), make(3)]), make(3))
-
-
-def test_detach_cuts_the_graph_and_keeps_the_numbers():
-    gaussians = make(3).map(lambda tensor: tensor.requires_grad_())
-    cut = gaussians.map(lambda tensor: tensor * 1).detach()
-    assert not any(tensor.requires_grad for tensor in cut.tensors().values())
-    assert_same(cut, gaussians)
 
 
 def test_to_converts_every_tensor_and_map_does_not_touch_the_original():

@@ -43,10 +43,6 @@ def test_angles_are_a_list_of_numbers_in_range(angles):
     Postcard(**GIVEN).require_angles("tilts", [-90, 0.5], limit=90, example=15)
 
 
-def test_whole_numbers_in_a_background_become_floating_point():
-    assert torch.equal(Postcard(**GIVEN).backgrounds(2), torch.tensor([[1.0, 0.5, 0.0]] * 2))
-
-
 def test_cameras_have_the_given_angles_and_settings():
     expected = turntable(3, elevation_deg=20.0, distance=3.0, fov_y_deg=40.0, size=16)
     assert vars_equal(Postcard(**GIVEN).ring(3, 20.0), expected)

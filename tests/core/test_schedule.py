@@ -5,11 +5,7 @@ import math
 import pytest
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.schedule import Constant, Linear, LogLinear, Steps, as_schedule, require_scheduled
-
-
-def test_a_constant_never_changes():
-    assert {Constant(0.3)(step) for step in (0, 1, 10**6)} == {0.3}
+from cadam3d.core.schedule import Linear, LogLinear, Steps, as_schedule, require_scheduled
 
 
 @pytest.mark.parametrize("kind", [Linear, LogLinear])
@@ -23,11 +19,6 @@ def test_ramps_have_their_first_and_final_values_and_keep_the_final_one(kind):
 def test_halfway_is_the_mean_on_a_linear_and_the_geometric_mean_on_a_logarithmic_ramp():
     assert Linear(start=1, end=3, steps=10)(5) == pytest.approx(2)
     assert LogLinear(start=1e-2, end=1e-4, steps=10)(5) == pytest.approx(1e-3)
-
-
-def test_ramps_may_rise():
-    assert Linear(start=0, end=1, steps=4)(3) == pytest.approx(0.75)
-    assert LogLinear(start=1, end=16, steps=4)(3) == pytest.approx(8)
 
 
 def test_steps_change_exactly_at_their_milestones():
@@ -55,11 +46,6 @@ def test_a_number_is_a_constant_schedule_and_a_schedule_is_itself():
 def test_impossible_schedules_name_the_key(build, key):
     with pytest.raises(UserError, match=key):
         build()
-
-
-@pytest.mark.parametrize("value", [0, 0.5, 1, Linear(start=1, end=0, steps=10), Steps([1, 0.5], [3])])
-def test_numbers_and_schedules_in_range_pass(value):
-    require_scheduled("key", value, low=0, high=1, example=0.5)
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,8 @@
 """Laws of AbsGS: gradients of opposite pixels count in full. All other laws are in test_baseline.py."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
-from cadam3d.core.errors import UserError
-from cadam3d.core.schedule import Linear
 from cadam3d.densifier.absgrad import AbsGrad
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.baseline import VIEWS, Baseline
@@ -47,21 +43,3 @@ def test_absgrad_is_the_baseline_with_absolute_gradients(views):
     two = theirs.observe(theirs.init_state(9, CPU), signal(pulls, None, height=10, width=60))
     assert all(torch.equal(rows, two.to_dict()[name]) for name, rows in one.to_dict().items())
     assert torch.equal(ours.unreliable(one), theirs.unreliable(two))
-
-
-def test_absgrad_needs_absolute_gradients_and_the_baseline_does_not():
-    assert AbsGrad(**SETTINGS).needs_absgrad
-    assert not Baseline(**SETTINGS).needs_absgrad
-
-
-def test_the_threshold_may_be_a_schedule():
-    densifier = replace(AbsGrad(**SETTINGS), tau_pos=Linear(start=0.1, end=1.0, steps=10))
-    state = densifier.observe(
-        densifier.init_state(1, CPU), signal(torch.zeros(1, 1, 2), torch.full((1, 1, 2), 0.4))
-    )
-    assert [bool(densifier.select(state, step, DRAWS)) for step in (0, 10)] == [True, False]
-
-
-def test_an_impossible_threshold_is_refused_by_name():
-    with pytest.raises(UserError, match=r"densifier\.tau_pos"):
-        AbsGrad(**SETTINGS | {"tau_pos": 0.0})

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 from composed import composed
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from cadam3d.build import build_trainer, component
 from cadam3d.callback.base import Callback
@@ -65,17 +64,6 @@ def run(overrides: Sequence[str], folder: Path) -> tuple[TrainState, Recorder, O
     return state, recorder, outcome
 
 
-def test_moments_of_never_densified_gaussians_are_those_of_the_optimizer_to_the_bit(tmp_path):
-    state, recorder, _ = run(["densifier.reset=all", *REGULARIZED], tmp_path)
-    old = state.densifier.age == state.step
-    assert any(report.cloned + report.split for report in recorder.reports)
-    assert 5 < int(old.sum()) < len(old)
-    saved = state.optimizer.state_dict()
-    assert torch.equal(state.densifier.m[old], saved["exp_avg"]["means"][old])
-    assert torch.equal(state.densifier.v[old], saved["exp_avg_sq"]["means"][old])
-    assert state.densifier.m[old].abs().max() > 0
-
-
 # The signal.
 
 
@@ -107,52 +95,6 @@ def test_a_second_backward_pass_happens_only_if_it_is_needed(overrides, passes, 
     )
     run(["steps=1", *overrides], tmp_path)
     assert len(calls) == passes
-
-
-class Asynchronous(TorchDispatchMode):
-    """Fails on operations that make a CUDA program wait for the device."""
-
-    WAITS = ("_local_scalar_dense", "nonzero", "item", "is_nonzero", "equal", "unique", "masked_select")
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        name = func.__name__.partition(".")[0].lstrip("_")
-        assert name not in {wait.lstrip("_") for wait in self.WAITS}, f"{func} waits for the device"
-        indices = args[1] if name == "index" else ()
-        assert not any(i is not None and i.dtype == torch.bool for i in indices), "a mask as index waits"
-        return func(*args, **(kwargs or {}))
-
-
-@pytest.mark.parametrize(
-    "choice",
-    [
-        "none",
-        "baseline",
-        "baseline densifier.screen_px=20",
-        "cadam",
-        "cadam_open densifier.invisible=skip",
-        "cadam_open densifier.nonfinite=skip_row",
-        "cadam_strict",
-        "cadam_calibrated",
-        "random",
-        "mcmc",
-        "absgrad",
-    ],
-)
-def test_observing_never_waits_for_the_device(choice):
-    densifier = component(compose(["prompt=a red cube", *f"densifier={choice}".split()]).densifier)
-    evidence = GradientSignal(
-        means=torch.ones(5, 3),
-        means2d=torch.ones(2, 5, 2),
-        radii=torch.ones(2, 5),
-        height=8,
-        width=8,
-        absgrad=torch.ones(2, 5, 2),
-    )
-    state = densifier.init_state(5, CPU)
-    with Asynchronous():
-        densifier.observe(state, evidence)
-    with pytest.raises(AssertionError, match="waits"), Asynchronous():
-        bool(evidence.means.sum())
 
 
 @pytest.mark.parametrize(("choice", "is_needed"), [("absgrad", True), ("baseline", False), ("cadam", False)])
@@ -203,13 +145,6 @@ def test_a_report_has_the_population_before_the_edit_and_the_selected_gaussians(
         assert (chosen > 0.1).all()
 
 
-def test_a_reset_without_refinement_reports_an_empty_selection(tmp_path):
-    _, recorder, _ = run(["refine.end=0"], tmp_path)
-    assert [report.step for report in recorder.reports] == [4]
-    assert not recorder.reports[0].population.is_selected.any()
-    assert set(recorder.reports[0].population.scores) == {"drift", "noise", "snr"}
-
-
 # Effects on the run.
 
 
@@ -239,14 +174,3 @@ def test_noise_moves_the_means_after_the_optimizer_step_and_nothing_else(tmp_pat
     assert expected.abs().max() > 1e-3
     for name in set(FIELDS) - {"means"}:
         assert torch.equal(getattr(moved.gaussians, name), getattr(still.gaussians, name))
-
-
-@pytest.mark.parametrize("clears", ["false", "true"])
-def test_reset_moments_gives_reset_gaussians_age_zero(clears, tmp_path):
-    line = f"densifier.reset_moments={clears}"
-    _, recorder, _ = run(
-        ["densifier=cadam_open", "densifier.reset=all", line, "densifier.tau_m=1e9"], tmp_path
-    )
-    ages, m = recorder.states[1]["age"], recorder.states[1]["m"]
-    assert ages.tolist() == [0 if clears == "true" else 4] * len(ages)
-    assert bool(m.any()) == (clears == "false")

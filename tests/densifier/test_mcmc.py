@@ -11,7 +11,6 @@ from scipy.integrate import quad
 from cadam3d.build import component
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import FIELDS, Gaussians
-from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.mcmc import MCMC, draw, share
 from cadam3d.densifier.refine import Refine
 from cadam3d.settings.compose import compose
@@ -68,20 +67,6 @@ def test_coincident_copies_look_like_the_original(opacity, among):
     assert line == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-5)
 
 
-def test_a_single_copy_is_unchanged():
-    logits = torch.linspace(-6, 13, 20, dtype=torch.float64)
-    new, log_shrink = share(logits, torch.ones(20, dtype=torch.long))
-    torch.testing.assert_close(new, logits)
-    torch.testing.assert_close(log_shrink, torch.zeros_like(logits), atol=1e-9, rtol=0)
-
-
-def test_shares_do_not_depend_on_the_rest_of_the_batch():
-    logits, among = torch.tensor([-2.0, 0.5, 3.0]).double(), torch.tensor([7, 1, 40])
-    together = torch.stack(share(logits, among))
-    alone = torch.cat([torch.stack(share(logits[i : i + 1], among[i : i + 1])) for i in range(3)], dim=1)
-    torch.testing.assert_close(together, alone)
-
-
 def test_fully_opaque_gaussians_share_without_nan():
     new, log_shrink = share(torch.tensor([20.0, 90.0]).double(), torch.tensor([2, 500]))
     assert new.isfinite().all()
@@ -97,10 +82,6 @@ def test_draws_are_in_proportion_to_the_weights():
     expected = 100_000 * weights / 10
     assert hits[0] == hits[3] == 0
     assert ((hits - expected).abs() <= 4.5 * expected.sqrt()).all()
-
-
-def test_a_count_of_zero_draws_nothing():
-    assert draw(torch.ones(3).double(), 0, draws()).shape == (0,)
 
 
 # The plan.
@@ -163,12 +144,6 @@ def test_the_population_grows_by_its_share_up_to_the_cap_and_then_keeps_its_size
     assert counts[-1] == counts[-2] == 180
 
 
-def test_a_population_above_the_cap_neither_grows_nor_shrinks():
-    scene = gaussians(50)
-    scene.opacity_logits[:10] = -9.0
-    assert plan(mcmc(cap=20), scene).edit.rows_after == 50
-
-
 def test_relocated_and_added_copies_share_one_original():
     scene = gaussians(40)
     scene.opacity_logits[1:] = -9.0
@@ -216,21 +191,6 @@ def test_a_plan_depends_on_the_generator_and_changes_nothing():
     assert torch.equal(first.parents, again.parents)
     assert not torch.equal(first.parents, other.parents)
     assert all(torch.equal(getattr(scene, field), getattr(before, field)) for field in FIELDS)
-
-
-def test_gradients_change_nothing_and_no_gaussian_is_reset_or_split():
-    state = mcmc().init_state(4, CPU)
-    loud = GradientSignal(
-        means=torch.full((4, 3), 1e6),
-        means2d=torch.full((2, 4, 2), 1e6),
-        radii=torch.ones(2, 4),
-        height=8,
-        width=8,
-    )
-    observed = mcmc().observe(state, loud)
-    assert torch.equal(observed.no_rows, state.no_rows)
-    assert not mcmc().unreliable(observed).any()
-    assert not mcmc().select(observed, LATE, draws()).any()
 
 
 # The noise.

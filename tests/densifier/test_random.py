@@ -6,12 +6,9 @@ import pytest
 import torch
 
 from cadam3d.build import component
-from cadam3d.core.edit import RowEdit
 from cadam3d.core.errors import UserError
-from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.reductions import quantile
 from cadam3d.core.schedule import Linear
-from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.random import RandomGrowth
 from cadam3d.settings.compose import compose
 
@@ -52,35 +49,6 @@ def test_choices_depend_on_the_given_generator_only():
     assert torch.equal(torch.random.get_rng_state(), before)
 
 
-def test_gradients_change_nothing_and_no_gaussian_is_reset():
-    densifier = RandomGrowth(share=0.5)
-    state = densifier.init_state(8, CPU)
-    loud = GradientSignal(
-        means=torch.full((8, 3), 1e6),
-        means2d=torch.full((2, 8, 2), 1e6),
-        radii=torch.ones(2, 8),
-        height=8,
-        width=8,
-    )
-    observed = densifier.observe(state, loud)
-    assert torch.equal(densifier.select(observed, STEP, draws()), densifier.select(state, STEP, draws()))
-    assert not densifier.unreliable(observed).any()
-
-
-def test_selecting_does_not_modify_the_state():
-    densifier = RandomGrowth(share=0.5)
-    state = densifier.init_state(8, CPU)
-    assert densifier.select(state, STEP, draws()).any()
-    assert not state.no_rows.any()
-
-
-def test_a_schedule_of_the_share_is_followed():
-    densifier = RandomGrowth(share=Linear(start=0.5, end=0.02, begin=100, steps=150))
-    drawn = [int(select(densifier, 1001, step=step).sum()) for step in (1, 100, 175, 250, 10_000)]
-    assert drawn == [500, 500, 260, 20, 20]
-    assert densifier.statistics(densifier.init_state(3, CPU), 175)["share"] == pytest.approx(0.26)
-
-
 def test_the_annealed_control_selects_as_many_as_cadam_annealed_at_every_refinement():
     cadam, control = (
         component(compose(["prompt=a red cube", f"densifier={name}"]).densifier)
@@ -100,20 +68,6 @@ def test_the_annealed_quantile_follows_the_schedule_and_bounds_growth_as_the_pap
     assert tau_Q(calls[-1]) == pytest.approx(0.98)
     bound, paper = math.prod(2 - tau_Q(at) for at in calls), 1.1 ** len(calls)
     assert 0.9 * paper < bound < 1.35 * paper
-
-
-def test_rows_follow_an_edit():
-    densifier = RandomGrowth(share=0.5)
-    children = Gaussians(
-        means=torch.zeros(3, 3),
-        log_scales=torch.zeros(3, 3),
-        quats=torch.ones(3, 4),
-        opacity_logits=torch.zeros(3),
-        sh=torch.zeros(3, 1, 3),
-    )
-    edit = RowEdit(keep=torch.tensor([0, 2]), children=children, parents=torch.tensor([1, 1, 0]))
-    state = densifier.init_state(4, CPU).carry(edit)
-    assert densifier.select(state, STEP, draws()).shape == (5,)
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.0, Linear(start=0.5, end=1.0, steps=10)])

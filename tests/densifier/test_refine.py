@@ -100,10 +100,6 @@ def test_resets_happen_at_the_steps_of_the_published_recipes(first, until, expec
     assert [step for step in range(1, 4000) if schedule.resets_at(step)] == list(expected)
 
 
-def test_without_an_interval_there_is_no_reset():
-    assert not any(refine(reset_interval=None).resets_at(step) for step in range(1, 4000))
-
-
 # Growth.
 
 
@@ -130,13 +126,6 @@ def test_the_counts_add_up(children):
     assert plan.edit.rows_after == 60 + plan.cloned + (children - 1) * plan.split - plan.pruned
     assert plan.pruned > 0
     assert len(plan.edit.apply(scene)) == plan.edit.rows_after
-
-
-def test_an_empty_selection_changes_nothing():
-    scene = gaussians(10)
-    plan = refine().plan(scene, torch.zeros(10, dtype=torch.bool), LATE, draw())
-    after = plan.edit.apply(scene)
-    assert all(torch.equal(getattr(after, name), getattr(scene, name)) for name in FIELDS)
 
 
 def test_a_clone_equals_its_parent():
@@ -216,14 +205,6 @@ def test_the_last_pruning_is_at_the_last_step_only():
     assert not refine(steps=450).prunes_at(450)
 
 
-def test_the_children_of_a_split_are_judged_by_their_own_scale():
-    scene = gaussians(1)
-    scene.log_scales[:] = torch.tensor(0.6).log()
-    plan = refine(max_scale=0.5).plan(scene, torch.ones(1, dtype=torch.bool), LATE, draw())
-    assert plan.pruned == 0
-    assert plan.edit.rows_after == 2
-
-
 @pytest.mark.parametrize("name", ["means", "log_scales", "opacity_logits"])
 def test_rows_with_nan_are_pruned(name):
     scene = gaussians(4)
@@ -239,18 +220,6 @@ def test_opacity_does_not_prune_during_the_grace_after_a_reset():
         step: schedule.plan(scene, no_rows, step, draw()).pruned for step in (200, 300, 301, 400, 401, 700)
     }
     assert pruned == {200: 1, 300: 1, 301: 0, 400: 0, 401: 1, 700: 0}
-
-
-def test_all_gaussians_may_be_pruned():
-    scene = with_opacity(gaussians(2), [1e-4, 1e-4])
-    plan = refine().plan(scene, torch.ones(2, dtype=torch.bool), LATE, draw())
-    assert plan.edit.rows_after == 0
-    assert len(plan.edit.apply(scene)) == 0
-
-
-def test_an_empty_scene_stays_empty():
-    plan = refine().plan(gaussians(0), torch.zeros(0, dtype=torch.bool), LATE, draw())
-    assert (plan.edit.rows_after, plan.selected, plan.pruned) == (0, 0, 0)
 
 
 # The cap.

@@ -9,7 +9,6 @@ import io
 import pickle
 import sys
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import pytest
@@ -21,7 +20,7 @@ from torch.nn import Parameter, ParameterDict
 
 pytest.importorskip("gsplat", reason="pip install -e .[dev]")
 
-from gsplat import DefaultStrategy, MCMCStrategy
+from gsplat import DefaultStrategy
 
 from cadam3d.build import component
 from cadam3d.core.errors import UserError
@@ -270,36 +269,6 @@ def test_selections_counts_and_resets_are_those_of_densifier_cadam_on_the_same_g
     assert len(trainer) > 24
 
 
-@pytest.mark.parametrize("strategy", [DefaultStrategy, partial(CAdamStrategy, min_age=2)])
-def test_one_line_of_a_trainer_for_default_strategy_changes(strategy):
-    torch.manual_seed(0)
-    trainer = Trainer(strategy(**SHORT))
-    for step in range(6):
-        trainer.step(step)
-    assert len(trainer) > 24
-
-
-class Calls(MCMCStrategy):
-    """Records the calls that a trainer makes."""
-
-    def step_pre_backward(self, *args, **kwargs):
-        self.pre = (args, kwargs)
-
-    def step_post_backward(self, *args, **kwargs):
-        self.post = (args, kwargs)
-
-
-def test_the_calls_for_mcmc_strategy_fit_too():
-    """The kernels of MCMCStrategy need a GPU, so its calls are recorded and then compared."""
-    calls = Calls()
-    Trainer(calls).step(0)
-    inspect.signature(MCMCStrategy.step_post_backward).bind(calls, *calls.post[0], **calls.post[1])
-    strategy = CAdamStrategy()
-    for method, (args, kwargs) in (("step_pre_backward", calls.pre), ("step_post_backward", calls.post)):
-        inspect.signature(getattr(strategy, method)).bind(*args, **kwargs)
-        getattr(strategy, method)(*args, **{**kwargs, "state": strategy.initialize_state()})
-
-
 def test_a_loop_for_mcmc_strategy_need_not_call_the_strategy_before_the_backward_pass():
     gradients = noise(4, 10)
     toy = Toy(CAdamStrategy())
@@ -382,15 +351,6 @@ def test_sparse_gradients_are_observed_like_dense_ones():
     assert_observed(toy.state, gradients)
 
 
-def test_a_gradient_that_is_not_finite_is_left_out():
-    gradients = noise(5, 10)
-    gradients[2, 4, 1] = float("inf")
-    toy = Toy(CAdamStrategy())
-    for step, gradient in enumerate(gradients):
-        toy.step(step, gradient)
-    assert_observed(toy.state, gradients[[0, 1, 3, 4]])
-
-
 class Masked(torch.optim.Adam):
     """An optimizer that calls the step of its parent, whose hooks torch then runs a second time."""
 
@@ -421,19 +381,6 @@ def test_a_step_of_the_optimizer_that_fails_does_not_end_the_observation(monkeyp
     for step in (1, 2):
         toy.step(step, gradients[step])
     assert_observed(toy.state, gradients)
-
-
-def test_a_trainer_that_calls_the_strategy_before_the_optimizer_loses_the_gradients_that_gsplat_drops():
-    """Operations of gsplat replace the parameters, so the optimizer does not get these gradients either."""
-    torch.manual_seed(0)
-    strategy = CAdamStrategy(refine_start_iter=0, refine_every=3, min_age=0, tau_Q=0.5, grow_scale3d=1e9)
-    toy = Toy(strategy)
-    for step, gradient in enumerate(noise(5, 10)):
-        toy.strategy.step_pre_backward(**toy.shared, step=step)
-        toy.loss(torch.cat([gradient, torch.ones(len(toy.params["means"]) - 10, 3)])).backward()
-        toy.strategy.step_post_backward(**toy.shared, step=step)
-        toy.optimize()
-    assert toy.state["age"].tolist() == [4] * 10 + [1] * 5
 
 
 # Rows and states.
@@ -487,16 +434,6 @@ def test_the_state_of_the_last_call_is_updated():
     assert_observed(toy.state, gradients[1:])
 
 
-def test_nothing_is_observed_after_the_last_refinement():
-    gradients = noise(5, 10)
-    toy = Toy(CAdamStrategy(refine_stop_iter=3))
-    for step, gradient in enumerate(gradients):
-        toy.step(step, gradient)
-    assert_observed(toy.state, gradients[:3])
-    assert not toy.optimizers["means"]._optimizer_step_pre_hooks
-    assert not toy.optimizers["means"]._optimizer_step_post_hooks
-
-
 def test_a_state_that_was_loaded_on_another_device_follows_the_gaussians():
     toy = Toy(CAdamStrategy())
     toy.step(0, torch.ones(10, 3))
@@ -504,22 +441,6 @@ def test_a_state_that_was_loaded_on_another_device_follows_the_gaussians():
     toy.optimizers["means"].param_groups[0]["params"] = [toy.params["means"].to("meta")]
     toy.strategy.step_pre_backward(**toy.shared, step=1)
     assert {toy.state[name].device.type for name in ("m", "v", "age", "radii")} == {"meta"}
-
-
-class Selective(torch.optim.SGD):
-    """Takes a mask in its step, as SelectiveAdam of gsplat does, whose kernel needs a GPU."""
-
-    def step(self, visibility):
-        super().step()
-
-
-def test_an_optimizer_whose_step_takes_a_mask_is_observed():
-    gradients = noise(3, 10)
-    toy = Toy(CAdamStrategy(), kind=Selective)
-    toy.optimize = lambda: [each.step(torch.ones(10)) or each.zero_grad() for each in toy.optimizers.values()]
-    for step, gradient in enumerate(gradients):
-        toy.step(step, gradient)
-    assert_observed(toy.state, gradients)
 
 
 def test_a_new_optimizer_is_found():
@@ -565,13 +486,6 @@ def test_large_gaussians_are_split_and_their_children_are_newborns():
     assert sorted(toy.state["age"].tolist()) == [0] * 10 + [1] * 5
     assert not toy.state["m"][toy.state["age"] == 0].any()
     assert toy.state["m"][toy.state["age"] == 1].all()
-
-
-def test_lengths_are_in_units_of_the_scene():
-    toy = Toy(growing(grow_scale3d=0.1))
-    toy.state["scene_scale"] = 100.0
-    toy.step(1, noise(1, 10)[0])
-    assert toy.state["age"].tolist() == [1] * 10 + [0] * 5, "all were cloned"
 
 
 def test_faint_gaussians_are_pruned_at_refinements_and_large_ones_after_the_first_reset():
@@ -635,24 +549,6 @@ def test_opacities_that_are_not_trained_are_not_reset():
     assert torch.equal(toy.params["opacities"], before)
 
 
-def test_nothing_is_pruned_below_an_opacity_of_zero():
-    toy = Toy(growing(prune_opa=0))
-    with torch.no_grad():
-        toy.params["opacities"].fill_(-99.0)
-    toy.step(1, noise(1, 10)[0])
-    assert len(toy.params["means"]) == 15
-
-
-def test_verbose_says_what_happened(capsys):
-    toy = Toy(growing(verbose=True, reset="all", refine_every=2, reset_every=2, reset_min_age=0))
-    for step in range(3):
-        toy.step(step, noise(1, 10)[0])
-    assert capsys.readouterr().out.splitlines() == [
-        "Step 2: cloned 5 and split 0 of 10 Gaussians, pruned 0. Now there are 15.",
-        "Step 2: reset the opacity of 15 of 15 Gaussians.",
-    ]
-
-
 # Mistakes.
 
 
@@ -661,12 +557,6 @@ def test_the_settings_of_default_strategy_keep_their_names_and_defaults():
     own = inspect.signature(CAdamStrategy).parameters
     assert {name: own[name].default for name in theirs} == {name: theirs[name].default for name in theirs}
     assert CAdamStrategy().cadam() == replace(CAdamStrategy(refine_every=50).cadam(), reset_min_age=100)
-
-
-def test_settings_without_effect_are_accepted_with_a_warning():
-    """Nerfstudio's splatfacto passes them to the strategy."""
-    with pytest.warns(UserWarning, match="ignores grow_grad2d and absgrad, because"):
-        CAdamStrategy(grow_grad2d=0.0008, absgrad=True)
 
 
 @pytest.mark.parametrize(
@@ -711,37 +601,6 @@ def test_a_trainer_that_steps_other_optimizers_is_stopped_at_the_first_refinemen
             toy.strategy.step_post_backward(**toy.shared, step=step)
     with pytest.raises(UserError, match=r"optimizers: .*that the trainer steps.*none in 3 training steps"):
         toy.strategy.step_post_backward(**toy.shared, step=3)
-
-
-def test_without_an_optimizer_of_the_means_the_message_says_so():
-    toy = Toy(CAdamStrategy())
-    del toy.optimizers["means"]
-    with pytest.raises(UserError, match='optimizers: expected an optimizer of "means"'):
-        toy.strategy.step_pre_backward(**toy.shared, step=0)
-
-
-class Wrapper(torch.optim.Optimizer):
-    """Has the class but not the hooks of an optimizer, like the wrapper of accelerate."""
-
-    def __init__(self, optimizer):
-        self.optimizer = optimizer
-
-
-def test_a_wrapper_of_an_optimizer_is_refused_with_the_way_to_unwrap_it():
-    toy = Toy(CAdamStrategy())
-    whole, optimizer = dict(toy.optimizers), toy.optimizers["means"]
-    toy.optimizers["means"] = Wrapper(optimizer)
-    with pytest.raises(UserError, match=r"itself.*got 'a wrapper of class Wrapper'") as caught:
-        toy.strategy.step_pre_backward(**toy.shared, step=0)
-    exec(str(caught.value).partition("Try: ")[2], {"optimizers": toy.optimizers})
-    assert toy.optimizers == whole
-    toy.step(0, torch.ones(10, 3))
-
-
-def test_without_radii_the_message_names_the_setting_that_needs_them():
-    toy = Toy(CAdamStrategy(refine_scale2d_stop_iter=9))
-    with pytest.raises(UserError, match=r"info: expected height, radii, .*Try: .*refine_scale2d_stop"):
-        toy.step(0, torch.ones(10, 3))
 
 
 @pytest.mark.parametrize("missing", [("gsplat",), ("gsplat", "gsplat.strategy")])

@@ -87,15 +87,6 @@ def test_a_child_can_take_the_place_of_its_parent():
     assert len(tracker) == 4
 
 
-def test_all_gaussians_may_vanish_and_others_may_appear():
-    tracker = tracker_of(noise(2, 3))
-    tracker.keep(torch.zeros(3, dtype=torch.bool))
-    tracker.observe(torch.zeros(0, 3))
-    assert len(tracker.select()) == 0
-    tracker.append(2)
-    assert tracker.state.age.tolist() == [0, 0]
-
-
 @pytest.mark.parametrize(
     "convert",
     [torch.Tensor.to_sparse, lambda gradient: gradient.to_sparse(1), torch.Tensor.double],
@@ -109,15 +100,6 @@ def test_the_format_of_the_gradient_does_not_matter(convert):
         other.observe(convert(gradient))
     assert torch.equal(tracker.state.m, other.state.m)
     assert torch.equal(tracker.state.v, other.state.v)
-
-
-def test_a_gradient_that_is_not_finite_changes_nothing():
-    tracker = tracker_of(noise(5, N))
-    before = tracker.state_dict()
-    gradient = noise(1, N)[0]
-    gradient[3, 1] = float("nan")
-    tracker.observe(gradient)
-    assert all(torch.equal(rows, before[name]) for name, rows in tracker.state_dict().items())
 
 
 def test_the_moments_move_to_another_device():

@@ -67,10 +67,6 @@ def test_the_reference_is_the_fallback_and_gives_the_reason(monkeypatch):
     assert brightest(AutoRasterizer()) > 0
 
 
-def test_the_reference_has_no_reason_if_nothing_faster_exists():
-    assert AutoRasterizer().prepare(torch.device("meta")) == Backend("reference", reason=None)
-
-
 def test_the_choice_for_a_device_is_made_once(monkeypatch):
     choices = []
 
@@ -83,19 +79,6 @@ def test_the_choice_for_a_device_is_made_once(monkeypatch):
     brightest(AutoRasterizer())
     AutoRasterizer().prepare(CPU)
     assert choices == [CPU]
-
-
-def test_the_choice_is_not_made_before_it_is_needed(monkeypatch):
-    def fastest(device):
-        raise AssertionError("the choice is too early")
-
-    monkeypatch.setattr(auto, "FASTEST", {"cpu": {"cpu": fastest}})
-    AutoRasterizer()
-
-
-@pytest.mark.parametrize("device", ["cpu", "mps", "meta", "cuda"])
-def test_there_is_a_backend_for_every_device(device):
-    assert AutoRasterizer().prepare(torch.device(device)).name in ("cpu", "cuda", "gsplat", "reference")
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
@@ -121,14 +104,6 @@ def test_auto_also_renders_ahead_with_the_chosen_rasterizer(monkeypatch):
     arguments = a_ball(), cameras, torch.zeros(1, 3)
     assert AutoRasterizer().render_ahead(*arguments).overflowed
     assert AutoRasterizer().render(*arguments).overflowed is None
-
-
-def test_a_rasterizer_that_cannot_render_ahead_just_renders():
-    cameras = turntable(2, elevation_deg=10.0, distance=2.0, fov_y_deg=40.0, size=8)
-    arguments = a_ball(), cameras, torch.rand(2, 3)
-    ahead, exact = ReferenceRasterizer().render_ahead(*arguments), ReferenceRasterizer().render(*arguments)
-    assert ahead.overflowed is None
-    assert torch.equal(ahead.rgb, exact.rgb)
 
 
 def test_a_subclass_that_overrides_render_alone_also_trains_with_it(monkeypatch):
@@ -240,13 +215,6 @@ def test_a_device_that_a_crash_made_unusable_is_refused(a_gpu, monkeypatch):
         choose(GPU)
 
 
-def test_kernels_that_do_not_compile_are_not_tested(a_gpu, monkeypatch):
-    tested = a_gpu(raising(AssertionError("tested")))
-    monkeypatch.setattr(CudaRasterizer, "prepare", lambda self, device: refuse(device))
-    assert choose(GPU).backend.reason == f"no compiler. {NO_GSPLAT}"
-    assert not tested
-
-
 # -------------------------------------------------------------------------- gsplat, if ours do not work
 
 NO_GSPLAT = "rasterizer=gsplat: expected the package gsplat, got none. Try: pip install 'cadam3d[gsplat]'"
@@ -268,12 +236,6 @@ def with_gsplat(a_gpu, monkeypatch):
         return tested
 
     return behave
-
-
-def test_gsplat_is_not_touched_while_our_kernels_work(with_gsplat, agreement):
-    tested = with_gsplat(cuda=lambda: agreement, gsplat=raising(AssertionError("tested")))
-    assert choose(GPU).backend == Backend("cuda", reason=None)
-    assert tested == [("cuda", OWN)]
 
 
 def test_gsplat_replaces_kernels_that_fail_and_one_note_tells_which_and_why(with_gsplat, agreement, capsys):

@@ -50,20 +50,6 @@ def test_memory_is_measured_beside_the_sum_of_the_arrays(tmp_path, capsys):
     assert "bytes per Gaussian" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("words", [["--counts", "0"], ["--threads", "-1"]])
-def test_a_number_that_makes_no_sense_is_one_message(words, capsys):
-    with pytest.raises(SystemExit):
-        bench_large.main(words)
-    assert "expected whole numbers >= 1" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("key", ["--base", "--json"])
-def test_a_folder_that_does_not_exist_is_one_message_before_any_measurement(key, tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        bench_large.main([key, str(tmp_path / "missing" / "large.json")])
-    assert f"{key}: expected" in capsys.readouterr().err
-
-
 def test_costs_count_the_slots_of_a_pass_of_this_rasterizer_only(cpu):
     gaussians = make_gaussians(200).map(lambda tensor: tensor.requires_grad_())
     scene = gaussians, make_cameras(2, 40, 40), backgrounds(2)

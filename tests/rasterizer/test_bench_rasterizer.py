@@ -18,12 +18,11 @@ from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.launcher import Launcher
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import GSPLAT, Agreement
-from cadam3d.rasterizer.workspace import Workspace
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))  # as Python does for a script
 
 import bench_rasterizer
-from rasterizer_bench import check, report, stages, targets, timing
+from rasterizer_bench import check, stages, timing
 from rasterizer_bench.scenes import make_scene, make_shell
 
 CPU = torch.device("cpu")
@@ -202,11 +201,6 @@ def test_a_step_without_enough_memory_is_repeated():
         assert torch.equal(got[name], gradient), name
 
 
-def test_without_a_check_every_backend_is_timed(capsys):
-    assert run([*TINY, "--no-check"], {"reference": ReferenceRasterizer()}) == 0
-    assert "check" not in capsys.readouterr().out
-
-
 def test_a_sort_that_is_wrong_is_found(emulator, monkeypatch):
     assert not check.check_long_sort(emulator, CPU, 5000)
     sort = check.sort
@@ -234,12 +228,6 @@ def test_gsplat_is_checked_with_its_own_demands(monkeypatch):
     assert tested == [GSPLAT]
 
 
-def test_gsplat_is_skipped_where_it_cannot_run(capsys):
-    backends = bench_rasterizer.make_backends(["gsplat", "reference"], CPU)
-    assert list(backends) == ["reference"]
-    assert "gsplat is skipped: rasterizer=gsplat: expected a CUDA device" in capsys.readouterr().out
-
-
 # -------------------------------------------------------------------------- timing
 
 
@@ -256,15 +244,6 @@ def test_a_backend_that_runs_out_of_memory_does_not_stop_the_others(capsys):
     timings = timing.take_turns(backends, make_scene(make_shell(20, 0, CPU), 9, 1), 1)
     assert timings["auto"] is None
     assert timings["reference"] is not None
-
-
-def test_every_repetition_starts_without_gradients():
-    scene = make_scene(make_shell(20, 1, CPU), 9, 1)
-    scene.backward(scene.render(ReferenceRasterizer()))
-    once = {name: tensor.grad.clone() for name, tensor in scene.gaussians.tensors().items()}
-    timing.time_phases(ReferenceRasterizer(), scene)
-    for name, tensor in scene.gaussians.tensors().items():
-        torch.testing.assert_close(tensor.grad, once[name])
 
 
 # -------------------------------------------------------------------------- stages
@@ -289,186 +268,7 @@ def test_every_launch_belongs_to_a_known_stage(emulator):
     assert kernels["project backward"] == ["project_backward_4", "centre_backward"]
 
 
-def test_the_load_of_a_scene_is_counted(emulator):
-    clock = stages.LaunchClock(emulator)
-    gaussians = make_shell(1, 0, CPU).detach()
-    gaussians.means.zero_()
-    # The splat is larger than the screen, so it touches every tile in both views.
-    gaussians.log_scales.fill_(1.0)
-    scene = make_scene(gaussians.map(lambda tensor: tensor.requires_grad_()), 20, 2)
-    scene.render(stages.KernelRasterizer(clock))
-    load = stages.measure_load(ReferenceRasterizer(), scene, clock.slots)
-    assert load == stages.Load(
-        gaussians=1, coefficients=1, views=2, visible=2, slots=18, pixels=800, tiles=18
-    )
-
-
-def test_the_bytes_of_a_stage_are_those_of_its_arguments(emulator, monkeypatch):
-    """If every pair is visible and in one tile, a stage needs exactly the bytes of its arguments."""
-    # An argument is an address, which either a tensor or a workspace has given out.
-    sizes, scales = {}, Scales(emulator)
-    point, places = torch.Tensor.data_ptr, Workspace.addresses
-
-    def note_tensor(tensor):
-        address = point(tensor)
-        sizes[address] = tensor.nbytes
-        return address
-
-    def note_arrays(workspace, blocks):
-        found = places(workspace, blocks)
-        sizes.update({found[name]: size for name, size in workspace.sizes.items() if size})
-        return found
-
-    monkeypatch.setattr(torch.Tensor, "data_ptr", note_tensor)
-    monkeypatch.setattr(Workspace, "addresses", note_arrays)
-    scales.sizes = sizes
-    # With many splats, the bytes of cameras, bins and ranges hardly count.
-    n = 2000
-    gaussians = make_shell(n, 1, CPU).detach()
-    gaussians.means.mul_(0.02)
-    gaussians.log_scales.fill_(-9.0)
-    gaussians.opacity_logits.fill_(-2.0)
-    scene = make_scene(gaussians.map(lambda tensor: tensor.requires_grad_()), 7, 1)  # one tile
-    scene.backward(scene.render(stages.KernelRasterizer(scales)))
-    load = stages.measure_load(ReferenceRasterizer(), scene, scales.slots)
-    assert load.visible == load.slots == n
-    needed, given = stages.stage_bytes(load), dict.fromkeys(stages.STAGES, 0)
-    names = [kernel.name for kernel in scales.launches]
-    for stage, size in zip(stages.stages_of(names), scales.given, strict=True):
-        given[stage] += size
-    for stage in stages.STAGES:
-        assert needed[stage] == pytest.approx(given[stage], rel=0.1), stage
-
-
-class Scales(stages.LaunchClock):
-    """Notes the bytes of the arrays of each launch."""
-
-    def __init__(self, inner):
-        super().__init__(inner)
-        self.sizes, self.given = {}, []
-
-    def _launch(self, launch, kernel, blocks, threads, *arguments):
-        super()._launch(launch, kernel, blocks, threads, *arguments)
-        self.given.append(sum(self.sizes.get(each, 0) for each in arguments))
-
-
-def test_kernels_that_a_profiler_has_seen_become_stages(emulator):
-    """The profiler of a GPU also sees kernels of torch; durations are those that it gives."""
-    scene = make_scene(make_shell(60, 0, CPU), 20, 2)
-    clock = stages.LaunchClock(emulator)
-
-    def profiled(work):
-        # The clock of the stages counts the launches, too.
-        names = [kernel.name for kernel in clock.watch(work)]
-        return [stages.Kernel("Memset (Device)", 5.0), *(stages.Kernel(name, 0.25) for name in names)]
-
-    timing = stages.time_stages(clock, scene, 3, 1e6, profiled)
-    by_stage = {stage.stage: stage for stage in timing.stages}
-    for name in stages.STAGES:
-        assert by_stage[name].median_ms == 0.25 * by_stage[name].launches > 0
-    assert (by_stage[stages.TORCH].launches, by_stage[stages.TORCH].median_ms) == (1, 5.0)
-    assert timing.kernel_ms == sum(by_stage[name].median_ms for name in (*stages.STAGES, stages.TORCH))
-    assert by_stage[stages.REST].median_ms == timing.wall_ms - timing.kernel_ms
-
-
-def test_a_torch_that_cannot_profile_kernels_is_reported(monkeypatch):
-    monkeypatch.setattr(torch.profiler, "supported_activities", set)
-    with pytest.raises(stages.NoKernelsError, match="of this torch cannot time kernels"):
-        stages.profile(lambda: None)
-
-
-def test_kernels_that_the_profiler_has_missed_are_reported(emulator):
-    scene = make_scene(make_shell(60, 0, CPU), 20, 2)
-    for lost in (1, 1000):
-
-        def incomplete(work, lost=lost):
-            work()
-            return [stages.Kernel("blend_forward", 0.1)] * max(0, 20 - lost)
-
-        with pytest.raises(stages.NoKernelsError, match=r"has seen \d+ of \d+ kernels"):
-            stages.time_stages(emulator, scene, 1, 1e6, incomplete)
-
-
 # -------------------------------------------------------------------------- targets
 
 
-def rows_of(scene, device="NVIDIA H200", **both_ms):
-    timings = {
-        name: timing.Timing(dict.fromkeys(timing.PHASES, ms), dict.fromkeys(timing.PHASES, ms), 2**20)
-        for name, ms in both_ms.items()
-    }
-    return {row.backend: row for row in report.make_rows(scene, timings, device)}
-
-
-@pytest.mark.parametrize(
-    ("scene", "times", "is_met"),
-    [
-        ((1_000_000, 1024, 4, 0), {"cuda": 11.0}, True),
-        ((1_000_000, 1024, 4, 0), {"cuda": 11.1}, False),
-        ((1_000_000, 1024, 4, 0), {"gsplat": 19.8, "cuda": 11.0}, True),
-        ((1_000_000, 1024, 4, 0), {"gsplat": 19.7, "cuda": 11.0}, False),  # 1.79 times as fast
-        ((1_000_000, 1024, 4, 3), {"gsplat": 19.7, "cuda": 11.0}, False),  # the ratio applies to all degrees
-        ((20_000, 512, 1, 0), {"cuda": 0.5}, True),
-        ((20_000, 512, 1, 0), {"cuda": 0.6}, False),
-        ((1_000_000, 1024, 1, 0), {"cuda": 99.0}, None),
-    ],
-)
-def test_targets_are_met_or_missed(scene, times, is_met):
-    row = rows_of(scene, **times)["cuda"]
-    assert row.is_met is is_met
-    assert ("MISSED" in str(row), ": met" in str(row)) == (is_met is False, is_met is True)
-
-
-def test_other_backends_and_unknown_devices_have_no_targets():
-    scene = (1_000_000, 1024, 4, 0)
-    assert rows_of(scene, gsplat=1.0, cuda=1.0)["gsplat"].is_met is None
-    assert rows_of(scene, device="a new card", cuda=99.0)["cuda"].is_met is None
-
-
-def test_targets_grow_with_the_amount_of_work():
-    for table in targets.MOST_MS.values():
-        for size in (512, 1024):
-            by_count = [ms for (_, pixels), ms in sorted(table.items()) if pixels == size]
-            assert by_count == sorted(by_count)
-        assert all(ms < table[count, 1024] for (count, pixels), ms in table.items() if pixels == 512)
-
-
 # -------------------------------------------------------------------------- the command line
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--backends unknown", "invalid choice: 'unknown'"),
-        ("--counts 0", "invalid whole number >= 1 value: '0'"),
-        ("--sizes big", "invalid whole number >= 1 value: 'big'"),
-        ("--degrees 4", "invalid choice: 4"),
-        ("--check-only --no-check", "leave nothing to do"),
-        ("--json nowhere/bench.json", "Try: mkdir -p nowhere"),
-        ("--backends gsplat", "no backend is left"),
-        ("--backends cuda", "rasterizer=cuda: expected a CUDA device, got cpu"),
-        pytest.param(
-            "--device cuda",
-            "torch sees no CUDA device",
-            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is one"),
-        ),
-    ],
-)
-def test_a_mistake_is_reported_in_one_line(words, message, capsys):
-    try:
-        code = bench_rasterizer.main(words.split())
-    except SystemExit as ended:
-        code = ended.code
-    error = capsys.readouterr().err
-    assert code == 2
-    assert message in error
-    assert error.startswith("bench_rasterizer: ")
-    assert error.count("\n") == 1
-
-
-def test_each_device_has_its_own_defaults():
-    cpu, gpu = (bench_rasterizer.parse(["--device", device]) for device in ("cpu", "cuda"))
-    assert (cpu.backends, cpu.counts, cpu.sizes) == (["reference", "cpu"], [3_000, 10_000], [128, 256])
-    assert set(targets.MOST_MS["H200"]) <= {(count, size) for count in gpu.counts for size in gpu.sizes}
-    assert {1, 4} == set(gpu.views)
-    assert bench_rasterizer.parse(["--device", "cuda", "--counts", "5"]).counts == [5]

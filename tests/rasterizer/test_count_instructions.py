@@ -52,28 +52,6 @@ def test_a_loop_is_divided_into_slot_sums_and_pixels():
     assert (slots.slot, slots.sums, slots.pixel, slots.all) == (4, 4, 1.5, 11)
 
 
-def test_a_kernel_without_an_exponential_has_no_slots():
-    listing = LISTING.replace("MUFU.EX2", "MUFU.RCP")
-    assert count_instructions.count_kernels(listing, LOG)["blend"].slots is None
-
-
-def test_the_table_has_the_numbers_of_both_trees():
-    before = count_instructions.count_kernels(LISTING, LOG)
-    now = count_instructions.count_kernels(
-        LISTING.replace(".blend", ".blend_8x8"), LOG.replace("'blend'", "'blend_8x8'")
-    )
-    text = count_instructions.as_text(90, {"base": before, "here": now})
-    assert "| `blend_8x8` | 14, 14 | 54, 54 | 8, 8 | 6144, 6144 |" in text
-    assert "| `blend_8x8` | 4, 4 | 4, 4 | 1.5, 1.5 | 11, 11 |" in text
-
-
-def test_a_missing_disassembler_is_reported_with_what_to_install(monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["count_instructions.py"])
-    monkeypatch.setattr(count_instructions, "find_nvdisasm", lambda: None)
-    with pytest.raises(SystemExit, match="Try: pip install nvidia-cuda-nvrtc nvidia-cuda-nvdisasm"):
-        count_instructions.main()
-
-
 @pytest.mark.slow
 def test_the_kernels_are_counted(monkeypatch, capsys):
     if find_compiler() is None or count_instructions.find_nvdisasm() is None:

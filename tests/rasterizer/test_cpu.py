@@ -20,7 +20,6 @@ from splats import (
 )
 
 from cadam3d.compiled.build import load
-from cadam3d.core.errors import UserError
 from cadam3d.rasterizer.cpu import instruction_set, rasterize
 
 
@@ -107,8 +106,3 @@ def test_narrower_vectors_and_groups_of_one_view_agree(kernel_build, build_with_
         for absgrad in (False, True):
             scene = make_gaussians(150, degree=1), make_cameras(views, 40, 50)
             assert_agrees(partial(rasterize, kernels), *scene, absgrad=absgrad)
-
-
-def test_rendering_off_the_cpu_is_refused_with_a_hint(cpu):
-    with pytest.raises(UserError, match="rasterizer=auto"):
-        cpu.render(make_gaussians(3).to("meta"), make_cameras(1, 9, 9), backgrounds(1))

@@ -67,11 +67,6 @@ def test_the_bits_of_tiles_of_8x4_do_not_depend_on_the_schedule_of_threads(emula
     assert_same_bits(*results)
 
 
-def test_only_small_images_have_small_tiles(monkeypatch):
-    monkeypatch.undo()
-    assert [cuda.tile_height(size, size) for size in (1, 112, 256, 257, 512)] == [4, 4, 4, 8, 8]
-
-
 @pytest.fixture(scope="module")
 def rough(build_cache, tmp_path_factory):
     """Return the kernels with results of the fast exponential and reciprocal that are off by some bits."""
@@ -148,19 +143,6 @@ def test_rendering_ahead_does_not_wait_for_the_device():
     report = find_forecast(gaussians.device, 2, 64, 64).report
     torch.cuda.synchronize()
     assert int(report) >> 32 == 1000, "kernels write what they count to memory of the host"
-
-
-def test_rendering_on_a_cpu_is_refused_with_a_hint():
-    with pytest.raises(UserError, match="rasterizer=auto"):
-        CudaRasterizer(cache_dir=None).render(make_gaussians(1), make_cameras(1, 9, 9), backgrounds(1))
-    with pytest.raises(UserError, match="rasterizer=auto"):
-        CudaRasterizer(cache_dir=None).prepare(CPU)
-
-
-def test_a_missing_cuda_device_is_reported_before_anything_is_compiled(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(UserError, match="sees no CUDA device"):
-        CudaRasterizer(cache_dir=None).prepare(torch.device("cuda"))
 
 
 # -------------------------------------------------------------------------- the parts

@@ -175,15 +175,6 @@ def test_a_forecast_remembers_the_largest_of_the_recent_renders():
     assert one.capacity(1000) < 0.4 * largest
 
 
-def test_a_forecast_takes_few_different_values():
-    one = Forecast(CPU)
-    values = set()
-    for slots in range(100_000, 200_000, 500):
-        one.learn(slots, 1000)
-        values.add(one.capacity(1000))
-    assert len(values) < 12
-
-
 def test_a_report_counts_once():
     """Renders that do not go ahead make no report, so the last one must not keep them from it for ever."""
     one = Forecast(CPU)
@@ -268,12 +259,6 @@ def test_a_compiled_function_may_render(emulator, monkeypatch):
 
 
 # -------------------------------------------------------------------------- the default device
-
-
-def test_another_default_device_of_torch_changes_no_report():
-    with torch.device("meta"):
-        report = Forecast(CPU).report
-    assert report.device == CPU, "the host reads its address"
 
 
 # -------------------------------------------------------------------------- memory

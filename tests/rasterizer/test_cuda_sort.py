@@ -59,14 +59,6 @@ def test_prefix_sums_are_exact_up_to_32_bits(emulator, name):
             check_scan(emulator, n)
 
 
-def test_long_prefix_sums_take_two_kernels(emulator):
-    launched = []
-    n = cuda_sort.FEW_NUMBERS + 1
-    cuda_sort.scan(lambda kernel, *_: launched.append(kernel), 0, 0, n, 0)
-    assert launched == ["scan_reduce", "scan_apply"]
-    check_scan(emulator, n)
-
-
 @pytest.mark.parametrize("name", LAYOUTS)
 @pytest.mark.parametrize("n", [2, 300, 9000])
 def test_prefix_sums_saturate(emulator, name, n):
@@ -105,17 +97,6 @@ def test_bits_above_the_lowest_are_not_compared(emulator):
     want = (keys % 32).sort(stable=True).indices
     assert torch.equal(order.long(), want)
     assert torch.equal(got.long(), keys[want]), "whole keys are moved"
-
-
-def test_no_digit_is_too_wide_and_none_could_be_saved():
-    for bits in range(1, 33):
-        widths = cuda_sort.digit_bits(bits)
-        assert sum(widths) == bits
-        assert max(widths) - min(widths) <= 1
-        assert max(widths) <= cuda_sort.DIGIT_BITS
-        assert len(widths) == -(-bits // cuda_sort.DIGIT_BITS)
-    assert cuda_sort.digit_bits(17) == [9, 8]
-    assert cuda_sort.digit_bits(32) == [11, 11, 10]
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
@@ -165,17 +146,6 @@ def launches(capacity: int, bits: int) -> list[tuple]:
     launched = []
     cuda_sort.sort(lambda *each: launched.append(each), 0, 0, capacity, bits, (0, 0, 2**40))
     return launched
-
-
-def test_few_keys_are_sorted_with_few_launches():
-    kernels = {
-        (n, bits): [name for name, *_ in launches(n, bits)]
-        for n in (20_000, 300_000, 10**7)
-        for bits in (13, 32)
-    }
-    assert kernels[20_000, 32] == ["sort_scatter"] * 3
-    assert kernels[300_000, 13] == ["sort_count", "sort_scatter"] * 2
-    assert kernels[10**7, 32] == ["sort_count", "sort_columns", "sort_scatter"] * 3
 
 
 def test_memory_for_many_keys_is_enough_for_fewer():

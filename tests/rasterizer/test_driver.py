@@ -16,11 +16,7 @@ from cadam3d.compiled.build import find_compiler
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import driver
 from cadam3d.rasterizer.cuda import (
-    BLEND_BLOCK,
-    MOST,
-    WARP,
     CudaRasterizer,
-    _launch_each,
     _start_reading,
     rasterize,
 )
@@ -103,13 +99,6 @@ def test_a_missing_driver_is_reported_with_a_hint(monkeypatch):
         load_driver()
 
 
-def test_arguments_are_packed_with_eight_bytes_each(stub):
-    numbers = [2**40, 0, -1, 2**63 - 1]
-    with Module(stub, 0, b"").launching(0) as launch:
-        launch("works", 1, 32, *numbers)
-    assert list((ctypes.c_longlong * 32).in_dll(stub, "stub_arguments"))[:4] == numbers
-
-
 def test_two_threads_never_share_a_buffer_of_arguments(stub):
     module = Module(stub, 0, b"")
     with module.launching(0) as one, module.launching(0) as other:
@@ -188,15 +177,6 @@ def test_kernels_run_on_the_given_device_and_its_current_stream(stub, built, tmp
     assert launched(stub) == {"blocks": 70_000, "threads": 256, "stream": stream, "context": context}
 
 
-def test_kernels_are_loaded_once_for_each_device(stub, built, tmp_path):
-    everywhere = driver.Driver(tmp_path)
-    for device in ("cuda:0", "cuda:1", "cuda", "cuda:1"):
-        with everywhere.on(torch.device(device)) as launch:
-            launch("works", 1, 1)
-    assert built == [(8, 0), (8, 1)]
-    assert launched(stub)["context"] == 101
-
-
 def streams_of_a_step(stub, launcher, stream: int) -> set[int]:
     """Return the streams of all launches of a forward and backward pass while ``stream`` is current."""
     torch.cuda.stream = stream
@@ -231,19 +211,6 @@ class Recorder:
         return lambda *arguments: self.names.append(name) or function(*arguments)
 
 
-def test_a_step_that_is_not_the_first_only_launches_kernels(stub, built, tmp_path, monkeypatch):
-    """A CUDA graph may record launches, but no other work of a step."""
-    recorder = Recorder(stub)
-    monkeypatch.setattr(driver, "load_driver", lambda: recorder)
-    launcher = driver.Driver(tmp_path)
-    streams_of_a_step(stub, launcher, 2**41)
-    recorder.names.clear()
-    streams_of_a_step(stub, launcher, 2**41)
-    assert set(recorder.names) == {"cuCtxPushCurrent_v2", "cuCtxPopCurrent_v2", "cuLaunchKernel"}
-    # One context for the forward pass, and one for each of the two functions of the backward pass.
-    assert recorder.names.count("cuCtxPushCurrent_v2") == 3
-
-
 def test_counts_are_copied_and_waited_for_on_the_current_stream(monkeypatch):
     log, fake = [], FakeCuda()
 
@@ -276,16 +243,6 @@ def test_counts_are_copied_and_waited_for_on_the_current_stream(monkeypatch):
     assert log == [("copy", 2**41, True), ("record", 2**41)]
     assert read() == [3, 4]
     assert log[2:] == ["wait"]
-
-
-def test_the_largest_grid_has_one_dimension(stub):
-    blocks = []
-    _launch_each(lambda kernel, count, *_: blocks.append(count), "any", MOST * WARP, BLEND_BLOCK)
-    assert blocks == [-(-MOST * WARP // BLEND_BLOCK)]
-    assert 65535 < blocks[0] < 2**31
-    with Module(stub, 0, b"").launching(0) as launch:
-        launch("works", blocks[0], BLEND_BLOCK)
-    assert launched(stub)["blocks"] == blocks[0]
 
 
 # -------------------------------------------------------------------------- on real devices

@@ -14,7 +14,6 @@ from emulation import content_hash, make_once
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import base, nvrtc
 from cadam3d.rasterizer.nvrtc import build, choose_architecture, compile_kernels, find_compiler
-from cadam3d.rasterizer.sources import KERNELS
 
 pytestmark = pytest.mark.slow
 
@@ -61,10 +60,6 @@ def compiler():
     if found is None:
         pytest.skip("no NVRTC: pip install nvidia-cuda-nvrtc")
     return found
-
-
-def test_all_architectures_of_the_compiler_are_tested(compiler):
-    assert {each for each in compiler.architectures if each >= 75} <= set(ARCHITECTURES)
 
 
 def compile_verbosely(compiler: nvrtc.Nvrtc, architecture: int, folder: Path) -> str:
@@ -143,13 +138,6 @@ def test_a_compilation_error_is_quoted(compiler, monkeypatch):
         compile_kernels(compiler, compiler.architectures[-1])
 
 
-def test_a_folder_that_cannot_be_written_is_reported_with_its_key(compiler, tmp_path, monkeypatch):
-    monkeypatch.setattr(nvrtc, "compile_kernels", lambda *_: b"")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"rasterizer\.cache_dir="):
-        build(tmp_path / "file", (8, 0))
-
-
 def test_the_cache_distinguishes_compilers_options_and_constants(compiler, monkeypatch):
     keys = {nvrtc._key(compiler), nvrtc._key(replace(compiler, version=(99, 0)))}
     monkeypatch.setattr(nvrtc, "OPTIONS", ())
@@ -157,19 +145,6 @@ def test_the_cache_distinguishes_compilers_options_and_constants(compiler, monke
     monkeypatch.setattr(base, "BLUR", 0.1)
     keys.add(nvrtc._key(compiler))
     assert len(keys) == 4
-
-
-def test_every_source_is_passed_to_the_compiler():
-    assert {path.name for path in KERNELS.glob("*.cuh")} < set(nvrtc.HEADERS)
-    for name in (nvrtc.SOURCE, *nvrtc.HEADERS):
-        for header in re.findall(r'#include [<"](.*)[>"]', (KERNELS / name).read_text()):
-            assert header in nvrtc.HEADERS
-
-
-def test_the_library_of_torchs_cuda_version_comes_first(monkeypatch, tmp_path):
-    monkeypatch.setattr(torch.version, "cuda", "12.8")
-    names = ("libnvrtc.alt.so.12", "libnvrtc.so.13", "libnvrtc.so.12")
-    assert min((tmp_path / name for name in names), key=nvrtc._distance_from_torch).name == "libnvrtc.so.12"
 
 
 @pytest.mark.parametrize(

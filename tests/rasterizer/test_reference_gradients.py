@@ -105,33 +105,6 @@ def test_gradients_of_means2d_add_up_to_the_effect_of_shifting_the_image(output,
     assert grad[1, :, axis].sum().item() == pytest.approx(finite_difference, rel=1e-6)
 
 
-def test_the_gradient_of_means2d_is_that_of_each_single_view():
-    gaussians, views = scene(), cameras()
-    both = render(gaussians, views)
-    both.rgb[1].sum().backward()
-    single = render(gaussians, views.index(slice(1, 2)))
-    single.rgb.sum().backward()
-    assert both.means2d.grad is not None
-    assert single.means2d.grad is not None
-    assert torch.equal(both.means2d.grad[1], single.means2d.grad[0])
-    assert not both.means2d.grad[0].any(), "the other view has no influence"
-
-
-def test_capped_splats_have_a_gradient_for_colour_but_not_for_opacity():
-    gaussians, views = scene().index(slice(0, 1)), cameras()
-    gaussians.means[:] = 0.0
-    gaussians.log_scales[:] = 3.0  # fills the image: capped everywhere
-    gaussians.opacity_logits[:] = 9.0
-    leaves = gaussians.map(lambda tensor: tensor.requires_grad_())
-    output = render(leaves, views)
-    assert torch.allclose(output.alpha, torch.tensor(0.99, dtype=torch.float64))
-    output.rgb.sum().backward()
-    for name in ("log_scales", "quats", "opacity_logits"):
-        assert not getattr(leaves, name).grad.any(), name
-    assert leaves.sh.grad is not None
-    assert leaves.sh.grad.any()
-
-
 def test_the_scene_exercises_the_cap_the_stop_and_the_clamped_jacobian():
     output = render(scene(), cameras())
     assert output.visible.all()

@@ -14,11 +14,6 @@ def test_the_kernels_run(kernel_build):
     assert find_cached(cpu_library(), kernel_build.path.parent, find_compiler()) == kernel_build.path
 
 
-def test_the_constants_of_the_model_are_passed_to_the_compiler():
-    flags = cpu_library().definitions
-    assert [f"-DSPLAT_{name}={getattr(base, name)!r}" for name in CONSTANTS] == list(flags)
-
-
 def test_the_kernels_use_every_constant_of_the_model():
     declared = {name for name, value in vars(base).items() if isinstance(value, float)}
     text = "".join(path.read_text(encoding="utf-8") for path in CPU_SOURCES)
@@ -31,15 +26,6 @@ def test_another_constant_leads_to_another_build(name, monkeypatch):
     before = cpu_library()
     monkeypatch.setattr(sources.base, name, getattr(base, name) / 2)
     assert cpu_library().definitions != before.definitions
-
-
-def test_the_headers_of_the_kernels_are_among_their_sources():
-    included = {
-        name
-        for path in CPU_SOURCES
-        for name in re.findall(r'#include "(.*)"', path.read_text(encoding="utf-8"))
-    }
-    assert included == {path.name for path in CPU_SOURCES[1:]}
 
 
 def test_the_shared_maths_needs_no_header():

@@ -69,12 +69,6 @@ def test_the_density_is_the_sum_of_the_truncated_gaussians():
     torch.testing.assert_close(density(some, grid).flatten().double(), expected, atol=0.02, rtol=0.01)
 
 
-def test_a_node_on_the_mean_of_a_single_gaussian_has_its_opacity():
-    grid = grid_around(torch.tensor([-0.5] * 3), torch.tensor([0.5] * 3), 20)
-    values = density(blobs(at(torch.zeros(1, 3))), grid)
-    assert float(values.max()) == pytest.approx(1 / (1 + math.exp(-3.0)), abs=1e-5)
-
-
 def test_pairs_of_gaussians_and_points_are_complete():
     some = blobs(random_gaussians(40))
     grid = grid_around(torch.tensor([-1.0] * 3), torch.tensor([1.0] * 3), 40)
@@ -141,13 +135,6 @@ def test_a_wall_thinner_than_a_cell_has_no_holes(thin):
     assert corners - edges + len(shape.faces) == 2  # Euler: like a ball, so nothing goes through it
 
 
-def test_a_huge_gaussian_costs_no_more_than_the_grid():
-    huge = at(torch.zeros(1, 3), scale=1e4, logit=-4.0)
-    shape = surface(concatenate([ball(0.5), *[huge] * 3]))
-    assert facts(shape.vertices, shape.faces).watertight
-    assert np.linalg.norm(shape.vertices, axis=1).max() < 0.6
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_simplification_keeps_a_mesh_watertight(seed):
     full = surface(random_gaussians(150, seed), smallest_part=0.0)
@@ -180,13 +167,6 @@ def test_sheets_that_touch_in_an_edge_become_separate():
     assert len(faces) == 8
     assert len(moved) == 8
     assert len(np.unique(moved, axis=0)) == 8
-
-
-def test_a_mesh_with_few_triangles_is_not_simplified():
-    full = surface(ball(0.5))
-    vertices, faces = simplified(full.vertices, full.faces, len(full.faces))
-    assert vertices is full.vertices
-    assert faces is full.faces
 
 
 def test_colours_are_those_in_front_of_the_others():
