@@ -23,11 +23,11 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.rasterizer import cuda, workspace
+from cadam3d.rasterizer.base import KERNELS, definitions
 from cadam3d.rasterizer.cuda import rasterize
 from cadam3d.rasterizer.cuda_sort import scan, scan_bytes, sort, sort_bytes
 from cadam3d.rasterizer.driver import Module
 from cadam3d.rasterizer.launcher import Launch, Launcher
-from cadam3d.rasterizer.sources import KERNELS, definitions
 from cadam3d.rasterizer.workspace import Workspace
 
 SOURCE = Path(__file__).parent / "rasterizer" / "emulator" / "emulator.cpp"

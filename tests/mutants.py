@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-from cadam3d.rasterizer.sources import KERNELS
+from cadam3d.rasterizer.base import KERNELS
 
 # The scenes of the judges have degree 0: kernels for more coefficients would only cost compile time.
 UNUSED = "KERNELS_FOR(4)\nKERNELS_FOR(9)\nKERNELS_FOR(16)\n"

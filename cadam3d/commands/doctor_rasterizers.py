@@ -14,12 +14,11 @@ from cadam3d.io.cache import kernels_dir
 from cadam3d.rasterizer import nvrtc
 from cadam3d.rasterizer.auto import AutoRasterizer
 from cadam3d.rasterizer.base import Rasterizer
-from cadam3d.rasterizer.cpu import CpuRasterizer, instruction_set
+from cadam3d.rasterizer.cpu import CpuRasterizer, cpu_library, instruction_set
 from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import ATOMIC, GSPLAT, OWN, Demands, self_test
-from cadam3d.rasterizer.sources import cpu_library
 
 CPU = torch.device("cpu")
 # Failures that do not end a training, because auto chooses another backend then.

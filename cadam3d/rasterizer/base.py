@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -33,6 +34,13 @@ NEAR = 0.01  # world units
 FAR = 1e15  # world units
 # Outside the image the Jacobian is evaluated at most this share of the image size beyond the border.
 FRUSTUM_MARGIN = 0.15
+CONSTANTS = ("BLUR", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN", "NEAR", "FAR", "FRUSTUM_MARGIN")
+KERNELS = Path(__file__).parent / "kernels"
+
+
+def definitions() -> list[str]:
+    """Return the flags of a compiler that define the constants for native kernels."""
+    return [f"-DSPLAT_{name}={globals()[name]!r}" for name in CONSTANTS]
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.compiled.build import build, load
+from cadam3d.compiled.build import SIMD, Library, Names, build, load
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput
 from cadam3d.io.cache import kernels_dir
-from cadam3d.rasterizer.base import Backend, Rasterizer
+from cadam3d.rasterizer.base import KERNELS, Backend, Rasterizer, definitions
 from cadam3d.rasterizer.native import RenderPass, require_shapes, run_pass
-from cadam3d.rasterizer.sources import cpu_library
+
+SOURCES = (KERNELS / "cpu.cpp", KERNELS / "splat_math.h", SIMD)
+NAMES = Names("rasterizer=cpu", fallback="rasterizer=reference", cache_key="rasterizer.cache_dir")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +53,11 @@ class CpuRasterizer(Rasterizer):
             )
         load_kernels(self.cache_dir)
         return super().prepare(device)
+
+
+def cpu_library() -> Library:
+    """Return the description of the kernels."""
+    return Library("rasterizer", NAMES, SOURCES, tuple(definitions()), "cadam3d_self_test")
 
 
 @cache

@@ -19,10 +19,11 @@ from pathlib import Path
 
 import torch
 
-from cadam3d.compiled.build import build_folder, find_intact, keep, own_folder, short_hash
+from cadam3d.compiled.build import Names, build_folder, find_intact, keep, own_folder, short_hash
 from cadam3d.core.errors import UserError
-from cadam3d.rasterizer.sources import CUDA_NAMES, KERNELS, definitions
+from cadam3d.rasterizer.base import KERNELS, definitions
 
+NAMES = Names("rasterizer=cuda", fallback="rasterizer=reference", cache_key="rasterizer.cache_dir")
 SOURCE = "cuda.cu"
 HEADERS = ("blend.cuh", "device.cuh", "project.cuh", "sort.cuh", "splat_math.h", "tiles.cuh")
 OPTIONS = (
@@ -145,13 +146,13 @@ def build(cache_dir: Path, capability: tuple[int, int]) -> Cubin:
         )
     architecture = choose_architecture(capability, compiler)
     name = f"rasterizer-{_key(compiler)}-sm{architecture}"
-    cache_dir = own_folder(cache_dir, CUDA_NAMES)
+    cache_dir = own_folder(cache_dir, NAMES)
     if cached := find_intact(cache_dir, f"{name}-*.cubin"):
         return Cubin(cached, 0.0)
     start = time.perf_counter()
     code = compile_kernels(compiler, architecture)
     final = cache_dir / f"{name}-{short_hash(code)}.cubin"
-    with build_folder(cache_dir, CUDA_NAMES) as folder:
+    with build_folder(cache_dir, NAMES) as folder:
         path = folder / "rasterizer.cubin"
         path.write_bytes(code)
         keep(path, final)

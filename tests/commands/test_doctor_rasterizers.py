@@ -19,11 +19,10 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.cache import kernels_dir
 from cadam3d.rasterizer import auto, gsplat, nvrtc
 from cadam3d.rasterizer.base import Backend
-from cadam3d.rasterizer.cpu import load_kernels
+from cadam3d.rasterizer.cpu import cpu_library, load_kernels
 from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import ATOMIC, GSPLAT, OWN, Agreement, self_test
-from cadam3d.rasterizer.sources import cpu_library
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
 

@@ -125,24 +125,12 @@ MISTAKES = {
     "rows removed": (lambda tracker: tracker.observe(torch.zeros(4, 3)), r"Try: tracker\.keep\(mask\)$"),
     "screen": (lambda tracker: tracker.observe(torch.zeros(N, 2)), r"shape \(12, 3\).*got \(12, 2\)"),
     "a number": (lambda tracker: tracker.observe(torch.tensor(1.0)), r"shape \(12, 3\).*got \(\)"),
-    "device": (
-        lambda tracker: tracker.observe(torch.zeros(N, 3, device="meta")),
-        r'a gradient on cpu.*got .meta.\. Try: tracker\.to\("meta"\)$',
-    ),
     "short mask": (
         lambda tracker: tracker.keep(torch.ones(3, dtype=torch.bool)),
         "keep: expected a mask of 12",
     ),
     "no such row": (lambda tracker: tracker.follow(torch.tensor([0, N])), "follow: .*from -1 to 11, got"),
     "below": (lambda tracker: tracker.follow(torch.tensor([0, -2])), "follow: .*from -1 to 11, got"),
-    "other state": (
-        lambda tracker: tracker.load_state_dict({"m": torch.zeros(2, 3)}),
-        "load_state_dict: expec",
-    ),
-    "torn state": (
-        lambda tracker: tracker.load_state_dict({**tracker.state_dict(), "m": torch.zeros(2, 3)}),
-        "load_state_dict: expected the tensors m, v, age",
-    ),
 }
 
 

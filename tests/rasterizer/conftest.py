@@ -12,10 +12,9 @@ from splats import Backend
 from cadam3d.compiled import build as build_module
 from cadam3d.compiled.build import Build, build, find_compiler
 from cadam3d.rasterizer import cuda
-from cadam3d.rasterizer.cpu import CpuRasterizer
+from cadam3d.rasterizer.cpu import CpuRasterizer, cpu_library
 from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.rasterizer.sources import cpu_library
 
 # More tiles than any image of the tests has.
 MANY = 10**9

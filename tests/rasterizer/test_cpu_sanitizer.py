@@ -8,7 +8,8 @@ import pytest
 from emulation import content_hash, make_once
 
 from cadam3d.compiled.build import SIMD, find_compiler
-from cadam3d.rasterizer.sources import CPU_SOURCES, KERNELS, definitions
+from cadam3d.rasterizer.base import KERNELS, definitions
+from cadam3d.rasterizer.cpu import SOURCES
 
 PROGRAM = Path(__file__).parent / "cpu_threads.cpp"
 # Without memory that is kept, a sanitizer sees the bounds of every array.
@@ -29,7 +30,7 @@ def compile_with(build_cache, tmp_path):
         for line in ([*command, str(empty), "-o", str(small)], [str(small)]):
             if subprocess.run(line, capture_output=True, check=False).returncode != 0:
                 pytest.skip(f"{' '.join(sanitizer)} does not work here")
-        sources = [PROGRAM, *CPU_SOURCES]
+        sources = [PROGRAM, *SOURCES]
         words = [*command, *definitions(), f"-I{KERNELS}", f"-I{SIMD.parent}", str(PROGRAM)]
         facts = [*words, compiler.version, *(path.read_text(encoding="utf-8") for path in sources)]
 

@@ -23,9 +23,9 @@ from splats import (
 
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import cuda
+from cadam3d.rasterizer.base import KERNELS
 from cadam3d.rasterizer.cuda import CudaRasterizer
 from cadam3d.rasterizer.forecast import find_forecast
-from cadam3d.rasterizer.sources import KERNELS
 
 pytestmark = pytest.mark.usefixtures("garbage_in_new_memory")
 

@@ -8,7 +8,7 @@ from emulation import Emulator, as_signed, as_unsigned, check_sort, passes, scan
 from mutants import NUMBERS, SORTING
 
 from cadam3d.rasterizer import cuda, cuda_sort
-from cadam3d.rasterizer.sources import KERNELS
+from cadam3d.rasterizer.base import KERNELS
 
 pytestmark = pytest.mark.usefixtures("garbage_in_new_memory")
 

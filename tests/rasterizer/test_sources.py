@@ -5,8 +5,9 @@ import re
 import pytest
 
 from cadam3d.compiled.build import find_cached, find_compiler, load
-from cadam3d.rasterizer import base, sources
-from cadam3d.rasterizer.sources import CONSTANTS, CPU_SOURCES, KERNELS, cpu_library
+from cadam3d.rasterizer import base
+from cadam3d.rasterizer.base import CONSTANTS, KERNELS
+from cadam3d.rasterizer.cpu import SOURCES, cpu_library
 
 
 def test_the_kernels_run(kernel_build):
@@ -16,7 +17,7 @@ def test_the_kernels_run(kernel_build):
 
 def test_the_kernels_use_every_constant_of_the_model():
     declared = {name for name, value in vars(base).items() if isinstance(value, float)}
-    text = "".join(path.read_text(encoding="utf-8") for path in CPU_SOURCES)
+    text = "".join(path.read_text(encoding="utf-8") for path in SOURCES)
     assert set(CONSTANTS) == declared
     assert not [name for name in declared if not re.search(rf"(?:Real|float|spread)\(SPLAT_{name}\)", text)]
 
@@ -24,7 +25,7 @@ def test_the_kernels_use_every_constant_of_the_model():
 @pytest.mark.parametrize("name", CONSTANTS)
 def test_another_constant_leads_to_another_build(name, monkeypatch):
     before = cpu_library()
-    monkeypatch.setattr(sources.base, name, getattr(base, name) / 2)
+    monkeypatch.setattr(base, name, getattr(base, name) / 2)
     assert cpu_library().definitions != before.definitions
 
 
