@@ -4,7 +4,7 @@ import pytest
 import torch
 from splats import make_gaussians
 
-from cadam3d.augmentation import LucidAugmentation, NoAugmentation
+from cadam3d.augmentation import LucidAugmentation
 from cadam3d.core.errors import UserError
 from cadam3d.core.render import RenderOutput
 
@@ -26,14 +26,6 @@ def output(size: int = 6) -> RenderOutput:
         means2d=torch.zeros(3, 0, 2),
         radii=torch.zeros(3, 0),
     )
-
-
-def test_no_augmentation_is_the_identity_and_draws_nothing():
-    gaussians, seen, generator = make_gaussians(5), output(), draw()
-    before = generator.get_state()
-    assert NoAugmentation().perturb(gaussians, generator) is gaussians
-    assert NoAugmentation().show(seen, generator) is seen.rgb
-    assert torch.equal(generator.get_state(), before)
 
 
 @pytest.mark.parametrize("noise", [0.1118, 0.02])

@@ -11,11 +11,6 @@ def draw(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def test_a_constant_background_is_its_color_for_every_view():
-    colors = ConstantBackground(color=[0.25, 0.5, 1.0]).sample(3, draw())
-    assert colors.tolist() == [[0.25, 0.5, 1.0]] * 3
-
-
 @pytest.mark.parametrize("probability", [0.0, 0.3, 1.0])
 def test_a_random_background_is_random_with_its_probability(probability):
     constant = torch.tensor([2.0**-20, 0.5, 1.0])

@@ -13,7 +13,6 @@ import os
 import platform
 import shlex
 import shutil
-import stat
 import subprocess
 import sys
 import sysconfig
@@ -158,19 +157,9 @@ def own_folder(cache_dir: Path, names: Names) -> Path:
     if reason:
         raise UserError(
             f"{names.key}: expected a folder for compiled kernels that no other user can write, got "
-            f"{folder} ({reason}). Try: {_own_advice(folder, names)}"
+            f"{folder} ({reason}). Try: {another_cache(names)}"
         )
     return folder
-
-
-def _own_advice(folder: Path, names: Names) -> str:
-    """Return what to type if others can write a folder: take their permission back, or another folder."""
-    # Folders that are meant for all users, such as /tmp, have the sticky bit.
-    with suppress(OSError):
-        facts = folder.stat()
-        if facts.st_uid == os.geteuid() and not facts.st_mode & stat.S_ISVTX:
-            return f"chmod go-w {shlex.quote(str(folder))}"
-    return another_cache(names)
 
 
 def find_intact(cache_dir: Path, pattern: str) -> Path | None:

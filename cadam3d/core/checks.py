@@ -80,9 +80,6 @@ def require_choice(key: str, value: object, choices: Sequence[object]) -> None:
 
 def _nearest(value: object, choices: Sequence[object]) -> str:
     """Return the choice nearest to ``value`` as it is typed, or the first one if none is near."""
-    numbers = [choice for choice in choices if isinstance(choice, int | float)]
-    if numbers and isinstance(value, int | float) and math.isfinite(value):
-        return _written(min(numbers, key=lambda number: abs(number - value)))
     texts = {_written(choice).lower(): _written(choice) for choice in choices}
     near = difflib.get_close_matches(str(value).lower(), list(texts), n=1)
     return texts[near[0]] if near else _written(choices[0])

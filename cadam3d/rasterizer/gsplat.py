@@ -77,6 +77,7 @@ class GsplatRasterizer(Rasterizer):
         return super().prepare(device)
 
 
+@cache
 def load_rasterization(device: torch.device) -> Rasterization:
     """Return ``gsplat.rasterization``, with kernels that run on ``device``.
 
@@ -90,15 +91,6 @@ def load_rasterization(device: torch.device) -> Rasterization:
         raise UserError(
             "rasterizer=gsplat: expected the package gsplat, got none. Try: pip install 'cadam3d[gsplat]'"
         )
-    loaded = _load(device)
-    if isinstance(loaded, str):
-        raise UserError(loaded)
-    return loaded
-
-
-@cache
-def _load(device: torch.device) -> Rasterization | str:
-    """Return ``gsplat.rasterization``, or the message of an error, so that a failed build is not repeated."""
     news = Timer(PATIENCE, print, [LOADING], {"file": sys.stderr, "flush": True})
     news.start()
     try:
@@ -112,17 +104,17 @@ def _load(device: torch.device) -> Rasterization | str:
             torch.cuda.synchronize(device)
             return gsplat.rasterization
     except Exception as error:
-        # A build may raise anything.
+        # A build may raise anything. Without the CUDA toolkit, gsplat loads but has no kernels.
         if getattr(sys.modules.get("gsplat.cuda._backend"), "_C", error) is None:
-            return (
+            raise UserError(
                 "rasterizer=gsplat: expected the CUDA toolkit (nvcc), with which gsplat compiles its kernels "
                 "once, got none. rasterizer=cuda needs no toolkit. Try: rasterizer=reference"
-            )
+            ) from error
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        return (
+        raise UserError(
             f"rasterizer=gsplat: the kernels of gsplat cannot be built or loaded ({reason}). "
             f"This repeats the build and prints all of its output. Try: {SHOW_BUILD}"
-        )
+        ) from error
     finally:
         news.cancel()
 

@@ -150,25 +150,12 @@ def test_two_processes_that_build_at_once_both_get_a_library(library, fake_compi
     assert load(built[0]).test() == 0
 
 
-def test_a_missing_compiler_is_reported_with_what_to_install(library, tmp_path, monkeypatch):
-    remove_compilers(monkeypatch)
-    with pytest.raises(UserError, match=r"apt install g\+\+.*'cadam3d\[compiler\]'"):
-        build(library, tmp_path)
-
-
 def test_a_cached_library_needs_no_compiler(library, fake_compiler, tmp_path, monkeypatch):
     fake_compiler()
     built = build(library, tmp_path / "cache")
     remove_compilers(monkeypatch)
     assert find_cached(library, tmp_path / "cache", None) == built.path
     assert build(library, tmp_path / "cache").path == built.path
-
-
-def test_the_output_of_a_failing_compiler_is_shown(library, fake_compiler, tmp_path):
-    fake_compiler(body="echo 'error: no such thing' >&2; exit 1")
-    with pytest.raises(UserError, match=r"(?s)fake 1\.0.*no such thing.*rasterizer=reference"):
-        build(library, tmp_path / "cache")
-    assert list((tmp_path / "cache").iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -220,7 +207,7 @@ def test_a_folder_that_another_user_can_write_is_refused_with_what_to_type(libra
     for call in (lambda: own_folder(cached.parent, NAMES), lambda: build(library, cached.parent)):
         with pytest.raises(UserError, match="no other user can write") as caught:
             call()
-        advice = "rasterizer.cache_dir=" if mode == 0o1777 else f"chmod go-w {cached.parent}"
+        advice = "rasterizer.cache_dir="
         assert f"Try: {advice}" in str(caught.value).replace("rasterizer=cpu rasterizer.", "rasterizer.")
 
 

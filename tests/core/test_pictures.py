@@ -34,15 +34,6 @@ def test_an_impossible_setting_is_refused_with_the_node_of_its_owner(key, value)
         Postcard(**GIVEN | {key: value})
 
 
-@pytest.mark.parametrize("angles", [[], [91], ["a"], 5, None])
-def test_angles_are_a_list_of_numbers_in_range(angles):
-    with pytest.raises(
-        UserError, match=r"^exporter\.postcard\.tilts: .* Try: 'exporter\.postcard\.tilts=\[15\]'"
-    ):
-        Postcard(**GIVEN).require_angles("tilts", angles, limit=90, example=15)
-    Postcard(**GIVEN).require_angles("tilts", [-90, 0.5], limit=90, example=15)
-
-
 def test_cameras_have_the_given_angles_and_settings():
     expected = turntable(3, elevation_deg=20.0, distance=3.0, fov_y_deg=40.0, size=16)
     assert vars_equal(Postcard(**GIVEN).ring(3, 20.0), expected)

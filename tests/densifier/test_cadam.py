@@ -212,14 +212,6 @@ def test_young_gaussians_do_not_grow_before_min_age():
     assert cadam(min_age=19).select(observe(cadam(), gradients), STEP, DRAWS).any()
 
 
-def test_without_the_quantile_the_gate_alone_selects():
-    gradients = noise(60, 300)
-    densifier = cadam(tau_Q=None, tau_SNR=0.2)
-    state = observe(densifier, gradients)
-    assert torch.equal(densifier.select(state, STEP, DRAWS), snr(densifier, state) > 0.2)
-    assert "drift_threshold" not in densifier.statistics(state, STEP)
-
-
 def test_without_gates_every_gaussian_with_a_gradient_is_selected():
     gradients = noise(30, 20)
     gradients[:, 12:] = 0.0
@@ -256,12 +248,6 @@ def test_the_selective_reset_lowers_only_noisy_gaussians_and_never_raises_one():
 def test_no_gaussian_is_both_selected_and_unreliable():
     densifier, state = cadam(tau_SNR=0.2), observe(cadam(), noise(100, 500))
     assert not (densifier.select(state, STEP, DRAWS) & densifier.unreliable(state)).any()
-
-
-def test_a_gaussian_that_never_had_a_gradient_is_unreliable():
-    state = observe(cadam(), torch.zeros(5, 2, 3))
-    assert cadam().unreliable(state).all()
-    assert not cadam(tau_SNR=0.0).unreliable(state).any()
 
 
 def test_young_gaussians_are_not_called_unreliable():

@@ -11,7 +11,6 @@ from composed import composed
 from cadam3d.build import build_trainer, component
 from cadam3d.callback.base import Callback
 from cadam3d.core.gaussians import FIELDS, Gaussians
-from cadam3d.densifier.base import GradientSignal
 from cadam3d.settings.compose import compose
 from cadam3d.state import Outcome, RefineReport, RunContext, TrainState
 
@@ -77,46 +76,6 @@ def test_the_guidance_alone_is_observed_on_request_while_the_optimizer_follows_t
     for kind in ("exp_avg", "exp_avg_sq"):
         whole, split = (each.optimizer.state_dict()[kind]["means"] for each in (total, guided))
         torch.testing.assert_close(split, whole, rtol=1e-3, atol=1e-4 * float(whole.norm()))
-
-
-@pytest.mark.parametrize(
-    ("overrides", "passes"),
-    [
-        ([], 1),
-        (REGULARIZED, 1),
-        (GUIDANCE, 1),
-        ([*GUIDANCE, *REGULARIZED], 2),
-    ],
-)
-def test_a_second_backward_pass_happens_only_if_it_is_needed(overrides, passes, tmp_path, monkeypatch):
-    calls, backward = [], torch.Tensor.backward
-    monkeypatch.setattr(
-        torch.Tensor, "backward", lambda *args, **kwargs: (calls.append(1), backward(*args, **kwargs))
-    )
-    run(["steps=1", *overrides], tmp_path)
-    assert len(calls) == passes
-
-
-@pytest.mark.parametrize(("choice", "is_needed"), [("absgrad", True), ("baseline", False), ("cadam", False)])
-def test_absolute_gradients_are_summed_only_for_densifiers_that_need_them(
-    choice, is_needed, tmp_path, monkeypatch
-):
-    seen: list[GradientSignal] = []
-    densifier = type(component(compose([*SMALL, f"densifier={choice}"]).densifier))
-    observe = densifier.observe
-    monkeypatch.setattr(
-        densifier,
-        "observe",
-        lambda self, state, signal: (seen.append(signal), observe(self, state, signal))[1],
-    )
-    run([f"densifier={choice}", "steps=2"], tmp_path)
-    assert len(seen) == 2
-    for signal in seen:
-        assert (signal.absgrad is not None) == is_needed
-        if is_needed:
-            slack = 1e-5 * float(signal.absgrad.max())
-            assert (signal.absgrad >= signal.means2d.abs() - slack).all()
-            assert (signal.absgrad > 1.01 * signal.means2d.abs() + slack).any()
 
 
 # The report that callbacks see.

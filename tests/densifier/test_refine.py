@@ -8,7 +8,7 @@ import torch
 from evidence import cadam
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.gaussians import FIELDS, Gaussians
+from cadam3d.core.gaussians import Gaussians
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.baseline import Baseline
 from cadam3d.densifier.none import NoGrowth
@@ -128,14 +128,6 @@ def test_the_counts_add_up(children):
     assert len(plan.edit.apply(scene)) == plan.edit.rows_after
 
 
-def test_a_clone_equals_its_parent():
-    scene = gaussians(6)
-    scene.log_scales[:] = -5.0
-    plan = refine().plan(scene, some(6), LATE, draw())
-    for name in FIELDS:
-        assert torch.equal(getattr(plan.edit.children, name), getattr(scene, name)[plan.edit.parents])
-
-
 def test_split_children_are_smaller_by_the_shrink_and_otherwise_like_their_parent():
     scene = gaussians(12)
     scene.log_scales[:] += 3.0
@@ -160,13 +152,6 @@ def test_split_children_are_distributed_like_their_parent():
     torch.testing.assert_close(offsets.mean(dim=0), torch.zeros(3), atol=0.04, rtol=0)
 
 
-def test_the_plan_depends_on_the_generator():
-    scene, all_rows = gaussians(10), torch.ones(10, dtype=torch.bool)
-    first, again, other = (refine().plan(scene, all_rows, LATE, draw(seed)) for seed in (0, 0, 1))
-    assert torch.equal(first.edit.children.means, again.edit.children.means)
-    assert not torch.equal(first.edit.children.means, other.edit.children.means)
-
-
 def test_planning_changes_nothing_and_keeps_no_autograd_graph():
     scene = gaussians(10).map(lambda tensor: tensor.requires_grad_())
     copies = {name: tensor.detach().clone() for name, tensor in scene.tensors().items()}
@@ -176,14 +161,6 @@ def test_planning_changes_nothing_and_keeps_no_autograd_graph():
 
 
 # Pruning.
-
-
-def test_faint_gaussians_are_pruned_whether_old_or_newborn():
-    scene = with_opacity(gaussians(4), [0.004, 0.006, 0.004, 0.006])  # two clones, two splits
-    plan = refine().plan(scene, torch.tensor([True, False, True, False]), LATE, draw())
-    assert plan.edit.keep.tolist() == [1, 3]
-    assert len(plan.edit.children) == 0
-    assert plan.pruned == 1 + 1 + 2  # a survivor, its clone, and both children of a split
 
 
 def test_large_gaussians_are_pruned_only_after_prune_from():

@@ -268,16 +268,6 @@ def test_selections_counts_and_resets_are_those_of_densifier_cadam_on_the_same_g
     assert len(trainer) > 24
 
 
-def test_a_loop_for_mcmc_strategy_need_not_call_the_strategy_before_the_backward_pass():
-    gradients = noise(4, 10)
-    toy = Toy(CAdamStrategy())
-    for step, gradient in enumerate(gradients):
-        toy.loss(gradient).backward()
-        toy.optimize()
-        toy.strategy.step_post_backward(**toy.shared, step=step, lr=1e-3)
-    assert_observed(toy.state, gradients[1:])  # from the second step on
-
-
 # What is observed.
 
 
@@ -421,36 +411,6 @@ def test_a_run_that_is_saved_and_loaded_continues_to_the_bit():
         torch.testing.assert_close(loaded.params[name], rows, **EXACT)
 
 
-def test_the_state_of_the_last_call_is_updated():
-    gradients = noise(4, 10)
-    toy = Toy(CAdamStrategy())
-    toy.step(0, gradients[0])
-    first = toy.state
-    toy.state = toy.strategy.initialize_state()
-    for step in (1, 2, 3):
-        toy.step(step, gradients[step])
-    assert_observed(first, gradients[:1])
-    assert_observed(toy.state, gradients[1:])
-
-
-def test_a_state_that_was_loaded_on_another_device_follows_the_gaussians():
-    toy = Toy(CAdamStrategy())
-    toy.step(0, torch.ones(10, 3))
-    toy.state["radii"] = torch.zeros(10)
-    toy.optimizers["means"].param_groups[0]["params"] = [toy.params["means"].to("meta")]
-    toy.strategy.step_pre_backward(**toy.shared, step=1)
-    assert {toy.state[name].device.type for name in ("m", "v", "age", "radii")} == {"meta"}
-
-
-def test_a_new_optimizer_is_found():
-    gradients = noise(4, 10)
-    toy = Toy(CAdamStrategy())
-    for step, gradient in enumerate(gradients):
-        toy.optimizers["means"] = torch.optim.SGD([toy.params["means"]], lr=0.0)
-        toy.step(step, gradient)
-    assert_observed(toy.state, gradients)
-
-
 # The schedule, and the rules that come from gsplat.
 
 
@@ -535,17 +495,6 @@ def test_only_unreliable_opacities_are_reset_and_every_shape_of_opacities_works(
         after = toy.params["opacities"].detach()
         assert torch.equal(after[:5], before[:5])
         assert (after[5:].sigmoid() <= 0.02 + 1e-6).all()
-
-
-def test_opacities_that_are_not_trained_are_not_reset():
-    toy = Toy(CAdamStrategy(reset="all", reset_every=2))
-    toy.params["opacities"].requires_grad_(False)
-    del toy.optimizers["opacities"]
-    toy.strategy.check_sanity(toy.params, toy.optimizers)
-    before = toy.params["opacities"].clone()
-    for step in range(3):
-        toy.step(step, torch.ones(10, 3))
-    assert torch.equal(toy.params["opacities"], before)
 
 
 # Mistakes.

@@ -104,15 +104,6 @@ def test_the_bits_do_not_depend_on_how_much_32_bits_can_count(emulator, n, log_s
     assert len(spy.arguments_of("blend_forward_8x8")) == VIEWS
 
 
-def test_a_group_has_as_many_views_as_fit_and_at_least_one():
-    split = cuda._split_views
-    spans = [(views.start, views.stop, slots) for views, slots in split([3, 4, 5, 9, 0, 1], 8, 99)]
-    assert spans == [(0, 2, 7), (2, 3, 5), (3, 4, 9), (4, 6, 1)]
-    assert [views for views, _ in split([1] * 5, 99, 2)] == [slice(0, 2), slice(2, 4), slice(4, 5)]
-    assert [views for views, _ in split([1, 1], 99, 0)] == [slice(0, 1), slice(1, 2)]
-    assert split([], 8, 8) == []
-
-
 @pytest.mark.parametrize(("views", "pairs"), [(7, 2**29), (3, 2**31 - 1)])
 def test_views_beyond_32_bits_together_are_split(emulator, views, pairs, monkeypatch):
     monkeypatch.setattr(cuda, "RECORD_MEMORY", 2**60)

@@ -17,7 +17,6 @@ from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import driver
 from cadam3d.rasterizer.cuda import (
     CudaRasterizer,
-    _start_reading,
     rasterize,
 )
 from cadam3d.rasterizer.driver import Module, load_driver
@@ -209,40 +208,6 @@ class Recorder:
     def __getattr__(self, name: str):
         function = getattr(self.library, name)
         return lambda *arguments: self.names.append(name) or function(*arguments)
-
-
-def test_counts_are_copied_and_waited_for_on_the_current_stream(monkeypatch):
-    log, fake = [], FakeCuda()
-
-    class OnDevice(torch.Tensor):
-        device = SimpleNamespace(type="cuda")
-
-    counts = torch.zeros(2).as_subclass(OnDevice)
-
-    class Event:
-        def record(self, stream=None):
-            log.append(("record", fake.stream if stream is None else stream))
-
-        def synchronize(self):
-            log.append("wait")
-
-    def empty_like(numbers, device, pin_memory):
-        assert (device, pin_memory) == ("cpu", True), "a copy to ordinary memory would wait"
-
-        def copy(source, non_blocking):
-            assert source is numbers is counts
-            log.append(("copy", fake.stream, non_blocking))
-
-        return SimpleNamespace(copy_=copy, tolist=lambda: [3, 4])
-
-    fake.Event = Event
-    monkeypatch.setattr(torch, "cuda", fake)
-    monkeypatch.setattr(torch, "empty_like", empty_like)
-    fake.stream = 2**41
-    read = _start_reading(counts)
-    assert log == [("copy", 2**41, True), ("record", 2**41)]
-    assert read() == [3, 4]
-    assert log[2:] == ["wait"]
 
 
 # -------------------------------------------------------------------------- on real devices

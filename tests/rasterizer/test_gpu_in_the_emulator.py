@@ -173,12 +173,3 @@ def test_the_stage_of_a_planted_mistake_is_named(name, mutants, emulator, monkey
     finally:
         mutants.activate(0)
     assert found["stage"] == STAGES[name], found
-
-
-def test_right_kernels_agree_in_every_stage_with_another_schedule(emulator):
-    assert bisect.find_stage(emulator.shuffled(7), CPU, emulator)["stage"] is None
-
-
-def test_without_a_compiler_the_self_test_narrows_the_stages_down(emulator, monkeypatch):
-    monkeypatch.setattr(bisect, "find_compiler", lambda: None)
-    assert bisect.find_stage(emulator, CPU)["says"].startswith("without a C++ compiler: nothing is wrong")

@@ -5,10 +5,8 @@ import os
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
-import torch
 from emulation import content_hash, make_once
 
 from cadam3d.core.errors import UserError
@@ -145,38 +143,3 @@ def test_the_cache_distinguishes_compilers_options_and_constants(compiler, monke
     monkeypatch.setattr(base, "BLUR", 0.1)
     keys.add(nvrtc._key(compiler))
     assert len(keys) == 4
-
-
-@pytest.mark.parametrize(
-    ("version", "order"),
-    [
-        ("12.8", ["libnvrtc.so.12", "libnvrtc.so.13", "libnvrtc.so"]),
-        ("13.0", ["libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so"]),
-        (None, ["libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so"]),
-    ],
-)
-def test_a_library_of_the_system_without_a_version_is_the_last_choice(monkeypatch, version, order):
-    tried = []
-
-    def refuse(path):
-        tried.append(path)
-        raise OSError
-
-    monkeypatch.setattr(torch.version, "cuda", version)
-    monkeypatch.setattr(nvrtc, "_bundled", lambda: iter([Path("/wheels/libnvrtc.so.11")]))
-    monkeypatch.setattr(nvrtc, "_load", refuse)
-    assert nvrtc.find_compiler.__wrapped__() is None
-    assert tried == ["/wheels/libnvrtc.so.11", *order]
-
-
-def test_nvrtc_is_found_in_the_folders_of_wheels_for_cuda_12_and_13(monkeypatch, tmp_path):
-    monkeypatch.setattr(torch.version, "cuda", "13.0")
-    monkeypatch.setattr(nvrtc, "PATTERN", "libnvrtc.so*")
-    paths = [tmp_path / folder for folder in ("cuda_nvrtc/lib/libnvrtc.so.12", "cu13/lib/libnvrtc.so.13")]
-    for path in paths:
-        path.parent.mkdir(parents=True)
-        path.touch()
-    spec = SimpleNamespace(submodule_search_locations=[str(tmp_path)])
-    monkeypatch.setattr(nvrtc, "find_spec", lambda name: spec if name == "nvidia" else None)
-    found = sorted(nvrtc._bundled(), key=nvrtc._distance_from_torch)
-    assert [path for path in found if tmp_path in path.parents] == paths[::-1]

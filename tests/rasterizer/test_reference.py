@@ -229,13 +229,6 @@ def test_exactly_the_pixels_within_the_radius_are_drawn():
             assert distance[is_drawn].max() > output.radii[0, 0] - 1, "the box touches the ellipse"
 
 
-def test_every_view_has_its_own_background():
-    nothing = scene(0)
-    background = backgrounds(3)
-    output = render(nothing, cameras(3, 4, 5), background)
-    assert torch.equal(output.rgb, background[:, None, None].expand(3, 4, 5, 3))
-
-
 # --- invariances
 
 
@@ -274,23 +267,6 @@ EXTREMES = [
     3e38,
     -3e38,
 ]
-
-
-def test_a_huge_splat_fills_the_image_evenly():
-    ball = balls(x=[0.0], radius=1e4, opacity=[0.7], rgb=[[1, 1, 1]])
-    torch.testing.assert_close(
-        render(ball, facing(9)).alpha, torch.full((1, 9, 9), 0.7).double(), rtol=1e-6, atol=0
-    )
-
-
-def test_a_loss_may_use_one_output_only():
-    views = cameras()
-    for which in range(3):
-        leaves = as_parameters(scene(20))
-        images(render(leaves, views))[which].sum().backward()
-        assert leaves.means.grad is not None
-        assert leaves.means.grad.any()
-        assert (leaves.sh.grad.any()) == (which == 0), "alpha and depth do not depend on colour"
 
 
 # --- determinism, autograd, dtypes and memory
