@@ -107,8 +107,8 @@ def test_with_nothing_installed_the_reference_is_tested_and_the_rest_is_named_as
     assert choice.facts["backend"] == "reference"
 
 
-def an_nvrtc() -> nvrtc.Compiler:
-    return nvrtc.Compiler(
+def an_nvrtc() -> nvrtc.Nvrtc:
+    return nvrtc.Nvrtc(
         library=ctypes.CDLL(None), path="/there/libnvrtc.so.13", version=(13, 0), architectures=(90,)
     )
 
