@@ -142,7 +142,8 @@ class Stopwatch:
 
 def random_texts(prior: Any) -> None:
     """Replace the text encoders by random embeddings; they run once per prompt and are not part of a step."""
-    from cadam3d.prior.latent import Texts, blank_texts
+    from cadam3d.prior.latent import blank_texts
+    from cadam3d.prior.texts import Texts
 
     def embed_texts(found: Any, texts: list[str], device: torch.device) -> Texts:
         config = found.skeleton(prior.network_part, prior.torch_dtype).config

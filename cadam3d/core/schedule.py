@@ -119,14 +119,15 @@ def settled_at(value: float | Schedule) -> int:
 
 
 def require_scheduled(key: str, value: object, *, example: object, **bounds: float) -> None:
-    """Raise unless ``value`` is a number in range, or a schedule whose first and final values are in range.
+    """Raise unless ``value`` is a number in range, or a schedule whose values are in range.
+
+    A schedule is checked at its first and last step and at its milestones, which are the extremes of ours.
 
     ``bounds`` are those of :func:`~cadam3d.core.checks.require_range`: ``low``, ``high``, ``below`` and
     ``above``.
     """
     is_scheduled = isinstance(value, int | float | Schedule)
     require(is_scheduled, key, expected="a number or a schedule", got=value, example=f"{key}={example}")
-    # Most mistakes are visible at one of the two ends.
-    for step in (0, FAR_STEP):
+    for step in (0, *getattr(value, "milestones", ()), FAR_STEP):
         number = value(step) if isinstance(value, Schedule) else value
         require_range(key, number, example=example, **bounds)

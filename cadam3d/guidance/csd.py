@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require_range
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.guidance.distill import Case, Comparison, Distillation
 from cadam3d.guidance.trajectory import UNGUIDED
@@ -43,7 +42,6 @@ class CSD(Distillation):
 
     def _reference(self, case: Case, noise: Float[Tensor, "v c h w"]) -> Float[Tensor, "v c h w"]:
         share = as_schedule(self.empty_share)(case.step)
-        require_range("guidance.empty_share", share, low=0, high=1, example=0.0)
         if share == 0:
             return case.guess(noise, NEGATIVE).noise
         empty = replace(case, condition=case.condition.unprompted()).guess(noise, UNGUIDED).noise

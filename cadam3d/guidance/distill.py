@@ -137,8 +137,8 @@ class Distillation(WindowedGuidance):
     ) -> GuidanceOutput:
         """Return the loss of the render ``rgb``, which is in [0, 1] and has a gradient.
 
-        All random numbers come from the CPU ``generator``. Raises ``UserError`` if a schedule leaves its
-        range at ``step``.
+        All random numbers come from the CPU ``generator``. Raises ``UserError`` if t_min and t_max
+        leave their range at ``step``.
         """
         clean = prior.encode(rgb)
         with torch.no_grad():
@@ -147,7 +147,8 @@ class Distillation(WindowedGuidance):
             found = self.compare(Case(clean.detach(), t, condition, prior, step, generator, drawn))
             weights = self.weight * WEIGHTINGS[self.weighting](prior.noise_path, t)
             gradient, nonfinite = finite(per_view(weights) * found.difference)
-            if (bound := self._bound(step)) is not None:
+            if self.clip is not None:
+                bound = as_schedule(self.clip)(step)
                 gradient = gradient.clamp(-bound, bound)
         return GuidanceOutput(
             loss=surrogate(clean, gradient, DIVISORS[self.reduction](clean.shape)),
@@ -162,13 +163,6 @@ class Distillation(WindowedGuidance):
     def charts(self) -> tuple[Chart, ...]:
         """Declare charts of ``guidance_rms`` and ``residual_rms``."""
         return (STRENGTH, RESIDUAL)
-
-    def _bound(self, step: int) -> float | None:
-        if self.clip is None:
-            return None
-        bound = as_schedule(self.clip)(step)
-        require_range("guidance.clip", bound, above=0, example="null")
-        return bound
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -129,8 +129,8 @@ class GCS(WindowedGuidance):
     ) -> GuidanceOutput:
         """Return the loss of the render ``rgb``, which is in [0, 1] and has a gradient.
 
-        All random numbers come from the CPU ``generator``. Raises ``UserError`` if a schedule leaves its
-        range at ``step``.
+        All random numbers come from the CPU ``generator``. Raises ``UserError`` if t_min and t_max
+        leave their range at ``step``.
         """
         clean = prior.encode(rgb)
         with torch.no_grad():
@@ -166,7 +166,6 @@ class GCS(WindowedGuidance):
     def draw_levels(self, clean: Float[Tensor, "v c h w"], step: int, generator: torch.Generator) -> Levels:
         """Draw t from the window, raised to at least delta + 0.001, and s and e below it, on the CPU."""
         delta = as_schedule(self.delta)(step)
-        require_range("guidance.delta", delta, above=GAP, high=0.5, example=0.08)
         t = self.draw_t(clean, step, generator).clamp_min(delta + ROW)
         s = t - delta
         lowest, highest = (s - delta).clamp_min(0), (s - GAP).clamp_min(ROW)

@@ -46,7 +46,7 @@ class ISM(GuidedDistillation):
         """Subtract the noise at s without a prompt from the guided noise at t, on one trajectory."""
         prior, path, unprompted = case.prior, case.prior.noise_path, case.condition.unprompted()
         start = case.host_t.clamp_max(self.initial_noise)
-        s = torch.maximum(case.host_t - self._interval(case.step), start)
+        s = torch.maximum(case.host_t - as_schedule(self.delta)(case.step), start)
         levels = strides(start, s, self.inversion_stride)
         start, s, *levels = case.on_device(start, s, *levels)
         at_start = case.clean
@@ -58,8 +58,3 @@ class ISM(GuidedDistillation):
         at_t = path.mix(before.clean, before.noise, case.t)
         after = prior.predict(at_t, case.t, case.condition, self.scale)
         return Comparison(difference=after.noise - before.noise, clean=after.clean)
-
-    def _interval(self, step: int) -> float:
-        delta = as_schedule(self.delta)(step)
-        require_range("guidance.delta", delta, above=0, high=1, example=0.05)
-        return delta

@@ -26,7 +26,7 @@ class WindowedGuidance(Guidance):
         require_choice("guidance.shared_t", self.shared_t, (True, False))
         require_scheduled("guidance.t_min", self.t_min, example=0.02)
         require_scheduled("guidance.t_max", self.t_max, example=0.98)
-        # The steps in between are checked when training reaches them.
+        # At the steps in between, the two may cross. These are checked when training reaches them.
         for step in (0, FAR_STEP):
             self.window(step)
 

@@ -5,7 +5,6 @@ is loaded. Networks compute in ``dtype``; all their outputs are converted to flo
 """
 
 import gc
-import hashlib
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +21,6 @@ from torch.utils.checkpoint import checkpoint
 from cadam3d.core.cameras import Cameras, orbit
 from cadam3d.core.checks import require, require_choice, require_whole
 from cadam3d.core.errors import UserError
-from cadam3d.io.atomic import replacing
 from cadam3d.io.cache import default_cache_dir
 from cadam3d.io.pretrained import DTYPES, VOCABULARY, ModelSource, Pretrained
 from cadam3d.prior.base import Condition, DiffusionPrior, MemoryEstimate, PromptEmbedding
@@ -30,6 +28,7 @@ from cadam3d.prior.memory import working_bytes
 from cadam3d.prior.path import DDPM, NoisePath, Prediction, Rows
 from cadam3d.prior.prompting import Mix, Prompting, guide
 from cadam3d.prior.shapes.lexicon import Lexicon
+from cadam3d.prior.texts import T5_TOKENS, TOKENS, TextCache, Texts
 
 # What to type for a model of each pipeline class.
 PRIORS = {
@@ -38,31 +37,12 @@ PRIORS = {
     "StableDiffusion3Pipeline": "prior=stable_diffusion_3",
     "MVDreamPipeline": "prior=mvdream",
 }
-# Tokens per text, of CLIP and of T5.
-TOKENS, T5_TOKENS = 77, 256
 # Every model of this family has this factor between an image and its latents.
 FACTOR = 8  # pixels per side
 # The levels at which a network is used: those of the table that it was trained on, or any.
 LEVELS = ("table", "any")
 # A network recognises nothing in images of more than this many times the size of those in its training.
 LARGEST = 2
-
-
-@dataclass(frozen=True)
-class Texts:
-    """Embedded texts, one per row."""
-
-    tokens: Float[Tensor, "k n d"]
-    pooled: Float[Tensor, "k p"] | None  # one vector per text, for networks that read it
-
-    def mixed(self, weights: Float[Tensor, "b k"]) -> "Texts":
-        """Return weighted sums of the rows, one for each row of ``weights``."""
-        tokens = torch.einsum("bk,knd->bnd", weights.to(self.tokens), self.tokens)
-        return Texts(tokens, None if self.pooled is None else weights.to(self.pooled) @ self.pooled)
-
-    def to(self, device: torch.device) -> "Texts":
-        """Return the same rows on ``device``."""
-        return Texts(self.tokens.to(device), None if self.pooled is None else self.pooled.to(device))
 
 
 @dataclass(frozen=True)
@@ -200,7 +180,7 @@ class LatentPrior(DiffusionPrior):
         Raises ``UserError`` for images too large for the network, and for words that it does not know.
         """
         self._require_readable(prompt, negative)
-        texts = self._embedded(self._listed(prompt, negative))
+        texts = self._cache.embedded(self._listed(prompt, negative), self._embed)
         hints = [self._size_hint(), self.lexicon.hint(prompt) if self.lexicon is not None else None]
         return LatentEmbedding(
             texts=texts.to(self.device), prompting=self.prompting, hints=[hint for hint in hints if hint]
@@ -273,7 +253,7 @@ class LatentPrior(DiffusionPrior):
             self._denoising(network, self._at_once(views * branches), vae.config.latent_channels, pixels),
             _encoding(vae, self._at_once(views), pixels),
         )
-        is_known = all(self._cache_file(text).is_file() for text in self._listed(prompt, negative))
+        is_known = all(map(self._cache.has, self._listed(prompt, negative)))
         is_elsewhere = self.text_device == "cpu" and self.device.type != "cpu"
         encoders = [part for part in self.encoders if self.found.has(part)]
         if is_known or is_elsewhere:
@@ -473,53 +453,17 @@ class LatentPrior(DiffusionPrior):
         with torch.no_grad():
             return working_bytes(lambda: ghost.denoise(noisy, timestep, texts, cameras), network.parameters())
 
-    def _embedded(self, listed: Sequence[str]) -> Texts:
-        """Return the rows of ``listed``, in order; only texts that are not cached are embedded."""
-        rows = {text: self._cached(text) for text in dict.fromkeys(listed)}
-        missing = [text for text, row in rows.items() if row is None]
-        if missing:
-            device = torch.device("cpu") if self.text_device == "cpu" else self.device
-            made = self.embed_texts(self.found, missing, device)
-            free()
-            for i, text in enumerate(missing):
-                row = Texts(made.tokens[i : i + 1], None if made.pooled is None else made.pooled[i : i + 1])
-                self._remember(text, row)
-                rows[text] = row
-        chosen = [row for text in listed if (row := rows[text]) is not None]
-        pooled = [row.pooled for row in chosen if row.pooled is not None]
-        return Texts(
-            torch.cat([row.tokens.to(self.device) for row in chosen]),
-            torch.cat([row.to(self.device) for row in pooled]) if pooled else None,
+    def _embed(self, texts: Sequence[str]) -> Texts:
+        made = self.embed_texts(
+            self.found, texts, torch.device("cpu") if self.text_device == "cpu" else self.device
         )
+        free()
+        return made
 
-    def _cached(self, text: str) -> Texts | None:
-        from safetensors import SafetensorError
-        from safetensors.torch import load_file
-
-        file = self._cache_file(text)
-        if not file.is_file():
-            return None
-        try:
-            kept = load_file(file)
-            return Texts(kept["tokens"], kept.get("pooled"))
-        except (OSError, KeyError, SafetensorError):
-            return None  # truncated by a crash
-
-    def _remember(self, text: str, row: Texts) -> None:
-        from safetensors.torch import save_file
-
-        kept = {"tokens": row.tokens} | ({} if row.pooled is None else {"pooled": row.pooled})
-        try:
-            with replacing(self._cache_file(text)) as temporary:
-                save_file({name: value.contiguous().cpu() for name, value in kept.items()}, temporary)
-        except UserError:
-            # A cache that cannot be written only costs time.
-            pass
-
-    def _cache_file(self, text: str) -> Path:
+    @property
+    def _cache(self) -> TextCache:
         folder = Path(self.cache_dir).expanduser() if self.cache_dir else default_cache_dir()
-        facts = (*self._identity, text)
-        return folder / "texts" / f"{hashlib.sha256(repr(facts).encode()).hexdigest()[:32]}.safetensors"
+        return TextCache(folder / "texts", self._identity)
 
     @property
     def _identity(self) -> tuple[str, ...]:
@@ -554,17 +498,6 @@ def blank_texts(count: int, config: Any, dtype: torch.dtype) -> Texts:
     if getattr(config, "addition_embed_type", None) == "text_time":
         width = config.projection_class_embeddings_input_dim - 6 * config.addition_time_embed_dim
     return Texts(tokens.to(dtype), None if width is None else torch.empty(count, width).to(dtype))
-
-
-def tokenize(tokenizer: Any, texts: Sequence[str], length: int | None = None) -> Tensor:
-    """Return token numbers, cut or padded to ``length`` (None = the length that the tokenizer defines)."""
-    return tokenizer(
-        list(texts),
-        padding="max_length",
-        max_length=length or tokenizer.model_max_length,
-        truncation=True,
-        return_tensors="pt",
-    ).input_ids
 
 
 def free() -> None:

@@ -15,10 +15,11 @@ from cadam3d.core.checks import require, require_range
 from cadam3d.core.errors import UserError
 from cadam3d.io.pretrained import Pretrained
 from cadam3d.prior.base import MemoryEstimate
-from cadam3d.prior.latent import PRIORS, LatentEmbedding, TextCondition, Texts
+from cadam3d.prior.latent import PRIORS, LatentEmbedding, TextCondition
 from cadam3d.prior.ldm import SingleFile, with_ldm_unet
 from cadam3d.prior.path import Prediction, per_view
 from cadam3d.prior.stable_diffusion import StableDiffusion
+from cadam3d.prior.texts import Texts
 
 VIEWS = 4  # per group
 # To read a noise level waits for a GPU, so only the first predictions of a run are checked there. These are

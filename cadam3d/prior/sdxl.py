@@ -10,9 +10,9 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.io.pretrained import Pretrained
-from cadam3d.prior.clip import penultimate
-from cadam3d.prior.latent import FACTOR, Texts
+from cadam3d.prior.latent import FACTOR
 from cadam3d.prior.stable_diffusion import StableDiffusion
+from cadam3d.prior.texts import Texts, penultimate
 
 
 @dataclass(frozen=True, kw_only=True)

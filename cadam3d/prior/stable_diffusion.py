@@ -11,8 +11,9 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.io.pretrained import Pretrained
-from cadam3d.prior.latent import LatentPrior, Texts, completion, ddpm_path, tokenize
+from cadam3d.prior.latent import LatentPrior, completion, ddpm_path
 from cadam3d.prior.path import NoisePath, Prediction
+from cadam3d.prior.texts import Texts, tokenize
 
 
 @dataclass(frozen=True, kw_only=True)

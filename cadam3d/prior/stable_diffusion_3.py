@@ -14,9 +14,9 @@ from torch.nn import functional as F  # noqa: N812  (the usual name)
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require, require_choice
 from cadam3d.io.pretrained import Pretrained
-from cadam3d.prior.clip import penultimate
-from cadam3d.prior.latent import T5_TOKENS, LatentPrior, Texts, tokenize
+from cadam3d.prior.latent import LatentPrior
 from cadam3d.prior.path import NoisePath, Prediction, RectifiedFlow
+from cadam3d.prior.texts import T5_TOKENS, Texts, penultimate, tokenize
 
 T5 = "text_encoder_3"
 

@@ -20,8 +20,8 @@ from cadam3d.prior.shapes.scene import PATTERN_NAMES, Scene, compile_scene
 from cadam3d.prior.shapes.solids import KINDS, Solid
 from cadam3d.prior.shapes.tracer import Layers, trace
 from cadam3d.prior.shapes.tracers import find_tracer, tracer_for
-from cadam3d.prior.shapes.truth import ShapesTruth
 from cadam3d.prior.shapes.vocabulary import COLOURS, NUMBERS, PATTERNS, SIZES, STRETCHES
+from cadam3d.prior.truth import ShapesTruth
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
 CPU = torch.device("cpu")

@@ -310,7 +310,7 @@ def test_a_model_that_is_not_on_disk_is_lacking_and_the_hub_is_not_queried(make,
     monkeypatch.setattr(huggingface_hub, "hf_hub_download", download)
     assert "a/one, b/two" in make(path=None, ids=["a/one", "b/two"]).lacks()
     assert asked == [True, True]
-    assert "nothing there" in make(path="/nowhere").lacks()
+    assert "expected a folder with a model_index.json" in make(path="/nowhere").lacks()
 
 
 # --- impossible values ------------------------------------------------------------------------------------

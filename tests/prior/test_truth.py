@@ -10,8 +10,7 @@ from cadam3d.build import component
 from cadam3d.core.cameras import Cameras, turntable
 from cadam3d.core.errors import UserError
 from cadam3d.core.render import Truth
-from cadam3d.prior.shapes.truth import ShapesTruth
-from cadam3d.prior.truth import NoTruth, PriorTruth
+from cadam3d.prior.truth import NoTruth, PriorTruth, ShapesTruth
 
 PROMPT = "a mug"
 

@@ -41,33 +41,14 @@ class Mixture:
         away = (noisy - a * mean) / total
         return mean + a * self.variance * away, b * away
 
-    def responsibilities(
-        self, noisy: Float[Tensor, "v c h w"], a: Float[Tensor, "v"], b: Float[Tensor, "v"]
-    ) -> Float[Tensor, "v m"]:
-        """Return the posterior probability of each mode (float64)."""
-        a, b = per_view(a), per_view(b)
-        return self._responsibilities(noisy, a, (a * a * self.variance + b * b).clamp_min(VARIANCE_FLOOR))
-
-    def log_density(
-        self, noisy: Float[Tensor, "v c h w"], a: Float[Tensor, "v"], b: Float[Tensor, "v"]
-    ) -> Float[Tensor, "v"]:
-        """Return the log-density of the noisy image (float64)."""
-        a, b = per_view(a), per_view(b)
-        total = (a * a * self.variance + b * b).clamp_min(VARIANCE_FLOOR).double()
-        norm = (2 * torch.pi * total).log().sum(dim=(1, 2, 3))
-        return self._log_joint(noisy, a, total).logsumexp(dim=1) - 0.5 * norm
-
-    def _log_joint(self, noisy: Tensor, a: Tensor, total: Tensor) -> Float[Tensor, "v m"]:
-        """Return the log of weight times density, without the normalizer, which is equal for all modes."""
+    def log_joint(self, noisy: Tensor, a: Tensor, total: Tensor) -> Float[Tensor, "v m"]:
+        """Return the log of weight times density for each mode (float64), up to a constant of the image."""
         away = noisy[:, None] - a[:, None] * self.means
         distance = (away * away / total[:, None]).sum(dim=(2, 3, 4), dtype=torch.float64)
         return self.log_weights.double() - 0.5 * distance
 
-    def _responsibilities(self, noisy: Tensor, a: Tensor, total: Tensor) -> Float[Tensor, "v m"]:
-        return self._log_joint(noisy, a, total).softmax(dim=1)
-
     def _mean_of_modes(self, noisy: Tensor, a: Tensor, total: Tensor) -> Float[Tensor, "v c h w"]:
         if self.means.shape[1] == 1:
             return self.means[:, 0]
-        shares = self._responsibilities(noisy, a, total).to(noisy.dtype)
+        shares = self.log_joint(noisy, a, total).softmax(dim=1).to(noisy.dtype)
         return torch.einsum("vm,vmchw->vchw", shares, self.means)

@@ -17,11 +17,10 @@ from cadam3d.prior.shapes.array_cache import cached_arrays
 from cadam3d.prior.shapes.grammar import EXAMPLE
 from cadam3d.prior.shapes.mixture import Mixture
 from cadam3d.prior.shapes.objects import known_objects, known_primitives
-from cadam3d.prior.shapes.scene import Scene, build
+from cadam3d.prior.shapes.scene import Scene, build, signed_distance
 from cadam3d.prior.shapes.trace_cache import shared_trace
 from cadam3d.prior.shapes.tracer import Layers
 from cadam3d.prior.shapes.tracers import TRACERS, find_tracer
-from cadam3d.prior.shapes.truth import true_scene
 
 CENSUS_VIEWS = 4  # per object, equally spaced in azimuth
 CENSUS_ELEVATION_DEG = 15.0
@@ -199,6 +198,27 @@ class ShapesPrior(DiffusionPrior):
         norm = per_view((a * a + b * b).sqrt())
         error = self.model_error * error_field(noisy / norm, self.seed * 2 + branch)
         return clean + per_view(b) / norm * error, noise - per_view(a) / norm * error
+
+
+def true_scene(scene: Scene, samples_per_pixel: int, turns: int | None = None, tracer: str = "auto") -> Truth:
+    """Return the images, the outlines and the shape of a scene, whose modes differ in colour only."""
+
+    def layers(cameras: Cameras) -> tuple[Layers, Scene]:
+        sized = scene.to(cameras.intrinsics.device, cameras.intrinsics.dtype)
+        return shared_trace(sized, cameras, samples_per_pixel, tracer), sized
+
+    def images(cameras: Cameras, background: Tensor) -> Tensor:
+        traced, sized = layers(cameras)
+        return traced.images(sized.albedo, background).permute(1, 0, 3, 4, 2)
+
+    def alpha(cameras: Cameras) -> Tensor:
+        traced, sized = layers(cameras)
+        return traced.alpha.expand(len(sized.albedo), *traced.alpha.shape)
+
+    def distance(points: Tensor) -> Tensor:
+        return signed_distance(scene.to(points.device, points.dtype), points)[None]
+
+    return Truth(images=images, distance=distance, alpha=alpha, turns=turns)
 
 
 def error_field(image: Float[Tensor, "v c h w"], seed: int) -> Float[Tensor, "v c h w"]:
