@@ -21,7 +21,7 @@ from cadam3d import cli, regularizer
 from cadam3d.build import component, components
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json, read_jsonl
-from cadam3d.io.prompts import read_prompts
+from cadam3d.io.prompt_files import read_prompts
 from cadam3d.settings import advice
 from cadam3d.settings.compose import compose, flatten, quote
 from cadam3d.settings.line import read_flags

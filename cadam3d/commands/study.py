@@ -145,7 +145,7 @@ def _prompts(source: str | None) -> set[str] | None:
     """Return the texts of the prompts that ``prompts=`` names; None for all."""
     if source is None:
         return None
-    from cadam3d.io.prompts import read_prompts
+    from cadam3d.io.prompt_files import read_prompts
 
     return {prompt.text for prompt in read_prompts(str(source))}
 

@@ -23,7 +23,7 @@ from cadam3d.initializer.points import (
     require_count,
 )
 from cadam3d.io.frames import points_to_world, turned_points
-from cadam3d.io.mesh import linear, srgb
+from cadam3d.io.gltf import linear, srgb
 
 UPS = ("z", "y")
 # Other formats of trimesh may refer to files elsewhere, or run other programs.

@@ -26,8 +26,6 @@ ratified. Drafts stored the logarithms of scales; the ratified text has "linear"
 negative".
 """
 
-import json
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -39,15 +37,11 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0
 from cadam3d.io.atomic import replacing
 from cadam3d.io.encoding import in_file_axes, linear_scales, opacities, to_bytes, unit_quats
+from cadam3d.io.gltf import FLOAT, LARGEST_FILE, UNSIGNED_BYTE, VERTEX_BUFFER, binary_gltf, linear
 
 EXTENSION = "KHR_gaussian_splatting"
-LARGEST_FILE = (1 << 32) - 1  # bytes; GLB stores its length in 32 bits
-HEADER = struct.Struct("<4sII")  # "glTF", version, length of the file
-CHUNK = struct.Struct("<I4s")  # length, kind
-# Constants of glTF.
-FLOAT, UNSIGNED_BYTE = 5126, 5121
-ARRAY_BUFFER = 34962
-POINTS = 0
+POINTS = 0  # the mode of drawing
+SPARE_BYTES = 1 << 20  # for the document
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
@@ -59,22 +53,15 @@ def write_glb(path: Path, gaussians: Gaussians, *, up: str) -> None:
     """
     local = in_file_axes(gaussians, up)
     arrays = _attributes(local) if len(local) else {}
-    binary_bytes = sum(array.nbytes for array in arrays.values())
-    text = json.dumps(_document(path.stem, arrays), separators=(",", ":")).encode("ascii")
-    text += b" " * (-len(text) % 4)
-    length = HEADER.size + CHUNK.size + len(text) + (CHUNK.size + binary_bytes if arrays else 0)
-    if length > LARGEST_FILE:
+    body_bytes = sum(array.nbytes for array in arrays.values())
+    if body_bytes > LARGEST_FILE - SPARE_BYTES:
         raise UserError(
-            f"{path}: expected at most {LARGEST_FILE:,} bytes, which is the limit of glb, got {length:,}. "
+            f"{path}: expected less than 4 GB, which is the limit of glb, got {body_bytes:,} bytes. "
             "Try: 'exporter=[ply]'"
         )
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(HEADER.pack(b"glTF", 2, length))
-        file.write(CHUNK.pack(len(text), b"JSON") + text)
-        if arrays:
-            file.write(CHUNK.pack(binary_bytes, b"BIN\0"))
-        for array in arrays.values():
-            file.write(array.tobytes())
+    body = b"".join(array.tobytes() for array in arrays.values())
+    with replacing(path) as temporary:
+        temporary.write_bytes(binary_gltf(_document(path.stem, arrays), body))
 
 
 def _attributes(local: Gaussians) -> dict[str, np.ndarray]:
@@ -91,15 +78,10 @@ def _attributes(local: Gaussians) -> dict[str, np.ndarray]:
     for degree in range(local.sh_degree + 1):
         for order in range(2 * degree + 1):
             floats[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = sh[:, degree**2 + order]
-    color = np.concatenate([_linear(diffuse), alphas[:, None]], axis=1)
+    color = np.concatenate([linear(diffuse), alphas[:, None]], axis=1)
     return {name: np.ascontiguousarray(array, dtype="<f4") for name, array in floats.items()} | {
         "COLOR_0": to_bytes(255 * color)
     }
-
-
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    """Return linear values of sRGB values, both in [0, 1] (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def _document(name: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -126,7 +108,7 @@ def _document(name: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
         if attribute == "POSITION":
             accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
         accessors.append(accessor)
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": ARRAY_BUFFER})
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": VERTEX_BUFFER})
         offset += array.nbytes
     splatting = {
         "kernel": "ellipse",

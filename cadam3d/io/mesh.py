@@ -7,8 +7,6 @@ colours apart. A texture is sRGB in every format. Vertex colours of obj (``v x y
 red green blue``) are sRGB by convention.
 """
 
-import json
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,14 +21,19 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.mesh.surface import Surface, SurfaceFacts, facts
 from cadam3d.io.atomic import replacing
 from cadam3d.io.frames import points_to_file
+from cadam3d.io.gltf import (
+    FLOAT,
+    INDEX_BUFFER,
+    UNSIGNED_INT,
+    UNSIGNED_SHORT,
+    VERTEX_BUFFER,
+    binary_gltf,
+    linear,
+)
 from cadam3d.io.ply_tables import header_text
 
 FORMATS = ("glb", "obj", "ply")
-# glTF 2.0, sec. 4.4 and 5.
-GLB_MAGIC, GLB_VERSION = 0x46546C67, 2
-JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
-FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125
-VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
+# Constants of glTF for the sampling of textures.
 LINEAR, CLAMP = 9729, 33071
 NAME = "cadam3d"
 
@@ -219,29 +222,7 @@ def _binary(document: Mapping[str, object], blocks: Sequence[bytes], targets: Se
         views.append(view if target is None else {**view, "target": target})
         body += block + b"\0" * (-len(block) % 4)
     whole = {**document, "bufferViews": views, "buffers": [{"byteLength": len(body)}]}
-    text = json.dumps(whole, separators=(",", ":")).encode("utf-8")
-    text += b" " * (-len(text) % 4)
-    size = 12 + 8 + len(text) + 8 + len(body)
-    head = struct.pack("<III", GLB_MAGIC, GLB_VERSION, size)
-    return b"".join(
-        [
-            head,
-            struct.pack("<II", len(text), JSON_CHUNK),
-            text,
-            struct.pack("<II", len(body), BINARY_CHUNK),
-            body,
-        ]
-    )
-
-
-def linear(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """Return linear light for sRGB colours, both in [0, 1] (IEC 61966-2-1)."""
-    return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-
-
-def srgb(light: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """Return sRGB colours for linear light, the inverse of ``linear``."""
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0) ** (1 / 2.4) - 0.055)
+    return binary_gltf(whole, body)
 
 
 def _bytes(rgb: Float[np.ndarray, "*batch 3"]) -> UInt8[np.ndarray, "*batch 3"]:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cadam3d.core.checks import require
 from cadam3d.core.number import Number
-from cadam3d.io.prompts import read_prompts
+from cadam3d.io.prompt_files import read_prompts
 from cadam3d.metric.clip import ClipMetric, load_clip
 from cadam3d.metric.scoring import LEVEL, Scorer, interval_record
 

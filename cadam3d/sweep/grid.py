@@ -20,7 +20,7 @@ from hydra.core.override_parser.types import Glob, Override, RangeSweep
 from cadam3d.core.checks import fail, require
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import to_json
-from cadam3d.io.prompts import Prompt
+from cadam3d.io.prompt_files import Prompt
 from cadam3d.settings.compose import TEXT_KEYS, quote, slug
 from cadam3d.settings.line import NOT_OF_A_RUN
 from cadam3d.sweep.folder import Job

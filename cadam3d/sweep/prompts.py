@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cadam3d.core.checks import fail, require, require_whole
-from cadam3d.io.prompts import Prompt, read_prompts, set_names
+from cadam3d.io.prompt_files import Prompt, read_prompts, set_names
 
 KEY, FILE = "prompts", "prompts.file"
 SHARD, CATEGORY, FIRST = "prompts.shard", "prompts.category", "prompts.first"

@@ -167,7 +167,7 @@ def test_the_same_gaussians_give_the_same_bytes(tmp_path):
 def test_a_file_beyond_the_limit_of_the_format_is_one_message(tmp_path, monkeypatch):
     monkeypatch.setattr(glb, "LARGEST_FILE", 1000)
     with pytest.raises(
-        UserError, match=r"at most 1,000 bytes, which is the limit of glb, got .*Try: 'exporter=\[ply\]'$"
+        UserError, match=r"less than 4 GB, which is the limit of glb, got .*Try: 'exporter=\[ply\]'$"
     ):
         write_glb(tmp_path / "a.glb", random_gaussians(30), up="+y")
     assert not list(tmp_path.iterdir())

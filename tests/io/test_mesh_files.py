@@ -12,7 +12,8 @@ from PIL import Image
 from cadam3d.core.errors import UserError
 from cadam3d.core.mesh.surface import Surface, facts, vertex_normals
 from cadam3d.io.frames import AXES
-from cadam3d.io.mesh import Texture, linear, mesh_facts, write_glb, write_mesh_ply, write_obj
+from cadam3d.io.gltf import linear
+from cadam3d.io.mesh import Texture, mesh_facts, write_glb, write_mesh_ply, write_obj
 
 VERTICES = np.array([[0.6, 0, 0], [0, 0.5, 0], [0, 0, 0.7], [-0.1, -0.2, -0.3]])
 FACES = np.array([[0, 1, 2], [0, 2, 3], [1, 0, 3], [2, 1, 3]])

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.prompts import Prompt
+from cadam3d.io.prompt_files import Prompt
 from cadam3d.report import results
 from cadam3d.settings.line import quoted, read_flags
 from cadam3d.sweep.folder import Job, Plan, load, write_plan

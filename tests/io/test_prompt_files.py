@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from cadam3d.core.errors import UserError
-from cadam3d.io import prompts as module
-from cadam3d.io.prompts import Prompt, read_prompts
+from cadam3d.io import prompt_files as module
+from cadam3d.io.prompt_files import Prompt, read_prompts
 from cadam3d.prior.shapes.grammar import parse
 
 # What commas, quotes, brackets, references and other scripts would change if they were not quoted.
