@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from composed import as_yaml
 from programs.files import CASES
 from splats import make_gaussians
@@ -84,14 +83,6 @@ def test_the_files_of_a_run_are_in_exports_and_described_there(run_folder, type_
         2,
         None,
     )
-
-
-def test_the_same_export_writes_the_same_record(run_folder, type_line):
-    records = []
-    for _ in range(2):
-        type_line("export", f"run={run_folder}")
-        records.append((run_folder / "exports/asset.json").read_bytes())
-    assert records[0] == records[1]
 
 
 def test_a_second_export_keeps_the_entries_of_unchanged_files_only(run_folder, type_line):
@@ -307,16 +298,6 @@ def test_a_target_chooses_an_exporter_whose_file_is_upright_there(target, run_fo
         torch.testing.assert_close(means, read_ply(run_folder / "asset.ply").means)
 
 
-def test_each_page_of_help_names_every_target(type_line):
-    out = type_line("export", "--help").out
-    assert all(f"  {target} " in out for target in TARGETS)
-    texts = [(config_dir() / f"for/{name}.yaml").read_text(encoding="utf-8") for name in TARGETS]
-    measured = {program.target: program.is_measured for program in PROGRAMS}
-    for name, text in zip(TARGETS, texts, strict=True):
-        assert ("Measured." in text) == measured[name]
-        assert yaml.safe_load(text).keys() == {"defaults", "exporter"}
-
-
 @pytest.mark.parametrize("target", sorted(UNKNOWN))
 def test_a_program_with_unknown_axes_is_refused_with_a_line_to_try(target, run_folder, type_line):
     typed = ("export", f"run={run_folder}", f"for={target}", "output=x.splat")
@@ -326,11 +307,6 @@ def test_a_program_with_unknown_axes_is_refused_with_a_line_to_try(target, run_f
     line = shlex.split(message.rpartition("Try: ")[2])
     assert line[:3] == ["cadam3d", "export", f"run={run_folder}"]
     assert type_line(*line[1:]).code == 0
-
-
-def test_an_unknown_target_lists_the_known_ones(run_folder, type_line):
-    message = type_line("export", f"run={run_folder}", "for=sparc").message
-    assert message == f"for: expected one of {'|'.join(TARGETS)}, got 'sparc'. Try: for=spark"
 
 
 def test_a_target_and_an_exporter_are_refused_but_a_setting_of_the_exporter_wins(run_folder, type_line):
@@ -349,12 +325,6 @@ def test_a_target_decides_the_format_of_a_named_file(run_folder, type_line, tmp_
     assert b"up=+y" in (tmp_path / "a.ply").read_bytes()[:200]
     message = type_line("export", f"run={run_folder}", "for=spark", "output=a.glb").message
     assert "exporter=[ply] writes 1 file(s) with suffix .ply" in message
-
-
-@pytest.mark.parametrize("command", ["render", "view"])
-def test_a_target_of_another_command_leads_to_export(command, run_folder, type_line):
-    message = type_line(command, f"run={run_folder}", "for=spark").message
-    assert message == f"for: belongs to cadam3d export. Try: cadam3d export 'run={run_folder}' for=spark"
 
 
 # --- suffixes ---------------------------------------------------------------------------------------------
@@ -434,26 +404,3 @@ def test_a_program_shows_a_file_in_one_way(exporter):
 
 
 # --- wrong places -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("output", "reason"),
-    [
-        ("output=a.jpg", "expected a file with suffix .compressed.ply|"),
-        ("output=file/a.ply", "cannot write to file/a.ply (file is a file)"),
-        ("output=thing.ply/", "expected a folder, got 'thing.ply/', which is a file"),
-    ],
-)
-def test_a_wrong_place_is_explained_with_one_that_works(run_folder, type_line, output, reason):
-    for name in ("file", "thing.ply"):
-        Path(name).touch()
-    message = type_line("export", f"run={run_folder}", output).message
-    assert reason in message
-    assert type_line("export", f"run={run_folder}", message.partition("Try: ")[2]).code == 0
-
-
-@pytest.mark.parametrize("typed", ["foo", "[foo]", "[spz,foo]"])
-def test_an_unknown_exporter_is_explained_with_the_usual_one(run_folder, type_line, typed):
-    message = type_line("export", f"run={run_folder}", f"exporter={typed}", "output=out").message
-    suggested = shlex.split(message.partition("Try: ")[2])
-    assert type_line("export", f"run={run_folder}", *suggested, "output=out").code == 0

@@ -1,21 +1,24 @@
-"""Exporters of splat, spz, glb, sog and ksplat: file names, axes, and wrong values that name their key."""
+"""Exporters of Gaussians: file names, axes, and wrong values that name their key."""
 
 import pytest
 from formats import asset, errors, gaussforge_reads, likeness_db, random_gaussians
 
 from cadam3d.core.errors import UserError
 from cadam3d.exporter.base import AssetExporter
+from cadam3d.exporter.compressed_ply import CompressedPlyExporter
 from cadam3d.exporter.glb import GlbExporter
 from cadam3d.exporter.ksplat import KsplatExporter
+from cadam3d.exporter.ply import PlyExporter
 from cadam3d.exporter.sog import SogExporter
 from cadam3d.exporter.splat import SplatExporter
 from cadam3d.exporter.spz import SpzExporter
 from cadam3d.io import gaussforge
-from cadam3d.io.frames import file_to_world
-from cadam3d.io.splat import read_splat
-from cadam3d.io.spz import read_spz
+from cadam3d.io.asset_file import read_gaussians
+from cadam3d.io.frames import UPS, file_to_world
 
 EXPORTERS = {
+    "asset.ply": (PlyExporter, {"pad_sh": 0}),
+    "asset.compressed.ply": (CompressedPlyExporter, {}),
     "asset.splat": (SplatExporter, {}),
     "asset.spz": (SpzExporter, {"version": 3}),
     "asset.glb": (GlbExporter, {}),
@@ -41,16 +44,23 @@ def test_each_exporter_writes_its_file_and_nothing_else(tmp_path, name):
 
 @pytest.mark.parametrize("name", EXPORTERS)
 def test_a_wrong_axis_names_its_key(name):
-    with pytest.raises(UserError, match=rf"^exporter\.{name.removeprefix('asset.')}\.up: .*Try: exporter\."):
+    with pytest.raises(UserError, match=rf"^{EXPORTERS[name][0].node}\.up: .*Try: exporter\."):
         built(name, up="up")
 
 
-@pytest.mark.parametrize("up", ["-y", "+y"])
-def test_the_file_has_the_chosen_axes(tmp_path, up):
-    built("asset.splat", up).export(asset(), never_renders, tmp_path)
-    built("asset.spz", up).export(asset(), never_renders, tmp_path)
-    assert likeness_db(read_splat(tmp_path / "asset.splat", up=up)) > 38
-    assert likeness_db(read_spz(tmp_path / "asset.spz", up=up)) > 38
+@pytest.mark.parametrize("name", ["asset.ply", "asset.compressed.ply", "asset.splat", "asset.spz"])
+@pytest.mark.parametrize("up", UPS)
+def test_the_file_has_the_chosen_axes(tmp_path, name, up):
+    built(name, up).export(asset(), never_renders, tmp_path)
+    assert likeness_db(read_gaussians(tmp_path / name, up=up)) > 38
+
+
+def test_a_ply_has_padded_spherical_harmonics(tmp_path):
+    made = built("asset.ply", pad_sh=3)
+    [path] = made.export(random_gaussians(5), never_renders, tmp_path)
+    assert read_gaussians(path).sh_degree == made.contents(path, random_gaussians(5)).sh_degree == 3
+    with pytest.raises(UserError, match=r"exporter\.ply\.pad_sh: expected one of 0\|1\|2\|3"):
+        built("asset.ply", pad_sh=4)
 
 
 def test_spz_has_the_chosen_version(tmp_path):

@@ -112,15 +112,6 @@ def test_a_texture_needs_fewer_triangles_for_the_same_colours(tmp_path):
     assert error.mean() < 6  # of 255
 
 
-def test_fewer_triangles_than_a_texture_may_have_stay_fewer(tmp_path):
-    settings = {**SETTINGS, "triangles": 500}
-    assert MeshExporter(**settings).most_triangles() == 500
-    pytest.importorskip("xatlas")
-    for triangles, most in ((500, 500), (20_000, 10_000), (None, 10_000)):
-        exporter = MeshExporter(**{**settings, "texture": 64, "triangles": triangles})
-        assert exporter.most_triangles() == most
-
-
 def test_a_texture_without_xatlas_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "xatlas", None)
     with pytest.raises(UserError, match=r"needs xatlas\. Try: pip install 'cadam3d\[texture\]'"):

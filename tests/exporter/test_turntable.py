@@ -75,17 +75,6 @@ def test_depth_is_beside_colour_and_black_where_nothing_is_visible(tmp_path):
     assert beside[16, 16, 2] < 0.4
 
 
-def test_alpha_can_be_beside_colour(tmp_path):
-    frames, _ = export(tmp_path, beside="alpha")
-    assert frames[0, 16, 48].min() > 0.95
-    assert frames[0, 2, 34].max() < 0.05
-
-
-def test_colour_can_be_alone(tmp_path):
-    frames, _ = export(tmp_path, beside="none")
-    assert frames.shape == (9, 32, 32, 3)
-
-
 def test_odd_sizes_are_padded_not_refused(tmp_path):
     frames, _ = export(tmp_path, beside="none", size=33)
     assert frames.shape == (9, 34, 34, 3)
@@ -101,13 +90,6 @@ def test_every_codec_writes_a_file_with_all_frames(tmp_path, codec, side):
     assert frames.shape[:3] == (9, side, side)
     shades = frames[..., :3].mean(axis=(1, 2, 3))
     assert np.abs(shades - np.arange(9) / 9).max() < 0.03
-
-
-def test_a_gif_repeats_for_ever_at_the_chosen_rate(tmp_path):
-    settings = {**SETTINGS, "codec": "gif", "beside": "none"}
-    [path] = TurntableExporter(**settings).export(no_gaussians(), Recorder(), tmp_path)
-    facts = imageio.immeta(path)
-    assert (facts["loop"], facts["duration"]) == (0, 100)
 
 
 def test_a_transparent_webm_has_the_alpha_of_the_render(tmp_path):

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from cadam3d.io.caption import DARK, LIGHT, Caption, plain, side_by_side
-from cadam3d.report import palette
+from cadam3d.io.caption import Caption, plain, side_by_side
 
 PICTURES = [np.full((40, 96, 3), shade, dtype=np.uint8) for shade in (50, 150)]
 
@@ -35,26 +34,3 @@ def test_a_text_of_any_kind_stays_below_its_own_picture(text):
     assert sheet.shape == side_by_side(PICTURES, [Caption("a", "b"), Caption("", "")]).shape
     assert not ink(sheet[40:])[:, 96:].any()
     assert "\n" not in plain(text)
-
-
-def test_letters_grow_with_the_pictures_and_stay_small_enough_for_tiny_ones():
-    heights = []
-    for size in (2, 64, 256, 512):
-        picture = np.zeros((size, size, 3), dtype=np.uint8)
-        heights.append(side_by_side([picture] * 2, [Caption("a", "b")] * 2).shape[0] - size)
-    assert heights == sorted(heights)
-    assert heights[-1] > 2 * heights[0]
-
-
-def test_text_on_dark_paper_is_light_and_a_fourth_channel_is_opaque_below_the_pictures():
-    picture = np.zeros((32, 96, 4), dtype=np.uint8)
-    sheet = side_by_side([picture] * 2, [Caption("a", "b")] * 2, (0, 0, 0))
-    assert sheet[32:, :, :3].max() > 200
-    assert sheet[:32, :96, 3].max() == 0
-    assert sheet[32:, :, 3].min() == 255
-
-
-def test_the_colours_are_those_of_the_reports():
-    light = [palette.INK, palette.SOFT]
-    assert ["#" + bytes(color).hex() for color in LIGHT] == light
-    assert ["#" + bytes(color).hex() for color in DARK] == [palette.PAGE[color][1] for color in light]

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 import torch
-from formats import WRONG_DB, asset, likeness_db, random_gaussians
+from formats import random_gaussians
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -47,14 +47,6 @@ def test_errors_are_at_most_half_a_step(tmp_path, up, degree):
     assert ((back.rotations - made.rotations).abs() <= 0.005).all()
 
 
-@pytest.mark.parametrize(("degree", "least_db"), [(0, 50), (3, 45)])
-def test_the_picture_of_the_file_is_the_picture_of_the_asset(tmp_path, degree, least_db):
-    back = read_back(tmp_path, asset(degree))
-    assert likeness_db(back, degree) > least_db
-    turned_over = Gaussians(**{**back.tensors(), "means": back.means * torch.tensor([1.0, -1.0, -1.0])})
-    assert likeness_db(turned_over, degree) < WRONG_DB
-
-
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("n", [0, 1, 255, 256, 257])
 def test_every_number_of_gaussians_and_degree_is_possible(tmp_path, n, degree):
@@ -94,12 +86,6 @@ def test_a_number_that_is_not_finite_is_refused_before_anything_is_written(tmp_p
     with pytest.raises(UserError, match="expected finite numbers, got NaN or infinity"):
         write_compressed_ply(tmp_path / "a.ply", made, up="-y")
     assert not list(tmp_path.iterdir())
-
-
-def test_the_same_gaussians_make_the_same_file(tmp_path):
-    for name in ("a.ply", "b.ply"):
-        write_compressed_ply(tmp_path / name, random_gaussians(300, 1), up="-y")
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
 def test_chunks_hold_neighbours():

@@ -12,7 +12,6 @@ from cadam3d.io.frames import (
     band_matrix,
     file_to_world,
     points_to_world,
-    turned,
     turned_points,
     world_to_file,
 )
@@ -91,13 +90,6 @@ def test_the_round_trip_rounds_higher_bands_only_slightly(up):
     torch.testing.assert_close(back.sh, world.sh, rtol=0, atol=1e-6)  # coefficients of size 1 to 4
 
 
-@pytest.mark.parametrize("degree", [1, 2, 3])
-def test_band_matrices_are_orthogonal_for_any_rotation(degree):
-    rotation = random_gaussians(n=1).rotations[0]
-    matrix = band_matrix(degree, tuple(rotation.flatten().tolist()))
-    torch.testing.assert_close(matrix @ matrix.T, torch.eye(2 * degree + 1, dtype=torch.float64))
-
-
 def test_the_vector_rule_of_band_one_agrees_with_the_fitted_matrix():
     world = random_gaussians(degree=1)
     matrix = band_matrix(1, tuple(axes("-y").flatten().tolist()))
@@ -119,17 +111,3 @@ def test_points_are_converted_like_gaussians(up):
 def test_a_quarter_turn_moves_the_front_to_the_left():
     front = torch.tensor([[1.0, 0.0, 0.5]])
     assert turned_points(front, 90).tolist() == [[0.0, 1.0, 0.5]]
-
-
-@pytest.mark.parametrize(("turn_deg", "back"), [(0, 0), (90, 270), (180, 180), (270, 90)])
-def test_turns_add_up_to_a_whole_one(turn_deg, back):
-    world = random_gaussians(degree=1, dtype=torch.float32)
-    made = turned(turned(world, turn_deg), back)
-    for name, tensor in world.tensors().items():
-        assert torch.equal(made.tensors()[name], tensor), name
-    assert torch.equal(turned_points(world.means, turn_deg), turned(world, turn_deg).means)
-
-
-def test_an_eighth_of_a_turn_is_refused():
-    with pytest.raises(UserError, match=r"turn_deg: expected one of 0\|90\|180\|270, got 45"):
-        turned(random_gaussians(), 45)

@@ -4,14 +4,9 @@ import numpy as np
 import pytest
 import torch
 from formats import (
-    ENOUGH_DB,
-    WRONG_DB,
-    asset,
     errors,
-    extreme_gaussians,
     gaussforge_reads,
     is_finite,
-    likeness_db,
     matched,
     random_gaussians,
 )
@@ -19,25 +14,11 @@ from formats import (
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io import gaussforge
-from cadam3d.io.frames import file_to_world, world_to_file
+from cadam3d.io.frames import world_to_file
 from cadam3d.io.gaussforge import write_ksplat, write_sog, write_spz4
 
 pytest.importorskip("gaussforge")
 WRITERS = {"sog": write_sog, "ksplat": write_ksplat, "spz": write_spz4}
-
-
-@pytest.mark.parametrize("kind", WRITERS)
-def test_the_picture_stays_and_a_wrong_up_axis_shows(tmp_path, kind):
-    WRITERS[kind](tmp_path / "a", asset(), up="+y")
-    read = gaussforge_reads((tmp_path / "a").read_bytes(), kind)
-    assert likeness_db(file_to_world(read, "+y")) > ENOUGH_DB
-    assert likeness_db(file_to_world(read, "-y")) < WRONG_DB
-
-
-@pytest.mark.parametrize("kind", ["sog", "spz"])
-def test_view_dependent_colours_stay(tmp_path, kind):
-    WRITERS[kind](tmp_path / "a", asset(3), up="+z")
-    assert likeness_db(gaussforge_reads((tmp_path / "a").read_bytes(), kind), degree=3) > ENOUGH_DB
 
 
 @pytest.mark.parametrize(("degree", "kept"), [(1, 1), (2, 2), (3, 2)])
@@ -77,19 +58,6 @@ def test_one_extreme_gaussian_costs_the_others_no_precision(tmp_path, kind):
     assert restored["log_scales"] < 0.3
     assert restored["opacities"] < 0.005
     assert restored["sh0"] < 0.5
-
-
-@pytest.mark.parametrize("kind", WRITERS)
-def test_extreme_numbers_are_written_as_finite_ones(tmp_path, kind):
-    WRITERS[kind](tmp_path / "a", extreme_gaussians(1), up="-y")
-    assert is_finite(gaussforge_reads((tmp_path / "a").read_bytes(), kind))
-
-
-@pytest.mark.parametrize("kind", WRITERS)
-def test_the_same_gaussians_give_the_same_bytes(tmp_path, kind):
-    for name in ("a", "b"):
-        WRITERS[kind](tmp_path / name, random_gaussians(300, degree=1), up="-y")
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 @pytest.mark.parametrize("kind", ["sog", "ksplat"])

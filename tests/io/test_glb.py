@@ -6,7 +6,6 @@ import struct
 import numpy as np
 import pytest
 import torch
-import trimesh
 from formats import (
     WRONG_DB,
     asset,
@@ -132,13 +131,6 @@ def test_the_picture_stays_and_a_wrong_up_axis_shows(tmp_path, degree):
     _, arrays = parsed((tmp_path / "a.glb").read_bytes())
     assert likeness_db(gaussians_of(arrays, "+y"), degree) > 60
     assert likeness_db(gaussians_of(arrays, "-y"), degree) < WRONG_DB
-
-
-def test_trimesh_opens_it_as_points(tmp_path):
-    gaussians = random_gaussians(30)
-    write_glb(tmp_path / "a.glb", gaussians, up="+z")
-    cloud = trimesh.load(tmp_path / "a.glb", force="scene").dump()[0]
-    assert np.allclose(cloud.vertices, gaussians.means)
 
 
 @pytest.mark.parametrize("degree", [0, 3])

@@ -52,10 +52,6 @@ def test_a_cut_last_line_is_left_out_and_harms_no_later_line(tmp_path, cut):
     assert read_jsonl(path) == [*complete, {"step": 3}]
 
 
-def test_a_missing_log_is_empty(tmp_path):
-    assert read_jsonl(tmp_path / "m.jsonl") == []
-
-
 def test_truncating_drops_later_steps_only(tmp_path):
     path = tmp_path / "m.jsonl"
     for line in [
@@ -77,17 +73,6 @@ def test_truncating_keeps_the_bytes_of_what_stays(tmp_path):
     before = path.read_bytes()
     truncate_after(path, 5)
     assert path.read_bytes() == before
-
-
-def test_truncating_removes_a_cut_line(tmp_path):
-    (tmp_path / "m.jsonl").write_text('{"step": 1}\n{"st')
-    truncate_after(tmp_path / "m.jsonl", 9)
-    assert (tmp_path / "m.jsonl").read_text() == '{"step": 1}\n'
-
-
-def test_truncating_nothing_makes_no_file(tmp_path):
-    truncate_after(tmp_path / "m.jsonl", 5)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_json_file_is_read_as_it_was_written(tmp_path):

@@ -58,9 +58,3 @@ def test_paths_are_shown_relative_to_the_current_folder_if_they_are_inside(tmp_p
     monkeypatch.chdir(tmp_path)
     assert shown(tmp_path / "a" / "b") == Path("a/b")
     assert shown(tmp_path.parent) == tmp_path.parent
-
-
-def test_a_number_is_in_front_of_the_suffix_of_a_file(tmp_path):
-    file = tmp_path / "a.compressed.ply"
-    file.touch()
-    assert numbered(file, suffix=".compressed.ply") == tmp_path / "a-2.compressed.ply"

@@ -5,15 +5,10 @@ import struct
 import pytest
 import torch
 from formats import (
-    ENOUGH_DB,
-    WRONG_DB,
-    asset,
     errors,
-    extreme_gaussians,
     gaussforge_reads,
     gaussforge_writes,
     is_finite,
-    likeness_db,
     matched,
     random_gaussians,
 )
@@ -82,34 +77,12 @@ def test_another_program_reads_the_same_numbers_and_we_read_its_file(tmp_path):
     assert back["angle_deg"] < 2 * MOST_DEG
 
 
-def test_the_picture_stays_and_a_wrong_up_axis_shows(tmp_path):
-    write_splat(tmp_path / "a.splat", asset(), up="-y")
-    assert likeness_db(read_splat(tmp_path / "a.splat")) > ENOUGH_DB
-    assert likeness_db(read_splat(tmp_path / "a.splat", up="+y")) < WRONG_DB
-
-
 def test_view_dependence_is_dropped_and_nothing_else(tmp_path):
     write_splat(tmp_path / "a.splat", random_gaussians(20, degree=3), up="-y")
     coloured = random_gaussians(20, degree=3)
     plain = type(coloured)(**{**coloured.tensors(), "sh": coloured.sh[:, :1]})
     write_splat(tmp_path / "b.splat", plain, up="-y")
     assert (tmp_path / "a.splat").read_bytes() == (tmp_path / "b.splat").read_bytes()
-
-
-def test_extreme_numbers_are_clamped_and_read_back_finite(tmp_path):
-    write_splat(tmp_path / "a.splat", extreme_gaussians(0), up="-y")
-    back = read_splat(tmp_path / "a.splat")
-    assert is_finite(back)
-    original = extreme_gaussians(0)
-    restored = matched(back, original)
-    assert (restored.opacities - original.opacities).abs().max() < HALF_STEP
-    assert torch.equal(restored.log_scales.argsort(dim=0)[-1], original.log_scales.argsort(dim=0)[-1])
-
-
-@pytest.mark.parametrize("n", [0, 1])
-def test_few_gaussians_are_a_valid_file(tmp_path, n):
-    write_splat(tmp_path / "a.splat", random_gaussians(n), up="-y")
-    assert len(read_splat(tmp_path / "a.splat")) == n
 
 
 def test_a_scale_of_zero_is_read_as_a_very_thin_one(tmp_path):
@@ -135,9 +108,3 @@ def test_a_broken_file_is_one_message(tmp_path, name):
     (tmp_path / "a.splat").write_bytes(content)
     with pytest.raises(UserError, match=message + r".*\. Try: another file$"):
         read_splat(tmp_path / "a.splat")
-
-
-def test_what_is_not_a_file_is_one_message(tmp_path):
-    for path in (tmp_path, tmp_path / "absent.splat", tmp_path / "null\0byte"):
-        with pytest.raises(UserError, match=r"Try: another file$"):
-            read_splat(path)

@@ -8,15 +8,9 @@ import zlib
 import pytest
 import torch
 from formats import (
-    ENOUGH_DB,
-    WRONG_DB,
-    asset,
     errors,
-    extreme_gaussians,
     gaussforge_reads,
     gaussforge_writes,
-    is_finite,
-    likeness_db,
     random_gaussians,
 )
 
@@ -109,13 +103,6 @@ def test_another_program_reads_the_same_numbers_and_we_read_its_files(tmp_path, 
     assert max(errors(gaussforge_reads((tmp_path / "b.spz").read_bytes(), "spz"), ours).values()) < 0.03
 
 
-@pytest.mark.parametrize("degree", [0, 3])
-def test_the_picture_stays_and_a_wrong_up_axis_shows(tmp_path, degree):
-    write_spz(tmp_path / "a.spz", asset(degree), up="+y")
-    assert likeness_db(read_spz(tmp_path / "a.spz"), degree) > ENOUGH_DB
-    assert likeness_db(read_spz(tmp_path / "a.spz", up="-y"), degree) < WRONG_DB
-
-
 def test_reading_and_writing_again_gives_the_same_bytes(tmp_path):
     write_spz(tmp_path / "a.spz", random_gaussians(300, degree=2), up="+z")
     write_spz(tmp_path / "b.spz", read_spz(tmp_path / "a.spz", up="+z"), up="+z")
@@ -140,21 +127,6 @@ def test_a_position_beyond_the_format_is_one_message(tmp_path):
     with pytest.raises(UserError, match=r"up to 8,388,607.*got 1e\+07. Try: 'exporter=\[ply\]'$"):
         write_spz(tmp_path / "a.spz", gaussians, up="+y")
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("degree", [0, 3])
-def test_extreme_numbers_are_clamped_and_read_back_finite(tmp_path, degree):
-    write_spz(tmp_path / "a.spz", extreme_gaussians(degree), up="+y")
-    back = read_spz(tmp_path / "a.spz")
-    assert is_finite(back)
-    assert (back.opacities - extreme_gaussians(degree).opacities).abs().max() < 1 / 500
-
-
-@pytest.mark.parametrize("n", [0, 1])
-def test_few_gaussians_are_a_valid_file(tmp_path, n):
-    write_spz(tmp_path / "a.spz", random_gaussians(n, degree=1), up="+y")
-    back = read_spz(tmp_path / "a.spz")
-    assert (len(back), back.sh_degree) == (n, 1)
 
 
 def test_many_rows_are_decoded_in_their_order(tmp_path):
@@ -188,12 +160,6 @@ def test_a_broken_file_is_one_message(tmp_path, name):
     content, message = BROKEN[name]
     with pytest.raises(UserError, match=message + r".*\. Try: another file$"):
         read(tmp_path, content)
-
-
-def test_what_is_not_a_file_is_one_message(tmp_path):
-    for path in (tmp_path, tmp_path / "absent.spz", tmp_path / "null\0byte"):
-        with pytest.raises(UserError, match=r"Try: another file$"):
-            read_spz(path)
 
 
 def test_extensions_after_the_gaussians_are_skipped(tmp_path):
