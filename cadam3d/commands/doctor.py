@@ -7,8 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
 from dataclasses import asdict
 from functools import partial
 from importlib import import_module, metadata
@@ -23,15 +22,21 @@ from cadam3d.settings.compose import Call, compose
 from cadam3d.settings.options import config_dir, option_names
 
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "fast-simplification", "imageio", "imageio-ffmpeg")
-PACKAGES += ("jaxtyping", "jinja2", "kornia", "matplotlib", "pillow", "pyyaml", "scikit-image", "scipy")
+PACKAGES += (
+    "jaxtyping",
+    "jinja2",
+    "kornia",
+    "matplotlib",
+    "pillow",
+    "pydantic",
+    "pyyaml",
+    "scikit-image",
+    "scipy",
+)
 PACKAGES += ("tqdm", "trimesh")
 IMPORT_NAMES = {"hydra-core": "hydra", "imageio-ffmpeg": "imageio_ffmpeg", "pillow": "PIL", "pyyaml": "yaml"}
 IMPORT_NAMES |= {"fast-simplification": "fast_simplification", "scikit-image": "skimage"}
-# The messages for compilers that are missing.
-COMPILERS = {
-    **dict.fromkeys(("c++", "g++", "clang++"), "not found; one C++ compiler is enough"),
-    "nvcc": "not found, not needed",
-}
+COMPILERS = ("c++", "g++", "clang++", "nvcc")
 SECONDS = 60  # longest wait for a program
 
 
@@ -55,24 +60,18 @@ def examine() -> Iterator[Finding]:
     """Run all checks. A check that fails does not stop the following ones."""
     yield _python()
     yield from map(_package, PACKAGES)
-    for check in (_torchvision, _device, _ffmpeg, _configs):
-        yield _guarded(check)
+    for topic, check in (
+        ("torchvision", _torchvision),
+        ("device", _device),
+        ("ffmpeg", _ffmpeg),
+        ("configs", _configs),
+    ):
+        yield attempt(topic, check, is_needed=True)
     yield from map(_compiler, COMPILERS)
-    yield from _rasterizers()
-    yield _guarded(_tracer)
-    yield from _priors()
-    yield from map(_guarded, (_diffusers, _models))
-
-
-def _guarded(check: Callable[[], Finding]) -> Finding:
-    """Return the finding of a check, or a broken one if the check raises an exception."""
-    try:
-        return check()
-    except Exception as error:
-        topic = check.__name__.strip("_")
-        return Finding(
-            topic, Verdict.BROKEN, f"{type(error).__name__}: {error}", "Try: pip install --upgrade ."
-        )
+    yield from _kernels()
+    for path in sorted((config_dir() / "prior").glob("*.yaml")):
+        yield attempt(f"prior={path.stem}", partial(_prior, f"prior={path.stem}"))
+    yield from (_diffusers(), _models())
 
 
 def _python() -> Finding:
@@ -151,7 +150,7 @@ def _configs() -> Finding:
 def _compiler(name: str) -> Finding:
     path = shutil.which(name)
     if path is None:
-        return Finding(name, Verdict.NOTE, COMPILERS.get(name, "not found"))
+        return Finding(name, Verdict.NOTE, "not found; one C++ compiler is enough, and nvcc is not needed")
     code, output = _run_program([path, "--version"])
     if code != 0:
         return Finding(name, Verdict.NOTE, f"{path} does not run")
@@ -161,27 +160,15 @@ def _compiler(name: str) -> Finding:
     return Finding(name, Verdict.OK, (release or lines)[0].strip())
 
 
-def _rasterizers() -> Iterator[Finding]:
+def _kernels() -> Iterator[Finding]:
     try:
-        from cadam3d.commands.doctor_rasterizers import check_rasterizers
+        from cadam3d.commands.doctor_kernels import check_kernels
     except Exception as error:
         # For example, torch cannot be imported. The check of that package has reported it already.
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         yield Finding("rasterizers", Verdict.BROKEN, f"cannot be loaded: {reason}")
         return
-    yield from check_rasterizers()
-
-
-def _tracer() -> Finding:
-    from cadam3d.commands.doctor_tracer import check_tracer
-
-    return check_tracer()
-
-
-def _priors() -> Iterator[Finding]:
-    for name in option_names("prior"):
-        topic = f"prior={name}"
-        yield attempt(topic, partial(_prior, topic))
+    yield from check_kernels()
 
 
 def _prior(topic: str) -> Finding:
@@ -199,29 +186,13 @@ def _diffusers() -> Finding:
 
 
 def _models() -> Finding:
-    """List the models in the cache of the Hugging Face hub and the settings that use them."""
+    """List the models in the cache of the Hugging Face hub."""
     home = Path(os.environ.get("HF_HOME") or Path("~/.cache/huggingface").expanduser())
     cache = Path(os.environ.get("HF_HUB_CACHE") or home / "hub")
-    folders = sorted(cache.glob("models--*"))
-    if not folders:
+    names = [folder.name.split("--", 1)[1].replace("--", "/") for folder in sorted(cache.glob("models--*"))]
+    if not names:
         return Finding("models on disk", Verdict.NOTE, f"none in {cache}; prior=shapes needs none")
-    return Finding("models on disk", Verdict.OK, ", ".join(map(_model, folders)))
-
-
-def _model(folder: Path) -> str:
-    """Return the name of a cached model and, if its index names a known kind, the setting that uses it."""
-    from cadam3d.initializer import shap_e
-    from cadam3d.io.pretrained import INDEX
-    from cadam3d.prior.latent import PRIORS
-
-    readers = PRIORS | {shap_e.KIND: "initializer=shap_e"}
-    name = folder.name.removeprefix("models--").replace("--", "/")
-    uses = set[str]()
-    for index in folder.glob(f"snapshots/*/{INDEX}"):
-        # The index may be incomplete or name an unknown kind.
-        with suppress(OSError, ValueError, LookupError, TypeError):
-            uses.add(readers[json.loads(index.read_text(encoding="utf-8"))["_class_name"]])
-    return f"{name} ({', '.join(sorted(uses))})" if uses else name
+    return Finding("models on disk", Verdict.OK, ", ".join(names))
 
 
 def _run_program(command: list[str]) -> tuple[int, str]:

@@ -26,13 +26,17 @@ class Finding:
     facts: Mapping[str, object] = field(default_factory=dict)  # JSON values, for programs
 
 
-def attempt(topic: str, check: Callable[[], Finding]) -> Finding:
-    """Return the finding of ``check``: a note if something is not available, broken after any other error."""
+def attempt(topic: str, check: Callable[[], Finding], *, is_needed: bool = False) -> Finding:
+    """Return the finding of ``check``, or one about the error that it raises.
+
+    The error is a note if something is not available that training does not need.
+    """
     try:
         return check()
-    except (UserError, ImportError, OSError) as error:
-        first, *others = str(error).splitlines() or [type(error).__name__]
-        return Finding(topic, Verdict.NOTE, first, others[-1] if others else "")
     except Exception as error:
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        return Finding(topic, Verdict.BROKEN, reason, "Try: pip install --force-reinstall cadam3d")
+        is_note = isinstance(error, UserError | ImportError | OSError) and not is_needed
+        first, *others = str(error).splitlines() or [type(error).__name__]
+        if is_note:
+            return Finding(topic, Verdict.NOTE, first, others[-1] if others else "")
+        hint = "Try: pip install --upgrade --force-reinstall ."
+        return Finding(topic, Verdict.BROKEN, f"{type(error).__name__}: {first}", hint)

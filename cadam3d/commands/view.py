@@ -20,7 +20,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.run_folder import REPORT, expanded, has_file, shown, typed_path
 from cadam3d.live.server import HOST, Server
-from cadam3d.live.subject import Run, Subject
+from cadam3d.live.subject import ShownFile, ShownRun
 from cadam3d.settings.compose import Call
 from cadam3d.sweep.folder import is_sweep
 
@@ -64,15 +64,15 @@ def _ended_by_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _subject(cfg: DictConfig) -> Subject:
+def _subject(cfg: DictConfig) -> ShownFile:
     if cfg.ply is not None:
         file = expanded(str(cfg.ply))
-        return Subject(file, lambda: read_gaussians(file, up=cfg.ply_up))
+        return ShownFile(file, lambda: read_gaussians(file, up=cfg.ply_up))
     folder = find_run(str(cfg.run))
-    return Run(folder, lambda: read_gaussians(find_asset(folder)))
+    return ShownRun(folder, lambda: read_gaussians(find_asset(folder)))
 
 
-def _listening(subject: Subject, port: int) -> Server:
+def _listening(subject: ShownFile, port: int) -> Server:
     """Return a server that listens. Raises ``UserError`` if the port is not free."""
     try:
         return Server(subject, port)

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 
 from cadam3d.io.jsonl import to_json
 from cadam3d.io.reading import signature
-from cadam3d.live.subject import Subject
+from cadam3d.live.subject import ShownFile
 from cadam3d.viewer import page as viewer
 
 HOST = "127.0.0.1"
@@ -70,7 +70,7 @@ FIXED: dict[str, tuple[str, Callable[[], bytes]]] = {
     "viewer.css": (STYLE, lambda: viewer.style().encode()),
 }
 # What depends on the run or the file. None means that there is nothing yet.
-CURRENT: dict[str, tuple[str, Callable[[Subject], bytes | None]]] = {
+CURRENT: dict[str, tuple[str, Callable[[ShownFile], bytes | None]]] = {
     "state": (JSON, lambda subject: _json(subject.state())),
     "charts": (JSON, lambda subject: _json(subject.charts())),
     "picture": (BYTES, lambda subject: subject.picture()),
@@ -84,7 +84,7 @@ class Server(ThreadingHTTPServer):
     # On Windows, another program could then use the same port.
     allow_reuse_address = os.name != "nt"
 
-    def __init__(self, subject: Subject, port: int) -> None:
+    def __init__(self, subject: ShownFile, port: int) -> None:
         """Listen on ``port``, or on any free one if it is 0. Raises ``OSError`` if that is impossible."""
         self.subject, self.token = subject, secrets.token_urlsafe(18)
         super().__init__((HOST, port), Handler)

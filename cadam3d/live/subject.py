@@ -83,8 +83,8 @@ class Kept(Generic[Value]):
 
 
 @dataclass
-class Subject:
-    """A file of Gaussians; :class:`Run` adds everything that only a run has.
+class ShownFile:
+    """A file of Gaussians; :class:`ShownRun` adds everything that only a run has.
 
     The methods change what is kept, so a thread calls them while it holds ``turns``.
     """
@@ -123,7 +123,7 @@ class Subject:
 
 
 @dataclass
-class Run(Subject):
+class ShownRun(ShownFile):
     """A run. It is live if a process holds the lock of its folder and has written the state in ``live/``."""
 
     def __post_init__(self) -> None:

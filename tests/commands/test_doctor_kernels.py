@@ -4,18 +4,16 @@ import ctypes
 import json
 import math
 from dataclasses import asdict, replace
-from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
 import torch
 
-from cadam3d.commands import doctor_rasterizers
-from cadam3d.commands.doctor_rasterizers import check_rasterizers
-from cadam3d.commands.finding import Finding, Verdict
+from cadam3d.commands import doctor_kernels
+from cadam3d.commands.doctor_kernels import TRACER, check_kernels
+from cadam3d.commands.finding import Finding, Verdict, attempt
 from cadam3d.compiled import build
 from cadam3d.compiled.build import find_compiler
-from cadam3d.core.errors import UserError
 from cadam3d.io.cache import kernels_dir
 from cadam3d.rasterizer import auto, gsplat, nvrtc
 from cadam3d.rasterizer.base import Backend
@@ -55,7 +53,7 @@ def agreement() -> Agreement:
 
 
 def by_topic() -> dict[str, Finding]:
-    found = list(check_rasterizers())
+    found = list(check_kernels())
     assert all(json.loads(json.dumps(asdict(finding), allow_nan=False)) for finding in found)
     return {finding.topic: finding for finding in found}
 
@@ -85,7 +83,7 @@ def test_the_native_kernels_are_named_and_tested():
 def test_the_finding_states_whether_kernels_were_compiled_now(seconds, words, monkeypatch):
     built = replace(build.build(cpu_library(), kernels_dir(None)), seconds=seconds)
     monkeypatch.setattr(build, "build", lambda library, cache_dir: built)
-    finding = doctor_rasterizers._cpu_kernels()
+    finding = doctor_kernels._cpu_kernels()
     assert words in finding.found
     assert finding.facts["compiled_now"] is (seconds > 0)
     assert finding.facts["compile_seconds"] == seconds
@@ -113,13 +111,6 @@ def an_nvrtc() -> nvrtc.Nvrtc:
     )
 
 
-def test_an_nvrtc_without_a_device_is_mentioned(bare, monkeypatch):
-    monkeypatch.setattr(nvrtc, "find_compiler", an_nvrtc)
-    finding = by_topic()["kernels for cuda"]
-    assert finding.found == "torch sees no CUDA device; NVRTC 13.0 is in /there/libnvrtc.so.13"
-    assert finding.facts == {"nvrtc": "/there/libnvrtc.so.13", "nvrtc_version": "13.0"}
-
-
 @pytest.fixture
 def a_gpu(bare, monkeypatch, tmp_path):
     """Simulate one CUDA device, for which the kernels have just been compiled."""
@@ -133,7 +124,7 @@ def a_gpu(bare, monkeypatch, tmp_path):
 
 
 def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu, monkeypatch, agreement):
-    monkeypatch.setattr(doctor_rasterizers, "self_test", lambda rasterizer, device, demands: agreement)
+    monkeypatch.setattr(doctor_kernels, "self_test", lambda rasterizer, device, demands: agreement)
     found = by_topic()
     assert found["kernels for cuda"].found.startswith(
         "sm_90 for a GPU (compute capability 9.0) by NVRTC 13.0 in /there/libnvrtc.so.13, compiled now in 7.0"
@@ -143,22 +134,11 @@ def test_cuda_kernels_are_named_with_device_architecture_compiler_and_time(a_gpu
     assert found["rasterizer=auto"].found == "chooses cuda on cuda:0: the fastest there is, and it works"
 
 
-def test_gsplat_is_named_with_its_version_or_as_not_installed(bare, monkeypatch):
-    def missing(name):
-        raise PackageNotFoundError
-
-    monkeypatch.setattr(doctor_rasterizers, "version", lambda name: "1.5.3")
-    topic = "kernels for gsplat"
-    assert by_topic()[topic].found == "torch sees no CUDA device; gsplat 1.5.3 is installed"
-    monkeypatch.setattr(doctor_rasterizers, "version", missing)
-    assert by_topic()[topic].found == "torch sees no CUDA device; gsplat is not installed, not needed"
-
-
 def test_gsplat_is_tested_on_a_gpu_with_its_own_demands(a_gpu, monkeypatch, agreement):
     monkeypatch.setattr(GsplatRasterizer, "prepare", lambda self, device: Backend("gsplat"))
-    monkeypatch.setattr(doctor_rasterizers, "version", lambda name: "1.5.3")
+    monkeypatch.setattr(doctor_kernels, "version", lambda name: "1.5.3")
     monkeypatch.setattr(
-        doctor_rasterizers,
+        doctor_kernels,
         "self_test",
         lambda rasterizer, device, demands: replace(
             agreement, demands=demands, repeats=demands is not GSPLAT
@@ -171,7 +151,7 @@ def test_gsplat_is_tested_on_a_gpu_with_its_own_demands(a_gpu, monkeypatch, agre
 
 
 def test_a_gpu_without_gsplat_gets_the_command_that_installs_it(a_gpu, monkeypatch, agreement):
-    monkeypatch.setattr(doctor_rasterizers, "self_test", lambda rasterizer, device, demands: agreement)
+    monkeypatch.setattr(doctor_kernels, "self_test", lambda rasterizer, device, demands: agreement)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(gsplat, "find_spec", lambda name: None)
     found = by_topic()
@@ -197,13 +177,13 @@ def test_a_gpu_without_gsplat_gets_the_command_that_installs_it(a_gpu, monkeypat
 )
 def test_a_failed_self_test_is_reported(topic, device, change, verdict, monkeypatch, agreement):
     monkeypatch.setattr(
-        doctor_rasterizers,
+        doctor_kernels,
         "self_test",
         lambda rasterizer, device, demands: replace(agreement, demands=demands, **change),
     )
     on_gpu = {"rasterizer=gsplat": GSPLAT, "rasterizer=reference": ATOMIC}
     demands = OWN if device == "cpu" else on_gpu.get(topic, OWN)
-    finding = doctor_rasterizers._tested(topic, ReferenceRasterizer(), torch.device(device), demands)
+    finding = doctor_kernels._tested(topic, ReferenceRasterizer(), torch.device(device), demands)
     assert finding.verdict is verdict
     assert ("report" in finding.hint) is (verdict is not Verdict.OK)
     json.dumps(finding.facts, allow_nan=False)
@@ -213,17 +193,41 @@ def test_a_self_test_that_crashes_is_a_finding(monkeypatch):
     def crash(rasterizer, device, demands):
         raise RuntimeError("an illegal memory access\nsomewhere")
 
-    monkeypatch.setattr(doctor_rasterizers, "self_test", crash)
-    finding = doctor_rasterizers._tested("rasterizer=cuda", ReferenceRasterizer(), torch.device("cpu"), OWN)
+    monkeypatch.setattr(doctor_kernels, "self_test", crash)
+    finding = doctor_kernels._tested("rasterizer=cuda", ReferenceRasterizer(), torch.device("cpu"), OWN)
     assert finding.verdict is Verdict.BROKEN
     assert finding.found == "RuntimeError: an illegal memory access"
 
 
-def test_an_error_of_the_compiler_is_one_line_and_a_hint(monkeypatch):
-    def fail(library, cache_dir):
-        raise UserError("rasterizer=cpu: c++ could not build the kernels:\nerror\nerror\nTry: another one")
+@needs_compiler
+def test_the_native_tracer_is_named_and_agrees_with_torch():
+    finding = attempt(TRACER, doctor_kernels._tracer)
+    assert (finding.topic, finding.verdict) == (TRACER, Verdict.OK)
+    assert finding.found.startswith(
+        f"native, {finding.facts['instruction_set']} by {find_compiler().version}, "
+    )
+    assert finding.facts["difference"] <= 1e-6
+    assert json.loads(json.dumps(asdict(finding), allow_nan=False))
 
-    monkeypatch.setattr(build, "build", fail)
-    finding = next(check_rasterizers())
-    assert finding.found == "rasterizer=cpu: c++ could not build the kernels:"
-    assert finding.hint == "Try: another one"
+
+@needs_compiler
+def test_a_native_tracer_that_draws_something_else_is_broken(monkeypatch):
+    trace = doctor_kernels.trace_natively
+
+    def brighter(*case):
+        layers = trace(*case)
+        return replace(layers, paints=1.01 * layers.paints)
+
+    monkeypatch.setattr(doctor_kernels, "trace_natively", brighter)
+    finding = attempt(TRACER, doctor_kernels._tracer)
+    assert finding.verdict is Verdict.BROKEN
+    assert finding.hint.endswith("use prior.tracer=torch")
+
+
+def test_without_a_compiler_the_tracer_in_torch_is_named_with_the_reason(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(build, "find_compiler", lambda: None)
+    finding = attempt(TRACER, doctor_kernels._tracer)
+    assert finding.verdict is Verdict.NOTE
+    assert finding.found.startswith("torch, which is slow: prior.tracer=native: expected a C++ compiler")
+    assert finding.facts == {"tracer": "torch"}

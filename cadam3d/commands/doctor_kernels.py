@@ -1,8 +1,8 @@
-"""Rasterizer checks of ``cadam3d doctor``: how each backend was compiled, and its self-test."""
+"""Kernels for ``cadam3d doctor``: how each rasterizer and the ray tracer was compiled, and its self-test."""
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 
@@ -10,7 +10,13 @@ import torch
 
 from cadam3d.commands.finding import Finding, Verdict, attempt
 from cadam3d.compiled import build
+from cadam3d.core.cameras import turntable
+from cadam3d.core.errors import UserError
 from cadam3d.io.cache import kernels_dir
+from cadam3d.prior.shapes import native_tracer
+from cadam3d.prior.shapes.native_tracer import load_tracer, trace_natively
+from cadam3d.prior.shapes.scene import build as scene_of
+from cadam3d.prior.shapes.tracer import trace
 from cadam3d.rasterizer import nvrtc
 from cadam3d.rasterizer.auto import AutoRasterizer
 from cadam3d.rasterizer.base import Rasterizer
@@ -21,41 +27,49 @@ from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import ATOMIC, GSPLAT, OWN, Demands, self_test
 
 CPU = torch.device("cpu")
+TRACER = "prior.tracer=auto"
+# Several kinds of solids. There is no pattern, because its borders may differ by a sample.
+PROMPT = "a red mug next to a tree"
+TOLERANCE = 1e-4  # of the light, in [0, 1]
 # Failures that do not end a training, because auto chooses another backend then.
 REPLACED = ("rasterizer=cuda", "rasterizer=gsplat")
 
 
-def check_rasterizers() -> Iterator[Finding]:
+def check_kernels() -> Iterator[Finding]:
     """Compile and test each backend on each device. ``auto`` is last because it would compile silently."""
     gpus = [torch.device("cuda", i) for i in range(torch.cuda.device_count())]
-    yield (kernels := attempt("kernels for cpu", _cpu_kernels))
-    if kernels.verdict is Verdict.OK:
-        yield _tested("rasterizer=cpu", CpuRasterizer(cache_dir=None), CPU, OWN)
+    yield from _compiled("cpu", _cpu_kernels, CpuRasterizer(cache_dir=None), CPU, OWN)
+    for gpu in gpus:
+        yield from _compiled("cuda", partial(_cuda_kernels, gpu), CudaRasterizer(cache_dir=None), gpu, OWN)
+        yield from _compiled("gsplat", partial(_gsplat_kernels, gpu), GsplatRasterizer(), gpu, GSPLAT)
     if not gpus:
         yield attempt("kernels for cuda", _no_cuda)
-    for gpu in gpus:
-        yield (kernels := attempt("kernels for cuda", partial(_cuda_kernels, gpu)))
-        if kernels.verdict is Verdict.OK:
-            yield _tested("rasterizer=cuda", CudaRasterizer(cache_dir=None), gpu, OWN)
-    if not gpus:
         yield _gsplat_without_gpu()
-    for gpu in gpus:
-        yield (kernels := attempt("kernels for gsplat", partial(_gsplat_kernels, gpu)))
-        if kernels.verdict is Verdict.OK:
-            yield _tested("rasterizer=gsplat", GsplatRasterizer(), gpu, GSPLAT)
     for device in (CPU, *gpus):
         demands = OWN if device == CPU else ATOMIC
         yield _tested("rasterizer=reference", ReferenceRasterizer(), device, demands)
     for device in (CPU, *gpus):
         yield attempt("rasterizer=auto", partial(_choice, device))
+    yield attempt(TRACER, _tracer)
+
+
+def _compiled(
+    name: str,
+    compiling: Callable[[], Finding],
+    rasterizer: Rasterizer,
+    device: torch.device,
+    demands: Demands,
+) -> Iterator[Finding]:
+    """Yield how a backend was compiled, and its self-test if that succeeded."""
+    kernels = attempt(f"kernels for {name}", compiling)
+    yield kernels
+    if kernels.verdict is Verdict.OK:
+        yield _tested(f"rasterizer={name}", rasterizer, device, demands)
 
 
 def _cpu_kernels() -> Finding:
-    built, compiler = build.build(cpu_library(), kernels_dir(None)), build.find_compiler()
-    instructions = instruction_set(build.load(built))
-    version = compiler.version if compiler else None
-    facts = {"compiler": version, "instruction_set": instructions, **kept(built)}
-    found = f"{instructions} by {version or 'a compiler that was removed'}, {when(built)}"
+    built = build.build(cpu_library(), kernels_dir(None))
+    found, facts = _native(instruction_set(build.load(built)), built)
     return Finding("kernels for cpu", Verdict.OK, found, facts=facts)
 
 
@@ -142,6 +156,34 @@ def _choice(device: torch.device) -> Finding:
     first, *others = backend.reason.splitlines()
     found = f"chooses {backend.name} on {device}{backend.remark}: {first}"
     return Finding("rasterizer=auto", Verdict.NOTE, found, others[-1] if others else "", facts)
+
+
+def _tracer() -> Finding:
+    """Compile the native tracer and compare it with the one in torch; a note if it cannot be compiled."""
+    try:
+        built, library = load_tracer()
+    except UserError as error:
+        first, *others = str(error).splitlines()
+        found = f"torch, which is slow: {first}"
+        return Finding(TRACER, Verdict.NOTE, found, others[-1] if others else "", {"tracer": "torch"})
+    scene = scene_of(PROMPT).to(CPU, torch.float32)
+    views = turntable(2, elevation_deg=20.0, distance=3.0, fov_y_deg=40.0, size=32)
+    ours, expected = trace_natively(library, scene, views, 2), trace(scene, views, 2)
+    difference = float((ours.paints - expected.paints).abs().max())
+    how, facts = _native(native_tracer.instruction_set(library), built)
+    facts |= {"tracer": "native", "difference": difference}
+    if difference <= TOLERANCE:
+        return Finding(TRACER, Verdict.OK, f"native, {how}; equals torch to {difference:.1g}", facts=facts)
+    hint = "Please report this. Until it is fixed, use prior.tracer=torch"
+    return Finding(TRACER, Verdict.BROKEN, f"native, {how}; differs by {difference:.1g}", hint, facts)
+
+
+def _native(instructions: str, built: build.Build) -> tuple[str, dict[str, object]]:
+    """Return how kernels for the CPU were compiled, in words and as JSON values."""
+    compiler = build.find_compiler()
+    version = compiler.version if compiler else None
+    facts = {"compiler": version, "instruction_set": instructions, **kept(built)}
+    return f"{instructions} by {version or 'a compiler that was removed'}, {when(built)}", facts
 
 
 def kept(built: build.Build | nvrtc.Cubin) -> dict[str, object]:
