@@ -69,8 +69,8 @@ def examine() -> Iterator[Finding]:
         yield attempt(topic, check, is_needed=True)
     yield from map(_compiler, COMPILERS)
     yield from _kernels()
-    for path in sorted((config_dir() / "prior").glob("*.yaml")):
-        yield attempt(f"prior={path.stem}", partial(_prior, f"prior={path.stem}"))
+    for name in option_names("prior"):
+        yield attempt(f"prior={name}", partial(_prior, f"prior={name}"))
     yield from (_diffusers(), _models())
 
 
