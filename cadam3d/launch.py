@@ -15,7 +15,7 @@ from cadam3d.io.run_folder import JOBS, RUN_FOLDER, expanded, has_file, typed_pa
 from cadam3d.settings.advice import explain, line_of, refused_path, require_values, reraise_interrupt
 from cadam3d.settings.check import require_settings
 from cadam3d.settings.compose import LONGEST_KEY, TEXT_KEYS, Call, compose_line
-from cadam3d.settings.help_page import help_text
+from cadam3d.settings.help import help_text
 from cadam3d.settings.hydra import refuse_missing_settings, refuse_unread_settings, run_hydra
 from cadam3d.settings.line import (
     DRY_RUN,
@@ -30,7 +30,6 @@ from cadam3d.settings.line import (
     text_of,
 )
 from cadam3d.settings.options import config_dir
-from cadam3d.settings.output import exporting
 from cadam3d.settings.target import require_target
 from cadam3d.sweep.plan import require_attempts
 
@@ -133,6 +132,9 @@ def read_line(command: str, words: Sequence[str]) -> Line:
         _refuse_resumed_jobs(overrides)
         overrides = resumed(overrides, is_sweep=is_sweep, folders=folders, retry=line.trusting)
     elif command in EXPORTING:
+        # The exporters load torch.
+        from cadam3d.settings.output import exporting
+
         overrides = exporting(overrides, folders)
     return replace(line, overrides=overrides)
 

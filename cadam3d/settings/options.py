@@ -8,6 +8,7 @@ package. Nothing is composed here.
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from difflib import get_close_matches
 from functools import cache
 from inspect import isabstract, isclass
 from pathlib import Path
@@ -46,8 +47,10 @@ def option_file(group: str, name: str, folders: Sequence[Path] = ()) -> Path:
     for folder in folders or (config_dir(),):
         if (path := folder / group / f"{name}.yaml").is_file():
             return path
-    known = "|".join(option_names(group, folders))
-    raise UserError(f"{group}: expected one of {known}, got {name!r}. Try: {option_word(group)}")
+    known = option_names(group, folders)
+    near = get_close_matches(name, known, n=1)
+    word = f"{group}={near[0]}" if near else option_word(group)
+    raise UserError(f"{group}: expected one of {'|'.join(known)}, got {name!r}. Try: {word}")
 
 
 def read_option(group: str, name: str, folders: Sequence[Path] = ()) -> dict[str, Any]:
@@ -58,6 +61,13 @@ def read_option(group: str, name: str, folders: Sequence[Path] = ()) -> dict[str
     """
     place, values = _read(group, name, folders)
     return _nested(place, values)
+
+
+def package_of(group: str, path: Path) -> list[str]:
+    """Return the keys under which the file of an option is composed, such as ``["exporter", "ply"]``."""
+    package = PACKAGE.match(read_text(path))
+    place = package.group(1).split(".") if package else group.split("/")
+    return [part for part in place if part != "_global_"]
 
 
 def option_class(group: str, name: str, folders: Sequence[Path] = ()) -> type | None:
@@ -162,8 +172,7 @@ def _read(group: str, name: str, folders: Sequence[Path]) -> tuple[list[str], di
     content = read_yaml(path)
     if not isinstance(content, dict):
         raise UserError(f"{path}: expected keys with values, got other data. Try: {option_word(group)}")
-    package = PACKAGE.match(read_text(path))
-    place = package.group(1).split(".") if package else group.split("/")
+    place = package_of(group, path)
     merged: dict[str, Any] = {}
     for base in content.pop("defaults", ()):
         if isinstance(base, str) and base != "_self_":
@@ -173,7 +182,7 @@ def _read(group: str, name: str, folders: Sequence[Path]) -> tuple[list[str], di
             merged = _merged(
                 merged, _nested([part for part in [below] if part not in ("", "_here_")], values)
             )
-    return [part for part in place if part != "_global_"], _merged(merged, content)
+    return place, _merged(merged, content)
 
 
 def _nested(place: Sequence[str], values: dict[str, Any]) -> dict[str, Any]:

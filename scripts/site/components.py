@@ -1,64 +1,66 @@
-"""Write the generated parts of docs/components.md: python scripts/write_components.py
+"""A hook of MkDocs: the page of components, from the comments in configs/ and the text in components.md.
 
-These parts are made from the comments in configs/. Each is between two lines, ``<!-- begin generated: NAME
--->`` and ``<!-- end generated -->``. If NAME is a group, the part lists its options and their settings. If
-NAME is a command, it lists the settings of the command. Everything around these parts is written by hand.
+``mkdocs.yml`` names this file. In components.md, ``{{ NAME }}`` stands for the options of a group and their
+settings, or for the settings of a command.
 """
 
 import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from cadam3d.settings.documentation import Library, Option, Setting
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+from cadam3d.settings.help import Library, Option, Setting
 from cadam3d.settings.options import config_dir
 
-PAGE = Path(__file__).parent.parent / "docs" / "components.md"
-PART = re.compile(r"(<!-- begin generated: (\S+) -->\n).*?(<!-- end generated -->)", re.DOTALL)
+TEXT = Path(__file__).parent / "components.md"
+PART = re.compile(r"^\{\{ (\S+) \}\}$", re.MULTILINE)
 # Options of these groups are lists of runs and have no settings.
 LISTED_ONLY = ("grid",)
 # Options of these groups change settings of other groups, which are documented there.
 RECIPES = ("experiment", "noise", "vram", "for")
 
 
-def main() -> None:
-    PAGE.write_text(written(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the page of components."""
+    files.append(File.generated(config, "components.md", content=page()))
+    return files
 
 
-def written(text: str) -> str:
-    """Return the page with all generated parts brought up to date."""
+def page() -> str:
+    """Return the page of components."""
     library = Library([config_dir()])
-    chosen = {group.name: group.chosen for group in library.groups("sweep")}
+    chosen = {name: group.chosen for name, group in library.groups("sweep").items()}
 
     def part(match: re.Match[str]) -> str:
-        name = match.group(2)
-        is_group = name in library.options
-        body = (
-            group(library, name, chosen.get(name, ())) if is_group else table(library.command(name).settings)
-        )
-        return f"{match.group(1)}\n{body}\n\n{match.group(3)}"
+        name = match.group(1)
+        if name in library.options:
+            return group(library, name, chosen.get(name, ()))
+        return table(library.command(name).settings)
 
-    return PART.sub(part, text)
+    return PART.sub(part, TEXT.read_text(encoding="utf-8"))
 
 
 def group(library: Library, name: str, chosen: tuple[str, ...]) -> str:
     """Return the table of the options of a group, and under it the settings of each option."""
-    options = [library.option(name, each) for each in library.options[name]]
+    options = {each: library.option(name, each) for each in library.options[name]}
     lines = [f"| `{name}=` | |", "|---|---|"]
-    for option in options:
-        mark = " (default)" if option.name in chosen else ""
-        lines.append(f"| `{option.name}`{mark} | {cell(option.about)} |")
+    for each, option in options.items():
+        mark = " (default)" if each in chosen else ""
+        lines.append(f"| `{each}`{mark} | {cell(option.about)} |")
     blocks = ["\n".join(lines)]
     if name not in LISTED_ONLY:
-        blocks += [block for option in options if (block := settings(name, option))]
+        blocks += [block for each, option in options.items() if (block := settings(name, each, option))]
     return "\n\n".join(blocks)
 
 
-def settings(name: str, option: Option) -> str:
+def settings(name: str, chosen: str, option: Option) -> str:
     """Return the settings of an option in a folded section: only the changed ones if it has a base."""
-    own = [each for each in option.settings if not option.base or each.key in option.own_keys]
+    own = [each for each in option.settings if not option.base or each.key in option.changed]
     if not own:
         return ""
-    title = f"<code>{name}={option.name}</code>"
+    title = f"<code>{name}={chosen}</code>"
     if option.base:
         title += f", otherwise as <code>{option.base}</code>"
     prefix = name.replace("/", ".") + "."
@@ -86,7 +88,3 @@ def changes(settings: Iterable[Setting]) -> str:
 def cell(text: str) -> str:
     """Return text for a cell of a table."""
     return " ".join(text.split()).replace("|", r"\|").replace("<", "&lt;")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,417 @@
+"""Help: describe groups, options and settings in the words of the YAML files, for the terminal and the site.
+
+The comment beside a key, or directly above it, describes the key. The first comment of a file describes the
+option or the command. A key without a comment has the words of the same key in the file that its option
+builds on, or else in another option with the same class. Nothing is composed and torch is not imported.
+"""
+
+import re
+import shutil
+import textwrap
+from argparse import Namespace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property, reduce
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+from cadam3d.core.errors import UserError
+from cadam3d.io.reading import read_text, read_yaml
+from cadam3d.settings.advice import did_you_mean
+from cadam3d.settings.options import TARGET, config_dir, option_file, option_names, package_of, read_option
+
+NARROWEST, WIDEST = 60, 120  # characters per line
+# Characters. The description of a longer key begins on the next line.
+FIRST_COLUMN = 34
+SCHEDULES = "cadam3d.core.schedule."
+SENTENCE_END = re.compile(r"(?<=[.!?])(?<!al\.)(?<!sec\.)(?<!fig\.)(?<!eq\.)\s+")
+KEY = re.compile(r"(\s*)(\w+):(?=\s|$)(.*)")
+# A group in the list of defaults, with the words about it.
+ENTRY = re.compile(r"\s*- (?:override )?/?([\w/]+): [^#]*(?:# (.*))?")
+COMMENT = re.compile(r"""(?:"[^"]*"|'[^']*'|[^#'"]|(?<=\S)#)*?(?<!\S)# ?(.*)""")
+NAME = re.compile(r"\w+")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """A key with its value and its description."""
+
+    key: str  # as in a command line, such as "camera.fov_y_deg"
+    # As it is typed, or the call that builds an object, such as "Linear(start=0.98, end=0.5, steps=500)".
+    value: str
+    words: str
+    is_object: bool  # the value is an object or a group of keys, with settings of its own
+
+
+@dataclass(frozen=True, kw_only=True)
+class Option:
+    """An option that ``group=name`` chooses, or a command with its settings outside of all groups."""
+
+    about: str  # paragraphs between empty lines; a line that begins with a space is an example
+    target: str  # the class, such as "cadam3d.camera.orbit.Orbit", or ""
+    base: str  # the option of the same group that this one builds on, or ""
+    settings: tuple[Setting, ...]
+    changed: tuple[str, ...]  # keys to which the file itself gives a value
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choices:
+    """A group of options as a command uses it."""
+
+    name: str  # such as "camera", or "initializer/fallback" for a group inside a group
+    chosen: tuple[str, ...]  # the default
+    is_list: bool  # several options can be chosen
+    words: str
+
+
+class Library:
+    """All YAML files in some folders, in the order in which Hydra searches them."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        self.folders = tuple(folders)
+
+    @cached_property
+    def options(self) -> dict[str, list[str]]:
+        """Return the names of the options of each group, without the groups of Hydra itself."""
+        files = [path.relative_to(folder) for folder in self.folders for path in folder.glob("*/**/*.yaml")]
+        groups = {path.parent.as_posix() for path in files if path.parts[0] != "hydra"}
+        return {group: option_names(group, self.folders) for group in sorted(groups)}
+
+    def summary(self, group: str, name: str) -> str:
+        """Return the first sentence of the description of an option."""
+        about = about_of(read_text(option_file(group, name, self.folders)))
+        return SENTENCE_END.split(about.partition("\n")[0], maxsplit=1)[0]
+
+    def groups(self, command: str) -> dict[str, Choices]:
+        """Return the groups of a command, with those of the command that it builds on first."""
+        path = self._command(command)
+        words = {
+            found[1]: found[2] or "" for found in map(ENTRY.match, read_text(path).splitlines()) if found
+        }
+        bases, choices = _defaults(read_yaml(path))
+        groups = {name: group for base in bases for name, group in self.groups(base).items()}
+        choices.pop("hydra", None)
+        for name in choices:
+            chosen, is_list = choices[name] or [], isinstance(choices[name], list)
+            chosen = tuple(chosen if is_list or not chosen else [chosen])
+            groups[name] = Choices(name=name, chosen=chosen, is_list=is_list, words=words[name])
+        return groups
+
+    def command(self, name: str) -> Option:
+        """Return a command with its settings outside of all groups."""
+        path = self._command(name)
+        values = read_yaml(path)
+        outside = {"defaults", "hydra", *self.groups(name)}
+        own = {key: value for key, value in values.items() if key not in outside}
+        inherited = [each for base in _defaults(values)[0] for each in self.command(base).settings]
+        settings = (*inherited, *_settings(own, _words_in(path)))
+        about = about_of(read_text(path))
+        return Option(about=about, target="", base="", settings=settings, changed=tuple(own))
+
+    def option(self, group: str, name: str, command: str = "train") -> Option:
+        """Return an option with all its settings, including those of the option that it builds on.
+
+        An option may also change settings and groups elsewhere. Their words are those of ``command``.
+        """
+        path = option_file(group, name, self.folders)
+        values, content = read_option(group, name, self.folders), read_yaml(path)
+        values.pop("hydra", None)
+        bases, choices = _defaults(content)
+        node = reduce(lambda inner, part: inner.get(part) or {}, group.split("/"), values)
+        own_words, known = self._words(group, name), self._words_elsewhere(values, group, command)
+        # Words about a setting of another group are a note about its value here.
+        here = {key: words for key, words in own_words.items() if key.partition(".")[0] == _head(group)}
+        words = _noted(known, own_words) | here
+        chosen = [
+            Setting(key=key, value=_spelled(value), words=self._about_choice(key, value), is_object=False)
+            for key, value in choices.items()
+            if key in self.options
+        ]
+        own = {key: value for key, value in content.items() if key != "defaults"}
+        changed = _settings(own, {}, "".join(f"{part}." for part in package_of(group, path)))
+        return Option(
+            about=about_of(read_text(path)),
+            target=str(node.get(TARGET) or (node.get(name) or {}).get(TARGET) or ""),
+            base=next((base for base in bases if "/" not in base), ""),
+            settings=(*chosen, *_settings(values, words)),
+            changed=(*choices, *(each.key for each in changed)),
+        )
+
+    def _command(self, name: str) -> Path:
+        places = [folder / f"{name}.yaml" for folder in self.folders]
+        if found := [path for path in places if path.is_file()]:
+            return found[0]
+        listed = " or ".join(map(str, self.folders))
+        raise UserError(f"{name}.yaml: expected this file in {listed}, got none. Try: cadam3d doctor")
+
+    def _words(self, group: str, name: str) -> dict[str, str]:
+        """Return the words in the file of an option and in those that it builds on, by full key."""
+        path = option_file(group, name, self.folders)
+        known: dict[str, str] = {}
+        for base in _defaults(read_yaml(path))[0]:
+            inner, _, option = base.lstrip("/").rpartition("/")
+            known |= self._words(inner or group, option)
+        place = package_of(group, path)
+        return _noted(known, {".".join([*place, key]): each for key, each in _words_in(path).items()})
+
+    def _words_elsewhere(self, values: dict[str, Any], group: str, command: str) -> dict[str, str]:
+        """Return the words that the command and other options have for the keys of an option.
+
+        These are the options of the same class, and for a setting of another group all its options.
+        """
+        words = {each.key: each.words for each in self.command(command).settings}
+        groups = self.groups(command)
+        for root in values.keys() & self.options.keys() - {_head(group)}:
+            first = groups[root].chosen if root in groups else ()
+            for name in reversed([*first, *self.options[root]]):
+                words |= self._words(root, name)
+        for key, target in _keys_by_class(values):
+            if meaning := self._words_by_class.get((target, key.rpartition(".")[2])):
+                words.setdefault(key, meaning)
+        return words
+
+    @cached_property
+    def _words_by_class(self) -> dict[tuple[str, str], str]:
+        """Return the words for the settings of objects, by class and key, in all options."""
+        known: dict[tuple[str, str], str] = {}
+        for group in self.options:
+            for name in self.options[group]:
+                path = option_file(group, name, self.folders)
+                values, words = read_yaml(path), _words_in(path)
+                for key, target in _keys_by_class(values if isinstance(values, dict) else {}):
+                    if key in words:
+                        known.setdefault((target, key.rpartition(".")[2]), words[key])
+        return known
+
+    def _about_choice(self, group: str, value: Any) -> str:
+        names = value if isinstance(value, list) else [value]
+        return " ".join(self.summary(group, name) for name in names)
+
+
+def help_text(command: str, overrides: Sequence[str], options: Namespace) -> str:
+    """Return the help of a command, or of the options that the overrides choose, such as ``camera=orbit``.
+
+    A word without ``=`` that names a group lists its options; overrides of single settings are ignored.
+    ``options`` are the flags of the line, of which ``--config-path`` and ``--config-dir`` name folders of
+    YAML files. Raises ``UserError`` for a group or an option that does not exist.
+    """
+    folders = [Path(options.config_dir)] if options.config_dir else []
+    library = Library([*folders, Path(options.config_path) if options.config_path else config_dir()])
+    config_name = options.config_name or command
+    groups = _groups(library, config_name)
+    width = min(max(shutil.get_terminal_size((100, 24)).columns, NARROWEST), WIDEST)
+    parts = []
+    for word in overrides:
+        name, equals, value = word.lstrip("+").partition("=")
+        if name in groups and equals:
+            chosen = [option for option in NAME.findall(value) if option != "null"]
+            parts += [_option(library, command, name, option, width) for option in chosen]
+        elif name in groups:
+            parts += [_group(library, groups[name], width), _hint(command, groups[name], width)]
+        elif name in library.options or not equals:
+            near = did_you_mean(name.partition(".")[0], list(groups)) or list(groups)
+            raise UserError(
+                f"{word!r}: expected a group of cadam3d {command} ({', '.join(groups) or 'it has none'}). "
+                f"Try: {' '.join(['cadam3d', command, '--help', *near[:1]])}"
+            )
+    return "\n\n".join(parts) if parts else _overview(library, command, config_name, groups, width)
+
+
+def about_of(text: str) -> str:
+    """Return the first comment of a file: paragraphs in one line each, and lines of examples."""
+    lines = [line for line in text.splitlines() if not line.startswith("# @package ")]
+    flowing = [""]
+    for line in (each[1:].removeprefix(" ").rstrip() for each in takewhile(_is_comment, lines)):
+        if line and flowing[-1] and not line.startswith(" ") and not flowing[-1].startswith(" "):
+            flowing[-1] += " " + line
+        else:
+            flowing.append(line)
+    return "\n".join(flowing).strip("\n")
+
+
+def _is_comment(line: str) -> bool:
+    return line.startswith("#")
+
+
+@cache
+def _words_in(path: Path) -> dict[str, str]:
+    return words_of(read_text(path))
+
+
+def words_of(text: str) -> dict[str, str]:
+    """Return the descriptions of the keys in a YAML file by dotted key, without those that have none."""
+    found: dict[str, str] = {}
+    parents: list[tuple[int, str]] = []  # columns and keys of the dicts around a line
+    above: list[str] = []
+    is_header = True
+    for line in text.splitlines():
+        is_header = is_header and line.startswith("#")
+        if line.lstrip().startswith("#") and not is_header:
+            above.append(line.lstrip("# "))
+            continue
+        if match := KEY.match(line):
+            column, key = len(match[1]), match[2]
+            parents = [parent for parent in parents if parent[0] < column] + [(column, key)]
+            comment = COMMENT.match(match[3])
+            words = " ".join(above)
+            if comment:
+                words = f"{words} {comment[1][0].upper()}{comment[1][1:]}" if words else comment[1]
+            if words:
+                found[".".join(name for _, name in parents)] = words
+        above = []
+    return found
+
+
+def _defaults(content: Any) -> tuple[list[str], dict[str, Any]]:
+    """Return the files and the choices of groups in the list of defaults of a file."""
+    entries = content.get("defaults", ())
+    bases = [each.partition("@")[0] for each in entries if isinstance(each, str) and each != "_self_"]
+    pairs = [pair for entry in entries if isinstance(entry, dict) for pair in entry.items()]
+    return bases, {key.removeprefix("override ").lstrip("/"): value for key, value in pairs}
+
+
+def _keys_by_class(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the dotted keys of all objects except schedules, each with the class of its object."""
+    target = str(values.get(TARGET, ""))
+    for name, value in values.items():
+        if target and not target.startswith(SCHEDULES):
+            yield f"{prefix}{name}", target
+        if isinstance(value, dict):
+            yield from _keys_by_class(value, f"{prefix}{name}.")
+
+
+def _head(group: str) -> str:
+    return group.partition("/")[0]
+
+
+def _settings(values: dict[str, Any], words: Mapping[str, str], prefix: str = "") -> Iterator[Setting]:
+    """Yield the settings in nested values. The numbers of a schedule are part of its value.
+
+    A group of keys is yielded only if it has a description.
+    """
+    for name, value in values.items():
+        key = f"{prefix}{name}"
+        target = str(value.get(TARGET, "")) if isinstance(value, dict) else ""
+        is_branch = isinstance(value, dict) and not (target and prefix and key in words)
+        if name != TARGET and (not is_branch or key in words):
+            text = "" if is_branch else _spelled(value)
+            yield Setting(key=key, value=text, words=words.get(key, ""), is_object=isinstance(value, dict))
+        if isinstance(value, dict) and not target.startswith(SCHEDULES):
+            yield from _settings(value, words, f"{key}.")
+
+
+def _noted(known: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
+    """Return the words for keys, with those of one file as notes about its values."""
+    return {**known, **{key: _with_note(known.get(key, ""), note) for key, note in own.items()}}
+
+
+def _with_note(meaning: str, note: str) -> str:
+    """Return the description of a key with a note about its value; a repetition is left out."""
+    if not meaning or not note or note in meaning:
+        return meaning or note
+    return f"{meaning.removesuffix('.')}. Here: {note}"
+
+
+def _spelled(value: Any) -> str:
+    """Return a value as a command line spells it, or the call that builds an object."""
+    if isinstance(value, list):
+        return f"[{','.join(map(_spelled, value))}]"
+    if isinstance(value, dict):
+        name = str(value.get(TARGET, "")).rpartition(".")[2]
+        is_short = name and not value[TARGET].startswith(SCHEDULES)
+        inner = ", ".join(f"{key}={_spelled(each)}" for key, each in value.items() if key != TARGET)
+        return name if is_short else f"{name}({inner})"
+    if value is None or isinstance(value, bool):
+        return str(value).lower().replace("none", "null")
+    return str(value) or '""'
+
+
+def _groups(library: Library, command: str) -> dict[str, Choices]:
+    """Return the groups of a command that have options, each followed by the groups inside it."""
+    groups: dict[str, Choices] = {}
+    for group in library.groups(command).values():
+        for name in library.options:
+            if name == group.name:
+                groups[name] = group
+            elif name.startswith(f"{group.name}/"):
+                words = "an option for the setting of this name"
+                groups[name] = Choices(name=name, chosen=(), is_list=False, words=words)
+    return groups
+
+
+def _overview(
+    library: Library, command: str, config_name: str, groups: dict[str, Choices], width: int
+) -> str:
+    """Return the purpose of a command, its settings, and its groups with their options."""
+    about = library.command(config_name)
+    parts = [_paragraphs(about.about, width)]
+    if about.settings:
+        parts.append("Settings (key=value):\n" + _table_of(about.settings, width))
+    if groups:
+        lists = [f"'{group.name}=[{','.join(group.chosen)}]'" for group in groups.values() if group.is_list]
+        note = f"; a list needs quotes, as in {lists[0]}" if lists else ""
+        parts.append(_fill(f"Parts (group=option{note}). * marks what is chosen by default.", width))
+        parts += [_group(library, group, width) for group in groups.values()]
+        parts.append(_hint(command, groups.get("densifier") or next(iter(groups.values())), width))
+    return "\n\n".join(parts)
+
+
+def _group(library: Library, group: Choices, width: int) -> str:
+    """Return the text for a group, with one line for each option."""
+    rows = [
+        (("* " if name in group.chosen else "  ") + name, library.summary(group.name, name))
+        for name in library.options[group.name]
+    ]
+    title = f"{group.name}: {group.words}" if group.words else group.name
+    return "\n".join([_fill(title, width, indent="  "), *_table(rows, width, widest=24)])
+
+
+def _option(library: Library, command: str, group: str, name: str, width: int) -> str:
+    """Return the text for an option and its settings. Raises ``UserError`` if there is no such option."""
+    option = library.option(group, name, command)
+    lines = [f"{group}={name}" + (f" ({option.target})" if option.target else "")]
+    lines.append(_paragraphs(option.about, width))
+    if option.base:
+        changed = ", ".join(key.removeprefix(f"{group}.") for key in option.changed)
+        lines.append(_fill(f"Builds on {group}={option.base} and changes {changed}.", width))
+    return "\n".join([*lines, _table_of(option.settings, width) or "  It has no settings."])
+
+
+def _table_of(settings: Iterable[Setting], width: int) -> str:
+    """Return a table with one row for each setting, under the key of the command line."""
+    rows = []
+    for each in settings:
+        sign = ": " if each.is_object and each.value else "" if each.is_object else "="
+        rows.append((f"  {each.key}{sign}{each.value}", each.words))
+    return "\n".join(_table(rows, width, widest=FIRST_COLUMN))
+
+
+def _table(rows: Sequence[tuple[str, str]], width: int, *, widest: int) -> Iterator[str]:
+    """Yield the lines of a table of two columns, the second of which is wrapped."""
+    column = min(max((len(first) for first, _ in rows), default=0), widest) + 2
+    for first, second in rows:
+        lines = textwrap.wrap(second, width - column, break_long_words=False, break_on_hyphens=False)
+        is_short = len(first) <= column - 2
+        yield (first.ljust(column) + (lines.pop(0) if lines else "")).rstrip() if is_short else first
+        yield from (" " * column + line for line in lines)
+
+
+def _paragraphs(text: str, width: int) -> str:
+    """Wrap each line of a text, except those that begin with a space."""
+    return "\n".join(line if line.startswith(" ") else _fill(line, width) for line in text.splitlines())
+
+
+def _hint(command: str, group: Choices, width: int) -> str:
+    """Return a hint about the pages with more details."""
+    example = group.chosen[0] if group.chosen else "NAME"
+    text = (
+        f"cadam3d {command} --help {group.name}={example} lists the settings of an option. "
+        f"cadam3d {command} --cfg job prints the settings that a command line runs with."
+    )
+    return _fill(text, width)
+
+
+def _fill(text: str, width: int, *, indent: str = "") -> str:
+    """Return ``text`` in lines of at most ``width`` characters, the later ones indented; words stay whole."""
+    return textwrap.fill(text, width, subsequent_indent=indent, break_on_hyphens=False)
