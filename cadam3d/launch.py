@@ -126,8 +126,8 @@ def read_line(command: str, words: Sequence[str]) -> Line:
         return line
     _refuse_words(line)
     overrides = [quoted(override, is_sweep=is_sweep) for override in typed]
-    folders = [Path(options.config_path) if options.config_path else config_dir()]
-    folders += [Path(options.config_dir)] if options.config_dir else []
+    folders = [Path(options.config_dir)] if options.config_dir else []
+    folders.append(Path(options.config_path) if options.config_path else config_dir())
     if command in TRAINING:
         _refuse_resumed_jobs(overrides)
         overrides = resumed(overrides, is_sweep=is_sweep, folders=folders, retry=line.trusting)

@@ -159,8 +159,8 @@ HOSTILE = [
     "prompt='${now:%Y}'",
     "camera.distance=[1,'${oc.create:planted}']",
     "+camera.x={y: '${oc.select:a}'}",
-    "++densifier.tau_Q='${span:0.43,${refine.start},${refine.end},${steps}}'",
-    "prompt='${slug:a}'",
+    "++densifier.tau_Q='${cadam3d.span:0.43,${refine.start},${refine.end},${steps}}'",
+    "prompt='${cadam3d.slug:a}'",
     "prompt=${hydra.runtime.cwd}",
     "mystery=3",
     "+mystery.key=3",
@@ -490,7 +490,7 @@ def test_nothing_is_written_through_a_link_of_a_run(command, run_folder, tmp_pat
 
 
 def test_a_pickled_configuration_is_never_loaded(type_line):
-    assert "may hold any code" in type_line("train", "--experimental-rerun=config.pickle").err
+    assert "--experimental-rerun" in type_line("train", "--experimental-rerun=config.pickle").err
 
 
 @pytest.mark.parametrize("name", ["..", ".", "", "/tmp", "a/b", "../x", "a\\b", "a\0b"])
