@@ -4,7 +4,7 @@ There is one panel per noise level, and an arm has the same colour and marker ev
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,7 +16,6 @@ from cadam3d.io.records import read_metrics
 from cadam3d.report.charts import Point, counts
 from cadam3d.report.compare import (
     FrontierPoint,
-    Value,
     arms_without_growth,
     by_cell,
     frontier,
@@ -26,9 +25,8 @@ from cadam3d.report.compare import (
     qualities,
     value_of,
 )
-from cadam3d.report.palette import INK, PAPER, SOFT
+from cadam3d.report.palette import INK, PAPER
 from cadam3d.report.results import (
-    NO_NOISE,
     ArmSetting,
     JobResult,
     arms_of,
@@ -41,9 +39,7 @@ from cadam3d.report.style import Look, label_axis, looks, new_figure
 
 # A dagger: some jobs of the setting ended before their last step.
 EARLY = "\u2020"
-DASHED = (0, (4, 3))
 LEGEND_COLUMNS = 4
-CLEAN = "best of all arms without noise"
 
 
 def frontier_figure(results: Sequence[JobResult], quality: Number | None = None) -> Figure | None:
@@ -75,16 +71,10 @@ def frontier_figure(results: Sequence[JobResult], quality: Number | None = None)
         label_axis(axes.xaxis)
     if not drawn:
         return None
-    has_bound = [
-        _draw_bound(axes, results, gain_over(at_noise(results, level) if gains else (), value_of(quality)))
-        for axes, level in zip(panels, levels, strict=True)
-        if level != NO_NOISE
-    ]
     panels[0].set_ylabel(f"{quality.heading}, gain over no growth" if gains else quality.heading)
     keys = {result.arm: [key for key, _ in result.setting.thresholds] for result in measured(results)}
     names = {arm: f"{arm}: {', '.join(keys[arm])}" if keys[arm] else arm for arm in style if arm in drawn}
-    handles = [Line2D([], [], label=CLEAN, color=SOFT, lw=1.1, ls=DASHED)] if any(has_bound) else []
-    _add_legend(figure, names, style, handles)
+    _add_legend(figure, names, style)
     return figure
 
 
@@ -119,30 +109,12 @@ def _draw_frontier(axes: Axes, points: Sequence[FrontierPoint], look: Look) -> N
         axes.annotate(text, (x, y), (4, 4), textcoords="offset points", color=look.color, fontsize=7.5)
 
 
-def _draw_bound(axes: Axes, results: Sequence[JobResult], gain: Value) -> bool:
-    """Draw what any arm reaches with the same seeds without noise: how much growth could help at all.
-
-    Return whether there is such a curve.
-    """
-    clean = at_noise(results, NO_NOISE)
-    points = [point for arm in arms_of(clean) for point in frontier(clean, arm, gain)]
-    if len(points) < 2:
-        return False
-    corners = hull_of((point.count.median, point.gain.median) for point in points)
-    places = [(10**x, y) for x, y in corners]
-    axes.plot(*zip(*places, strict=True), color=SOFT, lw=1.1, ls=DASHED, zorder=1, scaley=False)
-    return True
-
-
-def _add_legend(
-    figure: Figure, names: dict[str, str], style: dict[str, Look], more: Iterable[Line2D] = ()
-) -> None:
+def _add_legend(figure: Figure, names: dict[str, str], style: dict[str, Look]) -> None:
     """Write the names of arms below a figure, with their colours and markers."""
     handles = [
         Line2D([], [], label=name, color=style[arm].color, marker=style[arm].marker)
         for arm, name in names.items()
     ]
-    handles += more
     columns = min(len(handles), LEGEND_COLUMNS if len(figure.axes) > 1 else 2)
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False, fontsize=8)
 

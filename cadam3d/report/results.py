@@ -29,14 +29,13 @@ from cadam3d.io.run_folder import CONFIG
 from cadam3d.report.formatting import number
 from cadam3d.settings.compose import compose, flatten
 from cadam3d.settings.options import option_names
-from cadam3d.sweep.folder import UNFINISHED, load
+from cadam3d.sweep.folder import UNFINISHED, Row, load
 
 # The other outcomes leave nothing to measure.
 WITH_ASSET = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.OUT_OF_MEMORY)
 ARM, PREFIX = "densifier", "densifier."
 SEED, PROMPT, NOISE, GUIDANCE, RECIPE = "seed", "prompt", "noise", "guidance", "experiment"
 NO_NOISE = "none"  # the level whose gradients have no noise
-NOISE_ORDER = (NO_NOISE, "weak", "medium", "strong")  # other levels follow in alphabetical order
 
 
 @dataclass(frozen=True)
@@ -129,22 +128,6 @@ class JobResult:
         return self.outcome != Outcome.FINISHED
 
 
-@dataclass(frozen=True)
-class _KnownJob:
-    """A job with its overrides parsed, before it is known which keys the sweep varies."""
-
-    arm: str
-    folder: Path
-    overrides: Mapping[str, Any]  # key to value
-    summary: Mapping[str, Any]
-    outcome: str
-    category: str
-
-    @property
-    def densifier(self) -> str:
-        return str(self.overrides.get(ARM, self.summary.get(ARM, "")))
-
-
 def read(sweep_folder: Path) -> list[JobResult]:
     """Return every job of the sweep in ``sweep_folder``, in order, whether it is done or not.
 
@@ -152,50 +135,59 @@ def read(sweep_folder: Path) -> list[JobResult]:
     of the cells. A key that only differs between arms belongs to the arm. Raises ``UserError`` if
     the folder holds no sweep.
     """
-    jobs = [_known(job) for job in load(sweep_folder)]
-    arms = {job.arm: [other for other in jobs if other.arm == job.arm] for job in jobs}
-    varied = {arm: _varied(members) for arm, members in arms.items()}
-    axes = dict.fromkeys(key for keys in varied.values() for key in keys if not key.startswith(PREFIX))
-    thresholds = {arm: [key for key in keys if key.startswith(PREFIX)] for arm, keys in varied.items()}
-    return [_result(job, thresholds[job.arm], list(axes)) for job in jobs]
+    jobs = [(row, _overrides(row)) for row in load(sweep_folder)]
+    of_arms: dict[str, list[Mapping[str, Any]]] = {}
+    for row, overrides in jobs:
+        of_arms.setdefault(_arm(row, overrides), []).append(overrides)
+    varied = {arm: _varied(members) for arm, members in of_arms.items()}
+    axes = list(dict.fromkeys(key for keys in varied.values() for key in keys if not key.startswith(PREFIX)))
+    return [_result(row, overrides, varied[_arm(row, overrides)], axes) for row, overrides in jobs]
 
 
-def _known(job: Any) -> _KnownJob:
-    """Return a job of :func:`cadam3d.sweep.folder.load` with its overrides parsed.
+def _overrides(row: Row) -> dict[str, Any]:
+    """Return the overrides of a job without settings that come with its prompt.
 
-    Without a grid the arm of a job has no name; it is then the densifier. Settings that come with a prompt
-    are left out: they belong to the prompt, and arms without such a setting are compared too.
+    Those belong to the prompt, and arms without such a setting are compared too.
     """
-    pairs = (_pair(str(line)) for line in job.overrides)
-    overrides = {key: value for key, value in pairs if key not in job.brought}
-    known = _KnownJob(job.arm, job.folder, overrides, job.summary, str(job.outcome), job.category)
-    return known if job.arm else _KnownJob(**{**vars(known), "arm": known.densifier or "default"})
+    pairs = (_pair(str(line)) for line in row.overrides)
+    return {key: value for key, value in pairs if key not in row.brought}
 
 
-def _result(job: _KnownJob, thresholds: Sequence[str], axes: Sequence[str]) -> JobResult:
-    shipped = _shipped(job.densifier)
-    summary = {**job.summary, **read_quality(job.folder, job.summary)}
+def _densifier(row: Row, overrides: Mapping[str, Any]) -> str:
+    return str(overrides.get(ARM, row.summary.get(ARM, "")))
+
+
+def _arm(row: Row, overrides: Mapping[str, Any]) -> str:
+    """Return the arm of a job. Without a grid it has no name and is then the densifier."""
+    return row.arm or _densifier(row, overrides) or "default"
+
+
+def _result(row: Row, overrides: Mapping[str, Any], varied: Sequence[str], axes: Sequence[str]) -> JobResult:
+    shipped = _shipped(_densifier(row, overrides))
+    summary = {**row.summary, **read_quality(row.folder, row.summary)}
     # Whether a comparison with a truth comes from training or from eval.json is the same for all tables.
-    evaluation = read_evaluation(job.folder, job.summary)
-    known = declared(evaluation) | declared(job.summary)
+    evaluation = read_evaluation(row.folder, row.summary)
+    known = declared(evaluation) | declared(row.summary)
     evaluation = {
         name: value for name, value in evaluation.items() if name not in known or not known[name].needs_truth
     }
     sources = (summary, evaluation)
-    given = {key: value for key, value in job.overrides.items() if key.startswith(PREFIX)}
+    given = {key.removeprefix(PREFIX): value for key, value in overrides.items() if key.startswith(PREFIX)}
+    thresholds = [key.removeprefix(PREFIX) for key in varied if key.startswith(PREFIX)]
     return JobResult(
-        folder=job.folder,
+        folder=row.folder,
         setting=ArmSetting(
-            job.arm, tuple((key.removeprefix(PREFIX), _value(job, key, shipped)) for key in thresholds)
+            _arm(row, overrides),
+            tuple((key, _threshold(given.get(key, shipped.get(key)))) for key in thresholds),
         ),
-        is_standard=all(_same(shipped.get(key.removeprefix(PREFIX)), value) for key, value in given.items()),
-        cell=_cell(job, axes),
-        outcome=job.outcome,
-        message=str(job.summary.get("message") or ""),
+        is_standard=all(_same(shipped.get(key), value) for key, value in given.items()),
+        cell=_cell(row, overrides, axes),
+        outcome=str(row.outcome),
+        message=str(row.summary.get("message") or ""),
         grows=summary.get("grows") is not False,
         seconds=number(summary.get("seconds")),
-        objective=str(job.overrides.get(GUIDANCE) or job.summary.get(GUIDANCE) or ""),
-        category=job.category,
+        objective=str(overrides.get(GUIDANCE) or row.summary.get(GUIDANCE) or ""),
+        category=row.category,
         numbers=_numbers(sources, known),
         declared=known,
         scores=latest_scores(sources),
@@ -210,15 +202,14 @@ def _numbers(sources: Iterable[Mapping[str, Any]], known: Mapping[str, Number]) 
     return {name: value for name, value in found.items() if name not in replaced}
 
 
-def _cell(job: _KnownJob, axes: Sequence[str]) -> Cell:
-    known = {key: job.overrides.get(key, job.summary.get(key, "")) for key in (PROMPT, SEED)}
-    known[NOISE] = job.overrides.get(NOISE, "")
-    known |= {key: job.overrides.get(key, "default") for key in axes if key not in known}
+def _cell(row: Row, overrides: Mapping[str, Any], axes: Sequence[str]) -> Cell:
+    known = {key: overrides.get(key, row.summary.get(key, "")) for key in (PROMPT, SEED)}
+    known[NOISE] = overrides.get(NOISE, "")
+    known |= {key: overrides.get(key, "default") for key in axes if key not in known}
     return Cell(tuple(sorted((key, str(value)) for key, value in known.items())))
 
 
-def _value(job: _KnownJob, key: str, shipped: Mapping[str, Any]) -> float | str:
-    value = job.overrides.get(key, shipped.get(key.removeprefix(PREFIX)))
+def _threshold(value: object) -> float | str:
     as_number = number(value)
     return str(value) if as_number is None else as_number
 
@@ -227,10 +218,10 @@ def _same(one: object, other: object) -> bool:
     return one == other or (number(one) is not None and number(one) == number(other))
 
 
-def _varied(jobs: Sequence[_KnownJob]) -> list[str]:
-    """Return the keys with several values among these jobs, one of which may be the default."""
-    keys = dict.fromkeys(key for job in jobs for key in job.overrides if key != ARM)
-    return [key for key in keys if len({repr(job.overrides.get(key)) for job in jobs}) > 1]
+def _varied(jobs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the keys with several values among these overrides, one of which may be the default."""
+    keys = dict.fromkeys(key for overrides in jobs for key in overrides if key != ARM)
+    return [key for key in keys if len({repr(overrides.get(key)) for overrides in jobs}) > 1]
 
 
 # The lines of a sweep's jobs repeat, and the parser takes milliseconds for each.
@@ -277,8 +268,8 @@ def arms_of(results: Iterable[JobResult]) -> list[str]:
 
 
 def levels_of(results: Iterable[JobResult]) -> list[str]:
-    """Return the noise levels at which something was measured."""
-    return in_noise_order(result.cell[NOISE] for result in measured(results))
+    """Return the noise levels at which something was measured, in the order of the sweep."""
+    return list(dict.fromkeys(result.cell[NOISE] for result in measured(results)))
 
 
 def level_title(level: str) -> str:
@@ -286,12 +277,6 @@ def level_title(level: str) -> str:
     if level == NO_NOISE:
         return "no noise"
     return f"{level} noise" if level else ""
-
-
-def in_noise_order(levels: Iterable[str]) -> list[str]:
-    """Return the noise levels from none to strong, each once."""
-    position = {level: i for i, level in enumerate(NOISE_ORDER)}
-    return sorted(set(levels), key=lambda level: (position.get(level, len(position)), level))
 
 
 def at_noise(results: Iterable[JobResult], level: str) -> list[JobResult]:
@@ -324,10 +309,8 @@ def _shipped(arm: str) -> Mapping[str, Any]:
     # The name of an arm may be any text, also the path of another file.
     if arm not in option_names(ARM):
         return {}
-    node = compose([f"{ARM}={arm}", "prompt=any"])[ARM]
-    plain = OmegaConf.to_container(node, resolve=True)
-    assert isinstance(plain, dict)
-    return dict(flatten(plain, with_nodes=True))
+    node = OmegaConf.to_container(compose([f"{ARM}={arm}", "prompt=any"])[ARM], resolve=True)
+    return dict(flatten(node, with_nodes=True))
 
 
 def _written(value: float | str) -> str:

@@ -19,6 +19,7 @@ EMBED_BYTES = 8 << 20  # a larger video is linked, not embedded
 FILES = (ASSET, TURNTABLE, PREVIEW, SUMMARY, METRICS, CONFIG)
 HIDDEN = ("warnings", MEASUREMENTS, NUMBERS)  # entries of the summary that are no facts
 COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "device")
+# Entries of the summary, in the order of the page. Those that are not here follow under their own names.
 LABELS = {
     "prompt": "Prompt",
     "negative_prompt": "Negative prompt",
@@ -27,29 +28,15 @@ LABELS = {
     "initializer_note": "Fallback of the initializer",
     "backend": "Rasterizer backend",
     "backend_reason": "Why not a faster backend",
-    "seconds": "Seconds",
     "steps": "Steps done",
     "steps_asked": "Steps requested",
     "skipped_steps": "Steps skipped (gradient not finite)",
     "dimmed_steps": "Steps that dimmed all colours",
-    "seed": "Seed",
-    "densifier": "Densifier",
     "grows": "Adds Gaussians",
-    "guidance": "Guidance",
-    "prior": "Prior",
-    "truth": "Truth",
-    "rasterizer": "Rasterizer",
-    "initializer": "Initializer",
-    "camera": "Camera",
-    "refine": "Refinement",
-    "optimizer": "Optimizer",
-    "schedule": "Schedule",
-    "device": "Device",
     "memory_estimate_gib": "Memory, estimated (GiB)",
     "memory_peak_gib": "Memory of the GPU at its peak (GiB)",
     "cadam3d": "Version of cadam3d",
     "torch": "Version of torch",
-    "finished_at": "Finished at",
 }
 
 
@@ -131,4 +118,8 @@ def _facts(summary: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """Return the label and the value of every fact, the known ones first."""
     labels = LABELS | {name: each.fact for name, each in declared(summary).items()}
     ordered = [*(key for key in labels if key in summary), *(key for key in summary if key not in labels)]
-    return [(labels.get(key) or key.replace("_", " "), summary[key]) for key in ordered if key not in HIDDEN]
+    return [
+        (labels.get(key) or key.capitalize().replace("_", " "), summary[key])
+        for key in ordered
+        if key not in HIDDEN
+    ]

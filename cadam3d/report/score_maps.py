@@ -4,8 +4,9 @@ Which scores have a map, and which constants they are compared with, is declared
 (``charts.json``). The distributions come from the candidates callback.
 """
 
-import math
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,7 +18,7 @@ from cadam3d.report.declarations import read_declarations
 from cadam3d.report.results import JobResult, arms_of, at_noise, histograms, level_title, levels_of, measured
 from cadam3d.report.style import label_axis, new_figure
 
-MAX_COLUMNS = 3  # maps in one line, unless there are more noise levels
+MAX_COLUMNS = 3  # maps in one line
 LEAST_SHARE = 0.002  # of the Gaussians; emptier bins do not widen the axis
 # The map is light on dark pages too, so that darker always means more. None of these colours may be one that
 # palette.py replaces on dark pages.
@@ -35,85 +36,38 @@ def declared_scores(results: Iterable[JobResult]) -> dict[str, Chart]:
     return found
 
 
-def score_figure(results: Sequence[JobResult], chart: Chart) -> Figure | None:
-    """Draw a map per arm and noise level of the score of ``chart``, each arm at its main setting.
-
-    There is a column per level and a line per arm; if there is room, several arms share a line. Arms whose
-    jobs have no such score are left out. ``None`` if none has.
-    """
-    levels = levels_of(results)
-    chosen = {arm: main_setting(results, arm) for arm in arms_of(results)}
-    maps = {
-        (arm, level): found
-        for arm, setting in chosen.items()
-        for level in levels
-        if (found := ScoreMap(list(by_cell(at_noise(results, level), setting).values()), chart.score)).steps
-    }
-    arms = [arm for arm in chosen if any(key[0] == arm for key in maps)]
-    if not maps:
-        return None
-    arms_per_line = min(max(MAX_COLUMNS // len(levels), 1), len(arms))
-    columns, lines = arms_per_line * len(levels), math.ceil(len(arms) / arms_per_line)
-    figure = new_figure(columns, lines, height=2.7 if lines < 4 else 2.1)
-    panels = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
-    places = [(arm, level) for arm in arms for level in levels]
-    for axes, (arm, level) in zip(panels.flat, places, strict=False):
-        axes.set_title(f"{arm}, {level_title(level)}".removesuffix(", "))
-        axes.set_yscale("log")
-        if found := maps.get((arm, level)):
-            _draw(axes, found)
-    shown = [found.shown for found in maps.values()]
-    panels[0, 0].set_ylim(min(low for low, _ in shown) / 1.5, max(high for _, high in shown) * 2)
-    label_axis(panels[0, 0].yaxis)
-    sides = [found.sides for found in maps.values()]
-    panels[0, 0].set_xlim(min(low for low, _ in sides), max(high for _, high in sides))
-    for axes in panels[:, 0]:
-        axes.set_ylabel(chart.score)
-    for axes in panels.flat[len(places) :]:
-        axes.set_visible(False)
-    # The lowest panel of each column.
-    for axes in panels.flat[len(places) - columns : len(places)]:
-        axes.set_xlabel("step")
-        axes.tick_params(labelbottom=True)
-    return figure
-
-
+@dataclass(frozen=True)
 class ScoreMap:
     """Shares of Gaussians by score and refinement, averaged over jobs, and the levels they declare."""
 
-    def __init__(self, results: Sequence[JobResult], score: str) -> None:
-        lines = [line for result in results for line in histograms(result, score) if line.counts]
-        self.steps = sorted({line.step for line in lines})
-        self.per_decade = lines[0].bins_per_decade if lines else 1
-        lines = [line for line in lines if line.bins_per_decade == self.per_decade]
-        self.first = min((line.first for line in lines), default=0)
-        last = max((line.first + len(line.counts) for line in lines), default=0)
-        shares = np.zeros((last - self.first, len(self.steps)))
+    steps: list[float]
+    edges: np.ndarray  # of the bins of the score, one more than there are bins
+    shares: np.ndarray  # a line per bin, a column per step
+    levels: list[Level]
+
+    @classmethod
+    def of(cls, results: Sequence[JobResult], score: str) -> "ScoreMap | None":
+        """Return the map of a score over jobs; None if none of them has its histograms."""
+        lines = [line for result in results for line in histograms(result, score) if sum(line.counts)]
+        lines = [line for line in lines if line.bins_per_decade == lines[0].bins_per_decade]
+        if not lines:
+            return None
+        bins = range(min(line.first for line in lines), max(line.first + len(line.counts) for line in lines))
+        by_step = defaultdict(list)
         for line in lines:
-            at, total = line.first - self.first, sum(line.counts)
-            jobs = sum(other.step == line.step for other in lines)
-            if total:
-                column = self.steps.index(line.step)
-                shares[at : at + len(line.counts), column] += np.array(line.counts) / total / jobs
-        self.shares = shares
-        charts = read_declarations(results[0].folder) if results else ()
-        levels = next((chart.levels for chart in charts if chart.score == score), ())
-        self.levels: list[Level] = [level for level in levels if level.value > 0]
-
-    @property
-    def edges(self) -> np.ndarray:
-        """Return the edges of the bins, one more than there are bins."""
-        return 10 ** (np.arange(self.first, self.first + len(self.shares) + 1) / self.per_decade)
-
-    @property
-    def half(self) -> float:
-        """Return half the width of a column, in steps."""
-        return float(np.diff(self.steps).min() if len(self.steps) > 1 else 10.0) / 2
-
-    @property
-    def sides(self) -> tuple[float, float]:
-        """Return the left side of the first column and the right side of the last, in steps."""
-        return self.steps[0] - self.half, self.steps[-1] + self.half
+            share = np.zeros(len(bins))
+            share[line.first - bins[0] :][: len(line.counts)] = np.array(line.counts) / sum(line.counts)
+            by_step[line.step].append(share)
+        steps = sorted(by_step)
+        declared = next(
+            (each.levels for each in read_declarations(results[0].folder) if each.score == score), ()
+        )
+        return cls(
+            steps=steps,
+            edges=10 ** (np.arange(bins[0], bins[-1] + 2) / lines[0].bins_per_decade),
+            shares=np.stack([np.mean(by_step[step], axis=0) for step in steps], axis=1),
+            levels=[level for level in declared if level.value > 0],
+        )
 
     @property
     def shown(self) -> tuple[float, float]:
@@ -123,33 +77,65 @@ class ScoreMap:
         return float(min(values)), float(max(values))
 
 
+def score_figure(results: Sequence[JobResult], chart: Chart) -> Figure | None:
+    """Draw a map per arm and noise level of the score of ``chart``, each arm at its main setting.
+
+    Arms whose jobs have no such score are left out. ``None`` if none has.
+    """
+    maps = {
+        f"{arm}, {level_title(level)}".removesuffix(", "): found
+        for arm in arms_of(results)
+        for level in levels_of(results)
+        for members in [by_cell(at_noise(results, level), main_setting(results, arm))]
+        if (found := ScoreMap.of(list(members.values()), chart.score))
+    }
+    if not maps:
+        return None
+    columns = min(len(maps), MAX_COLUMNS)
+    lines = -(-len(maps) // columns)
+    figure = new_figure(columns, lines, height=2.7 if lines < 4 else 2.1)
+    panels = figure.subplots(lines, columns, squeeze=False, sharey=True)
+    for axes, (title, found) in zip(panels.flat, maps.items(), strict=False):
+        axes.set_title(title)
+        axes.set_xlabel("step")
+        axes.set_yscale("log")
+        _draw(axes, found)
+    shown = [found.shown for found in maps.values()]
+    panels[0, 0].set_ylim(min(low for low, _ in shown) / 1.5, max(high for _, high in shown) * 2)
+    label_axis(panels[0, 0].yaxis)
+    for axes in panels[:, 0]:
+        axes.set_ylabel(chart.score)
+    for axes in panels.flat[len(maps) :]:
+        axes.set_visible(False)
+    return figure
+
+
 def _draw(axes: Axes, found: ScoreMap) -> None:
     axes.set_facecolor(BACKGROUND)
     axes.grid(visible=False)
-    for column, step in enumerate(found.steps):
+    half = float(np.diff(found.steps).min() if len(found.steps) > 1 else 10.0) / 2
+    for step, shares in zip(found.steps, found.shares.T, strict=True):
         axes.pcolormesh(
-            [step - found.half, step + found.half],
+            [step - half, step + half],
             found.edges,
-            np.ma.masked_less_equal(found.shares[:, column : column + 1], 0),
+            np.ma.masked_less_equal(shares[:, None], 0),
             cmap="Blues",
             vmin=-0.02,
-            vmax=max(found.shares.max(), 1e-9),
+            vmax=found.shares.max(),
             rasterized=True,
         )
-    top = max((level.value for level in found.levels), default=0.0)
     for i, level in enumerate(found.levels):
         color = LEVEL_COLORS[i % len(LEVEL_COLORS)]
-        # The label of the highest level is above its line, the others are below theirs.
-        side = 1 if level.value == top else -1
         axes.axhline(level.value, color=color, lw=1.1, ls="--")
         axes.annotate(
             f"{level.label} {level.value:.3g}",
             (1, level.value),
             xycoords=("axes fraction", "data"),
-            xytext=(-3, 3 * side),
+            # The label of the highest level is above its line, the others are below theirs.
+            xytext=(-3, 8 if level == max(found.levels, key=lambda each: each.value) else -8),
             textcoords="offset points",
             ha="right",
-            va="bottom" if side > 0 else "top",
+            va="center",
             fontsize=7.5,
             color=color,
             bbox={"facecolor": BACKGROUND, "alpha": 0.85, "lw": 0, "pad": 0.5},

@@ -1,7 +1,7 @@
 """Strips: figures of a sweep that show assets in lines and columns, each with its numbers underneath."""
 
 import textwrap
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from cadam3d.io.image import read_png, step_pictures
 from cadam3d.io.run_folder import CANDIDATES, PREVIEW
 from cadam3d.report.compare import by_cell, main_setting, qualities
-from cadam3d.report.figures import arm_of_two_thresholds
 from cadam3d.report.palette import INK, SOFT
 from cadam3d.report.results import (
     NOISE,
@@ -106,32 +105,11 @@ def objectives_figure(results: Sequence[JobResult]) -> Figure | None:
     return _draw(lines, results, shown.without(axis))
 
 
-def regimes_figure(results: Sequence[JobResult]) -> Figure | None:
-    """Show the assets of the strictest, standard and loosest thresholds in one cell (paper fig. 8)."""
-    arm = arm_of_two_thresholds(results)
-    own = [result for result in measured(results) if result.arm == arm and has_views(result)]
-    shown = showcase(own, kind=lambda result: result.setting)
-    if shown is None:
-        return None
-    here = sorted((result for result in own if result.cell == shown), key=lambda result: result.count or 0)
-    middle = next((result for result in here if result.is_standard), here[len(here) // 2])
-    chosen = {"fewest": here[0], "standard" if middle.is_standard else "between": middle, "most": here[-1]}
-    if len({result.folder for result in chosen.values()}) < len(chosen):
-        return None
-    tiles = [
-        ShownPicture(views(result)[0], _facts(result), f"{name}: {result.setting.short}")
-        for name, result in chosen.items()
-    ]
-    return _draw({here[0].arm: tiles}, results, shown, inch=2.3)
-
-
-def showcase(
-    results: Sequence[JobResult], kind: Callable[[JobResult], Hashable] = lambda result: result.arm
-) -> Cell | None:
-    """Return the cell to show: one with most arms (or kinds), preferably at medium noise; ties by name."""
-    cells: dict[Cell, set[Hashable]] = {}
+def showcase(results: Sequence[JobResult]) -> Cell | None:
+    """Return the cell to show: one with most arms, preferably at medium noise; ties by name."""
+    cells: dict[Cell, set[str]] = {}
     for result in measured(results):
-        cells.setdefault(result.cell, set()).add(kind(result))
+        cells.setdefault(result.cell, set()).add(result.arm)
     preference = {level: i for i, level in enumerate(PREFERRED_NOISE)}
     worst = len(preference)
     return min(cells, key=lambda c: (-len(cells[c]), preference.get(c[NOISE], worst), c), default=None)
@@ -183,11 +161,10 @@ def _draw(
     lines: Mapping[str, Sequence[ShownPicture]],
     results: Sequence[JobResult],
     cell: Cell,
-    inch: float = PICTURE_INCH,
 ) -> Figure:
     """Draw lines of pictures with their titles on the left, and the name of the cell above all."""
     columns = max(map(len, lines.values()))
-    figure = new_figure(columns, len(lines), width=inch * columns + 0.4, height=inch * 1.25)
+    figure = new_figure(columns, len(lines), width=PICTURE_INCH * columns + 0.4, height=PICTURE_INCH * 1.25)
     panels = figure.subplots(len(lines), columns, squeeze=False)
     colors = {arm: look.color for arm, look in looks(result.arm for result in results).items()}
     for axes in panels.flat:

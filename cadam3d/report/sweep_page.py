@@ -19,7 +19,7 @@ from cadam3d.report.formatting import plural
 from cadam3d.report.pages import Column, Table, table, write_page
 from cadam3d.report.paper_formats import FORMATS, read_table
 from cadam3d.report.paper_table import PaperTable
-from cadam3d.report.results import ARM, NOISE, PROMPT, SEED, JobResult, measured, read
+from cadam3d.report.results import NOISE, PROMPT, SEED, JobResult, measured, read
 from cadam3d.report.score_maps import declared_scores, score_figure
 from cadam3d.report.style import inline, styled, write_figure
 from cadam3d.settings.line import key_of
@@ -47,8 +47,7 @@ class ShownFigure:
 FRONTIER = (
     "Up and to the left is better. Each mark is the median of one setting over cells; an arm with one "
     "threshold has it beside each mark, and the standard setting is ringed. Bars hold the middle half of the "
-    "cells. A hollow mark lacks some cells, and a dagger means that jobs ended early. The dashed line is the "
-    "best that any arm reaches with the same seeds and no noise."
+    "cells. A hollow mark lacks some cells, and a dagger means that jobs ended early."
 )
 # The figures of every sweep. Those of declared scores come after "growth", and a grid may also name
 # "frontier_NAME", the frontier of any other number.
@@ -71,12 +70,6 @@ KINDS = {
         "Two thresholds",
         "How the count and the quality depend on two thresholds of one arm. Medians over cells; the standard "
         "setting is bold.",
-    ),
-    "regimes": FigureKind(
-        strips.regimes_figure,
-        "From fewest to most Gaussians",
-        "The same scene with the thresholds that leave fewest Gaussians, the standard ones, and those that "
-        "leave most.",
     ),
     "ablation": FigureKind(
         strips.ablation_figure,
@@ -221,17 +214,11 @@ def _drawn(results: Sequence[JobResult], name: str, kind: FigureKind, folder: Pa
 
 
 def _title(plan: Plan, results: Sequence[JobResult]) -> str:
-    """Return the name of the grid, or the keys that vary, and the prompts."""
+    """Return the name of the grid, if there is one, and the prompts."""
     grids = [str(word).partition("=")[2].strip("'\"") for word in plan.line if key_of(str(word)) == "grid"]
-    name = next((grid for grid in grids if grid not in ("", "null")), "")
+    name = next((grid for grid in grids if grid not in ("", "null")), "Sweep")
     if plan.command == "train":
         name = plural(len(results), "attempt")
-    elif not name:
-        varied = [ARM] if len({result.arm for result in results}) > 1 else []
-        axes = [dict([*result.setting.thresholds, *result.cell.axes]) for result in results]
-        keys = dict.fromkeys(key for each in axes for key in each if key != PROMPT)
-        varied += [key for key in keys if len({each.get(key) for each in axes}) > 1]
-        name = f"Sweep of {', '.join(varied)}" if varied else "Sweep"
     prompts = list(filter(None, dict.fromkeys(result.cell[PROMPT] for result in results)))
     shown = [shorten(text, LONGEST_PROMPT, placeholder=" ...") for text in prompts[:MOST_PROMPTS]]
     more = f" and {len(prompts) - len(shown)} more" if len(prompts) > len(shown) else ""

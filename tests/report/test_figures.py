@@ -148,17 +148,6 @@ def test_a_preview_is_cut_into_single_pictures(bench_results):
     assert [picture.shape for picture in strips.views(result)] == [(12, 12, 3)] * 3
 
 
-def test_regimes_are_shown_in_a_cell_that_has_all_of_them(jobs):
-    for seed, settings in ((0, {0.9: 500}), (1, {0.95: 400, 0.9: 500, 0.7: 900})):
-        for tau, n in settings.items():
-            keys = (f"densifier.tau_Q={tau}", f"densifier.tau_SNR={0.1 if tau == 0.9 else 0.3}")
-            jobs.files(jobs.add("cadam", *keys, f"seed={seed}", n=n, psnr=20.0), n)
-    shown = texts(draw("regimes", read(jobs.folder)))
-    assert "seed 1" in shown
-    assert "fewest: tau_Q 0.95" in shown
-    assert "standard: tau_Q 0.9" in shown
-
-
 def test_an_ablation_shows_count_quality_and_outcome(bench_results):
     shown = texts(draw("ablation", bench_results))
     assert shown.count("Gaussians\n") == 3
