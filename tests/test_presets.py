@@ -183,11 +183,6 @@ def test_flowdreamers_cameras_are_its_codes_defaults_and_its_head_can_be_typed()
     assert camera.elevation_deg.at(9) == (0, 45)
 
 
-def test_the_guard_checks_the_published_share_of_a_run():
-    guard = build("exposure", "beg", "steps=5000")
-    assert (guard.begin, guard.end) == (1000, 4500)
-
-
 def test_gcs_beg_clips_gradients_in_its_own_unit_of_length():
     optimizer = build("optimizer", "gcs_beg", "steps=5000")
     steps = (0, 500, 1000, 3000)

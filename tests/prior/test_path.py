@@ -85,29 +85,15 @@ def test_flow_is_a_straight_line(name):
     torch.testing.assert_close(PATHS[name].a(t) + PATHS[name].b(t), torch.ones_like(t))
 
 
-def test_flow_without_shift_is_t_itself():
-    t = torch.linspace(0, 1, 500, dtype=torch.float64)
-    torch.testing.assert_close(PATHS["flow"].b(t), t)
-
-
 @pytest.mark.parametrize("shift", [0.5, 1.0, 3.0])
 def test_shift_follows_its_formula(shift):
     t = torch.linspace(0, 1, 101, dtype=torch.float64)
     torch.testing.assert_close(RectifiedFlow(shift=shift).b(t), shift * t / (1 + (shift - 1) * t))
 
 
-def test_shift_of_stable_diffusion_3_has_known_values():
-    sigma = PATHS["flow-3"].b(torch.tensor([0.02, 0.5, 0.98], dtype=torch.float64))
-    torch.testing.assert_close(sigma, torch.tensor([0.06 / 1.04, 0.75, 2.94 / 2.96], dtype=torch.float64))
-
-
 def test_ddpm_has_the_published_table_on_its_grid():
     t = torch.arange(1, 1001, dtype=torch.float64) / 1000
     torch.testing.assert_close(DDPM().a(t) ** 2, torch.from_numpy(stable_diffusion_abar()))
-
-
-def test_published_table_has_its_known_last_value():
-    assert float(DDPM().a(torch.tensor([1.0], dtype=torch.float64)) ** 2) == pytest.approx(0.00466, abs=5e-6)
 
 
 def test_between_grid_points_the_log_of_abar_is_linear():
@@ -200,13 +186,6 @@ def test_noise_of_a_clean_image_is_zero(path):
     assert (guess.noise == 0).all()
 
 
-def test_clean_image_behind_pure_noise_is_zero():
-    _, noise = pairs(1)
-    guess = RectifiedFlow().from_noise(noise, noise, torch.ones(1, dtype=torch.float64))
-    assert (guess.clean == 0).all()
-    torch.testing.assert_close(guess.velocity, noise)
-
-
 @every_path
 def test_ends_pass_finite_gradients(path):
     ends = torch.tensor([0.0, 1.0], dtype=torch.float64)
@@ -232,11 +211,6 @@ def test_velocity_of_a_flow_is_the_derivative_by_sigma():
     t = torch.linspace(0.1, 0.9, 7, dtype=torch.float64)
     slope = (path.mix(clean, noise, t + 1e-6) - path.mix(clean, noise, t - 1e-6)) / 2e-6
     torch.testing.assert_close(path.velocity(clean, noise, t), slope, rtol=0, atol=1e-8)
-
-
-def test_equal_paths_are_equal():
-    assert DDPM() == DDPM(train_steps=1000)
-    assert RectifiedFlow() != RectifiedFlow(shift=3.0)
 
 
 @pytest.mark.parametrize(

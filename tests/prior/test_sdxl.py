@@ -81,19 +81,6 @@ def test_a_prediction_equals_that_of_the_pipelines_parts(prior, pipe):
     torch.testing.assert_close(guess.clean, (noisy - (1 - a**2) ** 0.5 * expected) / a, rtol=1e-4, atol=1e-4)
 
 
-def test_the_network_reads_the_image_size(prior):
-    """The same latents as part of a larger image would have another embedding."""
-    texts = prior.embed("a red cube", "").texts
-    one = replace(texts, tokens=texts.tokens[:1], pooled=texts.pooled[:1])
-    cameras = condition_of(prior, views=1).cameras
-    encoded = []
-    hook = prior.network.add_embedding.register_forward_pre_hook(lambda _, inputs: encoded.append(inputs[0]))
-    for height, width in ((8, 8), (8, 16)):
-        prior.denoise(normal(1, 4, height, width), torch.tensor([500.0]), one, cameras)
-    hook.remove()
-    assert not torch.equal(encoded[0], encoded[1])
-
-
 def test_latents_are_those_of_the_pipelines_autoencoder(prior, pipe):
     encodes_like_the_autoencoder(prior, pipe.vae)
 

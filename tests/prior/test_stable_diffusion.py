@@ -2,10 +2,11 @@
 
 import pytest
 import torch
+from latents import KEYS, encodes_like_the_autoencoder, micro_batch_changes_nothing, normal
 
 from cadam3d.core.cameras import orbit
 from cadam3d.core.errors import UserError
-from cadam3d.prior.prompting import Discrete, Interpolated, PerpNeg, Plain
+from cadam3d.prior.prompting import Discrete, PerpNeg, Plain
 from cadam3d.prior.stable_diffusion import StableDiffusion
 
 diffusers = pytest.importorskip("diffusers")
@@ -23,21 +24,8 @@ def cache(tmp_path_factory):
 @pytest.fixture(scope="module")
 def make(pipelines, cache):
     def make(prediction="epsilon", **changes):
-        keys = {
-            "path": str(pipelines("stable_diffusion", prediction=prediction)),
-            "ids": [],
-            "revision": None,
-            "variant": None,
-            "prompting": Plain(),
-            "size": PIXELS,
-            "dtype": "auto",
-            "micro_batch": None,
-            "tiling": False,
-            "compile": False,
-            "text_device": "auto",
-            "noise_levels": "table",
-            "cache_dir": str(cache),
-        }
+        folder = str(pipelines("stable_diffusion", prediction=prediction))
+        keys = KEYS | {"path": folder, "cache_dir": str(cache), "prompting": Plain(), "dtype": "auto"}
         return StableDiffusion(**keys | changes)
 
     return make
@@ -71,16 +59,12 @@ def condition_of(prior, *azimuth, prompt="a corgi", negative="ugly"):
     return prior.embed(prompt, negative).at(cameras, torch.ones(len(cameras), 3))
 
 
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
-
-
 LEVELS = torch.tensor([0.3, 0.8])
 
 
 def test_the_network_is_used_at_the_levels_of_its_table_unless_any_is_asked_for(make):
     table, between = make("epsilon"), torch.tensor([0.3004, 0.7996])
-    anywhere, noisy = make("epsilon", noise_levels="any"), random(2, 4, 8, 8)
+    anywhere, noisy = make("epsilon", noise_levels="any"), normal(2, 4, 8, 8)
     at_rows, beside = (
         prior.predict(noisy, between, condition_of(prior, 0, 90), 7.5) for prior in (table, anywhere)
     )
@@ -94,7 +78,7 @@ def test_the_network_is_used_at_the_levels_of_its_table_unless_any_is_asked_for(
 def test_a_prediction_equals_that_of_the_pipeline(prediction, make, pipeline_of):
     """Compare with text encoder, UNet, guidance and scheduler of diffusers, at levels of its table."""
     pipeline = pipeline_of(prediction)
-    prior, clean, noise = make(prediction), random(2, 4, 8, 8), random(2, 4, 8, 8, seed=1)
+    prior, clean, noise = make(prediction), normal(2, 4, 8, 8), normal(2, 4, 8, 8, seed=1)
     # Rows of the table, where t = (row + 1) / 1000.
     steps = torch.tensor([299, 799])
     noisy = pipeline.scheduler.add_noise(clean, noise, steps)
@@ -115,7 +99,7 @@ def test_a_prediction_equals_that_of_the_pipeline(prediction, make, pipeline_of)
 
 
 def test_scale_zero_is_the_negative_prompt_alone_and_unprompted_uses_neither(make):
-    prior, noisy = make(), random(2, 4, 8, 8)
+    prior, noisy = make(), normal(2, 4, 8, 8)
     condition = condition_of(prior, 0, 90)
     swapped = condition_of(prior, 0, 90, prompt="ugly", negative="a corgi")
     zero = prior.predict(noisy, LEVELS, condition, 0.0)
@@ -130,15 +114,14 @@ def test_scale_zero_is_the_negative_prompt_alone_and_unprompted_uses_neither(mak
         )
 
 
-def test_encoding_is_the_mean_of_the_autoencoder_and_can_be_differentiated(make, pipeline):
-    prior = make()
-    rgb = torch.rand(2, PIXELS, PIXELS, 3, generator=torch.Generator().manual_seed(2)).requires_grad_()
-    latents = prior.encode(rgb)
-    with torch.no_grad():
-        mean = pipeline.vae.encode(2 * rgb.permute(0, 3, 1, 2) - 1).latent_dist.mean
-    torch.testing.assert_close(latents, 0.18215 * mean, rtol=1e-4, atol=1e-5)
-    latents.square().sum().backward()
-    assert rgb.grad.abs().sum() > 0
+def test_latents_are_those_of_the_pipelines_autoencoder(make, pipeline):
+    encodes_like_the_autoencoder(make(), pipeline.vae)
+
+
+@pytest.mark.parametrize("micro_batch", [1, 2])
+def test_micro_batches_do_not_change_results(make, micro_batch):
+    prior = make(prompting=PERP_NEG)
+    micro_batch_changes_nothing(prior, micro_batch, condition_of(prior, 0, 100, -45), channels=4)
 
 
 def test_renders_of_any_size_are_resized_and_gradients_reach_them(make):
@@ -152,7 +135,7 @@ def test_renders_of_any_size_are_resized_and_gradients_reach_them(make):
 
 
 def test_decoding_gives_images_of_the_requested_size(make, pipeline):
-    prior, latents = make(), random(2, 4, 8, 8)
+    prior, latents = make(), normal(2, 4, 8, 8)
     images = prior.decode(latents, PIXELS, PIXELS)
     with torch.no_grad():
         raw = pipeline.vae.decode(latents / 0.18215).sample
@@ -160,45 +143,15 @@ def test_decoding_gives_images_of_the_requested_size(make, pipeline):
     assert prior.decode(latents, 48, 40).shape == (2, 48, 40, 3)
 
 
-@pytest.mark.parametrize("micro_batch", [1, 2])
-def test_micro_batches_do_not_change_predictions_and_gradients(make, micro_batch):
-    whole, parts = make(prompting=PERP_NEG), make(prompting=PERP_NEG, micro_batch=micro_batch)
-    noisy, levels = random(3, 4, 8, 8), torch.tensor([0.2, 0.5, 0.9])
-    guesses = [p.predict(noisy, levels, condition_of(p, 0, 100, -45), 7.5).clean for p in (whole, parts)]
-    torch.testing.assert_close(*guesses, rtol=1e-4, atol=1e-4)
-    gradients = []
-    for prior in (whole, parts):
-        rgb = torch.rand(3, PIXELS, PIXELS, 3, generator=torch.Generator().manual_seed(2)).requires_grad_()
-        (prior.encode(rgb) * noisy).sum().backward()
-        gradients.append(rgb.grad)
-    torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-5)
-
-
 def test_each_view_gets_the_text_of_its_direction(make):
     prior = make(prompting=Discrete(front_deg=45, back_deg=45, overhead_deg=60))
-    noisy, levels = random(1, 4, 8, 8).repeat(3, 1, 1, 1), torch.full((3,), 0.5)
+    noisy, levels = normal(1, 4, 8, 8).repeat(3, 1, 1, 1), torch.full((3,), 0.5)
     front, back, again = prior.predict(noisy, levels, condition_of(prior, 0, 180, 10), 1.0).noise
     plain = make()
     worded = plain.predict(noisy[:1], levels[:1], condition_of(plain, 0, prompt="a corgi, back view"), 1.0)
     assert not torch.allclose(front, back, atol=1e-4)
     torch.testing.assert_close(front, again, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(back, worded.noise[0], rtol=1e-4, atol=1e-4)
-
-
-def test_interpolated_embeddings_are_weighted_sums(make):
-    prior = make(prompting=Interpolated())
-    embedding = prior.embed("a corgi", "ugly")
-    condition = embedding.at(views(30), torch.ones(1, 3))
-    mixed = condition.texts.mixed(condition.mix.positive).tokens[0]
-    front, side = embedding.texts.tokens[:2]
-    torch.testing.assert_close(mixed, 2 / 3 * front + 1 / 3 * side, rtol=1e-5, atol=1e-5)
-
-
-def test_perp_neg_changes_the_prediction_of_a_side_view(make):
-    plain, repelled = make(prompting=Interpolated()), make(prompting=PERP_NEG)
-    noisy, level = random(1, 4, 8, 8), torch.tensor([0.5])
-    guesses = [p.predict(noisy, level, condition_of(p, 100), 7.5).noise for p in (plain, repelled)]
-    assert not torch.allclose(*guesses, atol=1e-4)
 
 
 # --- embedded texts on disk -------------------------------------------------------------------------------
@@ -344,4 +297,4 @@ def test_an_unknown_noise_schedule_is_refused(make, changes, word):
     prior = make()
     object.__setattr__(prior, "scheduler", dict(prior.scheduler) | changes)
     with pytest.raises(UserError, match=word):
-        prior.predict(random(2, 4, 8, 8), LEVELS, condition_of(prior, 0, 0), 1.0)
+        prior.predict(normal(2, 4, 8, 8), LEVELS, condition_of(prior, 0, 0), 1.0)

@@ -72,14 +72,6 @@ def test_texts_are_embedded_as_the_pipeline_embeds_them_without_t5(prior, folder
     embeds_as_the_pipeline(replace(prior, t5=False), pipe)
 
 
-def test_a_model_without_t5_needs_no_setting(prior, pipelines):
-    folder = pipelines("stable_diffusion_3", t5=False)
-    other = replace(prior, path=str(folder))
-    assert other.encoders == ("text_encoder", "text_encoder_2")
-    none = {"text_encoder_3": None, "tokenizer_3": None}  # diffusers needs both, explicitly
-    embeds_as_the_pipeline(other, diffusers.StableDiffusion3Pipeline.from_pretrained(folder, **none))
-
-
 def test_t5_may_be_missing_if_it_is_not_used(prior, folder, tmp_path):
     """Neither T5 nor its tokenizer is searched, so neither is downloaded from the hub."""
     unwanted = ("text_encoder_3", "tokenizer_3", "tokens")
@@ -131,18 +123,6 @@ def test_a_prediction_equals_that_of_the_pipelines_parts(prior, folder, pipe, t5
     torch.testing.assert_close(guess.velocity, expected, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(guess.clean, noisy - sigma * expected, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(guess.noise, noisy + (1 - sigma) * expected, rtol=1e-4, atol=1e-4)
-
-
-def test_a_step_of_the_pipelines_sampler_is_a_mixture_of_the_prediction(prior, pipe):
-    """A step from one noise level to the next is an Euler step there and ``NoisePath.mix`` here."""
-    scheduler = type(pipe.scheduler).from_config(pipe.scheduler.config)
-    scheduler.set_timesteps(4)
-    noisy, velocity = normal(1, 16, 8, 8), normal(1, 16, 8, 8, seed=1)
-    stepped = scheduler.step(velocity, scheduler.timesteps[1], noisy).prev_sample
-    path = prior.noise_path
-    start, end = (s / (3 - 2 * s) for s in scheduler.sigmas[1:3, None])  # t of a sigma, the shift being 3
-    guess = path.from_velocity(noisy, velocity, start)
-    torch.testing.assert_close(path.mix(guess.clean, guess.noise, end), stepped, rtol=1e-4, atol=1e-4)
 
 
 def test_the_shift_is_the_models_own(prior, folder, tmp_path):
