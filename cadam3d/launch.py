@@ -67,7 +67,7 @@ def launch(command: str, words: Sequence[str]) -> int:
     try:
         return module.run(cfg, call) or 0
     except OSError as error:
-        if advice := refused_path(error, command, words):
+        if advice := refused_path(error, words):
             raise advice from error
         raise
 

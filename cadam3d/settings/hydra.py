@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-import yaml  # comes with OmegaConf
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.core.errors import UserError
-from cadam3d.settings.advice import default_option, did_you_mean, line_of
+from cadam3d.settings.advice import declared_names, did_you_mean
 from cadam3d.settings.compose import VERSION_BASE, register_resolvers
 from cadam3d.settings.line import key_of
-from cadam3d.settings.options import TARGET, config_dir, option_word
+from cadam3d.settings.options import TARGET, config_dir, default_option, option_word
 
 # A reference to other settings, such as ${steps}.
 REFERENCE = re.compile(r"\$\{[^}]*")
@@ -31,10 +30,10 @@ def refuse_missing_settings(cfg: DictConfig, command: str, overrides: Sequence[s
     for override in overrides:
         key = key_of(override)
         if override.startswith("~") and "." not in key and "/" not in key and key not in cfg:
-            rest = [other for other in overrides if other != override]
-            # A job of a sweep is also a line of train.
-            line = line_of("train" if command == "sweep" else command, rest)
-            raise UserError(f"~{key}: a setting can be changed but not removed. Try: {line}")
+            page = "train" if command == "sweep" else command
+            raise UserError(
+                f"~{key}: a setting can be changed but not removed. Try: cadam3d {page} --cfg job"
+            )
         if override.endswith("=[]") and key not in cfg and default_option(key, command):
             raise UserError(f"{key}: expected the name of an option, got []. Try: {option_word(key)}")
     raw = OmegaConf.to_container(cfg, resolve=False)
@@ -55,7 +54,7 @@ def refuse_unread_settings(cfg: DictConfig, command: str, overrides: Sequence[st
     raw = OmegaConf.to_container(cfg, resolve=False)
     assert isinstance(raw, dict)
     references = " ".join(REFERENCE.findall(str(raw)))
-    known = {"hydra", *_declared_names(command)}
+    known = {"hydra", *declared_names(command)}
     for name in map(str, raw):
         if name not in known and not re.search(rf"\b{re.escape(name)}\b", references):
             near = did_you_mean(name, sorted(known))
@@ -102,15 +101,3 @@ def run_hydra(
     finally:
         sys.argv = arguments_before
         os.environ["HYDRA_FULL_ERROR"] = switch_before or "0"
-
-
-def _declared_names(command: str) -> set[str]:
-    """Return the settings and groups that the YAML of a command declares, with those that it builds on."""
-    page = yaml.safe_load((config_dir() / f"{command}.yaml").read_text(encoding="utf-8"))
-    names = set(page) - {"defaults"}
-    for entry in page["defaults"]:
-        if isinstance(entry, dict):
-            names |= set(entry)
-        elif entry != "_self_":
-            names |= _declared_names(entry)
-    return names
