@@ -181,7 +181,7 @@ def _call(line: Line, cfg: DictConfig) -> Call:
         return Call(
             words=line.words,
             hydra=cfg.pop("hydra"),
-            folder=expanded(str(text)),
+            folder=expanded(str(text)).absolute(),
             has_chosen_folder=any(key_of(override) == RUN_FOLDER for override in line.overrides),
         )
 

@@ -50,11 +50,15 @@ def occupied(wanted: Path, *, is_chosen: bool, resume: Path | None) -> Iterator[
             if resume is None:
                 _refuse_occupied(folder)
             yield folder
-        except BaseException:
-            with suppress(OSError):
-                if not has_lock_file and set(folder.iterdir()) == before:
+        except BaseException as error:
+            has_begun = set(folder.iterdir()) != before
+            if not has_begun and not has_lock_file:
+                with suppress(OSError):
                     (folder / LOCK).unlink()
             remove_empty(folder, existing)
+            is_here = isinstance(error, OSError) and str(error.filename).startswith(str(folder))
+            if is_here and not has_begun:
+                raise _not_writable(folder, resume, error) from error
             raise
 
 

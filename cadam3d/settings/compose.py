@@ -45,7 +45,7 @@ class Call:
 
     words: Sequence[str]  # the overrides as they were typed
     hydra: DictConfig  # Hydra's own node
-    folder: Path  # of a run, as the settings name it
+    folder: Path  # of a run, as the settings name it; absolute
     has_chosen_folder: bool  # whether the line names it
 
     @property
