@@ -32,7 +32,7 @@ from cadam3d.build import component
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cuda import load_kernels
-from cadam3d.rasterizer.launcher import Launcher
+from cadam3d.rasterizer.driver import Launcher
 from cadam3d.settings.options import config_dir, option_names
 
 DEFAULTS = {

@@ -26,8 +26,7 @@ from cadam3d.rasterizer import cuda, workspace
 from cadam3d.rasterizer.base import KERNELS, definitions
 from cadam3d.rasterizer.cuda import rasterize
 from cadam3d.rasterizer.cuda_sort import scan, scan_bytes, sort, sort_bytes
-from cadam3d.rasterizer.driver import Module
-from cadam3d.rasterizer.launcher import Launch, Launcher
+from cadam3d.rasterizer.driver import Launch, Launcher, Module
 from cadam3d.rasterizer.workspace import Workspace
 
 SOURCE = Path(__file__).parent / "rasterizer" / "emulator" / "emulator.cpp"

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cadam3d.core.checks import require
+from cadam3d.core.checks import fail, require
 from cadam3d.densifier.cadam import CAdam, CAdamState
 from cadam3d.plugins.settings import CAdamSettings
 
@@ -49,13 +49,13 @@ class CAdamTracker(CAdamSettings):
         its numbers is NaN or infinite, the step changes nothing. This does not wait for the device. Raises
         :class:`UserError` if the tracker follows another number of Gaussians, or if there is no gradient.
         """
-        require(
-            gradient is not None and gradient.shape == (len(self), 3),
-            "observe",
-            expected=f"a gradient of shape ({len(self)}, 3), one row for each Gaussian of the tracker",
-            got=None if gradient is None else tuple(gradient.shape),
-            example="tracker.append(count) or tracker.keep(mask)",
-        )
+        if gradient is None or gradient.shape != (len(self), 3):
+            raise fail(
+                "observe",
+                expected=f"a gradient of shape ({len(self)}, 3), one row for each Gaussian of the tracker",
+                got=None if gradient is None else tuple(gradient.shape),
+                example="tracker.append(count) or tracker.keep(mask)",
+            )
         self.state = self.cadam().update(self.state, dense(gradient))
 
     def select(self) -> Bool[Tensor, "n"]:

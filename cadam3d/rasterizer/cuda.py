@@ -43,9 +43,8 @@ from cadam3d.io.cache import kernels_dir
 from cadam3d.rasterizer import workspace
 from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.rasterizer.cuda_sort import BLOCK, scan, scan_bytes, sort, sort_bytes, sort_order
-from cadam3d.rasterizer.driver import Driver
+from cadam3d.rasterizer.driver import Driver, Launch, Launcher
 from cadam3d.rasterizer.forecast import Forecast, find_forecast
-from cadam3d.rasterizer.launcher import Launch, Launcher
 from cadam3d.rasterizer.native import RenderPass, outside_of_graphs, require_shapes, run_pass
 from cadam3d.rasterizer.workspace import Workspace, plan
 

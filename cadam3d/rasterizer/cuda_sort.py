@@ -6,7 +6,7 @@ return how much of it is needed, one number for each array. More numbers never n
 
 from collections.abc import Sequence
 
-from cadam3d.rasterizer.launcher import Launch
+from cadam3d.rasterizer.driver import Launch
 
 # The kernels define the same constants (kernels/device.cuh, kernels/sort.cuh).
 BLOCK, COLUMN_BLOCK, WARP = 256, 1024, 32  # threads
@@ -122,16 +122,6 @@ def _sort(
         launch("sort_scatter", blocks, BLOCK, *inputs, *results)
         keys, other_keys, old, shift = other_keys, keys, new, shift + width
     return keys
-
-
-def sorted_bytes(keys: int, bits: int, only_order: bool = False) -> int:
-    """Return the bytes that a sort reads and writes, apart from counts: a model, not a measurement.
-
-    A pass reads the keys for counting, reads keys and values for moving them, and writes both. The first pass
-    has no values to read. Few keys are counted by each block, which reads them from a cache.
-    """
-    passes, counts = len(digit_bits(bits)), keys > FEW_NUMBERS
-    return 4 * keys * (passes * (4 + counts) - 1 - only_order)
 
 
 def _scan_blocks(count: int) -> int:

@@ -1,8 +1,12 @@
-"""Run compiled kernels through the CUDA driver, on torch's current stream and in torch's own context."""
+"""Run compiled kernels through the CUDA driver, on torch's current stream and in torch's own context.
+
+:class:`Launcher` is the interface between the CUDA rasterizer and whatever executes its kernels.
+"""
 
 import ctypes
 import struct
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -10,9 +14,11 @@ from pathlib import Path
 import torch
 
 from cadam3d.core.errors import UserError
-from cadam3d.rasterizer.launcher import Launch, Launcher
 from cadam3d.rasterizer.nvrtc import build
 
+# launch(kernel, blocks, threads, *arguments) starts ``blocks`` blocks of ``threads`` threads. An argument is
+# a whole number. An array is passed as its address, and an array that is left out as 0.
+Launch = Callable[..., None]
 LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 OUT_OF_MEMORY = 2  # CUDA_ERROR_OUT_OF_MEMORY
 # Labels in the list of extra options of a launch: CU_LAUNCH_PARAM_END and so on.
@@ -20,6 +26,14 @@ END, BUFFER_POINTER, BUFFER_SIZE = 0, 1, 2
 # By number of arguments: the function that writes them into a buffer, as whole numbers of eight bytes.
 MOST_ARGUMENTS = 32
 PACKERS = [struct.Struct(f"{count}q").pack_into for count in range(MOST_ARGUMENTS + 1)]
+
+
+class Launcher(ABC):
+    """Executes compiled kernels: on a GPU through the CUDA driver, or in the emulator of the tests."""
+
+    @abstractmethod
+    def on(self, device: torch.device) -> AbstractContextManager[Launch]:
+        """Yield the :data:`Launch` function for ``device`` and its current stream."""
 
 
 class Driver(Launcher):

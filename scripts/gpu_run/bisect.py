@@ -23,7 +23,7 @@ from torch import Tensor
 
 from cadam3d.compiled.build import find_compiler
 from cadam3d.core.gaussians import FIELDS
-from cadam3d.rasterizer.launcher import Launch, Launcher
+from cadam3d.rasterizer.driver import Launch, Launcher
 from cadam3d.rasterizer.selftest import IMAGES, Agreement, self_test
 from cadam3d.rasterizer.selftest import make_scene as self_test_scene
 from cadam3d.rasterizer.workspace import Workspace

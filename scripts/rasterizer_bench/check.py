@@ -10,7 +10,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cuda_sort import sort, sort_bytes
-from cadam3d.rasterizer.launcher import Launch, Launcher
+from cadam3d.rasterizer.driver import Launch, Launcher
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import GSPLAT, OWN, self_test
 

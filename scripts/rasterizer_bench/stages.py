@@ -27,7 +27,7 @@ from cadam3d.core.render import RenderOutput
 from cadam3d.rasterizer import cuda, cuda_sort
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cuda import rasterize, rasterize_ahead
-from cadam3d.rasterizer.launcher import Launch, Launcher
+from cadam3d.rasterizer.driver import Launch, Launcher
 
 # The stages in order, with the prefixes of their kernels. Sorts and prefix sums belong to several stages.
 STAGES = {
@@ -183,8 +183,14 @@ class Load:
 
 
 def sorted_bytes(items: int, bits: int) -> int:
-    """Return the bytes of a sort. The sort of depths does not write the sorted keys."""
-    return cuda_sort.sorted_bytes(items, bits, only_order=bits == cuda.DEPTH_BITS)
+    """Return the bytes that a sort reads and writes, apart from counts: a model, not a measurement.
+
+    A pass reads the keys for counting, reads keys and values for moving them, and writes both. The first pass
+    has no values to read. Few keys are counted by each block, which reads them from a cache. The sort of
+    depths does not write the sorted keys.
+    """
+    passes, counts = len(cuda_sort.digit_bits(bits)), items > cuda_sort.FEW_NUMBERS
+    return WORD * items * (passes * (4 + counts) - 1 - (bits == cuda.DEPTH_BITS))
 
 
 def stage_bytes(load: Load) -> dict[str, int]:

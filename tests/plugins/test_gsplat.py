@@ -8,6 +8,7 @@ import inspect
 import io
 import pickle
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -19,7 +20,7 @@ from torch.nn import Parameter, ParameterDict
 
 pytest.importorskip("gsplat", reason="pip install -e .[dev]")
 
-from gsplat import DefaultStrategy
+from gsplat import DefaultStrategy, MCMCStrategy
 
 from cadam3d.build import component
 from cadam3d.core.errors import UserError
@@ -266,6 +267,36 @@ def test_selections_counts_and_resets_are_those_of_densifier_cadam_on_the_same_g
         trainer.step(step)
     assert all(totals.values()), totals
     assert len(trainer) > 24
+
+
+@pytest.mark.parametrize("strategy", [DefaultStrategy, partial(CAdamStrategy, min_age=2)])
+def test_one_line_of_a_trainer_for_default_strategy_changes(strategy):
+    torch.manual_seed(0)
+    trainer = Trainer(strategy(**SHORT))
+    for step in range(6):
+        trainer.step(step)
+    assert len(trainer) > 24
+
+
+class Calls(MCMCStrategy):
+    """Records the calls that a trainer makes."""
+
+    def step_pre_backward(self, *args, **kwargs):
+        self.pre = (args, kwargs)
+
+    def step_post_backward(self, *args, **kwargs):
+        self.post = (args, kwargs)
+
+
+def test_the_calls_for_mcmc_strategy_fit_too():
+    """The kernels of MCMCStrategy need a GPU, so its calls are recorded and then compared."""
+    calls = Calls()
+    Trainer(calls).step(0)
+    inspect.signature(MCMCStrategy.step_post_backward).bind(calls, *calls.post[0], **calls.post[1])
+    strategy = CAdamStrategy()
+    for method, (args, kwargs) in (("step_pre_backward", calls.pre), ("step_post_backward", calls.post)):
+        inspect.signature(getattr(strategy, method)).bind(*args, **kwargs)
+        getattr(strategy, method)(*args, **{**kwargs, "state": strategy.initialize_state()})
 
 
 # What is observed.

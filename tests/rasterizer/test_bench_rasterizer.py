@@ -14,8 +14,8 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.rasterizer import gsplat
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cpu import CpuRasterizer
+from cadam3d.rasterizer.driver import Launcher
 from cadam3d.rasterizer.gsplat import GsplatRasterizer
-from cadam3d.rasterizer.launcher import Launcher
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 from cadam3d.rasterizer.selftest import GSPLAT, Agreement
 

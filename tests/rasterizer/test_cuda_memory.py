@@ -21,7 +21,7 @@ from splats import (
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.cuda import rasterize
-from cadam3d.rasterizer.launcher import Launch, Launcher
+from cadam3d.rasterizer.driver import Launch, Launcher
 
 pytestmark = pytest.mark.usefixtures("garbage_in_new_memory")
 
